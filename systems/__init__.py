@@ -1,0 +1,1 @@
+"""Drake LeafSystems of the kitting cell, one per file, and the signals that travel between them."""
