@@ -1,0 +1,429 @@
+"""From a scenario to the Diagram of the kitting cell: the only place where systems are wired."""
+
+import ctypes.util
+import importlib
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from pydrake.geometry import (
+    CollisionFilterDeclaration,
+    DepthRange,
+    DepthRenderCamera,
+    GeometrySet,
+    MakeRenderEngineVtk,
+    Meshcat,
+    MeshcatVisualizer,
+    MeshcatVisualizerParams,
+    RenderCameraCore,
+    RenderEngineVtkParams,
+    ClippingRange,
+    ColorRenderCamera,
+    Role,
+    SceneGraph,
+)
+from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
+from pydrake.multibody.parsing import Parser
+from pydrake.multibody.plant import (
+    AddMultibodyPlant,
+    MultibodyPlant,
+    MultibodyPlantConfig,
+)
+from pydrake.multibody.tree import RigidBody
+from pydrake.systems.framework import Context, Diagram, DiagramBuilder
+from pydrake.systems.sensors import CameraInfo, RgbdSensor
+
+from kitting_drake.errors import UserError
+from kitting_drake.paths import MODELS
+from kitting_drake.scenario import Heightmap, LookAt, Oracle, Pinhole, PythonPolicy, Scenario
+from kitting_drake.tasks.kitting import KittingScene, make_scene
+from systems.heightmap_projector import HeightmapProjector
+from systems.oracle_policy import OraclePolicy, OracleTarget
+from systems.pick_place_planner import PickPlacePlanner
+from systems.pick_place_policy import PickPlacePolicy
+from systems.placement_monitor import PlacementGoal, PlacementMonitor
+from systems.rest_detector import BoundedBody, RestDetector
+from systems.signals import Observation, PickPlaceAction, PixelGrid, PlanarPose
+from systems.trajectory_controller import TrajectoryController
+
+MESHCAT_PERIOD = 1 / 32
+_RENDERER = "vtk"
+_SURFACE_POINTS = 2000
+_X_WTABLE = RigidTransform([0.5, 0.0, 0.0])
+
+
+@dataclass(frozen=True)
+class Cell:
+    """The Diagram and the handles that running it takes. All memory is in its Context."""
+
+    diagram: Diagram
+    plant: MultibodyPlant
+    scene_graph: SceneGraph
+    planner: PickPlacePlanner
+    monitor: PlacementMonitor
+    rest_detector: RestDetector
+    scene: KittingScene
+    tool_bodies: tuple[RigidBody, ...]
+    sleep: bool
+
+    def apply_sleep(self, root_context: Context) -> None:
+        """Freezes the tools that are at rest and thaws the others.
+
+        A frozen tool's joint is locked and its contact with table and kit is not computed; what
+        comes near it still collides with it. No LeafSystem may touch another's part of a context,
+        hence a function for the simulator's monitor.
+        """
+        if not self.sleep:
+            return
+        at_rest = self.rest_detector.at_rest(
+            self.rest_detector.GetMyContextFromRoot(root_context)
+        )
+        plant_context = self.plant.GetMyMutableContextFromRoot(root_context)
+        for body, resting in zip(self.tool_bodies, at_rest, strict=True):
+            if resting == body.is_locked(plant_context):
+                continue
+            filters = self.scene_graph.collision_filter_manager(
+                self.scene_graph.GetMyMutableContextFromRoot(root_context)
+            )
+            tool = GeometrySet(self.plant.GetCollisionGeometriesForBody(body))
+            still = self._still_geometry()
+            if resting:
+                body.Lock(plant_context)
+                filters.Apply(CollisionFilterDeclaration().ExcludeBetween(tool, still))
+            else:
+                body.Unlock(plant_context)
+                filters.Apply(CollisionFilterDeclaration().AllowBetween(tool, still))
+
+    def _still_geometry(self) -> GeometrySet:
+        geometry = GeometrySet()
+        for name in ("table", "kit"):
+            body = self.plant.GetBodyByName(name)
+            geometry.Add(self.plant.GetCollisionGeometriesForBody(body))
+        return geometry
+
+
+def build_cell(
+    scenario: Scenario,
+    *,
+    seed: int,
+    base: Path,
+    meshcat: Meshcat | None = None,
+    images: bool = False,
+) -> Cell:
+    """Builds the cell.
+
+    Args:
+        scenario: what to build.
+        seed: of the scene; see `make_scene`.
+        base: where relative paths in the scenario start: the folder of its file.
+        meshcat: where to show it, if anywhere.
+        images: add the cameras even though the policy does not look.
+
+    Returns:
+        The cell. Its Diagram exports the output ports `observation` (with cameras), `action`,
+        `add_s`, `position_error`, `angle_error`, `height_error`, `mode` and `counts`.
+
+    Raises:
+        UserError: something in the scenario cannot be had.
+    """
+    grid = make_grid(scenario.heightmap)
+    scene = make_scene(scenario.task, grid=grid, seed=seed, base=base)
+    builder = DiagramBuilder()
+
+    # The plant: table, kit, tools, hand.
+    plant, scene_graph = _add_plant(builder, scenario)
+    tool_bodies = _add_models(plant, scene)
+    hand = plant.GetModelInstanceByName("franka_hand")
+    plant.Finalize()
+    _set_initial_poses(plant, scenario, scene, tool_bodies)
+
+    # The policy.
+    wants_images = images or not isinstance(scenario.policy, Oracle)
+    if wants_images:
+        projector = _add_cameras(builder, scenario, scene_graph, grid)
+        builder.ExportOutput(projector.GetOutputPort("observation"), "observation")
+    if isinstance(scenario.policy, Oracle):
+        policy = builder.AddNamedSystem("policy", _make_oracle(scene, tool_bodies))
+        builder.Connect(plant.get_body_poses_output_port(), policy.GetInputPort("body_poses"))
+    else:
+        policy = builder.AddNamedSystem(
+            "policy", PickPlacePolicy(policy=_import_function(scenario.policy))
+        )
+        builder.Connect(projector.GetOutputPort("observation"), policy.GetInputPort("observation"))
+
+    # Planner and controller.
+    planner = builder.AddNamedSystem("planner", PickPlacePlanner(parameters=scenario.planner))
+    controller = builder.AddNamedSystem("controller", _make_controller(scenario, plant))
+    hand_state = plant.get_state_output_port(hand)
+    builder.Connect(policy.GetOutputPort("action"), planner.GetInputPort("action"))
+    builder.Connect(hand_state, planner.GetInputPort("hand_state"))
+    builder.Connect(
+        plant.get_generalized_contact_forces_output_port(hand),
+        planner.GetInputPort("hand_contact_force"),
+    )
+    builder.Connect(hand_state, controller.GetInputPort("hand_state"))
+    for port in ("desired_motion", "desired_opening", "closing_force"):
+        builder.Connect(planner.GetOutputPort(port), controller.GetInputPort(port))
+    builder.Connect(controller.get_output_port(), plant.get_actuation_input_port(hand))
+
+    # Score and rest.
+    monitor = builder.AddNamedSystem("monitor", _make_monitor(scene, tool_bodies))
+    builder.Connect(plant.get_body_poses_output_port(), monitor.GetInputPort("body_poses"))
+    rest_detector = builder.AddNamedSystem(
+        "rest_detector", _make_rest_detector(scenario, plant, scene_graph, tool_bodies)
+    )
+    for port in ("body_poses", "body_spatial_velocities"):
+        builder.Connect(plant.GetOutputPort(port), rest_detector.GetInputPort(port))
+
+    for system, ports in (
+        (policy, ("action",)),
+        (monitor, ("add_s", "position_error", "angle_error", "height_error")),
+        (planner, ("mode", "counts")),
+    ):
+        for port in ports:
+            builder.ExportOutput(system.GetOutputPort(port), port)
+    if meshcat is not None:
+        parameters = MeshcatVisualizerParams(role=Role.kIllustration)
+        parameters.publish_period = MESHCAT_PERIOD
+        MeshcatVisualizer.AddToBuilder(builder, scene_graph, meshcat, parameters)
+    diagram = builder.Build()
+    diagram.set_name("kitting_cell")
+    return Cell(
+        diagram=diagram,
+        plant=plant,
+        scene_graph=scene_graph,
+        planner=planner,
+        monitor=monitor,
+        rest_detector=rest_detector,
+        scene=scene,
+        tool_bodies=tuple(tool_bodies),
+        sleep=scenario.sleep.enabled,
+    )
+
+
+def make_grid(config: Heightmap) -> PixelGrid:
+    """The pixel grid that a scenario describes."""
+    return PixelGrid(
+        x_min=config.x_min,
+        y_min=config.y_min,
+        resolution=config.resolution,
+        rows=config.rows,
+        cols=config.cols,
+        z_min=config.z_min,
+        z_max=config.z_max,
+    )
+
+
+def _add_plant(
+    builder: DiagramBuilder, scenario: Scenario
+) -> tuple[MultibodyPlant, SceneGraph]:
+    config = MultibodyPlantConfig(
+        time_step=scenario.plant.time_step,
+        # Strict: a pair that cannot be hydroelastic is an error, not a point contact in disguise.
+        contact_model="hydroelastic",
+        discrete_contact_approximation=scenario.plant.contact_approximation,
+    )
+    return AddMultibodyPlant(config, builder)
+
+
+def _add_models(plant: MultibodyPlant, scene: KittingScene) -> list[RigidBody]:
+    parser = Parser(plant)
+    parser.package_map().AddPackageXml(str(MODELS / "package.xml"))
+    parser.AddModels(str(MODELS / "table" / "table.sdf"))
+    plant.WeldFrames(plant.world_frame(), plant.GetFrameByName("table"), _X_WTABLE)
+    (kit,) = parser.AddModels(str(scene.kit.sdf))
+    plant.WeldFrames(
+        plant.world_frame(), plant.GetFrameByName("kit", kit), scene.X_WKit
+    )
+    tools = []
+    for tool in scene.tools:
+        (instance,) = parser.AddModels(str(tool.sdf))
+        tools.append(plant.GetBodyByName("tool", instance))
+    parser.AddModels(str(MODELS / "franka_hand" / "franka_hand.sdf"))
+    return tools
+
+
+def _set_initial_poses(
+    plant: MultibodyPlant, scenario: Scenario, scene: KittingScene, tools: list[RigidBody]
+) -> None:
+    for body, X_WT in zip(tools, scene.X_WTools, strict=True):
+        plant.SetDefaultFloatingBaseBodyPose(body, X_WT)
+    for joint, position in zip(("x", "y", "z", "yaw"), scenario.planner.home, strict=True):
+        plant.GetJointByName(joint).set_default_positions([position])
+    for joint in ("left_finger_slide", "right_finger_slide"):
+        plant.GetJointByName(joint).set_default_positions([scenario.planner.open_width / 2])
+
+
+def _make_oracle(scene: KittingScene, tools: list[RigidBody]) -> OraclePolicy:
+    return OraclePolicy(
+        targets=[
+            OracleTarget(
+                name=tool.name,
+                body=body.index(),
+                X_WGoal=X_WGoal,
+                grasp=PlanarPose(tool.grasp.x, tool.grasp.y, tool.grasp.theta),
+                surface_height=tool.grasp.surface_height,
+            )
+            for tool, body, X_WGoal in zip(scene.tools, tools, scene.X_WGoals, strict=True)
+        ]
+    )
+
+
+def _make_monitor(scene: KittingScene, tools: list[RigidBody]) -> PlacementMonitor:
+    return PlacementMonitor(
+        goals=[
+            PlacementGoal(tool.name, body.index(), X_WGoal, tool.surface_points(_SURFACE_POINTS))
+            for tool, body, X_WGoal in zip(scene.tools, tools, scene.X_WGoals, strict=True)
+        ]
+    )
+
+
+def _make_controller(scenario: Scenario, plant: MultibodyPlant) -> TrajectoryController:
+    config = scenario.controller
+    context = plant.CreateDefaultContext()
+    hand = plant.GetModelInstanceByName("franka_hand")
+    joints = [plant.GetJointByName(name) for name in ("x", "y", "z", "yaw")]
+    indices = [joint.velocity_start() for joint in joints]
+    inertia = plant.CalcMassMatrix(context).diagonal()[indices]
+    gravity = plant.CalcGravityGeneralizedForces(context)
+    assert plant.num_actuated_dofs(hand) == 6
+    return TrajectoryController(
+        inertia=inertia,
+        weight=-float(gravity[indices[2]]),
+        stiffness=np.array(config.stiffness),
+        damping=np.array(config.damping),
+        force_limit=np.array(config.force_limit),
+        finger_stiffness=config.finger_stiffness,
+        finger_damping=config.finger_damping,
+        finger_force_limit=config.finger_force_limit,
+    )
+
+
+def _make_rest_detector(
+    scenario: Scenario,
+    plant: MultibodyPlant,
+    scene_graph: SceneGraph,
+    tools: list[RigidBody],
+) -> RestDetector:
+    hand = [plant.GetBodyByName(name) for name in ("hand", "left_finger", "right_finger")]
+    return RestDetector(
+        objects=[_bounded(plant, scene_graph, body) for body in tools],
+        movers=[_bounded(plant, scene_graph, body) for body in hand],
+        linear_speed=scenario.sleep.linear_speed,
+        angular_speed=scenario.sleep.angular_speed,
+        patience=scenario.sleep.patience,
+        wake_distance=scenario.sleep.wake_distance,
+    )
+
+
+def _bounded(plant: MultibodyPlant, scene_graph: SceneGraph, body: RigidBody) -> BoundedBody:
+    inspector = scene_graph.model_inspector()
+    corners = []
+    for geometry in plant.GetCollisionGeometriesForBody(body):
+        box = inspector.GetObbInGeometryFrame(geometry)
+        half = np.asarray(box.half_width())
+        signs = np.array(np.meshgrid(*[(-1, 1)] * 3)).reshape(3, -1)
+        X_BBox = inspector.GetPoseInFrame(geometry) @ box.pose()
+        corners.append(X_BBox.multiply(half[:, None] * signs))
+    points = np.concatenate(corners, axis=1)
+    return BoundedBody(body.index(), points.min(axis=1), points.max(axis=1))
+
+
+def _import_function(config: PythonPolicy) -> Callable[[Observation], PickPlaceAction]:
+    module, _, name = config.function.partition(":")
+    try:
+        function = getattr(importlib.import_module(module), name)
+    except (ImportError, AttributeError) as error:
+        raise UserError(f"policy.function: cannot import {config.function}: {error}") from error
+    if not callable(function):
+        raise UserError(f"policy.function: {config.function} is not a function")
+    return function
+
+
+# Cameras.
+
+
+def require_rendering() -> None:
+    """Makes sure that images can be rendered here.
+
+    Raises:
+        UserError: the system library is missing; names the package.
+    """
+    if ctypes.util.find_library("EGL") is None:
+        raise UserError(
+            "rendering needs the system library libEGL: install it "
+            "(Debian and Ubuntu: apt-get install libegl1 libgl1-mesa-dri)"
+        )
+
+
+def add_renderer(scene_graph: SceneGraph) -> str:
+    """Adds the offscreen render engine, once; returns its name.
+
+    Raises:
+        UserError: images cannot be rendered here.
+    """
+    if not scene_graph.HasRenderer(_RENDERER):
+        require_rendering()
+        scene_graph.AddRenderer(_RENDERER, MakeRenderEngineVtk(RenderEngineVtkParams()))
+    return _RENDERER
+
+
+def camera_pose(config: Pinhole | LookAt) -> RigidTransform:
+    """X_WC of a camera: z looks, x points right in the image, y down."""
+    if isinstance(config, Pinhole):
+        return RigidTransform(RollPitchYaw(np.deg2rad(config.rpy_deg)), config.position)
+    z = np.subtract(config.target, config.position)
+    x = np.cross(z, [0.0, 0.0, 1.0])
+    R_WC = RotationMatrix(
+        np.column_stack([v / np.linalg.norm(v) for v in (x, np.cross(z, x), z)])
+    )
+    return RigidTransform(R_WC, config.position)
+
+
+def depth_camera(config: Pinhole | LookAt, renderer: str) -> DepthRenderCamera:
+    """Drake's description of a camera; colour and depth are seen from the same point."""
+    info = CameraInfo(
+        width=config.width,
+        height=config.height,
+        focal_x=config.focal_length,
+        focal_y=config.focal_length,
+        center_x=config.width / 2,
+        center_y=config.height / 2,
+    )
+    core = RenderCameraCore(renderer, info, ClippingRange(0.01, 10.0), RigidTransform())
+    return DepthRenderCamera(core, DepthRange(0.01, 10.0))
+
+
+def _add_cameras(
+    builder: DiagramBuilder, scenario: Scenario, scene_graph: SceneGraph, grid: PixelGrid
+) -> HeightmapProjector:
+    if not scenario.cameras:
+        raise UserError("cameras is empty: the heightmap needs at least one")
+    renderer = add_renderer(scene_graph)
+    cameras = {name: depth_camera(config, renderer) for name, config in scenario.cameras.items()}
+    projector = builder.AddNamedSystem(
+        "heightmap_projector", HeightmapProjector(cameras=cameras, grid=grid)
+    )
+    for name, config in scenario.cameras.items():
+        sensor = builder.AddNamedSystem(
+            f"camera_{name}",
+            RgbdSensor(
+                parent_id=scene_graph.world_frame_id(),
+                X_PB=camera_pose(config),
+                color_camera=ColorRenderCamera(cameras[name].core()),
+                depth_camera=cameras[name],
+            ),
+        )
+        builder.Connect(
+            scene_graph.get_query_output_port(), sensor.query_object_input_port()
+        )
+        for output, port in (
+            ("color_image", "color_image"),
+            ("depth_image_32f", "depth_image"),
+            ("body_pose_in_world", "body_pose_in_world"),
+        ):
+            builder.Connect(
+                sensor.GetOutputPort(output), projector.GetInputPort(f"{port}_{name}")
+            )
+    return projector

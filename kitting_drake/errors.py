@@ -1,0 +1,8 @@
+"""Errors that are the user's to mend."""
+
+
+class UserError(ValueError):
+    """Input that cannot be used. Its text is one sentence: what is wrong, where, what would do.
+
+    Verbs print it and leave with exit code 2.
+    """

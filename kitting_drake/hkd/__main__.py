@@ -1,0 +1,94 @@
+"""The hand tools: `python -m kitting_drake.hkd list | generate [NAME...] | sheet --output FILE.png`."""
+
+import argparse
+import sys
+from pathlib import Path
+
+import yaml
+from rich.console import Console
+from rich.progress import track
+from rich.table import Table
+
+from kitting_drake.hkd.generate import CatalogueError, ToolEntry, generate_tool, load_catalogue
+
+MODELS = Path(__file__).resolve().parents[2] / "models"
+
+
+def _chosen(entries: list[ToolEntry], names: list[str]) -> list[ToolEntry]:
+    """The entries named, in the catalogue's order; all of them if none is named."""
+    known = {entry.name for entry in entries}
+    for name in names:
+        if name not in known:
+            raise CatalogueError(f"no tool is called {name!r}; the catalogue has {', '.join(sorted(known))}")
+    return [entry for entry in entries if not names or entry.name in names]
+
+
+def _description(models: Path, name: str) -> dict:
+    path = models / "tools" / name / "tool.yaml"
+    if not path.exists():
+        raise CatalogueError(f"{path} is missing: run `python -m kitting_drake.hkd generate {name}` first")
+    return yaml.safe_load(path.read_text())
+
+
+def list_tools(args: argparse.Namespace, entries: list[ToolEntry]) -> None:
+    """Prints a table of the generated tools."""
+    table = Table("name", "category", "split")
+    for heading in ("length mm", "width mm", "height mm", "mass g", "grasp mm"):
+        table.add_column(heading, justify="right")
+    for entry in _chosen(entries, args.names):
+        d = _description(args.models, entry.name)
+        sizes = [f"{1e3 * d[key]:.1f}" for key in ("length", "width", "height", "mass")]
+        table.add_row(d["name"], d["category"], d["split"], *sizes, f"{1e3 * d['grasp']['width']:.1f}")
+    Console().print(table)
+
+
+def generate(args: argparse.Namespace, entries: list[ToolEntry]) -> None:
+    """Regenerates models and prints how true their collision pieces are."""
+    table = Table("name")
+    for heading in ("triangles", "pieces", "their triangles", "outside mm", "inside mm", "top mm",
+                    "grip mm", "tilt deg"):
+        table.add_column(heading, justify="right")
+    chosen = _chosen(entries, args.names)
+    for entry in track(chosen, "generating", console=Console(stderr=True), disable=args.quiet):
+        r = generate_tool(entry, args.models / "tools" / entry.name)
+        table.add_row(entry.name, str(r.triangles), str(r.collision_pieces), str(r.collision_triangles),
+                      *(f"{v:.2f}" for v in (r.outside_mm, r.inside_mm, r.top_error_mm, r.grip_error_mm,
+                                             r.tilt_deg)))
+    if not args.quiet:
+        Console().print(table)
+
+
+def sheet(args: argparse.Namespace, entries: list[ToolEntry]) -> None:
+    """Renders the contact sheet."""
+    # Imported here: Drake is slow to load, and only this verb needs it.
+    from kitting_drake.hkd.sheet import write_sheet
+    names = [entry.name for entry in _chosen(entries, args.names)]
+    for name in names:
+        _description(args.models, name)
+    write_sheet(args.models, names, args.output)
+
+
+def main() -> int:
+    """Runs one verb; returns the exit status."""
+    parser = argparse.ArgumentParser(prog="python -m kitting_drake.hkd", description=__doc__)
+    parser.add_argument("--models", type=Path, default=MODELS, help="the directory with package.xml and tools/")
+    verbs = parser.add_subparsers(dest="verb", required=True)
+    for name, function in (("list", list_tools), ("generate", generate), ("sheet", sheet)):
+        verb = verbs.add_parser(name, help=function.__doc__)
+        verb.add_argument("names", nargs="*", metavar="NAME", help="tools; all of them if none is named")
+        verb.set_defaults(function=function)
+        if name == "generate":
+            verb.add_argument("--quiet", action="store_true", help="print nothing")
+        if name == "sheet":
+            verb.add_argument("--output", type=Path, required=True, help="the PNG to write")
+    args = parser.parse_args()
+    try:
+        args.function(args, load_catalogue(args.models / "tools" / "catalogue.yaml"))
+    except (CatalogueError, OSError) as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

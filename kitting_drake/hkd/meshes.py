@@ -1,0 +1,64 @@
+"""Writing solids as Wavefront OBJ: metres, fixed digits and order, so that the same solid gives the same file."""
+
+from pathlib import Path
+
+import numpy as np
+from manifold3d import Manifold
+from scipy.spatial import ConvexHull
+
+
+def vertices_and_faces(solid: Manifold) -> tuple[np.ndarray, np.ndarray]:
+    """The vertices (n, 3) in the solid's own units and the faces (m, 3) of its surface."""
+    mesh = solid.to_mesh64()
+    return np.asarray(mesh.vert_properties)[:, :3], np.asarray(mesh.tri_verts).astype(int)
+
+
+def corner_normals(vertices: np.ndarray, faces: np.ndarray, crease_angle_deg: float) -> np.ndarray:
+    """Normals (m, 3, 3) of the faces' corners, smooth across edges flatter than the crease angle.
+
+    Each corner averages, by area, the faces about its vertex that lean less than that angle from its
+    own: broad flats then stay flat beside narrow bevels.
+    """
+    a, b, c = (vertices[faces[:, k]] for k in range(3))
+    weighted = np.cross(b - a, c - a)
+    unit = weighted / np.maximum(np.linalg.norm(weighted, axis=1, keepdims=True), 1e-30)
+    limit = np.cos(np.radians(crease_angle_deg))
+    corners = faces.ravel()
+    order = np.argsort(corners, kind="stable")
+    normals = np.empty((len(corners), 3))
+    for group in np.split(order, np.flatnonzero(np.diff(corners[order])) + 1):
+        around = group // 3
+        alike = unit[around] @ unit[around].T > limit
+        normals[group] = alike @ weighted[around]
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)
+    return normals.reshape(-1, 3, 3)
+
+
+def write_smooth_obj(path: Path, solid: Manifold, crease_angle_deg: float) -> int:
+    """Writes a solid given in mm, with normals; returns its number of triangles."""
+    vertices, faces = vertices_and_faces(solid)
+    normals = corner_normals(vertices, faces, crease_angle_deg)
+    # Adding zero turns -0 into 0, so that no sign depends on rounding.
+    texts = [f"vn {x:.4f} {y:.4f} {z:.4f}" for x, y, z in np.round(normals.reshape(-1, 3), 4) + 0.0]
+    index = {text: i + 1 for i, text in enumerate(dict.fromkeys(texts))}
+    lines = [*_vertex_lines(vertices), *index]
+    for face, names in zip(faces, np.reshape(texts, (-1, 3))):
+        lines.append("f " + " ".join(f"{v + 1}//{index[n]}" for v, n in zip(face, names)))
+    path.write_text("\n".join(lines) + "\n")
+    return len(faces)
+
+
+def write_convex_obj(path: Path, points: np.ndarray) -> int:
+    """Writes the convex hull of points (n, 3) in mm; returns its number of triangles."""
+    hull = ConvexHull(points)
+    # Qhull does not orient its facets: turn those that wind against their outward normal.
+    a, b, c = (points[hull.simplices[:, k]] for k in range(3))
+    inward = np.sum(np.cross(b - a, c - a) * hull.equations[:, :3], axis=1) < 0
+    faces = np.where(inward[:, None], hull.simplices[:, ::-1], hull.simplices)
+    lines = [*_vertex_lines(points), *(f"f {i} {j} {k}" for i, j, k in faces + 1)]
+    path.write_text("\n".join(lines) + "\n")
+    return len(faces)
+
+
+def _vertex_lines(vertices: np.ndarray) -> list[str]:
+    return [f"v {x:.6f} {y:.6f} {z:.6f}" for x, y, z in np.round(1e-3 * vertices, 6) + 0.0]

@@ -1,0 +1,251 @@
+"""Building blocks of the generated hand tools: parts, profiles, plates, lofts and their convex pieces.
+
+Everything here is in millimetres and in the *design frame* of a tool: x along the length, working end
+toward +x, z up when the tool lies flat. A shape is built twice from the same numbers: once as an exact
+solid, which is seen and weighed, and once as many small convex point sets that fill it, which
+`merge_hulls` later joins into the few convex collision pieces that a simulator wants.
+"""
+
+from dataclasses import dataclass, field
+from typing import NamedTuple, Sequence
+
+import manifold3d
+import numpy as np
+from manifold3d import CrossSection, JoinType, Manifold
+
+# Segments of a full circle. Given at every call: the library's own choice is meant for larger units.
+SEGMENTS = 48
+
+
+class Material(NamedTuple):
+    """What a part is made of: density in kg/m^3 and diffuse colour, red green blue alpha in [0, 1]."""
+
+    density: float
+    rgba: tuple[float, float, float, float]
+
+
+MATERIALS: dict[str, Material] = {
+    "polished_steel": Material(7850.0, (0.80, 0.81, 0.83, 1.0)),
+    "steel": Material(7850.0, (0.62, 0.64, 0.67, 1.0)),
+    "dark_steel": Material(7850.0, (0.27, 0.28, 0.30, 1.0)),
+    "hickory": Material(750.0, (0.82, 0.60, 0.34, 1.0)),
+    "painted_wood": Material(750.0, (0.62, 0.13, 0.10, 1.0)),
+    "red_grip": Material(1150.0, (0.80, 0.10, 0.09, 1.0)),
+    "blue_grip": Material(1150.0, (0.07, 0.26, 0.62, 1.0)),
+    "yellow_grip": Material(1150.0, (0.96, 0.71, 0.06, 1.0)),
+    "green_grip": Material(1150.0, (0.08, 0.45, 0.22, 1.0)),
+    "orange_grip": Material(1150.0, (0.93, 0.40, 0.05, 1.0)),
+    "black_rubber": Material(1200.0, (0.12, 0.12, 0.13, 1.0)),
+}
+
+
+@dataclass
+class Part:
+    """One homogeneous part of a tool, in mm in the design frame.
+
+    Parts may overlap: where they do, the part earlier in a tool's list keeps the volume.
+    """
+
+    name: str
+    # A key of MATERIALS.
+    material: str
+    solid: Manifold
+    # Arrays of shape (n, 3): the convex hulls of these point sets fill the solid. A part that lies
+    # wholly inside the hulls of others has none.
+    hulls: list[np.ndarray] = field(default_factory=list)
+
+
+class Shape(NamedTuple):
+    """A solid together with the convex point sets, each (n, 3), that fill it."""
+
+    solid: Manifold
+    hulls: list[np.ndarray]
+
+
+# --- Profiles: closed polygons in the plane, (n, 2), counter-clockwise. ---
+
+
+def circle(radius: float, center: Sequence[float] = (0.0, 0.0), segments: int = SEGMENTS) -> np.ndarray:
+    """A regular polygon inscribed in a circle, the first vertex toward +x."""
+    angles = 2 * np.pi * np.arange(segments) / segments
+    return np.asarray(center) + radius * np.column_stack([np.cos(angles), np.sin(angles)])
+
+
+def fillet(points: Sequence[Sequence[float]], radii: float | Sequence[float],
+           segments: int = 6) -> np.ndarray:
+    """Replaces each corner of a closed polygon by an arc.
+
+    A radius too large for its edges is cut back to what fits; zero keeps the corner.
+    """
+    points = np.asarray(points, dtype=float)
+    radii = np.broadcast_to(np.asarray(radii, dtype=float), len(points))
+    result = []
+    for before, corner, after, radius in zip(
+        np.roll(points, 1, axis=0), points, np.roll(points, -1, axis=0), radii
+    ):
+        u, v = before - corner, after - corner
+        length_u, length_v = np.linalg.norm(u), np.linalg.norm(v)
+        u, v = u / length_u, v / length_v
+        half = 0.5 * np.arccos(np.clip(u @ v, -1.0, 1.0))
+        # Leave a little of each edge, so that neighbouring arcs never share a point.
+        setback = min(radius / np.tan(half), 0.49 * length_u, 0.49 * length_v)
+        if setback < 1e-6 or half > 0.5 * np.pi - 1e-3:
+            result.append(corner)
+            continue
+        bisector = (u + v) / np.linalg.norm(u + v)
+        radius = setback * np.tan(half)
+        center = corner + bisector * radius / np.sin(half)
+        start, end = corner + setback * u - center, corner + setback * v - center
+        sweep = np.arctan2(start[0] * end[1] - start[1] * end[0], start @ end)
+        for t in np.linspace(0.0, sweep, segments + 1):
+            c, s = np.cos(t), np.sin(t)
+            result.append(center + np.array([c * start[0] - s * start[1], s * start[0] + c * start[1]]))
+    return np.array(result)
+
+
+def rounded_rectangle(width: float, height: float, radius: float, segments: int = 4) -> np.ndarray:
+    """A rectangle about the origin with arcs for corners; the vertex count depends on `segments` only."""
+    x, y = width / 2, height / 2
+    radius = min(radius, 0.98 * min(x, y))
+    return fillet([(-x, -y), (x, -y), (x, y), (-x, y)], radius, segments)
+
+
+def ribbon(path: np.ndarray, widths: Sequence[float]) -> np.ndarray:
+    """The outline, (2n, 2), of a band of the given `widths` (n) about a `path` (n, 2)."""
+    tangent = np.gradient(path, axis=0)
+    normal = np.column_stack([-tangent[:, 1], tangent[:, 0]])
+    normal *= 0.5 * np.asarray(widths)[:, None] / np.linalg.norm(normal, axis=1, keepdims=True)
+    return np.vstack([path - normal, (path + normal)[::-1]])
+
+
+def blend(profile: CrossSection, inner_radius: float, outer_radius: float = 0.0) -> CrossSection:
+    """Rounds the inward corners of a profile, and its outward ones, to the given radii."""
+    for radius in (inner_radius, -outer_radius):
+        profile = profile.offset(radius, JoinType.Round, circular_segments=SEGMENTS)
+        profile = profile.offset(-radius, JoinType.Round, circular_segments=SEGMENTS)
+    return profile.simplify(0.02)
+
+
+def without_holes(profile: CrossSection) -> CrossSection:
+    """The profile with its holes filled."""
+    outer = [p for p in profile.to_polygons() if CrossSection([p]).area() > 0]
+    return CrossSection(outer) if outer else profile
+
+
+# --- Solids. ---
+
+
+def _stitched(rings: np.ndarray, caps: tuple[np.ndarray, np.ndarray]) -> Manifold:
+    """Closes `rings` (m, n, 3) of equal loops with quads between neighbours and the given end caps."""
+    count, size = rings.shape[:2]
+    i = np.arange(size)
+    j = (i + 1) % size
+    walls = [
+        np.concatenate([np.column_stack([k + i, k + j, k + size + j]),
+                        np.column_stack([k + i, k + size + j, k + size + i])])
+        for k in size * np.arange(count - 1)
+    ]
+    faces = np.vstack([caps[0][:, ::-1], *walls, caps[1] + size * (count - 1)])
+    return _closed_solid(rings.reshape(-1, 3), faces)
+
+
+def _closed_solid(vertices: np.ndarray, faces: np.ndarray) -> Manifold:
+    """The solid of a closed mesh, its faces turned outward as a whole."""
+    solid = Manifold(manifold3d.Mesh64(np.ascontiguousarray(vertices), faces.astype(np.uint64)))
+    if solid.status() != manifold3d.Error.NoError:
+        raise ValueError(f"a shape does not close: {solid.status()}")
+    return solid if solid.volume() > 0 else _closed_solid(vertices, faces[:, ::-1])
+
+
+def plate(profile: CrossSection | np.ndarray, z_low: float, z_high: float, bevel: float = 0.8) -> Shape:
+    """A plate between two heights, its lower and upper edges bevelled at 45 degrees.
+
+    Holes are cut with plain edges, and do not appear in the hulls.
+    """
+    if isinstance(profile, np.ndarray):
+        profile = CrossSection([profile])
+    filled = without_holes(profile).simplify(0.01)
+    solid = _bevelled(filled, z_low, z_high, bevel)
+    holes = filled - profile
+    if not holes.is_empty():
+        solid -= holes.extrude(z_high - z_low + 2).translate((0, 0, z_low - 1))
+    return Shape(solid, _plate_hulls(filled, z_low, z_high, bevel))
+
+
+def _bevelled(profile: CrossSection, z_low: float, z_high: float, bevel: float) -> Manifold:
+    """The plate's solid. The inset outline may have other vertices, or loops, than the outline.
+
+    A bevel is the strip between the two outlines, triangulated in the plane and then lifted.
+    """
+    outer = profile.to_polygons()
+    inner = profile.offset(-bevel, JoinType.Miter).to_polygons()
+    rim, top = np.vstack(outer), np.vstack(inner)
+    strip = manifold3d.triangulate([*outer, *(loop[::-1] for loop in inner)])
+    # In the strip the inner loops run backward: number their vertices as in the cap.
+    numbers = np.arange(len(top))
+    starts = np.cumsum([len(loop) for loop in inner])[:-1]
+    backward = np.concatenate([n[::-1] for n in np.split(numbers, starts)])
+    strip = np.concatenate([np.arange(len(rim)), len(rim) + backward])[strip]
+    cap = len(rim) + manifold3d.triangulate(inner)
+    upper = np.vstack([strip, cap])
+    count = len(rim) + len(top)
+    walls, first = [], 0
+    for loop in outer:
+        i = first + np.arange(len(loop))
+        j = first + (np.arange(len(loop)) + 1) % len(loop)
+        walls += [np.column_stack([i, j, count + j]), np.column_stack([i, count + j, count + i])]
+        first += len(loop)
+    heights = ((z_low + bevel, z_low), (z_high - bevel, z_high))
+    vertices = np.vstack([np.column_stack([points, np.full(len(points), z)])
+                          for level in heights for points, z in zip((rim, top), level)])
+    return _closed_solid(vertices, np.vstack([upper[:, ::-1], *walls, count + upper]))
+
+
+def _plate_hulls(profile: CrossSection, z_low: float, z_high: float, bevel: float) -> list[np.ndarray]:
+    """Prisms over a triangulation of the profile that keep the bevels of its rim but not of its cuts."""
+    coarse = profile.simplify(0.08)
+    loops = coarse.to_polygons()
+    points = np.vstack(loops)
+    # The top edge's bevel is left out: nothing slides over it, and every vertex costs contact time.
+    levels = [(z_low, bevel), (z_low + bevel, 0.0), (z_high, 0.0)]
+    insets = {inset: coarse.offset(-inset, JoinType.Miter, circular_segments=SEGMENTS)
+              for _, inset in levels}
+    hulls = []
+    for triangle in manifold3d.triangulate(loops):
+        piece = CrossSection([points[triangle]])
+        rings = [
+            np.column_stack([p, np.full(len(p), z)])
+            for z, inset in levels
+            for p in (piece ^ insets[inset]).to_polygons()
+        ]
+        if rings:
+            hulls.append(np.vstack(rings))
+    return hulls
+
+
+def loft(sections: Sequence[np.ndarray]) -> Shape:
+    """A skin through cross-sections (n, 3), each star-shaped about its mean, with the same n."""
+    rings = np.asarray(sections, dtype=float)
+    caps = tuple(manifold3d.triangulate([_planar(ring)]) for ring in (rings[0], rings[-1]))
+    return Shape(_stitched(rings, caps), [np.vstack(pair) for pair in zip(rings, rings[1:])])
+
+
+def _planar(ring: np.ndarray) -> np.ndarray:
+    """A flat ring (n, 3) in coordinates of its own plane, counter-clockwise."""
+    centered = ring - ring.mean(axis=0)
+    u = centered[0] / np.linalg.norm(centered[0])
+    normal = np.sum(np.cross(centered, np.roll(centered, -1, axis=0)), axis=0)
+    normal /= np.linalg.norm(normal)
+    return np.ascontiguousarray(np.column_stack([centered @ u, centered @ np.cross(normal, u)]))
+
+
+def across_x(profile: np.ndarray, x: float, y: float = 0.0, z: float = 0.0) -> np.ndarray:
+    """A section (n, 3) of a loft along x: the profile's axes become y and z."""
+    return np.column_stack([np.full(len(profile), x), profile[:, 0] + y, profile[:, 1] + z])
+
+
+def across_path(profile: np.ndarray, point: Sequence[float], angle: float) -> np.ndarray:
+    """A section (n, 3) of a loft in the xy plane, travelling at `angle` (rad) from +x through `point`."""
+    left = np.array([-np.sin(angle), np.cos(angle)])
+    xy = np.asarray(point) + profile[:, :1] * left
+    return np.column_stack([xy, profile[:, 1]])

@@ -1,0 +1,346 @@
+"""The YAML schema of a scenario, in the manner of Drake's hardware_sim.
+
+A file holds one or more scenarios, each under its name. Every field has a default, so `Defaults: {}`
+is a scenario. Where a field is a union, a YAML tag chooses: `policy: !Oracle {}`.
+
+Units are SI; angles that a person writes are in degrees, and the field says so.
+"""
+
+import dataclasses as dc
+from pathlib import Path
+
+import yaml
+from pydrake.common.yaml import yaml_load, yaml_load_typed
+
+from kitting_drake.errors import UserError
+from kitting_drake.hkd.kit import KitParameters
+from kitting_drake.yaml_schema import check_yaml
+from systems.bounds import bounded, check_bounds
+from systems.pick_place_planner import PickPlaceParameters
+
+_ANGLE = (-360.0, 360.0)
+
+
+@dc.dataclass
+class Placement:
+    """A pose on the table."""
+
+    # World x and y, in m.
+    x: float = bounded(0.5, -2.0, 2.0)
+    y: float = bounded(0.0, -2.0, 2.0)
+
+    # Turn about world z, counter-clockwise, in degrees.
+    yaw_deg: float = bounded(0.0, *_ANGLE)
+
+
+@dc.dataclass
+class Kitting:
+    """Tools and kit stand anywhere in the workspace, drawn from the seed without collision."""
+
+    # The tools, one of each category at most: names under models/tools, or paths of tool folders.
+    tools: list[str] = dc.field(
+        default_factory=lambda: [
+            "claw_hammer",
+            "slip_joint_pliers",
+            "combination_wrench",
+            "flat_screwdriver",
+        ]
+    )
+
+    # The kit block and its cavities.
+    kit: KitParameters = dc.field(default_factory=KitParameters)
+
+    # Least distance between any two of tools and kit, in m.
+    spacing: float = bounded(0.008, 0.0, 0.2)
+
+    # Turns of tools and kit are drawn within plus or minus this, in degrees.
+    yaw_range_deg: float = bounded(180.0, 0.0, 180.0)
+
+    # The order in which an oracle takes the tools: drawn from the seed, or as listed.
+    random_order: bool = True
+
+    # ADD-S below this is a success (section IV-C of the paper), in m.
+    success_threshold: float = bounded(0.0035, 1e-6, 1.0)
+
+
+@dc.dataclass
+class ArrangedKitting:
+    """Tools and kit stand where you say, and an oracle takes them in the order given."""
+
+    # Tools by name or path, each with its pose on the table.
+    tools: dict[str, Placement] = dc.field(
+        default_factory=lambda: {"claw_hammer": Placement(x=0.35, y=0.3, yaw_deg=90.0)}
+    )
+
+    # Where the kit stands.
+    kit_pose: Placement = dc.field(default_factory=lambda: Placement(x=0.5, y=-0.1))
+
+    # The kit block and its cavities.
+    kit: KitParameters = dc.field(default_factory=KitParameters)
+
+    # ADD-S below this is a success (section IV-C of the paper), in m.
+    success_threshold: float = bounded(0.0035, 1e-6, 1.0)
+
+
+@dc.dataclass
+class Oracle:
+    """Ground truth and annotated grasps (section IV-B.4 of the paper)."""
+
+
+@dc.dataclass
+class PythonPolicy:
+    """Your own function from `Observation` to `PickPlaceAction` (see systems/signals.py)."""
+
+    # `module:function`, importable from where you run; called with one Observation.
+    function: str = ""
+
+
+@dc.dataclass
+class Pinhole:
+    """An RGB-D camera placed by roll, pitch and yaw. Its z axis looks, its x axis points right."""
+
+    # Position in the world, in m.
+    position: list[float] = bounded([1.0, 0.0, 0.75], -10.0, 10.0)
+
+    # Roll, pitch and yaw, R = Rz Ry Rx, in degrees.
+    rpy_deg: list[float] = bounded([45.0, 180.0, -90.0], *_ANGLE)
+
+    # Image size in pixels, focal length in pixels; the principal point is the image's middle.
+    width: int = bounded(640, 16, 4096)
+    height: int = bounded(480, 16, 4096)
+    focal_length: float = bounded(450.0, 10.0, 10000.0)
+
+
+@dc.dataclass
+class LookAt:
+    """An RGB-D camera placed by what it looks at, upright."""
+
+    # Position, and the point in the middle of the image, in the world, in m.
+    position: list[float] = bounded([1.0, 0.0, 0.75], -10.0, 10.0)
+    target: list[float] = bounded([0.5, 0.0, 0.0], -10.0, 10.0)
+
+    # Image size in pixels, focal length in pixels; the principal point is the image's middle.
+    width: int = bounded(640, 16, 4096)
+    height: int = bounded(480, 16, 4096)
+    focal_length: float = bounded(450.0, 10.0, 10000.0)
+
+
+@dc.dataclass
+class Heightmap:
+    """The orthographic observation o_t. The workspace is also where tools and kit are drawn."""
+
+    # Lower corner of the workspace in the world, in m.
+    x_min: float = bounded(0.25, -10.0, 10.0)
+    y_min: float = bounded(-0.5, -10.0, 10.0)
+
+    # Side of a pixel, in m, and pixels along x and y.
+    resolution: float = bounded(0.003125, 1e-4, 0.1)
+    rows: int = bounded(160, 1, 4096)
+    cols: int = bounded(320, 1, 4096)
+
+    # Heights outside this range are not seen, in m.
+    z_min: float = bounded(0.0, -1.0, 10.0)
+    z_max: float = bounded(0.28, -1.0, 10.0)
+
+
+@dc.dataclass
+class Controller:
+    """Gains of the TrajectoryController; for x, y, z (N/m, N s/m) and yaw (N m/rad, N m s/rad)."""
+
+    stiffness: list[float] = bounded([10000.0, 10000.0, 10000.0, 120.0], 0.0, 1e6)
+    damping: list[float] = bounded([320.0, 320.0, 320.0, 4.2], 0.0, 1e5)
+
+    # Force limits of the axes, in N and N m.
+    force_limit: list[float] = bounded([150.0, 150.0, 150.0, 12.0], 1e-3, 1e4)
+
+    # Of each finger: N/m, N s/m, N.
+    finger_stiffness: float = bounded(800.0, 1.0, 1e5)
+    finger_damping: float = bounded(16.0, 0.0, 1e4)
+    finger_force_limit: float = bounded(140.0, 1.0, 140.0)
+
+
+@dc.dataclass
+class Plant:
+    """The physics."""
+
+    # Discrete step, in s. Powers of two divide every other period of the cell exactly.
+    time_step: float = bounded(0.00390625, 1e-5, 0.02)
+
+    # Drake's approximation of contact: lagged, similar or sap.
+    contact_approximation: str = "lagged"
+
+
+@dc.dataclass
+class Sleep:
+    """What rests costs nothing: a tool at rest, out of reach of anything that moves, is frozen."""
+
+    enabled: bool = True
+
+    # A tool is at rest below these speeds (m/s, rad/s) ...
+    linear_speed: float = bounded(0.002, 0.0, 1.0)
+    angular_speed: float = bounded(0.05, 0.0, 10.0)
+
+    # ... that have lasted this long, in s.
+    patience: float = bounded(0.25, 0.0, 10.0)
+
+    # It wakes when the hand, or an object that is awake, comes this near, in m.
+    wake_distance: float = bounded(0.006, 0.001, 1.0)
+
+
+@dc.dataclass
+class Scenario:
+    """Everything about an episode but its seed."""
+
+    # The seed when none is given on the command line.
+    random_seed: int = bounded(0, 0, 2**32 - 1)
+
+    # The episode ends after this much simulated time whatever happens, in s.
+    time_limit: float = bounded(180.0, 0.1, 1e6)
+
+    # Live viewing: 1 is real time, 0 as fast as the machine allows.
+    target_realtime_rate: float = bounded(0.0, 0.0, 100.0)
+
+    # What stands on the table, and its score: !Kitting or !ArrangedKitting.
+    task: Kitting | ArrangedKitting = dc.field(default_factory=Kitting)
+
+    # Who decides: !Oracle or !PythonPolicy.
+    policy: Oracle | PythonPolicy = dc.field(default_factory=Oracle)
+
+    # The RGB-D cameras by name: !Pinhole or !LookAt. These three are those of Ravens.
+    cameras: dict[str, Pinhole | LookAt] = dc.field(
+        default_factory=lambda: {
+            "front": Pinhole(position=[1.0, 0.0, 0.75], rpy_deg=[45.0, 180.0, -90.0]),
+            "left": Pinhole(position=[0.0, 0.5, 0.75], rpy_deg=[40.0, 180.0, 45.0]),
+            "right": Pinhole(position=[0.0, -0.5, 0.75], rpy_deg=[40.0, 180.0, 135.0]),
+        }
+    )
+
+    # What the policy sees.
+    heightmap: Heightmap = dc.field(default_factory=Heightmap)
+
+    # How the hand moves.
+    planner: PickPlaceParameters = dc.field(default_factory=PickPlaceParameters)
+    controller: Controller = dc.field(default_factory=Controller)
+
+    # The physics.
+    plant: Plant = dc.field(default_factory=Plant)
+    sleep: Sleep = dc.field(default_factory=Sleep)
+
+
+def load_scenario(path: Path, name: str | None = None, text: str | None = None) -> Scenario:
+    """Reads a scenario.
+
+    Args:
+        path: the YAML file: a mapping from names to scenarios.
+        name: which one; the first when None.
+        text: YAML merged over it: mappings field by field, all else replaced.
+
+    Raises:
+        UserError: the file cannot be used; names the file and the field.
+    """
+    try:
+        content = path.read_text()
+    except (OSError, UnicodeDecodeError) as error:
+        reason = getattr(error, "strerror", None) or "it is not a text file"
+        raise UserError(f"cannot read the scenario {path}: {reason}") from error
+    root = _parse(content, str(path))
+    names = [key for key, value in root.items() if isinstance(key, str)]
+    fields = {item.name for item in dc.fields(Scenario)}
+    if names and not set(names) - fields:
+        raise UserError(
+            f"{path}: '{names[0]}' is a field, not a scenario: put the fields under a name of yours"
+        )
+    if name is None:
+        if not names:
+            raise UserError(f"{path} holds no scenario")
+        name = names[0]
+    if name not in root:
+        raise UserError(f"{path} has no scenario '{name}': use one of {', '.join(names)}")
+    scenario = _load(root[name], content, name, Scenario(), f"{path}: {name}")
+    if text is not None:
+        merged = _parse(text, "--scenario_text")
+        scenario = _load(merged, text, None, scenario, "--scenario_text")
+    return scenario
+
+
+def _parse(content: str, where: str) -> dict:
+    try:
+        # A Python mapping would swallow a field that is given twice.
+        _check_duplicates(yaml.compose(content, Loader=yaml.SafeLoader))
+        root = yaml_load(data=content)
+    except yaml.YAMLError as error:
+        mark = getattr(error, "problem_mark", None)
+        line = f", line {mark.line + 1}" if mark else ""
+        problem = getattr(error, "problem", None) or "it cannot be parsed"
+        raise UserError(f"{where}{line} is not YAML: {problem}") from error
+    except ValueError as error:
+        raise UserError(f"{where}: {error}") from error
+    except RecursionError as error:
+        raise UserError(f"{where} is not YAML that ends: it contains itself") from error
+    if root is None:
+        return {}
+    if not isinstance(root, dict):
+        raise UserError(f"{where} must be a mapping of names, not a {type(root).__name__}")
+    return root
+
+
+def _check_duplicates(node: yaml.Node | None) -> None:
+    if isinstance(node, yaml.MappingNode):
+        seen = set()
+        for key, value in node.value:
+            if key.value in seen:
+                line = key.start_mark.line + 1
+                raise ValueError(f"'{key.value}' is given twice (again on line {line})")
+            seen.add(str(key.value))
+            _check_duplicates(value)
+    elif isinstance(node, yaml.SequenceNode):
+        for item in node.value:
+            _check_duplicates(item)
+
+
+def _load(raw: object, content: str, name: str | None, defaults: Scenario, where: str) -> Scenario:
+    try:
+        check_yaml(Scenario, raw if raw is not None else {}, "")
+        if raw is None or raw == {}:
+            scenario = defaults
+        else:
+            scenario = yaml_load_typed(
+                schema=Scenario, data=content, child_name=name, defaults=defaults
+            )
+        check_bounds(scenario)
+        _check_meaning(scenario)
+    except (ValueError, RuntimeError) as error:
+        text = str(error).splitlines()[0]
+        raise UserError(f"{where}: {text}") from error
+    return scenario
+
+
+def _check_meaning(scenario: Scenario) -> None:
+    """What no type and no range can say."""
+    if scenario.plant.contact_approximation not in ("lagged", "similar", "sap"):
+        raise ValueError(
+            "plant.contact_approximation must be lagged, similar or sap, "
+            f"not '{scenario.plant.contact_approximation}'"
+        )
+    steps = (1 / 64) / scenario.plant.time_step
+    if abs(steps - round(steps)) > 1e-9 or steps < 1:
+        raise ValueError(
+            "plant.time_step must divide 1/64 s, the planner's period, "
+            f"not be {scenario.plant.time_step:g}"
+        )
+    if scenario.heightmap.z_max <= scenario.heightmap.z_min:
+        raise ValueError("heightmap.z_max must be above heightmap.z_min")
+    if not scenario.task.tools:
+        raise ValueError("task.tools is empty: name at least one tool")
+    for key, camera in scenario.cameras.items():
+        if isinstance(camera, LookAt) and camera.position[:2] == camera.target[:2]:
+            raise ValueError(
+                f"cameras.{key} looks straight down, where upright means nothing: use !Pinhole"
+            )
+    policy = scenario.policy
+    if isinstance(policy, PythonPolicy):
+        module, _, function = policy.function.partition(":")
+        if not module or not function:
+            raise ValueError(f"policy.function must be module:function, not '{policy.function}'")
+        if not scenario.cameras:
+            raise ValueError("cameras is empty: a !PythonPolicy needs at least one to see by")

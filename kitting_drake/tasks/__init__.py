@@ -1,0 +1,1 @@
+"""What stands on the table, where it belongs, and how it is scored."""

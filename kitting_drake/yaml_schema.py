@@ -1,0 +1,101 @@
+"""Checks YAML against a schema of dataclasses, so that a mistake is told by its path.
+
+Drake's `yaml_load_typed` does the loading; its complaints name neither the file nor, often, the
+field, which is what a person needs to mend it.
+"""
+
+import dataclasses
+import difflib
+import types
+import typing
+from pathlib import Path
+from typing import Any
+
+_NAMES = {float: "a number", int: "a whole number", bool: "true or false", str: "a text"}
+
+
+def check_yaml(schema: Any, value: Any, where: str) -> None:
+    """Checks what `pydrake.common.yaml.yaml_load` returned against a type of the schema.
+
+    Args:
+        schema: a dataclass, a union of dataclasses, `T | None`, float, int, bool, str, Path,
+            `list[T]` or `dict[str, T]`.
+        value: the untyped value; a mapping's YAML tag is its key `_tag`.
+        where: the path to the value, for messages; empty at the root.
+
+    Raises:
+        ValueError: with one sentence that begins with the path.
+    """
+    origin = typing.get_origin(schema)
+    if origin in (types.UnionType, typing.Union):
+        _check_union(schema, value, where)
+    elif origin is list:
+        if not isinstance(value, list):
+            raise ValueError(f"{where} must be a list, not {_shown(value)}")
+        for index, item in enumerate(value):
+            check_yaml(typing.get_args(schema)[0], item, f"{where}[{index}]")
+    elif origin is dict:
+        if not isinstance(value, dict):
+            raise ValueError(f"{where} must be a mapping of names, not {_shown(value)}")
+        for key, item in value.items():
+            check_yaml(typing.get_args(schema)[1], item, _join(where, key))
+    elif dataclasses.is_dataclass(schema):
+        _check_dataclass(schema, value, where)
+    else:
+        _check_scalar(schema, value, where)
+
+
+def _check_union(schema: Any, value: Any, where: str) -> None:
+    options = [option for option in typing.get_args(schema) if option is not type(None)]
+    if value is None:
+        if type(None) in typing.get_args(schema):
+            return
+        raise ValueError(f"{where} is empty: give a value or leave the field out")
+    if len(options) == 1 or not isinstance(value, dict):
+        check_yaml(options[0], value, where)
+        return
+    # An untagged mapping takes the first option, as in Drake.
+    tag = value.get("_tag", f"!{options[0].__name__}").lstrip("!")
+    for option in options:
+        if option.__name__ == tag:
+            check_yaml(option, value, where)
+            return
+    known = ", ".join(f"!{option.__name__}" for option in options)
+    raise ValueError(f"{where} has the unknown tag !{tag}: use one of {known}")
+
+
+def _check_dataclass(schema: Any, value: Any, where: str) -> None:
+    if not isinstance(value, dict):
+        raise ValueError(f"{where or 'the scenario'} must be a mapping, not {_shown(value)}")
+    hints = typing.get_type_hints(schema)
+    for key, item in value.items():
+        if key == "_tag":
+            continue
+        if key not in hints:
+            close = difflib.get_close_matches(str(key), hints, n=1)
+            advice = f"did you mean '{close[0]}'?" if close else f"use one of {', '.join(hints)}"
+            raise ValueError(f"{_join(where, key)} is an unknown field: {advice}")
+        check_yaml(hints[key], item, _join(where, key))
+
+
+def _check_scalar(schema: Any, value: Any, where: str) -> None:
+    if value is None:
+        raise ValueError(f"{where} is empty: give a value or leave the field out")
+    accepted: tuple[type, ...] = {float: (float, int), Path: (str,)}.get(schema, (schema,))
+    if not isinstance(value, accepted) or (isinstance(value, bool) and schema is not bool):
+        raise ValueError(f"{where} must be {_NAMES.get(schema, 'a path')}, not {_shown(value)}")
+
+
+def _join(where: str, key: object) -> str:
+    return f"{where}.{key}" if where else str(key)
+
+
+def _shown(value: Any) -> str:
+    if isinstance(value, dict):
+        return "a mapping"
+    if isinstance(value, list):
+        return "a list"
+    if value is None:
+        return "empty"
+    text = str(value)
+    return f"'{text if len(text) <= 40 else text[:37] + '...'}'"

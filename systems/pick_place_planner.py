@@ -1,0 +1,473 @@
+"""The pick-and-place motion primitive: a state machine that makes smooth, limited motions."""
+
+import enum
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from pydrake.common.containers import namedview
+from pydrake.common.value import Value
+from pydrake.systems.framework import (
+    BasicVector,
+    Context,
+    DiscreteValues,
+    EventStatus,
+    LeafSystem,
+)
+
+from systems.bounds import bounded
+from systems.signals import PickPlaceAction, wrap_to_pi
+
+
+class Mode(enum.IntEnum):
+    """What the planner is doing. The order is the order of a successful pick and place."""
+
+    OBSERVE = 0
+    """Go home, out of the cameras' sight, come to rest, and ask the policy."""
+    APPROACH = 1
+    """Move over the pick pose, jaws open."""
+    DESCEND = 2
+    """Go down to the grasp height, or until something is touched."""
+    CLOSE = 3
+    """Close the jaws until they stall, then press."""
+    CHECK = 4
+    """Look whether there is something between the pads."""
+    LIFT = 5
+    CARRY = 6
+    """Move over the place pose and turn."""
+    LOWER = 7
+    """Go down until something is touched."""
+    RELEASE = 8
+    RETREAT = 9
+    """Straight up from where the hand is."""
+    DONE = 10
+
+
+@dataclass
+class PickPlaceParameters:
+    """Heights, speeds and thresholds of the motion primitive."""
+
+    # Where the hand waits while the cameras look: x, y (m), height of the fingertips (m), yaw (rad).
+    home: list[float] = bounded([0.35, 0.0, 0.52, 0.0], -2.0, 2.0)
+
+    # Height of the fingertips while crossing the table, in m. What hangs below them must clear the
+    # kit block and tools that stand proud of it.
+    travel_height: float = bounded(0.115, 0.05, 0.5)
+
+    # How far below the top of an object the fingertips grip, in m.
+    grasp_depth: float = bounded(0.010, 0.001, 0.05)
+
+    # The fingertips stay this far above z = 0, in m.
+    floor_clearance: float = bounded(0.0015, 0.0, 0.05)
+
+    # Opening of the jaws before a grasp, in m.
+    open_width: float = bounded(0.080, 0.005, 0.080)
+
+    # How far each jaw draws back from an object to let go of it, in m.
+    release_clearance: float = bounded(0.006, 0.001, 0.04)
+
+    # How hard each pad presses on what it holds, in N.
+    grasp_force: float = bounded(60.0, 1.0, 140.0)
+
+    # Less than this between the pads is nothing at all, in m.
+    minimum_width: float = bounded(0.003, 0.0, 0.08)
+
+    # A vertical contact force beyond the load's weight that means "touched", in N.
+    contact_threshold: float = bounded(4.0, 0.5, 100.0)
+
+    # Highest linear speed (m/s) and acceleration (m/s^2) in free space.
+    linear_speed: float = bounded(1.0, 0.01, 1.7)
+    linear_acceleration: float = bounded(6.0, 0.1, 13.0)
+
+    # The same with an object in the hand.
+    carry_speed: float = bounded(0.6, 0.01, 1.7)
+    carry_acceleration: float = bounded(3.0, 0.1, 13.0)
+
+    # Highest yaw speed (rad/s) and acceleration (rad/s^2).
+    yaw_speed: float = bounded(2.0, 0.01, 2.5)
+    yaw_acceleration: float = bounded(8.0, 0.1, 25.0)
+
+    # Highest speed of the two guarded motions, in m/s.
+    descend_speed: float = bounded(0.20, 0.005, 1.0)
+    lower_speed: float = bounded(0.08, 0.005, 1.0)
+
+    # Speed of one finger, in m/s.
+    finger_speed: float = bounded(0.05, 0.005, 0.05)
+
+    # Time in which the grasp force builds up, and falls away again, in s.
+    force_ramp: float = bounded(0.15, 0.0, 5.0)
+
+    # The hand must rest this long, in s: before the cameras look, and before a load is weighed.
+    observe_settle: float = bounded(0.25, 0.0, 10.0)
+    weigh_settle: float = bounded(0.10, 0.0, 10.0)
+
+    # After this many actions the planner is done, whatever the policy says.
+    max_actions: int = bounded(4, 0, 1000)
+
+
+_FIELDS = (
+    ["mode", "start_time", "duration"]
+    + [f"start_{axis}" for axis in ("x", "y", "z", "yaw")]
+    + [f"goal_{axis}" for axis in ("x", "y", "z", "yaw")]
+    + ["start_opening", "goal_opening", "start_force", "goal_force"]
+    + ["pick_x", "pick_y", "pick_yaw", "place_x", "place_y", "place_yaw", "grasp_z"]
+    + ["load", "actions", "missed", "dropped"]
+)
+_PlannerState = namedview("PlannerState", _FIELDS)
+
+_START, _GOAL = slice(3, 7), slice(7, 11)
+
+# Peaks of the minimum-jerk polynomial 10 s^3 - 15 s^4 + 6 s^5 over a unit distance in unit time.
+_PEAK_SPEED = 1.875
+_PEAK_ACCELERATION = 10 / np.sqrt(3)
+
+
+def minimum_jerk(s: float) -> tuple[float, float, float]:
+    """Value and first two derivatives of 10 s^3 - 15 s^4 + 6 s^5, s clamped to [0, 1]."""
+    s = min(max(s, 0.0), 1.0)
+    return (
+        s**3 * (10 + s * (6 * s - 15)),
+        30 * s**2 * (1 - s) ** 2,
+        60 * s * (1 - s) * (1 - 2 * s),
+    )
+
+
+def nearest_turns(pick_yaw: float, place_yaw: float) -> tuple[float, float]:
+    """The equivalent yaws that keep the wrist nearest its middle.
+
+    The jaws are alike, so both yaws may be turned by pi together, and either by a whole turn.
+
+    Returns:
+        (pick, place) in radians, the larger of whose magnitudes is smallest.
+    """
+    candidates = []
+    for half_turn in (0.0, np.pi):
+        pick, place = wrap_to_pi(pick_yaw + half_turn), wrap_to_pi(place_yaw + half_turn)
+        candidates.append((pick, place))
+    return min(candidates, key=lambda yaws: max(abs(yaws[0]), abs(yaws[1])))
+
+
+class PickPlacePlanner(LeafSystem):
+    """Carries out one pick and place after another.
+
+    .. pydrake_system::
+
+        name: PickPlacePlanner
+        input_ports:
+        - hand_state
+        - hand_contact_force
+        - action
+        output_ports:
+        - desired_motion
+        - desired_opening
+        - closing_force
+        - mode
+        - counts
+
+    - `hand_state` (12): positions then velocities of (x, y, z, yaw, left finger, right finger).
+    - `hand_contact_force` (6): contact as generalized force on the same coordinates, in N and N m:
+      what a force-torque sensor at the wrist and one in each finger would read. Up is positive.
+    - `action` (abstract, `PickPlaceAction`): evaluated only at the moment in which the planner,
+      at rest at home, asks for it. Nothing upstream (policy, cameras) is computed at other times.
+    - `desired_motion` (12): q_d, v_d, a_d of (x, y, z, yaw).
+    - `desired_opening` (2): the opening between the pads in m, and its rate.
+    - `closing_force` (1): what each pad presses beyond that, in N.
+    - `mode` (1): a `Mode`.
+    - `counts` (3): actions begun, grasps missed, objects dropped.
+
+    Every motion is a straight line in (x, y, z, yaw) with a minimum-jerk profile, at rest at both
+    ends, as short as the limits on speed and acceleration allow. The two guarded motions, `DESCEND`
+    and `LOWER`, end where the vertical contact force rises `contact_threshold` above what the load
+    weighs, and hold the height reached: no known height of table, kit or cavity goes into them.
+    A grasp is good if the pads stand further apart than `minimum_width` and both feel at least half
+    of the grasp force; when it is not, or is lost on the way, the hand opens and goes home to look
+    again, which counts as an action.
+
+    All memory is one vector of discrete state.
+    """
+
+    def __init__(self, *, parameters: PickPlaceParameters, period: float = 1 / 64) -> None:
+        """
+        Args:
+            parameters: heights, speeds, thresholds.
+            period: how often the state machine looks, in s.
+        """
+        super().__init__()
+        self._parameters = parameters
+        self._motions = _motions(parameters)
+        model = np.zeros(len(_FIELDS))
+        state = _PlannerState(model)
+        state[_START] = state[_GOAL] = parameters.home
+        state.start_opening = state.goal_opening = parameters.open_width
+        self._state_index = self.DeclareDiscreteState(model)
+        self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
+
+        self._hand_state = self.DeclareVectorInputPort("hand_state", 12)
+        self._contact_force = self.DeclareVectorInputPort("hand_contact_force", 6)
+        self._action = self.DeclareAbstractInputPort("action", Value(PickPlaceAction()))
+        state_and_time = {self.discrete_state_ticket(self._state_index), self.time_ticket()}
+        self.DeclareVectorOutputPort("desired_motion", 12, self._calc_motion, state_and_time)
+        self.DeclareVectorOutputPort("desired_opening", 2, self._calc_opening, state_and_time)
+        self.DeclareVectorOutputPort("closing_force", 1, self._calc_force, state_and_time)
+        state_only = {self.discrete_state_ticket(self._state_index)}
+        self.DeclareVectorOutputPort("mode", 1, self._calc_mode, state_only)
+        self.DeclareVectorOutputPort("counts", 3, self._calc_counts, state_only)
+
+    def mode(self, context: Context) -> Mode:
+        """What the planner is doing in the given context (its own)."""
+        return Mode(int(self._state(context).mode))
+
+    def _state(self, context: Context) -> "_PlannerState":
+        return _PlannerState(context.get_discrete_state(self._state_index).get_value())
+
+    # Outputs.
+
+    def _calc_motion(self, context: Context, output: BasicVector) -> None:
+        state = self._state(context)
+        output.SetFromVector(_motion_at(state, context.get_time()))
+
+    def _calc_opening(self, context: Context, output: BasicVector) -> None:
+        state = self._state(context)
+        output.SetFromVector(
+            _ramp(
+                state.start_opening,
+                state.goal_opening,
+                2 * self._parameters.finger_speed,
+                context.get_time() - state.start_time,
+            )
+        )
+
+    def _calc_force(self, context: Context, output: BasicVector) -> None:
+        state = self._state(context)
+        fraction = 1.0
+        if self._parameters.force_ramp > 0:
+            elapsed = context.get_time() - state.start_time
+            fraction = min(max(elapsed / self._parameters.force_ramp, 0.0), 1.0)
+        output.SetFromVector(
+            [state.start_force + fraction * (state.goal_force - state.start_force)]
+        )
+
+    def _calc_mode(self, context: Context, output: BasicVector) -> None:
+        output.SetFromVector([self._state(context).mode])
+
+    def _calc_counts(self, context: Context, output: BasicVector) -> None:
+        state = self._state(context)
+        output.SetFromVector([state.actions, state.missed, state.dropped])
+
+    # The state machine.
+
+    def _update(self, context: Context, discrete_state: DiscreteValues) -> EventStatus:
+        state = _PlannerState(discrete_state.get_mutable_value(self._state_index))
+        time = context.get_time()
+        hand = self._hand_state.Eval(context)
+        contact = self._contact_force.Eval(context)
+        mode = Mode(int(state.mode))
+        step = {
+            Mode.OBSERVE: self._observe,
+            Mode.DESCEND: self._descend,
+            Mode.CLOSE: self._close,
+            Mode.CHECK: self._check,
+            Mode.LIFT: self._hold,
+            Mode.CARRY: self._hold,
+            Mode.LOWER: self._lower,
+        }.get(mode, self._follow)
+        if mode != Mode.DONE:
+            step(context, state, time, hand, contact)
+        return EventStatus.Succeeded()
+
+    def _observe(self, context, state, time, hand, contact) -> None:
+        if time < self._arrival(state) + self._parameters.observe_settle:
+            return
+        if state.actions >= self._parameters.max_actions:
+            self._begin(state, Mode.DONE, time)
+            return
+        action: PickPlaceAction = self._action.Eval(context)
+        if action.stop:
+            self._begin(state, Mode.DONE, time)
+            return
+        pick_yaw, place_yaw = nearest_turns(action.pick.theta, action.place.theta)
+        state.pick_x, state.pick_y, state.pick_yaw = action.pick.x, action.pick.y, pick_yaw
+        state.place_x, state.place_y, state.place_yaw = action.place.x, action.place.y, place_yaw
+        state.grasp_z = max(
+            action.surface_height - self._parameters.grasp_depth, self._parameters.floor_clearance
+        )
+        state.actions += 1
+        self._begin(state, Mode.APPROACH, time)
+
+    def _follow(self, context, state, time, hand, contact) -> None:
+        if time >= self._arrival(state):
+            following = Mode.OBSERVE if state.mode == Mode.RETREAT else Mode(int(state.mode) + 1)
+            self._begin(state, following, time)
+
+    def _descend(self, context, state, time, hand, contact) -> None:
+        if contact[2] > self._parameters.contact_threshold:
+            # Back off a little: pressed fingertips would not close.
+            self._begin(state, Mode.CLOSE, time, z=hand[2] + self._parameters.floor_clearance)
+        elif time >= self._arrival(state):
+            self._begin(state, Mode.CLOSE, time)
+
+    def _close(self, context, state, time, hand, contact) -> None:
+        opening, rate = hand[4] + hand[5], hand[10] + hand[11]
+        moving_for = time - state.start_time
+        # The command runs ahead of stalled jaws by what the fingers' spring makes of it.
+        commanded, _ = self.get_output_port(1).Eval(context)
+        stalled = moving_for > 0.1 and abs(rate) < 2e-3 and commanded < opening - 1e-3
+        if stalled or commanded <= 0.0:
+            self._begin(state, Mode.CHECK, time, opening=opening)
+
+    def _check(self, context, state, time, hand, contact) -> None:
+        if time < self._arrival(state) + self._parameters.weigh_settle:
+            return
+        if self._is_held(hand, contact):
+            self._begin(state, Mode.LIFT, time)
+        else:
+            state.missed += 1
+            self._begin(state, Mode.RETREAT, time)
+
+    def _hold(self, context, state, time, hand, contact) -> None:
+        if not self._is_held(hand, contact):
+            state.dropped += 1
+            self._begin(state, Mode.RETREAT, time)
+        elif state.mode == Mode.LIFT and time >= self._arrival(state):
+            self._begin(state, Mode.CARRY, time)
+        elif time >= self._arrival(state) + self._parameters.weigh_settle:
+            state.load = contact[2]
+            self._begin(state, Mode.LOWER, time)
+
+    def _lower(self, context, state, time, hand, contact) -> None:
+        if not self._is_held(hand, contact):
+            state.dropped += 1
+            self._begin(state, Mode.RETREAT, time)
+        elif contact[2] - state.load > self._parameters.contact_threshold:
+            self._begin(state, Mode.RELEASE, time, z=hand[2])
+        elif time >= self._arrival(state):
+            self._begin(state, Mode.RELEASE, time)
+
+    def _is_held(self, hand: NDArray[np.float64], contact: NDArray[np.float64]) -> bool:
+        # Contact pushes the fingers apart: along their positive axes.
+        pressed = contact[4:6].min() > self._parameters.grasp_force / 2
+        return bool(pressed and hand[4] + hand[5] > self._parameters.minimum_width)
+
+    def _begin(
+        self,
+        state: "_PlannerState",
+        mode: Mode,
+        time: float,
+        z: float | None = None,
+        opening: float | None = None,
+    ) -> None:
+        """Starts a mode from where the commands now stand.
+
+        Args:
+            state: the planner's state, written.
+            mode: the mode to begin.
+            time: now, in s.
+            z: hold the fingertips at this height from now on, in m.
+            opening: hold the jaws at this opening from now on, in m.
+        """
+        parameters = self._parameters
+        now = _motion_at(state, time)[:4]
+        now_opening, _ = _ramp(
+            state.start_opening,
+            state.goal_opening,
+            2 * parameters.finger_speed,
+            time - state.start_time,
+        )
+        if z is not None:
+            now[2] = z
+        if opening is not None:
+            now_opening = opening
+        state.start_force = state.goal_force
+        state.mode = mode
+        state.start_time = time
+        state[_START] = now
+        state[_GOAL] = now
+        state.start_opening = state.goal_opening = now_opening
+
+        if mode == Mode.OBSERVE:
+            state[_GOAL] = parameters.home
+            state.goal_opening = parameters.open_width
+        elif mode == Mode.APPROACH:
+            state[_GOAL] = (state.pick_x, state.pick_y, parameters.travel_height, state.pick_yaw)
+        elif mode == Mode.DESCEND:
+            state.goal_z = state.grasp_z
+        elif mode == Mode.CLOSE:
+            state.goal_opening = 0.0
+        elif mode == Mode.CHECK:
+            state.goal_force = parameters.grasp_force
+        elif mode == Mode.LIFT:
+            state.goal_z = parameters.travel_height
+        elif mode == Mode.CARRY:
+            state[_GOAL] = (state.place_x, state.place_y, parameters.travel_height, state.place_yaw)
+        elif mode == Mode.LOWER:
+            state.goal_z = parameters.floor_clearance
+        elif mode in (Mode.RELEASE, Mode.RETREAT):
+            state.goal_force = 0.0
+            state.goal_opening = min(
+                now_opening + 2 * parameters.release_clearance, parameters.open_width
+            )
+            if mode == Mode.RETREAT:
+                state.goal_opening = now_opening
+                state.goal_z = parameters.travel_height
+        state.duration = _duration(state[_GOAL] - state[_START], self._motions[mode])
+
+    def _arrival(self, state: "_PlannerState") -> float:
+        """When the motion, the jaws and the force of the present mode have arrived, in s."""
+        opening_time = abs(state.goal_opening - state.start_opening) / (
+            2 * self._parameters.finger_speed
+        )
+        force_time = self._parameters.force_ramp * (state.goal_force != state.start_force)
+        return float(state.start_time + max(state.duration, opening_time, force_time))
+
+
+@dataclass(frozen=True)
+class _Limits:
+    speed: float
+    acceleration: float
+    yaw_speed: float
+    yaw_acceleration: float
+
+
+def _motions(parameters: PickPlaceParameters) -> dict[Mode, _Limits]:
+    """The limits of each mode's motion."""
+    yaw = (parameters.yaw_speed, parameters.yaw_acceleration)
+    free = _Limits(parameters.linear_speed, parameters.linear_acceleration, *yaw)
+    carry = _Limits(parameters.carry_speed, parameters.carry_acceleration, *yaw)
+    limits = dict.fromkeys(Mode, free)
+    limits[Mode.LIFT] = limits[Mode.CARRY] = carry
+    limits[Mode.DESCEND] = _Limits(parameters.descend_speed, parameters.linear_acceleration, *yaw)
+    limits[Mode.LOWER] = _Limits(parameters.lower_speed, parameters.carry_acceleration, *yaw)
+    return limits
+
+
+def _duration(displacement: NDArray[np.float64], limits: _Limits) -> float:
+    """The shortest minimum-jerk motion over (dx, dy, dz, dyaw) within the limits, in s."""
+    distance, turn = float(np.linalg.norm(displacement[:3])), abs(float(displacement[3]))
+    return max(
+        _PEAK_SPEED * distance / limits.speed,
+        np.sqrt(_PEAK_ACCELERATION * distance / limits.acceleration),
+        _PEAK_SPEED * turn / limits.yaw_speed,
+        np.sqrt(_PEAK_ACCELERATION * turn / limits.yaw_acceleration),
+    )
+
+
+def _motion_at(state: "_PlannerState", time: float) -> NDArray[np.float64]:
+    """q_d, v_d, a_d (12) of the present mode's motion."""
+    duration = state.duration
+    s = (time - state.start_time) / duration if duration > 0 else 1.0
+    value, speed, acceleration = minimum_jerk(s)
+    if duration <= 0:
+        duration = 1.0
+    delta = state[_GOAL] - state[_START]
+    return np.concatenate(
+        [state[_START] + value * delta, speed / duration * delta, acceleration / duration**2 * delta]
+    )
+
+
+def _ramp(start: float, goal: float, rate: float, elapsed: float) -> tuple[float, float]:
+    """Value and rate of a ramp at constant speed that stops at its goal."""
+    distance = goal - start
+    travelled = rate * max(elapsed, 0.0)
+    if travelled >= abs(distance):
+        return goal, 0.0
+    return start + np.copysign(travelled, distance), float(np.copysign(rate, distance))

@@ -1,0 +1,148 @@
+"""Tells which objects rest out of reach of everything that moves, so that they can sleep."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from pydrake.common.value import Value
+from pydrake.math import RigidTransform
+from pydrake.multibody.math import SpatialVelocity
+from pydrake.multibody.tree import BodyIndex
+from pydrake.systems.framework import Context, DiscreteValues, EventStatus, LeafSystem
+
+
+@dataclass(frozen=True)
+class BoundedBody:
+    """A body and a box around its collision geometry."""
+
+    body: BodyIndex
+    p_BLower: NDArray[np.float64]
+    """(3,) lower corner of the box, in the body frame, in metres."""
+    p_BUpper: NDArray[np.float64]
+    """(3,) upper corner."""
+
+
+class RestDetector(LeafSystem):
+    """Says which objects may be frozen without changing what happens.
+
+    .. pydrake_system::
+
+        name: RestDetector
+        input_ports:
+        - body_poses
+        - body_spatial_velocities
+        output_ports:
+        - at_rest
+
+    - `body_poses`, `body_spatial_velocities`: the plant's ports of these names.
+    - `at_rest` (n): 1 for an object that is at rest, else 0, in the order of `objects`.
+
+    An object comes to rest when it has been slower than both speeds for `patience`, and nothing
+    that is not at rest, mover or object, is within `wake_distance` of it: distances of oriented
+    bounding boxes, never more than the true ones. It is no longer at rest as soon as something
+    comes that near. The memory (discrete state) is how long each object has been slow, in s, and
+    whether it is at rest.
+    """
+
+    def __init__(
+        self,
+        *,
+        objects: Sequence[BoundedBody],
+        movers: Sequence[BoundedBody],
+        linear_speed: float,
+        angular_speed: float,
+        patience: float,
+        wake_distance: float,
+        period: float = 1 / 64,
+    ) -> None:
+        """
+        Args:
+            objects: what may come to rest; n of them.
+            movers: what never does: the links of the hand.
+            linear_speed: of the body origin, in m/s.
+            angular_speed: in rad/s.
+            patience: in s.
+            wake_distance: in m; more than a mover travels in two periods.
+            period: how often to look, in s.
+        """
+        super().__init__()
+        self._count = len(objects)
+        bodies = [*objects, *movers]
+        self._bodies = [int(item.body) for item in bodies]
+        self._centres = np.array([(item.p_BLower + item.p_BUpper) / 2 for item in bodies])
+        self._half_sizes = np.array([(item.p_BUpper - item.p_BLower) / 2 for item in bodies])
+        self._linear_speed = linear_speed
+        self._angular_speed = angular_speed
+        self._patience = patience
+        self._wake_distance = wake_distance
+        self._period = period
+        self._poses = self.DeclareAbstractInputPort("body_poses", Value([RigidTransform()]))
+        self._velocities = self.DeclareAbstractInputPort(
+            "body_spatial_velocities", Value([SpatialVelocity()])
+        )
+        self._slow_for = self.DeclareDiscreteState(self._count)
+        self._at_rest = self.DeclareDiscreteState(self._count)
+        self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
+        self.DeclareStateOutputPort("at_rest", self._at_rest)
+
+    def at_rest(self, context: Context) -> NDArray[np.bool_]:
+        """(n,) which objects are at rest in the given context (its own)."""
+        return context.get_discrete_state(self._at_rest).value() > 0.5
+
+    def _update(self, context: Context, discrete_state: DiscreteValues) -> EventStatus:
+        n = self._count
+        velocities = self._velocities.Eval(context)
+        slow_for = discrete_state.get_mutable_value(self._slow_for)
+        for i, body in enumerate(self._bodies[:n]):
+            velocity = velocities[body]
+            slow = (
+                np.linalg.norm(velocity.translational()) < self._linear_speed
+                and np.linalg.norm(velocity.rotational()) < self._angular_speed
+            )
+            slow_for[i] = slow_for[i] + self._period if slow else 0.0
+        resting = slow_for >= self._patience - self._period / 2
+        near = self._near(context)
+        # An awake object wakes its neighbours, and they theirs.
+        for _ in range(n):
+            awake = np.concatenate([~resting, np.ones(len(self._bodies) - n, bool)])
+            woken = resting & (near & awake).any(axis=1)
+            if not woken.any():
+                break
+            resting &= ~woken
+        discrete_state.get_mutable_value(self._at_rest)[:] = resting
+        return EventStatus.Succeeded()
+
+    def _near(self, context: Context) -> NDArray[np.bool_]:
+        """(n, bodies) which bodies' boxes are within the wake distance of each object's."""
+        poses = self._poses.Eval(context)
+        rotations = np.array([poses[body].rotation().matrix() for body in self._bodies])
+        origins = np.array([poses[body].translation() for body in self._bodies])
+        centres = origins + np.einsum("bij,bj->bi", rotations, self._centres)
+        near = np.zeros((self._count, len(self._bodies)), bool)
+        for i in range(self._count):
+            for j in range(len(self._bodies)):
+                near[i, j] = i != j and (
+                    _box_gap(
+                        centres[i] - centres[j],
+                        rotations[i],
+                        self._half_sizes[i],
+                        rotations[j],
+                        self._half_sizes[j],
+                    )
+                    < self._wake_distance
+                )
+        return near
+
+
+def _box_gap(
+    offset: NDArray[np.float64],
+    R_WA: NDArray[np.float64],
+    half_a: NDArray[np.float64],
+    R_WB: NDArray[np.float64],
+    half_b: NDArray[np.float64],
+) -> float:
+    """A lower bound of the distance of two boxes: the widest gap along their face normals."""
+    axes = np.concatenate([R_WA, R_WB], axis=1)
+    reach = np.abs(axes.T @ R_WA) @ half_a + np.abs(axes.T @ R_WB) @ half_b
+    return float((np.abs(axes.T @ offset) - reach).max())

@@ -1,0 +1,130 @@
+"""Drives the Franka hand along a desired motion: feedback, feed-forward, gravity, force limits."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from pydrake.systems.framework import BasicVector, Context, LeafSystem
+
+HAND_AXES = 4
+"""x, y, z and yaw of the point midway between the fingertips."""
+FINGERS = 2
+
+
+class TrajectoryController(LeafSystem):
+    r"""Turns a desired hand motion and jaw opening into generalized forces.
+
+    .. pydrake_system::
+
+        name: TrajectoryController
+        input_ports:
+        - hand_state
+        - desired_motion
+        - desired_opening
+        - closing_force (optional)
+        output_ports:
+        - actuation
+
+    - `hand_state` (12): positions then velocities of (x, y, z, yaw, left finger, right finger), in
+      m, rad, m/s, rad/s: the state of the hand's model instance.
+    - `desired_motion` (12): q_d, v_d, a_d of (x, y, z, yaw).
+    - `desired_opening` (2): opening w_d between the pads in m, and its rate in m/s.
+    - `closing_force` (1): f, how hard each pad shall press *in addition to* what holding the
+      opening takes, in N; zero when left open.
+    - `actuation` (6): forces on the four axes and the two fingers, in N and N m.
+
+    The law of the axes is computed-torque control of a body whose axes do not couple,
+
+        u = clip(M a_d + g + k_p (q_d - q) + k_d (v_d - v), -u_max, u_max),
+
+    with M the effective inertia of each axis and g the hand's own weight on z. What the hand
+    carries is unknown to it and shows as a sag of payload weight / k_p.
+
+    The fingers (q_L, q_R; opening w = q_L + q_R, closed at zero) follow
+
+        u_finger = clip(k_w (w_d - w)/2 + d_w (w_d' - w')/2 - f, -f_max, f_max)
+
+    each, the centring of the pair being left to the plant's mimic constraint.
+
+    Stateless.
+    """
+
+    def __init__(
+        self,
+        *,
+        inertia: NDArray[np.float64],
+        weight: float,
+        stiffness: NDArray[np.float64],
+        damping: NDArray[np.float64],
+        force_limit: NDArray[np.float64],
+        finger_stiffness: float,
+        finger_damping: float,
+        finger_force_limit: float,
+    ) -> None:
+        """All arrays are (4): x, y, z, yaw.
+
+        Args:
+            inertia: M, in kg and kg m^2.
+            weight: gravity on the moving mass, in N, held by the z axis.
+            stiffness: k_p, in N/m and N m/rad.
+            damping: k_d, in N s/m and N m s/rad.
+            force_limit: u_max, in N and N m.
+            finger_stiffness: k_w, in N/m.
+            finger_damping: d_w, in N s/m.
+            finger_force_limit: f_max of each finger, in N.
+
+        Raises:
+            ValueError: an array of the wrong size, or a limit that is not positive.
+        """
+        super().__init__()
+        for name, value in {
+            "inertia": inertia,
+            "stiffness": stiffness,
+            "damping": damping,
+            "force_limit": force_limit,
+        }.items():
+            if np.shape(value) != (HAND_AXES,):
+                raise ValueError(f"{name} must hold {HAND_AXES} numbers, not {np.shape(value)}")
+        if np.any(np.asarray(force_limit) <= 0) or finger_force_limit <= 0:
+            raise ValueError("force limits must be positive")
+        self._inertia = np.array(inertia)
+        self._gravity = np.array([0.0, 0.0, weight, 0.0])
+        self._stiffness = np.array(stiffness)
+        self._damping = np.array(damping)
+        self._force_limit = np.array(force_limit)
+        self._finger_stiffness = finger_stiffness
+        self._finger_damping = finger_damping
+        self._finger_force_limit = finger_force_limit
+
+        self._hand_state = self.DeclareVectorInputPort("hand_state", 2 * (HAND_AXES + FINGERS))
+        self._desired_motion = self.DeclareVectorInputPort("desired_motion", 3 * HAND_AXES)
+        self._desired_opening = self.DeclareVectorInputPort("desired_opening", 2)
+        self._closing_force = self.DeclareVectorInputPort("closing_force", 1)
+        self.DeclareVectorOutputPort("actuation", HAND_AXES + FINGERS, self._calc_actuation)
+
+    def _calc_actuation(self, context: Context, output: BasicVector) -> None:
+        state = self._hand_state.Eval(context)
+        q, fingers, v, finger_rates = np.split(state, [4, 6, 10])
+        q_d, v_d, a_d = np.split(self._desired_motion.Eval(context), 3)
+        axes = (
+            self._inertia * a_d
+            + self._gravity
+            + self._stiffness * (q_d - q)
+            + self._damping * (v_d - v)
+        )
+        opening, opening_rate = self._desired_opening.Eval(context)
+        press = self._closing_force.Eval(context)[0] if self._closing_force.HasValue(context) else 0
+        finger = (
+            self._finger_stiffness * (opening - fingers.sum()) / 2
+            + self._finger_damping * (opening_rate - finger_rates.sum()) / 2
+            - press
+        )
+        limit = self._finger_force_limit
+        output.SetFromVector(
+            np.concatenate(
+                [
+                    np.clip(axes, -self._force_limit, self._force_limit),
+                    np.full(FINGERS, np.clip(finger, -limit, limit)),
+                ]
+            )
+        )
