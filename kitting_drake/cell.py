@@ -1,6 +1,5 @@
 """From a scenario to the Diagram of the kitting cell: the only place where systems are wired."""
 
-import ctypes.util
 import importlib
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -9,21 +8,17 @@ from pathlib import Path
 import numpy as np
 from pydrake.geometry import (
     CollisionFilterDeclaration,
+    ColorRenderCamera,
     DepthRange,
     DepthRenderCamera,
     GeometrySet,
-    MakeRenderEngineVtk,
     Meshcat,
     MeshcatVisualizer,
     MeshcatVisualizerParams,
-    RenderCameraCore,
-    RenderEngineVtkParams,
-    ClippingRange,
-    ColorRenderCamera,
     Role,
     SceneGraph,
 )
-from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
+from pydrake.math import RigidTransform
 from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import (
     AddMultibodyPlant,
@@ -32,11 +27,20 @@ from pydrake.multibody.plant import (
 )
 from pydrake.multibody.tree import RigidBody
 from pydrake.systems.framework import Context, Diagram, DiagramBuilder
-from pydrake.systems.sensors import CameraInfo, RgbdSensor
+from pydrake.systems.sensors import RgbdSensor
+from pydrake.visualization import VideoWriter
 
+from kitting_drake.cameras import (
+    OVERVIEW,
+    add_observation_renderer,
+    add_picture_renderer,
+    camera_pose,
+    depth_camera,
+    picture_camera,
+)
 from kitting_drake.errors import UserError
 from kitting_drake.paths import MODELS
-from kitting_drake.scenario import Heightmap, LookAt, Oracle, Pinhole, PythonPolicy, Scenario
+from kitting_drake.scenario import Heightmap, Oracle, PythonPolicy, Scenario
 from kitting_drake.tasks.kitting import KittingScene, make_scene
 from systems.heightmap_projector import HeightmapProjector
 from systems.oracle_policy import OraclePolicy, OracleTarget
@@ -48,7 +52,6 @@ from systems.signals import Observation, PickPlaceAction, PixelGrid, PlanarPose
 from systems.trajectory_controller import TrajectoryController
 
 MESHCAT_PERIOD = 1 / 32
-_RENDERER = "vtk"
 _SURFACE_POINTS = 2000
 _X_WTABLE = RigidTransform([0.5, 0.0, 0.0])
 
@@ -66,6 +69,8 @@ class Cell:
     scene: KittingScene
     tool_bodies: tuple[RigidBody, ...]
     sleep: bool
+    video_writer: VideoWriter | None
+    """Holds the film, if one was asked for, until its `Save()`."""
 
     def apply_sleep(self, root_context: Context) -> None:
         """Freezes the tools that are at rest and thaws the others.
@@ -76,9 +81,7 @@ class Cell:
         """
         if not self.sleep:
             return
-        at_rest = self.rest_detector.at_rest(
-            self.rest_detector.GetMyContextFromRoot(root_context)
-        )
+        at_rest = self.rest_detector.at_rest(self.rest_detector.GetMyContextFromRoot(root_context))
         plant_context = self.plant.GetMyMutableContextFromRoot(root_context)
         for body, resting in zip(self.tool_bodies, at_rest, strict=True):
             if resting == body.is_locked(plant_context):
@@ -110,6 +113,7 @@ def build_cell(
     base: Path,
     meshcat: Meshcat | None = None,
     images: bool = False,
+    video: Path | None = None,
 ) -> Cell:
     """Builds the cell.
 
@@ -119,6 +123,7 @@ def build_cell(
         base: where relative paths in the scenario start: the folder of its file.
         meshcat: where to show it, if anywhere.
         images: add the cameras even though the policy does not look.
+        video: the file of a film to make (.gif or .webp), if any.
 
     Returns:
         The cell. Its Diagram exports the output ports `observation` (with cameras), `action`,
@@ -187,6 +192,7 @@ def build_cell(
         parameters = MeshcatVisualizerParams(role=Role.kIllustration)
         parameters.publish_period = MESHCAT_PERIOD
         MeshcatVisualizer.AddToBuilder(builder, scene_graph, meshcat, parameters)
+    video_writer = None if video is None else _add_video(builder, scene_graph, video)
     diagram = builder.Build()
     diagram.set_name("kitting_cell")
     return Cell(
@@ -199,6 +205,7 @@ def build_cell(
         scene=scene,
         tool_bodies=tuple(tool_bodies),
         sleep=scenario.sleep.enabled,
+        video_writer=video_writer,
     )
 
 
@@ -215,9 +222,7 @@ def make_grid(config: Heightmap) -> PixelGrid:
     )
 
 
-def _add_plant(
-    builder: DiagramBuilder, scenario: Scenario
-) -> tuple[MultibodyPlant, SceneGraph]:
+def _add_plant(builder: DiagramBuilder, scenario: Scenario) -> tuple[MultibodyPlant, SceneGraph]:
     config = MultibodyPlantConfig(
         time_step=scenario.plant.time_step,
         # Strict: a pair that cannot be hydroelastic is an error, not a point contact in disguise.
@@ -233,9 +238,7 @@ def _add_models(plant: MultibodyPlant, scene: KittingScene) -> list[RigidBody]:
     parser.AddModels(str(MODELS / "table" / "table.sdf"))
     plant.WeldFrames(plant.world_frame(), plant.GetFrameByName("table"), _X_WTABLE)
     (kit,) = parser.AddModels(str(scene.kit.sdf))
-    plant.WeldFrames(
-        plant.world_frame(), plant.GetFrameByName("kit", kit), scene.X_WKit
-    )
+    plant.WeldFrames(plant.world_frame(), plant.GetFrameByName("kit", kit), scene.X_WKit)
     tools = []
     for tool in scene.tools:
         (instance,) = parser.AddModels(str(tool.sdf))
@@ -341,66 +344,12 @@ def _import_function(config: PythonPolicy) -> Callable[[Observation], PickPlaceA
     return function
 
 
-# Cameras.
-
-
-def require_rendering() -> None:
-    """Makes sure that images can be rendered here.
-
-    Raises:
-        UserError: the system library is missing; names the package.
-    """
-    if ctypes.util.find_library("EGL") is None:
-        raise UserError(
-            "rendering needs the system library libEGL: install it "
-            "(Debian and Ubuntu: apt-get install libegl1 libgl1-mesa-dri)"
-        )
-
-
-def add_renderer(scene_graph: SceneGraph) -> str:
-    """Adds the offscreen render engine, once; returns its name.
-
-    Raises:
-        UserError: images cannot be rendered here.
-    """
-    if not scene_graph.HasRenderer(_RENDERER):
-        require_rendering()
-        scene_graph.AddRenderer(_RENDERER, MakeRenderEngineVtk(RenderEngineVtkParams()))
-    return _RENDERER
-
-
-def camera_pose(config: Pinhole | LookAt) -> RigidTransform:
-    """X_WC of a camera: z looks, x points right in the image, y down."""
-    if isinstance(config, Pinhole):
-        return RigidTransform(RollPitchYaw(np.deg2rad(config.rpy_deg)), config.position)
-    z = np.subtract(config.target, config.position)
-    x = np.cross(z, [0.0, 0.0, 1.0])
-    R_WC = RotationMatrix(
-        np.column_stack([v / np.linalg.norm(v) for v in (x, np.cross(z, x), z)])
-    )
-    return RigidTransform(R_WC, config.position)
-
-
-def depth_camera(config: Pinhole | LookAt, renderer: str) -> DepthRenderCamera:
-    """Drake's description of a camera; colour and depth are seen from the same point."""
-    info = CameraInfo(
-        width=config.width,
-        height=config.height,
-        focal_x=config.focal_length,
-        focal_y=config.focal_length,
-        center_x=config.width / 2,
-        center_y=config.height / 2,
-    )
-    core = RenderCameraCore(renderer, info, ClippingRange(0.01, 10.0), RigidTransform())
-    return DepthRenderCamera(core, DepthRange(0.01, 10.0))
-
-
 def _add_cameras(
     builder: DiagramBuilder, scenario: Scenario, scene_graph: SceneGraph, grid: PixelGrid
 ) -> HeightmapProjector:
     if not scenario.cameras:
         raise UserError("cameras is empty: the heightmap needs at least one")
-    renderer = add_renderer(scene_graph)
+    renderer = add_observation_renderer(scene_graph)
     cameras = {name: depth_camera(config, renderer) for name, config in scenario.cameras.items()}
     projector = builder.AddNamedSystem(
         "heightmap_projector", HeightmapProjector(cameras=cameras, grid=grid)
@@ -415,15 +364,29 @@ def _add_cameras(
                 depth_camera=cameras[name],
             ),
         )
-        builder.Connect(
-            scene_graph.get_query_output_port(), sensor.query_object_input_port()
-        )
+        builder.Connect(scene_graph.get_query_output_port(), sensor.query_object_input_port())
         for output, port in (
             ("color_image", "color_image"),
             ("depth_image_32f", "depth_image"),
             ("body_pose_in_world", "body_pose_in_world"),
         ):
-            builder.Connect(
-                sensor.GetOutputPort(output), projector.GetInputPort(f"{port}_{name}")
-            )
+            builder.Connect(sensor.GetOutputPort(output), projector.GetInputPort(f"{port}_{name}"))
     return projector
+
+
+def _add_video(builder: DiagramBuilder, scene_graph: SceneGraph, path: Path) -> VideoWriter:
+    core = picture_camera(add_picture_renderer(scene_graph), width=640, height=400)
+    sensor = builder.AddNamedSystem(
+        "camera_video",
+        RgbdSensor(
+            parent_id=scene_graph.world_frame_id(),
+            X_PB=camera_pose(OVERVIEW),
+            color_camera=ColorRenderCamera(core),
+            depth_camera=DepthRenderCamera(core, DepthRange(0.05, 10.0)),
+        ),
+    )
+    builder.Connect(scene_graph.get_query_output_port(), sensor.query_object_input_port())
+    path.parent.mkdir(parents=True, exist_ok=True)
+    writer = builder.AddNamedSystem("video_writer", VideoWriter(filename=str(path), fps=16.0))
+    writer.ConnectRgbdSensor(builder=builder, sensor=sensor)
+    return writer

@@ -460,7 +460,11 @@ def _motion_at(state: "_PlannerState", time: float) -> NDArray[np.float64]:
         duration = 1.0
     delta = state[_GOAL] - state[_START]
     return np.concatenate(
-        [state[_START] + value * delta, speed / duration * delta, acceleration / duration**2 * delta]
+        [
+            state[_START] + value * delta,
+            speed / duration * delta,
+            acceleration / duration**2 * delta,
+        ]
     )
 
 

@@ -30,9 +30,7 @@ class PlacementGoal:
     depend on how finely a mesh is cut."""
 
 
-def add_s(
-    points: NDArray[np.float64], X_WGoal: RigidTransform, X_WActual: RigidTransform
-) -> float:
+def add_s(points: NDArray[np.float64], X_WGoal: RigidTransform, X_WActual: RigidTransform) -> float:
     """The average distance for symmetric objects, equation 9 of the paper, in metres.
 
     The mean, over the model's points at the goal pose, of the distance to the *nearest* model point

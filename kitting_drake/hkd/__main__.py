@@ -1,4 +1,4 @@
-"""The hand tools: `python -m kitting_drake.hkd list | generate [NAME...] | sheet --output FILE.png`."""
+"""The hand tools: `python -m kitting_drake.hkd list | generate | sheet`, each of `[NAME...]`."""
 
 import argparse
 import sys
@@ -9,7 +9,12 @@ from rich.console import Console
 from rich.progress import track
 from rich.table import Table
 
-from kitting_drake.hkd.generate import CatalogueError, ToolEntry, generate_tool, load_catalogue
+from kitting_drake.hkd.generate import (
+    CatalogueError,
+    ToolEntry,
+    generate_tool,
+    load_catalogue,
+)
 
 MODELS = Path(__file__).resolve().parents[2] / "models"
 
@@ -19,41 +24,57 @@ def _chosen(entries: list[ToolEntry], names: list[str]) -> list[ToolEntry]:
     known = {entry.name for entry in entries}
     for name in names:
         if name not in known:
-            raise CatalogueError(f"no tool is called {name!r}; the catalogue has {', '.join(sorted(known))}")
+            raise CatalogueError(
+                f"no tool is called {name!r}; the catalogue has {', '.join(sorted(known))}"
+            )
     return [entry for entry in entries if not names or entry.name in names]
 
 
 def _description(models: Path, name: str) -> dict:
     path = models / "tools" / name / "tool.yaml"
     if not path.exists():
-        raise CatalogueError(f"{path} is missing: run `python -m kitting_drake.hkd generate {name}` first")
+        raise CatalogueError(
+            f"{path} is missing: run `python -m kitting_drake.hkd generate {name}` first"
+        )
     return yaml.safe_load(path.read_text())
 
 
 def list_tools(args: argparse.Namespace, entries: list[ToolEntry]) -> None:
     """Prints a table of the generated tools."""
-    table = Table("name", "category", "split")
-    for heading in ("length mm", "width mm", "height mm", "mass g", "grasp mm"):
-        table.add_column(heading, justify="right")
+    table = Table()
+    table.add_column("name", no_wrap=True)
+    table.add_column("category")
+    table.add_column("split")
+    for heading in ("size, mm", "mass, g", "grasp, mm"):
+        table.add_column(heading, justify="right", no_wrap=True)
     for entry in _chosen(entries, args.names):
         d = _description(args.models, entry.name)
-        sizes = [f"{1e3 * d[key]:.1f}" for key in ("length", "width", "height", "mass")]
-        table.add_row(d["name"], d["category"], d["split"], *sizes, f"{1e3 * d['grasp']['width']:.1f}")
+        size = " x ".join(f"{1e3 * d[key]:.0f}" for key in ("length", "width", "height"))
+        grasp = f"{1e3 * d['grasp']['width']:.1f}"
+        row = (
+            d["name"],
+            d["category"],
+            d["split"],
+            size,
+            f"{1e3 * d['mass']:.0f}",
+            grasp,
+        )
+        table.add_row(*row)
     Console().print(table)
 
 
 def generate(args: argparse.Namespace, entries: list[ToolEntry]) -> None:
     """Regenerates models and prints how true their collision pieces are."""
-    table = Table("name")
-    for heading in ("triangles", "pieces", "their triangles", "outside mm", "inside mm", "top mm",
-                    "grip mm", "tilt deg"):
+    table = Table(caption="outline, top, grip: collision pieces against the visual shape, mm")
+    table.add_column("name", no_wrap=True)
+    for heading in ("triangles", "pieces", "outline", "top", "grip", "tilt, deg"):
         table.add_column(heading, justify="right")
     chosen = _chosen(entries, args.names)
     for entry in track(chosen, "generating", console=Console(stderr=True), disable=args.quiet):
         r = generate_tool(entry, args.models / "tools" / entry.name)
-        table.add_row(entry.name, str(r.triangles), str(r.collision_pieces), str(r.collision_triangles),
-                      *(f"{v:.2f}" for v in (r.outside_mm, r.inside_mm, r.top_error_mm, r.grip_error_mm,
-                                             r.tilt_deg)))
+        outline = f"+{r.outside_mm:.2f}/-{r.inside_mm:.2f}"
+        errors = (f"{v:.2f}" for v in (r.top_error_mm, r.grip_error_mm, r.tilt_deg))
+        table.add_row(entry.name, str(r.triangles), str(r.collision_pieces), outline, *errors)
     if not args.quiet:
         Console().print(table)
 
@@ -62,6 +83,7 @@ def sheet(args: argparse.Namespace, entries: list[ToolEntry]) -> None:
     """Renders the contact sheet."""
     # Imported here: Drake is slow to load, and only this verb needs it.
     from kitting_drake.hkd.sheet import write_sheet
+
     names = [entry.name for entry in _chosen(entries, args.names)]
     for name in names:
         _description(args.models, name)
@@ -71,11 +93,15 @@ def sheet(args: argparse.Namespace, entries: list[ToolEntry]) -> None:
 def main() -> int:
     """Runs one verb; returns the exit status."""
     parser = argparse.ArgumentParser(prog="python -m kitting_drake.hkd", description=__doc__)
-    parser.add_argument("--models", type=Path, default=MODELS, help="the directory with package.xml and tools/")
+    parser.add_argument(
+        "--models", type=Path, default=MODELS, help="the directory with package.xml and tools/"
+    )
     verbs = parser.add_subparsers(dest="verb", required=True)
     for name, function in (("list", list_tools), ("generate", generate), ("sheet", sheet)):
         verb = verbs.add_parser(name, help=function.__doc__)
-        verb.add_argument("names", nargs="*", metavar="NAME", help="tools; all of them if none is named")
+        verb.add_argument(
+            "names", nargs="*", metavar="NAME", help="tools; all of them if none is named"
+        )
         verb.set_defaults(function=function)
         if name == "generate":
             verb.add_argument("--quiet", action="store_true", help="print nothing")
@@ -84,7 +110,7 @@ def main() -> int:
     args = parser.parse_args()
     try:
         args.function(args, load_catalogue(args.models / "tools" / "catalogue.yaml"))
-    except (CatalogueError, OSError) as error:
+    except (ValueError, OSError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
     return 0

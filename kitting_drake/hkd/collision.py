@@ -1,11 +1,12 @@
 """Few convex pieces for a solid that is given as many: what a simulator touches.
 
-Lengths in mm; a piece is an array (n, 3) of points that stands for its convex hull. Two pieces may be
-replaced by the hull of both as long as nobody could tell by the shadows: on xy, where the outline decides
-whether the tool enters its cavity, and on xz and yz, where the heights decide what it lies on.
+Lengths in mm; a piece is an array (n, 3) of points that stands for its convex hull. Two pieces may
+be replaced by the hull of both as long as nobody could tell by the shadows: on xy, where the
+outline decides whether the tool enters its cavity, and on xz and yz, where the heights decide what
+it lies on.
 """
 
-from typing import Sequence
+from collections.abc import Sequence
 
 import manifold3d
 import numpy as np
@@ -17,12 +18,6 @@ from kitting_drake.hkd.solids import SEGMENTS
 # Grid of the vertices of collision pieces.
 GRID_MM = 0.05
 
-# Contact, for every tool: Drake's hydroelastic modulus (Pa), dissipation (s/m), margin (m), friction.
-HYDROELASTIC_MODULUS = 3e6
-HUNT_CROSSLEY_DISSIPATION = 20.0
-HYDROELASTIC_MARGIN = 0.0
-FRICTION = 0.5
-
 _XY, _XZ, _YZ = [0, 1], [0, 2], [1, 2]
 # Pieces are first joined where that changes next to nothing, which leaves few enough to search.
 _EXACT_MM = 0.03
@@ -33,13 +28,17 @@ _AREA = 1e-4
 def silhouette(hulls: Sequence[np.ndarray], plane: Sequence[int] = _XY) -> CrossSection:
     """The shadow of a union of convex pieces on a coordinate plane."""
     return CrossSection.batch_boolean(
-        [CrossSection.hull_points(np.ascontiguousarray(h[:, plane])) for h in hulls], manifold3d.OpType.Add)
+        [CrossSection.hull_points(np.ascontiguousarray(h[:, plane])) for h in hulls],
+        manifold3d.OpType.Add,
+    )
 
 
 def closed(profile: CrossSection, clearance: float) -> CrossSection:
-    """The profile as a cavity cut with this clearance sees it: holes, and gaps under twice that, filled."""
+    """The profile as a cavity with this clearance sees it: holes and gaps under twice it filled."""
+
     def outer(p: CrossSection) -> CrossSection:
         return CrossSection([loop for loop in p.to_polygons() if CrossSection([loop]).area() > 0])
+
     grown = outer(profile.offset(clearance, JoinType.Round, circular_segments=4 * SEGMENTS))
     return grown.offset(-clearance, JoinType.Round, circular_segments=4 * SEGMENTS)
 
@@ -61,7 +60,7 @@ def thinned(points: np.ndarray, tolerance: float) -> np.ndarray:
 
 
 def _farthest(points: np.ndarray, chosen: list[int], tolerance: float) -> list[int]:
-    """Indices of points whose hull, grown from `chosen` by the farthest point, reaches all the others."""
+    """Indices of points whose hull, grown from `chosen` by the farthest, reaches all others."""
     dimension = points.shape[1]
     directions = np.array(np.meshgrid(*[[-1.0, 0.0, 1.0]] * dimension)).reshape(dimension, -1).T
     chosen = list(dict.fromkeys([*chosen, *np.argmax(points @ directions.T, axis=0)]))
@@ -99,9 +98,13 @@ def _fits(piece: _Piece, allowed: CrossSection, tolerance: float) -> bool:
     """Whether a joined piece casts the shadows of its sources, within the tolerance."""
     if (silhouette([piece.points]) - allowed).area() > _AREA:
         return False
-    return all((silhouette([piece.points], plane)
-                - _grown(silhouette(piece.sources, plane), tolerance)).area() <= _AREA
-               for plane in (_XZ, _YZ))
+    return all(
+        (
+            silhouette([piece.points], plane) - _grown(silhouette(piece.sources, plane), tolerance)
+        ).area()
+        <= _AREA
+        for plane in (_XZ, _YZ)
+    )
 
 
 def _merged(pieces: list[_Piece], allowed: CrossSection, tolerance: float) -> list[_Piece]:
@@ -125,21 +128,24 @@ def _merged(pieces: list[_Piece], allowed: CrossSection, tolerance: float) -> li
     return list(alive.values())
 
 
-def cover(hulls: Sequence[np.ndarray], outline: CrossSection, allowed: CrossSection,
-          tolerance: float) -> list[np.ndarray]:
+def cover(
+    hulls: Sequence[np.ndarray], outline: CrossSection, allowed: CrossSection, tolerance: float
+) -> list[np.ndarray]:
     """Convex pieces, few and perhaps overlapping, that together fill what `hulls` fill.
 
-    Each piece is grown from one of `hulls` by whichever neighbour adds the least volume, as long as its
-    shadow on xy stays within `allowed` and the others move by at most `tolerance` (mm); of all that can
-    be grown, the one that fills the most that is still open is taken, until nothing is open. Pieces
-    that hardly show in any shadow are then left out. Deterministic.
+    Each piece is grown from one of `hulls` by whichever neighbour adds the least volume, as long
+    as its shadow on xy stays within `allowed` and the others move by at most `tolerance` (mm); of
+    all that can be grown, the one that fills the most that is still open is taken, until nothing
+    is open. Pieces that hardly show in any shadow are then left out. Deterministic.
     """
     pieces = _merged([_Piece(h) for h in hulls], _grown(outline, _EXACT_MM), _EXACT_MM)
     grown = [_grow(seed, pieces, allowed, tolerance) for seed in range(len(pieces))]
     open_pieces, result = set(range(len(pieces))), []
     while open_pieces:
-        gains = [round(sum(pieces[i].volume for i in members & open_pieces), 3) for _, members in grown]
-        points, members = grown[int(np.argmax(gains))]
+        gains = [
+            round(sum(pieces[i].volume for i in members & open_pieces), 3) for _, members in grown
+        ]
+        _, members = grown[int(np.argmax(gains))]
         # Span only what is still open: what others fill need not be filled twice.
         wanted = np.vstack([pieces[i].points for i in sorted(members & open_pieces)])
         result.append(wanted)
@@ -148,26 +154,30 @@ def cover(hulls: Sequence[np.ndarray], outline: CrossSection, allowed: CrossSect
 
 
 def _pruned(pieces: list[np.ndarray], tolerance: float) -> list[np.ndarray]:
-    """Leaves out pieces, the smallest first, without which no shadow shrinks by more than `tolerance`."""
+    """Leaves out pieces, the smallest first, without which no shadow shrinks by `tolerance`."""
     whole = [silhouette(pieces, plane) for plane in (_XY, _XZ, _YZ)]
     kept = list(pieces)
     for piece in sorted(pieces, key=lambda h: Manifold.hull_points(h).volume()):
         rest = [h for h in kept if h is not piece]
-        if rest and all((shadow - _grown(silhouette(rest, plane), tolerance)).area() <= _AREA
-                        for shadow, plane in zip(whole, (_XY, _XZ, _YZ))):
+        if rest and all(
+            (shadow - _grown(silhouette(rest, plane), tolerance)).area() <= _AREA
+            for shadow, plane in zip(whole, (_XY, _XZ, _YZ))
+        ):
             kept = rest
     return kept
 
 
-def _grow(seed: int, pieces: list[_Piece], allowed: CrossSection,
-          tolerance: float) -> tuple[np.ndarray, set[int]]:
+def _grow(
+    seed: int, pieces: list[_Piece], allowed: CrossSection, tolerance: float
+) -> tuple[np.ndarray, set[int]]:
     """The largest piece that grows from `seed`, and the indices of the pieces that it holds."""
     current, members = pieces[seed], {seed}
     candidates = set(range(len(pieces))) - members
     while True:
         near = [i for i in sorted(candidates) if current.touches(pieces[i], tolerance)]
-        trials = sorted(((current.joined(pieces[i]).volume - current.volume - pieces[i].volume, i)
-                         for i in near))
+        trials = sorted(
+            (current.joined(pieces[i]).volume - current.volume - pieces[i].volume, i) for i in near
+        )
         for _, i in trials:
             # What does not fit now never will: the piece only grows.
             candidates.discard(i)

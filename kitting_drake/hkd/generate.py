@@ -1,15 +1,16 @@
 """Makes the model of a hand tool from its catalogue entry: meshes, SDFormat and `tool.yaml`.
 
-The tool frame T: z up, the table is the plane z = 0 when the tool rests on it, x along the length with
-the working end toward +x, the origin in the middle of the visual bounding box's footprint. Solids are
-handled in mm and written in metres.
+The tool frame T: z up, the table is the plane z = 0 when the tool rests on it, x along the length
+with the working end toward +x, the origin in the middle of the visual bounding box's footprint.
+Solids are handled in mm and written in metres.
 """
 
 import dataclasses
 import shutil
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Callable
+from typing import Any
 
 import numpy as np
 import trimesh
@@ -19,8 +20,12 @@ from scipy.spatial import ConvexHull, QhullError
 
 from kitting_drake.hkd import hammer, meshes, pliers, screwdriver, wrench
 from kitting_drake.hkd.collision import (
-    FRICTION, HUNT_CROSSLEY_DISSIPATION, HYDROELASTIC_MARGIN, HYDROELASTIC_MODULUS, closed, cover,
-    silhouette, thinned)
+    closed,
+    cover,
+    silhouette,
+    thinned,
+)
+from kitting_drake.hkd.sdf import tool_sdf
 from kitting_drake.hkd.solids import MATERIALS, Part
 
 # The cavities of a kit stand this far off a tool's outline: what is narrower than twice this is no
@@ -28,7 +33,7 @@ from kitting_drake.hkd.solids import MATERIALS, Part
 CAVITY_CLEARANCE_MM = 2.0
 # How far joining two collision pieces may move the outline, and thinning their vertices.
 MERGE_TOLERANCE_MM = 0.25
-VERTEX_TOLERANCE_MM = 0.15
+VERTEX_TOLERANCE_MM = 0.2
 # The same for the faces that the jaws grip.
 GRIP_TOLERANCE_MM = 0.06
 # Edges sharper than this are drawn as edges.
@@ -97,7 +102,12 @@ class Report:
 
 def load_catalogue(path: Path) -> list[ToolEntry]:
     """Reads `catalogue.yaml`; raises CatalogueError for an entry that cannot be used."""
-    data = yaml.safe_load(path.read_text())
+    try:
+        data = yaml.safe_load(path.read_text())
+    except yaml.YAMLError as error:
+        raise CatalogueError(f"{path}: {' '.join(str(error).split())}") from error
+    if not isinstance(data, dict) or not isinstance(data.get("tools"), list):
+        raise CatalogueError(f"{path}: it has to hold a list named `tools`")
     entries = []
     for item in data["tools"]:
         name = item.get("name", f"number {len(entries) + 1}")
@@ -106,8 +116,10 @@ def load_catalogue(path: Path) -> list[ToolEntry]:
         except (KeyError, TypeError) as error:
             raise CatalogueError(f"{path}: tool {name}: {error}") from error
         if entries[-1].category not in DESIGNS:
-            raise CatalogueError(f"{path}: tool {name}: category {entries[-1].category!r} is none of "
-                                 f"{', '.join(DESIGNS)}")
+            raise CatalogueError(
+                f"{path}: tool {name}: category {entries[-1].category!r} is none of "
+                f"{', '.join(DESIGNS)}"
+            )
     names = [e.name for e in entries]
     if len(set(names)) != len(names):
         raise CatalogueError(f"{path}: two tools share a name")
@@ -119,14 +131,18 @@ def build_parts(entry: ToolEntry) -> list[Part]:
     parameters_type, build = DESIGNS[entry.category]
     known = {f.name for f in dataclasses.fields(parameters_type)}
     if unknown := sorted(set(entry.parameters) - known):
-        raise CatalogueError(f"tool {entry.name}: {parameters_type.__name__} has no field {unknown[0]!r}")
+        raise CatalogueError(
+            f"tool {entry.name}: {parameters_type.__name__} has no field {unknown[0]!r}"
+        )
     parts = build(parameters_type(**entry.parameters))
     box = Manifold.batch_boolean([part.solid for part in parts], OpType.Add).bounding_box()
     scale = entry.length_mm / max(box[3] - box[0], box[4] - box[1])
     taken, result = Manifold(), []
     for part in parts:
         solid = part.solid.scale((scale, scale, scale))
-        result.append(Part(part.name, part.material, solid - taken, [scale * h for h in part.hulls]))
+        result.append(
+            Part(part.name, part.material, solid - taken, [scale * h for h in part.hulls])
+        )
         taken += solid
     return result
 
@@ -159,7 +175,9 @@ def resting_pose(points: np.ndarray, center_of_mass: np.ndarray) -> np.ndarray:
         normal = np.array(normal)
         foot = center_of_mass - (center_of_mass @ normal + offset) * normal
         corners = points[simplex]
-        weights = np.linalg.lstsq(np.vstack([corners.T, np.ones(3)]), np.append(foot, 1.0), rcond=None)[0]
+        weights = np.linalg.lstsq(
+            np.vstack([corners.T, np.ones(3)]), np.append(foot, 1.0), rcond=None
+        )[0]
         tilt = np.arccos(np.clip(-normal[2], -1.0, 1.0))
         if weights.min() >= -1e-6 and tilt < best_tilt:
             best, best_tilt = normal, tilt
@@ -186,8 +204,10 @@ def generate_tool(entry: ToolEntry, directory: Path) -> Report:
     outline = closed(whole.project(), CAVITY_CLEARANCE_MM)
     allowed = _allowed(outline, entry.grasp)
     hulls = cover([h @ R_TD.T + p_T for h in hulls], outline, allowed, MERGE_TOLERANCE_MM)
-    hulls = sorted((thinned(h, VERTEX_TOLERANCE_MM) for h in hulls),
-                   key=lambda h: tuple(np.round(h.mean(axis=0), 3)))
+    hulls = sorted(
+        (thinned(h, VERTEX_TOLERANCE_MM) for h in hulls),
+        key=lambda h: tuple(np.round(h.mean(axis=0), 3)),
+    )
 
     if directory.exists():
         shutil.rmtree(directory)
@@ -200,7 +220,8 @@ def generate_tool(entry: ToolEntry, directory: Path) -> Report:
         collisions.append(f"collision_{i}.obj")
         collision_triangles += meshes.write_convex_obj(directory / collisions[-1], hull)
     (directory / f"{entry.name}.sdf").write_text(
-        _sdf(entry.name, mass, center, inertia, visuals, collisions))
+        tool_sdf(entry.name, mass, center, inertia, visuals, collisions)
+    )
 
     box = np.array(whole.bounding_box()).reshape(2, 3)
     grip, flatness, overhang, grip_top = _measure_grasp(entry.grasp, whole)
@@ -209,21 +230,28 @@ def generate_tool(entry: ToolEntry, directory: Path) -> Report:
     (directory / "tool.yaml").write_text(yaml.safe_dump(description, sort_keys=False))
     points = np.vstack(hulls)
     return Report(
-        description, triangles, len(hulls), collision_triangles,
+        description,
+        triangles,
+        len(hulls),
+        collision_triangles,
         outside_mm=_furthest(silhouette(hulls), outline),
         inside_mm=_furthest(outline, closed(silhouette(hulls), CAVITY_CLEARANCE_MM)),
         bottom_error_mm=points[:, 2].min() - box[0, 2],
         top_error_mm=points[:, 2].max() - box[1, 2],
         grip_error_mm=_measure_grasp(entry.grasp, solid_hulls)[0] - grip,
-        grip_flatness_mm=flatness, finger_overhang_mm=overhang,
+        grip_flatness_mm=flatness,
+        finger_overhang_mm=overhang,
         tilt_deg=float(np.degrees(np.arccos(min(1.0, R_TD[2, 2])))),
-        support_margin_mm=_support_margin(points, 1e3 * center))
+        support_margin_mm=_support_margin(points, 1e3 * center),
+    )
 
 
 def _allowed(outline: CrossSection, grasp: GraspEntry) -> CrossSection:
-    """Where collision pieces may reach: a little out of the outline, but not where the jaws grip it."""
+    """Where collision pieces may reach: a little out of the outline, not where the jaws grip."""
+
     def grown(distance: float) -> CrossSection:
         return outline.offset(distance, JoinType.Round, circular_segments=96)
+
     jaws = CrossSection.square((FINGER_LENGTH_MM + 2.0, 80.0), True)
     jaws = jaws.rotate(grasp.theta_deg).translate((grasp.x_mm, grasp.y_mm))
     return grown(MERGE_TOLERANCE_MM) - (jaws - grown(GRIP_TOLERANCE_MM))
@@ -233,8 +261,9 @@ def _moved(solid: Manifold, R: np.ndarray, p: np.ndarray) -> Manifold:
     return solid.transform(np.column_stack([R, p]))
 
 
-def _write_visuals(parts: list[Part], R_TD: np.ndarray, p_T: np.ndarray,
-                   directory: Path) -> tuple[list[tuple[str, str]], int]:
+def _write_visuals(
+    parts: list[Part], R_TD: np.ndarray, p_T: np.ndarray, directory: Path
+) -> tuple[list[tuple[str, str]], int]:
     """One OBJ per material; returns (file, material) pairs and the number of triangles."""
     visuals, triangles = [], 0
     for material in sorted({part.material for part in parts}):
@@ -246,19 +275,22 @@ def _write_visuals(parts: list[Part], R_TD: np.ndarray, p_T: np.ndarray,
 
 
 def _measure_grasp(grasp: GraspEntry, solid: Manifold) -> tuple[float, float, float, float]:
-    """Gripped width, its variation, the fingers' overhang beyond it, and height of the top there; mm."""
+    """Gripped width, its variation, the fingers' overhang, and height of the top there; mm."""
     # Into the grasp's frame: y along the closing direction.
     solid = solid.translate((-grasp.x_mm, -grasp.y_mm, 0.0)).rotate((0.0, 0.0, -grasp.theta_deg))
 
     def strip(x: float, length: float) -> np.ndarray:
         band = CrossSection.square((length, 80.0), True).translate((x, 0.0)).extrude(100.0)
         return np.array((solid ^ band.translate((0, 0, -1))).bounding_box()).reshape(2, 3)
+
     pad, finger = strip(0.0, PAD_LENGTH_MM), strip(0.0, FINGER_LENGTH_MM)
     slices = [strip(x, 0.5) for x in np.linspace(-0.5, 0.5, 7) * (PAD_LENGTH_MM - 0.5)]
     width = pad[1, 1] - pad[0, 1]
     if not 8.0 <= width <= 35.0:
-        raise CatalogueError(f"the grasp at ({grasp.x_mm}, {grasp.y_mm}) mm holds {width:.1f} mm; "
-                             "it has to be 8 to 35 mm")
+        raise CatalogueError(
+            f"the grasp at ({grasp.x_mm}, {grasp.y_mm}) mm holds {width:.1f} mm; "
+            "it has to be 8 to 35 mm"
+        )
     flatness = max(np.ptp([s[k, 1] for s in slices]) for k in (0, 1))
     overhang = max(finger[1, 1] - pad[1, 1], pad[0, 1] - finger[0, 1])
     return float(width), float(flatness), float(overhang), float(pad[1, 2])
@@ -275,7 +307,7 @@ def _furthest(inner: CrossSection, outer: CrossSection) -> float:
 
 
 def _support_margin(points: np.ndarray, center_of_mass: np.ndarray) -> float:
-    """Distance (mm) of the centre of mass, seen from above, from the rim of what touches the table."""
+    """Distance (mm) of the centre of mass, seen from above, from the rim of the support."""
     touching = points[points[:, 2] < 0.02][:, :2]
     try:
         equations = ConvexHull(touching).equations
@@ -284,62 +316,35 @@ def _support_margin(points: np.ndarray, center_of_mass: np.ndarray) -> float:
     return float(-(equations[:, :2] @ center_of_mass[:2] + equations[:, 2]).max())
 
 
-def _description(entry: ToolEntry, box: np.ndarray, mass: float, center: np.ndarray, grip: float,
-                 grip_top: float, visuals: list[tuple[str, str]]) -> dict[str, Any]:
+def _description(
+    entry: ToolEntry,
+    box: np.ndarray,
+    mass: float,
+    center: np.ndarray,
+    grip: float,
+    grip_top: float,
+    visuals: list[tuple[str, str]],
+) -> dict[str, Any]:
     """The content of `tool.yaml`: SI units, frame T."""
+
     def metres(value_mm: float) -> float:
         return round(1e-3 * float(value_mm), 6)
+
     return {
-        "name": entry.name, "category": entry.category, "split": entry.split,
-        "length": metres(box[1, 0] - box[0, 0]), "width": metres(box[1, 1] - box[0, 1]),
-        "height": metres(box[1, 2]), "mass": round(float(mass), 6),
-        "center_of_mass": [round(float(v), 6) for v in center],
-        "grasp": {"x": metres(entry.grasp.x_mm), "y": metres(entry.grasp.y_mm),
-                  "theta": round(float(np.radians(entry.grasp.theta_deg)), 6),
-                  "width": metres(grip), "surface_height": metres(grip_top)},
+        "name": entry.name,
+        "category": entry.category,
+        "split": entry.split,
+        "length": metres(box[1, 0] - box[0, 0]),
+        "width": metres(box[1, 1] - box[0, 1]),
+        "height": metres(box[1, 2]),
+        "mass": round(float(mass), 6),
+        "center_of_mass": [round(float(v), 6) + 0.0 for v in center],
+        "grasp": {
+            "x": metres(entry.grasp.x_mm),
+            "y": metres(entry.grasp.y_mm),
+            "theta": round(float(np.radians(entry.grasp.theta_deg)), 6),
+            "width": metres(grip),
+            "surface_height": metres(grip_top),
+        },
         "visual_meshes": [name for name, _ in visuals],
     }
-
-
-def _sdf(name: str, mass: float, center: np.ndarray, inertia: np.ndarray,
-         visuals: list[tuple[str, str]], collisions: list[str]) -> str:
-    """The SDFormat text of a model with one free link named `tool`."""
-    def numbers(values: Any) -> str:
-        return " ".join(f"{float(v):.9g}" for v in values)
-    package = f"package://kitting_models/tools/{name}"
-    moments = "".join(
-        f"<i{'xyz'[i]}{'xyz'[j]}>{inertia[i, j]:.9g}</i{'xyz'[i]}{'xyz'[j]}>"
-        for i in range(3) for j in range(i, 3))
-    seen = "".join(f"""
-      <visual name="{material}">
-        <geometry><mesh><uri>{package}/{file}</uri></mesh></geometry>
-        <material><diffuse>{numbers(MATERIALS[material].rgba)}</diffuse></material>
-      </visual>""" for file, material in visuals)
-    # Drake builds no margin for some finely faceted convex pieces: name one only if it is wanted.
-    margin = ("" if HYDROELASTIC_MARGIN == 0.0 else
-              f"          <drake:hydroelastic_margin>{HYDROELASTIC_MARGIN:g}</drake:hydroelastic_margin>\n")
-    touched = "".join(f"""
-      <collision name="{Path(file).stem}">
-        <geometry><mesh><uri>{package}/{file}</uri><drake:declare_convex/></mesh></geometry>
-        <drake:proximity_properties>
-          <drake:compliant_hydroelastic/>
-          <drake:hydroelastic_modulus>{HYDROELASTIC_MODULUS:g}</drake:hydroelastic_modulus>
-          <drake:hunt_crossley_dissipation>{HUNT_CROSSLEY_DISSIPATION:g}</drake:hunt_crossley_dissipation>
-{margin}          <drake:mu_static>{FRICTION:g}</drake:mu_static>
-          <drake:mu_dynamic>{FRICTION:g}</drake:mu_dynamic>
-        </drake:proximity_properties>
-      </collision>""" for file in collisions)
-    return f"""<?xml version="1.0"?>
-<!-- Generated by `python -m kitting_drake.hkd generate {name}`: edit the catalogue, not this file. -->
-<sdf version="1.9" xmlns:drake="http://drake.mit.edu">
-  <model name="{name}">
-    <link name="tool">
-      <inertial>
-        <pose>{numbers(center)} 0 0 0</pose>
-        <mass>{mass:.9g}</mass>
-        <inertia>{moments}</inertia>
-      </inertial>{seen}{touched}
-    </link>
-  </model>
-</sdf>
-"""

@@ -5,7 +5,18 @@ from dataclasses import dataclass
 import numpy as np
 from manifold3d import Manifold, OpType
 
-from kitting_drake.hkd.solids import Part, Shape, across_path, across_x, fillet, loft, rounded_rectangle
+from kitting_drake.hkd.solids import (
+    Part,
+    Shape,
+    across_path,
+    across_x,
+    fillet,
+    loft,
+    rounded_rectangle,
+)
+
+# How far the handle's end stands out of the eye.
+_PROUD_MM = 1.4
 
 
 @dataclass
@@ -31,8 +42,8 @@ class HammerParameters:
     claw_tip_mm: float = 3.5
     claw_width_mm: float = 31.0
     claw_gap_mm: float = 11.0
-    # The handle's widths along y at the eye, at the grip's swell and at its thinnest (the throat); its
-    # thickness along z is this share of the width.
+    # The handle's widths along y at the eye, at the grip's swell and at its thinnest (the throat);
+    # its thickness along z is this share of the width.
     eye_width_mm: float = 25.0
     throat_width_mm: float = 23.0
     swell_width_mm: float = 34.0
@@ -46,8 +57,9 @@ class HammerParameters:
 
 def build_hammer(p: HammerParameters) -> list[Part]:
     """The parts of a hammer, in mm in the design frame."""
-    wedge = Manifold.cube((12.0, 0.5 * p.eye_width_mm, 2.2), True).translate(
-        (p.cheek_height_mm / 2 - 3.4, 0.0, 0.0))
+    # The wedge spreads the handle in the eye; its end stands a hair proud, so that it can be seen.
+    wedge = Manifold.cube((12.0, 0.5 * p.eye_width_mm, 2.2), True)
+    wedge = wedge.translate((p.cheek_height_mm / 2 + _PROUD_MM - 5.8, 0.0, 0.0))
     wood, dipped = _handle(p)
     poll, face = _poll(p)
     head = _cheeks(p), poll, _claw(p)
@@ -56,35 +68,70 @@ def build_hammer(p: HammerParameters) -> list[Part]:
         Part("handle", p.handle_material, wood.solid, wood.hulls),
         Part("grip", p.grip_material, dipped.solid, dipped.hulls),
         Part("face", p.face_material, face.solid, face.hulls),
-        Part("head", p.head_material, Manifold.batch_boolean([s.solid for s in head], OpType.Add),
-             [h for s in head for h in s.hulls]),
+        Part(
+            "head",
+            p.head_material,
+            Manifold.batch_boolean([s.solid for s in head], OpType.Add),
+            [h for s in head for h in s.hulls],
+        ),
     ]
 
 
 def _octagon(width: float, thickness: float) -> np.ndarray:
     """A handle's section: flat on all four sides, its corners cut and softened; (8 arcs, 2)."""
     y, z, cut = width / 2, thickness / 2, 0.27 * thickness
-    corners = [(-y + cut, -z), (y - cut, -z), (y, -z + cut), (y, z - cut),
-               (y - cut, z), (-y + cut, z), (-y, z - cut), (-y, -z + cut)]
+    corners = [
+        (-y + cut, -z),
+        (y - cut, -z),
+        (y, -z + cut),
+        (y, z - cut),
+        (y - cut, z),
+        (-y + cut, z),
+        (-y, z - cut),
+        (-y, -z + cut),
+    ]
     return fillet(corners, 0.35 * cut, 3)
 
 
 def _handle(p: HammerParameters) -> tuple[Shape, Shape]:
     """The handle from the eye to the throat in bare wood, and its dipped grip with the swell."""
-    top = p.cheek_height_mm / 2 + 1.4
+    top = p.cheek_height_mm / 2 + _PROUD_MM
     end = top - p.length_mm
     eye, throat, swell = p.eye_width_mm, p.throat_width_mm, p.swell_width_mm
     # Distance from the end as a share of the length; width. The straight stretch behind the head is
     # where a gripper holds it: its flanks are parallel there.
-    bare = [(1.0, 0.86 * eye), (0.995, 0.9 * eye), (0.91, 0.92 * eye), (0.905, eye), (0.70, eye),
-            (0.64, 0.99 * eye), (0.58, 0.5 * (eye + throat)), (0.52, throat), (0.46, throat)]
-    dipped = [(0.46, throat), (0.40, 1.02 * throat), (0.32, 0.5 * (throat + 0.86 * swell)),
-              (0.24, 0.86 * swell), (0.15, 0.88 * swell), (0.09, 0.93 * swell), (0.045, swell),
-              (0.022, 0.98 * swell), (0.008, 0.92 * swell), (0.0, 0.82 * swell)]
+    bare = [
+        (1.0, 0.86 * eye),
+        (0.995, 0.9 * eye),
+        (0.91, 0.92 * eye),
+        (0.905, eye),
+        (0.70, eye),
+        (0.64, 0.99 * eye),
+        (0.58, 0.5 * (eye + throat)),
+        (0.52, throat),
+        (0.46, throat),
+    ]
+    dipped = [
+        (0.46, throat),
+        (0.40, 1.02 * throat),
+        (0.32, 0.5 * (throat + 0.86 * swell)),
+        (0.24, 0.86 * swell),
+        (0.15, 0.88 * swell),
+        (0.09, 0.93 * swell),
+        (0.045, swell),
+        (0.022, 0.98 * swell),
+        (0.008, 0.92 * swell),
+        (0.0, 0.82 * swell),
+    ]
 
     def along(stations: list[tuple[float, float]]) -> Shape:
-        return loft([across_x(_octagon(w, p.handle_flatness * w), end + t * p.length_mm)
-                     for t, w in stations])
+        return loft(
+            [
+                across_x(_octagon(w, p.handle_flatness * w), end + t * p.length_mm)
+                for t, w in stations
+            ]
+        )
+
     return along(bare), along(dipped)
 
 
@@ -97,8 +144,12 @@ def _cheeks(p: HammerParameters) -> Shape:
     """The block about the eye, drawn in toward poll and claw."""
     half, height, thickness = p.cheek_length_mm / 2, p.cheek_height_mm, p.head_thickness_mm
     sections = [(-1.0, 0.8), (-0.72, 1.0), (0.72, 1.0), (1.0, 0.8)]
-    return loft([_across_y(rounded_rectangle(height * (0.5 + 0.5 * s), thickness * s, 5.0 * s), y * half)
-                 for y, s in sections])
+    return loft(
+        [
+            _across_y(rounded_rectangle(height * (0.5 + 0.5 * s), thickness * s, 5.0 * s), y * half)
+            for y, s in sections
+        ]
+    )
 
 
 def _poll(p: HammerParameters) -> tuple[Shape, Shape]:
@@ -110,11 +161,26 @@ def _poll(p: HammerParameters) -> tuple[Shape, Shape]:
 
     def section(diameter: float, y: float, roundness: float = 1.0) -> np.ndarray:
         return _across_y(rounded_rectangle(diameter, diameter, roundness * diameter / 2, 10), y)
-    poll = loft([section(root, start, 0.5), section(0.5 * (root + neck), 0.6 * start + 0.4 * (bell - 7), 0.8),
-                 section(neck, bell - 7), section(neck, bell - 4), section(0.93 * face, bell - 0.5),
-                 section(face, bell + 1.5), section(face, end - bevel - 1.5)])
-    crown = loft([section(face, end - bevel - 1.5), section(face, end - bevel),
-                  section(face - 2 * bevel, end - 0.4), section(0.4 * face, end)])
+
+    poll = loft(
+        [
+            section(root, start, 0.5),
+            section(0.5 * (root + neck), 0.6 * start + 0.4 * (bell - 7), 0.8),
+            section(neck, bell - 7),
+            section(neck, bell - 4),
+            section(0.93 * face, bell - 0.5),
+            section(face, bell + 1.5),
+            section(face, end - bevel - 1.5),
+        ]
+    )
+    crown = loft(
+        [
+            section(face, end - bevel - 1.5),
+            section(face, end - bevel),
+            section(face - 2 * bevel, end - 0.4),
+            section(0.4 * face, end),
+        ]
+    )
     return poll, crown
 
 
@@ -128,12 +194,18 @@ def _claw(p: HammerParameters) -> Shape:
         # The outer edge follows the circle; the thickness grows inward from it.
         angle = -np.pi / 2 - t * turn
         thickness = p.claw_tip_mm + (root - p.claw_tip_mm) * (1 - t) ** 1.15
-        width = p.head_thickness_mm * 0.8 + (p.claw_width_mm - 0.8 * p.head_thickness_mm) * min(1.0, 2 * t)
+        width = p.head_thickness_mm * 0.8 + (p.claw_width_mm - 0.8 * p.head_thickness_mm) * min(
+            1.0, 2 * t
+        )
         reach = p.claw_radius_mm - thickness / 2
         center = (root / 2 - p.claw_radius_mm, -start) - reach * np.array(
-            [-np.cos(t * turn), np.sin(t * turn)])
-        sections.append(across_path(
-            rounded_rectangle(thickness, width, min(2.0, 0.4 * thickness)), center, angle))
+            [-np.cos(t * turn), np.sin(t * turn)]
+        )
+        sections.append(
+            across_path(
+                rounded_rectangle(thickness, width, min(2.0, 0.4 * thickness)), center, angle
+            )
+        )
     band = loft(sections)
     return Shape(band.solid - _split(p, start), band.hulls)
 
@@ -142,8 +214,15 @@ def _split(p: HammerParameters, start: float) -> Manifold:
     """The V between the tines, seen along x: a wedge that narrows to a round root."""
     reach = start + p.claw_radius_mm
     root = start + 0.32 * p.claw_radius_mm
-    outline = fillet([(-reach - 5, -p.claw_gap_mm / 2), (-root, -1.0), (-root, 1.0),
-                      (-reach - 5, p.claw_gap_mm / 2)], [0.0, 0.9, 0.9, 0.0])
+    outline = fillet(
+        [
+            (-reach - 5, -p.claw_gap_mm / 2),
+            (-root, -1.0),
+            (-root, 1.0),
+            (-reach - 5, p.claw_gap_mm / 2),
+        ],
+        [0.0, 0.9, 0.9, 0.0],
+    )
     height = 4 * p.cheek_height_mm
     prism = loft([np.column_stack([np.full(len(outline), x), outline]) for x in (-height, height)])
     return prism.solid

@@ -286,9 +286,7 @@ def _write_obj(
         normal = np.cross(b - a, c - a)
         normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-30)
         lines += [f"vn {x:.4f} {y:.4f} {z:.4f}" for x, y, z in normal]
-        lines += [
-            f"f {i}//{n} {j}//{n} {k}//{n}" for n, (i, j, k) in enumerate(faces + 1, start=1)
-        ]
+        lines += [f"f {i}//{n} {j}//{n} {k}//{n}" for n, (i, j, k) in enumerate(faces + 1, start=1)]
     else:
         lines += [f"f {i} {j} {k}" for i, j, k in faces + 1]
     path.write_text("\n".join(lines) + "\n")

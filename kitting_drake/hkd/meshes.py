@@ -1,4 +1,4 @@
-"""Writing solids as Wavefront OBJ: metres, fixed digits and order, so that the same solid gives the same file."""
+"""Solids as Wavefront OBJ: metres, fixed digits and order, so equal solids give equal files."""
 
 from pathlib import Path
 
@@ -16,8 +16,8 @@ def vertices_and_faces(solid: Manifold) -> tuple[np.ndarray, np.ndarray]:
 def corner_normals(vertices: np.ndarray, faces: np.ndarray, crease_angle_deg: float) -> np.ndarray:
     """Normals (m, 3, 3) of the faces' corners, smooth across edges flatter than the crease angle.
 
-    Each corner averages, by area, the faces about its vertex that lean less than that angle from its
-    own: broad flats then stay flat beside narrow bevels.
+    Each corner averages, by area, the faces about its vertex that lean less than that angle from
+    its own: broad flats then stay flat beside narrow bevels.
     """
     a, b, c = (vertices[faces[:, k]] for k in range(3))
     weighted = np.cross(b - a, c - a)

@@ -7,7 +7,17 @@ from manifold3d import CrossSection, Manifold
 from scipy.interpolate import PchipInterpolator
 
 from kitting_drake.hkd.solids import (
-    SEGMENTS, Part, Shape, across_path, circle, fillet, loft, plate, ribbon, rounded_rectangle)
+    SEGMENTS,
+    Part,
+    Shape,
+    across_path,
+    circle,
+    fillet,
+    loft,
+    plate,
+    ribbon,
+    rounded_rectangle,
+)
 
 
 @dataclass
@@ -19,7 +29,8 @@ class PliersParameters:
     handle_length_mm: float = 138.0
     # Thickness of joint and jaws.
     thickness_mm: float = 12.0
-    # Width across the parallel flanks of the joint, and how far they run behind and before the rivet.
+    # Width across the parallel flanks of the joint, and how far they run behind and before the
+    # rivet.
     joint_width_mm: float = 30.0
     joint_back_mm: float = 29.0
     joint_front_mm: float = 8.0
@@ -36,7 +47,7 @@ class PliersParameters:
     grip_width_mm: float = 14.5
     grip_thickness_mm: float = 13.5
     grip_length_mm: float = 96.0
-    # Diameters of the rivet and of the second hole's washer-like boss.
+    # Diameter of the rivet, and bevel of the steel's outer edges.
     rivet_diameter_mm: float = 13.0
     bevel_mm: float = 0.9
     # Keys of solids.MATERIALS.
@@ -68,7 +79,7 @@ def _turned_over(shape: Shape) -> Shape:
 
 
 def _handle_path(p: PliersParameters, count: int) -> np.ndarray:
-    """The middle of the upper lever's handle (at negative y), from the joint to its end; (count, 2)."""
+    """The middle of the upper lever's handle (y < 0), from the joint to its end; (count, 2)."""
     inner = p.joint_width_mm / 2 - p.handle_width_mm / 2
     outer = p.handle_spread_mm / 2
     # Along the joint's flank first, then a bow outward; the ends come back a little.
@@ -91,15 +102,29 @@ def _lever(p: PliersParameters) -> Shape:
     neck = plate(ribbon(bare, np.full(len(bare), p.handle_width_mm)), -z, z, p.bevel_mm)
     # The lap's outline: flanks parallel over a finger's width, corners drawn in before and behind.
     front, back = p.joint_front_mm, p.joint_back_mm
-    lap_outline = fillet([(-back, -half), (front, -half), (front + 7, -half + 5), (front + 7, half - 5),
-                          (front, half), (-0.45 * back, half), (-0.95 * back, 0.12 * half),
-                          (-back, -half + p.handle_width_mm)], [1, 5, 4, 4, 5, 12, 3, 3])
+    lap_outline = fillet(
+        [
+            (-back, -half),
+            (front, -half),
+            (front + 7, -half + 5),
+            (front + 7, half - 5),
+            (front, half),
+            (-0.45 * back, half),
+            (-0.95 * back, 0.12 * half),
+            (-back, -half + p.handle_width_mm),
+        ],
+        [1, 5, 4, 4, 5, 12, 3, 3],
+    )
     lap = plate(lap_outline, 0.0, z, p.bevel_mm)
     # Where the other lever's lap is, this one gives way, with play for the two to turn.
     room = CrossSection([lap_outline]).mirror((0, 1)).offset(0.25, circular_segments=SEGMENTS)
     room = room.extrude(z + 1).translate((0, 0, -z - 1))
-    return Shape((jaw.solid + handle.solid) - room + lap.solid, jaw.hulls + neck.hulls + [
-        h * sign for h in lap.hulls for sign in (np.ones(3), np.array([1.0, 1.0, -1.0]))])
+    return Shape(
+        (jaw.solid + handle.solid) - room + lap.solid,
+        jaw.hulls
+        + neck.hulls
+        + [h * sign for h in lap.hulls for sign in (np.ones(3), np.array([1.0, 1.0, -1.0]))],
+    )
 
 
 def _jaw_profile(p: PliersParameters) -> np.ndarray:
@@ -111,9 +136,16 @@ def _jaw_profile(p: PliersParameters) -> np.ndarray:
         """Half the opening: the jaws have turned about the rivet."""
         return 0.5 * p.tip_gap_mm * x / length
 
-    back = [(start - 6.0, half), (start, half), (0.5 * (start + length), 0.84 * half + 0.16 * tip),
-            (length - 3.0, tip + 0.9), (length, tip - 2.0)]
-    back = fillet([*back, (length, gap(length) + 0.4), (start - 6.0, 0.0)], [0, 14, 30, 3.5, 1.5, 0, 0])
+    back = [
+        (start - 6.0, half),
+        (start, half),
+        (0.5 * (start + length), 0.84 * half + 0.16 * tip),
+        (length - 3.0, tip + 0.9),
+        (length, tip - 2.0),
+    ]
+    back = fillet(
+        [*back, (length, gap(length) + 0.4), (start - 6.0, 0.0)], [0, 14, 30, 3.5, 1.5, 0, 0]
+    )
     back = [tuple(v) for v in back[:-1]]
     flat_end, pipe_end, pipe_start = length - 1.5, 0.60 * length, 0.26 * length
     bite: list[tuple[float, float]] = []
@@ -138,17 +170,34 @@ def _grip(p: PliersParameters) -> Shape:
     run = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=1))])
     start = run[-1] - p.grip_length_mm
     # Share of the sleeve, width, thickness, both as shares of the grip's.
-    stations = [(0.0, 0.80, 0.82), (0.012, 1.02, 0.92), (0.03, 1.16, 1.0), (0.055, 1.16, 1.0),
-                (0.085, 1.02, 1.0), (0.12, 0.96, 1.0), (0.25, 0.96, 1.0), (0.4, 1.0, 1.0), (0.55, 1.0, 1.0),
-                (0.7, 1.0, 1.0), (0.82, 1.0, 1.0), (0.92, 1.0, 1.0), (0.965, 0.96, 0.98),
-                (0.988, 0.8, 0.86), (1.0, 0.5, 0.6)]
+    stations = [
+        (0.0, 0.80, 0.82),
+        (0.012, 1.02, 0.92),
+        (0.03, 1.16, 1.0),
+        (0.055, 1.16, 1.0),
+        (0.085, 1.02, 1.0),
+        (0.12, 0.96, 1.0),
+        (0.25, 0.96, 1.0),
+        (0.4, 1.0, 1.0),
+        (0.55, 1.0, 1.0),
+        (0.7, 1.0, 1.0),
+        (0.82, 1.0, 1.0),
+        (0.92, 1.0, 1.0),
+        (0.965, 0.96, 0.98),
+        (0.988, 0.8, 0.86),
+        (1.0, 0.5, 0.6),
+    ]
     sections = []
     for share, width, thickness in stations:
         s = start + share * p.grip_length_mm
         point = [np.interp(s, run, path[:, k]) for k in (0, 1)]
         dx, dy = (np.interp(s, run, tangent[:, k]) for k in (0, 1))
-        profile = rounded_rectangle(width * p.grip_width_mm, thickness * p.grip_thickness_mm,
-                                    0.34 * p.grip_thickness_mm * thickness, 5)
+        profile = rounded_rectangle(
+            width * p.grip_width_mm,
+            thickness * p.grip_thickness_mm,
+            0.34 * p.grip_thickness_mm * thickness,
+            5,
+        )
         sections.append(across_path(profile, point, np.arctan2(dy, dx)))
     return loft(sections)
 
@@ -159,6 +208,7 @@ def _rivet(p: PliersParameters) -> Shape:
 
     def disc(r: float, height: float) -> np.ndarray:
         return np.column_stack([circle(r, segments=32), np.full(32, height)])
+
     rivet = loft([disc(radius, -z + 0.01), disc(radius, z + 0.6), disc(radius - 1.0, z + 1.3)])
     dimple = Manifold.cylinder(2.0, 0.5, 0.28 * radius + 1.4, SEGMENTS).translate((0, 0, z + 0.5))
     return Shape(rivet.solid - dimple, rivet.hulls)

@@ -5,7 +5,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from kitting_drake.hkd.solids import (
-    Part, Shape, across_x, circle, loft, rounded_rectangle)
+    Part,
+    Shape,
+    across_x,
+    circle,
+    loft,
+    rounded_rectangle,
+)
 
 
 @dataclass
@@ -22,7 +28,8 @@ class ScrewdriverParameters:
     # The hexagonal bolster on the shaft, across flats and along x.
     bolster_width_mm: float = 11.0
     bolster_length_mm: float = 9.0
-    # The handle: length, width across its flats, and what it loses of it at the neck behind the guard.
+    # The handle: length, width across its flats, and what it loses of it at the neck behind the
+    # guard.
     handle_length_mm: float = 105.0
     handle_width_mm: float = 28.0
     neck_depth_mm: float = 3.5
@@ -67,8 +74,12 @@ def _bolster(p: ScrewdriverParameters) -> Shape:
     """A hexagon on the shaft for a wrench, its ends chamfered."""
     hexagon = circle(p.bolster_width_mm / np.sqrt(3), segments=6)
     front = p.bolster_length_mm
-    return loft([across_x(scale * hexagon, x)
-                 for scale, x in ((1.0, -2.0), (1.0, front - 1.4), (0.82, front))])
+    return loft(
+        [
+            across_x(scale * hexagon, x)
+            for scale, x in ((1.0, -2.0), (1.0, front - 1.4), (0.82, front))
+        ]
+    )
 
 
 def _handle_section(p: ScrewdriverParameters, x: float, width: float, flute: float) -> np.ndarray:
@@ -86,15 +97,31 @@ def _handle(p: ScrewdriverParameters) -> tuple[Shape, Shape]:
     length, width, neck = p.handle_length_mm, p.handle_width_mm, p.handle_width_mm - p.neck_depth_mm
     # Along the handle from the butt: share of the length, width, share of the flute's depth.
     stations = [
-        (0.0, 0.55 * width, 0.0), (0.012, 0.72 * width, 0.0), (0.035, 0.87 * width, 0.0),
-        (0.065, 0.96 * width, 0.0), (0.10, width, 0.0), (0.13, width, 0.35), (0.17, width, 1.0),
+        (0.0, 0.55 * width, 0.0),
+        (0.012, 0.72 * width, 0.0),
+        (0.035, 0.87 * width, 0.0),
+        (0.065, 0.96 * width, 0.0),
+        (0.10, width, 0.0),
+        (0.13, width, 0.35),
+        (0.17, width, 1.0),
         (0.80, width, 1.0),
     ]
-    grip = loft([_handle_section(p, (t - 1) * length, w, f * p.flute_depth_mm) for t, w, f in stations])
+    grip = loft(
+        [_handle_section(p, (t - 1) * length, w, f * p.flute_depth_mm) for t, w, f in stations]
+    )
     stations = [
-        (0.80, width, 1.0), (0.84, width, 0.35), (0.87, width, 0.0), (0.895, 0.97 * width, 0.0),
-        (0.925, neck, 0.0), (0.945, neck, 0.0), (0.965, 0.93 * width, 0.0), (0.98, 0.93 * width, 0.0),
-        (0.992, 0.84 * width, 0.0), (1.0, 0.7 * width, 0.0),
+        (0.80, width, 1.0),
+        (0.84, width, 0.35),
+        (0.87, width, 0.0),
+        (0.895, 0.97 * width, 0.0),
+        (0.925, neck, 0.0),
+        (0.945, neck, 0.0),
+        (0.965, 0.93 * width, 0.0),
+        (0.98, 0.93 * width, 0.0),
+        (0.992, 0.84 * width, 0.0),
+        (1.0, 0.7 * width, 0.0),
     ]
-    collar = loft([_handle_section(p, (t - 1) * length, w, f * p.flute_depth_mm) for t, w, f in stations])
+    collar = loft(
+        [_handle_section(p, (t - 1) * length, w, f * p.flute_depth_mm) for t, w, f in stations]
+    )
     return grip, collar

@@ -1,24 +1,27 @@
-"""Building blocks of the generated hand tools: parts, profiles, plates, lofts and their convex pieces.
+"""Building blocks of the generated hand tools: parts, profiles, plates and lofts.
 
-Everything here is in millimetres and in the *design frame* of a tool: x along the length, working end
-toward +x, z up when the tool lies flat. A shape is built twice from the same numbers: once as an exact
-solid, which is seen and weighed, and once as many small convex point sets that fill it, which
-`merge_hulls` later joins into the few convex collision pieces that a simulator wants.
+Everything here is in millimetres and in the *design frame* of a tool: x along the length, working
+end toward +x, z up when the tool lies flat. A shape is built twice from the same numbers: once as
+an exact solid, which is seen and weighed, and once as many small convex point sets that fill it,
+which `collision.cover` later joins into the few convex collision pieces that a simulator wants.
 """
 
+import itertools
+from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import NamedTuple, Sequence
+from typing import NamedTuple
 
 import manifold3d
 import numpy as np
 from manifold3d import CrossSection, JoinType, Manifold
 
-# Segments of a full circle. Given at every call: the library's own choice is meant for larger units.
+# Segments of a full circle. Given at every call: the library's own choice is meant for larger
+# units.
 SEGMENTS = 48
 
 
 class Material(NamedTuple):
-    """What a part is made of: density in kg/m^3 and diffuse colour, red green blue alpha in [0, 1]."""
+    """What a part is made of: density (kg/m^3) and diffuse colour (r, g, b, a in [0, 1])."""
 
     density: float
     rgba: tuple[float, float, float, float]
@@ -65,14 +68,17 @@ class Shape(NamedTuple):
 # --- Profiles: closed polygons in the plane, (n, 2), counter-clockwise. ---
 
 
-def circle(radius: float, center: Sequence[float] = (0.0, 0.0), segments: int = SEGMENTS) -> np.ndarray:
+def circle(
+    radius: float, center: Sequence[float] = (0.0, 0.0), segments: int = SEGMENTS
+) -> np.ndarray:
     """A regular polygon inscribed in a circle, the first vertex toward +x."""
     angles = 2 * np.pi * np.arange(segments) / segments
     return np.asarray(center) + radius * np.column_stack([np.cos(angles), np.sin(angles)])
 
 
-def fillet(points: Sequence[Sequence[float]], radii: float | Sequence[float],
-           segments: int = 6) -> np.ndarray:
+def fillet(
+    points: Sequence[Sequence[float]], radii: float | Sequence[float], segments: int = 6
+) -> np.ndarray:
     """Replaces each corner of a closed polygon by an arc.
 
     A radius too large for its edges is cut back to what fits; zero keeps the corner.
@@ -99,12 +105,14 @@ def fillet(points: Sequence[Sequence[float]], radii: float | Sequence[float],
         sweep = np.arctan2(start[0] * end[1] - start[1] * end[0], start @ end)
         for t in np.linspace(0.0, sweep, segments + 1):
             c, s = np.cos(t), np.sin(t)
-            result.append(center + np.array([c * start[0] - s * start[1], s * start[0] + c * start[1]]))
+            result.append(
+                center + np.array([c * start[0] - s * start[1], s * start[0] + c * start[1]])
+            )
     return np.array(result)
 
 
 def rounded_rectangle(width: float, height: float, radius: float, segments: int = 4) -> np.ndarray:
-    """A rectangle about the origin with arcs for corners; the vertex count depends on `segments` only."""
+    """A rectangle about the origin with arcs for corners, 4 (segments + 1) vertices."""
     x, y = width / 2, height / 2
     radius = min(radius, 0.98 * min(x, y))
     return fillet([(-x, -y), (x, -y), (x, y), (-x, y)], radius, segments)
@@ -136,13 +144,17 @@ def without_holes(profile: CrossSection) -> CrossSection:
 
 
 def _stitched(rings: np.ndarray, caps: tuple[np.ndarray, np.ndarray]) -> Manifold:
-    """Closes `rings` (m, n, 3) of equal loops with quads between neighbours and the given end caps."""
+    """Closes `rings` (m, n, 3) of equal loops with quads between them and the given end caps."""
     count, size = rings.shape[:2]
     i = np.arange(size)
     j = (i + 1) % size
     walls = [
-        np.concatenate([np.column_stack([k + i, k + j, k + size + j]),
-                        np.column_stack([k + i, k + size + j, k + size + i])])
+        np.concatenate(
+            [
+                np.column_stack([k + i, k + j, k + size + j]),
+                np.column_stack([k + i, k + size + j, k + size + i]),
+            ]
+        )
         for k in size * np.arange(count - 1)
     ]
     faces = np.vstack([caps[0][:, ::-1], *walls, caps[1] + size * (count - 1)])
@@ -157,7 +169,9 @@ def _closed_solid(vertices: np.ndarray, faces: np.ndarray) -> Manifold:
     return solid if solid.volume() > 0 else _closed_solid(vertices, faces[:, ::-1])
 
 
-def plate(profile: CrossSection | np.ndarray, z_low: float, z_high: float, bevel: float = 0.8) -> Shape:
+def plate(
+    profile: CrossSection | np.ndarray, z_low: float, z_high: float, bevel: float = 0.8
+) -> Shape:
     """A plate between two heights, its lower and upper edges bevelled at 45 degrees.
 
     Holes are cut with plain edges, and do not appear in the hulls.
@@ -196,20 +210,29 @@ def _bevelled(profile: CrossSection, z_low: float, z_high: float, bevel: float) 
         walls += [np.column_stack([i, j, count + j]), np.column_stack([i, count + j, count + i])]
         first += len(loop)
     heights = ((z_low + bevel, z_low), (z_high - bevel, z_high))
-    vertices = np.vstack([np.column_stack([points, np.full(len(points), z)])
-                          for level in heights for points, z in zip((rim, top), level)])
+    vertices = np.vstack(
+        [
+            np.column_stack([points, np.full(len(points), z)])
+            for level in heights
+            for points, z in zip((rim, top), level)
+        ]
+    )
     return _closed_solid(vertices, np.vstack([upper[:, ::-1], *walls, count + upper]))
 
 
-def _plate_hulls(profile: CrossSection, z_low: float, z_high: float, bevel: float) -> list[np.ndarray]:
-    """Prisms over a triangulation of the profile that keep the bevels of its rim but not of its cuts."""
+def _plate_hulls(
+    profile: CrossSection, z_low: float, z_high: float, bevel: float
+) -> list[np.ndarray]:
+    """Prisms over a triangulation of the profile that bevel its rim but not the cuts."""
     coarse = profile.simplify(0.08)
     loops = coarse.to_polygons()
     points = np.vstack(loops)
     # The top edge's bevel is left out: nothing slides over it, and every vertex costs contact time.
     levels = [(z_low, bevel), (z_low + bevel, 0.0), (z_high, 0.0)]
-    insets = {inset: coarse.offset(-inset, JoinType.Miter, circular_segments=SEGMENTS)
-              for _, inset in levels}
+    insets = {
+        inset: coarse.offset(-inset, JoinType.Miter, circular_segments=SEGMENTS)
+        for _, inset in levels
+    }
     hulls = []
     for triangle in manifold3d.triangulate(loops):
         piece = CrossSection([points[triangle]])
@@ -227,7 +250,7 @@ def loft(sections: Sequence[np.ndarray]) -> Shape:
     """A skin through cross-sections (n, 3), each star-shaped about its mean, with the same n."""
     rings = np.asarray(sections, dtype=float)
     caps = tuple(manifold3d.triangulate([_planar(ring)]) for ring in (rings[0], rings[-1]))
-    return Shape(_stitched(rings, caps), [np.vstack(pair) for pair in zip(rings, rings[1:])])
+    return Shape(_stitched(rings, caps), [np.vstack(pair) for pair in itertools.pairwise(rings)])
 
 
 def _planar(ring: np.ndarray) -> np.ndarray:
@@ -245,7 +268,7 @@ def across_x(profile: np.ndarray, x: float, y: float = 0.0, z: float = 0.0) -> n
 
 
 def across_path(profile: np.ndarray, point: Sequence[float], angle: float) -> np.ndarray:
-    """A section (n, 3) of a loft in the xy plane, travelling at `angle` (rad) from +x through `point`."""
+    """A section (n, 3) of a loft in the xy plane, at `point`, heading at `angle` (rad) from +x."""
     left = np.array([-np.sin(angle), np.cos(angle)])
     xy = np.asarray(point) + profile[:, :1] * left
     return np.column_stack([xy, profile[:, 1]])

@@ -46,10 +46,18 @@ def build_wrench(p: WrenchParameters) -> list[Part]:
     head = _open_head(p, x_open)
     box = CrossSection([circle(p.box_diameter_mm / 2, (x_box, 0.0), 64)])
 
-    shank = CrossSection([np.array([
-        (x_box, -p.shank_width_box_mm / 2), (x_open, -p.shank_width_open_mm / 2),
-        (x_open, p.shank_width_open_mm / 2), (x_box, p.shank_width_box_mm / 2),
-    ])])
+    shank = CrossSection(
+        [
+            np.array(
+                [
+                    (x_box, -p.shank_width_box_mm / 2),
+                    (x_open, -p.shank_width_open_mm / 2),
+                    (x_open, p.shank_width_open_mm / 2),
+                    (x_box, p.shank_width_box_mm / 2),
+                ]
+            )
+        ]
+    )
     # Blend shank and heads as one outline, so that the forging flows; the heads then stand on it.
     outline = blend(head + shank + box, p.blend_radius_mm) - slot
     socket = _socket(p, x_box)
@@ -71,10 +79,17 @@ def _slab(profile: CrossSection, thickness: float, bevel: float) -> Shape:
 def _open_head(p: WrenchParameters, x: float) -> CrossSection:
     """The open head before its slot is cut: a disc with the two jaws drawn forward."""
     radius = p.open_diameter_mm / 2
-    jaws = fillet([(-0.2 * radius, -0.97 * radius), (0.62 * radius, -0.9 * radius),
-                   (1.12 * radius, -0.52 * radius), (1.12 * radius, 0.52 * radius),
-                   (0.62 * radius, 0.9 * radius), (-0.2 * radius, 0.97 * radius)],
-                  0.35 * radius)
+    jaws = fillet(
+        [
+            (-0.2 * radius, -0.97 * radius),
+            (0.62 * radius, -0.9 * radius),
+            (1.12 * radius, -0.52 * radius),
+            (1.12 * radius, 0.52 * radius),
+            (0.62 * radius, 0.9 * radius),
+            (-0.2 * radius, 0.97 * radius),
+        ],
+        0.35 * radius,
+    )
     head = CrossSection([circle(radius, segments=64)]) + CrossSection([jaws])
     return head.rotate(p.open_angle_deg).translate((x, 0.0))
 
@@ -83,10 +98,18 @@ def _open_slot(p: WrenchParameters, x: float) -> CrossSection:
     """The slot: parallel flanks, a floor of two facets of the hexagon, and slightly opened lips."""
     half, radius = p.size_mm / 2, p.open_diameter_mm / 2
     depth = 0.42 * radius
-    slot = fillet([(-depth - 0.3 * half, 0.0), (-depth + 0.2 * half, -half), (1.0 * radius, -half),
-                   (1.4 * radius, -half - 0.12 * radius), (1.4 * radius, half + 0.12 * radius),
-                   (1.0 * radius, half), (-depth + 0.2 * half, half)],
-                  [2.0 * half, 0.35 * half, 1.0, 0.0, 0.0, 1.0, 0.35 * half])
+    slot = fillet(
+        [
+            (-depth - 0.3 * half, 0.0),
+            (-depth + 0.2 * half, -half),
+            (1.0 * radius, -half),
+            (1.4 * radius, -half - 0.12 * radius),
+            (1.4 * radius, half + 0.12 * radius),
+            (1.0 * radius, half),
+            (-depth + 0.2 * half, half),
+        ],
+        [2.0 * half, 0.35 * half, 1.0, 0.0, 0.0, 1.0, 0.35 * half],
+    )
     return CrossSection([slot]).rotate(p.open_angle_deg).translate((x, 0.0))
 
 
@@ -102,8 +125,10 @@ def _panel(p: WrenchParameters, side: int) -> Manifold:
     start = -p.center_distance_mm / 2 + 0.85 * p.box_diameter_mm
     end = p.center_distance_mm / 2 - 0.85 * p.open_diameter_mm
     half_start, half_end = 0.29 * p.shank_width_box_mm, 0.29 * p.shank_width_open_mm
-    outline = fillet([(start, -half_start), (end, -half_end), (end, half_end), (start, half_start)],
-                     0.95 * half_start)
+    outline = fillet(
+        [(start, -half_start), (end, -half_end), (end, half_end), (start, half_start)],
+        0.95 * half_start,
+    )
     top = p.shank_thickness_mm / 2
     # Its own bevel slopes the recess's walls, as a forging die leaves them.
     cutter = plate(outline, top - p.panel_depth_mm, top + 4.0, 0.6).solid

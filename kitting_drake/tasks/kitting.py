@@ -142,7 +142,9 @@ class _Shape:
 def _tool_shape(tool: Tool) -> _Shape:
     def at_grasp(half_sizes: tuple[float, float]) -> CrossSection:
         rectangle = CrossSection.square((2 * half_sizes[0], 2 * half_sizes[1]), True)
-        return rectangle.rotate(np.rad2deg(tool.grasp.theta)).translate((tool.grasp.x, tool.grasp.y))
+        return rectangle.rotate(np.rad2deg(tool.grasp.theta)).translate(
+            (tool.grasp.x, tool.grasp.y)
+        )
 
     # The hull is coarser than the outline and never smaller.
     return _Shape(tool.silhouette.hull(), at_grasp(_FINGERS), at_grasp(_PALM))

@@ -1,0 +1,167 @@
+"""One episode from its first to its last step, and what is to be said of it afterwards."""
+
+import dataclasses
+import math
+import time
+from collections.abc import Callable
+from typing import Any
+
+from pydrake.systems.analysis import Simulator
+from pydrake.systems.framework import Context, EventStatus
+
+from kitting_drake.cell import Cell
+from systems.pick_place_planner import Mode
+
+_LAST_WAIT = 2.0
+"""How long the tools may take to come to rest after the last action, in s."""
+
+
+@dataclasses.dataclass
+class ObjectResult:
+    """How one object ended. The names are keys of `results.json`."""
+
+    name: str
+    category: str
+    add_s_mm: float
+    success: bool
+    position_error_mm: float
+    angle_error_deg: float
+    height_error_mm: float
+
+
+@dataclasses.dataclass
+class EpisodeResult:
+    """What came of an episode. The names are keys of `results.json`."""
+
+    scenario: str
+    policy: str
+    seed: int
+    objects: list[ObjectResult]
+    success_rate: float
+    """Share of the objects placed successfully; 0 when the episode failed."""
+    actions: int
+    missed_grasps: int
+    dropped_objects: int
+    sim_seconds: float
+    wall_seconds: float
+    point_contact_pairs: int
+    """The most pairs in point contact at any step."""
+    failure: str | None
+    """Why the simulation ended before its time, if it did."""
+    interrupted: bool
+    """Whether a person ended it."""
+
+    def as_dict(self) -> dict[str, Any]:
+        """For JSON."""
+        return dataclasses.asdict(self)
+
+
+def run_episode(
+    cell: Cell,
+    *,
+    scenario: str,
+    policy: str,
+    seed: int,
+    time_limit: float,
+    realtime_rate: float = 0.0,
+    watch: Callable[[Context, Mode], None] | None = None,
+) -> EpisodeResult:
+    """Runs an episode until the planner is done and the tools rest, or the time is up.
+
+    An error of the simulation (the contact solver not converging, a tool falling out of the world)
+    and Ctrl-C end the episode, not the program: the result tells of it, and of what was reached.
+
+    Args:
+        cell: fresh from `build_cell`.
+        scenario: names for the result.
+        policy: likewise.
+        seed: likewise; it has done its work in `build_cell`.
+        time_limit: simulated time at which the episode ends at the latest, in s.
+        realtime_rate: 1 for real time, 0 for as fast as possible.
+        watch: called after every step with the root context and the planner's mode.
+    """
+    simulator = Simulator(cell.diagram)
+    simulator.set_target_realtime_rate(realtime_rate)
+    monitor = _Monitor(cell, watch)
+    simulator.set_monitor(monitor.look)
+    failure, interrupted = None, False
+    start = time.perf_counter()
+    try:
+        simulator.Initialize()
+        simulator.AdvanceTo(time_limit)
+        if monitor.done_since is None:
+            failure = f"the time limit of {time_limit:g} s was reached"
+    except KeyboardInterrupt:
+        interrupted = True
+    except RuntimeError as error:
+        failure = " ".join(str(error).split())
+    wall_seconds = time.perf_counter() - start
+    context = simulator.get_context()
+    objects = score(cell, context)
+    succeeded = sum(item.success for item in objects) / len(objects)
+    counts = cell.planner.GetOutputPort("counts").Eval(cell.planner.GetMyContextFromRoot(context))
+    return EpisodeResult(
+        scenario=scenario,
+        policy=policy,
+        seed=seed,
+        objects=objects,
+        success_rate=0.0 if failure else succeeded,
+        actions=int(counts[0]),
+        missed_grasps=int(counts[1]),
+        dropped_objects=int(counts[2]),
+        sim_seconds=context.get_time(),
+        wall_seconds=wall_seconds,
+        point_contact_pairs=monitor.point_contact_pairs,
+        failure=failure,
+        interrupted=interrupted,
+    )
+
+
+def score(cell: Cell, root_context: Context) -> list[ObjectResult]:
+    """How every object stands now, in the order in which an oracle takes them."""
+    context = cell.monitor.GetMyContextFromRoot(root_context)
+    columns = [
+        cell.monitor.GetOutputPort(name).Eval(context)
+        for name in ("add_s", "position_error", "angle_error", "height_error")
+    ]
+    return [
+        ObjectResult(
+            name=tool.name,
+            category=tool.category,
+            add_s_mm=1e3 * add_s,
+            success=bool(add_s < cell.scene.success_threshold),
+            position_error_mm=1e3 * position,
+            angle_error_deg=math.degrees(angle),
+            height_error_mm=1e3 * height,
+        )
+        for tool, add_s, position, angle, height in zip(cell.scene.tools, *columns, strict=True)
+    ]
+
+
+class _Monitor:
+    """The simulator's monitor: puts tools to sleep, counts point contacts, knows the end."""
+
+    def __init__(self, cell: Cell, watch: Callable[[Context, Mode], None] | None) -> None:
+        self._cell = cell
+        self._watch = watch
+        self._contact_results = cell.plant.get_contact_results_output_port()
+        self.point_contact_pairs = 0
+        self.done_since: float | None = None
+
+    def look(self, root_context: Context) -> EventStatus:
+        cell = self._cell
+        results = self._contact_results.Eval(cell.plant.GetMyContextFromRoot(root_context))
+        self.point_contact_pairs = max(self.point_contact_pairs, results.num_point_pair_contacts())
+        cell.apply_sleep(root_context)
+        mode = cell.planner.mode(cell.planner.GetMyContextFromRoot(root_context))
+        if self._watch is not None:
+            self._watch(root_context, mode)
+        if mode != Mode.DONE:
+            return EventStatus.DidNothing()
+        now = root_context.get_time()
+        if self.done_since is None:
+            self.done_since = now
+        at_rest = cell.rest_detector.at_rest(cell.rest_detector.GetMyContextFromRoot(root_context))
+        if at_rest.all() or now - self.done_since > _LAST_WAIT:
+            return EventStatus.ReachedTermination(cell.diagram, "the episode is over")
+        return EventStatus.DidNothing()

@@ -1,0 +1,173 @@
+"""`python -m kitting_drake.run SCENARIO.yaml`: kits once, shows it live, leaves a replay."""
+
+import shutil
+import subprocess
+from pathlib import Path
+
+from pydrake.geometry import Meshcat, MeshcatParams
+from pydrake.systems.framework import Context, Diagram
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+
+from kitting_drake.cameras import render_picture, require_rendering, save_png
+from kitting_drake.cell import Cell, build_cell
+from kitting_drake.cli import (
+    INTERRUPTED,
+    choose_scenario,
+    output_folder,
+    run_verb,
+    scenario_parser,
+    seed_type,
+)
+from kitting_drake.episode import run_episode
+from kitting_drake.errors import UserError
+from kitting_drake.files import require_folder, write_json, write_whole
+from kitting_drake.report import print_episode
+from systems.pick_place_planner import Mode
+
+
+def main() -> int:
+    """Parses the command line and runs the episode; returns the exit code."""
+    parser = scenario_parser("run", "Kit once, watch it in Meshcat, keep results and a replay.")
+    parser.add_argument("--seed", type=seed_type, help="of the scene (default: the scenario's)")
+    parser.add_argument(
+        "--no-meshcat", action="store_true", help="show nothing, and leave no replay.html"
+    )
+    parser.add_argument(
+        "--graphviz",
+        type=Path,
+        metavar="FILE",
+        help="also draw the Diagram: .svg, .png or .pdf, or .dot for its source",
+    )
+    parser.add_argument(
+        "--picture", type=Path, metavar="FILE.png", help="also render the cell as the episode ends"
+    )
+    parser.add_argument(
+        "--video", type=Path, metavar="FILE.gif", help="also film the episode (.gif or .webp)"
+    )
+    arguments = parser.parse_args()
+    chosen = choose_scenario(arguments)
+    scenario = chosen.scenario
+    seed = scenario.random_seed if arguments.seed is None else arguments.seed
+    console = Console(quiet=arguments.quiet)
+    folder = require_folder(output_folder(arguments, chosen.name))
+    _check_endings(arguments.picture, arguments.video)
+
+    meshcat = None if arguments.no_meshcat else _start_meshcat(console)
+    cell = build_cell(scenario, seed=seed, base=chosen.base, meshcat=meshcat, video=arguments.video)
+    if arguments.graphviz:
+        draw_diagram(cell.diagram, arguments.graphviz)
+    if meshcat is not None:
+        meshcat.StartRecording(frames_per_second=32.0, set_visualizations_while_recording=True)
+
+    with _EpisodeProgress(console, cell) as progress:
+        result = run_episode(
+            cell,
+            scenario=chosen.name,
+            policy=chosen.policy,
+            seed=seed,
+            time_limit=scenario.time_limit,
+            realtime_rate=scenario.target_realtime_rate,
+            watch=progress.watch,
+        )
+    write_json(folder / "results.json", result.as_dict())
+    if meshcat is not None:
+        meshcat.StopRecording()
+        meshcat.PublishRecording()
+        write_whole(folder / "replay.html", meshcat.StaticHtml())
+    if arguments.picture and progress.last_context is not None:
+        context = cell.scene_graph.GetMyMutableContextFromRoot(progress.last_context)
+        save_png(render_picture(cell.scene_graph, context), arguments.picture)
+    if cell.video_writer is not None:
+        cell.video_writer.Save()
+    print_episode(console, result)
+    console.print(f"files: {folder}/", highlight=False)
+    return INTERRUPTED if result.interrupted else 0
+
+
+def _check_endings(picture: Path | None, video: Path | None) -> None:
+    if picture is not None and picture.suffix != ".png":
+        raise UserError(f"--picture writes .png files, not '{picture}'")
+    if picture is not None:
+        require_rendering()
+    if video is not None and video.suffix not in (".gif", ".webp"):
+        raise UserError(f"--video writes .gif and .webp files, not '{video}'")
+
+
+def _start_meshcat(console: Console) -> Meshcat:
+    # Drake's default host is every interface.
+    meshcat = Meshcat(MeshcatParams(host="localhost", show_stats_plot=False))
+    meshcat.SetProperty("/Background", "top_color", [0.93, 0.95, 0.97])
+    meshcat.SetProperty("/Background", "bottom_color", [0.80, 0.83, 0.86])
+    meshcat.SetProperty("/Grid", "visible", False)
+    meshcat.SetProperty("/Axes", "visible", False)
+    meshcat.SetCameraPose(camera_in_world=[1.35, -0.55, 0.75], target_in_world=[0.45, 0.0, 0.08])
+    console.print(f"watch at {meshcat.web_url()}", highlight=False)
+    return meshcat
+
+
+def draw_diagram(diagram: Diagram, path: Path) -> None:
+    """Draws a Diagram with Graphviz.
+
+    Raises:
+        UserError: an ending other than .svg, .png, .pdf and .dot, or Graphviz is not there.
+    """
+    source = diagram.GetGraphvizString(max_depth=1)
+    if path.suffix == ".dot":
+        write_whole(path, source)
+        return
+    if path.suffix not in (".svg", ".png", ".pdf"):
+        raise UserError(f"--graphviz writes .svg, .png, .pdf and .dot files, not '{path}'")
+    if shutil.which("dot") is None:
+        raise UserError(
+            "--graphviz needs the program dot: install it (Debian and Ubuntu: apt-get install "
+            "graphviz), or write the source to a .dot file"
+        )
+    drawn = subprocess.run(
+        ["dot", f"-T{path.suffix[1:]}"], input=source.encode(), capture_output=True, check=True
+    )
+    write_whole(path, drawn.stdout)
+
+
+class _EpisodeProgress:
+    """A progress bar of an episode: one step for each object."""
+
+    def __init__(self, console: Console, cell: Cell) -> None:
+        self._cell = cell
+        self._progress = Progress(
+            TextColumn("{task.description:9}"),
+            BarColumn(),
+            TextColumn("{task.fields[seconds]:.1f} s simulated"),
+            TimeElapsedColumn(),
+            console=console,
+            transient=True,
+            disable=not console.is_terminal,
+        )
+        self._task = self._progress.add_task("", total=len(cell.scene.tools), seconds=0.0)
+        self._mode: Mode | None = None
+        self._drawn = -1.0
+        self.last_context: Context | None = None
+
+    def __enter__(self) -> "_EpisodeProgress":
+        self._progress.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._progress.stop()
+
+    def watch(self, root_context: Context, mode: Mode) -> None:
+        self.last_context = root_context
+        now = root_context.get_time()
+        if mode == self._mode and now - self._drawn < 0.25:
+            return
+        self._mode, self._drawn = mode, now
+        planner = self._cell.planner
+        counts = planner.GetOutputPort("counts").Eval(planner.GetMyContextFromRoot(root_context))
+        finished = counts[0] - (mode not in (Mode.OBSERVE, Mode.DONE))
+        self._progress.update(
+            self._task, completed=finished, description=mode.name.lower(), seconds=now
+        )
+
+
+if __name__ == "__main__":
+    run_verb(main)
