@@ -67,7 +67,7 @@ class PickPlaceParameters:
     release_clearance: float = bounded(0.006, 0.001, 0.04)
 
     # How hard each pad presses on what it holds, in N.
-    grasp_force: float = bounded(60.0, 1.0, 140.0)
+    grasp_force: float = bounded(30.0, 1.0, 140.0)
 
     # Less than this between the pads is nothing at all, in m.
     minimum_width: float = bounded(0.003, 0.0, 0.08)

@@ -119,30 +119,25 @@ class RestDetector(LeafSystem):
         rotations = np.array([poses[body].rotation().matrix() for body in self._bodies])
         origins = np.array([poses[body].translation() for body in self._bodies])
         centres = origins + np.einsum("bij,bj->bi", rotations, self._centres)
-        near = np.zeros((self._count, len(self._bodies)), bool)
-        for i in range(self._count):
-            for j in range(len(self._bodies)):
-                near[i, j] = i != j and (
-                    _box_gap(
-                        centres[i] - centres[j],
-                        rotations[i],
-                        self._half_sizes[i],
-                        rotations[j],
-                        self._half_sizes[j],
-                    )
-                    < self._wake_distance
-                )
+        halves = self._half_sizes
+        # (i, j) pairs of objects and bodies; the widest gap along the six face normals of a pair is
+        # a lower bound of the distance of their boxes.
+        n, bodies = self._count, len(self._bodies)
+        shape = (n, bodies, 3, 3)
+        axes = np.concatenate(
+            [
+                np.broadcast_to(rotations[:n, None], shape),
+                np.broadcast_to(rotations[None], shape),
+            ],
+            axis=3,
+        )
+        offsets = np.abs(np.einsum("ijka,ijk->ija", axes, centres[:n, None] - centres[None]))
+        reach_i = np.einsum(
+            "ijab,ib->ija", np.abs(np.einsum("ijka,ikb->ijab", axes, rotations[:n])), halves[:n]
+        )
+        reach_j = np.einsum(
+            "ijab,jb->ija", np.abs(np.einsum("ijka,jkb->ijab", axes, rotations)), halves
+        )
+        near = (offsets - reach_i - reach_j).max(axis=2) < self._wake_distance
+        near[np.arange(n), np.arange(n)] = False
         return near
-
-
-def _box_gap(
-    offset: NDArray[np.float64],
-    R_WA: NDArray[np.float64],
-    half_a: NDArray[np.float64],
-    R_WB: NDArray[np.float64],
-    half_b: NDArray[np.float64],
-) -> float:
-    """A lower bound of the distance of two boxes: the widest gap along their face normals."""
-    axes = np.concatenate([R_WA, R_WB], axis=1)
-    reach = np.abs(axes.T @ R_WA) @ half_a + np.abs(axes.T @ R_WB) @ half_b
-    return float((np.abs(axes.T @ offset) - reach).max())

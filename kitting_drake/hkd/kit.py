@@ -33,7 +33,10 @@ SLOTS = {
 """Where the tool of each category goes: (x, y) of its frame T in the kit frame, in metres."""
 
 _ARC_SEGMENTS = 64
-_FORMAT_VERSION = "2"
+_TOP_CELL = 0.02
+"""Side of the squares into which the top is cut for the contact solver, in metres."""
+_FORMAT_VERSION = "3"
+"""Part of the cache key: changed whenever the same input makes another kit."""
 
 
 @dataclass
@@ -95,73 +98,114 @@ def cavity_outline(outline: CrossSection, parameters: KitParameters) -> CrossSec
     return closed.simplify(parameters.tolerance)
 
 
-def cavity_cutter(outline: CrossSection, depth: float, lead_in: float) -> Manifold:
-    """The solid to subtract: a prism down to z = -depth whose rim, at z = 0, is bevelled.
+class _Surface:
+    """Triangles that grow ring by ring. Lengths in metres, normals out of the cavity's solid."""
 
-    Args:
-        outline: of the wall, in metres.
-        depth: of the floor, in metres.
-        lead_in: width and depth of the bevel; none at zero.
-    """
-    above = 0.01
-    if lead_in <= 0:
-        return Manifold.extrude(outline, depth + above).translate((0, 0, -depth))
-    rim = outline.offset(lead_in, JoinType.Round, circular_segments=_ARC_SEGMENTS)
-    wall_loops, rim_loops = outline.to_polygons(), rim.to_polygons()
-    vertices: list[NDArray[np.float64]] = []
-    faces: list[NDArray[np.int64]] = []
+    def __init__(self) -> None:
+        self._vertices: list[NDArray[np.float64]] = []
+        self._faces: list[NDArray[np.int64]] = []
+        self._count = 0
 
-    def ring(loops: list[NDArray[np.float64]], z: float) -> int:
-        start = sum(map(len, vertices))
+    def add_vertices(self, vertices: NDArray[np.float64]) -> int:
+        """Adds (n, 3) vertices; returns the index of the first."""
+        self._vertices.append(vertices)
+        self._count += len(vertices)
+        return self._count - len(vertices)
+
+    def add_faces(self, faces: NDArray[np.int64]) -> None:
+        """Adds (n, 3) faces."""
+        self._faces.append(faces)
+
+    def add_ring(self, loops: list[NDArray[np.float64]], z: float) -> int:
+        """Adds the vertices of closed loops at a height; returns the index of the first."""
         flat = np.concatenate(loops)
-        vertices.append(np.column_stack([flat, np.full(len(flat), z)]))
-        return start
+        return self.add_vertices(np.column_stack([flat, np.full(len(flat), z)]))
 
-    def walls(loops: list[NDArray[np.float64]], lower: int, upper: int) -> None:
+    def add_walls(self, loops: list[NDArray[np.float64]], lower: int, upper: int) -> None:
+        """Joins two rings of the same loops by upright walls."""
         start = 0
         for loop in loops:
             here = start + np.arange(len(loop))
             there = start + (np.arange(len(loop)) + 1) % len(loop)
-            faces.append(np.column_stack([lower + here, lower + there, upper + there]))
-            faces.append(np.column_stack([lower + here, upper + there, upper + here]))
+            self.add_faces(np.column_stack([lower + here, lower + there, upper + there]))
+            self.add_faces(np.column_stack([lower + here, upper + there, upper + here]))
             start += len(loop)
 
-    floor = ring(wall_loops, -depth)
-    shoulder = ring(wall_loops, -lead_in)
-    edge = ring(rim_loops, 0.0)
-    top = ring(rim_loops, above)
-    walls(wall_loops, floor, shoulder)
-    walls(rim_loops, edge, top)
-    faces.append(np.asarray(triangulate(wall_loops))[:, ::-1] + floor)
-    faces.append(np.asarray(triangulate(rim_loops)) + top)
-    # The bevel is the flat band between rim and wall, its inner vertices let down to the shoulder.
-    band = np.asarray(triangulate(rim_loops + [loop[::-1] for loop in wall_loops]))
-    rim_count = sum(map(len, rim_loops))
-    # Reversed loops come out of the triangulation in reversed order.
-    reversed_index = np.concatenate(
-        [
-            start + np.arange(len(loop))[::-1]
-            for start, loop in zip(
-                np.cumsum([0, *map(len, wall_loops[:-1])]), wall_loops, strict=True
-            )
+    def add_bevel(
+        self,
+        outer_loops: list[NDArray[np.float64]],
+        outer: int,
+        inner_loops: list[NDArray[np.float64]],
+        inner: int,
+    ) -> None:
+        """Joins a ring to a narrower and lower one: the flat band between the loops, let down."""
+        band = np.asarray(triangulate(outer_loops + [loop[::-1] for loop in inner_loops]))
+        starts = np.cumsum([0, *map(len, inner_loops[:-1])])
+        inner_index = [
+            inner + start + np.arange(len(loop))[::-1]
+            for start, loop in zip(starts, inner_loops, strict=True)
         ]
-    )
-    lookup = np.concatenate([edge + np.arange(rim_count), shoulder + reversed_index])
-    faces.append(lookup[band][:, ::-1])
-    mesh = Mesh(
-        vert_properties=np.concatenate(vertices).astype(np.float32),
-        tri_verts=np.concatenate(faces).astype(np.uint32),
-    )
-    return Manifold(mesh)
+        outer_index = outer + np.arange(sum(map(len, outer_loops)))
+        self.add_faces(np.concatenate([outer_index, *inner_index])[band][:, ::-1])
+
+    def arrays(self) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+        """Vertices (n, 3) and faces (m, 3)."""
+        return np.concatenate(self._vertices), np.concatenate(self._faces)
 
 
-def build_block(tools: Sequence[Tool], parameters: KitParameters) -> Manifold:
-    """The kit block in the frame K, in metres: watertight, one body.
+@dataclass(frozen=True)
+class Cavity:
+    """A bevelled pit in the kit frame, in metres."""
+
+    outline: CrossSection
+    """Of the wall."""
+    floor: float
+    """Heights in the kit frame."""
+    top: float
+    lead_in: float
+    """Width and depth of the bevel around the rim; none at zero."""
+
+    @property
+    def rim(self) -> CrossSection:
+        """The outline at the very top."""
+        if self.lead_in <= 0:
+            return self.outline
+        return self.outline.offset(self.lead_in, JoinType.Round, circular_segments=_ARC_SEGMENTS)
+
+    def add_sides(self, surface: _Surface) -> tuple[int, int]:
+        """Adds wall and bevel; returns the first vertices of the floor's ring and of the rim's."""
+        wall_loops, rim_loops = self.outline.to_polygons(), self.rim.to_polygons()
+        floor = surface.add_ring(wall_loops, self.floor)
+        if self.lead_in <= 0:
+            rim = surface.add_ring(rim_loops, self.top)
+            surface.add_walls(wall_loops, floor, rim)
+            return floor, rim
+        shoulder = surface.add_ring(wall_loops, self.top - self.lead_in)
+        surface.add_walls(wall_loops, floor, shoulder)
+        rim = surface.add_ring(rim_loops, self.top)
+        surface.add_bevel(rim_loops, rim, wall_loops, shoulder)
+        return floor, rim
+
+    def cutter(self) -> Manifold:
+        """The solid to subtract from the block."""
+        surface = _Surface()
+        floor, rim = self.add_sides(surface)
+        rim_loops = self.rim.to_polygons()
+        above = surface.add_ring(rim_loops, self.top + 0.01)
+        surface.add_walls(rim_loops, rim, above)
+        surface.add_faces(np.asarray(triangulate(self.outline.to_polygons()))[:, ::-1] + floor)
+        surface.add_faces(np.asarray(triangulate(rim_loops)) + above)
+        vertices, faces = surface.arrays()
+        return Manifold(Mesh(vertices.astype(np.float32), faces.astype(np.uint32)))
+
+
+def kit_cavities(tools: Sequence[Tool], parameters: KitParameters) -> list[Cavity]:
+    """The cavity of each tool.
 
     Raises:
         UserError: two tools of one category, a tool too big for its place, cavities that meet.
     """
-    outlines: dict[str, CrossSection] = {}
+    cavities: dict[str, Cavity] = {}
     for tool in tools:
         if tool.category in {other.category for other in tools if other is not tool}:
             raise UserError(f"a kit holds one {tool.category}, not two")
@@ -171,23 +215,62 @@ def build_block(tools: Sequence[Tool], parameters: KitParameters) -> Manifold:
                 f"'{tool.name}' is {1e3 * tool.height:.1f} mm high and leaves no floor in a kit "
                 f"block of {1e3 * parameters.height:.1f} mm"
             )
-        outlines[tool.name] = cavity_outline(tool.silhouette, parameters).translate((x, y))
-    _check_walls(outlines, parameters)
-    block = Manifold.cube((parameters.length, parameters.width, parameters.height), True)
-    cutters = [
-        cavity_cutter(outlines[tool.name], tool.height, parameters.lead_in) for tool in tools
-    ]
-    top = parameters.height / 2
-    for cutter in cutters:
-        block -= cutter.translate((0, 0, top))
-    return block.translate((0, 0, top))
+        outline = cavity_outline(tool.silhouette, parameters).translate((x, y))
+        cavities[tool.name] = Cavity(outline, z, parameters.height, parameters.lead_in)
+    _check_walls({name: cavity.rim for name, cavity in cavities.items()}, parameters)
+    return list(cavities.values())
 
 
-def _check_walls(outlines: dict[str, CrossSection], parameters: KitParameters) -> None:
-    half_wall = parameters.minimum_wall / 2 + parameters.lead_in
+def build_block(cavities: Sequence[Cavity], parameters: KitParameters) -> Manifold:
+    """The kit block in the frame K, in metres: watertight, one body."""
+    size = (parameters.length, parameters.width, parameters.height)
+    block = Manifold.cube(size, True).translate((0, 0, parameters.height / 2))
+    for cavity in cavities:
+        block -= cavity.cutter()
+    return block
+
+
+def contact_surface(
+    cavities: Sequence[Cavity], parameters: KitParameters
+) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """The block's outside as the contact solver likes it: vertices (n, 3) and faces (m, 3).
+
+    The same walls, bevels and planes as the block's, cut otherwise. A triangulation of floors and
+    top by their outlines has long slivers, whose bounding boxes all overlap, and breaks every
+    contact patch into as many pieces. So a floor is one rectangle that reaches into the solid, where
+    nothing can touch it, and the top is cut into squares first. The underside is left out.
+    """
+    surface = _Surface()
+    room = CrossSection.square((parameters.length, parameters.width), True)
+    top = room
+    for cavity in cavities:
+        cavity.add_sides(surface)
+        x_min, y_min, x_max, y_max = cavity.outline.bounds()
+        corners = [(x_min, y_min), (x_max, y_min), (x_max, y_max), (x_min, y_max)]
+        start = surface.add_ring([np.array(corners)], cavity.floor)
+        surface.add_faces(start + np.array([[0, 2, 1], [0, 3, 2]]))
+        top -= cavity.rim
+    # What bounds the cavities from outside bounds the block from inside.
+    vertices, faces = surface.arrays()
+    block = _Surface()
+    block.add_faces(block.add_vertices(vertices) + faces[:, ::-1])
+    loops = room.to_polygons()
+    block.add_walls(loops, block.add_ring(loops, 0.0), block.add_ring(loops, parameters.height))
+    for x in np.arange(-parameters.length / 2, parameters.length / 2, _TOP_CELL):
+        for y in np.arange(-parameters.width / 2, parameters.width / 2, _TOP_CELL):
+            cell = top ^ CrossSection.square((_TOP_CELL, _TOP_CELL)).translate((x, y))
+            if cell.area() > 1e-10:
+                loops = cell.to_polygons()
+                start = block.add_ring(loops, parameters.height)
+                block.add_faces(start + np.asarray(triangulate(loops)))
+    return block.arrays()
+
+
+def _check_walls(rims: dict[str, CrossSection], parameters: KitParameters) -> None:
+    half_wall = parameters.minimum_wall / 2
     grown = {
         name: outline.offset(half_wall, JoinType.Round, circular_segments=_ARC_SEGMENTS)
-        for name, outline in outlines.items()
+        for name, outline in rims.items()
     }
     room = CrossSection.square((parameters.length, parameters.width), True)
     names = list(grown)
@@ -206,17 +289,17 @@ def make_kit(tools: Sequence[Tool], parameters: KitParameters) -> Kit:
     whole or not at all, and two processes that build the same one do not disturb each other.
 
     Raises:
-        UserError: the tools make no kit; see `build_block`.
+        UserError: the tools make no kit; see `kit_cavities`.
     """
     final = cache_directory() / "kits" / _content_key(tools, parameters)
     kit = Kit(sdf=final / "kit.sdf", parameters=parameters, tools=tuple(tools))
     if final.is_dir():
         return kit
-    block = build_block(tools, parameters)
+    cavities = kit_cavities(tools, parameters)
     final.parent.mkdir(parents=True, exist_ok=True)
     scratch = Path(tempfile.mkdtemp(dir=final.parent, prefix=".making-"))
     try:
-        _write(block, scratch)
+        _write(cavities, parameters, scratch)
         os.rename(scratch, final)
     except OSError:
         if not final.is_dir():
@@ -249,7 +332,7 @@ _SDF = """<?xml version="1.0"?>
         <material><diffuse>0.95 0.62 0.10 1</diffuse></material>
       </visual>
       <collision name="kit">
-        <geometry><mesh><uri>kit.obj</uri></mesh></geometry>
+        <geometry><mesh><uri>contact.obj</uri></mesh></geometry>
         <drake:proximity_properties>
           <drake:rigid_hydroelastic/>
           <drake:hunt_crossley_dissipation>5.0</drake:hunt_crossley_dissipation>
@@ -263,11 +346,13 @@ _SDF = """<?xml version="1.0"?>
 """
 
 
-def _write(block: Manifold, directory: Path) -> None:
+def _write(cavities: Sequence[Cavity], parameters: KitParameters, directory: Path) -> None:
+    block = build_block(cavities, parameters)
     mesh = block.to_mesh()
     vertices = np.asarray(mesh.vert_properties, dtype=float)[:, :3]
     faces = np.asarray(mesh.tri_verts, dtype=int)
     _write_obj(directory / "kit.obj", vertices, faces, normals=False)
+    _write_obj(directory / "contact.obj", *contact_surface(cavities, parameters), normals=False)
     # Two colours, as tool foam has: what is inside the block's faces is a cavity.
     bounds = np.array(block.bounding_box()).reshape(2, 3)
     centres = vertices[faces].mean(axis=1)

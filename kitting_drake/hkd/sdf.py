@@ -10,7 +10,7 @@ from kitting_drake.hkd.solids import MATERIALS
 # Contact, for every tool: Drake's hydroelastic modulus (Pa), dissipation (s/m), margin (m; 0 for
 # none) and friction. Drake 1.51 fails on the margin of finely faceted convex pieces, when it loads
 # or when they touch a mesh; the modulus is low enough that a flat bottom rests quietly without.
-HYDROELASTIC_MODULUS = 3e6
+HYDROELASTIC_MODULUS = 1e7
 HUNT_CROSSLEY_DISSIPATION = 20.0
 HYDROELASTIC_MARGIN = 0.0
 FRICTION = 0.5
