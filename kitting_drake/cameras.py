@@ -59,7 +59,7 @@ def add_observation_renderer(scene_graph: SceneGraph) -> str:
 
 
 def add_picture_renderer(scene_graph: SceneGraph, context: Context | None = None) -> str:
-    """Adds, once, the engine that people see by, to a scene or to a context of it; returns its name.
+    """Adds, once, the engine that people see by, to a scene or its context; returns its name.
 
     Three lights, one of which casts shadows to speak of, before a light background.
 

@@ -1,4 +1,4 @@
-"""Where the project's files are, in a checkout and in an installed wheel, and where its cache is."""
+"""Where the project's files are, in a checkout in an installed wheel, and its cache."""
 
 import os
 from pathlib import Path

@@ -1,7 +1,7 @@
 """The YAML schema of a scenario, in the manner of Drake's hardware_sim.
 
-A file holds one or more scenarios, each under its name. Every field has a default, so `Defaults: {}`
-is a scenario. Where a field is a union, a YAML tag chooses: `policy: !Oracle {}`.
+A file holds one or more scenarios, each under its name. Every field has a default, so that
+`Defaults: {}` is a scenario. Where a field is a union, a tag chooses: `policy: !Oracle {}`.
 
 Units are SI; angles that a person writes are in degrees, and the field says so.
 """

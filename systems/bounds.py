@@ -1,7 +1,7 @@
 """Ranges of configuration numbers, declared beside their defaults and checked in one place.
 
-The dataclasses that use them are also YAML schemas of Drake's `yaml_load_typed`, which takes neither
-frozen dataclasses nor postponed annotations.
+The dataclasses that use them are also YAML schemas of Drake's `yaml_load_typed`, which takes
+neither frozen dataclasses nor postponed annotations.
 """
 
 import dataclasses

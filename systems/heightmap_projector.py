@@ -81,7 +81,7 @@ class HeightmapProjector(LeafSystem):
         self.DeclareAbstractOutputPort(
             "observation",
             lambda: AbstractValue.Make(Observation(image=blank, grid=self._grid)),
-            self._CalcObservation,  # type: ignore[arg-type]  # Drake's stub says (object, object).
+            self._CalcObservation,
             prerequisites_of_calc={self.all_input_ports_ticket()},
         )
 

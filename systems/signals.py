@@ -68,7 +68,7 @@ class PixelGrid:
     def to_world(self, pixel: ArrayLike) -> NDArray[np.float64]:
         """World (x, y) in metres of continuous (row, col) coordinates (..., 2)."""
         offset = (np.asarray(pixel, dtype=float) + 0.5) * self.resolution
-        return offset + (self.x_min, self.y_min)
+        return offset + np.array([self.x_min, self.y_min])
 
     def contains(self, xy: ArrayLike) -> NDArray[np.bool_]:
         """Which of the world points (..., 2) fall on the grid."""

@@ -161,7 +161,7 @@ def _pruned(pieces: list[np.ndarray], tolerance: float) -> list[np.ndarray]:
         rest = [h for h in kept if h is not piece]
         if rest and all(
             (shadow - _grown(silhouette(rest, plane), tolerance)).area() <= _AREA
-            for shadow, plane in zip(whole, (_XY, _XZ, _YZ))
+            for shadow, plane in zip(whole, (_XY, _XZ, _YZ), strict=True)
         ):
             kept = rest
     return kept

@@ -108,7 +108,7 @@ def load_catalogue(path: Path) -> list[ToolEntry]:
         raise CatalogueError(f"{path}: {' '.join(str(error).split())}") from error
     if not isinstance(data, dict) or not isinstance(data.get("tools"), list):
         raise CatalogueError(f"{path}: it has to hold a list named `tools`")
-    entries = []
+    entries: list[ToolEntry] = []
     for item in data["tools"]:
         name = item.get("name", f"number {len(entries) + 1}")
         try:
@@ -170,8 +170,8 @@ def resting_pose(points: np.ndarray, center_of_mass: np.ndarray) -> np.ndarray:
     A body stands on a facet of its hull `points` (n, 3) if its centre of mass is above that facet.
     """
     hull = ConvexHull(points)
-    best, best_tilt = None, np.inf
-    for simplex, (*normal, offset) in zip(hull.simplices, hull.equations):
+    best, best_tilt = np.array([0.0, 0.0, -1.0]), np.inf
+    for simplex, (*normal, offset) in zip(hull.simplices, hull.equations, strict=True):
         normal = np.array(normal)
         foot = center_of_mass - (center_of_mass @ normal + offset) * normal
         corners = points[simplex]

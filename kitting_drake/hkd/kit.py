@@ -237,8 +237,8 @@ def contact_surface(
 
     The same walls, bevels and planes as the block's, cut otherwise. A triangulation of floors and
     top by their outlines has long slivers, whose bounding boxes all overlap, and breaks every
-    contact patch into as many pieces. So a floor is one rectangle that reaches into the solid, where
-    nothing can touch it, and the top is cut into squares first. The underside is left out.
+    contact patch into as many pieces. So a floor is one rectangle that reaches into the solid,
+    where nothing can touch it, and the top is cut into squares first. The underside is left out.
     """
     surface = _Surface()
     room = CrossSection.square((parameters.length, parameters.width), True)

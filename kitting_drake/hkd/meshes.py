@@ -42,8 +42,9 @@ def write_smooth_obj(path: Path, solid: Manifold, crease_angle_deg: float) -> in
     texts = [f"vn {x:.4f} {y:.4f} {z:.4f}" for x, y, z in np.round(normals.reshape(-1, 3), 4) + 0.0]
     index = {text: i + 1 for i, text in enumerate(dict.fromkeys(texts))}
     lines = [*_vertex_lines(vertices), *index]
-    for face, names in zip(faces, np.reshape(texts, (-1, 3))):
-        lines.append("f " + " ".join(f"{v + 1}//{index[n]}" for v, n in zip(face, names)))
+    for face, names in zip(faces, np.reshape(texts, (-1, 3)), strict=True):
+        corners = zip(face, names, strict=True)
+        lines.append("f " + " ".join(f"{v + 1}//{index[n]}" for v, n in corners))
     path.write_text("\n".join(lines) + "\n")
     return len(faces)
 

@@ -143,10 +143,10 @@ def _jaw_profile(p: PliersParameters) -> np.ndarray:
         (length - 3.0, tip + 0.9),
         (length, tip - 2.0),
     ]
-    back = fillet(
+    rounded = fillet(
         [*back, (length, gap(length) + 0.4), (start - 6.0, 0.0)], [0, 14, 30, 3.5, 1.5, 0, 0]
     )
-    back = [tuple(v) for v in back[:-1]]
+    back = [(float(x), float(y)) for x, y in rounded[:-1]]
     flat_end, pipe_end, pipe_start = length - 1.5, 0.60 * length, 0.26 * length
     bite: list[tuple[float, float]] = []
     for i in range(int((flat_end - pipe_end) / p.tooth_pitch_mm)):
@@ -198,7 +198,7 @@ def _grip(p: PliersParameters) -> Shape:
             0.34 * p.grip_thickness_mm * thickness,
             5,
         )
-        sections.append(across_path(profile, point, np.arctan2(dy, dx)))
+        sections.append(across_path(profile, point, float(np.arctan2(dy, dx))))
     return loft(sections)
 
 

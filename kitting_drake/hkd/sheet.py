@@ -124,7 +124,7 @@ def write_sheet(models: Path, names: list[str], output: Path) -> None:
     )
     for axis in axes.flat:
         axis.set_axis_off()
-    for axis, name in zip(axes.flat, names):
+    for axis, name in zip(axes.flat, names, strict=False):
         axis.imshow(render_tool(models, name))
         axis.set_title(name.replace("_", " "), fontsize=13, color="0.15")
     figure.tight_layout()

@@ -14,6 +14,7 @@ from typing import NamedTuple
 import manifold3d
 import numpy as np
 from manifold3d import CrossSection, JoinType, Manifold
+from numpy.typing import ArrayLike
 
 # Segments of a full circle. Given at every call: the library's own choice is meant for larger
 # units.
@@ -83,11 +84,15 @@ def fillet(
 
     A radius too large for its edges is cut back to what fits; zero keeps the corner.
     """
-    points = np.asarray(points, dtype=float)
-    radii = np.broadcast_to(np.asarray(radii, dtype=float), len(points))
+    corners = np.asarray(points, dtype=float)
+    corner_radii = np.broadcast_to(np.asarray(radii, dtype=float), len(corners))
     result = []
     for before, corner, after, radius in zip(
-        np.roll(points, 1, axis=0), points, np.roll(points, -1, axis=0), radii
+        np.roll(corners, 1, axis=0),
+        corners,
+        np.roll(corners, -1, axis=0),
+        corner_radii,
+        strict=True,
     ):
         u, v = before - corner, after - corner
         length_u, length_v = np.linalg.norm(u), np.linalg.norm(v)
@@ -118,7 +123,7 @@ def rounded_rectangle(width: float, height: float, radius: float, segments: int 
     return fillet([(-x, -y), (x, -y), (x, y), (-x, y)], radius, segments)
 
 
-def ribbon(path: np.ndarray, widths: Sequence[float]) -> np.ndarray:
+def ribbon(path: np.ndarray, widths: np.ndarray) -> np.ndarray:
     """The outline, (2n, 2), of a band of the given `widths` (n) about a `path` (n, 2)."""
     tangent = np.gradient(path, axis=0)
     normal = np.column_stack([-tangent[:, 1], tangent[:, 0]])
@@ -214,7 +219,7 @@ def _bevelled(profile: CrossSection, z_low: float, z_high: float, bevel: float) 
         [
             np.column_stack([points, np.full(len(points), z)])
             for level in heights
-            for points, z in zip((rim, top), level)
+            for points, z in zip((rim, top), level, strict=True)
         ]
     )
     return _closed_solid(vertices, np.vstack([upper[:, ::-1], *walls, count + upper]))
@@ -267,7 +272,7 @@ def across_x(profile: np.ndarray, x: float, y: float = 0.0, z: float = 0.0) -> n
     return np.column_stack([np.full(len(profile), x), profile[:, 0] + y, profile[:, 1] + z])
 
 
-def across_path(profile: np.ndarray, point: Sequence[float], angle: float) -> np.ndarray:
+def across_path(profile: np.ndarray, point: ArrayLike, angle: float) -> np.ndarray:
     """A section (n, 3) of a loft in the xy plane, at `point`, heading at `angle` (rad) from +x."""
     left = np.array([-np.sin(angle), np.cos(angle)])
     xy = np.asarray(point) + profile[:, :1] * left

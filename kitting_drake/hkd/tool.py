@@ -70,7 +70,7 @@ class Tool:
         return silhouette(self.triangles)
 
     def surface_points(self, count: int, seed: int = 0) -> NDArray[np.float64]:
-        """(count, 3) points of the surface, in T, in metres: uniform by area, the same each time."""
+        """(count, 3) points of the surface, in T, in metres: by area, the same each time."""
         faces = np.arange(3 * len(self.triangles)).reshape(-1, 3)
         mesh = trimesh.Trimesh(self.triangles.reshape(-1, 3), faces, process=False)
         points, _ = trimesh.sample.sample_surface(mesh, count, seed=seed)

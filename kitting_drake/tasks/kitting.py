@@ -1,4 +1,4 @@
-"""Kitting: free hand tools on a table, and a block with a cavity for each (section IV of the paper)."""
+"""Kitting: hand tools on a table, and a block with a cavity for each (section IV)."""
 
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,0 +1,92 @@
+"""The modes of the pick-and-place motion primitive, and its heights, speeds and thresholds."""
+
+import enum
+from dataclasses import dataclass
+
+from systems.bounds import bounded
+
+
+class Mode(enum.IntEnum):
+    """What the planner is doing. The order is the order of a successful pick and place."""
+
+    OBSERVE = 0
+    """Go home, out of the cameras' sight, come to rest, and ask the policy."""
+    APPROACH = 1
+    """Move over the pick pose, jaws open."""
+    DESCEND = 2
+    """Go down to the grasp height, or until something is touched."""
+    CLOSE = 3
+    """Close the jaws until they stall, then press."""
+    CHECK = 4
+    """Look whether there is something between the pads."""
+    LIFT = 5
+    CARRY = 6
+    """Move over the place pose and turn."""
+    LOWER = 7
+    """Go down until something is touched."""
+    RELEASE = 8
+    RETREAT = 9
+    """Straight up from where the hand is."""
+    DONE = 10
+
+
+@dataclass
+class PickPlaceParameters:
+    """Heights, speeds and thresholds of the motion primitive."""
+
+    # Where the hand waits while the cameras look: x, y, height of the fingertips (m), yaw (rad).
+    home: list[float] = bounded([0.35, 0.0, 0.52, 0.0], -2.0, 2.0)
+
+    # Height of the fingertips while crossing the table, in m. What hangs below them must clear the
+    # kit block and tools that stand proud of it.
+    travel_height: float = bounded(0.115, 0.05, 0.5)
+
+    # How far below the top of an object the fingertips grip, in m.
+    grasp_depth: float = bounded(0.010, 0.001, 0.05)
+
+    # The fingertips stay this far above z = 0, in m.
+    floor_clearance: float = bounded(0.0015, 0.0, 0.05)
+
+    # Opening of the jaws before a grasp, in m.
+    open_width: float = bounded(0.080, 0.005, 0.080)
+
+    # How far each jaw draws back from an object to let go of it, in m.
+    release_clearance: float = bounded(0.006, 0.001, 0.04)
+
+    # How hard each pad presses on what it holds, in N.
+    grasp_force: float = bounded(30.0, 1.0, 140.0)
+
+    # Less than this between the pads is nothing at all, in m.
+    minimum_width: float = bounded(0.003, 0.0, 0.08)
+
+    # A vertical contact force beyond the load's weight that means "touched", in N.
+    contact_threshold: float = bounded(4.0, 0.5, 100.0)
+
+    # Highest linear speed (m/s) and acceleration (m/s^2) in free space.
+    linear_speed: float = bounded(1.0, 0.01, 1.7)
+    linear_acceleration: float = bounded(6.0, 0.1, 13.0)
+
+    # The same with an object in the hand.
+    carry_speed: float = bounded(0.6, 0.01, 1.7)
+    carry_acceleration: float = bounded(3.0, 0.1, 13.0)
+
+    # Highest yaw speed (rad/s) and acceleration (rad/s^2).
+    yaw_speed: float = bounded(2.0, 0.01, 2.5)
+    yaw_acceleration: float = bounded(8.0, 0.1, 25.0)
+
+    # Highest speed of the two guarded motions, in m/s.
+    descend_speed: float = bounded(0.20, 0.005, 1.0)
+    lower_speed: float = bounded(0.08, 0.005, 1.0)
+
+    # Speed of one finger, in m/s.
+    finger_speed: float = bounded(0.05, 0.005, 0.05)
+
+    # Time in which the grasp force builds up, and falls away again, in s.
+    force_ramp: float = bounded(0.15, 0.0, 5.0)
+
+    # The hand must rest this long, in s: before the cameras look, and before a load is weighed.
+    observe_settle: float = bounded(0.25, 0.0, 10.0)
+    weigh_settle: float = bounded(0.10, 0.0, 10.0)
+
+    # After this many actions the planner is done, whatever the policy says.
+    max_actions: int = bounded(4, 0, 1000)

@@ -1,0 +1,40 @@
+"""What all tests share."""
+
+import ctypes
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+
+
+@pytest.fixture(scope="session", autouse=True)
+def cache_home(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    """A cache of this session's own: what an older version built there must not pass a test."""
+    with pytest.MonkeyPatch.context() as patch:
+        folder = tmp_path_factory.mktemp("cache")
+        patch.setenv("XDG_CACHE_HOME", str(folder))
+        yield folder
+
+
+@pytest.fixture(scope="session")
+def rendering() -> None:
+    """Skips where images cannot be rendered; see `kitting_drake.cameras.require_rendering`."""
+    try:
+        ctypes.CDLL("libEGL.so.1")
+    except OSError:
+        pytest.skip("rendering needs libEGL.so.1 (Debian package libegl1)")
+
+
+@pytest.fixture(scope="session")
+def verb() -> Callable[..., subprocess.CompletedProcess[str]]:
+    """Runs `python -m kitting_drake.VERB ARGUMENTS...` from the root of the tree."""
+
+    def run(name: str, *arguments: object) -> subprocess.CompletedProcess[str]:
+        command = [sys.executable, "-m", f"kitting_drake.{name}", *map(str, arguments)]
+        return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=300)
+
+    return run

@@ -1,0 +1,58 @@
+import numpy as np
+import pytest
+from pydrake.common.value import Value
+
+from systems.pick_place_policy import PickPlacePolicy
+from systems.signals import Observation, PickPlaceAction, PlanarPose
+
+ACTION = PickPlaceAction(PlanarPose(0.4, 0.1, 0.2), PlanarPose(0.5, -0.1, 1.0), 0.02)
+
+
+def observation(value: float) -> Observation:
+    return Observation(image=np.full((4, 160, 320), value, np.float32))
+
+
+def test_ports():
+    policy = PickPlacePolicy(policy=lambda _: ACTION)
+    assert policy.num_input_ports() == policy.num_output_ports() == 1
+    assert policy.GetInputPort("observation").Allocate().get_value() == Observation()
+    assert isinstance(policy.GetOutputPort("action").Allocate().get_value(), PickPlaceAction)
+
+
+def test_is_asked_once_for_each_observation():
+    asked = []
+
+    def answer(o: Observation) -> PickPlaceAction:
+        asked.append(float(o.image[3, 80, 160]))
+        return ACTION
+
+    policy = PickPlacePolicy(policy=answer)
+    context = policy.CreateDefaultContext()
+    port = policy.GetOutputPort("action")
+    policy.GetInputPort("observation").FixValue(context, Value(observation(0.25)))
+    assert port.Eval(context) == ACTION
+    context.SetTime(1.0)
+    port.Eval(context)
+    assert asked == [0.25]
+    policy.GetInputPort("observation").FixValue(context, Value(observation(0.5)))
+    port.Eval(context)
+    assert asked == [0.25, 0.5]
+
+
+def test_an_answer_of_another_type_is_refused():
+    policy = PickPlacePolicy(policy=lambda _: (0.4, 0.1))  # type: ignore[arg-type, return-value]
+    context = policy.CreateDefaultContext()
+    policy.GetInputPort("observation").FixValue(context, Value(Observation()))
+    with pytest.raises(TypeError, match="answered with tuple, not a PickPlaceAction"):
+        policy.GetOutputPort("action").Eval(context)
+
+
+def test_what_the_policy_raises_comes_through():
+    def fail(_: Observation) -> PickPlaceAction:
+        raise KeyError("no such weight")
+
+    policy = PickPlacePolicy(policy=fail)
+    context = policy.CreateDefaultContext()
+    policy.GetInputPort("observation").FixValue(context, Value(Observation()))
+    with pytest.raises(KeyError, match="no such weight"):
+        policy.GetOutputPort("action").Eval(context)
