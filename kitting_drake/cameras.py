@@ -26,7 +26,7 @@ from kitting_drake.errors import UserError
 from kitting_drake.files import write_whole
 from kitting_drake.scenario import LookAt, Pinhole
 
-OVERVIEW = LookAt(position=[1.45, -0.75, 0.85], target=[0.47, 0.0, 0.05])
+OVERVIEW = LookAt(position=[1.55, -0.85, 1.0], target=[0.46, -0.02, 0.14])
 """From where pictures and films show the whole cell."""
 
 _OBSERVATION, _PICTURE = "observation", "picture"

@@ -101,7 +101,7 @@ def _start_meshcat(console: Console) -> Meshcat:
     meshcat.SetProperty("/Background", "bottom_color", [0.80, 0.83, 0.86])
     meshcat.SetProperty("/Grid", "visible", False)
     meshcat.SetProperty("/Axes", "visible", False)
-    meshcat.SetCameraPose(camera_in_world=[1.35, -0.55, 0.75], target_in_world=[0.45, 0.0, 0.08])
+    meshcat.SetCameraPose(camera_in_world=[1.02, -0.48, 0.62], target_in_world=[0.45, -0.02, 0.08])
     console.print(f"watch at {meshcat.web_url()}", highlight=False)
     return meshcat
 

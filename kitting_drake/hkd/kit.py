@@ -35,7 +35,7 @@ SLOTS = {
 _ARC_SEGMENTS = 64
 _TOP_CELL = 0.02
 """Side of the squares into which the top is cut for the contact solver, in metres."""
-_FORMAT_VERSION = "3"
+_FORMAT_VERSION = "4"
 """Part of the cache key: changed whenever the same input makes another kit."""
 
 
@@ -325,7 +325,7 @@ _SDF = """<?xml version="1.0"?>
     <link name="kit">
       <visual name="block">
         <geometry><mesh><uri>block.obj</uri></mesh></geometry>
-        <material><diffuse>0.13 0.14 0.16 1</diffuse></material>
+        <material><diffuse>0.17 0.18 0.20 1</diffuse></material>
       </visual>
       <visual name="cavities">
         <geometry><mesh><uri>cavities.obj</uri></mesh></geometry>

@@ -15,7 +15,7 @@ def observation(value: float) -> Observation:
 def test_ports():
     policy = PickPlacePolicy(policy=lambda _: ACTION)
     assert policy.num_input_ports() == policy.num_output_ports() == 1
-    assert policy.GetInputPort("observation").Allocate().get_value() == Observation()
+    assert isinstance(policy.GetInputPort("observation").Allocate().get_value(), Observation)
     assert isinstance(policy.GetOutputPort("action").Allocate().get_value(), PickPlaceAction)
 
 

@@ -12,16 +12,16 @@ WEIGHT = 12.0
 STIFFNESS = np.array([1000.0, 900.0, 800.0, 20.0])
 DAMPING = np.array([50.0, 40.0, 30.0, 1.0])
 LIMIT = np.array([60.0, 60.0, 60.0, 3.0])
-PARAMETERS: dict[str, Any] = dict(
-    inertia=INERTIA,
-    weight=WEIGHT,
-    stiffness=STIFFNESS,
-    damping=DAMPING,
-    force_limit=LIMIT,
-    finger_stiffness=500.0,
-    finger_damping=10.0,
-    finger_force_limit=40.0,
-)
+PARAMETERS: dict[str, Any] = {
+    "inertia": INERTIA,
+    "weight": WEIGHT,
+    "stiffness": STIFFNESS,
+    "damping": DAMPING,
+    "force_limit": LIMIT,
+    "finger_stiffness": 500.0,
+    "finger_damping": 10.0,
+    "finger_force_limit": 40.0,
+}
 
 Q, V = np.array([0.4, 0.1, 0.2, 0.3]), np.array([0.1, -0.2, 0.05, 0.5])
 FINGERS, FINGER_RATES = np.array([0.02, 0.021]), np.array([-0.01, -0.02])

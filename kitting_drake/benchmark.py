@@ -1,0 +1,202 @@
+"""`python -m kitting_drake.benchmark simulation`: what the cell costs, measured here and now."""
+
+import argparse
+import os
+import platform
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from pydrake.systems.framework import Context
+from rich.console import Console
+from rich.progress import track
+from rich.table import Table
+
+from kitting_drake.cell import Cell, build_cell
+from kitting_drake.cli import count_type, run_verb, seed_type
+from kitting_drake.episode import run_episode
+from kitting_drake.files import require_folder, write_json
+from kitting_drake.paths import SCENARIOS
+from kitting_drake.scenario import Scenario, load_scenario
+from systems.pick_place_planner import Mode
+
+_SCENARIO = SCENARIOS / "kitting_oracle.yaml"
+
+
+def main() -> int:
+    """Parses the command line and measures; returns the exit code."""
+    parser = argparse.ArgumentParser(
+        prog="python -m kitting_drake.benchmark", description="Measure; print and keep tables."
+    )
+    verbs = parser.add_subparsers(dest="verb", required=True)
+    simulation = verbs.add_parser("simulation", help="phases of an episode, start-up, images")
+    simulation.add_argument("--episodes", type=count_type, default=3, help="how many to run (3)")
+    simulation.add_argument("--seed", type=seed_type, default=0, help="of the first (0)")
+    simulation.add_argument(
+        "--output", type=Path, default=Path("output/benchmark"), help="where the JSON goes"
+    )
+    simulation.add_argument("--quiet", action="store_true", help="print nothing but errors")
+    arguments = parser.parse_args()
+    console = Console(quiet=arguments.quiet)
+    folder = require_folder(arguments.output)
+    # One core, as claimed; children inherit it.
+    os.sched_setaffinity(0, {max(os.sched_getaffinity(0))})
+    measured = benchmark_simulation(arguments.episodes, arguments.seed, console)
+    write_json(folder / "simulation.json", measured)
+    for table in simulation_tables(measured):
+        console.print(table)
+    console.print(f"files: {folder}/", highlight=False)
+    return 0
+
+
+def benchmark_simulation(episodes: int, seed: int, console: Console) -> dict[str, Any]:
+    """Measures everything that `benchmark simulation` shows, in seconds of wall time.
+
+    Args:
+        episodes: how many whole episodes of the oracle to run.
+        seed: of the first; the others follow.
+        console: for progress.
+    """
+    scenario = load_scenario(_SCENARIO)
+    stopwatch = _PhaseWatch()
+    simulated = wall = 0.0
+    for number in track(
+        range(episodes), "episodes", console=console, transient=True, disable=console.quiet
+    ):
+        stopwatch.restart()
+        result = run_episode(
+            _build(scenario, seed + number),
+            scenario=_SCENARIO.stem,
+            policy="oracle",
+            seed=seed + number,
+            time_limit=scenario.time_limit,
+            watch=stopwatch.look,
+        )
+        simulated += result.sim_seconds
+        wall += result.wall_seconds
+    return {
+        "machine": f"{platform.machine()}, {os.cpu_count()} cores, one used",
+        "python": platform.python_version(),
+        "episodes": episodes,
+        "real_time_rate": simulated / wall,
+        "phases": {
+            name: {
+                "simulated_s": phase_simulated,
+                "wall_s": phase_wall,
+                "wall_s_per_simulated_s": phase_wall / phase_simulated,
+            }
+            for name, (phase_simulated, phase_wall) in stopwatch.phases.items()
+        },
+        "start_up_s": _start_up_times(),
+        "images_s": _image_times(scenario, seed),
+    }
+
+
+def _build(scenario: Scenario, seed: int, *, images: bool = False) -> Cell:
+    return build_cell(scenario, seed=seed, base=SCENARIOS, images=images)
+
+
+class _PhaseWatch:
+    """Sums simulated and wall time by the planner's mode."""
+
+    def __init__(self) -> None:
+        self.phases: dict[str, tuple[float, float]] = {}
+        self._last: tuple[float, float] | None = None
+
+    def restart(self) -> None:
+        """Forgets when the last step was: another episode begins."""
+        self._last = None
+
+    def look(self, root_context: Context, mode: Mode) -> None:
+        """Adds the time since the last step to the mode's."""
+        now = (root_context.get_time(), time.perf_counter())
+        if self._last is not None:
+            name = mode.name.lower()
+            simulated, wall = self.phases.get(name, (0.0, 0.0))
+            self.phases[name] = (simulated + now[0] - self._last[0], wall + now[1] - self._last[1])
+        self._last = now
+
+
+def _start_up_times() -> dict[str, float]:
+    """From the shell to the end of a run of a few steps, its Meshcat and files included."""
+    times = {}
+    with tempfile.TemporaryDirectory() as folder:
+        # The first run finds no kit in the cache, the second does.
+        environment = os.environ | {"XDG_CACHE_HOME": folder}
+        command = [sys.executable, "-m", "kitting_drake.run", str(_SCENARIO), "--quiet"]
+        command += ["--scenario_text", "{time_limit: 0.1}", "--output", folder]
+        for name in ("kit_to_build", "kit_cached"):
+            start = time.perf_counter()
+            subprocess.run(command, env=environment, check=True)
+            times[name] = time.perf_counter() - start
+    return times
+
+
+def _image_times(scenario: Scenario, seed: int) -> dict[str, float]:
+    """Of one RGB-D image, and of the heightmap from all cameras' images once they are there."""
+    cell = _build(scenario, seed, images=True)
+    context = cell.diagram.CreateDefaultContext()
+    sensors = [cell.diagram.GetSubsystemByName(f"camera_{name}") for name in scenario.cameras]
+    projector = cell.diagram.GetSubsystemByName("heightmap_projector")
+
+    def render() -> None:
+        for sensor in sensors:
+            for port in ("color_image", "depth_image_32f"):
+                sensor.GetOutputPort(port).Eval(sensor.GetMyContextFromRoot(context))
+
+    def project() -> None:
+        projector.get_output_port().Eval(projector.GetMyContextFromRoot(context))
+
+    render_times, project_times = [], []
+    for second in range(6):
+        # Images depend on time, so that what was rendered before is stale.
+        context.SetTime(float(second + 1))
+        render_times.append(_timed(render))
+        project_times.append(_timed(project))
+    # The first one loads meshes into the engine.
+    return {
+        "rgbd_image": float(np.median(render_times[1:])) / len(sensors),
+        "heightmap": float(np.median(project_times[1:])),
+    }
+
+
+def _timed(function: Callable[[], None]) -> float:
+    start = time.perf_counter()
+    function()
+    return time.perf_counter() - start
+
+
+def simulation_tables(measured: dict[str, Any]) -> list[Table]:
+    """For the terminal."""
+    phases = Table(
+        title=f"whole episodes: {measured['real_time_rate']:.2f} times real time on one core",
+        title_justify="left",
+    )
+    phases.add_column("phase")
+    for heading in ("simulated s", "wall s", "wall s per simulated s"):
+        phases.add_column(heading, justify="right")
+    for name, row in measured["phases"].items():
+        phases.add_row(
+            name,
+            f"{row['simulated_s']:.1f}",
+            f"{row['wall_s']:.1f}",
+            f"{row['wall_s_per_simulated_s']:.2f}",
+        )
+    once = Table(title="once", title_justify="left")
+    once.add_column("what")
+    once.add_column("wall s", justify="right")
+    start, images = measured["start_up_s"], measured["images_s"]
+    once.add_row("shell to first steps and out again, kit to build", f"{start['kit_to_build']:.2f}")
+    once.add_row("the same, kit in the cache", f"{start['kit_cached']:.2f}")
+    once.add_row("one RGB-D image", f"{images['rgbd_image']:.3f}")
+    once.add_row("heightmap from three images", f"{images['heightmap']:.3f}")
+    return [phases, once]
+
+
+if __name__ == "__main__":
+    run_verb(main)

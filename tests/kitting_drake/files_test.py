@@ -1,0 +1,37 @@
+import os
+from pathlib import Path
+
+import pytest
+
+from kitting_drake.errors import UserError
+from kitting_drake.files import require_folder, write_json, write_whole
+
+
+def test_writes_and_replaces_in_a_new_folder(tmp_path: Path):
+    path = tmp_path / "new" / "deep" / "results.json"
+    write_json(path, {"a": 1})
+    write_whole(path, "short")
+    assert path.read_text() == "short"
+    assert [item.name for item in path.parent.iterdir()] == [path.name]
+
+
+def test_what_was_there_stays_whole_when_writing_fails(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    path = tmp_path / "results.json"
+    write_whole(path, "before")
+
+    def full(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(os, "replace", full)
+    with pytest.raises(UserError, match=r"cannot write .*results\.json: No space left"):
+        write_whole(path, "after")
+    assert path.read_text() == "before"
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_a_folder_that_cannot_be_is_told_before_the_run(tmp_path: Path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(UserError, match=r"cannot write into .*/file/out: Not a directory"):
+        require_folder(tmp_path / "file" / "out")

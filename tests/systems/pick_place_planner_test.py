@@ -1,0 +1,365 @@
+import dataclasses
+import itertools
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from pydrake.common.value import Value
+from pydrake.systems.analysis import Simulator
+from pydrake.systems.framework import Context, DiagramBuilder, EventStatus, LeafSystem
+from pydrake.systems.primitives import LogVectorOutput
+
+from systems.pick_place_planner import Mode, PickPlaceParameters, PickPlacePlanner, nearest_turns
+from systems.signals import PickPlaceAction, PlanarPose
+
+PICK, PLACE = PlanarPose(0.4, 0.3, 0.5), PlanarPose(0.55, -0.2, -0.8)
+ACTION = PickPlaceAction(PICK, PLACE, surface_height=0.05)
+PARAMETERS = PickPlaceParameters(max_actions=10)
+GRASP_Z = 0.05 - PARAMETERS.grasp_depth
+WIDTH, WEIGHT = 0.02, 6.0
+NO_TOUCH = -1.0
+
+PICK_AND_PLACE = [mode for mode in Mode if mode != Mode.DONE]
+
+
+@dataclasses.dataclass
+class World:
+    """What the hand meets: heights that its tips, or what they hold, touch; between its jaws what.
+
+    Attributes:
+        touch_pick: height in m at which something is touched on the pick side of the table.
+        touch_place: likewise on the place side.
+        width: of what is between the pads, in m, by number of the attempt (from 1) and mode.
+    """
+
+    touch_pick: float = NO_TOUCH
+    touch_place: float = 0.04
+    width: Callable[[int, Mode], float] = lambda attempt, mode: WIDTH
+
+
+class PerfectHand(LeafSystem):
+    """Moves exactly as desired; jaws stop at what is between them; feels what the World says."""
+
+    def __init__(self, world: World) -> None:
+        super().__init__()
+        self._world = world
+        for name, size in (
+            ("desired_motion", 12),
+            ("desired_opening", 2),
+            ("closing_force", 1),
+            ("mode", 1),
+            ("counts", 3),
+        ):
+            self.DeclareVectorInputPort(name, size)
+        self.DeclareVectorOutputPort("hand_state", 12, self._calc_state)
+        self.DeclareVectorOutputPort("hand_contact_force", 6, self._calc_contact)
+
+    def _eval(self, context: Context, name: str) -> NDArray:
+        return self.GetInputPort(name).Eval(context)
+
+    def _width(self, context: Context) -> float:
+        attempt, mode = self._eval(context, "counts")[0], self._eval(context, "mode")[0]
+        return self._world.width(int(attempt), Mode(int(mode)))
+
+    def _calc_state(self, context, output) -> None:
+        q, v, _ = np.split(self._eval(context, "desired_motion"), 3)
+        opening, rate = self._eval(context, "desired_opening")
+        if opening < self._width(context):
+            opening, rate = self._width(context), 0.0
+        fingers, rates = [opening / 2] * 2, [rate / 2] * 2
+        output.SetFromVector(np.concatenate([q, fingers, v, rates]))
+
+    def _calc_contact(self, context, output) -> None:
+        q = self._eval(context, "desired_motion")[:4]
+        opening = self._eval(context, "desired_opening")[0]
+        press = self._eval(context, "closing_force")[0]
+        width = self._width(context)
+        pad = 800 * (width - opening) / 2 + press if width > 0 and opening <= width else 0.0
+        side = self._world.touch_pick if q[1] > 0 else self._world.touch_place
+        touch = max(side - q[2], 0.0) * 1e5
+        load = -WEIGHT if press > 0 and touch == 0 and pad > 0 else 0.0
+        output.SetFromVector([0, 0, touch + load, 0, pad, pad])
+
+
+class StubPolicy(LeafSystem):
+    """Answers `ACTION` a number of times, then stop; notes when it was asked."""
+
+    def __init__(self, actions: int) -> None:
+        super().__init__()
+        self.asked: list[float] = []
+        self._actions = actions
+        self.DeclareAbstractOutputPort("action", lambda: Value(PickPlaceAction()), self._calc)
+
+    def _calc(self, context, output) -> None:
+        self.asked.append(context.get_time())
+        stop = len(self.asked) > self._actions
+        output.set_value(PickPlaceAction(stop=True) if stop else ACTION)
+
+
+class Run:
+    """The planner, a perfect hand and a stub of a policy, simulated until the planner is done."""
+
+    def __init__(
+        self,
+        world: World | None = None,
+        *,
+        actions: int = 1,
+        parameters: PickPlaceParameters = PARAMETERS,
+    ) -> None:
+        builder = DiagramBuilder()
+        self.planner = builder.AddSystem(PickPlacePlanner(parameters=parameters))
+        self.policy = builder.AddSystem(StubPolicy(actions))
+        hand = builder.AddSystem(PerfectHand(world or World()))
+        for port in ("desired_motion", "desired_opening", "closing_force", "mode", "counts"):
+            builder.Connect(self.planner.GetOutputPort(port), hand.GetInputPort(port))
+        for port in ("hand_state", "hand_contact_force"):
+            builder.Connect(hand.GetOutputPort(port), self.planner.GetInputPort(port))
+        builder.Connect(self.policy.get_output_port(), self.planner.GetInputPort("action"))
+        self.log = LogVectorOutput(self.planner.GetOutputPort("desired_motion"), builder, 1 / 128)
+        self.diagram = builder.Build()
+        self.simulator = Simulator(self.diagram)
+        self.modes: list[tuple[float, Mode]] = []
+        self.simulator.set_monitor(self._look)
+
+    def _look(self, root: Context) -> EventStatus:
+        mode = self.planner.mode(self.planner.GetMyContextFromRoot(root))
+        if not self.modes or self.modes[-1][1] != mode:
+            self.modes.append((root.get_time(), mode))
+        if mode == Mode.DONE:
+            return EventStatus.ReachedTermination(self.planner, "done")
+        return EventStatus.DidNothing()
+
+    def finish(self) -> "Run":
+        self.simulator.AdvanceTo(100.0)
+        assert self.modes[-1][1] == Mode.DONE, self.modes
+        return self
+
+    def until(self, mode: Mode) -> "Run":
+        """Runs until a mode has just begun."""
+        while not self.modes or self.modes[-1][1] != mode:
+            assert self.simulator.get_context().get_time() < 100
+            self.simulator.AdvanceTo(self.simulator.get_context().get_time() + 1 / 64)
+        return self
+
+    def output(self, name: str) -> NDArray:
+        context = self.planner.GetMyContextFromRoot(self.simulator.get_context())
+        return self.planner.GetOutputPort(name).Eval(context)
+
+    @property
+    def sequence(self) -> list[Mode]:
+        return [mode for _, mode in self.modes]
+
+    @property
+    def counts(self) -> list[float]:
+        """Actions begun, grasps missed, objects dropped."""
+        return self.output("counts").tolist()
+
+
+def test_ports():
+    planner = PickPlacePlanner(parameters=PARAMETERS)
+    assert planner.num_input_ports() == 3
+    assert planner.GetInputPort("hand_state").size() == 12
+    assert planner.GetInputPort("hand_contact_force").size() == 6
+    assert isinstance(planner.GetInputPort("action").Allocate().get_value(), PickPlaceAction)
+    outputs = {
+        "desired_motion": 12,
+        "desired_opening": 2,
+        "closing_force": 1,
+        "mode": 1,
+        "counts": 3,
+    }
+    assert planner.num_output_ports() == len(outputs)
+    for name, size in outputs.items():
+        assert planner.GetOutputPort(name).size() == size
+
+
+def test_begins_at_home_with_open_jaws():
+    planner = PickPlacePlanner(parameters=PARAMETERS)
+    context = planner.CreateDefaultContext()
+    motion = planner.GetOutputPort("desired_motion").Eval(context)
+    np.testing.assert_array_equal(motion, [*PARAMETERS.home, *np.zeros(8)])
+    opening = planner.GetOutputPort("desired_opening").Eval(context)
+    np.testing.assert_array_equal(opening, [PARAMETERS.open_width, 0])
+    assert planner.mode(context) == Mode.OBSERVE
+
+
+def test_all_modes_of_a_pick_and_place_in_order():
+    run = Run().finish()
+    assert run.sequence == [*PICK_AND_PLACE, Mode.OBSERVE, Mode.DONE]
+    assert run.counts == [1, 0, 0]
+
+
+def test_where_the_hand_goes():
+    run = Run()
+    run.until(Mode.CLOSE)
+    np.testing.assert_allclose(run.output("desired_motion")[:3], [PICK.x, PICK.y, GRASP_Z])
+    turned = run.output("desired_motion")[3]
+    run.until(Mode.LIFT)
+    assert run.output("closing_force")[0] == PARAMETERS.grasp_force
+    assert run.output("desired_opening")[0] == pytest.approx(WIDTH, abs=1e-3)
+    run.until(Mode.LOWER)
+    place = [PLACE.x, PLACE.y, PARAMETERS.travel_height]
+    np.testing.assert_allclose(run.output("desired_motion")[:3], place, atol=1e-5)
+    # What is held turns by exactly this: the jaws being alike, the hand may be turned by pi.
+    assert run.output("desired_motion")[3] - turned == pytest.approx(PLACE.theta - PICK.theta)
+    run.until(Mode.RETREAT)
+    assert run.output("closing_force")[0] == 0
+    opened = WIDTH + 2 * PARAMETERS.release_clearance
+    assert run.output("desired_opening")[0] == pytest.approx(opened, abs=1e-3)
+    run.finish()
+    np.testing.assert_allclose(run.output("desired_motion"), [*PARAMETERS.home, *np.zeros(8)])
+
+
+@pytest.mark.parametrize("height", [0.02, 0.055])
+def test_lowering_stops_where_something_is_touched(height: float):
+    run = Run(World(touch_place=height)).until(Mode.RELEASE)
+    z = run.output("desired_motion")[2]
+    # The planner looks every 1/64 s: at most one look late, at the lowering speed.
+    assert height - PARAMETERS.lower_speed / 64 - 1e-4 <= z < height
+    run.simulator.AdvanceTo(run.simulator.get_context().get_time() + 0.05)
+    assert run.sequence[-1] == Mode.RELEASE
+    assert run.output("desired_motion")[2] == z
+
+
+def test_lowering_over_nothing_ends_above_the_floor():
+    run = Run(World(touch_place=NO_TOUCH)).until(Mode.RELEASE)
+    assert run.output("desired_motion")[2] == pytest.approx(PARAMETERS.floor_clearance)
+
+
+def test_descent_stops_where_something_is_touched():
+    touched = GRASP_Z + 0.02
+    run = Run(World(touch_pick=touched)).until(Mode.CLOSE)
+    z = run.output("desired_motion")[2]
+    late = PARAMETERS.descend_speed / 64
+    assert touched - late < z - PARAMETERS.floor_clearance <= touched
+
+
+def test_descent_to_a_flat_object_keeps_off_the_floor():
+    flat = dataclasses.replace(PARAMETERS, grasp_depth=0.05)
+    run = Run(parameters=flat).until(Mode.CLOSE)
+    assert run.output("desired_motion")[2] == pytest.approx(PARAMETERS.floor_clearance)
+
+
+def test_a_missed_grasp_is_counted_and_tried_again():
+    world = World(width=lambda attempt, mode: 0.0 if attempt == 1 else WIDTH)
+    run = Run(world, actions=2).finish()
+    missed = [*PICK_AND_PLACE[: PICK_AND_PLACE.index(Mode.CHECK) + 1], Mode.RETREAT]
+    assert run.sequence == [*missed, *PICK_AND_PLACE, Mode.OBSERVE, Mode.DONE]
+    assert run.counts == [2, 1, 0]
+
+
+@pytest.mark.parametrize("where", [Mode.LIFT, Mode.CARRY, Mode.LOWER])
+def test_a_dropped_object_is_counted_and_tried_again(where: Mode):
+    def width(attempt: int, mode: Mode) -> float:
+        return 0.0 if attempt == 1 and mode >= where else WIDTH
+
+    run = Run(World(width=width), actions=2).finish()
+    dropped = [*PICK_AND_PLACE[: PICK_AND_PLACE.index(where) + 1], Mode.RETREAT]
+    assert run.sequence == [*dropped, *PICK_AND_PLACE, Mode.OBSERVE, Mode.DONE]
+    assert run.counts == [2, 0, 1]
+
+
+def test_max_actions():
+    parameters = dataclasses.replace(PARAMETERS, max_actions=2)
+    run = Run(World(width=lambda attempt, mode: 0.0), actions=100, parameters=parameters).finish()
+    assert run.counts == [2, 2, 0]
+    assert len(run.policy.asked) == 2  # It would not heed a third answer, and asks for none.
+
+
+def test_the_policy_is_asked_only_at_the_end_of_observing():
+    run = Run(actions=2).finish()
+    ends = [
+        end
+        for (_, mode), (end, _) in itertools.pairwise(run.modes)
+        if mode == Mode.OBSERVE
+    ]
+    assert len(run.policy.asked) == 3
+    np.testing.assert_allclose(run.policy.asked, ends, atol=1 / 64)
+    assert run.policy.asked[0] >= PARAMETERS.observe_settle
+
+
+def test_motion_is_smooth_and_within_the_limits_of_its_mode():
+    p = PARAMETERS
+    speeds = dict.fromkeys(Mode, p.linear_speed)
+    speeds |= {Mode.LIFT: p.carry_speed, Mode.CARRY: p.carry_speed}
+    speeds |= {Mode.DESCEND: p.descend_speed, Mode.LOWER: p.lower_speed}
+    accelerations = dict.fromkeys(Mode, p.linear_acceleration)
+    accelerations |= dict.fromkeys((Mode.LIFT, Mode.CARRY, Mode.LOWER), p.carry_acceleration)
+    run = Run()
+    step = 1 / 512
+    times, samples, modes = [], [], []
+    while not samples or modes[-1] != Mode.DONE:
+        times.append(len(times) * step)
+        run.simulator.AdvanceTo(times[-1])
+        samples.append(run.output("desired_motion").copy())
+        modes.append(Mode(int(run.output("mode")[0])))
+    fastest: dict[Mode, float] = {}
+    turning = 0.0
+    for before, after, mode, next_mode in zip(samples, samples[1:], modes, modes[1:], strict=False):
+        if mode != next_mode:
+            continue
+        _, v, a = np.split(after, 3)
+        difference = (after - before) / step
+        mean_v, mean_a = (before[4:8] + v) / 2, (before[8:12] + a) / 2
+        np.testing.assert_allclose(difference[:4], mean_v, atol=1e-3)
+        np.testing.assert_allclose(difference[4:8], mean_a, atol=0.15)
+        for speed in (np.linalg.norm(v[:3]), np.linalg.norm(difference[:3])):
+            assert speed <= speeds[mode] * 1.0001, mode
+            fastest[mode] = max(fastest.get(mode, 0.0), speed)
+        for acceleration in (np.linalg.norm(a[:3]), np.linalg.norm(difference[4:7])):
+            assert acceleration <= accelerations[mode] * 1.0001, mode
+        assert abs(v[3]) <= p.yaw_speed * 1.0001
+        assert abs(a[3]) <= p.yaw_acceleration * 1.0001
+        turning = max(turning, abs(v[3]))
+    # Limits that are never reached would say nothing, and cost time.
+    assert fastest[Mode.DESCEND] == pytest.approx(p.descend_speed, rel=1e-2)
+    assert fastest[Mode.LOWER] == pytest.approx(p.lower_speed, rel=1e-2)
+    assert fastest[Mode.CARRY] == pytest.approx(p.carry_speed, rel=1e-2)
+    assert turning > p.yaw_speed / 2
+
+
+@pytest.mark.parametrize(
+    ("pick", "place", "expected"),
+    [
+        (0.1, 0.4, (0.1, 0.4)),
+        (3.0, -3.0, (3.0 - np.pi, np.pi - 3.0)),  # 8 degrees each way, not 172.
+        (0.2, 0.2 + np.pi, None),  # A half turn is a half turn: the object's ends differ.
+        (5.0, 11.0, None),
+        (-np.pi / 2, np.pi, None),
+    ],
+)
+def test_nearest_turns(pick: float, place: float, expected: tuple[float, float] | None):
+    turned = nearest_turns(pick, place)
+    if expected is not None:
+        np.testing.assert_allclose(turned, expected)
+    # The same grasp and the same turn of what is held...
+    half_turns = (turned[0] - pick) / np.pi
+    assert half_turns == pytest.approx(round(half_turns))
+    turns = ((turned[1] - turned[0]) - (place - pick)) / (2 * np.pi)
+    assert turns == pytest.approx(round(turns))
+    # ... and no equivalent pair stays nearer to zero.
+    equivalents = [
+        max(abs(pick + np.pi * half + 2 * np.pi * i), abs(place + np.pi * half + 2 * np.pi * j))
+        for half in (0, 1)
+        for i in range(-3, 4)
+        for j in range(-3, 4)
+    ]
+    assert max(map(abs, turned)) == pytest.approx(min(equivalents))
+
+
+def test_reset_and_rerun_give_equal_logs():
+    run = Run().finish()
+    context = run.simulator.get_mutable_context()
+    first = run.log.FindLog(context).data().copy()
+    counts, modes = run.counts, run.modes
+    assert first.shape[1] > 100
+    run.log.FindMutableLog(context).Clear()
+    context.SetTime(0.0)
+    run.diagram.SetDefaultContext(context)
+    run.policy.asked.clear()
+    run.modes = []
+    run.simulator.Initialize()
+    run.finish()
+    np.testing.assert_array_equal(run.log.FindLog(context).data(), first)
+    assert (run.counts, run.modes) == (counts, modes)
