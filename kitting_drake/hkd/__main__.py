@@ -1,7 +1,6 @@
 """The hand tools: `python -m kitting_drake.hkd list | generate | sheet`, each of `[NAME...]`."""
 
 import argparse
-import sys
 from pathlib import Path
 
 import yaml
@@ -9,14 +8,14 @@ from rich.console import Console
 from rich.progress import track
 from rich.table import Table
 
+from kitting_drake.cli import run_verb
 from kitting_drake.hkd.generate import (
     CatalogueError,
     ToolEntry,
     generate_tool,
     load_catalogue,
 )
-
-MODELS = Path(__file__).resolve().parents[2] / "models"
+from kitting_drake.paths import MODELS
 
 
 def _chosen(entries: list[ToolEntry], names: list[str]) -> list[ToolEntry]:
@@ -108,13 +107,9 @@ def main() -> int:
         if name == "sheet":
             verb.add_argument("--output", type=Path, required=True, help="the PNG to write")
     args = parser.parse_args()
-    try:
-        args.function(args, load_catalogue(args.models / "tools" / "catalogue.yaml"))
-    except (ValueError, OSError) as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
+    args.function(args, load_catalogue(args.models / "tools" / "catalogue.yaml"))
     return 0
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    run_verb(main)

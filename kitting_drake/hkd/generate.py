@@ -18,6 +18,7 @@ import yaml
 from manifold3d import CrossSection, JoinType, Manifold, OpType
 from scipy.spatial import ConvexHull, QhullError
 
+from kitting_drake.errors import UserError
 from kitting_drake.hkd import hammer, meshes, pliers, screwdriver, wrench
 from kitting_drake.hkd.collision import (
     closed,
@@ -36,6 +37,8 @@ MERGE_TOLERANCE_MM = 0.25
 VERTEX_TOLERANCE_MM = 0.2
 # The same for the faces that the jaws grip.
 GRIP_TOLERANCE_MM = 0.06
+# How far off the middle of those faces a grasp may be annotated.
+GRIP_CENTRING_MM = 0.2
 # Edges sharper than this are drawn as edges.
 CREASE_ANGLE_DEG = 35.0
 # The jaw pads of the gripper and its fingers, along the tool.
@@ -49,7 +52,7 @@ DESIGNS: dict[str, tuple[type, Callable[[Any], list[Part]]]] = {
 }
 
 
-class CatalogueError(ValueError):
+class CatalogueError(UserError):
     """A catalogue entry that cannot be used; the message names entry and field."""
 
 
@@ -104,6 +107,8 @@ def load_catalogue(path: Path) -> list[ToolEntry]:
     """Reads `catalogue.yaml`; raises CatalogueError for an entry that cannot be used."""
     try:
         data = yaml.safe_load(path.read_text())
+    except OSError as error:
+        raise CatalogueError(f"cannot read {path}: {error.strerror}") from error
     except yaml.YAMLError as error:
         raise CatalogueError(f"{path}: {' '.join(str(error).split())}") from error
     if not isinstance(data, dict) or not isinstance(data.get("tools"), list):
@@ -209,6 +214,10 @@ def generate_tool(entry: ToolEntry, directory: Path) -> Report:
         key=lambda h: tuple(np.round(h.mean(axis=0), 3)),
     )
 
+    # Nothing is written of a tool that cannot be used.
+    box = np.array(whole.bounding_box()).reshape(2, 3)
+    grip, flatness, overhang, grip_top = _measure_grasp(entry.grasp, whole)
+
     if directory.exists():
         shutil.rmtree(directory)
     directory.mkdir(parents=True)
@@ -223,8 +232,6 @@ def generate_tool(entry: ToolEntry, directory: Path) -> Report:
         tool_sdf(entry.name, mass, center, inertia, visuals, collisions)
     )
 
-    box = np.array(whole.bounding_box()).reshape(2, 3)
-    grip, flatness, overhang, grip_top = _measure_grasp(entry.grasp, whole)
     solid_hulls = Manifold.batch_boolean([Manifold.hull_points(h) for h in hulls], OpType.Add)
     description = _description(entry, box, mass, center, grip, grip_top, visuals)
     (directory / "tool.yaml").write_text(yaml.safe_dump(description, sort_keys=False))
@@ -290,6 +297,13 @@ def _measure_grasp(grasp: GraspEntry, solid: Manifold) -> tuple[float, float, fl
         raise CatalogueError(
             f"the grasp at ({grasp.x_mm}, {grasp.y_mm}) mm holds {width:.1f} mm; "
             "it has to be 8 to 35 mm"
+        )
+    middle = 0.5 * (pad[0, 1] + pad[1, 1])
+    if abs(middle) > GRIP_CENTRING_MM:
+        # The jaws would draw the tool over as they close, and put it down as much beside its place.
+        raise CatalogueError(
+            f"the grasp at ({grasp.x_mm}, {grasp.y_mm}) mm is not amid the faces it grips, but "
+            f"{middle:+.2f} mm off along the jaws"
         )
     flatness = max(np.ptp([s[k, 1] for s in slices]) for k in (0, 1))
     overhang = max(finger[1, 1] - pad[1, 1], pad[0, 1] - finger[0, 1])

@@ -269,11 +269,7 @@ def test_max_actions():
 
 def test_the_policy_is_asked_only_at_the_end_of_observing():
     run = Run(actions=2).finish()
-    ends = [
-        end
-        for (_, mode), (end, _) in itertools.pairwise(run.modes)
-        if mode == Mode.OBSERVE
-    ]
+    ends = [end for (_, mode), (end, _) in itertools.pairwise(run.modes) if mode == Mode.OBSERVE]
     assert len(run.policy.asked) == 3
     np.testing.assert_allclose(run.policy.asked, ends, atol=1 / 64)
     assert run.policy.asked[0] >= PARAMETERS.observe_settle

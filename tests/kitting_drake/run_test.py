@@ -1,0 +1,135 @@
+import json
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+from kitting_drake.paths import SCENARIOS
+from kitting_drake.scenario import Oracle, load_scenario
+
+ROOT = Path(__file__).resolve().parents[2]
+Verb = Callable[..., subprocess.CompletedProcess[str]]
+
+# Fixed by the design: other programs read them.
+KEYS = {
+    "scenario",
+    "policy",
+    "seed",
+    "objects",
+    "success_rate",
+    "actions",
+    "sim_seconds",
+    "wall_seconds",
+    "point_contact_pairs",
+}
+OBJECT_KEYS = {
+    "name",
+    "category",
+    "add_s_mm",
+    "success",
+    "position_error_mm",
+    "angle_error_deg",
+    "height_error_mm",
+}
+
+
+def shipped() -> list[Any]:
+    """Every scenario of every file under scenarios/."""
+    return [
+        pytest.param(path, key.value, id=f"{path.stem}:{key.value}")
+        for path in sorted(SCENARIOS.glob("*.yaml"))
+        for key, _ in yaml.compose(path.read_text(), Loader=yaml.SafeLoader).value
+    ]
+
+
+@pytest.mark.parametrize(("path", "name"), shipped())
+def test_shipped_scenarios_run(
+    path: Path, name: str, verb: Verb, tmp_path: Path, request: pytest.FixtureRequest
+):
+    scenario = load_scenario(path, name)
+    if not isinstance(scenario.policy, Oracle):
+        request.getfixturevalue("rendering")
+    flags = ("--scenario_text", "{time_limit: 1.0}", "--no-meshcat", "--output", tmp_path / "out")
+    diagram = tmp_path / "cell.dot"
+    done = verb("run", path, "--scenario_name", name, "--seed", 3, *flags, "--graphviz", diagram)
+    assert done.returncode == 0, done.stderr
+    assert [item.name for item in (tmp_path / "out").iterdir()] == ["results.json"]
+    results = json.loads((tmp_path / "out" / "results.json").read_text())
+    assert results.keys() >= KEYS
+    assert results["seed"] == 3
+    assert results["policy"] == type(scenario.policy).__name__.lower()
+    assert path.stem in results["scenario"]
+    assert results["sim_seconds"] == pytest.approx(1.0)
+    assert results["wall_seconds"] > 0
+    assert results["point_contact_pairs"] == 0
+    assert 0 <= results["success_rate"] <= 1
+    assert len(results["objects"]) == len(scenario.task.tools)
+    for item in results["objects"]:
+        assert item.keys() >= OBJECT_KEYS
+        assert item["name"] in done.stdout  # In the table.
+    assert diagram.read_text().startswith("digraph")
+    for system in ("plant", "policy", "planner", "controller", "monitor"):
+        assert system in diagram.read_text()
+
+
+def test_quiet_prints_nothing(verb: Verb, tmp_path: Path):
+    flags = ("--scenario_text", "{time_limit: 0.1}", "--no-meshcat", "--output", tmp_path)
+    done = verb("run", "scenarios/kitting_oracle.yaml", "--quiet", *flags)
+    assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
+
+
+INTERRUPTED_RUN = """
+import os, signal
+from kitting_drake import run
+from kitting_drake.cli import run_verb
+
+run_episode = run.run_episode
+
+def run_and_interrupt(cell, *, watch, **options):
+    def look(context, mode):
+        watch(context, mode)
+        if context.get_time() >= 1.0:
+            os.kill(os.getpid(), signal.SIGINT)
+    return run_episode(cell, watch=look, **options)
+
+run.run_episode = run_and_interrupt
+run_verb(run.main)
+"""
+
+
+def test_ctrl_c_leaves_whole_files(tmp_path: Path):
+    """The signal comes at a known step of the simulation: no waiting, no guessing."""
+    command = [sys.executable, "-c", INTERRUPTED_RUN, "scenarios/kitting_oracle.yaml"]
+    command += ["--output", str(tmp_path)]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=300)
+    assert done.returncode == 130, done.stderr
+    assert "Traceback" not in done.stderr
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["replay.html", "results.json"]
+    results = json.loads((tmp_path / "results.json").read_text())
+    assert results.keys() >= KEYS
+    assert results["interrupted"] is True
+    assert 1.0 <= results["sim_seconds"] < 1.1
+    replay = (tmp_path / "replay.html").read_text()
+    assert replay.rstrip().endswith("</html>")
+    assert "hammer" in replay
+
+
+@pytest.mark.parametrize(
+    ("flags", "words"),
+    [
+        (["--graphviz", "cell.jpg"], "--graphviz writes .svg, .png, .pdf and .dot"),
+        (["--seed", "-1"], "'-1' is not a whole number"),
+    ],
+)
+def test_flags_that_cannot_be_used(verb: Verb, tmp_path: Path, flags: list[str], words: str):
+    done = verb(
+        "run", "scenarios/kitting_oracle.yaml", "--no-meshcat", "--output", tmp_path, *flags
+    )
+    assert done.returncode == 2
+    assert words in done.stderr
+    assert "Traceback" not in done.stderr
+    assert not list(tmp_path.iterdir())
