@@ -17,6 +17,7 @@ from rich.console import Console
 from rich.progress import track
 from rich.table import Table
 
+from kitting_drake.cameras import require_rendering
 from kitting_drake.cell import Cell, build_cell
 from kitting_drake.cli import count_type, run_verb, seed_type
 from kitting_drake.episode import run_episode
@@ -97,8 +98,8 @@ def benchmark_simulation(episodes: int, seed: int, console: Console) -> dict[str
     }
 
 
-def _build(scenario: Scenario, seed: int, *, images: bool = False) -> Cell:
-    return build_cell(scenario, seed=seed, base=SCENARIOS, images=images)
+def _build(scenario: Scenario, seed: int) -> Cell:
+    return build_cell(scenario, seed=seed, base=SCENARIOS)
 
 
 class _PhaseWatch:
@@ -138,8 +139,13 @@ def _start_up_times() -> dict[str, float]:
 
 
 def _image_times(scenario: Scenario, seed: int) -> dict[str, float]:
-    """Of one RGB-D image, and of the heightmap from all cameras' images once they are there."""
-    cell = _build(scenario, seed, images=True)
+    """Of one RGB-D image, and of the heightmap from all cameras' images once they are there.
+
+    Raises:
+        UserError: images cannot be rendered here.
+    """
+    require_rendering()
+    cell = _build(scenario, seed)
     context = cell.diagram.CreateDefaultContext()
     sensors = [cell.diagram.GetSubsystemByName(f"camera_{name}") for name in scenario.cameras]
     projector = cell.diagram.GetSubsystemByName("heightmap_projector")

@@ -17,6 +17,7 @@ from pydrake.geometry import (
     RenderCameraCore,
     RenderEngineVtkParams,
     SceneGraph,
+    SsaoParameter,
 )
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 from pydrake.systems.framework import Context
@@ -26,10 +27,17 @@ from kitting_drake.errors import UserError
 from kitting_drake.files import write_whole
 from kitting_drake.scenario import LookAt, Pinhole
 
-OVERVIEW = LookAt(position=[1.55, -0.85, 1.0], target=[0.46, -0.02, 0.14])
+OVERVIEW = LookAt(position=[1.62, -0.95, 1.13], target=[0.48, -0.02, 0.06])
 """From where pictures and films show the whole cell."""
 
-_OBSERVATION, _PICTURE = "observation", "picture"
+
+def can_render() -> bool:
+    """Whether the system library that rendering needs is there."""
+    try:
+        ctypes.CDLL("libEGL.so.1")
+    except OSError:
+        return False
+    return True
 
 
 def require_rendering() -> None:
@@ -38,13 +46,11 @@ def require_rendering() -> None:
     Raises:
         UserError: the system library is missing; names the package.
     """
-    try:
-        ctypes.CDLL("libEGL.so.1")
-    except OSError as error:
+    if not can_render():
         raise UserError(
             "rendering needs the system library libEGL: install it "
             "(Debian and Ubuntu: apt-get install libegl1 libgl1-mesa-dri)"
-        ) from error
+        )
 
 
 def add_observation_renderer(scene_graph: SceneGraph) -> str:
@@ -54,33 +60,44 @@ def add_observation_renderer(scene_graph: SceneGraph) -> str:
         UserError: images cannot be rendered here.
     """
     require_rendering()
-    scene_graph.AddRenderer(_OBSERVATION, MakeRenderEngineVtk(RenderEngineVtkParams()))
-    return _OBSERVATION
+    scene_graph.AddRenderer("observation", MakeRenderEngineVtk(RenderEngineVtkParams()))
+    return "observation"
 
 
-def add_picture_renderer(scene_graph: SceneGraph, context: Context | None = None) -> str:
-    """Adds, once, the engine that people see by, to a scene or its context; returns its name.
+def add_picture_renderer(scene_graph: SceneGraph) -> str:
+    """Adds the engine that pictures are made with; returns its name.
 
-    Three lights, one of which casts shadows to speak of, before a light background.
+    Soft light from three sides, and ambient occlusion, which tells what stands on what. To be added
+    before a context is made: one that comes later is not told where things are.
 
     Raises:
         UserError: images cannot be rendered here.
     """
-    target = () if context is None else (context,)
-    if not scene_graph.HasRenderer(*target, _PICTURE):
-        require_rendering()
-        parameters = RenderEngineVtkParams(
-            default_clear_color=np.array([0.90, 0.92, 0.94]),
-            lights=[
-                _light([-0.45, 0.35, -0.9], 1.0),
-                _light([0.6, -0.5, -0.6], 0.45),
-                _light([0.1, 0.9, -0.4], 0.25),
-            ],
-            cast_shadows=True,
-            shadow_map_size=2048,
-        )
-        scene_graph.AddRenderer(*target, _PICTURE, MakeRenderEngineVtk(parameters))
-    return _PICTURE
+    return _add_studio(scene_graph, "picture", SsaoParameter(radius=0.08))
+
+
+def add_film_renderer(scene_graph: SceneGraph) -> str:
+    """Adds the engine that films are made with, lit as pictures are, but quick; returns its name.
+
+    Raises:
+        UserError: images cannot be rendered here.
+    """
+    return _add_studio(scene_graph, "film", None)
+
+
+def _add_studio(scene_graph: SceneGraph, name: str, ssao: SsaoParameter | None) -> str:
+    require_rendering()
+    parameters = RenderEngineVtkParams(
+        default_clear_color=np.array([0.90, 0.92, 0.94]),
+        lights=[
+            _light([-0.45, 0.35, -0.9], 0.9),
+            _light([0.6, -0.5, -0.6], 0.45),
+            _light([0.1, 0.9, -0.4], 0.25),
+        ],
+        ssao=ssao,
+    )
+    scene_graph.AddRenderer(name, MakeRenderEngineVtk(parameters))
+    return name
 
 
 def _light(direction: list[float], intensity: float) -> LightParameter:
@@ -114,7 +131,7 @@ def depth_camera(config: Pinhole | LookAt, renderer: str) -> DepthRenderCamera:
 
 
 def picture_camera(
-    renderer: str, *, width: int = 1280, height: int = 800, fov_y: float = 0.5
+    renderer: str, *, width: int = 1280, height: int = 800, fov_y: float = 0.42
 ) -> RenderCameraCore:
     """A camera for people's eyes: size in pixels, vertical field of view in radians."""
     return RenderCameraCore(
@@ -130,10 +147,9 @@ def render_picture(
 ) -> NDArray[np.uint8]:
     """(800, 1280, 3) what a scene graph's own, connected context shows from a camera's place.
 
-    Raises:
-        UserError: images cannot be rendered here.
+    The scene graph needs the engine of `add_picture_renderer`.
     """
-    camera = ColorRenderCamera(picture_camera(add_picture_renderer(scene_graph, context)))
+    camera = ColorRenderCamera(picture_camera("picture"))
     query = scene_graph.get_query_output_port().Eval(context)
     image = query.RenderColorImage(camera, scene_graph.world_frame_id(), camera_pose(view))
     return np.array(image.data[:, :, :3])

@@ -32,9 +32,11 @@ from pydrake.visualization import VideoWriter
 
 from kitting_drake.cameras import (
     OVERVIEW,
+    add_film_renderer,
     add_observation_renderer,
     add_picture_renderer,
     camera_pose,
+    can_render,
     depth_camera,
     picture_camera,
 )
@@ -112,7 +114,7 @@ def build_cell(
     seed: int,
     base: Path,
     meshcat: Meshcat | None = None,
-    images: bool = False,
+    picture: bool = False,
     video: Path | None = None,
 ) -> Cell:
     """Builds the cell.
@@ -122,12 +124,13 @@ def build_cell(
         seed: of the scene; see `make_scene`.
         base: where relative paths in the scenario start: the folder of its file.
         meshcat: where to show it, if anywhere.
-        images: add the cameras even though the policy does not look.
+        picture: have what `render_picture` takes.
         video: the file of a film to make (.gif or .webp), if any.
 
     Returns:
-        The cell. Its Diagram exports the output ports `observation` (with cameras), `action`,
-        `add_s`, `position_error`, `angle_error`, `height_error`, `mode` and `counts`.
+        The cell. Its Diagram exports the output ports `observation`, `action`, `add_s`,
+        `position_error`, `angle_error`, `height_error`, `mode` and `counts`. Where images cannot be
+        rendered, and the policy does not look, there are no cameras and there is no `observation`.
 
     Raises:
         UserError: something in the scenario cannot be had.
@@ -144,11 +147,11 @@ def build_cell(
     _set_initial_poses(plant, scenario, scene, tool_bodies)
 
     # The policy.
-    wants_images = images or not isinstance(scenario.policy, Oracle)
-    if wants_images:
+    looks = not isinstance(scenario.policy, Oracle)
+    if looks or (scenario.cameras and can_render()):
         projector = _add_cameras(builder, scenario, scene_graph, grid)
         builder.ExportOutput(projector.GetOutputPort("observation"), "observation")
-    if isinstance(scenario.policy, Oracle):
+    if not looks:
         policy = builder.AddNamedSystem("policy", _make_oracle(scene, tool_bodies))
         builder.Connect(plant.get_body_poses_output_port(), policy.GetInputPort("body_poses"))
     else:
@@ -192,6 +195,8 @@ def build_cell(
         parameters = MeshcatVisualizerParams(role=Role.kIllustration)
         parameters.publish_period = MESHCAT_PERIOD
         MeshcatVisualizer.AddToBuilder(builder, scene_graph, meshcat, parameters)
+    if picture:
+        add_picture_renderer(scene_graph)
     video_writer = None if video is None else _add_video(builder, scene_graph, video)
     diagram = builder.Build()
     diagram.set_name("kitting_cell")
@@ -375,7 +380,7 @@ def _add_cameras(
 
 
 def _add_video(builder: DiagramBuilder, scene_graph: SceneGraph, path: Path) -> VideoWriter:
-    core = picture_camera(add_picture_renderer(scene_graph), width=640, height=400)
+    core = picture_camera(add_film_renderer(scene_graph), width=640, height=400)
     sensor = builder.AddNamedSystem(
         "camera_video",
         RgbdSensor(

@@ -9,7 +9,7 @@ from pydrake.systems.framework import Context, Diagram
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
-from kitting_drake.cameras import render_picture, require_rendering, save_png
+from kitting_drake.cameras import render_picture, save_png
 from kitting_drake.cell import Cell, build_cell
 from kitting_drake.cli import (
     INTERRUPTED,
@@ -54,7 +54,14 @@ def main() -> int:
     _check_endings(arguments.picture, arguments.video)
 
     meshcat = None if arguments.no_meshcat else _start_meshcat(console)
-    cell = build_cell(scenario, seed=seed, base=chosen.base, meshcat=meshcat, video=arguments.video)
+    cell = build_cell(
+        scenario,
+        seed=seed,
+        base=chosen.base,
+        meshcat=meshcat,
+        picture=arguments.picture is not None,
+        video=arguments.video,
+    )
     if arguments.graphviz:
         draw_diagram(cell.diagram, arguments.graphviz)
     if meshcat is not None:
@@ -88,8 +95,6 @@ def main() -> int:
 def _check_endings(picture: Path | None, video: Path | None) -> None:
     if picture is not None and picture.suffix != ".png":
         raise UserError(f"--picture writes .png files, not '{picture}'")
-    if picture is not None:
-        require_rendering()
     if video is not None and video.suffix not in (".gif", ".webp"):
         raise UserError(f"--video writes .gif and .webp files, not '{video}'")
 

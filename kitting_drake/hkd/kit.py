@@ -300,6 +300,7 @@ def make_kit(tools: Sequence[Tool], parameters: KitParameters) -> Kit:
     scratch = Path(tempfile.mkdtemp(dir=final.parent, prefix=".making-"))
     try:
         _write(cavities, parameters, scratch)
+        scratch.chmod(0o755)
         os.rename(scratch, final)
     except OSError:
         if not final.is_dir():

@@ -1,5 +1,6 @@
 import dataclasses
 import shutil
+import sys
 import types
 from collections.abc import Callable
 from pathlib import Path
@@ -202,7 +203,7 @@ def stub(monkeypatch: pytest.MonkeyPatch) -> Stub:
     """A policy that a scenario may import as `stub_policy:policy`."""
     policy = Stub()
     module = types.SimpleNamespace(policy=policy, number=3)
-    monkeypatch.setitem(__import__("sys").modules, "stub_policy", module)
+    monkeypatch.setitem(sys.modules, "stub_policy", module)
     return policy
 
 
@@ -235,9 +236,9 @@ def test_a_python_policy_is_asked_only_when_the_planner_has_observed(stub: Stub)
     # It was shown the block, 50 mm high, where it stands, and not the hand.
     seen = stub.seen[1]
     row, col = np.round(seen.grid.to_pixel([0.45, 0.08])).astype(int)
-    assert np.median(seen.height[row - 2 : row + 3, col - 2 : col + 3]) == pytest.approx(
-        0.05, abs=0.004
-    )
+    block = seen.height[row - 8 : row + 9, col - 8 : col + 9]
+    assert np.count_nonzero(block) > 20  # These small images do not reach every pixel.
+    np.testing.assert_allclose(block[block > 0], 0.05, atol=0.004)
     assert seen.height.max() < 0.07
 
 
@@ -255,19 +256,18 @@ def test_a_policy_that_cannot_be_had_is_named(function: str, message: str):
         build(Scenario(policy=PythonPolicy(function=function)))
 
 
+@pytest.mark.xfail(
+    strict=True, raises=ValueError, reason="bug: ends the program in a traceback, not the episode"
+)
 @pytest.mark.usefixtures("rendering")
 def test_a_policy_that_fails_ends_the_episode_with_its_reason(monkeypatch: pytest.MonkeyPatch):
     def fail(_: Observation) -> PickPlaceAction:
         raise ValueError("weights of the wrong shape")
 
     module = types.SimpleNamespace(policy=fail)
-    monkeypatch.setitem(__import__("sys").modules, "stub_policy", module)
+    monkeypatch.setitem(sys.modules, "stub_policy", module)
     cell = build(Scenario(policy=PythonPolicy(function="stub_policy:policy"), cameras=SMALL))
-    try:
-        result = run(cell, 1.0)
-    except ValueError:
-        pytest.xfail("bug: what the policy raises ends the program, not the episode")
-    assert "weights of the wrong shape" in str(result.failure)
+    assert "weights of the wrong shape" in str(run(cell, 1.0).failure)
 
 
 @pytest.mark.parametrize("name", ["OneOfEverything", "OneOfEverythingElse"])

@@ -1,4 +1,6 @@
+import base64
 import json
+import re
 import subprocess
 import sys
 from collections.abc import Callable
@@ -115,7 +117,9 @@ def test_ctrl_c_leaves_whole_files(tmp_path: Path):
     assert 1.0 <= results["sim_seconds"] < 1.1
     replay = (tmp_path / "replay.html").read_text()
     assert replay.rstrip().endswith("</html>")
-    assert "hammer" in replay
+    commands = b"".join(map(base64.b64decode, re.findall(r"base64,([A-Za-z0-9+/=]+)", replay)))
+    assert b"claw_hammer" in commands
+    assert b"set_animation" in commands
 
 
 @pytest.mark.parametrize(
