@@ -42,7 +42,7 @@ from kitting_drake.cameras import (
 )
 from kitting_drake.errors import UserError
 from kitting_drake.paths import MODELS
-from kitting_drake.scenario import Heightmap, Oracle, PythonPolicy, Scenario
+from kitting_drake.scenario import Heightmap, PythonPolicy, Scenario
 from kitting_drake.tasks.kitting import KittingScene, make_scene
 from systems.heightmap_projector import HeightmapProjector
 from systems.oracle_policy import OraclePolicy, OracleTarget
@@ -147,18 +147,18 @@ def build_cell(
     _set_initial_poses(plant, scenario, scene, tool_bodies)
 
     # The policy.
-    looks = not isinstance(scenario.policy, Oracle)
+    looks = isinstance(scenario.policy, PythonPolicy)
     if looks or (scenario.cameras and can_render()):
         projector = _add_cameras(builder, scenario, scene_graph, grid)
         builder.ExportOutput(projector.GetOutputPort("observation"), "observation")
-    if not looks:
-        policy = builder.AddNamedSystem("policy", _make_oracle(scene, tool_bodies))
-        builder.Connect(plant.get_body_poses_output_port(), policy.GetInputPort("body_poses"))
-    else:
+    if isinstance(scenario.policy, PythonPolicy):
         policy = builder.AddNamedSystem(
             "policy", PickPlacePolicy(policy=_import_function(scenario.policy))
         )
         builder.Connect(projector.GetOutputPort("observation"), policy.GetInputPort("observation"))
+    else:
+        policy = builder.AddNamedSystem("policy", _make_oracle(scene, tool_bodies))
+        builder.Connect(plant.get_body_poses_output_port(), policy.GetInputPort("body_poses"))
 
     # Planner and controller.
     planner = builder.AddNamedSystem("planner", PickPlacePlanner(parameters=scenario.planner))
