@@ -1,6 +1,8 @@
 # `make run` kits; `make test` tests. Both first make .venv/, once.
 
-PYTHON ?= $(shell command -v python3.12 || command -v python3.11 || command -v python3)
+SUPPORTED := import sys; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 12))
+PYTHON ?= $(shell for python in python3 python3.12 python3.11; do \
+  $$python -c '$(SUPPORTED)' 2>/dev/null && echo $$python && break; done)
 VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/ready
@@ -27,9 +29,9 @@ clean:
 
 # The .pth file makes the checkout importable from anywhere.
 $(READY): requirements.txt
-	@$(PYTHON) -c 'import sys; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 12))' || \
+	@test -n "$(PYTHON)" && $(PYTHON) -c '$(SUPPORTED)' || \
 	  { echo "error: Python 3.11 or 3.12 is needed: say 'make PYTHON=/path/to/python3.11'"; exit 2; }
-	@$(PYTHON) -c 'import ensurepip, venv' || \
+	@$(PYTHON) -c 'import ensurepip, venv' 2>/dev/null || \
 	  { echo "error: Python's venv module is missing: install it (Debian and Ubuntu: apt-get install python3-venv)"; exit 2; }
 	$(PYTHON) -m venv --clear $(VENV)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c requirements.txt torch==2.13.0

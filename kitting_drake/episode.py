@@ -47,7 +47,9 @@ class EpisodeResult:
     point_contact_pairs: int
     """The most pairs in point contact at any step."""
     failure: str | None
-    """Why the simulation ended before its time, if it did."""
+    """Why the simulation could not go on, if it could not."""
+    timed_out: bool
+    """Whether the time limit ended it."""
     interrupted: bool
     """Whether a person ended it."""
 
@@ -84,13 +86,12 @@ def run_episode(
     simulator.set_target_realtime_rate(realtime_rate)
     monitor = _Monitor(cell, watch)
     simulator.set_monitor(monitor.look)
-    failure, interrupted = None, False
+    failure, timed_out, interrupted = None, False, False
     start = time.perf_counter()
     try:
         simulator.Initialize()
         simulator.AdvanceTo(time_limit)
-        if monitor.done_since is None:
-            failure = f"the time limit of {time_limit:g} s was reached"
+        timed_out = monitor.done_since is None
     except KeyboardInterrupt:
         interrupted = True
     except RuntimeError as error:
@@ -113,6 +114,7 @@ def run_episode(
         wall_seconds=wall_seconds,
         point_contact_pairs=monitor.point_contact_pairs,
         failure=failure,
+        timed_out=timed_out,
         interrupted=interrupted,
     )
 

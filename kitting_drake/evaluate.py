@@ -185,6 +185,7 @@ def _lost_episode(
         "wall_seconds": seconds,
         "point_contact_pairs": 0,
         "failure": f"the process of the episode ended with exit code {exit_code}",
+        "timed_out": False,
         "interrupted": False,
     }
 

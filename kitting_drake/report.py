@@ -40,5 +40,7 @@ def print_episode(console: Console, result: EpisodeResult) -> None:
         )
     if result.failure:
         console.print(f"[red]failed:[/] {result.failure}", highlight=False)
+    if result.timed_out:
+        console.print("[yellow]stopped:[/] the scenario's time_limit was reached")
     if result.interrupted:
         console.print("[yellow]interrupted:[/] what happened so far is kept")

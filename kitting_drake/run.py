@@ -101,7 +101,12 @@ def _check_endings(picture: Path | None, video: Path | None) -> None:
 
 def _start_meshcat(console: Console) -> Meshcat:
     # Drake's default host is every interface.
-    meshcat = Meshcat(MeshcatParams(host="localhost", show_stats_plot=False))
+    try:
+        meshcat = Meshcat(MeshcatParams(host="localhost", show_stats_plot=False))
+    except RuntimeError as error:
+        raise UserError(
+            "Meshcat finds no free port from 7000 to 7099: close other viewers, or give --no-meshcat"
+        ) from error
     meshcat.SetProperty("/Background", "top_color", [0.93, 0.95, 0.97])
     meshcat.SetProperty("/Background", "bottom_color", [0.80, 0.83, 0.86])
     meshcat.SetProperty("/Grid", "visible", False)

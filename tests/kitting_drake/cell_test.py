@@ -26,15 +26,15 @@ from kitting_drake.scenario import (
     Sleep,
     load_scenario,
 )
-from systems.pick_place_planner import Mode
+from systems.pick_place_parameters import Mode
 from systems.signals import Observation, PickPlaceAction, PlanarPose
 
 BASE = Path(__file__).parent
 SCORES = ["add_s", "position_error", "angle_error", "height_error"]
 
 
-def build(scenario: Scenario | None = None, seed: int = 0, *, images: bool = False) -> Cell:
-    return build_cell(scenario or Scenario(), seed=seed, base=BASE, images=images)
+def build(scenario: Scenario | None = None, seed: int = 0) -> Cell:
+    return build_cell(scenario or Scenario(), seed=seed, base=BASE)
 
 
 def run(
@@ -93,11 +93,19 @@ def test_nothing_touches_at_the_beginning_but_tools_the_table():
         assert pair & table, [inspector.GetName(surface.id_M()), inspector.GetName(surface.id_N())]
 
 
-def test_exported_ports():
+@pytest.mark.parametrize("can_render", [True, False])
+def test_exported_ports(
+    can_render: bool, request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch
+):
+    if can_render:
+        request.getfixturevalue("rendering")
+    else:
+        monkeypatch.setattr("kitting_drake.cell.can_render", lambda: False)
     diagram = build().diagram
     sizes = {**dict.fromkeys(SCORES, 4), "mode": 1, "counts": 3}
     names = [diagram.get_output_port(i).get_name() for i in range(diagram.num_output_ports())]
-    assert sorted(names) == sorted(["action", *sizes])
+    observation = ["observation"] if can_render else []
+    assert sorted(names) == sorted(["action", *sizes, *observation])
     assert diagram.num_input_ports() == 0
     context = diagram.CreateDefaultContext()
     for name, size in sizes.items():
@@ -274,7 +282,7 @@ def test_a_policy_that_fails_ends_the_episode_with_its_reason(monkeypatch: pytes
 @pytest.mark.usefixtures("rendering")
 def test_one_of_everything_builds_and_steps(name: str):
     scenario = load_scenario(BASE / "test_scenarios.yaml", name)
-    cell = build(scenario, images=True)
+    cell = build(scenario)
     assert cell.diagram.HasOutputPort("observation")
     assert cell.plant.time_step() == scenario.plant.time_step
     assert cell.sleep == scenario.sleep.enabled

@@ -10,7 +10,8 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import Context, DiagramBuilder, EventStatus, LeafSystem
 from pydrake.systems.primitives import LogVectorOutput
 
-from systems.pick_place_planner import Mode, PickPlaceParameters, PickPlacePlanner, nearest_turns
+from systems.pick_place_parameters import Mode, PickPlaceParameters
+from systems.pick_place_planner import PickPlacePlanner, nearest_turns
 from systems.signals import PickPlaceAction, PlanarPose
 
 PICK, PLACE = PlanarPose(0.4, 0.3, 0.5), PlanarPose(0.55, -0.2, -0.8)
@@ -30,11 +31,13 @@ class World:
     Attributes:
         touch_pick: height in m at which something is touched on the pick side of the table.
         touch_place: likewise on the place side.
+        stiffness: of what is touched, in N/m.
         width: of what is between the pads, in m, by number of the attempt (from 1) and mode.
     """
 
     touch_pick: float = NO_TOUCH
     touch_place: float = 0.04
+    stiffness: float = 1e5
     width: Callable[[int, Mode], float] = lambda attempt, mode: WIDTH
 
 
@@ -77,16 +80,18 @@ class PerfectHand(LeafSystem):
         width = self._width(context)
         pad = 800 * (width - opening) / 2 + press if width > 0 and opening <= width else 0.0
         side = self._world.touch_pick if q[1] > 0 else self._world.touch_place
-        touch = max(side - q[2], 0.0) * 1e5
-        load = -WEIGHT if press > 0 and touch == 0 and pad > 0 else 0.0
+        touch = max(side - q[2], 0.0) * self._world.stiffness
+        in_the_air = self._eval(context, "mode")[0] >= Mode.CARRY
+        load = -WEIGHT if in_the_air and press > 0 and pad > 0 else 0.0
         output.SetFromVector([0, 0, touch + load, 0, pad, pad])
 
 
 class StubPolicy(LeafSystem):
-    """Answers `ACTION` a number of times, then stop; notes when it was asked."""
+    """Gives one answer a number of times, then stop; notes when it was asked."""
 
-    def __init__(self, actions: int) -> None:
+    def __init__(self, actions: int, answer: PickPlaceAction) -> None:
         super().__init__()
+        self._answer = answer
         self.asked: list[float] = []
         self._actions = actions
         self.DeclareAbstractOutputPort("action", lambda: Value(PickPlaceAction()), self._calc)
@@ -94,7 +99,7 @@ class StubPolicy(LeafSystem):
     def _calc(self, context, output) -> None:
         self.asked.append(context.get_time())
         stop = len(self.asked) > self._actions
-        output.set_value(PickPlaceAction(stop=True) if stop else ACTION)
+        output.set_value(PickPlaceAction(stop=True) if stop else self._answer)
 
 
 class Run:
@@ -105,11 +110,12 @@ class Run:
         world: World | None = None,
         *,
         actions: int = 1,
+        answer: PickPlaceAction = ACTION,
         parameters: PickPlaceParameters = PARAMETERS,
     ) -> None:
         builder = DiagramBuilder()
         self.planner = builder.AddSystem(PickPlacePlanner(parameters=parameters))
-        self.policy = builder.AddSystem(StubPolicy(actions))
+        self.policy = builder.AddSystem(StubPolicy(actions, answer))
         hand = builder.AddSystem(PerfectHand(world or World()))
         for port in ("desired_motion", "desired_opening", "closing_force", "mode", "counts"):
             builder.Connect(self.planner.GetOutputPort(port), hand.GetInputPort(port))
@@ -222,6 +228,15 @@ def test_lowering_stops_where_something_is_touched(height: float):
     assert run.output("desired_motion")[2] == z
 
 
+def test_a_touch_is_told_from_the_load():
+    """On something soft: 4 N beyond the load is 2 mm deep, 4 N in all would be 5 mm."""
+    soft = World(touch_place=0.04, stiffness=2000.0)
+    run = Run(soft).until(Mode.RELEASE)
+    deep = PARAMETERS.contact_threshold / soft.stiffness
+    z = run.output("desired_motion")[2]
+    assert 0.04 - deep - 2 * PARAMETERS.lower_speed / 64 <= z < 0.04 - deep
+
+
 def test_lowering_over_nothing_ends_above_the_floor():
     run = Run(World(touch_place=NO_TOUCH)).until(Mode.RELEASE)
     assert run.output("desired_motion")[2] == pytest.approx(PARAMETERS.floor_clearance)
@@ -275,14 +290,19 @@ def test_the_policy_is_asked_only_at_the_end_of_observing():
     assert run.policy.asked[0] >= PARAMETERS.observe_settle
 
 
-def test_motion_is_smooth_and_within_the_limits_of_its_mode():
+FAR = PickPlaceAction(PlanarPose(0.35, 0.45, 0.1), PlanarPose(0.7, -0.45, -0.3), 0.05)
+TURN = PickPlaceAction(PlanarPose(0.5, 0.02, -1.4), PlanarPose(0.5, -0.02, 1.4), 0.05)
+
+
+@pytest.mark.parametrize("answer", [FAR, TURN], ids=["far", "turn"])
+def test_motion_is_smooth_and_within_the_limits_of_its_mode(answer: PickPlaceAction):
     p = PARAMETERS
     speeds = dict.fromkeys(Mode, p.linear_speed)
     speeds |= {Mode.LIFT: p.carry_speed, Mode.CARRY: p.carry_speed}
     speeds |= {Mode.DESCEND: p.descend_speed, Mode.LOWER: p.lower_speed}
     accelerations = dict.fromkeys(Mode, p.linear_acceleration)
     accelerations |= dict.fromkeys((Mode.LIFT, Mode.CARRY, Mode.LOWER), p.carry_acceleration)
-    run = Run()
+    run = Run(answer=answer)
     step = 1 / 512
     times, samples, modes = [], [], []
     while not samples or modes[-1] != Mode.DONE:
@@ -311,8 +331,10 @@ def test_motion_is_smooth_and_within_the_limits_of_its_mode():
     # Limits that are never reached would say nothing, and cost time.
     assert fastest[Mode.DESCEND] == pytest.approx(p.descend_speed, rel=1e-2)
     assert fastest[Mode.LOWER] == pytest.approx(p.lower_speed, rel=1e-2)
-    assert fastest[Mode.CARRY] == pytest.approx(p.carry_speed, rel=1e-2)
-    assert turning > p.yaw_speed / 2
+    if answer is FAR:
+        assert fastest[Mode.CARRY] == pytest.approx(p.carry_speed, rel=1e-2)
+    else:
+        assert turning == pytest.approx(p.yaw_speed, rel=1e-2)
 
 
 @pytest.mark.parametrize(

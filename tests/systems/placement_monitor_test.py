@@ -52,10 +52,10 @@ def test_add_s_takes_the_nearest_point_not_the_same_point():
 def test_add_s_measures_from_the_goal_to_the_actual_pose():
     """The two directions differ for a shape that is not symmetric; equation 9 has this one."""
     points = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [3.0, 0.0, 0.0]])
-    moved = RigidTransform([1.0, 0.0, 0.0])  # Goal 0, 1, 3; actual 1, 2, 4.
-    assert add_s(points, RigidTransform(), moved) == pytest.approx((1 + 0 + 1) / 3)
-    half_turn = RigidTransform(RollPitchYaw(0, 0, np.pi), [3.0, 0.0, 0.0])  # Actual 3, 2, 0.
-    assert add_s(points, RigidTransform(), half_turn) == pytest.approx((0 + 1 + 0) / 3)
+    moved = RigidTransform([3.0, 0.0, 0.0])  # Goal 0, 1, 3; actual 3, 4, 6.
+    assert add_s(points, RigidTransform(), moved) == pytest.approx((3 + 2 + 0) / 3)
+    back = RigidTransform([-3.0, 0.0, 0.0])  # Goal 0, 1, 3; actual -3, -2, 0.
+    assert add_s(points, RigidTransform(), back) == pytest.approx((0 + 1 + 3) / 3)
 
 
 @pytest.mark.parametrize("quarters", [1, 2, 3])
