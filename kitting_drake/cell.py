@@ -246,7 +246,11 @@ def _add_models(plant: MultibodyPlant, scene: KittingScene) -> list[RigidBody]:
     plant.WeldFrames(plant.world_frame(), plant.GetFrameByName("kit", kit), scene.X_WKit)
     tools = []
     for tool in scene.tools:
-        (instance,) = parser.AddModels(str(tool.sdf))
+        try:
+            (instance,) = parser.AddModels(str(tool.sdf))
+        except (RuntimeError, ValueError) as error:
+            reason = str(error).splitlines()[0]
+            raise UserError(f"task.tools: {tool.sdf} cannot be loaded: {reason}") from error
         tools.append(plant.GetBodyByName("tool", instance))
     parser.AddModels(str(MODELS / "franka_hand" / "franka_hand.sdf"))
     return tools

@@ -7,6 +7,9 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
+from pydrake.geometry import Meshcat
+
+from kitting_drake.cell import Cell, build_cell
 from kitting_drake.errors import UserError
 from kitting_drake.paths import SCENARIOS
 from kitting_drake.scenario import Scenario, load_scenario
@@ -95,6 +98,32 @@ def choose_scenario(arguments: argparse.Namespace) -> ChosenScenario:
     scenario = load_scenario(path, name, arguments.scenario_text)
     label = path.stem if name is None else f"{path.stem}:{name}"
     return ChosenScenario(scenario, path, label, arguments.scenario_text)
+
+
+def build_chosen(
+    chosen: ChosenScenario,
+    *,
+    seed: int,
+    meshcat: Meshcat | None = None,
+    picture: bool = False,
+    video: Path | None = None,
+) -> Cell:
+    """`build_cell` for a scenario of the command line.
+
+    Raises:
+        UserError: as `build_cell`, with the file's name.
+    """
+    try:
+        return build_cell(
+            chosen.scenario,
+            seed=seed,
+            base=chosen.base,
+            meshcat=meshcat,
+            picture=picture,
+            video=video,
+        )
+    except UserError as error:
+        raise UserError(f"{chosen.path}: {error}") from error
 
 
 def output_folder(arguments: argparse.Namespace, name: str) -> Path:

@@ -1,6 +1,7 @@
 """One episode from its first to its last step, and what is to be said of it afterwards."""
 
 import dataclasses
+import logging
 import math
 import time
 from collections.abc import Callable
@@ -70,8 +71,8 @@ def run_episode(
 ) -> EpisodeResult:
     """Runs an episode until the planner is done and the tools rest, or the time is up.
 
-    An error of the simulation (the contact solver not converging, a tool falling out of the world)
-    and Ctrl-C end the episode, not the program: the result tells of it, and of what was reached.
+    An error of the simulation (the contact solver not converging, say) or of the policy, and
+    Ctrl-C, end the episode, not the program: the result tells of it, and of what was reached.
 
     Args:
         cell: fresh from `build_cell`.
@@ -94,8 +95,12 @@ def run_episode(
         timed_out = monitor.done_since is None
     except KeyboardInterrupt:
         interrupted = True
-    except RuntimeError as error:
-        failure = " ".join(str(error).split())
+    except Exception as error:
+        # Drake's own errors are RuntimeErrors; what a policy raises may be anything, and its author
+        # wants to know where.
+        failure = " ".join(f"{type(error).__name__}: {error}".split())
+        if not isinstance(error, RuntimeError):
+            logging.getLogger(__name__).exception("the episode of seed %d failed", seed)
     wall_seconds = time.perf_counter() - start
     context = simulator.get_context()
     objects = score(cell, context)

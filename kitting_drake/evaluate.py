@@ -18,9 +18,9 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
-from kitting_drake.cell import build_cell
 from kitting_drake.cli import (
     ChosenScenario,
+    build_chosen,
     choose_scenario,
     count_type,
     output_folder,
@@ -50,7 +50,7 @@ def main() -> int:
     console = Console(quiet=arguments.quiet)
 
     # What cannot be built at all is told at once, not once for each seed.
-    build_cell(chosen.scenario, seed=seeds[0], base=chosen.base)
+    build_chosen(chosen, seed=seeds[0])
     episodes = evaluate(chosen, seeds, folder, workers=arguments.workers, console=console)
     summary = summarise(episodes, chosen)
     write_json(folder / "summary.json", summary)
@@ -158,7 +158,7 @@ def _run_apart(chosen: ChosenScenario, seed: int) -> Episode:
 def _work(chosen: ChosenScenario, seed: int, sender: Connection) -> None:
     # Ctrl-C is the parent's to handle.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    cell = build_cell(chosen.scenario, seed=seed, base=chosen.base)
+    cell = build_chosen(chosen, seed=seed)
     result = run_episode(
         cell,
         scenario=chosen.name,

@@ -10,9 +10,10 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 from kitting_drake.cameras import render_picture, save_png
-from kitting_drake.cell import Cell, build_cell
+from kitting_drake.cell import Cell
 from kitting_drake.cli import (
     INTERRUPTED,
+    build_chosen,
     choose_scenario,
     output_folder,
     run_verb,
@@ -54,10 +55,9 @@ def main() -> int:
     _check_endings(arguments.picture, arguments.video)
 
     meshcat = None if arguments.no_meshcat else _start_meshcat(console)
-    cell = build_cell(
-        scenario,
+    cell = build_chosen(
+        chosen,
         seed=seed,
-        base=chosen.base,
         meshcat=meshcat,
         picture=arguments.picture is not None,
         video=arguments.video,
@@ -105,7 +105,7 @@ def _start_meshcat(console: Console) -> Meshcat:
         meshcat = Meshcat(MeshcatParams(host="localhost", show_stats_plot=False))
     except RuntimeError as error:
         raise UserError(
-            "Meshcat finds no free port from 7000 to 7099: close other viewers, or give --no-meshcat"
+            "Meshcat finds no free port from 7000 to 7099: close viewers, or give --no-meshcat"
         ) from error
     meshcat.SetProperty("/Background", "top_color", [0.93, 0.95, 0.97])
     meshcat.SetProperty("/Background", "bottom_color", [0.80, 0.83, 0.86])

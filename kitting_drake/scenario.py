@@ -244,7 +244,7 @@ def load_scenario(path: Path, name: str | None = None, text: str | None = None) 
         reason = getattr(error, "strerror", None) or "it is not a text file"
         raise UserError(f"cannot read the scenario {path}: {reason}") from error
     root = _parse(content, str(path))
-    names = [key for key, value in root.items() if isinstance(key, str)]
+    names = list(root)
     fields = {item.name for item in dc.fields(Scenario)}
     if names and not set(names) - fields:
         raise UserError(
@@ -265,9 +265,10 @@ def load_scenario(path: Path, name: str | None = None, text: str | None = None) 
 
 def _parse(content: str, where: str) -> dict:
     try:
-        # A Python mapping would swallow a field that is given twice.
-        _check_duplicates(yaml.compose(content, Loader=yaml.SafeLoader))
-        root = yaml_load(data=content)
+        # A Python mapping swallows a field that is given twice.
+        _check_names(yaml.compose(content, Loader=yaml.SafeLoader))
+        # Drake takes an empty text for no text at all.
+        root = yaml_load(data=content) if content.strip() else None
     except yaml.YAMLError as error:
         mark = getattr(error, "problem_mark", None)
         line = f", line {mark.line + 1}" if mark else ""
@@ -284,18 +285,20 @@ def _parse(content: str, where: str) -> dict:
     return root
 
 
-def _check_duplicates(node: yaml.Node | None) -> None:
+def _check_names(node: yaml.Node | None) -> None:
     if isinstance(node, yaml.MappingNode):
         seen = set()
         for key, value in node.value:
+            line = key.start_mark.line + 1
+            if key.tag != "tag:yaml.org,2002:str":
+                raise ValueError(f"the name on line {line} must be a text")
             if key.value in seen:
-                line = key.start_mark.line + 1
                 raise ValueError(f"'{key.value}' is given twice (again on line {line})")
-            seen.add(str(key.value))
-            _check_duplicates(value)
+            seen.add(key.value)
+            _check_names(value)
     elif isinstance(node, yaml.SequenceNode):
         for item in node.value:
-            _check_duplicates(item)
+            _check_names(item)
 
 
 def _load(raw: object, content: str, name: str | None, defaults: Scenario, where: str) -> Scenario:
@@ -305,7 +308,12 @@ def _load(raw: object, content: str, name: str | None, defaults: Scenario, where
             scenario = defaults
         else:
             scenario = yaml_load_typed(
-                schema=Scenario, data=content, child_name=name, defaults=defaults
+                schema=Scenario,
+                data=content,
+                child_name=name,
+                defaults=defaults,
+                # A file's cameras and tools replace the default ones; --scenario_text adds.
+                retain_map_defaults=name is None,
             )
         check_bounds(scenario)
         _check_meaning(scenario)

@@ -55,7 +55,7 @@ def _check_union(schema: Any, value: Any, where: str) -> None:
         check_yaml(options[0], value, where)
         return
     # An untagged mapping takes the first option, as in Drake.
-    tag = value.get("_tag", f"!{options[0].__name__}").lstrip("!")
+    tag = str(value.get("_tag", options[0].__name__)).lstrip("!")
     for option in options:
         if option.__name__ == tag:
             check_yaml(option, value, where)

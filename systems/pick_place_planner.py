@@ -1,6 +1,5 @@
 """The pick-and-place motion primitive: a state machine that makes smooth, limited motions."""
 
-from dataclasses import dataclass
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -15,6 +14,13 @@ from pydrake.systems.framework import (
     LeafSystem,
 )
 
+from systems.hand_motion import (
+    MotionLimits,
+    braking_time,
+    motion_at,
+    motion_duration,
+    ramp,
+)
 from systems.pick_place_parameters import Mode, PickPlaceParameters
 from systems.signals import PickPlaceAction, wrap_to_pi
 
@@ -22,6 +28,7 @@ _FIELDS = (
     ["mode", "start_time", "duration"]
     + [f"start_{axis}" for axis in ("x", "y", "z", "yaw")]
     + [f"goal_{axis}" for axis in ("x", "y", "z", "yaw")]
+    + [f"start_rate_{axis}" for axis in ("x", "y", "z", "yaw")]
     + ["start_opening", "goal_opening", "start_force", "goal_force"]
     + ["pick_x", "pick_y", "pick_yaw", "place_x", "place_y", "place_yaw", "grasp_z"]
     + ["load", "actions", "missed", "dropped"]
@@ -30,21 +37,7 @@ _PlannerState = namedview("PlannerState", _FIELDS)
 _State: TypeAlias = Any
 """A `_PlannerState`, which is made at run time and is no type to a type checker."""
 
-_START, _GOAL = slice(3, 7), slice(7, 11)
-
-# Peaks of the minimum-jerk polynomial 10 s^3 - 15 s^4 + 6 s^5 over a unit distance in unit time.
-_PEAK_SPEED = 1.875
-_PEAK_ACCELERATION = 10 / np.sqrt(3)
-
-
-def minimum_jerk(s: float) -> tuple[float, float, float]:
-    """Value and first two derivatives of 10 s^3 - 15 s^4 + 6 s^5, s clamped to [0, 1]."""
-    s = min(max(s, 0.0), 1.0)
-    return (
-        s**3 * (10 + s * (6 * s - 15)),
-        30 * s**2 * (1 - s) ** 2,
-        60 * s * (1 - s) * (1 - 2 * s),
-    )
+_START, _GOAL, _START_RATE = slice(3, 7), slice(7, 11), slice(11, 15)
 
 
 def nearest_turns(pick_yaw: float, place_yaw: float) -> tuple[float, float]:
@@ -92,11 +85,11 @@ class PickPlacePlanner(LeafSystem):
 
     Every motion is a straight line in (x, y, z, yaw) with a minimum-jerk profile, at rest at both
     ends, as short as the limits on speed and acceleration allow. The two guarded motions, `DESCEND`
-    and `LOWER`, end where the vertical contact force rises `contact_threshold` above what the load
-    weighs, and hold the height reached: no known height of table, kit or cavity goes into them.
-    A grasp is good if the pads stand further apart than `minimum_width` and both feel at least half
-    of the grasp force; when it is not, or is lost on the way, the hand opens and goes home to look
-    again, which counts as an action.
+    and `LOWER`, stop dead where the vertical contact force rises `contact_threshold` above what the
+    load weighs, and hold the height reached: no known height of table, kit or cavity goes into
+    them. A grasp is good if the pads stand further apart than `minimum_width` and both feel at
+    least half of the grasp force; when it is not, or is lost on the way, the hand brakes, opens and
+    goes home to look again, which counts as an action.
 
     All memory is one vector of discrete state.
     """
@@ -144,7 +137,7 @@ class PickPlacePlanner(LeafSystem):
     def _calc_opening(self, context: Context, output: BasicVector) -> None:
         state = self._state(context)
         output.SetFromVector(
-            _ramp(
+            ramp(
                 state.start_opening,
                 state.goal_opening,
                 2 * self._parameters.finger_speed,
@@ -216,8 +209,12 @@ class PickPlacePlanner(LeafSystem):
 
     def _descend(self, context, state, time, hand, contact) -> None:
         if contact[2] > self._parameters.contact_threshold:
+            self._begin(state, Mode.CLOSE, time, z=hand[2])
             # Back off a little: pressed fingertips would not close.
-            self._begin(state, Mode.CLOSE, time, z=hand[2] + self._parameters.floor_clearance)
+            state.goal_z += self._parameters.floor_clearance
+            state.duration = motion_duration(
+                state[_GOAL] - state[_START], self._motions[Mode.CLOSE]
+            )
         elif time >= self._arrival(state):
             self._begin(state, Mode.CLOSE, time)
 
@@ -281,8 +278,8 @@ class PickPlacePlanner(LeafSystem):
             opening: hold the jaws at this opening from now on, in m.
         """
         parameters = self._parameters
-        now = _motion_at(state, time)[:4]
-        now_opening, _ = _ramp(
+        now, rate, _ = np.split(_motion_at(state, time), 3)
+        now_opening, _ = ramp(
             state.start_opening,
             state.goal_opening,
             2 * parameters.finger_speed,
@@ -290,6 +287,7 @@ class PickPlacePlanner(LeafSystem):
         )
         if z is not None:
             now[2] = z
+            rate = np.zeros(4)
         if opening is not None:
             now_opening = opening
         state.start_force = state.goal_force
@@ -297,6 +295,7 @@ class PickPlacePlanner(LeafSystem):
         state.start_time = time
         state[_START] = now
         state[_GOAL] = now
+        state[_START_RATE] = rate
         state.start_opening = state.goal_opening = now_opening
 
         if mode == Mode.OBSERVE:
@@ -324,7 +323,13 @@ class PickPlacePlanner(LeafSystem):
             if mode == Mode.RETREAT:
                 state.goal_opening = now_opening
                 state.goal_z = parameters.travel_height
-        state.duration = _duration(state[_GOAL] - state[_START], self._motions[mode])
+        limits = self._motions[mode]
+        state.duration = max(
+            motion_duration(state[_GOAL] - state[_START], limits), braking_time(rate, limits)
+        )
+        if mode == Mode.RETREAT:
+            # Called off on the way: come to rest where braking ends.
+            state[_GOAL] += rate * state.duration / 2 * np.array([1.0, 1.0, 0.0, 1.0])
 
     def _arrival(self, state: _State) -> float:
         """When the motion, the jaws and the force of the present mode have arrived, in s."""
@@ -335,58 +340,22 @@ class PickPlacePlanner(LeafSystem):
         return float(state.start_time + max(state.duration, opening_time, force_time))
 
 
-@dataclass(frozen=True)
-class _Limits:
-    speed: float
-    acceleration: float
-    yaw_speed: float
-    yaw_acceleration: float
-
-
-def _motions(parameters: PickPlaceParameters) -> dict[Mode, _Limits]:
+def _motions(parameters: PickPlaceParameters) -> dict[Mode, MotionLimits]:
     """The limits of each mode's motion."""
     yaw = (parameters.yaw_speed, parameters.yaw_acceleration)
-    free = _Limits(parameters.linear_speed, parameters.linear_acceleration, *yaw)
-    carry = _Limits(parameters.carry_speed, parameters.carry_acceleration, *yaw)
+    free = MotionLimits(parameters.linear_speed, parameters.linear_acceleration, *yaw)
+    carry = MotionLimits(parameters.carry_speed, parameters.carry_acceleration, *yaw)
     limits = dict.fromkeys(Mode, free)
     limits[Mode.LIFT] = limits[Mode.CARRY] = carry
-    limits[Mode.DESCEND] = _Limits(parameters.descend_speed, parameters.linear_acceleration, *yaw)
-    limits[Mode.LOWER] = _Limits(parameters.lower_speed, parameters.carry_acceleration, *yaw)
-    return limits
-
-
-def _duration(displacement: NDArray[np.float64], limits: _Limits) -> float:
-    """The shortest minimum-jerk motion over (dx, dy, dz, dyaw) within the limits, in s."""
-    distance, turn = float(np.linalg.norm(displacement[:3])), abs(float(displacement[3]))
-    return max(
-        _PEAK_SPEED * distance / limits.speed,
-        np.sqrt(_PEAK_ACCELERATION * distance / limits.acceleration),
-        _PEAK_SPEED * turn / limits.yaw_speed,
-        np.sqrt(_PEAK_ACCELERATION * turn / limits.yaw_acceleration),
+    limits[Mode.DESCEND] = MotionLimits(
+        parameters.descend_speed, parameters.linear_acceleration, *yaw
     )
+    limits[Mode.LOWER] = MotionLimits(parameters.lower_speed, parameters.carry_acceleration, *yaw)
+    return limits
 
 
 def _motion_at(state: _State, time: float) -> NDArray[np.float64]:
     """q_d, v_d, a_d (12) of the present mode's motion."""
-    duration = state.duration
-    s = (time - state.start_time) / duration if duration > 0 else 1.0
-    value, speed, acceleration = minimum_jerk(s)
-    if duration <= 0:
-        duration = 1.0
-    delta = state[_GOAL] - state[_START]
-    return np.concatenate(
-        [
-            state[_START] + value * delta,
-            speed / duration * delta,
-            acceleration / duration**2 * delta,
-        ]
+    return motion_at(
+        state[_START], state[_GOAL], state[_START_RATE], state.duration, time - state.start_time
     )
-
-
-def _ramp(start: float, goal: float, rate: float, elapsed: float) -> tuple[float, float]:
-    """Value and rate of a ramp at constant speed that stops at its goal."""
-    distance = goal - start
-    travelled = rate * max(elapsed, 0.0)
-    if travelled >= abs(distance):
-        return goal, 0.0
-    return start + np.copysign(travelled, distance), float(np.copysign(rate, distance))

@@ -9,7 +9,6 @@ the same cavity without the voxels, their steps, and the smoothing that has to h
 
 import hashlib
 import os
-import shutil
 import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -212,8 +211,9 @@ def kit_cavities(tools: Sequence[Tool], parameters: KitParameters) -> list[Cavit
         x, y, z = cavity_place(tool, parameters)
         if z < parameters.minimum_wall:
             raise UserError(
-                f"'{tool.name}' is {1e3 * tool.height:.1f} mm high and leaves no floor in a kit "
-                f"block of {1e3 * parameters.height:.1f} mm"
+                f"'{tool.name}' is {1e3 * tool.height:.1f} mm high and leaves less than "
+                f"kit.minimum_wall, {1e3 * parameters.minimum_wall:.1f} mm, below it in a block of "
+                f"{1e3 * parameters.height:.1f} mm"
             )
         outline = cavity_outline(tool.silhouette, parameters).translate((x, y))
         cavities[tool.name] = Cavity(outline, z, parameters.height, parameters.lead_in)
@@ -296,18 +296,17 @@ def make_kit(tools: Sequence[Tool], parameters: KitParameters) -> Kit:
     if final.is_dir():
         return kit
     cavities = kit_cavities(tools, parameters)
-    final.parent.mkdir(parents=True, exist_ok=True)
-    scratch = Path(tempfile.mkdtemp(dir=final.parent, prefix=".making-"))
     try:
-        _write(cavities, parameters, scratch)
-        scratch.chmod(0o755)
-        os.rename(scratch, final)
-    except OSError:
+        final.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(dir=final.parent, prefix=".making-") as folder:
+            scratch = Path(folder) / "kit"
+            scratch.mkdir()
+            _write(cavities, parameters, scratch)
+            os.rename(scratch, final)
+    except OSError as error:
+        # Unless another process was quicker: its kit is the same.
         if not final.is_dir():
-            raise
-        # Another process was quicker; its kit is the same.
-    finally:
-        shutil.rmtree(scratch, ignore_errors=True)
+            raise UserError(f"cannot write the kit to {final.parent}: {error.strerror}") from error
     return kit
 
 

@@ -57,9 +57,9 @@ def tool_sdf(
     """A model with one free link named `tool`, whose frame is the tool frame T.
 
     Mass in kg, centre of mass (3,) in m, inertia about it (3, 3) in kg m^2; visuals: pairs of OBJ
-    file and key of MATERIALS, collisions are OBJ files of convex pieces, all beside the SDFormat.
+    file and key of MATERIALS, collisions are OBJ files of convex pieces, all beside the SDFormat,
+    which names them relatively: a tool's folder may be copied and moved.
     """
-    package = f"package://kitting_models/tools/{name}"
     moments = "".join(
         f"<i{'xyz'[i]}{'xyz'[j]}>{inertia[i, j]:.9g}</i{'xyz'[i]}{'xyz'[j]}>"
         for i in range(3)
@@ -81,13 +81,11 @@ def tool_sdf(
         mass=_numbers([mass]),
         moments=moments,
         visuals="".join(
-            _VISUAL.format(
-                name=material, uri=f"{package}/{file}", rgba=_numbers(MATERIALS[material].rgba)
-            )
+            _VISUAL.format(name=material, uri=file, rgba=_numbers(MATERIALS[material].rgba))
             for file, material in visuals
         ),
         collisions="".join(
-            _COLLISION.format(name=Path(file).stem, uri=f"{package}/{file}", properties=properties)
+            _COLLISION.format(name=Path(file).stem, uri=file, properties=properties)
             for file in collisions
         ),
     )

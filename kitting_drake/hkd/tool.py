@@ -60,9 +60,12 @@ class Tool:
 
     @cached_property
     def triangles(self) -> NDArray[np.float64]:
-        """(n, 3, 3) the triangles of the visual surface, in T, in metres."""
-        meshes = [trimesh.load_mesh(path, process=False) for path in self.visual_meshes]
-        return np.concatenate([np.asarray(mesh.triangles) for mesh in meshes])
+        """(n, 3, 3) the triangles of the visual surface, in T, in metres.
+
+        Raises:
+            UserError: a file that is not a mesh.
+        """
+        return np.concatenate([_read_triangles(path) for path in self.visual_meshes])
 
     @cached_property
     def silhouette(self) -> CrossSection:
@@ -75,6 +78,16 @@ class Tool:
         mesh = trimesh.Trimesh(self.triangles.reshape(-1, 3), faces, process=False)
         points, _ = trimesh.sample.sample_surface(mesh, count, seed=seed)
         return np.asarray(points, dtype=float)
+
+
+def _read_triangles(path: Path) -> NDArray[np.float64]:
+    try:
+        triangles = np.asarray(trimesh.load_mesh(path, process=False).triangles, dtype=float)
+    except (OSError, ValueError, TypeError, AttributeError, IndexError, KeyError) as error:
+        raise UserError(f"{path} is not a mesh that can be read: {error}") from error
+    if not len(triangles) or not np.isfinite(triangles).all():
+        raise UserError(f"{path} holds no triangles, or some without a place")
+    return triangles
 
 
 def silhouette(triangles: NDArray[np.float64]) -> CrossSection:
@@ -97,7 +110,7 @@ def load_tool(name: str, base: Path | None = None) -> Tool:
         UserError: no such tool, or a record or a mesh that is missing or broken.
     """
     directory = MODELS / "tools" / name
-    if not (directory / "tool.yaml").is_file():
+    if Path(name).name != name or not (directory / "tool.yaml").is_file():
         directory = ((base or Path.cwd()) / name).resolve()
     record_path = directory / "tool.yaml"
     if not record_path.is_file():

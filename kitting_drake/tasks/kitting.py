@@ -52,8 +52,11 @@ def make_scene(
     Raises:
         UserError: an unknown tool, tools that make no kit, or no free space for them all.
     """
-    tools = [load_tool(name, base) for name in task.tools]
-    kit = make_kit(tools, task.kit)
+    try:
+        tools = [load_tool(name, base) for name in task.tools]
+        kit = make_kit(tools, task.kit)
+    except UserError as error:
+        raise UserError(f"task.tools: {error}") from error
     if isinstance(task, ArrangedKitting):
         X_WKit = _pose(task.kit_pose)
         X_WTools = [_pose(placement) for placement in task.tools.values()]

@@ -264,9 +264,6 @@ def test_a_policy_that_cannot_be_had_is_named(function: str, message: str):
         build(Scenario(policy=PythonPolicy(function=function)))
 
 
-@pytest.mark.xfail(
-    strict=True, raises=ValueError, reason="bug: ends the program in a traceback, not the episode"
-)
 @pytest.mark.usefixtures("rendering")
 def test_a_policy_that_fails_ends_the_episode_with_its_reason(monkeypatch: pytest.MonkeyPatch):
     def fail(_: Observation) -> PickPlaceAction:
@@ -311,7 +308,6 @@ def test_a_tool_of_ones_own(own_tool: Path):
     assert len(cell.plant.GetCollisionGeometriesForBody(cell.tool_bodies[0])) == 6
 
 
-@pytest.mark.xfail(strict=True, reason="bug: Drake's parser's RuntimeError, shown as a traceback")
 @pytest.mark.parametrize("spoilt", ["collision_0.obj", "flat_screwdriver.sdf"])
 def test_a_model_that_cannot_be_parsed_is_the_users_to_mend(own_tool: Path, spoilt: str):
     if spoilt.endswith(".obj"):
@@ -322,7 +318,6 @@ def test_a_model_that_cannot_be_parsed_is_the_users_to_mend(own_tool: Path, spoi
         build(Scenario(task=Kitting(tools=[str(own_tool)])))
 
 
-@pytest.mark.xfail(strict=True, reason="bug: numpy's ValueError, shown as a traceback")
 def test_a_mesh_that_is_none_is_the_users_to_mend(own_tool: Path):
     for name in ("red_grip.obj", "black_rubber.obj", "polished_steel.obj"):
         (own_tool / name).write_text("not a mesh\n")

@@ -64,7 +64,6 @@ def test_a_missing_file_is_named(copy: Path, name: str):
         load_tool(str(copy))
 
 
-@pytest.mark.xfail(strict=True, reason="bug: ./NAME takes the shipped tool, not the folder")
 def test_a_path_is_not_a_name(copy: Path, tmp_path: Path):
     mine = copy.rename(tmp_path / "claw_hammer")
     assert load_tool("./claw_hammer", tmp_path).directory == mine

@@ -106,7 +106,6 @@ def test_no_free_space_is_told_with_the_fields_to_change():
         draw(0, grid=PixelGrid(rows=110, cols=110))
 
 
-@pytest.mark.xfail(strict=True, reason="bug: the message names neither the file nor the field")
 @pytest.mark.parametrize("tools", [["spoon"], ["claw_hammer", "claw_hammer"]])
 def test_tools_that_cannot_be_had_are_told_by_their_field(tools: list[str]):
     with pytest.raises(UserError, match=r"task\.tools"):
