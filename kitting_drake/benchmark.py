@@ -1,4 +1,4 @@
-"""`python -m kitting_drake.benchmark simulation`: what the cell costs, measured here and now."""
+"""`python -m kitting_drake.benchmark simulation | kits`: what things cost here and now."""
 
 import argparse
 import os
@@ -22,6 +22,10 @@ from kitting_drake.cell import Cell, build_cell
 from kitting_drake.cli import count_type, run_verb, seed_type
 from kitting_drake.episode import run_episode
 from kitting_drake.files import require_folder, write_json
+from kitting_drake.hkd.clearance import measure_clearance
+from kitting_drake.hkd.kit import KitParameters, build_block, contact_surface, kit_cavities
+from kitting_drake.hkd.tool import load_tool
+from kitting_drake.hkd.toolsets import SPLITS, toolsets
 from kitting_drake.paths import SCENARIOS
 from kitting_drake.scenario import Scenario, load_scenario
 from systems.pick_place_planner import Mode
@@ -38,18 +42,26 @@ def main() -> int:
     simulation = verbs.add_parser("simulation", help="phases of an episode, start-up, images")
     simulation.add_argument("--episodes", type=count_type, default=3, help="how many to run (3)")
     simulation.add_argument("--seed", type=seed_type, default=0, help="of the first (0)")
-    simulation.add_argument(
-        "--output", type=Path, default=Path("output/benchmark"), help="where the JSON goes"
-    )
-    simulation.add_argument("--quiet", action="store_true", help="print nothing but errors")
+    kits = verbs.add_parser("kits", help="building time, clearance and size of the dataset's kits")
+    kits.add_argument("--kits", type=count_type, help="how many of each split (default: all)")
+    for verb in (simulation, kits):
+        verb.add_argument(
+            "--output", type=Path, default=Path("output/benchmark"), help="where the JSON goes"
+        )
+        verb.add_argument("--quiet", action="store_true", help="print nothing but errors")
     arguments = parser.parse_args()
     console = Console(quiet=arguments.quiet)
     folder = require_folder(arguments.output)
     # One core, as claimed; children inherit it.
     os.sched_setaffinity(0, {max(os.sched_getaffinity(0))})
-    measured = benchmark_simulation(arguments.episodes, arguments.seed, console)
-    write_json(folder / "simulation.json", measured)
-    for table in simulation_tables(measured):
+    if arguments.verb == "simulation":
+        measured = benchmark_simulation(arguments.episodes, arguments.seed, console)
+        tables = simulation_tables(measured)
+    else:
+        measured = benchmark_kits(arguments.kits, console)
+        tables = [kits_table(measured)]
+    write_json(folder / f"{arguments.verb}.json", measured)
+    for table in tables:
         console.print(table)
     console.print(f"files: {folder}/", highlight=False)
     return 0
@@ -175,6 +187,62 @@ def _timed(function: Callable[[], None]) -> float:
     start = time.perf_counter()
     function()
     return time.perf_counter() - start
+
+
+def benchmark_kits(count: int | None, console: Console) -> dict[str, Any]:
+    """Builds the dataset's kits anew and measures them; times in seconds, lengths in millimetres.
+
+    Args:
+        count: how many of each split, or all when None.
+        console: for progress.
+    """
+    parameters = KitParameters()
+    build_times, triangles, medians, minima = [], [], [], []
+    chosen = [names for split in SPLITS for names in toolsets(split)[:count]]
+    for names in track(chosen, "kits", console=console, transient=True, disable=console.quiet):
+        start = time.perf_counter()
+        # From the meshes on disk to the block, with nothing remembered.
+        tools = [load_tool(name) for name in names]
+        cavities = kit_cavities(tools, parameters)
+        block = build_block(cavities, parameters)
+        _, faces = contact_surface(cavities, parameters)
+        build_times.append(time.perf_counter() - start)
+        triangles.append(len(faces))
+        for tool in tools:
+            clearance = measure_clearance(block, tool, parameters)
+            medians.append(1e3 * clearance.median)
+            minima.append(1e3 * clearance.minimum)
+    return {
+        "kits": len(chosen),
+        "build_s": {"median": float(np.median(build_times)), "max": max(build_times)},
+        "contact_triangles": {"median": float(np.median(triangles)), "max": max(triangles)},
+        "clearance_mm": {
+            "smallest_median": min(medians),
+            "median": float(np.median(medians)),
+            "largest_median": max(medians),
+            "minimum": min(minima),
+        },
+    }
+
+
+def kits_table(measured: dict[str, Any]) -> Table:
+    """For the terminal."""
+    table = Table(title=f"{measured['kits']} kits, one core", title_justify="left")
+    table.add_column("what")
+    table.add_column("measured", justify="right")
+    build, triangles = measured["build_s"], measured["contact_triangles"]
+    clearance = measured["clearance_mm"]
+    table.add_row("building, s: median, slowest", f"{build['median']:.2f}, {build['max']:.2f}")
+    table.add_row(
+        "triangles for the contact solver: median, most",
+        f"{triangles['median']:.0f}, {triangles['max']}",
+    )
+    table.add_row(
+        "clearance, mm: median along an outline, over all cavities",
+        f"{clearance['smallest_median']:.2f} to {clearance['largest_median']:.2f}",
+    )
+    table.add_row("clearance, mm: least anywhere", f"{clearance['minimum']:.2f}")
+    return table
 
 
 def simulation_tables(measured: dict[str, Any]) -> list[Table]:

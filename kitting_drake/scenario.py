@@ -14,6 +14,7 @@ from pydrake.common.yaml import yaml_load, yaml_load_typed
 
 from kitting_drake.errors import UserError
 from kitting_drake.hkd.kit import KitParameters
+from kitting_drake.hkd.toolsets import SPLITS
 from kitting_drake.yaml_schema import check_yaml
 from systems.bounds import bounded, check_bounds
 from systems.pick_place_planner import PickPlaceParameters
@@ -34,18 +35,8 @@ class Placement:
 
 
 @dc.dataclass
-class Kitting:
-    """Tools and kit stand anywhere in the workspace, drawn from the seed without collision."""
-
-    # The tools, one of each category at most: names under models/tools, or paths of tool folders.
-    tools: list[str] = dc.field(
-        default_factory=lambda: [
-            "claw_hammer",
-            "slip_joint_pliers",
-            "combination_wrench",
-            "flat_screwdriver",
-        ]
-    )
+class _DrawnKitting:
+    """What tasks share whose tools and kit stand anywhere in the workspace, drawn from the seed."""
 
     # The kit block and its cavities.
     kit: KitParameters = dc.field(default_factory=KitParameters)
@@ -61,6 +52,29 @@ class Kitting:
 
     # ADD-S below this is a success (section IV-C of the paper), in m.
     success_threshold: float = bounded(0.0035, 1e-6, 1.0)
+
+
+@dc.dataclass
+class Kitting(_DrawnKitting):
+    """One toolset and its kit, in poses drawn from the seed: kitting-seen-toolset."""
+
+    # The tools, one of each category at most: names under models/tools, or paths of tool folders.
+    tools: list[str] = dc.field(
+        default_factory=lambda: [
+            "claw_hammer",
+            "slip_joint_pliers",
+            "combination_wrench",
+            "flat_screwdriver",
+        ]
+    )
+
+
+@dc.dataclass
+class ToolsetKitting(_DrawnKitting):
+    """Toolset and kit drawn from the seed too, out of a pool: kitting-unseen-toolsets."""
+
+    # The pool: train or test (section IV-B.1 of the paper).
+    split: str = "test"
 
 
 @dc.dataclass
@@ -200,8 +214,8 @@ class Scenario:
     # Live viewing: 1 is real time, 0 as fast as the machine allows.
     target_realtime_rate: float = bounded(0.0, 0.0, 100.0)
 
-    # What stands on the table, and its score: !Kitting or !ArrangedKitting.
-    task: Kitting | ArrangedKitting = dc.field(default_factory=Kitting)
+    # What stands on the table, and its score: !Kitting, !ToolsetKitting or !ArrangedKitting.
+    task: Kitting | ToolsetKitting | ArrangedKitting = dc.field(default_factory=Kitting)
 
     # Who decides: !Oracle or !PythonPolicy.
     policy: Oracle | PythonPolicy = dc.field(default_factory=Oracle)
@@ -338,7 +352,11 @@ def _check_meaning(scenario: Scenario) -> None:
         )
     if scenario.heightmap.z_max <= scenario.heightmap.z_min:
         raise ValueError("heightmap.z_max must be above heightmap.z_min")
-    if not scenario.task.tools:
+    task = scenario.task
+    if isinstance(task, ToolsetKitting):
+        if task.split not in SPLITS:
+            raise ValueError(f"task.split must be one of {', '.join(SPLITS)}, not '{task.split}'")
+    elif not task.tools:
         raise ValueError("task.tools is empty: name at least one tool")
     for key, camera in scenario.cameras.items():
         if isinstance(camera, LookAt) and camera.position[:2] == camera.target[:2]:

@@ -1,20 +1,22 @@
-"""The hand tools: `python -m kitting_drake.hkd list | generate | sheet`, each of `[NAME...]`."""
+"""The dataset: tools and kits, `python -m kitting_drake.hkd VERB`."""
 
 import argparse
 from pathlib import Path
 
 import yaml
 from rich.console import Console
-from rich.progress import track
+from rich.progress import Progress, track
 from rich.table import Table
 
-from kitting_drake.cli import run_verb
+from kitting_drake.cli import count_type, run_verb
 from kitting_drake.hkd.generate import (
     CatalogueError,
     ToolEntry,
     generate_tool,
     load_catalogue,
 )
+from kitting_drake.hkd.tool import load_tool
+from kitting_drake.hkd.toolsets import SPLITS, toolsets
 from kitting_drake.paths import MODELS
 
 
@@ -81,12 +83,37 @@ def generate(args: argparse.Namespace, entries: list[ToolEntry]) -> None:
 def sheet(args: argparse.Namespace, entries: list[ToolEntry]) -> None:
     """Renders the contact sheet."""
     # Imported here: Drake is slow to load, and only this verb needs it.
-    from kitting_drake.hkd.sheet import write_sheet
+    from kitting_drake.hkd.kit import KitParameters, make_kit
+    from kitting_drake.hkd.sheet import kit_subject, tool_subject, write_sheet
 
-    names = [entry.name for entry in _chosen(entries, args.names)]
-    for name in names:
-        _description(args.models, name)
-    write_sheet(args.models, names, args.output)
+    if args.kits:
+        chosen = toolsets(args.split)[: args.kits]
+        kits = [make_kit([load_tool(name) for name in names], KitParameters()) for names in chosen]
+        subjects = [kit_subject(f"{args.split} {i:03d}", kit) for i, kit in enumerate(kits)]
+    else:
+        subjects = [tool_subject(load_tool(entry.name)) for entry in _chosen(entries, args.names)]
+    write_sheet(subjects, args.output)
+
+
+def build(args: argparse.Namespace, entries: list[ToolEntry]) -> None:
+    """Writes the whole dataset, tools and kits, to a folder that other simulators can load."""
+    from kitting_drake.hkd.dataset import build_dataset
+
+    with Progress(console=Console(stderr=True), transient=True, disable=args.quiet) as progress:
+        task = progress.add_task("kits", total=None)
+        manifest = build_dataset(
+            args.output, lambda done, total: progress.update(task, completed=done, total=total)
+        )
+    if not args.quiet:
+        counts = f"{len(manifest['tools'])} tools and {len(manifest['kits'])} kits"
+        Console().print(f"{counts}: {args.output}/manifest.json", highlight=False)
+
+
+def annotate(args: argparse.Namespace, entries: list[ToolEntry]) -> None:
+    """Opens a page to look at a tool, move a gripper over it, and save its grasp."""
+    from kitting_drake.hkd.annotate import annotate as annotate_tool
+
+    annotate_tool(args.name, Console())
 
 
 def main() -> int:
@@ -106,6 +133,17 @@ def main() -> int:
             verb.add_argument("--quiet", action="store_true", help="print nothing")
         if name == "sheet":
             verb.add_argument("--output", type=Path, required=True, help="the PNG to write")
+            verb.add_argument("--kits", type=count_type, help="draw as many kits instead of tools")
+            verb.add_argument(
+                "--split", choices=SPLITS, default="train", help="which kits (default: train)"
+            )
+    builder = verbs.add_parser("build", help=build.__doc__)
+    builder.add_argument("--output", type=Path, required=True, help="the folder to make")
+    builder.add_argument("--quiet", action="store_true", help="print nothing")
+    builder.set_defaults(function=build)
+    annotator = verbs.add_parser("annotate", help=annotate.__doc__)
+    annotator.add_argument("name", metavar="NAME", help="a tool's name, or its folder")
+    annotator.set_defaults(function=annotate)
     args = parser.parse_args()
     args.function(args, load_catalogue(args.models / "tools" / "catalogue.yaml"))
     return 0

@@ -6,6 +6,7 @@ outline decides whether the tool enters its cavity, and on xz and yz, where the 
 it lies on.
 """
 
+import itertools
 from collections.abc import Sequence
 
 import manifold3d
@@ -64,6 +65,9 @@ def _farthest(points: np.ndarray, chosen: list[int], tolerance: float) -> list[i
     dimension = points.shape[1]
     directions = np.array(np.meshgrid(*[[-1.0, 0.0, 1.0]] * dimension)).reshape(dimension, -1).T
     chosen = list(dict.fromkeys([*chosen, *np.argmax(points @ directions.T, axis=0)]))
+    if len(chosen) <= dimension:
+        # A sliver, which has no hull to grow; it has few points anyhow.
+        return list(range(len(points)))
     while True:
         equations = ConvexHull(points[chosen], qhull_options="QJ Pp").equations
         distance = (points @ equations[:, :-1].T + equations[:, -1]).max(axis=1)
@@ -151,6 +155,37 @@ def cover(
         result.append(wanted)
         open_pieces -= members
     return _pruned(result, 0.5 * tolerance)
+
+
+def runs(
+    sections: Sequence[np.ndarray], tolerance: float, height_tolerance: float
+) -> list[np.ndarray]:
+    """The hulls along a loft through `sections`, (n, 3) each, few and long.
+
+    Neighbours are joined as long as the shadow on xy grows by at most `tolerance`, and the others,
+    which decide nothing beside a cavity's wall, by at most `height_tolerance` (both mm).
+    """
+    pairs = [np.vstack(pair) for pair in itertools.pairwise(sections)]
+    result, first = [], 0
+    for last in range(1, len(pairs) + 1):
+        if last < len(pairs):
+            trial = np.vstack(pairs[first : last + 1])
+            if all(
+                (
+                    silhouette([trial], plane)
+                    - _grown(silhouette(pairs[first : last + 1], plane), limit)
+                ).area()
+                <= _AREA
+                for plane, limit in (
+                    (_XY, tolerance),
+                    (_XZ, height_tolerance),
+                    (_YZ, height_tolerance),
+                )
+            ):
+                continue
+        result.append(np.vstack(pairs[first:last]))
+        first = last
+    return result
 
 
 def _pruned(pieces: list[np.ndarray], tolerance: float) -> list[np.ndarray]:

@@ -6,7 +6,7 @@ reaches to either side, at each height: the tool's horizontal slices give that, 
 lies along the closing direction follows, because a grasp is amid the faces that it grips.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,7 +29,7 @@ _TOUCH = 0.0003
 # The hand's upper fingers stand this much further out than its pads.
 _FINGER_RECESS = 0.003
 # Steeper than this, faces that narrow upward slip down out of the pads.
-_STEEPEST = np.radians(20.0)
+_STEEPEST = np.radians(28.0)
 # The least share of the pads' length that touches on both sides at once.
 _LEAST_CONTACT = 0.15
 # From the middle of a tool in its kit to where a neighbour begins.
@@ -87,7 +87,7 @@ def propose_grasps(triangles: Array, center_of_mass: Array) -> list[GraspProposa
     com = np.asarray(center_of_mass, dtype=float)[:2]
 
     def search(theta: float, near: float | None = None) -> list[GraspProposal]:
-        return _search(points, level, levels, triangles, com, theta, near)
+        return _search(points, level, levels, com, theta, near)
 
     # A turn by pi swaps the jaws, which are alike.
     coarse = np.radians(np.arange(-90.0, 90.0, _COARSE_DEG))
@@ -98,6 +98,8 @@ def propose_grasps(triangles: Array, center_of_mass: Array) -> list[GraspProposa
         near = float(along @ (proposal.x, proposal.y))
         fine = [p for d in _FINE_DEG for p in search(proposal.theta + float(np.radians(d)), near)]
         result.append(min([proposal, *fine], key=lambda p: p.cost))
+    tops = [_top(triangles, proposal) for proposal in result]
+    result = [replace(p, surface_height=top) for p, top in zip(result, tops, strict=True)]
     return sorted(result, key=lambda p: p.cost)
 
 
@@ -131,13 +133,13 @@ def _search(
     points: Array,
     level: NDArray[np.int64],
     levels: Array,
-    triangles: Array,
     com: Array,
     theta: float,
     near: float | None,
 ) -> list[GraspProposal]:
     """The acceptable grasps with one turn of the hand: along all of the tool, or about `near`."""
-    along, across = np.array([np.cos(theta), np.sin(theta)]), np.array([-np.sin(theta), np.cos(theta)])
+    along = np.array([np.cos(theta), np.sin(theta)])
+    across = np.array([-along[1], along[0]])
     u, v = points @ along, points @ across
     pad, finger = round(PAD_LENGTH / 2 / _BIN), round(FINGER_LENGTH / 2 / _BIN)
     u_min = u.min() - finger * _BIN
@@ -165,24 +167,23 @@ def _search(
         if not len(occupied):
             continue
         where = u_min + centre * _BIN
-        proposal = _judge(
+        judged = _judge(
             left[pads], right[pads], left[fingers], right[fingers], levels, occupied[-1]
         )
-        if proposal is None:
+        if judged is None:
             continue
-        middle, width, contact, depth, slope, overhang, twist, bottom = proposal
+        middle, width, contact, depth, slope, overhang, twist = judged
         x, y = where * along + middle * across
         lever = abs(where - float(com @ along))
         aside = abs(middle - float(com @ across))
-        top = _top(triangles, along, where) if near is not None else float(bottom + GRASP_DEPTH)
         reach = abs(y) + (width / 2 + RELEASE_REACH) * abs(np.cos(theta)) + (
             FINGER_LENGTH / 2 * abs(np.sin(theta))
         )
         penalties = {
-            "centre of mass": lever / 0.025 + aside / 0.100,
+            "centre of mass": lever / 0.025 + (lever / 0.040) ** 2 + aside / 0.100,
             "contact along the pads": 1.2 * (1 - contact),
             "contact down the pads": 0.6 * (1 - depth),
-            "slope": slope / np.radians(10.0),
+            "slope": (slope / np.radians(18.0)) ** 2,
             "overhang": max(overhang, 0.0) / 0.003,
             "twist": twist / 0.009,
             "narrow": max(0.0, 0.008 - width) / 0.005,
@@ -195,7 +196,7 @@ def _search(
                 y=float(y),
                 theta=float((theta + np.pi / 2) % np.pi - np.pi / 2),
                 width=float(width),
-                surface_height=top,
+                surface_height=float(levels[occupied[-1]]),
                 offset=float(np.hypot(lever, aside)),
                 contact=contact,
                 depth=depth,
@@ -209,7 +210,7 @@ def _search(
 
 def _judge(
     left: Array, right: Array, finger_left: Array, finger_right: Array, levels: Array, top: int
-) -> tuple[float, float, float, float, float, float, float, float] | None:
+) -> tuple[float, float, float, float, float, float, float] | None:
     """What two pads would grip, from how far the tool reaches to either side of them.
 
     Args:
@@ -220,7 +221,7 @@ def _judge(
 
     Returns:
         None if they cannot hold it; else the middle and the width between the faces, the shares of
-        contact along and down the pads, slope, overhang, twist, and the height of the pads' ends.
+        contact along and down the pads, slope, overhang and twist.
     """
     step = levels[1] - levels[0]
     bottom = max(levels[top] + step / 2 - GRASP_DEPTH, FLOOR_CLEARANCE)
@@ -258,7 +259,7 @@ def _judge(
         - np.average(places, weights=touch_right.sum(axis=1))
     )
     middle = (furthest_left + furthest_right) / 2
-    return float(middle), float(width), contact, depth, slope, overhang, float(twist), float(bottom)
+    return float(middle), float(width), contact, depth, slope, overhang, float(twist)
 
 
 def _lean(profile: Array, step: float) -> float:
@@ -269,18 +270,19 @@ def _lean(profile: Array, step: float) -> float:
     return float(np.arctan2(profile[0] - profile[above], above * step))
 
 
-def _top(triangles: Array, along: Array, where: float) -> float:
-    """The greatest height of a surface within the pads' length about `where`."""
-    u = triangles[..., :2] @ along - where
+def _top(triangles: Array, grasp: Grasp) -> float:
+    """The greatest height of a surface within the pads' length about a grasp."""
+    along = np.array([np.cos(grasp.theta), np.sin(grasp.theta)])
+    u = (triangles[..., :2] - (grasp.x, grasp.y)) @ along
     z = triangles[..., 2]
     half = PAD_LENGTH / 2
-    best = [z[np.abs(u) <= half]]
+    heights = [z[np.abs(u) <= half]]
     next_u, next_z = np.roll(u, -1, axis=1), np.roll(z, -1, axis=1)
     for edge in (-half, half):
         crosses = (u < edge) != (next_u < edge)
         share = (edge - u[crosses]) / (next_u[crosses] - u[crosses])
-        best.append(z[crosses] + share * (next_z[crosses] - z[crosses]))
-    return float(np.concatenate(best).max())
+        heights.append(z[crosses] + share * (next_z[crosses] - z[crosses]))
+    return float(np.concatenate(heights).max())
 
 
 def _distinct(proposals: list[GraspProposal]) -> list[GraspProposal]:

@@ -1,10 +1,14 @@
 """Hammers: a forged head on a wooden handle. They lie on the side, the face toward +y."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from manifold3d import Manifold, OpType
 
+from kitting_drake.errors import UserError
+from kitting_drake.hkd.hammer_heads import HeadEnd, build_head
+from kitting_drake.hkd.hammer_shafts import PROUD_MM, Shaft, build_shaft
 from kitting_drake.hkd.solids import (
     Part,
     Shape,
@@ -14,9 +18,6 @@ from kitting_drake.hkd.solids import (
     loft,
     rounded_rectangle,
 )
-
-# How far the handle's end stands out of the eye.
-_PROUD_MM = 1.4
 
 
 @dataclass
@@ -53,13 +54,30 @@ class HammerParameters:
     face_material: str = "polished_steel"
     handle_material: str = "hickory"
     grip_material: str = "painted_wood"
+    # Any other kind of hammer: its two ends and its shaft, which replace the bell, the claw and the
+    # handle above; their fields stand in hammer_heads.py and hammer_shafts.py. Mappings are taken
+    # for the values of their fields. All three or none.
+    front: HeadEnd | dict[str, Any] | None = None
+    back: HeadEnd | dict[str, Any] | None = None
+    shaft: Shaft | dict[str, Any] | None = None
+    # Corners of the cheeks' sections: 0 square, 1 round.
+    cheek_roundness: float = 0.3
+
+
+def _typed(kind: type, value: Any, field: str) -> Any:
+    try:
+        return kind(**value) if isinstance(value, dict) else value
+    except TypeError as error:
+        raise UserError(f"hammer: {field}: {error}") from error
 
 
 def build_hammer(p: HammerParameters) -> list[Part]:
     """The parts of a hammer, in mm in the design frame."""
+    if p.front or p.back or p.shaft:
+        return _assembled(p)
     # The wedge spreads the handle in the eye; its end stands a hair proud, so that it can be seen.
     wedge = Manifold.cube((12.0, 0.5 * p.eye_width_mm, 2.2), True)
-    wedge = wedge.translate((p.cheek_height_mm / 2 + _PROUD_MM - 5.8, 0.0, 0.0))
+    wedge = wedge.translate((p.cheek_height_mm / 2 + PROUD_MM - 5.8, 0.0, 0.0))
     wood, dipped = _handle(p)
     poll, face = _poll(p)
     head = _cheeks(p), poll, _claw(p)
@@ -75,6 +93,27 @@ def build_hammer(p: HammerParameters) -> list[Part]:
             [h for s in head for h in s.hulls],
         ),
     ]
+
+
+def _assembled(p: HammerParameters) -> list[Part]:
+    """A hammer of two chosen ends and a chosen shaft."""
+    shaft: Shaft = _typed(Shaft, p.shaft or {}, "shaft")
+    top = p.cheek_height_mm / 2 + PROUD_MM
+    parts = build_shaft(shaft, top)
+    head = build_head(
+        cheek_height=p.cheek_height_mm,
+        cheek_length=p.cheek_length_mm,
+        thickness=p.head_thickness_mm,
+        cheek_roundness=p.cheek_roundness,
+        front=_typed(HeadEnd, p.front or {}, "front"),
+        back=_typed(HeadEnd, p.back or {}, "back"),
+        material=p.head_material,
+    )
+    if shaft.material in ("hickory", "painted_wood"):
+        wedge = Manifold.cube((12.0, 0.5 * shaft.neck_width_mm, 2.2), True)
+        wedge = wedge.translate((top - 5.8, 0.0, 0.0))
+        parts.insert(0, Part("wedge", p.face_material, wedge))
+    return [*parts, *head]
 
 
 def _octagon(width: float, thickness: float) -> np.ndarray:
@@ -95,7 +134,7 @@ def _octagon(width: float, thickness: float) -> np.ndarray:
 
 def _handle(p: HammerParameters) -> tuple[Shape, Shape]:
     """The handle from the eye to the throat in bare wood, and its dipped grip with the swell."""
-    top = p.cheek_height_mm / 2 + _PROUD_MM
+    top = p.cheek_height_mm / 2 + PROUD_MM
     end = top - p.length_mm
     eye, throat, swell = p.eye_width_mm, p.throat_width_mm, p.swell_width_mm
     # Distance from the end as a share of the length; width. The straight stretch behind the head is

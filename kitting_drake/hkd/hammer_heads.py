@@ -11,8 +11,11 @@ from typing import NamedTuple
 import numpy as np
 from manifold3d import Manifold, OpType
 
+from kitting_drake.hkd.collision import runs
 from kitting_drake.hkd.solids import Part, Shape, across_path, fillet, loft, rounded_rectangle
 
+# How far the hulls of a full-size head or shaft may stand out of it, in the outline and in height.
+OUTLINE_MM, HEIGHT_MM = 0.4, 1.2
 
 @dataclass
 class HeadEnd:
@@ -65,9 +68,9 @@ def head_loft(stations: Sequence[Station], octagonal: bool = False) -> Shape:
         return rings
 
     fine = loft(sections(1 if octagonal else 7))
-    coarse = sections(1 if octagonal else 2)
-    hulls = [np.vstack(pair) for pair in zip(coarse[:-1], coarse[1:], strict=True)]
-    return Shape(fine.solid, hulls)
+    round_enough = max(s.roundness for s in stations) > 0.6
+    coarse = sections(2 if round_enough and not octagonal else 1)
+    return Shape(fine.solid, runs(coarse, OUTLINE_MM, HEIGHT_MM))
 
 
 def build_head(
@@ -213,7 +216,7 @@ def _ball(e: HeadEnd, height: float, thickness: float, start: float) -> tuple[Sh
     keep = head_loft(
         [
             Station(center - radius * np.cos(a), *[e.size_mm * np.sin(a)] * 2)
-            for a in np.linspace(join, np.pi - 0.25, 7)
+            for a in (join, 1.0, np.pi / 2, 2.1, 2.55, np.pi - 0.25)
         ]
     )
     return body, Shape(ball.solid, keep.hulls)
@@ -280,7 +283,7 @@ def _claw(e: HeadEnd, height: float, thickness: float, start: float) -> tuple[Sh
         return rings
 
     coarse = sections(9, 1)
-    hulls = [np.vstack(pair) for pair in zip(coarse[:-1], coarse[1:], strict=True)]
+    hulls = runs(coarse, OUTLINE_MM, HEIGHT_MM)
     solid = loft(sections(13, 4)).solid
     if e.gap_mm:
         mouth, close = e.reach_mm + 6.0, start + 0.30 * (e.reach_mm - start)

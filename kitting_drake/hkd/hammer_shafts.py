@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from kitting_drake.hkd.hammer_heads import HEIGHT_MM, OUTLINE_MM
 from kitting_drake.hkd.solids import Part, Shape, across_x, fillet, loft, rounded_rectangle
 
 # How far the handle's end stands out of the eye.
@@ -50,16 +51,14 @@ def _section(width: float, thickness: float, roundness: float, segments: int) ->
 def build_shaft(s: Shaft, top: float) -> list[Part]:
     """The parts of a handle; `top` is where along x it ends above the head."""
     neck = [
-        (0.0, 0.86 * s.neck_width_mm),
-        (0.006, 0.9 * s.neck_width_mm),
-        (0.09, 0.92 * s.neck_width_mm),
-        (0.095, s.neck_width_mm),
+        (0.0, 0.9 * s.neck_width_mm),
+        (0.004, s.neck_width_mm),
         (0.33, s.neck_width_mm),
         (0.5 * (0.33 + s.neck_share), 0.5 * (s.neck_width_mm + s.throat_width_mm)),
         (s.neck_share, s.throat_width_mm),
     ]
     if s.neck_share < 0.36:
-        neck = [*neck[:4], (s.neck_share, s.neck_width_mm)]
+        neck = [*neck[:2], (s.neck_share, s.neck_width_mm)]
     bare = _loft(s, top, [(u, w, s.flatness * w) for u, w in neck])
     if s.fullered:
         bare = Shape(bare.solid - _hollows(s, top), bare.hulls)
@@ -146,9 +145,8 @@ def _loft(s: Shaft, top: float, stations: list[tuple[float, float, float]]) -> S
             result.append(across_x(soft, top - u * s.length_mm, _bow(s, u)))
         return result
 
-    coarse = rings(1)
-    hulls = [np.vstack(pair) for pair in zip(coarse[:-1], coarse[1:], strict=True)]
-    return Shape(loft(rings(5)).solid, hulls)
+    coarse = rings(2 if s.roundness > 0.6 else 1)
+    return Shape(loft(rings(4)).solid, runs(coarse, OUTLINE_MM, HEIGHT_MM))
 
 
 def _bow(s: Shaft, u: float) -> float:
@@ -157,7 +155,7 @@ def _bow(s: Shaft, u: float) -> float:
     return s.bow_mm * (np.sin(np.pi * min(1.0, 1.25 * t)) * 1.0 - 1.2 * max(0.0, t - 0.55))
 
 
-def _hollows(s: Shaft, top: float):  # noqa: ANN202
+def _hollows(s: Shaft, top: float):
     """Hollows along the broad sides, between head and grip."""
     start, end = 0.13 * s.length_mm, (s.neck_share - 0.015) * s.length_mm
     thickness = s.flatness * s.neck_width_mm

@@ -32,9 +32,11 @@ SLOTS = {
 """Where the tool of each category goes: (x, y) of its frame T in the kit frame, in metres."""
 
 _ARC_SEGMENTS = 64
+_DIGITS = 7
+"""Of coordinates in files, after the point."""
 _TOP_CELL = 0.02
 """Side of the squares into which the top is cut for the contact solver, in metres."""
-_FORMAT_VERSION = "4"
+_FORMAT_VERSION = "5"
 """Part of the cache key: changed whenever the same input makes another kit."""
 
 
@@ -349,8 +351,12 @@ _SDF = """<?xml version="1.0"?>
 def _write(cavities: Sequence[Cavity], parameters: KitParameters, directory: Path) -> None:
     block = build_block(cavities, parameters)
     mesh = block.to_mesh()
-    vertices = np.asarray(mesh.vert_properties, dtype=float)[:, :3]
-    faces = np.asarray(mesh.tri_verts, dtype=int)
+    # Vertices that the file's digits cannot tell apart are one, or the surface would have seams.
+    rounded = np.round(np.asarray(mesh.vert_properties, dtype=float)[:, :3], _DIGITS) + 0.0
+    vertices, index = np.unique(rounded, axis=0, return_inverse=True)
+    faces = index[np.asarray(mesh.tri_verts, dtype=int)]
+    a, b, c = faces.T
+    faces = faces[(a != b) & (b != c) & (c != a)]
     _write_obj(directory / "kit.obj", vertices, faces, normals=False)
     _write_obj(directory / "contact.obj", *contact_surface(cavities, parameters), normals=False)
     # Two colours, as tool foam has: what is inside the block's faces is a cavity.
@@ -365,7 +371,7 @@ def _write(cavities: Sequence[Cavity], parameters: KitParameters, directory: Pat
 def _write_obj(
     path: Path, vertices: NDArray[np.float64], faces: NDArray[np.int64], *, normals: bool
 ) -> None:
-    lines = [f"v {x:.7f} {y:.7f} {z:.7f}" for x, y, z in vertices]
+    lines = [f"v {x:.{_DIGITS}f} {y:.{_DIGITS}f} {z:.{_DIGITS}f}" for x, y, z in vertices]
     if normals:
         a, b, c = np.moveaxis(vertices[faces], 1, 0)
         normal = np.cross(b - a, c - a)

@@ -1,5 +1,7 @@
-"""Pictures of tools, rendered without a display by Drake's VTK engine."""
+"""Contact sheets of tools and kits, rendered without a display by Drake's VTK engine."""
 
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -21,6 +23,10 @@ from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import AddMultibodyPlantSceneGraph
 from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.sensors import CameraInfo
+
+from kitting_drake.cameras import require_rendering
+from kitting_drake.hkd.kit import Kit
+from kitting_drake.hkd.tool import Tool
 
 _BACKGROUND = (0.97, 0.97, 0.96)
 # A key light that throws the shadows, and a fill from the camera, whose shadows cannot be seen.
@@ -54,17 +60,39 @@ def camera_pose(
     return RigidTransform(R_WC, target + distance * toward)
 
 
-def render_tool(
-    models: Path,
-    name: str,
-    *,
-    azimuth_deg: float = -62.0,
-    elevation_deg: float = 38.0,
-    width: int = 900,
-    height: int = 600,
-    field_of_view_deg: float = 11.0,
+@dataclass(frozen=True)
+class Subject:
+    """What a picture of the sheet shows."""
+
+    title: str
+    models: Sequence[tuple[Path, RigidTransform]]
+    """SDFormat files of one link each, and where their frames are, in metres."""
+    target: tuple[float, float, float]
+    """What the camera looks at, in metres."""
+    size: float
+    """How much of it the picture shows, side to side, in metres."""
+    elevation_deg: float = 38.0
+
+
+def tool_subject(tool: Tool) -> Subject:
+    """A tool lying on the table."""
+    title = tool.name.replace("_", " ")
+    return Subject(title, [(tool.sdf, RigidTransform())], (0.0, 0.0, 0.006), 0.208)
+
+
+def kit_subject(title: str, kit: Kit) -> Subject:
+    """A kit on the table, its tools seated but for the last, whose cavity is seen."""
+    seated = [
+        (tool.sdf, RigidTransform(kit.goal(index))) for index, tool in enumerate(kit.tools[:-1])
+    ]
+    models = [(kit.sdf, RigidTransform()), *seated]
+    return Subject(title, models, (0.0, 0.0, 0.03), 0.40, elevation_deg=52.0)
+
+
+def render_subject(
+    subject: Subject, *, azimuth_deg: float = -62.0, width: int = 900, height: int = 600
 ) -> np.ndarray:
-    """An image (height, width, 3) of a tool lying on a pale table. `models` holds package.xml."""
+    """An image (height, width, 3) of something on a pale table."""
     builder = DiagramBuilder()
     plant, scene_graph = AddMultibodyPlantSceneGraph(builder, 0.0)
     scene_graph.AddRenderer(
@@ -79,17 +107,22 @@ def render_tool(
         ),
     )
     parser = Parser(plant)
-    parser.package_map().AddPackageXml(str(models / "package.xml"))
-    parser.AddModels(str(models / "tools" / name / f"{name}.sdf"))
+    for path, X_WB in subject.models:
+        (instance,) = parser.AddModels(str(path))
+        (body,) = plant.GetBodyIndices(instance)
+        plant.WeldFrames(plant.world_frame(), plant.get_body(body).body_frame(), X_WB)
     plant.Finalize()
     _add_table(scene_graph)
     diagram = builder.Build()
     context = diagram.CreateDefaultContext()
 
-    pose = camera_pose(np.array([0.0, 0.0, 0.006]), azimuth_deg, elevation_deg, 0.72)
+    # From far away, as with a long lens, so that what is parallel looks so.
+    distance = 3.46 * subject.size
+    field_of_view = 2 * np.arctan(subject.size / distance / 2 * height / width)
+    pose = camera_pose(np.array(subject.target), azimuth_deg, subject.elevation_deg, distance)
     core = RenderCameraCore(
         "vtk",
-        CameraInfo(width, height, np.radians(field_of_view_deg)),
+        CameraInfo(width, height, field_of_view),
         ClippingRange(0.05, 5.0),
         RigidTransform(),
     )
@@ -109,24 +142,29 @@ def _add_table(scene_graph: SceneGraph) -> None:
     scene_graph.RegisterAnchoredGeometry(source, table)
 
 
-def write_sheet(models: Path, names: list[str], output: Path) -> None:
-    """Writes one picture of all the tools with their names."""
+def write_sheet(subjects: Sequence[Subject], output: Path) -> None:
+    """Writes one picture of all the subjects with their titles.
+
+    Raises:
+        UserError: images cannot be rendered here.
+    """
+    require_rendering()
     # Imported here: drawing is the only use, and the other verbs should not wait for it.
     import matplotlib
 
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
-    columns = min(len(names), 2 if len(names) <= 4 else 6)
-    rows = -(-len(names) // columns)
+    columns = min(len(subjects), 2 if len(subjects) <= 4 else 6)
+    rows = -(-len(subjects) // columns)
     figure, axes = plt.subplots(
         rows, columns, figsize=(4.5 * columns, 3.3 * rows), squeeze=False, facecolor=_BACKGROUND
     )
     for axis in axes.flat:
         axis.set_axis_off()
-    for axis, name in zip(axes.flat, names, strict=False):
-        axis.imshow(render_tool(models, name))
-        axis.set_title(name.replace("_", " "), fontsize=13, color="0.15")
+    for axis, subject in zip(axes.flat, subjects, strict=False):
+        axis.imshow(render_subject(subject))
+        axis.set_title(subject.title, fontsize=13, color="0.15")
     figure.tight_layout()
     figure.savefig(output, dpi=130)
     plt.close(figure)

@@ -33,6 +33,7 @@ MATERIALS: dict[str, Material] = {
     "steel": Material(7850.0, (0.62, 0.64, 0.67, 1.0)),
     "dark_steel": Material(7850.0, (0.27, 0.28, 0.30, 1.0)),
     "hickory": Material(750.0, (0.82, 0.60, 0.34, 1.0)),
+    "leather": Material(900.0, (0.55, 0.30, 0.14, 1.0)),
     "painted_wood": Material(750.0, (0.62, 0.13, 0.10, 1.0)),
     "red_grip": Material(1150.0, (0.80, 0.10, 0.09, 1.0)),
     "blue_grip": Material(1150.0, (0.07, 0.26, 0.62, 1.0)),
@@ -175,11 +176,16 @@ def _closed_solid(vertices: np.ndarray, faces: np.ndarray) -> Manifold:
 
 
 def plate(
-    profile: CrossSection | np.ndarray, z_low: float, z_high: float, bevel: float = 0.8
+    profile: CrossSection | np.ndarray,
+    z_low: float,
+    z_high: float,
+    bevel: float = 0.8,
+    cells: Sequence[CrossSection] = (),
 ) -> Shape:
     """A plate between two heights, its lower and upper edges bevelled at 45 degrees.
 
-    Holes are cut with plain edges, and do not appear in the hulls.
+    Holes are cut with plain edges, and do not appear in the hulls. There is a hull for the part of
+    the profile in each of the `cells`, or, if there are none, for each of many triangles.
     """
     if isinstance(profile, np.ndarray):
         profile = CrossSection([profile])
@@ -188,7 +194,7 @@ def plate(
     holes = filled - profile
     if not holes.is_empty():
         solid -= holes.extrude(z_high - z_low + 2).translate((0, 0, z_low - 1))
-    return Shape(solid, _plate_hulls(filled, z_low, z_high, bevel))
+    return Shape(solid, _plate_hulls(filled, z_low, z_high, bevel, cells))
 
 
 def _bevelled(profile: CrossSection, z_low: float, z_high: float, bevel: float) -> Manifold:
@@ -226,9 +232,13 @@ def _bevelled(profile: CrossSection, z_low: float, z_high: float, bevel: float) 
 
 
 def _plate_hulls(
-    profile: CrossSection, z_low: float, z_high: float, bevel: float
+    profile: CrossSection,
+    z_low: float,
+    z_high: float,
+    bevel: float,
+    cells: Sequence[CrossSection],
 ) -> list[np.ndarray]:
-    """Prisms over a triangulation of the profile that bevel its rim but not the cuts."""
+    """Prisms over cells or a triangulation of the profile that bevel its rim but not the cuts."""
     coarse = profile.simplify(0.08)
     loops = coarse.to_polygons()
     points = np.vstack(loops)
@@ -239,8 +249,7 @@ def _plate_hulls(
         for _, inset in levels
     }
     hulls = []
-    for triangle in manifold3d.triangulate(loops):
-        piece = CrossSection([points[triangle]])
+    for piece in cells or [CrossSection([points[t]]) for t in manifold3d.triangulate(loops)]:
         rings = [
             np.column_stack([p, np.full(len(p), z)])
             for z, inset in levels

@@ -1,5 +1,6 @@
 """A tool as a scenario uses it: a folder with its SDFormat model, its meshes and its record."""
 
+import os
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -44,6 +45,8 @@ class Tool:
     name: str
     category: str
     """One of `CATEGORIES`."""
+    split: str
+    """`train` or `test` (section IV-B.1 of the paper), or `user` for a tool of one's own."""
     length: float
     """Extents of the bounding box along x, y and z of T, in metres."""
     width: float
@@ -100,21 +103,24 @@ def silhouette(triangles: NDArray[np.float64]) -> CrossSection:
 
 
 def load_tool(name: str, base: Path | None = None) -> Tool:
-    """A tool by its name under `models/tools`, or by the path of its folder.
+    """A tool by its name under `models/tools` or `user_tools`, or by the path of its folder.
 
     Args:
-        name: a name, or a path, absolute or relative to `base`.
+        name: a name, or a path, absolute or relative to `base`. Where one name means several, the
+            project's own tool comes first, then the user's, then the path.
         base: where relative paths start; the working directory when None.
 
     Raises:
         UserError: no such tool, or a record or a mesh that is missing or broken.
     """
-    directory = MODELS / "tools" / name
-    if Path(name).name != name or not (directory / "tool.yaml").is_file():
-        directory = ((base or Path.cwd()) / name).resolve()
+    directory = ((base or Path.cwd()) / name).resolve()
+    if Path(name).name == name:
+        for folder in (user_tools(), MODELS / "tools"):
+            if (folder / name / "tool.yaml").is_file():
+                directory = folder / name
     record_path = directory / "tool.yaml"
     if not record_path.is_file():
-        known = ", ".join(tool_names())
+        known = ", ".join([*tool_names(), *user_tool_names()])
         raise UserError(f"there is no tool '{name}': use one of {known}, or the path of a folder")
     try:
         record = yaml.safe_load(record_path.read_text())
@@ -122,6 +128,7 @@ def load_tool(name: str, base: Path | None = None) -> Tool:
             directory=directory,
             name=str(record["name"]),
             category=str(record["category"]),
+            split=str(record["split"]),
             length=float(record["length"]),
             width=float(record["width"]),
             height=float(record["height"]),
@@ -144,3 +151,16 @@ def load_tool(name: str, base: Path | None = None) -> Tool:
 def tool_names() -> list[str]:
     """The names of the tools that come with the project."""
     return sorted(path.parent.name for path in (MODELS / "tools").glob("*/tool.yaml"))
+
+
+def user_tools() -> Path:
+    """The folder of the user's own tools: `$KITTING_DRAKE_TOOLS`, or one in `~/.local/share`."""
+    given = os.environ.get("KITTING_DRAKE_TOOLS")
+    return Path(given) if given else Path.home() / ".local" / "share" / "kitting_drake" / "tools"
+
+
+def user_tool_names() -> list[str]:
+    """The names of the tools in `user_tools`."""
+    # A folder that begins with a dot is one that is being made.
+    records = user_tools().glob("[!.]*/tool.yaml")
+    return sorted(path.parent.name for path in records)

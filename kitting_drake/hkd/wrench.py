@@ -1,135 +1,185 @@
 """Wrenches: flat forgings with a head at each end of a shank."""
 
-from dataclasses import dataclass
+import itertools
+from collections.abc import Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
 from manifold3d import CrossSection, Manifold
 
-from kitting_drake.hkd.solids import Part, Shape, blend, circle, fillet, plate
+from kitting_drake.hkd.solids import Part, Shape, blend, circle, fillet, plate, ribbon
+from kitting_drake.hkd.wrench_heads import Head, head_shape
+
+# Where an S-shaped shank bends, as a share of the way from its middle to a head.
+_BEND = 0.56
 
 
 @dataclass
 class WrenchParameters:
-    """A combination wrench: an open end toward +x, a box end toward -x. Lengths in mm."""
+    """A wrench, one head toward +x, the other toward -x: a combination wrench. Lengths in mm."""
 
-    # Size of the hexagon that it turns, across flats.
-    size_mm: float = 17.0
     # From the centre of one head to the centre of the other.
     center_distance_mm: float = 172.0
-    # Angle of the open end's slot to the shank, in degrees.
-    open_angle_deg: float = 15.0
-    # Diameter and thickness of the open head.
-    open_diameter_mm: float = 38.0
-    open_thickness_mm: float = 8.8
-    # Diameter and thickness of the box head, and the points of its hole (6 or 12).
-    box_diameter_mm: float = 28.0
-    box_thickness_mm: float = 11.0
-    box_points: int = 12
-    # Width of the shank at the open end and at the box end, its thickness, and the radius that
-    # blends it into the heads.
-    shank_width_open_mm: float = 16.0
-    shank_width_box_mm: float = 15.0
+    # The heads toward +x and -x; a mapping of Head's fields stands for a Head.
+    front: Head = field(
+        default_factory=lambda: Head("open", diameter_mm=38.0, thickness_mm=8.8, angle_deg=15.0)
+    )
+    back: Head = field(
+        default_factory=lambda: Head("box", diameter_mm=28.0, thickness_mm=11.0, points=12)
+    )
+    # Width of the shank at the front and at the back, its thickness, and the radius that blends it
+    # into the heads.
+    shank_width_front_mm: float = 16.0
+    shank_width_back_mm: float = 15.0
     shank_thickness_mm: float = 7.8
     blend_radius_mm: float = 16.0
-    # Depth of the recessed panel on each broad side of the shank.
+    # How far an S-shaped shank swings to either side.
+    swing_mm: float = 0.0
+    # Depth of the recessed panel on each broad side of the shank, below zero the height of a raised
+    # one; and the share of the shank's width that it takes.
     panel_depth_mm: float = 0.9
-    # Bevel of all outer edges.
+    panel_share: float = 0.58
+    # Bevel of all outer edges; of the shank's, where they differ.
     bevel_mm: float = 0.9
+    shank_bevel_mm: float | None = None
     # A key of solids.MATERIALS.
     material: str = "polished_steel"
+
+    def __post_init__(self) -> None:
+        if isinstance(self.front, dict):
+            self.front = Head(**self.front)
+        if isinstance(self.back, dict):
+            self.back = Head(**self.back)
 
 
 def build_wrench(p: WrenchParameters) -> list[Part]:
     """The parts of a wrench, in mm in the design frame."""
-    x_open, x_box = p.center_distance_mm / 2, -p.center_distance_mm / 2
-    slot = _open_slot(p, x_open)
-    head = _open_head(p, x_open)
-    box = CrossSection([circle(p.box_diameter_mm / 2, (x_box, 0.0), 64)])
+    x_front, x_back = p.center_distance_mm / 2, -p.center_distance_mm / 2
+    front = head_shape(p.front, x_front, 0.0, p.bevel_mm)
+    back = head_shape(p.back, x_back, 180.0, p.bevel_mm)
+    shank = CrossSection([_shank(p)])
+    for head, side in ((p.front, 1), (p.back, -1)):
+        if head.neck_mm and not p.swing_mm:
+            shank += _shoulders(p, head, side)
+    # Blend shank and heads as one outline, so that the forging flows; the heads then stand on it.
+    outline = blend(front.profile + shank + back.profile, p.blend_radius_mm)
+    outline = outline - front.cut - back.cut
+    bevel = p.bevel_mm if p.shank_bevel_mm is None else p.shank_bevel_mm
+    body = _slab(outline, p.shank_thickness_mm, bevel, _shank_cells(p))
 
-    shank = CrossSection(
+    solid, hulls = body.solid, list(body.hulls)
+    for head, shape in ((p.front, front), (p.back, back)):
+        if head.thickness_mm > p.shank_thickness_mm:
+            slab = _slab(shape.profile - shape.cut, head.thickness_mm, p.bevel_mm, shape.cells)
+            solid += slab.solid
+            hulls += slab.hulls
+    for side in (1, -1):
+        if p.panel_depth_mm > 0:
+            solid -= _panel(p, side)
+        elif p.panel_depth_mm < 0:
+            # It lies lower than the heads: nothing touches it but the eye.
+            solid += _panel(p, side)
+    return [*front.inserts, *back.inserts, Part("wrench", p.material, solid, hulls)]
+
+
+def _slab(
+    profile: CrossSection, thickness: float, bevel: float, cells: Sequence[CrossSection]
+) -> Shape:
+    # Corners sharper than the bevel is wide would fold it over.
+    profile = blend(profile, 0.3, 1.4 * bevel)
+    return plate(profile, -thickness / 2, thickness / 2, bevel, cells)
+
+
+def _half_width(p: WrenchParameters, x: float) -> float:
+    """Half the width of the shank at x."""
+    share = x / p.center_distance_mm + 0.5
+    return 0.5 * (p.shank_width_back_mm + share * (p.shank_width_front_mm - p.shank_width_back_mm))
+
+
+def _shoulders(p: WrenchParameters, head: Head, side: int) -> CrossSection:
+    """The convex taper from a head, on the side +1 or -1, down to the shank."""
+    x = side * (p.center_distance_mm / 2 - head.neck_mm)
+    half = _half_width(p, x)
+    # They run into the side of a box, but behind the jaws of an open end.
+    radius = (0.37 if head.kind in ("open", "flare_nut") else 0.49) * head.diameter_mm
+    disc = circle(radius, (side * p.center_distance_mm / 2, 0.0), 64)
+    return CrossSection.hull_points(np.vstack([disc, [(x, -half), (x, half)]]))
+
+
+def _shank_cells(p: WrenchParameters) -> list[CrossSection]:
+    """What cuts the shank into convex pieces; none unless it is straight and both ends simple.
+
+    What lies within a thicker head is left to the head.
+    """
+    if p.swing_mm:
+        return []
+    half, far = p.center_distance_mm / 2, 100.0
+    joints: list[float] = []
+    for head, side in ((p.back, -1), (p.front, 1)):
+        if head.kind == "tail":
+            continue
+        if not head.neck_mm:
+            return []
+        disc = CrossSection([circle(0.5 * head.diameter_mm, (side * half, 0.0), 64)])
+        bare = (_shoulders(p, head, side) - disc).bounds()
+        joints += [side * (half - head.neck_mm), bare[2] if side > 0 else bare[0]]
+    if p.back.kind == "tail":
+        joints.append(-half - far)
+    if p.front.kind == "tail":
+        joints.append(half + far)
+    return [
+        CrossSection.square((end - start, 2 * far)).translate((start, -far))
+        for start, end in itertools.pairwise(sorted(joints))
+    ]
+
+
+def _shank(p: WrenchParameters) -> np.ndarray:
+    """The outline of the shank alone, from the centre of one head to that of the other."""
+    x_front, x_back = p.center_distance_mm / 2, -p.center_distance_mm / 2
+    if p.swing_mm:
+        path = _swung(p)
+        return ribbon(path, np.array([2 * _half_width(p, x) for x in path[:, 0]]))
+    return np.array(
         [
-            np.array(
-                [
-                    (x_box, -p.shank_width_box_mm / 2),
-                    (x_open, -p.shank_width_open_mm / 2),
-                    (x_open, p.shank_width_open_mm / 2),
-                    (x_box, p.shank_width_box_mm / 2),
-                ]
-            )
+            (x_back, -p.shank_width_back_mm / 2),
+            (x_front, -p.shank_width_front_mm / 2),
+            (x_front, p.shank_width_front_mm / 2),
+            (x_back, p.shank_width_back_mm / 2),
         ]
     )
-    # Blend shank and heads as one outline, so that the forging flows; the heads then stand on it.
-    outline = blend(head + shank + box, p.blend_radius_mm) - slot
-    socket = _socket(p, x_box)
-
-    body = _slab(outline - socket, p.shank_thickness_mm, p.bevel_mm)
-    open_end = _slab(head - slot, p.open_thickness_mm, p.bevel_mm)
-    box_end = _slab(box - socket, p.box_thickness_mm, p.bevel_mm)
-    solid = body.solid + open_end.solid + box_end.solid
-    for side in (1, -1):
-        solid -= _panel(p, side)
-    return [Part("wrench", p.material, solid, body.hulls + open_end.hulls + box_end.hulls)]
 
 
-def _slab(profile: CrossSection, thickness: float, bevel: float) -> Shape:
-    # Corners sharper than the bevel is wide would fold it over.
-    return plate(blend(profile, 0.3, 1.4 * bevel), -thickness / 2, thickness / 2, bevel)
-
-
-def _open_head(p: WrenchParameters, x: float) -> CrossSection:
-    """The open head before its slot is cut: a disc with the two jaws drawn forward."""
-    radius = p.open_diameter_mm / 2
-    jaws = fillet(
-        [
-            (-0.2 * radius, -0.97 * radius),
-            (0.62 * radius, -0.9 * radius),
-            (1.12 * radius, -0.52 * radius),
-            (1.12 * radius, 0.52 * radius),
-            (0.62 * radius, 0.9 * radius),
-            (-0.2 * radius, 0.97 * radius),
-        ],
-        0.35 * radius,
-    )
-    head = CrossSection([circle(radius, segments=64)]) + CrossSection([jaws])
-    return head.rotate(p.open_angle_deg).translate((x, 0.0))
-
-
-def _open_slot(p: WrenchParameters, x: float) -> CrossSection:
-    """The slot: parallel flanks, a floor of two facets of the hexagon, and slightly opened lips."""
-    half, radius = p.size_mm / 2, p.open_diameter_mm / 2
-    depth = 0.42 * radius
-    slot = fillet(
-        [
-            (-depth - 0.3 * half, 0.0),
-            (-depth + 0.2 * half, -half),
-            (1.0 * radius, -half),
-            (1.4 * radius, -half - 0.12 * radius),
-            (1.4 * radius, half + 0.12 * radius),
-            (1.0 * radius, half),
-            (-depth + 0.2 * half, half),
-        ],
-        [2.0 * half, 0.35 * half, 1.0, 0.0, 0.0, 1.0, 0.35 * half],
-    )
-    return CrossSection([slot]).rotate(p.open_angle_deg).translate((x, 0.0))
-
-
-def _socket(p: WrenchParameters, x: float) -> CrossSection:
-    """The box end's hole: one hexagon for 6 points, two of them for 12."""
-    hexagon = CrossSection([circle(p.size_mm / np.sqrt(3), segments=6)])
-    hole = hexagon if p.box_points == 6 else hexagon + hexagon.rotate(30)
-    return hole.translate((x, 0.0))
+def _swung(p: WrenchParameters) -> np.ndarray:
+    """The middle line (n, 2) of an S-shaped shank: its middle is straight, for a gripper."""
+    half = p.center_distance_mm / 2
+    corners = [(-half, 0.0), (-_BEND * half, p.swing_mm), (_BEND * half, -p.swing_mm), (half, 0.0)]
+    # Closed far below, so that only the two bends are rounded.
+    loop = [*corners, (half, -4 * half), (-half, -4 * half)]
+    line = fillet(loop, [0.0, 0.2 * half, 0.2 * half, 0.0, 0.0, 0.0], 8)
+    return line[:-2]
 
 
 def _panel(p: WrenchParameters, side: int) -> Manifold:
-    """The recess of one broad side of the shank: a tapered plate to subtract; side is +1 or -1."""
-    start = -p.center_distance_mm / 2 + 0.85 * p.box_diameter_mm
-    end = p.center_distance_mm / 2 - 0.85 * p.open_diameter_mm
-    half_start, half_end = 0.29 * p.shank_width_box_mm, 0.29 * p.shank_width_open_mm
-    outline = fillet(
-        [(start, -half_start), (end, -half_end), (end, half_end), (start, half_start)],
-        0.95 * half_start,
-    )
+    """The panel of one broad side of the shank, to subtract or add; side is +1 or -1."""
+    start = -p.center_distance_mm / 2 + 0.85 * p.back.diameter_mm
+    end = p.center_distance_mm / 2 - 0.85 * p.front.diameter_mm
+    half_start = 0.5 * p.panel_share * p.shank_width_back_mm
+    half_end = 0.5 * p.panel_share * p.shank_width_front_mm
+    if p.swing_mm:
+        path = _swung(p)
+        path = path[(path[:, 0] > start) & (path[:, 0] < end)]
+        outline = ribbon(path, np.linspace(2 * half_start, 2 * half_end, len(path)))
+        outline = fillet(outline, 0.95 * half_start)
+    else:
+        outline = fillet(
+            [(start, -half_start), (end, -half_end), (end, half_end), (start, half_start)],
+            0.95 * half_start,
+        )
     top = p.shank_thickness_mm / 2
-    # Its own bevel slopes the recess's walls, as a forging die leaves them.
-    cutter = plate(outline, top - p.panel_depth_mm, top + 4.0, 0.6).solid
-    return cutter if side > 0 else cutter.mirror((0, 0, 1))
+    # Its own bevel slopes the panel's walls, as a forging die leaves them.
+    if p.panel_depth_mm > 0:
+        panel = plate(outline, top - p.panel_depth_mm, top + 4.0, 0.6).solid
+    else:
+        height = -p.panel_depth_mm
+        panel = plate(outline, top - 1.0, top + height, 0.6).solid
+    return panel if side > 0 else panel.mirror((0, 0, 1))

@@ -10,7 +10,8 @@ from pydrake.math import RigidTransform, RollPitchYaw
 from kitting_drake.errors import UserError
 from kitting_drake.hkd.kit import Kit, make_kit
 from kitting_drake.hkd.tool import Tool, load_tool
-from kitting_drake.scenario import ArrangedKitting, Kitting, Placement
+from kitting_drake.hkd.toolsets import toolsets
+from kitting_drake.scenario import ArrangedKitting, Kitting, Placement, ToolsetKitting
 from systems.signals import PixelGrid
 
 # What the open hand covers, seen from above with the jaws closing along y: (x, y) half sizes in m.
@@ -39,7 +40,7 @@ class KittingScene:
 
 
 def make_scene(
-    task: Kitting | ArrangedKitting, *, grid: PixelGrid, seed: int, base: Path
+    task: Kitting | ToolsetKitting | ArrangedKitting, *, grid: PixelGrid, seed: int, base: Path
 ) -> KittingScene:
     """Sets the table.
 
@@ -53,7 +54,7 @@ def make_scene(
         UserError: an unknown tool, tools that make no kit, or no free space for them all.
     """
     try:
-        tools = [load_tool(name, base) for name in task.tools]
+        tools = [load_tool(name, base) for name in _tool_names(task, seed)]
         kit = make_kit(tools, task.kit)
     except UserError as error:
         raise UserError(f"task.tools: {error}") from error
@@ -76,13 +77,25 @@ def make_scene(
     )
 
 
+def _tool_names(task: Kitting | ToolsetKitting | ArrangedKitting, seed: int) -> list[str]:
+    if not isinstance(task, ToolsetKitting):
+        return list(task.tools)
+    choices = toolsets(task.split)
+    # A stream of its own: the poses of a seed do not depend on how many toolsets there are.
+    return list(choices[np.random.default_rng([seed, 1]).integers(len(choices))])
+
+
 def _pose(placement: Placement) -> RigidTransform:
     yaw = np.deg2rad(placement.yaw_deg)
     return RigidTransform(RollPitchYaw(0, 0, yaw), [placement.x, placement.y, 0])
 
 
 def _draw_poses(
-    task: Kitting, kit: Kit, tools: list[Tool], grid: PixelGrid, rng: np.random.Generator
+    task: Kitting | ToolsetKitting,
+    kit: Kit,
+    tools: list[Tool],
+    grid: PixelGrid,
+    rng: np.random.Generator,
 ) -> tuple[RigidTransform, list[RigidTransform]]:
     """Poses of the kit and the tools, on the table, without collision.
 

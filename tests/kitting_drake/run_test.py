@@ -1,6 +1,7 @@
 import base64
 import json
 import re
+import signal
 import subprocess
 import sys
 from collections.abc import Callable
@@ -107,7 +108,15 @@ def test_ctrl_c_leaves_whole_files(tmp_path: Path):
     """The signal comes at a known step of the simulation: no waiting, no guessing."""
     command = [sys.executable, "-c", INTERRUPTED_RUN, "scenarios/kitting_oracle.yaml"]
     command += ["--output", str(tmp_path)]
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=300)
+    done = subprocess.run(
+        command,
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        timeout=300,
+        # A shell's background jobs, and all that they start, are born deaf to Ctrl-C.
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
+    )
     assert done.returncode == 130, done.stderr
     assert "Traceback" not in done.stderr
     assert sorted(path.name for path in tmp_path.iterdir()) == ["replay.html", "results.json"]

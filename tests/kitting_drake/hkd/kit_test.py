@@ -51,6 +51,14 @@ def grown(outline: CrossSection, distance: float) -> CrossSection:
     return outline.offset(distance, JoinType.Round, circular_segments=128)
 
 
+def test_files_of_a_kit_are_watertight_and_one_body(tools: list[Tool], cache: Path):
+    kit = make_kit(tools, PARAMETERS)
+    block = trimesh.load_mesh(kit.sdf.parent / "kit.obj")
+    assert block.is_watertight
+    assert block.is_winding_consistent
+    assert len(block.split()) == 1
+
+
 def test_block_is_watertight_and_one_body(cavities: list[Cavity]):
     block = build_block(cavities, PARAMETERS)
     assert block.status() == Error.NoError

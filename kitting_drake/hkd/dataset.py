@@ -1,0 +1,117 @@
+"""`hkd build`: the whole dataset as files that another simulator can load, with a manifest."""
+
+import hashlib
+import os
+import shutil
+import tempfile
+from collections.abc import Callable
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import kitting_drake
+from kitting_drake.errors import UserError
+from kitting_drake.files import write_json
+from kitting_drake.hkd.kit import Kit, KitParameters, make_kit
+from kitting_drake.hkd.tool import Tool, load_tool
+from kitting_drake.hkd.toolsets import SPLITS, TOOLSETS_SEED, tool_pools, toolsets
+
+
+def build_dataset(folder: Path, progress: Callable[[int, int], None]) -> dict[str, Any]:
+    """Writes tools and kits as SDFormat with their meshes, and `manifest.json`.
+
+    The folder appears whole or not at all. Tools are in `tools/NAME/`, kits in `kits/SPLIT_000/`;
+    meshes are named relatively, so that any part may be moved.
+
+    Args:
+        folder: where to; must not exist, or be empty.
+        progress: called with how many kits are done and how many there are.
+
+    Returns:
+        The manifest.
+
+    Raises:
+        UserError: the folder holds something, or cannot be written.
+    """
+    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        raise UserError(f"{folder} is not empty: give another --output, or delete it")
+    try:
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(dir=folder.parent, prefix=".building-") as scratch:
+            root = Path(scratch) / "dataset"
+            manifest = _write_dataset(root, progress)
+            if folder.exists():
+                folder.rmdir()
+            os.rename(root, folder)
+    except OSError as error:
+        raise UserError(f"cannot write the dataset to {folder}: {error.strerror}") from error
+    return manifest
+
+
+def _write_dataset(root: Path, progress: Callable[[int, int], None]) -> dict[str, Any]:
+    parameters = KitParameters()
+    tools: dict[str, Tool] = {}
+    for split in SPLITS:
+        for pool in tool_pools(split).values():
+            tools |= {name: load_tool(name) for name in pool}
+    for name, tool in tools.items():
+        shutil.copytree(tool.directory, root / "tools" / name)
+    chosen = [
+        (split, index, names) for split in SPLITS for index, names in enumerate(toolsets(split))
+    ]
+    kits = []
+    for done, (split, index, names) in enumerate(chosen):
+        kit = make_kit([tools[name] for name in names], parameters)
+        name = f"{split}_{index:03d}"
+        shutil.copytree(kit.sdf.parent, root / "kits" / name)
+        kits.append(_kit_entry(name, split, kit, root))
+        progress(done + 1, len(chosen))
+    manifest = {
+        "dataset": "Hand-tool Kitting Dataset",
+        "made_by": f"kitting_drake {kitting_drake.__version__}",
+        "units": "metres, kilograms, radians",
+        "toolsets_seed": TOOLSETS_SEED,
+        "kit_parameters": asdict(parameters),
+        "tools": [_tool_entry(tool, root) for tool in tools.values()],
+        "kits": kits,
+    }
+    write_json(root / "manifest.json", manifest)
+    return manifest
+
+
+def _tool_entry(tool: Tool, root: Path) -> dict[str, Any]:
+    folder = root / "tools" / tool.name
+    return {
+        "name": tool.name,
+        "category": tool.category,
+        "split": tool.split,
+        "length": tool.length,
+        "width": tool.width,
+        "height": tool.height,
+        "mass": tool.mass,
+        "grasp": asdict(tool.grasp),
+        "sdf": (folder / tool.sdf.name).relative_to(root).as_posix(),
+        "sha256": _checksums(folder, root),
+    }
+
+
+def _kit_entry(name: str, split: str, kit: Kit, root: Path) -> dict[str, Any]:
+    folder = root / "kits" / name
+    return {
+        "name": name,
+        "split": split,
+        "sdf": (folder / kit.sdf.name).relative_to(root).as_posix(),
+        # Where each tool's frame belongs in the kit's, unturned.
+        "tools": [
+            {"name": tool.name, "position": list(kit.goal(index))}
+            for index, tool in enumerate(kit.tools)
+        ],
+        "sha256": _checksums(folder, root),
+    }
+
+
+def _checksums(folder: Path, root: Path) -> dict[str, str]:
+    return {
+        path.relative_to(root).as_posix(): hashlib.sha256(path.read_bytes()).hexdigest()
+        for path in sorted(folder.iterdir())
+    }

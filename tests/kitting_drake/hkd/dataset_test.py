@@ -1,0 +1,68 @@
+import hashlib
+import json
+from pathlib import Path
+
+import pytest
+from pydrake.multibody.parsing import Parser
+from pydrake.multibody.plant import MultibodyPlant
+
+from kitting_drake.errors import UserError
+from kitting_drake.hkd import dataset
+from kitting_drake.hkd.toolsets import SPLITS, toolsets
+
+
+@pytest.fixture
+def few_kits(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(dataset, "toolsets", lambda split: toolsets(split)[:2])
+
+
+@pytest.mark.usefixtures("few_kits")
+def test_what_is_built_is_what_the_manifest_says(tmp_path: Path):
+    folder = tmp_path / "hkd"
+    steps: list[tuple[int, int]] = []
+    manifest = dataset.build_dataset(folder, lambda done, total: steps.append((done, total)))
+    assert manifest == json.loads((folder / "manifest.json").read_text())
+    assert steps == [(1, 4), (2, 4), (3, 4), (4, 4)]
+    assert len(manifest["tools"]) == 60
+    assert [kit["split"] for kit in manifest["kits"]] == [split for split in SPLITS for _ in "12"]
+    listed = {"manifest.json"}
+    for entry in manifest["tools"] + manifest["kits"]:
+        for path, checksum in entry["sha256"].items():
+            assert hashlib.sha256((folder / path).read_bytes()).hexdigest() == checksum
+            listed.add(path)
+    there = {p.relative_to(folder).as_posix() for p in folder.rglob("*") if p.is_file()}
+    assert there == listed
+
+
+@pytest.mark.usefixtures("few_kits")
+def test_parts_load_from_wherever_they_are_moved(tmp_path: Path):
+    manifest = dataset.build_dataset(tmp_path / "built", lambda done, total: None)
+    moved = (tmp_path / "built").rename(tmp_path / "moved")
+    for entry in (manifest["tools"][0], manifest["kits"][0]):
+        plant = MultibodyPlant(0.01)
+        plant.RegisterAsSourceForSceneGraph(_scene_graph())
+        assert len(Parser(plant).AddModels(str(moved / entry["sdf"]))) == 1
+
+
+def _scene_graph():
+    from pydrake.geometry import SceneGraph
+
+    return SceneGraph()
+
+
+def test_a_folder_that_holds_something_is_left_alone(tmp_path: Path):
+    (tmp_path / "mine.txt").write_text("mine")
+    with pytest.raises(UserError, match="not empty"):
+        dataset.build_dataset(tmp_path, lambda done, total: None)
+    assert [path.name for path in tmp_path.iterdir()] == ["mine.txt"]
+
+
+def test_nothing_is_left_of_a_build_that_fails(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    def fail(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(dataset, "write_json", fail)
+    monkeypatch.setattr(dataset, "toolsets", lambda split: [])
+    with pytest.raises(UserError, match="No space left"):
+        dataset.build_dataset(tmp_path / "hkd", lambda done, total: None)
+    assert not list(tmp_path.iterdir())
