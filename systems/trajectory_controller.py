@@ -104,19 +104,19 @@ class TrajectoryController(LeafSystem):
 
     def _calc_actuation(self, context: Context, output: BasicVector) -> None:
         state = self._hand_state.Eval(context)
-        q, fingers, v, finger_rates = np.split(state, [4, 6, 10])
-        q_d, v_d, a_d = np.split(self._desired_motion.Eval(context), 3)
+        # Sliced, not split: this runs at every step.
+        desired = self._desired_motion.Eval(context)
         axes = (
-            self._inertia * a_d
+            self._inertia * desired[8:]
             + self._gravity
-            + self._stiffness * (q_d - q)
-            + self._damping * (v_d - v)
+            + self._stiffness * (desired[:4] - state[:4])
+            + self._damping * (desired[4:8] - state[6:10])
         )
         opening, opening_rate = self._desired_opening.Eval(context)
         press = self._closing_force.Eval(context)[0] if self._closing_force.HasValue(context) else 0
         finger = (
-            self._finger_stiffness * (opening - fingers.sum()) / 2
-            + self._finger_damping * (opening_rate - finger_rates.sum()) / 2
+            self._finger_stiffness * (opening - state[4] - state[5]) / 2
+            + self._finger_damping * (opening_rate - state[10] - state[11]) / 2
             - press
         )
         limit = self._finger_force_limit

@@ -15,7 +15,7 @@ from kitting_drake.hkd.generate import (
     generate_tool,
     load_catalogue,
 )
-from kitting_drake.hkd.tool import load_tool
+from kitting_drake.hkd.tool import CATEGORIES, load_tool, user_tool_names, user_tools
 from kitting_drake.hkd.toolsets import SPLITS, toolsets
 from kitting_drake.paths import MODELS
 
@@ -48,8 +48,14 @@ def list_tools(args: argparse.Namespace, entries: list[ToolEntry]) -> None:
     table.add_column("split")
     for heading in ("size, mm", "mass, g", "grasp, mm"):
         table.add_column(heading, justify="right", no_wrap=True)
-    for entry in _chosen(entries, args.names):
-        d = _description(args.models, entry.name)
+    own = [name for name in user_tool_names() if not args.names or name in args.names]
+    known = [name for name in args.names if name not in own]
+    chosen = [] if args.names and not known else _chosen(entries, known)
+    descriptions = [_description(args.models, entry.name) for entry in chosen]
+    for name in own:
+        load_tool(str(user_tools() / name))
+        descriptions.append(yaml.safe_load((user_tools() / name / "tool.yaml").read_text()))
+    for d in descriptions:
         size = " x ".join(f"{1e3 * d[key]:.0f}" for key in ("length", "width", "height"))
         grasp = f"{1e3 * d['grasp']['width']:.1f}"
         row = (
@@ -116,6 +122,31 @@ def annotate(args: argparse.Namespace, entries: list[ToolEntry]) -> None:
     annotate_tool(args.name, Console())
 
 
+def import_mesh(args: argparse.Namespace, entries: list[ToolEntry]) -> None:
+    """Makes a tool that scenarios can name from a mesh: STL, OBJ, PLY or GLB."""
+    from kitting_drake.hkd.importer import ImportRequest, import_tool
+
+    console = Console(quiet=args.quiet, highlight=False)
+    request = ImportRequest(
+        mesh=args.mesh,
+        category=args.category,
+        name=args.name,
+        length_mm=args.length_mm,
+        density=args.density,
+        output=args.output,
+    )
+    with Console(stderr=True, quiet=args.quiet).status(f"importing {args.mesh}"):
+        report = import_tool(request)
+    d = report.record
+    size = " x ".join(f"{1e3 * d[key]:.0f}" for key in ("length", "width", "height"))
+    held = f"held by {1e3 * d['grasp']['width']:.1f} mm"
+    console.print(f"{d['name']}: {size} mm, {1e3 * d['mass']:.0f} g, {held}")
+    for note in report.notes:
+        console.print(f"  {note}", markup=False)
+    named = d["name"] if args.output is None else report.directory
+    console.print(f"files: {report.directory}/; name it '{named}' in a scenario", soft_wrap=True)
+
+
 def main() -> int:
     """Runs one verb; returns the exit status."""
     parser = argparse.ArgumentParser(prog="python -m kitting_drake.hkd", description=__doc__)
@@ -144,6 +175,24 @@ def main() -> int:
     annotator = verbs.add_parser("annotate", help=annotate.__doc__)
     annotator.add_argument("name", metavar="NAME", help="a tool's name, or its folder")
     annotator.set_defaults(function=annotate)
+    importer = verbs.add_parser("import", help=import_mesh.__doc__)
+    importer.add_argument("mesh", type=Path, metavar="MESH", help="the mesh's file")
+    importer.add_argument("--category", choices=CATEGORIES, required=True, help="of the tool")
+    importer.add_argument("--name", help="of the tool (default: the file's)")
+    importer.add_argument(
+        "--output",
+        type=Path,
+        metavar="DIR",
+        help="the folder of tools to add it to (default: $KITTING_DRAKE_TOOLS, or one's own)",
+    )
+    importer.add_argument(
+        "--length_mm", type=float, help="to scale it to (default: its own, if 150 to 200, or 180)"
+    )
+    importer.add_argument(
+        "--density", type=float, metavar="KG_M3", help="of it all (default: the category's)"
+    )
+    importer.add_argument("--quiet", action="store_true", help="print nothing but errors")
+    importer.set_defaults(function=import_mesh)
     args = parser.parse_args()
     args.function(args, load_catalogue(args.models / "tools" / "catalogue.yaml"))
     return 0

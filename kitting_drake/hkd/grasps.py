@@ -26,6 +26,8 @@ RELEASE_REACH = 0.006 + 0.015
 
 # Surface that stands back by less than this touches a pad.
 _TOUCH = 0.0003
+# The same while the hand is turned in coarse steps.
+_COARSE_TOUCH = 0.0008
 # The hand's upper fingers stand this much further out than its pads.
 _FINGER_RECESS = 0.003
 # Steeper than this, faces that narrow upward slip down out of the pads.
@@ -36,7 +38,7 @@ _LEAST_CONTACT = 0.15
 _LANE = 0.040
 
 _BIN, _STEP = 0.0005, 0.001
-_COARSE_DEG, _FINE_DEG = 5.0, (-2.5, -1.5, -1.0, -0.5, 0.5, 1.0, 1.5, 2.5)
+_COARSE_DEG, _FINE_DEG = 5.0, 0.5
 _MOST_PROPOSALS = 12
 # Proposals nearer than this to a better one are left out.
 _DISTINCT, _DISTINCT_ANGLE = 0.012, np.radians(20.0)
@@ -86,18 +88,19 @@ def propose_grasps(triangles: Array, center_of_mass: Array) -> list[GraspProposa
         return []
     com = np.asarray(center_of_mass, dtype=float)[:2]
 
-    def search(theta: float, near: float | None = None) -> list[GraspProposal]:
-        return _search(points, level, levels, com, theta, near)
-
     # A turn by pi swaps the jaws, which are alike.
-    coarse = np.radians(np.arange(-90.0, 90.0, _COARSE_DEG))
-    found = [proposal for theta in coarse for proposal in search(float(theta))]
+    found: list[GraspProposal] = []
+    for theta in np.radians(np.arange(-90.0, 90.0, _COARSE_DEG)):
+        found += _search(points, level, levels, com, float(theta), _COARSE_TOUCH)
+    fine = np.radians(np.arange(-_COARSE_DEG / 2, _COARSE_DEG / 2 + 1e-9, _FINE_DEG))
     result = []
-    for proposal in _distinct(found):
-        along = np.array([np.cos(proposal.theta), np.sin(proposal.theta)])
-        near = float(along @ (proposal.x, proposal.y))
-        fine = [p for d in _FINE_DEG for p in search(proposal.theta + float(np.radians(d)), near)]
-        result.append(min([proposal, *fine], key=lambda p: p.cost))
+    for coarse in _distinct(found):
+        place = np.array([coarse.x, coarse.y])
+        near: list[GraspProposal] = []
+        for theta in coarse.theta + fine:
+            near += _search(points, level, levels, com, float(theta), _TOUCH, place)
+        if near:
+            result.append(min(near, key=lambda p: p.cost))
     tops = [_top(triangles, proposal) for proposal in result]
     result = [replace(p, surface_height=top) for p, top in zip(result, tops, strict=True)]
     return sorted(result, key=lambda p: p.cost)
@@ -135,9 +138,13 @@ def _search(
     levels: Array,
     com: Array,
     theta: float,
-    near: float | None,
+    touch: float,
+    near: Array | None = None,
 ) -> list[GraspProposal]:
-    """The acceptable grasps with one turn of the hand: along all of the tool, or about `near`."""
+    """The acceptable grasps with one turn of the hand: along all of the tool, or about `near`.
+
+    Surface that stands back by less than `touch` counts as touched.
+    """
     along = np.array([np.cos(theta), np.sin(theta)])
     across = np.array([-along[1], along[0]])
     u, v = points @ along, points @ across
@@ -153,7 +160,7 @@ def _search(
     if near is None:
         centres = np.arange(finger, columns - finger, round(_STEP / _BIN))
     else:
-        centres = round((near - u_min) / _BIN) + np.arange(-4, 5, 2)
+        centres = round((float(near @ along) - u_min) / _BIN) + np.arange(-4, 5, 2)
         centres = centres[(centres >= finger) & (centres < columns - finger)]
     result = []
     for centre in centres:
@@ -168,7 +175,7 @@ def _search(
             continue
         where = u_min + centre * _BIN
         judged = _judge(
-            left[pads], right[pads], left[fingers], right[fingers], levels, occupied[-1]
+            left[pads], right[pads], left[fingers], right[fingers], levels, occupied[-1], touch
         )
         if judged is None:
             continue
@@ -176,8 +183,10 @@ def _search(
         x, y = where * along + middle * across
         lever = abs(where - float(com @ along))
         aside = abs(middle - float(com @ across))
-        reach = abs(y) + (width / 2 + RELEASE_REACH) * abs(np.cos(theta)) + (
-            FINGER_LENGTH / 2 * abs(np.sin(theta))
+        reach = (
+            abs(y)
+            + (width / 2 + RELEASE_REACH) * abs(np.cos(theta))
+            + (FINGER_LENGTH / 2 * abs(np.sin(theta)))
         )
         penalties = {
             "centre of mass": lever / 0.025 + (lever / 0.040) ** 2 + aside / 0.100,
@@ -209,7 +218,13 @@ def _search(
 
 
 def _judge(
-    left: Array, right: Array, finger_left: Array, finger_right: Array, levels: Array, top: int
+    left: Array,
+    right: Array,
+    finger_left: Array,
+    finger_right: Array,
+    levels: Array,
+    top: int,
+    touch: float,
 ) -> tuple[float, float, float, float, float, float, float] | None:
     """What two pads would grip, from how far the tool reaches to either side of them.
 
@@ -218,6 +233,7 @@ def _judge(
         finger_left, finger_right: the same over the length of the fingers.
         levels: their heights.
         top: the highest level that is occupied.
+        touch: surface that stands back by less than this counts as touched.
 
     Returns:
         None if they cannot hold it; else the middle and the width between the faces, the shares of
@@ -243,7 +259,7 @@ def _judge(
     )
     if overhang > _FINGER_RECESS:
         return None
-    touch_left, touch_right = left >= furthest_left - _TOUCH, right <= furthest_right + _TOUCH
+    touch_left, touch_right = left >= furthest_left - touch, right <= furthest_right + touch
     both = touch_left.any(axis=1) & touch_right.any(axis=1)
     contact = float(both.mean())
     if contact < _LEAST_CONTACT:

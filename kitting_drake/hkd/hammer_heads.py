@@ -123,13 +123,10 @@ def _bell(e: HeadEnd, height: float, thickness: float, start: float) -> tuple[Sh
     deep = e.thickness_mm or size
     ratio = deep / size
     bell = end - 0.30 * size
-    stem = start + 0.62 * (bell - start)
     body = head_loft(
         [
             Station(start, height, thickness, 0.5 * r),
-            Station(0.5 * (start + stem), 0.5 * (height + neck) - 1, 0.5 * (thickness + neck), r),
-            Station(stem, neck, neck * ratio, r),
-            Station(bell - 2.5, neck + 0.5, (neck + 0.5) * ratio, r),
+            Station(bell - 2.5, neck, neck * ratio, r),
             Station(bell + 2.0, size, deep, r),
             Station(end - 3.0, size, deep, r),
         ],
@@ -216,7 +213,7 @@ def _ball(e: HeadEnd, height: float, thickness: float, start: float) -> tuple[Sh
     keep = head_loft(
         [
             Station(center - radius * np.cos(a), *[e.size_mm * np.sin(a)] * 2)
-            for a in (join, 1.0, np.pi / 2, 2.1, 2.55, np.pi - 0.25)
+            for a in (join, 1.0, 1.3, np.pi / 2, 1.84, 2.1, 2.45, np.pi - 0.3)
         ]
     )
     return body, Shape(ball.solid, keep.hulls)
@@ -268,13 +265,13 @@ def _claw(e: HeadEnd, height: float, thickness: float, start: float) -> tuple[Sh
     root, wide = min(height, e.neck_mm), e.thickness_mm or thickness
     top = root / 2
 
-    def sections(count: int, segments: int) -> list[np.ndarray]:
+    def sections(count: int, segments: int, inset: float = 0.0) -> list[np.ndarray]:
         rings = []
         for t in np.linspace(0.0, 1.0, count):
             y = start + t * (e.reach_mm - start)
             slope = e.curve * e.drop_mm * t ** (e.curve - 1) / (e.reach_mm - start)
             along = np.arctan2(1.0, -slope)
-            band = e.size_mm + (root - e.size_mm) * (1 - t) ** 1.15
+            band = e.size_mm + (root - e.size_mm) * (1 - t) ** 1.15 - inset
             normal = np.array([-np.sin(along), np.cos(along)])
             center = np.array([top - e.drop_mm * t**e.curve, y]) + 0.5 * band * normal
             width = 0.85 * thickness + (wide - 0.85 * thickness) * min(1.0, 2 * t)
@@ -282,8 +279,9 @@ def _claw(e: HeadEnd, height: float, thickness: float, start: float) -> tuple[Sh
             rings.append(across_path(profile, center, float(along)))
         return rings
 
-    coarse = sections(9, 1)
-    hulls = runs(coarse, OUTLINE_MM, HEIGHT_MM)
+    # Chords of the inner edge lie half within it and half without.
+    inset = min(0.4, 0.1 * e.size_mm)
+    hulls = runs(sections(17, 1, inset), OUTLINE_MM + inset, HEIGHT_MM)
     solid = loft(sections(13, 4)).solid
     if e.gap_mm:
         mouth, close = e.reach_mm + 6.0, start + 0.30 * (e.reach_mm - start)

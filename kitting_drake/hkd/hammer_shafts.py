@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from kitting_drake.hkd.collision import runs
 from kitting_drake.hkd.hammer_heads import HEIGHT_MM, OUTLINE_MM
 from kitting_drake.hkd.solids import Part, Shape, across_x, fillet, loft, rounded_rectangle
 
@@ -74,9 +75,9 @@ def build_shaft(s: Shaft, top: float) -> list[Part]:
     grooved = sleeve.solid
     rings = None
     for a, b in zip(edges[1::2], edges[2::2], strict=False):
-        pitch = b - a
-        share = 0.28 if s.kind == "ribbed" else 0.5
-        a, b = a + share * pitch, b - share * pitch * 0.4
+        # A groove is narrow enough to be no part of a cavity.
+        middle, half = 0.5 * (a + b), min(0.3 * (b - a), 1.3 / s.length_mm)
+        a, b = middle - half, middle + half
         widths = np.interp([a, b], [u for u, _ in grip], [w for _, w in grip])
         depth = 1.1 if s.kind == "ribbed" else 0.5
         core = _loft(

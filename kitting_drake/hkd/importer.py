@@ -10,7 +10,6 @@ import hashlib
 import multiprocessing
 import os
 import re
-import shutil
 import signal
 import tempfile
 from dataclasses import dataclass
@@ -18,43 +17,24 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import trimesh
 import yaml
-from manifold3d import Manifold
 
 from kitting_drake.errors import UserError
 from kitting_drake.hkd import meshes
-from kitting_drake.hkd.grasps import WIDEST, propose_grasps
-from kitting_drake.hkd.kit import SLOTS, KitParameters, kit_cavities
-from kitting_drake.hkd.lie import lie_down, placed, size
+from kitting_drake.hkd.fit import MATERIALS, fit, lengths_to_try
+from kitting_drake.hkd.lie import lie_down, size
 from kitting_drake.hkd.pieces import convex_pieces
 from kitting_drake.hkd.repair import NOMINAL_MM, make_solid, read_mesh
 from kitting_drake.hkd.sdf import tool_sdf
-from kitting_drake.hkd.tool import CATEGORIES, Tool, load_tool, tool_names, user_tools
+from kitting_drake.hkd.tool import CATEGORIES, load_tool, tool_names, user_tools
 
 DENSITIES = {"hammer": 3000.0, "pliers": 6000.0, "wrench": 7850.0, "screwdriver": 2000.0}
 """What a tool of a category weighs on average, handle and all, in kg/m^3."""
 
-MATERIALS = {
-    "hammer": "steel",
-    "pliers": "steel",
-    "wrench": "polished_steel",
-    "screwdriver": "steel",
-}
-
-LENGTH_MM = 180.0
-KEPT_LENGTHS_MM = (150.0, 200.0)
-"""A tool of such a length keeps it: those of the dataset's tools."""
-POSSIBLE_LENGTHS_MM = (50.0, 600.0)
-"""How long hand tools are, by which a file's unit is guessed."""
-THINNEST_MM, HIGHEST_MM = 4.0, 45.0
 TIME_LIMIT = 55.0
 """Seconds after which the geometry is given up."""
 _MOST_MEMORY = 12 * 2**30
-
-_UNITS = {"mm": 1.0, "m": 1000.0, "cm": 10.0, "inches": 25.4}
-_CREASE_ANGLE_DEG = 35.0
 
 
 @dataclass(frozen=True)
@@ -66,7 +46,7 @@ class ImportRequest:
     name: str | None = None
     """Of the tool; from the file's if None."""
     length_mm: float | None = None
-    """To scale it to; see `_length` for None."""
+    """To scale it to; see `fit.lengths_to_try` for None."""
     density: float | None = None
     """In kg/m^3; see `DENSITIES` for None."""
     output: Path | None = None
@@ -229,9 +209,9 @@ def _prepare(request: ImportRequest, name: str, directory: Path) -> Prepared:
     nominal = NOMINAL_MM / longest
     solid, notes = make_solid((vertices - (low + high) / 2) * nominal, faces)
     solid = lie_down(solid, request.category)
-    lengths, assumed = _lengths(size(solid)[0] / nominal, request.length_mm)
+    lengths, assumed = lengths_to_try(size(solid)[0] / nominal, request.length_mm)
     notes = [assumed, *notes]
-    tool, solid = _fitted(request, name, solid, lengths, notes, directory)
+    tool, solid = fit(request.category, name, solid, lengths, notes, directory)
     density = request.density or DENSITIES[request.category]
     vertices, faces = meshes.vertices_and_faces(solid)
     physics = trimesh.triangles.mass_properties(1e-3 * vertices[faces], density=density)
@@ -280,135 +260,3 @@ def _prepare(request: ImportRequest, name: str, directory: Path) -> Prepared:
 def _safe(text: str) -> str:
     """Text that may stand in an XML comment."""
     return re.sub(r"[^\w. ]|-", "_", text, flags=re.ASCII)
-
-
-def guess_unit(length: float) -> str | None:
-    """In what a hand tool of this length may have been measured, or None if in nothing usual.
-
-    Inches and centimetres overlap; a length below 12 is taken for inches, above for centimetres.
-    """
-    shortest, longest = POSSIBLE_LENGTHS_MM
-    for unit, low, high in (
-        ("mm", shortest, longest),
-        ("m", shortest / 1000, longest / 1000),
-        ("inches", shortest / 25.4, 12.0),
-        ("cm", 12.0, longest / 10),
-    ):
-        if low <= length <= high:
-            return unit
-    return None
-
-
-def _lengths(length: float, wanted_mm: float | None) -> tuple[list[float], str]:
-    """The lengths (mm) to try, the first that will do; and why, for the user."""
-    unit = guess_unit(length)
-    if unit is None:
-        assumed, real = f"unit unknown ({length:.4g} long)", 0.0
-    else:
-        real = length * _UNITS[unit]
-        assumed = f"taken to be in {unit}: {real:.0f} mm long"
-    if wanted_mm is not None:
-        return [wanted_mm], f"{assumed}, scaled as asked"
-    if KEPT_LENGTHS_MM[0] <= real <= KEPT_LENGTHS_MM[1]:
-        return [real], f"{assumed}, kept"
-    return [LENGTH_MM, 170.0, 160.0, 150.0], f"{assumed}, scaled"
-
-
-def _fitted(
-    request: ImportRequest,
-    name: str,
-    solid: Manifold,
-    lengths: list[float],
-    notes: list[str],
-    directory: Path,
-) -> tuple[Tool, Manifold]:
-    """The tool, with its visual mesh written, at the first length at which it can be used.
-
-    Raises:
-        UserError: there is none; what was wrong with the first.
-    """
-    refusal: UserError | None = None
-    for length in lengths:
-        factor = length / size(solid)[0]
-        scaled = placed(solid.scale((factor, factor, factor)).simplify(0.01))
-        try:
-            _check_size(scaled)
-            tool = _tool(request.category, name, scaled, directory)
-            _check_place(tool)
-        except UserError as error:
-            refusal = refusal or error
-            continue
-        if refusal is not None:
-            notes.append(f"made {length:.0f} mm long, for {refusal}")
-        return tool, scaled
-    assert refusal is not None
-    raise refusal
-
-
-def _check_size(solid: Manifold) -> None:
-    length, width, height = size(solid)
-    if height < THINNEST_MM:
-        raise UserError(
-            f"at {length:.0f} mm length it is {height:.1f} mm thick, and the hand needs "
-            f"{THINNEST_MM:.0f} mm to hold"
-        )
-    if height > HIGHEST_MM:
-        raise UserError(
-            f"at {length:.0f} mm length it lies {height:.0f} mm high, and a kit takes "
-            f"{HIGHEST_MM:.0f} mm"
-        )
-
-
-def _tool(category: str, name: str, solid: Manifold, directory: Path) -> Tool:
-    """A tool with its visual mesh written and its best grasp.
-
-    Raises:
-        UserError: it cannot be grasped.
-    """
-    length, width, height = (round(1e-3 * float(extent), 6) for extent in size(solid))
-    visual = directory / f"{MATERIALS[category]}.obj"
-    meshes.write_smooth_obj(visual, solid, _CREASE_ANGLE_DEG)
-    vertices, faces = meshes.vertices_and_faces(solid)
-    triangles = 1e-3 * vertices[faces]
-    com = trimesh.triangles.mass_properties(triangles)["center_mass"]
-    proposals = propose_grasps(triangles, com)
-    if not proposals:
-        raise UserError(
-            f"at {1e3 * length:.0f} mm length the hand, whose jaws take {1e3 * WIDEST:.0f} mm, "
-            "finds no place to hold it from above"
-        )
-    return Tool(
-        directory=directory,
-        name=name,
-        category=category,
-        split="user",
-        length=length,
-        width=width,
-        height=height,
-        mass=0.0,
-        grasp=proposals[0].grasp,
-        visual_meshes=(visual,),
-    )
-
-
-def _check_place(tool: Tool) -> None:
-    """Raises UserError if no standard kit has room for a tool."""
-    parameters = KitParameters()
-    at = f"at {1e3 * tool.length:.0f} mm length it is {1e3 * tool.width:.0f} mm wide"
-    try:
-        kit_cavities([tool], parameters)
-    except UserError as error:
-        raise UserError(f"{at}, too big for its place in the kit") from error
-    shipped = [load_tool(name) for name in tool_names()]
-    for category in SLOTS:
-        others = [other for other in shipped if other.category == category != tool.category]
-        if others and not any(_share_a_kit(tool, other, parameters) for other in others):
-            raise UserError(f"{at} and leaves no room in the kit for any {category}")
-
-
-def _share_a_kit(tool: Tool, other: Tool, parameters: KitParameters) -> bool:
-    try:
-        kit_cavities([tool, other], parameters)
-    except UserError:
-        return False
-    return True

@@ -26,7 +26,8 @@ def lie_down(solid: Manifold, category: str) -> Manifold:
     """The solid (mm) moved into the frame T of a tool of that category; see `Tool`.
 
     Of all poses in which it would stay it takes the one that lies lowest. The working end is the
-    wider one of a hammer, the thinner one of a screwdriver, else the one nearer the centre of mass.
+    wider one of a hammer, the narrower one of pliers and of a screwdriver, and the one nearer the
+    centre of mass of a wrench.
 
     Raises:
         UserError: it is flat, or stands nowhere.
@@ -122,19 +123,19 @@ def _long_direction_deg(outline: CrossSection) -> float:
 
 
 def _works_at_plus_x(solid: Manifold, category: str) -> bool:
-    vertices, faces = meshes.vertices_and_faces(solid)
-    low, high = vertices[:, 0].min(), vertices[:, 0].max()
-    if category in ("hammer", "screwdriver"):
-        span = _END * (high - low)
-        outline = solid.project()
-        at_plus = _mean_width(outline, high - span, high)
-        at_minus = _mean_width(outline, low, low + span)
-        return at_plus >= at_minus if category == "hammer" else at_plus <= at_minus
-    com = trimesh.triangles.mass_properties(vertices[faces])["center_mass"]
-    return bool(com[0] >= (low + high) / 2)
+    low, high = np.array(solid.bounding_box()).reshape(2, 3)[:, 0]
+    if category == "wrench":
+        vertices, faces = meshes.vertices_and_faces(solid)
+        com = trimesh.triangles.mass_properties(vertices[faces])["center_mass"]
+        return bool(com[0] >= (low + high) / 2)
+    outline, span = solid.project(), _END * (high - low)
+    at_plus = _width(outline, high - span, high)
+    at_minus = _width(outline, low, low + span)
+    return at_plus >= at_minus if category == "hammer" else at_plus <= at_minus
 
 
-def _mean_width(outline: CrossSection, start: float, end: float) -> float:
+def _width(outline: CrossSection, start: float, end: float) -> float:
+    """The mean width of the hull of what lies between two places along x."""
     y_min, y_max = outline.bounds()[1], outline.bounds()[3]
     band = CrossSection.square((end - start, y_max - y_min)).translate((start, y_min))
-    return float((outline ^ band).area() / (end - start))
+    return float((outline ^ band).hull().area() / (end - start))

@@ -13,8 +13,11 @@ from kitting_drake.hkd.generate import FINGER_LENGTH_MM
 from kitting_drake.hkd.solids import SEGMENTS
 from kitting_drake.hkd.tool import Grasp
 
-# How far a piece may stand out of the tool's outline, and out of the faces that the jaws grip.
-OUTLINE_TOLERANCE_MM, GRIP_TOLERANCE_MM = 0.30, 0.12
+# How far a piece may stand out of the tool's outline; the second, if the first needs many pieces.
+OUTLINE_TOLERANCES_MM = (0.30, 0.45)
+_ENOUGH = 30
+# The same for the faces that the jaws grip.
+GRIP_TOLERANCE_MM = 0.12
 # How much a part's hull may add to it above and below, on average over its outline.
 HEIGHT_TOLERANCE_MM = 0.5
 # Notches narrower than twice this are no part of a cavity: they may be bridged.
@@ -27,14 +30,23 @@ _AREA = 0.02
 
 def convex_pieces(solid: Manifold, grasp: Grasp) -> list[np.ndarray]:
     """Arrays (n, 3) of points whose hulls together fill a tool that lies in its frame T."""
+    pieces: list[np.ndarray] = []
+    for tolerance in OUTLINE_TOLERANCES_MM:
+        pieces = _pieces(solid, grasp, tolerance)
+        if len(pieces) <= _ENOUGH:
+            break
+    return pieces
+
+
+def _pieces(solid: Manifold, grasp: Grasp, tolerance: float) -> list[np.ndarray]:
     outline = closed(solid.project().simplify(0.02), _NOTCH_MM)
-    grown = _grown(outline, OUTLINE_TOLERANCE_MM)
+    grown = _grown(outline, tolerance)
     jaws = CrossSection.square((FINGER_LENGTH_MM + 2.0, 100.0), True)
     jaws = jaws.rotate(float(np.degrees(grasp.theta))).translate((1e3 * grasp.x, 1e3 * grasp.y))
     allowed = grown - (jaws - _grown(outline, GRIP_TOLERANCE_MM))
     parts = [_vertices(part) for part in _parts(solid.simplify(0.03), allowed)]
     pieces = []
-    for piece in cover(parts, outline, allowed, OUTLINE_TOLERANCE_MM):
+    for piece in cover(parts, outline, allowed, tolerance):
         try:
             pieces.append(thinned(piece, _VERTEX_TOLERANCE_MM))
         except QhullError:
@@ -81,11 +93,12 @@ def _halves(part: Manifold) -> tuple[Manifold, Manifold]:
     """The part cut in two by the plane that leaves the least that is not solid in the hulls."""
     low, high = np.array(part.bounding_box()).reshape(2, 3)
     size = high - low
+    vertices = np.asarray(part.to_mesh64().vert_properties)[:, :3]
     best, best_volume = None, np.inf
     for axis in range(3):
         if size[axis] < max(1.0, 0.25 * size.max()):
             continue
-        for share in (0.35, 0.5, 0.65):
+        for share in (0.35, 0.5, 0.65, *_steps((vertices[:, axis] - low[axis]) / size[axis])):
             normal = np.eye(3)[axis]
             halves = part.split_by_plane(tuple(normal), low[axis] + share * size[axis])
             volume = sum(body.hull().volume() for half in halves for body in half.decompose())
@@ -95,3 +108,17 @@ def _halves(part: Manifold) -> tuple[Manifold, Manifold]:
                 best, best_volume = halves, volume
     assert best is not None
     return best
+
+
+def _steps(shares: np.ndarray) -> list[float]:
+    """Where many vertices are in one plane, of a part from 0 to 1: at a shoulder or a jaw's end."""
+    within = shares[(shares > 0.08) & (shares < 0.92)]
+    values, counts = np.unique(np.round(within, 3), return_counts=True)
+    order = np.argsort(-counts, kind="stable")[:3]
+    many = max(4, len(shares) // 50)
+    # The middle of the vertices themselves, not the rounded place.
+    return [
+        float(np.median(within[np.abs(within - values[i]) <= 6e-4]))
+        for i in order
+        if counts[i] >= many
+    ]

@@ -1,11 +1,16 @@
 """Pliers: two crossed levers on a rivet. They lie flat, the jaws toward +x."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from manifold3d import CrossSection, Manifold
 from scipy.interpolate import PchipInterpolator
 
+from kitting_drake.errors import UserError
+from kitting_drake.hkd.pliers_jaws import Jaws
+from kitting_drake.hkd.pliers_levers import Levers, build_levers
+from kitting_drake.hkd.pliers_locking import Locking, build_locking
 from kitting_drake.hkd.solids import (
     SEGMENTS,
     Part,
@@ -54,10 +59,26 @@ class PliersParameters:
     steel_material: str = "steel"
     rivet_material: str = "polished_steel"
     grip_material: str = "red_grip"
+    # Any other kind of pliers: jaws and levers, or a pair of locking pliers, in place of the fields
+    # above; their fields stand in pliers_jaws.py, pliers_levers.py and pliers_locking.py. Mappings
+    # are taken for the values of their fields.
+    jaws: Jaws | dict[str, Any] | None = None
+    levers: Levers | dict[str, Any] | None = None
+    locking: Locking | dict[str, Any] | None = None
 
 
+def _typed(kind: type, value: Any, field: str) -> Any:
+    try:
+        return kind(**value) if isinstance(value, dict) else value
+    except TypeError as error:
+        raise UserError(f"pliers: {field}: {error}") from error
 def build_pliers(p: PliersParameters) -> list[Part]:
     """The parts of a pair of pliers, in mm in the design frame."""
+    if p.locking is not None:
+        return build_locking(_typed(Locking, p.locking, "locking"))
+    if p.jaws is not None or p.levers is not None:
+        levers = _typed(Levers, p.levers or {}, "levers")
+        return build_levers(levers, _typed(Jaws, p.jaws or {}, "jaws"))
     upper = _lever(p)
     lower = _turned_over(upper)
     grip = _grip(p)

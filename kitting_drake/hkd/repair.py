@@ -47,10 +47,10 @@ def read_mesh(path: Path) -> tuple[Array, Faces]:
     kinds = ", ".join(suffix[1:].upper() for suffix in FORMATS)
     try:
         size = path.stat().st_size
-        if path.is_dir():
-            raise UserError(f"{path} is a folder: give a mesh file ({kinds})")
     except (OSError, ValueError) as error:
         raise UserError(f"there is no file {path}: give a mesh ({kinds})") from error
+    if not path.is_file():
+        raise UserError(f"{path} is a folder or no common file: give a mesh ({kinds})")
     if path.suffix.lower() not in FORMATS:
         raise UserError(f"{path} is none of the kinds of mesh that can be read: {kinds}")
     if size == 0:
@@ -137,7 +137,7 @@ def _merged(vertices: Array, faces: Faces) -> tuple[Array, Faces]:
 
 def _as_manifold(vertices: Array, faces: Faces) -> Manifold | None:
     """The solid that a surface bounds, or None where it bounds none."""
-    if len(faces) < 4:
+    if len(faces) < 4 or not _is_closed(faces):
         return None
     used, index = np.unique(faces, return_inverse=True)
     faces = index.reshape(-1, 3)
@@ -147,6 +147,16 @@ def _as_manifold(vertices: Array, faces: Faces) -> Manifold | None:
     if solid.volume() < 0:
         solid = Manifold(Mesh64(vertices[used], faces[:, ::-1].astype(np.uint64)))
     return solid if solid.volume() > 1e-3 else None
+
+
+def _is_closed(faces: Faces) -> bool:
+    """Whether every edge is run along once in either direction: manifold3d may crash else."""
+    edges = np.vstack([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+    keys = edges[:, 0] * (faces.max() + 1) + edges[:, 1]
+    opposite = edges[:, 1] * (faces.max() + 1) + edges[:, 0]
+    keys.sort()
+    opposite.sort()
+    return bool(np.array_equal(keys, opposite) and (np.diff(keys) > 0).all())
 
 
 def _mended(vertices: Array, faces: Faces) -> Manifold | None:
@@ -212,20 +222,32 @@ def _wrapped(triangles: Array) -> Manifold:
     field = ndimage.gaussian_filter(distance, 0.7) - 0.5
     inside = np.argwhere(field > -3)
     first, last = inside.min(axis=0), inside.max(axis=0)
-    top = np.array(shape) - 2
+    # A memoryview, because one number of an array at a time is slow to get.
+    values = memoryview(np.ascontiguousarray(field).reshape(-1))
+    last_x, last_y, last_z = (int(extent) - 2 for extent in shape)
+    low_x, low_y, low_z = map(float, low)
+    row, plane = int(shape[2]), int(shape[1] * shape[2])
 
     def depth(x: float, y: float, z: float) -> float:
-        i, j, k = (x - low[0]) / _VOXEL_MM, (y - low[1]) / _VOXEL_MM, (z - low[2]) / _VOXEL_MM
-        a, b, c = min(max(int(i), 0), top[0]), min(max(int(j), 0), top[1]), min(max(int(k), 0), top[2])
+        """The field at a point, linear between voxels."""
+        i, j, k = (x - low_x) / _VOXEL_MM, (y - low_y) / _VOXEL_MM, (z - low_z) / _VOXEL_MM
+        a, b, c = (
+            min(max(int(i), 0), last_x),
+            min(max(int(j), 0), last_y),
+            min(max(int(k), 0), last_z),
+        )
         i, j, k = i - a, j - b, k - c
-        near = field[a : a + 2, b : b + 2, c : c + 2].tolist()
-        (p, q), (r, s) = near
-        lower = (p[0] * (1 - k) + p[1] * k) * (1 - j) + (q[0] * (1 - k) + q[1] * k) * j
-        upper = (r[0] * (1 - k) + r[1] * k) * (1 - j) + (s[0] * (1 - k) + s[1] * k) * j
-        return float(lower * (1 - i) + upper * i)
+        n = a * plane + b * row + c
+
+        def edge(m: int) -> float:
+            return values[m] * (1 - k) + values[m + 1] * k
+
+        here = edge(n) * (1 - j) + edge(n + row) * j
+        there = edge(n + plane) * (1 - j) + edge(n + plane + row) * j
+        return here * (1 - i) + there * i
 
     bounds = [*(low + (first - 1) * _VOXEL_MM), *(low + (last + 1) * _VOXEL_MM)]
-    return Manifold.level_set(depth, bounds, 1.5 * _VOXEL_MM).simplify(0.05)
+    return Manifold.level_set(depth, bounds, 1.5 * _VOXEL_MM).simplify(0.15)
 
 
 def _box_volume(solid: Manifold) -> float:

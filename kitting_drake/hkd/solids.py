@@ -39,6 +39,7 @@ MATERIALS: dict[str, Material] = {
     "blue_grip": Material(1150.0, (0.07, 0.26, 0.62, 1.0)),
     "yellow_grip": Material(1150.0, (0.96, 0.71, 0.06, 1.0)),
     "green_grip": Material(1150.0, (0.08, 0.45, 0.22, 1.0)),
+    "amber_plastic": Material(1190.0, (0.90, 0.55, 0.08, 1.0)),
     "orange_grip": Material(1150.0, (0.93, 0.40, 0.05, 1.0)),
     "black_rubber": Material(1200.0, (0.12, 0.12, 0.13, 1.0)),
 }

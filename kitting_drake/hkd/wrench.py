@@ -107,30 +107,50 @@ def _shoulders(p: WrenchParameters, head: Head, side: int) -> CrossSection:
 
 
 def _shank_cells(p: WrenchParameters) -> list[CrossSection]:
-    """What cuts the shank into convex pieces; none unless it is straight and both ends simple.
+    """What cuts the shank into convex pieces; none unless both its ends are simple.
 
     What lies within a thicker head is left to the head.
     """
-    if p.swing_mm:
-        return []
     half, far = p.center_distance_mm / 2, 100.0
+    if p.swing_mm:
+        # The blend of the bends, a little of it, goes to the ends: jaws grip the middle.
+        bend = _BEND * half - 0.7
+        return [_rectangle(-bend, bend), *_swung_ends(p, bend)]
     joints: list[float] = []
     for head, side in ((p.back, -1), (p.front, 1)):
         if head.kind == "tail":
+            joints.append(side * (half + far))
             continue
         if not head.neck_mm:
             return []
         disc = CrossSection([circle(0.5 * head.diameter_mm, (side * half, 0.0), 64)])
         bare = (_shoulders(p, head, side) - disc).bounds()
-        joints += [side * (half - head.neck_mm), bare[2] if side > 0 else bare[0]]
-    if p.back.kind == "tail":
-        joints.append(-half - far)
-    if p.front.kind == "tail":
-        joints.append(half + far)
-    return [
-        CrossSection.square((end - start, 2 * far)).translate((start, -far))
-        for start, end in itertools.pairwise(sorted(joints))
-    ]
+        end = (bare[2] if side > 0 else -bare[0]) - 0.2 * p.blend_radius_mm
+        joints += [side * (half - head.neck_mm), side * end]
+    return [_rectangle(start, end) for start, end in itertools.pairwise(sorted(joints))]
+
+
+def _rectangle(x_low: float, x_high: float) -> CrossSection:
+    """All that lies between two x."""
+    return CrossSection.square((x_high - x_low, 200.0)).translate((x_low, -100.0))
+
+
+def _swung_ends(p: WrenchParameters, bend: float) -> list[CrossSection]:
+    """What cuts an S-shaped shank's ends off at its bends, and off its heads at right angles."""
+    half = p.center_distance_mm / 2
+    cells = []
+    for head, side in ((p.front, 1), (p.back, -1)):
+        angle = np.degrees(np.arctan2(p.swing_mm, (1.0 - _BEND) * half))
+        start = np.sqrt((head.diameter_mm / 2) ** 2 - _half_width(p, side * half) ** 2)
+        beyond = _rectangle(-150.0, -start - 0.2 * p.blend_radius_mm).rotate(angle)
+        if side < 0:
+            beyond = beyond.rotate(180.0)
+        cells.append(beyond.translate((side * half, 0.0)) ^ _between(side * bend, side * 150.0))
+    return cells
+
+
+def _between(x_a: float, x_b: float) -> CrossSection:
+    return _rectangle(min(x_a, x_b), max(x_a, x_b))
 
 
 def _shank(p: WrenchParameters) -> np.ndarray:
@@ -155,7 +175,7 @@ def _swung(p: WrenchParameters) -> np.ndarray:
     corners = [(-half, 0.0), (-_BEND * half, p.swing_mm), (_BEND * half, -p.swing_mm), (half, 0.0)]
     # Closed far below, so that only the two bends are rounded.
     loop = [*corners, (half, -4 * half), (-half, -4 * half)]
-    line = fillet(loop, [0.0, 0.2 * half, 0.2 * half, 0.0, 0.0, 0.0], 8)
+    line = fillet(loop, [0.0, 0.1 * half, 0.1 * half, 0.0, 0.0, 0.0], 8)
     return line[:-2]
 
 

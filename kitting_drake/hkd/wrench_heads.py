@@ -96,20 +96,22 @@ def _open(head: Head, x: float, turn_deg: float, bevel: float) -> HeadShape:
     The slot has parallel flanks, a floor of two facets of the hexagon, and slightly opened lips.
     """
     radius = head.diameter_mm / 2
+    cheek = (0.82 if head.neck_mm else 0.9) * radius
     jaws = fillet(
         [
             (-0.2 * radius, -0.97 * radius),
-            (0.62 * radius, -0.9 * radius),
+            (0.62 * radius, -cheek),
             (1.12 * radius, -0.52 * radius),
             (1.12 * radius, 0.52 * radius),
-            (0.62 * radius, 0.9 * radius),
+            (0.62 * radius, cheek),
             (-0.2 * radius, 0.97 * radius),
         ],
         0.35 * radius,
     )
     disc = CrossSection([circle(radius, segments=64)]) + CrossSection([jaws])
     half, depth = head.size_mm / 2, 0.42 * radius
-    corner = (0.15 if head.neck_mm else 0.35) * half
+    # Heads with straight shoulders are straight all over: convex pieces fill them well.
+    apex, corner = (0.12 * half, 0.12 * half) if head.neck_mm else (2.0 * half, 0.35 * half)
     slot = fillet(
         [
             (-depth - 0.3 * half, 0.0),
@@ -120,7 +122,7 @@ def _open(head: Head, x: float, turn_deg: float, bevel: float) -> HeadShape:
             (1.0 * radius, half),
             (-depth + 0.2 * half, half),
         ],
-        [2.0 * half, corner, 1.0, 0.0, 0.0, 1.0, corner],
+        [apex, corner, 1.0, 0.0, 0.0, 1.0, corner],
     )
     # Two jaws, and either half of what is behind the floor.
     far, floor = 2.0 * radius, -depth + 0.2 * half
@@ -298,7 +300,7 @@ def _pipe(head: Head, x: float, turn_deg: float, bevel: float) -> HeadShape:
         ],
         s * np.array([8.0, 3.0, 1.0, 1.0, 0.5, 1.0, 4.0, 4.0, 8.0]),
     )
-    mouth = CrossSection.square((60.0 * s, 80.0 * s)).translate((0.0, -40.0 * s))
+    mouth = CrossSection.square((60.0 * s, 80.0 * s)).translate((-1.1 * s, -40.0 * s))
     window = rounded_rectangle(9.6 * s, 20.0 * s, 1.5 * s) + (-17.0 * s, -10.6 * s)
     low, high = -15.2 * s, -6.2 * s
     hook = [
@@ -318,21 +320,21 @@ def _pipe(head: Head, x: float, turn_deg: float, bevel: float) -> HeadShape:
         0.78 * head.thickness_mm,
         bevel,
     )
-    pitch, height = 2.5 * s, 4.0 * head.thickness_mm
-    notch = CrossSection([np.array([(0.0, -0.5), (1.1, 0.0), (0.0, 0.5)]) * (s, pitch)])
-    for i in range(5):
-        tooth = notch.translate((gap - 0.01, (i - 0.6) * pitch)).extrude(height)
+    pitch, height = 1.6 * s, 4.0 * head.thickness_mm
+    notch = CrossSection([np.array([(0.0, -0.5), (0.9, 0.0), (0.0, 0.5)]) * (s, pitch)])
+    for i in range(8):
+        tooth = notch.translate((gap - 0.01, (i - 1.5) * pitch)).extrude(height)
         jaw.solid -= tooth.translate((0.0, 0.0, -height / 2))
-    heel = [(-4.0, -5.0), (0.0, -5.0), (0.0, 12.0), (-4.0, 12.0)]
+    heel = [(-4.0, -5.6), (0.0, -5.6), (0.0, 12.9), (-4.0, 12.9)]
     insert = _flat_part(
-        "heel_jaw", "steel", CrossSection([s * np.array(heel)]), head.thickness_mm + 0.8, 0.4
+        "heel_jaw", "steel", CrossSection([s * np.array(heel)]), head.thickness_mm, 0.3
     )
-    insert.hulls = []
-    for i in range(6):
-        tooth = notch.mirror((1.0, 0.0)).translate((0.01, (i - 1.2) * pitch)).extrude(height)
+    for i in range(9):
+        tooth = notch.mirror((1.0, 0.0)).translate((0.01, (i - 2.0) * pitch)).extrude(height)
         insert.solid -= tooth.translate((0.0, 0.0, -height / 2))
     nut = _knurled(0.5 * head.thickness_mm - 0.1, 8.8 * s, 5)
     nut.solid = nut.solid.translate((-17.0 * s, 0.5 * (low + high), 0.0))
+    nut.hulls = [np.asarray(nut.solid.hull().to_mesh64().vert_properties)[:, :3]]
     return HeadShape(
         _put(CrossSection([body]), x, turn_deg),
         _put(mouth + CrossSection([window]), x, turn_deg),
