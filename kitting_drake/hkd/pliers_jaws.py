@@ -48,6 +48,14 @@ def bent(j: Jaws, outline: np.ndarray, start: float) -> np.ndarray:
     """An outline turned about the joint, and bent along a circle from there."""
     if not j.turn_deg and not j.bend_deg:
         return outline
+    # Straight edges bend too.
+    count = np.ceil(np.linalg.norm(np.roll(outline, -1, axis=0) - outline, axis=1) / 2.0)
+    outline = np.vstack(
+        [
+            a + (b - a) * np.linspace(0.0, 1.0, int(n), endpoint=False)[:, None]
+            for a, b, n in zip(outline, np.roll(outline, -1, axis=0), count, strict=True)
+        ]
+    )
     t = np.clip((outline[:, 0] - start) / (j.length_mm - start), 0.0, 1.2)
     # Beyond the joint the middle line turns more and more.
     ease = np.clip((outline[:, 0] - start + 5.0) / 5.0, 0.0, 1.0)

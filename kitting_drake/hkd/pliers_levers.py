@@ -1,8 +1,8 @@
 """Pliers of any jaws: two crossed levers, a joint with parallel flanks, sleeves on the handles."""
 
+import itertools
 from dataclasses import dataclass
 
-import manifold3d
 import numpy as np
 from manifold3d import CrossSection, JoinType, Manifold, OpType
 
@@ -19,11 +19,12 @@ from kitting_drake.hkd.solids import (
     plate,
     ribbon,
     rounded_rectangle,
+    without_holes,
 )
 
 # How far the hulls of full-size pliers may stand out of them, in the outline and in height; and
 # how far within the outline those of a sleeve lie, so that chords may cut its hollow side.
-_OUTLINE_MM, _HEIGHT_MM, _INSET_MM = 0.22, 1.0, 0.2
+_OUTLINE_MM, _HEIGHT_MM, _INSET_MM = 0.22, 1.0, 0.14
 
 
 @dataclass
@@ -34,6 +35,8 @@ class Levers:
     # Width across the parallel flanks of the joint; how far they run behind and before the rivet.
     joint_width_mm: float = 28.0
     joint_back_mm: float = 22.0
+    # How far behind the rivet the handles run on in line with the flanks.
+    parallel_mm: float = 44.0
     joint_front_mm: float = 9.0
     # From the rivet to the end of the handles.
     handle_length_mm: float = 130.0
@@ -85,16 +88,16 @@ def _turned_over(shape: Shape) -> Shape:
 def handle_path(v: Levers) -> np.ndarray:
     """The middle of the handle at y < 0, from within the joint to its end; (n, 2)."""
     start = (-0.45 * v.joint_back_mm, -0.5 * (v.joint_width_mm - v.handle_width_mm))
-    shoulder_x = -v.joint_back_mm - v.shoulder_share * (v.handle_length_mm - v.joint_back_mm)
+    shoulder_x = -v.parallel_mm - v.shoulder_share * (v.handle_length_mm - v.parallel_mm)
     corners = [
         start,
-        (-0.85 * v.joint_back_mm, start[1]),
+        (-v.parallel_mm, start[1]),
         (shoulder_x, -v.spread_mm / 2),
         (-v.handle_length_mm, -v.end_spread_mm / 2),
     ]
     # The closing edge of the polygon runs far off, so that the two ends stay sharp.
     far = [(-v.handle_length_mm, -400.0), (start[0], -400.0)]
-    return fillet([*corners, *far], [0, 30.0, v.bend_radius_mm, 0, 0, 0], 6)[:-2]
+    return fillet([*corners, *far], [0, 20.0, v.bend_radius_mm, 0, 0, 0], 6)[:-2]
 
 
 def _even(path: np.ndarray, step: float) -> np.ndarray:
@@ -108,7 +111,7 @@ def _band(v: Levers, bare_only: bool) -> np.ndarray:
     """The outline of the steel handle at y < 0; of its bare stretch only, or whole."""
     path = _even(handle_path(v), 4.0)
     if bare_only and v.grip_length_mm:
-        path = path[path[:, 0] > v.grip_length_mm - v.handle_length_mm - 4.0]
+        path = path[path[:, 0] > v.grip_length_mm - v.handle_length_mm - 9.0]
     if not v.grip_length_mm:
         # A bare handle swells toward its end.
         run = np.linspace(0.0, 1.0, len(path))
@@ -163,7 +166,11 @@ def _lever(v: Levers, j: Jaws, upper: bool) -> Manifold:
     jaw = _tapered(plate(outline, -z, z, v.bevel_mm).solid, v, j)
     if j.kind in ("diagonal", "nipper", "snips"):
         jaw -= _edge_bevel(v, j)
-    band = plate(_band(v, False), -z, z, v.bevel_mm).solid
+    band = plate(_band(v, True), -z, z, v.bevel_mm).solid
+    if v.grip_length_mm:
+        # The tang within the sleeve.
+        tang = plate(_band(v, False), -0.45 * z, 0.45 * z, 0.3).solid
+        band += tang
     lap = plate(_lap_outline(v), 0.0, z, v.bevel_mm).solid
     room = CrossSection([_lap_outline(v)]).mirror((0, 1)).offset(0.25, circular_segments=SEGMENTS)
     gap = room.extrude(z + 1).translate((0, 0, -z - 1))
@@ -209,6 +216,8 @@ def _steel_hulls(v: Levers, j: Jaws) -> list[np.ndarray]:
         *_jaw_outlines(v, j),
         *(o for half in (band, lap) for o in (half, (half * np.array([1.0, -1.0]))[::-1])),
     ]
+    if v.spring:
+        outlines.append(_leaf(v))
     whole = CrossSection.batch_boolean([CrossSection([o]) for o in outlines], OpType.Add)
     hulls = slab_hulls(whole, -z, z, v.bevel_mm)
     if not j.tip_thickness_mm:
@@ -218,52 +227,50 @@ def _steel_hulls(v: Levers, j: Jaws) -> list[np.ndarray]:
 
 
 def slab_hulls(
-    profile: CrossSection, z_low: float, z_high: float, bevel: float, tolerance: float = 0.25
+    profile: CrossSection, z_low: float, z_high: float, bevel: float, tolerance: float = 0.24
 ) -> list[np.ndarray]:
-    """Few convex prisms for a plate, bevelled below where its rim is; gaps under 4 mm are filled.
+    """Few convex prisms for a plate, bevelled below where its rim is; holes and gaps are filled.
 
-    The profile is cut into triangles, and neighbours are joined while their hull stays within the
-    tolerance (mm), the pair first whose hull adds least.
+    The profile is cut across x into bands, each as long as the hulls of all its pieces stay within
+    the tolerance (mm).
     """
 
     def grown(p: CrossSection, d: float) -> CrossSection:
         return p.offset(d, JoinType.Round, circular_segments=SEGMENTS)
 
-    filled = grown(grown(profile, 2.0), -2.0).simplify(0.02)
-    filled = CrossSection([p for p in filled.to_polygons() if CrossSection([p]).area() > 12.0])
-    coarse = filled.simplify(0.15)
-    loops = coarse.to_polygons()
-    points = np.vstack(loops)
-    pieces = [CrossSection([points[t]]) for t in manifold3d.triangulate(loops)]
-    allowed = grown(coarse, tolerance)
+    filled = without_holes(grown(grown(profile, 2.0), -2.0)).simplify(0.02)
+    allowed = grown(filled, tolerance)
+    left, low, right, high = filled.bounds()
 
-    def cost(a: CrossSection, b: CrossSection) -> float | None:
-        box_a, box_b = a.bounds(), b.bounds()
-        if any(box_a[k] > box_b[k + 2] + 0.1 or box_b[k] > box_a[k + 2] + 0.1 for k in (0, 1)):
-            return None
-        joined = (a + b).hull()
-        if (joined - allowed).area() > 1e-4:
-            return None
-        return joined.area() - a.area() - b.area()
+    def pieces(start: float, end: float) -> list[CrossSection]:
+        band = CrossSection.square((end - start, high - low + 2)).translate((start, low - 1))
+        parts = [p for p in (filled ^ band).decompose() if p.area() > 0.05 * (end - start)]
+        return [p.hull() for p in parts]
 
-    alive = dict(enumerate(pieces))
-    options = {(a, b): cost(alive[a], alive[b]) for a in alive for b in alive if a < b}
-    while fitting := {pair: c for pair, c in options.items() if c is not None}:
-        a, b = min(fitting, key=lambda pair: (round(fitting[pair], 4), pair))
-        new = max(alive) + 1
-        alive[new] = (alive.pop(a) + alive.pop(b)).hull()
-        options = {pair: c for pair, c in fitting.items() if not {a, b} & set(pair)}
-        options |= {(c, new): cost(alive[c], alive[new]) for c in alive if c != new}
+    def fits(start: float, end: float) -> bool:
+        return all((p - allowed).area() < 0.15 for p in pieces(start, end))
+
+    step = 0.25
+    edges, count = [0], int(np.ceil((right - left) / step))
+    while edges[-1] < count:
+        shorter, longer = edges[-1] + 1, count
+        while shorter < longer:
+            middle = (shorter + longer + 1) // 2
+            if fits(left + step * edges[-1], left + step * middle):
+                shorter = middle
+            else:
+                longer = middle - 1
+        edges.append(shorter)
     levels = [(z_low, bevel), (z_low + bevel, 0.0), (z_high, 0.0)]
-    insets = {inset: grown(filled, tolerance).offset(-inset - tolerance) for _, inset in levels}
+    inset = grown(filled, tolerance).offset(-bevel - tolerance, JoinType.Miter)
     result = []
-    for piece in alive.values():
-        rings = [
-            np.column_stack([p, np.full(len(p), height)])
-            for height, inset in levels
-            for p in ((piece ^ insets[inset]) if inset else piece).to_polygons()
-        ]
-        if rings and np.ptp(np.vstack(rings)[:, 2]) > 0.5 * (z_high - z_low):
+    for start, end in itertools.pairwise(edges):
+        for piece in pieces(left + step * start, left + step * end):
+            rings = [
+                np.column_stack([p, np.full(len(p), height)])
+                for height, cut in levels
+                for p in ((piece ^ inset) if cut else piece).to_polygons()
+            ]
             result.append(np.vstack(rings))
     return result
 
@@ -314,10 +321,13 @@ def _rivet(v: Levers) -> Shape:
     return Shape(solid - dimple, [np.vstack([low, high])])
 
 
-def _spring(v: Levers) -> Manifold:
-    """A bowed leaf between the handles, just behind the joint."""
+def _leaf(v: Levers) -> np.ndarray:
+    """The outline of a bowed leaf spring between the handles, just behind the joint."""
     ends = 0.5 * (v.joint_width_mm - v.handle_width_mm)
     t = np.linspace(-1.0, 1.0, 21)
     x = -v.joint_back_mm - 2.0 - 9.0 * (1 - t**2)
-    leaf = ribbon(np.column_stack([x, -t * ends]), np.full(len(t), 1.6))
-    return plate(leaf, -2.5, 2.5, 0.2).solid
+    return ribbon(np.column_stack([x, -t * ends]), np.full(len(t), 1.6))
+
+
+def _spring(v: Levers) -> Manifold:
+    return plate(_leaf(v), -2.5, 2.5, 0.2).solid

@@ -120,19 +120,19 @@ def build_locking(k: Locking) -> list[Part]:
             (-70.0, -half + 0.35 * k.handle_depth_mm - 1.5, 2.6, z - 0.8),
         )
     ]
-    # One slab for all that is flat, thick as the body: the parts' own heights hardly differ.
-    outlines = [body, handle, upper, lower]
-    profiles = [CrossSection([o]) if CrossSection([o]).area() > 0 else CrossSection([o[::-1]])
-                for o in outlines]
-    slab = slab_hulls(CrossSection.batch_boolean(profiles[:2], OpType.Add), -z, z, 1.2)
-    front = slab_hulls(CrossSection.batch_boolean(profiles[2:], OpType.Add), -zj, zj, 0.8)
-    inner = slab_hulls(CrossSection([release]), -0.5 * z, 0.5 * z, 0.6)
+    # One slab for all that is flat, thick as the body.
+    def together(outlines: list[np.ndarray]) -> CrossSection:
+        profiles = [CrossSection([o]) + CrossSection([o[::-1]]) for o in outlines]
+        return CrossSection.batch_boolean(profiles, OpType.Add)
+
+    slab = slab_hulls(together([body, handle, release, link]), -z, z, 1.2)
+    front = slab_hulls(together([upper, lower]), -zj, zj, 0.8)
     return [
         *(Part(f"rivet_{i}", k.jaw_material, r) for i, r in enumerate(rivets)),
         Part("body", k.body_material, body_shape.solid, slab),
         Part("handle", k.body_material, handle_shape.solid),
         Part("jaws", k.jaw_material, jaws[0].solid + jaws[1].solid, front),
-        Part("release", k.lever_material, release_shape.solid, inner),
+        Part("release", k.lever_material, release_shape.solid),
         Part("link", k.jaw_material, link_shape.solid),
         Part("screw", k.jaw_material, screw.solid, screw.hulls),
         Part("knob", k.jaw_material, knob.solid, knob.hulls),

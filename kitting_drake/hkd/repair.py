@@ -223,7 +223,7 @@ def _wrapped(triangles: Array) -> Manifold:
     inside = np.argwhere(field > -3)
     first, last = inside.min(axis=0), inside.max(axis=0)
     # A memoryview, because one number of an array at a time is slow to get.
-    values = memoryview(np.ascontiguousarray(field).reshape(-1))
+    values = np.ascontiguousarray(field).reshape(-1).data
     last_x, last_y, last_z = (int(extent) - 2 for extent in shape)
     low_x, low_y, low_z = map(float, low)
     row, plane = int(shape[2]), int(shape[1] * shape[2])

@@ -35,6 +35,8 @@ MATERIALS: dict[str, Material] = {
     "hickory": Material(750.0, (0.82, 0.60, 0.34, 1.0)),
     "leather": Material(900.0, (0.55, 0.30, 0.14, 1.0)),
     "painted_wood": Material(750.0, (0.62, 0.13, 0.10, 1.0)),
+    # Painted aluminium.
+    "red_enamel": Material(2700.0, (0.74, 0.07, 0.06, 1.0)),
     "red_grip": Material(1150.0, (0.80, 0.10, 0.09, 1.0)),
     "blue_grip": Material(1150.0, (0.07, 0.26, 0.62, 1.0)),
     "yellow_grip": Material(1150.0, (0.96, 0.71, 0.06, 1.0)),

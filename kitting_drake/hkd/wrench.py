@@ -189,7 +189,7 @@ def _panel(p: WrenchParameters, side: int) -> Manifold:
         path = _swung(p)
         path = path[(path[:, 0] > start) & (path[:, 0] < end)]
         outline = ribbon(path, np.linspace(2 * half_start, 2 * half_end, len(path)))
-        outline = fillet(outline, 0.95 * half_start)
+        outline = fillet(outline.tolist(), 0.95 * half_start)
     else:
         outline = fillet(
             [(start, -half_start), (end, -half_end), (end, half_end), (start, half_start)],

@@ -240,7 +240,7 @@ def _adjustable(head: Head, x: float, turn_deg: float, bevel: float) -> HeadShap
             (-9.0, 20.0),
             (-22.0, 11.0),
         ],
-        s * np.array([8.0, 8.0, 5.0, 1.0, 0.0, 0.5, 2.0, 10.0, 12.0, 12.0, 10.0]),
+        [s * r for r in (8.0, 8.0, 5.0, 1.0, 0.0, 0.5, 2.0, 10.0, 12.0, 12.0, 10.0)],
     )
     foot, mouth = 0.0, 5.0 * s
     cut = CrossSection(
@@ -298,7 +298,7 @@ def _pipe(head: Head, x: float, turn_deg: float, bevel: float) -> HeadShape:
             (-36.0, 10.0),
             (-46.0, 6.0),
         ],
-        s * np.array([8.0, 3.0, 1.0, 1.0, 0.5, 1.0, 4.0, 4.0, 8.0]),
+        [s * r for r in (8.0, 3.0, 1.0, 1.0, 0.5, 1.0, 4.0, 4.0, 8.0)],
     )
     mouth = CrossSection.square((60.0 * s, 80.0 * s)).translate((-1.1 * s, -40.0 * s))
     window = rounded_rectangle(9.6 * s, 20.0 * s, 1.5 * s) + (-17.0 * s, -10.6 * s)
@@ -316,7 +316,7 @@ def _pipe(head: Head, x: float, turn_deg: float, bevel: float) -> HeadShape:
     jaw = _flat_part(
         "hook_jaw",
         "steel",
-        CrossSection([fillet(hook, s * np.array([0.0, 6.0, 9.0, 9.0, 5.0, 0.8, 2.0, 0.0]), 4)]),
+        CrossSection([fillet(hook, [s * r for r in (0.0, 6.0, 9.0, 9.0, 5.0, 0.8, 2.0, 0.0)], 4)]),
         0.78 * head.thickness_mm,
         bevel,
     )
@@ -346,14 +346,14 @@ def _pipe(head: Head, x: float, turn_deg: float, bevel: float) -> HeadShape:
 
 
 def _hook(head: Head, x: float, turn_deg: float, bevel: float) -> HeadShape:
-    """A quarter and a bit of a ring that ends in a nose, which points at the ring's middle.
+    """A third of a ring that ends in a nose, which points at the ring's middle.
 
     The ring leaves the shank along its axis and bends to the side of +y.
     """
     radius = head.diameter_mm / 2
-    angles = np.radians(np.linspace(-96.0, 22.0, 25))
+    angles = np.radians(np.linspace(-96.0, 40.0, 25))
     path = radius * np.column_stack([np.cos(angles), 1.0 + np.sin(angles)])
-    widths = np.interp(angles, angles[[0, -1]], (0.62 * radius, 0.34 * radius))
+    widths = np.interp(angles, angles[[0, -1]], (0.66 * radius, 0.3 * radius))
     arc = CrossSection([ribbon(path, widths)])
     nose = fillet(
         [
@@ -364,7 +364,7 @@ def _hook(head: Head, x: float, turn_deg: float, bevel: float) -> HeadShape:
         ],
         [0.6, 0.0, 0.0, 0.6],
     )
-    hook = CrossSection([nose]).rotate(17.0).translate((0.0, radius))
+    hook = CrossSection([nose]).rotate(34.0).translate((0.0, radius))
     return HeadShape(_put(arc + hook, x, turn_deg), CrossSection())
 
 

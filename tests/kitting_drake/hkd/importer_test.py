@@ -313,7 +313,7 @@ def corrupted(data: bytes, rng: np.random.Generator) -> bytes:
             return rng.integers(256, size=size * 20, dtype=np.uint8).tobytes()
 
 
-@pytest.mark.parametrize("seed", range(42))
+@pytest.mark.parametrize("seed", range(40))
 def test_a_broken_file_makes_a_whole_tool_or_none(seed: int, tmp_path: Path):
     suffix = SUFFIXES[seed % len(SUFFIXES)]
     path = tmp_path / f"it.{suffix.split('.')[-1]}"
@@ -335,12 +335,7 @@ def test_a_broken_file_makes_a_whole_tool_or_none(seed: int, tmp_path: Path):
 @pytest.mark.skipif(not REAL.is_dir(), reason=f"no real meshes in {REAL}")
 @pytest.mark.parametrize(
     "name",
-    [
-        "hammer/cc0_claw_hammer",
-        "pliers/cc0_pliers",
-        "screwdriver/stars_nut_driver",
-        "wrench/zeyuli_wrench",
-    ],
+    ["hammer/cc0_claw_hammer", "pliers/cc0_pliers", "wrench/zeyuli_wrench"],
 )
 def test_real_tools(name: str, tmp_path: Path):
     report = bring(REAL / f"{name}.obj", tmp_path / "tools", category=name.split("/")[0])
