@@ -139,7 +139,10 @@ def build_parts(entry: ToolEntry) -> list[Part]:
         raise CatalogueError(
             f"tool {entry.name}: {parameters_type.__name__} has no field {unknown[0]!r}"
         )
-    parts = build(parameters_type(**entry.parameters))
+    try:
+        parts = build(parameters_type(**entry.parameters))
+    except (TypeError, ValueError, KeyError) as error:
+        raise CatalogueError(f"tool {entry.name}: {error}") from error
     box = Manifold.batch_boolean([part.solid for part in parts], OpType.Add).bounding_box()
     scale = entry.length_mm / max(box[3] - box[0], box[4] - box[1])
     taken, result = Manifold(), []

@@ -17,6 +17,7 @@ from kitting_drake.hkd.solids import Part, Shape, across_path, fillet, loft, rou
 # How far the hulls of a full-size head or shaft may stand out of it, in the outline and in height.
 OUTLINE_MM, HEIGHT_MM = 0.4, 1.2
 
+
 @dataclass
 class HeadEnd:
     """One end of a head. Lengths in mm of the full-size tool."""

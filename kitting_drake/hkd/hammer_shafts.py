@@ -162,7 +162,9 @@ def _hollows(s: Shaft, top: float):
     thickness = s.flatness * s.neck_width_mm
     half = 0.24 * s.neck_width_mm
     outline = fillet([(start, -half), (end, -half), (end, half), (start, half)], 0.9 * half)
-    below = [np.column_stack([top - outline[:, 0], outline[:, 1], np.full(len(outline), z)])
-             for z in (0.27 * thickness, thickness)]
+    below = [
+        np.column_stack([top - outline[:, 0], outline[:, 1], np.full(len(outline), z)])
+        for z in (0.27 * thickness, thickness)
+    ]
     above = [ring * np.array([1.0, 1.0, -1.0]) for ring in below]
     return loft(below).solid + loft(above).solid

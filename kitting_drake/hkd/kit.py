@@ -36,7 +36,7 @@ _DIGITS = 7
 """Of coordinates in files, after the point."""
 _TOP_CELL = 0.02
 """Side of the squares into which the top is cut for the contact solver, in metres."""
-_FORMAT_VERSION = "5"
+_FORMAT_VERSION = "6"
 """Part of the cache key: changed whenever the same input makes another kit."""
 
 
@@ -89,14 +89,24 @@ def cavity_place(tool: Tool, parameters: KitParameters) -> tuple[float, float, f
 
 
 def cavity_outline(outline: CrossSection, parameters: KitParameters) -> CrossSection:
-    """The outline of a tool, closed and grown by the clearance."""
+    """The outline of a tool, closed and grown by the clearance.
+
+    A hole through the tool leaves no pillar standing in its cavity, thin and of no use.
+    """
     closing, clearance = parameters.closing_radius, parameters.clearance
     # Simplified first and last only: each time costs up to the tolerance.
     grown = outline.simplify(parameters.tolerance / 4).offset(
         closing + clearance, JoinType.Round, circular_segments=_ARC_SEGMENTS
     )
     closed = grown.offset(-closing, JoinType.Round, circular_segments=_ARC_SEGMENTS)
-    return closed.simplify(parameters.tolerance)
+    # Loops around holes run clockwise, and have negative areas.
+    loops = [loop for loop in closed.to_polygons() if _signed_area(loop) > 0]
+    return CrossSection(loops).simplify(parameters.tolerance)
+
+
+def _signed_area(loop: NDArray[np.float64]) -> float:
+    x, y = loop.T
+    return float(np.dot(x, np.roll(y, -1)) - np.dot(y, np.roll(x, -1))) / 2
 
 
 class _Surface:

@@ -72,6 +72,8 @@ def _typed(kind: type, value: Any, field: str) -> Any:
         return kind(**value) if isinstance(value, dict) else value
     except TypeError as error:
         raise UserError(f"pliers: {field}: {error}") from error
+
+
 def build_pliers(p: PliersParameters) -> list[Part]:
     """The parts of a pair of pliers, in mm in the design frame."""
     if p.locking is not None:

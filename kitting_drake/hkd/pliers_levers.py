@@ -1,6 +1,7 @@
 """Pliers of any jaws: two crossed levers, a joint with parallel flanks, sleeves on the handles."""
 
 import itertools
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -24,7 +25,7 @@ from kitting_drake.hkd.solids import (
 
 # How far the hulls of full-size pliers may stand out of them, in the outline and in height; and
 # how far within the outline those of a sleeve lie, so that chords may cut its hollow side.
-_OUTLINE_MM, _HEIGHT_MM, _INSET_MM = 0.22, 1.0, 0.14
+_OUTLINE_MM, _HEIGHT_MM, _INSET_MM = 0.22, 1.0, 0.08
 
 
 @dataclass
@@ -46,7 +47,7 @@ class Levers:
     end_spread_mm: float = 44.0
     shoulder_share: float = 0.4
     # Radius of the bend at the shoulder.
-    bend_radius_mm: float = 60.0
+    bend_radius_mm: float = 28.0
     handle_width_mm: float = 9.0
     # A sleeve: width and thickness, and its length; no sleeve if zero. A guard is a flare at its
     # front.
@@ -70,7 +71,9 @@ def build_levers(v: Levers, j: Jaws) -> list[Part]:
     upper, lower = _lever(v, j, True), _lever(v, j, False)
     steel = Part("steel", v.steel_material, upper + lower, _steel_hulls(v, j))
     rivet = _rivet(v)
-    parts = [Part("rivet", v.rivet_material, rivet.solid, rivet.hulls), steel]
+    # Its head touches nothing where sleeves stand higher.
+    hidden = v.grip_length_mm and v.grip_thickness_mm > v.thickness_mm + 2.6
+    parts = [Part("rivet", v.rivet_material, rivet.solid, [] if hidden else rivet.hulls), steel]
     if v.grip_length_mm:
         sleeve = _sleeve(v)
         for name, s in (("upper_grip", sleeve), ("lower_grip", _turned_over(sleeve))):
@@ -97,7 +100,7 @@ def handle_path(v: Levers) -> np.ndarray:
     ]
     # The closing edge of the polygon runs far off, so that the two ends stay sharp.
     far = [(-v.handle_length_mm, -400.0), (start[0], -400.0)]
-    return fillet([*corners, *far], [0, 20.0, v.bend_radius_mm, 0, 0, 0], 6)[:-2]
+    return fillet([*corners, *far], [0, 8.0, v.bend_radius_mm, 0, 0, 0], 6)[:-2]
 
 
 def _even(path: np.ndarray, step: float) -> np.ndarray:
@@ -219,7 +222,9 @@ def _steel_hulls(v: Levers, j: Jaws) -> list[np.ndarray]:
     if v.spring:
         outlines.append(_leaf(v))
     whole = CrossSection.batch_boolean([CrossSection([o]) for o in outlines], OpType.Add)
-    hulls = slab_hulls(whole, -z, z, v.bevel_mm)
+    half = v.joint_width_mm / 2
+    flanks = [(2.0 - v.parallel_mm, v.joint_front_mm - 2.0, y) for y in (-half, half)]
+    hulls = slab_hulls(whole, -z, z, v.bevel_mm, flanks)
     if not j.tip_thickness_mm:
         return hulls
     trimmed = [_tapered(Manifold.hull_points(h), v, j) for h in hulls]
@@ -227,20 +232,29 @@ def _steel_hulls(v: Levers, j: Jaws) -> list[np.ndarray]:
 
 
 def slab_hulls(
-    profile: CrossSection, z_low: float, z_high: float, bevel: float, tolerance: float = 0.24
+    profile: CrossSection,
+    z_low: float,
+    z_high: float,
+    bevel: float,
+    flanks: Sequence[tuple[float, float, float]] = (),
+    tolerance: float = 0.24,
 ) -> list[np.ndarray]:
     """Few convex prisms for a plate, bevelled below where its rim is; holes and gaps are filled.
 
     The profile is cut across x into bands, each as long as the hulls of all its pieces stay within
-    the tolerance (mm).
+    the tolerance (mm), and true to the flanks that jaws grip, each given as two bounds along x and
+    the height along y.
     """
 
     def grown(p: CrossSection, d: float) -> CrossSection:
         return p.offset(d, JoinType.Round, circular_segments=SEGMENTS)
 
-    filled = without_holes(grown(grown(profile, 2.0), -2.0)).simplify(0.02)
+    filled = without_holes(grown(grown(profile, 1.8), -1.8)).simplify(0.02)
     allowed = grown(filled, tolerance)
     left, low, right, high = filled.bounds()
+    for start, end, y in flanks:
+        strip = CrossSection.square((end - start, 50.0))
+        allowed -= strip.translate((start, y + 0.05 if y > 0 else y - 50.05))
 
     def pieces(start: float, end: float) -> list[CrossSection]:
         band = CrossSection.square((end - start, high - low + 2)).translate((start, low - 1))
@@ -248,7 +262,7 @@ def slab_hulls(
         return [p.hull() for p in parts]
 
     def fits(start: float, end: float) -> bool:
-        return all((p - allowed).area() < 0.15 for p in pieces(start, end))
+        return all((p - allowed).area() < 0.08 for p in pieces(start, end))
 
     step = 0.25
     edges, count = [0], int(np.ceil((right - left) / step))

@@ -112,7 +112,7 @@ def build_locking(k: Locking) -> list[Part]:
     jaws = [flat(o, -zj, zj, 0.8) for o in (upper, lower)]
     screw, knob = _screw(k, end, half - k.body_depth_mm / 2)
     rivets = [
-        plate(circle(r, (x, y), 24), -height + 0.1, height + 0.7, 0.6).solid
+        plate(circle(r, (x, y), 24), -height + 0.1, height + 0.3, 0.3).solid
         for x, y, r, height in (
             (2.0, -0.55 * half, 4.0, z - 0.8),
             (8.0, 0.68 * half, 3.2, z),
@@ -120,6 +120,7 @@ def build_locking(k: Locking) -> list[Part]:
             (-70.0, -half + 0.35 * k.handle_depth_mm - 1.5, 2.6, z - 0.8),
         )
     ]
+
     # One slab for all that is flat, thick as the body.
     def together(outlines: list[np.ndarray]) -> CrossSection:
         profiles = [CrossSection([o]) + CrossSection([o[::-1]]) for o in outlines]

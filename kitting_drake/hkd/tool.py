@@ -1,5 +1,6 @@
 """A tool as a scenario uses it: a folder with its SDFormat model, its meshes and its record."""
 
+import difflib
 import os
 from dataclasses import dataclass
 from functools import cached_property
@@ -120,8 +121,9 @@ def load_tool(name: str, base: Path | None = None) -> Tool:
                 directory = folder / name
     record_path = directory / "tool.yaml"
     if not record_path.is_file():
-        known = ", ".join([*tool_names(), *user_tool_names()])
-        raise UserError(f"there is no tool '{name}': use one of {known}, or the path of a folder")
+        close = difflib.get_close_matches(name, [*tool_names(), *user_tool_names()], n=1)
+        advice = f"did you mean '{close[0]}'?" if close else "'hkd list' shows those there are"
+        raise UserError(f"there is no tool '{name}', nor a folder with a tool.yaml: {advice}")
     try:
         record = yaml.safe_load(record_path.read_text())
         tool = Tool(
