@@ -4,7 +4,8 @@ from pathlib import Path
 
 import pytest
 from pydrake.multibody.parsing import Parser
-from pydrake.multibody.plant import MultibodyPlant
+from pydrake.multibody.plant import AddMultibodyPlantSceneGraph
+from pydrake.systems.framework import DiagramBuilder
 
 from kitting_drake.errors import UserError
 from kitting_drake.hkd import dataset
@@ -39,15 +40,10 @@ def test_parts_load_from_wherever_they_are_moved(tmp_path: Path):
     manifest = dataset.build_dataset(tmp_path / "built", lambda done, total: None)
     moved = (tmp_path / "built").rename(tmp_path / "moved")
     for entry in (manifest["tools"][0], manifest["kits"][0]):
-        plant = MultibodyPlant(0.01)
-        plant.RegisterAsSourceForSceneGraph(_scene_graph())
+        builder = DiagramBuilder()
+        plant, scene_graph = AddMultibodyPlantSceneGraph(builder, 0.01)
         assert len(Parser(plant).AddModels(str(moved / entry["sdf"]))) == 1
-
-
-def _scene_graph():
-    from pydrake.geometry import SceneGraph
-
-    return SceneGraph()
+        assert scene_graph.model_inspector().num_geometries() > 1
 
 
 def test_a_folder_that_holds_something_is_left_alone(tmp_path: Path):
