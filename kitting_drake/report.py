@@ -9,7 +9,7 @@ from kitting_drake.episode import EpisodeResult
 def episode_table(result: EpisodeResult) -> Table:
     """A row for each tool."""
     table = Table(title=f"{result.scenario}, seed {result.seed}", title_justify="left")
-    table.add_column("tool")
+    table.add_column("tool", no_wrap=True)
     table.add_column("kitted", justify="center")
     for name in ("ADD-S mm", "position mm", "angle deg", "height mm"):
         table.add_column(name, justify="right")

@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
+from manifold3d import Manifold
 
 from kitting_drake.hkd.collision import runs
 from kitting_drake.hkd.hammer_heads import HEIGHT_MM, OUTLINE_MM
@@ -156,7 +157,7 @@ def _bow(s: Shaft, u: float) -> float:
     return s.bow_mm * (np.sin(np.pi * min(1.0, 1.25 * t)) * 1.0 - 1.2 * max(0.0, t - 0.55))
 
 
-def _hollows(s: Shaft, top: float):
+def _hollows(s: Shaft, top: float) -> Manifold:
     """Hollows along the broad sides, between head and grip."""
     start, end = 0.13 * s.length_mm, (s.neck_share - 0.015) * s.length_mm
     thickness = s.flatness * s.neck_width_mm
