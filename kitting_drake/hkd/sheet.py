@@ -166,5 +166,5 @@ def write_sheet(subjects: Sequence[Subject], output: Path) -> None:
         axis.imshow(render_subject(subject))
         axis.set_title(subject.title, fontsize=13, color="0.15")
     figure.tight_layout()
-    figure.savefig(output, dpi=130)
+    figure.savefig(output, dpi=130 if len(subjects) <= 12 else 60)
     plt.close(figure)
