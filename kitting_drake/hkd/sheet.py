@@ -86,7 +86,7 @@ def kit_subject(title: str, kit: Kit) -> Subject:
         (tool.sdf, RigidTransform(kit.goal(index))) for index, tool in enumerate(kit.tools[:-1])
     ]
     models = [(kit.sdf, RigidTransform()), *seated]
-    return Subject(title, models, (0.0, 0.0, 0.03), 0.40, elevation_deg=52.0)
+    return Subject(title, models, (0.0, 0.0, 0.02), 0.47, elevation_deg=52.0)
 
 
 def render_subject(
