@@ -17,7 +17,13 @@ from rich.table import Table
 from kitting_drake.errors import UserError
 from kitting_drake.files import write_whole
 from kitting_drake.hkd.generate import generate_tool, load_catalogue
-from kitting_drake.hkd.grasps import PAD_LENGTH, GraspProposal, propose_grasps
+from kitting_drake.hkd.grasps import (
+    FLOOR_CLEARANCE,
+    GRASP_DEPTH,
+    PAD_LENGTH,
+    GraspProposal,
+    propose_grasps,
+)
 from kitting_drake.hkd.tool import Grasp, Tool, load_tool
 from kitting_drake.paths import MODELS
 
@@ -25,8 +31,6 @@ _HAND_MESHES = MODELS / "franka_hand" / "meshes"
 _FINGERTIP = 0.1121
 """From the hand's flange to its fingertips, in metres: see models/franka_hand/README.md."""
 _FINGER_START = 0.0584
-_GRASP_DEPTH = 0.010
-_FLOOR_CLEARANCE = 0.0015
 
 
 def measure_grasp(tool: Tool, x: float, y: float, theta: float) -> Grasp | None:
@@ -212,7 +216,7 @@ class AnnotationPage:
         self._meshcat.SetProperty("hand", "visible", grasp is not None)
         if grasp is None:
             return
-        tips = max(grasp.surface_height - _GRASP_DEPTH, _FLOOR_CLEARANCE)
+        tips = max(grasp.surface_height - GRASP_DEPTH, FLOOR_CLEARANCE)
         X_THand = RigidTransform(
             RollPitchYaw(math.pi, 0, grasp.theta), [grasp.x, grasp.y, tips + _FINGERTIP]
         )
