@@ -19,7 +19,6 @@ from rich.table import Table
 
 from kitting_drake.cameras import require_rendering
 from kitting_drake.cell import Cell, build_cell
-from kitting_drake.cli import count_type, run_verb, seed_type
 from kitting_drake.episode import run_episode
 from kitting_drake.files import require_folder, write_json
 from kitting_drake.hkd.clearance import measure_clearance
@@ -28,6 +27,7 @@ from kitting_drake.hkd.tool import load_tool
 from kitting_drake.hkd.toolsets import SPLITS, toolsets
 from kitting_drake.paths import SCENARIOS
 from kitting_drake.scenario import Scenario, load_scenario
+from kitting_drake.verb import count_type, run_verb, seed_type
 from systems.pick_place_planner import Mode
 
 _SCENARIO = SCENARIOS / "kitting_oracle.yaml"

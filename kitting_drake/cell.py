@@ -1,7 +1,5 @@
 """From a scenario to the Diagram of the kitting cell: the only place where systems are wired."""
 
-import importlib
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -41,16 +39,17 @@ from kitting_drake.cameras import (
     picture_camera,
 )
 from kitting_drake.errors import UserError
+from kitting_drake.looking import Watch, make_function
 from kitting_drake.paths import MODELS
-from kitting_drake.scenario import Heightmap, PythonPolicy, Scenario
+from kitting_drake.scenario import Heightmap, Learned, PythonPolicy, QuantisedOracle, Scenario
 from kitting_drake.tasks.kitting import KittingScene, make_scene
 from systems.heightmap_projector import HeightmapProjector
-from systems.oracle_policy import OraclePolicy, OracleTarget
+from systems.oracle_policy import OraclePolicy, OracleTarget, Rounding
 from systems.pick_place_planner import PickPlacePlanner
 from systems.pick_place_policy import PickPlacePolicy
 from systems.placement_monitor import PlacementGoal, PlacementMonitor
 from systems.rest_detector import BoundedBody, RestDetector
-from systems.signals import Observation, PickPlaceAction, PixelGrid, PlanarPose
+from systems.signals import PixelGrid, PlanarPose
 from systems.trajectory_controller import TrajectoryController
 
 MESHCAT_PERIOD = 1 / 32
@@ -116,6 +115,7 @@ def build_cell(
     meshcat: Meshcat | None = None,
     picture: bool = False,
     video: Path | None = None,
+    watch: Watch | None = None,
 ) -> Cell:
     """Builds the cell.
 
@@ -126,6 +126,7 @@ def build_cell(
         meshcat: where to show it, if anywhere.
         picture: have what `render_picture` takes.
         video: the file of a film to make (.gif or .webp), if any.
+        watch: told of every decision of a learned policy, and of the observation it is about.
 
     Returns:
         The cell. Its Diagram exports the output ports `observation`, `action`, `add_s`,
@@ -147,17 +148,19 @@ def build_cell(
     _set_initial_poses(plant, scenario, scene, tool_bodies)
 
     # The policy.
-    looks = isinstance(scenario.policy, PythonPolicy)
+    looks = isinstance(scenario.policy, Learned | PythonPolicy)
     if looks or (scenario.cameras and can_render()):
         projector = _add_cameras(builder, scenario, scene_graph, grid)
         builder.ExportOutput(projector.GetOutputPort("observation"), "observation")
-    if isinstance(scenario.policy, PythonPolicy):
-        policy = builder.AddNamedSystem(
-            "policy", PickPlacePolicy(policy=_import_function(scenario.policy))
-        )
+    if isinstance(scenario.policy, Learned | PythonPolicy):
+        function = make_function(scenario.policy, base=base, watch=watch)
+        policy = builder.AddNamedSystem("policy", PickPlacePolicy(policy=function))
         builder.Connect(projector.GetOutputPort("observation"), policy.GetInputPort("observation"))
     else:
-        policy = builder.AddNamedSystem("policy", _make_oracle(scene, tool_bodies))
+        rounding = None
+        if isinstance(scenario.policy, QuantisedOracle):
+            rounding = Rounding(grid, scenario.policy.orientations)
+        policy = builder.AddNamedSystem("policy", _make_oracle(scene, tool_bodies, rounding))
         builder.Connect(plant.get_body_poses_output_port(), policy.GetInputPort("body_poses"))
 
     # Planner and controller.
@@ -267,7 +270,9 @@ def _set_initial_poses(
         plant.GetJointByName(joint).set_default_positions([scenario.planner.open_width / 2])
 
 
-def _make_oracle(scene: KittingScene, tools: list[RigidBody]) -> OraclePolicy:
+def _make_oracle(
+    scene: KittingScene, tools: list[RigidBody], rounding: Rounding | None
+) -> OraclePolicy:
     return OraclePolicy(
         targets=[
             OracleTarget(
@@ -278,7 +283,8 @@ def _make_oracle(scene: KittingScene, tools: list[RigidBody]) -> OraclePolicy:
                 surface_height=tool.grasp.surface_height,
             )
             for tool, body, X_WGoal in zip(scene.tools, tools, scene.X_WGoals, strict=True)
-        ]
+        ],
+        rounding=rounding,
     )
 
 
@@ -340,17 +346,6 @@ def _bounded(plant: MultibodyPlant, scene_graph: SceneGraph, body: RigidBody) ->
         corners.append(X_BBox.multiply(half[:, None] * signs))
     points = np.concatenate(corners, axis=1)
     return BoundedBody(body.index(), points.min(axis=1), points.max(axis=1))
-
-
-def _import_function(config: PythonPolicy) -> Callable[[Observation], PickPlaceAction]:
-    module, _, name = config.function.partition(":")
-    try:
-        function = getattr(importlib.import_module(module), name)
-    except (ImportError, AttributeError) as error:
-        raise UserError(f"policy.function: cannot import {config.function}: {error}") from error
-    if not callable(function):
-        raise UserError(f"policy.function: {config.function} is not a function")
-    return function
 
 
 def _add_cameras(

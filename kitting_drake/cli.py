@@ -2,20 +2,17 @@
 
 import argparse
 import dataclasses
-import logging
-import sys
-from collections.abc import Callable
+import json
 from pathlib import Path
+from typing import Any
 
 from pydrake.geometry import Meshcat
 
 from kitting_drake.cell import Cell, build_cell
 from kitting_drake.errors import UserError
+from kitting_drake.looking import Watch
 from kitting_drake.paths import SCENARIOS
 from kitting_drake.scenario import Scenario, load_scenario
-
-INTERRUPTED = 130
-"""Exit code after Ctrl-C, as shells have it."""
 
 
 def scenario_parser(verb: str, description: str) -> argparse.ArgumentParser:
@@ -40,28 +37,6 @@ def scenario_parser(verb: str, description: str) -> argparse.ArgumentParser:
     return parser
 
 
-def seed_type(text: str) -> int:
-    """A seed given on the command line."""
-    try:
-        seed = int(text)
-    except ValueError:
-        seed = -1
-    if not 0 <= seed < 2**32:
-        raise argparse.ArgumentTypeError(f"'{text}' is not a whole number from 0 to {2**32 - 1}")
-    return seed
-
-
-def count_type(text: str) -> int:
-    """A count given on the command line: 1 or more."""
-    try:
-        count = int(text)
-    except ValueError:
-        count = 0
-    if count < 1:
-        raise argparse.ArgumentTypeError(f"'{text}' is not a whole number of 1 or more")
-    return count
-
-
 @dataclasses.dataclass(frozen=True)
 class ChosenScenario:
     """A scenario as the command line names it."""
@@ -82,6 +57,11 @@ class ChosenScenario:
     def policy(self) -> str:
         """The policy's name for results."""
         return type(self.scenario.policy).__name__.lower()
+
+    @property
+    def described(self) -> dict[str, Any]:
+        """The scenario as JSON holds it."""
+        return json.loads(json.dumps(dataclasses.asdict(self.scenario), default=str))
 
 
 def choose_scenario(arguments: argparse.Namespace) -> ChosenScenario:
@@ -107,6 +87,7 @@ def build_chosen(
     meshcat: Meshcat | None = None,
     picture: bool = False,
     video: Path | None = None,
+    watch: Watch | None = None,
 ) -> Cell:
     """`build_cell` for a scenario of the command line.
 
@@ -121,6 +102,7 @@ def build_chosen(
             meshcat=meshcat,
             picture=picture,
             video=video,
+            watch=watch,
         )
     except UserError as error:
         raise UserError(f"{chosen.path}: {error}") from error
@@ -129,17 +111,3 @@ def build_chosen(
 def output_folder(arguments: argparse.Namespace, name: str) -> Path:
     """The folder that `--output` names, or the verb's own."""
     return arguments.output or Path("output") / name.replace(":", "-")
-
-
-def run_verb(main: Callable[[], int]) -> None:
-    """Runs a verb and leaves with its exit code; a user's error is told in one sentence."""
-    # Drake announces ports and frame names; a verb says itself what a person needs to know.
-    logging.getLogger("drake").setLevel(logging.WARNING)
-    try:
-        code = main()
-    except UserError as error:
-        print(f"error: {error}", file=sys.stderr)
-        code = 2
-    except KeyboardInterrupt:
-        code = INTERRUPTED
-    sys.exit(code)

@@ -4,12 +4,13 @@ import dataclasses
 import logging
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import Context, EventStatus
 
+from kitting_drake.answers import ActionRecord, ActionRecorder, find_cause, object_poses
 from kitting_drake.cell import Cell
 from systems.pick_place_planner import Mode
 
@@ -28,6 +29,8 @@ class ObjectResult:
     position_error_mm: float
     angle_error_deg: float
     height_error_mm: float
+    cause: str | None
+    """Why it is no success, one of `kitting_drake.answers.CAUSES`; None when it is one."""
 
 
 @dataclasses.dataclass
@@ -43,6 +46,8 @@ class EpisodeResult:
     actions: int
     missed_grasps: int
     dropped_objects: int
+    actions_taken: list[ActionRecord]
+    """What the policy answered each time, and what came of it."""
     sim_seconds: float
     wall_seconds: float
     point_contact_pairs: int
@@ -103,7 +108,7 @@ def run_episode(
             logging.getLogger(__name__).exception("the episode of seed %d failed", seed)
     wall_seconds = time.perf_counter() - start
     context = simulator.get_context()
-    objects = score(cell, context)
+    objects = score(cell, context, monitor.recorder.records)
     succeeded = sum(item.success for item in objects) / len(objects)
     counts = cell.planner.GetOutputPort("counts").Eval(cell.planner.GetMyContextFromRoot(context))
     return EpisodeResult(
@@ -115,6 +120,7 @@ def run_episode(
         actions=int(counts[0]),
         missed_grasps=int(counts[1]),
         dropped_objects=int(counts[2]),
+        actions_taken=monitor.recorder.records,
         sim_seconds=context.get_time(),
         wall_seconds=wall_seconds,
         point_contact_pairs=monitor.point_contact_pairs,
@@ -124,34 +130,50 @@ def run_episode(
     )
 
 
-def score(cell: Cell, root_context: Context) -> list[ObjectResult]:
-    """How every object stands now, in the order in which an oracle takes them."""
+def score(
+    cell: Cell, root_context: Context, actions_taken: Sequence[ActionRecord] = ()
+) -> list[ObjectResult]:
+    """How every object stands now, in the order in which an oracle takes them.
+
+    Args:
+        cell: the episode's.
+        root_context: of the cell's diagram.
+        actions_taken: what was done so far, to tell why objects are not where they belong.
+    """
     context = cell.monitor.GetMyContextFromRoot(root_context)
     columns = [
         cell.monitor.GetOutputPort(name).Eval(context)
         for name in ("add_s", "position_error", "angle_error", "height_error")
     ]
-    return [
-        ObjectResult(
-            name=tool.name,
-            category=tool.category,
-            add_s_mm=1e3 * add_s,
-            success=bool(add_s < cell.scene.success_threshold),
-            position_error_mm=1e3 * position,
-            angle_error_deg=math.degrees(angle),
-            height_error_mm=1e3 * height,
+    poses = object_poses(cell, root_context)
+    results = []
+    for index, (tool, add_s, position, angle, height) in enumerate(
+        zip(cell.scene.tools, *columns, strict=True)
+    ):
+        success = bool(add_s < cell.scene.success_threshold)
+        results.append(
+            ObjectResult(
+                name=tool.name,
+                category=tool.category,
+                add_s_mm=1e3 * add_s,
+                success=success,
+                position_error_mm=1e3 * position,
+                angle_error_deg=math.degrees(angle),
+                height_error_mm=1e3 * height,
+                cause=None if success else find_cause(cell, index, poses[index], actions_taken),
+            )
         )
-        for tool, add_s, position, angle, height in zip(cell.scene.tools, *columns, strict=True)
-    ]
+    return results
 
 
 class _Monitor:
-    """The simulator's monitor: puts tools to sleep, counts point contacts, knows the end."""
+    """The simulator's monitor: puts tools to sleep, takes notes, knows the end."""
 
     def __init__(self, cell: Cell, watch: Callable[[Context, Mode], None] | None) -> None:
         self._cell = cell
         self._watch = watch
         self._contact_results = cell.plant.get_contact_results_output_port()
+        self.recorder = ActionRecorder(cell)
         self.point_contact_pairs = 0
         self.done_since: float | None = None
 
@@ -161,6 +183,7 @@ class _Monitor:
         self.point_contact_pairs = max(self.point_contact_pairs, results.num_point_pair_contacts())
         cell.apply_sleep(root_context)
         mode = cell.planner.mode(cell.planner.GetMyContextFromRoot(root_context))
+        self.recorder.look(root_context, mode)
         if self._watch is not None:
             self._watch(root_context, mode)
         if mode != Mode.DONE:

@@ -48,3 +48,24 @@ def require_folder(path: Path) -> Path:
             return path
     except OSError as error:
         raise UserError(f"cannot write into {path}: {error.strerror}") from error
+
+
+def claim_folder(folder: Path, name: str, described: Any, *, of: str) -> None:
+    """Marks a folder, by a JSON file in it, as that of one thing's files.
+
+    Args:
+        folder: whose.
+        name: of the file.
+        described: what tells the thing from others; anything that JSON takes.
+        of: what such a thing is called.
+
+    Raises:
+        UserError: it holds those of another.
+    """
+    path = folder / name
+    described = json.loads(json.dumps(described, default=str))
+    if path.exists() and json.loads(path.read_text()) != described:
+        raise UserError(
+            f"{folder} holds the files of another {of}: give another --output, or delete it"
+        )
+    write_json(path, described)

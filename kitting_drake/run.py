@@ -11,19 +11,12 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 from kitting_drake.cameras import render_picture, save_png
 from kitting_drake.cell import Cell
-from kitting_drake.cli import (
-    INTERRUPTED,
-    build_chosen,
-    choose_scenario,
-    output_folder,
-    run_verb,
-    scenario_parser,
-    seed_type,
-)
+from kitting_drake.cli import build_chosen, choose_scenario, output_folder, scenario_parser
 from kitting_drake.episode import run_episode
 from kitting_drake.errors import UserError
 from kitting_drake.files import require_folder, write_json, write_whole
 from kitting_drake.report import print_episode
+from kitting_drake.verb import INTERRUPTED, run_verb, seed_type
 from systems.pick_place_planner import Mode
 
 

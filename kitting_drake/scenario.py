@@ -102,6 +102,28 @@ class Oracle:
 
 
 @dc.dataclass
+class QuantisedOracle:
+    """The oracle, rounded to what a network can say: the ceiling of the paper's policy at an N."""
+
+    # N: picks and turns are among 2 pi i / N; positions are pixel centres of the heightmap.
+    orientations: int = bounded(180, 2, 3600)
+
+
+@dc.dataclass
+class Learned:
+    """Networks trained by `train`."""
+
+    # Their file, as `train` writes it; relative to the scenario's folder.
+    weights: str = ""
+
+    # N: picks and turns are among 2 pi i / N. The paper's own method answers at any N.
+    orientations: int = bounded(180, 2, 3600)
+
+    # Answer between pixels and bins (the paper does not) instead of on them.
+    continuous: bool = True
+
+
+@dc.dataclass
 class PythonPolicy:
     """Your own function from `Observation` to `PickPlaceAction` (see systems/signals.py)."""
 
@@ -217,8 +239,8 @@ class Scenario:
     # What stands on the table, and its score: !Kitting, !ToolsetKitting or !ArrangedKitting.
     task: Kitting | ToolsetKitting | ArrangedKitting = dc.field(default_factory=Kitting)
 
-    # Who decides: !Oracle or !PythonPolicy.
-    policy: Oracle | PythonPolicy = dc.field(default_factory=Oracle)
+    # Who decides: !Oracle, !QuantisedOracle, !Learned or !PythonPolicy.
+    policy: Oracle | QuantisedOracle | Learned | PythonPolicy = dc.field(default_factory=Oracle)
 
     # The RGB-D cameras by name: !Pinhole or !LookAt. These three are those of Ravens.
     cameras: dict[str, Pinhole | LookAt] = dc.field(
@@ -364,9 +386,11 @@ def _check_meaning(scenario: Scenario) -> None:
                 f"cameras.{key} looks straight down, where upright means nothing: use !Pinhole"
             )
     policy = scenario.policy
+    if isinstance(policy, Learned) and not policy.weights:
+        raise ValueError("policy.weights is empty: name a file that train wrote")
+    if isinstance(policy, Learned | PythonPolicy) and not scenario.cameras:
+        raise ValueError("cameras is empty: this policy needs at least one to see by")
     if isinstance(policy, PythonPolicy):
         module, _, function = policy.function.partition(":")
         if not module or not function:
             raise ValueError(f"policy.function must be module:function, not '{policy.function}'")
-        if not scenario.cameras:
-            raise ValueError("cameras is empty: a !PythonPolicy needs at least one to see by")

@@ -22,7 +22,7 @@ from systems.hand_motion import (
     ramp,
 )
 from systems.pick_place_parameters import Mode, PickPlaceParameters
-from systems.signals import PickPlaceAction, wrap_to_pi
+from systems.signals import PickPlaceAction, PlanarPose, wrap_to_pi
 
 _FIELDS = (
     ["mode", "start_time", "duration"]
@@ -124,6 +124,14 @@ class PickPlacePlanner(LeafSystem):
     def mode(self, context: Context) -> Mode:
         """What the planner is doing in the given context (its own)."""
         return Mode(int(self._state(context).mode))
+
+    def action(self, context: Context) -> tuple[PlanarPose, PlanarPose]:
+        """Pick and place of the action begun last, as the hand goes there (its own context)."""
+        state = self._state(context)
+        return (
+            PlanarPose(float(state.pick_x), float(state.pick_y), float(state.pick_yaw)),
+            PlanarPose(float(state.place_x), float(state.place_y), float(state.place_yaw)),
+        )
 
     def _state(self, context: Context) -> _State:
         return _PlannerState(context.get_discrete_state(self._state_index).get_value())

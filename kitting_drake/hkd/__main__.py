@@ -8,7 +8,6 @@ from rich.console import Console
 from rich.progress import Progress, track
 from rich.table import Table
 
-from kitting_drake.cli import count_type, run_verb
 from kitting_drake.hkd.generate import (
     CatalogueError,
     ToolEntry,
@@ -18,6 +17,7 @@ from kitting_drake.hkd.generate import (
 from kitting_drake.hkd.tool import CATEGORIES, load_tool, user_tool_names, user_tools
 from kitting_drake.hkd.toolsets import SPLITS, toolsets
 from kitting_drake.paths import MODELS
+from kitting_drake.verb import count_type, run_verb
 
 
 def _chosen(entries: list[ToolEntry], names: list[str]) -> list[ToolEntry]:

@@ -12,7 +12,7 @@ from pydrake.math import RigidTransform
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import Context
 
-from kitting_drake.cell import Cell, build_cell
+from kitting_drake.cell import Cell, build_cell, make_grid
 from kitting_drake.episode import EpisodeResult, run_episode
 from kitting_drake.errors import UserError
 from kitting_drake.paths import MODELS
@@ -22,6 +22,7 @@ from kitting_drake.scenario import (
     Pinhole,
     Placement,
     PythonPolicy,
+    QuantisedOracle,
     Scenario,
     Sleep,
     load_scenario,
@@ -120,6 +121,18 @@ def test_the_oracle_begins_with_the_first_tool():
     expected = cell.scene.X_WTools[0] @ np.array([grasp.x, grasp.y, 0.0])
     np.testing.assert_allclose([action.pick.x, action.pick.y], expected[:2], atol=1e-12)
     assert action.surface_height == pytest.approx(grasp.surface_height)
+
+
+def test_a_quantised_oracle_answers_in_pixels_and_bins():
+    exact, rounded = (
+        cell.diagram.GetOutputPort("action").Eval(cell.diagram.CreateDefaultContext())
+        for cell in (build(), build(Scenario(policy=QuantisedOracle(orientations=36))))
+    )
+    grid = make_grid(Scenario().heightmap)
+    pixel = grid.to_pixel((rounded.pick.x, rounded.pick.y))
+    np.testing.assert_allclose(pixel, np.round(grid.to_pixel((exact.pick.x, exact.pick.y))))
+    bins = np.rad2deg(rounded.pick.theta) / 10
+    assert bins == pytest.approx(round(np.rad2deg(exact.pick.theta) / 10))
 
 
 def test_what_lies_still_goes_to_sleep():
@@ -240,6 +253,8 @@ def test_a_python_policy_is_asked_only_when_the_planner_has_observed(stub: Stub)
     result = run(cell, 30.0, watch)
     assert asked == [Mode.OBSERVE, Mode.OBSERVE]
     assert (result.actions, result.missed_grasps) == (1, 1)
+    assert [action.outcome for action in result.actions_taken] == ["missed"]
+    assert result.objects[0].cause == "missed grasp"
     assert result.failure is None
     # It was shown the block, 50 mm high, where it stands, and not the hand.
     seen = stub.seen[1]

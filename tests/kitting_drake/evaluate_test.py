@@ -1,3 +1,4 @@
+import dataclasses
 import json
 import math
 import os
@@ -9,57 +10,23 @@ from rich.console import Console
 
 import kitting_drake.evaluate as evaluation
 from kitting_drake.cli import ChosenScenario
+from kitting_drake.episode import EpisodeResult
 from kitting_drake.errors import UserError
 from kitting_drake.scenario import Scenario
+from kitting_drake.summary import Episode
 
 CHOSEN = ChosenScenario(Scenario(), Path("mine.yaml"), "mine", None)
 QUIET = Console(quiet=True)
 
 
-def episode(seed: int, errors_mm: list[float], failure: str | None = None) -> evaluation.Episode:
-    objects = [
-        {
-            "category": "wrench",
-            "success": error < 3.5,
-            "add_s_mm": error,
-            "position_error_mm": error,
-            "angle_error_deg": -error,
-            "height_error_mm": 0.0,
-        }
-        for error in errors_mm
-    ]
-    lost = evaluation._lost_episode(CHOSEN, seed, 1, 2.0)
-    rate = sum(item["success"] for item in objects) / len(objects) if not failure else 0.0
-    return lost | {"objects": objects, "failure": failure, "success_rate": rate}
-
-
-def test_a_failed_episode_counts_zero_and_is_never_dropped():
-    episodes = [episode(0, [1.0, 1.0]), episode(1, [1.0, 9.0]), episode(2, [1.0, 1.0], "solver")]
-    summary = evaluation.summarise(episodes, CHOSEN)
-    assert summary["episodes"] == 3
-    assert summary["failed_episodes"] == 1
-    assert summary["success_rate"] == pytest.approx(0.5)
-    assert summary["add_s_mm"]["median"] == pytest.approx(1.0)
-    assert summary["angle_error_deg"]["max"] == pytest.approx(9.0)
-    assert summary["seeds"] == [0, 1, 2]
-
-
-def test_wilson_interval():
-    # 8 of 10: the textbook's 0.490 to 0.943.
-    assert evaluation.wilson_interval(0.8, 10) == pytest.approx([0.4902, 0.9433], abs=1e-4)
-    low, high = evaluation.wilson_interval(1.0, 200)
-    assert high == pytest.approx(1.0)
-    assert low == pytest.approx(200 / (200 + 1.959964**2))
-
-
-def fake_run(chosen: ChosenScenario, seed: int) -> evaluation.Episode:
-    return episode(seed, [float(seed)])
+def fake_run(chosen: ChosenScenario, seed: int) -> Episode:
+    return evaluation._lost_episode(chosen, seed, 1, 2.0)
 
 
 def test_goes_on_where_it_was_stopped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     ran = []
 
-    def run(chosen: ChosenScenario, seed: int) -> evaluation.Episode:
+    def run(chosen: ChosenScenario, seed: int) -> Episode:
         ran.append(seed)
         return fake_run(chosen, seed)
 
@@ -82,13 +49,14 @@ def test_a_folder_of_another_scenario_is_refused(tmp_path: Path, monkeypatch: py
         evaluation.evaluate(other, [0], tmp_path, workers=1, console=QUIET)
 
 
-def die(chosen: ChosenScenario, seed: int, sender) -> None:
+def die(chosen: ChosenScenario, seed: int) -> None:
     os.kill(os.getpid(), signal.SIGKILL)
 
 
 def test_an_episode_whose_process_dies_is_a_failed_one(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(evaluation, "_work", die)
     lost = evaluation._run_apart(CHOSEN, 7)
+    assert lost.keys() == {field.name for field in dataclasses.fields(EpisodeResult)}
     assert lost["seed"] == 7
     assert lost["success_rate"] == 0.0
     assert str(-signal.SIGKILL) in lost["failure"]
@@ -108,3 +76,7 @@ def test_two_short_episodes_side_by_side(verb, tmp_path: Path):
     assert summary["success_rate"] == 0.0
     assert math.isclose(summary["sim_seconds"], 0.4)
     assert summary["point_contact_pairs"] == 0
+    assert summary["causes"]["never picked"] == 8
+    assert summary["wall_seconds_total"] > 0
+    assert (tmp_path / "summary.png").read_bytes().startswith(b"\x89PNG")
+    assert "8 never picked" in done.stdout

@@ -67,6 +67,9 @@ def test_the_oracle_kits_all_four_and_does_so_again():
     assert first.success_rate == 1.0
     assert [item.add_s_mm < 3.5 and item.success for item in first.objects] == [True] * 4
     assert (first.actions, first.missed_grasps, first.dropped_objects) == (4, 0, 0)
+    assert [action.outcome for action in first.actions_taken] == ["placed"] * 4
+    assert [action.object for action in first.actions_taken] == [it.name for it in first.objects]
+    assert max(action.place_position_error_mm for action in first.actions_taken) < 0.1
     assert first.point_contact_pairs == 0
 
 

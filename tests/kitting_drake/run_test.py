@@ -26,6 +26,7 @@ KEYS = {
     "objects",
     "success_rate",
     "actions",
+    "actions_taken",
     "sim_seconds",
     "wall_seconds",
     "point_contact_pairs",
@@ -38,6 +39,7 @@ OBJECT_KEYS = {
     "position_error_mm",
     "angle_error_deg",
     "height_error_mm",
+    "cause",
 }
 
 
@@ -75,6 +77,7 @@ def test_shipped_scenarios_run(
     for item in results["objects"]:
         assert item.keys() >= OBJECT_KEYS
         assert item["name"] in done.stdout  # In the table.
+        assert item["cause"] == "never picked"
     assert diagram.read_text().startswith("digraph")
     for system in ("plant", "policy", "planner", "controller", "monitor"):
         assert system in diagram.read_text()
@@ -89,7 +92,6 @@ def test_quiet_prints_nothing(verb: Verb, tmp_path: Path):
 INTERRUPTED_RUN = """
 import os, signal
 from kitting_drake import run
-from kitting_drake.cli import run_verb
 
 run_episode = run.run_episode
 

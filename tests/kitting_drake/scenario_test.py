@@ -194,6 +194,7 @@ BAD = {
         "A: {cameras: {f: !LookAt {position: [0, 0, 1], target: [0, 0, 0]}}}",
         ["cameras.f", "!Pinhole"],
     ),
+    "orientations": ("A: {policy: !QuantisedOracle {orientations: 1}}", ["policy.orientations"]),
     "no function": ("A: {policy: !PythonPolicy {function: mine}}", ["policy.function", "mine"]),
 }
 

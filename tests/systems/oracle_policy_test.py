@@ -6,8 +6,14 @@ from pydrake.common.value import Value
 from pydrake.math import RigidTransform, RollPitchYaw
 from pydrake.multibody.tree import BodyIndex
 
-from systems.oracle_policy import OraclePolicy, OracleTarget
-from systems.signals import PickPlaceAction, PlanarPose
+from systems.oracle_policy import (
+    OraclePolicy,
+    OracleTarget,
+    Rounding,
+    grasp_taken,
+    gripper_pose,
+)
+from systems.signals import PickPlaceAction, PixelGrid, PlanarPose, wrap_to_pi
 
 
 def planar(x: float, y: float, yaw: float, z: float = 0.0) -> RigidTransform:
@@ -20,9 +26,11 @@ PLIERS = OracleTarget(
 )
 
 
-def ask(poses: dict[int, RigidTransform], *targets: OracleTarget) -> PickPlaceAction:
+def ask(
+    poses: dict[int, RigidTransform], *targets: OracleTarget, rounding: Rounding | None = None
+) -> PickPlaceAction:
     """The action for these body poses by body index."""
-    oracle = OraclePolicy(targets=targets)
+    oracle = OraclePolicy(targets=targets, rounding=rounding)
     context = oracle.CreateDefaultContext()
     everything = [poses.get(index, RigidTransform()) for index in range(3)]
     oracle.GetInputPort("body_poses").FixValue(context, Value(everything))
@@ -77,3 +85,42 @@ def test_surface_height_follows_the_object():
 def test_no_targets_is_refused():
     with pytest.raises(ValueError, match="at least one target"):
         OraclePolicy(targets=[])
+
+
+@pytest.mark.parametrize("yaw", [0.0, 2.0, -3.0])
+def test_the_grasp_taken_is_the_inverse_of_the_gripper_pose(yaw: float):
+    X_WB = planar(0.4, -0.1, yaw)
+    taken = grasp_taken(X_WB, gripper_pose(X_WB, PLIERS.grasp))
+    np.testing.assert_allclose(taken.as_array(), PLIERS.grasp.as_array(), atol=1e-12)
+
+
+@pytest.mark.parametrize("orientations", [36, 180])
+@pytest.mark.parametrize("yaw", [0.03, 1.234, 2.9, -2.0])
+def test_rounded_answers_are_the_nearest_that_can_be_said(yaw: float, orientations: int):
+    grid = PixelGrid()
+    X_WB = planar(0.3512, 0.2034, yaw)
+    action = ask({1: X_WB}, PLIERS, rounding=Rounding(grid, orientations))
+    for pose in (action.pick, action.place):
+        pixel = grid.to_pixel((pose.x, pose.y))
+        np.testing.assert_allclose(pixel, np.round(pixel), atol=1e-9)
+    turn = action.place.theta - action.pick.theta
+    for angle in (action.pick.theta, turn):
+        bins = angle * orientations / math.tau
+        assert bins == pytest.approx(round(bins), abs=1e-9)
+
+    pick = gripper_pose(X_WB, PLIERS.grasp)
+    half_pixel, half_bin = grid.resolution / 2 + 1e-12, math.pi / orientations + 1e-12
+    assert abs(action.pick.x - pick.x) <= half_pixel
+    assert abs(action.pick.y - pick.y) <= half_pixel
+    assert abs(wrap_to_pi(action.pick.theta - pick.theta)) <= half_bin
+    assert abs(wrap_to_pi(turn - (-2.0 - yaw))) <= half_bin
+    # The place is that of the rounded pick, not of the annotated grasp.
+    X_WPick = planar(action.pick.x, action.pick.y, action.pick.theta)
+    ideal = (PLIERS.X_WGoal @ X_WB.inverse() @ X_WPick).translation()
+    assert abs(action.place.x - ideal[0]) <= half_pixel
+    assert abs(action.place.y - ideal[1]) <= half_pixel
+
+
+def test_rounding_stays_on_the_grid():
+    rounding = Rounding(PixelGrid(), 36)
+    assert rounding.position(0.0, 2.0) == pytest.approx((0.2515625, 0.4984375))

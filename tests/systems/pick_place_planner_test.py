@@ -205,8 +205,12 @@ def test_where_the_hand_goes():
     assert run.output("closing_force")[0] == PARAMETERS.grasp_force
     assert run.output("desired_opening")[0] == pytest.approx(WIDTH, abs=1e-3)
     run.until(Mode.LOWER)
-    place = [PLACE.x, PLACE.y, PARAMETERS.travel_height]
-    np.testing.assert_allclose(run.output("desired_motion")[:3], place, atol=1e-5)
+    over_place = [PLACE.x, PLACE.y, PARAMETERS.travel_height]
+    np.testing.assert_allclose(run.output("desired_motion")[:3], over_place, atol=1e-5)
+    context = run.planner.GetMyContextFromRoot(run.simulator.get_context())
+    pick, place = run.planner.action(context)
+    assert (pick.x, pick.y, pick.theta) == (PICK.x, PICK.y, pytest.approx(turned))
+    assert (place.x, place.y) == (PLACE.x, PLACE.y)
     # What is held turns by exactly this: the jaws being alike, the hand may be turned by pi.
     assert run.output("desired_motion")[3] - turned == pytest.approx(PLACE.theta - PICK.theta)
     run.until(Mode.RETREAT)

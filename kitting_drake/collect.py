@@ -1,0 +1,397 @@
+"""`python -m kitting_drake.collect SCENARIO.yaml`: the oracle's demonstrations, in one file."""
+
+import contextlib
+import dataclasses
+import fcntl
+import importlib.metadata
+import itertools
+import json
+import math
+import os
+import platform
+import signal
+import time
+from collections.abc import Callable, Container, Iterable, Iterator, Sized
+from pathlib import Path
+
+import numpy as np
+from pydrake.systems.framework import Context
+from rich.console import Console
+
+import kitting_drake
+from kitting_drake.cameras import require_rendering
+from kitting_drake.cell import Cell, make_grid
+from kitting_drake.cli import (
+    ChosenScenario,
+    build_chosen,
+    choose_scenario,
+    output_folder,
+    scenario_parser,
+)
+from kitting_drake.episode import run_episode
+from kitting_drake.errors import UserError
+from kitting_drake.files import claim_folder, require_folder, write_json
+from kitting_drake.policies.demonstrations import (
+    Demonstration,
+    DemonstrationStep,
+    Origin,
+    Rejection,
+    merge_demonstrations,
+    read_contents,
+    write_demonstrations,
+)
+from kitting_drake.processes import Died, counting_bar, run_apart, side_by_side
+from kitting_drake.scenario import Oracle
+from kitting_drake.seeds import DEMONSTRATION_SEEDS, seeds_from
+from kitting_drake.verb import count_type, run_verb, seed_type
+from systems.pick_place_planner import Mode
+from systems.signals import Observation, PickPlaceAction
+
+LEAST_SCORE = 0.99
+"""A demonstration that scores less is rejected."""
+
+_PATIENCE = 20
+"""So many seeds rejected in a row mean that the oracle cannot do it."""
+
+_KILLED = (-signal.SIGKILL, -signal.SIGTERM)
+"""Exit codes of a process that did not end by its own doing."""
+
+Demonstrate = Callable[[int], Demonstration | Rejection | Died]
+"""What becomes of a seed; called in a thread."""
+
+
+def main() -> int:
+    """Parses the command line and collects; returns the exit code."""
+    parser = scenario_parser("collect", "Collect demonstrations of the oracle.")
+    parser.add_argument("--demos", type=count_type, default=100, help="how many (100)")
+    parser.add_argument("--workers", type=count_type, default=os.cpu_count(), help="side by side")
+    parser.add_argument(
+        "--seed",
+        type=seed_type,
+        default=DEMONSTRATION_SEEDS.start,
+        help=f"of the first ({DEMONSTRATION_SEEDS.start})",
+    )
+    arguments = parser.parse_args()
+    chosen = _by_oracle(choose_scenario(arguments))
+    folder = require_folder(output_folder(arguments, f"{chosen.name}-demonstrations"))
+    console = Console(quiet=arguments.quiet)
+    with _alone(folder):
+        claim_folder(folder, "scenario.json", chosen.described, of="scenario")
+        collection = Collection(folder, _origin(chosen, arguments.seed))
+        if collection.assembled >= arguments.demos:
+            console.print(f"nothing to do: {collection.summary()}", highlight=False, soft_wrap=True)
+            return 0
+        if not chosen.scenario.cameras:
+            raise UserError(f"{chosen.path}: cameras is empty: demonstrations need at least one")
+        require_rendering()
+        start = time.perf_counter()
+        # What cannot be built at all is told at once, not once for each seed.
+        build_chosen(chosen, seed=arguments.seed)
+        collection.collect(
+            arguments.demos,
+            lambda seed: run_apart(_demonstrate, chosen, seed),
+            workers=arguments.workers,
+            console=console,
+        )
+    seconds = time.perf_counter() - start
+    console.print(f"{collection.summary()}; {seconds:.0f} s", highlight=False, soft_wrap=True)
+    return 0
+
+
+@contextlib.contextmanager
+def _alone(folder: Path) -> Iterator[None]:
+    """Keeps a second collection out of a folder while one is at work there."""
+    handle = os.open(folder, os.O_RDONLY)
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        yield
+    except BlockingIOError as error:
+        raise UserError(
+            f"another process collects into {folder}: wait for it, or give another --output"
+        ) from error
+    finally:
+        os.close(handle)
+
+
+class Collection:
+    """A folder of demonstrations: those of the first seeds that are not rejected.
+
+    Which these are depends neither on the workers nor on when it was stopped and went on. Until all
+    are there, `parts` holds a file for each; then they become `demonstrations.h5`, the parts go.
+    """
+
+    def __init__(self, folder: Path, origin: Origin) -> None:
+        """Finds what is there.
+
+        Args:
+            folder: where the files are.
+            origin: of the demonstrations.
+
+        Raises:
+            UserError: what is there is of another origin, or damaged.
+        """
+        self.path = folder / "demonstrations.h5"
+        self._parts = folder / "parts"
+        self._origin = origin
+        self._accepted: dict[int, Path] = {}
+        self._rejected: dict[int, Rejection] = {}
+        self.assembled = 0
+        """How many demonstrations are in the one file."""
+        for path in self._parts.glob(".*"):
+            # Was being written when the process was killed.
+            path.unlink()
+        for path in self._parts.glob("seed_*.h5"):
+            self._accepted[int(path.stem.removeprefix("seed_"))] = path
+        for path in self._parts.glob("seed_*.json"):
+            rejection = Rejection(**json.loads(path.read_text()))
+            self._rejected[rejection.seed] = rejection
+        if self.path.exists():
+            self._find_assembled()
+
+    def _find_assembled(self) -> None:
+        contents = read_contents(self.path)
+        found = contents.origin
+        if found.scenario != self._origin.scenario:
+            raise UserError(
+                f"{self.path} is of another scenario: give another --output, or delete it"
+            )
+        if found.first_seed != self._origin.first_seed:
+            raise UserError(
+                f"{self.path} begins with seed {found.first_seed}: give --seed {found.first_seed} "
+                "or another --output"
+            )
+        self.assembled = len(contents.seeds)
+        self._accepted |= dict.fromkeys(contents.seeds, self.path)
+        self._rejected |= {item.seed: item for item in contents.rejected}
+        # The parts of what is there whole: it was stopped before they were gone.
+        self._remove_parts([*contents.seeds, *(item.seed for item in contents.rejected)])
+
+    def collect(
+        self, count: int, demonstrate: Demonstrate, *, workers: int, console: Console
+    ) -> None:
+        """Makes the demonstrations that are missing, and the one file of them all.
+
+        A process that dies is given a second chance: something else may have killed it, and which
+        seeds are rejected must not hang on that.
+
+        Args:
+            count: how many there shall be.
+            demonstrate: makes one; called in threads.
+            workers: how many at a time.
+            console: for the progress bar.
+
+        Raises:
+            UserError: the seeds come to an end, too many in a row are rejected, or a process is
+                killed twice.
+        """
+        seeds = seeds_from(self._origin.first_seed)
+        working: set[int] = set()
+        died: set[int] = set()
+
+        def draw() -> int | None:
+            seed = next_seed(seeds, count, self._accepted, self._rejected, working)
+            if seed is not None:
+                working.add(seed)
+            return seed
+
+        with counting_bar(console, "demonstrations") as progress:
+            task = progress.add_task("", total=count, completed=min(count, len(self._accepted)))
+            for seed, outcome in side_by_side(
+                lambda seed: (seed, demonstrate(seed)), draw, workers=workers
+            ):
+                working.remove(seed)
+                if not isinstance(outcome, Died):
+                    self._keep(outcome)
+                elif seed in died:
+                    self._keep(_reject_dead(seed, outcome))
+                died.add(seed)
+                progress.update(task, completed=min(count, len(self._accepted)))
+        done = (seed for seed in seeds if seed in self._accepted)
+        self._assemble(list(itertools.islice(done, count)))
+
+    def _keep(self, outcome: Demonstration | Rejection) -> None:
+        path = self._parts / f"seed_{outcome.seed:08d}"
+        if isinstance(outcome, Demonstration):
+            path = path.with_suffix(".h5")
+            write_demonstrations(path, self._origin, [outcome])
+            self._accepted[outcome.seed] = path
+        else:
+            write_json(path.with_suffix(".json"), dataclasses.asdict(outcome))
+            self._rejected[outcome.seed] = outcome
+
+    def _assemble(self, seeds: list[int]) -> None:
+        rejected = [item for seed, item in sorted(self._rejected.items()) if seed < seeds[-1]]
+        sources = [(self._accepted[seed], seed) for seed in seeds]
+        merge_demonstrations(self.path, sources, self._origin, rejected)
+        self._find_assembled()
+
+    def _remove_parts(self, seeds: Iterable[int]) -> None:
+        for seed in seeds:
+            for ending in (".h5", ".json"):
+                (self._parts / f"seed_{seed:08d}{ending}").unlink(missing_ok=True)
+        with contextlib.suppress(OSError):
+            # Not empty when more had been asked for before.
+            self._parts.rmdir()
+
+    def summary(self) -> str:
+        """What the one file holds, for people."""
+        contents = read_contents(self.path)
+        megabytes = self.path.stat().st_size / 1e6
+        return (
+            f"{self.path} ({megabytes:.1f} MB) holds {_number(contents.seeds, 'demonstration')}, "
+            f"{_number(contents.rejected, 'seed')} rejected"
+        )
+
+
+def _number(things: Sized, name: str) -> str:
+    return f"{len(things)} {name}{'' if len(things) == 1 else 's'}"
+
+
+def next_seed(
+    seeds: range,
+    count: int,
+    accepted: Container[int],
+    rejected: Container[int],
+    working: Container[int],
+) -> int | None:
+    """Which seed to try next, so that the first that are not rejected are those that are made.
+
+    Args:
+        seeds: all that may be tried, in their order.
+        count: how many demonstrations there shall be.
+        accepted: seeds that gave one.
+        rejected: seeds that did not.
+        working: seeds being tried.
+
+    Returns:
+        A seed; None when there are enough, provided that those being tried are not rejected.
+
+    Raises:
+        UserError: there is none left, or too many in a row were rejected.
+    """
+    none_left = UserError(
+        f"the seeds from {seeds[0]} end at {seeds[-1]}: ask for fewer --demos, or another --seed"
+    )
+    if count > len(seeds):
+        raise none_left
+    hoped_for = in_a_row = 0
+    for seed in seeds:
+        if hoped_for == count:
+            return None
+        if seed in rejected:
+            in_a_row += 1
+            if in_a_row == _PATIENCE:
+                raise UserError(
+                    f"the oracle failed with {_PATIENCE} seeds in a row, {seed - _PATIENCE + 1} to "
+                    f"{seed}: see why by python -m kitting_drake.run with --seed {seed}"
+                )
+        elif seed in accepted or seed in working:
+            hoped_for += 1
+            in_a_row = 0
+        else:
+            return seed
+    if hoped_for < count:
+        raise none_left
+    return None
+
+
+def _by_oracle(chosen: ChosenScenario) -> ChosenScenario:
+    scenario = dataclasses.replace(chosen.scenario, policy=Oracle())
+    return dataclasses.replace(chosen, scenario=scenario)
+
+
+def _origin(chosen: ChosenScenario, first_seed: int) -> Origin:
+    return Origin(
+        scenario_name=chosen.name,
+        scenario=chosen.described,
+        grid=make_grid(chosen.scenario.heightmap),
+        first_seed=first_seed,
+        versions={
+            "kitting_drake": kitting_drake.__version__,
+            "drake": importlib.metadata.version("drake"),
+            "numpy": np.__version__,
+            "python": platform.python_version(),
+        },
+    )
+
+
+def _reject_dead(seed: int, dead: Died) -> Rejection:
+    if dead.exit_code in _KILLED:
+        raise UserError(
+            f"the process of seed {seed} was killed twice, perhaps for want of memory: "
+            "give fewer --workers, and it goes on where it was"
+        )
+    return Rejection(seed, 0.0, f"its process ended with exit code {dead.exit_code}")
+
+
+def _demonstrate(chosen: ChosenScenario, seed: int) -> Demonstration | Rejection:
+    try:
+        cell = build_chosen(chosen, seed=seed)
+    except UserError as error:
+        return Rejection(seed, 0.0, str(error))
+    return demonstrate(cell, seed=seed, time_limit=chosen.scenario.time_limit)
+
+
+def demonstrate(cell: Cell, *, seed: int, time_limit: float) -> Demonstration | Rejection:
+    """Runs an episode of the oracle and takes down what it saw and did.
+
+    Args:
+        cell: fresh from `build_cell`, with the oracle and an `observation`.
+        seed: what it was built with.
+        time_limit: see `run_episode`.
+    """
+    recorder = Recorder(cell)
+    result = run_episode(
+        cell, scenario="", policy="", seed=seed, time_limit=time_limit, watch=recorder.watch
+    )
+    if result.failure or result.success_rate < LEAST_SCORE or not recorder.steps:
+        reason = result.failure or f"{result.success_rate:.0%} of the objects were placed"
+        return Rejection(seed, result.success_rate, reason)
+    return Demonstration(seed, result.success_rate, recorder.steps)
+
+
+class Recorder:
+    """Takes down what the planner acts upon: to be told of every step by `run_episode`."""
+
+    def __init__(self, cell: Cell) -> None:
+        """
+        Args:
+            cell: with the oracle and an `observation`.
+        """
+        self._cell = cell
+        self._mode = Mode.OBSERVE
+        self._steps: dict[str, DemonstrationStep] = {}
+
+    @property
+    def steps(self) -> tuple[DemonstrationStep, ...]:
+        """The last step with each object: after a grasp that failed it is picked again."""
+        return tuple(self._steps.values())
+
+    def watch(self, root_context: Context, mode: Mode) -> None:
+        """For `run_episode`."""
+        previous, self._mode = self._mode, mode
+        # The plant steps first, then the planner decides upon the outcome: what it decided upon is
+        # still there when the step is over, and the ports say the same again.
+        if previous == Mode.OBSERVE and mode == Mode.APPROACH:
+            self._take_down(root_context)
+
+    def _take_down(self, root_context: Context) -> None:
+        cell = self._cell
+        observation: Observation = cell.diagram.GetOutputPort("observation").Eval(root_context)
+        action: PickPlaceAction = cell.diagram.GetOutputPort("action").Eval(root_context)
+        plant_context = cell.plant.GetMyContextFromRoot(root_context)
+        distances = []
+        for tool, body in zip(cell.scene.tools, cell.tool_bodies, strict=True):
+            grasp = np.array([tool.grasp.x, tool.grasp.y, 0.0])
+            x, y, _ = body.EvalPoseInWorld(plant_context) @ grasp
+            distances.append(math.hypot(x - action.pick.x, y - action.pick.y))
+        tool = cell.scene.tools[int(np.argmin(distances))]
+        # What is taken down again moves to the end.
+        self._steps.pop(tool.name, None)
+        self._steps[tool.name] = DemonstrationStep.of(
+            observation, action, name=tool.name, category=tool.category
+        )
+
+
+if __name__ == "__main__":
+    run_verb(main)

@@ -1,0 +1,82 @@
+"""The policies that see nothing but the observation, as functions from it to an action."""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from kitting_drake.errors import UserError
+from kitting_drake.scenario import Learned, PythonPolicy
+from systems.signals import Observation, PickPlaceAction
+
+if TYPE_CHECKING:
+    from kitting_drake.policies.learned_policy import Decision
+
+Watch = Callable[[Observation, "Decision"], None]
+"""Told of every decision of a learned policy."""
+
+
+def make_function(
+    config: Learned | PythonPolicy, *, base: Path, watch: Watch | None
+) -> Callable[[Observation], PickPlaceAction]:
+    """The function that a scenario names.
+
+    Args:
+        config: the scenario's policy.
+        base: where relative paths start.
+        watch: told of a learned policy's decisions.
+
+    Raises:
+        UserError: it cannot be had.
+    """
+    if isinstance(config, PythonPolicy):
+        return _import_function(config)
+    # Only who uses a network waits for torch.
+    from kitting_drake.policies.learned_policy import LearnedPolicy
+    from kitting_drake.policies.weights import load_networks, preferred_type
+
+    networks = load_networks(base / config.weights, preferred_type())
+    try:
+        return LearnedPolicy(
+            networks,
+            orientations=config.orientations,
+            continuous=config.continuous,
+            watch=watch,
+        )
+    except ValueError as error:
+        raise UserError(f"policy.orientations: {error}") from error
+
+
+def describe_learned(config: Learned, *, base: Path) -> dict[str, Any]:
+    """What results say of a learned policy: its method, its size, and what it learned from.
+
+    Raises:
+        UserError: the weights cannot be read.
+    """
+    from kitting_drake.policies.weights import read_weights_file
+
+    file = read_weights_file(base / config.weights)
+    return {
+        "method": file.config.method,
+        "preset": file.config.preset,
+        "orientations": config.orientations,
+        "continuous": config.continuous,
+        "trained_orientations": file.config.orientations,
+        **{
+            key: file.card.get(key)
+            for key in ("scenario", "demonstrations", "demonstration_seeds", "steps")
+        },
+    }
+
+
+def _import_function(config: PythonPolicy) -> Callable[[Observation], PickPlaceAction]:
+    module, _, name = config.function.partition(":")
+    try:
+        function = getattr(importlib.import_module(module), name)
+    except (ImportError, AttributeError) as error:
+        raise UserError(f"policy.function: cannot import {config.function}: {error}") from error
+    if not callable(function):
+        raise UserError(f"policy.function: {config.function} is not a function")
+    return function

@@ -1,0 +1,1 @@
+"""What decides by looking: demonstrations to learn from, networks, losses. No pydrake here."""

@@ -1,0 +1,294 @@
+"""Demonstrations to learn from: episodes of an expert, as (o_t, a_pick, a_place), in one file.
+
+The file is HDF5. Its attributes are `format`, `format_version`, `first_seed`, `scenario_name` and,
+as JSON, `scenario`, `grid`, `versions` and `rejected`. Each demonstration of T steps is a group,
+`seed_00010000`, with the attributes `seed` and `score` and the datasets
+
+- `rgb` (T, 3, rows, cols), 8 bits, and `height` (T, rows, cols), metres: the observations,
+- `pick` and `place` (T, 3), x and y in m, theta in rad, and `surface_height` (T,), m: the actions,
+- `object` and `category` (T,): what was picked.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import json
+import os
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+
+from kitting_drake.errors import UserError
+from systems.signals import Observation, PickPlaceAction, PixelGrid, PlanarPose
+
+FORMAT = "kitting_drake demonstrations"
+FORMAT_VERSION = 1
+
+
+@dataclass(frozen=True)
+class DemonstrationStep:
+    """One observation, and what the expert did."""
+
+    rgb: NDArray[np.uint8]
+    """(3, rows, cols)."""
+    height: NDArray[np.float32]
+    """(rows, cols), metres above `grid.z_min`."""
+    pick: PlanarPose
+    place: PlanarPose
+    surface_height: float
+    """World z of what lies under the pick point, in metres."""
+    object: str
+    """The name of what is picked."""
+    category: str
+
+    @staticmethod
+    def of(
+        observation: Observation, action: PickPlaceAction, *, name: str, category: str
+    ) -> DemonstrationStep:
+        """A step as it happened; colours are rounded to 8 bits."""
+        return DemonstrationStep(
+            rgb=np.rint(observation.rgb * 255).astype(np.uint8),
+            height=observation.height.copy(),
+            pick=action.pick,
+            place=action.place,
+            surface_height=action.surface_height,
+            object=name,
+            category=category,
+        )
+
+    @property
+    def image(self) -> NDArray[np.float32]:
+        """(4, rows, cols), as `Observation.image`: colours in [0, 1], height in metres."""
+        return np.concatenate([self.rgb.astype(np.float32) / 255, self.height[None]])
+
+
+@dataclass(frozen=True)
+class Demonstration:
+    """One episode of the expert."""
+
+    seed: int
+    score: float
+    """Share of the objects that it placed."""
+    steps: tuple[DemonstrationStep, ...]
+
+
+@dataclass(frozen=True)
+class Rejection:
+    """A seed with which the expert did not do well enough to be learned from."""
+
+    seed: int
+    score: float
+    reason: str
+
+
+@dataclass(frozen=True)
+class Origin:
+    """Where demonstrations come from."""
+
+    scenario_name: str
+    scenario: dict[str, Any]
+    """Its fields, as JSON has them."""
+    grid: PixelGrid
+    first_seed: int
+    """Demonstrations are of the first seeds from here on that were not rejected."""
+    versions: dict[str, str]
+    """Of what the last of them were made with."""
+
+
+@dataclass(frozen=True)
+class Demonstrations:
+    """What a file holds."""
+
+    origin: Origin
+    rejected: tuple[Rejection, ...]
+    demonstrations: tuple[Demonstration, ...]
+    """In the order of their seeds."""
+
+
+@dataclass(frozen=True)
+class Contents:
+    """What a file holds, without the demonstrations themselves."""
+
+    origin: Origin
+    rejected: tuple[Rejection, ...]
+    seeds: tuple[int, ...]
+
+
+def read_demonstrations(path: Path, first: int | None = None) -> Demonstrations:
+    """Reads a file of demonstrations.
+
+    Args:
+        path: the file.
+        first: how many, in the order of their seeds; all when None.
+
+    Raises:
+        UserError: the file cannot be used.
+    """
+    with _opened(path) as file:
+        contents = _contents(file)
+        seeds = contents.seeds[:first]
+        demonstrations = tuple(_read_group(file[_group_name(seed)]) for seed in seeds)
+    return Demonstrations(contents.origin, contents.rejected, demonstrations)
+
+
+def read_contents(path: Path) -> Contents:
+    """Reads what a file of demonstrations holds, which is quick.
+
+    Raises:
+        UserError: the file cannot be used.
+    """
+    with _opened(path) as file:
+        return _contents(file)
+
+
+def write_demonstrations(
+    path: Path,
+    origin: Origin,
+    demonstrations: Iterable[Demonstration],
+    rejected: Iterable[Rejection] = (),
+) -> None:
+    """Writes a file of demonstrations, whole or not at all, over what was there.
+
+    Raises:
+        UserError: the file cannot be written.
+    """
+    with _created(path, origin, rejected) as file:
+        for demonstration in demonstrations:
+            _write_group(file, demonstration)
+
+
+def merge_demonstrations(
+    path: Path, sources: Iterable[tuple[Path, int]], origin: Origin, rejected: Iterable[Rejection]
+) -> None:
+    """Writes, whole or not at all, a file of demonstrations taken as they are from other files.
+
+    Args:
+        path: the file; may be one of the others.
+        sources: files, each with the seed of a demonstration that is in it.
+        origin: of them all.
+        rejected: seeds left out.
+
+    Raises:
+        UserError: a file cannot be used or written.
+    """
+    with _created(path, origin, rejected) as file:
+        for source, seed in sources:
+            with _opened(source) as part:
+                part.copy(_group_name(seed), file)
+
+
+def _group_name(seed: int) -> str:
+    return f"seed_{seed:08d}"
+
+
+@contextlib.contextmanager
+def _created(path: Path, origin: Origin, rejected: Iterable[Rejection]) -> Iterator[h5py.File]:
+    """A file to write demonstrations to; it comes to its place when all is written."""
+    scratch = path.with_name(f".{path.name}.scratch")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with h5py.File(scratch, "w") as file:
+            file.attrs["format"] = FORMAT
+            file.attrs["format_version"] = FORMAT_VERSION
+            file.attrs["scenario_name"] = origin.scenario_name
+            file.attrs["scenario"] = json.dumps(origin.scenario)
+            file.attrs["grid"] = json.dumps(dataclasses.asdict(origin.grid))
+            file.attrs["first_seed"] = origin.first_seed
+            file.attrs["versions"] = json.dumps(origin.versions)
+            file.attrs["rejected"] = json.dumps([dataclasses.asdict(item) for item in rejected])
+            yield file
+        os.replace(scratch, path)
+    except OSError as error:
+        raise UserError(f"cannot write {path}: {error.strerror or error}") from error
+    finally:
+        scratch.unlink(missing_ok=True)
+
+
+def _write_group(file: h5py.File, demonstration: Demonstration) -> None:
+    steps = demonstration.steps
+    group = file.create_group(_group_name(demonstration.seed))
+    group.attrs["seed"] = demonstration.seed
+    group.attrs["score"] = demonstration.score
+    for name in ("rgb", "height"):
+        images = np.stack([getattr(step, name) for step in steps])
+        group.create_dataset(
+            name,
+            data=images,
+            chunks=(1, *images.shape[1:]),
+            compression="gzip",
+            compression_opts=4,
+            shuffle=True,
+        )
+    group["pick"] = np.stack([step.pick.as_array() for step in steps])
+    group["place"] = np.stack([step.place.as_array() for step in steps])
+    group["surface_height"] = np.array([step.surface_height for step in steps])
+    for name in ("object", "category"):
+        texts = [getattr(step, name) for step in steps]
+        group.create_dataset(name, data=texts, dtype=h5py.string_dtype())
+
+
+@contextlib.contextmanager
+def _opened(path: Path) -> Iterator[h5py.File]:
+    """A file of demonstrations to read; whatever is wrong with it becomes a UserError."""
+    if not path.is_file():
+        raise UserError(f"there is no file {path}: make it by python -m kitting_drake.collect")
+    foreign = f"{path} is no file of demonstrations: make one by python -m kitting_drake.collect"
+    try:
+        if not h5py.is_hdf5(path):
+            raise UserError(foreign)
+        with h5py.File(path, "r") as file:
+            if file.attrs.get("format") != FORMAT:
+                raise UserError(foreign)
+            version = file.attrs["format_version"]
+            if version != FORMAT_VERSION:
+                raise UserError(
+                    f"{path} is of format version {version}, and version {FORMAT_VERSION} is what "
+                    "can be read: use the kitting_drake that made it, or collect anew"
+                )
+            yield file
+    except (OSError, KeyError, TypeError, json.JSONDecodeError) as error:
+        raise UserError(f"{path} is truncated or damaged: collect anew ({error})") from error
+
+
+def _contents(file: h5py.File) -> Contents:
+    attributes = file.attrs
+    origin = Origin(
+        scenario_name=str(attributes["scenario_name"]),
+        scenario=json.loads(attributes["scenario"]),
+        grid=PixelGrid(**json.loads(attributes["grid"])),
+        first_seed=int(attributes["first_seed"]),
+        versions=json.loads(attributes["versions"]),
+    )
+    rejected = tuple(Rejection(**item) for item in json.loads(attributes["rejected"]))
+    seeds = sorted(int(group.attrs["seed"]) for group in file.values())
+    return Contents(origin, rejected, tuple(seeds))
+
+
+def _read_group(group: h5py.Group) -> Demonstration:
+    names = ("rgb", "height", "pick", "place", "surface_height")
+    numbers = (group[name][()] for name in names)
+    texts = (group[name].asstr()[()] for name in ("object", "category"))
+    return Demonstration(
+        seed=int(group.attrs["seed"]),
+        score=float(group.attrs["score"]),
+        steps=tuple(
+            DemonstrationStep(
+                rgb=rgb,
+                height=height,
+                pick=PlanarPose(*map(float, pick)),
+                place=PlanarPose(*map(float, place)),
+                surface_height=float(surface_height),
+                object=str(name),
+                category=str(category),
+            )
+            for rgb, height, pick, place, surface_height, name, category in zip(
+                *numbers, *texts, strict=True
+            )
+        ),
+    )

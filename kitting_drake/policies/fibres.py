@@ -1,0 +1,150 @@
+"""What a field carries at each pixel: the fibre, and how it travels between layers.
+
+Fields of irreps are stored as *samples* of the function that their coefficients describe, so that a
+pointwise nonlinearity acts on them directly (see `steerable.py`). Everything here is plain linear
+algebra: an exported network needs it, and no group library.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+class Fibre(Protocol):
+    """The representation that one field turns with, and the numbers that stand for it."""
+
+    def __hash__(self) -> int: ...
+
+    @property
+    def size(self) -> int:
+        """Dimension of the representation."""
+
+    @property
+    def channels(self) -> int:
+        """Numbers that travel for one field."""
+
+    def synthesis(self) -> NDArray[np.float64]:
+        """(channels, size): what travels, from a vector of the representation."""
+
+    def analysis(self) -> NDArray[np.float64]:
+        """(size, channels): its left inverse, which drops what the representation cannot hold."""
+
+    def invariant(self) -> NDArray[np.float64]:
+        """(channels,): the functional that no turn changes, scaled as the authors' Fourier ELU."""
+
+
+@dataclass(frozen=True)
+class Scalar:
+    """The trivial representation rho_0."""
+
+    size: int = 1
+    channels: int = 1
+
+    def synthesis(self) -> NDArray[np.float64]:
+        return np.eye(1)
+
+    def analysis(self) -> NDArray[np.float64]:
+        return np.eye(1)
+
+    def invariant(self) -> NDArray[np.float64]:
+        return np.ones(1)
+
+
+@dataclass(frozen=True)
+class Irreps:
+    """A direct sum of irreps of SO(2), equation 4 of the paper.
+
+    Even frequencies alone make a field of the quotient SO(2)/C_2.
+    """
+
+    frequencies: tuple[int, ...]
+    """j of each rho_j, ascending."""
+    samples: int = 0
+    """How many evenly spaced samples of the band-limited function travel; 0: coefficients do."""
+
+    def __post_init__(self) -> None:
+        if list(self.frequencies) != sorted(set(self.frequencies)) or min(self.frequencies) < 0:
+            raise ValueError("frequencies must ascend from 0 or more")
+        if 0 < self.samples <= 2 * max(self.frequencies):
+            raise ValueError(
+                f"{self.samples} samples cannot hold frequency {max(self.frequencies)}: "
+                f"at least {2 * max(self.frequencies) + 1} are needed"
+            )
+
+    @property
+    def size(self) -> int:
+        return sum(2 if j else 1 for j in self.frequencies)
+
+    @property
+    def channels(self) -> int:
+        return self.samples or self.size
+
+    def synthesis(self) -> NDArray[np.float64]:
+        if not self.samples:
+            return np.eye(self.size)
+        angles = 2 * np.pi * np.arange(self.samples) / self.samples
+        columns = fourier_basis(angles, self.frequencies)
+        # Orthogonal columns of equal norm, scaled as escnn's FourierPointwise scales them.
+        columns[:, [0] if self.frequencies[0] == 0 else []] /= math.sqrt(2)
+        return columns * math.sqrt(2 / self.size)
+
+    def analysis(self) -> NDArray[np.float64]:
+        return np.linalg.pinv(self.synthesis())
+
+    def invariant(self) -> NDArray[np.float64]:
+        if not self.samples:
+            raise ValueError("a field of coefficients is read by its first, not by its mean")
+        return np.full(self.samples, math.sqrt(self.size) / self.samples)
+
+
+@dataclass(frozen=True)
+class Regular:
+    """The regular representation of C_N, or of its quotient C_N / C_q: N / q numbers permuted."""
+
+    order: int
+    quotient: int = 1
+
+    def __post_init__(self) -> None:
+        if self.order < 1 or self.quotient < 1 or self.order % self.quotient:
+            raise ValueError(f"C_{self.order} has no subgroup of {self.quotient} elements")
+
+    @property
+    def size(self) -> int:
+        return self.order // self.quotient
+
+    @property
+    def channels(self) -> int:
+        return self.size
+
+    def synthesis(self) -> NDArray[np.float64]:
+        return np.eye(self.size)
+
+    def analysis(self) -> NDArray[np.float64]:
+        return np.eye(self.size)
+
+    def invariant(self) -> NDArray[np.float64]:
+        return np.full(self.size, 1 / math.sqrt(self.size))
+
+
+def fourier_basis(angles: NDArray[np.float64], frequencies: Sequence[int]) -> NDArray[np.float64]:
+    """The basis of equation 5 at some angles.
+
+    Args:
+        angles: (n,), in radians.
+        frequencies: ascending.
+
+    Returns:
+        (n, d): for each frequency a column of cosines and, above zero, one of sines.
+    """
+    columns = []
+    for j in frequencies:
+        columns.append(np.cos(j * angles))
+        if j:
+            columns.append(np.sin(j * angles))
+    return np.stack(columns, axis=1)

@@ -1,0 +1,21 @@
+"""Networks by the names that configs and command lines use."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from kitting_drake.policies.config import NetworkConfig
+from kitting_drake.policies.networks import Networks, SO2Networks
+from kitting_drake.policies.steerable import Convolution, SteerableConv2d
+
+_METHODS: dict[str, Callable[[NetworkConfig, Convolution], Networks]] = {"so2": SO2Networks}
+
+
+def make_networks(config: NetworkConfig, convolution: Convolution = SteerableConv2d) -> Networks:
+    """The networks of a config, with fresh weights.
+
+    Args:
+        config: what to make.
+        convolution: `SteerableConv2d` to train them, `PlainConv2d` to load exported weights.
+    """
+    return _METHODS[config.method](config, convolution)

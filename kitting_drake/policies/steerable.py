@@ -1,0 +1,259 @@
+"""Steerable convolutions that run as plain ones.
+
+A kernel is a combination of escnn's basis kernels. The Fourier transforms that a pointwise
+nonlinearity needs on either side are folded into it,
+
+    kernel' = synthesis_out . kernel . analysis_in,
+
+so that samples travel between layers, ELU acts on them directly, and no transform ever runs on a
+feature map: the same function as escnn's R2Conv followed by FourierELU, of the same weights.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+import warnings
+from collections.abc import Callable
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from kitting_drake.policies.fibres import Fibre, Irreps, Regular, Scalar
+
+Convolution = Callable[..., nn.Module]
+"""`SteerableConv2d`, or `PlainConv2d`: makes a layer from (in_fields, in_fibre, out_fields,
+out_fibre, size, padding=..., bias=...)."""
+
+
+class SteerableConv2d(nn.Module):
+    """A convolution between fields that commutes with turns (equation 3), while it is trained."""
+
+    basis: Tensor
+
+    def __init__(
+        self,
+        in_fields: int,
+        in_fibre: Fibre,
+        out_fields: int,
+        out_fibre: Fibre,
+        size: int,
+        *,
+        padding: int | None = None,
+        bias: bool = False,
+        gain: float = 1.0,
+    ) -> None:
+        """
+        Args:
+            in_fields: how many fields come in.
+            in_fibre: what each carries.
+            out_fields: how many go out.
+            out_fibre: what each carries.
+            size: side of the kernel, odd, in pixels.
+            padding: of the image by zeros; by default the image keeps its size.
+            bias: one for each field, on its invariant part; needs samples or a scalar.
+            gain: of the initial weights' standard deviation.
+        """
+        super().__init__()
+        self.in_fibre, self.out_fibre = in_fibre, out_fibre
+        self.padding = size // 2 if padding is None else padding
+        basis = kernel_basis(in_fibre, out_fibre, size)
+        self.register_buffer("basis", basis.to(torch.get_default_dtype()), persistent=False)
+        scale = math.sqrt(2 / (in_fields * float(basis.square().sum()) / out_fibre.channels))
+        self.weights = nn.Parameter(torch.randn(out_fields, in_fields, len(basis)) * (gain * scale))
+        self.bias = nn.Parameter(torch.zeros(out_fields)) if bias else None
+
+    def kernel(self) -> Tensor:
+        """(out channels, in channels, size, size): what a plain convolution takes."""
+        return expand_kernel(self.weights, self.basis)
+
+    def channel_bias(self) -> Tensor | None:
+        """(out channels,), if there is a bias."""
+        return None if self.bias is None else self.bias.repeat_interleave(self.out_fibre.channels)
+
+    def forward(self, features: Tensor) -> Tensor:
+        """(batch, in channels, rows, cols) to (batch, out channels, rows, cols)."""
+        kernel = self.kernel().to(features.dtype, memory_format=torch.channels_last)
+        bias = self.channel_bias()
+        return F.conv2d(
+            features,
+            kernel,
+            None if bias is None else bias.to(features.dtype),
+            padding=self.padding,
+        )
+
+
+def expand_kernel(weights: Tensor, basis: Tensor) -> Tensor:
+    """A plain kernel from weights in a basis.
+
+    Args:
+        weights: (out fields, in fields, D).
+        basis: (D, out channels, in channels, size, size) of one field each.
+
+    Returns:
+        (out fields * out channels, in fields * in channels, size, size).
+    """
+    out_fields, in_fields, _ = weights.shape
+    _, out_channels, in_channels, size, _ = basis.shape
+    kernel = weights.flatten(0, 1) @ basis.flatten(1)
+    kernel = kernel.view(out_fields, in_fields, out_channels, in_channels, size, size)
+    return kernel.transpose(1, 2).reshape(
+        out_fields * out_channels, in_fields * in_channels, size, size
+    )
+
+
+class PlainConv2d(nn.Conv2d):
+    """What a `SteerableConv2d` becomes for inference: it computes in the type of its input."""
+
+    def __init__(
+        self,
+        in_fields: int,
+        in_fibre: Fibre,
+        out_fields: int,
+        out_fibre: Fibre,
+        size: int,
+        *,
+        padding: int | None = None,
+        bias: bool = False,
+        gain: float = 1.0,
+    ) -> None:
+        super().__init__(
+            in_fields * in_fibre.channels,
+            out_fields * out_fibre.channels,
+            size,
+            padding=size // 2 if padding is None else padding,
+            bias=bias,
+        )
+
+    def forward(self, features: Tensor) -> Tensor:
+        """(batch, in channels, rows, cols) to (batch, out channels, rows, cols)."""
+        if self.weight.dtype != features.dtype:
+            # A layer always sees the same type: once is enough.
+            self.to(features.dtype).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+        return super().forward(features)
+
+
+@functools.lru_cache(maxsize=64)
+def kernel_basis(in_fibre: Fibre, out_fibre: Fibre, size: int) -> Tensor:
+    """escnn's basis of the steerable kernels between two fields, transforms folded in.
+
+    Returns:
+        (D, out channels, in channels, size, size), float64.
+    """
+    # escnn warns of an optional package that planar groups never use.
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        from escnn import gspaces
+        from escnn import nn as enn
+
+    orders = {fibre.order for fibre in (in_fibre, out_fibre) if isinstance(fibre, Regular)}
+    irreps = [fibre for fibre in (in_fibre, out_fibre) if isinstance(fibre, Irreps)]
+    if len(orders) > 1 or (orders and irreps):
+        raise ValueError(f"no kernels lead from {in_fibre} to {out_fibre}: their groups differ")
+    if orders:
+        space = gspaces.rot2dOnR2(orders.pop())
+    else:
+        band = max((max(fibre.frequencies) for fibre in irreps), default=0)
+        space = gspaces.rot2dOnR2(-1, maximum_frequency=max(band, 1))
+
+    def field(fibre: Fibre) -> enn.FieldType:
+        if isinstance(fibre, Scalar):
+            return enn.FieldType(space, [space.trivial_repr])
+        if isinstance(fibre, Irreps):
+            irreps = [(j,) for j in fibre.frequencies]
+            return enn.FieldType(
+                space, [space.fibergroup.spectral_regular_representation(*irreps, name=None)]
+            )
+        assert isinstance(fibre, Regular)
+        if fibre.quotient == 1:
+            return enn.FieldType(space, [space.regular_repr])
+        return enn.FieldType(space, [space.quotient_repr(fibre.quotient)])
+
+    convolution = enn.R2Conv(field(in_fibre), field(out_fibre), size, bias=False, initialize=False)
+    kernels = []
+    with torch.no_grad():
+        for index in range(convolution.weights.numel()):
+            convolution.weights.zero_()
+            convolution.weights[index] = 1
+            kernels.append(convolution.expand_parameters()[0].double())
+    stack = torch.stack(kernels)
+    synthesis = torch.from_numpy(out_fibre.synthesis())
+    analysis = torch.from_numpy(in_fibre.analysis())
+    return torch.einsum("ms,dstxy,tn->dmnxy", synthesis, stack, analysis).contiguous()
+
+
+class BandLimit(nn.Module):
+    """Drops from each field's samples what its irreps cannot hold (ELU makes high frequencies)."""
+
+    projection: Tensor
+
+    def __init__(self, fibre: Fibre) -> None:
+        super().__init__()
+        projection = fibre.synthesis() @ fibre.analysis()
+        self.trivial = bool(np.allclose(projection, np.eye(len(projection))))
+        self.register_buffer(
+            "projection",
+            torch.from_numpy(projection).to(torch.get_default_dtype()),
+            persistent=False,
+        )
+
+    def forward(self, features: Tensor) -> Tensor:
+        """(batch, fields * channels, rows, cols), and the same back."""
+        if self.trivial:
+            return features
+        last = features.permute(0, 2, 3, 1)
+        projection = self.projection.to(features.dtype)
+        fields = last.reshape(-1, len(projection)) @ projection
+        return fields.view(last.shape).permute(0, 3, 1, 2)
+
+
+class InvariantPart(nn.Module):
+    """The part of each field that no turn changes."""
+
+    functional: Tensor
+
+    def __init__(self, fibre: Fibre) -> None:
+        super().__init__()
+        self.register_buffer(
+            "functional",
+            torch.from_numpy(fibre.invariant()).to(torch.get_default_dtype()),
+            persistent=False,
+        )
+
+    def forward(self, features: Tensor) -> Tensor:
+        """(batch, fields * channels, rows, cols) to (batch, fields, rows, cols)."""
+        last = features.permute(0, 2, 3, 1)
+        fields = last.unflatten(3, (-1, len(self.functional)))
+        return (fields @ self.functional.to(features.dtype)).permute(0, 3, 1, 2)
+
+
+class BlurPool(nn.Module):
+    """Antialiased pooling to every other pixel, the outermost among them.
+
+    A side of 2 n + 1 pixels becomes n + 1, so that a quarter turn about the middle is exact.
+    """
+
+    kernel: Tensor
+    _SIGMA = 0.66
+
+    def __init__(self) -> None:
+        super().__init__()
+        taps = torch.exp(-(torch.arange(-2, 3) ** 2) / (2 * self._SIGMA**2))
+        kernel = torch.outer(taps, taps)
+        self.register_buffer("kernel", kernel / kernel.sum(), persistent=False)
+
+    def forward(self, features: Tensor) -> Tensor:
+        """(batch, channels, rows, cols), odd sides, to half the resolution."""
+        channels = features.shape[1]
+        kernel = self.kernel.to(features.dtype).expand(channels, 1, 5, 5)
+        return F.conv2d(features, kernel, stride=2, padding=2, groups=channels)
+
+
+def upsample(features: Tensor) -> Tensor:
+    """Bilinear, the inverse of `BlurPool`'s sizes: n + 1 pixels become 2 n + 1."""
+    rows, cols = features.shape[2:]
+    return F.interpolate(
+        features, size=(2 * rows - 1, 2 * cols - 1), mode="bilinear", align_corners=True
+    )

@@ -1,0 +1,113 @@
+"""The U-net of alpha, phi and psi (section V-A.1 of the paper)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from kitting_drake.policies.fibres import Fibre, Scalar
+from kitting_drake.policies.steerable import (
+    BandLimit,
+    BlurPool,
+    Convolution,
+    InvariantPart,
+    upsample,
+)
+
+STRIDE = 16
+"""A side of the image must be a multiple of this, and one more."""
+
+
+@dataclass(frozen=True)
+class UNetSize:
+    """How wide a U-net is."""
+
+    down: tuple[int, int, int, int, int] = (16, 32, 64, 128, 128)
+    """Fields of the five blocks on the way down, a pooling between them."""
+    up: tuple[int, int, int, int] = (64, 32, 16, 16)
+    """Fields of the four blocks on the way up."""
+    head: int = 16
+    """Scalars before the last layer."""
+    skip: int = 3
+    """Side of the kernel that widens a residual block's shortcut, in pixels."""
+
+
+class ResidualBlock(nn.Module):
+    """Two 3x3 convolutions beside a shortcut, and ELU after each."""
+
+    def __init__(
+        self, fields_in: int, fields: int, fibre: Fibre, convolution: Convolution, skip: int
+    ) -> None:
+        super().__init__()
+        self.first = convolution(fields_in, fibre, fields, fibre, 3)
+        # Without normalisation, nine blocks at full gain would blow the features up.
+        self.second = convolution(fields, fibre, fields, fibre, 3, gain=0.5)
+        self.shortcut = (
+            BandLimit(fibre)
+            if fields_in == fields
+            else convolution(fields_in, fibre, fields, fibre, skip, gain=0.7)
+        )
+
+    def forward(self, features: Tensor) -> Tensor:
+        """(batch, channels, rows, cols) to the same rows and cols."""
+        hidden = self.second(F.elu_(self.first(features)))
+        return F.elu_(hidden + self.shortcut(features))
+
+
+class UNet(nn.Module):
+    """Scalar images to scalar images, through fields of one fibre: 21 layers.
+
+    Commutes with turns of the image: its output is a scalar field.
+    """
+
+    def __init__(
+        self,
+        in_channels: int,
+        out_channels: int,
+        fibre: Fibre,
+        size: UNetSize,
+        convolution: Convolution,
+    ) -> None:
+        super().__init__()
+        down, up = size.down, size.up
+        self.lift = convolution(in_channels, Scalar(), down[0], fibre, 3)
+        before = (down[0], *down[:-1])
+        self.down = nn.ModuleList(
+            ResidualBlock(a, b, fibre, convolution, size.skip)
+            for a, b in zip(before, down, strict=True)
+        )
+        below = (down[-1], *up[:-1])
+        beside = down[-2::-1]
+        self.up = nn.ModuleList(
+            ResidualBlock(a + b, c, fibre, convolution, size.skip)
+            for a, b, c in zip(below, beside, up, strict=True)
+        )
+        self.pool = BlurPool()
+        self.invariant = InvariantPart(fibre)
+        self.mix = convolution(up[-1], Scalar(), size.head, Scalar(), 3, bias=True)
+        self.out = convolution(size.head, Scalar(), out_channels, Scalar(), 1, bias=True, gain=0.1)
+
+    def forward(self, image: Tensor) -> Tensor:
+        """(batch, in channels, rows, cols) to (batch, out channels, rows, cols) in float32.
+
+        Computes in the type of the image, whose sides are one above a multiple of 16.
+        """
+        if image.shape[2] % STRIDE != 1 or image.shape[3] % STRIDE != 1:
+            raise ValueError(
+                f"an image of {tuple(image.shape[2:])} pixels cannot be halved 4 times"
+            )
+        features = F.elu_(self.lift(image.contiguous(memory_format=torch.channels_last)))
+        levels = []
+        for index, block in enumerate(self.down):
+            if index:
+                levels.append(features)
+                features = self.pool(features)
+            features = block(features)
+        for block in self.up:
+            features = block(torch.cat([upsample(features), levels.pop()], dim=1))
+        # The last two layers are small, and their output wants more than eight bits.
+        scalars = self.invariant(features).float()
+        return self.out(F.elu(self.mix(scalars)))

@@ -1,0 +1,18 @@
+"""Which seeds are for what: what a policy has learned from is not what it is tested on."""
+
+TEST_SEEDS = range(10_000)
+"""Of test episodes."""
+
+DEMONSTRATION_SEEDS = range(10_000, 20_000)
+"""Of demonstrations to learn from."""
+
+VALIDATION_SEEDS = range(20_000, 30_000)
+"""Of what a choice among trained policies is made by."""
+
+
+def seeds_from(first: int) -> range:
+    """The seeds from one on, to the end of those of its kind."""
+    for seeds in (TEST_SEEDS, DEMONSTRATION_SEEDS, VALIDATION_SEEDS):
+        if first in seeds:
+            return range(first, seeds.stop)
+    return range(first, 2**32)

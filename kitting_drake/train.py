@@ -1,0 +1,341 @@
+"""`python -m kitting_drake.train --demos FILE`: networks from demonstrations; needs no Drake."""
+
+import argparse
+import dataclasses
+import io
+import json
+import pickle
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from torch.utils.tensorboard import SummaryWriter
+
+from kitting_drake.errors import UserError
+from kitting_drake.files import claim_folder, require_folder, write_json, write_whole
+from kitting_drake.policies.config import METHODS, PRESETS, NetworkConfig
+from kitting_drake.policies.demonstrations import Demonstrations, read_demonstrations
+from kitting_drake.policies.learned_policy import LearnedPolicy
+from kitting_drake.policies.methods import make_networks
+from kitting_drake.policies.samples import Scene, labelled_images, normalisation, scenes
+from kitting_drake.policies.training import Trainer
+from kitting_drake.policies.validation import validate
+from kitting_drake.policies.weights import preferred_type, save_weights
+from kitting_drake.verb import count_type, run_verb, seed_type
+
+_CHECKPOINT_EVERY = 100
+"""Steps between checkpoints, and between points of the curves."""
+_MOST_VALIDATED = 64
+"""Scenes that a validation looks at."""
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What tells one training run from another."""
+
+    scenario: str
+    demonstrations: int
+    seeds: tuple[int, ...]
+    validation_seeds: tuple[int, ...]
+    method: str
+    preset: str
+    orientations: int
+    steps: int
+    learning_rate: float
+    decay: bool
+    taken_only: bool
+    validate_every: int
+    seed: int
+
+
+def main() -> int:
+    """Parses the command line and trains; returns the exit code."""
+    arguments = _parse()
+    console = Console(quiet=arguments.quiet)
+    demonstrations = read_demonstrations(arguments.demos, arguments.demonstrations)
+    count = len(demonstrations.demonstrations)
+    if arguments.demonstrations is not None and count < arguments.demonstrations:
+        raise UserError(
+            f"{arguments.demos} holds {count} demonstrations, not {arguments.demonstrations}: "
+            "collect more"
+        )
+    held_out = _held_out(demonstrations, arguments.validation)
+    settings = Settings(
+        scenario=demonstrations.origin.scenario_name,
+        demonstrations=count,
+        seeds=tuple(item.seed for item in demonstrations.demonstrations),
+        validation_seeds=tuple(item.seed for item in held_out.demonstrations),
+        method=arguments.method,
+        preset=arguments.preset,
+        orientations=arguments.orientations,
+        steps=arguments.steps,
+        learning_rate=arguments.learning_rate,
+        decay=arguments.decay,
+        taken_only=arguments.taken_only,
+        validate_every=arguments.validate_every,
+        seed=arguments.seed,
+    )
+    folder = require_folder(
+        arguments.output or Path("output") / f"{demonstrations.origin.scenario_name}-training"
+    )
+    claim_folder(folder, "settings.json", dataclasses.asdict(settings), of="training run")
+    run = _Run(settings, demonstrations, held_out, folder, console)
+    run.train()
+    console.print(f"files: {folder}/", highlight=False)
+    return 0
+
+
+def _parse() -> argparse.Namespace:
+    parser = argparse.ArgumentParser(
+        prog="python -m kitting_drake.train",
+        description="Train a policy's networks from demonstrations; run again, it goes on.",
+    )
+    parser.add_argument(
+        "--demos", type=Path, required=True, metavar="FILE.h5", help="what to learn from"
+    )
+    parser.add_argument(
+        "--demonstrations", type=count_type, metavar="N", help="how many of them (all)"
+    )
+    parser.add_argument(
+        "--validation",
+        type=Path,
+        metavar="FILE.h5",
+        help="demonstrations to choose a checkpoint by (default: a tenth of --demos is held out)",
+    )
+    parser.add_argument("--method", choices=METHODS, default="so2")
+    parser.add_argument("--preset", choices=PRESETS, default="small", help="size of the networks")
+    parser.add_argument("--orientations", type=count_type, default=180, metavar="N")
+    parser.add_argument("--steps", type=count_type, default=10_000, help="(10000)")
+    parser.add_argument("--learning-rate", type=_rate_type, default=1e-4, help="Adam's (1e-4)")
+    parser.add_argument(
+        "--decay", action="store_true", help="let the learning rate fall to zero over the steps"
+    )
+    parser.add_argument(
+        "--taken-only",
+        action="store_true",
+        help="as the paper: learn of each observation only what was picked then, "
+        "not also what was picked later",
+    )
+    parser.add_argument(
+        "--validate-every", type=count_type, default=500, metavar="STEPS", help="(500)"
+    )
+    parser.add_argument("--seed", type=seed_type, default=0, help="of weights and draws (0)")
+    parser.add_argument("--output", type=Path, metavar="DIR", help="where all files go")
+    parser.add_argument("--quiet", action="store_true", help="print nothing but errors")
+    return parser.parse_args()
+
+
+def _rate_type(text: str) -> float:
+    try:
+        rate = float(text)
+    except ValueError:
+        rate = -1.0
+    if not 0 < rate < 1:
+        raise argparse.ArgumentTypeError(f"'{text}' is not a number between 0 and 1")
+    return rate
+
+
+def _held_out(demonstrations: Demonstrations, path: Path | None) -> Demonstrations:
+    if path is None:
+        items = demonstrations.demonstrations
+        count = max(1, len(items) // 10)
+        if len(items) < 2:
+            raise UserError("one demonstration leaves none to validate by: give --validation")
+        return dataclasses.replace(demonstrations, demonstrations=items[-count:])
+    held_out = read_demonstrations(path)
+    shared = {item.seed for item in held_out.demonstrations} & {
+        item.seed for item in demonstrations.demonstrations
+    }
+    if shared and held_out.origin.scenario == demonstrations.origin.scenario:
+        raise UserError(
+            f"{path} and --demos share the seed {min(shared)}: validation needs other ones"
+        )
+    if held_out.origin.grid != demonstrations.origin.grid:
+        raise UserError(f"{path} and --demos have different pixel grids")
+    return held_out
+
+
+class _Run:
+    """A training run and its files."""
+
+    def __init__(
+        self,
+        settings: Settings,
+        demonstrations: Demonstrations,
+        held_out: Demonstrations,
+        folder: Path,
+        console: Console,
+    ) -> None:
+        self.settings, self.folder, self.console = settings, folder, console
+        self.grid = demonstrations.origin.grid
+        seeds = {item.seed for item in held_out.demonstrations}
+        kept = [item for item in demonstrations.demonstrations if item.seed not in seeds]
+        learned = scenes(kept, self.grid)
+        self.validation_scenes = _spread_out(scenes(held_out.demonstrations, self.grid))
+        self.samples = labelled_images(learned, taken_only=settings.taken_only)
+        try:
+            config = NetworkConfig(
+                method=settings.method,
+                preset=settings.preset,
+                orientations=settings.orientations,
+                **normalisation(learned),  # type: ignore[arg-type]
+            )
+            torch.manual_seed(settings.seed)
+            networks = make_networks(config)
+            networks.check_orientations(settings.orientations)
+        except ValueError as error:
+            raise UserError(f"--orientations {settings.orientations}: {error}") from error
+        networks.to("cuda" if torch.cuda.is_available() else "cpu")
+        networks.compute_type = preferred_type()
+        self.trainer = Trainer(
+            networks,
+            seed=settings.seed,
+            steps=settings.steps,
+            learning_rate=settings.learning_rate,
+            decay=settings.decay,
+        )
+        self.best: dict[str, Any] | None = None
+        self.seconds = 0.0
+        self.card = {
+            "scenario": demonstrations.origin.scenario_name,
+            "demonstrations": settings.demonstrations,
+            "demonstration_seeds": [item.seed for item in kept],
+            "validation_seeds": [item.seed for item in held_out.demonstrations],
+            "samples": len(self.samples),
+            "steps": settings.steps,
+            "learning_rate": settings.learning_rate,
+            "decay": settings.decay,
+            "taken_only": settings.taken_only,
+            "seed": settings.seed,
+            "compute_type": str(networks.compute_type).removeprefix("torch."),
+            "torch": torch.__version__,
+        }
+
+    def train(self) -> None:
+        """Trains to the last step, from the checkpoint if there is one."""
+        self._resume()
+        trainer, settings = self.trainer, self.settings
+        if trainer.step_count >= settings.steps:
+            self.console.print("all steps are done")
+            return
+        size = sum(weight.numel() for weight in trainer.networks.parameters())
+        self.console.print(
+            f"{settings.method}, {settings.preset}: {size:,} parameters; {len(self.samples)} "
+            f"samples of {settings.demonstrations} demonstrations; "
+            f"{len(self.validation_scenes)} scenes to validate by",
+            highlight=False,
+        )
+        progress = Progress(
+            TextColumn("{task.description}"),
+            BarColumn(),
+            MofNCompleteColumn(),
+            TextColumn("{task.fields[speed]}"),
+            TimeRemainingColumn(),
+            console=self.console,
+            transient=True,
+            disable=not self.console.is_terminal,
+        )
+        recent: list[dict[str, float]] = []
+        start, begun = time.perf_counter() - self.seconds, trainer.step_count
+        clock = time.perf_counter()
+        writer = SummaryWriter(str(self.folder / "tensorboard"), purge_step=begun + 1)
+        with writer, progress:
+            task = progress.add_task("steps", total=settings.steps, completed=begun, speed="")
+            while trainer.step_count < settings.steps:
+                recent.append(trainer.step(self.samples))
+                step = trainer.step_count
+                last = step == settings.steps
+                speed = (step - begun) / (time.perf_counter() - clock)
+                progress.update(task, completed=step, speed=f"{speed:.2f} a second")
+                if not all(np.isfinite(list(recent[-1].values()))):
+                    raise UserError(
+                        f"a loss is no longer a number at step {step}: lower --learning-rate"
+                    )
+                if step % settings.validate_every == 0 or last:
+                    report = self._validate()
+                    for name, value in report.items():
+                        writer.add_scalar(f"validation/{name}", value, step)
+                    progress.print(_report_line(step, report), highlight=False)
+                if step % _CHECKPOINT_EVERY == 0 or last:
+                    means = {
+                        name: float(np.mean([item[name] for item in recent])) for name in recent[0]
+                    }
+                    recent.clear()
+                    for name, value in means.items():
+                        writer.add_scalar(f"loss/{name}", value, step)
+                    self._append({"step": step, **means})
+                    self.seconds = time.perf_counter() - start
+                    self._save()
+        write_json(
+            self.folder / "summary.json",
+            {**self.card, "best": self.best, "wall_seconds": self.seconds},
+        )
+
+    def _validate(self) -> dict[str, float]:
+        networks = self.trainer.networks.eval()
+        policy = LearnedPolicy(networks, orientations=self.settings.orientations)
+        report = validate(policy, self.validation_scenes, self.grid)
+        chosen = {"step": self.trainer.step_count, **report}
+        if self.best is None or report["displacement_mm"] < self.best["displacement_mm"]:
+            self.best = chosen
+            card = {**self.card, "validation": chosen}
+            save_weights(self.folder / "policy.safetensors", networks, card)
+        self._append(chosen)
+        return report
+
+    def _resume(self) -> None:
+        path = self.folder / "checkpoint.pt"
+        if not path.exists():
+            (self.folder / "log.jsonl").unlink(missing_ok=True)
+            return
+        try:
+            state = torch.load(path, map_location=self.trainer.networks.device, weights_only=True)
+            self.trainer.load_state_dict(state["trainer"])
+        except (OSError, RuntimeError, KeyError, pickle.UnpicklingError) as error:
+            raise UserError(f"{path} cannot be taken up again: delete {self.folder}") from error
+        self.best, self.seconds = state["best"], state["seconds"]
+        kept = [line for line in self._lines() if line["step"] <= self.trainer.step_count]
+        write_whole(self.folder / "log.jsonl", "".join(json.dumps(line) + "\n" for line in kept))
+
+    def _save(self) -> None:
+        buffer = io.BytesIO()
+        state = {"trainer": self.trainer.state_dict(), "best": self.best, "seconds": self.seconds}
+        torch.save(state, buffer)
+        write_whole(self.folder / "checkpoint.pt", buffer.getvalue())
+
+    def _append(self, line: dict[str, Any]) -> None:
+        with (self.folder / "log.jsonl").open("a") as file:
+            file.write(json.dumps(line) + "\n")
+
+    def _lines(self) -> Iterator[dict[str, Any]]:
+        path = self.folder / "log.jsonl"
+        if path.exists():
+            content = path.read_text()
+            # A line that was being written when the process was killed has no end.
+            for line in content[: content.rfind("\n") + 1].splitlines():
+                yield json.loads(line)
+
+
+def _spread_out(observed: list[Scene]) -> list[Scene]:
+    """Evenly chosen ones, if there are too many."""
+    count = min(len(observed), _MOST_VALIDATED)
+    return [observed[i * len(observed) // count] for i in range(count)]
+
+
+def _report_line(step: int, report: dict[str, float]) -> str:
+    return (
+        f"step {step}: median errors of the pick {report['median_pick_mm']:.1f} mm, "
+        f"{report['median_pick_deg']:.2f} deg, of the place {report['median_place_mm']:.1f} mm, "
+        f"{report['median_turn_deg']:.2f} deg; "
+        f"mean displacement {report['displacement_mm']:.2f} mm"
+    )
+
+
+if __name__ == "__main__":
+    run_verb(main)

@@ -1,0 +1,47 @@
+"""What every verb does the same way; no pydrake here."""
+
+import argparse
+import logging
+import sys
+from collections.abc import Callable
+
+from kitting_drake.errors import UserError
+
+INTERRUPTED = 130
+"""Exit code after Ctrl-C, as shells have it."""
+
+
+def seed_type(text: str) -> int:
+    """A seed given on the command line."""
+    try:
+        seed = int(text)
+    except ValueError:
+        seed = -1
+    if not 0 <= seed < 2**32:
+        raise argparse.ArgumentTypeError(f"'{text}' is not a whole number from 0 to {2**32 - 1}")
+    return seed
+
+
+def count_type(text: str) -> int:
+    """A count given on the command line: 1 or more."""
+    try:
+        count = int(text)
+    except ValueError:
+        count = 0
+    if count < 1:
+        raise argparse.ArgumentTypeError(f"'{text}' is not a whole number of 1 or more")
+    return count
+
+
+def run_verb(main: Callable[[], int]) -> None:
+    """Runs a verb and leaves with its exit code; a user's error is told in one sentence."""
+    # Drake announces ports and frame names; a verb says itself what a person needs to know.
+    logging.getLogger("drake").setLevel(logging.WARNING)
+    try:
+        code = main()
+    except UserError as error:
+        print(f"error: {error}", file=sys.stderr)
+        code = 2
+    except KeyboardInterrupt:
+        code = INTERRUPTED
+    sys.exit(code)

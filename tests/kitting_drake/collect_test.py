@@ -1,0 +1,409 @@
+import dataclasses
+import json
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+import types
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+from pydrake.math import RigidTransform
+from pydrake.systems.framework import Context
+from rich.console import Console
+
+import kitting_drake.collect as collecting
+from kitting_drake.cell import Cell, build_cell
+from kitting_drake.collect import Collection, Recorder, demonstrate, next_seed
+from kitting_drake.episode import run_episode
+from kitting_drake.errors import UserError
+from kitting_drake.policies.demonstrations import (
+    Demonstration,
+    DemonstrationStep,
+    Origin,
+    Rejection,
+    read_demonstrations,
+)
+from kitting_drake.processes import Died
+from kitting_drake.scenario import ArrangedKitting, Placement, PythonPolicy, Scenario
+from kitting_drake.seeds import DEMONSTRATION_SEEDS, TEST_SEEDS, VALIDATION_SEEDS, seeds_from
+from systems.pick_place_parameters import Mode, PickPlaceParameters
+from systems.signals import Observation, PickPlaceAction, PixelGrid, PlanarPose
+
+ROOT = Path(__file__).resolve().parents[2]
+QUIET = Console(quiet=True)
+GRID = PixelGrid(rows=3, cols=4)
+ORIGIN = Origin("mine", {"time_limit": 1.0}, GRID, 10, {"drake": "1.51.1"})
+BAD = {11, 14, 15}
+
+
+class Oracle:
+    """Demonstrates at once, or is killed; knows which seeds it was asked for."""
+
+    def __init__(self, killed_after: int = 1000) -> None:
+        self.asked: list[int] = []
+        self._killed_after = killed_after
+
+    def __call__(self, seed: int) -> Demonstration | Rejection | Died:
+        if len(self.asked) == self._killed_after:
+            raise KeyboardInterrupt
+        self.asked.append(seed)
+        # Later seeds end before earlier ones.
+        time.sleep(0.02 * (seed % 3 == 1))
+        if seed in BAD:
+            return Rejection(seed, 0.5, f"{seed} is bad")
+        image = np.random.default_rng(seed).random((4, *GRID.shape), np.float32)
+        action = PickPlaceAction(PlanarPose(seed), PlanarPose(0, seed), 0.01)
+        step = DemonstrationStep.of(Observation(image, GRID), action, name="a", category="b")
+        return Demonstration(seed, 1.0, (step,))
+
+
+def collect(folder: Path, count: int, oracle: Oracle | None = None, workers: int = 1) -> Oracle:
+    oracle = oracle or Oracle()
+    Collection(folder, ORIGIN).collect(count, oracle, workers=workers, console=QUIET)
+    return oracle
+
+
+def content(folder: Path) -> dict[str, object]:
+    """All that a demonstrations file holds, by name."""
+    found: dict[str, object] = {}
+
+    def note(name: str, item: h5py.Group | h5py.Dataset) -> None:
+        found.update({f"{name}@{key}": value for key, value in item.attrs.items()})
+        if isinstance(item, h5py.Dataset):
+            found[name] = (item.dtype, item.shape, item[()].tobytes())
+            if item.dtype == h5py.string_dtype():
+                found[name] = item.asstr()[()].tolist()
+
+    with h5py.File(folder / "demonstrations.h5") as file:
+        note("", file)
+        file.visititems(note)
+    return found
+
+
+def test_the_seeds_for_tests_and_for_learning_are_not_the_same():
+    kinds = (TEST_SEEDS, DEMONSTRATION_SEEDS, VALIDATION_SEEDS)
+    assert len({seed for seeds in kinds for seed in seeds}) == 30_000
+    assert seeds_from(10_003) == range(10_003, 20_000)
+    assert seeds_from(50_000)[-1] == 2**32 - 1
+
+
+@pytest.mark.parametrize(
+    ("accepted", "rejected", "working", "expected"),
+    [
+        ([], [], [], 10),
+        ([], [], [10, 11], 12),
+        ([10], [], [11, 12], None),
+        # One of those at work was rejected.
+        ([10], [11], [12], 13),
+        # A hole that a killed run has left.
+        ([10, 12], [], [], 11),
+        ([10, 12, 13], [], [], 11),
+        ([10, 12, 13], [], [11], None),
+        ([10, 11, 12], [], [], None),
+    ],
+)
+def test_the_next_seed(accepted, rejected, working, expected):
+    assert next_seed(range(10, 20), 3, accepted, rejected, working) == expected
+
+
+def test_seeds_come_to_an_end():
+    with pytest.raises(UserError, match="the seeds from 10 end at 12: ask for fewer"):
+        next_seed(range(10, 13), 4, [], [], [])
+    with pytest.raises(UserError, match="the seeds from 10 end at 12"):
+        next_seed(range(10, 13), 3, [10, 12], [11], [])
+    assert next_seed(range(10, 13), 3, [10, 11, 12], [], []) is None
+
+
+def test_an_oracle_that_always_fails_is_told_of():
+    with pytest.raises(UserError, match="failed with 20 seeds in a row, 11 to 30"):
+        next_seed(range(10, 99), 3, [10], range(11, 31), [])
+    assert next_seed(range(10, 99), 3, [10], range(11, 30), []) == 30
+
+
+@pytest.mark.parametrize("workers", [1, 3])
+def test_the_first_seeds_that_are_not_rejected(tmp_path: Path, workers: int):
+    collect(tmp_path, 4, workers=workers)
+    assert [item.name for item in tmp_path.iterdir()] == ["demonstrations.h5"]
+    read = read_demonstrations(tmp_path / "demonstrations.h5")
+    assert read.origin == ORIGIN
+    assert [item.seed for item in read.demonstrations] == [10, 12, 13, 16]
+    assert [item.seed for item in read.rejected] == [11, 14, 15]
+    assert read.rejected[0] == Rejection(11, 0.5, "11 is bad")
+    assert [item.steps[0].pick.x for item in read.demonstrations] == [10, 12, 13, 16]
+
+
+@pytest.mark.parametrize("workers", [1, 3])
+@pytest.mark.parametrize("after", range(1, 7))
+def test_goes_on_where_it_was_stopped(tmp_path: Path, after: int, workers: int):
+    collect(tmp_path / "whole", 4)
+    with pytest.raises(KeyboardInterrupt):
+        collect(tmp_path / "stopped", 4, Oracle(killed_after=after), workers)
+    parts = tmp_path / "stopped" / "parts"
+    kept = {int(path.stem.removeprefix("seed_")) for path in parts.glob("seed_*")}
+    # Killed while files were being written.
+    for name in (".seed_00000099.h5.scratch", ".seed_00000099.json.x1"):
+        parts.mkdir(parents=True, exist_ok=True)
+        (parts / name).write_text("half")
+    oracle = collect(tmp_path / "stopped", 4, workers=workers)
+    assert sorted(oracle.asked) == sorted(set(range(10, 17)) - kept)
+    assert content(tmp_path / "stopped") == content(tmp_path / "whole")
+    assert not parts.exists()
+
+
+def test_killed_before_the_parts_were_gone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    collect(tmp_path / "whole", 4)
+    with monkeypatch.context() as patch:
+        patch.setattr(Collection, "_remove_parts", lambda *_: None)
+        collect(tmp_path, 4)
+    assert (tmp_path / "parts").exists()
+    assert Collection(tmp_path, ORIGIN).assembled == 4
+    assert not (tmp_path / "parts").exists()
+    assert collect(tmp_path, 4).asked == []
+    assert content(tmp_path) == content(tmp_path / "whole")
+
+
+def test_more_are_added_to_those_there(tmp_path: Path):
+    collect(tmp_path / "whole", 5)
+    collect(tmp_path / "extended", 2)
+    assert collect(tmp_path / "extended", 5).asked == [13, 14, 15, 16, 17]
+    assert content(tmp_path / "extended") == content(tmp_path / "whole")
+
+
+def test_fewer_after_a_stop_lose_nothing(tmp_path: Path):
+    collect(tmp_path / "whole", 2)
+    with pytest.raises(KeyboardInterrupt):
+        collect(tmp_path / "stopped", 9, Oracle(killed_after=6))
+    assert collect(tmp_path / "stopped", 2).asked == []
+    assert content(tmp_path / "stopped") == content(tmp_path / "whole")
+    assert collect(tmp_path / "stopped", 4).asked == [16]
+
+
+def test_a_file_of_another_origin_is_refused(tmp_path: Path):
+    collect(tmp_path, 1)
+    with pytest.raises(UserError, match="another scenario"):
+        Collection(tmp_path, dataclasses.replace(ORIGIN, scenario={"time_limit": 2.0}))
+    with pytest.raises(UserError, match="begins with seed 10: give --seed 10 or another"):
+        Collection(tmp_path, dataclasses.replace(ORIGIN, first_seed=12))
+
+
+class Mortal(Oracle):
+    """Dies on the way to seed 12, so many times."""
+
+    def __init__(self, deaths: int, exit_code: int) -> None:
+        super().__init__()
+        self._deaths, self._exit_code = deaths, exit_code
+
+    def __call__(self, seed: int) -> Demonstration | Rejection | Died:
+        outcome = super().__call__(seed)
+        dies = seed == 12 and self.asked.count(12) <= self._deaths
+        return Died(self._exit_code) if dies else outcome
+
+
+@pytest.mark.parametrize("exit_code", [1, -signal.SIGKILL])
+def test_a_process_that_dies_is_given_a_second_chance(tmp_path: Path, exit_code: int):
+    collect(tmp_path / "whole", 2)
+    assert collect(tmp_path, 2, Mortal(1, exit_code)).asked == [10, 11, 12, 12]
+    assert content(tmp_path) == content(tmp_path / "whole")
+
+
+def test_a_seed_that_takes_its_process_down_is_rejected(tmp_path: Path):
+    collect(tmp_path, 2, Mortal(2, -signal.SIGSEGV))
+    rejected = read_demonstrations(tmp_path / "demonstrations.h5").rejected
+    assert rejected[-1] == Rejection(12, 0.0, "its process ended with exit code -11")
+
+
+def test_what_is_killed_from_outside_is_not_rejected(tmp_path: Path):
+    with pytest.raises(UserError, match="seed 12 was killed twice, perhaps for want of memory"):
+        collect(tmp_path, 2, Mortal(2, -signal.SIGKILL))
+    assert collect(tmp_path, 2).asked == [12]
+
+
+def arguments(folder: Path, *more: object) -> list[str]:
+    return ["collect", "scenarios/kitting_oracle.yaml", "--output", str(folder), *map(str, more)]
+
+
+def test_without_rendering_one_sentence(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    monkeypatch.chdir(ROOT)
+    monkeypatch.setattr("kitting_drake.cameras.can_render", lambda: False)
+    monkeypatch.setattr(sys, "argv", arguments(tmp_path))
+    with pytest.raises(SystemExit) as left:
+        collecting.run_verb(collecting.main)
+    assert left.value.code == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith("error: rendering needs the system library libEGL")
+
+
+def test_without_cameras_one_sentence(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.chdir(ROOT)
+    scenario = tmp_path / "blind.yaml"
+    scenario.write_text("Blind: {cameras: {}}\n")
+    monkeypatch.setattr(sys, "argv", ["collect", str(scenario), "--output", str(tmp_path / "out")])
+    with pytest.raises(UserError, match=r"blind\.yaml: cameras is empty"):
+        collecting.main()
+
+
+def test_two_do_not_collect_into_one_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.chdir(ROOT)
+    monkeypatch.setattr(sys, "argv", arguments(tmp_path))
+    with collecting._alone(tmp_path), pytest.raises(UserError, match="another process collects"):
+        collecting.main()
+
+
+def test_what_is_finished_is_left_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    monkeypatch.chdir(ROOT)
+    monkeypatch.setattr(collecting, "require_rendering", lambda: None)
+    monkeypatch.setattr(collecting, "build_chosen", lambda *_, **__: None)
+    monkeypatch.setattr(collecting, "run_apart", lambda _, __, seed: Oracle()(seed))
+    monkeypatch.setattr(sys, "argv", arguments(tmp_path, "--demos", 3, "--seed", 10))
+    assert collecting.main() == 0
+    assert "holds 3 demonstrations, 1 seed rejected; " in capsys.readouterr().out
+    path = tmp_path / "demonstrations.h5"
+    before = path.stat()
+    monkeypatch.setattr(sys, "argv", arguments(tmp_path, "--demos", 2, "--seed", 10))
+    assert collecting.main() == 0
+    assert capsys.readouterr().out.startswith("nothing to do: ")
+    assert path.stat() == before
+    monkeypatch.setattr(sys, "argv", [*arguments(tmp_path), "--scenario_text", "{time_limit: 2}"])
+    with pytest.raises(UserError, match="another scenario"):
+        collecting.main()
+
+
+def two_tools(**more: object) -> Cell:
+    task = ArrangedKitting(
+        tools={
+            "claw_hammer": Placement(x=0.35, y=0.3, yaw_deg=90.0),
+            "flat_screwdriver": Placement(x=0.60, y=0.3, yaw_deg=20.0),
+        }
+    )
+    return build_cell(Scenario(task=task, **more), seed=0, base=Path())  # type: ignore[arg-type]
+
+
+# The tools still sink onto the table: no two steps are the same.
+HASTY = PickPlaceParameters(observe_settle=0.02)
+
+
+@pytest.mark.usefixtures("rendering")
+def test_what_is_taken_down_is_what_the_planner_acted_upon():
+    cell = two_tools(planner=HASTY)
+    recorder = Recorder(cell)
+    latched: list[tuple[PlanarPose, PlanarPose]] = []
+
+    def watch(root: Context, mode: Mode) -> None:
+        recorder.watch(root, mode)
+        if mode != Mode.OBSERVE:
+            latched.append(cell.planner.action(cell.planner.GetMyContextFromRoot(root)))
+
+    run_episode(cell, scenario="", policy="", seed=0, time_limit=0.1, watch=watch)
+    (step,) = recorder.steps
+    assert (step.object, step.category) == ("claw_hammer", "hammer")
+    assert (step.pick, step.place) == latched[0]
+    assert step.surface_height == pytest.approx(cell.scene.tools[0].grasp.surface_height, abs=1e-4)
+
+
+@pytest.mark.usefixtures("rendering")
+def test_what_is_taken_down_is_what_a_policy_would_have_seen(monkeypatch: pytest.MonkeyPatch):
+    action = PickPlaceAction(PlanarPose(0.35, 0.3, 0.1), PlanarPose(0.5, 0.0, 0.2), 0.02)
+    seen: list[Observation] = []
+
+    def look(observation: Observation) -> PickPlaceAction:
+        seen.append(observation)
+        return action
+
+    module = types.ModuleType("looking")
+    module.look = look  # type: ignore[attr-defined]
+    monkeypatch.setitem(sys.modules, "looking", module)
+    cell = two_tools(planner=HASTY, policy=PythonPolicy(function="looking:look"))
+    recorder = Recorder(cell)
+    run_episode(cell, scenario="", policy="", seed=0, time_limit=0.1, watch=recorder.watch)
+    (step,) = recorder.steps
+    expected = DemonstrationStep.of(seen[0], action, name="", category="")
+    np.testing.assert_array_equal(step.image, expected.image)
+    assert step.height.max() > 0.04
+    assert (step.pick, step.place, step.surface_height) == (action.pick, action.place, 0.02)
+
+
+@pytest.mark.usefixtures("rendering")
+def test_of_a_grasp_that_is_done_again_the_last_is_kept():
+    cell = two_tools()
+    recorder = Recorder(cell)
+    root = cell.diagram.CreateDefaultContext()
+    plant_context = cell.plant.GetMyMutableContextFromRoot(root)
+
+    def act(*, hammer_x: float | None = None) -> None:
+        if hammer_x is not None:
+            X_WT = RigidTransform(cell.scene.X_WTools[0].rotation(), [hammer_x, 0.3, 0.0])
+            cell.plant.SetFreeBodyPose(plant_context, cell.tool_bodies[0], X_WT)
+        for mode in (Mode.OBSERVE, Mode.OBSERVE, Mode.APPROACH, Mode.DESCEND, Mode.RETREAT):
+            recorder.watch(root, mode)
+
+    act()
+    first = recorder.steps[0]
+    act(hammer_x=0.36)
+    (again,) = recorder.steps
+    assert again.object == first.object == "claw_hammer"
+    assert again.pick.x == pytest.approx(first.pick.x + 0.01)
+    assert (again.image != first.image).any()
+    # In its cavity the hammer is done with, then it jumps out.
+    cell.plant.SetFreeBodyPose(plant_context, cell.tool_bodies[0], cell.scene.X_WGoals[0])
+    act()
+    assert [step.object for step in recorder.steps] == ["claw_hammer", "flat_screwdriver"]
+    act(hammer_x=0.34)
+    assert [step.object for step in recorder.steps] == ["flat_screwdriver", "claw_hammer"]
+    # Nothing is acted upon when the planner is done.
+    recorder.watch(root, Mode.OBSERVE)
+    recorder.watch(root, Mode.DONE)
+    assert len(recorder.steps) == 2
+
+
+@pytest.mark.usefixtures("rendering")
+def test_an_episode_that_places_less_than_all_is_rejected():
+    outcome = demonstrate(two_tools(), seed=3, time_limit=0.3)
+    assert outcome == Rejection(3, 0.0, "0% of the objects were placed")
+
+
+ONE_TOOL = """
+OneTool:
+  task: !Kitting
+    tools: [claw_hammer]
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("rendering")
+def test_killed_again_and_again_it_collects_what_it_would_have(verb, tmp_path: Path):
+    scenario = tmp_path / "one_tool.yaml"
+    scenario.write_text(ONE_TOOL)
+    whole, killed = tmp_path / "whole", tmp_path / "killed"
+    counts = ("--demos", 2, "--workers", 2)
+    done = verb("collect", scenario, *counts, "--output", whole)
+    assert done.returncode == 0, done.stderr
+    command = [sys.executable, "-m", "kitting_drake.collect", scenario, *counts]
+    rng = random.Random(0)
+    kills = 0
+    for longest in (3.0, 8.0, 8.0, 12.0):
+        process = subprocess.Popen(
+            [*map(str, command), "--output", killed], cwd=ROOT, stdout=subprocess.DEVNULL
+        )
+        try:
+            process.wait(rng.uniform(1.0, longest))
+        except subprocess.TimeoutExpired:
+            os.kill(process.pid, signal.SIGKILL)
+            kills += 1
+        process.wait()
+    assert kills > 0
+    done = verb("collect", scenario, "--demos", 2, "--workers", 1, "--output", killed)
+    assert done.returncode == 0, done.stderr
+    assert sorted(item.name for item in killed.iterdir()) == ["demonstrations.h5", "scenario.json"]
+    assert content(killed) == content(whole)
+    read = read_demonstrations(killed / "demonstrations.h5")
+    assert [item.seed for item in read.demonstrations] == [10000, 10001]
+    assert read.origin.scenario == json.loads((killed / "scenario.json").read_text())

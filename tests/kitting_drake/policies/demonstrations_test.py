@@ -1,0 +1,171 @@
+import subprocess
+import sys
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+
+from kitting_drake.errors import UserError
+from kitting_drake.policies.demonstrations import (
+    Demonstration,
+    DemonstrationStep,
+    Origin,
+    Rejection,
+    merge_demonstrations,
+    read_contents,
+    read_demonstrations,
+    write_demonstrations,
+)
+from systems.signals import Observation, PickPlaceAction, PixelGrid, PlanarPose
+
+GRID = PixelGrid(rows=5, cols=7, z_max=0.3)
+ORIGIN = Origin("mine", {"time_limit": 1.0}, GRID, 10, {"drake": "1.51.1"})
+REJECTED = (Rejection(11, 0.5, "a tool fell"),)
+
+
+def step(seed: int) -> DemonstrationStep:
+    rng = np.random.default_rng(seed)
+    return DemonstrationStep.of(
+        Observation(rng.random((4, *GRID.shape), np.float32), GRID),
+        PickPlaceAction(PlanarPose(*rng.random(3)), PlanarPose(*rng.random(3)), rng.random()),
+        name=f"wrench_{seed}",
+        category="wrench",
+    )
+
+
+def demonstration(seed: int, steps: int = 3) -> Demonstration:
+    return Demonstration(seed, 1.0, tuple(step(10 * seed + i) for i in range(steps)))
+
+
+def assert_same(one: Demonstration, other: Demonstration) -> None:
+    assert (one.seed, one.score) == (other.seed, other.score)
+    for a, b in zip(one.steps, other.steps, strict=True):
+        np.testing.assert_array_equal(a.rgb, b.rgb)
+        np.testing.assert_array_equal(a.height, b.height)
+        assert a.rgb.dtype == b.rgb.dtype == np.uint8
+        assert a.height.dtype == b.height.dtype == np.float32
+        for name in ("pick", "place", "surface_height", "object", "category"):
+            assert getattr(a, name) == getattr(b, name)
+
+
+def written(folder: Path) -> Path:
+    path = folder / "demonstrations.h5"
+    write_demonstrations(path, ORIGIN, [demonstration(12), demonstration(10)], REJECTED)
+    return path
+
+
+def test_a_step_is_the_observation_to_half_a_colour():
+    image = np.random.default_rng(0).random((4, *GRID.shape), np.float32)
+    taken = DemonstrationStep.of(Observation(image, GRID), PickPlaceAction(), name="", category="")
+    assert taken.image.shape == image.shape
+    assert taken.image.dtype == np.float32
+    np.testing.assert_allclose(taken.image[:3], image[:3], atol=0.5 / 255 + 1e-6)
+    np.testing.assert_array_equal(taken.image[3], image[3])
+
+
+def test_what_is_written_is_read(tmp_path: Path):
+    path = written(tmp_path)
+    assert [item.name for item in tmp_path.iterdir()] == [path.name]
+    read = read_demonstrations(path)
+    assert read.origin == ORIGIN
+    assert read.rejected == REJECTED
+    for found, expected in zip(
+        read.demonstrations, [demonstration(10), demonstration(12)], strict=True
+    ):
+        assert_same(found, expected)
+    assert read_contents(path).seeds == (10, 12)
+    assert [item.seed for item in read_demonstrations(path, first=1).demonstrations] == [10]
+
+
+def test_the_layout_of_the_file(tmp_path: Path):
+    with h5py.File(written(tmp_path)) as file:
+        assert file.attrs["format"] == "kitting_drake demonstrations"
+        assert file.attrs["format_version"] == 1
+        assert sorted(file) == ["seed_00000010", "seed_00000012"]
+        group = file["seed_00000012"]
+        assert group["rgb"].shape == (3, 3, 5, 7)
+        assert group["rgb"].chunks == (1, 3, 5, 7)
+        assert group["height"].shape == (3, 5, 7)
+        assert group["pick"].shape == group["place"].shape == (3, 3)
+        assert group["surface_height"].shape == (3,)
+        assert group["object"].asstr()[0] == "wrench_120"
+
+
+def test_a_file_takes_in_others_and_itself(tmp_path: Path):
+    path, part = written(tmp_path), tmp_path / "part.h5"
+    write_demonstrations(part, ORIGIN, [demonstration(13, steps=1)])
+    sources = [(path, 10), (path, 12), (part, 13)]
+    merge_demonstrations(path, sources, ORIGIN, REJECTED)
+    read = read_demonstrations(path)
+    assert read.rejected == REJECTED
+    for found, expected in zip(
+        read.demonstrations,
+        [demonstration(10), demonstration(12), demonstration(13, steps=1)],
+        strict=True,
+    ):
+        assert_same(found, expected)
+
+
+def test_what_was_there_stays_whole_when_writing_fails(tmp_path: Path):
+    path = written(tmp_path)
+    before = path.read_bytes()
+    with pytest.raises(UserError, match="there is no file"):
+        merge_demonstrations(path, [(path, 10), (tmp_path / "gone.h5", 13)], ORIGIN, [])
+    assert path.read_bytes() == before
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_thousands_of_rejected_seeds_fit(tmp_path: Path):
+    path = tmp_path / "demonstrations.h5"
+    rejected = tuple(Rejection(seed, 0.75, "why " * 30) for seed in range(5000))
+    write_demonstrations(path, ORIGIN, [], rejected)
+    assert read_contents(path).rejected == rejected
+
+
+def test_a_file_that_is_not_there_is_refused(tmp_path: Path):
+    with pytest.raises(UserError, match=r"no file .*gone\.h5: make it by"):
+        read_demonstrations(tmp_path / "gone.h5")
+
+
+@pytest.mark.parametrize("share", [0.001, 0.5, 0.99])
+def test_a_truncated_file_is_refused(tmp_path: Path, share: float):
+    path = written(tmp_path)
+    content = path.read_bytes()
+    path.write_bytes(content[: int(share * len(content))])
+    with pytest.raises(UserError, match=r"demonstrations\.h5 is (truncated|no file of)"):
+        read_demonstrations(path)
+
+
+def test_a_damaged_file_is_refused(tmp_path: Path):
+    path = written(tmp_path)
+    with h5py.File(path, "a") as file:
+        del file["seed_00000010"]["place"]
+    with pytest.raises(UserError, match="damaged: collect anew"):
+        read_demonstrations(path)
+
+
+def test_a_foreign_file_is_refused(tmp_path: Path):
+    text, other = tmp_path / "notes.h5", tmp_path / "other.h5"
+    text.write_text("not HDF5 at all\n")
+    with h5py.File(other, "w") as file:
+        file["weights"] = np.zeros(3)
+    for path in (text, other):
+        with pytest.raises(UserError, match=rf"{path.name} is no file of demonstrations"):
+            read_demonstrations(path)
+
+
+def test_another_version_of_the_format_is_refused(tmp_path: Path):
+    path = written(tmp_path)
+    with h5py.File(path, "a") as file:
+        file.attrs["format_version"] = 2
+    with pytest.raises(UserError, match="is of format version 2, and version 1 is what"):
+        read_demonstrations(path)
+
+
+def test_reads_where_drake_is_not_installed():
+    program = (
+        "import sys, kitting_drake.policies.demonstrations as d; print('pydrake' in sys.modules)"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    assert done.stdout == "False\n", done.stderr
