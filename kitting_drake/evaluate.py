@@ -17,7 +17,9 @@ from kitting_drake.cli import (
 )
 from kitting_drake.episode import run_episode
 from kitting_drake.files import claim_folder, require_folder, write_json
+from kitting_drake.looking import seeds_learned_from
 from kitting_drake.processes import Died, counting_bar, run_apart, side_by_side
+from kitting_drake.scenario import Learned
 from kitting_drake.summary import Episode, summarise, summary_notes, summary_table
 from kitting_drake.summary_figure import draw_summary
 from kitting_drake.verb import count_type, run_verb, seed_type
@@ -36,6 +38,11 @@ def main() -> int:
     folder = require_folder(output_folder(arguments, f"{chosen.name}-evaluation"))
     console = Console(quiet=arguments.quiet)
 
+    policy = chosen.scenario.policy
+    if isinstance(policy, Learned):
+        known = seeds_learned_from(policy, base=chosen.base).intersection(seeds)
+        if known:
+            console.print(f"note: the policy has learned from seeds {min(known)} to {max(known)}")
     # What cannot be built at all is told at once, not once for each seed.
     build_chosen(chosen, seed=seeds[0])
     start = time.perf_counter()

@@ -64,11 +64,20 @@ def describe_learned(config: Learned, *, base: Path) -> dict[str, Any]:
         "orientations": config.orientations,
         "continuous": config.continuous,
         "trained_orientations": file.config.orientations,
-        **{
-            key: file.card.get(key)
-            for key in ("scenario", "demonstrations", "demonstration_seeds", "steps")
-        },
+        **{key: file.card.get(key) for key in ("scenario", "demonstrations", "steps")},
     }
+
+
+def seeds_learned_from(config: Learned, *, base: Path) -> set[int]:
+    """The seeds of the demonstrations that a policy was trained, or chosen, with.
+
+    Raises:
+        UserError: the weights cannot be read.
+    """
+    from kitting_drake.policies.weights import read_weights_file
+
+    card = read_weights_file(base / config.weights).card
+    return {*card.get("demonstration_seeds", ()), *card.get("validation_seeds", ())}
 
 
 def _import_function(config: PythonPolicy) -> Callable[[Observation], PickPlaceAction]:

@@ -3,6 +3,7 @@
 import shutil
 import subprocess
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from pydrake.geometry import Meshcat, MeshcatParams
 from pydrake.systems.framework import Context, Diagram
@@ -18,6 +19,10 @@ from kitting_drake.files import require_folder, write_json, write_whole
 from kitting_drake.report import print_episode
 from kitting_drake.verb import INTERRUPTED, run_verb, seed_type
 from systems.pick_place_planner import Mode
+from systems.signals import Observation
+
+if TYPE_CHECKING:
+    from kitting_drake.policies.learned_policy import Decision
 
 
 def main() -> int:
@@ -47,6 +52,7 @@ def main() -> int:
     folder = require_folder(output_folder(arguments, chosen.name))
     _check_endings(arguments.picture, arguments.video)
 
+    decisions: list[tuple[Observation, Decision]] = []
     meshcat = None if arguments.no_meshcat else _start_meshcat(console)
     cell = build_chosen(
         chosen,
@@ -54,6 +60,7 @@ def main() -> int:
         meshcat=meshcat,
         picture=arguments.picture is not None,
         video=arguments.video,
+        watch=lambda observation, decision: decisions.append((observation, decision)),
     )
     if arguments.graphviz:
         draw_diagram(cell.diagram, arguments.graphviz)
@@ -71,6 +78,7 @@ def main() -> int:
             watch=progress.watch,
         )
     write_json(folder / "results.json", result.as_dict())
+    _save_decisions(folder / "decisions", decisions)
     if meshcat is not None:
         meshcat.StopRecording()
         meshcat.PublishRecording()
@@ -83,6 +91,19 @@ def main() -> int:
     print_episode(console, result)
     console.print(f"files: {folder}/", highlight=False)
     return INTERRUPTED if result.interrupted else 0
+
+
+def _save_decisions(folder: Path, decisions: "list[tuple[Observation, Decision]]") -> None:
+    """A picture for each decision of a learned policy; those of an earlier run go."""
+    for path in folder.glob("decision_*.png"):
+        path.unlink()
+    if decisions:
+        # Who draws nothing does not wait for matplotlib.
+        from kitting_drake.decision_figure import draw_decision
+
+        for number, (observation, decision) in enumerate(decisions, start=1):
+            picture = draw_decision(observation, decision)
+            write_whole(folder / f"decision_{number:02}.png", picture)
 
 
 def _check_endings(picture: Path | None, video: Path | None) -> None:

@@ -33,6 +33,16 @@ _CHECKPOINT_EVERY = 100
 """Steps between checkpoints, and between points of the curves."""
 _MOST_VALIDATED = 64
 """Scenes that a validation looks at."""
+_DAMAGED = (
+    OSError,
+    EOFError,
+    RuntimeError,
+    KeyError,
+    TypeError,
+    ValueError,
+    pickle.UnpicklingError,
+)
+"""What reading a checkpoint that is none may raise."""
 
 
 @dataclass(frozen=True)
@@ -65,7 +75,7 @@ def main() -> int:
             f"{arguments.demos} holds {count} demonstrations, not {arguments.demonstrations}: "
             "collect more"
         )
-    held_out = _held_out(demonstrations, arguments.validation)
+    learned, held_out = _split(demonstrations, arguments.demos, arguments.validation)
     settings = Settings(
         scenario=demonstrations.origin.scenario_name,
         demonstrations=count,
@@ -84,8 +94,8 @@ def main() -> int:
     folder = require_folder(
         arguments.output or Path("output") / f"{demonstrations.origin.scenario_name}-training"
     )
+    run = _Run(settings, learned, held_out, folder, console)
     claim_folder(folder, "settings.json", dataclasses.asdict(settings), of="training run")
-    run = _Run(settings, demonstrations, held_out, folder, console)
     run.train()
     console.print(f"files: {folder}/", highlight=False)
     return 0
@@ -141,24 +151,32 @@ def _rate_type(text: str) -> float:
     return rate
 
 
-def _held_out(demonstrations: Demonstrations, path: Path | None) -> Demonstrations:
-    if path is None:
-        items = demonstrations.demonstrations
+def _split(
+    demonstrations: Demonstrations, path: Path, validation: Path | None
+) -> tuple[Demonstrations, Demonstrations]:
+    """What to learn from, and what to validate by."""
+    items = demonstrations.demonstrations
+    if not items:
+        raise UserError(f"{path} holds no demonstrations: collect some")
+    if validation is None:
         count = max(1, len(items) // 10)
         if len(items) < 2:
             raise UserError("one demonstration leaves none to validate by: give --validation")
-        return dataclasses.replace(demonstrations, demonstrations=items[-count:])
-    held_out = read_demonstrations(path)
-    shared = {item.seed for item in held_out.demonstrations} & {
-        item.seed for item in demonstrations.demonstrations
-    }
+        return (
+            dataclasses.replace(demonstrations, demonstrations=items[:-count]),
+            dataclasses.replace(demonstrations, demonstrations=items[-count:]),
+        )
+    held_out = read_demonstrations(validation)
+    if not held_out.demonstrations:
+        raise UserError(f"{validation} holds no demonstrations: collect some")
+    shared = {item.seed for item in held_out.demonstrations} & {item.seed for item in items}
     if shared and held_out.origin.scenario == demonstrations.origin.scenario:
         raise UserError(
-            f"{path} and --demos share the seed {min(shared)}: validation needs other ones"
+            f"{validation} and {path} share the seed {min(shared)}: validation needs other ones"
         )
     if held_out.origin.grid != demonstrations.origin.grid:
-        raise UserError(f"{path} and --demos have different pixel grids")
-    return held_out
+        raise UserError(f"{validation} and {path} have different pixel grids")
+    return demonstrations, held_out
 
 
 class _Run:
@@ -174,9 +192,7 @@ class _Run:
     ) -> None:
         self.settings, self.folder, self.console = settings, folder, console
         self.grid = demonstrations.origin.grid
-        seeds = {item.seed for item in held_out.demonstrations}
-        kept = [item for item in demonstrations.demonstrations if item.seed not in seeds]
-        learned = scenes(kept, self.grid)
+        learned = scenes(demonstrations.demonstrations, self.grid)
         self.validation_scenes = _spread_out(scenes(held_out.demonstrations, self.grid))
         self.samples = labelled_images(learned, taken_only=settings.taken_only)
         try:
@@ -205,7 +221,7 @@ class _Run:
         self.card = {
             "scenario": demonstrations.origin.scenario_name,
             "demonstrations": settings.demonstrations,
-            "demonstration_seeds": [item.seed for item in kept],
+            "demonstration_seeds": [item.seed for item in demonstrations.demonstrations],
             "validation_seeds": [item.seed for item in held_out.demonstrations],
             "samples": len(self.samples),
             "steps": settings.steps,
@@ -222,6 +238,7 @@ class _Run:
         self._resume()
         trainer, settings = self.trainer, self.settings
         if trainer.step_count >= settings.steps:
+            self._summarise()
             self.console.print("all steps are done")
             return
         size = sum(weight.numel() for weight in trainer.networks.parameters())
@@ -272,10 +289,11 @@ class _Run:
                     self._append({"step": step, **means})
                     self.seconds = time.perf_counter() - start
                     self._save()
-        write_json(
-            self.folder / "summary.json",
-            {**self.card, "best": self.best, "wall_seconds": self.seconds},
-        )
+        self._summarise()
+
+    def _summarise(self) -> None:
+        summary = {**self.card, "best": self.best, "wall_seconds": self.seconds}
+        write_json(self.folder / "summary.json", summary)
 
     def _validate(self) -> dict[str, float]:
         networks = self.trainer.networks.eval()
@@ -297,9 +315,9 @@ class _Run:
         try:
             state = torch.load(path, map_location=self.trainer.networks.device, weights_only=True)
             self.trainer.load_state_dict(state["trainer"])
-        except (OSError, RuntimeError, KeyError, pickle.UnpicklingError) as error:
+            self.best, self.seconds = state["best"], state["seconds"]
+        except _DAMAGED as error:
             raise UserError(f"{path} cannot be taken up again: delete {self.folder}") from error
-        self.best, self.seconds = state["best"], state["seconds"]
         kept = [line for line in self._lines() if line["step"] <= self.trainer.step_count]
         write_whole(self.folder / "log.jsonl", "".join(json.dumps(line) + "\n" for line in kept))
 

@@ -10,6 +10,7 @@ from torch import Tensor, nn
 
 from kitting_drake.policies.fibres import Fibre, Scalar
 from kitting_drake.policies.steerable import BlurPool, Convolution
+from kitting_drake.policies.unet import ResidualBlock
 
 
 @dataclass(frozen=True)
@@ -24,6 +25,9 @@ class AngleNetSize:
     """Side of the last layer's kernels."""
     whole: bool = False
     """The last layer's kernel covers all that is left, instead of a mean being taken after it."""
+    residual: bool = False
+    """A stage of two layers is a residual block, with a shortcut of the same kernels where the
+    number of fields changes."""
 
 
 class AngleNet(nn.Module):
@@ -42,9 +46,16 @@ class AngleNet(nn.Module):
         before: tuple[int, Fibre] = (in_channels, Scalar())
         for fields in size.stages:
             layers = nn.ModuleList()
-            for count in fields:
-                layers.append(convolution(*before, count, fibre, size.kernel))
+            if size.residual and len(fields) == 2:
+                count = fields[1]
+                layers.append(
+                    ResidualBlock(before[0], count, fibre, convolution, size.kernel, size.kernel)
+                )
                 before = (count, fibre)
+            else:
+                for count in fields:
+                    layers.append(convolution(*before, count, fibre, size.kernel))
+                    before = (count, fibre)
             stages.append(layers)
         self.stages = nn.ModuleList(stages)
         self.pool = BlurPool()
@@ -59,5 +70,7 @@ class AngleNet(nn.Module):
             if index:
                 features = self.pool(features)
             for layer in layers:
-                features = F.elu_(layer(features))
+                # A block has an ELU of its own.
+                is_block = isinstance(layer, ResidualBlock)
+                features = layer(features) if is_block else F.elu_(layer(features))
         return self.readout(features.float()).mean(dim=(2, 3))

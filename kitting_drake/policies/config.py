@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -27,7 +28,13 @@ class Preset:
     """j_c of beta's hidden fields."""
     angle_samples: int = 32
     """Samples of each of beta's SO(2) fields."""
-    resnet: tuple[int, ...] = (64, 64, 128, 256, 512)
+    group_angle: AngleNetSize = field(
+        default_factory=lambda: AngleNetSize(
+            stages=((18,), (36, 36), (18, 18), (18, 18), (8,)), residual=True
+        )
+    )
+    """Of the Equivariant Transporter's angle network, in regular fields."""
+    resnet: tuple[int, int, int, int, int] = (64, 64, 128, 256, 512)
     """Channels of the Transporter's stem and of its four stages."""
 
 
@@ -43,6 +50,9 @@ PRESETS = {
         ),
         angle_band=3,
         angle_samples=8,
+        group_angle=AngleNetSize(
+            stages=((2, 2), (4, 4), (6, 6), (6,)), kernel=3, readout=9, whole=True
+        ),
         resnet=(16, 16, 24, 32, 48),
     ),
     # For tests: everything is there, and nothing is large.
@@ -52,6 +62,7 @@ PRESETS = {
         angle=AngleNetSize(stages=((4,), (6,), (6,), (6,)), kernel=3, readout=9, whole=True),
         angle_band=3,
         angle_samples=8,
+        group_angle=AngleNetSize(stages=((1,), (2,), (2,), (2,)), kernel=3, readout=9, whole=True),
         resnet=(8, 8, 8, 12, 16),
     ),
 }
@@ -98,7 +109,10 @@ class NetworkConfig:
             raise ValueError(f"preset must be one of {', '.join(PRESETS)}, not '{self.preset}'")
         if self.orientations < 2 or self.orientations % 2:
             raise ValueError(f"orientations must be an even number, not {self.orientations}")
-        if self.colour_deviation <= 0 or self.height_deviation <= 0:
+        deviations = (self.colour_deviation, self.height_deviation)
+        if not all(map(math.isfinite, (self.colour_mean, self.height_mean, *deviations))):
+            raise ValueError("means and standard deviations must be finite")
+        if min(deviations) <= 0:
             raise ValueError("a standard deviation must be positive")
 
     def as_dict(self) -> dict[str, Any]:

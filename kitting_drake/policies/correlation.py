@@ -155,7 +155,12 @@ class Candidate:
 
 
 def search(
-    scene: Tensor, encoding: Tensor, orientations: int, *, candidates: int = 6
+    scene: Tensor,
+    encoding: Tensor,
+    orientations: int,
+    *,
+    shape: tuple[int, int] | None = None,
+    candidates: int = 6,
 ) -> tuple[list[Candidate], Tensor]:
     """The peaks of the plain correlation at N orientations, best first, and the coarse volume.
 
@@ -163,13 +168,15 @@ def search(
         scene: (1, channels, rows, cols), odd sides, phi(o_t).
         encoding: (1, channels, side, side), psi(c).
         orientations: N.
+        shape: rows and cols to look in, from the first on; by default all.
         candidates: how many of the coarse volume's peaks are looked at.
 
     Returns:
         The candidates, and the coarse volume (COARSE_TURNS, about rows / 2, about cols / 2).
     """
+    rows, cols = shape or scene.shape[-2:]
     volume = coarse_volume(scene, encoding, turns(COARSE_TURNS, scene))
-    rows, cols = scene.shape[-2:]
+    volume = volume[:, : rows // 2 + 1, : cols // 2 + 1]
     found = []
     remaining = volume.clone()
     for _ in range(candidates):

@@ -92,7 +92,7 @@ class LearnedPolicy:
 
         # The crop is around the pixel: what is said of its middle is carried over to the pick.
         scene, encoding = networks.encode_scene(image), networks.encode_crop(image, (row, col))
-        candidates, volume = search(scene, encoding, self._orientations)
+        candidates, volume = search(scene, encoding, self._orientations, shape=(rows, cols))
         turn, place = best_placement(candidates[0], self._orientations, self._continuous)
         place = place + rotation(turn) @ (pick - pixel)
         return Decision(

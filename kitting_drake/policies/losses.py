@@ -149,19 +149,19 @@ def place_loss(
     return coarse_loss + everything - (label * fine).sum()
 
 
-def joint_loss(logits: Tensor, bin_: float, pixel: tuple[float, float]) -> Tensor:
+def joint_loss(
+    logits: Tensor, *labels: tuple[list[tuple[int, float]], tuple[float, float]]
+) -> Tensor:
     """Cross-entropy over bins and pixels at once, as the Transporter's f_pick has it.
 
     Args:
-        logits: (bins, rows, cols); the bins are cyclic.
-        bin_: the label, in bins.
-        pixel: the label (row, col).
+        logits: (bins, rows, cols).
+        labels: for each its bins as (index, weight) pairs (see `spread`) and its pixel (row, col);
+            all equally likely.
     """
-    bins, rows, cols = logits.shape
-    label = soft_label(
-        spread(bin_, bins, cyclic=True),
-        spread(pixel[0], rows),
-        spread(pixel[1], cols),
-        like=logits,
-    )
-    return cross_entropy(logits, label)
+    _, rows, cols = logits.shape
+    parts = [
+        soft_label(bins, spread(row, rows), spread(col, cols), like=logits)
+        for bins, (row, col) in labels
+    ]
+    return cross_entropy(logits, torch.stack(parts).mean(0))

@@ -5,10 +5,16 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from kitting_drake.policies.config import NetworkConfig
+from kitting_drake.policies.equivariant_transporter import EquivariantTransporterNetworks
 from kitting_drake.policies.networks import Networks, SO2Networks
 from kitting_drake.policies.steerable import Convolution, SteerableConv2d
+from kitting_drake.policies.transporter import TransporterNetworks
 
-_METHODS: dict[str, Callable[[NetworkConfig, Convolution], Networks]] = {"so2": SO2Networks}
+_METHODS: dict[str, Callable[[NetworkConfig, Convolution], Networks]] = {
+    "so2": SO2Networks,
+    "equivariant_transporter": EquivariantTransporterNetworks,
+    "transporter": TransporterNetworks,
+}
 
 
 def make_networks(config: NetworkConfig, convolution: Convolution = SteerableConv2d) -> Networks:

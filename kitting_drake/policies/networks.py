@@ -101,17 +101,21 @@ class Networks(nn.Module):
         sample = within_image(sample)
         pixels = [jittered(pick, random) for pick in (sample.pick, *sample.other_picks)]
         generator = torch.Generator().manual_seed(int(random.integers(2**62)))
-        yield from self.pick_losses(sample, pixels)
+        yield from self.pick_losses(sample, pixels, random)
         yield "place", lambda: self.place_loss(sample, pixels[0], generator)
 
     def pick_losses(
-        self, sample: LabelledImage, pixels: list[tuple[int, int]]
+        self,
+        sample: LabelledImage,
+        pixels: list[tuple[int, int]],
+        random: np.random.Generator,
     ) -> Iterator[tuple[str, Callable[[], Tensor]]]:
         """Those of the picking module.
 
         Args:
             sample: what to learn from.
             pixels: around which crops are taken: near the pick, and near each of the others.
+            random: for what else is drawn.
         """
         raise NotImplementedError
 
@@ -134,50 +138,36 @@ class Networks(nn.Module):
         raise NotImplementedError
 
 
-class SO2Networks(Networks):
-    """The paper's own: irrep fields of SO(2), and a discretized answer for the angle."""
+class FactoredNetworks(Networks):
+    """Those that first choose where to pick, then at which angle (section III-C.1)."""
 
-    def __init__(self, config: NetworkConfig, convolution: Convolution = SteerableConv2d) -> None:
-        super().__init__(config)
-        preset = self.preset
-        fibre = Irreps(tuple(range(config.band + 1)), preset.samples)
-        angle_fibre = Irreps(tuple(range(preset.angle_band + 1)), preset.angle_samples)
-        answer = Irreps(config.angle_frequencies)
-        self.alpha = UNet(4, 1, fibre, preset.unet, convolution)
-        self.beta = AngleNet(4, angle_fibre, answer, preset.angle, convolution)
-        self.phi = UNet(4, sizes.FEATURES, fibre, preset.unet, convolution)
-        self.psi = UNet(4, sizes.FEATURES, fibre, preset.unet, convolution)
+    alpha: nn.Module
+    beta: nn.Module
+
+    def crop_angle_logits(self, crops: Tensor, orientations: int) -> Tensor:
+        """f_theta: (n, channels, side, side), crops made ready, to (n, N / 2)."""
+        raise NotImplementedError
 
     def position_logits(self, image: Image, orientations: int) -> Tensor:
         rows, cols = image.shape[1:]
         return self.alpha(self.prepare(image))[0, 0, :rows, :cols]
 
-    def angle_coefficients(self, image: Image, pixel: tuple[int, int]) -> Tensor:
-        """beta(c_1): (13,), the Fourier coefficients of the angle's logits."""
-        return self.beta(self.prepare(crop(image, pixel, sizes.PICK_CROP)))[0]
-
     def angle_logits(self, image: Image, pixel: tuple[int, int], orientations: int) -> Tensor:
-        coefficients = self.angle_coefficients(image, pixel)
-        return discretize(coefficients, orientations, self.config.angle_frequencies, quotient=2)
-
-    def angle_maximum(self, image: Image, pixel: tuple[int, int]) -> float | None:
-        coefficients = self.angle_coefficients(image, pixel).detach().double().cpu().numpy()
-        return series_maximum(coefficients, self.config.angle_frequencies)
+        prepared = self.prepare(crop(image, pixel, sizes.PICK_CROP))
+        return self.crop_angle_logits(prepared, orientations)[0]
 
     def pick_losses(
-        self, sample: LabelledImage, pixels: list[tuple[int, int]]
+        self,
+        sample: LabelledImage,
+        pixels: list[tuple[int, int]],
+        random: np.random.Generator,
     ) -> Iterator[tuple[str, Callable[[], Tensor]]]:
         orientations = self.config.orientations
         picks = [(float(row), float(col)) for row, col in (sample.pick, *sample.other_picks)]
 
         def angle() -> Tensor:
             crops = [self.prepare(crop(sample.image, pixel, sizes.PICK_CROP)) for pixel in pixels]
-            logits = discretize(
-                self.beta(torch.cat(crops)),
-                orientations,
-                self.config.angle_frequencies,
-                quotient=2,
-            )
+            logits = self.crop_angle_logits(torch.cat(crops), orientations)
             thetas = (sample.pick_theta, *sample.other_thetas)
             losses = [
                 angle_loss(row, theta % math.pi, orientations)
@@ -197,6 +187,33 @@ class SO2Networks(Networks):
             "pick_angle": [self.beta],
             "place": [self.phi, self.psi],
         }
+
+
+class SO2Networks(FactoredNetworks):
+    """The paper's own: irrep fields of SO(2), and a discretized answer for the angle."""
+
+    def __init__(self, config: NetworkConfig, convolution: Convolution = SteerableConv2d) -> None:
+        super().__init__(config)
+        preset = self.preset
+        fibre = Irreps(tuple(range(config.band + 1)), preset.samples)
+        angle_fibre = Irreps(tuple(range(preset.angle_band + 1)), preset.angle_samples)
+        answer = Irreps(config.angle_frequencies)
+        self.alpha = UNet(4, 1, fibre, preset.unet, convolution)
+        self.beta = AngleNet(4, angle_fibre, answer, preset.angle, convolution)
+        self.phi = UNet(4, sizes.FEATURES, fibre, preset.unet, convolution)
+        self.psi = UNet(4, sizes.FEATURES, fibre, preset.unet, convolution)
+
+    def angle_coefficients(self, image: Image, pixel: tuple[int, int]) -> Tensor:
+        """beta(c_1): (13,), the Fourier coefficients of the angle's logits."""
+        return self.beta(self.prepare(crop(image, pixel, sizes.PICK_CROP)))[0]
+
+    def crop_angle_logits(self, crops: Tensor, orientations: int) -> Tensor:
+        frequencies = self.config.angle_frequencies
+        return discretize(self.beta(crops), orientations, frequencies, quotient=2)
+
+    def angle_maximum(self, image: Image, pixel: tuple[int, int]) -> float | None:
+        coefficients = self.angle_coefficients(image, pixel).detach().double().cpu().numpy()
+        return series_maximum(coefficients, self.config.angle_frequencies)
 
 
 def within_image(sample: LabelledImage) -> LabelledImage:

@@ -24,12 +24,50 @@ from torch import Tensor, nn
 from kitting_drake.policies.fibres import Fibre, Irreps, Regular, Scalar
 
 Convolution = Callable[..., nn.Module]
-"""`SteerableConv2d`, or `PlainConv2d`: makes a layer from (in_fields, in_fibre, out_fields,
+"""An `ExpandedConv2d`, or `PlainConv2d`: makes a layer from (in_fields, in_fibre, out_fields,
 out_fibre, size, padding=..., bias=...)."""
 
 
-class SteerableConv2d(nn.Module):
-    """A convolution between fields that commutes with turns (equation 3), while it is trained."""
+class ExpandedConv2d(nn.Module):
+    """A convolution between fields, while it is trained: of fewer weights than its kernel has."""
+
+    def __init__(
+        self,
+        in_fibre: Fibre,
+        out_fibre: Fibre,
+        size: int,
+        padding: int | None,
+        weights: Tensor,
+        bias: bool,
+    ) -> None:
+        super().__init__()
+        self.in_fibre, self.out_fibre = in_fibre, out_fibre
+        self.padding = size // 2 if padding is None else padding
+        self.weights = nn.Parameter(weights)
+        self.bias = nn.Parameter(torch.zeros(len(weights))) if bias else None
+
+    def kernel(self) -> Tensor:
+        """(out channels, in channels, size, size): what a plain convolution takes."""
+        raise NotImplementedError
+
+    def channel_bias(self) -> Tensor | None:
+        """(out channels,), if there is a bias."""
+        return None if self.bias is None else self.bias.repeat_interleave(self.out_fibre.channels)
+
+    def forward(self, features: Tensor) -> Tensor:
+        """(batch, in channels, rows, cols) to (batch, out channels, rows, cols)."""
+        kernel = self.kernel().to(features.dtype, memory_format=torch.channels_last)
+        bias = self.channel_bias()
+        return F.conv2d(
+            features,
+            kernel,
+            None if bias is None else bias.to(features.dtype),
+            padding=self.padding,
+        )
+
+
+class SteerableConv2d(ExpandedConv2d):
+    """A convolution between fields that commutes with turns (equation 3), of escnn's basis."""
 
     basis: Tensor
 
@@ -56,33 +94,15 @@ class SteerableConv2d(nn.Module):
             bias: one for each field, on its invariant part; needs samples or a scalar.
             gain: of the initial weights' standard deviation.
         """
-        super().__init__()
-        self.in_fibre, self.out_fibre = in_fibre, out_fibre
-        self.padding = size // 2 if padding is None else padding
         basis = kernel_basis(in_fibre, out_fibre, size)
-        self.register_buffer("basis", basis.to(torch.get_default_dtype()), persistent=False)
         scale = math.sqrt(2 / (in_fields * float(basis.square().sum()) / out_fibre.channels))
-        self.weights = nn.Parameter(torch.randn(out_fields, in_fields, len(basis)) * (gain * scale))
-        self.bias = nn.Parameter(torch.zeros(out_fields)) if bias else None
+        weights = torch.randn(out_fields, in_fields, len(basis)) * (gain * scale)
+        super().__init__(in_fibre, out_fibre, size, padding, weights, bias)
+        self.register_buffer("basis", basis.to(torch.get_default_dtype()), persistent=False)
 
     def kernel(self) -> Tensor:
         """(out channels, in channels, size, size): what a plain convolution takes."""
         return expand_kernel(self.weights, self.basis)
-
-    def channel_bias(self) -> Tensor | None:
-        """(out channels,), if there is a bias."""
-        return None if self.bias is None else self.bias.repeat_interleave(self.out_fibre.channels)
-
-    def forward(self, features: Tensor) -> Tensor:
-        """(batch, in channels, rows, cols) to (batch, out channels, rows, cols)."""
-        kernel = self.kernel().to(features.dtype, memory_format=torch.channels_last)
-        bias = self.channel_bias()
-        return F.conv2d(
-            features,
-            kernel,
-            None if bias is None else bias.to(features.dtype),
-            padding=self.padding,
-        )
 
 
 def expand_kernel(weights: Tensor, basis: Tensor) -> Tensor:
@@ -105,7 +125,7 @@ def expand_kernel(weights: Tensor, basis: Tensor) -> Tensor:
 
 
 class PlainConv2d(nn.Conv2d):
-    """What a `SteerableConv2d` becomes for inference: it computes in the type of its input."""
+    """What an `ExpandedConv2d` becomes for inference: it computes in the type of its input."""
 
     def __init__(
         self,

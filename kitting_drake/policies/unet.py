@@ -36,15 +36,21 @@ class UNetSize:
 
 
 class ResidualBlock(nn.Module):
-    """Two 3x3 convolutions beside a shortcut, and ELU after each."""
+    """Two convolutions beside a shortcut, and ELU after each."""
 
     def __init__(
-        self, fields_in: int, fields: int, fibre: Fibre, convolution: Convolution, skip: int
+        self,
+        fields_in: int,
+        fields: int,
+        fibre: Fibre,
+        convolution: Convolution,
+        skip: int,
+        size: int = 3,
     ) -> None:
         super().__init__()
-        self.first = convolution(fields_in, fibre, fields, fibre, 3)
+        self.first = convolution(fields_in, fibre, fields, fibre, size)
         # Without normalisation, nine blocks at full gain would blow the features up.
-        self.second = convolution(fields, fibre, fields, fibre, 3, gain=0.5)
+        self.second = convolution(fields, fibre, fields, fibre, size, gain=0.5)
         self.shortcut = (
             BandLimit(fibre)
             if fields_in == fields

@@ -1,13 +1,14 @@
 """Trained networks as files: safetensors, loaded as plain convolutions without any group library.
 
 A file holds what was trained, in its own small coordinates, and the few kernel bases that turn them
-into plain convolutions: a hundred kilobytes where the plain kernels would take tens of megabytes.
+into plain convolutions: a tenth of what the plain kernels would take (4 of 37 MB, preset small).
 """
 
 from __future__ import annotations
 
 import dataclasses
 import json
+import textwrap
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -115,20 +116,26 @@ def load_networks(path: Path, compute_type: torch.dtype = torch.float32) -> Netw
         layer, _, kind = name.rpartition(".")
         if layer == "basis":
             continue
-        if kind == "weights" and layer in bases and bases[layer] in tensors:
-            basis = tensors[bases[layer]]
-            if tensor.dim() != 3 or basis.dim() != 5 or tensor.shape[2] != len(basis):
+        basis = tensors.get(str(bases.get(layer)))
+        if kind == "weights" and basis is not None:
+            square = basis.dim() == 5 and basis.shape[3] == basis.shape[4]
+            if tensor.dim() != 3 or not square or tensor.shape[2] != len(basis):
                 raise UserError(f"{path}: the weights of {layer} do not fit their kernel basis")
             state[f"{layer}.weight"] = expand_kernel(tensor, basis)
         else:
             state[name] = tensor
-    networks = make_networks(config, PlainConv2d)
+    try:
+        networks = make_networks(config, PlainConv2d)
+    except (TypeError, ValueError) as error:
+        raise UserError(f"{path}: its config cannot be used: {error}") from error
     try:
         networks.load_state_dict(state)
     except RuntimeError as error:
+        # Torch tells of every tensor.
+        first = textwrap.shorten(str(error).splitlines()[1], 150, placeholder=" ...")
         raise UserError(
             f"{path}: the weights are not those of a {config.preset} {config.method} network: "
-            f"{str(error).splitlines()[1].strip()}"
+            f"{first}"
         ) from error
     if not all(bool(value.isfinite().all()) for value in state.values()):
         raise UserError(f"{path}: the weights are not all finite numbers")

@@ -16,9 +16,12 @@ from kitting_drake.cell import Cell, build_cell, make_grid
 from kitting_drake.episode import EpisodeResult, run_episode
 from kitting_drake.errors import UserError
 from kitting_drake.paths import MODELS
+from kitting_drake.policies.learned_policy import LearnedPolicy
+from kitting_drake.policies.weights import load_networks, preferred_type
 from kitting_drake.scenario import (
     ArrangedKitting,
     Kitting,
+    Learned,
     Pinhole,
     Placement,
     PythonPolicy,
@@ -288,6 +291,29 @@ def test_a_policy_that_fails_ends_the_episode_with_its_reason(monkeypatch: pytes
     monkeypatch.setitem(sys.modules, "stub_policy", module)
     cell = build(Scenario(policy=PythonPolicy(function="stub_policy:policy"), cameras=SMALL))
     assert "weights of the wrong shape" in str(run(cell, 1.0).failure)
+
+
+@pytest.mark.usefixtures("rendering")
+def test_a_learned_policy_answers_what_it_sees(weights_file: Path):
+    told: list[Observation] = []
+    cell = build_cell(
+        Scenario(policy=Learned(weights=weights_file.name, orientations=36), cameras=SMALL),
+        seed=0,
+        base=weights_file.parent,
+        watch=lambda observation, _: told.append(observation),
+    )
+    context = cell.diagram.CreateDefaultContext()
+    observation = cell.diagram.GetOutputPort("observation").Eval(context)
+    assert observation.height.any()
+    assert not told
+    found = cell.diagram.GetOutputPort("action").Eval(context)
+    policy = LearnedPolicy(load_networks(weights_file, preferred_type()), orientations=36)
+    assert found == policy(observation)
+    (seen,) = told
+    np.testing.assert_array_equal(seen.image, observation.image)
+    # Nothing has changed: it is not asked again.
+    assert cell.diagram.GetOutputPort("action").Eval(context) == found
+    assert len(told) == 1
 
 
 @pytest.mark.parametrize("name", ["OneOfEverything", "OneOfEverythingElse"])

@@ -1,6 +1,12 @@
-"""Made-up episodes, for tests of what is made of them."""
+"""Made-up episodes and policies, for tests of what is made of them."""
 
+import os
+import random
+import signal
+import subprocess
+import time
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -54,3 +60,48 @@ def made_up_episode() -> Callable[..., dict[str, Any]]:
         }
 
     return make
+
+
+@pytest.fixture(scope="session")
+def kill_at_random() -> Callable[..., None]:
+    """Kills a process at a random moment: after a file of its own has changed so many times."""
+
+    def kill(process: subprocess.Popen, file: Path, rng: random.Random, *, changes: int) -> None:
+        def size() -> int:
+            return file.stat().st_size if file.exists() else 0
+
+        for _ in range(changes):
+            before = size()
+            while size() == before:
+                assert process.poll() is None, "it was to be killed before its end"
+                time.sleep(0.01)
+        time.sleep(rng.uniform(0, 0.5))
+        assert process.poll() is None, "it was to be killed before its end"
+        os.kill(process.pid, signal.SIGKILL)
+        process.wait()
+
+    return kill
+
+
+@pytest.fixture(scope="session")
+def weights_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A policy that has learned nothing: the smallest networks, as they are before training."""
+    # Who tests no network does not wait for torch.
+    import torch
+
+    from kitting_drake.policies.config import NetworkConfig
+    from kitting_drake.policies.methods import make_networks
+    from kitting_drake.policies.weights import save_weights
+
+    torch.set_num_threads(1)
+    torch.manual_seed(0)
+    path = tmp_path_factory.mktemp("weights") / "policy.safetensors"
+    card = {
+        "scenario": "mine",
+        "demonstrations": 3,
+        "demonstration_seeds": [10_000, 10_001],
+        "validation_seeds": [10_002],
+        "steps": 0,
+    }
+    save_weights(path, make_networks(NetworkConfig(preset="tiny", orientations=72)), card)
+    return path

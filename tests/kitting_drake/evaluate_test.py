@@ -2,7 +2,11 @@ import dataclasses
 import json
 import math
 import os
+import random
 import signal
+import subprocess
+import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -16,6 +20,7 @@ from kitting_drake.scenario import Scenario
 from kitting_drake.summary import Episode
 
 CHOSEN = ChosenScenario(Scenario(), Path("mine.yaml"), "mine", None)
+ROOT = Path(__file__).resolve().parents[2]
 QUIET = Console(quiet=True)
 
 
@@ -80,3 +85,36 @@ def test_two_short_episodes_side_by_side(verb, tmp_path: Path):
     assert summary["wall_seconds_total"] > 0
     assert (tmp_path / "summary.png").read_bytes().startswith(b"\x89PNG")
     assert "8 never picked" in done.stdout
+
+
+@pytest.mark.slow
+def test_killed_again_and_again_it_evaluates_what_it_would_have(
+    tmp_path: Path, kill_at_random: Callable[..., None]
+):
+    scenario = tmp_path / "drawn.yaml"
+    scenario.write_text("Drawn: {time_limit: 2.0, task: !ToolsetKitting {}}\n")
+    whole, killed = tmp_path / "whole", tmp_path / "killed"
+
+    def start(folder: Path, workers: int) -> subprocess.Popen[bytes]:
+        flags = ("--episodes", 8, "--workers", workers, "--output", folder, "--quiet")
+        command = [sys.executable, "-m", "kitting_drake.evaluate", scenario, *flags]
+        return subprocess.Popen([str(word) for word in command], cwd=ROOT)
+
+    def episodes(folder: Path) -> list[Episode]:
+        lines = (folder / "episodes.jsonl").read_text().splitlines()
+        found = [json.loads(line) | {"wall_seconds": 0} for line in lines]
+        return sorted(found, key=lambda episode: episode["seed"])
+
+    assert start(whole, 2).wait() == 0
+    rng = random.Random(0)
+    for _ in range(4):
+        kill_at_random(start(killed, 2), killed / "episodes.jsonl", rng, changes=rng.randrange(2))
+    assert start(killed, 1).wait() == 0
+    assert episodes(killed) == episodes(whole)
+    assert [episode["seed"] for episode in episodes(whole)] == list(range(8))
+    # They are not all alike, and none was lost.
+    assert len({json.dumps(episode["objects"]) for episode in episodes(whole)}) == 8
+    assert not any(episode["failure"] for episode in episodes(whole))
+    one, two = (json.loads((path / "summary.json").read_text()) for path in (killed, whole))
+    assert one["success_rate"] == two["success_rate"]
+    assert one["add_s_mm"] == two["add_s_mm"]

@@ -1,6 +1,7 @@
 import base64
 import json
 import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -9,11 +10,15 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import torch
 import yaml
+from safetensors.torch import save_file
 
+from kitting_drake import run as running
 from kitting_drake.hkd.tool import CATEGORIES
 from kitting_drake.paths import SCENARIOS
-from kitting_drake.scenario import Oracle, load_scenario
+from kitting_drake.scenario import Learned, Oracle, load_scenario
+from kitting_drake.verb import run_verb
 
 ROOT = Path(__file__).resolve().parents[2]
 Verb = Callable[..., subprocess.CompletedProcess[str]]
@@ -63,7 +68,8 @@ def test_shipped_scenarios_run(
     diagram = tmp_path / "cell.dot"
     done = verb("run", path, "--scenario_name", name, "--seed", 3, *flags, "--graphviz", diagram)
     assert done.returncode == 0, done.stderr
-    assert [item.name for item in (tmp_path / "out").iterdir()] == ["results.json"]
+    left = {"results.json", *(["decisions"] if isinstance(scenario.policy, Learned) else [])}
+    assert {item.name for item in (tmp_path / "out").iterdir()} == left
     results = json.loads((tmp_path / "out" / "results.json").read_text())
     assert results.keys() >= KEYS
     assert results["seed"] == 3
@@ -149,3 +155,74 @@ def test_flags_that_cannot_be_used(verb: Verb, tmp_path: Path, flags: list[str],
     assert words in done.stderr
     assert "Traceback" not in done.stderr
     assert not list(tmp_path.iterdir())
+
+
+LEARNED = """
+Mine:
+  time_limit: 0.6
+  task: !ArrangedKitting {}
+  policy: !Learned {weights: policy.safetensors}
+  cameras:
+    front: !Pinhole {width: 160, height: 120, focal_length: 112.5}
+"""
+
+
+@pytest.fixture
+def learned(tmp_path: Path) -> Path:
+    """A scenario's file, beside which its weights should be."""
+    path = tmp_path / "mine.yaml"
+    path.write_text(LEARNED)
+    return path
+
+
+@pytest.mark.usefixtures("rendering")
+def test_every_decision_of_a_learned_policy_leaves_a_picture(
+    verb: Verb, learned: Path, weights_file: Path, tmp_path: Path
+):
+    shutil.copy(weights_file, tmp_path)
+    out = tmp_path / "out"
+    old = out / "decisions" / "decision_07.png"
+    old.parent.mkdir(parents=True)
+    old.touch()
+    done = verb("run", learned, "--no-meshcat", "--output", out)
+    assert done.returncode == 0, done.stderr
+    assert [path.name for path in old.parent.iterdir()] == ["decision_01.png"]
+    assert (out / "decisions" / "decision_01.png").read_bytes().startswith(b"\x89PNG")
+    results = json.loads((out / "results.json").read_text())
+    assert (results["policy"], results["failure"]) == ("learned", None)
+    # It timed out in its first action.
+    assert results["actions"] == 1
+
+
+@pytest.mark.parametrize(
+    ("content", "sentence"),
+    [
+        (None, "cannot read the weights {weights}: there is no such file"),
+        ("text", "cannot read the weights {weights}: it is not a whole safetensors file"),
+        ("foreign", "{weights} is a safetensors file, but no policy of this program"),
+    ],
+)
+@pytest.mark.usefixtures("rendering")
+def test_weights_that_cannot_be_used(
+    learned: Path,
+    content: str | None,
+    sentence: str,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+):
+    weights = learned.with_name("policy.safetensors")
+    if content == "text":
+        weights.write_text("not weights\n")
+    elif content == "foreign":
+        save_file({"weight": torch.zeros(3)}, weights)
+    out = learned.with_name("out")
+    monkeypatch.setattr(
+        sys, "argv", ["run", str(learned), "--no-meshcat", "--output", str(out), "--quiet"]
+    )
+    with pytest.raises(SystemExit) as left:
+        run_verb(running.main)
+    assert left.value.code == 2
+    told = capsys.readouterr()
+    assert told.out == ""
+    assert told.err == f"error: {learned}: {sentence.format(weights=weights)}\n"
+    assert not list(out.iterdir())

@@ -60,7 +60,7 @@ def test_one_of_everything():
     compare(Scenario, root["OneOfEverything"], loaded, "OneOfEverything", seen)
     # What cannot stand beside it in one scenario.
     hints = typing.get_type_hints(Scenario)
-    for name in ("OneOfEverythingElse", "OneOfEverythingDrawn"):
+    for name in ("OneOfEverythingElse", "OneOfEverythingLearned", "OneOfEverythingDrawn"):
         other = load_scenario(TEST_SCENARIOS, name)
         for key, raw in root[name].items():
             compare(hints[key], raw, getattr(other, key), f"{name}.{key}", seen)
@@ -195,6 +195,15 @@ BAD = {
         ["cameras.f", "!Pinhole"],
     ),
     "orientations": ("A: {policy: !QuantisedOracle {orientations: 1}}", ["policy.orientations"]),
+    "orientations of a network": (
+        "A: {policy: !Learned {weights: w, orientations: 4000}}",
+        ["policy.orientations", "3600"],
+    ),
+    "no weights": ("A: {policy: !Learned {}}", ["policy.weights is empty", "train"]),
+    "blind": (
+        "A: {policy: !Learned {weights: w}, cameras: {}}",
+        ["cameras is empty: this policy needs at least one"],
+    ),
     "no function": ("A: {policy: !PythonPolicy {function: mine}}", ["policy.function", "mine"]),
 }
 

@@ -1,0 +1,202 @@
+"""What `benchmark networks` measured, for the terminal."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from rich.table import Table
+
+METHOD_NAMES = {
+    "so2": "SO(2), this paper",
+    "equivariant_transporter": "Equivariant Transporter",
+    "transporter": "Transporter",
+}
+RUNG_NAMES = {
+    "escnn_float32": "escnn, float32",
+    "escnn_bfloat16": "escnn, bfloat16 autocast",
+    "ours_float32": "folded, float32",
+    "ours_bfloat16": "folded, bfloat16",
+}
+MEASURE_NAMES = {
+    "training_step": "training step, all four networks",
+    "alpha_training_step": "training step, alpha",
+    "decision": "decision",
+    "alpha_inference": "inference, alpha",
+}
+
+
+def network_tables(measured: dict[str, Any]) -> list[Table]:
+    """All of them.
+
+    Args:
+        measured: what `benchmark_networks` returns.
+    """
+    presets = dict.fromkeys(row["preset"] for row in measured["pick_angle"])
+    return [
+        *(_pick_angle_table(measured, preset) for preset in presets),
+        _decision_table(measured),
+        _folding_table(measured),
+        _share_table(measured),
+        _level_table(measured),
+    ]
+
+
+def seconds_text(seconds: float | None) -> str:
+    """Three digits, in the unit that suits."""
+    if seconds is None:
+        return "-"
+    return f"{seconds:.3g} s" if seconds >= 1 else f"{1e3 * seconds:.3g} ms"
+
+
+def count_text(count: float) -> str:
+    """Three digits and a thousand's power: k, M, G, T."""
+    for power, letter in ((1e12, "T"), (1e9, "G"), (1e6, "M"), (1e3, "k")):
+        if count >= power:
+            return f"{count / power:.3g} {letter}"
+    return f"{count:.3g}"
+
+
+def _table(title: str, *headings: str) -> Table:
+    """Words on the left in the first column, numbers on the right in the others."""
+    table = Table(title=title, title_justify="left")
+    for index, heading in enumerate(headings):
+        table.add_column(heading, justify="right" if index else "left")
+    return table
+
+
+def _ratio_text(ratio: float | None) -> str:
+    return "-" if ratio is None else f"{ratio:.2f}"
+
+
+def _growth(measured: dict[str, Any], name: str, preset: str, method: str) -> dict[str, Any]:
+    rows = measured[f"{name}_growth"]
+    return next(row for row in rows if (row["preset"], row["method"]) == (preset, method))
+
+
+def _pick_angle_table(measured: dict[str, Any], preset: str) -> Table:
+    table = _table(
+        f"what answers the pick angle, preset {preset} (figure 6(c); the Transporter: all its "
+        "picking)",
+        "method",
+        "N",
+        "parameters",
+        "multiply-accumulates",
+        "time",
+    )
+    rows = [row for row in measured["pick_angle"] if row["preset"] == preset]
+    for method in dict.fromkeys(row["method"] for row in rows):
+        for row in rows:
+            if row["method"] == method:
+                table.add_row(
+                    METHOD_NAMES[method],
+                    str(row["orientations"]),
+                    count_text(row["parameters"]),
+                    count_text(row["operations"] / 2),
+                    row["skipped"] or seconds_text(row["seconds"]),
+                )
+        growth = _growth(measured, "pick_angle", preset, method)
+        table.add_row(
+            "",
+            f"{growth['to']} / {growth['from']}",
+            *(_ratio_text(growth[key]) for key in ("parameters", "operations", "seconds")),
+            style="bold",
+            end_section=True,
+        )
+    return table
+
+
+def _decision_table(measured: dict[str, Any]) -> Table:
+    parts = ("pick_position", "pick_angle", "phi", "psi", "search")
+    table = _table(
+        f"a decision, preset {measured['preset']}, {measured['inference_type']}",
+        "method",
+        "N",
+        *(part.replace("_", " ") for part in parts),
+        "all",
+    )
+    rows = measured["decision"]
+    for method in dict.fromkeys(row["method"] for row in rows):
+        for row in rows:
+            if row["method"] == method:
+                split = row["parts"] or dict.fromkeys(parts)
+                table.add_row(
+                    METHOD_NAMES[method],
+                    str(row["orientations"]),
+                    *(seconds_text(split[part]) for part in parts),
+                    row["skipped"] or seconds_text(row["seconds"]),
+                )
+        growth = _growth(measured, "decision", measured["preset"], method)
+        ends = f"{growth['to']} / {growth['from']}"
+        blanks = [""] * len(parts)
+        ratio = _ratio_text(growth["seconds"])
+        table.add_row("", ends, *blanks, ratio, style="bold", end_section=True)
+    return table
+
+
+def _folding_table(measured: dict[str, Any]) -> Table:
+    folding = measured["folding"]
+    table = _table(
+        f"the same networks, preset {measured['preset']}: time, and times faster than escnn's "
+        "float32",
+        "how",
+        *MEASURE_NAMES.values(),
+        "difference",
+    )
+    for rung, timings in folding["rungs"].items():
+        cells = [
+            f"{seconds_text(timings[name]['seconds'])}, {folding['speed_up'][rung][name]:.2f}x"
+            for name in MEASURE_NAMES
+        ]
+        table.add_row(RUNG_NAMES[rung], *cells, f"{folding['alpha_difference'][rung]:.1e}")
+    return table
+
+
+def _share_table(measured: dict[str, Any]) -> Table:
+    peaks = ", ".join(
+        f"{name} {count_text(rates['best'])}FLOP/s" for name, rates in measured["peak"].items()
+    )
+    table = _table(
+        f"share of the machine's peak ({peaks})",
+        "network",
+        "type",
+        "multiply-accumulates",
+        "inference",
+        "share",
+        "training step",
+        "share",
+    )
+    rows = {(row["network"], row["type"], row["mode"]): row for row in measured["share_of_peak"]}
+    for name, type_ in dict.fromkeys((name, type_) for name, type_, _ in rows):
+        infer, train = (rows[name, type_, mode] for mode in ("inference", "training"))
+        table.add_row(
+            name,
+            type_,
+            count_text(infer["operations"] / 2),
+            seconds_text(infer["seconds"]),
+            f"{infer['share']:.0%}",
+            seconds_text(train["seconds"]),
+            f"{train['share']:.0%}",
+        )
+    return table
+
+
+def _level_table(measured: dict[str, Any]) -> Table:
+    table = _table(
+        f"alpha's inference, preset {measured['preset']}, level by level",
+        "level",
+        "multiply-accumulates",
+        "time",
+        "in convolutions",
+        "their share of peak",
+        "share of peak",
+    )
+    for row in measured["alpha_levels"]["levels"]:
+        table.add_row(
+            row["level"],
+            count_text(row["operations"] / 2),
+            seconds_text(row["seconds"]),
+            seconds_text(row["convolution_s"]),
+            f"{row['convolution_share']:.0%}",
+            f"{row['share']:.0%}",
+        )
+    return table

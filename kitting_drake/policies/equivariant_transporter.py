@@ -1,0 +1,52 @@
+"""The Equivariant Transporter, the first baseline of the paper (section V-C.3).
+
+The paper's own method but for its fields: regular ones of C_6 where an answer is invariant, and
+regular ones of C_N / C_2 all through the angle network, which N is thereby built into: its weights,
+its kernels and its time grow with N.
+"""
+
+from __future__ import annotations
+
+from torch import Tensor
+
+from kitting_drake.policies import config as sizes
+from kitting_drake.policies.angle_net import AngleNet
+from kitting_drake.policies.config import NetworkConfig
+from kitting_drake.policies.fibres import Regular
+from kitting_drake.policies.group_convolution import GroupConv2d
+from kitting_drake.policies.networks import FactoredNetworks
+from kitting_drake.policies.steerable import Convolution, SteerableConv2d
+from kitting_drake.policies.unet import UNet
+
+_ORDER = 6
+"""Of the group whose regular fields the U-nets have."""
+
+
+class EquivariantTransporterNetworks(FactoredNetworks):
+    """Networks of regular fields.
+
+    At the preset "paper" the angle network has 0.90, 1.81, 3.01 and 4.51 million parameters at
+    N = 36, 72, 120 and 180, as the authors'.
+    """
+
+    def __init__(self, config: NetworkConfig, convolution: Convolution = SteerableConv2d) -> None:
+        super().__init__(config)
+        preset = self.preset
+        fibre, angle_fibre = Regular(_ORDER), Regular(config.orientations, quotient=2)
+        grouped = GroupConv2d if convolution is SteerableConv2d else convolution
+        self.alpha = UNet(4, 1, fibre, preset.unet, convolution)
+        self.beta = AngleNet(4, angle_fibre, angle_fibre, preset.group_angle, grouped)
+        self.phi = UNet(4, sizes.FEATURES, fibre, preset.unet, convolution)
+        self.psi = UNet(4, sizes.FEATURES, fibre, preset.unet, convolution)
+
+    def check_orientations(self, orientations: int) -> None:
+        """Raises ValueError if the networks were made for another N."""
+        if orientations != self.config.orientations:
+            raise ValueError(
+                f"this Equivariant Transporter answers at {self.config.orientations} orientations, "
+                f"not at {orientations}: train one for that"
+            )
+
+    def crop_angle_logits(self, crops: Tensor, orientations: int) -> Tensor:
+        self.check_orientations(orientations)
+        return self.beta(crops)

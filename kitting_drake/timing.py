@@ -1,0 +1,146 @@
+"""Clocks, counters and the machine's own limits, for benchmarks of networks; needs no Drake."""
+
+from __future__ import annotations
+
+import os
+import platform
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from torch.utils.flop_counter import FlopCounterMode
+
+Name = TypeVar("Name")
+
+_WARM_UPS = 2
+"""Runs before the first that counts: kernels are chosen, weights laid out."""
+
+
+@dataclass(frozen=True)
+class Timing:
+    """How long something took, in seconds of wall time."""
+
+    seconds: float
+    """The median."""
+    fastest: float
+    slowest: float
+    runs: int
+
+    @classmethod
+    def of(cls, times: list[float]) -> Timing:
+        """Of single runs."""
+        return cls(float(np.median(times)), min(times), max(times), len(times))
+
+
+def read_clock(device: torch.device) -> float:
+    """Seconds, when all that was asked of the device is done."""
+    if device.type == "cuda":
+        torch.cuda.synchronize(device)
+    return time.perf_counter()
+
+
+def time_each(
+    functions: Mapping[Name, Callable[[], object]],
+    device: torch.device,
+    *,
+    repeats: int,
+    budget: float,
+) -> dict[Name, Timing]:
+    """Times functions in turns, so that whatever else the machine does falls on all of them.
+
+    Args:
+        functions: what to run.
+        device: where they compute.
+        repeats: how often each is timed, after warming up.
+        budget: seconds after which a function is not run once more.
+    """
+    spent = dict.fromkeys(functions, 0.0)
+    times: dict[Name, list[float]] = {name: [] for name in functions}
+    for turn in range(_WARM_UPS + repeats):
+        for name, function in functions.items():
+            if turn and spent[name] > budget:
+                continue
+            start = read_clock(device)
+            function()
+            elapsed = read_clock(device) - start
+            spent[name] += elapsed
+            if turn == 0 or turn >= _WARM_UPS:
+                times[name].append(elapsed)
+    # The first counts only where there was no time for another.
+    return {name: Timing.of(runs[1:] or runs) for name, runs in times.items()}
+
+
+def count_operations(function: Callable[[], object]) -> int:
+    """Floating-point operations of a function's convolutions and products of matrices.
+
+    A multiply-accumulate is two. Backward passes within the function are counted.
+    """
+    with FlopCounterMode(display=False) as counter:
+        function()
+    return int(counter.get_total_flops())
+
+
+def measure_peak(
+    type_: torch.dtype, device: torch.device, *, side: int, repeats: int
+) -> dict[str, float]:
+    """What the machine reaches at best, in operations a second.
+
+    Args:
+        type_: to compute in.
+        device: where.
+        side: of the matrices; the convolution is of an eighth as many channels.
+        repeats: how often each is timed.
+
+    Returns:
+        Of a product of large square matrices as `matmul`, of a wide 3x3 convolution in
+        channels_last as `convolution`, and of the better as `best`.
+    """
+    channels = side // 8
+    matrix = torch.randn(side, side, device=device, dtype=type_)
+    image = torch.randn(side // 128, channels, 32, 32, device=device, dtype=type_)
+    kernel = torch.randn(channels, channels, 3, 3, device=device, dtype=type_)
+    image, kernel = (item.contiguous(memory_format=torch.channels_last) for item in (image, kernel))
+    functions: dict[str, Callable[[], object]] = {
+        "matmul": lambda: matrix @ matrix,
+        "convolution": lambda: F.conv2d(image, kernel, padding=1),
+    }
+    with torch.inference_mode():
+        timings = time_each(functions, device, repeats=repeats, budget=10.0)
+    with torch.no_grad():
+        # The peak is the fastest run, not the usual one.
+        rates = {
+            name: count_operations(function) / timings[name].fastest
+            for name, function in functions.items()
+        }
+    return rates | {"best": max(rates.values())}
+
+
+def describe_machine(device: torch.device) -> dict[str, Any]:
+    """What the figures were measured on."""
+    return {
+        "cpu": _cpu_name(),
+        "cores": len(os.sched_getaffinity(0)),
+        "threads": torch.get_num_threads(),
+        "device": torch.cuda.get_device_name(device) if device.type == "cuda" else "cpu",
+        "torch": torch.__version__,
+        "python": platform.python_version(),
+        # What others did: 0 on a machine of one's own, before anything was measured.
+        "load_before": os.getloadavg()[0],
+    }
+
+
+def memory_bytes() -> int:
+    """Of the whole machine."""
+    return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+
+
+def _cpu_name() -> str:
+    info = Path("/proc/cpuinfo")
+    lines = info.read_text().splitlines() if info.is_file() else []
+    names = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
+    return names[0] if names else platform.processor() or platform.machine()

@@ -1,0 +1,97 @@
+import math
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from kitting_drake.policies.angle_net import AngleNet, AngleNetSize
+from kitting_drake.policies.config import ANGLE_FREQUENCIES, PICK_CROP, PRESETS, NetworkConfig
+from kitting_drake.policies.discretization import discretize
+from kitting_drake.policies.fibres import Irreps
+from kitting_drake.policies.networks import SO2Networks
+from kitting_drake.policies.steerable import SteerableConv2d
+from tests.kitting_drake.policies.turning import smooth_image, turn_image
+
+MEAN = AngleNetSize(stages=((4,), (6,), (6,), (6,)), kernel=3, readout=3)
+"""A mean over what is left, as in the paper."""
+WHOLE = PRESETS["tiny"].angle
+"""A kernel over what is left."""
+
+
+def angle_net(frequencies: tuple[int, ...], size: AngleNetSize = WHOLE) -> AngleNet:
+    hidden = Irreps((0, 1, 2, 3), samples=8)
+    return AngleNet(4, hidden, Irreps(frequencies), size, SteerableConv2d)
+
+
+def rho(frequencies: tuple[int, ...], degrees: float) -> Tensor:
+    """rho_irrep of equations 1 and 4."""
+    blocks = []
+    for j in frequencies:
+        cos, sin = (f(j * math.radians(degrees)) for f in (math.cos, math.sin))
+        blocks.append(torch.tensor([[cos, -sin], [sin, cos]]) if j else torch.ones(1, 1))
+    return torch.block_diag(*blocks)
+
+
+@pytest.mark.parametrize("size", [MEAN, WHOLE], ids=["mean", "whole"])
+@pytest.mark.parametrize("frequencies", [(0, 1, 2, 3), (0, 2, 4, 6)])
+def test_the_answer_turns_by_quarters_with_the_crop(
+    size: AngleNetSize, frequencies: tuple[int, ...]
+):
+    network = angle_net(frequencies, size)
+    crop = torch.randn(1, 4, PICK_CROP, PICK_CROP)
+    answer = network(crop)
+    for degrees in (90, 180, 270):
+        expected = answer @ rho(frequencies, degrees).T
+        found = network(turn_image(crop, degrees))
+        assert (found - expected).norm() < 1e-5 * answer.norm()
+
+
+def test_bins_shift_with_the_crop_and_half_turns_are_none():
+    network = angle_net(ANGLE_FREQUENCIES)
+    crop = torch.randn(1, 4, PICK_CROP, PICK_CROP)
+
+    def bins(degrees: int) -> Tensor:
+        return discretize(network(turn_image(crop, degrees)), 36, ANGLE_FREQUENCIES, quotient=2)[0]
+
+    logits = bins(0)
+    assert logits.shape == (18,)
+    assert logits.std() > 1e-3
+    torch.testing.assert_close(bins(90), logits.roll(9), atol=1e-5, rtol=0)
+    torch.testing.assert_close(bins(180), logits, atol=1e-5, rtol=0)
+
+
+def test_other_turns_are_nearly_exact():
+    errors = []
+    for seed in range(4):
+        torch.manual_seed(seed)
+        network = angle_net(ANGLE_FREQUENCIES)
+        crop = smooth_image(PICK_CROP, seed=seed)
+        with torch.no_grad():
+            answer = network(crop)
+            for degrees in (10, 30, 45):
+                expected = answer @ rho(ANGLE_FREQUENCIES, degrees).T
+                found = network(turn_image(crop, degrees))
+                errors.append(float((found - expected).norm() / expected.norm()))
+    # Coarse as it is, a network that did not turn would be far off.
+    assert np.median(errors) < 0.25
+    assert np.max(errors) < 0.4
+
+
+@pytest.mark.parametrize("preset", ["tiny", "small", pytest.param("paper", marks=pytest.mark.slow)])
+def test_every_frequency_of_the_answer_is_reached(preset: str):
+    networks = SO2Networks(NetworkConfig(preset=preset))
+    crop = torch.randn(1, 4, PICK_CROP, PICK_CROP)
+    with torch.no_grad():
+        answer = networks.beta(crop)[0].numpy()
+    sizes = [np.hypot(*answer[i : i + 2]) for i in range(1, len(answer), 2)]
+    assert min(sizes) > 1e-3 * max(sizes)
+
+
+def test_neither_parameters_nor_weights_depend_on_n():
+    few, many = (SO2Networks(NetworkConfig(preset="tiny", orientations=n)) for n in (36, 720))
+    many.load_state_dict(few.state_dict())
+    image = np.random.default_rng(0).random((4, 80, 80), np.float32)
+    coarse = few.angle_logits(image, (40, 40), 36)
+    fine = many.angle_logits(image, (40, 40), 720)
+    torch.testing.assert_close(coarse, fine[::20], atol=1e-5, rtol=0)

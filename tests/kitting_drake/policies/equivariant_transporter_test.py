@@ -1,0 +1,135 @@
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from kitting_drake.policies.angle_net import AngleNet
+from kitting_drake.policies.config import PICK_CROP, PRESETS, NetworkConfig
+from kitting_drake.policies.equivariant_transporter import EquivariantTransporterNetworks
+from kitting_drake.policies.fibres import Regular
+from kitting_drake.policies.group_convolution import GroupConv2d
+from kitting_drake.policies.images import LabelledImage
+from kitting_drake.policies.methods import make_networks
+from kitting_drake.policies.training import Trainer
+from kitting_drake.policies.weights import load_networks, save_weights
+
+N = 12
+TINY = NetworkConfig(method="equivariant_transporter", preset="tiny", orientations=N)
+
+
+def sample() -> LabelledImage:
+    image = np.random.default_rng(0).random((4, 49, 65), np.float32)
+    return LabelledImage(
+        image=image,
+        pick=np.array([20.3, 30.6]),
+        pick_theta=0.7,
+        place=np.array([25.2, 40.1]),
+        turn=2.1,
+        other_picks=np.array([[33.0, 12.5]]),
+        other_thetas=np.array([1.9]),
+    )
+
+
+def assert_near(found: Tensor, expected: Tensor) -> None:
+    assert expected.std() > 0
+    assert (found - expected).norm() < 1e-5 * expected.norm()
+
+
+def test_is_made_by_its_name():
+    assert isinstance(make_networks(TINY), EquivariantTransporterNetworks)
+
+
+@pytest.mark.parametrize("name", ["alpha", "phi", "psi"])
+def test_encodings_turn_by_halves_with_the_image(name: str):
+    # Of the turns that C_6 knows, this is the one that a grid does not blur.
+    network = getattr(make_networks(TINY), name)
+    image = torch.randn(1, 4, 33, 49)
+    assert_near(network(image.rot90(2, (2, 3))), network(image).rot90(2, (2, 3)))
+
+
+@pytest.mark.parametrize("orientations", [4, 12, 36])
+def test_angles_turn_by_quarters_with_the_crop(orientations: int):
+    config = NetworkConfig(TINY.method, "tiny", orientations)
+    network = make_networks(config)
+    crop = torch.randn(2, 4, PICK_CROP, PICK_CROP)
+    with torch.no_grad():
+        answer = network.crop_angle_logits(crop, orientations)
+        turned = network.crop_angle_logits(crop.rot90(1, (2, 3)), orientations)
+        half = network.crop_angle_logits(crop.rot90(2, (2, 3)), orientations)
+    assert answer.shape == (2, orientations // 2)
+    assert_near(turned, answer.roll(orientations // 4, 1))
+    assert_near(half, answer)
+
+
+@pytest.mark.parametrize(
+    ("orientations", "count"), [(36, 902_880), (72, 1_805_040), (120, 3_007_920), (180, 4_511_520)]
+)
+def test_the_paper_s_angle_network_has_the_authors_size(orientations: int, count: int):
+    # 0.90, 1.81, 3.01 and 4.51 million.
+    fibre = Regular(orientations, quotient=2)
+    network = AngleNet(4, fibre, fibre, PRESETS["paper"].group_angle, GroupConv2d)
+    assert sum(weight.numel() for weight in network.parameters()) == count
+    convolutions = [name for name, item in network.named_modules() if isinstance(item, GroupConv2d)]
+    assert sum("shortcut" not in name for name in convolutions) == 9
+
+
+@pytest.mark.parametrize("preset", ["small", "tiny"])
+def test_parameters_of_the_angle_network_grow_with_n(preset: str):
+    def count(orientations: int) -> int:
+        fibre = Regular(orientations, quotient=2)
+        network = AngleNet(4, fibre, fibre, PRESETS[preset].group_angle, GroupConv2d)
+        return sum(weight.numel() for weight in network.parameters())
+
+    assert count(72) - count(36) == pytest.approx((count(180) - count(72)) / 3)
+    assert count(180) > 4 * count(36)
+
+
+def test_answers_at_its_own_n_alone():
+    networks = make_networks(TINY)
+    image = sample().image
+    networks.check_orientations(N)
+    assert networks.position_logits(image, N).shape == image.shape[1:]
+    assert networks.angle_logits(image, (20, 30), N).shape == (N // 2,)
+    assert networks.angle_maximum(image, (20, 30)) is None
+    with pytest.raises(ValueError, match="answers at 12 orientations, not at 36"):
+        networks.check_orientations(36)
+    with pytest.raises(ValueError, match="not at 36"):
+        networks.angle_logits(image, (20, 30), 36)
+
+
+def losses(steps: int) -> list[dict[str, float]]:
+    torch.manual_seed(1)
+    trainer = Trainer(make_networks(TINY), seed=0, learning_rate=1e-3)
+    found = []
+    for _ in range(steps):
+        # The same draws, so the same motion of the scene.
+        trainer.step_count = 0
+        found.append(trainer.step([sample()]))
+    return found
+
+
+def test_learns_a_sample_and_the_same_for_a_seed():
+    found = losses(5)
+    assert set(found[0]) == {"pick_position", "pick_angle", "place"}
+    for name in found[0]:
+        assert found[-1][name] < found[0][name]
+    assert losses(2) == found[:2]
+
+
+def test_comes_back_from_a_file_as_plain_convolutions(tmp_path: Path):
+    networks = make_networks(TINY).eval()
+    path = tmp_path / "policy.safetensors"
+    save_weights(path, networks, {})
+    loaded = load_networks(path)
+    assert loaded.config == TINY
+    image = sample().image
+    with torch.no_grad():
+        for ask in (
+            lambda item: item.position_logits(image, N),
+            lambda item: item.angle_logits(image, (20, 30), N),
+            lambda item: item.encode_scene(image),
+            lambda item: item.encode_crop(image, (20, 30)),
+        ):
+            assert_near(ask(loaded), ask(networks))

@@ -1,0 +1,141 @@
+import math
+
+import numpy as np
+import pytest
+
+from kitting_drake.policies.images import LabelledImage, augment, crop, move, rotation
+from systems.signals import PickPlaceAction, PixelGrid, PlanarPose
+
+ROWS, COLS = 61, 91
+MIDDLE = np.array([(ROWS - 1) / 2, (COLS - 1) / 2])
+
+
+def marked(pick: tuple[float, float], place: tuple[float, float]) -> LabelledImage:
+    """An image whose height is a round hill at each of the labels, of 1 m and 2 m."""
+    row, col = np.meshgrid(np.arange(ROWS), np.arange(COLS), indexing="ij")
+    height = sum(
+        top * np.exp(-((row - at[0]) ** 2 + (col - at[1]) ** 2) / 8)
+        for top, at in ((1.0, pick), (2.0, place))
+    )
+    image = np.concatenate([np.full((3, ROWS, COLS), 0.5), height[None]]).astype(np.float32)
+    return LabelledImage(image, np.array(pick), 0.3, np.array(place), 1.1)
+
+
+SAMPLE = marked((20.0, 30.0), (38.25, 55.5))
+
+
+def hill(sample: LabelledImage, near: np.ndarray) -> np.ndarray:
+    """The middle of the hill around a position."""
+    row, col = np.rint(near).astype(int)
+    rows, cols = np.arange(row - 6, row + 7), np.arange(col - 6, col + 7)
+    weights = sample.image[3][np.ix_(rows, cols)]
+    total = weights.sum()
+    return np.array([(weights.sum(1) * rows).sum(), (weights.sum(0) * cols).sum()]) / total
+
+
+def test_rotation_is_counter_clockwise_on_a_picture_with_row_0_on_top():
+    down, right = np.array([1.0, 0]), np.array([0, 1.0])
+    np.testing.assert_allclose(rotation(math.pi / 2) @ down, right, atol=1e-12)
+    image = np.zeros((3, 3))
+    image[2, 1] = 1  # Below the middle, which a counter-clockwise turn brings to its right.
+    assert np.rot90(image)[1, 2] == 1
+
+
+def test_labels_of_an_action():
+    grid = PixelGrid()
+    pick, place = grid.to_world((40.25, 100.5)), grid.to_world((90.0, 200.0))
+    action = PickPlaceAction(PlanarPose(*pick, 2.0), PlanarPose(*place, -1.5))
+    sample = LabelledImage.from_action(np.zeros((4, *grid.shape), np.float32), action, grid)
+    np.testing.assert_allclose(sample.pick, (40.25, 100.5))
+    np.testing.assert_allclose(sample.place, (90.0, 200.0))
+    assert sample.pick_theta == 2.0
+    assert sample.turn == -3.5
+
+
+def test_other_points_of_the_object_go_along():
+    # A quarter turn: what is below the pick comes to the right of the place.
+    sample = LabelledImage(
+        SAMPLE.image, np.array([10.0, 20]), 0.0, np.array([40.0, 50]), math.pi / 2
+    )
+    np.testing.assert_allclose(sample.place_of(sample.pick), sample.place)
+    np.testing.assert_allclose(sample.place_of(np.array([13.0, 20])), (40, 53))
+
+
+@pytest.mark.parametrize("centre", [(30, 40), (0, 0), (60, 90), (-3, 45), (200, 20)])
+def test_crops_are_around_their_pixel_and_zero_outside(centre: tuple[int, int]):
+    image = np.random.default_rng(0).random((4, ROWS, COLS)).astype(np.float32)
+    taken = crop(image, centre, 9)
+    assert taken.shape == (4, 9, 9)
+    for row in range(9):
+        for col in range(9):
+            i, j = centre[0] + row - 4, centre[1] + col - 4
+            inside = 0 <= i < ROWS and 0 <= j < COLS
+            np.testing.assert_array_equal(taken[:, row, col], image[:, i, j] if inside else 0)
+
+
+def test_what_is_at_the_labels_moves_with_them():
+    random = np.random.default_rng(1)
+    for _ in range(10):
+        angle, shift = random.uniform(-np.pi, np.pi), random.uniform(-3, 3, size=2)
+        moved = move(marked((27.0, 40.0), (36.5, 52.25)), angle, shift)
+        np.testing.assert_allclose(hill(moved, moved.pick), moved.pick, atol=0.3)
+        np.testing.assert_allclose(hill(moved, moved.place), moved.place, atol=0.3)
+        assert moved.pick_theta == pytest.approx(0.3 + angle)
+        assert moved.turn == 1.1
+        # The relation between pick and place has turned, and nothing else.
+        expected = rotation(angle) @ (np.array([36.5, 52.25]) - (27.0, 40.0))
+        np.testing.assert_allclose(moved.place - moved.pick, expected)
+
+
+def test_other_objects_move_too():
+    sample = LabelledImage(
+        SAMPLE.image,
+        SAMPLE.pick,
+        0.3,
+        SAMPLE.place,
+        1.1,
+        other_picks=np.array([MIDDLE, MIDDLE + (10, 0)]),
+        other_thetas=np.array([0.1, 0.2]),
+    )
+    moved = move(sample, math.pi / 2, np.array([1.0, 2.0]))
+    np.testing.assert_allclose(moved.other_picks - MIDDLE, [(1, 2), (1, 12)], atol=1e-9)
+    np.testing.assert_allclose(moved.other_thetas, np.array([0.1, 0.2]) + math.pi / 2)
+
+
+def test_a_half_turn_is_exact():
+    moved = move(SAMPLE, math.pi, np.zeros(2))
+    np.testing.assert_array_equal(moved.image, SAMPLE.image[:, ::-1, ::-1])
+    np.testing.assert_allclose(moved.pick, 2 * MIDDLE - SAMPLE.pick)
+
+
+def test_no_height_is_made_up():
+    moved = move(SAMPLE, 0.7, np.array([0.4, -0.3]))
+    assert set(np.unique(moved.image[3])) <= {0, *np.unique(SAMPLE.image[3])}
+    assert moved.image.dtype == np.float32
+    # What comes in from outside was not seen.
+    np.testing.assert_array_equal(moved.image[:, 0, 0], 0)
+
+
+def test_augmentation_keeps_both_labels_inside():
+    sample = marked((10.0, 15.0), (50.0, 60.0))
+    angles = []
+    for seed in range(100):
+        moved = augment(sample, np.random.default_rng(seed))
+        for label in (moved.pick, moved.place):
+            assert (label >= 0).all()
+            assert (label <= (ROWS - 1, COLS - 1)).all()
+        angles.append(math.remainder(moved.pick_theta - 0.3, math.tau))
+    assert np.std(angles) > math.radians(20)
+    assert len(set(angles)) == 100
+
+
+def test_augmentation_is_that_of_the_seed():
+    one, same, other = (augment(SAMPLE, np.random.default_rng(seed)) for seed in (3, 3, 4))
+    np.testing.assert_array_equal(one.image, same.image)
+    np.testing.assert_array_equal(one.pick, same.pick)
+    assert not np.array_equal(one.pick, other.pick)
+
+
+def test_a_sample_that_cannot_stay_inside_is_left_alone():
+    sample = LabelledImage(SAMPLE.image, np.array([-30.0, 0]), 0.3, np.array([90.0, 90]), 1.1)
+    assert augment(sample, np.random.default_rng(0)) is sample

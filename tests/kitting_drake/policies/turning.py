@@ -1,0 +1,41 @@
+"""Pictures to turn, and how much a turn changes what is made of them."""
+
+import math
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from kitting_drake.policies.correlation import lift
+
+
+def distance_from_middle(side: int) -> Tensor:
+    """(side, side), in halves of the side."""
+    offset = torch.arange(side, dtype=torch.float32) - side // 2
+    return torch.hypot(offset[:, None], offset[None, :]) / (side / 2)
+
+
+def smooth_image(side: int, *, seed: int = 0, channels: int = 4, blur: int = 6) -> Tensor:
+    """(1, channels, side, side): random, without detail below `blur` pixels, zero near the edge."""
+    generator = torch.Generator().manual_seed(seed)
+    reach = 3 * blur
+    noise = torch.randn(channels, 1, side + 2 * reach, side + 2 * reach, generator=generator)
+    taps = torch.exp(-((torch.arange(-reach, reach + 1) / blur) ** 2) / 2)
+    noise = F.conv2d(F.conv2d(noise, taps[None, None, None, :]), taps[None, None, :, None])
+    disc = torch.sigmoid(40 * (0.7 - distance_from_middle(side)))
+    return (noise / noise.std() * disc).transpose(0, 1)
+
+
+def turn_image(image: Tensor, degrees: float) -> Tensor:
+    """Counter-clockwise about the middle of a square: exactly where it can be."""
+    quarters, rest = divmod(degrees, 90)
+    if rest == 0:
+        return image.rot90(int(quarters), (2, 3))
+    return lift(image, torch.tensor([math.radians(degrees)]), image.shape[-1])
+
+
+def relative_error(found: Tensor, expected: Tensor) -> float:
+    """Of square pictures, in an interior disc: the deviation, in parts of the picture's own."""
+    disc = distance_from_middle(expected.shape[-1]) < 0.7
+    variation = expected[..., disc] - expected[..., disc].mean(-1, keepdim=True)
+    return float((found - expected)[..., disc].norm() / variation.norm())

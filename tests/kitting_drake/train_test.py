@@ -1,0 +1,338 @@
+import dataclasses
+import json
+import os
+import random
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+from kitting_drake import train as training
+from kitting_drake.errors import UserError
+from kitting_drake.policies.demonstrations import (
+    Demonstration,
+    DemonstrationStep,
+    Origin,
+    write_demonstrations,
+)
+from kitting_drake.policies.training import Trainer
+from kitting_drake.policies.weights import load_networks, read_weights_file
+from systems.signals import Observation, PickPlaceAction, PixelGrid, PlanarPose
+
+ROOT = Path(__file__).resolve().parents[2]
+GRID = PixelGrid(rows=33, cols=49)
+ORIGIN = Origin("mine", {"time_limit": 1.0}, GRID, 10, {})
+ONE_THREAD = os.environ | {"OMP_NUM_THREADS": "1"}
+LOSSES = {"pick_position", "pick_angle", "place"}
+
+
+def demonstration(seed: int) -> Demonstration:
+    """Of two steps."""
+    rng = np.random.default_rng(seed)
+    steps = []
+    for _ in range(2):
+        pick, place = GRID.to_world(rng.uniform(5, 28, (2, 2)))
+        theta, turn = rng.uniform(-3, 3, 2)
+        action = PickPlaceAction(PlanarPose(*pick, theta), PlanarPose(*place, theta + turn), 0.02)
+        seen = Observation(rng.random((4, *GRID.shape), np.float32), GRID)
+        steps.append(DemonstrationStep.of(seen, action, name="a", category="b"))
+    return Demonstration(seed, 1.0, tuple(steps))
+
+
+def write(path: Path, seeds: Iterable[int], origin: Origin = ORIGIN) -> Path:
+    write_demonstrations(path, origin, map(demonstration, seeds))
+    return path
+
+
+@pytest.fixture(scope="module")
+def demos(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Demonstrations of the seeds 10 to 13."""
+    return write(tmp_path_factory.mktemp("demos") / "demonstrations.h5", range(10, 14))
+
+
+def words(demos: Path, folder: Path, *more: object) -> list[str]:
+    """What is written after `python -m kitting_drake.train`."""
+    flags = ("--preset", "tiny", "--steps", 4, "--validate-every", 3, "--learning-rate", "0.01")
+    return [str(word) for word in ("--demos", demos, "--output", folder, *flags, *more)]
+
+
+def train(demos: Path, folder: Path, *more: object) -> None:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sys, "argv", ["train", *words(demos, folder, *more)])
+        patch.setattr(training, "_CHECKPOINT_EVERY", 2)
+        assert training.main() == 0
+
+
+@pytest.fixture(scope="module")
+def trained(demos: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of a run that has come to its end."""
+    torch.set_num_threads(1)
+    folder = tmp_path_factory.mktemp("trained")
+    train(demos, folder)
+    return folder
+
+
+@pytest.fixture
+def folder(trained: Path, tmp_path: Path) -> Path:
+    """The same, to be changed."""
+    return Path(shutil.copytree(trained, tmp_path / "run"))
+
+
+def log(folder: Path) -> list[dict[str, Any]]:
+    return [json.loads(line) for line in (folder / "log.jsonl").read_text().splitlines()]
+
+
+def test_leaves_a_policy_and_what_it_comes_from(trained: Path):
+    assert sorted(path.name for path in trained.iterdir()) == [
+        "checkpoint.pt",
+        "log.jsonl",
+        "policy.safetensors",
+        "settings.json",
+        "summary.json",
+        "tensorboard",
+    ]
+    file = read_weights_file(trained / "policy.safetensors")
+    assert (file.config.method, file.config.preset) == ("so2", "tiny")
+    assert file.card["scenario"] == "mine"
+    # A tenth is held out, and one at least.
+    assert file.card["demonstration_seeds"] == [10, 11, 12]
+    assert file.card["validation_seeds"] == [13]
+    # Of the first observation of two, either object may be picked.
+    assert file.card["samples"] == 3 * 3
+    summary = json.loads((trained / "summary.json").read_text())
+    assert summary["best"] == file.card.pop("validation")
+    assert summary.items() >= file.card.items()
+    assert summary["wall_seconds"] > 0
+    load_networks(trained / "policy.safetensors")
+
+
+def test_the_curves(trained: Path):
+    lines = log(trained)
+    assert [line["step"] for line in lines] == [2, 3, 4, 4]
+    assert [line.keys() >= LOSSES for line in lines] == [True, False, False, True]
+    events = EventAccumulator(str(trained / "tensorboard"))
+    events.Reload()
+    assert {tag for tag in events.Tags()["scalars"] if tag.startswith("loss/")} == {
+        f"loss/{name}" for name in LOSSES
+    }
+    for tag, key in (("loss/place", "place"), ("validation/displacement_mm", "displacement_mm")):
+        points = [(event.step, event.value) for event in events.Scalars(tag)]
+        told = [(line["step"], pytest.approx(line[key])) for line in lines if key in line]
+        assert points == told
+
+
+def test_run_again_it_has_nothing_to_do(
+    demos: Path, folder: Path, capsys: pytest.CaptureFixture[str]
+):
+    before = {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+    # Killed between the last checkpoint and this.
+    (folder / "summary.json").unlink()
+    train(demos, folder)
+    assert capsys.readouterr().out.startswith("all steps are done\n")
+    assert {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()} == before
+
+
+def tensors(folder: Path) -> dict[str, torch.Tensor]:
+    return load_networks(folder / "policy.safetensors").state_dict()
+
+
+def assert_same_outcome(folder: Path, other: Path) -> None:
+    """To the bit."""
+    assert (folder / "log.jsonl").read_text() == (other / "log.jsonl").read_text()
+    one, two = tensors(folder), tensors(other)
+    assert all(torch.equal(one[name], two[name]) for name in one.keys() | two.keys())
+    one, two = (
+        torch.load(path / "checkpoint.pt", weights_only=True)["trainer"]["networks"]
+        for path in (folder, other)
+    )
+    assert all(torch.equal(one[name], two[name]) for name in one.keys() | two.keys())
+    one, two = (json.loads((path / "summary.json").read_text()) for path in (folder, other))
+    assert one | {"wall_seconds": 0} == two | {"wall_seconds": 0}
+
+
+@pytest.mark.parametrize("stop", [1, 3])
+def test_stopped_it_goes_on_as_if_it_had_not(
+    demos: Path, trained: Path, tmp_path: Path, stop: int, monkeypatch: pytest.MonkeyPatch
+):
+    step = Trainer.step
+
+    def step_or_stop(self: Trainer, *arguments: Any) -> dict[str, float]:
+        if self.step_count == stop:
+            raise KeyboardInterrupt
+        return step(self, *arguments)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Trainer, "step", step_or_stop)
+        with pytest.raises(KeyboardInterrupt):
+            train(demos, tmp_path)
+    # Killed while a line was being written.
+    with (tmp_path / "log.jsonl").open("a") as file:
+        file.write('{"step": 9, "pla')
+    train(demos, tmp_path)
+    assert_same_outcome(tmp_path, trained)
+
+
+def test_demonstrations_of_another_scenario_may_have_the_same_seeds(demos: Path, tmp_path: Path):
+    origin = dataclasses.replace(ORIGIN, scenario={"time_limit": 2.0})
+    validation = write(tmp_path / "validation.h5", range(10, 12), origin)
+    train(demos, tmp_path / "run", "--validation", validation, "--steps", 1)
+    card = read_weights_file(tmp_path / "run" / "policy.safetensors").card
+    assert card["demonstration_seeds"] == [10, 11, 12, 13]
+    assert card["validation_seeds"] == [10, 11]
+
+
+NO_DRAKE = """
+import sys
+sys.modules["pydrake"] = None
+from kitting_drake.train import main, run_verb
+run_verb(main)
+"""
+
+
+def test_trains_where_drake_is_not_installed(demos: Path, tmp_path: Path):
+    command = [sys.executable, "-c", NO_DRAKE, *words(demos, tmp_path, "--steps", 1, "--quiet")]
+    done = subprocess.run(command, cwd=ROOT, env=ONE_THREAD, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout == ""
+    assert (tmp_path / "policy.safetensors").exists()
+
+
+# What cannot be used.
+
+
+@pytest.fixture
+def refused(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> Callable[..., str]:
+    """The one sentence with which a run is refused."""
+
+    def run(*arguments: Any) -> str:
+        monkeypatch.setattr(sys, "argv", ["train", *words(*arguments)])
+        with pytest.raises(SystemExit) as left:
+            training.run_verb(training.main)
+        assert left.value.code == 2
+        (line,) = capsys.readouterr().err.splitlines()
+        assert line.startswith("error: ")
+        return line
+
+    return run
+
+
+@pytest.mark.parametrize(
+    ("flags", "sentence"),
+    [
+        (("--demonstrations", 5), "demonstrations.h5 holds 4 demonstrations, not 5: collect more"),
+        (
+            ("--demonstrations", 1),
+            "one demonstration leaves none to validate by: give --validation",
+        ),
+        (("--orientations", 24), "--orientations 24: 24 orientations alias"),
+        (("--orientations", 37), "--orientations 37: orientations must be an even number, not 37"),
+        (("--validation", "gone.h5"), "there is no file gone.h5"),
+    ],
+)
+def test_refuses(
+    demos: Path, tmp_path: Path, refused: Callable[..., str], flags: tuple, sentence: str
+):
+    assert sentence in refused(demos, tmp_path, *flags)
+    # The folder may be used for what is asked for instead.
+    assert not list(tmp_path.iterdir())
+
+
+VALIDATIONS = {
+    "overlapping": (range(13, 15), ORIGIN, "share the seed 13: validation needs other ones"),
+    "another grid": (
+        [20],
+        dataclasses.replace(ORIGIN, grid=PixelGrid(rows=33, cols=50)),
+        "have different pixel grids",
+    ),
+    "empty": ([], ORIGIN, "validation.h5 holds no demonstrations"),
+}
+
+
+@pytest.mark.parametrize("case", VALIDATIONS)
+def test_validation_by_what_does_not_do_is_refused(
+    demos: Path, tmp_path: Path, refused: Callable[..., str], case: str
+):
+    seeds, origin, sentence = VALIDATIONS[case]
+    path = write(tmp_path / "validation.h5", seeds, origin)
+    assert sentence in refused(demos, tmp_path / "run", "--validation", path)
+
+
+def test_a_file_without_demonstrations_is_refused(tmp_path: Path, refused: Callable[..., str]):
+    path = write(tmp_path / "empty.h5", [])
+    assert "empty.h5 holds no demonstrations" in refused(path, tmp_path / "run")
+
+
+@pytest.mark.parametrize("flags", [("--steps", 5), ("--seed", 1), ("--demonstrations", 3)])
+def test_a_folder_of_another_run_is_refused(
+    demos: Path, folder: Path, refused: Callable[..., str], flags: tuple
+):
+    before = (folder / "settings.json").read_bytes()
+    assert f"{folder} holds the files of another training run" in refused(demos, folder, *flags)
+    assert (folder / "settings.json").read_bytes() == before
+
+
+@pytest.mark.parametrize("content", [b"", b"not a checkpoint", "half", "foreign", "other networks"])
+def test_a_damaged_checkpoint_is_refused(
+    demos: Path, folder: Path, refused: Callable[..., str], content: bytes | str
+):
+    path = folder / "checkpoint.pt"
+    whole = path.read_bytes()
+    if isinstance(content, bytes):
+        path.write_bytes(content)
+    elif content == "half":
+        path.write_bytes(whole[: len(whole) // 2])
+    elif content == "foreign":
+        torch.save({"weights": torch.zeros(3)}, path)
+    else:
+        state = torch.load(path, weights_only=True)
+        state["trainer"]["networks"].popitem()
+        torch.save(state, path)
+    assert f"{path} cannot be taken up again: delete {folder}" in refused(demos, folder)
+
+
+def test_a_loss_that_is_no_number_ends_it(
+    demos: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr(Trainer, "step", lambda *_: {"place": float("nan")})
+    with pytest.raises(UserError, match="no longer a number at step 0: lower --learning-rate"):
+        train(demos, tmp_path)
+    assert not (tmp_path / "checkpoint.pt").exists()
+
+
+# Checkpoints are a second apart, and no displacement is too large to tell from another.
+KILLABLE = """
+from kitting_drake import train
+from kitting_drake.policies import validation
+train._CHECKPOINT_EVERY = 3
+validation._LOST = 1e9
+train.run_verb(train.main)
+"""
+
+
+@pytest.mark.slow
+def test_killed_again_and_again_it_ends_as_it_would_have(
+    demos: Path, tmp_path: Path, kill_at_random: Callable[..., None]
+):
+    whole, killed = tmp_path / "whole", tmp_path / "killed"
+
+    def start(folder: Path) -> subprocess.Popen[bytes]:
+        flags = words(demos, folder, "--steps", 60, "--validate-every", 4, "--quiet")
+        return subprocess.Popen([sys.executable, "-c", KILLABLE, *flags], cwd=ROOT, env=ONE_THREAD)
+
+    assert start(whole).wait() == 0
+    rng = random.Random(0)
+    for _ in range(5):
+        kill_at_random(start(killed), killed / "log.jsonl", rng, changes=rng.randrange(4))
+    assert start(killed).wait() == 0
+    assert_same_outcome(killed, whole)
+    # The best is not one that every run begins with.
+    assert json.loads((whole / "summary.json").read_text())["best"]["step"] > 4
