@@ -6,7 +6,7 @@ PYTHON ?= $(shell for python in python3 python3.12 python3.11; do \
 VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/ready
-SCENARIO ?= scenarios/kitting_oracle.yaml
+SCENARIO ?= scenarios/kitting_seen.yaml
 
 .PHONY: run test test-slow lint clean
 

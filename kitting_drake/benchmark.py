@@ -1,4 +1,4 @@
-"""`python -m kitting_drake.benchmark simulation | kits`: what things cost here and now."""
+"""`python -m kitting_drake.benchmark simulation | networks | kits`: what things cost here."""
 
 import argparse
 import os
@@ -42,29 +42,60 @@ def main() -> int:
     simulation = verbs.add_parser("simulation", help="phases of an episode, start-up, images")
     simulation.add_argument("--episodes", type=count_type, default=3, help="how many to run (3)")
     simulation.add_argument("--seed", type=seed_type, default=0, help="of the first (0)")
+    networks = verbs.add_parser(
+        "networks", help="parameters and time of the policies' networks, and how fast they could be"
+    )
+    networks.add_argument("--preset", default="small", help="size of the networks (small)")
+    networks.add_argument(
+        "--demos",
+        type=Path,
+        metavar="FILE.h5",
+        help="demonstrations, of whose first observation to decide (default: one is drawn)",
+    )
+    networks.add_argument(
+        "--repeats", type=count_type, default=9, help="runs of which the median is taken (9)"
+    )
     kits = verbs.add_parser("kits", help="building time, clearance and size of the dataset's kits")
     kits.add_argument("--kits", type=count_type, help="how many of each split (default: all)")
-    for verb in (simulation, kits):
+    for verb in (simulation, networks, kits):
         verb.add_argument(
-            "--output", type=Path, default=Path("output/benchmark"), help="where the JSON goes"
+            "--output", type=Path, default=Path("output/benchmark"), help="where the files go"
         )
         verb.add_argument("--quiet", action="store_true", help="print nothing but errors")
     arguments = parser.parse_args()
     console = Console(quiet=arguments.quiet)
     folder = require_folder(arguments.output)
-    # One core, as claimed; children inherit it.
-    os.sched_setaffinity(0, {max(os.sched_getaffinity(0))})
-    if arguments.verb == "simulation":
-        measured = benchmark_simulation(arguments.episodes, arguments.seed, console)
-        tables = simulation_tables(measured)
+    if arguments.verb == "networks":
+        measured, tables = _networks(arguments, folder, console)
     else:
-        measured = benchmark_kits(arguments.kits, console)
-        tables = [kits_table(measured)]
+        # One core, as claimed; children inherit it.
+        os.sched_setaffinity(0, {max(os.sched_getaffinity(0))})
+        if arguments.verb == "simulation":
+            measured = benchmark_simulation(arguments.episodes, arguments.seed, console)
+            tables = simulation_tables(measured)
+        else:
+            measured = benchmark_kits(arguments.kits, console)
+            tables = [kits_table(measured)]
     write_json(folder / f"{arguments.verb}.json", measured)
     for table in tables:
         console.print(table)
     console.print(f"files: {folder}/", highlight=False)
     return 0
+
+
+def _networks(
+    arguments: argparse.Namespace, folder: Path, console: Console
+) -> tuple[dict[str, Any], list[Table]]:
+    """Measures the networks and draws them."""
+    # Imported here: the other verbs need no torch.
+    from kitting_drake.network_benchmark import Plan, benchmark_networks
+    from kitting_drake.network_figure import draw_networks
+    from kitting_drake.network_tables import network_tables
+
+    plan = Plan(preset=arguments.preset, repeats=arguments.repeats, demonstrations=arguments.demos)
+    measured = benchmark_networks(plan, console)
+    draw_networks(measured, folder / "networks.png")
+    return measured, network_tables(measured)
 
 
 def benchmark_simulation(episodes: int, seed: int, console: Console) -> dict[str, Any]:

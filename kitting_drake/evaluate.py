@@ -16,7 +16,7 @@ from kitting_drake.cli import (
     scenario_parser,
 )
 from kitting_drake.episode import run_episode
-from kitting_drake.files import claim_folder, require_folder, write_json
+from kitting_drake.files import claim_folder, require_folder, write_json, write_whole
 from kitting_drake.looking import seeds_learned_from
 from kitting_drake.processes import Died, counting_bar, run_apart, side_by_side
 from kitting_drake.scenario import Learned
@@ -101,7 +101,7 @@ def _read_lines(path: Path) -> Iterator[Episode]:
     # A line that was being written when the process was killed has no end.
     whole = content[: content.rfind("\n") + 1]
     if whole != content:
-        path.write_text(whole)
+        write_whole(path, whole)
     for line in whole.splitlines():
         yield json.loads(line)
 

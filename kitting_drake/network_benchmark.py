@@ -145,7 +145,7 @@ class _Bench:
         if seconds > self.plan.budget:
             return f"would take about {seconds:.0f} s"
         size = 4 * sum(weight.numel() for weight in outlined.parameters())
-        if size > memory_bytes() / 2:
+        if size > memory_bytes(self.device) / 2:
             return f"needs {size / 2**30:.0f} GiB of kernels"
         return None
 

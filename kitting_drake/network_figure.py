@@ -62,6 +62,7 @@ def draw_networks(measured: dict[str, Any], path: Path) -> None:
     top = [f"angle {preset}" for preset in presets for _ in range(6 // len(presets))]
     machine = measured["machine"]
     place = machine["cpu"] if machine["device"] == "cpu" else machine["device"]
+    threads = f"{machine['threads']} thread{'s' if machine['threads'] > 1 else ''}"
     image = io.BytesIO()
     with matplotlib.rc_context(_STYLE):
         figure = Figure(figsize=(14.0, 9.0), layout="constrained")
@@ -71,8 +72,8 @@ def draw_networks(measured: dict[str, Any], path: Path) -> None:
             height_ratios=(1.0, 0.9, 0.75),
         )
         figure.suptitle(
-            f"What the networks cost: {place}, {machine['threads']} threads, "
-            f"{measured['inference_type']} unless said",
+            f"What the networks cost: {place}, {threads}, "
+            f"{measured['inference_type']} where not said otherwise",
             x=0.01,
             horizontalalignment="left",
             fontsize=13,
@@ -96,16 +97,26 @@ def _draw_pick_angle(axis: Any, measured: dict[str, Any], preset: str) -> None:
     width = 0.32
     for index, method in enumerate(barred):
         chosen = [row for row in rows if row["method"] == method]
-        axis.bar(
+        bars = axis.bar(
             [places[row["orientations"]] + (index - 0.5) * width for row in chosen],
-            [row["parameters"] / 1e6 for row in chosen],
+            [row["parameters"] for row in chosen],
             width,
             color=_METHODS[method],
             alpha=0.35,
         )
+        for bar, row in zip(bars, chosen, strict=True):
+            axis.annotate(
+                count_text(row["parameters"]),
+                (bar.get_x() + 0.5 * width, 0.0),
+                xytext=(0, 3),
+                textcoords="offset points",
+                horizontalalignment="center",
+                fontsize=8,
+            )
     most = max(row["parameters"] for row in rows if row["method"] in barred)
-    axis.set_ylim(0.0, 1.6e-6 * most)
-    axis.set_ylabel("parameters, millions (bars)")
+    axis.set_ylim(0.0, 1.6 * most)
+    axis.yaxis.set_major_formatter(lambda count, _: count_text(count))
+    axis.set_ylabel("parameters (bars)")
     axis.set_xticks(list(places.values()), [str(n) for n in counts])
     axis.set_xlabel("orientations N")
     axis.set_title(f"Pick angle: parameters and time, preset {preset}")
@@ -127,17 +138,24 @@ def _draw_pick_angle(axis: Any, measured: dict[str, Any], preset: str) -> None:
             label=name,
         )
         for row in chosen:
+            beside = [
+                other["seconds"]
+                for other in rows
+                if other["seconds"] and other["orientations"] == row["orientations"]
+            ]
+            below = len(beside) > 1 and row["seconds"] == min(beside)
             times.annotate(
                 seconds_text(row["seconds"]),
                 (places[row["orientations"]], row["seconds"]),
-                xytext=(0, 6),
+                xytext=(0, -6 if below else 6),
                 textcoords="offset points",
                 horizontalalignment="center",
+                verticalalignment="top" if below else "bottom",
                 fontsize=8,
                 color=colour,
             )
     low, high = times.get_ylim()
-    times.set_ylim(low / 1.5, high * (high / low) ** 0.25 * 1.5)
+    times.set_ylim(low * (low / high) ** 0.3, high * (high / low) ** 0.4)
     times.yaxis.set_major_formatter(lambda seconds, _: seconds_text(seconds))
     times.minorticks_off()
     times.legend(loc="upper left", fontsize=8.5)
@@ -213,9 +231,7 @@ def _draw_folding(axis: Any, measured: dict[str, Any]) -> None:
     axis.axvline(1.0, color="0.5", linewidth=0.8, linestyle="--")
     axis.grid(True, axis="x")
     axis.set_xlabel("times faster than plain escnn in float32")
-    axis.set_title(
-        f"The same networks and weights, transforms folded in, preset {measured['preset']}"
-    )
+    axis.set_title(f"The same networks, of escnn and folded, preset {measured['preset']}")
     axis.legend(loc="upper center", bbox_to_anchor=(0.5, -0.09), ncols=len(rungs), fontsize=8.5)
 
 
@@ -241,7 +257,6 @@ def _draw_levels(axis: Any, measured: dict[str, Any]) -> None:
     axis.set_ylabel("milliseconds")
     axis.grid(True, axis="y")
     axis.set_title(
-        "Alpha, level by level; above: its convolutions' share of the peak, "
-        f"{count_text(peak)}FLOP/s"
+        f"Alpha by level; above: convolutions' share of {count_text(peak)}FLOP/s, the peak"
     )
     axis.legend(loc="upper center", ncols=2, fontsize=8)

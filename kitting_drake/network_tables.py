@@ -45,6 +45,8 @@ def seconds_text(seconds: float | None) -> str:
     """Three digits, in the unit that suits."""
     if seconds is None:
         return "-"
+    if seconds >= 100:
+        return f"{seconds:.0f} s"
     return f"{seconds:.3g} s" if seconds >= 1 else f"{1e3 * seconds:.3g} ms"
 
 

@@ -134,9 +134,12 @@ def describe_machine(device: torch.device) -> dict[str, Any]:
     }
 
 
-def memory_bytes() -> int:
-    """Of the whole machine."""
-    return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+def memory_bytes(device: torch.device) -> int:
+    """Of the whole machine, or of the accelerator if it has less."""
+    size = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    if device.type == "cuda":
+        size = min(size, torch.cuda.get_device_properties(device).total_memory)
+    return size
 
 
 def _cpu_name() -> str:

@@ -33,7 +33,8 @@ class Preset:
             stages=((18,), (36, 36), (18, 18), (18, 18), (8,)), residual=True
         )
     )
-    """Of the Equivariant Transporter's angle network, in regular fields."""
+    """Of the Equivariant Transporter's angle network, in regular fields of N / 2 channels; these,
+    in blocks, have the authors' 0.90, 1.81, 3.01 and 4.51 M parameters at N = 36, 72, 120, 180."""
     resnet: tuple[int, int, int, int, int] = (64, 64, 128, 256, 512)
     """Channels of the Transporter's stem and of its four stages."""
 

@@ -88,7 +88,7 @@ def turned_patterns(fibre: Regular, size: int) -> Tensor:
         (M, B, size, size), float64: B patterns, each turned counter-clockwise by 2 pi m / N.
     """
     reach = size // 2
-    # escnn has frequencies up to three times the radius.
+    # A bound: by default escnn keeps far fewer, about as many as the radius has pixels.
     frequencies = tuple(range(0, 3 * reach + 1, fibre.quotient))
     pairs = kernel_basis(Scalar(), Irreps(frequencies), size)[:, :, 0]
     angles = 2 * math.pi * torch.arange(fibre.size, dtype=torch.float64) / fibre.order

@@ -144,7 +144,9 @@ def draw_bins(
         stratum that were not drawn.
     """
     strata: tuple[list[int], list[int]] = ([], [])
-    for bin_ in set(range(bins)) - labels:
+    for bin_ in range(bins):
+        if bin_ in labels:
+            continue
         apart = min(abs(math.remainder((bin_ - label) * step, math.pi)) for label in labels)
         strata[apart > _NEAR].append(bin_)
     drawn = dict.fromkeys(sorted(labels), 0.0)
@@ -267,13 +269,13 @@ class ResNet(nn.Module):
         self, in_channels: int, out_channels: int, widths: tuple[int, int, int, int, int]
     ) -> None:
         super().__init__()
-        top, *lower = widths[1:]
-        below = (top, *lower)
-        self.stem = PlainLayer(in_channels, widths[0], 3)
-        self.down = nn.ModuleList([_stage(widths[0], top)])
-        self.down.extend(_stage(a, b, stride=2) for a, b in itertools.pairwise(below))
-        self.up = nn.ModuleList(_stage(b, a) for a, b in list(itertools.pairwise(below))[:0:-1])
-        self.last = Bottleneck(lower[0], top, top)
+        stem, *stages = widths
+        top, second = stages[:2]
+        self.stem = PlainLayer(in_channels, stem, 3)
+        self.down = nn.ModuleList([_stage(stem, top)])
+        self.down.extend(_stage(a, b, stride=2) for a, b in itertools.pairwise(stages))
+        self.up = nn.ModuleList(_stage(a, b) for a, b in itertools.pairwise(stages[:0:-1]))
+        self.last = Bottleneck(second, top, top)
         self.out = Bottleneck(top, top, out_channels, gain=0.1)
 
     def forward(self, image: Tensor) -> Tensor:

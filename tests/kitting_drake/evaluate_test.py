@@ -96,7 +96,7 @@ def test_killed_again_and_again_it_evaluates_what_it_would_have(
     whole, killed = tmp_path / "whole", tmp_path / "killed"
 
     def start(folder: Path, workers: int) -> subprocess.Popen[bytes]:
-        flags = ("--episodes", 8, "--workers", workers, "--output", folder, "--quiet")
+        flags = ("--episodes", 10, "--workers", workers, "--output", folder, "--quiet")
         command = [sys.executable, "-m", "kitting_drake.evaluate", scenario, *flags]
         return subprocess.Popen([str(word) for word in command], cwd=ROOT)
 
@@ -111,9 +111,9 @@ def test_killed_again_and_again_it_evaluates_what_it_would_have(
         kill_at_random(start(killed, 2), killed / "episodes.jsonl", rng, changes=rng.randrange(2))
     assert start(killed, 1).wait() == 0
     assert episodes(killed) == episodes(whole)
-    assert [episode["seed"] for episode in episodes(whole)] == list(range(8))
+    assert [episode["seed"] for episode in episodes(whole)] == list(range(10))
     # They are not all alike, and none was lost.
-    assert len({json.dumps(episode["objects"]) for episode in episodes(whole)}) == 8
+    assert len({json.dumps(episode["objects"]) for episode in episodes(whole)}) == 10
     assert not any(episode["failure"] for episode in episodes(whole))
     one, two = (json.loads((path / "summary.json").read_text()) for path in (killed, whole))
     assert one["success_rate"] == two["success_rate"]
