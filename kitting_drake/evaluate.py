@@ -1,10 +1,12 @@
 """`python -m kitting_drake.evaluate SCENARIO.yaml`: many seeds side by side, and their summary."""
 
+import hashlib
 import json
 import os
 import time
 from collections.abc import Iterable, Iterator
 from pathlib import Path
+from typing import Any
 
 from rich.console import Console
 
@@ -79,7 +81,7 @@ def evaluate(
     """
     seeds = list(seeds)
     path = folder / "episodes.jsonl"
-    claim_folder(folder, "scenario.json", chosen.described, of="scenario")
+    claim_folder(folder, "scenario.json", _identity(chosen), of="scenario")
     done = {episode["seed"]: episode for episode in _read_lines(path)}
     pending = [seed for seed in seeds if seed not in done]
     queue = iter(pending)
@@ -92,6 +94,15 @@ def evaluate(
             _append_line(path, episode)
             progress.advance(task)
     return [done[seed] for seed in seeds]
+
+
+def _identity(chosen: ChosenScenario) -> dict[str, Any]:
+    """What tells one evaluation from another: weights by what they are, not by where they lie."""
+    policy = chosen.scenario.policy
+    if not isinstance(policy, Learned):
+        return chosen.described
+    content = (chosen.base / policy.weights).read_bytes()
+    return {**chosen.described, "weights_sha256": hashlib.sha256(content).hexdigest()}
 
 
 def _read_lines(path: Path) -> Iterator[Episode]:

@@ -113,10 +113,13 @@ class _Bench:
         """The scene as if seen anew: networks may remember what they saw."""
         return Observation(self.image.copy(), self.grid)
 
-    def time_each(self, functions: dict[Any, Callable[[], object]]) -> dict[Any, Timing]:
+    def time_each(
+        self, functions: dict[Any, Callable[[], object]], *, training: bool = False
+    ) -> dict[Any, Timing]:
         """`timing.time_each`, as carefully as planned."""
         plan = self.plan
-        return time_each(functions, self.device, repeats=plan.repeats, budget=plan.budget)
+        with torch.inference_mode(not training):
+            return time_each(functions, self.device, repeats=plan.repeats, budget=plan.budget)
 
     def inputs(self, networks: Networks) -> dict[str, Tensor]:
         """Each network's."""
@@ -335,11 +338,7 @@ def _without_others(networks: Networks, names: set[str]) -> Networks:
 def _ask_angle(networks: Networks, bench: _Bench, orientations: int) -> Callable[[], object]:
     """The angle at a known pixel, of an image that was not seen before."""
 
-    @torch.inference_mode()
-    def ask() -> object:
-        return networks.angle_logits(bench.image.copy(), bench.pixel, orientations)
-
-    return ask
+    return lambda: networks.angle_logits(bench.image.copy(), bench.pixel, orientations)
 
 
 def _times(timing: Timing | None) -> dict[str, Any]:
@@ -408,7 +407,6 @@ def measure_decisions(bench: _Bench) -> list[dict[str, Any]]:
 def _ask_everything(networks: Networks, bench: _Bench, orientations: int) -> Callable[[], object]:
     """All that a decision asks of the networks, the search left out."""
 
-    @torch.inference_mode()
     def ask() -> None:
         # The Transporter's networks answer both at once.
         if isinstance(networks, FactoredNetworks):
@@ -498,20 +496,22 @@ def measure_folding(bench: _Bench) -> dict[str, Any]:
     exact = answers[baseline]
     timings = {
         "training_step": bench.time_each(
-            {name: _training(trained, bench.scene) for name, (trained, _) in ways.items()}
+            {name: _training(trained, bench.scene) for name, (trained, _) in ways.items()},
+            training=True,
         ),
         "alpha_training_step": bench.time_each(
             {
-                name: _stepping(_network(trained, "alpha"), bench.inputs(trained)["alpha"])
+                name: _stepping(trained.get_submodule("alpha"), bench.inputs(trained)["alpha"])
                 for name, (trained, _) in ways.items()
-            }
+            },
+            training=True,
         ),
         "decision": bench.time_each(
             {name: _deciding(plain, bench) for name, (_, plain) in ways.items()}
         ),
         "alpha_inference": bench.time_each(
             {
-                name: _inferring(_network(plain, "alpha"), bench.inputs(plain)["alpha"])
+                name: _inferring(plain.get_submodule("alpha"), bench.inputs(plain)["alpha"])
                 for name, (_, plain) in ways.items()
             }
         ),
@@ -534,16 +534,12 @@ def measure_folding(bench: _Bench) -> dict[str, Any]:
             # Types do not change them, and autocast cannot be counted.
             name: count_operations(
                 _inferring(
-                    _network(ways[f"{name}_float32"][1], "alpha"), bench.inputs(ours)["alpha"]
+                    ways[f"{name}_float32"][1].get_submodule("alpha"), bench.inputs(ours)["alpha"]
                 )
             )
             for name in ("escnn", "ours")
         },
     }
-
-
-def _network(networks: Networks, name: str) -> nn.Module:
-    return networks.get_submodule(name)
 
 
 def _training(networks: Networks, scene: Scene) -> Callable[[], object]:
@@ -571,11 +567,7 @@ def _stepping(network: nn.Module, features: Tensor) -> Callable[[], object]:
 
 
 def _inferring(network: nn.Module, features: Tensor) -> Callable[[], object]:
-    @torch.inference_mode()
-    def infer() -> object:
-        return network(features)
-
-    return infer
+    return lambda: network(features)
 
 
 def _deciding(networks: Networks, bench: _Bench) -> Callable[[], object]:
@@ -593,16 +585,19 @@ def measure_shares(bench: _Bench) -> list[dict[str, Any]]:
         A row for each network, type and mode (`inference`, `training`).
     """
     ours = make_networks(NetworkConfig("so2", bench.plan.preset))
-    functions: dict[tuple[str, torch.dtype, str], Callable[[], object]] = {}
+    inferring: dict[Any, Callable[[], object]] = {}
+    stepping: dict[Any, Callable[[], object]] = {}
     for type_ in bench.peak:
         exported = bench.export(ours, type_)
         trained = copy.deepcopy(ours).to(bench.device)
         trained.compute_type = type_
         for name, features in bench.inputs(exported).items():
-            functions[name, type_, "inference"] = _inferring(_network(exported, name), features)
-            functions[name, type_, "training"] = _stepping(_network(trained, name), features)
+            inferring[name, type_, "inference"] = _inferring(exported.get_submodule(name), features)
+            stepping[name, type_, "training"] = _stepping(trained.get_submodule(name), features)
+    timings = bench.time_each(inferring) | bench.time_each(stepping, training=True)
+    functions = inferring | stepping
     rows = []
-    for (name, type_, mode), timing in bench.time_each(functions).items():
+    for (name, type_, mode), timing in timings.items():
         operations = count_operations(functions[name, type_, mode])
         rate = operations / timing.seconds
         rows.append(
@@ -628,7 +623,7 @@ def measure_levels(bench: _Bench) -> dict[str, Any]:
     """
     type_ = preferred_type()
     networks = bench.export(make_networks(NetworkConfig("so2", bench.plan.preset)), type_)
-    alpha = _network(networks, "alpha")
+    alpha = networks.get_submodule("alpha")
     assert isinstance(alpha, UNet)
     watch = _UNetWatch(alpha, bench.device)
     features = bench.inputs(networks)["alpha"]

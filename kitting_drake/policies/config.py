@@ -22,7 +22,11 @@ class Preset:
     """Of alpha, phi and psi."""
     samples: int = 16
     """Samples of each SO(2) field of the U-nets, at which their nonlinearity acts."""
-    angle: AngleNetSize = field(default_factory=AngleNetSize)
+    angle: AngleNetSize = field(
+        default_factory=lambda: AngleNetSize(
+            stages=((16,), (32, 32), (16, 16), (16, 16), (8,)), residual=True
+        )
+    )
     """Of beta."""
     angle_band: int = 6
     """j_c of beta's hidden fields."""

@@ -16,7 +16,7 @@ from kitting_drake.policies.angle_net import AngleNet
 from kitting_drake.policies.fibres import Fibre, Irreps, Scalar
 from kitting_drake.policies.methods import make_networks
 from kitting_drake.policies.networks import Networks, SO2Networks
-from kitting_drake.policies.steerable import SteerableConv2d, upsample
+from kitting_drake.policies.steerable import SteerableConv2d, frequencies_cutoff, upsample
 from kitting_drake.policies.unet import ResidualBlock, UNet
 
 # escnn warns of an optional package that planar groups never use.
@@ -120,7 +120,10 @@ class EscnnAngleNet(nn.Module):
                 modules.append(_pool(modules[-1].out_type))
             assert isinstance(stage, nn.ModuleList)
             for layer in stage:
-                modules += [_convolution(layer), _fourier_elu(layer)]
+                if isinstance(layer, ResidualBlock):
+                    modules.append(_EscnnBlock(layer))
+                else:
+                    modules += [_convolution(layer), _fourier_elu(layer)]
         self.layers = nn.Sequential(*modules, _convolution(source.readout))
         self.in_type = modules[0].in_type
 
@@ -157,6 +160,9 @@ def _convolution(source: nn.Module) -> enn.R2Conv:
         padding=source.padding,
         bias=source.bias is not None,
         initialize=False,
+        frequencies_cutoff=frequencies_cutoff(
+            source.in_fibre, source.out_fibre, source.basis.shape[-1]
+        ),
     )
     with torch.no_grad():
         layer.weights.copy_(source.weights.flatten())

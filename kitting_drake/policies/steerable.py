@@ -95,7 +95,10 @@ class SteerableConv2d(ExpandedConv2d):
             gain: of the initial weights' standard deviation.
         """
         basis = kernel_basis(in_fibre, out_fibre, size)
-        scale = math.sqrt(2 / (in_fields * float(basis.square().sum()) / out_fibre.channels))
+        # The samples of a field are not independent: as many as its coefficients are.
+        repeated = in_fibre.channels / in_fibre.size
+        gathered = in_fields * float(basis.square().sum()) * repeated / out_fibre.channels
+        scale = math.sqrt(2 / gathered)
         weights = torch.randn(out_fields, in_fields, len(basis)) * (gain * scale)
         super().__init__(in_fibre, out_fibre, size, padding, weights, bias)
         self.register_buffer("basis", basis.to(torch.get_default_dtype()), persistent=False)
@@ -191,7 +194,14 @@ def kernel_basis(in_fibre: Fibre, out_fibre: Fibre, size: int) -> Tensor:
             return enn.FieldType(space, [space.regular_repr])
         return enn.FieldType(space, [space.quotient_repr(fibre.quotient)])
 
-    convolution = enn.R2Conv(field(in_fibre), field(out_fibre), size, bias=False, initialize=False)
+    convolution = enn.R2Conv(
+        field(in_fibre),
+        field(out_fibre),
+        size,
+        bias=False,
+        initialize=False,
+        frequencies_cutoff=frequencies_cutoff(in_fibre, out_fibre, size),
+    )
     kernels = []
     with torch.no_grad():
         for index in range(convolution.weights.numel()):
@@ -202,6 +212,19 @@ def kernel_basis(in_fibre: Fibre, out_fibre: Fibre, size: int) -> Tensor:
     synthesis = torch.from_numpy(out_fibre.synthesis())
     analysis = torch.from_numpy(in_fibre.analysis())
     return torch.einsum("ms,dstxy,tn->dmnxy", synthesis, stack, analysis).contiguous()
+
+
+def frequencies_cutoff(in_fibre: Fibre, out_fibre: Fibre, size: int) -> float | None:
+    """How many times a ring's radius the angular frequency of its kernels may be; None: escnn's own
+    choice, about once.
+
+    A kernel of frequency k leads from rho_i to rho_j with j up to i + k: where escnn's choice would
+    leave the highest frequencies of the answer zero for ever, take three times the radius.
+    """
+    if not (isinstance(in_fibre, Irreps) and isinstance(out_fibre, Irreps)):
+        return None
+    missing = max(out_fibre.frequencies) - max(in_fibre.frequencies)
+    return 3.0 if missing > size // 2 else None
 
 
 class BandLimit(nn.Module):

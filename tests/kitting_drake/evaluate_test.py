@@ -16,7 +16,7 @@ import kitting_drake.evaluate as evaluation
 from kitting_drake.cli import ChosenScenario
 from kitting_drake.episode import EpisodeResult
 from kitting_drake.errors import UserError
-from kitting_drake.scenario import Scenario
+from kitting_drake.scenario import Learned, Scenario
 from kitting_drake.summary import Episode
 
 CHOSEN = ChosenScenario(Scenario(), Path("mine.yaml"), "mine", None)
@@ -52,6 +52,21 @@ def test_a_folder_of_another_scenario_is_refused(tmp_path: Path, monkeypatch: py
     other = ChosenScenario(Scenario(time_limit=1.0), Path("mine.yaml"), "mine", None)
     with pytest.raises(UserError, match="another scenario"):
         evaluation.evaluate(other, [0], tmp_path, workers=1, console=QUIET)
+
+
+def test_a_folder_of_other_weights_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(evaluation, "_run_apart", fake_run)
+    weights = tmp_path / "policy.safetensors"
+    scenario = Scenario(policy=Learned(weights.name))
+    chosen = ChosenScenario(scenario, tmp_path / "mine.yaml", "mine", None)
+    folder = tmp_path / "out"
+    folder.mkdir()
+    weights.write_bytes(b"trained")
+    for seeds in ([0], [0, 1]):
+        evaluation.evaluate(chosen, seeds, folder, workers=1, console=QUIET)
+    weights.write_bytes(b"trained anew")
+    with pytest.raises(UserError, match="another scenario"):
+        evaluation.evaluate(chosen, [0, 1, 2], folder, workers=1, console=QUIET)
 
 
 def die(chosen: ChosenScenario, seed: int) -> None:

@@ -1,0 +1,86 @@
+import copy
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from kitting_drake.policies import training
+from kitting_drake.policies.config import METHODS
+from kitting_drake.policies.images import LabelledImage, move
+from kitting_drake.policies.learned_policy import LearnedPolicy
+from kitting_drake.policies.methods import make_networks
+from kitting_drake.policies.networks import Networks
+from kitting_drake.policies.training import Trainer
+from systems.signals import Observation, PixelGrid
+from tests.kitting_drake.policies.scenes import ORIENTATIONS, SIDE, config, scene
+
+
+def trainer(*, weights: int = 0, method: str = "so2", **arguments: Any) -> Trainer:
+    torch.manual_seed(weights)
+    return Trainer(make_networks(config(method)), **{"seed": 0, **arguments})
+
+
+def assert_same(one: Trainer, other: Trainer) -> None:
+    pairs = zip(one.networks.parameters(), other.networks.parameters(), strict=True)
+    assert all(torch.equal(a, b) for a, b in pairs)
+
+
+def test_a_seed_says_all():
+    samples = [scene(0), scene(1)]
+    one, same, other = trainer(), trainer(), trainer(seed=1)
+    losses = [[item.step(samples) for _ in range(2)] for item in (one, same, other)]
+    assert losses[0] == losses[1] != losses[2]
+    assert_same(one, same)
+
+
+@pytest.mark.parametrize("decay", [False, True])
+def test_a_run_that_is_taken_up_goes_on_bit_by_bit(decay: bool):
+    samples = [scene(0), scene(1)]
+    whole, before, after = (
+        trainer(weights=weights, steps=4, decay=decay, learning_rate=1e-2) for weights in (0, 0, 1)
+    )
+    expected = [whole.step(samples) for _ in range(4)]
+    found = [before.step(samples) for _ in range(2)]
+    after.load_state_dict(copy.deepcopy(before.state_dict()))
+    found += [after.step(samples) for _ in range(2)]
+    assert found == expected
+    assert after.step_count == 4
+    assert_same(after, whole)
+
+
+def test_every_loss_falls():
+    learner = trainer(learning_rate=3e-3)
+    losses = [learner.step([scene(0)]) for _ in range(30)]
+    for name in ("pick_position", "pick_angle", "place"):
+        first, last = (np.mean([step[name] for step in part]) for part in (losses[:5], losses[-5:]))
+        assert last < 0.9 * first, name
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_every_weight_is_trained_by_one_loss(method: str):
+    networks = make_networks(config(method))
+    trained = [
+        weight
+        for modules in networks.modules_by_loss().values()
+        for module in modules
+        for weight in module.parameters()
+    ]
+    assert sorted(map(id, trained)) == sorted(map(id, networks.parameters()))
+    before = copy.deepcopy(networks.state_dict())
+    Trainer(networks, seed=0).step([scene(0)])
+    after = networks.state_dict()
+    assert [name for name in before if torch.equal(before[name], after[name])] == []
+
+
+def test_the_learning_rate_rises_and_falls_to_nothing():
+    constant, decaying = trainer(steps=1000), trainer(steps=1000, decay=True)
+    assert {constant.rate(step) for step in (0, 500, 2000)} == {1e-4}
+    rates = [decaying.rate(step) for step in range(1001)]
+    assert rates[0] == pytest.approx(1e-6, rel=0.01)
+    assert max(rates) == pytest.approx(1e-4, rel=0.05)
+    assert (np.diff(rates[100:]) < 0).all()
+    assert rates[1000] == pytest.approx(0, abs=1e-12)
+    # What is trained on beyond the end does not start to rise again.
+    assert decaying.rate(1500) == pytest.approx(0, abs=1e-12)
