@@ -88,9 +88,10 @@ def _networks(
 ) -> tuple[dict[str, Any], list[Table]]:
     """Measures the networks and draws them."""
     # Imported here: the other verbs need no torch.
-    from kitting_drake.network_benchmark import Plan, benchmark_networks
-    from kitting_drake.network_figure import draw_networks
-    from kitting_drake.network_tables import network_tables
+    from kitting_drake.network_benchmark import benchmark_networks
+    from kitting_drake.network_benchmark.bench import Plan
+    from kitting_drake.network_benchmark.figure import draw_networks
+    from kitting_drake.network_benchmark.tables import network_tables
 
     plan = Plan(preset=arguments.preset, repeats=arguments.repeats, demonstrations=arguments.demos)
     measured = benchmark_networks(plan, console)

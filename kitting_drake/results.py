@@ -59,7 +59,8 @@ Written by `python -m kitting_drake.results` from files alone, each the `summary
 
 A cell of the first tables is the success rate in percent (section IV-C of the paper: the share of
 the tools that ended with ADD-S below the threshold; failed episodes count 0), its 95 % interval
-(Wilson's), and how many episodes were run. `-`: not run.
+(Wilson's), and how many episodes were run. `-`: not run. A star: answered between pixels and bins,
+which the paper does not; else on them, and trained at N = 180 whatever N is asked for.
 
 The oracle knows the truth. Rounded, it says it in pixels and N orientations: no policy of that N
 can be expected to do better. Exact, it has no N, and its one figure stands in every column.
@@ -219,7 +220,16 @@ def _with_others(usual: Sequence[int], found: Iterable[int | None]) -> list[int]
 
 def _cell(runs: list[_Run]) -> str:
     # Runs that differ in nothing but their training are all told: choosing would be flattering.
-    return "<br>".join(f"{_rate(run.summary)}, {run.summary['episodes']}" for run in runs) or "-"
+    return (
+        "<br>".join(
+            f"{_rate(run.summary)}, {run.summary['episodes']}{_between(run)}" for run in runs
+        )
+        or "-"
+    )
+
+
+def _between(run: _Run) -> str:
+    return " \\*" if run.detail("continuous") and run.detail("method") == "so2" else ""
 
 
 def _rate(summary: dict[str, Any]) -> str:

@@ -126,11 +126,19 @@ def window(
     """
     reach = KERNEL // 2
     rows, cols = scene.shape[-2:]
-    top, left = corner[0] - reach, corner[1] - reach
-    bottom, right = corner[0] + shape[0] + reach, corner[1] + shape[1] + reach
-    part = scene[:, :, max(top, 0) : max(bottom, 0), max(left, 0) : max(right, 0)]
-    pads = (max(-left, 0), max(right - cols, 0), max(-top, 0), max(bottom - rows, 0))
+    vertical = _overlap(corner[0] - reach, shape[0] + 2 * reach, rows)
+    horizontal = _overlap(corner[1] - reach, shape[1] + 2 * reach, cols)
+    part = scene[:, :, vertical[0], horizontal[0]]
+    pads = (*horizontal[1], *vertical[1])
     return F.conv2d(F.pad(part, pads), lift(encoding, angles, KERNEL))[0] / KERNEL
+
+
+def _overlap(start: int, length: int, side: int) -> tuple[slice, tuple[int, int]]:
+    """What of a span lies on an axis of `side` pixels, and how much of it lies before and after."""
+    first = min(max(start, 0), side)
+    last = min(max(start + length, first), side)
+    before = min(max(-start, 0), length)
+    return slice(first, last), (before, length - before - (last - first))
 
 
 @dataclass(frozen=True)

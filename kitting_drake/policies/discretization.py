@@ -81,25 +81,37 @@ def series_maximum(coefficients: NDArray[np.float64], frequencies: Sequence[int]
     Returns:
         Radians in [0, 2 pi); of several equal maxima (a quotient has them) the first.
     """
-    band = max(max(frequencies), 1)
-    angles = 2 * np.pi * np.arange(32 * band) / (32 * band)
-    values = fourier_basis(angles, frequencies) @ coefficients
-    best = int(np.argmax(values))
-    # A half turn away the same value may differ in its last bit: take the first.
-    best = int(np.flatnonzero(values >= values[best] - 1e-9 * np.ptp(values))[0])
-    angle = angles[best]
+    # What has a period of a part of a turn is looked at over that part.
+    period = math.gcd(*frequencies) or 1
+    reduced = np.array(frequencies) // period
+    count = 32 * max(int(reduced.max()), 1)
+    values = fourier_basis(2 * np.pi * np.arange(count) / count, reduced.tolist()) @ coefficients
+    peaks = np.flatnonzero((values >= np.roll(values, 1)) & (values >= np.roll(values, -1)))
     weights = _complex_weights(coefficients, frequencies)
-    for _ in range(8):
-        phases = np.exp(1j * np.asarray(frequencies) * angle) * weights
-        slope = -(np.asarray(frequencies) * phases.imag).sum()
-        curvature = -(np.asarray(frequencies) ** 2 * phases.real).sum()
-        if curvature >= 0:
-            break
-        step = float(np.clip(-slope / curvature, -np.pi / (32 * band), np.pi / (32 * band)))
-        angle += step
-        if abs(step) < 1e-12:
-            break
-    return angle % math.tau
+
+    def evaluate(angle: float) -> NDArray[np.complex128]:
+        return np.exp(1j * reduced * angle) * weights
+
+    best, largest = 0.0, -math.inf
+    for peak in peaks:
+        # Newton's steps, none beyond the neighbouring samples.
+        angle = math.tau * float(peak) / count
+        for _ in range(8):
+            terms = evaluate(angle)
+            slope = -(reduced * terms.imag).sum()
+            curvature = -(reduced**2 * terms.real).sum()
+            if curvature >= 0:
+                break
+            step = float(np.clip(-slope / curvature, -math.pi / count, math.pi / count))
+            angle += step
+            if abs(step) < 1e-12:
+                break
+        value = float(evaluate(angle).real.sum())
+        if value > largest + 1e-12 * float(np.ptp(values)):
+            best, largest = angle, value
+    # Zero from below is zero.
+    best %= math.tau
+    return 0.0 if math.tau - best < 1e-9 else best / period
 
 
 def _complex_weights(

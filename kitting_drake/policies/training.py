@@ -59,7 +59,8 @@ class Trainer:
         if not self.decay:
             return self.learning_rate
         rise = min(1.0, (step + 1) / 100)
-        return self.learning_rate * rise * 0.5 * (1 + math.cos(math.pi * step / self.steps))
+        share = min(1.0, step / self.steps)
+        return self.learning_rate * rise * 0.5 * (1 + math.cos(math.pi * share))
 
     def step(self, samples: list[LabelledImage]) -> dict[str, float]:
         """One step on one of the samples, drawn at random and augmented.

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from kitting_drake.files import write_whole
-from kitting_drake.network_tables import (
+from kitting_drake.network_benchmark.tables import (
     MEASURE_NAMES,
     METHOD_NAMES,
     RUNG_NAMES,

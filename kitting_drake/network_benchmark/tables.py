@@ -137,9 +137,11 @@ def _decision_table(measured: dict[str, Any]) -> Table:
 
 def _folding_table(measured: dict[str, Any]) -> Table:
     folding = measured["folding"]
+    operations = {name: count_text(n / 2) for name, n in folding["alpha_operations"].items()}
     table = _table(
         f"the same networks, preset {measured['preset']}: time, and times faster than escnn's "
-        "float32",
+        f"float32 (multiply-accumulates of alpha: escnn {operations['escnn']}, folded "
+        f"{operations['ours']})",
         "how",
         *MEASURE_NAMES.values(),
         "difference",
