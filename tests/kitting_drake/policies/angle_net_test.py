@@ -61,21 +61,24 @@ def test_bins_shift_with_the_crop_and_half_turns_are_none():
     torch.testing.assert_close(bins(180), logits, atol=1e-5, rtol=0)
 
 
-def test_other_turns_are_nearly_exact():
+@pytest.mark.parametrize(
+    ("frequencies", "median", "most"), [((0, 2, 4, 6), 0.25, 0.4), (ANGLE_FREQUENCIES, 0.4, 0.5)]
+)
+def test_other_turns_are_nearly_exact(frequencies: tuple[int, ...], median: float, most: float):
     errors = []
     for seed in range(4):
         torch.manual_seed(seed)
-        network = angle_net(ANGLE_FREQUENCIES)
+        network = angle_net(frequencies)
         crop = smooth_image(PICK_CROP, seed=seed)
         with torch.no_grad():
             answer = network(crop)
             for degrees in (10, 30, 45):
-                expected = answer @ rho(ANGLE_FREQUENCIES, degrees).T
+                expected = answer @ rho(frequencies, degrees).T
                 found = network(turn_image(crop, degrees))
                 errors.append(float((found - expected).norm() / expected.norm()))
-    # Coarse as it is, a network that did not turn would be far off.
-    assert np.median(errors) < 0.4
-    assert np.max(errors) < 0.7
+    # Coarse kernels of high frequency turn the least exactly.
+    assert np.median(errors) < median
+    assert np.max(errors) < most
 
 
 @pytest.mark.parametrize("preset", ["tiny", "small", pytest.param("paper", marks=pytest.mark.slow)])

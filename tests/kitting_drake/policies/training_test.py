@@ -1,20 +1,14 @@
 import copy
-import math
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
 
-from kitting_drake.policies import training
 from kitting_drake.policies.config import METHODS
-from kitting_drake.policies.images import LabelledImage, move
-from kitting_drake.policies.learned_policy import LearnedPolicy
 from kitting_drake.policies.methods import make_networks
-from kitting_drake.policies.networks import Networks
 from kitting_drake.policies.training import Trainer
-from systems.signals import Observation, PixelGrid
-from tests.kitting_drake.policies.scenes import ORIENTATIONS, SIDE, config, scene
+from tests.kitting_drake.policies.scenes import config, scene
 
 
 def trainer(*, weights: int = 0, method: str = "so2", **arguments: Any) -> Trainer:
