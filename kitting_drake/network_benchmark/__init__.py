@@ -63,10 +63,7 @@ def benchmark_networks(plan: Plan, console: Console) -> dict[str, Any]:
 
         def peak() -> dict[str, dict[str, float]]:
             side = plan.peak_side * (4 if device.type == "cuda" else 1)
-            bench.peak = {
-                type_: measure_peak(type_, device, side=side, repeats=plan.repeats)
-                for type_ in types
-            }
+            bench.peak = {type_: measure_peak(type_, device, side=side) for type_ in types}
             return {type_name(type_): rates for type_, rates in bench.peak.items()}
 
         stages: dict[str, Callable[[], Any]] = {

@@ -88,7 +88,9 @@ def draw_networks(measured: dict[str, Any], path: Path) -> None:
 
 
 def _draw_pick_angle(axis: Any, measured: dict[str, Any], preset: str) -> None:
-    """Bars of parameters, lines of time; both start at the bottom of what they span."""
+    """Bars of parameters, lines of time."""
+    from matplotlib.ticker import LogLocator
+
     rows = [row for row in measured["pick_angle"] if row["preset"] == preset]
     counts = sorted({row["orientations"] for row in rows})
     places = {n: index for index, n in enumerate(counts)}
@@ -155,17 +157,19 @@ def _draw_pick_angle(axis: Any, measured: dict[str, Any], preset: str) -> None:
                 color=colour,
             )
     low, high = times.get_ylim()
-    times.set_ylim(low * (low / high) ** 0.3, high * (high / low) ** 0.4)
+    times.set_ylim(low * (low / high) ** 0.3, high * (high / low) ** 0.3)
+    # A tick for each decade, or three where there are few decades.
+    times.yaxis.set_major_locator(LogLocator(subs=(1.0,) if high > 100 * low else (1.0, 2.0, 5.0)))
     times.yaxis.set_major_formatter(lambda seconds, _: seconds_text(seconds))
     times.minorticks_off()
-    times.legend(loc="upper left", fontsize=8.5)
+    times.legend(loc="upper left", ncols=3, fontsize=8, columnspacing=1.0, handlelength=1.5)
 
 
 def _draw_decisions(axis: Any, measured: dict[str, Any]) -> None:
     """A bar for each method and N, of the parts; a bar that is far too long is cut."""
     rows = [row for row in measured["decision"] if row["seconds"]]
     ours = [row["seconds"] for row in rows if row["method"] != "transporter"]
-    limit = 1.25 * max(ours or [row["seconds"] for row in rows])
+    limit = 1.35 * max(ours or [row["seconds"] for row in rows])
     place, places, labels, groups = 0.0, [], [], {}
     for method in dict.fromkeys(row["method"] for row in rows):
         chosen = [row for row in rows if row["method"] == method]
@@ -174,10 +178,10 @@ def _draw_decisions(axis: Any, measured: dict[str, Any]) -> None:
             for part, colour in _PARTS.items():
                 axis.bar(place, row["parts"][part], 0.8, bottom=bottom, color=colour)
                 bottom += row["parts"][part]
-            cut = row["seconds"] > limit
+            cut = bottom > limit
             axis.text(
                 place,
-                (0.985 if cut else 1.01) * min(row["seconds"], limit),
+                0.985 * limit if cut else bottom + 0.01 * limit,
                 seconds_text(row["seconds"]) + ("\n↑" if cut else ""),
                 horizontalalignment="center",
                 verticalalignment="top" if cut else "bottom",
@@ -254,6 +258,7 @@ def _draw_levels(axis: Any, measured: dict[str, Any]) -> None:
         )
     peak = measured["peak"][measured["inference_type"]]["best"]
     axis.set_ylim(0.0, 1.35e3 * max(row["seconds"] for row in levels))
+    axis.tick_params(axis="x", labelsize=8)
     axis.set_ylabel("milliseconds")
     axis.grid(True, axis="y")
     axis.set_title(

@@ -7,8 +7,8 @@ from typing import Any
 from rich.table import Table
 
 METHOD_NAMES = {
-    "so2": "SO(2), this paper",
-    "equivariant_transporter": "Equivariant Transporter",
+    "so2": "SO(2), the paper's",
+    "equivariant_transporter": "Equiv. Transporter",
     "transporter": "Transporter",
 }
 RUNG_NAMES = {
@@ -18,7 +18,7 @@ RUNG_NAMES = {
     "ours_bfloat16": "folded, bfloat16",
 }
 MEASURE_NAMES = {
-    "training_step": "training step, all four networks",
+    "training_step": "training step, all networks",
     "alpha_training_step": "training step, alpha",
     "decision": "decision",
     "alpha_inference": "inference, alpha",
@@ -62,7 +62,7 @@ def _table(title: str, *headings: str) -> Table:
     """Words on the left in the first column, numbers on the right in the others."""
     table = Table(title=title, title_justify="left")
     for index, heading in enumerate(headings):
-        table.add_column(heading, justify="right" if index else "left")
+        table.add_column(heading, justify="right" if index else "left", no_wrap=not index)
     return table
 
 
@@ -77,12 +77,12 @@ def _growth(measured: dict[str, Any], name: str, preset: str, method: str) -> di
 
 def _pick_angle_table(measured: dict[str, Any], preset: str) -> Table:
     table = _table(
-        f"what answers the pick angle, preset {preset} (figure 6(c); the Transporter: all its "
-        "picking)",
+        f"what answers the pick angle, preset {preset} (figure 6(c)): the Transporter's whole "
+        "picking; MAC: multiply-accumulates",
         "method",
         "N",
         "parameters",
-        "multiply-accumulates",
+        "MAC",
         "time",
     )
     rows = [row for row in measured["pick_angle"] if row["preset"] == preset]
@@ -113,7 +113,7 @@ def _decision_table(measured: dict[str, Any]) -> Table:
         f"a decision, preset {measured['preset']}, {measured['inference_type']}",
         "method",
         "N",
-        *(part.replace("_", " ") for part in parts),
+        *(part.removeprefix("pick_") for part in parts),
         "all",
     )
     rows = measured["decision"]
@@ -137,21 +137,23 @@ def _decision_table(measured: dict[str, Any]) -> Table:
 
 def _folding_table(measured: dict[str, Any]) -> Table:
     folding = measured["folding"]
+    rungs = list(folding["rungs"])
     operations = {name: count_text(n / 2) for name, n in folding["alpha_operations"].items()}
     table = _table(
         f"the same networks, preset {measured['preset']}: time, and times faster than escnn's "
-        f"float32 (multiply-accumulates of alpha: escnn {operations['escnn']}, folded "
-        f"{operations['ours']})",
-        "how",
-        *MEASURE_NAMES.values(),
-        "difference",
+        f"float32 (MAC of alpha: escnn {operations['escnn']}, folded {operations['ours']})",
+        "what",
+        *(RUNG_NAMES[rung] for rung in rungs),
     )
-    for rung, timings in folding["rungs"].items():
+    for name, title in MEASURE_NAMES.items():
         cells = [
-            f"{seconds_text(timings[name]['seconds'])}, {folding['speed_up'][rung][name]:.2f}x"
-            for name in MEASURE_NAMES
+            f"{seconds_text(folding['rungs'][rung][name]['seconds'])}\n"
+            f"[bold]{folding['speed_up'][rung][name]:.2f}x[/]"
+            for rung in rungs
         ]
-        table.add_row(RUNG_NAMES[rung], *cells, f"{folding['alpha_difference'][rung]:.1e}")
+        table.add_row(title, *cells)
+    differences = (folding["alpha_difference"][rung] for rung in rungs)
+    table.add_row("difference of alpha's answer", *(f"{value:.1e}" for value in differences))
     return table
 
 
@@ -163,7 +165,7 @@ def _share_table(measured: dict[str, Any]) -> Table:
         f"share of the machine's peak ({peaks})",
         "network",
         "type",
-        "multiply-accumulates",
+        "MAC",
         "inference",
         "share",
         "training step",
@@ -188,7 +190,7 @@ def _level_table(measured: dict[str, Any]) -> Table:
     table = _table(
         f"alpha's inference, preset {measured['preset']}, level by level",
         "level",
-        "multiply-accumulates",
+        "MAC",
         "time",
         "in convolutions",
         "their share of peak",

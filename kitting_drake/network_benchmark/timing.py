@@ -20,6 +20,8 @@ Name = TypeVar("Name")
 
 _WARM_UPS = 2
 """Runs before the first that counts, at most: kernels are chosen, weights laid out."""
+_PEAK_RUNS = 15
+"""Of which the fastest shows the peak."""
 
 
 @dataclass(frozen=True)
@@ -106,16 +108,13 @@ class _OperationCounter(TorchDispatchMode):
         return result
 
 
-def measure_peak(
-    type_: torch.dtype, device: torch.device, *, side: int, repeats: int
-) -> dict[str, float]:
+def measure_peak(type_: torch.dtype, device: torch.device, *, side: int) -> dict[str, float]:
     """What the machine reaches at best, in operations a second.
 
     Args:
         type_: to compute in.
         device: where.
         side: of the matrices; the convolution is of an eighth as many channels.
-        repeats: how often each is timed.
 
     Returns:
         Of a product of large square matrices as `matmul`, of a wide 3x3 convolution in
@@ -131,9 +130,8 @@ def measure_peak(
         "convolution": lambda: F.conv2d(image, kernel, padding=1),
     }
     with torch.inference_mode():
-        timings = time_each(functions, device, repeats=repeats, budget=10.0)
+        timings = time_each(functions, device, repeats=_PEAK_RUNS, budget=10.0)
     with torch.no_grad():
-        # The peak is the fastest run, not the usual one.
         rates = {
             name: count_operations(function) / timings[name].fastest
             for name, function in functions.items()

@@ -98,6 +98,7 @@ def test_quiet_prints_nothing(verb: Verb, tmp_path: Path):
 INTERRUPTED_RUN = """
 import os, signal
 from kitting_drake import run
+from kitting_drake.verb import run_verb
 
 run_episode = run.run_episode
 
