@@ -113,10 +113,10 @@ class Bench:
         """
         seconds = operations / (_EXPECTED_SHARE * self.peak[preferred_type()]["best"])
         if seconds > self.plan.budget:
-            return f"would take about {seconds:.0f} s"
+            return f"not run: ~{seconds:.0f} s"
         size = 4 * sum(weight.numel() for weight in outlined.parameters())
         if size > memory_bytes(self.device) / 2:
-            return f"needs {size / 2**30:.0f} GiB of kernels"
+            return f"not run: needs {size / 2**30:.0f} GiB"
         return None
 
 

@@ -7,7 +7,7 @@ from typing import Any
 from rich.table import Table
 
 METHOD_NAMES = {
-    "so2": "SO(2), the paper's",
+    "so2": "SO(2)",
     "equivariant_transporter": "Equiv. Transporter",
     "transporter": "Transporter",
 }
@@ -66,6 +66,13 @@ def _table(title: str, *headings: str) -> Table:
     return table
 
 
+def _milliseconds_text(seconds: float | None) -> str:
+    """Without the unit."""
+    if seconds is None:
+        return "-"
+    return f"{1e3 * seconds:.0f}" if seconds >= 0.1 else f"{1e3 * seconds:.2g}"
+
+
 def _ratio_text(ratio: float | None) -> str:
     return "-" if ratio is None else f"{ratio:.2f}"
 
@@ -77,8 +84,8 @@ def _growth(measured: dict[str, Any], name: str, preset: str, method: str) -> di
 
 def _pick_angle_table(measured: dict[str, Any], preset: str) -> Table:
     table = _table(
-        f"what answers the pick angle, preset {preset} (figure 6(c)): the Transporter's whole "
-        "picking; MAC: multiply-accumulates",
+        f"what answers the pick angle, preset {preset} (the Transporter: all its picking); "
+        "MAC: multiply-accumulates",
         "method",
         "N",
         "parameters",
@@ -99,7 +106,7 @@ def _pick_angle_table(measured: dict[str, Any], preset: str) -> Table:
         growth = _growth(measured, "pick_angle", preset, method)
         table.add_row(
             "",
-            f"{growth['to']} / {growth['from']}",
+            f"{growth['to']}/{growth['from']}",
             *(_ratio_text(growth[key]) for key in ("parameters", "operations", "seconds")),
             style="bold",
             end_section=True,
@@ -108,28 +115,34 @@ def _pick_angle_table(measured: dict[str, Any], preset: str) -> Table:
 
 
 def _decision_table(measured: dict[str, Any]) -> Table:
-    parts = ("pick_position", "pick_angle", "phi", "psi", "search")
+    headings = {
+        "pick_position": "pixel",
+        "pick_angle": "angle",
+        "phi": "phi",
+        "psi": "psi",
+        "search": "search",
+    }
     table = _table(
-        f"a decision, preset {measured['preset']}, {measured['inference_type']}",
+        f"a decision, in ms, preset {measured['preset']}, {measured['inference_type']}",
         "method",
         "N",
-        *(part.removeprefix("pick_") for part in parts),
+        *headings.values(),
         "all",
     )
     rows = measured["decision"]
     for method in dict.fromkeys(row["method"] for row in rows):
         for row in rows:
             if row["method"] == method:
-                split = row["parts"] or dict.fromkeys(parts)
+                split = row["parts"] or dict.fromkeys(headings)
                 table.add_row(
                     METHOD_NAMES[method],
                     str(row["orientations"]),
-                    *(seconds_text(split[part]) for part in parts),
-                    row["skipped"] or seconds_text(row["seconds"]),
+                    *(_milliseconds_text(split[part]) for part in headings),
+                    row["skipped"] or _milliseconds_text(row["seconds"]),
                 )
         growth = _growth(measured, "decision", measured["preset"], method)
-        ends = f"{growth['to']} / {growth['from']}"
-        blanks = [""] * len(parts)
+        ends = f"{growth['to']}/{growth['from']}"
+        blanks = [""] * len(headings)
         ratio = _ratio_text(growth["seconds"])
         table.add_row("", ends, *blanks, ratio, style="bold", end_section=True)
     return table

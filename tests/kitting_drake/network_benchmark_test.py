@@ -148,13 +148,13 @@ def test_draws_and_prints_whatever_there_is(measured: dict[str, Any], tmp_path: 
     measured = copy.deepcopy(measured)
     for row in measured["pick_angle"] + measured["decision"]:
         if row["method"] == "transporter":
-            row |= {"seconds": None, "parts": None, "skipped": "would take about 99 s"}
+            row |= {"seconds": None, "parts": None, "skipped": "not run: ~99 s"}
     draw_networks(measured, tmp_path / "networks.png")
     assert np.asarray(Image.open(tmp_path / "networks.png")).shape[1] > 1000
     console = Console(width=200, record=True, file=io.StringIO())
     for table in network_tables(measured):
         console.print(table)
-    assert console.export_text().count("would take about 99 s") == 4
+    assert console.export_text().count("not run: ~99 s") == 4
 
 
 def test_the_drawn_scene_has_its_picks_on_tools():
