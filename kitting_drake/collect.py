@@ -2,7 +2,6 @@
 
 import contextlib
 import dataclasses
-import fcntl
 import importlib.metadata
 import itertools
 import json
@@ -11,7 +10,7 @@ import os
 import platform
 import signal
 import time
-from collections.abc import Callable, Container, Iterable, Iterator, Sized
+from collections.abc import Callable, Container, Iterable, Sized
 from pathlib import Path
 
 import numpy as np
@@ -30,7 +29,7 @@ from kitting_drake.cli import (
 )
 from kitting_drake.episode import run_episode
 from kitting_drake.errors import UserError
-from kitting_drake.files import claim_folder, require_folder, write_json
+from kitting_drake.files import alone_in, claim_folder, require_folder, write_json
 from kitting_drake.policies.demonstrations import (
     Demonstration,
     DemonstrationStep,
@@ -75,7 +74,7 @@ def main() -> int:
     chosen = _by_oracle(choose_scenario(arguments))
     folder = require_folder(output_folder(arguments, f"{chosen.name}-demonstrations"))
     console = Console(quiet=arguments.quiet)
-    with _alone(folder):
+    with alone_in(folder):
         claim_folder(folder, "scenario.json", chosen.described, of="scenario")
         collection = Collection(folder, _origin(chosen, arguments.seed))
         if collection.assembled >= arguments.demos:
@@ -96,21 +95,6 @@ def main() -> int:
     seconds = time.perf_counter() - start
     console.print(f"{collection.summary()}; {seconds:.0f} s", highlight=False, soft_wrap=True)
     return 0
-
-
-@contextlib.contextmanager
-def _alone(folder: Path) -> Iterator[None]:
-    """Keeps a second collection out of a folder while one is at work there."""
-    handle = os.open(folder, os.O_RDONLY)
-    try:
-        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        yield
-    except BlockingIOError as error:
-        raise UserError(
-            f"another process collects into {folder}: wait for it, or give another --output"
-        ) from error
-    finally:
-        os.close(handle)
 
 
 class Collection:

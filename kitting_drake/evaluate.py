@@ -18,7 +18,7 @@ from kitting_drake.cli import (
     scenario_parser,
 )
 from kitting_drake.episode import run_episode
-from kitting_drake.files import claim_folder, require_folder, write_json, write_whole
+from kitting_drake.files import alone_in, claim_folder, require_folder, write_json, write_whole
 from kitting_drake.looking import seeds_learned_from
 from kitting_drake.processes import Died, counting_bar, run_apart, side_by_side
 from kitting_drake.scenario import Learned
@@ -48,10 +48,11 @@ def main() -> int:
     # What cannot be built at all is told at once, not once for each seed.
     build_chosen(chosen, seed=seeds[0])
     start = time.perf_counter()
-    episodes = evaluate(chosen, seeds, folder, workers=arguments.workers, console=console)
-    summary = summarise(episodes, chosen, wall_seconds_total=time.perf_counter() - start)
-    write_json(folder / "summary.json", summary)
-    draw_summary(summary, episodes, folder / "summary.png")
+    with alone_in(folder):
+        episodes = evaluate(chosen, seeds, folder, workers=arguments.workers, console=console)
+        summary = summarise(episodes, chosen, wall_seconds_total=time.perf_counter() - start)
+        write_json(folder / "summary.json", summary)
+        draw_summary(summary, episodes, folder / "summary.png")
     console.print(summary_table(summary))
     console.print(summary_notes(summary), highlight=False)
     console.print(f"files: {folder}/", highlight=False)

@@ -1,8 +1,11 @@
-"""Writing files that are there whole or not at all."""
+"""Writing files that are there whole or not at all, in folders of one thing and one process."""
 
+import contextlib
+import fcntl
 import json
 import os
 import tempfile
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -69,3 +72,22 @@ def claim_folder(folder: Path, name: str, described: Any, *, of: str) -> None:
             f"{folder} holds the files of another {of}: give another --output, or delete it"
         )
     write_json(path, described)
+
+
+@contextlib.contextmanager
+def alone_in(folder: Path) -> Iterator[None]:
+    """Keeps a second process out of a folder while one is at work there.
+
+    Raises:
+        UserError: there is one already.
+    """
+    handle = os.open(folder, os.O_RDONLY)
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        yield
+    except BlockingIOError as error:
+        raise UserError(
+            f"another process is at work in {folder}: wait for it, or give another --output"
+        ) from error
+    finally:
+        os.close(handle)

@@ -18,7 +18,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from torch.utils.tensorboard import SummaryWriter
 
 from kitting_drake.errors import UserError
-from kitting_drake.files import claim_folder, require_folder, write_json, write_whole
+from kitting_drake.files import alone_in, claim_folder, require_folder, write_json, write_whole
 from kitting_drake.policies.config import METHODS, PRESETS, NetworkConfig
 from kitting_drake.policies.demonstrations import Demonstrations, read_demonstrations
 from kitting_drake.policies.learned_policy import LearnedPolicy
@@ -60,6 +60,7 @@ class Settings:
     learning_rate: float
     decay: bool
     taken_only: bool
+    rigid: bool
     validate_every: int
     seed: int
 
@@ -88,6 +89,7 @@ def main() -> int:
         learning_rate=arguments.learning_rate,
         decay=arguments.decay,
         taken_only=arguments.taken_only,
+        rigid=arguments.rigid,
         validate_every=arguments.validate_every,
         seed=arguments.seed,
     )
@@ -95,8 +97,9 @@ def main() -> int:
         arguments.output or Path("output") / f"{demonstrations.origin.scenario_name}-training"
     )
     run = _Run(settings, learned, held_out, folder, console)
-    claim_folder(folder, "settings.json", dataclasses.asdict(settings), of="training run")
-    run.train()
+    with alone_in(folder):
+        claim_folder(folder, "settings.json", dataclasses.asdict(settings), of="training run")
+        run.train()
     console.print(f"files: {folder}/", highlight=False)
     return 0
 
@@ -131,6 +134,11 @@ def _parse() -> argparse.Namespace:
         action="store_true",
         help="as the paper: learn of each observation only what was picked then, "
         "not also what was picked later",
+    )
+    parser.add_argument(
+        "--rigid",
+        action="store_true",
+        help="as the paper: augment by motions of the whole scene only, not also by bent tools",
     )
     parser.add_argument(
         "--validate-every", type=count_type, default=500, metavar="STEPS", help="(500)"
@@ -215,6 +223,7 @@ class _Run:
             steps=settings.steps,
             learning_rate=settings.learning_rate,
             decay=settings.decay,
+            rigid=settings.rigid,
         )
         self.best: dict[str, Any] | None = None
         self.seconds = 0.0
@@ -228,6 +237,7 @@ class _Run:
             "learning_rate": settings.learning_rate,
             "decay": settings.decay,
             "taken_only": settings.taken_only,
+            "rigid": settings.rigid,
             "seed": settings.seed,
             "compute_type": str(networks.compute_type).removeprefix("torch."),
             "torch": torch.__version__,

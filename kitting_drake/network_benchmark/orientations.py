@@ -17,12 +17,12 @@ from kitting_drake.policies.steerable import PlainConv2d
 from kitting_drake.policies.weights import preferred_type
 
 PARTS = {
-    "pick_position": ("position_logits",),
-    "pick_angle": ("angle_logits", "angle_maximum"),
-    "phi": ("encode_scene",),
-    "psi": ("encode_crop",),
+    "pick_position": "position_logits",
+    "pick_angle": "angle_answer",
+    "phi": "encode_scene",
+    "psi": "encode_crop",
 }
-"""Of a decision, by the methods of `Networks` that compute them; the rest of it is `search`."""
+"""Of a decision, by the method of `Networks` that computes it; the rest of it is `search`."""
 
 _MADE_FOR_N = ("equivariant_transporter",)
 """Methods whose networks depend on N; the others' are asked at any N."""
@@ -163,9 +163,8 @@ class _WatchedPolicy:
         self._bench, self._device = bench, bench.device
         self._networks = networks
         self._parts: dict[str, float] = {}
-        for part, methods in PARTS.items():
-            for method in methods:
-                setattr(networks, method, self._watched(part, getattr(networks, method)))
+        for part, method in PARTS.items():
+            setattr(networks, method, self._watched(part, getattr(networks, method)))
 
     def _watched(self, part: str, method: Callable[..., Any]) -> Callable[..., Any]:
         def call(*arguments: Any) -> Any:

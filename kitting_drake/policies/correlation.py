@@ -129,8 +129,10 @@ def window(
     vertical = _overlap(corner[0] - reach, shape[0] + 2 * reach, rows)
     horizontal = _overlap(corner[1] - reach, shape[1] + 2 * reach, cols)
     part = scene[:, :, vertical[0], horizontal[0]]
-    pads = (*horizontal[1], *vertical[1])
-    return F.conv2d(F.pad(part, pads), lift(encoding, angles, KERNEL))[0] / KERNEL
+    padded = F.pad(part, (*horizontal[1], *vertical[1]))
+    # So large a kernel is much slower in channels_last, as U-nets leave their outputs.
+    kernels = lift(encoding, angles, KERNEL)
+    return F.conv2d(padded.contiguous(), kernels.contiguous())[0] / KERNEL
 
 
 def _overlap(start: int, length: int, side: int) -> tuple[slice, tuple[int, int]]:

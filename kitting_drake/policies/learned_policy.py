@@ -82,11 +82,10 @@ class LearnedPolicy:
         row, col = divmod(int(logits.argmax()), cols)
         pixel = np.array([row, col], float)
 
-        angles = networks.angle_logits(image, (row, col), self._orientations)
+        angles, between = networks.angle_answer(image, (row, col), self._orientations)
         theta = int(angles.argmax()) * math.tau / self._orientations
         pick = pixel
         if self._continuous:
-            between = networks.angle_maximum(image, (row, col))
             theta = theta if between is None else between
             pick = expected_position(logits, (row, col))
 

@@ -89,10 +89,12 @@ class Networks(nn.Module):
         """f_theta around a pixel: (N / 2,), at the gripper angles 2 pi i / N."""
         raise NotImplementedError
 
-    def angle_maximum(self, image: Image, pixel: tuple[int, int]) -> float | None:
-        """The most likely of all angles around a pixel in radians, if the method knows angles
-        between the bins; else None."""
-        return None
+    def angle_answer(
+        self, image: Image, pixel: tuple[int, int], orientations: int
+    ) -> tuple[Tensor, float | None]:
+        """`angle_logits`, and the most likely of all angles in radians if the method knows angles
+        between the bins, else None."""
+        return self.angle_logits(image, pixel, orientations), None
 
     def losses(
         self, sample: LabelledImage, random: np.random.Generator
@@ -166,9 +168,16 @@ class FactoredNetworks(Networks):
         picks = [(float(row), float(col)) for row, col in (sample.pick, *sample.other_picks)]
 
         def angle() -> Tensor:
-            crops = [self.prepare(crop(sample.image, pixel, sizes.PICK_CROP)) for pixel in pixels]
-            logits = self.crop_angle_logits(torch.cat(crops), orientations)
-            thetas = (sample.pick_theta, *sample.other_thetas)
+            crops = [crop(sample.image, pixel, sizes.PICK_CROP) for pixel in pixels]
+            thetas = [sample.pick_theta, *sample.other_thetas]
+            if len(sample.bends):
+                crops += [
+                    sample.bent_crop(index, pixel, sizes.PICK_CROP)
+                    for index, pixel in enumerate(pixels)
+                ]
+                thetas += thetas
+            prepared = torch.cat([self.prepare(item) for item in crops])
+            logits = self.crop_angle_logits(prepared, orientations)
             losses = [
                 angle_loss(row, theta % math.pi, orientations)
                 for row, theta in zip(logits, thetas, strict=True)
@@ -211,9 +220,13 @@ class SO2Networks(FactoredNetworks):
         frequencies = self.config.angle_frequencies
         return discretize(self.beta(crops), orientations, frequencies, quotient=2)
 
-    def angle_maximum(self, image: Image, pixel: tuple[int, int]) -> float | None:
-        coefficients = self.angle_coefficients(image, pixel).detach().double().cpu().numpy()
-        return series_maximum(coefficients, self.config.angle_frequencies)
+    def angle_answer(
+        self, image: Image, pixel: tuple[int, int], orientations: int
+    ) -> tuple[Tensor, float | None]:
+        frequencies = self.config.angle_frequencies
+        coefficients = self.angle_coefficients(image, pixel)
+        logits = discretize(coefficients, orientations, frequencies, quotient=2)
+        return logits, series_maximum(coefficients.detach().double().cpu().numpy(), frequencies)
 
 
 def within_image(sample: LabelledImage) -> LabelledImage:
@@ -222,7 +235,10 @@ def within_image(sample: LabelledImage) -> LabelledImage:
     picks = sample.other_picks
     inside = ((picks >= 0) & (picks <= (rows - 1, cols - 1))).all(axis=1)
     return dataclasses.replace(
-        sample, other_picks=picks[inside], other_thetas=sample.other_thetas[inside]
+        sample,
+        other_picks=picks[inside],
+        other_thetas=sample.other_thetas[inside],
+        bends=sample.bends[np.append(True, inside)] if len(sample.bends) else sample.bends,
     )
 
 

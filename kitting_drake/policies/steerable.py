@@ -219,12 +219,14 @@ def frequencies_cutoff(in_fibre: Fibre, out_fibre: Fibre, size: int) -> float | 
     choice, about once.
 
     A kernel of frequency k leads from rho_i to rho_j with j up to i + k: where escnn's choice would
-    leave the highest frequencies of the answer zero for ever, take three times the radius.
+    leave the highest frequencies of the answer zero for ever, just as much as these need of the
+    outermost ring. More only brings in what the pixels cannot hold.
     """
     if not (isinstance(in_fibre, Irreps) and isinstance(out_fibre, Irreps)):
         return None
     missing = max(out_fibre.frequencies) - max(in_fibre.frequencies)
-    return 3.0 if missing > size // 2 else None
+    radius = size // 2
+    return missing / radius if missing > radius else None
 
 
 class BandLimit(nn.Module):

@@ -29,6 +29,7 @@ class Trainer:
         steps: int = 10_000,
         learning_rate: float = 1e-4,
         decay: bool = False,
+        rigid: bool = False,
     ) -> None:
         """
         Args:
@@ -38,12 +39,14 @@ class Trainer:
             learning_rate: Adam's.
             decay: let the learning rate fall to zero over the steps (half a cosine, after a rise
                 over the first hundred) instead of keeping it.
+            rigid: see `augment`.
         """
         self.networks = networks
         self.seed = seed
         self.steps = steps
         self.learning_rate = learning_rate
         self.decay = decay
+        self.rigid = rigid
         self.step_count = 0
         self.optimisers = {
             name: torch.optim.Adam(
@@ -69,7 +72,7 @@ class Trainer:
             Each loss, in nats.
         """
         random = np.random.default_rng([self.seed, self.step_count])
-        sample = augment(samples[random.integers(len(samples))], random)
+        sample = augment(samples[random.integers(len(samples))], random, rigid=self.rigid)
         self.networks.train()
         values = {}
         for name, loss_of in self.networks.losses(sample, random):

@@ -16,6 +16,7 @@ import kitting_drake.evaluate as evaluation
 from kitting_drake.cli import ChosenScenario
 from kitting_drake.episode import EpisodeResult
 from kitting_drake.errors import UserError
+from kitting_drake.files import alone_in
 from kitting_drake.scenario import Learned, Scenario
 from kitting_drake.summary import Episode
 
@@ -69,6 +70,16 @@ def test_a_folder_of_other_weights_is_refused(tmp_path: Path, monkeypatch: pytes
         evaluation.evaluate(chosen, [0, 1, 2], folder, workers=1, console=QUIET)
 
 
+def test_two_do_not_evaluate_into_one_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    scenario = tmp_path / "mine.yaml"
+    scenario.write_text("Mine: {task: !ToolsetKitting {}}\n")
+    folder = tmp_path / "out"
+    folder.mkdir()
+    monkeypatch.setattr(sys, "argv", ["evaluate", str(scenario), "--output", str(folder)])
+    with alone_in(folder), pytest.raises(UserError, match="another process is at work"):
+        evaluation.main()
+
+
 def die(chosen: ChosenScenario, seed: int) -> None:
     os.kill(os.getpid(), signal.SIGKILL)
 
@@ -111,7 +122,7 @@ def test_killed_again_and_again_it_evaluates_what_it_would_have(
     whole, killed = tmp_path / "whole", tmp_path / "killed"
 
     def start(folder: Path, workers: int) -> subprocess.Popen[bytes]:
-        flags = ("--episodes", 10, "--workers", workers, "--output", folder, "--quiet")
+        flags = ("--episodes", 40, "--workers", workers, "--output", folder, "--quiet")
         command = [sys.executable, "-m", "kitting_drake.evaluate", scenario, *flags]
         return subprocess.Popen([str(word) for word in command], cwd=ROOT)
 
@@ -122,13 +133,13 @@ def test_killed_again_and_again_it_evaluates_what_it_would_have(
 
     assert start(whole, 2).wait() == 0
     rng = random.Random(0)
-    for _ in range(4):
+    for _ in range(20):
         kill_at_random(start(killed, 2), killed / "episodes.jsonl", rng, changes=rng.randrange(2))
     assert start(killed, 1).wait() == 0
     assert episodes(killed) == episodes(whole)
-    assert [episode["seed"] for episode in episodes(whole)] == list(range(10))
+    assert [episode["seed"] for episode in episodes(whole)] == list(range(40))
     # They are not all alike, and none was lost.
-    assert len({json.dumps(episode["objects"]) for episode in episodes(whole)}) == 10
+    assert len({json.dumps(episode["objects"]) for episode in episodes(whole)}) == 40
     assert not any(episode["failure"] for episode in episodes(whole))
     one, two = (json.loads((path / "summary.json").read_text()) for path in (killed, whole))
     assert one["success_rate"] == two["success_rate"]

@@ -92,7 +92,7 @@ def test_answers_at_its_own_n_alone():
     networks.check_orientations(N)
     assert networks.position_logits(image, N).shape == image.shape[1:]
     assert networks.angle_logits(image, (20, 30), N).shape == (N // 2,)
-    assert networks.angle_maximum(image, (20, 30)) is None
+    assert networks.angle_answer(image, (20, 30), N)[1] is None
     with pytest.raises(ValueError, match="answers at 12 orientations, not at 36"):
         networks.check_orientations(36)
     with pytest.raises(ValueError, match="not at 36"):

@@ -1,9 +1,10 @@
+import dataclasses
 import math
 
 import numpy as np
 import pytest
 
-from kitting_drake.policies.images import LabelledImage, augment, crop, move, rotation
+from kitting_drake.policies.images import LabelledImage, Motion, augment, crop, move, rotation
 from systems.signals import PickPlaceAction, PixelGrid, PlanarPose
 
 ROWS, COLS = 61, 91
@@ -138,4 +139,65 @@ def test_augmentation_is_that_of_the_seed():
 
 def test_a_sample_that_cannot_stay_inside_is_left_alone():
     sample = LabelledImage(SAMPLE.image, np.array([-30.0, 0]), 0.3, np.array([90.0, 90]), 1.1)
-    assert augment(sample, np.random.default_rng(0)) is sample
+    assert augment(sample, np.random.default_rng(0), rigid=True) is sample
+
+
+def barred(theta: float) -> LabelledImage:
+    """A long bar, 6 pixels wide, that is held by its middle."""
+    row, col = np.meshgrid(np.arange(ROWS), np.arange(COLS), indexing="ij")
+    offsets = np.stack([row, col], axis=-1) - MIDDLE
+    across = offsets @ rotation(theta)[:, 1]
+    height = np.where(np.abs(across) < 3, 0.02, 0)
+    image = np.stack([height] * 4).astype(np.float32)
+    return LabelledImage(image, MIDDLE, theta, np.array([10.0, 20]), 0.0)
+
+
+def middle_line(image: np.ndarray, theta: float, u: float) -> float:
+    """How far across the bar is, at u pixels along its direction at the middle of a crop."""
+    side = image.shape[1]
+    across = np.linspace(-12, 12, 97)
+    points = (
+        side // 2 + np.array([u, 0]) @ rotation(theta).T + across[:, None] * rotation(theta)[:, 1]
+    )
+    row, col = np.rint(points).astype(int).T
+    return float(across[image[3, row, col] > 0].mean())
+
+
+@pytest.mark.parametrize("theta", [0.0, 0.7, 2.0])
+@pytest.mark.parametrize("moved", [False, True])
+def test_a_bend_keeps_the_object_at_the_pick_and_its_direction_there(theta: float, moved: bool):
+    sample = barred(theta)
+    if moved:
+        sample = move(sample, 0.4, np.array([2.0, -3]))
+        theta += 0.4
+    sample = dataclasses.replace(sample, bends=np.array([[0.3, -0.1]]))
+    pixel = tuple(int(x) for x in np.rint(sample.pick))
+    bent = sample.bent_crop(0, pixel, 41)
+    start = middle_line(bent, theta, 0)
+    for u in (-16, -8, -3, 3, 8, 16):
+        v = u / 20
+        # The object goes the other way than where its pixels are fetched from.
+        expected = -20 * (0.3 * v**2 - 0.1 * v**3)
+        assert middle_line(bent, theta, u) - start == pytest.approx(expected, abs=1.2)
+
+
+def test_without_a_bend_it_is_the_crop():
+    sample = move(SAMPLE, 0.6, np.array([3.0, -2]))
+    pixel = (22, 31)
+    expected = crop(sample.image, pixel, 41)
+    straight = dataclasses.replace(sample, bends=np.zeros((1, 2)))
+    np.testing.assert_array_equal(straight.bent_crop(0, pixel, 41), expected)
+
+
+def test_every_object_has_a_bend_of_its_own():
+    others = np.array([[20.0, 60], [40, 30]])
+    sample = dataclasses.replace(SAMPLE, other_picks=others, other_thetas=np.zeros(2))
+    assert len(np.unique(augment(sample, np.random.default_rng(0)).bends)) == 6
+    assert not len(augment(sample, np.random.default_rng(0), rigid=True).bends)
+
+
+def test_a_motion_is_undone():
+    motion = Motion(SAMPLE.image, 0.7, np.array([3.0, -2]))
+    points = np.array([[[1.0, 2], [30, 40]]])
+    np.testing.assert_allclose(motion.before(motion.after(points)), points)
+    assert np.abs(motion.after(points) - points).max() > 1

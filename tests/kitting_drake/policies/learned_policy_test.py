@@ -70,8 +70,10 @@ class Known(Networks):
         angles = torch.arange(orientations // 2) * (math.tau / orientations)
         return 9 * torch.cos(2 * (angles - self._theta))
 
-    def angle_maximum(self, image: Image, pixel: tuple[int, int]) -> float | None:
-        return self._theta
+    def angle_answer(
+        self, image: Image, pixel: tuple[int, int], orientations: int
+    ) -> tuple[Tensor, float | None]:
+        return self.angle_logits(image, pixel, orientations), self._theta
 
     def encode_scene(self, image: Image) -> Tensor:
         ends = [GOAL + turned(arm, self._turn) for arm in ARMS]
@@ -148,7 +150,7 @@ def test_the_maps_say_what_the_answer_was_read_from():
 
 
 def test_a_method_without_angles_between_bins_answers_with_a_bin(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(Known, "angle_maximum", Networks.angle_maximum)
+    monkeypatch.setattr(Known, "angle_answer", Networks.angle_answer)
     found = decide(Known(), continuous=True)
     assert found.action.pick.theta / BIN == pytest.approx(12)
     np.testing.assert_allclose(found.pick_pixel, PICK, atol=1e-5)

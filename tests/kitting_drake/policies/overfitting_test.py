@@ -47,7 +47,7 @@ def turned_errors(
 )
 def test_learns_by_heart_and_perhaps_more(method: str, steps: int, monkeypatch: pytest.MonkeyPatch):
     # No turned copy is ever shown.
-    monkeypatch.setattr(training, "augment", lambda sample, random: sample)
+    monkeypatch.setattr(training, "augment", lambda sample, random, *, rigid: sample)
     samples = [scene(seed) for seed in range(4)]
     torch.manual_seed(0)
     networks = make_networks(config(method))

@@ -65,7 +65,9 @@ def test_every_weight_is_trained_by_one_loss(method: str):
     before = copy.deepcopy(networks.state_dict())
     Trainer(networks, seed=0).step([scene(0)])
     after = networks.state_dict()
-    assert [name for name in before if torch.equal(before[name], after[name])] == []
+    unmoved = {name for name in before if torch.equal(before[name], after[name])}
+    # A softmax does not see what is added to all logits: rounding alone moves these.
+    assert unmoved <= {"alpha.out.bias", "pick.out.third.bias", "pick.out.shortcut.bias"}
 
 
 def test_the_learning_rate_rises_and_falls_to_nothing():

@@ -64,10 +64,10 @@ def file(tmp_path: Path) -> Path:
 def maps(networks: Networks, image: NDArray[np.float32]) -> dict[str, Tensor]:
     """All that networks are asked for."""
     pixel = (20, 70)
-    maximum = networks.angle_maximum(image, pixel)
+    logits, maximum = networks.angle_answer(image, pixel, 36)
     return {
         "position": networks.position_logits(image, 36),
-        "angle": networks.angle_logits(image, pixel, 36),
+        "angle": logits,
         "angle, continuous": torch.tensor(maximum),
         "scene": networks.encode_scene(image),
         "crop": networks.encode_crop(image, pixel),
