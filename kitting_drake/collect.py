@@ -8,7 +8,6 @@ import json
 import math
 import os
 import platform
-import signal
 import time
 from collections.abc import Callable, Container, Iterable, Sized
 from pathlib import Path
@@ -51,9 +50,6 @@ LEAST_SCORE = 0.99
 
 _PATIENCE = 20
 """So many seeds rejected in a row mean that the oracle cannot do it."""
-
-_KILLED = (-signal.SIGKILL, -signal.SIGTERM)
-"""Exit codes of a process that did not end by its own doing."""
 
 Demonstrate = Callable[[int], Demonstration | Rejection | Died]
 """What becomes of a seed; called in a thread."""
@@ -300,11 +296,8 @@ def _origin(chosen: ChosenScenario, first_seed: int) -> Origin:
 
 
 def _reject_dead(seed: int, dead: Died) -> Rejection:
-    if dead.exit_code in _KILLED:
-        raise UserError(
-            f"the process of seed {seed} was killed twice, perhaps for want of memory: "
-            "give fewer --workers, and it goes on where it was"
-        )
+    if dead.was_killed:
+        raise dead.killed_twice(seed)
     return Rejection(seed, 0.0, f"its process ended with exit code {dead.exit_code}")
 
 

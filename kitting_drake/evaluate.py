@@ -1,10 +1,10 @@
 """`python -m kitting_drake.evaluate SCENARIO.yaml`: many seeds side by side, and their summary."""
 
+import copy
 import hashlib
-import json
 import os
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +18,14 @@ from kitting_drake.cli import (
     scenario_parser,
 )
 from kitting_drake.episode import run_episode
-from kitting_drake.files import alone_in, claim_folder, require_folder, write_json, write_whole
+from kitting_drake.files import (
+    alone_in,
+    append_line,
+    claim_folder,
+    read_lines,
+    require_folder,
+    write_json,
+)
 from kitting_drake.looking import seeds_learned_from
 from kitting_drake.processes import Died, counting_bar, run_apart, side_by_side
 from kitting_drake.scenario import Learned
@@ -65,7 +72,8 @@ def evaluate(
     """Runs an episode for each seed, each in a process of its own.
 
     Episodes already in `folder/episodes.jsonl` are not run again; one is written there as it ends.
-    A process that dies leaves a failed episode with its reason.
+    A process that dies leaves a failed episode with its reason; one that something else killed is
+    given a second chance.
 
     Args:
         chosen: the scenario.
@@ -78,12 +86,12 @@ def evaluate(
         The episodes, in the order of the seeds.
 
     Raises:
-        UserError: the folder holds another scenario's episodes.
+        UserError: the folder holds another scenario's episodes, or a process was killed twice.
     """
     seeds = list(seeds)
     path = folder / "episodes.jsonl"
     claim_folder(folder, "scenario.json", _identity(chosen), of="scenario")
-    done = {episode["seed"]: episode for episode in _read_lines(path)}
+    done = {episode["seed"]: episode for episode in read_lines(path)}
     pending = [seed for seed in seeds if seed not in done]
     queue = iter(pending)
     with counting_bar(console, "episodes") as progress:
@@ -92,7 +100,7 @@ def evaluate(
             lambda seed: _run_apart(chosen, seed), lambda: next(queue, None), workers=workers
         ):
             done[episode["seed"]] = episode
-            _append_line(path, episode)
+            append_line(path, episode)
             progress.advance(task)
     return [done[seed] for seed in seeds]
 
@@ -103,32 +111,19 @@ def _identity(chosen: ChosenScenario) -> dict[str, Any]:
     if not isinstance(policy, Learned):
         return chosen.described
     content = (chosen.base / policy.weights).read_bytes()
-    return {**chosen.described, "weights_sha256": hashlib.sha256(content).hexdigest()}
-
-
-def _read_lines(path: Path) -> Iterator[Episode]:
-    if not path.exists():
-        return
-    content = path.read_text()
-    # A line that was being written when the process was killed has no end.
-    whole = content[: content.rfind("\n") + 1]
-    if whole != content:
-        write_whole(path, whole)
-    for line in whole.splitlines():
-        yield json.loads(line)
-
-
-def _append_line(path: Path, episode: Episode) -> None:
-    with path.open("a") as file:
-        file.write(json.dumps(episode) + "\n")
-        file.flush()
-        os.fsync(file.fileno())
+    identity = copy.deepcopy(chosen.described)
+    identity["policy"]["weights"] = f"sha256 {hashlib.sha256(content).hexdigest()}"
+    return identity
 
 
 def _run_apart(chosen: ChosenScenario, seed: int) -> Episode:
     """Runs one episode in a fresh process and waits for it."""
     start = time.perf_counter()
     episode = run_apart(_work, chosen, seed)
+    if isinstance(episode, Died) and episode.was_killed:
+        episode = run_apart(_work, chosen, seed)
+        if isinstance(episode, Died) and episode.was_killed:
+            raise episode.killed_twice(seed)
     if isinstance(episode, Died):
         return _lost_episode(chosen, seed, episode.exit_code, time.perf_counter() - start)
     return episode

@@ -81,13 +81,35 @@ def alone_in(folder: Path) -> Iterator[None]:
     Raises:
         UserError: there is one already.
     """
-    handle = os.open(folder, os.O_RDONLY)
-    try:
-        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    with (folder / ".lock").open("w") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            raise UserError(
+                f"another process is at work in {folder}: wait for it, or give another --output"
+            ) from error
+        except OSError as error:
+            raise UserError(f"{folder} cannot be locked: {error.strerror}") from error
         yield
-    except BlockingIOError as error:
-        raise UserError(
-            f"another process is at work in {folder}: wait for it, or give another --output"
-        ) from error
-    finally:
-        os.close(handle)
+
+
+def append_line(path: Path, item: Any) -> None:
+    """Adds an object to a file of JSON lines, and sees to it that it is on the disk."""
+    with path.open("a") as file:
+        file.write(json.dumps(item) + "\n")
+        file.flush()
+        os.fsync(file.fileno())
+
+
+def read_lines(path: Path) -> list[Any]:
+    """The objects of a file of JSON lines; none if there is no file.
+
+    A last line without an end, which was being written when the process was killed, is cut off.
+    """
+    if not path.exists():
+        return []
+    content = path.read_text()
+    whole = content[: content.rfind("\n") + 1]
+    if whole != content:
+        write_whole(path, whole)
+    return [json.loads(line) for line in whole.splitlines()]

@@ -84,7 +84,7 @@ def _import_function(config: PythonPolicy) -> Callable[[Observation], PickPlaceA
     module, _, name = config.function.partition(":")
     try:
         function = getattr(importlib.import_module(module), name)
-    except (ImportError, AttributeError) as error:
+    except (ImportError, AttributeError, TypeError) as error:
         raise UserError(f"policy.function: cannot import {config.function}: {error}") from error
     if not callable(function):
         raise UserError(f"policy.function: {config.function} is not a function")

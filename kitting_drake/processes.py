@@ -15,6 +15,8 @@ from typing import TypeVar
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
+from kitting_drake.errors import UserError
+
 _Item = TypeVar("_Item")
 _Result = TypeVar("_Result")
 
@@ -27,6 +29,18 @@ class Died:
 
     exit_code: int | None
     """Negative: the signal that killed it."""
+
+    @property
+    def was_killed(self) -> bool:
+        """By something else, for want of memory perhaps: not by what it did."""
+        return self.exit_code in (-signal.SIGKILL, -signal.SIGTERM)
+
+    def killed_twice(self, seed: int) -> UserError:
+        """What is to be said when a second chance did not help."""
+        return UserError(
+            f"the process of seed {seed} was killed twice, perhaps for want of memory: "
+            "give fewer --workers, and it goes on where it was"
+        )
 
 
 def run_apart(function: Callable[..., _Result], *arguments: object) -> _Result | Died:
@@ -47,7 +61,8 @@ def run_apart(function: Callable[..., _Result], *arguments: object) -> _Result |
     sender.close()
     try:
         return receiver.recv()
-    except EOFError:
+    except (EOFError, OSError):
+        # OSError: it died in the middle of its answer.
         process.join()
         return Died(process.exitcode)
     finally:

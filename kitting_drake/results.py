@@ -60,7 +60,7 @@ Written by `python -m kitting_drake.results` from files alone, each the `summary
 A cell of the first tables is the success rate in percent (section IV-C of the paper: the share of
 the tools that ended with ADD-S below the threshold; failed episodes count 0), its 95 % interval
 (Wilson's), and how many episodes were run. `-`: not run. A star: answered between pixels and bins,
-which the paper does not; else on them, and trained at N = 180 whatever N is asked for.
+which the paper does not; else on them. A dagger: asked for another N than it was trained at.
 
 The oracle knows the truth. Rounded, it says it in pixels and N orientations: no policy of that N
 can be expected to do better. Exact, it has no N, and its one figure stands in every column.
@@ -221,15 +221,17 @@ def _with_others(usual: Sequence[int], found: Iterable[int | None]) -> list[int]
 def _cell(runs: list[_Run]) -> str:
     # Runs that differ in nothing but their training are all told: choosing would be flattering.
     return (
-        "<br>".join(
-            f"{_rate(run.summary)}, {run.summary['episodes']}{_between(run)}" for run in runs
-        )
+        "<br>".join(f"{_rate(run.summary)}, {run.summary['episodes']}{_marks(run)}" for run in runs)
         or "-"
     )
 
 
-def _between(run: _Run) -> str:
-    return " \\*" if run.detail("continuous") and run.detail("method") == "so2" else ""
+def _marks(run: _Run) -> str:
+    trained = run.detail("trained_orientations")
+    marks = ["\\*"] if run.detail("continuous") else []
+    if trained is not None and trained != run.detail("orientations"):
+        marks.append("†")
+    return "".join(f" {mark}" for mark in marks)
 
 
 def _rate(summary: dict[str, Any]) -> str:

@@ -6,7 +6,6 @@ import io
 import json
 import pickle
 import time
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,7 +17,15 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from torch.utils.tensorboard import SummaryWriter
 
 from kitting_drake.errors import UserError
-from kitting_drake.files import alone_in, claim_folder, require_folder, write_json, write_whole
+from kitting_drake.files import (
+    alone_in,
+    append_line,
+    claim_folder,
+    read_lines,
+    require_folder,
+    write_json,
+    write_whole,
+)
 from kitting_drake.policies.config import METHODS, PRESETS, NetworkConfig
 from kitting_drake.policies.demonstrations import Demonstrations, read_demonstrations
 from kitting_drake.policies.learned_policy import LearnedPolicy
@@ -51,7 +58,8 @@ class Settings:
 
     scenario: str
     demonstrations: int
-    seeds: tuple[int, ...]
+    """How many are learned from."""
+    demonstration_seeds: tuple[int, ...]
     validation_seeds: tuple[int, ...]
     method: str
     preset: str
@@ -63,24 +71,19 @@ class Settings:
     rigid: bool
     validate_every: int
     seed: int
+    device: str
+    compute_type: str
 
 
 def main() -> int:
     """Parses the command line and trains; returns the exit code."""
     arguments = _parse()
     console = Console(quiet=arguments.quiet)
-    demonstrations = read_demonstrations(arguments.demos, arguments.demonstrations)
-    count = len(demonstrations.demonstrations)
-    if arguments.demonstrations is not None and count < arguments.demonstrations:
-        raise UserError(
-            f"{arguments.demos} holds {count} demonstrations, not {arguments.demonstrations}: "
-            "collect more"
-        )
-    learned, held_out = _split(demonstrations, arguments.demos, arguments.validation)
+    learned, held_out = _split(arguments.demos, arguments.demonstrations, arguments.validation)
     settings = Settings(
-        scenario=demonstrations.origin.scenario_name,
-        demonstrations=count,
-        seeds=tuple(item.seed for item in demonstrations.demonstrations),
+        scenario=learned.origin.scenario_name,
+        demonstrations=len(learned.demonstrations),
+        demonstration_seeds=tuple(item.seed for item in learned.demonstrations),
         validation_seeds=tuple(item.seed for item in held_out.demonstrations),
         method=arguments.method,
         preset=arguments.preset,
@@ -89,16 +92,22 @@ def main() -> int:
         learning_rate=arguments.learning_rate,
         decay=arguments.decay,
         taken_only=arguments.taken_only,
-        rigid=arguments.rigid,
+        # The Transporter turns whole images: it has no crop in which to bend a tool.
+        rigid=arguments.rigid or arguments.method == "transporter",
         validate_every=arguments.validate_every,
         seed=arguments.seed,
+        device="cuda" if torch.cuda.is_available() else "cpu",
+        compute_type=str(preferred_type()).removeprefix("torch."),
     )
     folder = require_folder(
-        arguments.output or Path("output") / f"{demonstrations.origin.scenario_name}-training"
+        arguments.output or Path("output") / f"{learned.origin.scenario_name}-training"
     )
     run = _Run(settings, learned, held_out, folder, console)
     with alone_in(folder):
-        claim_folder(folder, "settings.json", dataclasses.asdict(settings), of="training run")
+        # Scenarios of one name may differ, and with them what the same seeds give.
+        origins = [item.origin.scenario for item in (learned, held_out)]
+        described = {**dataclasses.asdict(settings), "origins": origins}
+        claim_folder(folder, "settings.json", described, of="training run")
         run.train()
     console.print(f"files: {folder}/", highlight=False)
     return 0
@@ -113,13 +122,17 @@ def _parse() -> argparse.Namespace:
         "--demos", type=Path, required=True, metavar="FILE.h5", help="what to learn from"
     )
     parser.add_argument(
-        "--demonstrations", type=count_type, metavar="N", help="how many of them (all)"
+        "--demonstrations",
+        type=count_type,
+        metavar="N",
+        help="learn from the first N (all, but for those to validate by)",
     )
     parser.add_argument(
         "--validation",
         type=Path,
         metavar="FILE.h5",
-        help="demonstrations to choose a checkpoint by (default: a tenth of --demos is held out)",
+        help="demonstrations to choose a checkpoint by (default: those of --demos that come after "
+        "the ones learned from, a tenth as many)",
     )
     parser.add_argument("--method", choices=METHODS, default="so2")
     parser.add_argument("--preset", choices=PRESETS, default="small", help="size of the networks")
@@ -138,7 +151,8 @@ def _parse() -> argparse.Namespace:
     parser.add_argument(
         "--rigid",
         action="store_true",
-        help="as the paper: augment by motions of the whole scene only, not also by bent tools",
+        help="as the paper: augment by motions of the whole scene only, not also by bent tools "
+        "(always so with transporter)",
     )
     parser.add_argument(
         "--validate-every", type=count_type, default=500, metavar="STEPS", help="(500)"
@@ -160,31 +174,37 @@ def _rate_type(text: str) -> float:
 
 
 def _split(
-    demonstrations: Demonstrations, path: Path, validation: Path | None
+    path: Path, count: int | None, validation: Path | None
 ) -> tuple[Demonstrations, Demonstrations]:
     """What to learn from, and what to validate by."""
-    items = demonstrations.demonstrations
+    everything = read_demonstrations(path)
+    items = everything.demonstrations
     if not items:
         raise UserError(f"{path} holds no demonstrations: collect some")
+    if count is None:
+        count = len(items) if validation else len(items) - max(1, len(items) // 11)
+    if len(items) < count:
+        raise UserError(f"{path} holds {len(items)} demonstrations, not {count}: collect more")
+    learned = dataclasses.replace(everything, demonstrations=items[:count])
     if validation is None:
-        count = max(1, len(items) // 10)
-        if len(items) < 2:
-            raise UserError("one demonstration leaves none to validate by: give --validation")
-        return (
-            dataclasses.replace(demonstrations, demonstrations=items[:-count]),
-            dataclasses.replace(demonstrations, demonstrations=items[-count:]),
-        )
+        kept = items[count : count + max(1, count // 10)]
+        if not kept or not count:
+            raise UserError(
+                f"of {len(items)} in {path}, {count} to learn from leave none to validate by: "
+                "collect more, or give --validation"
+            )
+        return learned, dataclasses.replace(everything, demonstrations=kept)
     held_out = read_demonstrations(validation)
     if not held_out.demonstrations:
         raise UserError(f"{validation} holds no demonstrations: collect some")
-    shared = {item.seed for item in held_out.demonstrations} & {item.seed for item in items}
-    if shared and held_out.origin.scenario == demonstrations.origin.scenario:
+    shared = {item.seed for item in held_out.demonstrations} & {item.seed for item in items[:count]}
+    if shared and held_out.origin.scenario == everything.origin.scenario:
         raise UserError(
             f"{validation} and {path} share the seed {min(shared)}: validation needs other ones"
         )
-    if held_out.origin.grid != demonstrations.origin.grid:
+    if held_out.origin.grid != everything.origin.grid:
         raise UserError(f"{validation} and {path} have different pixel grids")
-    return demonstrations, held_out
+    return learned, held_out
 
 
 class _Run:
@@ -199,6 +219,7 @@ class _Run:
         console: Console,
     ) -> None:
         self.settings, self.folder, self.console = settings, folder, console
+        self._log = folder / "log.jsonl"
         self.grid = demonstrations.origin.grid
         learned = scenes(demonstrations.demonstrations, self.grid)
         self.validation_scenes = _spread_out(scenes(held_out.demonstrations, self.grid))
@@ -215,7 +236,7 @@ class _Run:
             networks.check_orientations(settings.orientations)
         except ValueError as error:
             raise UserError(f"--orientations {settings.orientations}: {error}") from error
-        networks.to("cuda" if torch.cuda.is_available() else "cpu")
+        networks.to(settings.device)
         networks.compute_type = preferred_type()
         self.trainer = Trainer(
             networks,
@@ -228,18 +249,8 @@ class _Run:
         self.best: dict[str, Any] | None = None
         self.seconds = 0.0
         self.card = {
-            "scenario": demonstrations.origin.scenario_name,
-            "demonstrations": settings.demonstrations,
-            "demonstration_seeds": [item.seed for item in demonstrations.demonstrations],
-            "validation_seeds": [item.seed for item in held_out.demonstrations],
+            **dataclasses.asdict(settings),
             "samples": len(self.samples),
-            "steps": settings.steps,
-            "learning_rate": settings.learning_rate,
-            "decay": settings.decay,
-            "taken_only": settings.taken_only,
-            "rigid": settings.rigid,
-            "seed": settings.seed,
-            "compute_type": str(networks.compute_type).removeprefix("torch."),
             "torch": torch.__version__,
         }
 
@@ -296,7 +307,7 @@ class _Run:
                     recent.clear()
                     for name, value in means.items():
                         writer.add_scalar(f"loss/{name}", value, step)
-                    self._append({"step": step, **means})
+                    append_line(self._log, {"step": step, **means})
                     self.seconds = time.perf_counter() - start
                     self._save()
         self._summarise()
@@ -314,13 +325,13 @@ class _Run:
             self.best = chosen
             card = {**self.card, "validation": chosen}
             save_weights(self.folder / "policy.safetensors", networks, card)
-        self._append(chosen)
+        append_line(self._log, chosen)
         return report
 
     def _resume(self) -> None:
         path = self.folder / "checkpoint.pt"
         if not path.exists():
-            (self.folder / "log.jsonl").unlink(missing_ok=True)
+            self._log.unlink(missing_ok=True)
             return
         try:
             state = torch.load(path, map_location=self.trainer.networks.device, weights_only=True)
@@ -328,26 +339,14 @@ class _Run:
             self.best, self.seconds = state["best"], state["seconds"]
         except _DAMAGED as error:
             raise UserError(f"{path} cannot be taken up again: delete {self.folder}") from error
-        kept = [line for line in self._lines() if line["step"] <= self.trainer.step_count]
-        write_whole(self.folder / "log.jsonl", "".join(json.dumps(line) + "\n" for line in kept))
+        kept = [line for line in read_lines(self._log) if line["step"] <= self.trainer.step_count]
+        write_whole(self._log, "".join(json.dumps(line) + "\n" for line in kept))
 
     def _save(self) -> None:
         buffer = io.BytesIO()
         state = {"trainer": self.trainer.state_dict(), "best": self.best, "seconds": self.seconds}
         torch.save(state, buffer)
         write_whole(self.folder / "checkpoint.pt", buffer.getvalue())
-
-    def _append(self, line: dict[str, Any]) -> None:
-        with (self.folder / "log.jsonl").open("a") as file:
-            file.write(json.dumps(line) + "\n")
-
-    def _lines(self) -> Iterator[dict[str, Any]]:
-        path = self.folder / "log.jsonl"
-        if path.exists():
-            content = path.read_text()
-            # A line that was being written when the process was killed has no end.
-            for line in content[: content.rfind("\n") + 1].splitlines():
-                yield json.loads(line)
 
 
 def _spread_out(observed: list[Scene]) -> list[Scene]:

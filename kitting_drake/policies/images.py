@@ -64,9 +64,9 @@ class LabelledImage:
     def bent_crop(self, index: int, pixel: tuple[int, int], side: int) -> Image:
         """(channels, side, side) around a pixel near pick 0 or one of the others, its object bent.
 
-        A bend (a, b) moves what lies at u along the gripper, in half sides of the crop from the
-        pick, by a u^2 + b u^3 half sides across it. At the pick nothing moves and nothing turns:
-        the label stays exact, while the object's far ends say less about it.
+        Under a bend (a, b) what is seen at u along the gripper, in half sides of the crop from the
+        pick, lay a u^2 + b u^3 half sides further across it. At the pick nothing moves and nothing
+        turns: the label stays exact, while the object's far ends say less about it.
         """
         reach = side // 2
         picks = np.vstack([self.pick, self.other_picks])

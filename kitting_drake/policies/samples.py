@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from kitting_drake.policies.config import NetworkConfig
 from kitting_drake.policies.demonstrations import Demonstration
@@ -68,12 +70,24 @@ def labelled_images(observed: Iterable[Scene], *, taken_only: bool) -> list[Labe
 
 def normalisation(observed: list[Scene]) -> dict[str, float]:
     """The fields of a `NetworkConfig` that say how its inputs are distributed."""
-    colours = np.stack([scene.image[:3] for scene in observed])
-    heights = np.stack([scene.image[3] for scene in observed])
+    colour, colour_deviation = _moments(scene.image[:3] for scene in observed)
+    height, height_deviation = _moments(scene.image[3] for scene in observed)
     default = NetworkConfig()
     return {
-        "colour_mean": float(colours.mean()),
-        "colour_deviation": float(colours.std()) or default.colour_deviation,
-        "height_mean": float(heights.mean()),
-        "height_deviation": float(heights.std()) or default.height_deviation,
+        "colour_mean": colour,
+        "colour_deviation": colour_deviation or default.colour_deviation,
+        "height_mean": height,
+        "height_deviation": height_deviation or default.height_deviation,
     }
+
+
+def _moments(images: Iterable[NDArray[np.float32]]) -> tuple[float, float]:
+    """Mean and standard deviation of all pixels of some images of one shape, one in memory."""
+    means, squares = [], []
+    for image in images:
+        means.append(image.mean(dtype=float))
+        squares.append(np.square(image, dtype=float).mean())
+    mean = float(np.mean(means))
+    variance = float(np.mean(squares)) - mean**2
+    # Of pixels that are all alike, rounding is left over.
+    return mean, math.sqrt(variance) if variance > 1e-12 else 0.0

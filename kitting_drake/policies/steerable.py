@@ -5,8 +5,9 @@ nonlinearity needs on either side are folded into it,
 
     kernel' = synthesis_out . kernel . analysis_in,
 
-so that samples travel between layers, ELU acts on them directly, and no transform ever runs on a
-feature map: the same function as escnn's R2Conv followed by FourierELU, of the same weights.
+so that samples travel between layers and ELU acts on them directly, without a transform of the
+feature map around it: the same function as escnn's R2Conv followed by FourierELU, of the same
+weights.
 """
 
 from __future__ import annotations
@@ -216,7 +217,7 @@ def kernel_basis(in_fibre: Fibre, out_fibre: Fibre, size: int) -> Tensor:
 
 def frequencies_cutoff(in_fibre: Fibre, out_fibre: Fibre, size: int) -> float | None:
     """How many times a ring's radius the angular frequency of its kernels may be; None: escnn's own
-    choice, about once.
+    choice.
 
     A kernel of frequency k leads from rho_i to rho_j with j up to i + k: where escnn's choice would
     leave the highest frequencies of the answer zero for ever, just as much as these need of the

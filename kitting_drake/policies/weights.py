@@ -158,7 +158,8 @@ def _read(path: Path, *, tensors: bool) -> tuple[dict[str, str], dict[str, Tenso
     try:
         with safe_open(path, framework="pt") as file:
             metadata = file.metadata() or {}
-            content = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - it is no dict if tensors else {}
+            names = file.keys() if tensors else []
+            content = {name: file.get_tensor(name) for name in names}
     except (OSError, SafetensorError) as error:
         reason = getattr(error, "strerror", None) or "it is not a whole safetensors file"
         if isinstance(error, FileNotFoundError):

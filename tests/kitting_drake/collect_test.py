@@ -399,7 +399,10 @@ def test_killed_again_and_again_it_collects_what_it_would_have(verb, tmp_path: P
         process.wait()
     done = verb("collect", scenario, "--demos", 30, "--workers", 1, "--output", killed)
     assert done.returncode == 0, done.stderr
-    assert sorted(item.name for item in killed.iterdir()) == ["demonstrations.h5", "scenario.json"]
+    assert sorted(item.name for item in killed.glob("[!.]*")) == [
+        "demonstrations.h5",
+        "scenario.json",
+    ]
     assert content(killed) == content(whole)
     read = read_demonstrations(killed / "demonstrations.h5")
     assert [item.seed for item in read.demonstrations] == list(range(10000, 10030))

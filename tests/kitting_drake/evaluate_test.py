@@ -17,6 +17,7 @@ from kitting_drake.cli import ChosenScenario
 from kitting_drake.episode import EpisodeResult
 from kitting_drake.errors import UserError
 from kitting_drake.files import alone_in
+from kitting_drake.processes import Died
 from kitting_drake.scenario import Learned, Scenario
 from kitting_drake.summary import Episode
 
@@ -81,7 +82,7 @@ def test_two_do_not_evaluate_into_one_folder(tmp_path: Path, monkeypatch: pytest
 
 
 def die(chosen: ChosenScenario, seed: int) -> None:
-    os.kill(os.getpid(), signal.SIGKILL)
+    os.kill(os.getpid(), signal.SIGSEGV)
 
 
 def test_an_episode_whose_process_dies_is_a_failed_one(monkeypatch: pytest.MonkeyPatch):
@@ -90,7 +91,16 @@ def test_an_episode_whose_process_dies_is_a_failed_one(monkeypatch: pytest.Monke
     assert lost.keys() == {field.name for field in dataclasses.fields(EpisodeResult)}
     assert lost["seed"] == 7
     assert lost["success_rate"] == 0.0
-    assert str(-signal.SIGKILL) in lost["failure"]
+    assert str(-signal.SIGSEGV) in lost["failure"]
+
+
+def test_what_something_else_killed_is_given_a_second_chance(monkeypatch: pytest.MonkeyPatch):
+    killed, lost = Died(-signal.SIGKILL), fake_run(CHOSEN, 7)
+    answers = [killed, lost, killed, killed]
+    monkeypatch.setattr(evaluation, "run_apart", lambda *_: answers.pop(0))
+    assert evaluation._run_apart(CHOSEN, 7) == lost
+    with pytest.raises(UserError, match="seed 7 was killed twice, perhaps for want of memory"):
+        evaluation._run_apart(CHOSEN, 7)
 
 
 def test_two_short_episodes_side_by_side(verb, tmp_path: Path):

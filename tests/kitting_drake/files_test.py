@@ -4,7 +4,14 @@ from pathlib import Path
 import pytest
 
 from kitting_drake.errors import UserError
-from kitting_drake.files import require_folder, write_json, write_whole
+from kitting_drake.files import (
+    alone_in,
+    append_line,
+    read_lines,
+    require_folder,
+    write_json,
+    write_whole,
+)
 
 
 def test_writes_and_replaces_in_a_new_folder(tmp_path: Path):
@@ -35,3 +42,25 @@ def test_a_folder_that_cannot_be_is_told_before_the_run(tmp_path: Path):
     (tmp_path / "file").write_text("")
     with pytest.raises(UserError, match=r"cannot write into .*/file/out: Not a directory"):
         require_folder(tmp_path / "file" / "out")
+
+
+def test_only_another_process_in_the_folder_is_told_of(tmp_path: Path):
+    told = pytest.raises(UserError, match="another process is at work")
+    with alone_in(tmp_path), told, alone_in(tmp_path):
+        pass
+    # What goes wrong inside is not taken for it.
+    with pytest.raises(BlockingIOError), alone_in(tmp_path):
+        raise BlockingIOError
+    with alone_in(tmp_path):
+        pass
+
+
+def test_a_line_that_was_being_written_is_cut_off(tmp_path: Path):
+    path = tmp_path / "lines.jsonl"
+    assert read_lines(path) == []
+    append_line(path, {"seed": 1})
+    with path.open("a") as file:
+        file.write('{"seed": 2, "s')
+    assert read_lines(path) == [{"seed": 1}]
+    append_line(path, {"seed": 3})
+    assert read_lines(path) == [{"seed": 1}, {"seed": 3}]

@@ -92,6 +92,7 @@ def log(folder: Path) -> list[dict[str, Any]]:
 
 def test_leaves_a_policy_and_what_it_comes_from(trained: Path):
     assert sorted(path.name for path in trained.iterdir()) == [
+        ".lock",
         "checkpoint.pt",
         "log.jsonl",
         "policy.safetensors",
@@ -103,6 +104,7 @@ def test_leaves_a_policy_and_what_it_comes_from(trained: Path):
     assert (file.config.method, file.config.preset) == ("so2", "tiny")
     assert file.card["scenario"] == "mine"
     # A tenth is held out, and one at least.
+    assert file.card["demonstrations"] == 3
     assert file.card["demonstration_seeds"] == [10, 11, 12]
     assert file.card["validation_seeds"] == [13]
     # Of the first observation of two, either object may be picked.
@@ -230,10 +232,7 @@ def refused(
     ("flags", "sentence"),
     [
         (("--demonstrations", 5), "demonstrations.h5 holds 4 demonstrations, not 5: collect more"),
-        (
-            ("--demonstrations", 1),
-            "one demonstration leaves none to validate by: give --validation",
-        ),
+        (("--demonstrations", 4), "4 to learn from leave none to validate by: collect more, or"),
         (("--orientations", 24), "--orientations 24: 24 orientations alias"),
         (("--orientations", 37), "--orientations 37: orientations must be an even number, not 37"),
         (("--validation", "gone.h5"), "there is no file gone.h5"),
@@ -272,13 +271,21 @@ def test_a_file_without_demonstrations_is_refused(tmp_path: Path, refused: Calla
     assert "empty.h5 holds no demonstrations" in refused(path, tmp_path / "run")
 
 
-@pytest.mark.parametrize("flags", [("--steps", 5), ("--seed", 1), ("--demonstrations", 3)])
+@pytest.mark.parametrize("flags", [("--steps", 5), ("--seed", 1), ("--demonstrations", 2)])
 def test_a_folder_of_another_run_is_refused(
     demos: Path, folder: Path, refused: Callable[..., str], flags: tuple
 ):
     before = (folder / "settings.json").read_bytes()
     assert f"{folder} holds the files of another training run" in refused(demos, folder, *flags)
     assert (folder / "settings.json").read_bytes() == before
+
+
+def test_what_the_same_seeds_gave_in_another_scenario_is_another_run(
+    folder: Path, tmp_path: Path, refused: Callable[..., str]
+):
+    origin = dataclasses.replace(ORIGIN, scenario={"time_limit": 2.0})
+    others = write(tmp_path / "others.h5", range(10, 14), origin)
+    assert f"{folder} holds the files of another training run" in refused(others, folder)
 
 
 def test_two_do_not_train_in_one_folder(demos: Path, folder: Path, refused: Callable[..., str]):
