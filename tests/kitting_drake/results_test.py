@@ -91,6 +91,23 @@ def test_the_most_tested_network_and_all_causes(folder: Path):
     ]
 
 
+@pytest.mark.parametrize("method", ["so2", "transporter"])
+@pytest.mark.parametrize(
+    ("continuous", "trained", "marks"), [(True, 180, " \\*"), (False, 36, " †")]
+)
+def test_marks_tell_how_a_run_departs(
+    folder: Path, method: str, continuous: bool, trained: int, marks: str
+):
+    summary = json.loads((folder / "ours.json").read_text())
+    summary["policy_details"] |= {
+        "method": method,
+        "continuous": continuous,
+        "trained_orientations": trained,
+    }
+    (folder / "ours.json").write_text(json.dumps(summary))
+    assert f"100.0 (91.2 to 100.0), 10{marks} |" in page(folder)
+
+
 def test_every_file_is_listed(folder: Path):
     files = tables(page(folder))[-1]
     assert [row[0] for row in files[1:]] == [
