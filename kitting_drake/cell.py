@@ -281,6 +281,7 @@ def _make_oracle(
                 X_WGoal=X_WGoal,
                 grasp=PlanarPose(tool.grasp.x, tool.grasp.y, tool.grasp.theta),
                 surface_height=tool.grasp.surface_height,
+                rim_height=scene.X_WKit.translation()[2] + scene.kit.parameters.height,
             )
             for tool, body, X_WGoal in zip(scene.tools, tools, scene.X_WGoals, strict=True)
         ],

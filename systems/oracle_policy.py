@@ -30,6 +30,8 @@ class OracleTarget:
     B's y."""
     surface_height: float
     """Height of the object's top at the grasp, above B's origin, in metres."""
+    rim_height: float | None = None
+    """See `PickPlaceAction`."""
 
 
 def gripper_pose(X_WB: RigidTransform, grasp: PlanarPose) -> PlanarPose:
@@ -134,6 +136,7 @@ class OraclePolicy(LeafSystem):
                     pick=pick,
                     place=place,
                     surface_height=X_WB.translation()[2] + target.surface_height,
+                    rim_height=target.rim_height,
                 )
             )
             return

@@ -7,7 +7,7 @@ from systems.bounds import bounded
 
 
 class Mode(enum.IntEnum):
-    """What the planner is doing. The order is the order of a successful pick and place."""
+    """What the planner is doing. The order to DONE is that of a successful pick and place."""
 
     OBSERVE = 0
     """Go home, out of the cameras' sight, come to rest, and ask the policy."""
@@ -28,6 +28,8 @@ class Mode(enum.IntEnum):
     RETREAT = 9
     """Straight up from where the hand is."""
     DONE = 10
+    SEARCH = 11
+    """Lowering was blocked: turn to and fro, lightly pressed down, and feel for the cavity."""
 
 
 @dataclass
@@ -77,6 +79,10 @@ class PickPlaceParameters:
     # Highest speed of the two guarded motions, in m/s.
     descend_speed: float = bounded(0.20, 0.005, 1.0)
     lower_speed: float = bounded(0.08, 0.005, 1.0)
+
+    # How far the hand turns to and fro where lowering is blocked, in rad: a tool that the closing
+    # jaws turned a little slips into its cavity then. At zero it is let go where it is.
+    search_turn: float = bounded(0.12, 0.0, 0.5)
 
     # Speed of one finger, in m/s.
     finger_speed: float = bounded(0.05, 0.005, 0.05)

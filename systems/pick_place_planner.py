@@ -1,5 +1,6 @@
 """The pick-and-place motion primitive: a state machine that makes smooth, limited motions."""
 
+import dataclasses
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -31,6 +32,7 @@ _FIELDS = (
     + [f"start_rate_{axis}" for axis in ("x", "y", "z", "yaw")]
     + ["start_opening", "goal_opening", "start_force", "goal_force"]
     + ["pick_x", "pick_y", "pick_yaw", "place_x", "place_y", "place_yaw", "grasp_z"]
+    + ["hold_z", "rim_height", "touch_z", "swing"]
     + ["load", "actions", "missed", "dropped"]
 )
 _PlannerState = namedview("PlannerState", _FIELDS)
@@ -38,6 +40,16 @@ _State: TypeAlias = Any
 """A `_PlannerState`, which is made at run time and is no type to a type checker."""
 
 _START, _GOAL, _START_RATE = slice(3, 7), slice(7, 11), slice(11, 15)
+
+_SUNK = 0.0007
+"""What is lowered and touches something is blocked unless it is this far below the rim, in m."""
+_PRESS = 0.001
+"""While searching, the hand is to be this far below where it was stopped, in m: its stiffness makes
+a light pressure of it."""
+_SWINGS = (0.5, -0.5, 1.0, -1.0, 0.0)
+"""Where the search turns to, in parts of `search_turn`."""
+_SWING_SPEED = 0.3
+"""In rad/s: the free space around a tool is about 3 degrees wide, and is not to be missed."""
 
 
 def nearest_turns(pick_yaw: float, place_yaw: float) -> tuple[float, float]:
@@ -87,7 +99,9 @@ class PickPlacePlanner(LeafSystem):
     ends, as short as the limits on speed and acceleration allow. The two guarded motions, `DESCEND`
     and `LOWER`, stop dead where the vertical contact force rises `contact_threshold` above what the
     load weighs, and hold the height reached: no known height of table, kit or cavity goes into
-    them. A grasp is good if the pads stand further apart than `minimum_width` and both feel at
+    them. Where the action says how high the rim of the cavity is, and the object comes to stand on
+    it, the hand feels for the cavity (`SEARCH`) and lowers again once the resistance ends. A grasp
+    is good if the pads stand further apart than `minimum_width` and both feel at
     least half of the grasp force; when it is not, or is lost on the way, the hand brakes, opens and
     goes home to look again, which counts as an action.
 
@@ -186,6 +200,7 @@ class PickPlacePlanner(LeafSystem):
             Mode.LIFT: self._hold,
             Mode.CARRY: self._hold,
             Mode.LOWER: self._lower,
+            Mode.SEARCH: self._search,
         }.get(mode, self._follow)
         if mode != Mode.DONE:
             step(context, state, time, hand, contact)
@@ -207,6 +222,9 @@ class PickPlacePlanner(LeafSystem):
         state.grasp_z = max(
             action.surface_height - self._parameters.grasp_depth, self._parameters.floor_clearance
         )
+        # No height is above NaN.
+        state.rim_height = np.nan if action.rim_height is None else action.rim_height
+        state.swing = 0
         state.actions += 1
         self._begin(state, Mode.APPROACH, time)
 
@@ -239,6 +257,7 @@ class PickPlacePlanner(LeafSystem):
         if time < self._arrival(state) + self._parameters.weigh_settle:
             return
         if self._is_held(hand, contact):
+            state.hold_z = hand[2]
             self._begin(state, Mode.LIFT, time)
         else:
             state.missed += 1
@@ -259,9 +278,34 @@ class PickPlacePlanner(LeafSystem):
             state.dropped += 1
             self._begin(state, Mode.RETREAT, time)
         elif contact[2] - state.load > self._parameters.contact_threshold:
-            self._begin(state, Mode.RELEASE, time, z=hand[2])
+            if self._is_blocked(state, hand):
+                state.touch_z = hand[2]
+                self._begin(state, Mode.SEARCH, time, z=hand[2])
+            else:
+                self._begin(state, Mode.RELEASE, time, z=hand[2])
         elif time >= self._arrival(state):
             self._begin(state, Mode.RELEASE, time)
+
+    def _search(self, context, state, time, hand, contact) -> None:
+        free = contact[2] - state.load < self._parameters.contact_threshold / 2
+        if not self._is_held(hand, contact):
+            state.dropped += 1
+            self._begin(state, Mode.RETREAT, time)
+        elif free and hand[2] < state.touch_z - _PRESS / 2:
+            # Given a height, it stops dead: here the object fits.
+            self._begin(state, Mode.LOWER, time, z=hand[2])
+        elif time >= self._arrival(state):
+            state.swing += 1
+            if state.swing < len(_SWINGS):
+                self._begin(state, Mode.SEARCH, time)
+            else:
+                self._begin(state, Mode.RELEASE, time, z=hand[2])
+
+    def _is_blocked(self, state: _State, hand: NDArray[np.float64]) -> bool:
+        # When it was grasped, it lay on the table.
+        bottom = hand[2] - state.hold_z
+        left = state.swing < len(_SWINGS) and self._parameters.search_turn > 0
+        return bool(left and bottom > state.rim_height - _SUNK)
 
     def _is_held(self, hand: NDArray[np.float64], contact: NDArray[np.float64]) -> bool:
         # Contact pushes the fingers apart: along their positive axes.
@@ -323,6 +367,9 @@ class PickPlacePlanner(LeafSystem):
             state[_GOAL] = (state.place_x, state.place_y, parameters.travel_height, state.place_yaw)
         elif mode == Mode.LOWER:
             state.goal_z = parameters.floor_clearance
+        elif mode == Mode.SEARCH:
+            state.goal_yaw = state.place_yaw + _SWINGS[int(state.swing)] * parameters.search_turn
+            state.goal_z = state.touch_z - _PRESS
         elif mode in (Mode.RELEASE, Mode.RETREAT):
             state.goal_force = 0.0
             state.goal_opening = min(
@@ -359,6 +406,9 @@ def _motions(parameters: PickPlaceParameters) -> dict[Mode, MotionLimits]:
         parameters.descend_speed, parameters.linear_acceleration, *yaw
     )
     limits[Mode.LOWER] = MotionLimits(parameters.lower_speed, parameters.carry_acceleration, *yaw)
+    limits[Mode.SEARCH] = dataclasses.replace(
+        limits[Mode.LOWER], yaw_speed=min(_SWING_SPEED, parameters.yaw_speed)
+    )
     return limits
 
 

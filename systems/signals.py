@@ -128,6 +128,9 @@ class PickPlaceAction:
     place: PlanarPose = field(default_factory=PlanarPose)
     surface_height: float = 0.0
     """World z of what lies under the pick point, in metres: how high the grasp starts."""
+    rim_height: float | None = None
+    """World z of what is around the place, a kit's top, in metres; None: unknown. What is let down
+    on it has not found its cavity."""
     stop: bool = False
     """True: there is nothing left to do, and the poses mean nothing."""
 

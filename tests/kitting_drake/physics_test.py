@@ -8,9 +8,12 @@ import pytest
 from pydrake.math import RigidTransform, RollPitchYaw
 from pydrake.systems.analysis import Simulator
 
+import kitting_drake.cell
 from kitting_drake.cell import Cell, build_cell
 from kitting_drake.episode import run_episode
 from kitting_drake.scenario import ArrangedKitting, Kitting, Placement, Scenario, Sleep
+from kitting_drake.tasks.kitting import KittingScene, make_scene
+from systems.pick_place_parameters import PickPlaceParameters
 
 pytestmark = pytest.mark.slow
 
@@ -105,3 +108,25 @@ def test_tools_in_their_cavities_do_not_creep():
         creep = np.linalg.norm(moved.multiply(points.T).T - points, axis=1).max()
         assert creep < 2e-4, name
     assert (table.add_s() < 1e-3).all()
+
+
+@pytest.mark.parametrize(("search_turn", "kitted"), [(0.0, False), (0.12, True)])
+def test_a_tool_that_the_closing_jaws_turned_is_turned_into_its_cavity(
+    search_turn: float, kitted: bool, monkeypatch: pytest.MonkeyPatch
+):
+    """The grasp is 5 degrees off: the jaws turn the tool by as much, and so it is lowered."""
+
+    def misjudged(*arguments, **more) -> KittingScene:
+        scene = make_scene(*arguments, **more)
+        (tool,) = scene.tools
+        grasp = dataclasses.replace(tool.grasp, theta=tool.grasp.theta + np.radians(5))
+        return dataclasses.replace(scene, tools=(dataclasses.replace(tool, grasp=grasp),))
+
+    monkeypatch.setattr(kitting_drake.cell, "make_scene", misjudged)
+    task = ArrangedKitting(tools={"s_wrench": Placement(x=0.36, y=0.3, yaw_deg=75.0)})
+    planner = PickPlaceParameters(search_turn=search_turn, max_actions=1)
+    cell = build_cell(Scenario(task=task, planner=planner), seed=0, base=Path())
+    result = run_episode(cell, scenario="", policy="", seed=0, time_limit=60.0)
+    assert result.success_rate == float(kitted)
+    if not kitted:
+        assert result.objects[0].cause == "jammed"

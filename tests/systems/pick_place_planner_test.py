@@ -21,7 +21,7 @@ GRASP_Z = 0.05 - PARAMETERS.grasp_depth
 WIDTH, WEIGHT = 0.02, 6.0
 NO_TOUCH = -1.0
 
-PICK_AND_PLACE = [mode for mode in Mode if mode != Mode.DONE]
+PICK_AND_PLACE = [mode for mode in Mode if mode < Mode.DONE]
 
 
 @dataclasses.dataclass
@@ -31,12 +31,14 @@ class World:
     Attributes:
         touch_pick: height in m at which something is touched on the pick side of the table.
         touch_place: likewise on the place side.
+        cavity: yaws between which, and the height at which, it is touched there instead.
         stiffness: of what is touched, in N/m.
         width: of what is between the pads, in m, by number of the attempt (from 1) and mode.
     """
 
     touch_pick: float = NO_TOUCH
     touch_place: float = 0.04
+    cavity: tuple[float, float, float] = (0.0, 0.0, 0.0)
     stiffness: float = 1e5
     width: Callable[[int, Mode], float] = lambda attempt, mode: WIDTH
 
@@ -79,7 +81,9 @@ class PerfectHand(LeafSystem):
         press = self._eval(context, "closing_force")[0]
         width = self._width(context)
         pad = 800 * (width - opening) / 2 + press if width > 0 and opening <= width else 0.0
-        side = self._world.touch_pick if q[1] > 0 else self._world.touch_place
+        first, last, floor = self._world.cavity
+        place = floor if first < q[3] < last else self._world.touch_place
+        side = self._world.touch_pick if q[1] > 0 else place
         touch = max(side - q[2], 0.0) * self._world.stiffness
         in_the_air = self._eval(context, "mode")[0] >= Mode.CARRY
         load = -WEIGHT if in_the_air and press > 0 and pad > 0 else 0.0
@@ -246,6 +250,53 @@ def test_lowering_over_nothing_ends_above_the_floor():
     assert run.output("desired_motion")[2] == pytest.approx(PARAMETERS.floor_clearance)
 
 
+RIM = 0.03
+ON_THE_RIM, IN_THE_CAVITY = GRASP_Z + RIM, GRASP_Z + RIM - 0.015
+OVER_A_CAVITY = dataclasses.replace(ACTION, rim_height=RIM)
+
+
+@pytest.mark.parametrize("offset", [-0.1, -0.05, 0.05, 0.1])
+def test_what_stands_on_the_rim_is_turned_into_its_cavity(offset: float):
+    yaw = PLACE.theta + offset
+    world = World(touch_place=ON_THE_RIM, cavity=(yaw - 0.02, yaw + 0.02, IN_THE_CAVITY))
+    run = Run(world, answer=OVER_A_CAVITY).until(Mode.RELEASE)
+    assert set(run.sequence[run.sequence.index(Mode.LOWER) :]) == {
+        Mode.LOWER,
+        Mode.SEARCH,
+        Mode.RELEASE,
+    }
+    assert run.sequence[-2] == Mode.LOWER
+    q = run.output("desired_motion")[:4]
+    assert q[2] == pytest.approx(IN_THE_CAVITY, abs=2e-3)
+    assert q[3] == pytest.approx(yaw, abs=0.025)
+    assert run.finish().counts == [1, 0, 0]
+
+
+def test_a_search_in_vain_ends_where_it_began():
+    run = Run(World(touch_place=ON_THE_RIM), answer=OVER_A_CAVITY).until(Mode.RELEASE)
+    assert run.sequence[-2] == Mode.SEARCH
+    q = run.output("desired_motion")[:4]
+    assert q[2] == pytest.approx(ON_THE_RIM, abs=2.5e-3)
+    assert q[3] == pytest.approx(PLACE.theta)
+    # Both ways, as far as it may.
+    yaws = run.log.FindLog(run.simulator.get_context()).data()[3] - PLACE.theta
+    searched = yaws[-(3 * 128) :]
+    assert searched.min() == pytest.approx(-PARAMETERS.search_turn, abs=1e-3)
+    assert run.finish().sequence[-1] == Mode.DONE
+
+
+@pytest.mark.parametrize(
+    ("touched", "rim", "turn"),
+    [(IN_THE_CAVITY, RIM, 0.12), (ON_THE_RIM, None, 0.12), (ON_THE_RIM, RIM, 0.0)],
+    ids=["in its cavity", "unknown rim", "not wanted"],
+)
+def test_nothing_is_searched_for(touched: float, rim: float | None, turn: float):
+    answer = dataclasses.replace(ACTION, rim_height=rim)
+    parameters = dataclasses.replace(PARAMETERS, search_turn=turn)
+    run = Run(World(touch_place=touched), answer=answer, parameters=parameters).finish()
+    assert run.sequence == [*PICK_AND_PLACE, Mode.OBSERVE, Mode.DONE]
+
+
 def test_descent_stops_where_something_is_touched():
     touched = GRASP_Z + 0.02
     run = Run(World(touch_pick=touched)).until(Mode.CLOSE)
@@ -266,6 +317,16 @@ def test_a_missed_grasp_is_counted_and_tried_again():
     missed = [*PICK_AND_PLACE[: PICK_AND_PLACE.index(Mode.CHECK) + 1], Mode.RETREAT]
     assert run.sequence == [*missed, *PICK_AND_PLACE, Mode.OBSERVE, Mode.DONE]
     assert run.counts == [2, 1, 0]
+
+
+def test_an_object_dropped_while_searching_is_counted():
+    def width(attempt: int, mode: Mode) -> float:
+        return 0.0 if attempt == 1 and mode == Mode.SEARCH else WIDTH
+
+    world = World(touch_place=ON_THE_RIM, width=width)
+    run = Run(world, answer=OVER_A_CAVITY).until(Mode.RETREAT)
+    assert run.sequence[-2:] == [Mode.SEARCH, Mode.RETREAT]
+    assert run.finish().counts == [1, 0, 1]
 
 
 @pytest.mark.parametrize("where", [Mode.LIFT, Mode.CARRY, Mode.LOWER])

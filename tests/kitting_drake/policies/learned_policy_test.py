@@ -15,7 +15,7 @@ from kitting_drake.policies.learned_policy import (
     LearnedPolicy,
     best_placement,
     expected_position,
-    surface_height,
+    highest_around,
 )
 from kitting_drake.policies.methods import make_networks
 from kitting_drake.policies.networks import Networks
@@ -171,7 +171,17 @@ def test_the_grasp_starts_at_the_highest_of_the_pixels_around_the_pick():
 def test_heights_at_the_edge_and_beyond(pixel: tuple[float, float], expected: float):
     height = np.zeros((4, 4), np.float32)
     height[0, 0], height[1, 3], height[3, 2] = 1, 5, 9
-    assert surface_height(height, np.array(pixel)) == expected
+    assert highest_around(height, np.array(pixel), 1) == expected
+
+
+def test_the_rim_is_the_highest_around_the_place():
+    seen = observation()
+    row, col = np.rint(GOAL).astype(int)
+    seen.height[row - 5, col + 6] = 0.04
+    seen.height[row - 9, col] = 0.1
+    assert decide(Known(), continuous=True, seen=seen).action.rim_height == pytest.approx(
+        0.04 + GRID.z_min
+    )
 
 
 @pytest.mark.parametrize(
