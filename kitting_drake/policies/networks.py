@@ -212,10 +212,6 @@ class SO2Networks(FactoredNetworks):
         self.phi = UNet(4, sizes.FEATURES, fibre, preset.unet, convolution)
         self.psi = UNet(4, sizes.FEATURES, fibre, preset.unet, convolution)
 
-    def angle_coefficients(self, image: Image, pixel: tuple[int, int]) -> Tensor:
-        """beta(c_1): (13,), the Fourier coefficients of the angle's logits."""
-        return self.beta(self.prepare(crop(image, pixel, sizes.PICK_CROP)))[0]
-
     def crop_angle_logits(self, crops: Tensor, orientations: int) -> Tensor:
         frequencies = self.config.angle_frequencies
         return discretize(self.beta(crops), orientations, frequencies, quotient=2)
@@ -224,7 +220,8 @@ class SO2Networks(FactoredNetworks):
         self, image: Image, pixel: tuple[int, int], orientations: int
     ) -> tuple[Tensor, float | None]:
         frequencies = self.config.angle_frequencies
-        coefficients = self.angle_coefficients(image, pixel)
+        # Computed once for both: (13,), the Fourier coefficients of the angle's logits.
+        coefficients = self.beta(self.prepare(crop(image, pixel, sizes.PICK_CROP)))[0]
         logits = discretize(coefficients, orientations, frequencies, quotient=2)
         return logits, series_maximum(coefficients.detach().double().cpu().numpy(), frequencies)
 
