@@ -64,7 +64,7 @@ PRESETS = {
     "tiny": Preset(
         unet=UNetSize(down=(2, 4, 4, 4, 4), up=(4, 4, 2, 2), head=4, skip=1),
         samples=8,
-        angle=AngleNetSize(stages=((4,), (6,), (6,), (6,)), kernel=3, readout=9, whole=True),
+        angle=AngleNetSize(stages=((4, 4), (6, 6), (6,)), kernel=3, readout=17, whole=True),
         angle_band=3,
         angle_samples=8,
         group_angle=AngleNetSize(stages=((1,), (2,), (2,), (2,)), kernel=3, readout=9, whole=True),

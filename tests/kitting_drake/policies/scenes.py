@@ -1,4 +1,4 @@
-"""Made-up scenes to learn: a blocky shape somewhere, and a cavity like it somewhere else."""
+"""Made-up scenes to learn: a tool of a few blocks, and a kit with a cavity like it."""
 
 import math
 
@@ -8,13 +8,22 @@ from numpy.typing import NDArray
 from kitting_drake.policies.config import NetworkConfig
 from kitting_drake.policies.images import LabelledImage, rotation
 
-SIDE = 81
+SIDE = 113
 ORIENTATIONS = 36
+ROOM = 8
+"""By how many pixels a scene may be shifted after any turn about its middle: nothing leaves it."""
 
-_CELL = 4.0
+_BLOCK = 4.0
 """Side of the blocks, in pixels."""
-_APART = 19
-"""Distance of the shape and of the cavity from the middle of the image, in pixels."""
+_APART = 22
+"""Distance of the tool and of the cavity from the middle of the image, in pixels."""
+_FINE = 4
+"""A pixel shows the mean of so many points along each side of it, as a camera's does."""
+
+_Blocks = frozenset[tuple[int, int]]
+_HANDLE: _Blocks = frozenset((i, 0) for i in range(-4, 1))
+_BESIDE: _Blocks = frozenset({(0, -1), (0, 1), (1, -1), (1, 1)})
+_KIT: _Blocks = frozenset((i, j) for i in range(-5, 4) for j in range(-3, 4))
 
 
 def config(method: str) -> NetworkConfig:
@@ -30,28 +39,35 @@ def config(method: str) -> NetworkConfig:
     )
 
 
-def scene(seed: int) -> LabelledImage:
-    """A scene: it may be turned about its middle by any angle, and nothing leaves it.
+def scene(seed: int, degrees: float = 0.0) -> LabelledImage:
+    """A scene, turned about its middle and then looked at: no image is turned.
 
-    The labels lie on pixels and bins. The shape is picked by one of its blocks, along its own
-    first axis, and goes into the cavity.
+    The tool is picked by its neck, along its handle. The labels of scenes that are not turned lie
+    on pixels and bins.
+
+    Args:
+        seed: of the tool and of where all lies.
+        degrees: counter-clockwise.
     """
     random = np.random.default_rng(seed)
-    cells = _shape(random)
-    height, colour = np.zeros((2, SIDE, SIDE))
+    tool = _tool(random)
     bins = random.integers(ORIENTATIONS, size=3)
     pick_angle, place_angle, at = bins * math.tau / ORIENTATIONS
-    offset = rotation(at) @ np.array([_APART, 0])
-    middle = np.full(2, (SIDE - 1) / 2)
-    pick, place = np.rint(middle + offset), np.rint(middle - offset)
+    offset = np.rint(rotation(at) @ np.array([_APART, 0]))
 
-    block = _filled(place, place_angle, {(i, j) for i in range(-3, 4) for j in range(-3, 4)})
-    cavity = _filled(place, place_angle, cells)
-    shape = _filled(pick, pick_angle, cells)
-    height[block & ~cavity], colour[block] = 0.03, 0.4
-    height[shape], colour[shape] = 0.02, 1.0
+    turn = math.radians(degrees)
+    middle = np.full(2, (SIDE - 1) / 2)
+    pick, place = middle + rotation(turn) @ offset, middle - rotation(turn) @ offset
+    pick_angle, place_angle = pick_angle + turn, place_angle + turn
+    height, colour = np.zeros((2, SIDE * _FINE, SIDE * _FINE))
+    kit, cavity = _filled(place, place_angle, _KIT), _filled(place, place_angle, tool)
+    height[kit & ~cavity], colour[kit] = 0.03, 0.4
+    seen = _filled(pick, pick_angle, tool)
+    height[seen], colour[seen] = 0.02, 1.0
+    points = np.stack([colour, colour, colour, height])
+    image = points.reshape(4, SIDE, _FINE, SIDE, _FINE).mean(axis=(2, 4))
     return LabelledImage(
-        image=np.stack([colour, colour, colour, height]).astype(np.float32),
+        image=image.astype(np.float32),
         pick=pick,
         pick_theta=float(pick_angle),
         place=place,
@@ -59,24 +75,22 @@ def scene(seed: int) -> LabelledImage:
     )
 
 
-def _shape(random: np.random.Generator) -> set[tuple[int, int]]:
-    """Seven blocks that hang together, around (0, 0), and look different after every turn."""
+def _tool(random: np.random.Generator) -> _Blocks:
+    """A handle, and a head of three blocks that tells left from right."""
+    beside = sorted(_BESIDE)
     while True:
-        cells = {(0, 0)}
-        while len(cells) < 7:
-            row, col = sorted(cells)[random.integers(len(cells))]
-            down, right = [(0, 1), (1, 0), (0, -1), (-1, 0)][random.integers(4)]
-            if max(abs(row + down), abs(col + right)) <= 2:
-                cells.add((row + down, col + right))
-        turned = {(-row, -col) for row, col in cells}
-        if len(cells & turned) <= 3:
-            return cells
+        chosen = random.choice(len(beside), 2, replace=False)
+        head = {beside[index] for index in chosen}
+        if head != {(row, -col) for row, col in head}:
+            return _HANDLE | head | {(1, 0)}
 
 
-def _filled(
-    centre: NDArray[np.float64], angle: float, cells: set[tuple[int, int]]
-) -> NDArray[np.bool_]:
-    """Which pixels lie in some blocks around a centre, turned."""
-    pixels = np.stack(np.meshgrid(np.arange(SIDE), np.arange(SIDE), indexing="ij"), axis=-1)
-    local = np.rint((pixels - centre) @ rotation(angle) / _CELL + 1e-9).astype(int)
-    return np.array([tuple(cell) in cells for cell in local.reshape(-1, 2)]).reshape(SIDE, SIDE)
+def _filled(centre: NDArray[np.float64], angle: float, blocks: _Blocks) -> NDArray[np.bool_]:
+    """(SIDE * _FINE, SIDE * _FINE): which points lie in some blocks around a centre, turned."""
+    points = (np.arange(SIDE * _FINE) + 0.5) / _FINE - 0.5
+    grid = np.stack(np.meshgrid(points, points, indexing="ij"), axis=-1)
+    row, col = np.rint((grid - centre) @ rotation(angle) / _BLOCK).astype(int).clip(-6, 6).T
+    inside = np.zeros((13, 13), bool)
+    for block in blocks:
+        inside[block[0] + 6, block[1] + 6] = True
+    return inside[row + 6, col + 6].T
