@@ -168,21 +168,23 @@ def _draw_pick_angle(axis: Any, measured: dict[str, Any], preset: str) -> None:
 def _draw_decisions(axis: Any, measured: dict[str, Any]) -> None:
     """A bar for each method and N, of the parts; a bar that is far too long is cut."""
     rows = [row for row in measured["decision"] if row["seconds"]]
-    ours = [row["seconds"] for row in rows if row["method"] != "transporter"]
-    limit = 1.35 * max(ours or [row["seconds"] for row in rows])
+    others = [row["seconds"] for row in rows if row["method"] != "transporter"]
+    # Leaves room for the legend.
+    limit = 1.5e3 * max(others or [row["seconds"] for row in rows])
     place, places, labels, groups = 0.0, [], [], {}
     for method in dict.fromkeys(row["method"] for row in rows):
         chosen = [row for row in rows if row["method"] == method]
         for row in chosen:
             bottom = 0.0
             for part, colour in _PARTS.items():
-                axis.bar(place, row["parts"][part], 0.8, bottom=bottom, color=colour)
-                bottom += row["parts"][part]
+                taken = 1e3 * row["parts"][part]
+                axis.bar(place, taken, 0.8, bottom=bottom, color=colour)
+                bottom += taken
             cut = bottom > limit
             axis.text(
                 place,
                 0.985 * limit if cut else bottom + 0.01 * limit,
-                seconds_text(row["seconds"]) + ("\n↑" if cut else ""),
+                f"{1e3 * row['seconds']:.0f}" + ("\n↑" if cut else ""),
                 horizontalalignment="center",
                 verticalalignment="top" if cut else "bottom",
                 color="white" if cut else "black",
@@ -205,12 +207,12 @@ def _draw_decisions(axis: Any, measured: dict[str, Any]) -> None:
             verticalalignment="top",
         )
     axis.set_ylim(0.0, limit)
-    axis.set_ylabel("seconds")
+    axis.set_ylabel("milliseconds")
     axis.grid(True, axis="y")
     axis.set_title(f"A whole decision at N orientations, preset {measured['preset']}")
     handles = [axis.bar(0, 0, color=colour) for colour in _PARTS.values()]
     names = [part.replace("_", " ") for part in _PARTS]
-    axis.legend(handles, names, loc="upper left", ncols=len(names), fontsize=8, columnspacing=1.0)
+    axis.legend(handles, names, loc="upper left", ncols=3, fontsize=8, columnspacing=1.0)
 
 
 def _draw_folding(axis: Any, measured: dict[str, Any]) -> None:
