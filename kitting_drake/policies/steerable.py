@@ -203,13 +203,10 @@ def kernel_basis(in_fibre: Fibre, out_fibre: Fibre, size: int) -> Tensor:
         initialize=False,
         frequencies_cutoff=frequencies_cutoff(in_fibre, out_fibre, size),
     )
-    kernels = []
     with torch.no_grad():
-        for index in range(convolution.weights.numel()):
-            convolution.weights.zero_()
-            convolution.weights[index] = 1
-            kernels.append(convolution.expand_parameters()[0].double())
-    stack = torch.stack(kernels)
+        # A kernel for each unit vector of weights.
+        units = torch.eye(convolution.weights.numel())
+        stack = torch.vmap(convolution.basisexpansion)(units).unflatten(-1, (size, size)).double()
     synthesis = torch.from_numpy(out_fibre.synthesis())
     analysis = torch.from_numpy(in_fibre.analysis())
     return torch.einsum("ms,dstxy,tn->dmnxy", synthesis, stack, analysis).contiguous()

@@ -84,7 +84,8 @@ def test_learns_by_heart_and_perhaps_more(method: str, steps: int, monkeypatch: 
     elif method == "equivariant_transporter":
         # C_6 has half turns, but no quarter turns.
         assert half.max() < 0.01 < quarter.max()
-        assert not right.all()
+        assert right.mean() < 0.6
     else:
-        assert not right.any()
+        # Picking looks at the image from N sides; placing knows only what it was shown.
+        assert right.mean() < 0.4
         assert (quarter > 1).any(axis=1).all() and (half > 1).any(axis=1).all()
