@@ -88,4 +88,4 @@ def test_learns_by_heart_and_perhaps_more(method: str, steps: int, monkeypatch: 
     else:
         # Picking looks at the image from N sides; placing knows only what it was shown.
         assert right.mean() < 0.4
-        assert (quarter > 1).any(axis=1).all() and (half > 1).any(axis=1).all()
+        assert min(quarter.max(), half.max()) > 5
