@@ -11,7 +11,7 @@ from kitting_drake.policies.images import LabelledImage, rotation
 SIDE = 113
 ORIENTATIONS = 36
 ROOM = 8
-"""By how many pixels a scene may be shifted after any turn about its middle: nothing leaves it."""
+"""By how many pixels a scene may be shifted, however turned: at most the tip of a corner leaves."""
 
 _BLOCK = 4.0
 """Side of the blocks, in pixels."""
@@ -22,7 +22,7 @@ _FINE = 4
 
 _Blocks = frozenset[tuple[int, int]]
 _HANDLE: _Blocks = frozenset((i, 0) for i in range(-4, 1))
-_BESIDE: _Blocks = frozenset({(0, -1), (0, 1), (1, -1), (1, 1)})
+_BESIDE = ((0, -1), (0, 1), (1, -1), (1, 1))
 _KIT: _Blocks = frozenset((i, j) for i in range(-5, 4) for j in range(-3, 4))
 
 
@@ -77,10 +77,9 @@ def scene(seed: int, degrees: float = 0.0) -> LabelledImage:
 
 def _tool(random: np.random.Generator) -> _Blocks:
     """A handle, and a head of three blocks that tells left from right."""
-    beside = sorted(_BESIDE)
     while True:
-        chosen = random.choice(len(beside), 2, replace=False)
-        head = {beside[index] for index in chosen}
+        chosen = random.choice(len(_BESIDE), 2, replace=False)
+        head = {_BESIDE[index] for index in chosen}
         if head != {(row, -col) for row, col in head}:
             return _HANDLE | head | {(1, 0)}
 
