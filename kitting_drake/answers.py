@@ -55,7 +55,8 @@ class ActionRecord:
     pick_angle_error_deg: float
     """Likewise, half turns being the same: 0 to 90."""
     place_position_error_mm: float
-    """How far from its goal the action would bring the object as it lay before the pick."""
+    """How far from its goal the action would bring the middle of the object as it lay before the
+    pick."""
     place_angle_error_deg: float
     """Likewise, 0 to 180: beyond 90 the object would arrive the wrong way round."""
 
@@ -69,6 +70,7 @@ class ActionRecorder:
             cell: the cell that the episode runs.
         """
         self._cell = cell
+        self._middles = [goal.p_BMiddle for goal in cell.monitor.goals]
         self._mode = Mode.OBSERVE
         self._before: list[RigidTransform] = []
         self.records: list[ActionRecord] = []
@@ -123,7 +125,7 @@ class ActionRecorder:
             place=place,
             pick_position_error_mm=1e3 * math.hypot(pick.x - best.x, pick.y - best.y),
             pick_angle_error_deg=math.degrees(abs(turned_jaws)),
-            place_position_error_mm=1e3 * _gap(arrival, X_WGoal, np.zeros(3)),
+            place_position_error_mm=1e3 * _gap(arrival, X_WGoal, self._middles[index]),
             place_angle_error_deg=math.degrees(
                 abs(wrap_to_pi(heading(arrival) - heading(X_WGoal)))
             ),
@@ -174,17 +176,22 @@ def find_cause(
 
     X_WGoal = scene.X_WGoals[index]
     turn = abs(wrap_to_pi(heading(X_WB) - heading(X_WGoal)))
+    middles = [goal.p_BMiddle for goal in cell.monitor.goals]
     grasp_point = np.array([tool.grasp.x, tool.grasp.y, 0.0])
-    # A half turn about the grasp leaves the grasp where it was and takes the origin away.
-    if min(_gap(X_WB, X_WGoal, np.zeros(3)), _gap(X_WB, X_WGoal, grasp_point)) < _NEAR:
+    # A half turn about the grasp leaves the grasp where it was and takes the middle away.
+    if min(_gap(X_WB, X_WGoal, middles[index]), _gap(X_WB, X_WGoal, grasp_point)) < _NEAR:
         if turn > math.pi - _ALIGNED or _tilt(X_WB) > _TILTED:
             return "flipped"
         if turn < _ALIGNED:
             return "jammed"
     if last.outcome == "dropped":
         return "slipped"
-    others = [goal for other, goal in enumerate(scene.X_WGoals) if other != index]
-    if any(_lies_along(X_WB, goal) for goal in others):
+    p_WMiddle = X_WB @ middles[index]
+    if any(
+        np.linalg.norm((p_WMiddle - X_WOther @ middle)[:2]) < _NEAR and _is_along(X_WB, X_WOther)
+        for other, (X_WOther, middle) in enumerate(zip(scene.X_WGoals, middles, strict=True))
+        if other != index
+    ):
         return "wrong cavity"
     meant_well = (
         last.place_position_error_mm < 1e3 * _NEAR
@@ -203,10 +210,9 @@ def _tilt(X_WB: RigidTransform) -> float:
     return math.acos(np.clip(X_WB.rotation().matrix()[2, 2], -1.0, 1.0))
 
 
-def _lies_along(X_WB: RigidTransform, X_WGoal: RigidTransform) -> bool:
-    """Whether a body is over a cavity, either way round."""
-    turn = abs(wrap_to_pi(2 * (heading(X_WB) - heading(X_WGoal)))) / 2
-    return _gap(X_WB, X_WGoal, np.zeros(3)) < _NEAR and turn < _ALIGNED
+def _is_along(X_WB: RigidTransform, X_WGoal: RigidTransform) -> bool:
+    """Whether a body lies along a cavity, either way round."""
+    return abs(wrap_to_pi(2 * (heading(X_WB) - heading(X_WGoal)))) / 2 < _ALIGNED
 
 
 def _is_over_kit(cell: Cell, X_WB: RigidTransform) -> bool:

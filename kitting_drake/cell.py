@@ -39,6 +39,7 @@ from kitting_drake.cameras import (
     picture_camera,
 )
 from kitting_drake.errors import UserError
+from kitting_drake.files import require_folder
 from kitting_drake.looking import Watch, make_function
 from kitting_drake.paths import MODELS
 from kitting_drake.scenario import Heightmap, Learned, PythonPolicy, QuantisedOracle, Scenario
@@ -153,7 +154,7 @@ def build_cell(
         projector = _add_cameras(builder, scenario, scene_graph, grid)
         builder.ExportOutput(projector.GetOutputPort("observation"), "observation")
     if isinstance(scenario.policy, Learned | PythonPolicy):
-        function = make_function(scenario.policy, base=base, watch=watch)
+        function = make_function(scenario.policy, base=base, grid=grid, watch=watch)
         policy = builder.AddNamedSystem("policy", PickPlacePolicy(policy=function))
         builder.Connect(projector.GetOutputPort("observation"), policy.GetInputPort("observation"))
     else:
@@ -391,7 +392,7 @@ def _add_video(builder: DiagramBuilder, scene_graph: SceneGraph, path: Path) -> 
         ),
     )
     builder.Connect(scene_graph.get_query_output_port(), sensor.query_object_input_port())
-    path.parent.mkdir(parents=True, exist_ok=True)
+    require_folder(path.parent)
     writer = builder.AddNamedSystem("video_writer", VideoWriter(filename=str(path), fps=16.0))
     writer.ConnectRgbdSensor(builder=builder, sensor=sensor)
     return writer

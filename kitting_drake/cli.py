@@ -2,12 +2,16 @@
 
 import argparse
 import dataclasses
+import importlib.metadata
 import json
+import platform
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from pydrake.geometry import Meshcat
 
+import kitting_drake
 from kitting_drake.cell import Cell, build_cell
 from kitting_drake.errors import UserError
 from kitting_drake.looking import Watch
@@ -71,7 +75,8 @@ def choose_scenario(arguments: argparse.Namespace) -> ChosenScenario:
         UserError: it cannot be used.
     """
     path: Path = arguments.scenario
-    if not path.exists() and not path.is_absolute() and (SCENARIOS / path.name).is_file():
+    by_name = path.parent in (Path(), Path(SCENARIOS.name))
+    if by_name and not path.exists() and (SCENARIOS / path.name).is_file():
         # An installed wheel carries its scenarios; `scenarios/x.yaml` means them anywhere.
         path = SCENARIOS / path.name
     name: str | None = arguments.scenario_name
@@ -106,6 +111,16 @@ def build_chosen(
         )
     except UserError as error:
         raise UserError(f"{chosen.path}: {error}") from error
+
+
+def versions() -> dict[str, str]:
+    """Of what results depend on: of this package, and of what it stands on."""
+    return {
+        "kitting_drake": kitting_drake.__version__,
+        "drake": importlib.metadata.version("drake"),
+        "numpy": np.__version__,
+        "python": platform.python_version(),
+    }
 
 
 def output_folder(arguments: argparse.Namespace, name: str) -> Path:

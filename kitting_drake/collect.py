@@ -2,12 +2,10 @@
 
 import contextlib
 import dataclasses
-import importlib.metadata
 import itertools
 import json
 import math
 import os
-import platform
 import time
 from collections.abc import Callable, Container, Iterable, Sized
 from pathlib import Path
@@ -16,7 +14,6 @@ import numpy as np
 from pydrake.systems.framework import Context
 from rich.console import Console
 
-import kitting_drake
 from kitting_drake.cameras import require_rendering
 from kitting_drake.cell import Cell, make_grid
 from kitting_drake.cli import (
@@ -25,6 +22,7 @@ from kitting_drake.cli import (
     choose_scenario,
     output_folder,
     scenario_parser,
+    versions,
 )
 from kitting_drake.episode import run_episode
 from kitting_drake.errors import UserError
@@ -70,18 +68,18 @@ def main() -> int:
     chosen = _by_oracle(choose_scenario(arguments))
     folder = require_folder(output_folder(arguments, f"{chosen.name}-demonstrations"))
     console = Console(quiet=arguments.quiet)
+    start = time.perf_counter()
+    if not chosen.scenario.cameras:
+        raise UserError(f"{chosen.path}: cameras is empty: demonstrations need at least one")
+    require_rendering()
+    # What cannot be built at all is told at once, and claims no folder.
+    build_chosen(chosen, seed=arguments.seed)
     with alone_in(folder):
         claim_folder(folder, "scenario.json", chosen.described, of="scenario")
         collection = Collection(folder, _origin(chosen, arguments.seed))
         if collection.assembled >= arguments.demos:
             console.print(f"nothing to do: {collection.summary()}", highlight=False, soft_wrap=True)
             return 0
-        if not chosen.scenario.cameras:
-            raise UserError(f"{chosen.path}: cameras is empty: demonstrations need at least one")
-        require_rendering()
-        start = time.perf_counter()
-        # What cannot be built at all is told at once, not once for each seed.
-        build_chosen(chosen, seed=arguments.seed)
         collection.collect(
             arguments.demos,
             lambda seed: run_apart(_demonstrate, chosen, seed),
@@ -286,12 +284,7 @@ def _origin(chosen: ChosenScenario, first_seed: int) -> Origin:
         scenario=chosen.described,
         grid=make_grid(chosen.scenario.heightmap),
         first_seed=first_seed,
-        versions={
-            "kitting_drake": kitting_drake.__version__,
-            "drake": importlib.metadata.version("drake"),
-            "numpy": np.__version__,
-            "python": platform.python_version(),
-        },
+        versions=versions(),
     )
 
 

@@ -26,6 +26,7 @@ class ObjectResult:
     category: str
     add_s_mm: float
     success: bool
+    """By the paper's measure alone: ADD-S below the threshold."""
     position_error_mm: float
     angle_error_deg: float
     height_error_mm: float

@@ -16,8 +16,10 @@ from kitting_drake.cli import (
     choose_scenario,
     output_folder,
     scenario_parser,
+    versions,
 )
 from kitting_drake.episode import run_episode
+from kitting_drake.errors import UserError
 from kitting_drake.files import (
     alone_in,
     append_line,
@@ -26,12 +28,13 @@ from kitting_drake.files import (
     require_folder,
     write_json,
 )
-from kitting_drake.looking import seeds_learned_from
+from kitting_drake.hkd.tool import load_tool
+from kitting_drake.looking import seeds_learned_from, source_of
 from kitting_drake.processes import Died, counting_bar, run_apart, side_by_side
-from kitting_drake.scenario import Learned
+from kitting_drake.scenario import Learned, PythonPolicy, ToolsetKitting
 from kitting_drake.summary import Episode, summarise, summary_notes, summary_table
 from kitting_drake.summary_figure import draw_summary
-from kitting_drake.verb import count_type, run_verb, seed_type
+from kitting_drake.verb import FAILED, count_type, run_verb, seed_type
 
 
 def main() -> int:
@@ -63,7 +66,11 @@ def main() -> int:
     console.print(summary_table(summary))
     console.print(summary_notes(summary), highlight=False)
     console.print(f"files: {folder}/", highlight=False)
-    return 0
+    failed = [episode for episode in episodes if episode["failure"]]
+    if failed:
+        first = failed[0]
+        console.print(f"failed first: seed {first['seed']}: {first['failure']}", highlight=False)
+    return FAILED if len(failed) == len(episodes) else 0
 
 
 def evaluate(
@@ -78,7 +85,7 @@ def evaluate(
     Args:
         chosen: the scenario.
         seeds: one episode each.
-        folder: where `episodes.jsonl` is; must not hold those of another scenario.
+        folder: where `episodes.jsonl` is; must not hold those of anything else.
         workers: how many run at a time.
         console: for the progress bar.
 
@@ -86,11 +93,12 @@ def evaluate(
         The episodes, in the order of the seeds.
 
     Raises:
-        UserError: the folder holds another scenario's episodes, or a process was killed twice.
+        UserError: the folder holds the episodes of another scenario, or of the same with another
+            policy, other tools or other versions; or a process was killed twice.
     """
     seeds = list(seeds)
     path = folder / "episodes.jsonl"
-    claim_folder(folder, "scenario.json", _identity(chosen), of="scenario")
+    claim_folder(folder, "scenario.json", _identity(chosen), of="scenario, policy or version")
     done = {episode["seed"]: episode for episode in read_lines(path)}
     pending = [seed for seed in seeds if seed not in done]
     queue = iter(pending)
@@ -106,31 +114,51 @@ def evaluate(
 
 
 def _identity(chosen: ChosenScenario) -> dict[str, Any]:
-    """What tells one evaluation from another: weights by what they are, not by where they lie."""
-    policy = chosen.scenario.policy
-    if not isinstance(policy, Learned):
-        return chosen.described
-    content = (chosen.base / policy.weights).read_bytes()
-    identity = copy.deepcopy(chosen.described)
-    identity["policy"]["weights"] = f"sha256 {hashlib.sha256(content).hexdigest()}"
+    """What tells one evaluation from another: files by what they are, not by where they lie."""
+    identity = {**copy.deepcopy(chosen.described), "versions": versions()}
+    policy, task = chosen.scenario.policy, chosen.scenario.task
+    if isinstance(policy, Learned):
+        identity["policy"]["weights"] = _digest([chosen.base / policy.weights])
+    if isinstance(policy, PythonPolicy):
+        identity["policy"]["source"] = _digest([source_of(policy)])
+    if not isinstance(task, ToolsetKitting):
+        folders = [load_tool(name, chosen.base).directory for name in task.tools]
+        identity["tools"] = [
+            _digest(sorted(path for path in folder.iterdir() if path.is_file()))
+            for folder in folders
+        ]
     return identity
+
+
+def _digest(paths: Iterable[Path]) -> str:
+    """Of the content of files."""
+    digest = hashlib.sha256()
+    for path in paths:
+        digest.update(path.read_bytes())
+    return f"sha256 {digest.hexdigest()}"
 
 
 def _run_apart(chosen: ChosenScenario, seed: int) -> Episode:
     """Runs one episode in a fresh process and waits for it."""
     start = time.perf_counter()
-    episode = run_apart(_work, chosen, seed)
-    if isinstance(episode, Died) and episode.was_killed:
-        episode = run_apart(_work, chosen, seed)
-        if isinstance(episode, Died) and episode.was_killed:
-            raise episode.killed_twice(seed)
-    if isinstance(episode, Died):
-        return _lost_episode(chosen, seed, episode.exit_code, time.perf_counter() - start)
-    return episode
+    outcome = run_apart(_work, chosen, seed)
+    if isinstance(outcome, Died) and outcome.was_killed:
+        outcome = run_apart(_work, chosen, seed)
+        if isinstance(outcome, Died) and outcome.was_killed:
+            raise outcome.killed_twice(seed)
+    if isinstance(outcome, Died):
+        outcome = f"the process of the episode ended with exit code {outcome.exit_code}"
+    if isinstance(outcome, str):
+        return _lost_episode(chosen, seed, outcome, time.perf_counter() - start)
+    return outcome
 
 
-def _work(chosen: ChosenScenario, seed: int) -> Episode:
-    cell = build_chosen(chosen, seed=seed)
+def _work(chosen: ChosenScenario, seed: int) -> Episode | str:
+    """An episode, or why there is none."""
+    try:
+        cell = build_chosen(chosen, seed=seed)
+    except UserError as error:
+        return str(error)
     result = run_episode(
         cell,
         scenario=chosen.name,
@@ -141,9 +169,7 @@ def _work(chosen: ChosenScenario, seed: int) -> Episode:
     return result.as_dict()
 
 
-def _lost_episode(
-    chosen: ChosenScenario, seed: int, exit_code: int | None, seconds: float
-) -> Episode:
+def _lost_episode(chosen: ChosenScenario, seed: int, failure: str, seconds: float) -> Episode:
     return {
         "scenario": chosen.name,
         "policy": chosen.policy,
@@ -157,7 +183,7 @@ def _lost_episode(
         "sim_seconds": 0.0,
         "wall_seconds": seconds,
         "point_contact_pairs": 0,
-        "failure": f"the process of the episode ended with exit code {exit_code}",
+        "failure": failure,
         "timed_out": False,
         "interrupted": False,
     }

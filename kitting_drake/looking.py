@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import importlib
+import importlib.util
+import math
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from kitting_drake.errors import UserError
 from kitting_drake.scenario import Learned, PythonPolicy
-from systems.signals import Observation, PickPlaceAction
+from systems.signals import Observation, PickPlaceAction, PixelGrid
 
 if TYPE_CHECKING:
     from kitting_drake.policies.learned_policy import Decision
@@ -19,13 +21,14 @@ Watch = Callable[[Observation, "Decision"], None]
 
 
 def make_function(
-    config: Learned | PythonPolicy, *, base: Path, watch: Watch | None
+    config: Learned | PythonPolicy, *, base: Path, grid: PixelGrid, watch: Watch | None
 ) -> Callable[[Observation], PickPlaceAction]:
     """The function that a scenario names.
 
     Args:
         config: the scenario's policy.
         base: where relative paths start.
+        grid: of the observations that it will be given.
         watch: told of a learned policy's decisions.
 
     Raises:
@@ -35,9 +38,15 @@ def make_function(
         return _import_function(config)
     # Only who uses a network waits for torch.
     from kitting_drake.policies.learned_policy import LearnedPolicy
-    from kitting_drake.policies.weights import load_networks, preferred_type
+    from kitting_drake.policies.weights import load_networks, preferred_type, read_weights_file
 
     networks = load_networks(base / config.weights, preferred_type())
+    learned_at = read_weights_file(base / config.weights).card.get("resolution")
+    if learned_at is not None and not math.isclose(learned_at, grid.resolution, rel_tol=1e-6):
+        raise UserError(
+            f"heightmap.resolution is {grid.resolution:g} m, and the policy of {config.weights} "
+            f"learned from pixels of {learned_at:g} m"
+        )
     try:
         return LearnedPolicy(
             networks,
@@ -80,12 +89,30 @@ def seeds_learned_from(config: Learned, *, base: Path) -> set[int]:
     return {*card.get("demonstration_seeds", ()), *card.get("validation_seeds", ())}
 
 
+def source_of(config: PythonPolicy) -> Path:
+    """The file of the module that a function is in.
+
+    Raises:
+        UserError: it cannot be found.
+    """
+    module = config.function.partition(":")[0]
+    try:
+        spec = importlib.util.find_spec(module)
+    except (ImportError, ValueError) as error:
+        raise UserError(f"policy.function: cannot import {config.function}: {error}") from error
+    if spec is None or spec.origin is None:
+        raise UserError(f"policy.function: there is no file of the module {module}")
+    return Path(spec.origin)
+
+
 def _import_function(config: PythonPolicy) -> Callable[[Observation], PickPlaceAction]:
     module, _, name = config.function.partition(":")
     try:
         function = getattr(importlib.import_module(module), name)
-    except (ImportError, AttributeError, TypeError) as error:
-        raise UserError(f"policy.function: cannot import {config.function}: {error}") from error
+    except Exception as error:
+        # A person's own module may raise anything.
+        reason = f"{type(error).__name__}: {error}"
+        raise UserError(f"policy.function: cannot import {config.function}: {reason}") from error
     if not callable(function):
         raise UserError(f"policy.function: {config.function} is not a function")
     return function

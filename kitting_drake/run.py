@@ -17,7 +17,7 @@ from kitting_drake.episode import run_episode
 from kitting_drake.errors import UserError
 from kitting_drake.files import require_folder, write_json, write_whole
 from kitting_drake.report import print_episode
-from kitting_drake.verb import INTERRUPTED, run_verb, seed_type
+from kitting_drake.verb import FAILED, INTERRUPTED, run_verb, seed_type
 from systems.pick_place_planner import Mode
 from systems.signals import Observation
 
@@ -90,6 +90,8 @@ def main() -> int:
         cell.video_writer.Save()
     print_episode(console, result)
     console.print(f"files: {folder}/", highlight=False)
+    if result.failure:
+        return FAILED
     return INTERRUPTED if result.interrupted else 0
 
 

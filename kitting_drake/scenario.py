@@ -10,7 +10,7 @@ import dataclasses as dc
 from pathlib import Path
 
 import yaml
-from pydrake.common.yaml import yaml_load, yaml_load_typed
+from pydrake.common.yaml import yaml_dump, yaml_load, yaml_load_typed
 
 from kitting_drake.errors import UserError
 from kitting_drake.hkd.kit import KitParameters
@@ -163,7 +163,7 @@ class LookAt:
 
 @dc.dataclass
 class Heightmap:
-    """The orthographic observation o_t. The workspace is also where tools and kit are drawn."""
+    """The orthographic observation o_t. Tools and kit are drawn within it, and on the table."""
 
     # Lower corner of the workspace in the world, in m.
     x_min: float = bounded(0.25, -10.0, 10.0)
@@ -269,7 +269,8 @@ def load_scenario(path: Path, name: str | None = None, text: str | None = None) 
     Args:
         path: the YAML file: a mapping from names to scenarios.
         name: which one; the first when None.
-        text: YAML merged over it: mappings field by field, all else replaced.
+        text: YAML merged over it: mappings field by field, all else replaced; a tag that is not
+            given is that of what is merged over.
 
     Raises:
         UserError: the file cannot be used; names the file and the field.
@@ -294,8 +295,8 @@ def load_scenario(path: Path, name: str | None = None, text: str | None = None) 
         raise UserError(f"{path} has no scenario '{name}': use one of {', '.join(names)}")
     scenario = _load(root[name], content, name, Scenario(), f"{path}: {name}")
     if text is not None:
-        merged = _parse(text, "--scenario_text")
-        scenario = _load(merged, text, None, scenario, "--scenario_text")
+        raw, defaults = _onto(_parse(text, "--scenario_text"), scenario)
+        scenario = _load(raw, yaml_dump(raw), None, defaults, "--scenario_text")
     return scenario
 
 
@@ -319,6 +320,41 @@ def _parse(content: str, where: str) -> dict:
     if not isinstance(root, dict):
         raise UserError(f"{where} must be a mapping of names, not a {type(root).__name__}")
     return root
+
+
+def _onto(raw: dict, defaults: Scenario) -> tuple[dict, Scenario]:
+    """Makes ready what is merged over a scenario.
+
+    Drake reads a mapping without a tag as the first variant of its union; here it is of the variant
+    that it is merged over. And where a tag brings another variant, nothing of its default mappings
+    is to remain beside what is given.
+    """
+    tagged = dict(raw)
+    for name in ("task", "policy"):
+        if name in raw:
+            tagged[name] = _of_variant(raw[name], getattr(defaults, name))
+    task = tagged.get("task")
+    if (
+        isinstance(task, dict)
+        and task["_tag"] == "!ArrangedKitting"
+        and "tools" in task
+        and not isinstance(defaults.task, ArrangedKitting)
+    ):
+        defaults = dc.replace(defaults, task=ArrangedKitting(tools={}))
+    cameras = raw.get("cameras")
+    if isinstance(cameras, dict):
+        tagged["cameras"] = {
+            name: _of_variant(camera, defaults.cameras[name])
+            if name in defaults.cameras
+            else camera
+            for name, camera in cameras.items()
+        }
+    return tagged, defaults
+
+
+def _of_variant(given: object, current: object) -> object:
+    """A mapping with the tag of a variant, if it has none of its own."""
+    return {"_tag": f"!{type(current).__name__}", **given} if isinstance(given, dict) else given
 
 
 def _check_names(node: yaml.Node | None) -> None:
@@ -385,6 +421,16 @@ def _check_meaning(scenario: Scenario) -> None:
             raise ValueError(
                 f"cameras.{key} looks straight down, where upright means nothing: use !Pinhole"
             )
+    planner = scenario.planner
+    if planner.home[2] < planner.floor_clearance:
+        raise ValueError(
+            "planner.home[2] is below planner.floor_clearance: the hand would begin in the table"
+        )
+    if planner.grasp_force > scenario.controller.finger_force_limit:
+        raise ValueError(
+            f"planner.grasp_force is {planner.grasp_force:g} N, more than the fingers can press "
+            f"(controller.finger_force_limit: {scenario.controller.finger_force_limit:g} N)"
+        )
     policy = scenario.policy
     if isinstance(policy, Learned) and not policy.weights:
         raise ValueError("policy.weights is empty: name a file that train wrote")

@@ -9,7 +9,7 @@ import numpy as np
 from rich.table import Table
 
 from kitting_drake.answers import CAUSES
-from kitting_drake.cli import ChosenScenario
+from kitting_drake.cli import ChosenScenario, versions
 from kitting_drake.hkd.tool import CATEGORIES
 from kitting_drake.looking import describe_learned
 from kitting_drake.scenario import (
@@ -34,6 +34,11 @@ UNSEEN_TASK = "kitting-unseen-toolsets"
 
 FAILED = "failed episode"
 """The cause of all objects of an episode that failed."""
+
+DOUBTS = {"proud": ("height_error_mm", 2.0), "turned": ("angle_error_deg", 20.0)}
+"""Why a success may not be one to a person: an error that ADD-S forgives, and beyond what it is
+counted. Proud: it stands so far above (or below) its seat. Turned: it lies so far round, which for
+a tool whose two ends are alike means nothing."""
 
 ERRORS = ("add_s_mm", "position_error_mm", "angle_error_deg", "height_error_mm")
 """Of an object where it ended."""
@@ -74,6 +79,7 @@ def summarise(
         "scenario": chosen.name,
         "task": task_name(chosen.scenario.task),
         "policy": chosen.policy,
+        "versions": versions(),
         "policy_details": policy_details(chosen.scenario.policy, chosen.base),
         "success_threshold_mm": 1e3 * chosen.scenario.task.success_threshold,
         "seeds": [episode["seed"] for episode in episodes],
@@ -97,12 +103,14 @@ def summarise(
 
 
 def task_name(task: Kitting | ToolsetKitting | ArrangedKitting) -> str:
-    """The paper's name of a task, where it has one."""
-    if isinstance(task, Kitting):
+    """The paper's name of a task, where it has one: where nothing in it was changed."""
+    if task == Kitting():
         return SEEN_TASK
-    if isinstance(task, ToolsetKitting):
-        return UNSEEN_TASK if task.split == "test" else f"kitting-{task.split}-toolsets"
-    return "arranged"
+    if task == ToolsetKitting(split="test"):
+        return UNSEEN_TASK
+    if task == ToolsetKitting(split="train"):
+        return "kitting-train-toolsets"
+    return "arranged" if isinstance(task, ArrangedKitting) else "kitting"
 
 
 def policy_details(
@@ -141,6 +149,10 @@ def _statistics(objects: list[Entry], actions: list[Entry], failed: int) -> dict
         **{key: _spread([abs(item[key]) for item in objects]) for key in ERRORS},
         "answers": {key: _spread([item[key] for item in actions]) for key in ANSWER_ERRORS},
         "causes": {cause: causes[cause] for cause in (*CAUSES, FAILED)},
+        "doubts": {
+            name: sum(item["success"] and abs(item[key]) > limit for item in objects)
+            for name, (key, limit) in DOUBTS.items()
+        },
     }
 
 
@@ -195,8 +207,10 @@ def summary_notes(summary: dict[str, Any]) -> str:
     position, angle, place_position, place_angle = (
         number(summary["answers"][key]["median"]) for key in ANSWER_ERRORS
     )
+    doubts = [f"{count} {name}" for name, count in summary["doubts"].items() if count]
     return (
         f"not kitted: {', '.join(causes) or 'none'}\n"
+        f"kitted, but: {', '.join(doubts) or 'none'}\n"
         f"answers, median error: pick {position} mm {angle} deg, "
         f"place {place_position} mm {place_angle} deg"
     )

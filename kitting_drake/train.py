@@ -251,6 +251,7 @@ class _Run:
         self.card = {
             **dataclasses.asdict(settings),
             "samples": len(self.samples),
+            "resolution": self.grid.resolution,
             "torch": torch.__version__,
         }
 

@@ -7,6 +7,9 @@ from collections.abc import Callable
 
 from kitting_drake.errors import UserError
 
+FAILED = 1
+"""Exit code when a simulation or a policy failed, and nothing else can be blamed."""
+
 INTERRUPTED = 130
 """Exit code after Ctrl-C, as shells have it."""
 

@@ -73,7 +73,8 @@ def _check_dataclass(schema: Any, value: Any, where: str) -> None:
             continue
         if key not in hints:
             close = difflib.get_close_matches(str(key), hints, n=1)
-            advice = f"did you mean '{close[0]}'?" if close else f"use one of {', '.join(hints)}"
+            known = f"use one of {', '.join(hints)}" if hints else "it has none"
+            advice = f"did you mean '{close[0]}'?" if close else known
             raise ValueError(f"{_join(where, key)} is an unknown field: {advice}")
         check_yaml(hints[key], item, _join(where, key))
 

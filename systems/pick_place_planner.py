@@ -96,14 +96,15 @@ class PickPlacePlanner(LeafSystem):
     - `counts` (3): actions begun, grasps missed, objects dropped.
 
     Every motion is a straight line in (x, y, z, yaw) with a minimum-jerk profile, at rest at both
-    ends, as short as the limits on speed and acceleration allow. The two guarded motions, `DESCEND`
+    ends (a `RETREAT` from an object that was lost brakes first), as short as the limits on speed
+    and acceleration allow. The two guarded motions, `DESCEND`
     and `LOWER`, stop dead where the vertical contact force rises `contact_threshold` above what the
     load weighs, and hold the height reached: no known height of table, kit or cavity tells them
     where to stop. Where the action says how high the rim of the cavity is, and the object, which
     lay on the table z = 0, comes to stand on it, the hand feels for the cavity (`SEARCH`) and
     lowers again once the resistance ends. A grasp is good if the pads stand further apart than
     `minimum_width` and both feel at least half of the grasp force; when it is not, or is lost on
-    the way, the hand brakes, opens and goes home to look again, which counts as an action.
+    the way, the hand rises, opens on the way home and looks again, which counts as an action.
 
     All memory is one vector of discrete state.
     """

@@ -29,12 +29,22 @@ class PlacementGoal:
     """(m, 3) points of the object's surface, in metres. Sample them by area: the score must not
     depend on how finely a mesh is cut."""
 
+    @property
+    def p_BMiddle(self) -> NDArray[np.float64]:
+        """(3,) the middle of the points' bounding box, where positions are compared. It lies on the
+        axis of a round object; the origin of B need not, and would wander as the object rolls."""
+        return (self.p_BPoints.min(axis=0) + self.p_BPoints.max(axis=0)) / 2
+
 
 def add_s(points: NDArray[np.float64], X_WGoal: RigidTransform, X_WActual: RigidTransform) -> float:
     """The average distance for symmetric objects, equation 9 of the paper, in metres.
 
     The mean, over the model's points at the goal pose, of the distance to the *nearest* model point
-    at the actual pose: a turn that maps the object onto itself costs nothing.
+    at the actual pose: a turn that maps the *points* onto themselves costs nothing, one that maps
+    the surface onto itself costs no more than the distance between neighbouring points.
+
+    It forgives much: a flat object that stands proud of its goal by h scores about h / 2, and one
+    turned about may score less than the paper's threshold. See `height_error`, `angle_error`.
 
     Args:
         points: (m, 3) model points in the body frame.
@@ -72,9 +82,9 @@ class PlacementMonitor(LeafSystem):
 
     - `body_poses` (abstract, list of RigidTransform by body index): the plant's port of that name.
     - `add_s` (n): equation 9, metres, one for each goal in the order given.
-    - `position_error` (n): horizontal distance of the origins, metres.
+    - `position_error` (n): horizontal distance of the middles (`PlacementGoal.p_BMiddle`), metres.
     - `angle_error` (n): heading (of body x about world z) beyond the goal's, radians in [-pi, pi].
-    - `height_error` (n): how far the origin is above the goal's, metres, signed.
+    - `height_error` (n): how far the middle is above the goal's, metres, signed.
 
     Stateless, pulled.
     """
@@ -127,7 +137,7 @@ class PlacementMonitor(LeafSystem):
     def _offsets(self, context: Context) -> NDArray[np.float64]:
         return np.array(
             [
-                X_WActual.translation() - goal.X_WGoal.translation()
+                X_WActual @ goal.p_BMiddle - goal.X_WGoal @ goal.p_BMiddle
                 for goal, X_WActual in zip(self._goals, self._actual(context), strict=True)
             ]
         )

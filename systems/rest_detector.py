@@ -63,7 +63,8 @@ class RestDetector(LeafSystem):
             linear_speed: of the body origin, in m/s.
             angular_speed: in rad/s.
             patience: in s.
-            wake_distance: in m; more than a mover travels in two periods.
+            wake_distance: in m. What moves faster than this in a period may touch an object before
+                it wakes: for that long the object stands as firm as a rock.
             period: how often to look, in s.
         """
         super().__init__()

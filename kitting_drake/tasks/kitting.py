@@ -19,6 +19,9 @@ _FINGERS = (0.0104, 0.0663)
 _PALM = (0.032, 0.1045)
 """The palm is 46 mm above the fingertips: above every tool, but not above a kit block."""
 
+TABLE = ((0.0, -0.75), (1.0, 0.75))
+"""Lower and upper (x, y) corner of the table in the world, in m."""
+
 _TRIES = 300
 _RESTARTS = 60
 
@@ -46,12 +49,13 @@ def make_scene(
 
     Args:
         task: what stands on it.
-        grid: the workspace in which tools and kit must lie whole.
+        grid: the workspace. What is drawn lies whole in it, and on the table.
         seed: of the poses and of the order. The same seed gives the same scene.
         base: where relative paths of tools start.
 
     Raises:
-        UserError: an unknown tool, tools that make no kit, or no free space for them all.
+        UserError: an unknown tool, tools that make no kit, no free space for them all, or an
+            arrangement beside the table or of things within each other.
     """
     try:
         tools = [load_tool(name, base) for name in _tool_names(task, seed)]
@@ -61,6 +65,7 @@ def make_scene(
     if isinstance(task, ArrangedKitting):
         X_WKit = _pose(task.kit_pose)
         X_WTools = [_pose(placement) for placement in task.tools.values()]
+        _check_arrangement(task, kit, tools)
         order = np.arange(len(tools))
     else:
         rng = np.random.default_rng(seed)
@@ -90,6 +95,34 @@ def _pose(placement: Placement) -> RigidTransform:
     return RigidTransform(RollPitchYaw(0, 0, yaw), [placement.x, placement.y, 0])
 
 
+def _rectangle(lower: tuple[float, float], upper: tuple[float, float]) -> CrossSection:
+    return CrossSection.square((upper[0] - lower[0], upper[1] - lower[1])).translate(lower)
+
+
+def _block(kit: Kit) -> CrossSection:
+    return CrossSection.square((kit.parameters.length, kit.parameters.width), True)
+
+
+def _check_arrangement(task: ArrangedKitting, kit: Kit, tools: list[Tool]) -> None:
+    table = _rectangle(*TABLE)
+    placed: dict[str, CrossSection] = {}
+    placements = [task.kit_pose, *task.tools.values()]
+    outlines = [_block(kit), *(tool.silhouette for tool in tools)]
+    names = ["task.kit_pose", *(f"task.tools.{name}" for name in task.tools)]
+    for name, placement, outline in zip(names, placements, outlines, strict=True):
+        outline = outline.rotate(placement.yaw_deg).translate((placement.x, placement.y))
+        if (outline - table).area() > 1e-9:
+            (x_min, y_min), (x_max, y_max) = TABLE
+            raise UserError(
+                f"{name} is not whole on the table, which is x from {x_min:g} to {x_max:g} m and "
+                f"y from {y_min:g} to {y_max:g} m"
+            )
+        for other, standing in placed.items():
+            if _overlap(outline, standing):
+                raise UserError(f"{other} and {name} are within each other")
+        placed[name] = outline
+
+
 def _draw_poses(
     task: Kitting | ToolsetKitting,
     kit: Kit,
@@ -102,11 +135,9 @@ def _draw_poses(
     Besides the spacing between them, every tool can be reached: the open hand at its grasp touches
     no other tool and no kit.
     """
-    room = CrossSection.square((grid.x_max - grid.x_min, grid.y_max - grid.y_min)).translate(
-        (grid.x_min, grid.y_min)
-    )
-    block = CrossSection.square((kit.parameters.length, kit.parameters.width), True)
-    shapes = [_Shape(block, CrossSection(), CrossSection())]
+    seen = _rectangle((grid.x_min, grid.y_min), (grid.x_max, grid.y_max))
+    room = seen ^ _rectangle(*TABLE)
+    shapes = [_Shape(_block(kit), CrossSection(), CrossSection())]
     shapes += [_tool_shape(tool) for tool in tools]
     for _ in range(_RESTARTS):
         poses: list[RigidTransform] = []

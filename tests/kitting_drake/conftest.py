@@ -102,6 +102,7 @@ def weights_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
         "demonstration_seeds": [10_000, 10_001],
         "validation_seeds": [10_002],
         "steps": 0,
+        "resolution": 0.003125,
     }
     save_weights(path, make_networks(NetworkConfig(preset="tiny", orientations=72)), card)
     return path

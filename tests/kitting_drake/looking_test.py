@@ -1,3 +1,4 @@
+import dataclasses
 import subprocess
 import sys
 from pathlib import Path
@@ -30,7 +31,10 @@ def test_a_learned_policy_as_the_scenario_says(
     told: list[Decision] = []
     config = Learned(weights_file.name, orientations=orientations, continuous=continuous)
     function = make_function(
-        config, base=weights_file.parent, watch=lambda _, decision: told.append(decision)
+        config,
+        base=weights_file.parent,
+        grid=GRID,
+        watch=lambda _, decision: told.append(decision),
     )
     networks = load_networks(weights_file, preferred_type())
     policy = LearnedPolicy(networks, orientations=orientations, continuous=continuous)
@@ -40,9 +44,10 @@ def test_a_learned_policy_as_the_scenario_says(
 
 
 def test_what_cannot_be_had_is_named(weights_file: Path, tmp_path: Path):
-    def refusal(**fields: object) -> str:
+    def refusal(grid: PixelGrid = GRID, **fields: object) -> str:
         with pytest.raises(UserError) as caught:
-            make_function(Learned(**fields), base=tmp_path, watch=None)  # type: ignore[arg-type]
+            config = Learned(**fields)  # type: ignore[arg-type]
+            make_function(config, base=tmp_path, grid=grid, watch=None)
         assert "\n" not in str(caught.value)
         return str(caught.value)
 
@@ -57,6 +62,10 @@ def test_what_cannot_be_had_is_named(weights_file: Path, tmp_path: Path):
     )
     assert "37 orientations are not a multiple of 2" in refusal(
         weights=str(weights_file), orientations=37
+    )
+    coarse = dataclasses.replace(GRID, resolution=0.00625)
+    assert "heightmap.resolution is 0.00625 m, and the policy of" in refusal(
+        coarse, weights=str(weights_file)
     )
 
 
@@ -77,7 +86,7 @@ def test_results_say_what_a_policy_is(weights_file: Path):
 
 def test_a_function_of_ones_own_needs_no_networks():
     config = PythonPolicy("systems.signals:PickPlaceAction")
-    assert make_function(config, base=ROOT, watch=None) is PickPlaceAction
+    assert make_function(config, base=ROOT, grid=GRID, watch=None) is PickPlaceAction
 
 
 def test_who_uses_no_network_does_not_wait_for_torch():

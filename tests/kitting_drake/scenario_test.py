@@ -17,12 +17,14 @@ from kitting_drake.paths import SCENARIOS
 from kitting_drake.scenario import (
     ArrangedKitting,
     Kitting,
+    Learned,
     LookAt,
     Oracle,
     Pinhole,
     Placement,
     PythonPolicy,
     Scenario,
+    ToolsetKitting,
     load_scenario,
 )
 
@@ -124,8 +126,19 @@ planner: {home: [0.4, 0.0, 0.5, 0.0]}
     assert merged.planner.home == [0.4, 0.0, 0.5, 0.0]  # A list is replaced as a whole.
     assert merged.planner.linear_speed == 0.5
     assert merged.time_limit == 9.0
-    untagged = load_scenario(path, text="{task: {yaw_range_deg: 30.0}}")
-    assert untagged.task == merged.task
+
+
+def test_text_without_a_tag_keeps_the_variant(tmp_path: Path):
+    path = write(
+        tmp_path,
+        "A: {task: !ToolsetKitting {split: train}, policy: !Learned {weights: w},"
+        " cameras: {top: !LookAt {width: 99}}}",
+    )
+    text = "{task: {spacing: 0.02}, policy: {orientations: 36}, cameras: {top: {height: 77}}}"
+    merged = load_scenario(path, text=text)
+    assert merged.task == ToolsetKitting(split="train", spacing=0.02)
+    assert merged.policy == Learned(weights="w", orientations=36)
+    assert merged.cameras == {"top": LookAt(width=99, height=77)}
 
 
 def test_text_can_choose_another_variant(tmp_path: Path):
@@ -134,6 +147,8 @@ def test_text_can_choose_another_variant(tmp_path: Path):
     merged = load_scenario(path, text=text)
     assert merged.task == ArrangedKitting(kit_pose=Placement(x=0.6, y=-0.1))
     assert merged.policy == PythonPolicy(function="a:b")
+    merged = load_scenario(path, text="{task: !ArrangedKitting {tools: {flat_screwdriver: {}}}}")
+    assert list(merged.task.tools) == ["flat_screwdriver"]
 
 
 def test_arranged_tools_are_those_of_the_file(tmp_path: Path):

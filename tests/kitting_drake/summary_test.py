@@ -97,6 +97,20 @@ def test_categories_add_up_to_the_whole(made_up_episode: Make):
         assert count == sum(row["causes"][cause] for row in summary["categories"].values())
 
 
+def test_successes_in_doubt_are_counted(made_up_episode: Make):
+    """ADD-S forgives a flat tool that stands proud, or lies the wrong way round."""
+    episode = made_up_episode(0, [1.0, 1.0, 1.0, 9.0])
+    hammer, pliers, wrench, lost = episode["objects"]
+    hammer["height_error_mm"] = 2.5
+    pliers["angle_error_deg"] = -178.0
+    wrench["height_error_mm"] = 1.5
+    lost["height_error_mm"] = 20.0
+    summary = summarise([episode], CHOSEN, wall_seconds_total=1.0)
+    assert summary["doubts"] == {"proud": 1, "turned": 1}
+    assert summary["categories"]["pliers"]["doubts"] == {"proud": 0, "turned": 1}
+    assert "kitted, but: 1 proud, 1 turned" in summary_notes(summary)
+
+
 def test_nothing_but_failures_has_a_summary(made_up_episode: Make):
     lost = made_up_episode(0, [1.0], "died") | {"objects": [], "actions_taken": []}
     summary = summarise([lost], CHOSEN, wall_seconds_total=1.0)
@@ -122,6 +136,10 @@ def test_wilson_interval():
         (Kitting(), "kitting-seen-toolset"),
         (ToolsetKitting(), "kitting-unseen-toolsets"),
         (ToolsetKitting(split="train"), "kitting-train-toolsets"),
+        # An easier task is not the paper's.
+        (Kitting(success_threshold=0.01), "kitting"),
+        (Kitting(tools=["claw_hammer"]), "kitting"),
+        (ToolsetKitting(yaw_range_deg=10.0), "kitting"),
         (ArrangedKitting(), "arranged"),
     ],
 )
@@ -153,5 +171,6 @@ def test_what_the_terminal_shows(made_up_episode: Make):
     ]
     assert summary_notes(summary).splitlines() == [
         "not kitted: 2 jammed",
+        "kitted, but: none",
         "answers, median error: pick 1.00 mm 2.00 deg, place 2.00 mm 3.00 deg",
     ]

@@ -84,6 +84,19 @@ def test_errors_of_each_object_and_their_signs():
     assert result["add_s"][2] > 0.01
 
 
+def test_a_round_object_that_rolls_stays_where_it_is():
+    """The origin is on the table, below the axis; positions are compared on the axis."""
+    turns = np.arange(16) * np.pi / 8
+    ring = np.stack([0 * turns, np.sin(turns), 1 + np.cos(turns)], axis=1)
+    rolled = GOAL @ RigidTransform(RollPitchYaw(np.pi, 0, 0), [0, 0, 1])
+    rolled = rolled @ RigidTransform([0, 0, -1])
+    monitor = PlacementMonitor(goals=[PlacementGoal("roll", BodyIndex(1), GOAL, ring)])
+    context = monitor.CreateDefaultContext()
+    monitor.GetInputPort("body_poses").FixValue(context, Value([RigidTransform(), rolled]))
+    for name in ("add_s", "position_error", "height_error"):
+        assert monitor.GetOutputPort(name).Eval(context)[0] == pytest.approx(0.0, abs=1e-9)
+
+
 def test_angle_error_goes_the_short_way_round():
     goal = RigidTransform(RollPitchYaw(0, 0, 3.0), [0, 0, 0])
     actual = RigidTransform(RollPitchYaw(0, 0, -3.0), [0, 0, 0])
