@@ -69,12 +69,12 @@ def main() -> int:
     folder = require_folder(output_folder(arguments, f"{chosen.name}-demonstrations"))
     console = Console(quiet=arguments.quiet)
     start = time.perf_counter()
-    if not chosen.scenario.cameras:
-        raise UserError(f"{chosen.path}: cameras is empty: demonstrations need at least one")
-    require_rendering()
-    # What cannot be built at all is told at once, and claims no folder.
-    build_chosen(chosen, seed=arguments.seed)
     with alone_in(folder):
+        # What cannot be built at all is told at once, and claims no folder.
+        if not chosen.scenario.cameras:
+            raise UserError(f"{chosen.path}: cameras is empty: demonstrations need at least one")
+        require_rendering()
+        build_chosen(chosen, seed=arguments.seed)
         claim_folder(folder, "scenario.json", chosen.described, of="scenario")
         collection = Collection(folder, _origin(chosen, arguments.seed))
         if collection.assembled >= arguments.demos:

@@ -30,6 +30,7 @@ from kitting_drake.scenario import (
     Sleep,
     load_scenario,
 )
+from kitting_drake.tasks.kitting import TABLE
 from systems.pick_place_parameters import Mode
 from systems.signals import Observation, PickPlaceAction, PlanarPose
 
@@ -80,6 +81,20 @@ def test_default_context_is_the_scene():
     np.testing.assert_allclose(
         cell.plant.GetPositionsAndVelocities(context, hand), [*home, 0.04, 0.04, *np.zeros(6)]
     )
+
+
+def test_the_table_is_where_the_task_has_it():
+    cell = build()
+    (geometry,) = cell.plant.GetCollisionGeometriesForBody(cell.plant.GetBodyByName("table"))
+    inspector = cell.scene_graph.model_inspector()
+    X_WTable = cell.plant.GetBodyByName("table").EvalPoseInWorld(
+        cell.plant.GetMyContextFromRoot(cell.diagram.CreateDefaultContext())
+    )
+    middle = (X_WTable @ inspector.GetPoseInFrame(geometry)).translation()
+    half_sizes = inspector.GetShape(geometry).size() / 2
+    for corner, sign in zip(TABLE, (-1, 1), strict=True):
+        np.testing.assert_allclose(corner, (middle + sign * half_sizes)[:2])
+    assert middle[2] + half_sizes[2] == pytest.approx(0.0)
 
 
 def test_nothing_touches_at_the_beginning_but_tools_the_table():

@@ -248,6 +248,8 @@ def test_without_cameras_one_sentence(tmp_path: Path, monkeypatch: pytest.Monkey
     monkeypatch.setattr(sys, "argv", ["collect", str(scenario), "--output", str(tmp_path / "out")])
     with pytest.raises(UserError, match=r"blind\.yaml: cameras is empty"):
         collecting.main()
+    # It can be corrected and collected into the same folder.
+    assert not (tmp_path / "out" / "scenario.json").exists()
 
 
 def test_two_do_not_collect_into_one_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

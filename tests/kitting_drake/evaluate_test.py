@@ -3,6 +3,7 @@ import json
 import math
 import os
 import random
+import shutil
 import signal
 import subprocess
 import sys
@@ -17,8 +18,9 @@ from kitting_drake.cli import ChosenScenario
 from kitting_drake.episode import EpisodeResult
 from kitting_drake.errors import UserError
 from kitting_drake.files import alone_in
+from kitting_drake.paths import MODELS
 from kitting_drake.processes import Died
-from kitting_drake.scenario import Learned, Scenario
+from kitting_drake.scenario import Heightmap, Kitting, Learned, PythonPolicy, Scenario
 from kitting_drake.summary import Episode
 
 CHOSEN = ChosenScenario(Scenario(), Path("mine.yaml"), "mine", None)
@@ -27,7 +29,7 @@ QUIET = Console(quiet=True)
 
 
 def fake_run(chosen: ChosenScenario, seed: int) -> Episode:
-    return evaluation._lost_episode(chosen, seed, 1, 2.0)
+    return evaluation._lost_episode(chosen, seed, "made up", 2.0)
 
 
 def test_goes_on_where_it_was_stopped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
@@ -71,6 +73,36 @@ def test_a_folder_of_other_weights_is_refused(tmp_path: Path, monkeypatch: pytes
         evaluation.evaluate(chosen, [0, 1, 2], folder, workers=1, console=QUIET)
 
 
+def test_a_folder_of_another_program_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """The scenario is the same to the letter; what it names is not."""
+    monkeypatch.setattr(evaluation, "_run_apart", fake_run)
+    monkeypatch.syspath_prepend(tmp_path)
+    source = tmp_path / "policy_of_mine.py"
+    tool = tmp_path / "my_tool"
+    shutil.copytree(MODELS / "tools" / "claw_hammer", tool)
+    scenario = Scenario(
+        task=Kitting(tools=[str(tool)]), policy=PythonPolicy("policy_of_mine:answer")
+    )
+    chosen = ChosenScenario(scenario, tmp_path / "mine.yaml", "mine", None)
+    folder = tmp_path / "out"
+    folder.mkdir()
+
+    def evaluate() -> None:
+        evaluation.evaluate(chosen, [0], folder, workers=1, console=QUIET)
+
+    source.write_text("def answer(observation): ...\n")
+    evaluate()
+    evaluate()
+    source.write_text("def answer(observation): return 1\n")
+    with pytest.raises(UserError, match="another scenario, policy or version"):
+        evaluate()
+    source.write_text("def answer(observation): ...\n")
+    record = tool / "tool.yaml"
+    record.write_text(record.read_text() + "# Another grasp.\n")
+    with pytest.raises(UserError, match="another scenario, policy or version"):
+        evaluate()
+
+
 def test_two_do_not_evaluate_into_one_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     scenario = tmp_path / "mine.yaml"
     scenario.write_text("Mine: {task: !ToolsetKitting {}}\n")
@@ -92,6 +124,33 @@ def test_an_episode_whose_process_dies_is_a_failed_one(monkeypatch: pytest.Monke
     assert lost["seed"] == 7
     assert lost["success_rate"] == 0.0
     assert str(-signal.SIGSEGV) in lost["failure"]
+
+
+def test_a_scene_that_cannot_be_set_is_a_failed_episode():
+    scenario = Scenario(heightmap=Heightmap(rows=110, cols=110))
+    lost = evaluation._run_apart(dataclasses.replace(CHOSEN, scenario=scenario), 7)
+    assert "there is no free space in the workspace" in lost["failure"]
+
+
+@pytest.mark.parametrize(("failures", "code"), [([None, "no"], 0), (["no", "no"], 1)])
+def test_nothing_but_failures_leaves_with_a_failure(
+    failures: list[str | None],
+    code: int,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+):
+    scenario = tmp_path / "mine.yaml"
+    scenario.write_text("Mine: {}\n")
+
+    def run(chosen: ChosenScenario, seed: int) -> Episode:
+        return fake_run(chosen, seed) | {"failure": failures[seed]}
+
+    monkeypatch.setattr(evaluation, "_run_apart", run)
+    flags = ["--episodes", "2", "--workers", "1", "--output", str(tmp_path / "out")]
+    monkeypatch.setattr(sys, "argv", ["evaluate", str(scenario), *flags])
+    assert evaluation.main() == code
+    assert f"failed first: seed {failures.index('no')}: no" in capsys.readouterr().out
 
 
 def test_what_something_else_killed_is_given_a_second_chance(monkeypatch: pytest.MonkeyPatch):

@@ -85,10 +85,25 @@ def test_the_most_tested_network_and_all_causes(folder: Path):
     assert placed[3][2] == "2.00, 2.00"
     assert answered[3][1:] == ["1.00, 1.00", "2.00, 2.00", "4.00, 4.00", "6.00, 6.00"]
     jammed = causes[0].index("jammed")
-    assert [(row[0], row[1], row[jammed]) for row in causes[1:]] == [
-        ("SO(2)-equivariant (ours), N = 180, 100 demonstrations, preset small", "40", "0"),
-        ("oracle, rounded, N = 36", "20", "5"),
+    proud = causes[0].index("kitted, but proud")
+    assert [(*row[:3], row[jammed], row[proud]) for row in causes[1:]] == [
+        (
+            "SO(2)-equivariant (ours), N = 180, 100 demonstrations, preset small",
+            "100 to 109",
+            "40",
+            "0",
+            "0",
+        ),
+        ("oracle, rounded, N = 36", "0 to 4", "20", "5", "0"),
     ]
+
+
+def test_what_an_older_summary_did_not_count_is_not_zero(folder: Path):
+    summary = json.loads((folder / "rounded.json").read_text())
+    del summary["doubts"]
+    (folder / "rounded.json").write_text(json.dumps(summary))
+    *_, last = tables(page(folder))[3]
+    assert last[-2:] == ["?", "?"]
 
 
 @pytest.mark.parametrize("method", ["so2", "transporter"])

@@ -146,6 +146,7 @@ def test_ctrl_c_leaves_whole_files(tmp_path: Path):
     [
         (["--graphviz", "cell.jpg"], "--graphviz writes .svg, .png, .pdf and .dot"),
         (["--seed", "-1"], "'-1' is not a whole number"),
+        (["--video", "/proc/none/film.gif"], "cannot write into /proc/none"),
     ],
 )
 def test_flags_that_cannot_be_used(verb: Verb, tmp_path: Path, flags: list[str], words: str):
@@ -156,6 +157,22 @@ def test_flags_that_cannot_be_used(verb: Verb, tmp_path: Path, flags: list[str],
     assert words in done.stderr
     assert "Traceback" not in done.stderr
     assert not list(tmp_path.iterdir())
+
+
+def test_a_scenario_is_found_by_its_name_and_not_by_another_path(verb: Verb, tmp_path: Path):
+    done = verb("run", "no/such/kitting_oracle.yaml", "--no-meshcat", "--output", tmp_path)
+    assert done.returncode == 2
+    assert "cannot read the scenario no/such/kitting_oracle.yaml" in done.stderr
+
+
+def test_a_policy_that_raises_leaves_its_reason_and_a_failure(verb: Verb, tmp_path: Path):
+    scenario = tmp_path / "mine.yaml"
+    scenario.write_text('Mine: {policy: !PythonPolicy {function: "math:sqrt"}}\n')
+    done = verb("run", scenario, "--no-meshcat", "--output", tmp_path / "out")
+    assert done.returncode == 1
+    results = json.loads((tmp_path / "out" / "results.json").read_text())
+    assert results["failure"].startswith("TypeError: must be real number")
+    assert results["success_rate"] == 0.0
 
 
 LEARNED = """

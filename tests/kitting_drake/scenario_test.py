@@ -179,6 +179,11 @@ BAD = {
         "A: {task: !ArrangedKitting {spacing: 0.01}}",
         ["task.spacing", "unknown field"],
     ),
+    "hand in the table": ("A: {planner: {home: [0.3, 0, -1, 0]}}", ["planner.home[2]", "table"]),
+    "more force than there is": (
+        "A: {controller: {finger_force_limit: 20.0}}",
+        ["planner.grasp_force is 30 N", "controller.finger_force_limit: 20 N"],
+    ),
     "unknown tag": ("A: {policy: !Orcle {}}", ["policy", "!Orcle", "!Oracle"]),
     "tag without a value": ("A: {policy: !Oracle }", ["mine.yaml"]),
     "empty value": ("A: {time_limit: }", ["time_limit", "empty"]),

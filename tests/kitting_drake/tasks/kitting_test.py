@@ -7,7 +7,7 @@ from pydrake.math import RigidTransform, RollPitchYaw
 
 from kitting_drake.errors import UserError
 from kitting_drake.scenario import ArrangedKitting, Kitting, Placement
-from kitting_drake.tasks.kitting import KittingScene, make_scene
+from kitting_drake.tasks.kitting import TABLE, KittingScene, make_scene
 from systems.signals import PixelGrid
 
 GRID, BASE = PixelGrid(), Path()
@@ -99,6 +99,40 @@ def test_arranged_stands_where_you_say():
     for X, placement in zip((scene.X_WKit, *scene.X_WTools), placements, strict=True):
         np.testing.assert_allclose(X.translation(), [placement.x, placement.y, 0], atol=1e-12)
         assert yaw_deg(X) == pytest.approx(placement.yaw_deg)
+
+
+@pytest.mark.parametrize(
+    ("kit_x", "tools", "words"),
+    [
+        (0.9, {"claw_hammer": Placement(x=0.3, y=0.4)}, "task.kit_pose is not whole on the table"),
+        (0.6, {"claw_hammer": Placement(x=0.3, y=0.8)}, "task.tools.claw_hammer is not whole"),
+        (
+            0.6,
+            {"claw_hammer": Placement(x=0.6, y=0.1)},
+            "task.kit_pose and task.tools.claw_hammer are within",
+        ),
+        (
+            0.6,
+            {
+                "claw_hammer": Placement(x=0.3, y=0.3),
+                "flat_screwdriver": Placement(x=0.3, y=0.31),
+            },
+            "task.tools.claw_hammer and task.tools.flat_screwdriver are within each other",
+        ),
+    ],
+)
+def test_an_arrangement_that_cannot_stand_is_refused(
+    kit_x: float, tools: dict[str, Placement], words: str
+):
+    task = ArrangedKitting(tools=tools, kit_pose=Placement(x=kit_x, y=0.0))
+    with pytest.raises(UserError, match=words.replace(".", r"\.")):
+        make_scene(task, grid=GRID, seed=0, base=BASE)
+
+
+def test_what_is_drawn_lies_on_the_table_however_far_one_sees():
+    for seed in range(5):
+        scene = draw(seed, grid=PixelGrid(rows=640))
+        assert all(X.translation()[0] < TABLE[1][0] for X in (scene.X_WKit, *scene.X_WTools))
 
 
 def test_no_free_space_is_told_with_the_fields_to_change():
