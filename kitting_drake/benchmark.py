@@ -66,7 +66,7 @@ def main() -> int:
     console = Console(quiet=arguments.quiet)
     folder = require_folder(arguments.output)
     if arguments.verb == "networks":
-        measured, tables = _networks(arguments, folder, console)
+        measured, tables = _networks(arguments, console)
     else:
         # One core, as claimed; children inherit it.
         os.sched_setaffinity(0, {max(os.sched_getaffinity(0))})
@@ -77,6 +77,11 @@ def main() -> int:
             measured = benchmark_kits(arguments.kits, console)
             tables = [kits_table(measured)]
     write_json(folder / f"{arguments.verb}.json", measured)
+    if arguments.verb == "networks":
+        # Not before the figures are safe, and not where nobody needs torch.
+        from kitting_drake.network_benchmark.figure import draw_networks
+
+        draw_networks(measured, folder / "networks.png")
     for table in tables:
         console.print(table)
     console.print(f"files: {folder}/", highlight=False)
@@ -84,18 +89,16 @@ def main() -> int:
 
 
 def _networks(
-    arguments: argparse.Namespace, folder: Path, console: Console
+    arguments: argparse.Namespace, console: Console
 ) -> tuple[dict[str, Any], list[Table]]:
-    """Measures the networks and draws them."""
+    """Measures the networks."""
     # Imported here: the other verbs need no torch.
     from kitting_drake.network_benchmark import benchmark_networks
     from kitting_drake.network_benchmark.bench import Plan
-    from kitting_drake.network_benchmark.figure import draw_networks
     from kitting_drake.network_benchmark.tables import network_tables
 
     plan = Plan(preset=arguments.preset, repeats=arguments.repeats, demonstrations=arguments.demos)
     measured = benchmark_networks(plan, console)
-    draw_networks(measured, folder / "networks.png")
     return measured, network_tables(measured)
 
 

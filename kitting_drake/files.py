@@ -67,11 +67,31 @@ def claim_folder(folder: Path, name: str, described: Any, *, of: str) -> None:
     """
     path = folder / name
     described = json.loads(json.dumps(described, default=str))
-    if path.exists() and json.loads(path.read_text()) != described:
-        raise UserError(
-            f"{folder} holds the files of another {of}: give another --output, or delete it"
-        )
+    if path.exists():
+        try:
+            found = json.loads(path.read_text())
+        except (OSError, ValueError) as error:
+            raise UserError(f"{path} is damaged: give another --output, or delete {folder}") from (
+                error
+            )
+        if found != described:
+            raise UserError(
+                f"{folder} holds the files of another {of}"
+                f"{_first_difference(found, described)}: give another --output, or delete it"
+            )
     write_json(path, described)
+
+
+def _first_difference(found: Any, described: Any) -> str:
+    """Where two descriptions differ, for a person; nothing if that cannot be said in few words."""
+    if not isinstance(found, dict) or not isinstance(described, dict):
+        return ""
+    for key in (*described, *found):
+        old, new = found.get(key), described.get(key)
+        if old != new:
+            simple = all(isinstance(value, str | float | int | None) for value in (old, new))
+            return f" ({key} is {new}, there {old})" if simple else f" ({key} differs)"
+    return ""
 
 
 @contextlib.contextmanager
@@ -105,6 +125,9 @@ def read_lines(path: Path) -> list[Any]:
     """The objects of a file of JSON lines; none if there is no file.
 
     A last line without an end, which was being written when the process was killed, is cut off.
+
+    Raises:
+        UserError: another line is damaged.
     """
     if not path.exists():
         return []
@@ -112,4 +135,7 @@ def read_lines(path: Path) -> list[Any]:
     whole = content[: content.rfind("\n") + 1]
     if whole != content:
         write_whole(path, whole)
-    return [json.loads(line) for line in whole.splitlines()]
+    try:
+        return [json.loads(line) for line in whole.splitlines()]
+    except ValueError as error:
+        raise UserError(f"{path} is damaged: {error}") from error

@@ -38,9 +38,14 @@ def make_function(
         return _import_function(config)
     # Only who uses a network waits for torch.
     from kitting_drake.policies.learned_policy import LearnedPolicy
-    from kitting_drake.policies.weights import load_networks, preferred_type, read_weights_file
+    from kitting_drake.policies.weights import (
+        load_networks,
+        preferred_device,
+        preferred_type,
+        read_weights_file,
+    )
 
-    networks = load_networks(base / config.weights, preferred_type())
+    networks = load_networks(base / config.weights, preferred_type()).to(preferred_device())
     learned_at = read_weights_file(base / config.weights).card.get("resolution")
     if learned_at is not None and not math.isclose(learned_at, grid.resolution, rel_tol=1e-6):
         raise UserError(
@@ -59,12 +64,13 @@ def make_function(
 
 
 def describe_learned(config: Learned, *, base: Path) -> dict[str, Any]:
-    """What results say of a learned policy: its method, its size, and what it learned from.
+    """What results say of a learned policy: its method, its size, what it learned from, and in
+    which numbers this machine computes it.
 
     Raises:
         UserError: the weights cannot be read.
     """
-    from kitting_drake.policies.weights import read_weights_file
+    from kitting_drake.policies.weights import preferred_type, read_weights_file
 
     file = read_weights_file(base / config.weights)
     return {
@@ -73,6 +79,7 @@ def describe_learned(config: Learned, *, base: Path) -> dict[str, Any]:
         "orientations": config.orientations,
         "continuous": config.continuous,
         "trained_orientations": file.config.orientations,
+        "compute_type": str(preferred_type()).removeprefix("torch."),
         **{key: file.card.get(key) for key in ("scenario", "demonstrations", "steps")},
     }
 

@@ -171,6 +171,8 @@ def _read_summary(path: Path) -> dict[str, Any]:
     for key in (*required, *ERRORS, "answers", "causes", "categories", "wall_seconds"):
         if not isinstance(summary, dict) or key not in summary:
             raise UserError(f"{path} lacks '{key}': it must be a summary.json of evaluate")
+    if not summary["seeds"] or len(summary["ci95"] or ()) != 2:
+        raise UserError(f"{path} has no seeds or no ci95: it must be a summary.json of evaluate")
     _check_details(summary["policy_details"], f"{path}: policy_details")
     return summary
 
@@ -267,10 +269,8 @@ def _rate(summary: dict[str, Any]) -> str:
 def _most_tested_run(runs: list[_Run]) -> list[str]:
     """Tables by category of the network that was tested most; if there is none, of an oracle."""
     learned = [run for run in runs if run.detail("method") in _LEARNED]
-    # Of few episodes, the best is the luckiest.
-    most = max(
-        learned or runs, key=lambda run: (run.summary["episodes"], run.summary["success_rate"])
-    )
+    # Not the best: of few episodes, that is the luckiest.
+    most = max(learned or runs, key=lambda run: (run.summary["episodes"], run.file))
     rows = [*most.summary["categories"].items(), ("all", most.summary)]
     placed = [
         [name, _rate(row)]
@@ -306,7 +306,7 @@ def _causes(runs: list[_Run]) -> list[str]:
         doubts = run.summary.get("doubts", {})
         rows.append(
             [run.label, run.seeds, str(tools)]
-            + [str(causes[name]) for name in (*CAUSES, FAILED)]
+            + [str(causes.get(name, "?")) for name in (*CAUSES, FAILED)]
             + [str(doubts.get(name, "?")) for name in DOUBTS]
         )
     headings = ["run", "seeds", "tools", *CAUSES, FAILED, *(f"kitted, but {x}" for x in DOUBTS)]

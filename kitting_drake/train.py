@@ -33,11 +33,13 @@ from kitting_drake.policies.methods import make_networks
 from kitting_drake.policies.samples import Scene, labelled_images, normalisation, scenes
 from kitting_drake.policies.training import Trainer
 from kitting_drake.policies.validation import validate
-from kitting_drake.policies.weights import preferred_type, save_weights
+from kitting_drake.policies.weights import preferred_device, preferred_type, save_weights
 from kitting_drake.verb import count_type, run_verb, seed_type
 
 _CHECKPOINT_EVERY = 100
 """Steps between checkpoints, and between points of the curves."""
+_TABLE = ("task", "heightmap")
+"""The fields of a scenario that, with the seed, say what stands where."""
 _MOST_VALIDATED = 64
 """Scenes that a validation looks at."""
 _DAMAGED = (
@@ -96,7 +98,7 @@ def main() -> int:
         rigid=arguments.rigid or arguments.method == "transporter",
         validate_every=arguments.validate_every,
         seed=arguments.seed,
-        device="cuda" if torch.cuda.is_available() else "cpu",
+        device=preferred_device().type,
         compute_type=str(preferred_type()).removeprefix("torch."),
     )
     folder = require_folder(
@@ -198,7 +200,9 @@ def _split(
     if not held_out.demonstrations:
         raise UserError(f"{validation} holds no demonstrations: collect some")
     shared = {item.seed for item in held_out.demonstrations} & {item.seed for item in items[:count]}
-    if shared and held_out.origin.scenario == everything.origin.scenario:
+    # What stands where depends on these and the seed alone.
+    scenarios = [item.origin.scenario for item in (everything, held_out)]
+    if shared and all(scenarios[0].get(key) == scenarios[1].get(key) for key in _TABLE):
         raise UserError(
             f"{validation} and {path} share the seed {min(shared)}: validation needs other ones"
         )

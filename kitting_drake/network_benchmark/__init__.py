@@ -22,7 +22,7 @@ from kitting_drake.network_benchmark.orientations import (
 )
 from kitting_drake.network_benchmark.speed import measure_folding, measure_levels, measure_shares
 from kitting_drake.network_benchmark.timing import describe_machine, measure_peak
-from kitting_drake.policies.weights import preferred_type
+from kitting_drake.policies.weights import preferred_device, preferred_type
 
 
 def benchmark_networks(plan: Plan, console: Console) -> dict[str, Any]:
@@ -38,7 +38,7 @@ def benchmark_networks(plan: Plan, console: Console) -> dict[str, Any]:
     Raises:
         UserError: the demonstrations cannot be used.
     """
-    device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    device = preferred_device()
     machine = describe_machine(device)
     scene, grid = observed_scene(plan.demonstrations)
     types = sorted({preferred_type(), torch.float32}, key=str)

@@ -168,6 +168,9 @@ def _draw_pick_angle(axis: Any, measured: dict[str, Any], preset: str) -> None:
 def _draw_decisions(axis: Any, measured: dict[str, Any]) -> None:
     """A bar for each method and N, of the parts; a bar that is far too long is cut."""
     rows = [row for row in measured["decision"] if row["seconds"]]
+    if not rows:
+        axis.text(0.5, 0.5, "every decision takes too long here", horizontalalignment="center")
+        return
     others = [row["seconds"] for row in rows if row["method"] != "transporter"]
     # Leaves room for the legend.
     limit = 1.5e3 * max(others or [row["seconds"] for row in rows])

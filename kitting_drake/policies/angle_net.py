@@ -17,7 +17,7 @@ from kitting_drake.policies.unet import ResidualBlock
 class AngleNetSize:
     """How deep and wide a pick-angle network is."""
 
-    stages: tuple[tuple[int, ...], ...] = ((16, 16), (32, 32), (16, 16), (8, 8))
+    stages: tuple[tuple[int, ...], ...]
     """Fields of each layer; a pooling between stages."""
     kernel: int = 7
     """Side of each layer's kernels, in pixels."""
@@ -27,7 +27,11 @@ class AngleNetSize:
     """The last layer's kernel covers all that is left, instead of a mean being taken after it."""
     residual: bool = False
     """A stage of two layers is a residual block, with a shortcut of the same kernels where the
-    number of fields changes."""
+    number of fields changes; the first stage, which takes scalars, must be of another kind."""
+
+    def __post_init__(self) -> None:
+        if self.residual and len(self.stages[0]) == 2:
+            raise ValueError("the first stage takes scalars, which no residual block does")
 
 
 class AngleNet(nn.Module):

@@ -133,7 +133,9 @@ def read_demonstrations(path: Path, first: int | None = None) -> Demonstrations:
     with _opened(path) as file:
         contents = _contents(file)
         seeds = contents.seeds[:first]
-        demonstrations = tuple(_read_group(file[_group_name(seed)]) for seed in seeds)
+        demonstrations = tuple(
+            _read_group(file[_group_name(seed)], contents.origin.grid) for seed in seeds
+        )
     return Demonstrations(contents.origin, contents.rejected, demonstrations)
 
 
@@ -252,7 +254,10 @@ def _opened(path: Path) -> Iterator[h5py.File]:
                     "can be read: use the kitting_drake that made it, or collect anew"
                 )
             yield file
-    except (OSError, KeyError, TypeError, json.JSONDecodeError) as error:
+    except UserError:
+        raise
+    except (OSError, LookupError, TypeError, AttributeError, ValueError, RuntimeError) as error:
+        # h5py has all of these for bytes that make no sense.
         raise UserError(f"{path} is truncated or damaged: collect anew ({error})") from error
 
 
@@ -270,10 +275,22 @@ def _contents(file: h5py.File) -> Contents:
     return Contents(origin, rejected, tuple(seeds))
 
 
-def _read_group(group: h5py.Group) -> Demonstration:
-    names = ("rgb", "height", "pick", "place", "surface_height")
-    numbers = (group[name][()] for name in names)
-    texts = (group[name].asstr()[()] for name in ("object", "category"))
+def _read_group(group: h5py.Group, grid: PixelGrid) -> Demonstration:
+    shapes = {
+        "rgb": (3, *grid.shape),
+        "height": grid.shape,
+        "pick": (3,),
+        "place": (3,),
+        "surface_height": (),
+    }
+    numbers = [group[name][()] for name in shapes]
+    texts = [group[name].asstr()[()] for name in ("object", "category")]
+    steps = len(texts[0])
+    for (name, shape), values in zip(shapes.items(), numbers, strict=True):
+        if values.shape != (steps, *shape) or not steps:
+            raise ValueError(f"{group.name}/{name} is of the shape {values.shape}")
+        if not np.isfinite(values).all():
+            raise ValueError(f"{group.name}/{name} holds what is no number")
     return Demonstration(
         seed=int(group.attrs["seed"]),
         score=float(group.attrs["score"]),

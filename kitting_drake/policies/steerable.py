@@ -224,6 +224,8 @@ def frequencies_cutoff(in_fibre: Fibre, out_fibre: Fibre, size: int) -> float | 
         return None
     missing = max(out_fibre.frequencies) - max(in_fibre.frequencies)
     radius = size // 2
+    if missing > 0 and not radius:
+        raise ValueError("a kernel of one pixel cannot lead to higher frequencies")
     return missing / radius if missing > radius else None
 
 

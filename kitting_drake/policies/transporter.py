@@ -67,12 +67,8 @@ class TransporterNetworks(Networks):
     def pick_volume(self, image: Image, orientations: int) -> Tensor:
         """f_pick: (N / 2, rows, cols), logits of all gripper angles 2 pi i / N and pixels at once.
 
-        In evaluation mode the last image's volume is kept, for who asks again with that very array.
+        In evaluation mode it is kept for `angle_logits`.
         """
-        if self._known is not None:
-            known, count, volume = self._known
-            if known is image and count == orientations:
-                return volume
         self.check_orientations(orientations)
         step = math.tau / orientations
         volume = torch.stack([self._scores(image, i * step) for i in range(orientations // 2)])
@@ -97,7 +93,14 @@ class TransporterNetworks(Networks):
         return self.pick_volume(image, orientations).amax(0)
 
     def angle_logits(self, image: Image, pixel: tuple[int, int], orientations: int) -> Tensor:
-        return self.pick_volume(image, orientations)[:, pixel[0], pixel[1]]
+        volume = None
+        if self._known is not None:
+            known, count, found = self._known
+            # `position_logits` has been asked of this very array just now.
+            volume = found if known is image and count == orientations else None
+        if volume is None:
+            volume = self.pick_volume(image, orientations)
+        return volume[:, pixel[0], pixel[1]]
 
     def pick_losses(
         self,

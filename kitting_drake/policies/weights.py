@@ -144,9 +144,14 @@ def load_networks(path: Path, compute_type: torch.dtype = torch.float32) -> Netw
     return networks
 
 
+def preferred_device() -> torch.device:
+    """The accelerator where there is one, else the CPU: where networks are trained and asked."""
+    return torch.device("cuda" if torch.cuda.is_available() else "cpu")
+
+
 def preferred_type() -> torch.dtype:
-    """bfloat16 where the CPU or the accelerator computes in it, else float32."""
-    if torch.cuda.is_available():
+    """bfloat16 where the preferred device computes in it, else float32."""
+    if preferred_device().type == "cuda":
         return torch.bfloat16 if torch.cuda.is_bf16_supported() else torch.float32
     fast = torch.backends.cpu.get_cpu_capability() in ("AVX512", "AMX") and (
         torch.cpu._is_avx512_bf16_supported() or torch.cpu._is_amx_tile_supported()

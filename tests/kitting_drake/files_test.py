@@ -7,6 +7,7 @@ from kitting_drake.errors import UserError
 from kitting_drake.files import (
     alone_in,
     append_line,
+    claim_folder,
     read_lines,
     require_folder,
     write_json,
@@ -64,3 +65,16 @@ def test_a_line_that_was_being_written_is_cut_off(tmp_path: Path):
     assert read_lines(path) == [{"seed": 1}]
     append_line(path, {"seed": 3})
     assert read_lines(path) == [{"seed": 1}, {"seed": 3}]
+    path.write_text('{"seed": 1\n{"seed": 3}\n')
+    with pytest.raises(UserError, match="is damaged"):
+        read_lines(path)
+
+
+def test_a_folder_is_that_of_one_thing(tmp_path: Path):
+    claim_folder(tmp_path, "settings.json", {"steps": 3, "type": "float32"}, of="run")
+    claim_folder(tmp_path, "settings.json", {"steps": 3, "type": "float32"}, of="run")
+    with pytest.raises(UserError, match=r"another run \(type is bfloat16, there float32\)"):
+        claim_folder(tmp_path, "settings.json", {"steps": 3, "type": "bfloat16"}, of="run")
+    (tmp_path / "settings.json").write_text('{"steps": ')
+    with pytest.raises(UserError, match=r"settings\.json is damaged"):
+        claim_folder(tmp_path, "settings.json", {}, of="run")

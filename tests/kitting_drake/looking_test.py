@@ -77,6 +77,7 @@ def test_results_say_what_a_policy_is(weights_file: Path):
         "orientations": 36,
         "continuous": False,
         "trained_orientations": 72,
+        "compute_type": str(preferred_type()).removeprefix("torch."),
         "scenario": "mine",
         "demonstrations": 3,
         "steps": 0,

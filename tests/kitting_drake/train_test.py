@@ -182,8 +182,8 @@ def test_stopped_it_goes_on_as_if_it_had_not(
     assert_same_outcome(tmp_path, trained)
 
 
-def test_demonstrations_of_another_scenario_may_have_the_same_seeds(demos: Path, tmp_path: Path):
-    origin = dataclasses.replace(ORIGIN, scenario={"time_limit": 2.0})
+def test_demonstrations_of_another_task_may_have_the_same_seeds(demos: Path, tmp_path: Path):
+    origin = dataclasses.replace(ORIGIN, scenario={"task": {"spacing": 0.02}})
     validation = write(tmp_path / "validation.h5", range(10, 12), origin)
     train(demos, tmp_path / "run", "--validation", validation, "--steps", 1)
     card = read_weights_file(tmp_path / "run" / "policy.safetensors").card
@@ -248,9 +248,15 @@ def test_refuses(
 
 VALIDATIONS = {
     "overlapping": (range(13, 15), ORIGIN, "share the seed 13: validation needs other ones"),
+    # Who moves faster does so at the same table.
+    "the same tables": (
+        range(13, 15),
+        dataclasses.replace(ORIGIN, scenario={"time_limit": 2.0}),
+        "share the seed 13: validation needs other ones",
+    ),
     "another grid": (
         [20],
-        dataclasses.replace(ORIGIN, grid=PixelGrid(rows=33, cols=50)),
+        dataclasses.replace(ORIGIN, grid=dataclasses.replace(GRID, resolution=0.005)),
         "have different pixel grids",
     ),
     "empty": ([], ORIGIN, "validation.h5 holds no demonstrations"),

@@ -145,6 +145,41 @@ def test_a_damaged_file_is_refused(tmp_path: Path):
         read_demonstrations(path)
 
 
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("height", np.zeros((3, 4, 7), np.float32)),
+        ("rgb", np.zeros((3, 5, 7, 3), np.uint8)),
+        ("pick", np.full((3, 3), np.nan)),
+        ("height", np.full((3, 5, 7), np.inf, np.float32)),
+        ("place", np.zeros((2, 3))),
+    ],
+)
+def test_content_that_makes_no_sense_is_refused(tmp_path: Path, name: str, value: np.ndarray):
+    path = written(tmp_path)
+    with h5py.File(path, "a") as file:
+        del file["seed_00000010"][name]
+        file["seed_00000010"][name] = value
+    with pytest.raises(UserError, match=rf"damaged: collect anew .*seed_00000010/{name} "):
+        read_demonstrations(path)
+
+
+def test_flipped_bytes_never_end_in_anything_but_a_sentence(tmp_path: Path):
+    path = written(tmp_path)
+    content, rng = path.read_bytes(), np.random.default_rng(0)
+    refused = 0
+    for _ in range(100):
+        damaged = bytearray(content)
+        for place in rng.integers(len(content), size=4):
+            damaged[place] ^= int(rng.integers(1, 256))
+        path.write_bytes(damaged)
+        try:
+            read_demonstrations(path)
+        except UserError:
+            refused += 1
+    assert refused > 10
+
+
 def test_a_foreign_file_is_refused(tmp_path: Path):
     text, other = tmp_path / "notes.h5", tmp_path / "other.h5"
     text.write_text("not HDF5 at all\n")

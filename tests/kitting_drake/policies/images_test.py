@@ -119,14 +119,16 @@ def test_no_height_is_made_up():
 
 def test_augmentation_keeps_both_labels_inside():
     sample = marked((10.0, 15.0), (50.0, 60.0))
-    angles = []
+    angles, shifts = [], []
     for seed in range(100):
         moved = augment(sample, np.random.default_rng(seed))
         for label in (moved.pick, moved.place):
             assert (label >= 0).all()
             assert (label <= (ROWS - 1, COLS - 1)).all()
         angles.append(math.remainder(moved.pick_theta - 0.3, math.tau))
+        shifts.append(moved.pick - Motion(moved.image, angles[-1], np.zeros(2)).after(sample.pick))
     assert np.std(angles) > math.radians(20)
+    assert (np.std(shifts, axis=0) > (ROWS / 12, COLS / 12)).all()
     assert len(set(angles)) == 100
 
 
@@ -165,14 +167,27 @@ def middle_line(image: np.ndarray, theta: float, u: float) -> float:
 
 @pytest.mark.parametrize("theta", [0.0, 0.7, 2.0])
 @pytest.mark.parametrize("moved", [False, True])
-def test_a_bend_keeps_the_object_at_the_pick_and_its_direction_there(theta: float, moved: bool):
+@pytest.mark.parametrize("index", [0, 1])
+def test_a_bend_keeps_the_object_at_its_pick_and_its_direction_there(
+    theta: float, moved: bool, index: int
+):
     sample = barred(theta)
+    if index:
+        # The bar is another object than the one that is picked.
+        sample = dataclasses.replace(
+            sample,
+            pick=np.array([10.0, 80.0]),
+            pick_theta=theta + 1.0,
+            other_picks=MIDDLE[None],
+            other_thetas=np.array([theta]),
+        )
     if moved:
         sample = move(sample, 0.4, np.array([2.0, -3]))
         theta += 0.4
-    sample = dataclasses.replace(sample, bends=np.array([[0.3, -0.1]]))
-    pixel = tuple(int(x) for x in np.rint(sample.pick))
-    bent = sample.bent_crop(0, pixel, 41)
+    bends = np.array([[-0.5, 0.5]] * index + [[0.3, -0.1]])
+    sample = dataclasses.replace(sample, bends=bends)
+    row, col = np.rint(sample.other_picks[0] if index else sample.pick).astype(int)
+    bent = sample.bent_crop(index, (int(row), int(col)), 41)
     start = middle_line(bent, theta, 0)
     for u in (-16, -8, -3, 3, 8, 16):
         v = u / 20

@@ -44,6 +44,15 @@ def test_a_run_that_is_taken_up_goes_on_bit_by_bit(decay: bool):
     assert_same(after, whole)
 
 
+def test_the_rate_is_that_of_the_step():
+    learner = trainer(steps=300, decay=True)
+    for step in range(3):
+        learner.step([scene(0)])
+        for optimiser in learner.optimisers.values():
+            assert [group["lr"] for group in optimiser.param_groups] == [learner.rate(step)]
+    assert learner.rate(0) < learner.rate(1)
+
+
 def test_every_loss_falls():
     learner = trainer(learning_rate=3e-3)
     losses = [learner.step([scene(0)]) for _ in range(30)]

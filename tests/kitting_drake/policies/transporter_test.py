@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from kitting_drake.policies.config import PRESETS, NetworkConfig
-from kitting_drake.policies.images import LabelledImage, rotation
+from kitting_drake.policies.images import Image, LabelledImage, rotation
 from kitting_drake.policies.losses import joint_loss, spread
 from kitting_drake.policies.methods import make_networks
 from kitting_drake.policies.training import Trainer
@@ -135,19 +135,27 @@ def test_picks_the_best_of_the_volume():
 
 
 @torch.no_grad()
-def test_an_image_is_looked_at_once_until_the_weights_change():
+def test_a_decision_looks_once_and_the_next_one_anew(monkeypatch: pytest.MonkeyPatch):
     networks = transporter().eval()
-    image = sample().image
-    first = networks.pick_volume(image, N)
-    assert networks.pick_volume(image, N) is first
-    again = networks.pick_volume(image.copy(), N)
-    assert again is not first
-    torch.testing.assert_close(again, first)
+    image = sample().image.copy()
+    looks = []
+    scores = networks._scores
+
+    def look(image: Image, theta: float) -> torch.Tensor:
+        looks.append(theta)
+        return scores(image, theta)
+
+    monkeypatch.setattr(networks, "_scores", look)
+    before = networks.position_logits(image, N)
+    angles = networks.angle_logits(image, (20, 30), N)
+    assert len(looks) == N // 2
+    assert angles.max() == before[20, 30]
+    # A camera may fill the same buffer again.
+    image[:] = image[:, ::-1].copy()
+    assert not torch.equal(networks.position_logits(image, N), before)
     state = {name: value + 0.1 for name, value in networks.state_dict().items()}
     networks.load_state_dict(state)
-    assert not torch.equal(networks.pick_volume(image, N), first)
-    networks.train()
-    assert networks.pick_volume(image, N) is not networks.pick_volume(image, N)
+    assert not torch.equal(networks.angle_logits(image, (20, 30), N), angles)
 
 
 def test_draws_stand_for_all_turns():
