@@ -39,7 +39,6 @@ from kitting_drake.cameras import (
     picture_camera,
 )
 from kitting_drake.errors import UserError
-from kitting_drake.files import require_folder
 from kitting_drake.looking import Watch, make_function
 from kitting_drake.paths import MODELS
 from kitting_drake.scenario import Heightmap, Learned, PythonPolicy, QuantisedOracle, Scenario
@@ -392,7 +391,6 @@ def _add_video(builder: DiagramBuilder, scene_graph: SceneGraph, path: Path) -> 
         ),
     )
     builder.Connect(scene_graph.get_query_output_port(), sensor.query_object_input_port())
-    require_folder(path.parent)
     writer = builder.AddNamedSystem("video_writer", VideoWriter(filename=str(path), fps=16.0))
     writer.ConnectRgbdSensor(builder=builder, sensor=sensor)
     return writer

@@ -118,11 +118,15 @@ class Collection:
         for path in self._parts.glob(".*"):
             # Was being written when the process was killed.
             path.unlink()
-        for path in self._parts.glob("seed_*.h5"):
-            self._accepted[int(path.stem.removeprefix("seed_"))] = path
-        for path in self._parts.glob("seed_*.json"):
-            rejection = Rejection(**json.loads(path.read_text()))
-            self._rejected[rejection.seed] = rejection
+        for path in self._parts.glob("seed_*"):
+            try:
+                if path.suffix == ".h5":
+                    self._accepted[int(path.stem.removeprefix("seed_"))] = path
+                else:
+                    rejection = Rejection(**json.loads(path.read_text()))
+                    self._rejected[rejection.seed] = rejection
+            except (OSError, ValueError, TypeError) as error:
+                raise UserError(f"{path} makes no sense here: delete it") from error
         if self.path.exists():
             self._find_assembled()
 

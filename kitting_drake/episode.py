@@ -101,7 +101,7 @@ def run_episode(
         timed_out = monitor.done_since is None
     except KeyboardInterrupt:
         interrupted = True
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         # Drake's own errors are RuntimeErrors; what a policy raises may be anything, and its author
         # wants to know where.
         failure = " ".join(f"{type(error).__name__}: {error}".split())

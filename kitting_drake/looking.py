@@ -116,7 +116,7 @@ def _import_function(config: PythonPolicy) -> Callable[[Observation], PickPlaceA
     module, _, name = config.function.partition(":")
     try:
         function = getattr(importlib.import_module(module), name)
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         # A person's own module may raise anything.
         reason = f"{type(error).__name__}: {error}"
         raise UserError(f"policy.function: cannot import {config.function}: {reason}") from error

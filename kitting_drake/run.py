@@ -77,6 +77,8 @@ def main() -> int:
             realtime_rate=scenario.target_realtime_rate,
             watch=progress.watch,
         )
+    # What an earlier run left is not of this one.
+    (folder / "replay.html").unlink(missing_ok=True)
     write_json(folder / "results.json", result.as_dict())
     _save_decisions(folder / "decisions", decisions)
     if meshcat is not None:
@@ -113,6 +115,12 @@ def _check_endings(picture: Path | None, video: Path | None) -> None:
         raise UserError(f"--picture writes .png files, not '{picture}'")
     if video is not None and video.suffix not in (".gif", ".webp"):
         raise UserError(f"--video writes .gif and .webp files, not '{video}'")
+    # Told before the episode, not after it.
+    for path in (picture, video):
+        if path is not None and path.is_dir():
+            raise UserError(f"{path} is a folder")
+        if path is not None:
+            require_folder(path.parent)
 
 
 def _start_meshcat(console: Console) -> Meshcat:

@@ -79,6 +79,7 @@ def summarise(
         "scenario": chosen.name,
         "task": task_name(chosen.scenario.task),
         "policy": chosen.policy,
+        "scenario_text": chosen.text,
         "versions": versions(),
         "policy_details": policy_details(chosen.scenario.policy, chosen.base),
         "success_threshold_mm": 1e3 * chosen.scenario.task.success_threshold,
@@ -184,7 +185,7 @@ def summary_table(summary: dict[str, Any]) -> Table:
         f"{summary['failed_episodes']} failed",
         title_justify="left",
     )
-    table.add_column("category")
+    table.add_column("category", no_wrap=True)
     for heading in ("kitted", "ADD-S mm", "95 %", "position mm", "angle deg", "height mm"):
         table.add_column(heading, justify="right")
     categories = summary["categories"]

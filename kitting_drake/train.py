@@ -34,7 +34,7 @@ from kitting_drake.policies.samples import Scene, labelled_images, normalisation
 from kitting_drake.policies.training import Trainer
 from kitting_drake.policies.validation import validate
 from kitting_drake.policies.weights import preferred_device, preferred_type, save_weights
-from kitting_drake.verb import count_type, run_verb, seed_type
+from kitting_drake.verb import count_type, interrupts_wait, run_verb, seed_type
 
 _CHECKPOINT_EVERY = 100
 """Steps between checkpoints, and between points of the curves."""
@@ -252,6 +252,8 @@ class _Run:
         )
         self.best: dict[str, Any] | None = None
         self.seconds = 0.0
+        self.recent: list[dict[str, float]] = []
+        """The losses since the last point of the curves."""
         self.card = {
             **dataclasses.asdict(settings),
             "samples": len(self.samples),
@@ -284,11 +286,11 @@ class _Run:
             transient=True,
             disable=not self.console.is_terminal,
         )
-        recent: list[dict[str, float]] = []
+        recent = self.recent
         start, begun = time.perf_counter() - self.seconds, trainer.step_count
         clock = time.perf_counter()
         writer = SummaryWriter(str(self.folder / "tensorboard"), purge_step=begun + 1)
-        with writer, progress:
+        with writer, progress, interrupts_wait() as interrupted:
             task = progress.add_task("steps", total=settings.steps, completed=begun, speed="")
             while trainer.step_count < settings.steps:
                 recent.append(trainer.step(self.samples))
@@ -313,8 +315,12 @@ class _Run:
                     for name, value in means.items():
                         writer.add_scalar(f"loss/{name}", value, step)
                     append_line(self._log, {"step": step, **means})
+                if interrupted() or step % _CHECKPOINT_EVERY == 0 or last:
                     self.seconds = time.perf_counter() - start
                     self._save()
+                if interrupted() and not last:
+                    progress.print(f"stopped after step {step}: the same command goes on there")
+                    raise KeyboardInterrupt
         self._summarise()
 
     def _summarise(self) -> None:
@@ -341,7 +347,9 @@ class _Run:
         try:
             state = torch.load(path, map_location=self.trainer.networks.device, weights_only=True)
             self.trainer.load_state_dict(state["trainer"])
-            self.best, self.seconds = state["best"], state["seconds"]
+            self.best, self.seconds, self.recent = (
+                state[key] for key in ("best", "seconds", "recent")
+            )
         except _DAMAGED as error:
             raise UserError(f"{path} cannot be taken up again: delete {self.folder}") from error
         kept = [line for line in read_lines(self._log) if line["step"] <= self.trainer.step_count]
@@ -349,7 +357,12 @@ class _Run:
 
     def _save(self) -> None:
         buffer = io.BytesIO()
-        state = {"trainer": self.trainer.state_dict(), "best": self.best, "seconds": self.seconds}
+        state = {
+            "trainer": self.trainer.state_dict(),
+            "best": self.best,
+            "seconds": self.seconds,
+            "recent": self.recent,
+        }
         torch.save(state, buffer)
         write_whole(self.folder / "checkpoint.pt", buffer.getvalue())
 

@@ -1,9 +1,11 @@
 """What every verb does the same way; no pydrake here."""
 
 import argparse
+import contextlib
 import logging
+import signal
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
 from kitting_drake.errors import UserError
 
@@ -34,6 +36,33 @@ def count_type(text: str) -> int:
     if count < 1:
         raise argparse.ArgumentTypeError(f"'{text}' is not a whole number of 1 or more")
     return count
+
+
+@contextlib.contextmanager
+def interrupts_wait() -> Iterator[Callable[[], bool]]:
+    """Lets Ctrl-C wait for a good moment; a second one does not wait.
+
+    Yields:
+        Whether there was one: who asks goes on to raise KeyboardInterrupt.
+    """
+    before = signal.getsignal(signal.SIGINT)
+    if before == signal.SIG_IGN:
+        # As of jobs that a shell starts in the background.
+        yield lambda: False
+        return
+    came = False
+
+    def note(number: int, frame: object) -> None:
+        nonlocal came
+        if came:
+            raise KeyboardInterrupt
+        came = True
+
+    signal.signal(signal.SIGINT, note)
+    try:
+        yield lambda: came
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 def run_verb(main: Callable[[], int]) -> None:

@@ -31,6 +31,13 @@ def _chosen(entries: list[ToolEntry], names: list[str]) -> list[ToolEntry]:
     return [entry for entry in entries if not names or entry.name in names]
 
 
+def _with_own(entries: list[ToolEntry], names: list[str]) -> tuple[list[ToolEntry], list[str]]:
+    """The entries named and the user's own tools named; where no name is given, all of both."""
+    own = [name for name in user_tool_names() if not names or name in names]
+    known = [name for name in names if name not in own]
+    return [] if names and not known else _chosen(entries, known), own
+
+
 def _description(models: Path, name: str) -> dict:
     path = models / "tools" / name / "tool.yaml"
     if not path.exists():
@@ -44,13 +51,11 @@ def list_tools(args: argparse.Namespace, entries: list[ToolEntry]) -> None:
     """Prints a table of the generated tools."""
     table = Table()
     table.add_column("name", no_wrap=True)
-    table.add_column("category")
-    table.add_column("split")
+    table.add_column("category", no_wrap=True)
+    table.add_column("split", no_wrap=True)
     for heading in ("size, mm", "mass, g", "grasp, mm"):
         table.add_column(heading, justify="right", no_wrap=True)
-    own = [name for name in user_tool_names() if not args.names or name in args.names]
-    known = [name for name in args.names if name not in own]
-    chosen = [] if args.names and not known else _chosen(entries, known)
+    chosen, own = _with_own(entries, args.names)
     descriptions = [_description(args.models, entry.name) for entry in chosen]
     for name in own:
         load_tool(str(user_tools() / name))
@@ -97,7 +102,9 @@ def sheet(args: argparse.Namespace, entries: list[ToolEntry]) -> None:
         kits = [make_kit([load_tool(name) for name in names], KitParameters()) for names in chosen]
         subjects = [kit_subject(f"{args.split} {i:03d}", kit) for i, kit in enumerate(kits)]
     else:
-        subjects = [tool_subject(load_tool(entry.name)) for entry in _chosen(entries, args.names)]
+        shown, own = _with_own(entries, args.names)
+        names = [*(entry.name for entry in shown), *own]
+        subjects = [tool_subject(load_tool(name)) for name in names]
     write_sheet(subjects, args.output)
 
 
@@ -143,7 +150,7 @@ def import_mesh(args: argparse.Namespace, entries: list[ToolEntry]) -> None:
     console.print(f"{d['name']}: {size} mm, {1e3 * d['mass']:.0f} g, {held}")
     for note in report.notes:
         console.print(f"  {note}", markup=False)
-    named = d["name"] if args.output is None else report.directory
+    named = d["name"] if args.output is None else report.directory.resolve()
     console.print(f"files: {report.directory}/; name it '{named}' in a scenario", soft_wrap=True)
 
 

@@ -96,6 +96,8 @@ def save_grasp(tool: Tool, grasp: Grasp, models: Path = MODELS) -> None:
         record_path = tool.directory / "tool.yaml"
         record = yaml.safe_load(record_path.read_text())
         record["grasp"] = {key: round(value, 6) for key, value in dataclasses.asdict(grasp).items()}
+        # Importing again is not to undo it.
+        record["annotated"] = True
         write_whole(record_path, yaml.safe_dump(record, sort_keys=False))
         return
     path = models / "tools" / "catalogue.yaml"

@@ -89,6 +89,8 @@ def import_tool(request: ImportRequest, time_limit: float | None = TIME_LIMIT) -
     final = folder / name
     if final.exists() and not _is_import(final):
         raise UserError(f"{final} exists and is no imported tool: give another --name")
+    if final.exists() and yaml.safe_load((final / "tool.yaml").read_text()).get("annotated"):
+        raise UserError(f"{final} has a grasp that you saved: give another --name, or delete it")
     new_folders = [p for p in (folder, *folder.parents) if not p.exists()]
     try:
         folder.mkdir(parents=True, exist_ok=True)

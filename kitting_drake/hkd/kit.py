@@ -9,6 +9,7 @@ the same cavity without the voxels, their steps, and the smoothing that has to h
 
 import hashlib
 import os
+import shutil
 import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -305,8 +306,10 @@ def make_kit(tools: Sequence[Tool], parameters: KitParameters) -> Kit:
     """
     final = cache_directory() / "kits" / _content_key(tools, parameters)
     kit = Kit(sdf=final / "kit.sdf", parameters=parameters, tools=tuple(tools))
-    if final.is_dir():
+    if _is_whole(final):
         return kit
+    # A machine that went down may have left names without content.
+    shutil.rmtree(final, ignore_errors=True)
     cavities = kit_cavities(tools, parameters)
     try:
         final.parent.mkdir(parents=True, exist_ok=True)
@@ -322,6 +325,11 @@ def make_kit(tools: Sequence[Tool], parameters: KitParameters) -> Kit:
     return kit
 
 
+def _is_whole(folder: Path) -> bool:
+    sizes = [(folder / name).stat().st_size for name in _FILES if (folder / name).is_file()]
+    return len(sizes) == len(_FILES) and all(sizes)
+
+
 def _content_key(tools: Sequence[Tool], parameters: KitParameters) -> str:
     digest = hashlib.sha256(f"{_FORMAT_VERSION} {parameters}".encode())
     for tool in tools:
@@ -330,6 +338,8 @@ def _content_key(tools: Sequence[Tool], parameters: KitParameters) -> str:
             digest.update(path.read_bytes())
     return digest.hexdigest()[:24]
 
+
+_FILES = ("kit.obj", "contact.obj", "block.obj", "cavities.obj", "kit.sdf")
 
 _SDF = """<?xml version="1.0"?>
 <sdf version="1.9" xmlns:drake="http://drake.mit.edu">

@@ -1,5 +1,6 @@
 """Contact sheets of tools and kits, rendered without a display by Drake's VTK engine."""
 
+import io
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -25,6 +26,7 @@ from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.sensors import CameraInfo
 
 from kitting_drake.cameras import require_rendering
+from kitting_drake.files import write_whole
 from kitting_drake.hkd.kit import Kit
 from kitting_drake.hkd.tool import Tool
 
@@ -86,7 +88,7 @@ def kit_subject(title: str, kit: Kit) -> Subject:
         (tool.sdf, RigidTransform(kit.goal(index))) for index, tool in enumerate(kit.tools[:-1])
     ]
     models = [(kit.sdf, RigidTransform()), *seated]
-    return Subject(title, models, (0.0, 0.0, 0.02), 0.47, elevation_deg=52.0)
+    return Subject(title, models, (0.0, 0.0, 0.02), 0.52, elevation_deg=52.0)
 
 
 def render_subject(
@@ -146,7 +148,7 @@ def write_sheet(subjects: Sequence[Subject], output: Path) -> None:
     """Writes one picture of all the subjects with their titles.
 
     Raises:
-        UserError: images cannot be rendered here.
+        UserError: images cannot be rendered here, or the picture cannot be written.
     """
     require_rendering()
     # Imported here: drawing is the only use, and the other verbs should not wait for it.
@@ -166,5 +168,7 @@ def write_sheet(subjects: Sequence[Subject], output: Path) -> None:
         axis.imshow(render_subject(subject))
         axis.set_title(subject.title, fontsize=13, color="0.15")
     figure.tight_layout()
-    figure.savefig(output, dpi=130 if len(subjects) <= 12 else 60)
+    picture = io.BytesIO()
+    figure.savefig(picture, format="png", dpi=130 if len(subjects) <= 12 else 60)
     plt.close(figure)
+    write_whole(output, picture.getvalue())

@@ -256,9 +256,13 @@ def _opened(path: Path) -> Iterator[h5py.File]:
             yield file
     except UserError:
         raise
+    except PermissionError as error:
+        raise UserError(f"cannot read {path}: {error.strerror}") from error
     except (OSError, LookupError, TypeError, AttributeError, ValueError, RuntimeError) as error:
         # h5py has all of these for bytes that make no sense.
-        raise UserError(f"{path} is truncated or damaged: collect anew ({error})") from error
+        raise UserError(
+            f"{path} is truncated or damaged: delete it and collect again ({error})"
+        ) from error
 
 
 def _contents(file: h5py.File) -> Contents:

@@ -168,11 +168,15 @@ def test_a_scenario_is_found_by_its_name_and_not_by_another_path(verb: Verb, tmp
 def test_a_policy_that_raises_leaves_its_reason_and_a_failure(verb: Verb, tmp_path: Path):
     scenario = tmp_path / "mine.yaml"
     scenario.write_text('Mine: {policy: !PythonPolicy {function: "math:sqrt"}}\n')
+    (tmp_path / "out").mkdir()
+    replay = tmp_path / "out" / "replay.html"
+    replay.write_text("of an earlier run")
     done = verb("run", scenario, "--no-meshcat", "--output", tmp_path / "out")
     assert done.returncode == 1
     results = json.loads((tmp_path / "out" / "results.json").read_text())
     assert results["failure"].startswith("TypeError: must be real number")
     assert results["success_rate"] == 0.0
+    assert not replay.exists()
 
 
 LEARNED = """

@@ -3,6 +3,7 @@ import json
 import os
 import random
 import shutil
+import signal
 import subprocess
 import sys
 from collections.abc import Callable, Iterable
@@ -158,6 +159,32 @@ def assert_same_outcome(folder: Path, other: Path) -> None:
     assert all(torch.equal(one[name], two[name]) for name in one.keys() | two.keys())
     one, two = (json.loads((path / "summary.json").read_text()) for path in (folder, other))
     assert one | {"wall_seconds": 0} == two | {"wall_seconds": 0}
+
+
+def test_ctrl_c_loses_no_step(
+    demos: Path,
+    trained: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+):
+    step = Trainer.step
+
+    def step_and_interrupt(self: Trainer, *arguments: Any) -> dict[str, float]:
+        if self.step_count == 2:
+            # In the middle of a step, and between two checkpoints.
+            os.kill(os.getpid(), signal.SIGINT)
+        return step(self, *arguments)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Trainer, "step", step_and_interrupt)
+        with pytest.raises(KeyboardInterrupt):
+            train(demos, tmp_path)
+    assert "stopped after step 3: the same command goes on there" in capsys.readouterr().out
+    state = torch.load(tmp_path / "checkpoint.pt", weights_only=True)
+    assert state["trainer"]["step_count"] == 3
+    train(demos, tmp_path)
+    assert_same_outcome(tmp_path, trained)
 
 
 @pytest.mark.parametrize("stop", [1, 3])

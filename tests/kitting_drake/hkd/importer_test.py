@@ -1,3 +1,4 @@
+import dataclasses
 import os
 import struct
 from collections.abc import Callable
@@ -11,6 +12,7 @@ from manifold3d import JoinType, Manifold, OpType
 
 from kitting_drake.errors import UserError
 from kitting_drake.hkd import importer
+from kitting_drake.hkd.annotate import save_grasp
 from kitting_drake.hkd.fit import guess_unit
 from kitting_drake.hkd.importer import ImportRequest, import_tool
 from kitting_drake.hkd.meshes import vertices_and_faces
@@ -233,6 +235,12 @@ def test_names(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     # An import may be done again; what is none is not overwritten.
     again = bring(path, tmp_path / "own", name="mine", length_mm=160.0)
     assert load_tool("mine").length == pytest.approx(0.160) == again.record["length"]
+    # A person's work is not undone by it.
+    grasp = dataclasses.replace(load_tool("mine").grasp, x=0.011)
+    save_grasp(load_tool("mine"), grasp)
+    with pytest.raises(UserError, match="has a grasp that you saved"):
+        bring(path, tmp_path / "own", name="mine")
+    assert load_tool("mine").grasp == grasp
     (tmp_path / "own" / "other").mkdir()
     with pytest.raises(UserError, match="is no imported tool"):
         bring(path, tmp_path / "own", name="other")

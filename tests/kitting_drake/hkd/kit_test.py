@@ -149,8 +149,15 @@ def test_a_kit_is_built_once(tools: list[Tool], cache: Path, monkeypatch: pytest
     def fail(*_: object) -> None:
         raise AssertionError("built again")
 
-    monkeypatch.setattr(kit_module, "_write", fail)
-    assert make_kit(tools, PARAMETERS).sdf == first.sdf
+    with monkeypatch.context() as patch:
+        patch.setattr(kit_module, "_write", fail)
+        assert make_kit(tools, PARAMETERS).sdf == first.sdf
+    # The machine went down before the content was on the disk.
+    path = first.sdf.with_name("contact.obj")
+    content = path.read_bytes()
+    path.write_bytes(b"")
+    make_kit(tools, PARAMETERS)
+    assert path.read_bytes() == content
 
 
 def test_what_changes_a_kit_makes_another(tools: list[Tool], cache: Path):
