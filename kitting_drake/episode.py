@@ -143,7 +143,7 @@ def score(
     """
     context = cell.monitor.GetMyContextFromRoot(root_context)
     columns = [
-        cell.monitor.GetOutputPort(name).Eval(context)
+        cell.monitor.GetOutputPort(name).Eval(context).tolist()
         for name in ("add_s", "position_error", "angle_error", "height_error")
     ]
     poses = object_poses(cell, root_context)
@@ -151,7 +151,7 @@ def score(
     for index, (tool, add_s, position, angle, height) in enumerate(
         zip(cell.scene.tools, *columns, strict=True)
     ):
-        success = bool(add_s < cell.scene.success_threshold)
+        success = add_s < cell.scene.success_threshold
         results.append(
             ObjectResult(
                 name=tool.name,

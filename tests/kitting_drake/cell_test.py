@@ -201,6 +201,9 @@ def test_a_simulation_that_fails_ends_the_episode_with_its_reason():
     assert not result.interrupted
     assert len(result.objects) == 4
     assert 0.05 < result.sim_seconds < 0.1
+    # Plain numbers, of which JSON can be made.
+    kinds = {type(value) for item in result.objects for value in vars(item).values()}
+    assert kinds == {str, float, bool}
 
 
 def test_an_interrupted_episode_has_a_result():
