@@ -160,7 +160,7 @@ def test_content_that_makes_no_sense_is_refused(tmp_path: Path, name: str, value
     with h5py.File(path, "a") as file:
         del file["seed_00000010"][name]
         file["seed_00000010"][name] = value
-    with pytest.raises(UserError, match=rf"damaged: delete it and collect again .*seed_00000010/{name} "):
+    with pytest.raises(UserError, match=rf"damaged: delete it .*seed_00000010/{name} "):
         read_demonstrations(path)
 
 
