@@ -9,7 +9,6 @@ the same cavity without the voxels, their steps, and the smoothing that has to h
 
 import hashlib
 import os
-import shutil
 import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -308,8 +307,6 @@ def make_kit(tools: Sequence[Tool], parameters: KitParameters) -> Kit:
     kit = Kit(sdf=final / "kit.sdf", parameters=parameters, tools=tuple(tools))
     if _is_whole(final):
         return kit
-    # A machine that went down may have left names without content.
-    shutil.rmtree(final, ignore_errors=True)
     cavities = kit_cavities(tools, parameters)
     try:
         final.parent.mkdir(parents=True, exist_ok=True)
@@ -317,10 +314,13 @@ def make_kit(tools: Sequence[Tool], parameters: KitParameters) -> Kit:
             scratch = Path(folder) / "kit"
             scratch.mkdir()
             _write(cavities, parameters, scratch)
+            if final.exists() and not _is_whole(final):
+                # A machine that went down may have left names without content.
+                os.rename(final, Path(folder) / "damaged")
             os.rename(scratch, final)
     except OSError as error:
         # Unless another process was quicker: its kit is the same.
-        if not final.is_dir():
+        if not _is_whole(final):
             raise UserError(f"cannot write the kit to {final.parent}: {error.strerror}") from error
     return kit
 
