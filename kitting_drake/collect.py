@@ -14,19 +14,14 @@ import numpy as np
 from pydrake.systems.framework import Context
 from rich.console import Console
 
-from kitting_drake.cameras import require_rendering
-from kitting_drake.cell import Cell, make_grid
-from kitting_drake.cli import (
-    ChosenScenario,
-    build_chosen,
-    choose_scenario,
-    output_folder,
-    scenario_parser,
-    versions,
-)
-from kitting_drake.episode import run_episode
-from kitting_drake.errors import UserError
-from kitting_drake.files import alone_in, claim_folder, require_folder, write_json
+from kitting_drake.cell.cameras import require_rendering
+from kitting_drake.cell.cell import Cell, make_grid
+from kitting_drake.common.command_line import count_type, run_verb, seed_type
+from kitting_drake.common.errors import UserError
+from kitting_drake.common.files import alone_in, claim_folder, require_folder, write_json
+from kitting_drake.common.processes import Died, counting_bar, run_apart, side_by_side
+from kitting_drake.common.seeds import DEMONSTRATION_SEEDS, seeds_from
+from kitting_drake.episode.episode import run_episode
 from kitting_drake.policies.demonstrations import (
     Demonstration,
     DemonstrationStep,
@@ -36,10 +31,15 @@ from kitting_drake.policies.demonstrations import (
     read_contents,
     write_demonstrations,
 )
-from kitting_drake.processes import Died, counting_bar, run_apart, side_by_side
-from kitting_drake.scenario import Oracle
-from kitting_drake.seeds import DEMONSTRATION_SEEDS, seeds_from
-from kitting_drake.verb import count_type, run_verb, seed_type
+from kitting_drake.scenario.command_line import (
+    ChosenScenario,
+    build_chosen,
+    choose_scenario,
+    output_folder,
+    scenario_parser,
+    versions,
+)
+from kitting_drake.scenario.schema import Oracle
 from systems.pick_place_planner import Mode
 from systems.signals import Observation, PickPlaceAction
 

@@ -10,17 +10,9 @@ from typing import Any
 
 from rich.console import Console
 
-from kitting_drake.cli import (
-    ChosenScenario,
-    build_chosen,
-    choose_scenario,
-    output_folder,
-    scenario_parser,
-    versions,
-)
-from kitting_drake.episode import run_episode
-from kitting_drake.errors import UserError
-from kitting_drake.files import (
+from kitting_drake.common.command_line import FAILED, count_type, run_verb, seed_type
+from kitting_drake.common.errors import UserError
+from kitting_drake.common.files import (
     alone_in,
     append_line,
     claim_folder,
@@ -28,13 +20,21 @@ from kitting_drake.files import (
     require_folder,
     write_json,
 )
-from kitting_drake.hkd.tool import load_tool
-from kitting_drake.looking import seeds_learned_from, source_of
-from kitting_drake.processes import Died, counting_bar, run_apart, side_by_side
-from kitting_drake.scenario import Learned, PythonPolicy, ToolsetKitting
-from kitting_drake.summary import Episode, summarise, summary_notes, summary_table
-from kitting_drake.summary_figure import draw_summary
-from kitting_drake.verb import FAILED, count_type, run_verb, seed_type
+from kitting_drake.common.processes import Died, counting_bar, run_apart, side_by_side
+from kitting_drake.episode.episode import run_episode
+from kitting_drake.hkd.tools.tool import load_tool
+from kitting_drake.reporting.summary import Episode, summarise, summary_notes, summary_table
+from kitting_drake.reporting.summary_figure import draw_summary
+from kitting_drake.scenario.command_line import (
+    ChosenScenario,
+    build_chosen,
+    choose_scenario,
+    output_folder,
+    scenario_parser,
+    versions,
+)
+from kitting_drake.scenario.policies import seeds_learned_from, source_of
+from kitting_drake.scenario.schema import Learned, PythonPolicy, ToolsetKitting
 
 
 def main() -> int:

@@ -15,10 +15,11 @@ from typing import Any
 
 from rich.console import Console
 
-from kitting_drake.answers import CAUSES
-from kitting_drake.errors import UserError
-from kitting_drake.files import write_whole
-from kitting_drake.summary import (
+from kitting_drake.common.command_line import run_verb
+from kitting_drake.common.errors import UserError
+from kitting_drake.common.files import write_whole
+from kitting_drake.episode.action_log import CAUSES
+from kitting_drake.reporting.summary import (
     ANSWER_ERRORS,
     DOUBTS,
     ERRORS,
@@ -27,7 +28,6 @@ from kitting_drake.summary import (
     UNSEEN_TASK,
     number,
 )
-from kitting_drake.verb import run_verb
 
 _METHODS = {
     "so2": "SO(2)-equivariant (ours)",

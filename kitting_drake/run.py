@@ -10,14 +10,19 @@ from pydrake.systems.framework import Context, Diagram
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
-from kitting_drake.cameras import render_picture, save_png
-from kitting_drake.cell import Cell
-from kitting_drake.cli import build_chosen, choose_scenario, output_folder, scenario_parser
-from kitting_drake.episode import run_episode
-from kitting_drake.errors import UserError
-from kitting_drake.files import require_folder, write_json, write_whole
-from kitting_drake.report import print_episode
-from kitting_drake.verb import FAILED, INTERRUPTED, run_verb, seed_type
+from kitting_drake.cell.cameras import render_picture, save_png
+from kitting_drake.cell.cell import Cell
+from kitting_drake.common.command_line import FAILED, INTERRUPTED, run_verb, seed_type
+from kitting_drake.common.errors import UserError
+from kitting_drake.common.files import require_folder, write_json, write_whole
+from kitting_drake.episode.episode import run_episode
+from kitting_drake.reporting.terminal import print_episode
+from kitting_drake.scenario.command_line import (
+    build_chosen,
+    choose_scenario,
+    output_folder,
+    scenario_parser,
+)
 from systems.pick_place_planner import Mode
 from systems.signals import Observation
 
@@ -103,7 +108,7 @@ def _save_decisions(folder: Path, decisions: "list[tuple[Observation, Decision]]
         path.unlink()
     if decisions:
         # Who draws nothing does not wait for matplotlib.
-        from kitting_drake.decision_figure import draw_decision
+        from kitting_drake.reporting.decision_figure import draw_decision
 
         for number, (observation, decision) in enumerate(decisions, start=1):
             picture = draw_decision(observation, decision)

@@ -16,8 +16,9 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from torch.utils.tensorboard import SummaryWriter
 
-from kitting_drake.errors import UserError
-from kitting_drake.files import (
+from kitting_drake.common.command_line import count_type, interrupts_wait, run_verb, seed_type
+from kitting_drake.common.errors import UserError
+from kitting_drake.common.files import (
     alone_in,
     append_line,
     claim_folder,
@@ -34,7 +35,6 @@ from kitting_drake.policies.samples import Scene, labelled_images, normalisation
 from kitting_drake.policies.training import Trainer
 from kitting_drake.policies.validation import validate
 from kitting_drake.policies.weights import preferred_device, preferred_type, save_weights
-from kitting_drake.verb import count_type, interrupts_wait, run_verb, seed_type
 
 _CHECKPOINT_EVERY = 100
 """Steps between checkpoints, and between points of the curves."""

@@ -8,16 +8,16 @@ from rich.console import Console
 from rich.progress import Progress, track
 from rich.table import Table
 
-from kitting_drake.hkd.generate import (
+from kitting_drake.common.command_line import count_type, run_verb
+from kitting_drake.common.paths import MODELS
+from kitting_drake.hkd.tools.generate import (
     CatalogueError,
     ToolEntry,
     generate_tool,
     load_catalogue,
 )
-from kitting_drake.hkd.tool import CATEGORIES, load_tool, user_tool_names, user_tools
-from kitting_drake.hkd.toolsets import SPLITS, toolsets
-from kitting_drake.paths import MODELS
-from kitting_drake.verb import count_type, run_verb
+from kitting_drake.hkd.tools.tool import CATEGORIES, load_tool, user_tool_names, user_tools
+from kitting_drake.hkd.tools.toolsets import SPLITS, toolsets
 
 
 def _chosen(entries: list[ToolEntry], names: list[str]) -> list[ToolEntry]:
@@ -94,7 +94,7 @@ def generate(args: argparse.Namespace, entries: list[ToolEntry]) -> None:
 def sheet(args: argparse.Namespace, entries: list[ToolEntry]) -> None:
     """Renders the contact sheet."""
     # Imported here: Drake is slow to load, and only this verb needs it.
-    from kitting_drake.hkd.kit import KitParameters, make_kit
+    from kitting_drake.hkd.kits.kit import KitParameters, make_kit
     from kitting_drake.hkd.sheet import kit_subject, tool_subject, write_sheet
 
     if args.kits:
@@ -124,14 +124,14 @@ def build(args: argparse.Namespace, entries: list[ToolEntry]) -> None:
 
 def annotate(args: argparse.Namespace, entries: list[ToolEntry]) -> None:
     """Opens a page to look at a tool, move a gripper over it, and save its grasp."""
-    from kitting_drake.hkd.annotate import annotate as annotate_tool
+    from kitting_drake.hkd.grasps.annotate import annotate as annotate_tool
 
     annotate_tool(args.name, Console())
 
 
 def import_mesh(args: argparse.Namespace, entries: list[ToolEntry]) -> None:
     """Makes a tool that scenarios can name from a mesh: STL, OBJ, PLY or GLB."""
-    from kitting_drake.hkd.importer import ImportRequest, import_tool
+    from kitting_drake.hkd.importing.importer import ImportRequest, import_tool
 
     console = Console(quiet=args.quiet, highlight=False)
     request = ImportRequest(

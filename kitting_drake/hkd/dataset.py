@@ -10,11 +10,11 @@ from pathlib import Path
 from typing import Any
 
 import kitting_drake
-from kitting_drake.errors import UserError
-from kitting_drake.files import write_json
-from kitting_drake.hkd.kit import Kit, KitParameters, make_kit
-from kitting_drake.hkd.tool import Tool, load_tool
-from kitting_drake.hkd.toolsets import SPLITS, TOOLSETS_SEED, tool_pools, toolsets
+from kitting_drake.common.errors import UserError
+from kitting_drake.common.files import write_json
+from kitting_drake.hkd.kits.kit import Kit, KitParameters, make_kit
+from kitting_drake.hkd.tools.tool import Tool, load_tool
+from kitting_drake.hkd.tools.toolsets import SPLITS, TOOLSETS_SEED, tool_pools, toolsets
 
 
 def build_dataset(folder: Path, progress: Callable[[int, int], None]) -> dict[str, Any]:

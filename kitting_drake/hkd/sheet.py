@@ -25,10 +25,10 @@ from pydrake.multibody.plant import AddMultibodyPlantSceneGraph
 from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.sensors import CameraInfo
 
-from kitting_drake.cameras import require_rendering
-from kitting_drake.files import write_whole
-from kitting_drake.hkd.kit import Kit
-from kitting_drake.hkd.tool import Tool
+from kitting_drake.cell.cameras import require_rendering
+from kitting_drake.common.files import write_whole
+from kitting_drake.hkd.kits.kit import Kit
+from kitting_drake.hkd.tools.tool import Tool
 
 _BACKGROUND = (0.97, 0.97, 0.96)
 # A key light that throws the shadows, and a fill from the camera, whose shadows cannot be seen.

@@ -24,7 +24,7 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from kitting_drake.errors import UserError
+from kitting_drake.common.errors import UserError
 from systems.signals import Observation, PickPlaceAction, PixelGrid, PlanarPose
 
 FORMAT = "kitting_drake demonstrations"

@@ -18,8 +18,8 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import Tensor
 
-from kitting_drake.errors import UserError
-from kitting_drake.files import write_whole
+from kitting_drake.common.errors import UserError
+from kitting_drake.common.files import write_whole
 from kitting_drake.policies.config import NetworkConfig
 from kitting_drake.policies.methods import make_networks
 from kitting_drake.policies.networks import Networks

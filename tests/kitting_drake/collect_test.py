@@ -17,11 +17,13 @@ from pydrake.systems.framework import Context
 from rich.console import Console
 
 import kitting_drake.collect as collecting
-from kitting_drake.cell import Cell, build_cell
+from kitting_drake.cell.cell import Cell, build_cell
 from kitting_drake.collect import Collection, Recorder, demonstrate, next_seed
-from kitting_drake.episode import run_episode
-from kitting_drake.errors import UserError
-from kitting_drake.files import alone_in
+from kitting_drake.common.errors import UserError
+from kitting_drake.common.files import alone_in
+from kitting_drake.common.processes import Died
+from kitting_drake.common.seeds import DEMONSTRATION_SEEDS, TEST_SEEDS, VALIDATION_SEEDS, seeds_from
+from kitting_drake.episode.episode import run_episode
 from kitting_drake.policies.demonstrations import (
     Demonstration,
     DemonstrationStep,
@@ -29,9 +31,7 @@ from kitting_drake.policies.demonstrations import (
     Rejection,
     read_demonstrations,
 )
-from kitting_drake.processes import Died
-from kitting_drake.scenario import ArrangedKitting, Placement, PythonPolicy, Scenario
-from kitting_drake.seeds import DEMONSTRATION_SEEDS, TEST_SEEDS, VALIDATION_SEEDS, seeds_from
+from kitting_drake.scenario.schema import ArrangedKitting, Placement, PythonPolicy, Scenario
 from systems.pick_place_parameters import Mode, PickPlaceParameters
 from systems.signals import Observation, PickPlaceAction, PixelGrid, PlanarPose
 
@@ -232,7 +232,7 @@ def test_without_rendering_one_sentence(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
     monkeypatch.chdir(ROOT)
-    monkeypatch.setattr("kitting_drake.cameras.can_render", lambda: False)
+    monkeypatch.setattr("kitting_drake.cell.cameras.can_render", lambda: False)
     monkeypatch.setattr(sys, "argv", arguments(tmp_path))
     with pytest.raises(SystemExit) as left:
         collecting.run_verb(collecting.main)

@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from kitting_drake.hkd.tool import CATEGORIES
+from kitting_drake.hkd.tools.tool import CATEGORIES
 
 
 @pytest.fixture(scope="session")

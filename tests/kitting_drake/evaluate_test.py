@@ -14,14 +14,14 @@ import pytest
 from rich.console import Console
 
 import kitting_drake.evaluate as evaluation
-from kitting_drake.cli import ChosenScenario
-from kitting_drake.episode import EpisodeResult
-from kitting_drake.errors import UserError
-from kitting_drake.files import alone_in
-from kitting_drake.paths import MODELS
-from kitting_drake.processes import Died
-from kitting_drake.scenario import Heightmap, Kitting, Learned, PythonPolicy, Scenario
-from kitting_drake.summary import Episode
+from kitting_drake.common.errors import UserError
+from kitting_drake.common.files import alone_in
+from kitting_drake.common.paths import MODELS
+from kitting_drake.common.processes import Died
+from kitting_drake.episode.episode import EpisodeResult
+from kitting_drake.reporting.summary import Episode
+from kitting_drake.scenario.command_line import ChosenScenario
+from kitting_drake.scenario.schema import Heightmap, Kitting, Learned, PythonPolicy, Scenario
 
 CHOSEN = ChosenScenario(Scenario(), Path("mine.yaml"), "mine", None)
 ROOT = Path(__file__).resolve().parents[2]

@@ -8,11 +8,11 @@ import pytest
 from pydrake.math import RigidTransform, RollPitchYaw
 from pydrake.systems.analysis import Simulator
 
-import kitting_drake.cell
-from kitting_drake.cell import Cell, build_cell
-from kitting_drake.episode import run_episode
-from kitting_drake.scenario import ArrangedKitting, Kitting, Placement, Scenario, Sleep
-from kitting_drake.tasks.kitting import KittingScene, make_scene
+import kitting_drake.cell.cell
+from kitting_drake.cell.cell import Cell, build_cell
+from kitting_drake.episode.episode import run_episode
+from kitting_drake.scenario.schema import ArrangedKitting, Kitting, Placement, Scenario, Sleep
+from kitting_drake.tasks.kitting.scene import KittingScene, make_scene
 from systems.pick_place_parameters import PickPlaceParameters
 
 pytestmark = pytest.mark.slow
@@ -122,7 +122,7 @@ def test_a_tool_that_the_closing_jaws_turned_is_turned_into_its_cavity(
         grasp = dataclasses.replace(tool.grasp, theta=tool.grasp.theta + np.radians(5))
         return dataclasses.replace(scene, tools=(dataclasses.replace(tool, grasp=grasp),))
 
-    monkeypatch.setattr(kitting_drake.cell, "make_scene", misjudged)
+    monkeypatch.setattr(kitting_drake.cell.cell, "make_scene", misjudged)
     task = ArrangedKitting(tools={"s_wrench": Placement(x=0.36, y=0.3, yaw_deg=75.0)})
     planner = PickPlaceParameters(search_turn=search_turn, max_actions=1)
     cell = build_cell(Scenario(task=task, planner=planner), seed=0, base=Path())

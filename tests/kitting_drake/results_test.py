@@ -7,11 +7,11 @@ from typing import Any
 
 import pytest
 
-from kitting_drake.cli import ChosenScenario
-from kitting_drake.errors import UserError
+from kitting_drake.common.errors import UserError
+from kitting_drake.reporting.summary import summarise
 from kitting_drake.results import read_summaries, results_page
-from kitting_drake.scenario import QuantisedOracle, Scenario
-from kitting_drake.summary import summarise
+from kitting_drake.scenario.command_line import ChosenScenario
+from kitting_drake.scenario.schema import QuantisedOracle, Scenario
 
 OURS = {
     "method": "so2",

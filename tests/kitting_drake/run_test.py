@@ -15,10 +15,10 @@ import yaml
 from safetensors.torch import save_file
 
 from kitting_drake import run as running
-from kitting_drake.hkd.tool import CATEGORIES
-from kitting_drake.paths import SCENARIOS
-from kitting_drake.scenario import Learned, Oracle, load_scenario
-from kitting_drake.verb import run_verb
+from kitting_drake.common.command_line import run_verb
+from kitting_drake.common.paths import SCENARIOS
+from kitting_drake.hkd.tools.tool import CATEGORIES
+from kitting_drake.scenario.schema import Learned, Oracle, load_scenario
 
 ROOT = Path(__file__).resolve().parents[2]
 Verb = Callable[..., subprocess.CompletedProcess[str]]
@@ -98,7 +98,7 @@ def test_quiet_prints_nothing(verb: Verb, tmp_path: Path):
 INTERRUPTED_RUN = """
 import os, signal
 from kitting_drake import run
-from kitting_drake.verb import run_verb
+from kitting_drake.common.command_line import run_verb
 
 run_episode = run.run_episode
 

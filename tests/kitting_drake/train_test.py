@@ -16,8 +16,8 @@ import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from kitting_drake import train as training
-from kitting_drake.errors import UserError
-from kitting_drake.files import alone_in
+from kitting_drake.common.errors import UserError
+from kitting_drake.common.files import alone_in
 from kitting_drake.policies.demonstrations import (
     Demonstration,
     DemonstrationStep,

@@ -7,9 +7,9 @@ from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import AddMultibodyPlantSceneGraph
 from pydrake.systems.framework import DiagramBuilder
 
-from kitting_drake.errors import UserError
+from kitting_drake.common.errors import UserError
 from kitting_drake.hkd import dataset
-from kitting_drake.hkd.toolsets import SPLITS, toolsets
+from kitting_drake.hkd.tools.toolsets import SPLITS, toolsets
 
 
 @pytest.fixture

@@ -6,7 +6,7 @@ import h5py
 import numpy as np
 import pytest
 
-from kitting_drake.errors import UserError
+from kitting_drake.common.errors import UserError
 from kitting_drake.policies.demonstrations import (
     Demonstration,
     DemonstrationStep,

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 import torch
 
-from kitting_drake.paths import MODELS
+from kitting_drake.common.paths import MODELS
+from kitting_drake.common.seeds import TEST_SEEDS
 from kitting_drake.policies.config import PICK_CROP, NetworkConfig
 from kitting_drake.policies.methods import make_networks
 from kitting_drake.policies.networks import SO2Networks
 from kitting_drake.policies.weights import load_networks, read_weights_file
-from kitting_drake.seeds import TEST_SEEDS
 from tests.kitting_drake.policies.turning import relative_error, smooth_image, turn_image
 
 SHIPPED = sorted((MODELS / "policies").glob("*.safetensors"))

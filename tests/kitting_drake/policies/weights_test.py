@@ -15,7 +15,7 @@ from safetensors import safe_open
 from safetensors.torch import save_file
 from torch import Tensor
 
-from kitting_drake.errors import UserError
+from kitting_drake.common.errors import UserError
 from kitting_drake.policies.config import NetworkConfig
 from kitting_drake.policies.learned_policy import LearnedPolicy
 from kitting_drake.policies.methods import make_networks

@@ -1,0 +1,177 @@
+"""What the measurements of a benchmark share: the plan, the machine and what is looked at."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from kitting_drake.benchmark.networks.timing import Timing, memory_bytes, time_each
+from kitting_drake.common.errors import UserError
+from kitting_drake.policies import config as sizes
+from kitting_drake.policies.config import PRESETS
+from kitting_drake.policies.demonstrations import read_demonstrations
+from kitting_drake.policies.images import Image, LabelledImage, crop, rotation
+from kitting_drake.policies.networks import Networks
+from kitting_drake.policies.samples import Scene, scenes
+from kitting_drake.policies.weights import load_networks, preferred_type, save_weights
+from systems.signals import Observation, PixelGrid
+
+_EXPECTED_SHARE = 0.3
+"""Of the machine's peak: what a network is expected to reach when its time is predicted."""
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What to measure, and how carefully."""
+
+    preset: str = "small"
+    compared_preset: str | None = "paper"
+    """One more, of which only the models that answer the pick angle are measured."""
+    orientations: tuple[int, ...] = (36, 72, 120, 180)
+    """N of section V-B.1 of the paper."""
+    finer: int = 720
+    """N at which the paper's own method alone is asked."""
+    repeats: int = 9
+    """Of which the median is taken."""
+    peak_side: int = 2048
+    """Of the matrices whose product shows the machine's peak; fourfold on an accelerator."""
+    budget: float = 60.0
+    """Seconds that a figure may take; what is predicted to take longer is left out."""
+    demonstrations: Path | None = None
+    """Where the observation comes from; None: it is drawn."""
+
+    def __post_init__(self) -> None:
+        if self.preset not in PRESETS:
+            raise UserError(f"--preset must be one of {', '.join(PRESETS)}, not '{self.preset}'")
+
+
+@dataclass
+class Bench:
+    """What all measurements share."""
+
+    plan: Plan
+    device: torch.device
+    folder: Path
+    """For the weights of exported networks."""
+    scene: Scene
+    grid: PixelGrid
+    peak: dict[torch.dtype, dict[str, float]] = field(default_factory=dict)
+    """By type: what `measure_peak` gives."""
+
+    @property
+    def image(self) -> Image:
+        return self.scene.image
+
+    @property
+    def pixel(self) -> tuple[int, int]:
+        """(row, col) of the pick."""
+        row, col = np.rint(self.scene.targets[0].pick).astype(int)
+        return int(row), int(col)
+
+    def observe(self) -> Observation:
+        """The scene as if seen anew: networks may remember what they saw."""
+        return Observation(self.image.copy(), self.grid)
+
+    def time_each(
+        self, functions: dict[Any, Callable[[], object]], *, training: bool = False
+    ) -> dict[Any, Timing]:
+        """`timing.time_each`, as carefully as planned."""
+        plan = self.plan
+        with torch.inference_mode(not training):
+            return time_each(functions, self.device, repeats=plan.repeats, budget=plan.budget)
+
+    def inputs(self, networks: Networks) -> dict[str, Tensor]:
+        """Each network's."""
+        scene = networks.prepare(self.image)
+        return {
+            "alpha": scene,
+            "phi": scene,
+            "psi": networks.prepare(crop(self.image, self.pixel, sizes.PLACE_CROP)),
+            "beta": networks.prepare(crop(self.image, self.pixel, sizes.PICK_CROP)),
+        }
+
+    def export(self, networks: Networks, type_: torch.dtype) -> Networks:
+        """What evaluation runs: saved, and loaded as plain convolutions."""
+        path = self.folder / "networks.safetensors"
+        save_weights(path, networks, {})
+        return load_networks(path, type_).to(self.device)
+
+    def why_not(self, outlined: Networks, operations: int) -> str | None:
+        """Why something is not timed, if it is not.
+
+        Args:
+            outlined: its networks, without values.
+            operations: of one run.
+        """
+        seconds = operations / (_EXPECTED_SHARE * self.peak[preferred_type()]["best"])
+        if seconds > self.plan.budget:
+            return f"not run: ~{seconds:.0f} s"
+        size = 4 * sum(weight.numel() for weight in outlined.parameters())
+        if size > memory_bytes(self.device) / 2:
+            return f"not run: needs {size / 2**30:.0f} GiB"
+        return None
+
+
+def times_of(timing: Timing | None) -> dict[str, Any]:
+    """As JSON holds it."""
+    return dataclasses.asdict(timing) if timing else {"seconds": None}
+
+
+def type_name(type_: torch.dtype) -> str:
+    """As JSON holds it: `float32`."""
+    return str(type_).removeprefix("torch.")
+
+
+def observed_scene(path: Path | None) -> tuple[Scene, PixelGrid]:
+    """What is decided upon: the first observation of a demonstration, or one that is drawn.
+
+    Raises:
+        UserError: the demonstrations cannot be used.
+    """
+    if path is None:
+        grid = PixelGrid()
+        return drawn_scene(grid), grid
+    demonstrations = read_demonstrations(path, 1)
+    grid = demonstrations.origin.grid
+    observed = scenes(demonstrations.demonstrations, grid)
+    if not observed:
+        raise UserError(f"{path} holds no demonstration")
+    return observed[0], grid
+
+
+def drawn_scene(grid: PixelGrid) -> Scene:
+    """Four bars of a tool's size on a table, and a block with cavities for them."""
+    random = np.random.default_rng(0)
+    pixel = np.stack(np.meshgrid(np.arange(grid.rows), np.arange(grid.cols), indexing="ij"), -1)
+    image = np.full((4, *grid.shape), 0.4, np.float32)
+    image[3] = 0.0
+
+    def bar(middle: NDArray[np.float64], angle: float, length: float, width: float) -> Any:
+        """Which pixels (rows, cols) are in it; lengths in metres, along the rows at angle 0."""
+        along, across = np.moveaxis(np.abs((pixel - middle) @ rotation(angle)), -1, 0)
+        half = 0.5 * np.array([length, width]) / grid.resolution
+        return (along <= half[0]) & (across <= half[1])
+
+    rows, cols = grid.shape
+    kit = np.array([0.5 * rows, 0.25 * cols])
+    block = bar(kit, 0.0, 0.26, 0.28)
+    image[:3, block], image[3, block] = 0.6, 0.05
+    targets = []
+    for index in range(4):
+        pick = np.array([(0.2 + 0.2 * index) * rows, 0.75 * cols])
+        place = kit + (0.0, (index - 1.5) * 0.06 / grid.resolution)
+        theta = float(random.uniform(0.3, 1.2))
+        cavity, tool = bar(place, 0.0, 0.17, 0.03), bar(pick, theta, 0.17, 0.025)
+        image[3, cavity] = 0.03
+        image[:3, tool] = random.uniform(0.1, 0.9, (3, 1))
+        image[3, tool] = 0.02
+        targets.append(LabelledImage(image, pick=pick, pick_theta=theta, place=place, turn=-theta))
+    return Scene(image, tuple(targets))

@@ -1,0 +1,166 @@
+"""Cameras and render engines: from their descriptions in a scenario to Drake's."""
+
+import ctypes
+import io
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+from pydrake.geometry import (
+    ClippingRange,
+    ColorRenderCamera,
+    DepthRange,
+    DepthRenderCamera,
+    LightParameter,
+    MakeRenderEngineVtk,
+    RenderCameraCore,
+    RenderEngineVtkParams,
+    SceneGraph,
+    SsaoParameter,
+)
+from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
+from pydrake.systems.framework import Context
+from pydrake.systems.sensors import CameraInfo
+
+from kitting_drake.common.errors import UserError
+from kitting_drake.common.files import write_whole
+from kitting_drake.scenario.schema import LookAt, Pinhole
+
+OVERVIEW = LookAt(position=[1.62, -0.95, 1.13], target=[0.48, -0.02, 0.06])
+"""From where pictures and films show the whole cell."""
+
+
+def can_render() -> bool:
+    """Whether the system library that rendering needs is there."""
+    try:
+        ctypes.CDLL("libEGL.so.1")
+    except OSError:
+        return False
+    return True
+
+
+def require_rendering() -> None:
+    """Makes sure that images can be rendered here.
+
+    Raises:
+        UserError: the system library is missing; names the package.
+    """
+    if not can_render():
+        raise UserError(
+            "rendering needs the system library libEGL: install it "
+            "(Debian and Ubuntu: apt-get install libegl1 libgl1-mesa-dri)"
+        )
+
+
+def add_observation_renderer(scene_graph: SceneGraph) -> str:
+    """Adds the engine that the policy sees by, plain and quick; returns its name.
+
+    Raises:
+        UserError: images cannot be rendered here.
+    """
+    require_rendering()
+    scene_graph.AddRenderer("observation", MakeRenderEngineVtk(RenderEngineVtkParams()))
+    return "observation"
+
+
+def add_picture_renderer(scene_graph: SceneGraph) -> str:
+    """Adds the engine that pictures are made with; returns its name.
+
+    Soft light from three sides, and ambient occlusion, which tells what stands on what. To be added
+    before a context is made: one that comes later is not told where things are.
+
+    Raises:
+        UserError: images cannot be rendered here.
+    """
+    return _add_studio(scene_graph, "picture", SsaoParameter(radius=0.08))
+
+
+def add_film_renderer(scene_graph: SceneGraph) -> str:
+    """Adds the engine that films are made with, lit as pictures are, but quick; returns its name.
+
+    Raises:
+        UserError: images cannot be rendered here.
+    """
+    return _add_studio(scene_graph, "film", None)
+
+
+def _add_studio(scene_graph: SceneGraph, name: str, ssao: SsaoParameter | None) -> str:
+    require_rendering()
+    parameters = RenderEngineVtkParams(
+        default_clear_color=np.array([0.90, 0.92, 0.94]),
+        lights=[
+            _light([-0.45, 0.35, -0.9], 0.9),
+            _light([0.6, -0.5, -0.6], 0.45),
+            _light([0.1, 0.9, -0.4], 0.25),
+        ],
+        ssao=ssao,
+    )
+    scene_graph.AddRenderer(name, MakeRenderEngineVtk(parameters))
+    return name
+
+
+def _light(direction: list[float], intensity: float) -> LightParameter:
+    return LightParameter(
+        type="directional", frame="world", direction=direction, intensity=intensity
+    )
+
+
+def camera_pose(config: Pinhole | LookAt) -> RigidTransform:
+    """X_WC of a camera: z looks, x points right in the image, y down."""
+    if isinstance(config, Pinhole):
+        return RigidTransform(RollPitchYaw(np.deg2rad(config.rpy_deg)), config.position)
+    z = np.subtract(config.target, config.position)
+    x = np.cross(z, [0.0, 0.0, 1.0])
+    R_WC = RotationMatrix(np.column_stack([v / np.linalg.norm(v) for v in (x, np.cross(z, x), z)]))
+    return RigidTransform(R_WC, config.position)
+
+
+def depth_camera(config: Pinhole | LookAt, renderer: str) -> DepthRenderCamera:
+    """Drake's description of a camera; colour and depth are seen from the same point."""
+    info = CameraInfo(
+        width=config.width,
+        height=config.height,
+        focal_x=config.focal_length,
+        focal_y=config.focal_length,
+        center_x=config.width / 2,
+        center_y=config.height / 2,
+    )
+    core = RenderCameraCore(renderer, info, ClippingRange(0.01, 10.0), RigidTransform())
+    return DepthRenderCamera(core, DepthRange(0.01, 10.0))
+
+
+def picture_camera(
+    renderer: str, *, width: int = 1280, height: int = 800, fov_y: float = 0.42
+) -> RenderCameraCore:
+    """A camera for people's eyes: size in pixels, vertical field of view in radians."""
+    return RenderCameraCore(
+        renderer,
+        CameraInfo(width=width, height=height, fov_y=fov_y),
+        ClippingRange(0.05, 10.0),
+        RigidTransform(),
+    )
+
+
+def render_picture(
+    scene_graph: SceneGraph, context: Context, view: Pinhole | LookAt = OVERVIEW
+) -> NDArray[np.uint8]:
+    """(800, 1280, 3) what a scene graph's own, connected context shows from a camera's place.
+
+    The scene graph needs the engine of `add_picture_renderer`.
+    """
+    camera = ColorRenderCamera(picture_camera("picture"))
+    query = scene_graph.get_query_output_port().Eval(context)
+    image = query.RenderColorImage(camera, scene_graph.world_frame_id(), camera_pose(view))
+    return np.array(image.data[:, :, :3])
+
+
+def save_png(pixels: NDArray[np.uint8], path: Path) -> None:
+    """Writes an image (height, width, 3) to a PNG file, whole or not at all.
+
+    Raises:
+        UserError: the file cannot be written.
+    """
+    buffer = io.BytesIO()
+    Image.fromarray(pixels).save(buffer, "PNG")
+    write_whole(path, buffer.getvalue())

@@ -1,0 +1,1 @@
+"""Shared by the whole application: files, processes, errors, paths, command lines."""

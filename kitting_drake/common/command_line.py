@@ -1,0 +1,79 @@
+"""What every verb does the same way; no pydrake here."""
+
+import argparse
+import contextlib
+import logging
+import signal
+import sys
+from collections.abc import Callable, Iterator
+
+from kitting_drake.common.errors import UserError
+
+FAILED = 1
+"""Exit code when a simulation or a policy failed, and nothing else can be blamed."""
+
+INTERRUPTED = 130
+"""Exit code after Ctrl-C, as shells have it."""
+
+
+def seed_type(text: str) -> int:
+    """A seed given on the command line."""
+    try:
+        seed = int(text)
+    except ValueError:
+        seed = -1
+    if not 0 <= seed < 2**32:
+        raise argparse.ArgumentTypeError(f"'{text}' is not a whole number from 0 to {2**32 - 1}")
+    return seed
+
+
+def count_type(text: str) -> int:
+    """A count given on the command line: 1 or more."""
+    try:
+        count = int(text)
+    except ValueError:
+        count = 0
+    if count < 1:
+        raise argparse.ArgumentTypeError(f"'{text}' is not a whole number of 1 or more")
+    return count
+
+
+@contextlib.contextmanager
+def interrupts_wait() -> Iterator[Callable[[], bool]]:
+    """Lets Ctrl-C wait for a good moment; a second one does not wait.
+
+    Yields:
+        Whether there was one: who asks goes on to raise KeyboardInterrupt.
+    """
+    before = signal.getsignal(signal.SIGINT)
+    if before == signal.SIG_IGN:
+        # As of jobs that a shell starts in the background.
+        yield lambda: False
+        return
+    came = False
+
+    def note(number: int, frame: object) -> None:
+        nonlocal came
+        if came:
+            raise KeyboardInterrupt
+        came = True
+
+    signal.signal(signal.SIGINT, note)
+    try:
+        yield lambda: came
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+def run_verb(main: Callable[[], int]) -> None:
+    """Runs a verb and leaves with its exit code; a user's error is told in one sentence."""
+    # Drake announces ports and frame names; a verb says itself what a person needs to know.
+    logging.getLogger("drake").setLevel(logging.WARNING)
+    try:
+        code = main()
+    except UserError as error:
+        print(f"error: {error}", file=sys.stderr)
+        code = 2
+    except KeyboardInterrupt:
+        code = INTERRUPTED
+    sys.exit(code)

@@ -1,0 +1,143 @@
+"""Writing files that are there whole or not at all, in folders of one thing and one process."""
+
+import contextlib
+import fcntl
+import json
+import os
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from kitting_drake.common.errors import UserError
+
+
+def write_whole(path: Path, content: str | bytes) -> None:
+    """Writes a file beside its place and moves it there, making its folder if need be.
+
+    Raises:
+        UserError: the place cannot be written to.
+    """
+    data = content.encode() if isinstance(content, str) else content
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        handle, scratch = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
+        try:
+            with os.fdopen(handle, "wb") as file:
+                file.write(data)
+            os.chmod(scratch, 0o644)
+            os.replace(scratch, path)
+        except BaseException:
+            os.unlink(scratch)
+            raise
+    except OSError as error:
+        raise UserError(f"cannot write {path}: {error.strerror}") from error
+
+
+def write_json(path: Path, value: Any) -> None:
+    """Writes JSON for people to read; see `write_whole`."""
+    write_whole(path, json.dumps(value, indent=2) + "\n")
+
+
+def require_folder(path: Path) -> Path:
+    """Makes a folder for a run's files, before the run.
+
+    Raises:
+        UserError: it cannot be made, or written to.
+    """
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=path):
+            return path
+    except OSError as error:
+        raise UserError(f"cannot write into {path}: {error.strerror}") from error
+
+
+def claim_folder(folder: Path, name: str, described: Any, *, of: str) -> None:
+    """Marks a folder, by a JSON file in it, as that of one thing's files.
+
+    Args:
+        folder: whose.
+        name: of the file.
+        described: what tells the thing from others; anything that JSON takes.
+        of: what such a thing is called.
+
+    Raises:
+        UserError: it holds those of another.
+    """
+    path = folder / name
+    described = json.loads(json.dumps(described, default=str))
+    if not path.exists() and (folder / "summary.json").exists():
+        raise UserError(f"{folder} holds the summary.json of something else: give another --output")
+    if path.exists():
+        try:
+            found = json.loads(path.read_text())
+        except (OSError, ValueError) as error:
+            raise UserError(f"{path} is damaged: give another --output, or delete {folder}") from (
+                error
+            )
+        if found != described:
+            raise UserError(
+                f"{folder} holds the files of another {of}"
+                f"{_first_difference(found, described)}: give another --output, or delete it"
+            )
+    write_json(path, described)
+
+
+def _first_difference(found: Any, described: Any) -> str:
+    """Where two descriptions differ, for a person; nothing if that cannot be said in few words."""
+    if not isinstance(found, dict) or not isinstance(described, dict):
+        return ""
+    for key in (*described, *found):
+        old, new = found.get(key), described.get(key)
+        if old != new:
+            simple = all(isinstance(value, str | float | int | None) for value in (old, new))
+            return f" ({key} is {new}, there {old})" if simple else f" ({key} differs)"
+    return ""
+
+
+@contextlib.contextmanager
+def alone_in(folder: Path) -> Iterator[None]:
+    """Keeps a second process out of a folder while one is at work there.
+
+    Raises:
+        UserError: there is one already.
+    """
+    with (folder / ".lock").open("w") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            raise UserError(
+                f"another process is at work in {folder}: wait for it, or give another --output"
+            ) from error
+        except OSError as error:
+            raise UserError(f"{folder} cannot be locked: {error.strerror}") from error
+        yield
+
+
+def append_line(path: Path, item: Any) -> None:
+    """Adds an object to a file of JSON lines, and sees to it that it is on the disk."""
+    with path.open("a") as file:
+        file.write(json.dumps(item) + "\n")
+        file.flush()
+        os.fsync(file.fileno())
+
+
+def read_lines(path: Path) -> list[Any]:
+    """The objects of a file of JSON lines; none if there is no file.
+
+    A last line without an end, which was being written when the process was killed, is cut off.
+
+    Raises:
+        UserError: another line is damaged.
+    """
+    if not path.exists():
+        return []
+    content = path.read_text()
+    whole = content[: content.rfind("\n") + 1]
+    if whole != content:
+        write_whole(path, whole)
+    try:
+        return [json.loads(line) for line in whole.splitlines()]
+    except ValueError as error:
+        raise UserError(f"{path} is damaged: {error}") from error

@@ -1,0 +1,1 @@
+"""One episode: running it, recording its actions, scoring it."""

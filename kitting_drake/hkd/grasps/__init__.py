@@ -1,0 +1,1 @@
+"""Grasps: proposed and annotated."""

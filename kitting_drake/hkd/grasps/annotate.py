@@ -1,0 +1,310 @@
+"""`hkd annotate NAME`: a Meshcat page to move a gripper over a tool and save its grasp."""
+
+import dataclasses
+import math
+import re
+import time
+from pathlib import Path
+
+import numpy as np
+import yaml
+from numpy.typing import NDArray
+from pydrake.geometry import Box, Mesh, Meshcat, MeshcatParams, Rgba, Sphere
+from pydrake.math import RigidTransform, RollPitchYaw
+from rich.console import Console
+from rich.table import Table
+
+from kitting_drake.common.errors import UserError
+from kitting_drake.common.files import write_whole
+from kitting_drake.common.paths import MODELS
+from kitting_drake.hkd.grasps.proposals import (
+    FLOOR_CLEARANCE,
+    GRASP_DEPTH,
+    PAD_LENGTH,
+    GraspProposal,
+    propose_grasps,
+)
+from kitting_drake.hkd.tools.generate import generate_tool, load_catalogue
+from kitting_drake.hkd.tools.tool import Grasp, Tool, load_tool
+
+_HAND_MESHES = MODELS / "franka_hand" / "meshes"
+_FINGERTIP = 0.1121
+"""From the hand's flange to its fingertips, in metres: see models/franka_hand/README.md."""
+_FINGER_START = 0.0584
+
+
+def measure_grasp(tool: Tool, x: float, y: float, theta: float) -> Grasp | None:
+    """What the jaws take hold of when they close at a place over a tool.
+
+    Args:
+        tool: lying in its frame T.
+        x: of the middle of the pads in T, in metres.
+        y: likewise; only its part along the pads counts, as closing jaws draw the tool amid them.
+        theta: turn of the hand about T's z, in radians.
+
+    Returns:
+        The grasp amid the faces that are gripped, or None where there is nothing between the pads.
+    """
+    along = np.array([math.cos(theta), math.sin(theta), 0.0])
+    across = np.array([-math.sin(theta), math.cos(theta), 0.0])
+    middle = np.array([x, y, 0.0])
+    points = _points_between(tool.triangles - middle, along, PAD_LENGTH / 2)
+    if not len(points):
+        return None
+    reach = points @ across
+    low, high = float(reach.min()), float(reach.max())
+    centre = middle + (low + high) / 2 * across
+    return Grasp(
+        x=float(centre[0]),
+        y=float(centre[1]),
+        theta=theta,
+        width=high - low,
+        surface_height=float(points[:, 2].max()),
+    )
+
+
+def _points_between(
+    triangles: NDArray[np.float64], normal: NDArray[np.float64], distance: float
+) -> NDArray[np.float64]:
+    """The corners (m, 3) of what is left of triangles (n, 3, 3) between two parallel planes."""
+    starts, ends = triangles.reshape(-1, 3), np.roll(triangles, -1, axis=1).reshape(-1, 3)
+    start_heights, end_heights = starts @ normal, ends @ normal
+    found = [starts[np.abs(start_heights) <= distance]]
+    for plane in (-distance, distance):
+        crossing = (start_heights < plane) != (end_heights < plane)
+        share = (plane - start_heights[crossing]) / (
+            end_heights[crossing] - start_heights[crossing]
+        )
+        found.append(starts[crossing] + share[:, None] * (ends[crossing] - starts[crossing]))
+    return np.concatenate(found)
+
+
+def save_grasp(tool: Tool, grasp: Grasp, models: Path = MODELS) -> None:
+    """Makes a grasp the tool's annotated one.
+
+    A tool of the catalogue gets it in the catalogue, and is generated anew; another in its record.
+
+    Args:
+        tool: the tool.
+        grasp: in its frame T.
+        models: the folder with the catalogue in `tools/`.
+
+    Raises:
+        UserError: the catalogue cannot have it; then nothing has changed.
+    """
+    if tool.directory.parent != models / "tools":
+        record_path = tool.directory / "tool.yaml"
+        record = yaml.safe_load(record_path.read_text())
+        record["grasp"] = {key: round(value, 6) for key, value in dataclasses.asdict(grasp).items()}
+        # Importing again is not to undo it.
+        record["annotated"] = True
+        write_whole(record_path, yaml.safe_dump(record, sort_keys=False))
+        return
+    path = models / "tools" / "catalogue.yaml"
+    before = path.read_text()
+    write_whole(path, with_grasp(before, tool.name, grasp))
+    try:
+        entry = next(entry for entry in load_catalogue(path) if entry.name == tool.name)
+        generate_tool(entry, tool.directory)
+    except UserError:
+        write_whole(path, before)
+        raise
+
+
+def with_grasp(catalogue: str, name: str, grasp: Grasp) -> str:
+    """The text of the catalogue with another grasp for one tool, all else and all comments kept.
+
+    Raises:
+        UserError: the catalogue has no such tool.
+    """
+    entry = re.compile(
+        rf"(^  - name: {re.escape(name)}\n(?:(?!  - name:).*\n)*?    grasp: )\{{.*\}}", re.M
+    )
+    text = (
+        f"{{x_mm: {1e3 * grasp.x:.2f}, y_mm: {1e3 * grasp.y:.2f}, "
+        f"theta_deg: {math.degrees(grasp.theta):.1f}}}"
+    )
+    changed, count = entry.subn(lambda match: match[1] + text, catalogue)
+    if count != 1:
+        raise UserError(f"the catalogue has no tool '{name}' with a grasp on one line")
+    return changed
+
+
+class AnnotationPage:
+    """The page: the tool, the hand over it, sliders, buttons.
+
+    Sliders move the hand; "take proposal" sets them to the proposal of the first slider.
+    """
+
+    def __init__(self, tool: Tool, proposals: list[GraspProposal], meshcat: Meshcat) -> None:
+        """
+        Args:
+            tool: to annotate.
+            proposals: the best first.
+            meshcat: whose page it is.
+        """
+        self._tool = tool
+        self._proposals = proposals
+        self._meshcat = meshcat
+        self._shown: tuple[float, ...] | None = None
+        self._draw_tool()
+        if proposals:
+            meshcat.AddSlider("proposal", 1, len(proposals), 1, 1)
+            meshcat.AddButton("take proposal")
+        half_length, half_width = 500 * tool.length, 500 * tool.width
+        meshcat.AddSlider("x, mm", -half_length, half_length, 0.25, 1e3 * tool.grasp.x)
+        meshcat.AddSlider("y, mm", -half_width, half_width, 0.25, 1e3 * tool.grasp.y)
+        theta = math.degrees(math.remainder(tool.grasp.theta, math.pi))
+        meshcat.AddSlider("turn, deg", -90, 90, 0.5, theta)
+        meshcat.AddButton("save")
+        meshcat.AddButton("done")
+        self._taken = 0
+        self.refresh()
+
+    @property
+    def grasp(self) -> Grasp | None:
+        """What the sliders say, amid the faces gripped there; None where nothing is gripped."""
+        x, y, turn = (
+            self._meshcat.GetSliderValue(name) for name in ("x, mm", "y, mm", "turn, deg")
+        )
+        return measure_grasp(self._tool, 1e-3 * x, 1e-3 * y, math.radians(turn))
+
+    def clicks(self, button: str) -> int:
+        """How often a button was clicked."""
+        return int(self._meshcat.GetButtonClicks(button))
+
+    def refresh(self) -> None:
+        """Takes a proposal if that was asked for, and draws the hand where the sliders say."""
+        if self._proposals and self.clicks("take proposal") != self._taken:
+            self._taken = self.clicks("take proposal")
+            chosen = self._proposals[round(self._meshcat.GetSliderValue("proposal")) - 1]
+            self._meshcat.SetSliderValue("x, mm", 1e3 * chosen.x)
+            self._meshcat.SetSliderValue("y, mm", 1e3 * chosen.y)
+            turn = math.degrees(math.remainder(chosen.theta, math.pi))
+            self._meshcat.SetSliderValue("turn, deg", turn)
+        values = tuple(
+            self._meshcat.GetSliderValue(name) for name in ("x, mm", "y, mm", "turn, deg")
+        )
+        if values != self._shown:
+            self._shown = values
+            self._draw_hand()
+
+    def _draw_tool(self) -> None:
+        meshcat, tool = self._meshcat, self._tool
+        meshcat.SetProperty("/Background", "top_color", [0.93, 0.95, 0.97])
+        meshcat.SetProperty("/Background", "bottom_color", [0.80, 0.83, 0.86])
+        meshcat.SetProperty("/Axes", "visible", False)
+        meshcat.SetProperty("/Grid", "visible", False)
+        meshcat.SetObject("table", Box(0.4, 0.3, 0.01), Rgba(0.46, 0.48, 0.50))
+        meshcat.SetTransform("table", RigidTransform([0, 0, -0.005]))
+        for path, rgba in zip(tool.visual_meshes, _colours(tool), strict=True):
+            meshcat.SetObject(f"tool/{path.stem}", Mesh(path), rgba)
+        for rank, proposal in enumerate(self._proposals):
+            # From green, the best, to red.
+            share = rank / max(len(self._proposals) - 1, 1)
+            path_name = f"proposals/{rank + 1}"
+            meshcat.SetObject(path_name, Sphere(0.002), Rgba(share, 1 - share, 0.1))
+            height = proposal.surface_height + 0.004
+            meshcat.SetTransform(path_name, RigidTransform([proposal.x, proposal.y, height]))
+        for side in ("left", "right"):
+            meshcat.SetObject(
+                f"hand/{side}", Mesh(_HAND_MESHES / "finger.obj"), Rgba(0.18, 0.18, 0.19)
+            )
+        meshcat.SetObject("hand/palm", Mesh(_HAND_MESHES / "hand.obj"), Rgba(0.9, 0.91, 0.92, 0.2))
+        meshcat.SetCameraPose([0.03, -0.2, 0.17], [0.0, 0.0, 0.02])
+
+    def _draw_hand(self) -> None:
+        grasp = self.grasp
+        self._meshcat.SetProperty("hand", "visible", grasp is not None)
+        if grasp is None:
+            return
+        tips = max(grasp.surface_height - GRASP_DEPTH, FLOOR_CLEARANCE)
+        X_THand = RigidTransform(
+            RollPitchYaw(math.pi, 0, grasp.theta), [grasp.x, grasp.y, tips + _FINGERTIP]
+        )
+        self._meshcat.SetTransform("hand", X_THand)
+        for side, turn in (("left", 0.0), ("right", math.pi)):
+            X_HandFinger = RigidTransform(RollPitchYaw(0, 0, turn), [0, 0, _FINGER_START])
+            opened = RigidTransform([0, grasp.width / 2, 0])
+            self._meshcat.SetTransform(f"hand/{side}", X_HandFinger @ opened)
+
+
+def _colours(tool: Tool) -> list[Rgba]:
+    """The colour of each visual mesh, as the model has it."""
+    text = tool.sdf.read_text()
+    colours = []
+    for path in tool.visual_meshes:
+        found = re.search(rf"{re.escape(path.name)}</uri>.*?<diffuse>(.*?)</diffuse>", text, re.S)
+        colours.append(Rgba(*map(float, found[1].split())) if found else Rgba(0.6, 0.6, 0.6))
+    return colours
+
+
+def proposal_table(tool: Tool, proposals: list[GraspProposal]) -> Table:
+    """The proposals, ranked, and the grasp that is annotated now."""
+    table = Table(title=f"grasps of {tool.name}, best first", title_justify="left")
+    for heading in (
+        "rank",
+        "x mm",
+        "y mm",
+        "turn deg",
+        "width mm",
+        "from centre of mass mm",
+        "cost",
+    ):
+        table.add_column(heading, justify="right")
+    for rank, proposal in enumerate(proposals, start=1):
+        table.add_row(
+            str(rank), *_numbers(proposal), f"{1e3 * proposal.offset:.1f}", f"{proposal.cost:.2f}"
+        )
+    table.add_section()
+    table.add_row("now", *_numbers(tool.grasp), "", "")
+    return table
+
+
+def _numbers(grasp: Grasp) -> list[str]:
+    turn = math.degrees(math.remainder(grasp.theta, math.pi))
+    return [
+        f"{1e3 * grasp.x:.1f}",
+        f"{1e3 * grasp.y:.1f}",
+        f"{turn:.1f}",
+        f"{1e3 * grasp.width:.1f}",
+    ]
+
+
+def annotate(name: str, console: Console) -> None:
+    """Serves the page on localhost until "done" is clicked or Ctrl-C is pressed.
+
+    Raises:
+        UserError: no such tool, or no port for the page.
+    """
+    tool = load_tool(name)
+    record = yaml.safe_load((tool.directory / "tool.yaml").read_text())
+    proposals = propose_grasps(tool.triangles, np.array(record["center_of_mass"]))
+    console.print(proposal_table(tool, proposals))
+    try:
+        meshcat = Meshcat(MeshcatParams(host="localhost", show_stats_plot=False))
+    except RuntimeError as error:
+        raise UserError("Meshcat finds no free port from 7000 to 7099: close viewers") from error
+    page = AnnotationPage(tool, proposals, meshcat)
+    console.print(
+        f"annotate at {meshcat.web_url()}: open the controls, move, save", highlight=False
+    )
+    saved = 0
+    while not page.clicks("done"):
+        page.refresh()
+        if page.clicks("save") != saved:
+            saved = page.clicks("save")
+            _save_and_tell(tool, page.grasp, console)
+        time.sleep(0.05)
+
+
+def _save_and_tell(tool: Tool, grasp: Grasp | None, console: Console) -> None:
+    if grasp is None:
+        console.print("not saved: there is nothing between the pads")
+        return
+    try:
+        save_grasp(tool, grasp)
+    except UserError as error:
+        console.print(f"not saved: {error}")
+    else:
+        console.print(f"saved: {', '.join(_numbers(grasp))} (x, y, turn, width)")

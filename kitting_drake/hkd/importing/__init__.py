@@ -1,0 +1,1 @@
+"""From anyone's mesh to a tool."""

@@ -1,0 +1,195 @@
+"""How long an imported tool is made, and whether the hand and the kit can take it then."""
+
+import functools
+from pathlib import Path
+
+import trimesh
+from manifold3d import CrossSection, JoinType, Manifold
+
+from kitting_drake.common.errors import UserError
+from kitting_drake.hkd.grasps.proposals import WIDEST, propose_grasps
+from kitting_drake.hkd.importing.stable_pose import placed, size
+from kitting_drake.hkd.kits.kit import SLOTS, KitParameters, kit_cavities
+from kitting_drake.hkd.tools import meshes
+from kitting_drake.hkd.tools.tool import Tool, load_tool, tool_names
+
+MATERIALS = {
+    "hammer": "steel",
+    "pliers": "steel",
+    "wrench": "polished_steel",
+    "screwdriver": "steel",
+}
+"""What an imported tool of a category looks like."""
+
+SCALED_LENGTHS_MM = (180.0, 170.0, 160.0, 150.0)
+"""A tool is scaled to the first of these at which kits have room for it and its neighbours."""
+KEPT_LENGTHS_MM = (150.0, 200.0)
+"""A tool of such a length keeps it: those of the dataset's tools."""
+POSSIBLE_LENGTHS_MM = (50.0, 600.0)
+"""How long hand tools are, by which a file's unit is guessed."""
+THINNEST_MM, HIGHEST_MM = 4.0, 45.0
+
+_UNITS = {"mm": 1.0, "m": 1000.0, "cm": 10.0, "inches": 25.4}
+_CREASE_ANGLE_DEG = 35.0
+# So many of the project's tools of a category are tried as neighbours in a kit, and as many of them
+# have to fit, by share, for a length to be kept without trying shorter ones.
+_NEIGHBOURS, _ENOUGH_ROOM = 5, 0.8
+
+
+def guess_unit(length: float) -> str | None:
+    """In what a hand tool of this length may have been measured, or None if in nothing usual.
+
+    Inches and centimetres overlap; a length below 12 is taken for inches, above for centimetres.
+    """
+    shortest, longest = POSSIBLE_LENGTHS_MM
+    for unit, low, high in (
+        ("mm", shortest, longest),
+        ("m", shortest / 1000, longest / 1000),
+        ("inches", shortest / 25.4, 12.0),
+        ("cm", 12.0, longest / 10),
+    ):
+        if low <= length <= high:
+            return unit
+    return None
+
+
+def lengths_to_try(length: float, wanted_mm: float | None) -> tuple[list[float], str]:
+    """The lengths (mm) to try, the first that will do; and why, for the user."""
+    unit = guess_unit(length)
+    if unit is None:
+        assumed, real = f"unit unknown ({length:.4g} long)", 0.0
+    else:
+        real = length * _UNITS[unit]
+        assumed = f"taken to be in {unit}: {real:.0f} mm long"
+    if wanted_mm is not None:
+        return [wanted_mm], f"{assumed}, scaled as asked"
+    if KEPT_LENGTHS_MM[0] <= real <= KEPT_LENGTHS_MM[1]:
+        return [real], f"{assumed}, kept"
+    return list(SCALED_LENGTHS_MM), f"{assumed}, scaled"
+
+
+def fit(
+    category: str,
+    name: str,
+    solid: Manifold,
+    lengths: list[float],
+    notes: list[str],
+    directory: Path,
+) -> tuple[Tool, Manifold]:
+    """The tool, with its visual mesh written, at the first length at which it can be used.
+
+    Raises:
+        UserError: there is none; what was wrong with the first.
+    """
+    refusal: UserError | None = None
+    best_room = 0.0
+    best = None
+    for length in lengths:
+        factor = length / size(solid)[0]
+        scaled = placed(solid.scale((factor, factor, factor)).simplify(0.01))
+        try:
+            _check_size(scaled)
+            tool = _tool(category, name, scaled, directory)
+            room = _room(tool)
+        except UserError as error:
+            refusal = refusal or error
+            continue
+        if room > best_room:
+            best_room, best = room, (tool, scaled)
+        if room >= _ENOUGH_ROOM:
+            break
+    if best is None:
+        assert refusal is not None
+        raise refusal
+    tool, scaled = best
+    if tool.length < 0.9995e-3 * lengths[0]:
+        notes.append(f"made {1e3 * tool.length:.0f} mm long, so that its neighbours in a kit fit")
+    if length * 1e-3 != tool.length:
+        # What was written last was another try.
+        meshes.write_smooth_obj(tool.visual_meshes[0], scaled, _CREASE_ANGLE_DEG)
+    return tool, scaled
+
+
+def _check_size(solid: Manifold) -> None:
+    length, _, height = size(solid)
+    if height < THINNEST_MM:
+        raise UserError(
+            f"at {length:.0f} mm length it is {height:.1f} mm thick, and the hand needs "
+            f"{THINNEST_MM:.0f} mm to hold"
+        )
+    if height > HIGHEST_MM:
+        raise UserError(
+            f"at {length:.0f} mm length it lies {height:.0f} mm high, and a kit takes "
+            f"{HIGHEST_MM:.0f} mm"
+        )
+
+
+def _tool(category: str, name: str, solid: Manifold, directory: Path) -> Tool:
+    """A tool with its visual mesh written and its best grasp.
+
+    Raises:
+        UserError: it cannot be grasped.
+    """
+    length, width, height = (round(1e-3 * float(extent), 6) for extent in size(solid))
+    visual = directory / f"{MATERIALS[category]}.obj"
+    meshes.write_smooth_obj(visual, solid, _CREASE_ANGLE_DEG)
+    vertices, faces = meshes.vertices_and_faces(solid)
+    triangles = 1e-3 * vertices[faces]
+    com = trimesh.triangles.mass_properties(triangles)["center_mass"]
+    proposals = propose_grasps(triangles, com)
+    if not proposals:
+        raise UserError(
+            f"at {1e3 * length:.0f} mm length the hand, whose jaws take {1e3 * WIDEST:.0f} mm, "
+            "finds no place to hold it from above"
+        )
+    return Tool(
+        directory=directory,
+        name=name,
+        category=category,
+        split="user",
+        length=length,
+        width=width,
+        height=height,
+        mass=0.0,
+        grasp=proposals[0].grasp,
+        visual_meshes=(visual,),
+    )
+
+
+def _room(tool: Tool) -> float:
+    """The share of the project's tools of each category, at least, with which a kit can be made.
+
+    Raises:
+        UserError: there is none.
+    """
+    at = f"at {1e3 * tool.length:.0f} mm length it is {1e3 * tool.width:.0f} mm wide"
+    try:
+        mine = _walled_place(tool)
+    except UserError as error:
+        raise UserError(f"{at}, too big for its place in the kit") from error
+    shares = [1.0]
+    for category, places in _neighbours().items():
+        if places and category != tool.category:
+            shares.append(sum((mine ^ other).area() < 1e-9 for other in places) / len(places))
+            if shares[-1] == 0.0:
+                raise UserError(f"{at} and leaves no room for {category} beside it in a kit")
+    return min(shares)
+
+
+@functools.cache
+def _neighbours() -> dict[str, list[CrossSection]]:
+    """What some of the project's tools take up in a kit, by category."""
+    tools = [load_tool(name) for name in tool_names()]
+    result = {}
+    for category in SLOTS:
+        others = [tool for tool in tools if tool.category == category]
+        step = max(1, len(others) // _NEIGHBOURS)
+        result[category] = [_walled_place(tool) for tool in others[::step][:_NEIGHBOURS]]
+    return result
+
+
+def _walled_place(tool: Tool) -> CrossSection:
+    """The outline in the kit of a tool's cavity with half a wall about it."""
+    parameters = KitParameters()
+    rim = kit_cavities([tool], parameters)[0].rim
+    return rim.offset(parameters.minimum_wall / 2, JoinType.Round, circular_segments=64)

@@ -1,0 +1,264 @@
+"""`hkd import`: from anyone's mesh to a tool that scenarios can name.
+
+Read and mended (`repair`), laid down flat in a pose in which it stays, turned along x, scaled,
+weighed, given collision pieces (`pieces`) and the best grasp (`grasps`). All of that happens in a
+process of its own, which may fail or hang as it likes: the tool's folder appears whole or not at
+all. Solids are handled in mm and written in metres.
+"""
+
+import hashlib
+import multiprocessing
+import os
+import re
+import signal
+import tempfile
+from dataclasses import dataclass
+from multiprocessing.connection import Connection
+from pathlib import Path
+from typing import Any
+
+import trimesh
+import yaml
+
+from kitting_drake.common.errors import UserError
+from kitting_drake.hkd.importing.convex_decomposition import convex_pieces
+from kitting_drake.hkd.importing.fit import MATERIALS, fit, lengths_to_try
+from kitting_drake.hkd.importing.repair import NOMINAL_MM, make_solid, read_mesh
+from kitting_drake.hkd.importing.stable_pose import lie_down, size
+from kitting_drake.hkd.tools import meshes
+from kitting_drake.hkd.tools.sdf import tool_sdf
+from kitting_drake.hkd.tools.tool import CATEGORIES, load_tool, tool_names, user_tools
+
+DENSITIES = {"hammer": 3000.0, "pliers": 6000.0, "wrench": 7850.0, "screwdriver": 2000.0}
+"""What a tool of a category weighs on average, handle and all, in kg/m^3."""
+
+TIME_LIMIT = 55.0
+"""Seconds after which the geometry is given up."""
+_MOST_MEMORY = 12 * 2**30
+
+
+@dataclass(frozen=True)
+class ImportRequest:
+    """What to import, as what."""
+
+    mesh: Path
+    category: str
+    name: str | None = None
+    """Of the tool; from the file's if None."""
+    length_mm: float | None = None
+    """To scale it to; see `fit.lengths_to_try` for None."""
+    density: float | None = None
+    """In kg/m^3; see `DENSITIES` for None."""
+    output: Path | None = None
+    """The folder of tools to write into; `user_tools` if None."""
+
+
+@dataclass(frozen=True)
+class ImportReport:
+    """What became of it."""
+
+    directory: Path
+    record: dict[str, Any]
+    """The tool's record, as in `tool.yaml`."""
+    notes: list[str]
+    """What was assumed and mended, a phrase each."""
+    pieces: int
+    """Of its collision geometry."""
+
+
+def import_tool(request: ImportRequest, time_limit: float | None = TIME_LIMIT) -> ImportReport:
+    """Makes a tool's folder from a mesh.
+
+    Args:
+        request: what to import.
+        time_limit: in seconds, for the process that does it; None does it in this process.
+
+    Raises:
+        UserError: it cannot be saved, and nothing was written.
+    """
+    if request.category not in CATEGORIES:
+        raise UserError(f"category '{request.category}' is none of {', '.join(CATEGORIES)}")
+    name = _checked_name(request)
+    for flag, value, low, high in (
+        ("--length_mm", request.length_mm, 20.0, 250.0),
+        ("--density", request.density, 50.0, 25000.0),
+    ):
+        if value is not None and not low <= value <= high:
+            raise UserError(f"{flag} {value:g} is out of range: give {low:g} to {high:g}")
+    folder = request.output or user_tools()
+    final = folder / name
+    if final.exists() and not _is_import(final):
+        raise UserError(f"{final} exists and is no imported tool: give another --name")
+    if final.exists() and yaml.safe_load((final / "tool.yaml").read_text()).get("annotated"):
+        raise UserError(f"{final} has a grasp that you saved: give another --name, or delete it")
+    new_folders = [p for p in (folder, *folder.parents) if not p.exists()]
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(dir=folder, prefix=".making-") as scratch:
+            made = Path(scratch) / name
+            made.mkdir()
+            report = (
+                prepare_tool(request, name, made)
+                if time_limit is None
+                else _prepare_aside(request, name, made, time_limit)
+            )
+            if final.exists():
+                os.rename(final, Path(scratch) / "replaced")
+            os.rename(made, final)
+            return ImportReport(final, *report)
+    except OSError as error:
+        raise UserError(f"cannot write {final}: {error.strerror}") from error
+    finally:
+        for path in new_folders:
+            if path.is_dir() and not any(path.iterdir()):
+                path.rmdir()
+
+
+def _checked_name(request: ImportRequest) -> str:
+    if request.name is None:
+        name = re.sub(r"[^a-z0-9]+", "_", request.mesh.stem.lower()).strip("_")[:60] or "tool"
+    else:
+        name = request.name
+    if not re.fullmatch(r"[a-z0-9][a-z0-9_]{0,63}", name):
+        raise UserError(f"--name '{name}' has to be small letters, digits and underscores")
+    if name in tool_names():
+        raise UserError(f"'{name}' is the name of one of the project's own tools: give --name")
+    return name
+
+
+def _is_import(folder: Path) -> bool:
+    try:
+        return bool(yaml.safe_load((folder / "tool.yaml").read_text())["split"] == "user")
+    except (OSError, yaml.YAMLError, KeyError, TypeError, UnicodeDecodeError):
+        return False
+
+
+Prepared = tuple[dict[str, Any], list[str], int]
+
+
+def _prepare_aside(request: ImportRequest, name: str, made: Path, time_limit: float) -> Prepared:
+    """`prepare_tool` in a process that is ended after `time_limit`."""
+    context = multiprocessing.get_context("spawn")
+    ours, theirs = context.Pipe(duplex=False)
+    process = context.Process(target=_child, args=(theirs, request, name, made), daemon=True)
+    process.start()
+    theirs.close()
+    try:
+        if not ours.poll(time_limit):
+            raise UserError(
+                f"{request.mesh} was not worked out in {time_limit:.0f} s: decimate the mesh first"
+            )
+        error, result = ours.recv()
+    except EOFError as end:
+        raise UserError(f"{request.mesh} is too broken a mesh to be worked out") from end
+    finally:
+        process.kill()
+        process.join()
+        ours.close()
+    if error is not None:
+        raise UserError(error)
+    return result
+
+
+def _child(pipe: Connection, request: ImportRequest, name: str, made: Path) -> None:
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    # Libraries talk: what there is to say goes through the pipe.
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    os.dup2(nowhere, 1)
+    os.dup2(nowhere, 2)
+    try:
+        import resource
+
+        resource.setrlimit(resource.RLIMIT_AS, (_MOST_MEMORY, _MOST_MEMORY))
+    except (ImportError, ValueError, OSError):
+        pass
+    try:
+        pipe.send((None, prepare_tool(request, name, made)))
+    except UserError as error:
+        pipe.send((str(error), None))
+
+
+def prepare_tool(request: ImportRequest, name: str, directory: Path) -> Prepared:
+    """Writes a tool's files into an empty folder.
+
+    Returns:
+        Its record, what was assumed and mended, and the number of its collision pieces.
+
+    Raises:
+        UserError: it cannot be saved.
+    """
+    try:
+        return _prepare(request, name, directory)
+    except UserError as error:
+        text = str(error)
+        path = str(request.mesh)
+        raise UserError(text if path in text else f"{path}: {text}") from error
+    except MemoryError as error:
+        raise UserError(f"{request.mesh} needs more memory than there is") from error
+    except Exception as error:
+        # Whatever geometry fails on: a broken mesh is the user's to mend, not a fault to trace.
+        raise UserError(
+            f"{request.mesh} is too broken a mesh to be worked out ({type(error).__name__})"
+        ) from error
+
+
+def _prepare(request: ImportRequest, name: str, directory: Path) -> Prepared:
+    vertices, faces = read_mesh(request.mesh)
+    low, high = vertices.min(axis=0), vertices.max(axis=0)
+    longest = float((high - low).max())
+    if not longest > 1e-12:
+        raise UserError("all of the mesh is one point")
+    nominal = NOMINAL_MM / longest
+    solid, notes = make_solid((vertices - (low + high) / 2) * nominal, faces)
+    solid = lie_down(solid, request.category)
+    lengths, assumed = lengths_to_try(size(solid)[0] / nominal, request.length_mm)
+    notes = [assumed, *notes]
+    tool, solid = fit(request.category, name, solid, lengths, notes, directory)
+    density = request.density or DENSITIES[request.category]
+    vertices, faces = meshes.vertices_and_faces(solid)
+    physics = trimesh.triangles.mass_properties(1e-3 * vertices[faces], density=density)
+    pieces = convex_pieces(solid, tool.grasp)
+    if not pieces:
+        raise UserError("the mesh encloses too little volume to be touched")
+    collisions = []
+    for index, piece in enumerate(pieces):
+        collisions.append(f"collision_{index}.obj")
+        meshes.write_convex_obj(directory / collisions[-1], piece)
+    material = MATERIALS[request.category]
+    text = tool_sdf(
+        name,
+        physics["mass"],
+        physics["center_mass"],
+        physics["inertia"],
+        [(tool.visual_meshes[0].name, material)],
+        collisions,
+    )
+    (directory / f"{name}.sdf").write_text(
+        re.sub(r"<!--.*?-->", f"<!-- Made by `hkd import` of {_safe(request.mesh.name)}. -->", text)
+    )
+    record = {
+        "name": name,
+        "category": request.category,
+        "split": "user",
+        "length": tool.length,
+        "width": tool.width,
+        "height": tool.height,
+        "mass": round(float(physics["mass"]), 6),
+        "center_of_mass": [round(float(v), 6) + 0.0 for v in physics["center_mass"]],
+        "grasp": {key: round(float(value), 6) for key, value in vars(tool.grasp).items()},
+        "visual_meshes": [path.name for path in tool.visual_meshes],
+        "imported": {
+            "file": request.mesh.name,
+            "sha256": hashlib.sha256(request.mesh.read_bytes()).hexdigest(),
+            "density": float(density),
+            "notes": notes,
+        },
+    }
+    (directory / "tool.yaml").write_text(yaml.safe_dump(record, sort_keys=False))
+    load_tool(str(directory))
+    return record, notes, len(pieces)
+
+
+def _safe(text: str) -> str:
+    """Text that may stand in an XML comment."""
+    return re.sub(r"[^\w. ]|-", "_", text, flags=re.ASCII)

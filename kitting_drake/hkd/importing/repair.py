@@ -1,0 +1,282 @@
+"""Anyone's mesh, read and made one solid: what `hkd import` begins with.
+
+A mesh that is sound is taken as it is. One that is not is taken apart into connected pieces, each
+mended alone (winding, then holes, then pymeshfix) and all united; where that loses any of the shape
+that can be seen, the surface is wrapped instead: filled as voxels, and traced.
+"""
+
+from pathlib import Path
+
+import numpy as np
+import pymeshfix
+import trimesh
+from manifold3d import Error, Manifold, Mesh64, OpType
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from kitting_drake.common.errors import UserError
+from kitting_drake.hkd.tools.tool import silhouette
+
+FORMATS = (".stl", ".obj", ".ply", ".glb", ".gltf")
+MOST_BYTES = 200_000_000
+MOST_TRIANGLES = 2_000_000
+# Solids are mended at this size, whatever the file's units: tolerances below are for it.
+NOMINAL_MM = 180.0
+
+# Vertices on the same point of this grid are one.
+_MERGE_MM = 1e-3
+# Bodies further apart than this are no one tool; what is smaller than this share is dirt.
+_GAP_MM, _DIRT = 1.5, 0.02
+# A mended mesh may lose this share of any of its three shadows.
+_LOST = 0.03
+_MOST_PIECES = 3000
+_VOXEL_MM = 0.75
+# Less than this share of a box is no solid but a skin.
+_HOLLOW = 0.002
+
+Array = NDArray[np.float64]
+Faces = NDArray[np.int64]
+
+
+def read_mesh(path: Path) -> tuple[Array, Faces]:
+    """Vertices (n, 3), in the file's own units, and triangles (m, 3) of all that a file shows.
+
+    Raises:
+        UserError: no such file, too big, or not a mesh.
+    """
+    kinds = ", ".join(suffix[1:].upper() for suffix in FORMATS)
+    try:
+        size = path.stat().st_size
+    except (OSError, ValueError) as error:
+        raise UserError(f"there is no file {path}: give a mesh ({kinds})") from error
+    if not path.is_file():
+        raise UserError(f"{path} is a folder or no common file: give a mesh ({kinds})")
+    if path.suffix.lower() not in FORMATS:
+        raise UserError(f"{path} is none of the kinds of mesh that can be read: {kinds}")
+    if size == 0:
+        raise UserError(f"{path} is empty")
+    if size > MOST_BYTES:
+        raise UserError(
+            f"{path} has {size / 1e6:.0f} MB, and {MOST_BYTES / 1e6:.0f} MB is the most that is "
+            "read: decimate the mesh first"
+        )
+    options = {"skip_materials": True} if path.suffix.lower() == ".obj" else {}
+    try:
+        scene = trimesh.load_scene(path, process=False, **options)
+        mesh = scene.to_mesh()
+        vertices, faces = np.array(mesh.vertices, dtype=float), np.array(mesh.faces, dtype=np.int64)
+    except MemoryError:
+        raise
+    except Exception as error:
+        # Readers fail on broken files in as many ways as there are.
+        raise UserError(f"{path} cannot be read as {path.suffix[1:].upper()}") from error
+    if len(faces) == 0 or vertices.ndim != 2 or faces.ndim != 2 or faces.shape[1] != 3:
+        raise UserError(f"{path} holds no triangles")
+    if len(faces) > MOST_TRIANGLES:
+        raise UserError(
+            f"{path} has {len(faces)} triangles, and {MOST_TRIANGLES} is the most that is taken: "
+            "decimate the mesh first"
+        )
+    whole = ((faces >= 0) & (faces < len(vertices))).all(axis=1)
+    faces = faces[whole]
+    with np.errstate(over="ignore", invalid="ignore"):
+        good = np.isfinite(vertices).all(axis=1) & (np.abs(vertices) < 1e30).all(axis=1)
+    faces = faces[good[faces].all(axis=1)]
+    if len(faces) == 0:
+        raise UserError(f"{path} holds no triangle whose corners are all numbers")
+    used, faces = np.unique(faces, return_inverse=True)
+    return vertices[used], faces.reshape(-1, 3)
+
+
+def make_solid(vertices: Array, faces: Faces) -> tuple[Manifold, list[str]]:
+    """One solid of a mesh whose longest side is `NOMINAL_MM`, and what had to be done for it.
+
+    Raises:
+        UserError: it encloses no volume, or is several things.
+    """
+    vertices, faces = _merged(vertices, faces)
+    if len(faces) < 4:
+        raise UserError("the mesh encloses no volume")
+    notes: list[str] = []
+    pieces = trimesh.graph.connected_components(
+        trimesh.graph.face_adjacency(faces), nodes=np.arange(len(faces)), min_len=1
+    )
+    solids, mended = [], 0
+    if len(pieces) <= _MOST_PIECES:
+        for piece in sorted(pieces, key=len, reverse=True):
+            sound = _as_manifold(vertices, faces[piece])
+            if sound is None:
+                mended += 1
+                sound = _mended(vertices, faces[piece])
+            if sound is not None:
+                solids.append(sound)
+    solid = Manifold.batch_boolean(solids, OpType.Add) if solids else Manifold()
+    if mended:
+        notes.append(f"mended {mended} of {len(pieces)} surfaces")
+    if len(solids) > 1:
+        notes.append(f"united {len(solids)} bodies")
+    if mended or not solids:
+        triangles = vertices[faces]
+        if _loses(triangles, solid):
+            solid = _wrapped(triangles)
+            notes = ["wrapped a surface with large gaps"]
+    if solid.is_empty() or solid.volume() < _HOLLOW * _box_volume(solid):
+        raise UserError("the mesh encloses no volume")
+    return _one_thing(solid, notes), notes
+
+
+def _merged(vertices: Array, faces: Faces) -> tuple[Array, Faces]:
+    grid = np.round(vertices / _MERGE_MM).astype(np.int64)
+    _, first, index = np.unique(grid, axis=0, return_index=True, return_inverse=True)
+    faces = index.reshape(-1)[faces]
+    a, b, c = faces.T
+    faces = faces[(a != b) & (b != c) & (c != a)]
+    _, unique = np.unique(np.sort(faces, axis=1), axis=0, return_index=True)
+    return vertices[first], faces[np.sort(unique)]
+
+
+def _as_manifold(vertices: Array, faces: Faces) -> Manifold | None:
+    """The solid that a surface bounds, or None where it bounds none."""
+    if len(faces) < 4 or not _is_closed(faces):
+        return None
+    used, index = np.unique(faces, return_inverse=True)
+    faces = index.reshape(-1, 3)
+    solid = Manifold(Mesh64(vertices[used], faces.astype(np.uint64)))
+    if solid.status() != Error.NoError or solid.is_empty():
+        return None
+    if solid.volume() < 0:
+        solid = Manifold(Mesh64(vertices[used], faces[:, ::-1].astype(np.uint64)))
+    return solid if solid.volume() > 1e-3 else None
+
+
+def _is_closed(faces: Faces) -> bool:
+    """Whether every edge is run along once in either direction: manifold3d may crash else."""
+    edges = np.vstack([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+    keys = edges[:, 0] * (faces.max() + 1) + edges[:, 1]
+    opposite = edges[:, 1] * (faces.max() + 1) + edges[:, 0]
+    keys.sort()
+    opposite.sort()
+    return bool(np.array_equal(keys, opposite) and (np.diff(keys) > 0).all())
+
+
+def _mended(vertices: Array, faces: Faces) -> Manifold | None:
+    mesh = trimesh.Trimesh(vertices, faces, process=False)
+    mesh.remove_unreferenced_vertices()
+    trimesh.repair.fix_winding(mesh)
+    if mesh.is_watertight or trimesh.repair.fill_holes(mesh):
+        solid = _as_manifold(np.asarray(mesh.vertices), np.asarray(mesh.faces))
+        if solid is not None:
+            return solid
+    fixer = pymeshfix.PyTMesh()
+    fixer.set_quiet(True)
+    try:
+        fixer.load_array(
+            np.ascontiguousarray(mesh.vertices, dtype=float),
+            np.ascontiguousarray(mesh.faces, dtype=np.int32),
+        )
+        fixer.fill_small_boundaries(0, False)
+        fixer.clean(10, 3)
+        new_vertices, new_faces = fixer.return_arrays()
+    except RuntimeError:
+        return None
+    if len(new_faces) < 4:
+        return None
+    return _as_manifold(np.asarray(new_vertices, dtype=float), np.asarray(new_faces, np.int64))
+
+
+def _loses(triangles: Array, solid: Manifold) -> bool:
+    """Whether a solid lacks part of what can be seen of triangles from any of three sides."""
+    if solid.is_empty():
+        return True
+    mesh = solid.to_mesh64()
+    mine = np.asarray(mesh.vert_properties)[:, :3][np.asarray(mesh.tri_verts).astype(int)]
+    for axes in ([0, 1, 2], [0, 2, 1], [1, 2, 0]):
+        seen, kept = silhouette(triangles[:, :, axes]), silhouette(mine[:, :, axes])
+        lost, gained = (seen - kept).area(), (kept - seen).area()
+        # Filled holes in walls may show: gains count only if large.
+        if lost > _LOST * seen.area() or gained > 5 * _LOST * seen.area():
+            return True
+    return False
+
+
+def _wrapped(triangles: Array) -> Manifold:
+    """The solid inside a surface with gaps of up to some voxels, within about half a voxel."""
+    corners = triangles.reshape(-1, 3)
+    margin = 5 * _VOXEL_MM
+    low = corners.min(axis=0) - margin
+    shape = np.ceil((corners.max(axis=0) + margin - low) / _VOXEL_MM).astype(int) + 1
+    mesh = trimesh.Trimesh(corners, np.arange(len(corners)).reshape(-1, 3), process=False)
+    count = int(min(4e6, 12 * mesh.area / _VOXEL_MM**2)) + 1
+    points, _ = trimesh.sample.sample_surface(mesh, count, seed=0)
+    filled = np.zeros(shape, dtype=bool)
+    skin = np.round((np.vstack([points, corners]) - low) / _VOXEL_MM).astype(int)
+    filled[tuple(skin.T)] = True
+    ball = ndimage.generate_binary_structure(3, 1)
+    filled = ndimage.binary_closing(filled, ball, iterations=3)
+    surface = int(filled.sum())
+    filled = ndimage.binary_fill_holes(filled)
+    if filled.sum() < 1.05 * surface:
+        return Manifold()
+    distance = ndimage.distance_transform_edt(filled) - ndimage.distance_transform_edt(~filled)
+    # The skin's voxels reach half of one beyond it.
+    field = ndimage.gaussian_filter(distance, 0.7) - 0.5
+    inside = np.argwhere(field > -3)
+    first, last = inside.min(axis=0), inside.max(axis=0)
+    # A memoryview, because one number of an array at a time is slow to get.
+    values = np.ascontiguousarray(field).reshape(-1).data
+    last_x, last_y, last_z = (int(extent) - 2 for extent in shape)
+    low_x, low_y, low_z = map(float, low)
+    row, plane = int(shape[2]), int(shape[1] * shape[2])
+
+    def depth(x: float, y: float, z: float) -> float:
+        """The field at a point, linear between voxels."""
+        i, j, k = (x - low_x) / _VOXEL_MM, (y - low_y) / _VOXEL_MM, (z - low_z) / _VOXEL_MM
+        a, b, c = (
+            min(max(int(i), 0), last_x),
+            min(max(int(j), 0), last_y),
+            min(max(int(k), 0), last_z),
+        )
+        i, j, k = i - a, j - b, k - c
+        n = a * plane + b * row + c
+
+        def edge(m: int) -> float:
+            return values[m] * (1 - k) + values[m + 1] * k
+
+        here = edge(n) * (1 - j) + edge(n + row) * j
+        there = edge(n + plane) * (1 - j) + edge(n + plane + row) * j
+        return here * (1 - i) + there * i
+
+    bounds = [*(low + (first - 1) * _VOXEL_MM), *(low + (last + 1) * _VOXEL_MM)]
+    return Manifold.level_set(depth, bounds, 1.5 * _VOXEL_MM).simplify(0.15)
+
+
+def _box_volume(solid: Manifold) -> float:
+    box = np.array(solid.bounding_box()).reshape(2, 3)
+    return float(np.prod(box[1] - box[0]))
+
+
+def _one_thing(solid: Manifold, notes: list[str]) -> Manifold:
+    """The solid without dirt that lies about it.
+
+    Raises:
+        UserError: it is several things that stand apart.
+    """
+    bodies = sorted(solid.decompose(), key=lambda body: -body.volume())
+    if len(bodies) <= 1:
+        return solid
+    whole = solid.volume()
+    crumbs = [body for body in bodies if body.volume() < 1e-4 * whole]
+    bodies = [body for body in bodies if body.volume() >= 1e-4 * whole][:50]
+    groups: list[list[Manifold]] = []
+    for body in bodies:
+        near = [g for g in groups if any(body.min_gap(o, 2 * _GAP_MM) < _GAP_MM for o in g)]
+        groups = [g for g in groups if g not in near] + [[body, *(o for g in near for o in g)]]
+    volumes = [sum(body.volume() for body in group) for group in groups]
+    main = int(np.argmax(volumes))
+    if volumes[main] < (1 - _DIRT) * whole:
+        raise UserError(
+            f"the mesh holds {len(groups)} things that stand apart: import each from its own file"
+        )
+    if len(groups) > 1 or crumbs:
+        notes.append("left out dirt that lay about")
+    return Manifold.batch_boolean(groups[main], OpType.Add)

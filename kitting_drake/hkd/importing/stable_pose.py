@@ -1,0 +1,141 @@
+"""How a solid lies on a table: flat, along x, the working end toward +x."""
+
+import numpy as np
+import trimesh
+from manifold3d import CrossSection, Manifold
+from numpy.typing import NDArray
+from scipy.spatial import ConvexHull, QhullError
+
+from kitting_drake.common.errors import UserError
+from kitting_drake.hkd.tools import meshes
+
+Array = NDArray[np.float64]
+
+# Poses whose centre of mass is this little higher than the lowest are as good; of those the one
+# with the broadest support is taken, to this step. For a solid some 180 mm long.
+_EQUAL_HEIGHT_MM, _MARGIN_STEP_MM = 0.3, 0.5
+# Facets whose normals differ by less are one.
+_COPLANAR = 1e-3
+# How far the length may run off the axis of least inertia, and what counts as one direction.
+_SIDEWAYS_DEG, _LIKE_DEG = 25.0, 6.0
+_END = 0.3
+"""Share of the length that is an end."""
+
+
+def lie_down(solid: Manifold, category: str) -> Manifold:
+    """The solid (mm) moved into the frame T of a tool of that category; see `Tool`.
+
+    Of all poses in which it would stay it takes the one that lies lowest. The working end is the
+    wider one of a hammer, the narrower one of pliers and of a screwdriver, and the one nearer the
+    centre of mass of a wrench.
+
+    Raises:
+        UserError: it is flat, or stands nowhere.
+    """
+    vertices, faces = meshes.vertices_and_faces(solid)
+    com = trimesh.triangles.mass_properties(vertices[faces])["center_mass"]
+    z = -_resting_normal(vertices, com)
+    helper = np.eye(3)[np.abs(z).argmin()]
+    x = np.cross(helper, z) / np.linalg.norm(np.cross(helper, z))
+    solid = _turned(solid, np.array([x, np.cross(z, x), z]))
+    solid = solid.rotate((0.0, 0.0, -_long_direction_deg(solid.project())))
+    if not _works_at_plus_x(solid, category):
+        solid = solid.rotate((0.0, 0.0, 180.0))
+    return placed(solid)
+
+
+def placed(solid: Manifold) -> Manifold:
+    """The solid moved to the origin of the frame T: amid its outline, on the table."""
+    low, high = np.array(solid.bounding_box()).reshape(2, 3)
+    middle = (low + high) / 2
+    return solid.translate((-middle[0], -middle[1], -low[2]))
+
+
+def size(solid: Manifold) -> Array:
+    """Extents (3,) of the bounding box."""
+    low, high = np.array(solid.bounding_box()).reshape(2, 3)
+    return high - low
+
+
+def _turned(solid: Manifold, R: Array) -> Manifold:
+    return solid.transform(np.column_stack([R, np.zeros(3)]))
+
+
+def _resting_normal(vertices: Array, com: Array) -> Array:
+    """The outward normal of the hull's facet on which a body lies lowest."""
+    try:
+        hull = ConvexHull(vertices)
+    except (QhullError, ValueError) as error:
+        raise UserError("the mesh encloses no volume") from error
+    keys = np.round(hull.equations[:, :3] / _COPLANAR).astype(int)
+    _, group = np.unique(keys, axis=0, return_inverse=True)
+    group = group.reshape(-1)
+    poses = []
+    for index in range(group.max() + 1):
+        members = np.flatnonzero(group == index)
+        # The facet that lies outermost stands for all.
+        normal = hull.equations[members[0], :3]
+        reach = vertices[hull.vertices] @ normal
+        height = float(reach.max() - com @ normal)
+        corners = vertices[np.unique(hull.simplices[members])]
+        margin = _margin(corners, normal, com)
+        if margin > 0:
+            poses.append((height, margin, normal))
+    if not poses:
+        raise UserError("the mesh stands on none of its sides")
+    lowest = min(height for height, _, _ in poses)
+    good = [pose for pose in poses if pose[0] < lowest + _EQUAL_HEIGHT_MM]
+    # Of equals, the one nearest to how the file has it.
+    return max(good, key=lambda pose: (round(pose[1] / _MARGIN_STEP_MM), -round(pose[2][2], 3)))[2]
+
+
+def _margin(corners: Array, normal: Array, com: Array) -> float:
+    """How far the centre of mass is inside the rim of its support, seen along the normal."""
+    first = np.linalg.svd(normal[None])[2][1:]
+    flat = corners @ first.T
+    try:
+        equations = ConvexHull(flat).equations
+    except (QhullError, ValueError):
+        return -1.0
+    return float(-(equations[:, :2] @ (first @ com) + equations[:, 2]).max())
+
+
+def _long_direction_deg(outline: CrossSection) -> float:
+    """The direction along which most of an outline's edge runs, of those near its long axis.
+
+    A handle's two edges decide it, not how far a head or a jaw stands out to one side.
+    """
+    loops = outline.simplify(0.2).to_polygons()
+    points = np.vstack([0.5 * (loop + np.roll(loop, -1, axis=0)) for loop in loops])
+    edges = np.vstack([np.roll(loop, -1, axis=0) - loop for loop in loops])
+    lengths = np.linalg.norm(edges, axis=1)
+    angles = np.degrees(np.arctan2(edges[:, 1], edges[:, 0]))
+    centred = points - np.average(points, axis=0, weights=lengths)
+    _, axes = np.linalg.eigh((centred * lengths[:, None]).T @ centred)
+    axis = np.degrees(np.arctan2(axes[1, 1], axes[0, 1]))
+    directions = axis + np.arange(-_SIDEWAYS_DEG, _SIDEWAYS_DEG, 0.25)
+    apart = (directions[:, None] - angles + 90.0) % 180.0 - 90.0
+    votes = np.exp(-0.5 * (apart / _LIKE_DEG) ** 2) @ lengths
+    # The middle of what agrees with the winner, which is finer than the steps.
+    near = apart[int(np.argmax(votes))]
+    weights = lengths * np.exp(-0.5 * (near / _LIKE_DEG) ** 2)
+    return float(directions[int(np.argmax(votes))] - np.average(near, weights=weights))
+
+
+def _works_at_plus_x(solid: Manifold, category: str) -> bool:
+    low, high = np.array(solid.bounding_box()).reshape(2, 3)[:, 0]
+    if category == "wrench":
+        vertices, faces = meshes.vertices_and_faces(solid)
+        com = trimesh.triangles.mass_properties(vertices[faces])["center_mass"]
+        return bool(com[0] >= (low + high) / 2)
+    outline, span = solid.project(), _END * (high - low)
+    at_plus = _width(outline, high - span, high)
+    at_minus = _width(outline, low, low + span)
+    return at_plus >= at_minus if category == "hammer" else at_plus <= at_minus
+
+
+def _width(outline: CrossSection, start: float, end: float) -> float:
+    """The mean width of the hull of what lies between two places along x."""
+    y_min, y_max = outline.bounds()[1], outline.bounds()[3]
+    band = CrossSection.square((end - start, y_max - y_min)).translate((start, y_min))
+    return float((outline ^ band).hull().area() / (end - start))

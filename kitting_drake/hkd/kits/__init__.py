@@ -1,0 +1,1 @@
+"""Kits: blocks with a conformal cavity for each tool."""

@@ -1,0 +1,61 @@
+"""Measures a kit as built: how much room a seated tool has in its cavity."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from manifold3d import CrossSection, Manifold
+from numpy.typing import NDArray
+
+from kitting_drake.hkd.kits.kit import KitParameters, cavity_place
+from kitting_drake.hkd.tools.tool import Tool
+
+_STEP = 0.00025
+"""Distance of the points that are measured along a tool's outline, in metres."""
+
+
+@dataclass(frozen=True)
+class Clearance:
+    """Free space between the outline of a seated tool and the wall of its cavity, in metres."""
+
+    median: float
+    minimum: float
+
+
+def measure_clearance(block: Manifold, tool: Tool, parameters: KitParameters) -> Clearance:
+    """The clearance of a tool in the block of a kit, all along the tool's outline.
+
+    The wall is taken from the block itself, cut halfway between floor and bevel; the outline from
+    the tool's visual mesh. Where the tool has notches that the cavity bridges, and its wall has no
+    counterpart, the distance is that to the nearest wall there is.
+
+    Raises:
+        ValueError: the tool, in its place, is not inside a cavity.
+    """
+    x, y, floor = cavity_place(tool, parameters)
+    level = (floor + parameters.height - parameters.lead_in) / 2
+    solid = block.slice(level)
+    outline = tool.silhouette.translate((x, y))
+    if (outline ^ solid).area() > 1e-9:
+        raise ValueError(f"'{tool.name}' does not fit into its cavity")
+    points = np.concatenate([_points_along(loop) for loop in outline.to_polygons()])
+    distances = _distances(points, solid)
+    return Clearance(float(np.median(distances)), float(distances.min()))
+
+
+def _points_along(loop: NDArray[np.float64]) -> NDArray[np.float64]:
+    closed = np.concatenate([loop, loop[:1]])
+    along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(closed, axis=0), axis=1))])
+    at = np.arange(0.0, along[-1], _STEP)
+    return np.column_stack([np.interp(at, along, closed[:, axis]) for axis in (0, 1)])
+
+
+def _distances(points: NDArray[np.float64], shape: CrossSection) -> NDArray[np.float64]:
+    """The distance (n) of points (n, 2) from the nearest edge of a shape."""
+    nearest = np.full(len(points), np.inf)
+    for loop in shape.to_polygons():
+        for start, end in zip(loop, np.roll(loop, -1, axis=0), strict=True):
+            edge = end - start
+            share = np.clip((points - start) @ edge / (edge @ edge), 0.0, 1.0)
+            offset = points - start - share[:, None] * edge
+            np.minimum(nearest, np.linalg.norm(offset, axis=1), out=nearest)
+    return nearest

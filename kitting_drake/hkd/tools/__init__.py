@@ -1,0 +1,1 @@
+"""Hand tools: their families, generation and records."""

@@ -1,0 +1,225 @@
+"""Few convex pieces for a solid that is given as many: what a simulator touches.
+
+Lengths in mm; a piece is an array (n, 3) of points that stands for its convex hull. Two pieces may
+be replaced by the hull of both as long as nobody could tell by the shadows: on xy, where the
+outline decides whether the tool enters its cavity, and on xz and yz, where the heights decide what
+it lies on.
+"""
+
+import itertools
+from collections.abc import Sequence
+
+import manifold3d
+import numpy as np
+from manifold3d import CrossSection, JoinType, Manifold
+from scipy.spatial import ConvexHull
+
+from kitting_drake.hkd.tools.solids import SEGMENTS
+
+# Grid of the vertices of collision pieces.
+GRID_MM = 0.05
+
+_XY, _XZ, _YZ = [0, 1], [0, 2], [1, 2]
+# Pieces are first joined where that changes next to nothing, which leaves few enough to search.
+_EXACT_MM = 0.03
+# Area (mm^2) below which a difference of outlines is rounding.
+_AREA = 1e-4
+
+
+def silhouette(hulls: Sequence[np.ndarray], plane: Sequence[int] = _XY) -> CrossSection:
+    """The shadow of a union of convex pieces on a coordinate plane."""
+    return CrossSection.batch_boolean(
+        [CrossSection.hull_points(np.ascontiguousarray(h[:, plane])) for h in hulls],
+        manifold3d.OpType.Add,
+    )
+
+
+def closed(profile: CrossSection, clearance: float) -> CrossSection:
+    """The profile as a cavity with this clearance sees it: holes and gaps under twice it filled."""
+
+    def outer(p: CrossSection) -> CrossSection:
+        return CrossSection([loop for loop in p.to_polygons() if CrossSection([loop]).area() > 0])
+
+    grown = outer(profile.offset(clearance, JoinType.Round, circular_segments=4 * SEGMENTS))
+    return grown.offset(-clearance, JoinType.Round, circular_segments=4 * SEGMENTS)
+
+
+def thinned(points: np.ndarray, tolerance: float) -> np.ndarray:
+    """Vertices (m, 3) that span the hull of `points` to within about `tolerance` (mm).
+
+    What touches the table is chosen first, in the plane, so that a flat bottom stays exactly flat.
+    The result lies on a grid: facets that are almost coplanar become exactly so, or clearly not.
+    """
+    points = points[ConvexHull(points).vertices]
+    touching = np.flatnonzero(points[:, 2] < 1e-3)
+    seeds: list[int] = []
+    if len(touching) > 2:
+        seeds = list(touching[_farthest(points[touching, :2], [], tolerance)])
+    chosen = points[_farthest(points, seeds, tolerance)]
+    snapped = np.round(np.round(chosen / GRID_MM) * GRID_MM, 3) + 0.0
+    return np.unique(snapped[ConvexHull(snapped).vertices], axis=0)
+
+
+def _farthest(points: np.ndarray, chosen: list[int], tolerance: float) -> list[int]:
+    """Indices of points whose hull, grown from `chosen` by the farthest, reaches all others."""
+    dimension = points.shape[1]
+    directions = np.array(np.meshgrid(*[[-1.0, 0.0, 1.0]] * dimension)).reshape(dimension, -1).T
+    chosen = list(dict.fromkeys([*chosen, *np.argmax(points @ directions.T, axis=0)]))
+    if len(chosen) <= dimension:
+        # A sliver, which has no hull to grow; it has few points anyhow.
+        return list(range(len(points)))
+    while True:
+        equations = ConvexHull(points[chosen], qhull_options="QJ Pp").equations
+        distance = (points @ equations[:, :-1].T + equations[:, -1]).max(axis=1)
+        farthest = int(np.argmax(distance))
+        if distance[farthest] <= tolerance or farthest in chosen:
+            return sorted(chosen)
+        chosen.append(farthest)
+
+
+class _Piece:
+    """A convex piece, the pieces it was made of, its volume and its box."""
+
+    def __init__(self, points: np.ndarray, sources: list[np.ndarray] | None = None):
+        hull = Manifold.hull_points(np.ascontiguousarray(points))
+        self.points = np.asarray(hull.to_mesh64().vert_properties)[:, :3]
+        self.sources = sources or [points]
+        self.volume = hull.volume()
+        self.low, self.high = points.min(axis=0), points.max(axis=0)
+
+    def touches(self, other: "_Piece", gap: float) -> bool:
+        return bool(np.all(self.low <= other.high + gap) and np.all(other.low <= self.high + gap))
+
+    def joined(self, other: "_Piece") -> "_Piece":
+        return _Piece(np.vstack([self.points, other.points]), self.sources + other.sources)
+
+
+def _grown(profile: CrossSection, distance: float) -> CrossSection:
+    return profile.offset(distance, JoinType.Round, circular_segments=SEGMENTS)
+
+
+def _fits(piece: _Piece, allowed: CrossSection, tolerance: float) -> bool:
+    """Whether a joined piece casts the shadows of its sources, within the tolerance."""
+    if (silhouette([piece.points]) - allowed).area() > _AREA:
+        return False
+    return all(
+        (
+            silhouette([piece.points], plane) - _grown(silhouette(piece.sources, plane), tolerance)
+        ).area()
+        <= _AREA
+        for plane in (_XZ, _YZ)
+    )
+
+
+def _merged(pieces: list[_Piece], allowed: CrossSection, tolerance: float) -> list[_Piece]:
+    """Joins pairs, the one that adds the least volume first, until no pair fits."""
+    alive = dict(enumerate(pieces))
+
+    def options(a: int, b: int) -> list[tuple[float, int, int]]:
+        if not alive[a].touches(alive[b], tolerance):
+            return []
+        joined = alive[a].joined(alive[b])
+        added = joined.volume - alive[a].volume - alive[b].volume
+        return [(round(added, 3), a, b)] if _fits(joined, allowed, tolerance) else []
+
+    pairs = [option for a in alive for b in alive if a < b for option in options(a, b)]
+    while pairs:
+        _, a, b = min(pairs)
+        new = max(alive) + 1
+        alive[new] = alive.pop(a).joined(alive.pop(b))
+        pairs = [pair for pair in pairs if not {a, b} & set(pair[1:])]
+        pairs += [option for c in alive if c != new for option in options(c, new)]
+    return list(alive.values())
+
+
+def cover(
+    hulls: Sequence[np.ndarray], outline: CrossSection, allowed: CrossSection, tolerance: float
+) -> list[np.ndarray]:
+    """Convex pieces, few and perhaps overlapping, that together fill what `hulls` fill.
+
+    Each piece is grown from one of `hulls` by whichever neighbour adds the least volume, as long
+    as its shadow on xy stays within `allowed` and the others move by at most `tolerance` (mm); of
+    all that can be grown, the one that fills the most that is still open is taken, until nothing
+    is open. Pieces that hardly show in any shadow are then left out. Deterministic.
+    """
+    pieces = _merged([_Piece(h) for h in hulls], _grown(outline, _EXACT_MM), _EXACT_MM)
+    grown = [_grow(seed, pieces, allowed, tolerance) for seed in range(len(pieces))]
+    open_pieces, result = set(range(len(pieces))), []
+    while open_pieces:
+        gains = [
+            round(sum(pieces[i].volume for i in members & open_pieces), 3) for _, members in grown
+        ]
+        _, members = grown[int(np.argmax(gains))]
+        # Span only what is still open: what others fill need not be filled twice.
+        wanted = np.vstack([pieces[i].points for i in sorted(members & open_pieces)])
+        result.append(wanted)
+        open_pieces -= members
+    return _pruned(result, 0.5 * tolerance)
+
+
+def runs(
+    sections: Sequence[np.ndarray], tolerance: float, height_tolerance: float
+) -> list[np.ndarray]:
+    """The hulls along a loft through `sections`, (n, 3) each, few and long.
+
+    Neighbours are joined as long as the shadow on xy grows by at most `tolerance`, and the others,
+    which decide nothing beside a cavity's wall, by at most `height_tolerance` (both mm).
+    """
+    pairs = [np.vstack(pair) for pair in itertools.pairwise(sections)]
+    result, first = [], 0
+    for last in range(1, len(pairs) + 1):
+        if last < len(pairs):
+            trial = np.vstack(pairs[first : last + 1])
+            if all(
+                (
+                    silhouette([trial], plane)
+                    - _grown(silhouette(pairs[first : last + 1], plane), limit)
+                ).area()
+                <= _AREA
+                for plane, limit in (
+                    (_XY, tolerance),
+                    (_XZ, height_tolerance),
+                    (_YZ, height_tolerance),
+                )
+            ):
+                continue
+        result.append(np.vstack(pairs[first:last]))
+        first = last
+    return result
+
+
+def _pruned(pieces: list[np.ndarray], tolerance: float) -> list[np.ndarray]:
+    """Leaves out pieces, the smallest first, without which no shadow shrinks by `tolerance`."""
+    whole = [silhouette(pieces, plane) for plane in (_XY, _XZ, _YZ)]
+    kept = list(pieces)
+    for piece in sorted(pieces, key=lambda h: Manifold.hull_points(h).volume()):
+        rest = [h for h in kept if h is not piece]
+        if rest and all(
+            (shadow - _grown(silhouette(rest, plane), tolerance)).area() <= _AREA
+            for shadow, plane in zip(whole, (_XY, _XZ, _YZ), strict=True)
+        ):
+            kept = rest
+    return kept
+
+
+def _grow(
+    seed: int, pieces: list[_Piece], allowed: CrossSection, tolerance: float
+) -> tuple[np.ndarray, set[int]]:
+    """The largest piece that grows from `seed`, and the indices of the pieces that it holds."""
+    current, members = pieces[seed], {seed}
+    candidates = set(range(len(pieces))) - members
+    while True:
+        near = [i for i in sorted(candidates) if current.touches(pieces[i], tolerance)]
+        trials = sorted(
+            (current.joined(pieces[i]).volume - current.volume - pieces[i].volume, i) for i in near
+        )
+        for _, i in trials:
+            # What does not fit now never will: the piece only grows.
+            candidates.discard(i)
+            joined = current.joined(pieces[i])
+            if _fits(joined, allowed, tolerance):
+                current = joined
+                members.add(i)
+                break
+        else:
+            return current.points, members

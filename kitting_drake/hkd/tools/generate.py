@@ -1,0 +1,367 @@
+"""Makes the model of a hand tool from its catalogue entry: meshes, SDFormat and `tool.yaml`.
+
+The tool frame T: z up, the table is the plane z = 0 when the tool rests on it, x along the length
+with the working end toward +x, the origin in the middle of the visual bounding box's footprint.
+Solids are handled in mm and written in metres.
+"""
+
+import dataclasses
+import shutil
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import trimesh
+import yaml
+from manifold3d import CrossSection, JoinType, Manifold, OpType
+from scipy.spatial import ConvexHull, QhullError
+
+from kitting_drake.common.errors import UserError
+from kitting_drake.hkd.tools import hammer, meshes, pliers, screwdriver, wrench
+from kitting_drake.hkd.tools.collision import (
+    closed,
+    cover,
+    silhouette,
+    thinned,
+)
+from kitting_drake.hkd.tools.sdf import tool_sdf
+from kitting_drake.hkd.tools.solids import MATERIALS, Part
+
+# The cavities of a kit stand this far off a tool's outline: what is narrower than twice this is no
+# part of a cavity, so collision pieces may bridge it.
+CAVITY_CLEARANCE_MM = 2.0
+# How far joining two collision pieces may move the outline, and thinning their vertices.
+MERGE_TOLERANCE_MM = 0.25
+VERTEX_TOLERANCE_MM = 0.2
+# The same for the faces that the jaws grip.
+GRIP_TOLERANCE_MM = 0.06
+# How far off the middle of those faces a grasp may be annotated.
+GRIP_CENTRING_MM = 0.2
+# Edges sharper than this are drawn as edges.
+CREASE_ANGLE_DEG = 35.0
+# The jaw pads of the gripper and its fingers, along the tool.
+PAD_LENGTH_MM, FINGER_LENGTH_MM = 18.0, 22.0
+
+DESIGNS: dict[str, tuple[type, Callable[[Any], list[Part]]]] = {
+    "hammer": (hammer.HammerParameters, hammer.build_hammer),
+    "pliers": (pliers.PliersParameters, pliers.build_pliers),
+    "wrench": (wrench.WrenchParameters, wrench.build_wrench),
+    "screwdriver": (screwdriver.ScrewdriverParameters, screwdriver.build_screwdriver),
+}
+
+
+class CatalogueError(UserError):
+    """A catalogue entry that cannot be used; the message names entry and field."""
+
+
+@dataclass
+class GraspEntry:
+    """A grasp annotated by hand in frame T: the jaws close along +y turned by theta about +z."""
+
+    x_mm: float = 0.0
+    y_mm: float = 0.0
+    theta_deg: float = 0.0
+
+
+@dataclass
+class ToolEntry:
+    """One entry of the catalogue."""
+
+    name: str
+    category: str
+    split: str
+    # The design is scaled to this length.
+    length_mm: float
+    grasp: GraspEntry
+    # Departures from the defaults of the category's parameters.
+    parameters: dict[str, Any] = field(default_factory=dict)
+
+
+@dataclass
+class Report:
+    """What generating one tool measured; lengths in mm."""
+
+    description: dict[str, Any]
+    triangles: int
+    collision_pieces: int
+    collision_triangles: int
+    # The furthest that the collision outline lies outside and inside the visual outline.
+    outside_mm: float
+    inside_mm: float
+    # Collision less visual: lowest point, highest point, gripped width.
+    bottom_error_mm: float
+    top_error_mm: float
+    grip_error_mm: float
+    # How much the gripped faces' distance varies along the pads, and how far anything beside them
+    # stands out where the fingers pass.
+    grip_flatness_mm: float
+    finger_overhang_mm: float
+    # Tilt from the design's lie, and distance of the centre of mass from the support's rim.
+    tilt_deg: float
+    support_margin_mm: float
+
+
+def load_catalogue(path: Path) -> list[ToolEntry]:
+    """Reads `catalogue.yaml`; raises CatalogueError for an entry that cannot be used."""
+    try:
+        data = yaml.safe_load(path.read_text())
+    except OSError as error:
+        raise CatalogueError(f"cannot read {path}: {error.strerror}") from error
+    except yaml.YAMLError as error:
+        raise CatalogueError(f"{path}: {' '.join(str(error).split())}") from error
+    if not isinstance(data, dict) or not isinstance(data.get("tools"), list):
+        raise CatalogueError(f"{path}: it has to hold a list named `tools`")
+    entries: list[ToolEntry] = []
+    for item in data["tools"]:
+        name = item.get("name", f"number {len(entries) + 1}")
+        try:
+            entries.append(ToolEntry(**{**item, "grasp": GraspEntry(**item["grasp"])}))
+        except (KeyError, TypeError) as error:
+            raise CatalogueError(f"{path}: tool {name}: {error}") from error
+        if entries[-1].category not in DESIGNS:
+            raise CatalogueError(
+                f"{path}: tool {name}: category {entries[-1].category!r} is none of "
+                f"{', '.join(DESIGNS)}"
+            )
+    names = [e.name for e in entries]
+    if len(set(names)) != len(names):
+        raise CatalogueError(f"{path}: two tools share a name")
+    return entries
+
+
+def build_parts(entry: ToolEntry) -> list[Part]:
+    """The tool's parts in the design frame, scaled to its length and free of overlaps; mm."""
+    parameters_type, build = DESIGNS[entry.category]
+    known = {f.name for f in dataclasses.fields(parameters_type)}
+    if unknown := sorted(set(entry.parameters) - known):
+        raise CatalogueError(
+            f"tool {entry.name}: {parameters_type.__name__} has no field {unknown[0]!r}"
+        )
+    try:
+        parts = build(parameters_type(**entry.parameters))
+    except (TypeError, ValueError, KeyError) as error:
+        raise CatalogueError(f"tool {entry.name}: {error}") from error
+    box = Manifold.batch_boolean([part.solid for part in parts], OpType.Add).bounding_box()
+    scale = entry.length_mm / max(box[3] - box[0], box[4] - box[1])
+    taken, result = Manifold(), []
+    for part in parts:
+        solid = part.solid.scale((scale, scale, scale))
+        result.append(
+            Part(part.name, part.material, solid - taken, [scale * h for h in part.hulls])
+        )
+        taken += solid
+    return result
+
+
+def mass_properties(parts: list[Part]) -> tuple[float, np.ndarray, np.ndarray]:
+    """Mass (kg), centre of mass (m) and rotational inertia about it (kg m^2, 3 by 3)."""
+    bodies = []
+    for part in parts:
+        vertices, faces = meshes.vertices_and_faces(part.solid)
+        density = MATERIALS[part.material].density
+        p = trimesh.triangles.mass_properties(1e-3 * vertices[faces], density=density)
+        bodies.append((p["mass"], p["center_mass"], p["inertia"]))
+    mass = sum(m for m, _, _ in bodies)
+    center = sum(m * c for m, c, _ in bodies) / mass
+    inertia = np.zeros((3, 3))
+    for m, c, about_center in bodies:
+        d = c - center
+        inertia += about_center + m * (d @ d * np.eye(3) - np.outer(d, d))
+    return mass, center, inertia
+
+
+def resting_pose(points: np.ndarray, center_of_mass: np.ndarray) -> np.ndarray:
+    """The rotation R_TD (3 by 3) that lays a body on a table, as near to its design lie as can be.
+
+    A body stands on a facet of its hull `points` (n, 3) if its centre of mass is above that facet.
+    """
+    hull = ConvexHull(points)
+    best, best_tilt = np.array([0.0, 0.0, -1.0]), np.inf
+    for simplex, (*normal, offset) in zip(hull.simplices, hull.equations, strict=True):
+        normal = np.array(normal)
+        foot = center_of_mass - (center_of_mass @ normal + offset) * normal
+        corners = points[simplex]
+        weights = np.linalg.lstsq(
+            np.vstack([corners.T, np.ones(3)]), np.append(foot, 1.0), rcond=None
+        )[0]
+        tilt = np.arccos(np.clip(-normal[2], -1.0, 1.0))
+        if weights.min() >= -1e-6 and tilt < best_tilt:
+            best, best_tilt = normal, tilt
+    z = -best
+    x = np.array([1.0, 0.0, 0.0]) - z[0] * z
+    x /= np.linalg.norm(x)
+    return np.array([x, np.cross(z, x), z])
+
+
+def generate_tool(entry: ToolEntry, directory: Path) -> Report:
+    """Writes the model of one tool to `directory`, replacing what is there."""
+    parts = build_parts(entry)
+    hulls = [h for part in parts for h in part.hulls]
+    mass, center, inertia = mass_properties(parts)
+    # Lie the tool down before its pieces are merged: outline and heights are those of the lie.
+    R_TD = resting_pose(np.vstack(hulls), 1e3 * center)
+    whole = _moved(Manifold.batch_boolean([p.solid for p in parts], OpType.Add), R_TD, np.zeros(3))
+    if sum(body.volume() > 1e-3 for body in whole.decompose()) != 1:
+        raise CatalogueError(f"tool {entry.name}: its parts do not touch")
+    box = np.array(whole.bounding_box()).reshape(2, 3)
+    bottom = min((h @ R_TD.T)[:, 2].min() for h in hulls)
+    p_T = -np.array([*box[:, :2].mean(axis=0), bottom])
+    whole = whole.translate(p_T)
+    outline = closed(whole.project(), CAVITY_CLEARANCE_MM)
+    allowed = _allowed(outline, entry.grasp)
+    hulls = cover([h @ R_TD.T + p_T for h in hulls], outline, allowed, MERGE_TOLERANCE_MM)
+    hulls = sorted(
+        (thinned(h, VERTEX_TOLERANCE_MM) for h in hulls),
+        key=lambda h: tuple(np.round(h.mean(axis=0), 3)),
+    )
+
+    # Nothing is written of a tool that cannot be used.
+    box = np.array(whole.bounding_box()).reshape(2, 3)
+    grip, flatness, overhang, grip_top = _measure_grasp(entry.grasp, whole)
+
+    if directory.exists():
+        shutil.rmtree(directory)
+    directory.mkdir(parents=True)
+    center = R_TD @ center + 1e-3 * p_T
+    inertia = R_TD @ inertia @ R_TD.T
+    visuals, triangles = _write_visuals(parts, R_TD, p_T, directory)
+    collisions, collision_triangles = [], 0
+    for i, hull in enumerate(hulls):
+        collisions.append(f"collision_{i}.obj")
+        collision_triangles += meshes.write_convex_obj(directory / collisions[-1], hull)
+    (directory / f"{entry.name}.sdf").write_text(
+        tool_sdf(entry.name, mass, center, inertia, visuals, collisions)
+    )
+
+    solid_hulls = Manifold.batch_boolean([Manifold.hull_points(h) for h in hulls], OpType.Add)
+    description = _description(entry, box, mass, center, grip, grip_top, visuals)
+    (directory / "tool.yaml").write_text(yaml.safe_dump(description, sort_keys=False))
+    points = np.vstack(hulls)
+    return Report(
+        description,
+        triangles,
+        len(hulls),
+        collision_triangles,
+        outside_mm=_furthest(silhouette(hulls), outline),
+        inside_mm=_furthest(outline, closed(silhouette(hulls), CAVITY_CLEARANCE_MM)),
+        bottom_error_mm=points[:, 2].min() - box[0, 2],
+        top_error_mm=points[:, 2].max() - box[1, 2],
+        grip_error_mm=_measure_grasp(entry.grasp, solid_hulls)[0] - grip,
+        grip_flatness_mm=flatness,
+        finger_overhang_mm=overhang,
+        tilt_deg=float(np.degrees(np.arccos(min(1.0, R_TD[2, 2])))),
+        support_margin_mm=_support_margin(points, 1e3 * center),
+    )
+
+
+def _allowed(outline: CrossSection, grasp: GraspEntry) -> CrossSection:
+    """Where collision pieces may reach: a little out of the outline, not where the jaws grip."""
+
+    def grown(distance: float) -> CrossSection:
+        return outline.offset(distance, JoinType.Round, circular_segments=96)
+
+    jaws = CrossSection.square((FINGER_LENGTH_MM + 2.0, 80.0), True)
+    jaws = jaws.rotate(grasp.theta_deg).translate((grasp.x_mm, grasp.y_mm))
+    return grown(MERGE_TOLERANCE_MM) - (jaws - grown(GRIP_TOLERANCE_MM))
+
+
+def _moved(solid: Manifold, R: np.ndarray, p: np.ndarray) -> Manifold:
+    return solid.transform(np.column_stack([R, p]))
+
+
+def _write_visuals(
+    parts: list[Part], R_TD: np.ndarray, p_T: np.ndarray, directory: Path
+) -> tuple[list[tuple[str, str]], int]:
+    """One OBJ per material; returns (file, material) pairs and the number of triangles."""
+    visuals, triangles = [], 0
+    for material in sorted({part.material for part in parts}):
+        solids = [part.solid for part in parts if part.material == material]
+        solid = _moved(Manifold.batch_boolean(solids, OpType.Add), R_TD, p_T).simplify(0.01)
+        visuals.append((f"{material}.obj", material))
+        triangles += meshes.write_smooth_obj(directory / visuals[-1][0], solid, CREASE_ANGLE_DEG)
+    return visuals, triangles
+
+
+def _measure_grasp(grasp: GraspEntry, solid: Manifold) -> tuple[float, float, float, float]:
+    """Gripped width, its variation, the fingers' overhang, and height of the top there; mm."""
+    # Into the grasp's frame: y along the closing direction.
+    solid = solid.translate((-grasp.x_mm, -grasp.y_mm, 0.0)).rotate((0.0, 0.0, -grasp.theta_deg))
+
+    def strip(x: float, length: float) -> np.ndarray:
+        band = CrossSection.square((length, 80.0), True).translate((x, 0.0)).extrude(100.0)
+        return np.array((solid ^ band.translate((0, 0, -1))).bounding_box()).reshape(2, 3)
+
+    pad, finger = strip(0.0, PAD_LENGTH_MM), strip(0.0, FINGER_LENGTH_MM)
+    slices = [strip(x, 0.5) for x in np.linspace(-0.5, 0.5, 7) * (PAD_LENGTH_MM - 0.5)]
+    width = pad[1, 1] - pad[0, 1]
+    if not 8.0 <= width <= 35.0:
+        raise CatalogueError(
+            f"the grasp at ({grasp.x_mm}, {grasp.y_mm}) mm holds {width:.1f} mm; "
+            "it has to be 8 to 35 mm"
+        )
+    middle = 0.5 * (pad[0, 1] + pad[1, 1])
+    if abs(middle) > GRIP_CENTRING_MM:
+        # The jaws would draw the tool over as they close, and put it down as much beside its place.
+        raise CatalogueError(
+            f"the grasp at ({grasp.x_mm}, {grasp.y_mm}) mm is not amid the faces it grips, but "
+            f"{middle:+.2f} mm off along the jaws"
+        )
+    flatness = max(np.ptp([s[k, 1] for s in slices]) for k in (0, 1))
+    overhang = max(finger[1, 1] - pad[1, 1], pad[0, 1] - finger[0, 1])
+    return float(width), float(flatness), float(overhang), float(pad[1, 2])
+
+
+def _furthest(inner: CrossSection, outer: CrossSection) -> float:
+    """The furthest that `inner` reaches out of `outer`, by bisection, to 0.01 mm."""
+    low, high = 0.0, 5.0
+    while high - low > 0.01:
+        middle = 0.5 * (low + high)
+        grown = outer.offset(middle, JoinType.Round, circular_segments=96)
+        low, high = (low, middle) if (inner - grown).area() < 1e-4 else (middle, high)
+    return high
+
+
+def _support_margin(points: np.ndarray, center_of_mass: np.ndarray) -> float:
+    """Distance (mm) of the centre of mass, seen from above, from the rim of the support."""
+    touching = points[points[:, 2] < 0.02][:, :2]
+    try:
+        equations = ConvexHull(touching).equations
+    except QhullError:
+        return 0.0
+    return float(-(equations[:, :2] @ center_of_mass[:2] + equations[:, 2]).max())
+
+
+def _description(
+    entry: ToolEntry,
+    box: np.ndarray,
+    mass: float,
+    center: np.ndarray,
+    grip: float,
+    grip_top: float,
+    visuals: list[tuple[str, str]],
+) -> dict[str, Any]:
+    """The content of `tool.yaml`: SI units, frame T."""
+
+    def metres(value_mm: float) -> float:
+        return round(1e-3 * float(value_mm), 6)
+
+    return {
+        "name": entry.name,
+        "category": entry.category,
+        "split": entry.split,
+        "length": metres(box[1, 0] - box[0, 0]),
+        "width": metres(box[1, 1] - box[0, 1]),
+        "height": metres(box[1, 2]),
+        "mass": round(float(mass), 6),
+        "center_of_mass": [round(float(v), 6) + 0.0 for v in center],
+        "grasp": {
+            "x": metres(entry.grasp.x_mm),
+            "y": metres(entry.grasp.y_mm),
+            "theta": round(float(np.radians(entry.grasp.theta_deg)), 6),
+            "width": metres(grip),
+            "surface_height": metres(grip_top),
+        },
+        "visual_meshes": [name for name, _ in visuals],
+    }

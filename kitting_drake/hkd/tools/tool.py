@@ -1,0 +1,168 @@
+"""A tool as a scenario uses it: a folder with its SDFormat model, its meshes and its record."""
+
+import difflib
+import os
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+import trimesh
+import yaml
+from manifold3d import CrossSection, FillRule
+from numpy.typing import NDArray
+
+from kitting_drake.common.errors import UserError
+from kitting_drake.common.paths import MODELS
+
+CATEGORIES = ("hammer", "pliers", "wrench", "screwdriver")
+"""The four categories of the paper (section IV-B.1)."""
+
+
+@dataclass(frozen=True)
+class Grasp:
+    """An annotated grasp in the tool frame T; see `Tool` for the frame."""
+
+    x: float
+    """Of the point midway between the pads, in metres."""
+    y: float
+    theta: float
+    """Turn of the hand about T's z, in radians; at zero the jaws close along T's y."""
+    width: float
+    """Distance of the faces that are gripped, in metres."""
+    surface_height: float
+    """Height of the tool's top at the grasp above its resting plane, in metres."""
+
+
+@dataclass(frozen=True)
+class Tool:
+    """One hand tool.
+
+    The tool frame T: z up when the tool lies flat, the resting plane is z = 0, x along the tool's
+    length with the working end at +x, the origin amid the bounding box of its outline.
+    """
+
+    directory: Path
+    name: str
+    category: str
+    """One of `CATEGORIES`."""
+    split: str
+    """`train` or `test` (section IV-B.1 of the paper), or `user` for a tool of one's own."""
+    length: float
+    """Extents of the bounding box along x, y and z of T, in metres."""
+    width: float
+    height: float
+    mass: float
+    """In kg."""
+    grasp: Grasp
+    visual_meshes: tuple[Path, ...]
+
+    @property
+    def sdf(self) -> Path:
+        """The model, with one free link `tool` whose body frame is T."""
+        return self.directory / f"{self.name}.sdf"
+
+    @cached_property
+    def triangles(self) -> NDArray[np.float64]:
+        """(n, 3, 3) the triangles of the visual surface, in T, in metres.
+
+        Raises:
+            UserError: a file that is not a mesh.
+        """
+        return np.concatenate([_read_triangles(path) for path in self.visual_meshes])
+
+    @cached_property
+    def silhouette(self) -> CrossSection:
+        """The outline from above, in T, in metres."""
+        return silhouette(self.triangles)
+
+    def surface_points(self, count: int, seed: int = 0) -> NDArray[np.float64]:
+        """(count, 3) points of the surface, in T, in metres: by area, the same each time."""
+        faces = np.arange(3 * len(self.triangles)).reshape(-1, 3)
+        mesh = trimesh.Trimesh(self.triangles.reshape(-1, 3), faces, process=False)
+        points, _ = trimesh.sample.sample_surface(mesh, count, seed=seed)
+        return np.asarray(points, dtype=float)
+
+
+def _read_triangles(path: Path) -> NDArray[np.float64]:
+    try:
+        triangles = np.asarray(trimesh.load_mesh(path, process=False).triangles, dtype=float)
+    except (OSError, ValueError, TypeError, AttributeError, IndexError, KeyError) as error:
+        raise UserError(f"{path} is not a mesh that can be read: {error}") from error
+    if not len(triangles) or not np.isfinite(triangles).all():
+        raise UserError(f"{path} holds no triangles, or some without a place")
+    return triangles
+
+
+def silhouette(triangles: NDArray[np.float64]) -> CrossSection:
+    """The union of triangles (n, 3, 3) seen along z, whole or broken as their mesh may be."""
+    flat = np.array(triangles[:, :, :2], dtype=float)
+    edge_1, edge_2 = flat[:, 1] - flat[:, 0], flat[:, 2] - flat[:, 0]
+    area = edge_1[:, 0] * edge_2[:, 1] - edge_1[:, 1] * edge_2[:, 0]
+    flat[area < 0] = flat[area < 0, ::-1]
+    return CrossSection(list(flat[np.abs(area) > 1e-12]), FillRule.NonZero)
+
+
+def load_tool(name: str, base: Path | None = None) -> Tool:
+    """A tool by its name under `models/tools` or `user_tools`, or by the path of its folder.
+
+    Args:
+        name: a name, or a path, absolute or relative to `base`. Where one name means several, the
+            project's own tool comes first, then the user's, then the path.
+        base: where relative paths start; the working directory when None.
+
+    Raises:
+        UserError: no such tool, or a record or a mesh that is missing or broken.
+    """
+    directory = ((base or Path.cwd()) / name).resolve()
+    if Path(name).name == name:
+        for folder in (user_tools(), MODELS / "tools"):
+            if (folder / name / "tool.yaml").is_file():
+                directory = folder / name
+    record_path = directory / "tool.yaml"
+    if not record_path.is_file():
+        close = difflib.get_close_matches(name, [*tool_names(), *user_tool_names()], n=1)
+        advice = f"did you mean '{close[0]}'?" if close else "'hkd list' shows those there are"
+        raise UserError(f"there is no tool '{name}', nor a folder with a tool.yaml: {advice}")
+    try:
+        record = yaml.safe_load(record_path.read_text())
+        tool = Tool(
+            directory=directory,
+            name=str(record["name"]),
+            category=str(record["category"]),
+            split=str(record["split"]),
+            length=float(record["length"]),
+            width=float(record["width"]),
+            height=float(record["height"]),
+            mass=float(record["mass"]),
+            grasp=Grasp(**{key: float(value) for key, value in record["grasp"].items()}),
+            visual_meshes=tuple(directory / str(path) for path in record["visual_meshes"]),
+        )
+    except (yaml.YAMLError, KeyError, TypeError, ValueError, AttributeError) as error:
+        raise UserError(f"{record_path} is not a tool record: {error!r}") from error
+    for path in (tool.sdf, *tool.visual_meshes):
+        if not path.is_file():
+            raise UserError(f"the tool '{name}' lacks its file {path}")
+    if tool.category not in CATEGORIES:
+        raise UserError(
+            f"{record_path}: category '{tool.category}' is none of {', '.join(CATEGORIES)}"
+        )
+    return tool
+
+
+def tool_names() -> list[str]:
+    """The names of the tools that come with the project."""
+    return sorted(path.parent.name for path in (MODELS / "tools").glob("*/tool.yaml"))
+
+
+def user_tools() -> Path:
+    """The folder of the user's own tools: `$KITTING_DRAKE_TOOLS`, or one in `~/.local/share`."""
+    given = os.environ.get("KITTING_DRAKE_TOOLS")
+    return Path(given) if given else Path.home() / ".local" / "share" / "kitting_drake" / "tools"
+
+
+def user_tool_names() -> list[str]:
+    """The names of the tools in `user_tools`."""
+    # A folder that begins with a dot is one that is being made.
+    records = user_tools().glob("[!.]*/tool.yaml")
+    return sorted(path.parent.name for path in records)

@@ -1,0 +1,43 @@
+"""Toolsets: which four tools, one of each category, share a kit (section IV-B.2 of the paper)."""
+
+import numpy as np
+
+from kitting_drake.common.errors import UserError
+from kitting_drake.hkd.tools.tool import CATEGORIES, load_tool, tool_names
+
+SPLITS = ("train", "test")
+TOOLSET_COUNT = 100
+"""Toolsets, and so kits, of each split."""
+TOOLSETS_SEED = 2024
+"""What the toolsets are drawn from."""
+
+
+def tool_pools(split: str) -> dict[str, list[str]]:
+    """The names of a split's tools by category, in the order of `CATEGORIES`."""
+    pools: dict[str, list[str]] = {category: [] for category in CATEGORIES}
+    for name in tool_names():
+        tool = load_tool(name)
+        if tool.split == split:
+            pools[tool.category].append(name)
+    return pools
+
+
+def toolsets(split: str) -> list[tuple[str, ...]]:
+    """The split's toolsets, all different, always the same: names in the order of `CATEGORIES`.
+
+    There are `TOOLSET_COUNT`, or as many as there are combinations.
+
+    Raises:
+        UserError: a category has no tool in the split.
+    """
+    pools = list(tool_pools(split).values())
+    sizes = [len(pool) for pool in pools]
+    combinations = int(np.prod(sizes))
+    if not combinations:
+        raise UserError(f"there are no {split} toolsets: a category has no {split} tool")
+    rng = np.random.default_rng([TOOLSETS_SEED, SPLITS.index(split)])
+    chosen = rng.permutation(combinations)[:TOOLSET_COUNT]
+    return [
+        tuple(pool[index] for pool, index in zip(pools, indices, strict=True))
+        for indices in zip(*np.unravel_index(chosen, sizes), strict=True)
+    ]

@@ -1,0 +1,1 @@
+"""The typed YAML schema of a scenario, and its loader."""

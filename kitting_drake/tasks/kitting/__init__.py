@@ -1,0 +1,1 @@
+"""Kitting: hand tools on a table, and a kit with a cavity for each (section IV)."""

@@ -1,0 +1,83 @@
+import os
+from pathlib import Path
+
+import pytest
+
+from kitting_drake.common.errors import UserError
+from kitting_drake.common.files import (
+    alone_in,
+    append_line,
+    claim_folder,
+    read_lines,
+    require_folder,
+    write_json,
+    write_whole,
+)
+
+
+def test_writes_and_replaces_in_a_new_folder(tmp_path: Path):
+    path = tmp_path / "new" / "deep" / "results.json"
+    write_json(path, {"a": 1})
+    write_whole(path, "short")
+    assert path.read_text() == "short"
+    assert [item.name for item in path.parent.iterdir()] == [path.name]
+
+
+def test_what_was_there_stays_whole_when_writing_fails(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    path = tmp_path / "results.json"
+    write_whole(path, "before")
+
+    def full(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(os, "replace", full)
+    with pytest.raises(UserError, match=r"cannot write .*results\.json: No space left"):
+        write_whole(path, "after")
+    assert path.read_text() == "before"
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_a_folder_that_cannot_be_is_told_before_the_run(tmp_path: Path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(UserError, match=r"cannot write into .*/file/out: Not a directory"):
+        require_folder(tmp_path / "file" / "out")
+
+
+def test_only_another_process_in_the_folder_is_told_of(tmp_path: Path):
+    told = pytest.raises(UserError, match="another process is at work")
+    with alone_in(tmp_path), told, alone_in(tmp_path):
+        pass
+    # What goes wrong inside is not taken for it.
+    with pytest.raises(BlockingIOError), alone_in(tmp_path):
+        raise BlockingIOError
+    with alone_in(tmp_path):
+        pass
+
+
+def test_a_line_that_was_being_written_is_cut_off(tmp_path: Path):
+    path = tmp_path / "lines.jsonl"
+    assert read_lines(path) == []
+    append_line(path, {"seed": 1})
+    with path.open("a") as file:
+        file.write('{"seed": 2, "s')
+    assert read_lines(path) == [{"seed": 1}]
+    append_line(path, {"seed": 3})
+    assert read_lines(path) == [{"seed": 1}, {"seed": 3}]
+    path.write_text('{"seed": 1\n{"seed": 3}\n')
+    with pytest.raises(UserError, match="is damaged"):
+        read_lines(path)
+
+
+def test_a_folder_is_that_of_one_thing(tmp_path: Path):
+    claim_folder(tmp_path, "settings.json", {"steps": 3, "type": "float32"}, of="run")
+    claim_folder(tmp_path, "settings.json", {"steps": 3, "type": "float32"}, of="run")
+    with pytest.raises(UserError, match=r"another run \(type is bfloat16, there float32\)"):
+        claim_folder(tmp_path, "settings.json", {"steps": 3, "type": "bfloat16"}, of="run")
+    (tmp_path / "summary.json").write_text("{}")
+    with pytest.raises(UserError, match=r"holds the summary\.json of something else"):
+        claim_folder(tmp_path, "scenario.json", {}, of="scenario")
+    (tmp_path / "settings.json").write_text('{"steps": ')
+    with pytest.raises(UserError, match=r"settings\.json is damaged"):
+        claim_folder(tmp_path, "settings.json", {}, of="run")

@@ -1,0 +1,120 @@
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from kitting_drake.common.processes import Died, run_apart, side_by_side
+
+ROOT = Path(__file__).resolve().parents[3]
+
+
+def add(a: int, b: int) -> int:
+    return a + b
+
+
+def process_and_threads() -> tuple[int, str | None]:
+    return os.getpid(), os.environ.get("OMP_NUM_THREADS")
+
+
+def kill_itself() -> None:
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+def leave() -> None:
+    sys.exit(3)
+
+
+def test_the_result_comes_back_from_another_process():
+    assert run_apart(add, 2, 3) == 5
+    process, _ = run_apart(process_and_threads)
+    assert process != os.getpid()
+
+
+def test_a_process_that_dies_takes_nothing_with_it():
+    assert run_apart(kill_itself) == Died(-signal.SIGKILL)
+    assert run_apart(leave) == Died(3)
+
+
+@pytest.mark.parametrize(("workers", "threads"), [(2, "1"), (1, "7")])
+def test_side_by_side_processes_compute_in_one_thread(
+    workers: int, threads: str, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setenv("OMP_NUM_THREADS", "7")
+    items = iter([0])
+    ((_, found),) = side_by_side(
+        lambda _: run_apart(process_and_threads), lambda: next(items, None), workers=workers
+    )
+    assert found == threads
+    assert os.environ["OMP_NUM_THREADS"] == "7"
+
+
+def test_more_is_asked_for_after_every_result():
+    wanted, given, most = {0, 1, 2}, [], []
+
+    def draw() -> int | None:
+        number = len(given)
+        if number not in wanted:
+            return None
+        given.append(number)
+        return number
+
+    def work(item: int) -> int:
+        time.sleep(0.01)
+        return item
+
+    ended = []
+    for item in side_by_side(work, draw, workers=2):
+        ended.append(item)
+        most.append(len(given) - len(ended))
+        if item == 2:
+            wanted |= {3}
+    assert sorted(ended) == [0, 1, 2, 3]
+    assert max(most) <= 2
+
+
+def test_who_ends_early_does_not_wait():
+    items = iter([60.0, 0.0])
+    start = time.monotonic()
+    for _ in side_by_side(
+        lambda item: run_apart(time.sleep, item), lambda: next(items, None), workers=2
+    ):
+        break
+    assert time.monotonic() - start < 30.0
+
+
+_PROGRAM = """
+import sys, time
+from kitting_drake.common.processes import run_apart
+
+if __name__ == "__main__":
+    run_apart(time.sleep, 60)
+"""
+
+
+def test_a_killed_parent_leaves_no_process_behind(tmp_path: Path):
+    program = tmp_path / "parent.py"
+    program.write_text(_PROGRAM)
+    parent = subprocess.Popen([sys.executable, program], env=os.environ | {"PYTHONPATH": str(ROOT)})
+    children: list[int] = []
+    while not children:
+        time.sleep(0.02)
+        listed = Path(f"/proc/{parent.pid}/task/{parent.pid}/children").read_text().split()
+        # There is multiprocessing's resource tracker, too.
+        children = [pid for pid in map(int, listed) if "spawn_main" in command(pid)]
+    parent.kill()
+    parent.wait()
+    deadline = time.monotonic() + 30.0
+    while any("spawn_main" in command(pid) for pid in children):
+        assert time.monotonic() < deadline
+        time.sleep(0.02)
+
+
+def command(pid: int) -> str:
+    try:
+        return Path(f"/proc/{pid}/cmdline").read_text()
+    except FileNotFoundError:
+        return ""

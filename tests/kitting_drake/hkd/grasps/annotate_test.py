@@ -1,0 +1,88 @@
+import math
+import shutil
+from pathlib import Path
+
+import pytest
+import yaml
+
+from kitting_drake.common.errors import UserError
+from kitting_drake.common.paths import MODELS
+from kitting_drake.hkd.grasps.annotate import measure_grasp, save_grasp, with_grasp
+from kitting_drake.hkd.tools.tool import Grasp, Tool, load_tool
+
+CATALOGUE = (MODELS / "tools" / "catalogue.yaml").read_text()
+GRASP = Grasp(x=-0.0205, y=0.0, theta=math.radians(0.5), width=0.02, surface_height=0.02)
+
+
+@pytest.fixture
+def models(tmp_path: Path) -> Path:
+    """A copy of the models with one tool."""
+    for name in ("package.xml", "tools/catalogue.yaml", "tools/flat_screwdriver"):
+        target = tmp_path / "models" / name
+        target.parent.mkdir(parents=True, exist_ok=True)
+        copy = shutil.copytree if (MODELS / name).is_dir() else shutil.copy
+        copy(MODELS / name, target)
+    return tmp_path / "models"
+
+
+def copied(models: Path) -> Tool:
+    return load_tool(str(models / "tools" / "flat_screwdriver"))
+
+
+@pytest.mark.parametrize("name", ["claw_hammer", "combination_wrench", "flat_screwdriver"])
+def test_measures_what_the_generator_measured(name: str):
+    tool = load_tool(name)
+    measured = measure_grasp(tool, tool.grasp.x, tool.grasp.y, tool.grasp.theta)
+    assert measured is not None
+    assert measured.width == pytest.approx(tool.grasp.width, abs=2e-4)
+    assert measured.surface_height == pytest.approx(tool.grasp.surface_height, abs=2e-4)
+
+
+def test_a_grasp_is_amid_the_faces_wherever_the_hand_stood():
+    tool = load_tool("claw_hammer")
+    measured = measure_grasp(tool, tool.grasp.x, tool.grasp.y + 0.004, tool.grasp.theta)
+    assert measured is not None
+    assert measured.y == pytest.approx(tool.grasp.y, abs=2e-4)
+
+
+def test_there_is_nothing_to_grasp_beside_a_tool():
+    assert measure_grasp(load_tool("claw_hammer"), 0.2, 0.0, 0.0) is None
+
+
+def test_the_catalogue_keeps_all_but_the_grasp():
+    changed = with_grasp(CATALOGUE, "flat_screwdriver", GRASP)
+    before, after = yaml.safe_load(CATALOGUE)["tools"], yaml.safe_load(changed)["tools"]
+    for old, new in zip(before, after, strict=True):
+        if old["name"] == "flat_screwdriver":
+            assert new["grasp"] == {"x_mm": -20.5, "y_mm": 0.0, "theta_deg": 0.5}
+            old["grasp"] = new["grasp"]
+        assert old == new
+    changed_lines = set(changed.splitlines()) - set(CATALOGUE.splitlines())
+    assert len(changed_lines) == 1
+    with pytest.raises(UserError, match="spoon"):
+        with_grasp(CATALOGUE, "spoon", GRASP)
+
+
+def test_saving_regenerates_a_tool_of_the_catalogue(models: Path):
+    tool = copied(models)
+    grasp = measure_grasp(tool, -0.03, 0.0, 0.0)
+    assert grasp is not None
+    save_grasp(tool, grasp, models)
+    assert copied(models).grasp.x == pytest.approx(-0.03)
+
+
+def test_what_the_catalogue_cannot_have_changes_nothing(models: Path):
+    off = Grasp(x=-0.03, y=0.004, theta=0.0, width=0.02, surface_height=0.02)
+    with pytest.raises(UserError, match="not amid"):
+        save_grasp(copied(models), off, models)
+    assert (models / "tools" / "catalogue.yaml").read_text() == CATALOGUE
+    assert copied(models).grasp == load_tool("flat_screwdriver").grasp
+
+
+def test_saving_a_tool_of_ones_own_changes_its_record(models: Path, tmp_path: Path):
+    own = tmp_path / "flat_screwdriver"
+    shutil.copytree(models / "tools" / "flat_screwdriver", own)
+    tool = load_tool(str(own))
+    save_grasp(tool, GRASP)
+    assert load_tool(str(own)).grasp.x == pytest.approx(GRASP.x)
+    assert load_tool(str(own)).mass == tool.mass

@@ -1,0 +1,354 @@
+import dataclasses
+import os
+import struct
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+import yaml
+from manifold3d import JoinType, Manifold, OpType
+
+from kitting_drake.common.errors import UserError
+from kitting_drake.hkd.grasps.annotate import save_grasp
+from kitting_drake.hkd.importing import importer
+from kitting_drake.hkd.importing.fit import guess_unit
+from kitting_drake.hkd.importing.importer import ImportRequest, import_tool
+from kitting_drake.hkd.tools.meshes import vertices_and_faces
+from kitting_drake.hkd.tools.tool import load_tool, user_tool_names
+
+ROOT = Path(__file__).resolve().parents[4]
+REAL = Path(os.environ.get("KITTING_REAL_TOOLS", ROOT.parent / "shared" / "real_tools"))
+
+
+def mallet() -> trimesh.Trimesh:
+    """A handle and a head, 175 mm long in mm, flat below."""
+    handle = Manifold.cube((170, 20, 12), True).translate((0, 0, -2))
+    head = Manifold.cube((26, 50, 16), True).translate((77, 5, 0))
+    vertices, faces = vertices_and_faces(handle + head)
+    return trimesh.Trimesh(vertices, faces, process=False)
+
+
+def exported(mesh: trimesh.Trimesh, path: Path) -> Path:
+    mesh.export(path)
+    return path
+
+
+def bring(path: Path, folder: Path, **options: object) -> importer.ImportReport:
+    """Imports in this process."""
+    request = ImportRequest(path, options.pop("category", "hammer"), output=folder, **options)
+    return import_tool(request, time_limit=None)
+
+
+def left_in(folder: Path) -> list[str]:
+    return sorted(path.name for path in folder.iterdir()) if folder.exists() else []
+
+
+@pytest.fixture(scope="module")
+def plain(tmp_path_factory: pytest.TempPathFactory) -> importer.ImportReport:
+    """The mallet as it is, in mm."""
+    folder = tmp_path_factory.mktemp("plain")
+    return bring(exported(mallet(), folder / "mallet.stl"), folder / "tools")
+
+
+def test_a_tool_is_as_its_mesh_is(plain: importer.ImportReport):
+    tool = load_tool(str(plain.directory))
+    assert (tool.name, tool.category, tool.split) == ("mallet", "hammer", "user")
+    assert (tool.length, tool.width, tool.height) == pytest.approx((0.175, 0.050, 0.016), abs=1e-5)
+    volume = mallet().volume * 1e-9
+    assert tool.mass == pytest.approx(volume * importer.DENSITIES["hammer"], rel=1e-4)
+    # The head is the working end.
+    assert plain.record["center_of_mass"][0] > 0.01
+    assert tool.grasp.width == pytest.approx(0.020, abs=2e-4)
+    points = tool.triangles.reshape(-1, 3)
+    np.testing.assert_allclose(points.min(axis=0)[2], 0, atol=1e-6)
+    np.testing.assert_allclose((points.min(axis=0) + points.max(axis=0))[:2], 0, atol=1e-6)
+
+
+def test_collision_pieces_are_few_convex_and_true(plain: importer.ImportReport):
+    pieces = [
+        trimesh.load_mesh(path, process=False) for path in plain.directory.glob("collision_*.obj")
+    ]
+    assert len(pieces) == plain.pieces <= 4
+    assert all(piece.is_watertight and piece.is_convex for piece in pieces)
+    together = Manifold.batch_boolean(
+        [Manifold.hull_points(np.asarray(piece.vertices)) for piece in pieces],
+        OpType.Add,
+    )
+    tool = load_tool(str(plain.directory))
+    shadow = together.project()
+    for one, other in ((shadow, tool.silhouette), (tool.silhouette, shadow)):
+        assert (one - other.offset(0.0005, JoinType.Miter)).area() < 1e-9
+
+
+def test_the_model_loads_where_it_is(plain: importer.ImportReport):
+    from pydrake.multibody.parsing import Parser
+    from pydrake.multibody.plant import MultibodyPlant
+
+    plant = MultibodyPlant(0.001)
+    Parser(plant).AddModels(str(load_tool(str(plain.directory)).sdf))
+    plant.Finalize()
+    body = plant.GetBodyByName("tool")
+    assert body.default_mass() == pytest.approx(plain.record["mass"], abs=1e-6)
+    assert "package://" not in load_tool(str(plain.directory)).sdf.read_text()
+
+
+@pytest.mark.parametrize(
+    ("suffix", "units_per_mm", "turned"),
+    [
+        ("stl", 1.0, False),
+        ("obj", 1 / 25.4, True),
+        ("ply", 0.001, True),
+        ("glb", 0.001, False),
+        ("stl", 0.1, True),
+        ("obj", 37.0, True),
+    ],
+)
+def test_units_pose_and_format_do_not_matter(
+    plain: importer.ImportReport, tmp_path: Path, suffix: str, units_per_mm: float, turned: bool
+):
+    mesh = mallet()
+    if turned:
+        mesh.apply_transform(
+            trimesh.transformations.random_rotation_matrix(np.array([0.3, 0.8, 0.1]))
+        )
+        mesh.apply_translation([900, -400, 100])
+    mesh.apply_scale(units_per_mm)
+    path = exported(mesh, tmp_path / f"mallet.{suffix}")
+    # A unit that nobody uses leaves the size open: then it is asked for.
+    length = 175.0 if units_per_mm == 37.0 else None
+    report = bring(path, tmp_path / "tools", length_mm=length)
+    for key in ("length", "width", "height"):
+        assert report.record[key] == pytest.approx(plain.record[key], abs=2e-4)
+    assert report.record["mass"] == pytest.approx(plain.record["mass"], rel=0.005)
+    mine, other = report.record["grasp"], plain.record["grasp"]
+    for key in ("x", "width", "surface_height"):
+        assert mine[key] == pytest.approx(other[key], abs=1.5e-3)
+    # It may lie on its other side.
+    assert abs(mine["y"]) == pytest.approx(abs(other["y"]), abs=5e-4)
+
+
+@pytest.mark.parametrize(
+    ("length", "unit"),
+    [(180, "mm"), (0.18, "m"), (7.1, "inches"), (18, "cm"), (4000, None), (1e-5, None)],
+)
+def test_units_are_guessed(length: float, unit: str | None):
+    assert guess_unit(length) == unit
+
+
+def test_a_long_tool_is_scaled_and_a_holed_one_mended(tmp_path: Path):
+    mesh = mallet()
+    mesh.apply_scale(2.0)
+    mesh.update_faces(np.arange(len(mesh.faces)) != 3)
+    report = bring(exported(mesh, tmp_path / "open.stl"), tmp_path / "tools")
+    assert report.record["length"] == pytest.approx(0.180, abs=1e-6)
+    assert report.record["width"] == pytest.approx(0.180 * 50 / 175, abs=1e-4)
+    assert any("mended" in note for note in report.notes)
+
+
+def test_one_body_is_made_of_several_and_of_a_soup(tmp_path: Path):
+    handle, head = trimesh.creation.box((170, 20, 12)), trimesh.creation.box((26, 50, 16))
+    head.apply_translation((72, 0, 0))
+    both = trimesh.util.concatenate([handle, head])
+    united = bring(exported(both, tmp_path / "two.obj"), tmp_path / "tools").record
+    rng = np.random.default_rng(0)
+    triangles = both.subdivide_to_size(8.0).triangles
+    triangles = triangles + rng.normal(0, 0.05, (len(triangles), 1, 3))
+    soup = trimesh.Trimesh(**trimesh.triangles.to_kwargs(triangles), process=False)
+    report = bring(exported(soup, tmp_path / "soup.stl"), tmp_path / "tools")
+    assert any("wrapped" in note for note in report.notes)
+    for key in ("length", "width", "height"):
+        assert report.record[key] == pytest.approx(united[key], abs=1.2e-3)
+
+
+def apart() -> trimesh.Trimesh:
+    other = mallet()
+    other.apply_translation((0, 90, 0))
+    return trimesh.util.concatenate([mallet(), other])
+
+
+def sheet() -> trimesh.Trimesh:
+    corners = [[0, 0, 0], [180, 0, 0], [180, 20, 3], [0, 20, 0]]
+    return trimesh.Trimesh(corners, [[0, 1, 2], [0, 2, 3]], process=False)
+
+
+@pytest.mark.parametrize(
+    ("make", "sentence"),
+    [
+        (lambda: trimesh.creation.box((180, 20, 2)), "2.0 mm thick, and the hand needs 4 mm"),
+        (lambda: trimesh.creation.box((180, 80, 60)), "lies 60 mm high"),
+        (lambda: trimesh.creation.box((180, 150, 20)), "(mm wide|no place to hold)"),
+        (lambda: trimesh.creation.box((160, 150, 10)), "jaws take 65 mm, finds no place"),
+        (sheet, "encloses no volume"),
+        (apart, "2 things that stand apart"),
+    ],
+)
+def test_what_cannot_be_used_is_told(
+    make: Callable[[], trimesh.Trimesh], sentence: str, tmp_path: Path
+):
+    path = exported(make(), tmp_path / "it.stl")
+    with pytest.raises(UserError, match=sentence) as refusal:
+        bring(path, tmp_path / "tools")
+    assert str(path) in str(refusal.value) and "\n" not in str(refusal.value)
+    assert not (tmp_path / "tools").exists()
+
+
+def test_what_is_no_mesh_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    for name, content, sentence in (
+        ("empty.stl", b"", "is empty"),
+        ("notes.txt", b"hello", "none of the kinds"),
+        ("letter.stl", b"Dear Sir or Madam, " * 40, "(cannot be read as STL|holds no triangle)"),
+        ("points.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\n", "(cannot be read|holds no triangle)"),
+        ("nan.obj", b"v nan nan nan\nv nan 0 0\nv 0 nan 0\nf 1 2 3\n", "all numbers"),
+    ):
+        (tmp_path / name).write_bytes(content)
+        with pytest.raises(UserError, match=sentence):
+            bring(tmp_path / name, tmp_path / "tools")
+    with pytest.raises(UserError, match="there is no file"):
+        bring(tmp_path / "missing.stl", tmp_path / "tools")
+    with pytest.raises(UserError, match="is a folder"):
+        bring(tmp_path, tmp_path / "tools")
+    huge = tmp_path / "huge.stl"
+    with huge.open("wb") as file:
+        file.truncate(300_000_000)
+    with pytest.raises(UserError, match="300 MB, and 200 MB is the most"):
+        bring(huge, tmp_path / "tools")
+    monkeypatch.setattr("kitting_drake.hkd.importing.repair.MOST_TRIANGLES", 20)
+    with pytest.raises(UserError, match="triangles, and 20 is the most"):
+        bring(exported(mallet(), tmp_path / "mallet.stl"), tmp_path / "tools")
+    assert not (tmp_path / "tools").exists()
+
+
+def test_names(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setenv("KITTING_DRAKE_TOOLS", str(tmp_path / "own"))
+    assert user_tool_names() == []
+    path = exported(mallet(), tmp_path / "Claw Hammer.stl")
+    request = ImportRequest(path, "hammer")
+    with pytest.raises(UserError, match="'claw_hammer' is the name of one of the project's own"):
+        import_tool(request, time_limit=None)
+    with pytest.raises(UserError, match="small letters"):
+        bring(path, tmp_path / "own", name="../away")
+    report = import_tool(ImportRequest(path, "hammer", name="mine"), time_limit=None)
+    assert user_tool_names() == ["mine"]
+    assert load_tool("mine").directory == report.directory == tmp_path / "own" / "mine"
+    # An import may be done again; what is none is not overwritten.
+    again = bring(path, tmp_path / "own", name="mine", length_mm=160.0)
+    assert load_tool("mine").length == pytest.approx(0.160) == again.record["length"]
+    # A person's work is not undone by it.
+    grasp = dataclasses.replace(load_tool("mine").grasp, x=0.011)
+    save_grasp(load_tool("mine"), grasp)
+    with pytest.raises(UserError, match="has a grasp that you saved"):
+        bring(path, tmp_path / "own", name="mine")
+    assert load_tool("mine").grasp == grasp
+    (tmp_path / "own" / "other").mkdir()
+    with pytest.raises(UserError, match="is no imported tool"):
+        bring(path, tmp_path / "own", name="other")
+    assert left_in(tmp_path / "own") == ["mine", "other"]
+
+
+@pytest.mark.parametrize(
+    "options", [{"length_mm": float("nan")}, {"length_mm": -5.0}, {"density": 1e9}]
+)
+def test_numbers_out_of_range(options: dict, tmp_path: Path):
+    with pytest.raises(UserError, match="is out of range: give"):
+        bring(exported(mallet(), tmp_path / "it.stl"), tmp_path / "tools", **options)
+
+
+def test_the_process_aside(tmp_path: Path):
+    path = exported(mallet(), tmp_path / "mallet.stl")
+    with pytest.raises(UserError, match="was not worked out in 0 s"):
+        import_tool(ImportRequest(path, "hammer", output=tmp_path / "tools"), time_limit=0.0)
+    assert not (tmp_path / "tools").exists()
+    report = import_tool(ImportRequest(path, "hammer", output=tmp_path / "tools"))
+    assert load_tool(str(report.directory)).name == "mallet"
+    (tmp_path / "bad.stl").write_bytes(b"solid\n" + bytes(range(256)) * 9)
+    with pytest.raises(UserError, match="bad"):
+        import_tool(ImportRequest(tmp_path / "bad.stl", "hammer", output=tmp_path / "tools"))
+    assert left_in(tmp_path / "tools") == ["mallet"]
+
+
+# Broken files.
+
+SUFFIXES = ("stl", "ascii.stl", "obj", "ply", "ascii.ply", "glb")
+
+
+def sound_file(suffix: str) -> bytes:
+    kinds = {"ascii.stl": "stl_ascii", "ascii.ply": "ply"}
+    options = {"encoding": "ascii"} if suffix == "ascii.ply" else {}
+    data = mallet().export(file_type=kinds.get(suffix, suffix), **options)
+    return data.encode() if isinstance(data, str) else data
+
+
+def corrupted(data: bytes, rng: np.random.Generator) -> bytes:
+    """A file with something wrong with it, of a kind that files in the wild have."""
+    place = int(rng.integers(len(data)))
+    size = int(rng.integers(1, 200))
+    floats = [float("nan"), float("inf"), -1e38, 1e-45, 0.0, 1e6]
+    match int(rng.integers(10)):
+        case 0:
+            return data[:place]
+        case 1:
+            return data[:place] + data[place + size :]
+        case 2:
+            noise = rng.integers(256, size=size, dtype=np.uint8).tobytes()
+            return data[:place] + noise + data[place + size :]
+        case 3:
+            flipped = bytearray(data)
+            for index in rng.integers(len(data), size=int(rng.integers(1, 30))):
+                flipped[index] ^= 1 << int(rng.integers(8))
+            return bytes(flipped)
+        case 4:
+            place -= place % 4
+            packed = struct.pack("<f", floats[int(rng.integers(len(floats)))])
+            return data[:place] + packed * 3 + data[place + 12 :]
+        case 5:
+            words = data.split(b" ")
+            for index in rng.integers(len(words), size=3):
+                words[index] = [b"nan", b"inf", b"-7", b"1e400", b"99999999", b"x"][
+                    int(rng.integers(6))
+                ]
+            return b" ".join(words)
+        case 6:
+            lines = data.split(b"\n")
+            rng.shuffle(lines)
+            return b"\n".join(lines)
+        case 7:
+            return data + data[place:]
+        case 8:
+            return data[:place] + b"\n# what is this doing here?\n" + data[place:]
+        case _:
+            return rng.integers(256, size=size * 20, dtype=np.uint8).tobytes()
+
+
+@pytest.mark.parametrize("seed", range(40))
+def test_a_broken_file_makes_a_whole_tool_or_none(seed: int, tmp_path: Path):
+    suffix = SUFFIXES[seed % len(SUFFIXES)]
+    path = tmp_path / f"it.{suffix.split('.')[-1]}"
+    path.write_bytes(corrupted(sound_file(suffix), np.random.default_rng(seed)))
+    try:
+        report = bring(path, tmp_path / "tools")
+    except UserError as error:
+        assert str(path) in str(error) and "\n" not in str(error)
+        assert not (tmp_path / "tools").exists()
+    else:
+        assert left_in(tmp_path / "tools") == ["it"]
+        tool = load_tool(str(report.directory))
+        assert np.isfinite(tool.triangles).all() and tool.mass > 0
+
+
+# The real ones.
+
+
+@pytest.mark.skipif(not REAL.is_dir(), reason=f"no real meshes in {REAL}")
+@pytest.mark.parametrize(
+    "name",
+    ["hammer/cc0_claw_hammer", "pliers/cc0_pliers", "wrench/zeyuli_wrench"],
+)
+def test_real_tools(name: str, tmp_path: Path):
+    report = bring(REAL / f"{name}.obj", tmp_path / "tools", category=name.split("/")[0])
+    tool = load_tool(str(report.directory))
+    assert 0.1499 < tool.length < 0.2001
+    assert report.pieces <= 45
+    com = yaml.safe_load((tool.directory / "tool.yaml").read_text())["center_of_mass"]
+    assert abs(tool.grasp.x - com[0]) < 0.045

@@ -1,0 +1,243 @@
+import dataclasses
+import threading
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from manifold3d import CrossSection, Error, JoinType
+from numpy.typing import NDArray
+
+from kitting_drake.common.errors import UserError
+from kitting_drake.hkd.kits import kit as kit_module
+from kitting_drake.hkd.kits.kit import (
+    SLOTS,
+    Cavity,
+    KitParameters,
+    build_block,
+    contact_surface,
+    kit_cavities,
+    make_kit,
+)
+from kitting_drake.hkd.tools.tool import Tool, load_tool
+
+NAMES = ["claw_hammer", "slip_joint_pliers", "combination_wrench", "flat_screwdriver"]
+PARAMETERS = KitParameters()
+
+
+@pytest.fixture(scope="module")
+def tools() -> list[Tool]:
+    return [load_tool(name) for name in NAMES]
+
+
+@pytest.fixture(scope="module")
+def cavities(tools: list[Tool]) -> list[Cavity]:
+    return kit_cavities(tools, PARAMETERS)
+
+
+@pytest.fixture
+def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """An empty cache; the folder in which kits will be."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    return tmp_path / "kitting_drake" / "kits"
+
+
+def seated_outline(tool: Tool) -> CrossSection:
+    return tool.silhouette.translate(SLOTS[tool.category])
+
+
+def grown(outline: CrossSection, distance: float) -> CrossSection:
+    return outline.offset(distance, JoinType.Round, circular_segments=128)
+
+
+def test_files_of_a_kit_are_watertight_and_one_body(tools: list[Tool], cache: Path):
+    kit = make_kit(tools, PARAMETERS)
+    block = trimesh.load_mesh(kit.sdf.parent / "kit.obj")
+    assert block.is_watertight
+    assert block.is_winding_consistent
+    assert len(block.split()) == 1
+
+
+def test_block_is_watertight_and_one_body(cavities: list[Cavity]):
+    block = build_block(cavities, PARAMETERS)
+    assert block.status() == Error.NoError
+    assert len(block.decompose()) == 1
+    bounds = np.array(block.bounding_box())
+    np.testing.assert_allclose(bounds, [-0.14, -0.13, 0, 0.14, 0.13, 0.05], atol=1e-6)
+    pits = sum(c.outline.area() * (c.top - c.floor) for c in cavities)
+    bevels = sum(c.outline.to_polygons()[0].shape[0] > 0 for c in cavities)
+    assert bevels == len(NAMES)
+    # Besides the pits the bevels are cut away: a triangle of 1 mm along about 2 m of rim.
+    assert 0 < 0.28 * 0.26 * 0.05 - pits - block.volume() < 2e-6
+
+
+def test_every_cavity_is_a_pit_open_at_the_top(tools: list[Tool], cavities: list[Cavity]):
+    block = build_block(cavities, PARAMETERS)
+    for tool, cavity in zip(tools, cavities, strict=True):
+        # The seated tool's top is flush with the block's.
+        assert cavity.floor + tool.height == pytest.approx(PARAMETERS.height)
+        shadow = seated_outline(tool)
+        for height, free in ((cavity.floor + 1e-4, True), (cavity.floor - 1e-4, False)):
+            inside = (block.slice(height) ^ shadow).area()
+            assert inside == pytest.approx(0.0 if free else shadow.area(), abs=1e-8)
+
+
+def test_clearance_all_round(tools: list[Tool], cavities: list[Cavity]):
+    for tool, cavity in zip(tools, cavities, strict=True):
+        outline = seated_outline(tool)
+        assert (grown(outline, 0.0019) - cavity.outline).area() < 1e-9, tool.name
+        # Where the tool reaches farthest the closing does nothing: 2 mm are 2 mm.
+        box, tool_box = np.array(cavity.outline.bounds()), np.array(outline.bounds())
+        np.testing.assert_allclose(np.abs(box - tool_box), 0.002, atol=1.5e-4)
+        # Half of the wall or more is as near as the clearance: it follows the tool.
+        points = np.concatenate(cavity.outline.to_polygons())
+        middle = (points + np.roll(points, 1, axis=0)) / 2
+        length = np.linalg.norm(points - np.roll(points, 1, axis=0), axis=1)
+        near = [(box_at(p) ^ grown(outline, 0.00215)).area() > 0 for p in middle]
+        assert length[near].sum() > 0.5 * length.sum(), tool.name
+
+
+def box_at(point: NDArray) -> CrossSection:
+    return CrossSection.square((1e-6, 1e-6), True).translate(tuple(point))
+
+
+def test_clearance_is_a_parameter(tools: list[Tool]):
+    wide = kit_cavities(tools[2:3], KitParameters(clearance=0.004))[0].outline
+    narrow = kit_cavities(tools[2:3], KitParameters(clearance=0.001))[0].outline
+    np.testing.assert_allclose(
+        np.abs(np.array(wide.bounds()) - np.array(narrow.bounds())), 0.003, atol=2e-4
+    )
+
+
+@pytest.mark.parametrize("lead_in", [0.0, 0.001])
+def test_contact_surface_has_the_walls_of_the_block(tools: list[Tool], lead_in: float):
+    parameters = KitParameters(lead_in=lead_in)
+    cavities = kit_cavities(tools, parameters)
+    mesh = build_block(cavities, parameters).to_mesh()
+    block = trimesh.Trimesh(np.asarray(mesh.vert_properties)[:, :3], mesh.tri_verts, process=False)
+    contact = trimesh.Trimesh(*contact_surface(cavities, parameters), process=False)
+    for mesh_ in (block, contact):
+        assert np.isfinite(mesh_.face_normals).all()
+
+    def facing(mesh_: trimesh.Trimesh, low: float, high: float) -> tuple[float, NDArray, NDArray]:
+        """Area, moment and flux of the faces whose normals rise so much."""
+        chosen = (mesh_.face_normals[:, 2] > low) & (mesh_.face_normals[:, 2] < high)
+        area, centre = mesh_.area_faces[chosen], mesh_.triangles_center[chosen]
+        return area.sum(), area @ centre, (area * mesh_.face_normals[chosen].T) @ centre
+
+    for low, high in ((-0.1, 0.1), (0.1, 0.9)):  # Walls; bevels.
+        for one, other in zip(facing(block, low, high), facing(contact, low, high), strict=True):
+            np.testing.assert_allclose(one, other, atol=2e-7)
+    # The floors are where the block has them, and face up.
+    up = contact.triangles[contact.face_normals[:, 2] > 0.99]
+    heights = np.unique(np.round(up[:, :, 2], 9))
+    expected = [*(cavity.floor for cavity in cavities), parameters.height]
+    np.testing.assert_allclose(heights, np.unique(np.round(expected, 9)), atol=1e-9)
+    top = up[np.isclose(up[:, :, 2], parameters.height).all(axis=1)]
+    rims = sum(cavity.rim.area() for cavity in cavities)
+    assert trimesh.Trimesh(**trimesh.triangles.to_kwargs(top)).area == pytest.approx(
+        0.28 * 0.26 - rims, abs=1e-7
+    )
+
+
+def test_a_kit_is_built_once(tools: list[Tool], cache: Path, monkeypatch: pytest.MonkeyPatch):
+    first = make_kit(tools, PARAMETERS)
+    assert first.sdf.is_file()
+    assert first.sdf.is_relative_to(cache)
+
+    def fail(*_: object) -> None:
+        raise AssertionError("built again")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(kit_module, "_write", fail)
+        assert make_kit(tools, PARAMETERS).sdf == first.sdf
+    # The machine went down before the content was on the disk.
+    path = first.sdf.with_name("contact.obj")
+    content = path.read_bytes()
+    path.write_bytes(b"")
+    make_kit(tools, PARAMETERS)
+    assert path.read_bytes() == content
+
+
+def test_what_changes_a_kit_makes_another(tools: list[Tool], cache: Path):
+    folders = {make_kit(tools[:2], PARAMETERS).sdf.parent}
+    for name, value in (("height", 0.055), ("clearance", 0.0025), ("lead_in", 0.0)):
+        changed = dataclasses.replace(PARAMETERS, **{name: value})
+        folders.add(make_kit(tools[:2], changed).sdf.parent)
+    folders.add(make_kit(tools[:1], PARAMETERS).sdf.parent)
+    assert len(folders) == 5
+    assert set(cache.iterdir()) == folders
+
+
+def test_a_changed_mesh_makes_another_kit(tools: list[Tool], cache: Path, tmp_path: Path):
+    tool = tools[3]
+    meshes = []
+    for path in tool.visual_meshes:
+        meshes.append(tmp_path / path.name)
+        meshes[-1].write_bytes(path.read_bytes())
+    copy = dataclasses.replace(tool, visual_meshes=tuple(meshes))
+    same = make_kit([tool], PARAMETERS).sdf
+    assert make_kit([copy], PARAMETERS).sdf == same
+    meshes[0].write_text(meshes[0].read_text() + "v 0.01 0.0 0.0\n")
+    assert make_kit([copy], PARAMETERS).sdf != same
+
+
+def test_two_that_build_the_same_kit_at_once_both_get_it(
+    tools: list[Tool], cache: Path, monkeypatch: pytest.MonkeyPatch
+):
+    write, both = kit_module._write, threading.Barrier(2)
+
+    def write_together(*arguments: object) -> None:
+        write(*arguments)  # type: ignore[arg-type]
+        both.wait(timeout=60)  # Neither has put its kit into place.
+
+    monkeypatch.setattr(kit_module, "_write", write_together)
+    with ThreadPoolExecutor(2) as pool:
+        kits = list(pool.map(lambda _: make_kit(tools[:1], PARAMETERS), range(2)))
+    assert kits[0].sdf == kits[1].sdf
+    assert list(cache.iterdir()) == [kits[0].sdf.parent]
+    names = {"kit.sdf", "kit.obj", "block.obj", "cavities.obj", "contact.obj"}
+    assert {path.name for path in kits[0].sdf.parent.iterdir()} == names
+
+
+@pytest.mark.parametrize("error", [OSError(28, "No space left on device"), KeyboardInterrupt()])
+def test_nothing_half_written_stays(
+    tools: list[Tool], cache: Path, monkeypatch: pytest.MonkeyPatch, error: BaseException
+):
+    with monkeypatch.context() as patch:
+        write = kit_module._write_obj
+
+        def fail_late(path: Path, *arguments: object, **options: bool) -> None:
+            if path.name == "cavities.obj":
+                raise error
+            write(path, *arguments, **options)  # type: ignore[arg-type]
+
+        patch.setattr(kit_module, "_write_obj", fail_late)
+        with pytest.raises((type(error), UserError)):
+            make_kit(tools[:1], PARAMETERS)
+        assert list(cache.iterdir()) == []
+    assert make_kit(tools[:1], PARAMETERS).sdf.is_file()
+
+
+def test_a_cache_that_cannot_be_written_is_the_users_to_mend(
+    tools: list[Tool], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    (tmp_path / "file").write_text("")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "file"))
+    with pytest.raises(UserError, match="file"):
+        make_kit(tools[:1], PARAMETERS)
+
+
+@pytest.mark.parametrize(
+    ("names", "parameters", "message"),
+    [
+        (["claw_hammer"] * 2, {}, "a kit holds one hammer, not two"),
+        (NAMES, {"length": 0.15}, "'claw_hammer' does not fit into the kit block"),
+        (NAMES, {"height": 0.018}, "'claw_hammer' is 17.0 mm high and leaves less than"),
+        (NAMES, {"minimum_wall": 0.025}, "'claw_hammer' and .* meet"),
+    ],
+)
+def test_tools_that_make_no_kit(names: list[str], parameters: dict[str, float], message: str):
+    with pytest.raises(UserError, match=message):
+        kit_cavities([load_tool(name) for name in names], KitParameters(**parameters))

@@ -1,0 +1,22 @@
+import itertools
+
+import pytest
+
+from kitting_drake.hkd.tools.distinct import mean_surface_distance
+from kitting_drake.hkd.tools.tool import CATEGORIES, load_tool, tool_names
+
+
+def test_a_tool_is_no_distance_from_itself():
+    tool = load_tool("claw_hammer")
+    assert mean_surface_distance(tool, tool) < 0.0005
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("category", CATEGORIES)
+def test_no_two_tools_of_a_category_are_alike(category: str):
+    tools = [tool for tool in map(load_tool, tool_names()) if tool.category == category]
+    distances = {
+        (a.name, b.name): mean_surface_distance(a, b) for a, b in itertools.combinations(tools, 2)
+    }
+    nearest = min(distances, key=distances.__getitem__)
+    assert distances[nearest] > 0.0015, nearest

@@ -1,0 +1,60 @@
+from pathlib import Path
+
+import pytest
+
+from kitting_drake.common.paths import MODELS
+from kitting_drake.hkd.tools.generate import CatalogueError, generate_tool, load_catalogue
+from kitting_drake.hkd.tools.tool import tool_names
+
+CATALOGUE = MODELS / "tools" / "catalogue.yaml"
+ENTRIES = load_catalogue(CATALOGUE)
+
+
+def test_the_catalogue_is_what_is_shipped():
+    assert sorted(entry.name for entry in ENTRIES) == tool_names()
+
+
+# One of each category by default; all of them take a minute.
+QUICK = ["claw_hammer", "needle_nose_pliers", "adjustable_wrench", "phillips_screwdriver"]
+
+
+@pytest.mark.parametrize(
+    "entry",
+    [
+        pytest.param(entry, id=entry.name, marks=[] if entry.name in QUICK else pytest.mark.slow)
+        for entry in ENTRIES
+    ],
+)
+def test_generating_gives_the_committed_files(entry, tmp_path: Path):
+    report = generate_tool(entry, tmp_path / entry.name)
+    made = {path.name: path.read_bytes() for path in (tmp_path / entry.name).iterdir()}
+    kept = {path.name: path.read_bytes() for path in (MODELS / "tools" / entry.name).iterdir()}
+    assert made.keys() == kept.keys()
+    for name in kept:
+        assert made[name] == kept[name], name
+    # What can be touched is what is seen, to a fraction of the clearance.
+    assert max(report.outside_mm, report.inside_mm) < 0.35
+    assert abs(report.bottom_error_mm) < 0.1
+    assert abs(report.grip_error_mm) < 0.2
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("tools: {", "catalogue.yaml"),
+        ("[]", "has to hold a list named `tools`"),
+        ("tools: [{name: spade}]", "tool spade: 'grasp'"),
+        (
+            "tools: [{name: a, category: spade, split: train, length_mm: 1, grasp: {}}]",
+            "tool a: category 'spade' is none of hammer",
+        ),
+        (
+            "tools: [{name: a, category: hammer, split: train, length_mm: 1, grasp: {q: 1}}]",
+            "tool a: .*'q'",
+        ),
+    ],
+)
+def test_a_bad_catalogue_is_named(tmp_path: Path, text: str, message: str):
+    (tmp_path / "catalogue.yaml").write_text(text)
+    with pytest.raises(CatalogueError, match=message):
+        load_catalogue(tmp_path / "catalogue.yaml")
