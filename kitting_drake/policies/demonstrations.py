@@ -1,12 +1,14 @@
 """Demonstrations to learn from: episodes of an expert, as (o_t, a_pick, a_place), in one file.
 
 The file is HDF5. Its attributes are `format`, `format_version`, `first_seed`, `scenario_name` and,
-as JSON, `scenario`, `grid`, `versions` and `rejected`. Each demonstration of T steps is a group,
-`seed_00010000`, with the attributes `seed` and `score` and the datasets
+as JSON, `scenario`, `grid`, `learning`, `versions` and `rejected`. Each demonstration of T steps is
+a group, `seed_00010000`, with the attributes `seed` and `score` and the datasets
 
 - `rgb` (T, 3, rows, cols), 8 bits, and `height` (T, rows, cols), metres: the observations,
-- `pick` and `place` (T, 3), x and y in m, theta in rad, and `surface_height` (T,), m: the actions,
-- `object` and `category` (T,): what was picked.
+- `pick` and `place` (T, 3), x and y in metres and theta in radians: the actions,
+- `object` and `category` (T,): what was picked,
+- `final_rgb` (3, rows, cols) and `final_height` (rows, cols): what was seen when the expert said
+  that nothing is left to do. They are absent where the number of actions ended the episode.
 """
 
 from __future__ import annotations
@@ -16,7 +18,7 @@ import dataclasses
 import json
 import os
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -25,47 +27,69 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kitting_drake.common.errors import UserError
+from kitting_drake.policies.learning import Learning
 from systems.signals import Observation, PickPlaceAction, PixelGrid, PlanarPose
 
 FORMAT = "kitting_drake demonstrations"
-FORMAT_VERSION = 1
+FORMAT_VERSION = 2
 
 
 @dataclass(frozen=True)
-class DemonstrationStep:
-    """One observation, and what the expert did."""
+class _Recorded:
+    """An observation as the file holds it: colours in 8 bits."""
 
     rgb: NDArray[np.uint8]
     """(3, rows, cols)."""
     height: NDArray[np.float32]
     """(rows, cols), metres above `grid.z_min`."""
-    pick: PlanarPose
-    place: PlanarPose
-    surface_height: float
-    """World z of what lies under the pick point, in metres."""
-    object: str
-    """The name of what is picked."""
-    category: str
-
-    @staticmethod
-    def of(
-        observation: Observation, action: PickPlaceAction, *, name: str, category: str
-    ) -> DemonstrationStep:
-        """A step as it happened; colours are rounded to 8 bits."""
-        return DemonstrationStep(
-            rgb=np.rint(observation.rgb * 255).astype(np.uint8),
-            height=observation.height.copy(),
-            pick=action.pick,
-            place=action.place,
-            surface_height=action.surface_height,
-            object=name,
-            category=category,
-        )
 
     @property
     def image(self) -> NDArray[np.float32]:
         """(4, rows, cols), as `Observation.image`: colours in [0, 1], height in metres."""
-        return np.concatenate([self.rgb.astype(np.float32) / 255, self.height[None]])
+        image = np.empty((4, *self.height.shape), np.float32)
+        np.divide(self.rgb, 255, out=image[:3], dtype=np.float32)
+        image[3] = self.height
+        return image
+
+
+@dataclass(frozen=True)
+class DemonstrationStep(_Recorded):
+    """One observation, and what the expert did."""
+
+    pick: PlanarPose
+    place: PlanarPose
+    object: str
+    """The name of what is picked."""
+    category: str = ""
+    """Its category, where the task has categories."""
+
+    @staticmethod
+    def of(
+        observation: Observation, action: PickPlaceAction, *, name: str, category: str = ""
+    ) -> DemonstrationStep:
+        """A step as it happened; colours are rounded to 8 bits."""
+        return DemonstrationStep(
+            rgb=_eight_bits(observation.rgb),
+            height=observation.height.copy(),
+            pick=action.pick,
+            place=action.place,
+            object=name,
+            category=category,
+        )
+
+
+@dataclass(frozen=True)
+class FinalObservation(_Recorded):
+    """What was seen when the expert said that nothing is left to do (`PickPlaceAction.stop`)."""
+
+    @staticmethod
+    def of(observation: Observation) -> FinalObservation:
+        """The observation; colours are rounded to 8 bits."""
+        return FinalObservation(_eight_bits(observation.rgb), observation.height.copy())
+
+
+def _eight_bits(rgb: NDArray[np.float32]) -> NDArray[np.uint8]:
+    return np.rint(rgb * 255).astype(np.uint8)
 
 
 @dataclass(frozen=True)
@@ -76,6 +100,8 @@ class Demonstration:
     score: float
     """Share of the objects that it placed."""
     steps: tuple[DemonstrationStep, ...]
+    final: FinalObservation | None = None
+    """None: the episode was ended by its number of actions, before the expert said stop."""
 
 
 @dataclass(frozen=True)
@@ -99,6 +125,8 @@ class Origin:
     """Demonstrations are of the first seeds from here on that were not rejected."""
     versions: dict[str, str]
     """Of what the last of them were made with."""
+    learning: Learning = field(default_factory=Learning)
+    """What the task lets training assume."""
 
 
 @dataclass(frozen=True)
@@ -201,6 +229,7 @@ def _created(path: Path, origin: Origin, rejected: Iterable[Rejection]) -> Itera
             file.attrs["scenario_name"] = origin.scenario_name
             file.attrs["scenario"] = json.dumps(origin.scenario)
             file.attrs["grid"] = json.dumps(dataclasses.asdict(origin.grid))
+            file.attrs["learning"] = json.dumps(dataclasses.asdict(origin.learning))
             file.attrs["first_seed"] = origin.first_seed
             file.attrs["versions"] = json.dumps(origin.versions)
             file.attrs["rejected"] = json.dumps([dataclasses.asdict(item) for item in rejected])
@@ -219,20 +248,23 @@ def _write_group(file: h5py.File, demonstration: Demonstration) -> None:
     group.attrs["score"] = demonstration.score
     for name in ("rgb", "height"):
         images = np.stack([getattr(step, name) for step in steps])
-        group.create_dataset(
-            name,
-            data=images,
-            chunks=(1, *images.shape[1:]),
-            compression="gzip",
-            compression_opts=4,
-            shuffle=True,
-        )
+        _write_images(group, name, images, chunks=(1, *images.shape[1:]))
+        if demonstration.final is not None:
+            image = getattr(demonstration.final, name)
+            _write_images(group, f"final_{name}", image, chunks=image.shape)
     group["pick"] = np.stack([step.pick.as_array() for step in steps])
     group["place"] = np.stack([step.place.as_array() for step in steps])
-    group["surface_height"] = np.array([step.surface_height for step in steps])
     for name in ("object", "category"):
         texts = [getattr(step, name) for step in steps]
         group.create_dataset(name, data=texts, dtype=h5py.string_dtype())
+
+
+def _write_images(
+    group: h5py.Group, name: str, images: NDArray[Any], chunks: tuple[int, ...]
+) -> None:
+    group.create_dataset(
+        name, data=images, chunks=chunks, compression="gzip", compression_opts=4, shuffle=True
+    )
 
 
 @contextlib.contextmanager
@@ -273,6 +305,7 @@ def _contents(file: h5py.File) -> Contents:
         grid=PixelGrid(**json.loads(attributes["grid"])),
         first_seed=int(attributes["first_seed"]),
         versions=json.loads(attributes["versions"]),
+        learning=Learning(**json.loads(attributes["learning"])),
     )
     rejected = tuple(Rejection(**item) for item in json.loads(attributes["rejected"]))
     seeds = sorted(int(group.attrs["seed"]) for group in file.values())
@@ -280,21 +313,22 @@ def _contents(file: h5py.File) -> Contents:
 
 
 def _read_group(group: h5py.Group, grid: PixelGrid) -> Demonstration:
-    shapes = {
-        "rgb": (3, *grid.shape),
-        "height": grid.shape,
-        "pick": (3,),
-        "place": (3,),
-        "surface_height": (),
-    }
-    numbers = [group[name][()] for name in shapes]
     texts = [group[name].asstr()[()] for name in ("object", "category")]
     steps = len(texts[0])
-    for (name, shape), values in zip(shapes.items(), numbers, strict=True):
-        if values.shape != (steps, *shape) or not steps:
-            raise ValueError(f"{group.name}/{name} is of the shape {values.shape}")
-        if not np.isfinite(values).all():
-            raise ValueError(f"{group.name}/{name} holds what is no number")
+    if not steps:
+        raise ValueError(f"{group.name} holds no step")
+    columns = (
+        _numbers(group, "rgb", (steps, 3, *grid.shape)),
+        _numbers(group, "height", (steps, *grid.shape)),
+        _numbers(group, "pick", (steps, 3)),
+        _numbers(group, "place", (steps, 3)),
+    )
+    final = None
+    if "final_rgb" in group:
+        final = FinalObservation(
+            rgb=_numbers(group, "final_rgb", (3, *grid.shape)),
+            height=_numbers(group, "final_height", grid.shape),
+        )
     return Demonstration(
         seed=int(group.attrs["seed"]),
         score=float(group.attrs["score"]),
@@ -304,12 +338,20 @@ def _read_group(group: h5py.Group, grid: PixelGrid) -> Demonstration:
                 height=height,
                 pick=PlanarPose(*map(float, pick)),
                 place=PlanarPose(*map(float, place)),
-                surface_height=float(surface_height),
                 object=str(name),
                 category=str(category),
             )
-            for rgb, height, pick, place, surface_height, name, category in zip(
-                *numbers, *texts, strict=True
-            )
+            for rgb, height, pick, place, name, category in zip(*columns, *texts, strict=True)
         ),
+        final=final,
     )
+
+
+def _numbers(group: h5py.Group, name: str, shape: tuple[int, ...]) -> NDArray[Any]:
+    """A dataset of some shape, all of whose entries are finite."""
+    values = group[name][()]
+    if values.shape != shape:
+        raise ValueError(f"{group.name}/{name} is of the shape {values.shape}")
+    if not np.isfinite(values).all():
+        raise ValueError(f"{group.name}/{name} holds what is no number")
+    return values

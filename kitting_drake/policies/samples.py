@@ -30,10 +30,7 @@ def scenes(demonstrations: Iterable[Demonstration], grid: PixelGrid) -> list[Sce
     """Every observation of some demonstrations."""
     result = []
     for demonstration in demonstrations:
-        actions = [
-            PickPlaceAction(step.pick, step.place, step.surface_height)
-            for step in demonstration.steps
-        ]
+        actions = [PickPlaceAction(step.pick, step.place) for step in demonstration.steps]
         for index, step in enumerate(demonstration.steps):
             image = step.image
             targets = tuple(

@@ -10,6 +10,8 @@ from kitting_drake.common.errors import UserError
 from kitting_drake.policies.demonstrations import (
     Demonstration,
     DemonstrationStep,
+    FinalObservation,
+    Learning,
     Origin,
     Rejection,
     merge_demonstrations,
@@ -20,7 +22,8 @@ from kitting_drake.policies.demonstrations import (
 from systems.signals import Observation, PickPlaceAction, PixelGrid, PlanarPose
 
 GRID = PixelGrid(rows=5, cols=7, z_max=0.3)
-ORIGIN = Origin("mine", {"time_limit": 1.0}, GRID, 10, {"drake": "1.51.1"})
+LEARNING = Learning(later_picks_possible=True, curvature=False)
+ORIGIN = Origin("mine", {"time_limit": 1.0}, GRID, 10, {"drake": "1.51.1"}, LEARNING)
 REJECTED = (Rejection(11, 0.5, "a tool fell"),)
 
 
@@ -28,14 +31,20 @@ def step(seed: int) -> DemonstrationStep:
     rng = np.random.default_rng(seed)
     return DemonstrationStep.of(
         Observation(rng.random((4, *GRID.shape), np.float32), GRID),
-        PickPlaceAction(PlanarPose(*rng.random(3)), PlanarPose(*rng.random(3)), rng.random()),
+        PickPlaceAction(PlanarPose(*rng.random(3)), PlanarPose(*rng.random(3))),
         name=f"wrench_{seed}",
         category="wrench",
     )
 
 
-def demonstration(seed: int, steps: int = 3) -> Demonstration:
-    return Demonstration(seed, 1.0, tuple(step(10 * seed + i) for i in range(steps)))
+def demonstration(seed: int, steps: int = 3, *, final: bool = True) -> Demonstration:
+    image = np.random.default_rng(seed).random((4, *GRID.shape), np.float32)
+    return Demonstration(
+        seed,
+        1.0,
+        tuple(step(10 * seed + i) for i in range(steps)),
+        FinalObservation.of(Observation(image, GRID)) if final else None,
+    )
 
 
 def assert_same(one: Demonstration, other: Demonstration) -> None:
@@ -45,23 +54,31 @@ def assert_same(one: Demonstration, other: Demonstration) -> None:
         np.testing.assert_array_equal(a.height, b.height)
         assert a.rgb.dtype == b.rgb.dtype == np.uint8
         assert a.height.dtype == b.height.dtype == np.float32
-        for name in ("pick", "place", "surface_height", "object", "category"):
+        for name in ("pick", "place", "object", "category"):
             assert getattr(a, name) == getattr(b, name)
+    assert (one.final is None) == (other.final is None)
+    if one.final is not None and other.final is not None:
+        np.testing.assert_array_equal(one.final.image, other.final.image)
+        assert one.final.rgb.dtype == other.final.rgb.dtype == np.uint8
 
 
 def written(folder: Path) -> Path:
     path = folder / "demonstrations.h5"
-    write_demonstrations(path, ORIGIN, [demonstration(12), demonstration(10)], REJECTED)
+    items = [demonstration(12), demonstration(10, final=False)]
+    write_demonstrations(path, ORIGIN, items, REJECTED)
     return path
 
 
 def test_a_step_is_the_observation_to_half_a_colour():
     image = np.random.default_rng(0).random((4, *GRID.shape), np.float32)
-    taken = DemonstrationStep.of(Observation(image, GRID), PickPlaceAction(), name="", category="")
-    assert taken.image.shape == image.shape
-    assert taken.image.dtype == np.float32
-    np.testing.assert_allclose(taken.image[:3], image[:3], atol=0.5 / 255 + 1e-6)
-    np.testing.assert_array_equal(taken.image[3], image[3])
+    observation = Observation(image, GRID)
+    taken = DemonstrationStep.of(observation, PickPlaceAction(), name="")
+    assert taken.category == ""
+    for found in (taken.image, FinalObservation.of(observation).image):
+        assert found.shape == image.shape
+        assert found.dtype == np.float32
+        np.testing.assert_allclose(found[:3], image[:3], atol=0.5 / 255 + 1e-6)
+        np.testing.assert_array_equal(found[3], image[3])
 
 
 def test_what_is_written_is_read(tmp_path: Path):
@@ -71,7 +88,7 @@ def test_what_is_written_is_read(tmp_path: Path):
     assert read.origin == ORIGIN
     assert read.rejected == REJECTED
     for found, expected in zip(
-        read.demonstrations, [demonstration(10), demonstration(12)], strict=True
+        read.demonstrations, [demonstration(10, final=False), demonstration(12)], strict=True
     ):
         assert_same(found, expected)
     assert read_contents(path).seeds == (10, 12)
@@ -81,15 +98,18 @@ def test_what_is_written_is_read(tmp_path: Path):
 def test_the_layout_of_the_file(tmp_path: Path):
     with h5py.File(written(tmp_path)) as file:
         assert file.attrs["format"] == "kitting_drake demonstrations"
-        assert file.attrs["format_version"] == 1
+        assert file.attrs["format_version"] == 2
         assert sorted(file) == ["seed_00000010", "seed_00000012"]
         group = file["seed_00000012"]
         assert group["rgb"].shape == (3, 3, 5, 7)
         assert group["rgb"].chunks == (1, 3, 5, 7)
         assert group["height"].shape == (3, 5, 7)
         assert group["pick"].shape == group["place"].shape == (3, 3)
-        assert group["surface_height"].shape == (3,)
+        assert "surface_height" not in group
+        assert group["final_rgb"].shape == (3, 5, 7)
+        assert group["final_height"].shape == (5, 7)
         assert group["object"].asstr()[0] == "wrench_120"
+        assert "final_rgb" not in file["seed_00000010"]
 
 
 def test_a_file_takes_in_others_and_itself(tmp_path: Path):
@@ -101,7 +121,7 @@ def test_a_file_takes_in_others_and_itself(tmp_path: Path):
     assert read.rejected == REJECTED
     for found, expected in zip(
         read.demonstrations,
-        [demonstration(10), demonstration(12), demonstration(13, steps=1)],
+        [demonstration(10, final=False), demonstration(12), demonstration(13, steps=1)],
         strict=True,
     ):
         assert_same(found, expected)
@@ -148,6 +168,8 @@ def test_a_damaged_file_is_refused(tmp_path: Path):
 @pytest.mark.parametrize(
     ("name", "value"),
     [
+        ("final_height", np.zeros((5, 8), np.float32)),
+        ("final_rgb", np.zeros((5, 7, 3), np.uint8)),
         ("height", np.zeros((3, 4, 7), np.float32)),
         ("rgb", np.zeros((3, 5, 7, 3), np.uint8)),
         ("pick", np.full((3, 3), np.nan)),
@@ -158,9 +180,9 @@ def test_a_damaged_file_is_refused(tmp_path: Path):
 def test_content_that_makes_no_sense_is_refused(tmp_path: Path, name: str, value: np.ndarray):
     path = written(tmp_path)
     with h5py.File(path, "a") as file:
-        del file["seed_00000010"][name]
-        file["seed_00000010"][name] = value
-    with pytest.raises(UserError, match=rf"damaged: delete it .*seed_00000010/{name} "):
+        del file["seed_00000012"][name]
+        file["seed_00000012"][name] = value
+    with pytest.raises(UserError, match=rf"damaged: delete it .*seed_00000012/{name} "):
         read_demonstrations(path)
 
 
@@ -193,8 +215,8 @@ def test_a_foreign_file_is_refused(tmp_path: Path):
 def test_another_version_of_the_format_is_refused(tmp_path: Path):
     path = written(tmp_path)
     with h5py.File(path, "a") as file:
-        file.attrs["format_version"] = 2
-    with pytest.raises(UserError, match="is of format version 2, and version 1 is what"):
+        file.attrs["format_version"] = 1
+    with pytest.raises(UserError, match="is of format version 1, and version 2 is what"):
         read_demonstrations(path)
 
 

@@ -1,0 +1,20 @@
+"""What a task says about how its demonstrations may be learned from; no Drake and no torch here."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Learning:
+    """Assumptions that training may make: a task says which of them hold for its scenes.
+
+    By default none does, which is the paper's own way of training (section V-C.1).
+    """
+
+    later_picks_possible: bool = False
+    """What the expert picked later in an episode could have been picked at once, from where it lay:
+    every later pick is then a label of an observation too. True for kitting, false for stacking."""
+    curvature: bool = False
+    """Objects may be bent in the image to augment pick angles: objects of the task come in slightly
+    different shapes and bent ones are picked alike. True for hand tools, false for blocks."""
