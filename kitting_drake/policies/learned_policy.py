@@ -17,11 +17,6 @@ from kitting_drake.policies.images import rotation
 from kitting_drake.policies.networks import Networks
 from systems.signals import Observation, PickPlaceAction, PlanarPose, wrap_to_pi
 
-_PATCH = 1
-"""How far around the pick pixel its surface is looked for, in pixels."""
-_RIM = 8
-"""How far around the place the rim of a cavity is looked for, in pixels."""
-
 
 @dataclass(frozen=True)
 class Decision:
@@ -152,7 +147,7 @@ def make_action(
     place: NDArray[np.float64],
     turn: float,
 ) -> PickPlaceAction:
-    """The action of an answer in pixels; heights are read off the heightmap.
+    """The action of an answer in pixels.
 
     Args:
         observation: what was seen.
@@ -168,23 +163,7 @@ def make_action(
     return PickPlaceAction(
         pick=PlanarPose(float(pick_x), float(pick_y), theta),
         place=PlanarPose(float(place_x), float(place_y), theta + turn),
-        surface_height=grid.z_min + highest_around(observation.height, pick, _PATCH),
-        rim_height=grid.z_min + highest_around(observation.height, place, _RIM),
     )
-
-
-def highest_around(height: NDArray[np.float32], pixel: NDArray[np.float64], reach: int) -> float:
-    """The highest pixel around a position (row, col), in metres above `grid.z_min`.
-
-    Args:
-        height: (rows, cols).
-        pixel: the position.
-        reach: how far around it, in pixels.
-    """
-    row, col = np.rint(pixel).astype(int)
-    rows = slice(max(row - reach, 0), max(row + reach + 1, 0))
-    cols = slice(max(col - reach, 0), max(col + reach + 1, 0))
-    return float(height[rows, cols].max(initial=0.0))
 
 
 def _place_map(volume: Tensor, shape: tuple[int, int]) -> NDArray[np.float32]:

@@ -42,7 +42,7 @@ def demonstration(seed: int) -> Demonstration:
     for _ in range(2):
         pick, place = GRID.to_world(rng.uniform(5, 28, (2, 2)))
         theta, turn = rng.uniform(-3, 3, 2)
-        action = PickPlaceAction(PlanarPose(*pick, theta), PlanarPose(*place, theta + turn), 0.02)
+        action = PickPlaceAction(PlanarPose(*pick, theta), PlanarPose(*place, theta + turn))
         seen = Observation(rng.random((4, *GRID.shape), np.float32), GRID)
         steps.append(DemonstrationStep.of(seen, action, name="a", category="b"))
     return Demonstration(seed, 1.0, tuple(steps))

@@ -15,7 +15,6 @@ from kitting_drake.policies.learned_policy import (
     LearnedPolicy,
     best_placement,
     expected_position,
-    highest_around,
 )
 from kitting_drake.policies.methods import make_networks
 from kitting_drake.policies.networks import Networks
@@ -154,34 +153,6 @@ def test_a_method_without_angles_between_bins_answers_with_a_bin(monkeypatch: py
     found = decide(Known(), continuous=True)
     assert found.action.pick.theta / BIN == pytest.approx(12)
     np.testing.assert_allclose(found.pick_pixel, PICK, atol=1e-5)
-
-
-def test_the_grasp_starts_at_the_highest_of_the_pixels_around_the_pick():
-    seen = observation()
-    seen.height[60:63, 21:24] = np.linspace(0.01, 0.03, 9, dtype=np.float32).reshape(3, 3)
-    # Just beyond.
-    seen.height[59, 22] = seen.height[61, 24] = 0.1
-    action = decide(Known(), continuous=True, seen=seen).action
-    assert action.surface_height == pytest.approx(0.02 + 0.03)
-
-
-@pytest.mark.parametrize(
-    ("pixel", "expected"), [((0, 0), 1), ((0.4, 2.2), 5), ((3, 3), 9), ((-1.6, 0), 0), ((9, 9), 0)]
-)
-def test_heights_at_the_edge_and_beyond(pixel: tuple[float, float], expected: float):
-    height = np.zeros((4, 4), np.float32)
-    height[0, 0], height[1, 3], height[3, 2] = 1, 5, 9
-    assert highest_around(height, np.array(pixel), 1) == expected
-
-
-def test_the_rim_is_the_highest_around_the_place():
-    seen = observation()
-    row, col = np.rint(GOAL).astype(int)
-    seen.height[row - 5, col + 6] = 0.04
-    seen.height[row - 9, col] = 0.1
-    assert decide(Known(), continuous=True, seen=seen).action.rim_height == pytest.approx(
-        0.04 + GRID.z_min
-    )
 
 
 @pytest.mark.parametrize(

@@ -18,9 +18,7 @@ def demonstration(seed: int, steps: int) -> Demonstration:
     for i in range(steps):
         pick, place = GRID.to_world((i, 2 * i)), GRID.to_world((10 + i, 3))
         image = np.full((4, *GRID.shape), (seed + i) / 100, np.float32)
-        action = PickPlaceAction(
-            PlanarPose(*pick, THETAS[i]), PlanarPose(*place, THETAS[i] + TURN), 0.02
-        )
+        action = PickPlaceAction(PlanarPose(*pick, THETAS[i]), PlanarPose(*place, THETAS[i] + TURN))
         taken.append(DemonstrationStep.of(Observation(image, GRID), action, name="a", category="b"))
     return Demonstration(seed, 1.0, tuple(taken))
 

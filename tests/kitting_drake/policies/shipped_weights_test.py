@@ -1,5 +1,6 @@
-"""The weights that come with the project: what they say of themselves, and how they turn."""
+"""The weights that come with the project: their cards, their decisions and their equivariance."""
 
+import math
 from pathlib import Path
 
 import numpy as np
@@ -9,12 +10,24 @@ import torch
 from kitting_drake.common.paths import MODELS
 from kitting_drake.common.seeds import TEST_SEEDS
 from kitting_drake.policies.config import PICK_CROP, NetworkConfig
+from kitting_drake.policies.learned_policy import LearnedPolicy
 from kitting_drake.policies.methods import make_networks
 from kitting_drake.policies.networks import SO2Networks
 from kitting_drake.policies.weights import load_networks, read_weights_file
+from systems.signals import Observation, PixelGrid
 from tests.kitting_drake.policies.turning import relative_error, smooth_image, turn_image
 
 SHIPPED = sorted((MODELS / "policies").glob("*.safetensors"))
+DATA = Path(__file__).parent / "data"
+"""One rendered observation for each of them (seeds 103 and 105, at rest, four tools on the table):
+`rgb` (3, rows, cols), 8 bits, and `height_tenth_mm` (rows, cols), in tenths of a millimetre."""
+
+GOLDEN = {
+    "kitting_seen": ((19.884, 24.756), 57.352, (60.774, 177.633), -151.384),
+    "kitting_unseen": ((59.508, 219.945), 40.767, (69.721, 123.693), -146.098),
+}
+"""The pick (row, col) and its angle, and the place (row, col) and the rotation, in degrees, that
+the weights decided on these observations when they were shipped (float32)."""
 
 
 def test_there_is_one_for_each_task():
@@ -31,6 +44,23 @@ def test_no_test_seed_was_learned_from(path: Path):
     learned = {*file.card["demonstration_seeds"], *file.card["validation_seeds"]}
     assert not learned.intersection(TEST_SEEDS)
     assert file.card["validation"]["median_turn_deg"] < 0.5
+
+
+@pytest.mark.parametrize("path", SHIPPED, ids=lambda path: path.stem)
+def test_decides_as_when_it_was_shipped(path: Path):
+    stored = np.load(DATA / f"{path.stem}.npz")
+    colours = stored["rgb"].astype(np.float32) / 255
+    height = stored["height_tenth_mm"].astype(np.float32) * 1e-4
+    seen = Observation(np.concatenate([colours, height[None]]), PixelGrid())
+    found = LearnedPolicy(load_networks(path), orientations=180).decide(seen)
+
+    pick, angle, place, rotation = GOLDEN[path.stem]
+    action = found.action
+    np.testing.assert_allclose(found.pick_pixel, pick, atol=1 / 3)
+    np.testing.assert_allclose(found.place_pixel, place, atol=1 / 3)
+    turned = action.place.theta - action.pick.theta
+    assert abs(math.remainder(math.degrees(action.pick.theta) - angle, 180)) < 1
+    assert abs(math.remainder(math.degrees(turned) - rotation, 360)) < 1
 
 
 @pytest.mark.parametrize("path", SHIPPED, ids=lambda path: path.stem)
