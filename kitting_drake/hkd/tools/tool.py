@@ -56,6 +56,8 @@ class Tool:
     """In kg."""
     grasp: Grasp
     visual_meshes: tuple[Path, ...]
+    scale: float = 1.0
+    """Of the visual meshes, whose files have the lengths of the tool as it was made."""
 
     @property
     def sdf(self) -> Path:
@@ -69,7 +71,8 @@ class Tool:
         Raises:
             UserError: a file that is not a mesh.
         """
-        return np.concatenate([_read_triangles(path) for path in self.visual_meshes])
+        triangles = np.concatenate([_read_triangles(path) for path in self.visual_meshes])
+        return triangles if self.scale == 1.0 else self.scale * triangles
 
     @cached_property
     def silhouette(self) -> CrossSection:

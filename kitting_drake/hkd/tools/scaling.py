@@ -1,0 +1,117 @@
+"""Tools of other lengths: section IV-B.2 of the paper scales the tools of a toolset at random.
+
+A tool scaled uniformly by s keeps its density, so its mass grows with s^3, its moments of inertia
+with s^5, and its lengths, its centre of mass among them, with s.
+"""
+
+import dataclasses
+import hashlib
+import xml.etree.ElementTree as ElementTree
+from pathlib import Path
+
+from kitting_drake.common.errors import UserError
+from kitting_drake.common.paths import cache_directory
+from kitting_drake.hkd.cache import cached_folder
+from kitting_drake.hkd.tools.tool import Tool
+
+LENGTH_RANGE = (0.150, 0.200)
+"""The lengths to which the paper scales tools, in metres."""
+
+_FORMAT_VERSION = "1"
+"""Part of the cache key: changed whenever the same input makes another file."""
+_SAME_LENGTH = 1e-9
+
+_DRAKE = "http://drake.mit.edu"
+
+
+def scaled_tool(tool: Tool, length: float) -> Tool:
+    """The tool, uniformly scaled to a length in metres; the tool itself if that is its length.
+
+    The scaled tool has an SDFormat file of its own, in the cache, which loads the meshes of the
+    original with a scale. All else is that of the original, its name included.
+
+    Raises:
+        UserError: the length is not positive, the tool's model cannot be scaled, or the cache
+            cannot be written.
+    """
+    if not 0.0 < length < float("inf"):
+        raise UserError(f"the tool '{tool.name}' cannot be made {length:g} m long")
+    if abs(length - tool.length) <= _SAME_LENGTH:
+        return tool
+    factor = length / tool.length
+    grasp = dataclasses.replace(
+        tool.grasp,
+        x=factor * tool.grasp.x,
+        y=factor * tool.grasp.y,
+        width=factor * tool.grasp.width,
+        surface_height=factor * tool.grasp.surface_height,
+    )
+    return dataclasses.replace(
+        tool,
+        directory=_scaled_model(tool, factor),
+        length=length,
+        width=factor * tool.width,
+        height=factor * tool.height,
+        mass=factor**3 * tool.mass,
+        grasp=grasp,
+        scale=factor * tool.scale,
+    )
+
+
+def _scaled_model(tool: Tool, factor: float) -> Path:
+    """The folder in the cache with the SDFormat file of a scaled tool."""
+    original = tool.sdf.read_bytes()
+    key = f"{_FORMAT_VERSION} {tool.sdf.resolve()} {factor!r}".encode()
+    name = hashlib.sha256(key + original).hexdigest()[:24]
+    try:
+        text = scaled_sdf(original.decode(), tool.sdf.resolve().parent, factor)
+    except (ElementTree.ParseError, UnicodeDecodeError, ValueError) as error:
+        raise UserError(f"{tool.sdf} is not a model that can be scaled: {error}") from error
+    return cached_folder(
+        cache_directory() / "tools" / name,
+        [tool.sdf.name],
+        lambda folder: (folder / tool.sdf.name).write_text(text),
+    )
+
+
+def scaled_sdf(text: str, directory: Path, factor: float) -> str:
+    """The SDFormat text of a model of meshes, uniformly scaled.
+
+    Args:
+        text: of the original.
+        directory: where the original's relative URIs start; the result's are absolute.
+        factor: the scale.
+
+    Raises:
+        ValueError: the model has geometry that is not a mesh, or a number that is none.
+        xml.etree.ElementTree.ParseError: the text is not XML.
+    """
+    ElementTree.register_namespace("drake", _DRAKE)
+    root = ElementTree.fromstring(text)
+    for geometry in root.iter("geometry"):
+        if [child.tag for child in geometry] != ["mesh"]:
+            raise ValueError("only geometry of one mesh each can be scaled")
+    for mesh in root.iter("mesh"):
+        uri = mesh.find("uri")
+        if uri is None or not uri.text:
+            raise ValueError("a mesh has no uri")
+        if "://" not in uri.text:
+            uri.text = str(directory / uri.text)
+        scale = mesh.find("scale")
+        if scale is None:
+            scale = ElementTree.SubElement(mesh, "scale")
+        _scale_numbers(scale, [factor] * 3, default="1 1 1")
+    for pose in root.iter("pose"):
+        _scale_numbers(pose, [factor] * 3 + [1.0] * 3)
+    for inertial in root.iter("inertial"):
+        for mass in inertial.iter("mass"):
+            _scale_numbers(mass, [factor**3])
+        for moment in inertial.find("inertia") or ():
+            _scale_numbers(moment, [factor**5])
+    return '<?xml version="1.0"?>\n' + ElementTree.tostring(root, encoding="unicode") + "\n"
+
+
+def _scale_numbers(element: ElementTree.Element, factors: list[float], default: str = "") -> None:
+    numbers = [float(word) for word in (element.text or default).split()]
+    scaled = [factor * number for factor, number in zip(factors, numbers, strict=True)]
+    element.text = " ".join(f"{number:.12g}" for number in scaled)
