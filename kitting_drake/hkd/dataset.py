@@ -101,10 +101,11 @@ def _kit_entry(name: str, split: str, kit: Kit, root: Path) -> dict[str, Any]:
         "name": name,
         "split": split,
         "sdf": (folder / kit.sdf.name).relative_to(root).as_posix(),
-        # Where each tool's frame belongs in the kit's, unturned.
+        "size": list(kit.size),
+        # The pose of each seated tool's frame in the kit's: yaw is about the kit's z.
         "tools": [
-            {"name": tool.name, "position": list(kit.goal(index))}
-            for index, tool in enumerate(kit.tools)
+            {"name": tool.name, "position": [pose.x, pose.y, pose.z], "yaw": pose.yaw}
+            for tool, pose in zip(kit.tools, kit.layout.poses, strict=True)
         ],
         "sha256": _checksums(folder, root),
     }

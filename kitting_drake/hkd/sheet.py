@@ -19,7 +19,7 @@ from pydrake.geometry import (
     Rgba,
     SceneGraph,
 )
-from pydrake.math import RigidTransform, RotationMatrix
+from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import AddMultibodyPlantSceneGraph
 from pydrake.systems.framework import DiagramBuilder
@@ -27,7 +27,7 @@ from pydrake.systems.sensors import CameraInfo
 
 from kitting_drake.cell.cameras import require_rendering
 from kitting_drake.common.files import write_whole
-from kitting_drake.hkd.kits.kit import Kit
+from kitting_drake.hkd.kits.kit import Kit, KitParameters
 from kitting_drake.hkd.tools.tool import Tool
 
 _BACKGROUND = (0.97, 0.97, 0.96)
@@ -85,10 +85,14 @@ def tool_subject(tool: Tool) -> Subject:
 def kit_subject(title: str, kit: Kit) -> Subject:
     """A kit on the table, its tools seated but for the last, whose cavity is seen."""
     seated = [
-        (tool.sdf, RigidTransform(kit.goal(index))) for index, tool in enumerate(kit.tools[:-1])
+        (tool.sdf, RigidTransform(RollPitchYaw(0, 0, pose.yaw), [pose.x, pose.y, pose.z]))
+        for tool, pose in zip(kit.tools[:-1], kit.layout.poses[:-1], strict=True)
     ]
     models = [(kit.sdf, RigidTransform()), *seated]
-    return Subject(title, models, (0.0, 0.0, 0.02), 0.52, elevation_deg=52.0)
+    # A block of the template's size fills the picture; a larger one is seen from further away.
+    template = KitParameters()
+    size = 0.52 * max(1.0, kit.size[0] / template.length, kit.size[1] / template.width)
+    return Subject(title, models, (0.0, 0.0, 0.02), size, elevation_deg=52.0)
 
 
 def render_subject(

@@ -6,7 +6,7 @@ import numpy as np
 from manifold3d import CrossSection, Manifold
 from numpy.typing import NDArray
 
-from kitting_drake.hkd.kits.kit import KitParameters, cavity_place
+from kitting_drake.hkd.kits.kit import CavityPose, KitParameters, moved_outline, slot_pose
 from kitting_drake.hkd.tools.tool import Tool
 
 _STEP = 0.00025
@@ -21,20 +21,28 @@ class Clearance:
     minimum: float
 
 
-def measure_clearance(block: Manifold, tool: Tool, parameters: KitParameters) -> Clearance:
+def measure_clearance(
+    block: Manifold, tool: Tool, parameters: KitParameters, pose: CavityPose | None = None
+) -> Clearance:
     """The clearance of a tool in the block of a kit, all along the tool's outline.
 
     The wall is taken from the block itself, cut halfway between floor and bevel; the outline from
     the tool's visual mesh. Where the tool has notches that the cavity bridges, and its wall has no
     counterpart, the distance is that to the nearest wall there is.
 
+    Args:
+        block: of the kit, in its frame K.
+        tool: to seat.
+        parameters: of the kit.
+        pose: of the seated tool; that in the slot of its category if None.
+
     Raises:
-        ValueError: the tool, in its place, is not inside a cavity.
+        ValueError: the tool, so seated, is not inside a cavity.
     """
-    x, y, floor = cavity_place(tool, parameters)
-    level = (floor + parameters.height - parameters.lead_in) / 2
+    pose = slot_pose(tool, parameters) if pose is None else pose
+    level = (pose.z + parameters.height - parameters.lead_in) / 2
     solid = block.slice(level)
-    outline = tool.silhouette.translate((x, y))
+    outline = moved_outline(tool.silhouette, pose)
     if (outline ^ solid).area() > 1e-9:
         raise ValueError(f"'{tool.name}' does not fit into its cavity")
     points = np.concatenate([_points_along(loop) for loop in outline.to_polygons()])

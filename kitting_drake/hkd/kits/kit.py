@@ -5,11 +5,16 @@ morphologically, grows it by 2 mm and subtracts it from the block; its authors t
 that the tool can get in. A depth image filled downward and cut upward is a prism over the tool's
 outline. So the outline is taken exactly, as polygons, and closed and grown exactly, by offsetting:
 the same cavity without the voxels, their steps, and the smoothing that has to hide them.
+
+A toolset, one tool of each of the paper's categories at most, takes the slots of a template. Any
+other tools, and tools that are too big for their slots, are nested on a block of their own size.
 """
 
+import dataclasses
 import hashlib
-import os
-import tempfile
+import itertools
+import json
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,6 +25,9 @@ from numpy.typing import NDArray
 
 from kitting_drake.common.errors import UserError
 from kitting_drake.common.paths import cache_directory
+from kitting_drake.hkd.cache import cached_folder
+from kitting_drake.hkd.grasps.proposals import FINGER_LENGTH, RELEASE_REACH
+from kitting_drake.hkd.kits.nesting import LONGEST_SIDES, NestedShape, nest
 from kitting_drake.hkd.tools.tool import Tool
 from systems.bounds import bounded
 
@@ -31,12 +39,17 @@ SLOTS = {
 }
 """Where the tool of each category goes: (x, y) of its frame T in the kit frame, in metres."""
 
+MOST_TOOLS = 12
+"""The largest number of tools in a kit."""
+
 _ARC_SEGMENTS = 64
 _DIGITS = 7
 """Of coordinates in files, after the point."""
 _TOP_CELL = 0.02
 """Side of the squares into which the top is cut for the contact solver, in metres."""
-_FORMAT_VERSION = "6"
+_SIZE_STEP = 0.001
+"""Nested blocks have a length and a width that are multiples of this, in metres."""
+_FORMAT_VERSION = "7"
 """Part of the cache key: changed whenever the same input makes another kit."""
 
 
@@ -44,7 +57,8 @@ _FORMAT_VERSION = "6"
 class KitParameters:
     """The template of the kit block. Lengths in m."""
 
-    # The block's extents along x, y and z.
+    # The block's extents along x, y and z. The length and the width are those of a block with the
+    # slots of a toolset; where tools are nested instead, the block gets a size of its own.
     length: float = bounded(0.280, 0.05, 1.0)
     width: float = bounded(0.260, 0.05, 1.0)
     height: float = bounded(0.050, 0.01, 0.2)
@@ -64,28 +78,67 @@ class KitParameters:
     # The least thickness of block between two cavities, and below one.
     minimum_wall: float = bounded(0.002, 0.0, 0.05)
 
+    # The same between two nested cavities, and around them.
+    nested_wall: float = bounded(0.006, 0.001, 0.05)
+
+
+@dataclass(frozen=True)
+class CavityPose:
+    """The pose of a seated tool's frame T in the kit frame K."""
+
+    x: float
+    """In metres."""
+    y: float
+    z: float
+    yaw: float = 0.0
+    """The rotation about K's z, in radians."""
+
+
+@dataclass(frozen=True)
+class KitLayout:
+    """How large a kit block is, and where its cavities are."""
+
+    parameters: KitParameters
+    """The template, with the length and the width that the block has."""
+    poses: tuple[CavityPose, ...]
+    """Of the tools, in their order."""
+
 
 @dataclass(frozen=True)
 class Kit:
     """A kit block on disk.
 
-    The kit frame K: z up, the origin amid the block's bottom, x along its length.
+    The kit frame K: z up, the origin in the centre of the block's bottom, x along its length.
     """
 
     sdf: Path
     """A model with one link `kit` whose body frame is K."""
-    parameters: KitParameters
     tools: tuple[Tool, ...]
+    layout: KitLayout
 
-    def goal(self, index: int) -> tuple[float, float, float]:
-        """Where the frame T of tool `index` belongs, (x, y, z) in K, unturned, in metres."""
-        return cavity_place(self.tools[index], self.parameters)
+    @property
+    def parameters(self) -> KitParameters:
+        """The template, with the length and the width that the block has."""
+        return self.layout.parameters
+
+    @property
+    def size(self) -> tuple[float, float, float]:
+        """The block's extents along x, y and z of K, in metres."""
+        return self.parameters.length, self.parameters.width, self.parameters.height
+
+    def goal(self, index: int) -> CavityPose:
+        """Where the frame T of tool `index` belongs in K."""
+        return self.layout.poses[index]
 
 
-def cavity_place(tool: Tool, parameters: KitParameters) -> tuple[float, float, float]:
-    """(x, y, z) of a seated tool's frame in the kit frame: its top is flush with the block's."""
+def slot_pose(tool: Tool, parameters: KitParameters) -> CavityPose:
+    """The pose of a tool in the slot of its category: its top is flush with the block's.
+
+    Raises:
+        KeyError: there is no slot for the tool's category.
+    """
     x, y = SLOTS[tool.category]
-    return x, y, parameters.height - tool.height
+    return CavityPose(x, y, parameters.height - tool.height)
 
 
 def cavity_outline(outline: CrossSection, parameters: KitParameters) -> CrossSection:
@@ -210,31 +263,105 @@ class Cavity:
         return Manifold(Mesh(vertices.astype(np.float32), faces.astype(np.uint32)))
 
 
-def kit_cavities(tools: Sequence[Tool], parameters: KitParameters) -> list[Cavity]:
-    """The cavity of each tool.
+def layout_kit(tools: Sequence[Tool], parameters: KitParameters) -> KitLayout:
+    """Chooses the block's size and the poses of the tools: in their slots, or else nested.
 
     Raises:
-        UserError: two tools of one category, a tool too big for its place, cavities that meet.
+        UserError: there are no tools or too many, one is too high for the block, or no block is
+            large enough for them all.
     """
-    cavities: dict[str, Cavity] = {}
+    if not 1 <= len(tools) <= MOST_TOOLS:
+        raise UserError(f"a kit holds 1 to {MOST_TOOLS} tools, not {len(tools)}")
     for tool in tools:
-        if tool.category in {other.category for other in tools if other is not tool}:
-            raise UserError(f"a kit holds one {tool.category}, not two")
-        x, y, z = cavity_place(tool, parameters)
-        if z < parameters.minimum_wall:
+        if parameters.height - tool.height < parameters.minimum_wall:
             raise UserError(
                 f"'{tool.name}' is {1e3 * tool.height:.1f} mm high and leaves less than "
                 f"kit.minimum_wall, {1e3 * parameters.minimum_wall:.1f} mm, below it in a block of "
                 f"{1e3 * parameters.height:.1f} mm"
             )
-        outline = cavity_outline(tool.silhouette, parameters).translate((x, y))
-        cavities[tool.name] = Cavity(outline, z, parameters.height, parameters.lead_in)
-    _check_walls({name: cavity.rim for name, cavity in cavities.items()}, parameters)
-    return list(cavities.values())
+    categories = [tool.category for tool in tools]
+    if len(set(categories)) == len(categories) and set(categories) <= set(SLOTS):
+        slots = tuple(slot_pose(tool, parameters) for tool in tools)
+        if _has_walls(kit_cavities(tools, parameters, slots), parameters):
+            return KitLayout(parameters, slots)
+    return _nested_layout(tools, parameters)
+
+
+def _nested_layout(tools: Sequence[Tool], parameters: KitParameters) -> KitLayout:
+    def shape(tool: Tool) -> NestedShape:
+        outline = cavity_outline(tool.silhouette, parameters)
+        rim = Cavity(outline, 0.0, parameters.height, parameters.lead_in).rim
+        return NestedShape(rim, released_fingers(tool))
+
+    wall = max(parameters.minimum_wall, parameters.nested_wall)
+    nesting = nest([shape(tool) for tool in tools], wall)
+    if nesting is None:
+        names = ", ".join(f"'{tool.name}'" for tool in tools)
+        sides = " by ".join(f"{1e3 * side:.0f}" for side in LONGEST_SIDES)
+        raise UserError(f"{names} do not fit into one kit: its block may be {sides} mm at most")
+    length, width = (
+        _SIZE_STEP * math.ceil(side / _SIZE_STEP) for side in (nesting.length, nesting.width)
+    )
+    return KitLayout(
+        dataclasses.replace(parameters, length=length, width=width),
+        tuple(
+            CavityPose(pose.x, pose.y, parameters.height - tool.height, math.radians(pose.yaw_deg))
+            for tool, pose in zip(tools, nesting.poses, strict=True)
+        ),
+    )
+
+
+def released_fingers(tool: Tool) -> CrossSection:
+    """What the fingers cover as they let go of a tool at its annotated grasp, in T, in metres.
+
+    One rectangle for each finger, from the gripped face outward.
+    """
+    fingers = CrossSection()
+    for side in (-1, 1):
+        middle = side * (tool.grasp.width + RELEASE_REACH) / 2
+        fingers += CrossSection.square((FINGER_LENGTH, RELEASE_REACH), True).translate((0, middle))
+    return fingers.rotate(math.degrees(tool.grasp.theta)).translate((tool.grasp.x, tool.grasp.y))
+
+
+def kit_cavities(
+    tools: Sequence[Tool], parameters: KitParameters, poses: Sequence[CavityPose] | None = None
+) -> list[Cavity]:
+    """The cavity of each tool.
+
+    Args:
+        tools: of the kit.
+        parameters: of the kit.
+        poses: of the seated tools; those of `layout_kit` if None.
+
+    Raises:
+        UserError: the tools make no kit; see `layout_kit`.
+    """
+    poses = layout_kit(tools, parameters).poses if poses is None else poses
+    return [
+        Cavity(
+            moved_outline(cavity_outline(tool.silhouette, parameters), pose),
+            pose.z,
+            parameters.height,
+            parameters.lead_in,
+        )
+        for tool, pose in zip(tools, poses, strict=True)
+    ]
+
+
+def moved_outline(outline: CrossSection, pose: CavityPose) -> CrossSection:
+    """An outline in a tool's frame T as it is in the kit frame K when the tool is seated."""
+    if pose.yaw:
+        outline = outline.rotate(math.degrees(pose.yaw))
+    return outline.translate((pose.x, pose.y))
 
 
 def build_block(cavities: Sequence[Cavity], parameters: KitParameters) -> Manifold:
-    """The kit block in the frame K, in metres: watertight, one body."""
+    """The kit block in the frame K, in metres: watertight, one body.
+
+    Args:
+        cavities: to cut out.
+        parameters: whose length and width are the block's; see `KitLayout.parameters`.
+    """
     size = (parameters.length, parameters.width, parameters.height)
     block = Manifold.cube(size, True).translate((0, 0, parameters.height / 2))
     for cavity in cavities:
@@ -278,68 +405,58 @@ def contact_surface(
     return block.arrays()
 
 
-def _check_walls(rims: dict[str, CrossSection], parameters: KitParameters) -> None:
+def _has_walls(cavities: Sequence[Cavity], parameters: KitParameters) -> bool:
+    """Whether there is a wall between any two cavities, and around them in the block."""
     half_wall = parameters.minimum_wall / 2
-    grown = {
-        name: outline.offset(half_wall, JoinType.Round, circular_segments=_ARC_SEGMENTS)
-        for name, outline in rims.items()
-    }
+    grown = [
+        cavity.rim.offset(half_wall, JoinType.Round, circular_segments=_ARC_SEGMENTS)
+        for cavity in cavities
+    ]
     room = CrossSection.square((parameters.length, parameters.width), True)
-    names = list(grown)
-    for index, name in enumerate(names):
-        if (grown[name] - room).area() > 1e-9:
-            raise UserError(f"the cavity of '{name}' does not fit into the kit block")
-        for other in names[index + 1 :]:
-            if (grown[name] ^ grown[other]).area() > 1e-9:
-                raise UserError(f"the cavities of '{name}' and '{other}' meet in the kit block")
+    return all((outline - room).area() <= 1e-9 for outline in grown) and all(
+        (one ^ other).area() <= 1e-9 for one, other in itertools.combinations(grown, 2)
+    )
 
 
 def make_kit(tools: Sequence[Tool], parameters: KitParameters) -> Kit:
     """The kit for these tools, from the cache, or built and put there.
 
     The cache goes by content, so a changed tool or parameter makes another kit. A kit appears there
-    whole or not at all, and two processes that build the same one do not disturb each other.
+    atomically, and two processes that build the same one do not disturb each other.
 
     Raises:
-        UserError: the tools make no kit; see `kit_cavities`.
+        UserError: the tools make no kit (see `layout_kit`), or the cache cannot be written.
     """
-    final = cache_directory() / "kits" / _content_key(tools, parameters)
-    kit = Kit(sdf=final / "kit.sdf", parameters=parameters, tools=tuple(tools))
-    if _is_whole(final):
-        return kit
-    cavities = kit_cavities(tools, parameters)
+    folder = cached_folder(
+        cache_directory() / "kits" / _content_key(tools, parameters),
+        _FILES,
+        lambda scratch: _write(tools, layout_kit(tools, parameters), scratch),
+    )
+    return Kit(folder / "kit.sdf", tuple(tools), _read_layout(folder, parameters))
+
+
+def _read_layout(folder: Path, parameters: KitParameters) -> KitLayout:
     try:
-        final.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(dir=final.parent, prefix=".making-") as folder:
-            scratch = Path(folder) / "kit"
-            scratch.mkdir()
-            _write(cavities, parameters, scratch)
-            if final.exists() and not _is_whole(final):
-                # A machine that went down may have left names without content.
-                os.rename(final, Path(folder) / "damaged")
-            os.rename(scratch, final)
-    except OSError as error:
-        # Unless another process was quicker: its kit is the same.
-        if not _is_whole(final):
-            raise UserError(f"cannot write the kit to {final.parent}: {error.strerror}") from error
-    return kit
-
-
-def _is_whole(folder: Path) -> bool:
-    sizes = [(folder / name).stat().st_size for name in _FILES if (folder / name).is_file()]
-    return len(sizes) == len(_FILES) and all(sizes)
+        layout = json.loads((folder / _LAYOUT).read_text())
+        return KitLayout(
+            dataclasses.replace(parameters, length=layout["length"], width=layout["width"]),
+            tuple(CavityPose(**pose) for pose in layout["poses"]),
+        )
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise UserError(f"{folder / _LAYOUT} is damaged: delete {folder}") from error
 
 
 def _content_key(tools: Sequence[Tool], parameters: KitParameters) -> str:
     digest = hashlib.sha256(f"{_FORMAT_VERSION} {parameters}".encode())
     for tool in tools:
-        digest.update(f"{tool.category} {tool.height!r}".encode())
+        digest.update(f"{tool.category} {tool.height!r} {tool.scale!r} {tool.grasp}".encode())
         for path in tool.visual_meshes:
             digest.update(path.read_bytes())
     return digest.hexdigest()[:24]
 
 
-_FILES = ("kit.obj", "contact.obj", "block.obj", "cavities.obj", "kit.sdf")
+_LAYOUT = "layout.json"
+_FILES = ("kit.obj", "contact.obj", "block.obj", "cavities.obj", "kit.sdf", _LAYOUT)
 
 _SDF = """<?xml version="1.0"?>
 <sdf version="1.9" xmlns:drake="http://drake.mit.edu">
@@ -368,7 +485,9 @@ _SDF = """<?xml version="1.0"?>
 """
 
 
-def _write(cavities: Sequence[Cavity], parameters: KitParameters, directory: Path) -> None:
+def _write(tools: Sequence[Tool], layout: KitLayout, directory: Path) -> None:
+    parameters = layout.parameters
+    cavities = kit_cavities(tools, parameters, layout.poses)
     block = build_block(cavities, parameters)
     mesh = block.to_mesh()
     # Vertices that the file's digits cannot tell apart are one, or the surface would have seams.
@@ -386,6 +505,9 @@ def _write(cavities: Sequence[Cavity], parameters: KitParameters, directory: Pat
     _write_obj(directory / "block.obj", vertices, faces[on_hull], normals=True)
     _write_obj(directory / "cavities.obj", vertices, faces[~on_hull], normals=True)
     (directory / "kit.sdf").write_text(_SDF)
+    described = {"length": parameters.length, "width": parameters.width}
+    poses = [dataclasses.asdict(pose) for pose in layout.poses]
+    (directory / _LAYOUT).write_text(json.dumps({**described, "poses": poses}, indent=2) + "\n")
 
 
 def _write_obj(

@@ -6,11 +6,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
-from manifold3d import CrossSection, Error, JoinType
+from manifold3d import CrossSection, Error, JoinType, Manifold, Mesh, OpType
 from numpy.typing import NDArray
 
 from kitting_drake.common.errors import UserError
 from kitting_drake.hkd.kits import kit as kit_module
+from kitting_drake.hkd.kits.clearance import measure_clearance
 from kitting_drake.hkd.kits.kit import (
     SLOTS,
     Cavity,
@@ -18,8 +19,10 @@ from kitting_drake.hkd.kits.kit import (
     build_block,
     contact_surface,
     kit_cavities,
+    layout_kit,
     make_kit,
 )
+from kitting_drake.hkd.tools.scaling import scaled_tool
 from kitting_drake.hkd.tools.tool import Tool, load_tool
 
 NAMES = ["claw_hammer", "slip_joint_pliers", "combination_wrench", "flat_screwdriver"]
@@ -197,7 +200,7 @@ def test_two_that_build_the_same_kit_at_once_both_get_it(
         kits = list(pool.map(lambda _: make_kit(tools[:1], PARAMETERS), range(2)))
     assert kits[0].sdf == kits[1].sdf
     assert list(cache.iterdir()) == [kits[0].sdf.parent]
-    names = {"kit.sdf", "kit.obj", "block.obj", "cavities.obj", "contact.obj"}
+    names = {"kit.sdf", "kit.obj", "block.obj", "cavities.obj", "contact.obj", "layout.json"}
     assert {path.name for path in kits[0].sdf.parent.iterdir()} == names
 
 
@@ -232,12 +235,120 @@ def test_a_cache_that_cannot_be_written_is_the_users_to_mend(
 @pytest.mark.parametrize(
     ("names", "parameters", "message"),
     [
-        (["claw_hammer"] * 2, {}, "a kit holds one hammer, not two"),
-        (NAMES, {"length": 0.15}, "'claw_hammer' does not fit into the kit block"),
+        ([], {}, "a kit holds 1 to 12 tools, not 0"),
+        (["claw_hammer"] * 13, {}, "a kit holds 1 to 12 tools, not 13"),
         (NAMES, {"height": 0.018}, "'claw_hammer' is 17.0 mm high and leaves less than"),
-        (NAMES, {"minimum_wall": 0.025}, "'claw_hammer' and .* meet"),
     ],
 )
 def test_tools_that_make_no_kit(names: list[str], parameters: dict[str, float], message: str):
-    with pytest.raises(UserError, match=message):
-        kit_cavities([load_tool(name) for name in names], KitParameters(**parameters))
+    with pytest.raises(UserError, match=message) as refusal:
+        make_kit([load_tool(name) for name in names], KitParameters(**parameters))
+    assert "\n" not in str(refusal.value)
+
+
+# Slots and nesting.
+
+
+def test_a_toolset_takes_the_slots_of_the_template(tools: list[Tool]):
+    for count in (1, 2, 4):
+        layout = layout_kit(tools[:count], PARAMETERS)
+        assert layout.parameters == PARAMETERS
+        for tool, pose in zip(tools[:count], layout.poses, strict=True):
+            assert (pose.x, pose.y) == SLOTS[tool.category]
+            assert (pose.z, pose.yaw) == (PARAMETERS.height - tool.height, 0.0)
+
+
+SEVEN = [*NAMES, "claw_hammer", "t_handle_screwdriver", "tin_snips"]
+TWELVE = [*SEVEN, "pipe_wrench", "soft_face_mallet", "s_wrench", "torx_screwdriver", "tin_snips"]
+
+
+@pytest.mark.parametrize(
+    ("names", "parameters"),
+    [
+        (["claw_hammer"], {"length": 0.15}),
+        (["claw_hammer", "claw_hammer"], {}),
+        (NAMES, {"minimum_wall": 0.025}),
+        (SEVEN, {}),
+        (SEVEN, {"nested_wall": 0.012, "lead_in": 0.0}),
+        (TWELVE, {}),
+        (["t_handle_screwdriver"] * 12, {}),
+    ],
+)
+def test_nested_cavities_keep_walls_and_room_for_the_fingers(
+    names: list[str], parameters: dict[str, float]
+):
+    template = KitParameters(**parameters)
+    tools = [load_tool(name) for name in names]
+    layout = layout_kit(tools, template)
+    wall = max(template.nested_wall, template.minimum_wall)
+    block = CrossSection.square((layout.parameters.length, layout.parameters.width), True)
+    rims, fingers = [], []
+    for tool, pose in zip(tools, layout.poses, strict=True):
+        assert pose.z == template.height - tool.height
+        # From the tool itself: no part of the code under test.
+        shape = tool.silhouette.rotate(np.degrees(pose.yaw)).translate((pose.x, pose.y))
+        rims.append(grown(shape, template.clearance + template.lead_in))
+        turn = tool.grasp.theta + pose.yaw
+        X = np.array([[np.cos(pose.yaw), -np.sin(pose.yaw)], [np.sin(pose.yaw), np.cos(pose.yaw)]])
+        grasp = X @ (tool.grasp.x, tool.grasp.y) + (pose.x, pose.y)
+        along = np.array([np.cos(turn), np.sin(turn)])
+        across = np.array([-np.sin(turn), np.cos(turn)])
+        boxes = []
+        for side in (-1, 1):
+            near, far = tool.grasp.width / 2, tool.grasp.width / 2 + 0.021
+            corners = [
+                grasp + side * v * across + u * along
+                for v in (near, far)
+                for u in (-0.0105, 0.0105)
+            ]
+            boxes.append(CrossSection.hull_points(np.array(corners)))
+        fingers.append(boxes[0] + boxes[1])
+    for i, rim in enumerate(rims):
+        assert (grown(rim, wall - 1e-4) - block).area() < 1e-9
+        for j, other in enumerate(rims):
+            if i != j:
+                assert (grown(rim, wall - 1e-4) ^ other).area() < 1e-9, (names[i], names[j])
+                assert (fingers[i] ^ other).area() < 1e-9, (names[i], names[j])
+    # The block is no larger than it has to be.
+    bounds = np.array(CrossSection.batch_boolean(rims, OpType.Add).bounds())
+    extents = bounds[2:] - bounds[:2]
+    size = np.array([layout.parameters.length, layout.parameters.width])
+    assert (size - extents - 2 * wall < 0.012).all()
+    assert max(size) <= 0.42
+    if len(names) > 6:
+        assert sum(rim.area() for rim in rims) > 0.3 * size.prod()
+
+
+def test_nested_kits_are_the_same_each_time_and_load(cache: Path):
+    tools = [load_tool(name) for name in SEVEN]
+    kit = make_kit(tools, PARAMETERS)
+    assert kit.layout == layout_kit(tools, PARAMETERS) == make_kit(tools, PARAMETERS).layout
+    assert kit.size[2] == PARAMETERS.height
+    block = trimesh.load_mesh(kit.sdf.parent / "kit.obj")
+    assert block.is_watertight
+    assert len(block.split()) == 1
+    np.testing.assert_allclose(block.extents, kit.size, atol=1e-6)
+    solid = Manifold(Mesh(block.vertices.astype(np.float32), block.faces.astype(np.uint32)))
+    for tool, pose in zip(tools, kit.layout.poses, strict=True):
+        assert measure_clearance(solid, tool, PARAMETERS, pose).minimum > 0.0017
+
+
+def test_a_scaled_tool_has_another_kit(tools: list[Tool], cache: Path):
+    scaled = scaled_tool(tools[0], 0.16)
+    assert make_kit([scaled], PARAMETERS).sdf != make_kit([tools[0]], PARAMETERS).sdf
+    cavity = kit_cavities([scaled], PARAMETERS)[0]
+    x_min, _, x_max, _ = cavity.outline.bounds()
+    assert x_max - x_min == pytest.approx(0.16 + 0.004, abs=4e-4)
+
+
+def test_what_no_block_holds_is_told():
+    hammers = [scaled_tool(load_tool("claw_hammer"), 0.5)] * 5
+    with pytest.raises(UserError, match=r"^'claw_hammer', .* do not fit into one kit: its block"):
+        layout_kit(hammers, KitParameters(height=0.1))
+
+
+def test_a_damaged_layout_is_told(tools: list[Tool], cache: Path):
+    kit = make_kit(tools[:1], PARAMETERS)
+    (kit.sdf.parent / "layout.json").write_text("{")
+    with pytest.raises(UserError, match=r"layout\.json is damaged"):
+        make_kit(tools[:1], PARAMETERS)

@@ -6,9 +6,6 @@ from kitting_drake.hkd.kits.kit import KitParameters, build_block, kit_cavities
 from kitting_drake.hkd.tools import toolsets as toolsets_module
 from kitting_drake.hkd.tools.tool import CATEGORIES, load_tool
 from kitting_drake.hkd.tools.toolsets import SPLITS, TOOLSET_COUNT, tool_pools, toolsets
-from kitting_drake.scenario.schema import ToolsetKitting
-from kitting_drake.tasks.kitting.scene import make_scene
-from systems.signals import PixelGrid
 
 
 def test_ten_tools_of_each_category_to_train_with_and_five_to_test():
@@ -34,17 +31,6 @@ def test_a_split_that_lacks_a_category_is_told(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(toolsets_module, "tool_names", lambda: ["claw_hammer"])
     with pytest.raises(UserError, match="no train toolsets"):
         toolsets("train")
-
-
-def test_an_episode_draws_its_toolset_from_its_split(tmp_path):
-    scenes = [
-        make_scene(ToolsetKitting(split="test"), grid=PixelGrid(), seed=seed, base=tmp_path)
-        for seed in (0, 0, 1, 2)
-    ]
-    names = [frozenset(tool.name for tool in scene.tools) for scene in scenes]
-    assert names[0] == names[1]
-    assert len(set(names)) > 1
-    assert {tool.split for scene in scenes for tool in scene.tools} == {"test"}
 
 
 def test_clearance_is_what_the_kit_was_asked_for():

@@ -1,0 +1,261 @@
+"""Nesting: where shapes of any outline go on a rectangle that is as small as can be.
+
+Shapes are placed one by one, the largest first, in a strip of a given width, each where it raises
+the used height of the strip least; of several strip widths the best is kept. On a raster, all the
+translations of a shape are tried at once: it may not go where the correlation of its mask with the
+mask of what is taken is not zero, and a fast Fourier transform gives that for the whole strip. The
+masks are conservative, so what the raster allows keeps its distances in the continuum too.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from manifold3d import CrossSection, JoinType
+from numpy.typing import NDArray
+from scipy import fft
+
+CELL = 0.0015
+"""Side of the raster's cells, in metres."""
+
+PREFERRED_SIDE = 0.42
+"""The longest side of a rectangle that is taken if there is any such, in metres."""
+
+LONGEST_SIDES = (0.48, 0.95)
+"""The longest sides of any rectangle, in metres: the workspace of 0.5 by 1 m, with a margin."""
+
+_YAWS_DEG = (0, 90, 180, 270)
+_WIDTHS = (1.0, 0.9, 1.1, 0.8, 1.25, 1.45)
+"""Strip widths that are tried, as multiples of the side of a square of the expected area."""
+_EXPECTED_USE = 0.60
+"""The share of the rectangle's area that outlines and their walls are expected to take."""
+_ELONGATION_COST = 0.10
+"""How much more area a square may have than a rectangle whose sides are as two to one."""
+_ARC_SEGMENTS = 64
+_REACH = 1.02 * CELL / math.sqrt(2)
+"""From any point to the centre of its cell, at most, in metres, and some for rounding."""
+
+Mask = NDArray[np.bool_]
+Spectrum = NDArray[np.complexfloating]
+
+
+@dataclass(frozen=True)
+class NestedShape:
+    """What takes room, in metres."""
+
+    outline: CrossSection
+    """It keeps its distance from all other outlines."""
+    keep_out: CrossSection
+    """It overlaps no other outline, though perhaps its own and other keep-outs."""
+
+
+@dataclass(frozen=True)
+class NestedPose:
+    """The pose of a shape's frame: in metres from the rectangle's centre, and in degrees."""
+
+    x: float
+    y: float
+    yaw_deg: int
+    """A multiple of 90."""
+
+
+@dataclass(frozen=True)
+class Nesting:
+    """A rectangle, and where the shapes are on it."""
+
+    length: float
+    """Along x, in metres."""
+    width: float
+    """Along y."""
+    poses: tuple[NestedPose, ...]
+    """In the order of the shapes."""
+
+
+def nest(shapes: Sequence[NestedShape], wall: float) -> Nesting | None:
+    """Places shapes on the best rectangle that is found; None if none is large enough.
+
+    The best is small and nearly square; one with a side over `PREFERRED_SIDE` is the last resort.
+    The same shapes always get the same poses.
+
+    Args:
+        shapes: at least one.
+        wall: the least distance between two outlines, and to the rectangle's edge, in metres.
+    """
+    parts = [[_Part(shape, yaw, wall) for yaw in _YAWS_DEG] for shape in shapes]
+    sizes = [int(rotated[0].walled.sum()) for rotated in parts]
+    order = sorted(range(len(shapes)), key=lambda i: -sizes[i])
+    side = math.sqrt(sum(sizes) / _EXPECTED_USE)
+    narrowest = max(min(part.size[1] for part in rotated) for rotated in parts)
+    for longest in ((PREFERRED_SIDE, PREFERRED_SIDE), LONGEST_SIDES):
+        columns, rows = (int(length / CELL) for length in longest)
+        widths = [min(columns, max(narrowest, round(share * side))) for share in _WIDTHS]
+        best, lowest_cost = None, math.inf
+        for width in dict.fromkeys([*widths, columns]):
+            placements = _fill_strip(parts, order, (rows, width), lowest_cost)
+            if placements is None:
+                continue
+            nesting = _tightened(shapes, placements, wall)
+            cost = _cost(nesting.length, nesting.width)
+            if cost < lowest_cost:
+                best, lowest_cost = nesting, cost
+        if best is not None:
+            return best
+    return None
+
+
+def _cost(length: float, width: float) -> float:
+    ratio = max(length, width) / min(length, width)
+    return length * width * (1.0 + _ELONGATION_COST * (ratio - 1.0))
+
+
+class _Part:
+    """A rotated shape as masks (rows along y, columns along x).
+
+    All masks are of one size. The corner of the shape's outline with its wall is `inset` cells
+    (along y, along x) inside them.
+    """
+
+    def __init__(self, shape: NestedShape, yaw_deg: int, wall: float) -> None:
+        self.yaw_deg = yaw_deg
+        # A point of an outline is in a cell of its `solid`. So where no such cell is in another's
+        # `walled`, outlines are further apart than the wall, and in no `keep_out`, clear of it.
+        solid = _grown(shape.outline.rotate(yaw_deg), _REACH)
+        walled = _grown(shape.outline.rotate(yaw_deg), wall + _REACH)
+        keep_out = _grown(shape.keep_out.rotate(yaw_deg), _REACH)
+        x_low, y_low, x_high, y_high = walled.bounds()
+        self.size = (_cells(y_high - y_low), _cells(x_high - x_low))
+        x_min, y_min, x_max, y_max = (walled + keep_out).bounds()
+        self.inset = (_cells(y_low - y_min), _cells(x_low - x_min))
+        self.corner = np.array([x_low, y_low])
+        """Of the outline with its wall in the rotated shape's frame, (x, y), in metres."""
+        start = self.corner - CELL * np.array(self.inset[::-1])
+        counts = (_cells(y_max - start[1]), _cells(x_max - start[0]))
+        self.solid = _rasterized(solid, start, counts)
+        self.walled = _rasterized(walled, start, counts)
+        self.keep_out = _rasterized(keep_out, start, counts)
+        self._spectra: dict[tuple[int, int], tuple[Spectrum, Spectrum]] = {}
+
+    def spectra(self, canvas: tuple[int, int]) -> tuple[Spectrum, Spectrum]:
+        """Conjugate transforms of what may not meet solids, and of what may not meet keep-outs."""
+        if canvas not in self._spectra:
+            self._spectra[canvas] = (
+                np.conj(_transform(self.on_canvas(self.walled | self.keep_out, canvas, (0, 0)))),
+                np.conj(_transform(self.on_canvas(self.solid, canvas, (0, 0)))),
+            )
+        return self._spectra[canvas]
+
+    def on_canvas(self, mask: Mask, canvas: tuple[int, int], place: tuple[int, int]) -> Mask:
+        """One of the masks with its corner at a place on a canvas that is joined at its edges."""
+        result = np.zeros(canvas, dtype=bool)
+        result[: mask.shape[0], : mask.shape[1]] = mask
+        return np.roll(result, (place[0] - self.inset[0], place[1] - self.inset[1]), axis=(0, 1))
+
+
+def _transform(mask: Mask) -> Spectrum:
+    return fft.rfft2(mask.astype(np.float32))
+
+
+def _cells(length: float) -> int:
+    return math.ceil(length / CELL - 1e-9)
+
+
+def _grown(outline: CrossSection, distance: float) -> CrossSection:
+    return outline.offset(distance, JoinType.Round, circular_segments=_ARC_SEGMENTS)
+
+
+def _rasterized(outline: CrossSection, start: NDArray[np.float64], counts: tuple[int, int]) -> Mask:
+    """Which cells have their centres inside an outline; the raster's corner is at `start`."""
+    loops = outline.to_polygons()
+    a = (np.concatenate(loops) - start) / CELL - 0.5
+    b = (np.concatenate([np.roll(loop, -1, axis=0) for loop in loops]) - start) / CELL - 0.5
+    rows = np.arange(counts[0])[:, None]
+    row, edge = np.nonzero((a[:, 1] <= rows) != (b[:, 1] <= rows))
+    (a_x, a_y), (b_x, b_y) = a[edge].T, b[edge].T
+    crossing = a_x + (row - a_y) / (b_y - a_y) * (b_x - a_x)
+    # Inside is what is right of an odd number of crossings.
+    flips = np.zeros((counts[0], counts[1] + 1), dtype=np.int64)
+    np.add.at(flips, (row, np.clip(np.ceil(crossing), 0, counts[1]).astype(int)), 1)
+    return np.cumsum(flips, axis=1)[:, :-1] % 2 == 1
+
+
+_Placement = tuple[_Part, tuple[int, int]]
+
+
+def _fill_strip(
+    parts: Sequence[Sequence[_Part]], order: Sequence[int], strip: tuple[int, int], limit: float
+) -> list[_Placement] | None:
+    """Places one part of each list in a strip of (rows, columns), each as low as it can be.
+
+    Returns:
+        For each list the part and the (row, column) of its corner; None if they do not fit, or
+        surely cost more than the limit.
+    """
+    # Keep-outs may reach out of the strip. On a canvas that is joined at its edges, that is to say
+    # under a discrete Fourier transform, they then reach into a margin on the other side.
+    overhang = max(
+        max(part.solid.shape[axis] - part.size[axis] for axis in (0, 1))
+        for rotated in parts
+        for part in rotated
+    )
+    canvas = tuple(fft.next_fast_len(extent + overhang, real=True) for extent in strip)
+    solid, keep_out = np.zeros(canvas, dtype=bool), np.zeros(canvas, dtype=bool)
+    placements: dict[int, _Placement] = {}
+    height = 0
+    for index in order:
+        taken = (_transform(solid), _transform(keep_out))
+        options = []
+        for rank, part in enumerate(parts[index]):
+            place = _lowest_place(part, taken, strip, canvas)
+            if place is not None:
+                top = place[0] + part.size[0]
+                options.append((max(height, top), top, place[1], rank, place))
+        if not options:
+            return None
+        height, _, _, rank, place = min(options)
+        if _cost(strip[1] * CELL, max(1, height) * CELL) > limit and height >= strip[1]:
+            return None
+        part = parts[index][rank]
+        solid |= part.on_canvas(part.solid, canvas, place)
+        keep_out |= part.on_canvas(part.keep_out, canvas, place)
+        placements[index] = (part, place)
+    return [placements[index] for index in range(len(parts))]
+
+
+def _lowest_place(
+    part: _Part,
+    taken: tuple[Spectrum, Spectrum],
+    strip: tuple[int, int],
+    canvas: tuple[int, int],
+) -> tuple[int, int] | None:
+    """The lowest (row, column) of a part's corner, and of those the leftmost; None for none."""
+    rows, columns = strip[0] - part.size[0] + 1, strip[1] - part.size[1] + 1
+    if rows <= 0 or columns <= 0:
+        return None
+    against_solid, against_keep_out = part.spectra(canvas)
+    overlap = fft.irfft2(taken[0] * against_solid + taken[1] * against_keep_out, s=canvas)
+    # Overlaps are whole numbers of cells.
+    free = overlap[:rows, :columns] < 0.5
+    first = int(np.argmax(free))
+    row, column = divmod(first, columns)
+    return (row, column) if free[row, column] else None
+
+
+def _tightened(
+    shapes: Sequence[NestedShape], placements: Sequence[_Placement], wall: float
+) -> Nesting:
+    """The nesting on the smallest rectangle about what was placed."""
+    origins = [CELL * np.array([column, row]) - part.corner for part, (row, column) in placements]
+    bounds = np.array(
+        [
+            np.array(shape.outline.rotate(part.yaw_deg).bounds()) + np.tile(origin, 2)
+            for shape, (part, _), origin in zip(shapes, placements, origins, strict=True)
+        ]
+    )
+    low, high = bounds[:, :2].min(axis=0) - wall, bounds[:, 2:].max(axis=0) + wall
+    centred = np.array(origins) - (low + high) / 2
+    poses = [
+        NestedPose(float(x), float(y), part.yaw_deg)
+        for (x, y), (part, _) in zip(centred, placements, strict=True)
+    ]
+    return Nesting(float(high[0] - low[0]), float(high[1] - low[1]), tuple(poses))
