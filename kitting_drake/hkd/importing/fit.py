@@ -1,17 +1,16 @@
-"""How long an imported tool is made, and whether the hand and the kit can take it then."""
+"""How long an imported tool is made, and whether the hand and a kit can take it then."""
 
-import functools
 from pathlib import Path
 
 import trimesh
-from manifold3d import CrossSection, JoinType, Manifold
+from manifold3d import Manifold
 
 from kitting_drake.common.errors import UserError
 from kitting_drake.hkd.grasps.proposals import WIDEST, propose_grasps
 from kitting_drake.hkd.importing.stable_pose import placed, size
-from kitting_drake.hkd.kits.kit import SLOTS, KitParameters, kit_cavities
+from kitting_drake.hkd.kits.kit import KitParameters, layout_kit
 from kitting_drake.hkd.tools import meshes
-from kitting_drake.hkd.tools.tool import Tool, load_tool, tool_names
+from kitting_drake.hkd.tools.tool import Tool
 
 MATERIALS = {
     "hammer": "steel",
@@ -22,7 +21,7 @@ MATERIALS = {
 """What an imported tool of a category looks like."""
 
 SCALED_LENGTHS_MM = (180.0, 170.0, 160.0, 150.0)
-"""A tool is scaled to the first of these at which kits have room for it and its neighbours."""
+"""A tool is scaled to the first of these at which the hand can hold it and a kit take it."""
 KEPT_LENGTHS_MM = (150.0, 200.0)
 """A tool of such a length keeps it: those of the dataset's tools."""
 POSSIBLE_LENGTHS_MM = (50.0, 600.0)
@@ -31,9 +30,6 @@ THINNEST_MM, HIGHEST_MM = 4.0, 45.0
 
 _UNITS = {"mm": 1.0, "m": 1000.0, "cm": 10.0, "inches": 25.4}
 _CREASE_ANGLE_DEG = 35.0
-# So many of the project's tools of a category are tried as neighbours in a kit, and as many of them
-# have to fit, by share, for a length to be kept without trying shorter ones.
-_NEIGHBOURS, _ENOUGH_ROOM = 5, 0.8
 
 
 def guess_unit(length: float) -> str | None:
@@ -82,32 +78,21 @@ def fit(
         UserError: there is none; what was wrong with the first.
     """
     refusal: UserError | None = None
-    best_room = 0.0
-    best = None
     for length in lengths:
         factor = length / size(solid)[0]
         scaled = placed(solid.scale((factor, factor, factor)).simplify(0.01))
         try:
             _check_size(scaled)
             tool = _tool(category, name, scaled, directory)
-            room = _room(tool)
+            layout_kit([tool], KitParameters())
         except UserError as error:
             refusal = refusal or error
             continue
-        if room > best_room:
-            best_room, best = room, (tool, scaled)
-        if room >= _ENOUGH_ROOM:
-            break
-    if best is None:
-        assert refusal is not None
-        raise refusal
-    tool, scaled = best
-    if tool.length < 0.9995e-3 * lengths[0]:
-        notes.append(f"made {1e3 * tool.length:.0f} mm long, so that its neighbours in a kit fit")
-    if length * 1e-3 != tool.length:
-        # What was written last was another try.
-        meshes.write_smooth_obj(tool.visual_meshes[0], scaled, _CREASE_ANGLE_DEG)
-    return tool, scaled
+        if refusal is not None:
+            notes.append(f"made {1e3 * tool.length:.0f} mm long, because {refusal}")
+        return tool, scaled
+    assert refusal is not None
+    raise refusal
 
 
 def _check_size(solid: Manifold) -> None:
@@ -154,42 +139,3 @@ def _tool(category: str, name: str, solid: Manifold, directory: Path) -> Tool:
         grasp=proposals[0].grasp,
         visual_meshes=(visual,),
     )
-
-
-def _room(tool: Tool) -> float:
-    """The share of the project's tools of each category, at least, with which a kit can be made.
-
-    Raises:
-        UserError: there is none.
-    """
-    at = f"at {1e3 * tool.length:.0f} mm length it is {1e3 * tool.width:.0f} mm wide"
-    try:
-        mine = _walled_place(tool)
-    except UserError as error:
-        raise UserError(f"{at}, too big for its place in the kit") from error
-    shares = [1.0]
-    for category, places in _neighbours().items():
-        if places and category != tool.category:
-            shares.append(sum((mine ^ other).area() < 1e-9 for other in places) / len(places))
-            if shares[-1] == 0.0:
-                raise UserError(f"{at} and leaves no room for {category} beside it in a kit")
-    return min(shares)
-
-
-@functools.cache
-def _neighbours() -> dict[str, list[CrossSection]]:
-    """What some of the project's tools take up in a kit, by category."""
-    tools = [load_tool(name) for name in tool_names()]
-    result = {}
-    for category in SLOTS:
-        others = [tool for tool in tools if tool.category == category]
-        step = max(1, len(others) // _NEIGHBOURS)
-        result[category] = [_walled_place(tool) for tool in others[::step][:_NEIGHBOURS]]
-    return result
-
-
-def _walled_place(tool: Tool) -> CrossSection:
-    """The outline in the kit of a tool's cavity with half a wall about it."""
-    parameters = KitParameters()
-    rim = kit_cavities([tool], parameters)[0].rim
-    return rim.offset(parameters.minimum_wall / 2, JoinType.Round, circular_segments=64)

@@ -15,6 +15,7 @@ from kitting_drake.hkd.grasps.annotate import save_grasp
 from kitting_drake.hkd.importing import importer
 from kitting_drake.hkd.importing.fit import guess_unit
 from kitting_drake.hkd.importing.importer import ImportRequest, import_tool
+from kitting_drake.hkd.kits.kit import KitParameters, layout_kit
 from kitting_drake.hkd.tools.meshes import vertices_and_faces
 from kitting_drake.hkd.tools.tool import load_tool, user_tool_names
 
@@ -145,6 +146,26 @@ def test_a_long_tool_is_scaled_and_a_holed_one_mended(tmp_path: Path):
     assert report.record["length"] == pytest.approx(0.180, abs=1e-6)
     assert report.record["width"] == pytest.approx(0.180 * 50 / 175, abs=1e-4)
     assert any("mended" in note for note in report.notes)
+
+
+def test_a_broad_tool_keeps_its_length(tmp_path: Path):
+    # Broader than the slot of a hammer: no tool beside it in the template would have room.
+    handle = Manifold.cube((180, 20, 14), True)
+    head = Manifold.cube((30, 130, 14), True).translate((80, 0, 0))
+    vertices, faces = vertices_and_faces(handle + head)
+    mesh = trimesh.Trimesh(vertices, faces, process=False)
+    report = bring(exported(mesh, tmp_path / "broad.stl"), tmp_path / "tools")
+    assert report.record["length"] == pytest.approx(0.185, abs=1e-5)
+    assert report.record["width"] == pytest.approx(0.130, abs=1e-5)
+    tools = [load_tool(str(report.directory)), *map(load_tool, ("tin_snips", "s_wrench"))]
+    assert len(layout_kit(tools, KitParameters()).poses) == 3
+
+
+def test_a_tool_too_high_for_a_kit_is_made_shorter(tmp_path: Path):
+    mesh = trimesh.creation.box((300, 76, 78))
+    report = bring(exported(mesh, tmp_path / "beam.stl"), tmp_path / "tools")
+    assert report.record["length"] == pytest.approx(0.170, abs=1e-5)
+    assert any("170 mm long, because at 180 mm" in note for note in report.notes)
 
 
 def test_one_body_is_made_of_several_and_of_a_soup(tmp_path: Path):
