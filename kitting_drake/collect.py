@@ -4,27 +4,27 @@ import contextlib
 import dataclasses
 import itertools
 import json
-import math
 import os
 import time
 from collections.abc import Callable, Container, Iterable, Sized
 from pathlib import Path
 
-import numpy as np
-from pydrake.systems.framework import Context
 from rich.console import Console
 
+from kitting_drake.cell import Cell
 from kitting_drake.cell.cameras import require_rendering
-from kitting_drake.cell.cell import Cell, make_grid
-from kitting_drake.common.command_line import count_type, run_verb, seed_type
+from kitting_drake.common.command_line import count_type, run_command, seed_type
 from kitting_drake.common.errors import UserError
 from kitting_drake.common.files import alone_in, claim_folder, require_folder, write_json
 from kitting_drake.common.processes import Died, counting_bar, run_apart, side_by_side
+from kitting_drake.common.provenance import versions
 from kitting_drake.common.seeds import DEMONSTRATION_SEEDS, seeds_from
-from kitting_drake.episode.episode import run_episode
+from kitting_drake.episode import EpisodeResult, ModeChange
+from kitting_drake.episode.chosen import build_chosen, run_chosen
 from kitting_drake.policies.demonstrations import (
     Demonstration,
     DemonstrationStep,
+    FinalObservation,
     Origin,
     Rejection,
     merge_demonstrations,
@@ -33,20 +33,17 @@ from kitting_drake.policies.demonstrations import (
 )
 from kitting_drake.scenario.command_line import (
     ChosenScenario,
-    build_chosen,
     choose_scenario,
     output_folder,
     scenario_parser,
-    versions,
 )
-from kitting_drake.scenario.schema import Oracle
-from systems.pick_place_planner import Mode
+from kitting_drake.scenario.policies import Oracle
 from systems.signals import Observation, PickPlaceAction
 
 LEAST_SCORE = 0.99
 """A demonstration that scores less is rejected."""
 
-_PATIENCE = 20
+_MOST_REJECTED = 20
 """So many seeds rejected in a row mean that the oracle cannot do it."""
 
 Demonstrate = Callable[[int], Demonstration | Rejection | Died]
@@ -262,9 +259,10 @@ def next_seed(
             return None
         if seed in rejected:
             in_a_row += 1
-            if in_a_row == _PATIENCE:
+            if in_a_row == _MOST_REJECTED:
+                first = seed - _MOST_REJECTED + 1
                 raise UserError(
-                    f"the oracle failed with {_PATIENCE} seeds in a row, {seed - _PATIENCE + 1} to "
+                    f"the oracle failed with {_MOST_REJECTED} seeds in a row, {first} to "
                     f"{seed}: see why by python -m kitting_drake.run with --seed {seed}"
                 )
         elif seed in accepted or seed in working:
@@ -286,7 +284,8 @@ def _origin(chosen: ChosenScenario, first_seed: int) -> Origin:
     return Origin(
         scenario_name=chosen.name,
         scenario=chosen.described,
-        grid=make_grid(chosen.scenario.heightmap),
+        grid=chosen.scenario.heightmap.grid(),
+        learning=chosen.scenario.task.learning,
         first_seed=first_seed,
         versions=versions(),
     )
@@ -303,29 +302,13 @@ def _demonstrate(chosen: ChosenScenario, seed: int) -> Demonstration | Rejection
         cell = build_chosen(chosen, seed=seed)
     except UserError as error:
         return Rejection(seed, 0.0, str(error))
-    return demonstrate(cell, seed=seed, time_limit=chosen.scenario.time_limit)
+    recorder = DemonstrationRecorder(cell)
+    result = run_chosen(chosen, cell, seed=seed, observers=[recorder.observe])
+    return recorder.demonstration(result)
 
 
-def demonstrate(cell: Cell, *, seed: int, time_limit: float) -> Demonstration | Rejection:
-    """Runs an episode of the oracle and takes down what it saw and did.
-
-    Args:
-        cell: fresh from `build_cell`, with the oracle and an `observation`.
-        seed: what it was built with.
-        time_limit: see `run_episode`.
-    """
-    recorder = Recorder(cell)
-    result = run_episode(
-        cell, scenario="", policy="", seed=seed, time_limit=time_limit, watch=recorder.watch
-    )
-    if result.failure or result.success_rate < LEAST_SCORE or not recorder.steps:
-        reason = result.failure or f"{result.success_rate:.0%} of the objects were placed"
-        return Rejection(seed, result.success_rate, reason)
-    return Demonstration(seed, result.success_rate, recorder.steps)
-
-
-class Recorder:
-    """Takes down what the planner acts upon: to be told of every step by `run_episode`."""
+class DemonstrationRecorder:
+    """Takes down what the expert saw and did: an `EpisodeObserver`."""
 
     def __init__(self, cell: Cell) -> None:
         """
@@ -333,39 +316,36 @@ class Recorder:
             cell: with the oracle and an `observation`.
         """
         self._cell = cell
-        self._mode = Mode.OBSERVE
-        self._steps: dict[str, DemonstrationStep] = {}
+        self._actions: list[tuple[Observation, PickPlaceAction]] = []
+        self._final: FinalObservation | None = None
 
-    @property
-    def steps(self) -> tuple[DemonstrationStep, ...]:
-        """The last step with each object: after a grasp that failed it is picked again."""
-        return tuple(self._steps.values())
+    def observe(self, event: ModeChange) -> None:
+        """Takes down what the planner acts upon."""
+        if event.is_last or not (event.is_action_start or event.is_stop):
+            return
+        ports = self._cell.diagram
+        observation = ports.GetOutputPort("observation").Eval(event.root_context)
+        if event.is_stop:
+            self._final = FinalObservation.of(observation)
+        else:
+            action = ports.GetOutputPort("action").Eval(event.root_context)
+            self._actions.append((observation, action))
 
-    def watch(self, root_context: Context, mode: Mode) -> None:
-        """For `run_episode`."""
-        previous, self._mode = self._mode, mode
-        # The plant steps first, then the planner decides upon the outcome: what it decided upon is
-        # still there when the step is over, and the ports say the same again.
-        if previous == Mode.OBSERVE and mode == Mode.APPROACH:
-            self._take_down(root_context)
-
-    def _take_down(self, root_context: Context) -> None:
-        cell = self._cell
-        observation: Observation = cell.diagram.GetOutputPort("observation").Eval(root_context)
-        action: PickPlaceAction = cell.diagram.GetOutputPort("action").Eval(root_context)
-        plant_context = cell.plant.GetMyContextFromRoot(root_context)
-        distances = []
-        for tool, body in zip(cell.scene.tools, cell.tool_bodies, strict=True):
-            grasp = np.array([tool.grasp.x, tool.grasp.y, 0.0])
-            x, y, _ = body.EvalPoseInWorld(plant_context) @ grasp
-            distances.append(math.hypot(x - action.pick.x, y - action.pick.y))
-        tool = cell.scene.tools[int(np.argmin(distances))]
-        # What is taken down again moves to the end.
-        self._steps.pop(tool.name, None)
-        self._steps[tool.name] = DemonstrationStep.of(
-            observation, action, name=tool.name, category=tool.category
+    def demonstration(self, result: EpisodeResult) -> Demonstration | Rejection:
+        """The demonstration of the episode, now that it is over; steps that failed are left out."""
+        steps = tuple(
+            DemonstrationStep.of(observation, action, name=item.object, category=item.category)
+            for (observation, action), item in zip(
+                self._actions, result.actions_taken, strict=True
+            )
+            if item.outcome == "placed"
         )
+        if result.failure or result.success_rate < LEAST_SCORE or not steps:
+            reason = result.failure or f"the reward was {result.success_rate:.0%}"
+            return Rejection(result.seed, result.success_rate, reason)
+        # All goals are filled: whether the expert was asked again or not, nothing is left to do.
+        return Demonstration(result.seed, result.success_rate, steps, self._final)
 
 
 if __name__ == "__main__":
-    run_verb(main)
+    run_command(main)

@@ -7,34 +7,36 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 from pydrake.common.value import AbstractValue, Value
 from pydrake.math import RigidTransform
-from pydrake.multibody.tree import BodyIndex
 from pydrake.systems.framework import Context, LeafSystem
 
-from systems.placement_monitor import heading
-from systems.signals import PickPlaceAction, PixelGrid, PlanarPose, wrap_to_pi
+from systems.action_quantizer import ActionQuantizer
+from systems.grasp import Grasp
+from systems.hand_geometry import FINGER_LENGTH, FINGERTIP_DEPTH, MAX_OPENING
+from systems.placement import (
+    Goal,
+    PlacedObject,
+    Placement,
+    SuccessPredicate,
+    displacement,
+    evaluate_placements,
+    heading,
+)
+from systems.signals import PickPlaceAction, PlanarPose, SurfaceHeights, wrap_to_pi
+
+_NEAR_GOAL = 0.03
+"""An object displaced by less is at its goal, though it may not fill it, in metres."""
+_SAME_HEIGHT = 0.005
+"""Objects whose heights differ by less are picked in the order given, in metres."""
+_TIP_DEPTH = 0.010
+"""How far below an object's top the fingertips are taken to reach, in metres."""
+_RELEASE = 0.006
+"""How far each jaw draws back to let go, in metres."""
 
 
-@dataclass(frozen=True)
-class OracleTarget:
-    """One object, where it belongs and how it is held."""
-
-    name: str
-    body: BodyIndex
-    """The object's body B."""
-    X_WGoal: RigidTransform
-    """The pose that B should have."""
-    grasp: PlanarPose
-    """The annotated grasp in the plane of B: (x, y) in metres; at theta zero the jaws close along
-    B's y."""
-    surface_height: float
-    """Height of the object's top at the grasp, above B's origin, in metres."""
-    rim_height: float | None = None
-    """See `PickPlaceAction`."""
-
-
-def gripper_pose(X_WB: RigidTransform, grasp: PlanarPose) -> PlanarPose:
+def gripper_pose(X_WB: RigidTransform, grasp: PlanarPose | Grasp) -> PlanarPose:
     """The gripper pose in the world that holds an object at X_WB by its grasp."""
     yaw = heading(X_WB)
     x, y, _ = X_WB @ np.array([grasp.x, grasp.y, 0.0])
@@ -53,27 +55,17 @@ def grasp_taken(X_WB: RigidTransform, gripper: PlanarPose) -> PlanarPose:
 
 
 @dataclass(frozen=True)
-class Rounding:
-    """How finely a policy of the paper can say an action (section III-A)."""
+class _Plan:
+    """One object, the grasp to hold it by, and where it is to go."""
 
-    grid: PixelGrid
-    """Positions are centres of its pixels."""
-    orientations: int
-    """N: angles are among 2 pi i / N."""
-
-    def position(self, x: float, y: float) -> tuple[float, float]:
-        """The nearest pixel centre, in metres."""
-        pixel = np.clip(np.round(self.grid.to_pixel((x, y))), 0, np.array(self.grid.shape) - 1)
-        rounded_x, rounded_y = self.grid.to_world(pixel)
-        return float(rounded_x), float(rounded_y)
-
-    def angle(self, theta: float) -> float:
-        """The nearest of the N orientations, in radians."""
-        return round(theta * self.orientations / math.tau) * math.tau / self.orientations
+    index: int
+    grasp: Grasp
+    X_WGoal: RigidTransform
+    goal: Goal
 
 
 class OraclePolicy(LeafSystem):
-    """Picks each object by its annotated grasp and places it at its goal, from the ground truth.
+    """Fills one goal after another, from the ground truth.
 
     .. pydrake_system::
 
@@ -84,13 +76,21 @@ class OraclePolicy(LeafSystem):
         - action
 
     - `body_poses` (abstract, list of RigidTransform by body index): the plant's port of that name.
-    - `action` (abstract, `PickPlaceAction`): for the first object, in the order given, that is
-      further from its goal than `done_distance` horizontally; `stop` when there is none.
+    - `action` (abstract, `PickPlaceAction`): an object and a goal that it may fill; `stop` when
+      every goal is filled.
 
-    With a rounding it answers the best that a network can say: the pick is the annotated grasp,
-    rounded; the place is where the gripper, *holding the object as the rounded pick does*, brings
-    it to its goal, and its position and the object's turn are rounded in their turn. That is how
-    a place network is labelled whose crop is centred on the pick (section III-C.2).
+    The law. The next goal is the first, in the order given, that is not filled and whose
+    prerequisites are; goals whose object is already there, though not as it should be, come last.
+    Of the objects that may fill it and fill no other, the highest is taken, as nothing lies on it;
+    of several as high, the one assigned to the goal by `evaluate_placements`. Of the goal's poses
+    it takes the free one that rotates the object least, and of the object's grasps the first at
+    which the fingers are clear of other objects at the pick and at the place.
+
+    With a quantizer it answers the best action that a policy of the paper can choose: the pick is
+    the annotated grasp, rounded; the place is where the gripper, *holding the object as the rounded
+    pick does*, brings it to its goal, and its position and the object's rotation are rounded in
+    turn. That is how a place network is labelled whose crop is centred on the pick (section
+    III-C.2).
 
     Stateless: an object whose grasp failed still lies where it lay, and is the answer again.
     """
@@ -98,61 +98,195 @@ class OraclePolicy(LeafSystem):
     def __init__(
         self,
         *,
-        targets: Sequence[OracleTarget],
-        done_distance: float = 0.03,
-        rounding: Rounding | None = None,
+        objects: Sequence[PlacedObject],
+        grasps: Sequence[Sequence[Grasp]],
+        goals: Sequence[Goal],
+        success: SuccessPredicate,
+        quantizer: ActionQuantizer | None = None,
     ) -> None:
         """
         Args:
-            targets: the objects, in the order in which they are to be placed.
-            done_distance: an object this close to its goal is left alone, in metres.
-            rounding: of the answers; exact when None.
+            objects: n of them.
+            grasps: n, the grasps of each, best first; empty for one that no goal takes.
+            goals: what is to be brought about, in the order in which to do it.
+            success: when a goal is filled.
+            quantizer: of the actions; exact when None.
 
         Raises:
-            ValueError: no targets.
+            ValueError: no goals, or an object of a goal without a grasp.
         """
         super().__init__()
-        if not targets:
-            raise ValueError("an oracle needs at least one target")
-        self._targets = tuple(targets)
-        self._done_distance = done_distance
-        self._rounding = rounding
-        poses = self.DeclareAbstractInputPort("body_poses", Value([RigidTransform()]))
-        self._body_poses = poses
+        if not goals:
+            raise ValueError("an oracle needs at least one goal")
+        for index in {index for goal in goals for index in goal.objects}:
+            if not grasps[index]:
+                raise ValueError(f"{objects[index].name} has no grasp")
+        self._objects, self._goals, self._success = tuple(objects), tuple(goals), success
+        self._grasps = tuple(tuple(choices) for choices in grasps)
+        self._quantizer = quantizer
+        self._body_poses = self.DeclareAbstractInputPort("body_poses", Value([RigidTransform()]))
         self.DeclareAbstractOutputPort(
-            "action", lambda: Value(PickPlaceAction()), self._calc_action, {poses.ticket()}
+            "action",
+            lambda: Value(PickPlaceAction()),
+            self._calc_action,
+            {self._body_poses.ticket()},
         )
 
     def _calc_action(self, context: Context, output: AbstractValue) -> None:
-        poses = self._body_poses.Eval(context)
-        for target in self._targets:
-            X_WB = poses[int(target.body)]
-            offset = X_WB.translation() - target.X_WGoal.translation()
-            if math.hypot(offset[0], offset[1]) < self._done_distance:
-                continue
-            pick, place = self._poses(X_WB, target)
-            output.set_value(
-                PickPlaceAction(
-                    pick=pick,
-                    place=place,
-                    surface_height=X_WB.translation()[2] + target.surface_height,
-                    rim_height=target.rim_height,
+        bodies = self._body_poses.Eval(context)
+        poses = [bodies[int(item.body)] for item in self._objects]
+        placements = evaluate_placements(self._objects, self._goals, self._success, poses)
+        plan = self._plan(poses, placements)
+        output.set_value(PickPlaceAction(stop=True) if plan is None else self._action(plan, poses))
+
+    def _plan(self, poses: list[RigidTransform], placements: list[Placement]) -> _Plan | None:
+        """What to do next; None when every goal is filled, or none can be."""
+        filled = {item.goal for item in placements if item.success}
+        failed_there = {
+            item.goal
+            for index, item in enumerate(placements)
+            if item.goal is not None and self._is_near(index, item, poses[index])
+        }
+        open_goals = [
+            index
+            for index, goal in enumerate(self._goals)
+            if index not in filled and filled.issuperset(goal.after)
+        ]
+        for index in sorted(open_goals, key=lambda index: index in failed_there):
+            goal = self._goals[index]
+            item = self._choose_object(index, poses, placements)
+            if item is not None:
+                X_WGoal = self._choose_pose(goal, item, poses)
+                grasp = self._choose_grasp(item, X_WGoal, goal, poses)
+                return _Plan(item, grasp, X_WGoal, goal)
+        return None
+
+    def _is_near(self, index: int, placement: Placement, X_WB: RigidTransform) -> bool:
+        assert placement.goal is not None
+        goal = self._goals[placement.goal]
+        X_WGoal = goal.poses[placement.pose]
+        item = self._objects[index]
+        return displacement(item, X_WGoal, X_WB, any_heading=goal.any_heading) < _NEAR_GOAL
+
+    def _choose_object(
+        self, goal: int, poses: list[RigidTransform], placements: list[Placement]
+    ) -> int | None:
+        free = [
+            index
+            for index in self._goals[goal].objects
+            if not placements[index].success or placements[index].goal == goal
+        ]
+        if not free:
+            return None
+        heights = {i: float((poses[i] @ self._objects[i].p_BMiddle)[2]) for i in free}
+        highest = max(heights.values())
+        on_top = [index for index in free if heights[index] > highest - _SAME_HEIGHT]
+        return min(on_top, key=lambda index: placements[index].goal != goal)
+
+    def _choose_pose(self, goal: Goal, item: int, poses: list[RigidTransform]) -> RigidTransform:
+        yaw = heading(poses[item])
+        free = [X for X in goal.poses if not self._is_taken(X, item, poses)] or list(goal.poses)
+        return min(free, key=lambda X: abs(wrap_to_pi(heading(X) - yaw)))
+
+    def _is_taken(self, X_WGoal: RigidTransform, item: int, poses: list[RigidTransform]) -> bool:
+        """Whether another object's middle is where this one's would be."""
+        middle = X_WGoal @ self._objects[item].p_BMiddle
+        return any(
+            bool(np.linalg.norm(X_WB @ other.p_BMiddle - middle) < _NEAR_GOAL / 2)
+            for index, (other, X_WB) in enumerate(zip(self._objects, poses, strict=True))
+            if index != item
+        )
+
+    def _choose_grasp(
+        self, item: int, X_WGoal: RigidTransform, goal: Goal, poses: list[RigidTransform]
+    ) -> Grasp:
+        grasps = self._grasps[item]
+        if len(grasps) == 1:
+            return grasps[0]
+        others = np.concatenate(
+            [np.zeros((0, 3))]
+            + [
+                X_WB.multiply(other.p_BPoints.T).T
+                for index, (other, X_WB) in enumerate(zip(self._objects, poses, strict=True))
+                if index != item
+            ]
+        )
+
+        def obstruction(grasp: Grasp) -> int:
+            place = self._arrival(poses[item], X_WGoal, goal)
+            return sum(
+                _count_within_fingers(others, gripper_pose(X_WB, grasp), tip, reach)
+                for X_WB, tip, reach in (
+                    (
+                        poses[item],
+                        poses[item].translation()[2] + grasp.surface_height - _TIP_DEPTH,
+                        (grasp.width / 2, MAX_OPENING / 2 + FINGERTIP_DEPTH),
+                    ),
+                    (
+                        place,
+                        X_WGoal.translation()[2] + grasp.surface_height - _TIP_DEPTH,
+                        (grasp.width / 2, grasp.width / 2 + _RELEASE + FINGERTIP_DEPTH),
+                    ),
                 )
             )
-            return
-        output.set_value(PickPlaceAction(stop=True))
 
-    def _poses(self, X_WB: RigidTransform, target: OracleTarget) -> tuple[PlanarPose, PlanarPose]:
-        """Pick and place of an object at X_WB."""
-        pick, grasp = gripper_pose(X_WB, target.grasp), target.grasp
-        rounding = self._rounding
-        if rounding is not None:
-            pick = PlanarPose(*rounding.position(pick.x, pick.y), rounding.angle(pick.theta))
-            grasp = grasp_taken(X_WB, pick)
-        place = gripper_pose(target.X_WGoal, grasp)
+        return min(grasps, key=obstruction)
+
+    @staticmethod
+    def _arrival(X_WB: RigidTransform, X_WGoal: RigidTransform, goal: Goal) -> RigidTransform:
+        """Where an object now at X_WB is brought to."""
+        if not goal.any_heading:
+            return X_WGoal
+        return RigidTransform(X_WB.rotation(), X_WGoal.translation())
+
+    def _action(self, plan: _Plan, poses: list[RigidTransform]) -> PickPlaceAction:
+        X_WB = poses[plan.index]
+        pick = gripper_pose(X_WB, plan.grasp)
+        held: PlanarPose | Grasp = plan.grasp
+        quantizer = self._quantizer
+        if quantizer is not None:
+            pick = PlanarPose(*quantizer.position(pick.x, pick.y), quantizer.angle(pick.theta))
+            held = grasp_taken(X_WB, pick)
+        place = gripper_pose(self._arrival(X_WB, plan.X_WGoal, plan.goal), held)
         theta = wrap_to_pi(pick.theta)
-        turn = wrap_to_pi(place.theta - pick.theta)
-        if rounding is not None:
-            place = PlanarPose(*rounding.position(place.x, place.y))
-            turn = rounding.angle(turn)
-        return PlanarPose(pick.x, pick.y, theta), PlanarPose(place.x, place.y, theta + turn)
+        rotation = wrap_to_pi(place.theta - pick.theta)
+        if quantizer is not None:
+            place = PlanarPose(*quantizer.position(place.x, place.y))
+            rotation = quantizer.angle(rotation)
+        return PickPlaceAction(
+            pick=PlanarPose(pick.x, pick.y, theta),
+            place=PlanarPose(place.x, place.y, theta + rotation),
+            heights=self._heights(plan, poses),
+        )
+
+    def _heights(self, plan: _Plan, poses: list[RigidTransform]) -> SurfaceHeights:
+        tops = [
+            float(X_WB.multiply(item.p_BPoints.T)[2].max())
+            for item, X_WB in zip(self._objects, poses, strict=True)
+        ]
+        rim = plan.goal.rim_height
+        bottom = poses[plan.index].translation()[2]
+        return SurfaceHeights(
+            pick_top=bottom + plan.grasp.surface_height,
+            support=bottom,
+            place_rim=0.0 if rim is None else rim,
+            highest=max(*tops, *([] if rim is None else [rim]), 0.0),
+        )
+
+
+def _count_within_fingers(
+    points: NDArray[np.float64], gripper: PlanarPose, tip: float, reach: tuple[float, float]
+) -> int:
+    """How many points (m, 3) are where the fingers are.
+
+    Args:
+        points: in the world, in metres.
+        gripper: where the gripper is.
+        tip: world z of the fingertips, in metres.
+        reach: how near to, and how far from, its middle a finger reaches along the jaws, in metres.
+    """
+    cos, sin = math.cos(gripper.theta), math.sin(gripper.theta)
+    dx, dy = points[:, 0] - gripper.x, points[:, 1] - gripper.y
+    along, across = np.abs(cos * dx + sin * dy), np.abs(cos * dy - sin * dx)
+    inside = (along < FINGER_LENGTH / 2) & (across > reach[0]) & (across < reach[1])
+    return int((inside & (points[:, 2] > tip)).sum())

@@ -1,9 +1,10 @@
 """The modes of the pick-and-place motion primitive, and its heights, speeds and thresholds."""
 
 import enum
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from systems.bounds import bounded
+from systems.insertion_search import InsertionSearch
 
 
 class Mode(enum.IntEnum):
@@ -29,7 +30,7 @@ class Mode(enum.IntEnum):
     """Straight up from where the hand is."""
     DONE = 10
     SEARCH = 11
-    """Lowering was blocked: turn to and fro, lightly pressed down, and feel for the cavity."""
+    """Insertion was blocked: feel for the cavity, see `InsertionSearch`."""
 
 
 @dataclass
@@ -39,14 +40,15 @@ class PickPlaceParameters:
     # Where the hand waits while the cameras look: x, y, height of the fingertips (m), yaw (rad).
     home: list[float] = bounded([0.35, 0.0, 0.52, 0.0], -2.0, 2.0)
 
-    # Height of the fingertips while crossing the table, in m. What hangs below them must clear the
-    # kit block and tools that stand proud of it.
+    # Least height of the fingertips while crossing the table, in m. It is more where the highest
+    # surface of o_t, what hangs below the fingertips and travel_clearance ask for more.
     travel_height: float = bounded(0.115, 0.05, 0.5)
+    travel_clearance: float = bounded(0.015, 0.0, 0.1)
 
     # How far below the top of an object the fingertips grip, in m.
     grasp_depth: float = bounded(0.010, 0.001, 0.05)
 
-    # The fingertips stay this far above z = 0, in m.
+    # The fingertips stay this far above the table, in m.
     floor_clearance: float = bounded(0.0015, 0.0, 0.05)
 
     # Opening of the jaws before a grasp, in m.
@@ -61,7 +63,7 @@ class PickPlaceParameters:
     # Less than this between the pads is nothing at all, in m.
     minimum_width: float = bounded(0.003, 0.0, 0.08)
 
-    # A vertical contact force beyond the load's weight that means "touched", in N.
+    # A vertical contact force beyond the payload's weight that means "touched", in N.
     contact_threshold: float = bounded(4.0, 0.5, 100.0)
 
     # Highest linear speed (m/s) and acceleration (m/s^2) in free space.
@@ -80,9 +82,8 @@ class PickPlaceParameters:
     descend_speed: float = bounded(0.20, 0.005, 1.0)
     lower_speed: float = bounded(0.08, 0.005, 1.0)
 
-    # How far the hand turns to and fro where lowering is blocked, in rad: a tool that the closing
-    # jaws turned a little slips into its cavity then. At zero it is let go where it is.
-    search_turn: float = bounded(0.12, 0.0, 0.5)
+    # What the hand does where an insertion is blocked. Only for places that are insertions.
+    search: InsertionSearch = field(default_factory=InsertionSearch)
 
     # Speed of one finger, in m/s.
     finger_speed: float = bounded(0.05, 0.005, 0.05)
@@ -90,9 +91,9 @@ class PickPlaceParameters:
     # Time in which the grasp force builds up, and falls away again, in s.
     force_ramp: float = bounded(0.15, 0.0, 5.0)
 
-    # The hand must rest this long, in s: before the cameras look, and before a load is weighed.
+    # The hand must rest this long, in s: before the cameras look, and before the payload is tared.
     observe_settle: float = bounded(0.25, 0.0, 10.0)
-    weigh_settle: float = bounded(0.10, 0.0, 10.0)
+    tare_settle: float = bounded(0.10, 0.0, 10.0)
 
-    # After this many actions the planner is done, whatever the policy says.
-    max_actions: int = bounded(4, 0, 1000)
+    # After this many actions the planner is done, whatever the policy says; null: the task's.
+    max_actions: int | None = bounded(None, 0, 1000)

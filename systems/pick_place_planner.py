@@ -23,7 +23,8 @@ from systems.hand_motion import (
     ramp,
 )
 from systems.pick_place_parameters import Mode, PickPlaceParameters
-from systems.signals import PickPlaceAction, PlanarPose, wrap_to_pi
+from systems.signals import Observation, PickPlaceAction, PlanarPose, SurfaceHeights, wrap_to_pi
+from systems.surface_heights import read_surface_heights
 
 _FIELDS = (
     ["mode", "start_time", "duration"]
@@ -32,8 +33,9 @@ _FIELDS = (
     + [f"start_rate_{axis}" for axis in ("x", "y", "z", "yaw")]
     + ["start_opening", "goal_opening", "start_force", "goal_force"]
     + ["pick_x", "pick_y", "pick_yaw", "place_x", "place_y", "place_yaw", "grasp_z"]
-    + ["hold_z", "rim_height", "touch_z", "swing"]
-    + ["load", "actions", "missed", "dropped"]
+    + ["travel_z", "table_z", "support_z", "rim_z"]
+    + ["hold_z", "touch_z", "search_step"]
+    + ["payload", "actions", "missed", "dropped"]
 )
 _PlannerState = namedview("PlannerState", _FIELDS)
 _State: TypeAlias = Any
@@ -41,21 +43,11 @@ _State: TypeAlias = Any
 
 _START, _GOAL, _START_RATE = slice(3, 7), slice(7, 11), slice(11, 15)
 
-_SUNK = 0.0007
-"""What is lowered and touches something is blocked unless it is this far below the rim, in m."""
-_PRESS = 0.001
-"""While searching, the hand is to be this far below where it was stopped, in m: its stiffness makes
-a light pressure of it."""
-_SWINGS = (0.5, -0.5, 1.0, -1.0, 0.0)
-"""Where the search turns to, in parts of `search_turn`."""
-_SWING_SPEED = 0.3
-"""In rad/s: the free space around a tool is about 3 degrees wide, and is not to be missed."""
 
-
-def nearest_turns(pick_yaw: float, place_yaw: float) -> tuple[float, float]:
+def nearest_yaws(pick_yaw: float, place_yaw: float) -> tuple[float, float]:
     """The equivalent yaws that keep the wrist nearest its middle.
 
-    The jaws are alike, so both yaws may be turned by pi together, and either by a whole turn.
+    The jaws are alike, so both yaws may be rotated by pi together, and either by 2 pi.
 
     Returns:
         (pick, place) in radians, the larger of whose magnitudes is smallest.
@@ -77,6 +69,7 @@ class PickPlacePlanner(LeafSystem):
         - hand_state
         - hand_contact_force
         - action
+        - observation (optional)
         output_ports:
         - desired_motion
         - desired_opening
@@ -89,6 +82,9 @@ class PickPlacePlanner(LeafSystem):
       what a force-torque sensor at the wrist and one in each finger would read. Up is positive.
     - `action` (abstract, `PickPlaceAction`): evaluated only at the moment in which the planner,
       at rest at home, asks for it. Nothing upstream (policy, cameras) is computed at other times.
+    - `observation` (abstract, `Observation`): o_t, evaluated together with the action: the heights
+      under the pick and around the place are read off it. Where it is not connected, as where
+      nothing can be rendered, the action must bring its own.
     - `desired_motion` (12): q_d, v_d, a_d of (x, y, z, yaw).
     - `desired_opening` (2): the opening between the pads in m, and its rate.
     - `closing_force` (1): what each pad presses beyond that, in N.
@@ -97,37 +93,51 @@ class PickPlacePlanner(LeafSystem):
 
     Every motion is a straight line in (x, y, z, yaw) with a minimum-jerk profile, at rest at both
     ends (a `RETREAT` from an object that was lost brakes first), as short as the limits on speed
-    and acceleration allow. The two guarded motions, `DESCEND`
-    and `LOWER`, stop dead where the vertical contact force rises `contact_threshold` above what the
-    load weighs, and hold the height reached: no known height of table, kit or cavity tells them
-    where to stop. Where the action says how high the rim of the cavity is, and the object, which
-    lay on the table z = 0, comes to stand on it, the hand feels for the cavity (`SEARCH`) and
-    lowers again once the resistance ends. A grasp is good if the pads stand further apart than
-    `minimum_width` and both feel at least half of the grasp force; when it is not, or is lost on
-    the way, the hand rises, opens on the way home and looks again, which counts as an action.
+    and acceleration allow. The two guarded motions, `DESCEND` and `LOWER`, stop dead where the
+    vertical contact force rises `contact_threshold` above the payload's weight, and hold the height
+    reached: no known height of table, kit or cavity tells them where to stop. Where places are
+    insertions, and the object comes to stand on the rim around its place, the hand feels for the
+    cavity (`SEARCH`) and lowers again once the resistance ends. A grasp is good if the pads stand
+    further apart than `minimum_width` and both feel at least half of the grasp force; when it is
+    not, or is lost on the way, the hand rises, opens on the way home and observes again, which
+    counts as an action.
 
     All memory is one vector of discrete state.
     """
 
-    def __init__(self, *, parameters: PickPlaceParameters, period: float = 1 / 64) -> None:
+    def __init__(
+        self,
+        *,
+        parameters: PickPlaceParameters,
+        max_actions: int,
+        insertion: bool = False,
+        period: float = 1 / 64,
+    ) -> None:
         """
         Args:
-            parameters: heights, speeds, thresholds.
-            period: how often the state machine looks, in s.
+            parameters: heights, speeds, thresholds; `max_actions` among them comes first.
+            max_actions: after so many actions it is done, unless the parameters say otherwise.
+            insertion: whether places are insertions, for which to search.
+            period: how often the state machine is updated, in s.
         """
         super().__init__()
         self._parameters = parameters
+        given = parameters.max_actions
+        self._max_actions = max_actions if given is None else given
+        self._search_steps = parameters.search.steps if insertion else 0
         self._motions = _motions(parameters)
         model = np.zeros(len(_FIELDS))
         state = _PlannerState(model)
         state[_START] = state[_GOAL] = parameters.home
         state.start_opening = state.goal_opening = parameters.open_width
+        state.travel_z = parameters.travel_height
         self._state_index = self.DeclareDiscreteState(model)
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
 
         self._hand_state = self.DeclareVectorInputPort("hand_state", 12)
         self._contact_force = self.DeclareVectorInputPort("hand_contact_force", 6)
         self._action = self.DeclareAbstractInputPort("action", Value(PickPlaceAction()))
+        self._observation = self.DeclareAbstractInputPort("observation", Value(Observation()))
         state_and_time = {self.discrete_state_ticket(self._state_index), self.time_ticket()}
         self.DeclareVectorOutputPort("desired_motion", 12, self._calc_motion, state_and_time)
         self.DeclareVectorOutputPort("desired_opening", 2, self._calc_opening, state_and_time)
@@ -210,24 +220,41 @@ class PickPlacePlanner(LeafSystem):
     def _observe(self, context, state, time, hand, contact) -> None:
         if time < self._arrival(state) + self._parameters.observe_settle:
             return
-        if state.actions >= self._parameters.max_actions:
+        if state.actions >= self._max_actions:
             self._begin(state, Mode.DONE, time)
             return
         action: PickPlaceAction = self._action.Eval(context)
         if action.stop:
             self._begin(state, Mode.DONE, time)
             return
-        pick_yaw, place_yaw = nearest_turns(action.pick.theta, action.place.theta)
+        pick_yaw, place_yaw = nearest_yaws(action.pick.theta, action.place.theta)
         state.pick_x, state.pick_y, state.pick_yaw = action.pick.x, action.pick.y, pick_yaw
         state.place_x, state.place_y, state.place_yaw = action.place.x, action.place.y, place_yaw
-        state.grasp_z = max(
-            action.surface_height - self._parameters.grasp_depth, self._parameters.floor_clearance
-        )
-        # No height is above NaN.
-        state.rim_height = np.nan if action.rim_height is None else action.rim_height
-        state.swing = 0
+        self._set_heights(state, self._heights(context, action))
+        state.search_step = 0
         state.actions += 1
         self._begin(state, Mode.APPROACH, time)
+
+    def _heights(self, context: Context, action: PickPlaceAction) -> SurfaceHeights:
+        if self._observation.HasValue(context):
+            observation = self._observation.Eval(context)
+            return read_surface_heights(observation, action.pick, action.place)
+        if action.heights is None:
+            raise RuntimeError(
+                "the planner's port `observation` is not connected, and the action has no heights"
+            )
+        return action.heights
+
+    def _set_heights(self, state: _State, heights: SurfaceHeights) -> None:
+        parameters = self._parameters
+        floor = heights.table + parameters.floor_clearance
+        state.grasp_z = max(heights.pick_top - parameters.grasp_depth, floor)
+        state.table_z, state.support_z = heights.table, heights.support
+        state.rim_z = heights.place_rim
+        hanging = max(state.grasp_z - heights.support, 0.0)
+        state.travel_z = max(
+            parameters.travel_height, heights.highest + hanging + parameters.travel_clearance
+        )
 
     def _follow(self, context, state, time, hand, contact) -> None:
         if time >= self._arrival(state):
@@ -255,7 +282,7 @@ class PickPlacePlanner(LeafSystem):
             self._begin(state, Mode.CHECK, time, opening=opening)
 
     def _check(self, context, state, time, hand, contact) -> None:
-        if time < self._arrival(state) + self._parameters.weigh_settle:
+        if time < self._arrival(state) + self._parameters.tare_settle:
             return
         if self._is_held(hand, contact):
             state.hold_z = hand[2]
@@ -270,15 +297,15 @@ class PickPlacePlanner(LeafSystem):
             self._begin(state, Mode.RETREAT, time)
         elif state.mode == Mode.LIFT and time >= self._arrival(state):
             self._begin(state, Mode.CARRY, time)
-        elif time >= self._arrival(state) + self._parameters.weigh_settle:
-            state.load = contact[2]
+        elif time >= self._arrival(state) + self._parameters.tare_settle:
+            state.payload = contact[2]
             self._begin(state, Mode.LOWER, time)
 
     def _lower(self, context, state, time, hand, contact) -> None:
         if not self._is_held(hand, contact):
             state.dropped += 1
             self._begin(state, Mode.RETREAT, time)
-        elif contact[2] - state.load > self._parameters.contact_threshold:
+        elif contact[2] - state.payload > self._parameters.contact_threshold:
             if self._is_blocked(state, hand):
                 state.touch_z = hand[2]
                 self._begin(state, Mode.SEARCH, time, z=hand[2])
@@ -288,25 +315,24 @@ class PickPlacePlanner(LeafSystem):
             self._begin(state, Mode.RELEASE, time)
 
     def _search(self, context, state, time, hand, contact) -> None:
-        free = contact[2] - state.load < self._parameters.contact_threshold / 2
+        free = contact[2] - state.payload < self._parameters.contact_threshold / 2
         if not self._is_held(hand, contact):
             state.dropped += 1
             self._begin(state, Mode.RETREAT, time)
-        elif free and hand[2] < state.touch_z - _PRESS / 2:
+        elif free and self._parameters.search.has_slipped_in(hand[2], state.touch_z):
             # Given a height, it stops dead: here the object fits.
             self._begin(state, Mode.LOWER, time, z=hand[2])
         elif time >= self._arrival(state):
-            state.swing += 1
-            if state.swing < len(_SWINGS):
+            state.search_step += 1
+            if state.search_step < self._search_steps:
                 self._begin(state, Mode.SEARCH, time)
             else:
                 self._begin(state, Mode.RELEASE, time, z=hand[2])
 
     def _is_blocked(self, state: _State, hand: NDArray[np.float64]) -> bool:
-        # When it was grasped, it lay on the table.
-        bottom = hand[2] - state.hold_z
-        left = state.swing < len(_SWINGS) and self._parameters.search_turn > 0
-        return bool(left and bottom > state.rim_height - _SUNK)
+        bottom = hand[2] - state.hold_z + state.support_z
+        left = state.search_step < self._search_steps
+        return left and self._parameters.search.is_on_rim(float(bottom), float(state.rim_z))
 
     def _is_held(self, hand: NDArray[np.float64], contact: NDArray[np.float64]) -> bool:
         # Contact pushes the fingers apart: along their positive axes.
@@ -355,7 +381,7 @@ class PickPlacePlanner(LeafSystem):
             state[_GOAL] = parameters.home
             state.goal_opening = parameters.open_width
         elif mode == Mode.APPROACH:
-            state[_GOAL] = (state.pick_x, state.pick_y, parameters.travel_height, state.pick_yaw)
+            state[_GOAL] = (state.pick_x, state.pick_y, state.travel_z, state.pick_yaw)
         elif mode == Mode.DESCEND:
             state.goal_z = state.grasp_z
         elif mode == Mode.CLOSE:
@@ -363,14 +389,14 @@ class PickPlacePlanner(LeafSystem):
         elif mode == Mode.CHECK:
             state.goal_force = parameters.grasp_force
         elif mode == Mode.LIFT:
-            state.goal_z = parameters.travel_height
+            state.goal_z = state.travel_z
         elif mode == Mode.CARRY:
-            state[_GOAL] = (state.place_x, state.place_y, parameters.travel_height, state.place_yaw)
+            state[_GOAL] = (state.place_x, state.place_y, state.travel_z, state.place_yaw)
         elif mode == Mode.LOWER:
-            state.goal_z = parameters.floor_clearance
+            state.goal_z = state.table_z + parameters.floor_clearance
         elif mode == Mode.SEARCH:
-            state.goal_yaw = state.place_yaw + _SWINGS[int(state.swing)] * parameters.search_turn
-            state.goal_z = state.touch_z - _PRESS
+            state.goal_yaw = state.place_yaw + parameters.search.yaw_offset(int(state.search_step))
+            state.goal_z = state.touch_z - parameters.search.press
         elif mode in (Mode.RELEASE, Mode.RETREAT):
             state.goal_force = 0.0
             state.goal_opening = min(
@@ -378,7 +404,7 @@ class PickPlacePlanner(LeafSystem):
             )
             if mode == Mode.RETREAT:
                 state.goal_opening = now_opening
-                state.goal_z = parameters.travel_height
+                state.goal_z = state.travel_z
         limits = self._motions[mode]
         state.duration = max(
             motion_duration(state[_GOAL] - state[_START], limits), braking_time(rate, limits)
@@ -408,7 +434,7 @@ def _motions(parameters: PickPlaceParameters) -> dict[Mode, MotionLimits]:
     )
     limits[Mode.LOWER] = MotionLimits(parameters.lower_speed, parameters.carry_acceleration, *yaw)
     limits[Mode.SEARCH] = dataclasses.replace(
-        limits[Mode.LOWER], yaw_speed=min(_SWING_SPEED, parameters.yaw_speed)
+        limits[Mode.LOWER], yaw_speed=min(parameters.search.yaw_speed, parameters.yaw_speed)
     )
     return limits
 

@@ -38,10 +38,10 @@ class RestDetector(LeafSystem):
     - `body_poses`, `body_spatial_velocities`: the plant's ports of these names.
     - `at_rest` (n): 1 for an object that is at rest, else 0, in the order of `objects`.
 
-    An object comes to rest when it has been slower than both speeds for `patience`, and nothing
-    that is not at rest, mover or object, is within `wake_distance` of it: distances of oriented
-    bounding boxes, never more than the true ones. It is no longer at rest as soon as something
-    comes that near. The memory (discrete state) is how long each object has been slow, in s, and
+    An object comes to rest when it has been slower than both speeds for `time_to_sleep`, and
+    nothing that is not at rest, mover or object, is within `wake_distance` of it: distances of
+    oriented bounding boxes, never more than the true ones. It is no longer at rest as soon as
+    something comes that near. The memory (discrete state) is how long each object has been slow, in s, and
     whether it is at rest.
     """
 
@@ -52,7 +52,7 @@ class RestDetector(LeafSystem):
         movers: Sequence[BoundedBody],
         linear_speed: float,
         angular_speed: float,
-        patience: float,
+        time_to_sleep: float,
         wake_distance: float,
         period: float = 1 / 64,
     ) -> None:
@@ -62,7 +62,7 @@ class RestDetector(LeafSystem):
             movers: what never does: the links of the hand.
             linear_speed: of the body origin, in m/s.
             angular_speed: in rad/s.
-            patience: in s.
+            time_to_sleep: in s.
             wake_distance: in m. What moves faster than this in a period may touch an object before
                 it wakes: for that long the object stands as firm as a rock.
             period: how often to look, in s.
@@ -75,7 +75,7 @@ class RestDetector(LeafSystem):
         self._half_sizes = np.array([(item.p_BUpper - item.p_BLower) / 2 for item in bodies])
         self._linear_speed = linear_speed
         self._angular_speed = angular_speed
-        self._patience = patience
+        self._time_to_sleep = time_to_sleep
         self._wake_distance = wake_distance
         self._period = period
         self._poses = self.DeclareAbstractInputPort("body_poses", Value([RigidTransform()]))
@@ -102,7 +102,7 @@ class RestDetector(LeafSystem):
                 and np.linalg.norm(velocity.rotational()) < self._angular_speed
             )
             slow_for[i] = slow_for[i] + self._period if slow else 0.0
-        resting = slow_for >= self._patience - self._period / 2
+        resting = slow_for >= self._time_to_sleep - self._period / 2
         near = self._near(context)
         # An awake object wakes its neighbours, and they theirs.
         for _ in range(n):

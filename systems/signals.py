@@ -117,6 +117,25 @@ class PlanarPose:
 
 
 @dataclass(frozen=True)
+class SurfaceHeights:
+    """The heights that a motion between pick and place must respect, in metres in the world.
+
+    `systems.surface_heights.read_surface_heights` reads them off o_t, for every policy.
+    """
+
+    pick_top: float = 0.0
+    """The top of what lies under the pick."""
+    support: float = 0.0
+    """What that stands on."""
+    place_rim: float = 0.0
+    """The highest surface around the place: the rim of a cavity, if there is one."""
+    highest: float = 0.0
+    """The highest surface of the workspace."""
+    table: float = 0.0
+    """The table, below which nothing goes."""
+
+
+@dataclass(frozen=True)
 class PickPlaceAction:
     """One pick and one place: a_pick and a_place of the paper (section III-A), both in SE(2).
 
@@ -126,13 +145,10 @@ class PickPlaceAction:
 
     pick: PlanarPose = field(default_factory=PlanarPose)
     place: PlanarPose = field(default_factory=PlanarPose)
-    surface_height: float = 0.0
-    """World z of what lies under the pick point, in metres: how high the grasp starts."""
-    rim_height: float | None = None
-    """World z of what is around the place, a kit's top, in metres; None: unknown. What is let down
-    on it has not found its cavity."""
     stop: bool = False
     """True: there is nothing left to do, and the poses mean nothing."""
+    heights: SurfaceHeights | None = None
+    """Of a policy that knows them from elsewhere (the oracle); used only where nothing is seen."""
 
 
 def wrap_to_pi(angle: float) -> float:

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 from pydrake.geometry import (
     CollisionFilterDeclaration,
     ColorRenderCamera,
@@ -24,7 +25,7 @@ from pydrake.multibody.plant import (
     MultibodyPlantConfig,
 )
 from pydrake.multibody.tree import RigidBody
-from pydrake.systems.framework import Context, Diagram, DiagramBuilder
+from pydrake.systems.framework import Context, Diagram, DiagramBuilder, LeafSystem
 from pydrake.systems.sensors import RgbdSensor
 from pydrake.visualization import VideoWriter
 
@@ -40,26 +41,18 @@ from kitting_drake.cell.cameras import (
 )
 from kitting_drake.common.errors import UserError
 from kitting_drake.common.paths import MODELS
-from kitting_drake.scenario.policies import Watch, make_function
-from kitting_drake.scenario.schema import (
-    Heightmap,
-    Learned,
-    PythonPolicy,
-    QuantisedOracle,
-    Scenario,
-)
-from kitting_drake.tasks.kitting.scene import KittingScene, make_scene
+from kitting_drake.scenario.policies import DecisionObserver, PolicySite
+from kitting_drake.scenario.schema import Scenario
+from kitting_drake.tasks.task import Scene
 from systems.heightmap_projector import HeightmapProjector
-from systems.oracle_policy import OraclePolicy, OracleTarget, Rounding
 from systems.pick_place_planner import PickPlacePlanner
-from systems.pick_place_policy import PickPlacePolicy
-from systems.placement_monitor import PlacementGoal, PlacementMonitor
+from systems.placement import PlacedObject, Placement
+from systems.placement_monitor import PlacementMonitor
 from systems.rest_detector import BoundedBody, RestDetector
-from systems.signals import PixelGrid, PlanarPose
+from systems.signals import PixelGrid
 from systems.trajectory_controller import TrajectoryController
 
 MESHCAT_PERIOD = 1 / 32
-_SURFACE_POINTS = 2000
 _X_WTABLE = RigidTransform([0.5, 0.0, 0.0])
 
 
@@ -73,44 +66,55 @@ class Cell:
     planner: PickPlacePlanner
     monitor: PlacementMonitor
     rest_detector: RestDetector
-    scene: KittingScene
-    tool_bodies: tuple[RigidBody, ...]
+    scene: Scene
+    objects: tuple[PlacedObject, ...]
+    """The scene's objects, with their bodies."""
+    still_bodies: tuple[RigidBody, ...]
+    """The table and the fixtures."""
     sleep: bool
     video_writer: VideoWriter | None
     """Holds the film, if one was asked for, until its `Save()`."""
 
-    def apply_sleep(self, root_context: Context) -> None:
-        """Freezes the tools that are at rest and thaws the others.
+    def object_poses(self, root_context: Context) -> list[RigidTransform]:
+        """X_WB of each of the scene's objects."""
+        context = self.plant.GetMyContextFromRoot(root_context)
+        return [self.plant.get_body(item.body).EvalPoseInWorld(context) for item in self.objects]
 
-        A frozen tool's joint is locked and its contact with table and kit is not computed; what
-        comes near it still collides with it. No LeafSystem may touch another's part of a context,
-        hence a function for the simulator's monitor.
+    def placements(self, root_context: Context) -> list[Placement]:
+        """Where each of the scene's objects is relative to its goal."""
+        return self.monitor.placements(self.monitor.GetMyContextFromRoot(root_context))
+
+    def at_rest(self, root_context: Context) -> NDArray[np.bool_]:
+        """(n,) which of the scene's objects are at rest."""
+        return self.rest_detector.at_rest(self.rest_detector.GetMyContextFromRoot(root_context))
+
+    def apply_sleep(self, root_context: Context) -> None:
+        """Freezes the objects that are at rest and thaws the others.
+
+        A frozen object's joint is locked and its contact with table and fixtures is not computed;
+        what comes near it still collides with it. No LeafSystem may touch another's part of a
+        context, hence a function for the simulator's monitor.
         """
         if not self.sleep:
             return
-        at_rest = self.rest_detector.at_rest(self.rest_detector.GetMyContextFromRoot(root_context))
         plant_context = self.plant.GetMyMutableContextFromRoot(root_context)
-        for body, resting in zip(self.tool_bodies, at_rest, strict=True):
+        for item, resting in zip(self.objects, self.at_rest(root_context), strict=True):
+            body = self.plant.get_body(item.body)
             if resting == body.is_locked(plant_context):
                 continue
             filters = self.scene_graph.collision_filter_manager(
                 self.scene_graph.GetMyMutableContextFromRoot(root_context)
             )
-            tool = GeometrySet(self.plant.GetCollisionGeometriesForBody(body))
-            still = self._still_geometry()
+            own = GeometrySet(self.plant.GetCollisionGeometriesForBody(body))
+            still = GeometrySet()
+            for other in self.still_bodies:
+                still.Add(self.plant.GetCollisionGeometriesForBody(other))
             if resting:
                 body.Lock(plant_context)
-                filters.Apply(CollisionFilterDeclaration().ExcludeBetween(tool, still))
+                filters.Apply(CollisionFilterDeclaration().ExcludeBetween(own, still))
             else:
                 body.Unlock(plant_context)
-                filters.Apply(CollisionFilterDeclaration().AllowBetween(tool, still))
-
-    def _still_geometry(self) -> GeometrySet:
-        geometry = GeometrySet()
-        for name in ("table", "kit"):
-            body = self.plant.GetBodyByName(name)
-            geometry.Add(self.plant.GetCollisionGeometriesForBody(body))
-        return geometry
+                filters.Apply(CollisionFilterDeclaration().AllowBetween(own, still))
 
 
 def build_cell(
@@ -121,82 +125,68 @@ def build_cell(
     meshcat: Meshcat | None = None,
     picture: bool = False,
     video: Path | None = None,
-    watch: Watch | None = None,
+    observer: DecisionObserver | None = None,
 ) -> Cell:
     """Builds the cell.
 
     Args:
         scenario: what to build.
-        seed: of the scene; see `make_scene`.
+        seed: of the scene; see `TaskConfig.make_scene`.
         base: where relative paths in the scenario start: the folder of its file.
         meshcat: where to show it, if anywhere.
         picture: have what `render_picture` takes.
         video: the file of a film to make (.gif or .webp), if any.
-        watch: told of every decision of a learned policy, and of the observation it is about.
+        observer: told of every decision of a learned policy, and of the observation it is about.
 
     Returns:
-        The cell. Its Diagram exports the output ports `observation`, `action`, `add_s`,
-        `position_error`, `angle_error`, `height_error`, `mode` and `counts`. Where images cannot be
-        rendered, and the policy does not look, there are no cameras and there is no `observation`.
+        The cell. Its Diagram exports the output ports `observation`, `action`, `placements`,
+        `reward`, `success`, `add_s`, `position_error`, `angle_error`, `height_error`, `mode` and
+        `counts`. Where images cannot be rendered, and the policy needs none, there are no cameras
+        and there is no `observation`.
 
     Raises:
         UserError: something in the scenario cannot be had.
     """
-    grid = make_grid(scenario.heightmap)
-    scene = make_scene(scenario.task, grid=grid, seed=seed, base=base)
+    grid = scenario.heightmap.grid()
+    scene = scenario.task.make_scene(grid=grid, seed=seed, base=base)
     builder = DiagramBuilder()
 
-    # The plant: table, kit, tools, hand.
+    # The plant: table, fixtures, objects, hand.
     plant, scene_graph = _add_plant(builder, scenario)
-    tool_bodies = _add_models(plant, scene)
-    hand = plant.GetModelInstanceByName("franka_hand")
+    objects, still_bodies = _add_models(plant, scene)
     plant.Finalize()
-    _set_initial_poses(plant, scenario, scene, tool_bodies)
+    _set_initial_poses(plant, scenario, scene, objects)
 
-    # The policy.
-    looks = isinstance(scenario.policy, Learned | PythonPolicy)
-    if looks or (scenario.cameras and can_render()):
+    # Cameras and policy.
+    site = PolicySite(scene=scene, objects=objects, grid=grid, base=base, observer=observer)
+    projector = None
+    if scenario.policy.needs_observation or (scenario.cameras and can_render()):
         projector = _add_cameras(builder, scenario, scene_graph, grid)
         builder.ExportOutput(projector.GetOutputPort("observation"), "observation")
-    if isinstance(scenario.policy, Learned | PythonPolicy):
-        function = make_function(scenario.policy, base=base, grid=grid, watch=watch)
-        policy = builder.AddNamedSystem("policy", PickPlacePolicy(policy=function))
+    policy = builder.AddNamedSystem("policy", scenario.policy.make_system(site))
+    if scenario.policy.needs_observation:
+        assert projector is not None
         builder.Connect(projector.GetOutputPort("observation"), policy.GetInputPort("observation"))
     else:
-        rounding = None
-        if isinstance(scenario.policy, QuantisedOracle):
-            rounding = Rounding(grid, scenario.policy.orientations)
-        policy = builder.AddNamedSystem("policy", _make_oracle(scene, tool_bodies, rounding))
         builder.Connect(plant.get_body_poses_output_port(), policy.GetInputPort("body_poses"))
 
-    # Planner and controller.
-    planner = builder.AddNamedSystem("planner", PickPlacePlanner(parameters=scenario.planner))
-    controller = builder.AddNamedSystem("controller", _make_controller(scenario, plant))
-    hand_state = plant.get_state_output_port(hand)
-    builder.Connect(policy.GetOutputPort("action"), planner.GetInputPort("action"))
-    builder.Connect(hand_state, planner.GetInputPort("hand_state"))
-    builder.Connect(
-        plant.get_generalized_contact_forces_output_port(hand),
-        planner.GetInputPort("hand_contact_force"),
-    )
-    builder.Connect(hand_state, controller.GetInputPort("hand_state"))
-    for port in ("desired_motion", "desired_opening", "closing_force"):
-        builder.Connect(planner.GetOutputPort(port), controller.GetInputPort(port))
-    builder.Connect(controller.get_output_port(), plant.get_actuation_input_port(hand))
+    planner = _add_planner_and_controller(builder, scenario, scene, plant, policy, projector)
 
     # Score and rest.
-    monitor = builder.AddNamedSystem("monitor", _make_monitor(scene, tool_bodies))
+    monitor = builder.AddNamedSystem(
+        "monitor", PlacementMonitor(objects=objects, goals=scene.goals, success=scene.success)
+    )
     builder.Connect(plant.get_body_poses_output_port(), monitor.GetInputPort("body_poses"))
     rest_detector = builder.AddNamedSystem(
-        "rest_detector", _make_rest_detector(scenario, plant, scene_graph, tool_bodies)
+        "rest_detector", _make_rest_detector(scenario, plant, scene_graph, objects)
     )
     for port in ("body_poses", "body_spatial_velocities"):
         builder.Connect(plant.GetOutputPort(port), rest_detector.GetInputPort(port))
 
     for system, ports in (
-        (policy, ("action",)),
-        (monitor, ("add_s", "position_error", "angle_error", "height_error")),
-        (planner, ("mode", "counts")),
+        (policy, ["action"]),
+        (monitor, [monitor.get_output_port(i).get_name() for i in range(7)]),
+        (planner, ["mode", "counts"]),
     ):
         for port in ports:
             builder.ExportOutput(system.GetOutputPort(port), port)
@@ -217,23 +207,46 @@ def build_cell(
         monitor=monitor,
         rest_detector=rest_detector,
         scene=scene,
-        tool_bodies=tuple(tool_bodies),
+        objects=objects,
+        still_bodies=still_bodies,
         sleep=scenario.sleep.enabled,
         video_writer=video_writer,
     )
 
 
-def make_grid(config: Heightmap) -> PixelGrid:
-    """The pixel grid that a scenario describes."""
-    return PixelGrid(
-        x_min=config.x_min,
-        y_min=config.y_min,
-        resolution=config.resolution,
-        rows=config.rows,
-        cols=config.cols,
-        z_min=config.z_min,
-        z_max=config.z_max,
+def _add_planner_and_controller(
+    builder: DiagramBuilder,
+    scenario: Scenario,
+    scene: Scene,
+    plant: MultibodyPlant,
+    policy: LeafSystem,
+    projector: HeightmapProjector | None,
+) -> PickPlacePlanner:
+    """Adds both, and closes the loop through the plant."""
+    hand = plant.GetModelInstanceByName("franka_hand")
+    planner = builder.AddNamedSystem(
+        "planner",
+        PickPlacePlanner(
+            parameters=scenario.planner,
+            max_actions=scene.max_actions,
+            insertion=any(goal.rim_height is not None for goal in scene.goals),
+        ),
     )
+    controller = builder.AddNamedSystem("controller", _make_controller(scenario, plant))
+    hand_state = plant.get_state_output_port(hand)
+    builder.Connect(policy.GetOutputPort("action"), planner.GetInputPort("action"))
+    if projector is not None:
+        builder.Connect(projector.GetOutputPort("observation"), planner.GetInputPort("observation"))
+    builder.Connect(hand_state, planner.GetInputPort("hand_state"))
+    builder.Connect(
+        plant.get_generalized_contact_forces_output_port(hand),
+        planner.GetInputPort("hand_contact_force"),
+    )
+    builder.Connect(hand_state, controller.GetInputPort("hand_state"))
+    for port in ("desired_motion", "desired_opening", "closing_force"):
+        builder.Connect(planner.GetOutputPort(port), controller.GetInputPort(port))
+    builder.Connect(controller.get_output_port(), plant.get_actuation_input_port(hand))
+    return planner
 
 
 def _add_plant(builder: DiagramBuilder, scenario: Scenario) -> tuple[MultibodyPlant, SceneGraph]:
@@ -246,62 +259,50 @@ def _add_plant(builder: DiagramBuilder, scenario: Scenario) -> tuple[MultibodyPl
     return AddMultibodyPlant(config, builder)
 
 
-def _add_models(plant: MultibodyPlant, scene: KittingScene) -> list[RigidBody]:
+def _add_models(
+    plant: MultibodyPlant, scene: Scene
+) -> tuple[tuple[PlacedObject, ...], tuple[RigidBody, ...]]:
+    """Adds everything that the plant holds.
+
+    Returns:
+        The scene's objects with their bodies, and the bodies that never move.
+    """
     parser = Parser(plant)
+    # The same model may be there several times.
+    parser.SetAutoRenaming(True)
     parser.package_map().AddPackageXml(str(MODELS / "package.xml"))
-    parser.AddModels(str(MODELS / "table" / "table.sdf"))
-    plant.WeldFrames(plant.world_frame(), plant.GetFrameByName("table"), _X_WTABLE)
-    (kit,) = parser.AddModels(str(scene.kit.sdf))
-    plant.WeldFrames(plant.world_frame(), plant.GetFrameByName("kit", kit), scene.X_WKit)
-    tools = []
-    for tool in scene.tools:
-        try:
-            (instance,) = parser.AddModels(str(tool.sdf))
-        except (RuntimeError, ValueError) as error:
-            reason = str(error).splitlines()[0]
-            raise UserError(f"task.tools: {tool.sdf} cannot be loaded: {reason}") from error
-        tools.append(plant.GetBodyByName("tool", instance))
+    still = [_add_body(plant, parser, MODELS / "table" / "table.sdf")]
+    plant.WeldFrames(plant.world_frame(), still[0].body_frame(), _X_WTABLE)
+    for fixture in scene.fixtures:
+        still.append(_add_body(plant, parser, fixture.model))
+        plant.WeldFrames(plant.world_frame(), still[-1].body_frame(), fixture.X_WF)
+    objects = []
+    for item in scene.objects:
+        body = _add_body(plant, parser, item.model)
+        objects.append(PlacedObject(item.name, body.index(), item.p_BPoints, item.symmetry))
     parser.AddModels(str(MODELS / "franka_hand" / "franka_hand.sdf"))
-    return tools
+    return tuple(objects), tuple(still)
+
+
+def _add_body(plant: MultibodyPlant, parser: Parser, model: Path) -> RigidBody:
+    try:
+        (instance,) = parser.AddModels(str(model))
+        (body,) = plant.GetBodyIndices(instance)
+    except (RuntimeError, ValueError) as error:
+        reason = str(error).splitlines()[0]
+        raise UserError(f"task: {model} cannot be loaded: {reason}") from error
+    return plant.get_body(body)
 
 
 def _set_initial_poses(
-    plant: MultibodyPlant, scenario: Scenario, scene: KittingScene, tools: list[RigidBody]
+    plant: MultibodyPlant, scenario: Scenario, scene: Scene, objects: tuple[PlacedObject, ...]
 ) -> None:
-    for body, X_WT in zip(tools, scene.X_WTools, strict=True):
-        plant.SetDefaultFloatingBaseBodyPose(body, X_WT)
+    for placed, item in zip(objects, scene.objects, strict=True):
+        plant.SetDefaultFloatingBaseBodyPose(plant.get_body(placed.body), item.X_WB)
     for joint, position in zip(("x", "y", "z", "yaw"), scenario.planner.home, strict=True):
         plant.GetJointByName(joint).set_default_positions([position])
     for joint in ("left_finger_slide", "right_finger_slide"):
         plant.GetJointByName(joint).set_default_positions([scenario.planner.open_width / 2])
-
-
-def _make_oracle(
-    scene: KittingScene, tools: list[RigidBody], rounding: Rounding | None
-) -> OraclePolicy:
-    return OraclePolicy(
-        targets=[
-            OracleTarget(
-                name=tool.name,
-                body=body.index(),
-                X_WGoal=X_WGoal,
-                grasp=PlanarPose(tool.grasp.x, tool.grasp.y, tool.grasp.theta),
-                surface_height=tool.grasp.surface_height,
-                rim_height=scene.X_WKit.translation()[2] + scene.kit.parameters.height,
-            )
-            for tool, body, X_WGoal in zip(scene.tools, tools, scene.X_WGoals, strict=True)
-        ],
-        rounding=rounding,
-    )
-
-
-def _make_monitor(scene: KittingScene, tools: list[RigidBody]) -> PlacementMonitor:
-    return PlacementMonitor(
-        goals=[
-            PlacementGoal(tool.name, body.index(), X_WGoal, tool.surface_points(_SURFACE_POINTS))
-            for tool, body, X_WGoal in zip(scene.tools, tools, scene.X_WGoals, strict=True)
-        ]
-    )
 
 
 def _make_controller(scenario: Scenario, plant: MultibodyPlant) -> TrajectoryController:
@@ -329,15 +330,15 @@ def _make_rest_detector(
     scenario: Scenario,
     plant: MultibodyPlant,
     scene_graph: SceneGraph,
-    tools: list[RigidBody],
+    objects: tuple[PlacedObject, ...],
 ) -> RestDetector:
     hand = [plant.GetBodyByName(name) for name in ("hand", "left_finger", "right_finger")]
     return RestDetector(
-        objects=[_bounded(plant, scene_graph, body) for body in tools],
+        objects=[_bounded(plant, scene_graph, plant.get_body(item.body)) for item in objects],
         movers=[_bounded(plant, scene_graph, body) for body in hand],
         linear_speed=scenario.sleep.linear_speed,
         angular_speed=scenario.sleep.angular_speed,
-        patience=scenario.sleep.patience,
+        time_to_sleep=scenario.sleep.time_to_sleep,
         wake_distance=scenario.sleep.wake_distance,
     )
 

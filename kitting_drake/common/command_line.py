@@ -1,4 +1,4 @@
-"""What every verb does the same way; no pydrake here."""
+"""What every command does the same way; no pydrake here."""
 
 import argparse
 import contextlib
@@ -65,9 +65,9 @@ def interrupts_wait() -> Iterator[Callable[[], bool]]:
         signal.signal(signal.SIGINT, before)
 
 
-def run_verb(main: Callable[[], int]) -> None:
-    """Runs a verb and leaves with its exit code; a user's error is told in one sentence."""
-    # Drake announces ports and frame names; a verb says itself what a person needs to know.
+def run_command(main: Callable[[], int]) -> None:
+    """Runs a command and leaves with its exit code; a user's error is told in one sentence."""
+    # Drake announces ports and frame names; a command says itself what a person needs to know.
     logging.getLogger("drake").setLevel(logging.WARNING)
     try:
         code = main()

@@ -1,21 +1,24 @@
-"""One episode from its first to its last step, and what is to be said of it afterwards."""
+"""One episode from its first to its last step, and its result."""
 
 import dataclasses
 import logging
 import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import Context, EventStatus
 
-from kitting_drake.cell.cell import Cell
-from kitting_drake.episode.action_log import ActionRecord, ActionRecorder, find_cause, object_poses
-from systems.pick_place_planner import Mode
+from kitting_drake.cell import Cell
+from kitting_drake.episode.action_log import ActionLog
+from kitting_drake.episode.events import EpisodeObserver, ModeChange
+from kitting_drake.tasks.task import ActionRecord, TaskConfig
+from systems.pick_place_parameters import Mode
+from systems.placement import Placement, strict_reward, total_reward
 
 _LAST_WAIT = 2.0
-"""How long the tools may take to come to rest after the last action, in s."""
+"""How long the objects may take to come to rest after the last action, in s."""
 
 
 @dataclasses.dataclass
@@ -24,35 +27,45 @@ class ObjectResult:
 
     name: str
     category: str
-    add_s_mm: float
+    add_s_mm: float | None
+    """None, as the other errors, for an object that no goal was left for."""
     success: bool
-    """By the paper's measure alone: ADD-S below the threshold."""
-    position_error_mm: float
-    angle_error_deg: float
-    height_error_mm: float
+    """By the task's own measure; for kitting the paper's, ADD-S below the threshold."""
+    strict_success: bool
+    """That, and at its height and heading: see `systems.placement.Placement`."""
+    position_error_mm: float | None
+    angle_error_deg: float | None
+    """Modulo the symmetry that the object declares."""
+    height_error_mm: float | None
     cause: str | None
-    """Why it is no success; None when it is one."""
+    """Why it is no success, one of the task's `causes`; None when it is one."""
 
 
 @dataclasses.dataclass
 class EpisodeResult:
-    """What came of an episode. The names are keys of `results.json`."""
+    """The result of an episode. The names are keys of `results.json`."""
 
     scenario: str
     policy: str
     seed: int
     objects: list[ObjectResult]
+    """Those that a goal takes."""
     success_rate: float
-    """Share of the objects placed successfully; 0 when the episode failed."""
+    """The task's reward, 0 to 1: for kitting the share of the tools that are kitted; 0 when the
+    episode failed or timed out."""
+    strict_success_rate: float
+    """The same, counting strict successes alone."""
     actions: int
     missed_grasps: int
     dropped_objects: int
     actions_taken: list[ActionRecord]
-    """What the policy answered each time, and what came of it."""
+    """The policy's actions, and what came of each."""
     sim_seconds: float
     wall_seconds: float
     point_contact_pairs: int
     """The most pairs in point contact at any step."""
+    moving_at_end: list[str]
+    """The objects that had not come to rest when the episode ended."""
     failure: str | None
     """Why the simulation could not go on, if it could not."""
     timed_out: bool
@@ -68,31 +81,34 @@ class EpisodeResult:
 def run_episode(
     cell: Cell,
     *,
+    task: TaskConfig,
     scenario: str,
     policy: str,
     seed: int,
     time_limit: float,
     realtime_rate: float = 0.0,
-    watch: Callable[[Context, Mode], None] | None = None,
+    observers: Sequence[EpisodeObserver] = (),
 ) -> EpisodeResult:
-    """Runs an episode until the planner is done and the tools rest, or the time is up.
+    """Runs an episode until the planner is done and the objects rest, or the time is up.
 
     An error of the simulation (the contact solver not converging, say) or of the policy, and
     Ctrl-C, end the episode, not the program: the result tells of it, and of what was reached.
 
     Args:
         cell: fresh from `build_cell`.
-        scenario: names for the result.
-        policy: likewise.
-        seed: likewise; it has done its work in `build_cell`.
+        task: the scenario's, which knows why objects fail.
+        scenario: its name, for the result.
+        policy: its name, for the result.
+        seed: for the result; it has done its work in `build_cell`.
         time_limit: simulated time at which the episode ends at the latest, in s.
         realtime_rate: 1 for real time, 0 for as fast as possible.
-        watch: called after every step with the root context and the planner's mode.
+        observers: told of every event.
     """
     simulator = Simulator(cell.diagram)
     simulator.set_target_realtime_rate(realtime_rate)
-    monitor = _Monitor(cell, watch)
-    simulator.set_monitor(monitor.look)
+    log = ActionLog(cell)
+    monitor = _Monitor(cell, [log.observe, *observers])
+    simulator.set_monitor(monitor.step)
     failure, timed_out, interrupted = None, False, False
     start = time.perf_counter()
     try:
@@ -109,90 +125,110 @@ def run_episode(
             logging.getLogger(__name__).exception("the episode of seed %d failed", seed)
     wall_seconds = time.perf_counter() - start
     context = simulator.get_context()
-    objects = score(cell, context, monitor.recorder.records)
-    succeeded = sum(item.success for item in objects) / len(objects)
+    monitor.tell(context, is_last=True)
+    placements = cell.placements(context)
     counts = cell.planner.GetOutputPort("counts").Eval(cell.planner.GetMyContextFromRoot(context))
+    lost = failure is not None or timed_out
+    at_rest = cell.at_rest(context)
     return EpisodeResult(
         scenario=scenario,
         policy=policy,
         seed=seed,
-        objects=objects,
-        success_rate=0.0 if failure else succeeded,
+        objects=object_results(cell, task, context, log.records),
+        success_rate=0.0 if lost else total_reward(cell.scene.goals, placements),
+        strict_success_rate=0.0 if lost else strict_reward(cell.scene.goals, placements),
         actions=int(counts[0]),
         missed_grasps=int(counts[1]),
         dropped_objects=int(counts[2]),
-        actions_taken=monitor.recorder.records,
+        actions_taken=log.records,
         sim_seconds=context.get_time(),
         wall_seconds=wall_seconds,
         point_contact_pairs=monitor.point_contact_pairs,
+        moving_at_end=[
+            item.name for item, rests in zip(cell.objects, at_rest, strict=True) if not rests
+        ],
         failure=failure,
         timed_out=timed_out,
         interrupted=interrupted,
     )
 
 
-def score(
-    cell: Cell, root_context: Context, actions_taken: Sequence[ActionRecord] = ()
+def object_results(
+    cell: Cell, task: TaskConfig, root_context: Context, records: Sequence[ActionRecord] = ()
 ) -> list[ObjectResult]:
-    """How every object stands now, in the order in which an oracle takes them.
+    """How every object that a goal takes stands now, in the scene's order.
 
     Args:
         cell: the episode's.
+        task: which knows why objects fail.
         root_context: of the cell's diagram.
-        actions_taken: what was done so far, to tell why objects are not where they belong.
+        records: the actions so far.
     """
-    context = cell.monitor.GetMyContextFromRoot(root_context)
-    columns = [
-        cell.monitor.GetOutputPort(name).Eval(context).tolist()
-        for name in ("add_s", "position_error", "angle_error", "height_error")
-    ]
-    poses = object_poses(cell, root_context)
+    poses = cell.object_poses(root_context)
+    placements = cell.placements(root_context)
     results = []
-    for index, (tool, add_s, position, angle, height) in enumerate(
-        zip(cell.scene.tools, *columns, strict=True)
-    ):
-        success = add_s < cell.scene.success_threshold
-        results.append(
-            ObjectResult(
-                name=tool.name,
-                category=tool.category,
-                add_s_mm=1e3 * add_s,
-                success=success,
-                position_error_mm=1e3 * position,
-                angle_error_deg=math.degrees(angle),
-                height_error_mm=1e3 * height,
-                cause=None if success else find_cause(cell, index, poses[index], actions_taken),
-            )
-        )
+    for index in cell.scene.goal_objects:
+        item, placement = cell.scene.objects[index], placements[index]
+        cause = None
+        if not placement.success:
+            cause = task.find_cause(cell.scene, index, poses, placement, records)
+        results.append(_object_result(item.name, item.category, placement, cause))
     return results
 
 
-class _Monitor:
-    """The simulator's monitor: puts tools to sleep, takes notes, knows the end."""
+def _object_result(
+    name: str, category: str, placement: Placement, cause: str | None
+) -> ObjectResult:
+    def finite(value: float) -> float | None:
+        return value if math.isfinite(value) else None
 
-    def __init__(self, cell: Cell, watch: Callable[[Context, Mode], None] | None) -> None:
+    return ObjectResult(
+        name=name,
+        category=category,
+        add_s_mm=finite(1e3 * placement.add_s),
+        success=placement.success,
+        strict_success=placement.strict_success,
+        position_error_mm=finite(1e3 * placement.position_error),
+        angle_error_deg=finite(math.degrees(placement.angle_error)),
+        height_error_mm=finite(1e3 * placement.height_error),
+        cause=cause,
+    )
+
+
+class _Monitor:
+    """The simulator's monitor: puts objects to sleep, tells of events, knows the end."""
+
+    def __init__(self, cell: Cell, observers: Sequence[EpisodeObserver]) -> None:
         self._cell = cell
-        self._watch = watch
+        self._observers = observers
         self._contact_results = cell.plant.get_contact_results_output_port()
-        self.recorder = ActionRecorder(cell)
+        self._mode = Mode.OBSERVE
         self.point_contact_pairs = 0
         self.done_since: float | None = None
 
-    def look(self, root_context: Context) -> EventStatus:
+    def step(self, root_context: Context) -> EventStatus:
+        """What the simulator calls after every step."""
         cell = self._cell
         results = self._contact_results.Eval(cell.plant.GetMyContextFromRoot(root_context))
         self.point_contact_pairs = max(self.point_contact_pairs, results.num_point_pair_contacts())
         cell.apply_sleep(root_context)
-        mode = cell.planner.mode(cell.planner.GetMyContextFromRoot(root_context))
-        self.recorder.look(root_context, mode)
-        if self._watch is not None:
-            self._watch(root_context, mode)
-        if mode != Mode.DONE:
+        self.tell(root_context)
+        if self._mode != Mode.DONE:
             return EventStatus.DidNothing()
         now = root_context.get_time()
         if self.done_since is None:
             self.done_since = now
-        at_rest = cell.rest_detector.at_rest(cell.rest_detector.GetMyContextFromRoot(root_context))
-        if at_rest.all() or now - self.done_since > _LAST_WAIT:
+        if cell.at_rest(root_context).all() or now - self.done_since > _LAST_WAIT:
             return EventStatus.ReachedTermination(cell.diagram, "the episode is over")
         return EventStatus.DidNothing()
+
+    def tell(self, root_context: Context, *, is_last: bool = False) -> None:
+        """Tells the observers, if the mode has changed or the episode is over."""
+        planner = self._cell.planner
+        previous, self._mode = self._mode, planner.mode(planner.GetMyContextFromRoot(root_context))
+        if is_last or self._mode != previous:
+            event = ModeChange(
+                self._mode if is_last else previous, self._mode, root_context, is_last
+            )
+            for observer in self._observers:
+                observer(event)

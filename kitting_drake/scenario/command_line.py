@@ -1,28 +1,21 @@
-"""What the verbs' command lines share."""
+"""What the command lines of the commands on a scenario share."""
 
 import argparse
 import dataclasses
-import importlib.metadata
-import json
-import platform
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from pydrake.geometry import Meshcat
 
-import kitting_drake
-from kitting_drake.cell.cell import Cell, build_cell
-from kitting_drake.common.errors import UserError
 from kitting_drake.common.paths import SCENARIOS
-from kitting_drake.scenario.policies import Watch
-from kitting_drake.scenario.schema import Scenario, load_scenario
+from kitting_drake.scenario.loader import load_scenario
+from kitting_drake.scenario.schema import Scenario
 
 
-def scenario_parser(verb: str, description: str) -> argparse.ArgumentParser:
-    """A parser with the flags that every verb on a scenario takes."""
+def scenario_parser(command: str, description: str) -> argparse.ArgumentParser:
+    """A parser with the flags that every command on a scenario takes."""
     parser = argparse.ArgumentParser(
-        prog=f"python -m kitting_drake.{verb}", description=description
+        prog=f"python -m kitting_drake.{command}", description=description
     )
     parser.add_argument("scenario", type=Path, metavar="SCENARIO.yaml", help="the scenario's file")
     parser.add_argument(
@@ -60,12 +53,29 @@ class ChosenScenario:
     @property
     def policy(self) -> str:
         """The policy's name for results."""
-        return type(self.scenario.policy).__name__.lower()
+        return self.scenario.policy.name
 
     @property
     def described(self) -> dict[str, Any]:
-        """The scenario as JSON holds it."""
-        return json.loads(json.dumps(dataclasses.asdict(self.scenario), default=str))
+        """The whole scenario, defaults included, as JSON holds it; variants have a `_tag`."""
+        return _described(self.scenario)
+
+
+def _described(value: Any) -> Any:
+    if dataclasses.is_dataclass(value):
+        fields = {
+            item.name: _described(getattr(value, item.name)) for item in dataclasses.fields(value)
+        }
+        return fields if isinstance(value, Scenario) else {"_tag": _tag(value), **fields}
+    if isinstance(value, dict):
+        return {key: _described(item) for key, item in value.items()}
+    if isinstance(value, list | tuple | np.ndarray):
+        return [_described(item) for item in value]
+    return str(value) if isinstance(value, Path) else value
+
+
+def _tag(value: Any) -> str:
+    return f"!{type(value).__name__}"
 
 
 def choose_scenario(arguments: argparse.Namespace) -> ChosenScenario:
@@ -85,44 +95,6 @@ def choose_scenario(arguments: argparse.Namespace) -> ChosenScenario:
     return ChosenScenario(scenario, path, label, arguments.scenario_text)
 
 
-def build_chosen(
-    chosen: ChosenScenario,
-    *,
-    seed: int,
-    meshcat: Meshcat | None = None,
-    picture: bool = False,
-    video: Path | None = None,
-    watch: Watch | None = None,
-) -> Cell:
-    """`build_cell` for a scenario of the command line.
-
-    Raises:
-        UserError: as `build_cell`, with the file's name.
-    """
-    try:
-        return build_cell(
-            chosen.scenario,
-            seed=seed,
-            base=chosen.base,
-            meshcat=meshcat,
-            picture=picture,
-            video=video,
-            watch=watch,
-        )
-    except UserError as error:
-        raise UserError(f"{chosen.path}: {error}") from error
-
-
-def versions() -> dict[str, str]:
-    """Of what results depend on: of this package, and of what it stands on."""
-    return {
-        "kitting_drake": kitting_drake.__version__,
-        "drake": importlib.metadata.version("drake"),
-        "numpy": np.__version__,
-        "python": platform.python_version(),
-    }
-
-
 def output_folder(arguments: argparse.Namespace, name: str) -> Path:
-    """The folder that `--output` names, or the verb's own."""
+    """The folder that `--output` names, or the command's own."""
     return arguments.output or Path("output") / name.replace(":", "-")

@@ -1,125 +1,253 @@
-"""The policies that see nothing but the observation, as functions from it to an action."""
+"""The variants of a scenario's `policy:`; each knows how to make its LeafSystem."""
 
 from __future__ import annotations
 
+import hashlib
 import importlib
 import importlib.util
 import math
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from pydrake.systems.framework import LeafSystem
+
 from kitting_drake.common.errors import UserError
-from kitting_drake.scenario.schema import Learned, PythonPolicy
-from systems.signals import Observation, PickPlaceAction, PixelGrid
+from kitting_drake.tasks.task import Scene
+from systems.action_quantizer import ActionQuantizer
+from systems.bounds import bounded
+from systems.oracle_policy import OraclePolicy
+from systems.pick_place_policy import PickPlacePolicy
+from systems.placement import PlacedObject
+from systems.signals import Observation, PixelGrid
 
 if TYPE_CHECKING:
     from kitting_drake.policies.learned_policy import Decision
 
-Watch = Callable[[Observation, "Decision"], None]
+DecisionObserver = Callable[[Observation, "Decision"], None]
 """Told of every decision of a learned policy."""
 
 
-def make_function(
-    config: Learned | PythonPolicy, *, base: Path, grid: PixelGrid, watch: Watch | None
-) -> Callable[[Observation], PickPlaceAction]:
-    """The function that a scenario names.
+@dataclass(frozen=True)
+class PolicySite:
+    """What a policy is made for: the cell as far as it is built."""
 
-    Args:
-        config: the scenario's policy.
-        base: where relative paths start.
-        grid: of the observations that it will be given.
-        watch: told of a learned policy's decisions.
+    scene: Scene
+    objects: tuple[PlacedObject, ...]
+    """The scene's objects, with their bodies."""
+    grid: PixelGrid
+    """Of the observations."""
+    base: Path
+    """Where relative paths in the scenario start."""
+    observer: DecisionObserver | None = None
 
-    Raises:
-        UserError: it cannot be had.
-    """
-    if isinstance(config, PythonPolicy):
-        return _import_function(config)
-    # Only who uses a network waits for torch.
-    from kitting_drake.policies.learned_policy import LearnedPolicy
-    from kitting_drake.policies.weights import (
-        load_networks,
-        preferred_device,
-        preferred_type,
-        read_weights_file,
+
+class PolicyConfig:
+    """What a policy is asked; each variant of the scenario's `policy:` derives from it."""
+
+    needs_observation: bool = True
+    """Whether the system has an input port `observation`; else one called `body_poses`."""
+
+    @property
+    def name(self) -> str:
+        """The policy's name for results."""
+        return "".join(f"_{c.lower()}" if c.isupper() else c for c in type(self).__name__)[1:]
+
+    def make_system(self, site: PolicySite) -> LeafSystem:
+        """The system; it has the output port `action`.
+
+        Raises:
+            UserError: it cannot be made.
+        """
+        raise NotImplementedError
+
+    def details(self, base: Path) -> dict[str, Any]:
+        """What tells one policy from another of its kind, for results.
+
+        Raises:
+            UserError: its files cannot be read.
+        """
+        return {}
+
+    def digest(self, base: Path) -> str | None:
+        """Of the content of the policy's files; None if it has none.
+
+        Raises:
+            UserError: they cannot be read.
+        """
+        return None
+
+    def training_seeds(self, base: Path) -> set[int]:
+        """The seeds of the demonstrations that it was trained, or chosen, with.
+
+        Raises:
+            UserError: its files cannot be read.
+        """
+        return set()
+
+    def validate(self) -> None:
+        """Checks what neither types nor ranges say.
+
+        Raises:
+            ValueError: one sentence that begins with the path of a field, `policy.x`.
+        """
+
+
+@dataclass
+class Oracle(PolicyConfig):
+    """Ground truth and annotated grasps (section IV-B.4 of the paper)."""
+
+    needs_observation = False
+
+    def make_system(self, site: PolicySite) -> LeafSystem:
+        return _make_oracle(site, None)
+
+    def details(self, base: Path) -> dict[str, Any]:
+        return {"method": "oracle"}
+
+
+@dataclass
+class QuantizedOracle(PolicyConfig):
+    """The oracle, rounded to the actions of a network: the ceiling of the paper's policy."""
+
+    needs_observation = False
+
+    # N: picks and rotations are among 2 pi i / N; positions are pixel centres of the heightmap.
+    orientations: int = bounded(180, 2, 3600)
+
+    def make_system(self, site: PolicySite) -> LeafSystem:
+        return _make_oracle(site, ActionQuantizer(site.grid, self.orientations))
+
+    def details(self, base: Path) -> dict[str, Any]:
+        return {"method": "quantized_oracle", "orientations": self.orientations}
+
+
+@dataclass
+class Learned(PolicyConfig):
+    """Networks trained by `train`."""
+
+    # Their file, as `train` writes it; relative to the scenario's folder.
+    weights: str = ""
+
+    # N: picks and rotations are among 2 pi i / N. The paper's own method takes any N.
+    orientations: int = bounded(180, 2, 3600)
+
+    # Refine actions to sub-pixel and sub-bin accuracy (the paper does not) instead of choosing
+    # among pixel centres and the N orientations.
+    continuous: bool = True
+
+    def make_system(self, site: PolicySite) -> LeafSystem:
+        # Only who uses a network waits for torch.
+        from kitting_drake.policies.learned_policy import LearnedPolicy
+        from kitting_drake.policies.weights import (
+            load_networks,
+            preferred_device,
+            preferred_type,
+            read_weights_file,
+        )
+
+        path = site.base / self.weights
+        networks = load_networks(path, preferred_type()).to(preferred_device())
+        card = read_weights_file(path).card
+        learned_at = card.get("resolution")
+        resolution = site.grid.resolution
+        if learned_at is not None and not math.isclose(learned_at, resolution, rel_tol=1e-6):
+            raise UserError(
+                f"heightmap.resolution is {resolution:g} m, and the policy of {self.weights} "
+                f"learned from pixels of {learned_at:g} m"
+            )
+        try:
+            function = LearnedPolicy(
+                networks,
+                orientations=self.orientations,
+                continuous=self.continuous,
+                stop_threshold=card.get("stop_threshold"),
+                watch=site.observer,
+            )
+        except ValueError as error:
+            raise UserError(f"policy.orientations: {error}") from error
+        return PickPlacePolicy(policy=function)
+
+    def details(self, base: Path) -> dict[str, Any]:
+        from kitting_drake.policies.weights import preferred_type, read_weights_file
+
+        file = read_weights_file(base / self.weights)
+        return {
+            "method": file.config.method,
+            "preset": file.config.preset,
+            "orientations": self.orientations,
+            "continuous": self.continuous,
+            "trained_orientations": file.config.orientations,
+            "compute_type": str(preferred_type()).removeprefix("torch."),
+            **{key: file.card.get(key) for key in ("scenario", "demonstrations", "steps")},
+        }
+
+    def digest(self, base: Path) -> str | None:
+        return _digest(base / self.weights)
+
+    def training_seeds(self, base: Path) -> set[int]:
+        from kitting_drake.policies.weights import read_weights_file
+
+        card = read_weights_file(base / self.weights).card
+        return {*card.get("demonstration_seeds", ()), *card.get("validation_seeds", ())}
+
+    def validate(self) -> None:
+        if not self.weights:
+            raise ValueError("policy.weights is empty: name a file that train wrote")
+
+
+@dataclass
+class PythonPolicy(PolicyConfig):
+    """Your own function from `Observation` to `PickPlaceAction` (see systems/signals.py)."""
+
+    # `module:function`, importable from where you run; called with one Observation.
+    function: str = ""
+
+    def make_system(self, site: PolicySite) -> LeafSystem:
+        module, _, name = self.function.partition(":")
+        try:
+            function = getattr(importlib.import_module(module), name)
+        except (Exception, SystemExit) as error:
+            # A person's own module may raise anything.
+            reason = f"{type(error).__name__}: {error}"
+            raise UserError(f"policy.function: cannot import {self.function}: {reason}") from error
+        if not callable(function):
+            raise UserError(f"policy.function: {self.function} is not a function")
+        return PickPlacePolicy(policy=function)
+
+    def digest(self, base: Path) -> str | None:
+        module = self.function.partition(":")[0]
+        try:
+            spec = importlib.util.find_spec(module)
+        except (ImportError, ValueError) as error:
+            raise UserError(f"policy.function: cannot import {self.function}: {error}") from error
+        if spec is None or spec.origin is None:
+            raise UserError(f"policy.function: there is no file of the module {module}")
+        return _digest(Path(spec.origin))
+
+    def validate(self) -> None:
+        module, _, function = self.function.partition(":")
+        if not module or not function:
+            raise ValueError(f"policy.function must be module:function, not '{self.function}'")
+
+
+Policy = Oracle | QuantizedOracle | Learned | PythonPolicy
+"""The variants of a scenario's `policy:`; the first is the default."""
+
+
+def _make_oracle(site: PolicySite, quantizer: ActionQuantizer | None) -> OraclePolicy:
+    return OraclePolicy(
+        objects=site.objects,
+        grasps=[item.grasps for item in site.scene.objects],
+        goals=site.scene.goals,
+        success=site.scene.success,
+        quantizer=quantizer,
     )
 
-    networks = load_networks(base / config.weights, preferred_type()).to(preferred_device())
-    learned_at = read_weights_file(base / config.weights).card.get("resolution")
-    if learned_at is not None and not math.isclose(learned_at, grid.resolution, rel_tol=1e-6):
-        raise UserError(
-            f"heightmap.resolution is {grid.resolution:g} m, and the policy of {config.weights} "
-            f"learned from pixels of {learned_at:g} m"
-        )
+
+def _digest(path: Path) -> str:
     try:
-        return LearnedPolicy(
-            networks,
-            orientations=config.orientations,
-            continuous=config.continuous,
-            watch=watch,
-        )
-    except ValueError as error:
-        raise UserError(f"policy.orientations: {error}") from error
-
-
-def describe_learned(config: Learned, *, base: Path) -> dict[str, Any]:
-    """What results say of a learned policy: its method, its size, what it learned from, and in
-    which numbers this machine computes it.
-
-    Raises:
-        UserError: the weights cannot be read.
-    """
-    from kitting_drake.policies.weights import preferred_type, read_weights_file
-
-    file = read_weights_file(base / config.weights)
-    return {
-        "method": file.config.method,
-        "preset": file.config.preset,
-        "orientations": config.orientations,
-        "continuous": config.continuous,
-        "trained_orientations": file.config.orientations,
-        "compute_type": str(preferred_type()).removeprefix("torch."),
-        **{key: file.card.get(key) for key in ("scenario", "demonstrations", "steps")},
-    }
-
-
-def seeds_learned_from(config: Learned, *, base: Path) -> set[int]:
-    """The seeds of the demonstrations that a policy was trained, or chosen, with.
-
-    Raises:
-        UserError: the weights cannot be read.
-    """
-    from kitting_drake.policies.weights import read_weights_file
-
-    card = read_weights_file(base / config.weights).card
-    return {*card.get("demonstration_seeds", ()), *card.get("validation_seeds", ())}
-
-
-def source_of(config: PythonPolicy) -> Path:
-    """The file of the module that a function is in.
-
-    Raises:
-        UserError: it cannot be found.
-    """
-    module = config.function.partition(":")[0]
-    try:
-        spec = importlib.util.find_spec(module)
-    except (ImportError, ValueError) as error:
-        raise UserError(f"policy.function: cannot import {config.function}: {error}") from error
-    if spec is None or spec.origin is None:
-        raise UserError(f"policy.function: there is no file of the module {module}")
-    return Path(spec.origin)
-
-
-def _import_function(config: PythonPolicy) -> Callable[[Observation], PickPlaceAction]:
-    module, _, name = config.function.partition(":")
-    try:
-        function = getattr(importlib.import_module(module), name)
-    except (Exception, SystemExit) as error:
-        # A person's own module may raise anything.
-        reason = f"{type(error).__name__}: {error}"
-        raise UserError(f"policy.function: cannot import {config.function}: {reason}") from error
-    if not callable(function):
-        raise UserError(f"policy.function: {config.function} is not a function")
-    return function
+        return f"sha256 {hashlib.sha256(path.read_bytes()).hexdigest()}"
+    except OSError as error:
+        raise UserError(f"cannot read {path}: {error.strerror}") from error

@@ -1,1 +1,6 @@
-"""What stands on the table, where it belongs, and how it is scored."""
+"""Tasks: what stands on the table, what is to be brought about, and when it is success."""
+
+from kitting_drake.tasks.kitting.config import ArrangedKitting, Kitting, ToolsetKitting
+
+Task = Kitting | ToolsetKitting | ArrangedKitting
+"""The variants of a scenario's `task:`; the first is the default."""

@@ -1,0 +1,41 @@
+"""What results depend on beside the scenario: versions, and the commit."""
+
+import importlib.metadata
+import platform
+import subprocess
+from pathlib import Path
+
+import numpy as np
+
+import kitting_drake
+
+
+def versions() -> dict[str, str]:
+    """Of this package, and of what it stands on."""
+    return {
+        "kitting_drake": kitting_drake.__version__,
+        "drake": importlib.metadata.version("drake"),
+        "numpy": np.__version__,
+        "python": platform.python_version(),
+    }
+
+
+def commit() -> str | None:
+    """The checkout's commit, with `+` behind it if tracked files were changed since; None for an
+    installed package."""
+    root = Path(kitting_drake.__file__).resolve().parents[1]
+    if not (root / ".git").exists():
+        return None
+    try:
+        head = _git(root, "rev-parse", "HEAD")
+        changed = _git(root, "status", "--porcelain", "--untracked-files=no")
+    except (OSError, subprocess.CalledProcessError):
+        return None
+    return head + ("+" if changed else "")
+
+
+def _git(root: Path, *arguments: str) -> str:
+    done = subprocess.run(
+        ["git", "-C", str(root), *arguments], capture_output=True, text=True, check=True
+    )
+    return done.stdout.strip()

@@ -1,0 +1,62 @@
+"""The cell and the episode of a scenario that a command line names."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from pydrake.geometry import Meshcat
+
+from kitting_drake.cell import Cell, build_cell
+from kitting_drake.common.errors import UserError
+from kitting_drake.episode.episode import EpisodeResult, run_episode
+from kitting_drake.episode.events import EpisodeObserver
+from kitting_drake.scenario.command_line import ChosenScenario
+from kitting_drake.scenario.policies import DecisionObserver
+
+
+def build_chosen(
+    chosen: ChosenScenario,
+    *,
+    seed: int,
+    meshcat: Meshcat | None = None,
+    picture: bool = False,
+    video: Path | None = None,
+    observer: DecisionObserver | None = None,
+) -> Cell:
+    """`build_cell` for a scenario of the command line.
+
+    Raises:
+        UserError: as `build_cell`, with the file's name.
+    """
+    try:
+        return build_cell(
+            chosen.scenario,
+            seed=seed,
+            base=chosen.base,
+            meshcat=meshcat,
+            picture=picture,
+            video=video,
+            observer=observer,
+        )
+    except UserError as error:
+        raise UserError(f"{chosen.path}: {error}") from error
+
+
+def run_chosen(
+    chosen: ChosenScenario,
+    cell: Cell,
+    *,
+    seed: int,
+    realtime_rate: float = 0.0,
+    observers: Sequence[EpisodeObserver] = (),
+) -> EpisodeResult:
+    """`run_episode` for a scenario of the command line, in a cell fresh from `build_chosen`."""
+    return run_episode(
+        cell,
+        task=chosen.scenario.task,
+        scenario=chosen.name,
+        policy=chosen.policy,
+        seed=seed,
+        time_limit=chosen.scenario.time_limit,
+        realtime_rate=realtime_rate,
+        observers=observers,
+    )

@@ -1,0 +1,192 @@
+"""Reads scenarios from YAML; a mistake is told by its file and field."""
+
+import dataclasses as dc
+import typing
+from pathlib import Path
+
+import yaml
+from pydrake.common.yaml import yaml_dump, yaml_load, yaml_load_typed
+
+from kitting_drake.common.errors import UserError
+from kitting_drake.scenario.schema import LookAt, Scenario
+from kitting_drake.scenario.yaml_check import check_yaml
+from kitting_drake.tasks import Task
+from systems.bounds import check_bounds
+
+
+def load_scenario(path: Path, name: str | None = None, text: str | None = None) -> Scenario:
+    """Reads a scenario.
+
+    Args:
+        path: the YAML file: a mapping from names to scenarios.
+        name: which one; the first when None.
+        text: YAML merged over it: mappings field by field, all else replaced; a tag that is not
+            given is that of what is merged over.
+
+    Raises:
+        UserError: the file cannot be used; names the file and the field.
+    """
+    try:
+        content = path.read_text()
+    except (OSError, UnicodeDecodeError) as error:
+        reason = getattr(error, "strerror", None) or "it is not a text file"
+        raise UserError(f"cannot read the scenario {path}: {reason}") from error
+    root = _parse(content, str(path))
+    names = list(root)
+    fields = {item.name for item in dc.fields(Scenario)}
+    if names and not set(names) - fields:
+        raise UserError(
+            f"{path}: '{names[0]}' is a field, not a scenario: put the fields under a name of yours"
+        )
+    if name is None:
+        if not names:
+            raise UserError(f"{path} holds no scenario")
+        name = names[0]
+    if name not in root:
+        raise UserError(f"{path} has no scenario '{name}': use one of {', '.join(names)}")
+    scenario = _load(root[name], content, name, Scenario(), f"{path}: {name}")
+    if text is not None:
+        raw, defaults = _onto(_parse(text, "--scenario_text"), scenario)
+        scenario = _load(raw, yaml_dump(raw), None, defaults, "--scenario_text")
+    return scenario
+
+
+def _parse(content: str, where: str) -> dict:
+    try:
+        # A Python mapping swallows a field that is given twice.
+        _check_names(yaml.compose(content, Loader=yaml.SafeLoader))
+        # Drake takes an empty text for no text at all.
+        root = yaml_load(data=content) if content.strip() else None
+    except yaml.YAMLError as error:
+        mark = getattr(error, "problem_mark", None)
+        line = f", line {mark.line + 1}" if mark else ""
+        problem = getattr(error, "problem", None) or "it cannot be parsed"
+        raise UserError(f"{where}{line} is not YAML: {problem}") from error
+    except ValueError as error:
+        raise UserError(f"{where}: {error}") from error
+    except RecursionError as error:
+        raise UserError(f"{where} is not YAML that ends: it contains itself") from error
+    if root is None:
+        return {}
+    if not isinstance(root, dict):
+        raise UserError(f"{where} must be a mapping of names, not a {type(root).__name__}")
+    return root
+
+
+def _onto(raw: dict, defaults: Scenario) -> tuple[dict, Scenario]:
+    """Makes ready what is merged over a scenario.
+
+    Drake reads a mapping without a tag as the first variant of its union; here it is of the variant
+    that it is merged over. And where a tag brings another variant, nothing of its default mappings
+    is to remain beside what is given.
+    """
+    tagged = dict(raw)
+    for name in ("task", "policy"):
+        if name in raw:
+            tagged[name] = _of_variant(raw[name], getattr(defaults, name))
+    task = tagged.get("task")
+    if isinstance(task, dict):
+        defaults = dc.replace(defaults, task=_without_mappings(task, defaults.task))
+    cameras = raw.get("cameras")
+    if isinstance(cameras, dict):
+        tagged["cameras"] = {
+            name: _of_variant(camera, defaults.cameras[name])
+            if name in defaults.cameras
+            else camera
+            for name, camera in cameras.items()
+        }
+    return tagged, defaults
+
+
+def _without_mappings(given: dict, current: Task) -> Task:
+    """The task to merge `given` over: of another variant than `current`, its defaults, but for the
+    mappings that are given."""
+    for variant in typing.get_args(Task):
+        if given["_tag"] == f"!{variant.__name__}" and not isinstance(current, variant):
+            fresh = variant()
+            emptied = {
+                item.name: {}
+                for item in dc.fields(variant)
+                if item.name in given and isinstance(getattr(fresh, item.name), dict)
+            }
+            return dc.replace(fresh, **emptied)
+    return current
+
+
+def _of_variant(given: object, current: object) -> object:
+    """A mapping with the tag of a variant, if it has none of its own."""
+    return {"_tag": f"!{type(current).__name__}", **given} if isinstance(given, dict) else given
+
+
+def _check_names(node: yaml.Node | None) -> None:
+    if isinstance(node, yaml.MappingNode):
+        seen = set()
+        for key, value in node.value:
+            line = key.start_mark.line + 1
+            if key.tag != "tag:yaml.org,2002:str":
+                raise ValueError(f"the name on line {line} must be a text")
+            if key.value in seen:
+                raise ValueError(f"'{key.value}' is given twice (again on line {line})")
+            seen.add(key.value)
+            _check_names(value)
+    elif isinstance(node, yaml.SequenceNode):
+        for item in node.value:
+            _check_names(item)
+
+
+def _load(raw: object, content: str, name: str | None, defaults: Scenario, where: str) -> Scenario:
+    try:
+        check_yaml(Scenario, raw if raw is not None else {}, "")
+        if raw is None or raw == {}:
+            scenario = defaults
+        else:
+            scenario = yaml_load_typed(
+                schema=Scenario,
+                data=content,
+                child_name=name,
+                defaults=defaults,
+                # A file's cameras and tools replace the default ones; --scenario_text adds.
+                retain_map_defaults=name is None,
+            )
+        check_bounds(scenario)
+        _check_meaning(scenario)
+    except (ValueError, RuntimeError) as error:
+        text = str(error).splitlines()[0]
+        raise UserError(f"{where}: {text}") from error
+    return scenario
+
+
+def _check_meaning(scenario: Scenario) -> None:
+    """What no type and no range can say."""
+    if scenario.plant.contact_approximation not in ("lagged", "similar", "sap"):
+        raise ValueError(
+            "plant.contact_approximation must be lagged, similar or sap, "
+            f"not '{scenario.plant.contact_approximation}'"
+        )
+    steps = (1 / 64) / scenario.plant.time_step
+    if abs(steps - round(steps)) > 1e-9 or steps < 1:
+        raise ValueError(
+            "plant.time_step must divide 1/64 s, the planner's period, "
+            f"not be {scenario.plant.time_step:g}"
+        )
+    if scenario.heightmap.z_max <= scenario.heightmap.z_min:
+        raise ValueError("heightmap.z_max must be above heightmap.z_min")
+    scenario.task.validate()
+    for key, camera in scenario.cameras.items():
+        if isinstance(camera, LookAt) and camera.position[:2] == camera.target[:2]:
+            raise ValueError(
+                f"cameras.{key} looks straight down, where upright means nothing: use !Pinhole"
+            )
+    planner = scenario.planner
+    if planner.home[2] < planner.floor_clearance:
+        raise ValueError(
+            "planner.home[2] is below planner.floor_clearance: the hand would begin in the table"
+        )
+    if planner.grasp_force > scenario.controller.finger_force_limit:
+        raise ValueError(
+            f"planner.grasp_force is {planner.grasp_force:g} N, more than the fingers can press "
+            f"(controller.finger_force_limit: {scenario.controller.finger_force_limit:g} N)"
+        )
+    scenario.policy.validate()
+    if scenario.policy.needs_observation and not scenario.cameras:
+        raise ValueError("cameras is empty: this policy needs at least one to see by")

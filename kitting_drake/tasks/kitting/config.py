@@ -1,0 +1,290 @@
+"""The kitting tasks: which tools, which kit, where they stand, and when a tool is kitted."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from pydrake.math import RigidTransform, RollPitchYaw
+
+from kitting_drake.common.errors import UserError
+from kitting_drake.hkd.kits.kit import Kit, KitParameters, make_kit
+from kitting_drake.hkd.tools.scaling import scaled_tool
+from kitting_drake.hkd.tools.tool import Tool, load_tool
+from kitting_drake.hkd.tools.toolsets import SPLITS, toolsets
+from kitting_drake.policies.learning import Learning
+from kitting_drake.tasks.kitting import diagnosis
+from kitting_drake.tasks.kitting.sampling import TablePose, check_arrangement, draw_poses
+from kitting_drake.tasks.task import ActionRecord, Fixture, Scene, SceneObject, TaskConfig
+from systems.bounds import bounded
+from systems.placement import AddS, Goal, Placement
+from systems.signals import PixelGrid
+
+_SURFACE_POINTS = 2000
+_MOST_TOOLS = 12
+
+SEEN = "kitting-seen-toolset"
+UNSEEN = "kitting-unseen-toolsets"
+"""The tasks of the paper (section V-B.1)."""
+
+
+@dataclass
+class _KittingTask(TaskConfig):
+    """What all kitting tasks share."""
+
+    # The kit block and its cavities.
+    kit: KitParameters = field(default_factory=KitParameters)
+
+    # ADD-S below this is a success (section IV-C of the paper), in m.
+    success_threshold: float = bounded(0.0035, 1e-6, 1.0)
+
+    causes = diagnosis.CAUSES
+
+    @property
+    def learning(self) -> Learning:
+        return Learning(later_picks_possible=True, curvature=True)
+
+    def find_cause(
+        self,
+        scene: Scene,
+        index: int,
+        X_WB: Sequence[RigidTransform],
+        placement: Placement,
+        records: Sequence[ActionRecord],
+    ) -> str:
+        return diagnosis.find_cause(scene, index, X_WB[index], placement, records)
+
+    def _kit_of(self, tools: Sequence[Tool]) -> Kit:
+        try:
+            return make_kit(tools, self.kit)
+        except UserError as error:
+            raise UserError(f"task.tools: {error}") from error
+
+
+@dataclass
+class _DrawnKitting(_KittingTask):
+    """What tasks share whose tools and kit stand anywhere in the workspace, drawn from the seed."""
+
+    # Least distance between any two of tools and kit, in m.
+    spacing: float = bounded(0.008, 0.0, 0.2)
+
+    # Rotations of tools and kit are drawn within plus or minus this, in degrees.
+    yaw_range_deg: float = bounded(180.0, 0.0, 180.0)
+
+    # The order in which an oracle takes the tools: drawn from the seed, or as listed.
+    random_order: bool = True
+
+    def _draw_scene(self, tools: list[Tool], grid: PixelGrid, seed: int) -> Scene:
+        kit = self._kit_of(tools)
+        rng = np.random.default_rng(seed)
+        X_WKit, X_WTools = draw_poses(
+            kit,
+            tools,
+            grid=grid,
+            spacing=self.spacing,
+            yaw_range_deg=self.yaw_range_deg,
+            rng=rng,
+        )
+        order = rng.permutation(len(tools)) if self.random_order else np.arange(len(tools))
+        return kitting_scene(kit, X_WKit, X_WTools, order, self.success_threshold)
+
+
+@dataclass
+class Kitting(_DrawnKitting):
+    """A kit and its tools, in poses drawn from the seed: kitting-seen-toolset."""
+
+    # 1 to 12 tools, one of them several times too: names under models/tools, or paths of tool
+    # folders.
+    tools: list[str] = field(
+        default_factory=lambda: [
+            "claw_hammer",
+            "slip_joint_pliers",
+            "combination_wrench",
+            "flat_screwdriver",
+        ]
+    )
+
+    @property
+    def title(self) -> str:
+        return SEEN if self == Kitting() else "kitting"
+
+    def make_scene(self, *, grid: PixelGrid, seed: int, base: Path) -> Scene:
+        return self._draw_scene(_load_tools(self.tools, base), grid, seed)
+
+    def input_files(self, base: Path) -> list[Path]:
+        return _tool_files(self.tools, base)
+
+    def validate(self) -> None:
+        _check_count(len(self.tools))
+
+
+@dataclass
+class ToolsetKitting(_DrawnKitting):
+    """Tools and kit drawn from the seed too, out of a pool: kitting-unseen-toolsets."""
+
+    # The pool: train or test (section IV-B.1 of the paper).
+    split: str = "test"
+
+    # Whether each tool's length is drawn, within tool_length in m (section IV-B.2); else it is
+    # that of the dataset.
+    random_lengths: bool = True
+    tool_length: list[float] = bounded([0.15, 0.20], 0.05, 0.30)
+
+    @property
+    def title(self) -> str:
+        if self == ToolsetKitting(split="test"):
+            return UNSEEN
+        return "kitting-train-toolsets" if self == ToolsetKitting(split="train") else "kitting"
+
+    def make_scene(self, *, grid: PixelGrid, seed: int, base: Path) -> Scene:
+        choices = toolsets(self.split)
+        # Streams of their own: the poses of a seed depend neither on how many toolsets there are
+        # nor on the lengths.
+        names = choices[np.random.default_rng([seed, 1]).integers(len(choices))]
+        tools = _load_tools(names, base)
+        if self.random_lengths:
+            lengths = np.random.default_rng([seed, 2]).uniform(*self.tool_length, len(tools))
+            tools = [
+                scaled_tool(tool, float(length))
+                for tool, length in zip(tools, lengths, strict=True)
+            ]
+        return self._draw_scene(tools, grid, seed)
+
+    def validate(self) -> None:
+        if self.split not in SPLITS:
+            raise ValueError(f"task.split must be one of {', '.join(SPLITS)}, not '{self.split}'")
+        if self.tool_length[0] > self.tool_length[1]:
+            raise ValueError("task.tool_length must be the least length and then the greatest")
+
+
+@dataclass
+class ArrangedKitting(_KittingTask):
+    """Tools and kit stand where you say, and an oracle takes them in the order given."""
+
+    # Tools by name or path, each with its pose on the table.
+    tools: dict[str, TablePose] = field(
+        default_factory=lambda: {"claw_hammer": TablePose(x=0.35, y=0.3, yaw_deg=90.0)}
+    )
+
+    # Where the kit stands.
+    kit_pose: TablePose = field(default_factory=lambda: TablePose(x=0.5, y=-0.1))
+
+    @property
+    def title(self) -> str:
+        return "arranged"
+
+    def make_scene(self, *, grid: PixelGrid, seed: int, base: Path) -> Scene:
+        tools = _load_tools(self.tools, base)
+        kit = self._kit_of(tools)
+        poses = list(self.tools.values())
+        check_arrangement(
+            kit,
+            self.kit_pose,
+            dict(zip(self.tools, zip(tools, poses, strict=True), strict=True)),
+        )
+        return kitting_scene(
+            kit,
+            self.kit_pose.transform(),
+            [pose.transform() for pose in poses],
+            np.arange(len(tools)),
+            self.success_threshold,
+        )
+
+    def input_files(self, base: Path) -> list[Path]:
+        return _tool_files(self.tools, base)
+
+    def validate(self) -> None:
+        _check_count(len(self.tools))
+
+
+def kitting_scene(
+    kit: Kit,
+    X_WKit: RigidTransform,
+    X_WTools: Sequence[RigidTransform],
+    order: Sequence[int] | np.ndarray,
+    threshold: float,
+) -> Scene:
+    """The scene of a kit and its tools; a goal for each cavity.
+
+    Tools that are alike may fill each other's cavities.
+
+    Args:
+        kit: the kit, which knows its tools.
+        X_WKit: its pose.
+        X_WTools: the initial pose of each tool.
+        order: in which an expert takes the tools, indices into the kit's.
+        threshold: of ADD-S, in metres.
+    """
+    tools = [kit.tools[index] for index in order]
+    names = _unique_names(tools)
+    rim = float(X_WKit.translation()[2]) + kit.size[2]
+    goals = []
+    for name, tool, index in zip(names, tools, order, strict=True):
+        pose = kit.goal(int(index))
+        X_KGoal = RigidTransform(RollPitchYaw(0, 0, pose.yaw), [pose.x, pose.y, pose.z])
+        alike = tuple(i for i, other in enumerate(tools) if _are_alike(tool, other))
+        goals.append(
+            Goal(
+                name=f"cavity of {name}",
+                objects=alike,
+                poses=(X_WKit @ X_KGoal,),
+                reward=1 / len(tools),
+                rim_height=rim,
+            )
+        )
+    return Scene(
+        objects=tuple(
+            SceneObject(
+                name=name,
+                category=tool.category,
+                model=tool.sdf,
+                X_WB=X_WTools[index],
+                p_BPoints=tool.surface_points(_SURFACE_POINTS),
+                grasps=(tool.grasp,),
+                symmetry=getattr(tool, "symmetry", 1),
+            )
+            for name, tool, index in zip(names, tools, order, strict=True)
+        ),
+        fixtures=(Fixture("kit", kit.sdf, X_WKit),),
+        goals=tuple(goals),
+        success=AddS(threshold),
+        max_actions=len(tools),
+    )
+
+
+def _are_alike(tool: Tool, other: Tool) -> bool:
+    return tool.directory == other.directory and tool.length == other.length
+
+
+def _unique_names(tools: Sequence[Tool]) -> list[str]:
+    names: list[str] = []
+    for tool in tools:
+        name, number = tool.name, 2
+        while name in names:
+            name, number = f"{tool.name}_{number}", number + 1
+        names.append(name)
+    return names
+
+
+def _load_tools(names: Sequence[str] | dict[str, TablePose], base: Path) -> list[Tool]:
+    loaded = {name: _load_tool(name, base) for name in dict.fromkeys(names)}
+    return [loaded[name] for name in names]
+
+
+def _load_tool(name: str, base: Path) -> Tool:
+    try:
+        return load_tool(name, base)
+    except UserError as error:
+        raise UserError(f"task.tools: {error}") from error
+
+
+def _tool_files(names: Sequence[str] | dict[str, TablePose], base: Path) -> list[Path]:
+    folders = [tool.directory for tool in _load_tools(names, base)]
+    return [path for folder in folders for path in sorted(folder.iterdir()) if path.is_file()]
+
+
+def _check_count(count: int) -> None:
+    if not count:
+        raise ValueError("task.tools is empty: name at least one tool")
+    if count > _MOST_TOOLS:
+        raise ValueError(f"task.tools has {count} tools: a kit takes up to {_MOST_TOOLS}")

@@ -1,0 +1,114 @@
+"""Why a tool that was not kitted was not. Decided from true poses, which no policy sees."""
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+from pydrake.math import RigidTransform
+
+from kitting_drake.tasks.task import (
+    MISPLACED,
+    MISSED_GRASP,
+    NEVER_PICKED,
+    SLIPPED,
+    ActionRecord,
+    Scene,
+    last_action_on,
+)
+from systems.placement import Placement, heading
+from systems.signals import wrap_to_pi
+
+BLOCKED = "insertion blocked"
+WRONG_CAVITY = "wrong cavity"
+REVERSED = "reversed"
+
+CAUSES = (MISSED_GRASP, SLIPPED, BLOCKED, WRONG_CAVITY, REVERSED, MISPLACED, NEVER_PICKED)
+
+_NEAR = 0.030
+"""A tool this close to a cavity is over it: half the distance of two cavities, in m."""
+_BORDER = 0.015
+"""How far a kit reaches beyond its tools, in m."""
+_ALIGNED = math.radians(20.0)
+"""With its heading no further than this from a cavity's, a tool lies along it."""
+_TILTED = math.radians(60.0)
+"""Tilted further than this, a tool does not lie on the side on which it should."""
+
+
+def find_cause(
+    scene: Scene,
+    index: int,
+    X_WB: RigidTransform,
+    placement: Placement,
+    records: Sequence[ActionRecord],
+) -> str:
+    """One of `CAUSES`, for a tool that is no success.
+
+    - `never picked`: no action on it came to an end.
+    - `missed grasp`: it was tried, and never held.
+    - `reversed`: at its cavity, but the wrong way round or on the wrong side.
+    - `insertion blocked`: over its cavity, but protruding or off.
+    - `slipped`: lost on the way; or left outside the kit by an action that was right.
+    - `wrong cavity`: over another tool's.
+    - `misplaced`: put anywhere else.
+
+    Args:
+        scene: the episode's.
+        index: of the tool among the scene's objects.
+        X_WB: where it ended.
+        placement: against the cavity that it is nearest to filling.
+        records: the episode's actions.
+    """
+    item = scene.objects[index]
+    last = last_action_on(item.name, records)
+    if isinstance(last, str):
+        return last
+    middle = (item.p_BPoints.min(axis=0) + item.p_BPoints.max(axis=0)) / 2
+    goal = scene.goals[placement.goal] if placement.goal is not None else None
+    if goal is not None:
+        X_WGoal = goal.poses[placement.pose]
+        grasp_point = np.array([item.grasps[0].x, item.grasps[0].y, 0.0])
+        # Half a rotation about the grasp leaves the grasp where it was and takes the middle away.
+        if min(_gap(X_WB, X_WGoal, middle), _gap(X_WB, X_WGoal, grasp_point)) < _NEAR:
+            rotation = abs(wrap_to_pi(heading(X_WB) - heading(X_WGoal)))
+            if rotation > math.pi - _ALIGNED or _tilt(X_WB) > _TILTED:
+                return REVERSED
+            if rotation < _ALIGNED:
+                return BLOCKED
+    if last.outcome == "dropped":
+        return SLIPPED
+    if any(_is_over(X_WB @ middle, X_WB, X) for g in scene.goals if g is not goal for X in g.poses):
+        return WRONG_CAVITY
+    meant_well = (last.place_position_error_mm or 0.0) < 1e3 * _NEAR and (
+        last.place_angle_error_deg or 0.0
+    ) < math.degrees(_ALIGNED)
+    return SLIPPED if meant_well and not _is_over_kit(scene, X_WB @ middle) else MISPLACED
+
+
+def _gap(X_WB: RigidTransform, X_WGoal: RigidTransform, point: np.ndarray) -> float:
+    """Horizontal distance of a body's point (3) from where it belongs, in m."""
+    return float(np.linalg.norm((X_WB @ point - X_WGoal @ point)[:2]))
+
+
+def _tilt(X_WB: RigidTransform) -> float:
+    """The angle between body z and world z, in radians."""
+    return math.acos(np.clip(X_WB.rotation().matrix()[2, 2], -1.0, 1.0))
+
+
+def _is_over(p_WMiddle: np.ndarray, X_WB: RigidTransform, X_WGoal: RigidTransform) -> bool:
+    """Whether a tool lies over and along a cavity, either way round."""
+    along = abs(wrap_to_pi(2 * (heading(X_WB) - heading(X_WGoal)))) / 2 < _ALIGNED
+    return along and float(np.linalg.norm((p_WMiddle - X_WGoal.translation())[:2])) < _NEAR
+
+
+def _is_over_kit(scene: Scene, p_WPoint: np.ndarray) -> bool:
+    """Whether a point is over the kit: over the bounding box, in its frame, of all seated tools."""
+    X_KW = scene.fixtures[0].X_WF.inverse()
+    seated = np.concatenate(
+        [
+            (X_KW @ goal.poses[0]).multiply(scene.objects[goal.objects[0]].p_BPoints.T).T
+            for goal in scene.goals
+        ]
+    )
+    low, high = seated.min(axis=0)[:2] - _BORDER, seated.max(axis=0)[:2] + _BORDER
+    point = (X_KW @ p_WPoint)[:2]
+    return bool((point >= low).all() and (point <= high).all())

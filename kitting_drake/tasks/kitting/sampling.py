@@ -1,0 +1,193 @@
+"""Poses of kit and tools on the table: drawn from a seed, or checked where a person gives them."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from manifold3d import CrossSection, JoinType
+from pydrake.math import RigidTransform, RollPitchYaw
+
+from kitting_drake.common.errors import UserError
+from kitting_drake.hkd.kits.kit import Kit
+from kitting_drake.hkd.tools.tool import Tool
+from kitting_drake.tasks.task import TABLE
+from systems.bounds import bounded
+from systems.hand_geometry import FINGER_DEPTH, FINGER_LENGTH, MAX_OPENING, PALM_SIZE
+from systems.signals import PixelGrid
+
+_TRIES = 300
+_RESTARTS = 60
+_MANY = 6
+"""With more tools than this, those that are hardest to place are drawn first."""
+
+
+@dataclass
+class TablePose:
+    """A pose on the table."""
+
+    # World x and y, in m.
+    x: float = bounded(0.5, -2.0, 2.0)
+    y: float = bounded(0.0, -2.0, 2.0)
+
+    # Rotation about world z, counter-clockwise, in degrees.
+    yaw_deg: float = bounded(0.0, -360.0, 360.0)
+
+    def transform(self) -> RigidTransform:
+        """X_W of a frame that stands there."""
+        yaw = np.deg2rad(self.yaw_deg)
+        return RigidTransform(RollPitchYaw(0, 0, yaw), [self.x, self.y, 0])
+
+
+@dataclass(frozen=True)
+class _Footprint:
+    """What is covered on the table: by a thing, and by the open hand that grasps it."""
+
+    outline: CrossSection
+    fingers: CrossSection
+    palm: CrossSection
+    """The palm is above every tool, but not above a kit block."""
+
+    def moved(self, pose: TablePose) -> "_Footprint":
+        return _Footprint(
+            *(
+                shape.rotate(pose.yaw_deg).translate((pose.x, pose.y))
+                for shape in (self.outline, self.fingers, self.palm)
+            )
+        )
+
+
+def block_outline(kit: Kit) -> CrossSection:
+    """The kit block from above, in its frame, in metres."""
+    return CrossSection.square(kit.size[:2], True)
+
+
+def check_arrangement(
+    kit: Kit, kit_pose: TablePose, tools: dict[str, tuple[Tool, TablePose]]
+) -> None:
+    """Checks that kit and tools are on the table, and not within each other.
+
+    Args:
+        kit: the kit.
+        kit_pose: where it stands.
+        tools: the tools by the names that the scenario gives them, and where they lie.
+
+    Raises:
+        UserError: they are not; names the fields.
+    """
+    table = _rectangle(*TABLE)
+    placed: dict[str, CrossSection] = {}
+    things = {"task.kit_pose": (block_outline(kit), kit_pose)}
+    things |= {f"task.tools.{name}": (tool.silhouette, pose) for name, (tool, pose) in tools.items()}
+    for name, (outline, pose) in things.items():
+        outline = outline.rotate(pose.yaw_deg).translate((pose.x, pose.y))
+        if (outline - table).area() > 1e-9:
+            (x_min, y_min), (x_max, y_max) = TABLE
+            raise UserError(
+                f"{name} is not whole on the table, which is x from {x_min:g} to {x_max:g} m and "
+                f"y from {y_min:g} to {y_max:g} m"
+            )
+        for other, standing in placed.items():
+            if _overlap(outline, standing):
+                raise UserError(f"{other} and {name} are within each other")
+        placed[name] = outline
+
+
+def draw_poses(
+    kit: Kit,
+    tools: Sequence[Tool],
+    *,
+    grid: PixelGrid,
+    spacing: float,
+    yaw_range_deg: float,
+    rng: np.random.Generator,
+) -> tuple[RigidTransform, list[RigidTransform]]:
+    """Poses of the kit and of the tools, within the workspace and on the table.
+
+    Nothing collides, and every tool can be reached: the open hand at its grasp touches no other
+    tool and no kit.
+
+    Args:
+        kit: the kit.
+        tools: the tools.
+        grid: the workspace.
+        spacing: least distance between any two, in metres.
+        yaw_range_deg: rotations are drawn within plus or minus this, in degrees.
+        rng: for all draws.
+
+    Returns:
+        X_WKit, and X_WT of each tool.
+
+    Raises:
+        UserError: no free space was found.
+    """
+    seen = _rectangle((grid.x_min, grid.y_min), (grid.x_max, grid.y_max))
+    room = seen ^ _rectangle(*TABLE)
+    shapes = [_Footprint(block_outline(kit), CrossSection(), CrossSection())]
+    shapes += [_tool_footprint(tool) for tool in tools]
+    order = list(range(len(shapes)))
+    if len(tools) > _MANY:
+        order.sort(key=lambda index: (index > 0, -shapes[index].outline.area()))
+    for _ in range(_RESTARTS):
+        poses: dict[int, TablePose] = {}
+        placed: list[_Footprint] = []
+        for index in order:
+            found = _draw_pose(shapes[index], placed, room, grid, spacing, yaw_range_deg, rng)
+            if found is None:
+                break
+            poses[index], footprint = found
+            placed.append(footprint)
+        else:
+            transforms = [poses[index].transform() for index in range(len(shapes))]
+            return transforms[0], transforms[1:]
+    raise UserError(
+        f"there is no free space in the workspace for the kit and {len(tools)} tools: "
+        "enlarge heightmap.rows and heightmap.cols, or lessen task.spacing"
+    )
+
+
+def _draw_pose(
+    shape: _Footprint,
+    placed: list[_Footprint],
+    room: CrossSection,
+    grid: PixelGrid,
+    spacing: float,
+    yaw_range_deg: float,
+    rng: np.random.Generator,
+) -> tuple[TablePose, _Footprint] | None:
+    """A free pose, the first of them that is placed being the kit; None if none was found."""
+    for _ in range(_TRIES):
+        x, y = rng.uniform((grid.x_min, grid.y_min), (grid.x_max, grid.y_max))
+        pose = TablePose(x=x, y=y, yaw_deg=rng.uniform(-yaw_range_deg, yaw_range_deg))
+        candidate = shape.moved(pose)
+        if (candidate.outline - room).area() > 1e-9:
+            continue
+        grown = candidate.outline.offset(spacing, JoinType.Square)
+        blocked = any(
+            _overlap(grown, other.outline)
+            or _overlap(candidate.fingers, other.outline)
+            or _overlap(candidate.outline, other.fingers)
+            for other in placed
+        )
+        if not blocked and not (placed and _overlap(candidate.palm, placed[0].outline)):
+            return pose, candidate
+    return None
+
+
+def _tool_footprint(tool: Tool) -> _Footprint:
+    def at_grasp(size: tuple[float, float]) -> CrossSection:
+        rectangle = CrossSection.square(size, True)
+        return rectangle.rotate(np.rad2deg(tool.grasp.theta)).translate(
+            (tool.grasp.x, tool.grasp.y)
+        )
+
+    open_fingers = (FINGER_LENGTH, MAX_OPENING + 2 * FINGER_DEPTH)
+    # The hull is coarser than the outline and never smaller.
+    return _Footprint(tool.silhouette.hull(), at_grasp(open_fingers), at_grasp(PALM_SIZE))
+
+
+def _rectangle(lower: tuple[float, float], upper: tuple[float, float]) -> CrossSection:
+    return CrossSection.square((upper[0] - lower[0], upper[1] - lower[1])).translate(lower)
+
+
+def _overlap(a: CrossSection, b: CrossSection) -> bool:
+    return (a ^ b).area() > 1e-9

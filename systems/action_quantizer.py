@@ -1,0 +1,28 @@
+"""The finite set of actions that a policy of the paper chooses from (section III-A)."""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from systems.signals import PixelGrid
+
+
+@dataclass(frozen=True)
+class ActionQuantizer:
+    """Rounds positions to pixel centres and rotations to N orientations."""
+
+    grid: PixelGrid
+    """Positions are centres of its pixels."""
+    orientations: int
+    """N: angles are among 2 pi i / N."""
+
+    def position(self, x: float, y: float) -> tuple[float, float]:
+        """The nearest pixel centre, in metres."""
+        pixel = np.clip(np.round(self.grid.to_pixel((x, y))), 0, np.array(self.grid.shape) - 1)
+        rounded_x, rounded_y = self.grid.to_world(pixel)
+        return float(rounded_x), float(rounded_y)
+
+    def angle(self, theta: float) -> float:
+        """The nearest of the N orientations, in radians."""
+        return round(theta * self.orientations / math.tau) * math.tau / self.orientations

@@ -1,0 +1,21 @@
+"""The Franka hand's geometry, as `models/franka_hand` has it: the one place that owns it.
+
+The gripper frame G: the origin midway between the fingertip ends, z up, the jaws close along y.
+Lengths in metres.
+"""
+
+PAD_LENGTH = 0.0176
+"""Of the pads' gripping faces along G's x."""
+FINGER_LENGTH = 0.0208
+"""Of the fingers along G's x."""
+FINGER_DEPTH = 0.0263
+"""How far a finger reaches from its pad away from the other, along G's y, at any height above the
+pads."""
+FINGERTIP_DEPTH = 0.015
+"""The same near the fingertip."""
+MAX_OPENING = 0.080
+"""Between the pads of the open jaws."""
+PALM_SIZE = (0.064, 0.209)
+"""Extents of the palm along G's x and y."""
+PALM_HEIGHT = 0.046
+"""Of the underside of the palm above the fingertips."""

@@ -1,0 +1,361 @@
+"""Goals, how far objects are from them, and when that is success.
+
+No Drake system is in here: `PlacementMonitor` and `OraclePolicy` evaluate these laws.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+from pydrake.math import RigidTransform, RollPitchYaw
+from pydrake.multibody.tree import BodyIndex
+from scipy.optimize import linear_sum_assignment
+from scipy.spatial import cKDTree
+
+from systems.signals import wrap_to_pi
+
+STRICT_HEIGHT = 0.002
+"""A strict success stands at most this far above or below its goal, in metres."""
+STRICT_ANGLE = math.radians(20.0)
+"""Its heading differs by at most this, modulo the object's symmetry, in radians."""
+
+_FAR = 0.5
+"""Beyond this an object is no nearer to one goal than to another, in metres."""
+_FREE_ANGLES = 24
+"""In how many headings an object of any heading is compared with its goal."""
+
+
+@dataclass(frozen=True)
+class PlacedObject:
+    """An object as placements are scored."""
+
+    name: str
+    body: BodyIndex
+    """The object's body B, whose frame points and goal poses refer to."""
+    p_BPoints: NDArray[np.float64]
+    """(m, 3) points of the object's surface, in metres. Sample them by area: the score must not
+    depend on how finely a mesh is cut."""
+    symmetry: int = 1
+    """Rotations about body z by 2 pi / symmetry that a person could not tell; 1 when there are
+    none. Declared with the object, not measured by ADD-S."""
+
+    @cached_property
+    def p_BMiddle(self) -> NDArray[np.float64]:
+        """(3,) the middle of the points' bounding box, where positions are compared. It lies on the
+        axis of a round object; the origin of B need not, and would wander as the object rolls."""
+        return (self.p_BPoints.min(axis=0) + self.p_BPoints.max(axis=0)) / 2
+
+    @cached_property
+    def p_BCorners(self) -> NDArray[np.float64]:
+        """(8, 3) corners of the points' bounding box."""
+        low, high = self.p_BPoints.min(axis=0), self.p_BPoints.max(axis=0)
+        signs = np.array(np.meshgrid(*[(0, 1)] * 3)).reshape(3, -1).T
+        return low + signs * (high - low)
+
+    @cached_property
+    def tree(self) -> cKDTree:
+        """Of the points."""
+        return cKDTree(self.p_BPoints)
+
+
+@dataclass(frozen=True)
+class Goal:
+    """Something to be brought about: one of some objects in one of some poses."""
+
+    name: str
+    objects: tuple[int, ...]
+    """Which objects may fill it, as indices into the scene's."""
+    poses: tuple[RigidTransform, ...]
+    """X_WGoal: any of these poses of the object's frame will do."""
+    reward: float
+    """Share of the episode's score; those of all goals add up to 1."""
+    after: tuple[int, ...] = ()
+    """The goals that must be filled before this one counts, as indices into the scene's."""
+    any_heading: bool = False
+    """Whether the object's rotation about world z means nothing."""
+    rim_height: float | None = None
+    """World z of the rim that the object is inserted below, in metres; None: it is put down."""
+
+
+@dataclass(frozen=True)
+class Placement:
+    """Where one object is, relative to the goal that it is nearest to filling."""
+
+    goal: int | None = None
+    """Index of the goal; None for an object that no goal is left for."""
+    pose: int = 0
+    """Which of the goal's poses is the nearest."""
+    add_s: float = math.inf
+    """Equation 9 of the paper, in metres."""
+    position_error: float = math.inf
+    """Horizontal distance of the middles (`PlacedObject.p_BMiddle`), in metres."""
+    angle_error: float = math.inf
+    """Heading beyond the goal's, about world z and modulo the object's symmetry, in radians;
+    zero where any heading will do."""
+    height_error: float = math.inf
+    """How far the middle is above the goal's, in metres."""
+    share: float = 0.0
+    """Of the goal's reward, 0 to 1, by the success predicate; 0 while a goal that must come
+    before is not filled."""
+
+    @property
+    def success(self) -> bool:
+        """Whether the object fills its goal by the task's own measure."""
+        return self.share > 1 - 1e-9
+
+    @property
+    def strict_success(self) -> bool:
+        """Success that a person would sign: at its height and heading too."""
+        return (
+            self.success
+            and abs(self.height_error) <= STRICT_HEIGHT
+            and abs(self.angle_error) <= STRICT_ANGLE
+        )
+
+
+class SuccessPredicate(Protocol):
+    """When an object fills its goal."""
+
+    @property
+    def description(self) -> str:
+        """In words, for people: what is asked for, with its threshold."""
+        ...
+
+    def share(self, placement: Placement, X_WB: RigidTransform) -> float:
+        """The share of the goal's reward, 0 to 1, that a placement earns by its pose alone.
+
+        Args:
+            placement: the errors; its own `share` is not yet known.
+            X_WB: the object's pose.
+        """
+        ...
+
+
+@dataclass(frozen=True)
+class AddS:
+    """Success by the paper's measure (section IV-C): ADD-S below a threshold."""
+
+    threshold: float = 0.0035
+    """In metres."""
+
+    @property
+    def description(self) -> str:
+        return f"ADD-S below {1e3 * self.threshold:g} mm"
+
+    def share(self, placement: Placement, X_WB: RigidTransform) -> float:
+        return float(placement.add_s < self.threshold)
+
+
+@dataclass(frozen=True)
+class PoseWithin:
+    """Success as Ravens has it: a pose error below thresholds; heights are not compared."""
+
+    position: float = 0.01
+    """Horizontal, in metres."""
+    angle: float = math.radians(15.0)
+    """Modulo the object's symmetry, in radians."""
+
+    @property
+    def description(self) -> str:
+        return f"within {1e3 * self.position:g} mm and {math.degrees(self.angle):g} degrees"
+
+    def share(self, placement: Placement, X_WB: RigidTransform) -> float:
+        near = placement.position_error < self.position
+        return float(near and abs(placement.angle_error) < self.angle)
+
+
+@dataclass(frozen=True)
+class InZone:
+    """Success as Ravens has it for zones: the share of an object's volume that is in a box."""
+
+    X_WZone: RigidTransform
+    """The zone stands on the origin of this frame."""
+    size: tuple[float, float, float]
+    """Extents of the zone along the axes of its frame, in metres."""
+    p_BVolume: NDArray[np.float64] = field(repr=False)
+    """(m, 3) points that fill an object evenly, in its frame, in metres."""
+
+    @property
+    def description(self) -> str:
+        length, width, height = (1e3 * side for side in self.size)
+        return f"inside a zone of {length:g} x {width:g} x {height:g} mm"
+
+    def share(self, placement: Placement, X_WB: RigidTransform) -> float:
+        points = self.X_WZone.InvertAndCompose(X_WB).multiply(self.p_BVolume.T).T
+        half = np.array([self.size[0] / 2, self.size[1] / 2])
+        inside = (np.abs(points[:, :2]) <= half).all(axis=1)
+        inside &= (points[:, 2] >= 0) & (points[:, 2] <= self.size[2])
+        return float(inside.mean())
+
+
+def heading(X_WB: RigidTransform) -> float:
+    """The direction of body x seen from above, about world +z, in radians."""
+    x_axis = X_WB.rotation().col(0)
+    return float(np.arctan2(x_axis[1], x_axis[0]))
+
+
+def add_s(points: NDArray[np.float64], X_WGoal: RigidTransform, X_WActual: RigidTransform) -> float:
+    """The average distance for symmetric objects, equation 9 of the paper, in metres.
+
+    The mean, over the model's points at the goal pose, of the distance to the *nearest* model point
+    at the actual pose: a rotation that maps the *points* onto themselves costs nothing, one that
+    maps the surface onto itself costs no more than the distance between neighbouring points.
+
+    It forgives much: a flat object that protrudes from its goal by h scores about h / 2, and a
+    reversed one may score less than the paper's threshold. See `Placement.strict_success`.
+
+    Args:
+        points: (m, 3) model points in the body frame.
+        X_WGoal: the target pose.
+        X_WActual: the pose reached.
+    """
+    return _add_s(cKDTree(points), points, X_WGoal, X_WActual)
+
+
+def _add_s(
+    tree: cKDTree,
+    points: NDArray[np.float64],
+    X_WGoal: RigidTransform,
+    X_WActual: RigidTransform,
+) -> float:
+    # Distances do not depend on the frame: queried in the actual body frame, one tree serves all.
+    X_ActualGoal = X_WActual.InvertAndCompose(X_WGoal)
+    goal_points = points @ X_ActualGoal.rotation().matrix().T + X_ActualGoal.translation()
+    return float(tree.query(goal_points)[0].mean())
+
+
+def evaluate_placements(
+    objects: Sequence[PlacedObject],
+    goals: Sequence[Goal],
+    success: SuccessPredicate,
+    poses: Sequence[RigidTransform],
+) -> list[Placement]:
+    """Assigns objects to the goals that they may fill, and measures how far from them they are.
+
+    The assignment is the one of least displacement in all (Hungarian method), the displacement of
+    an object being the mean distance of the corners of its bounding box from where they belong.
+
+    Args:
+        objects: n of them.
+        goals: what is to be brought about.
+        success: when a goal is filled.
+        poses: n, X_WB of each object.
+
+    Returns:
+        One for each object, in their order. An object without a goal has no errors.
+    """
+    placements = [Placement() for _ in objects]
+    for index, goal_index, pose_index in _assign(objects, goals, poses):
+        goal = goals[goal_index]
+        placements[index] = _measure(
+            objects[index], goal, goal_index, pose_index, poses[index], success
+        )
+    filled = {item.goal for item in placements if item.success}
+
+    def counts(goal: int) -> bool:
+        return all(other in filled and counts(other) for other in goals[goal].after)
+
+    return [
+        item if item.goal is None or counts(item.goal) else dataclasses.replace(item, share=0.0)
+        for item in placements
+    ]
+
+
+def _assign(
+    objects: Sequence[PlacedObject], goals: Sequence[Goal], poses: Sequence[RigidTransform]
+) -> list[tuple[int, int, int]]:
+    """(object, goal, pose) of each pair."""
+    # Pairs that are not allowed cost more than all that are.
+    cost = np.full((len(objects), len(goals)), 10.0 * _FAR * max(len(objects), 1))
+    nearest = np.zeros(cost.shape, int)
+    for column, goal in enumerate(goals):
+        for row in goal.objects:
+            distances = [
+                displacement(objects[row], X_WGoal, poses[row], any_heading=goal.any_heading)
+                for X_WGoal in goal.poses
+            ]
+            nearest[row, column] = int(np.argmin(distances))
+            cost[row, column] = min(distances[nearest[row, column]], _FAR)
+    return [
+        (int(row), int(column), int(nearest[row, column]))
+        for row, column in zip(*linear_sum_assignment(cost), strict=True)
+        if row in goals[column].objects
+    ]
+
+
+def displacement(
+    item: PlacedObject, X_WGoal: RigidTransform, X_WB: RigidTransform, *, any_heading: bool = False
+) -> float:
+    """The mean distance of the corners of an object's bounding box from where they belong.
+
+    Args:
+        item: the object.
+        X_WGoal: where it belongs; its symmetry makes other poses as good.
+        X_WB: where it is.
+        any_heading: whether all its headings are as good.
+
+    Returns:
+        In metres, for the best of the poses that are as good.
+    """
+    here = X_WB.multiply(item.p_BCorners.T)
+    order = _FREE_ANGLES if any_heading else item.symmetry
+    return min(
+        float(np.linalg.norm(here - X_WGoal.multiply(_turn(item, step, order).T), axis=0).mean())
+        for step in range(order)
+    )
+
+
+def _turn(item: PlacedObject, step: int, order: int) -> NDArray[np.float64]:
+    """(8, 3) the corners, rotated about the body's z axis through its middle."""
+    if step == 0:
+        return item.p_BCorners
+    R = RollPitchYaw(0, 0, step * math.tau / order).ToRotationMatrix().matrix()
+    return (item.p_BCorners - item.p_BMiddle) @ R.T + item.p_BMiddle
+
+
+def _measure(
+    item: PlacedObject,
+    goal: Goal,
+    goal_index: int,
+    pose_index: int,
+    X_WB: RigidTransform,
+    success: SuccessPredicate,
+) -> Placement:
+    X_WGoal = goal.poses[pose_index]
+    offset = X_WB @ item.p_BMiddle - X_WGoal @ item.p_BMiddle
+    angle = 0.0
+    if not goal.any_heading:
+        angle = wrap_to_pi(heading(X_WB) - heading(X_WGoal))
+        if item.symmetry > 1:
+            angle = math.remainder(angle, math.tau / item.symmetry)
+    measured = {
+        "goal": goal_index,
+        "pose": pose_index,
+        "add_s": _add_s(item.tree, item.p_BPoints, X_WGoal, X_WB),
+        "position_error": float(np.linalg.norm(offset[:2])),
+        "angle_error": angle,
+        "height_error": float(offset[2]),
+    }
+    share = success.share(Placement(**measured), X_WB)
+    return Placement(**measured, share=share)
+
+
+def total_reward(goals: Sequence[Goal], placements: Sequence[Placement]) -> float:
+    """The episode's score, 0 to 1."""
+    return sum(goals[item.goal].reward * item.share for item in placements if item.goal is not None)
+
+
+def strict_reward(goals: Sequence[Goal], placements: Sequence[Placement]) -> float:
+    """The episode's score if only strict successes counted, 0 to 1."""
+    return sum(
+        goals[item.goal].reward
+        for item in placements
+        if item.goal is not None and item.strict_success
+    )
