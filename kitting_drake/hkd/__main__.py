@@ -8,7 +8,7 @@ from rich.console import Console
 from rich.progress import Progress, track
 from rich.table import Table
 
-from kitting_drake.common.command_line import count_type, run_verb
+from kitting_drake.common.command_line import count_type, run_command
 from kitting_drake.common.paths import MODELS
 from kitting_drake.hkd.tools.generate import (
     CatalogueError,
@@ -53,7 +53,7 @@ def list_tools(args: argparse.Namespace, entries: list[ToolEntry]) -> None:
     table.add_column("name", no_wrap=True)
     table.add_column("category", no_wrap=True)
     table.add_column("split", no_wrap=True)
-    for heading in ("size, mm", "mass, g", "grasp, mm"):
+    for heading in ("size, mm", "mass, g", "grasp, mm", "symmetry"):
         table.add_column(heading, justify="right", no_wrap=True)
     chosen, own = _with_own(entries, args.names)
     descriptions = [_description(args.models, entry.name) for entry in chosen]
@@ -70,6 +70,7 @@ def list_tools(args: argparse.Namespace, entries: list[ToolEntry]) -> None:
             size,
             f"{1e3 * d['mass']:.0f}",
             grasp,
+            str(d.get("symmetry", 1)),
         )
         table.add_row(*row)
     Console().print(table)
@@ -206,4 +207,4 @@ def main() -> int:
 
 
 if __name__ == "__main__":
-    run_verb(main)
+    run_command(main)

@@ -27,6 +27,7 @@ from kitting_drake.hkd.importing.repair import NOMINAL_MM, make_solid, read_mesh
 from kitting_drake.hkd.importing.stable_pose import lie_down, size
 from kitting_drake.hkd.tools import meshes
 from kitting_drake.hkd.tools.sdf import tool_sdf
+from kitting_drake.hkd.tools.symmetry import symmetry_order
 from kitting_drake.hkd.tools.tool import CATEGORIES, load_tool, tool_names, user_tools
 
 DENSITIES = {"hammer": 3000.0, "pliers": 6000.0, "wrench": 7850.0, "screwdriver": 2000.0}
@@ -245,6 +246,7 @@ def _prepare(request: ImportRequest, name: str, directory: Path) -> Prepared:
         "height": tool.height,
         "mass": round(float(physics["mass"]), 6),
         "center_of_mass": [round(float(v), 6) + 0.0 for v in physics["center_mass"]],
+        "symmetry": symmetry_order(1e-3 * vertices[faces]),
         "grasp": {key: round(float(value), 6) for key, value in vars(tool.grasp).items()},
         "visual_meshes": [path.name for path in tool.visual_meshes],
         "imported": {

@@ -44,6 +44,16 @@ def closed(profile: CrossSection, clearance: float) -> CrossSection:
     return grown.offset(-clearance, JoinType.Round, circular_segments=4 * SEGMENTS)
 
 
+def furthest(inner: CrossSection, outer: CrossSection) -> float:
+    """The furthest that `inner` reaches out of `outer`, at most 5 mm, to 0.01 mm by bisection."""
+    low, high = 0.0, 5.0
+    while high - low > 0.01:
+        middle = 0.5 * (low + high)
+        grown = outer.offset(middle, JoinType.Round, circular_segments=96)
+        low, high = (low, middle) if (inner - grown).area() < 1e-4 else (middle, high)
+    return high
+
+
 def thinned(points: np.ndarray, tolerance: float) -> np.ndarray:
     """Vertices (m, 3) that span the hull of `points` to within about `tolerance` (mm).
 

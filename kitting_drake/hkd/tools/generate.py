@@ -23,11 +23,13 @@ from kitting_drake.hkd.tools import hammer, meshes, pliers, screwdriver, wrench
 from kitting_drake.hkd.tools.collision import (
     closed,
     cover,
+    furthest,
     silhouette,
     thinned,
 )
 from kitting_drake.hkd.tools.sdf import tool_sdf
 from kitting_drake.hkd.tools.solids import MATERIALS, Part
+from kitting_drake.hkd.tools.symmetry import symmetry_order
 
 # The cavities of a kit stand this far off a tool's outline: what is narrower than twice this is no
 # part of a cavity, so collision pieces may bridge it.
@@ -236,7 +238,9 @@ def generate_tool(entry: ToolEntry, directory: Path) -> Report:
     )
 
     solid_hulls = Manifold.batch_boolean([Manifold.hull_points(h) for h in hulls], OpType.Add)
-    description = _description(entry, box, mass, center, grip, grip_top, visuals)
+    vertices, faces = meshes.vertices_and_faces(whole)
+    symmetry = symmetry_order(1e-3 * vertices[faces])
+    description = _description(entry, box, mass, center, symmetry, grip, grip_top, visuals)
     (directory / "tool.yaml").write_text(yaml.safe_dump(description, sort_keys=False))
     points = np.vstack(hulls)
     return Report(
@@ -244,8 +248,8 @@ def generate_tool(entry: ToolEntry, directory: Path) -> Report:
         triangles,
         len(hulls),
         collision_triangles,
-        outside_mm=_furthest(silhouette(hulls), outline),
-        inside_mm=_furthest(outline, closed(silhouette(hulls), CAVITY_CLEARANCE_MM)),
+        outside_mm=furthest(silhouette(hulls), outline),
+        inside_mm=furthest(outline, closed(silhouette(hulls), CAVITY_CLEARANCE_MM)),
         bottom_error_mm=points[:, 2].min() - box[0, 2],
         top_error_mm=points[:, 2].max() - box[1, 2],
         grip_error_mm=_measure_grasp(entry.grasp, solid_hulls)[0] - grip,
@@ -313,16 +317,6 @@ def _measure_grasp(grasp: GraspEntry, solid: Manifold) -> tuple[float, float, fl
     return float(width), float(flatness), float(overhang), float(pad[1, 2])
 
 
-def _furthest(inner: CrossSection, outer: CrossSection) -> float:
-    """The furthest that `inner` reaches out of `outer`, by bisection, to 0.01 mm."""
-    low, high = 0.0, 5.0
-    while high - low > 0.01:
-        middle = 0.5 * (low + high)
-        grown = outer.offset(middle, JoinType.Round, circular_segments=96)
-        low, high = (low, middle) if (inner - grown).area() < 1e-4 else (middle, high)
-    return high
-
-
 def _support_margin(points: np.ndarray, center_of_mass: np.ndarray) -> float:
     """Distance (mm) of the centre of mass, seen from above, from the rim of the support."""
     touching = points[points[:, 2] < 0.02][:, :2]
@@ -338,6 +332,7 @@ def _description(
     box: np.ndarray,
     mass: float,
     center: np.ndarray,
+    symmetry: int,
     grip: float,
     grip_top: float,
     visuals: list[tuple[str, str]],
@@ -356,6 +351,7 @@ def _description(
         "height": metres(box[1, 2]),
         "mass": round(float(mass), 6),
         "center_of_mass": [round(float(v), 6) + 0.0 for v in center],
+        "symmetry": symmetry,
         "grasp": {
             "x": metres(entry.grasp.x_mm),
             "y": metres(entry.grasp.y_mm),

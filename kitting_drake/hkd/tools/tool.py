@@ -56,6 +56,9 @@ class Tool:
     """In kg."""
     grasp: Grasp
     visual_meshes: tuple[Path, ...]
+    symmetry: int = 1
+    """The order of the rotational symmetry about T's z: 1 for none; 2 for a reversible tool, for
+    which a half turn in its cavity is the same placement."""
     scale: float = 1.0
     """Of the visual meshes, whose files have the lengths of the tool as it was made."""
 
@@ -140,6 +143,7 @@ def load_tool(name: str, base: Path | None = None) -> Tool:
             mass=float(record["mass"]),
             grasp=Grasp(**{key: float(value) for key, value in record["grasp"].items()}),
             visual_meshes=tuple(directory / str(path) for path in record["visual_meshes"]),
+            symmetry=int(record.get("symmetry", 1)),
         )
     except (yaml.YAMLError, KeyError, TypeError, ValueError, AttributeError) as error:
         raise UserError(f"{record_path} is not a tool record: {error!r}") from error
@@ -150,6 +154,8 @@ def load_tool(name: str, base: Path | None = None) -> Tool:
         raise UserError(
             f"{record_path}: category '{tool.category}' is none of {', '.join(CATEGORIES)}"
         )
+    if tool.symmetry < 1:
+        raise UserError(f"{record_path}: symmetry is {tool.symmetry}, and has to be 1 or more")
     return tool
 
 

@@ -10,7 +10,7 @@ from pydrake.math import RigidTransform, RollPitchYaw
 from kitting_drake.common.errors import UserError
 from kitting_drake.common.paths import MODELS
 from kitting_drake.hkd.tools.tool import Tool, load_tool, tool_names
-from systems.placement_monitor import add_s
+from systems.placement import add_s
 
 
 @pytest.fixture
@@ -64,6 +64,15 @@ def test_a_missing_file_is_named(copy: Path, name: str):
         load_tool(str(copy))
 
 
+def test_a_record_without_symmetry_has_none(copy: Path):
+    record = yaml.safe_load((copy / "tool.yaml").read_text())
+    del record["symmetry"]
+    (copy / "tool.yaml").write_text(yaml.safe_dump(record))
+    assert load_tool(str(copy)).symmetry == 1
+    change(copy, symmetry=2)
+    assert load_tool(str(copy)).symmetry == 2
+
+
 def test_a_path_is_not_a_name(copy: Path, tmp_path: Path):
     mine = copy.rename(tmp_path / "claw_hammer")
     assert load_tool("./claw_hammer", tmp_path).directory == mine
@@ -73,6 +82,7 @@ def test_a_path_is_not_a_name(copy: Path, tmp_path: Path):
     ("fields", "message"),
     [
         ({"category": "spoon"}, r"tool\.yaml: category 'spoon' is none of hammer"),
+        ({"symmetry": 0}, r"tool\.yaml: symmetry is 0, and has to be 1 or more"),
         ({"mass": "heavy"}, r"tool\.yaml is not a tool record"),
         ({"grasp": {"x": 0.0}}, r"tool\.yaml is not a tool record"),
         ({"grasp": None}, r"tool\.yaml is not a tool record"),

@@ -1,0 +1,68 @@
+import numpy as np
+import pytest
+from manifold3d import Manifold
+from numpy.typing import NDArray
+
+from kitting_drake.hkd.tools.meshes import vertices_and_faces
+from kitting_drake.hkd.tools.symmetry import measure_reversal, symmetry_order
+from kitting_drake.hkd.tools.tool import load_tool
+
+
+def bar() -> Manifold:
+    return Manifold.cube((180, 20, 10), True).translate((0, 0, 5))
+
+
+def block(length: float, width: float, height: float) -> Manifold:
+    return Manifold.cube((length, width, height), True).translate((0, 0, height / 2))
+
+
+def triangles(solid: Manifold) -> NDArray[np.float64]:
+    vertices, faces = vertices_and_faces(solid)
+    return 1e-3 * vertices[faces]
+
+
+@pytest.mark.parametrize(
+    ("solid", "order"),
+    [
+        (bar(), 2),
+        # Off the origin, the best centre is elsewhere.
+        (bar().translate((3, -1, 0)), 2),
+        # Point-symmetric without being a mirror image of itself.
+        (
+            bar()
+            + block(20, 30, 10).translate((80, 5, 0))
+            + block(20, 30, 10).translate((-80, -5, 0)),
+            2,
+        ),
+        (
+            bar()
+            + block(20, 30, 10).translate((80, 5, 0))
+            + block(20, 30, 10).translate((-80, 5, 0)),
+            1,
+        ),
+        # Nobody sees a notch of half a millimetre; of five, everybody does.
+        (bar() - block(1, 4, 30).translate((90, 0, 0)), 2),
+        (bar() - block(10, 4, 30).translate((90, 0, 0)), 1),
+        # The same outline, but a hollow at one end.
+        (bar() - block(70, 18, 10).translate((50, 0, 5)), 1),
+    ],
+)
+def test_the_order_of_shapes(solid: Manifold, order: int):
+    assert symmetry_order(triangles(solid)) == order
+
+
+def test_what_is_measured():
+    longer = bar() + block(10, 20, 10).translate((85, 5, 0))
+    reversal = measure_reversal(triangles(longer), complete=True)
+    # The step of 5 mm is shared between the two ends.
+    assert reversal.outline_deviation_mm == pytest.approx(2.5, abs=0.1)
+    assert 0.1 < reversal.surface_distance_mm < 0.5
+    assert not reversal.is_symmetric
+
+
+@pytest.mark.parametrize(
+    "name", ["double_box_end_wrench", "offset_screwdriver", "s_wrench", "claw_hammer"]
+)
+def test_tools_whose_ends_differ_are_not_reversible(name: str):
+    tool = load_tool(name)
+    assert tool.symmetry == symmetry_order(tool.triangles) == 1
