@@ -1,4 +1,4 @@
-"""`python -m kitting_drake.run SCENARIO.yaml`: kits once, shows it live, leaves a replay."""
+"""`python -m kitting_drake.run SCENARIO.yaml`: one episode, shown live; leaves a replay."""
 
 import shutil
 import subprocess
@@ -10,20 +10,16 @@ from pydrake.systems.framework import Context, Diagram
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
+from kitting_drake.cell import Cell
 from kitting_drake.cell.cameras import render_picture, save_png
-from kitting_drake.cell.cell import Cell
-from kitting_drake.common.command_line import FAILED, INTERRUPTED, run_verb, seed_type
+from kitting_drake.common.command_line import FAILED, INTERRUPTED, run_command, seed_type
 from kitting_drake.common.errors import UserError
 from kitting_drake.common.files import require_folder, write_json, write_whole
-from kitting_drake.episode.episode import run_episode
+from kitting_drake.episode import ModeChange
+from kitting_drake.episode.chosen import build_chosen, run_chosen
 from kitting_drake.reporting.terminal import print_episode
-from kitting_drake.scenario.command_line import (
-    build_chosen,
-    choose_scenario,
-    output_folder,
-    scenario_parser,
-)
-from systems.pick_place_planner import Mode
+from kitting_drake.scenario.command_line import choose_scenario, output_folder, scenario_parser
+from systems.pick_place_parameters import Mode
 from systems.signals import Observation
 
 if TYPE_CHECKING:
@@ -32,7 +28,9 @@ if TYPE_CHECKING:
 
 def main() -> int:
     """Parses the command line and runs the episode; returns the exit code."""
-    parser = scenario_parser("run", "Kit once, watch it in Meshcat, keep results and a replay.")
+    parser = scenario_parser(
+        "run", "Run an episode, watch it in Meshcat, keep a replay."
+    )
     parser.add_argument("--seed", type=seed_type, help="of the scene (default: the scenario's)")
     parser.add_argument(
         "--no-meshcat", action="store_true", help="show nothing, and leave no replay.html"
@@ -65,7 +63,7 @@ def main() -> int:
         meshcat=meshcat,
         picture=arguments.picture is not None,
         video=arguments.video,
-        watch=lambda observation, decision: decisions.append((observation, decision)),
+        observer=lambda observation, decision: decisions.append((observation, decision)),
     )
     if arguments.graphviz:
         draw_diagram(cell.diagram, arguments.graphviz)
@@ -73,14 +71,12 @@ def main() -> int:
         meshcat.StartRecording(frames_per_second=32.0, set_visualizations_while_recording=True)
 
     with _EpisodeProgress(console, cell) as progress:
-        result = run_episode(
+        result = run_chosen(
+            chosen,
             cell,
-            scenario=chosen.name,
-            policy=chosen.policy,
             seed=seed,
-            time_limit=scenario.time_limit,
             realtime_rate=scenario.target_realtime_rate,
-            watch=progress.watch,
+            observers=[progress.observe],
         )
     # What an earlier run left is not of this one.
     (folder / "replay.html").unlink(missing_ok=True)
@@ -169,7 +165,7 @@ def draw_diagram(diagram: Diagram, path: Path) -> None:
 
 
 class _EpisodeProgress:
-    """A progress bar of an episode: one step for each object."""
+    """A progress bar of an episode, one step for each action: an `EpisodeObserver`."""
 
     def __init__(self, console: Console, cell: Cell) -> None:
         self._cell = cell
@@ -182,9 +178,7 @@ class _EpisodeProgress:
             transient=True,
             disable=not console.is_terminal,
         )
-        self._task = self._progress.add_task("", total=len(cell.scene.tools), seconds=0.0)
-        self._mode: Mode | None = None
-        self._drawn = -1.0
+        self._task = self._progress.add_task("", total=len(cell.scene.goals), seconds=0.0)
         self.last_context: Context | None = None
 
     def __enter__(self) -> "_EpisodeProgress":
@@ -194,19 +188,21 @@ class _EpisodeProgress:
     def __exit__(self, *_: object) -> None:
         self._progress.stop()
 
-    def watch(self, root_context: Context, mode: Mode) -> None:
-        self.last_context = root_context
-        now = root_context.get_time()
-        if mode == self._mode and now - self._drawn < 0.25:
-            return
-        self._mode, self._drawn = mode, now
+    def observe(self, event: ModeChange) -> None:
+        """Shows what the planner is doing now."""
+        self.last_context = event.root_context
         planner = self._cell.planner
-        counts = planner.GetOutputPort("counts").Eval(planner.GetMyContextFromRoot(root_context))
-        finished = counts[0] - (mode not in (Mode.OBSERVE, Mode.DONE))
+        counts = planner.GetOutputPort("counts").Eval(
+            planner.GetMyContextFromRoot(event.root_context)
+        )
+        finished = counts[0] - (event.mode not in (Mode.OBSERVE, Mode.DONE))
         self._progress.update(
-            self._task, completed=finished, description=mode.name.lower(), seconds=now
+            self._task,
+            completed=min(finished, len(self._cell.scene.goals)),
+            description=event.mode.name.lower(),
+            seconds=event.root_context.get_time(),
         )
 
 
 if __name__ == "__main__":
-    run_verb(main)
+    run_command(main)

@@ -6,121 +6,219 @@ from pydrake.common.value import Value
 from pydrake.math import RigidTransform, RollPitchYaw
 from pydrake.multibody.tree import BodyIndex
 
-from systems.oracle_policy import (
-    OraclePolicy,
-    OracleTarget,
-    Rounding,
-    grasp_taken,
-    gripper_pose,
-)
-from systems.signals import PickPlaceAction, PixelGrid, PlanarPose, wrap_to_pi
+from systems.action_quantizer import ActionQuantizer
+from systems.grasp import Grasp
+from systems.oracle_policy import OraclePolicy, grasp_taken, gripper_pose
+from systems.placement import AddS, Goal, PlacedObject, PoseWithin, SuccessPredicate
+from systems.signals import PickPlaceAction, PixelGrid, wrap_to_pi
+
+BOX = 0.5 * np.array([[x, y, z] for x in (-0.1, 0.1) for y in (-0.04, 0.04) for z in (0, 0.04)])
+"""The corners of a box, 100 x 40 x 20 mm, that stands on its origin."""
+ALONG_Y = Grasp(0.0, 0.0, 0.0, 0.04, 0.02)
+ALONG_X = Grasp(0.0, 0.0, math.pi / 2, 0.05, 0.02)
 
 
-def planar(x: float, y: float, yaw: float, z: float = 0.0) -> RigidTransform:
+def planar(x: float, y: float, yaw: float = 0.0, z: float = 0.0) -> RigidTransform:
     return RigidTransform(RollPitchYaw(0, 0, yaw), [x, y, z])
 
 
-HAMMER = OracleTarget("hammer", BodyIndex(2), planar(0.5, 0.1, 0.7), PlanarPose(0.05, 0.0), 0.013)
-PLIERS = OracleTarget(
-    "pliers", BodyIndex(1), planar(0.6, -0.2, -2.0, 0.03), PlanarPose(0.02, 0.01, 0.4), 0.010
-)
+HAMMER, PLIERS = (PlacedObject(name, BodyIndex(i + 1), BOX) for i, name in enumerate(("h", "p")))
+HAMMER_GRASP = Grasp(0.05, 0.0, 0.0, 0.014, 0.013)
+PLIERS_GRASP = Grasp(0.02, 0.01, 0.4, 0.02, 0.010)
+HAMMER_GOAL = Goal("h", (0,), (planar(0.5, 0.1, 0.7),), 0.5)
+PLIERS_GOAL = Goal("p", (1,), (planar(0.6, -0.2, -2.0, 0.03),), 0.5, rim_height=0.05)
 
 
 def ask(
-    poses: dict[int, RigidTransform], *targets: OracleTarget, rounding: Rounding | None = None
+    poses: list[RigidTransform],
+    goals: list[Goal],
+    *,
+    objects: list[PlacedObject] | None = None,
+    grasps: list[tuple[Grasp, ...]] | None = None,
+    success: SuccessPredicate | None = None,
+    quantizer: ActionQuantizer | None = None,
 ) -> PickPlaceAction:
-    """The action for these body poses by body index."""
-    oracle = OraclePolicy(targets=targets, rounding=rounding)
+    """The action for these poses of the objects."""
+    oracle = OraclePolicy(
+        objects=objects or [HAMMER, PLIERS],
+        grasps=grasps or [(HAMMER_GRASP,), (PLIERS_GRASP,)],
+        goals=goals,
+        success=success or AddS(),
+        quantizer=quantizer,
+    )
     context = oracle.CreateDefaultContext()
-    everything = [poses.get(index, RigidTransform()) for index in range(3)]
-    oracle.GetInputPort("body_poses").FixValue(context, Value(everything))
+    oracle.GetInputPort("body_poses").FixValue(context, Value([RigidTransform(), *poses]))
     return oracle.GetOutputPort("action").Eval(context)
 
 
+def ask_boxes(poses: list[RigidTransform], goals: list[Goal], **more) -> PickPlaceAction:
+    """The same for boxes that are all alike."""
+    objects = [PlacedObject(f"box {i}", BodyIndex(i + 1), BOX, 2) for i in range(len(poses))]
+    grasps = more.pop("grasps", (ALONG_Y,))
+    return ask(poses, goals, objects=objects, grasps=[grasps] * len(poses), **more)
+
+
 def test_ports():
-    oracle = OraclePolicy(targets=[HAMMER])
+    oracle = OraclePolicy(
+        objects=[HAMMER], grasps=[(HAMMER_GRASP,)], goals=[HAMMER_GOAL], success=AddS()
+    )
     assert oracle.num_input_ports() == oracle.num_output_ports() == 1
     assert oracle.GetInputPort("body_poses").Allocate().get_value() is not None
     assert oracle.GetOutputPort("action").Allocate().get_value() == PickPlaceAction()
 
 
-def test_takes_the_first_object_in_order_that_is_not_at_its_goal():
-    away = {1: planar(0.3, 0.0, 0.0), 2: planar(0.3, 0.3, 0.0)}
-    at_pliers, at_hammer = (0.32, 0.01), (0.35, 0.3)
-    for targets, expected in (((HAMMER, PLIERS), at_hammer), ((PLIERS, HAMMER), at_pliers)):
-        action = ask(away, *targets)
-        assert not action.stop
-        np.testing.assert_allclose((action.pick.x, action.pick.y), expected, atol=1e-12)
-    # Near its goal counts as at its goal, whatever its heading or height.
-    seated = {1: away[1], 2: planar(0.52, 0.11, 3.0, 0.02)}
-    np.testing.assert_allclose(ask(seated, HAMMER, PLIERS).pick.x, at_pliers[0])
+def test_takes_the_first_goal_in_order_that_is_not_filled():
+    away = [planar(0.3, 0.3), planar(0.3, 0.0)]
+    at_hammer, at_pliers = (0.35, 0.3), gripper_pose(away[1], PLIERS_GRASP)
+    action = ask(away, [HAMMER_GOAL, PLIERS_GOAL])
+    np.testing.assert_allclose((action.pick.x, action.pick.y), at_hammer, atol=1e-12)
+    action = ask(away, [PLIERS_GOAL, HAMMER_GOAL])
+    assert (action.pick.x, action.pick.y) == pytest.approx((at_pliers.x, at_pliers.y))
+    seated = [HAMMER_GOAL.poses[0], away[1]]
+    assert ask(seated, [HAMMER_GOAL, PLIERS_GOAL]).pick.x == pytest.approx(at_pliers.x)
 
 
-def test_stops_when_all_are_at_their_goals():
-    assert ask({1: PLIERS.X_WGoal, 2: HAMMER.X_WGoal}, HAMMER, PLIERS).stop
+def test_an_object_that_failed_at_its_goal_is_tried_again_last():
+    protruding = HAMMER_GOAL.poses[0] @ planar(0, 0, 0, 0.012)
+    away = planar(0.3, 0.0)
+    goals = [HAMMER_GOAL, PLIERS_GOAL]
+    assert ask([protruding, away], goals).pick.x == pytest.approx(
+        gripper_pose(away, PLIERS_GRASP).x
+    )
+    again = ask([protruding, PLIERS_GOAL.poses[0]], goals)
+    assert again.pick.x == pytest.approx(gripper_pose(protruding, HAMMER_GRASP).x)
 
 
-@pytest.mark.parametrize("kit_yaw", [0.0, 1.0, math.pi, -2.5])
-def test_what_is_held_arrives_at_the_goal(kit_yaw: float):
-    """The gripper carries the object rigidly; goal and object are turned by any angles."""
-    goal = planar(0.5, 0.0, kit_yaw) @ planar(0.02, -0.03, 0.3, 0.033)
-    target = OracleTarget("pliers", BodyIndex(1), goal, PLIERS.grasp, 0.010)
+def test_stops_when_every_goal_is_filled():
+    assert ask([HAMMER_GOAL.poses[0], PLIERS_GOAL.poses[0]], [HAMMER_GOAL, PLIERS_GOAL]).stop
+
+
+@pytest.mark.parametrize("goal_yaw", [0.0, 1.0, math.pi, -2.5])
+def test_what_is_held_arrives_at_the_goal(goal_yaw: float):
+    """The gripper carries the object rigidly; goal and object are rotated by any angles."""
+    X_WGoal = planar(0.5, 0.0, goal_yaw) @ planar(0.02, -0.03, 0.3, 0.033)
     X_WB = planar(0.35, 0.2, 2.9)
-    action = ask({1: X_WB}, target)
+    action = ask([planar(0, 0), X_WB], [Goal("p", (1,), (X_WGoal,), 1.0)])
     X_WPick = planar(action.pick.x, action.pick.y, action.pick.theta)
     X_WPlace = planar(action.place.x, action.place.y, action.place.theta)
     arrived = X_WPlace @ X_WPick.inverse() @ X_WB
-    np.testing.assert_allclose(arrived.rotation().matrix(), goal.rotation().matrix(), atol=1e-12)
-    np.testing.assert_allclose(arrived.translation()[:2], goal.translation()[:2], atol=1e-12)
+    np.testing.assert_allclose(arrived.rotation().matrix(), X_WGoal.rotation().matrix(), atol=1e-12)
+    np.testing.assert_allclose(arrived.translation()[:2], X_WGoal.translation()[:2], atol=1e-12)
     # The jaws close across the object where its annotation says.
     X_BPick = X_WB.inverse() @ X_WPick
     np.testing.assert_allclose(X_BPick.translation()[:2], (0.02, 0.01), atol=1e-12)
     assert RollPitchYaw(X_BPick.rotation()).yaw_angle() == pytest.approx(0.4)
 
 
-def test_surface_height_follows_the_object():
-    assert ask({1: planar(0.3, 0.0, 0.0, 0.04)}, PLIERS).surface_height == pytest.approx(0.05)
+def test_heights_are_the_truth():
+    heights = ask([planar(0, 0), planar(0.3, 0.0, 0.0, 0.04)], [PLIERS_GOAL]).heights
+    assert heights is not None
+    assert heights.pick_top == pytest.approx(0.05)
+    assert heights.support == pytest.approx(0.04)
+    assert heights.place_rim == pytest.approx(0.05)
+    assert heights.highest == pytest.approx(0.06)
 
 
-def test_no_targets_is_refused():
-    with pytest.raises(ValueError, match="at least one target"):
-        OraclePolicy(targets=[])
+def test_goals_wait_for_those_that_come_before():
+    ground, top = planar(0.5, 0), planar(0.5, 0, 0, 0.02)
+    goals = [
+        Goal("top", (0, 1), (top,), 0.5, after=(1,)),
+        Goal("ground", (0, 1), (ground,), 0.5),
+    ]
+    away = planar(0.3, 0.3), planar(0.3, -0.3)
+    assert ask_boxes(list(away), goals).place.x == pytest.approx(0.5)
+    first = ask_boxes([ground, away[1]], goals)
+    assert first.pick.y == pytest.approx(-0.3)
+
+
+def test_the_highest_of_objects_that_will_do_is_taken():
+    stack = [planar(0.3, 0.2, 0, 0.02 * level) for level in (0, 2, 1)]
+    goals = [Goal("anywhere", (0, 1, 2), (planar(0.5, 0),), 1.0)]
+    heights = ask_boxes(stack, goals).heights
+    assert heights is not None
+    assert heights.support == pytest.approx(0.04)
+
+
+def test_of_several_poses_the_free_one_that_rotates_least():
+    corners = tuple(planar(0.5, 0, k * math.pi / 2) for k in range(4))
+    goals = [Goal("corner", (0,), corners, 1.0)]
+    action = ask_boxes([planar(0.3, 0.3, 1.5)], goals)
+    assert wrap_to_pi(action.place.theta - action.pick.theta) == pytest.approx(math.pi / 2 - 1.5)
+    bowls = (planar(0.5, 0.0), planar(0.6, 0.0))
+    goals = [Goal("bowl", (0, 1), bowls, 1.0, any_heading=True)]
+    success = PoseWithin(0.02, 0.3)
+    action = ask_boxes([bowls[0], planar(0.3, 0.3, 0.4)], [*goals, *goals], success=success)
+    assert action.place.x == pytest.approx(0.6)
+    # Any heading will do: it keeps the one that it has.
+    assert action.place.theta == pytest.approx(action.pick.theta)
+
+
+@pytest.mark.parametrize(
+    ("neighbour", "expected"),
+    [
+        (planar(0.3, 0.05), math.pi / 2),
+        (planar(0.38, 0.0), 0.0),
+        (planar(0.5, 0.045), math.pi / 2),
+        (planar(0.9, 0.9), 0.0),
+    ],
+    ids=["beside the pick", "at its end", "beside the place", "nowhere"],
+)
+def test_the_first_grasp_at_which_the_fingers_are_free(neighbour: RigidTransform, expected: float):
+    axes = (np.linspace(low, high, 9) for low, high in zip(BOX.min(0), BOX.max(0), strict=True))
+    dense = np.stack(np.meshgrid(*axes))
+    objects = [PlacedObject(str(i), BodyIndex(i + 1), dense.reshape(3, -1).T, 2) for i in range(2)]
+    action = ask(
+        [planar(0.3, 0.0), neighbour],
+        [Goal("there", (0,), (planar(0.5, 0.0),), 1.0)],
+        objects=objects,
+        grasps=[(ALONG_Y, ALONG_X), ()],
+    )
+    assert action.pick.theta == pytest.approx(expected)
+
+
+def test_what_no_oracle_can_do_is_refused():
+    with pytest.raises(ValueError, match="at least one goal"):
+        ask([], [])
+    with pytest.raises(ValueError, match="h has no grasp"):
+        ask([planar(0, 0)] * 2, [HAMMER_GOAL], grasps=[(), (PLIERS_GRASP,)])
 
 
 @pytest.mark.parametrize("yaw", [0.0, 2.0, -3.0])
 def test_the_grasp_taken_is_the_inverse_of_the_gripper_pose(yaw: float):
     X_WB = planar(0.4, -0.1, yaw)
-    taken = grasp_taken(X_WB, gripper_pose(X_WB, PLIERS.grasp))
-    np.testing.assert_allclose(taken.as_array(), PLIERS.grasp.as_array(), atol=1e-12)
+    taken = grasp_taken(X_WB, gripper_pose(X_WB, PLIERS_GRASP))
+    expected = (PLIERS_GRASP.x, PLIERS_GRASP.y, PLIERS_GRASP.theta)
+    np.testing.assert_allclose(taken.as_array(), expected, atol=1e-12)
 
 
 @pytest.mark.parametrize("orientations", [36, 180])
 @pytest.mark.parametrize("yaw", [0.03, 1.234, 2.9, -2.0])
-def test_rounded_answers_are_the_nearest_that_can_be_said(yaw: float, orientations: int):
+def test_quantized_actions_are_the_nearest_there_are(yaw: float, orientations: int):
     grid = PixelGrid()
     X_WB = planar(0.3512, 0.2034, yaw)
-    action = ask({1: X_WB}, PLIERS, rounding=Rounding(grid, orientations))
+    quantizer = ActionQuantizer(grid, orientations)
+    action = ask([planar(0, 0), X_WB], [PLIERS_GOAL], quantizer=quantizer)
     for pose in (action.pick, action.place):
         pixel = grid.to_pixel((pose.x, pose.y))
         np.testing.assert_allclose(pixel, np.round(pixel), atol=1e-9)
-    turn = action.place.theta - action.pick.theta
-    for angle in (action.pick.theta, turn):
+    rotation = action.place.theta - action.pick.theta
+    for angle in (action.pick.theta, rotation):
         bins = angle * orientations / math.tau
         assert bins == pytest.approx(round(bins), abs=1e-9)
 
-    pick = gripper_pose(X_WB, PLIERS.grasp)
+    pick = gripper_pose(X_WB, PLIERS_GRASP)
     half_pixel, half_bin = grid.resolution / 2 + 1e-12, math.pi / orientations + 1e-12
     assert abs(action.pick.x - pick.x) <= half_pixel
     assert abs(action.pick.y - pick.y) <= half_pixel
     assert abs(wrap_to_pi(action.pick.theta - pick.theta)) <= half_bin
-    assert abs(wrap_to_pi(turn - (-2.0 - yaw))) <= half_bin
+    assert abs(wrap_to_pi(rotation - (-2.0 - yaw))) <= half_bin
     # The place is that of the rounded pick, not of the annotated grasp.
     X_WPick = planar(action.pick.x, action.pick.y, action.pick.theta)
-    ideal = (PLIERS.X_WGoal @ X_WB.inverse() @ X_WPick).translation()
+    ideal = (PLIERS_GOAL.poses[0] @ X_WB.inverse() @ X_WPick).translation()
     assert abs(action.place.x - ideal[0]) <= half_pixel
     assert abs(action.place.y - ideal[1]) <= half_pixel
 
 
-def test_rounding_stays_on_the_grid():
-    rounding = Rounding(PixelGrid(), 36)
-    assert rounding.position(0.0, 2.0) == pytest.approx((0.2515625, 0.4984375))
+def test_quantized_positions_stay_on_the_grid():
+    quantizer = ActionQuantizer(PixelGrid(), 36)
+    assert quantizer.position(0.0, 2.0) == pytest.approx((0.2515625, 0.4984375))

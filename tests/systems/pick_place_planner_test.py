@@ -10,13 +10,23 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import Context, DiagramBuilder, EventStatus, LeafSystem
 from pydrake.systems.primitives import LogVectorOutput
 
+from systems.insertion_search import InsertionSearch
 from systems.pick_place_parameters import Mode, PickPlaceParameters
-from systems.pick_place_planner import PickPlacePlanner, nearest_turns
-from systems.signals import PickPlaceAction, PlanarPose
+from systems.pick_place_planner import PickPlacePlanner, nearest_yaws
+from systems.signals import (
+    Observation,
+    PickPlaceAction,
+    PixelGrid,
+    PlanarPose,
+    SurfaceHeights,
+)
 
 PICK, PLACE = PlanarPose(0.4, 0.3, 0.5), PlanarPose(0.55, -0.2, -0.8)
-ACTION = PickPlaceAction(PICK, PLACE, surface_height=0.05)
-PARAMETERS = PickPlaceParameters(max_actions=10)
+HEIGHTS = SurfaceHeights(pick_top=0.05)
+ACTION = PickPlaceAction(PICK, PLACE, heights=HEIGHTS)
+PARAMETERS = PickPlaceParameters()
+TEN = 10
+"""Actions that the planner of most tests may take."""
 GRASP_Z = 0.05 - PARAMETERS.grasp_depth
 WIDTH, WEIGHT = 0.02, 6.0
 NO_TOUCH = -1.0
@@ -116,9 +126,13 @@ class Run:
         actions: int = 1,
         answer: PickPlaceAction = ACTION,
         parameters: PickPlaceParameters = PARAMETERS,
+        insertion: bool = False,
+        observation: Observation | None = None,
     ) -> None:
         builder = DiagramBuilder()
-        self.planner = builder.AddSystem(PickPlacePlanner(parameters=parameters))
+        self.planner = builder.AddSystem(
+            PickPlacePlanner(parameters=parameters, max_actions=TEN, insertion=insertion)
+        )
         self.policy = builder.AddSystem(StubPolicy(actions, answer))
         hand = builder.AddSystem(PerfectHand(world or World()))
         for port in ("desired_motion", "desired_opening", "closing_force", "mode", "counts"):
@@ -129,6 +143,9 @@ class Run:
         self.log = LogVectorOutput(self.planner.GetOutputPort("desired_motion"), builder, 1 / 128)
         self.diagram = builder.Build()
         self.simulator = Simulator(self.diagram)
+        if observation is not None:
+            context = self.planner.GetMyMutableContextFromRoot(self.simulator.get_mutable_context())
+            self.planner.GetInputPort("observation").FixValue(context, Value(observation))
         self.modes: list[tuple[float, Mode]] = []
         self.simulator.set_monitor(self._look)
 
@@ -167,8 +184,9 @@ class Run:
 
 
 def test_ports():
-    planner = PickPlacePlanner(parameters=PARAMETERS)
-    assert planner.num_input_ports() == 3
+    planner = PickPlacePlanner(parameters=PARAMETERS, max_actions=TEN)
+    assert planner.num_input_ports() == 4
+    assert isinstance(planner.GetInputPort("observation").Allocate().get_value(), Observation)
     assert planner.GetInputPort("hand_state").size() == 12
     assert planner.GetInputPort("hand_contact_force").size() == 6
     assert isinstance(planner.GetInputPort("action").Allocate().get_value(), PickPlaceAction)
@@ -185,7 +203,7 @@ def test_ports():
 
 
 def test_begins_at_home_with_open_jaws():
-    planner = PickPlacePlanner(parameters=PARAMETERS)
+    planner = PickPlacePlanner(parameters=PARAMETERS, max_actions=TEN)
     context = planner.CreateDefaultContext()
     motion = planner.GetOutputPort("desired_motion").Eval(context)
     np.testing.assert_array_equal(motion, [*PARAMETERS.home, *np.zeros(8)])
@@ -252,14 +270,14 @@ def test_lowering_over_nothing_ends_above_the_floor():
 
 RIM = 0.03
 ON_THE_RIM, IN_THE_CAVITY = GRASP_Z + RIM, GRASP_Z + RIM - 0.015
-OVER_A_CAVITY = dataclasses.replace(ACTION, rim_height=RIM)
+OVER_A_CAVITY = dataclasses.replace(ACTION, heights=dataclasses.replace(HEIGHTS, place_rim=RIM))
 
 
 @pytest.mark.parametrize("offset", [-0.1, -0.05, 0.05, 0.1])
 def test_what_stands_on_the_rim_is_turned_into_its_cavity(offset: float):
     yaw = PLACE.theta + offset
     world = World(touch_place=ON_THE_RIM, cavity=(yaw - 0.02, yaw + 0.02, IN_THE_CAVITY))
-    run = Run(world, answer=OVER_A_CAVITY).until(Mode.RELEASE)
+    run = Run(world, answer=OVER_A_CAVITY, insertion=True).until(Mode.RELEASE)
     assert set(run.sequence[run.sequence.index(Mode.LOWER) :]) == {
         Mode.LOWER,
         Mode.SEARCH,
@@ -273,7 +291,9 @@ def test_what_stands_on_the_rim_is_turned_into_its_cavity(offset: float):
 
 
 def test_a_search_in_vain_ends_where_it_began():
-    run = Run(World(touch_place=ON_THE_RIM), answer=OVER_A_CAVITY).until(Mode.RELEASE)
+    run = Run(World(touch_place=ON_THE_RIM), answer=OVER_A_CAVITY, insertion=True).until(
+        Mode.RELEASE
+    )
     assert run.sequence[-2] == Mode.SEARCH
     q = run.output("desired_motion")[:4]
     assert q[2] == pytest.approx(ON_THE_RIM, abs=2.5e-3)
@@ -281,20 +301,74 @@ def test_a_search_in_vain_ends_where_it_began():
     # Both ways, as far as it may.
     yaws = run.log.FindLog(run.simulator.get_context()).data()[3] - PLACE.theta
     searched = yaws[-(3 * 128) :]
-    assert searched.min() == pytest.approx(-PARAMETERS.search_turn, abs=1e-3)
+    assert searched.min() == pytest.approx(-PARAMETERS.search.amplitude, abs=1e-3)
     assert run.finish().sequence[-1] == Mode.DONE
 
 
 @pytest.mark.parametrize(
-    ("touched", "rim", "turn"),
-    [(IN_THE_CAVITY, RIM, 0.12), (ON_THE_RIM, None, 0.12), (ON_THE_RIM, RIM, 0.0)],
-    ids=["in its cavity", "unknown rim", "not wanted"],
+    ("touched", "insertion", "amplitude"),
+    [(IN_THE_CAVITY, True, 0.12), (ON_THE_RIM, False, 0.12), (ON_THE_RIM, True, 0.0)],
+    ids=["in its cavity", "no insertion", "not wanted"],
 )
-def test_nothing_is_searched_for(touched: float, rim: float | None, turn: float):
-    answer = dataclasses.replace(ACTION, rim_height=rim)
-    parameters = dataclasses.replace(PARAMETERS, search_turn=turn)
-    run = Run(World(touch_place=touched), answer=answer, parameters=parameters).finish()
+def test_nothing_is_searched_for(touched: float, insertion: bool, amplitude: float):
+    parameters = dataclasses.replace(PARAMETERS, search=InsertionSearch(amplitude=amplitude))
+    run = Run(
+        World(touch_place=touched),
+        answer=OVER_A_CAVITY,
+        parameters=parameters,
+        insertion=insertion,
+    ).finish()
     assert run.sequence == [*PICK_AND_PLACE, Mode.OBSERVE, Mode.DONE]
+
+
+def test_the_rim_is_told_from_what_the_object_stood_on():
+    """Picked off something 20 mm high, its bottom is 20 mm nearer to the fingertips."""
+    on_a_box = dataclasses.replace(HEIGHTS, support=0.02, place_rim=RIM)
+    answer = dataclasses.replace(ACTION, heights=on_a_box)
+    run = Run(World(touch_place=ON_THE_RIM - 0.02), answer=answer, insertion=True).finish()
+    assert Mode.SEARCH in run.sequence
+    run = Run(World(touch_place=ON_THE_RIM - 0.025), answer=answer, insertion=True).finish()
+    assert Mode.SEARCH not in run.sequence
+
+
+def seen(**heights: float) -> Observation:
+    """A table, a tall block in a corner, and something at the pick and at the place."""
+    grid = PixelGrid()
+    image = np.zeros((4, *grid.shape), np.float32)
+    image[3] = heights.get("table", 0.0)
+    image[3, :10, :10] = heights.get("tallest", 0.0)
+    for pose, height in ((PICK, heights.get("pick", 0.0)), (PLACE, heights.get("place", 0.0))):
+        row, col = np.rint(grid.to_pixel((pose.x, pose.y))).astype(int)
+        image[3, row - 1 : row + 2, col - 1 : col + 2] = height
+    return Observation(image, grid)
+
+
+def test_heights_are_read_off_the_observation_where_there_is_one():
+    """Not those of the action, which an oracle knows from the truth."""
+    run = Run(observation=seen(table=0.01, pick=0.04)).until(Mode.CLOSE)
+    assert run.output("desired_motion")[2] == pytest.approx(0.04 - PARAMETERS.grasp_depth)
+    # Nothing goes below the table, wherever that is.
+    run = Run(observation=seen(table=0.01, pick=0.012)).until(Mode.CLOSE)
+    assert run.output("desired_motion")[2] == pytest.approx(0.01 + PARAMETERS.floor_clearance)
+    run = Run(World(touch_place=NO_TOUCH), observation=seen(table=0.01)).until(Mode.RELEASE)
+    assert run.output("desired_motion")[2] == pytest.approx(0.01 + PARAMETERS.floor_clearance)
+
+
+@pytest.mark.parametrize("tallest", [0.05, 0.16])
+def test_what_hangs_below_the_hand_clears_the_highest_surface(tallest: float):
+    run = Run(observation=seen(pick=0.06, tallest=tallest)).until(Mode.CARRY)
+    z = run.output("desired_motion")[2]
+    bottom = z - (0.06 - PARAMETERS.grasp_depth)
+    assert z >= PARAMETERS.travel_height - 1e-9
+    assert bottom >= tallest + PARAMETERS.travel_clearance - 1e-6
+    run.until(Mode.LOWER)
+    assert run.output("desired_motion")[2] == pytest.approx(z, abs=1e-5)
+
+
+def test_an_action_without_heights_needs_an_observation():
+    run = Run(answer=PickPlaceAction(PICK, PLACE))
+    with pytest.raises(RuntimeError, match="`observation` is not connected"):
+        run.simulator.AdvanceTo(2.0)
 
 
 def test_descent_stops_where_something_is_touched():
@@ -324,7 +398,7 @@ def test_an_object_dropped_while_searching_is_counted():
         return 0.0 if attempt == 1 and mode == Mode.SEARCH else WIDTH
 
     world = World(touch_place=ON_THE_RIM, width=width)
-    run = Run(world, answer=OVER_A_CAVITY).until(Mode.RETREAT)
+    run = Run(world, answer=OVER_A_CAVITY, insertion=True).until(Mode.RETREAT)
     assert run.sequence[-2:] == [Mode.SEARCH, Mode.RETREAT]
     assert run.finish().counts == [1, 0, 1]
 
@@ -355,8 +429,8 @@ def test_the_policy_is_asked_only_at_the_end_of_observing():
     assert run.policy.asked[0] >= PARAMETERS.observe_settle
 
 
-FAR = PickPlaceAction(PlanarPose(0.35, 0.45, 0.1), PlanarPose(0.7, -0.45, -0.3), 0.05)
-TURN = PickPlaceAction(PlanarPose(0.5, 0.02, -1.4), PlanarPose(0.5, -0.02, 1.4), 0.05)
+FAR = PickPlaceAction(PlanarPose(0.35, 0.45, 0.1), PlanarPose(0.7, -0.45, -0.3), heights=HEIGHTS)
+TURN = PickPlaceAction(PlanarPose(0.5, 0.02, -1.4), PlanarPose(0.5, -0.02, 1.4), heights=HEIGHTS)
 
 
 @pytest.mark.parametrize("answer", [FAR, TURN], ids=["far", "turn"])
@@ -412,8 +486,8 @@ def test_motion_is_smooth_and_within_the_limits_of_its_mode(answer: PickPlaceAct
         (-np.pi / 2, np.pi, None),
     ],
 )
-def test_nearest_turns(pick: float, place: float, expected: tuple[float, float] | None):
-    turned = nearest_turns(pick, place)
+def test_nearest_yaws(pick: float, place: float, expected: tuple[float, float] | None):
+    turned = nearest_yaws(pick, place)
     if expected is not None:
         np.testing.assert_allclose(turned, expected)
     # The same grasp and the same turn of what is held...

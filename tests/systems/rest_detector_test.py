@@ -27,7 +27,7 @@ class Table:
             movers=[BoundedBody(BodyIndex(HAND), np.full(3, -0.02), np.full(3, 0.02))],
             linear_speed=0.002,
             angular_speed=0.05,
-            patience=PATIENCE,
+            time_to_sleep=PATIENCE,
             wake_distance=0.006,
         )
         self.simulator = Simulator(self.detector)
@@ -65,7 +65,7 @@ def test_ports():
     assert detector.GetOutputPort("at_rest").size() == 2
 
 
-def test_rest_takes_patience():
+def test_rest_takes_time_to_sleep():
     table = Table()
     assert table.at_rest_after(PATIENCE - 2 / 64) == [False, False]
     assert table.at_rest_after(2 / 64) == [True, True]

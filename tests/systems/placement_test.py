@@ -1,0 +1,185 @@
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+from pydrake.math import RigidTransform, RollPitchYaw
+from pydrake.multibody.tree import BodyIndex
+
+from systems.placement import (
+    AddS,
+    Goal,
+    InZone,
+    PlacedObject,
+    Placement,
+    PoseWithin,
+    add_s,
+    evaluate_placements,
+    strict_reward,
+    total_reward,
+)
+
+SQUARE = np.array([[1.0, 1.0, 0.0], [-1.0, 1.0, 0.0], [-1.0, -1.0, 0.0], [1.0, -1.0, 0.0]])
+"""Four points, 2 apart, which a quarter rotation maps onto themselves."""
+
+GOAL = RigidTransform(RollPitchYaw(0, 0, 0.5), [0.5, -0.1, 0.03])
+BAR = 0.5 * np.array([[x, y, z] for x in (-0.2, 0.2) for y in (-0.03, 0.03) for z in (0, 0.02)])
+"""The corners of a bar, 200 x 30 x 10 mm, that stands on its origin."""
+
+
+def planar(x: float, y: float, yaw: float = 0.0, z: float = 0.0) -> RigidTransform:
+    return RigidTransform(RollPitchYaw(0, 0, yaw), [x, y, z])
+
+
+def bar(index: int = 0, symmetry: int = 1) -> PlacedObject:
+    return PlacedObject(f"bar {index}", BodyIndex(index + 1), BAR, symmetry)
+
+
+def goal(*objects: int, pose: RigidTransform = GOAL, **fields) -> Goal:
+    return Goal(**{"name": "", "objects": objects, "poses": (pose,), "reward": 1.0, **fields})
+
+
+def place(item: PlacedObject, target: Goal, X_WB: RigidTransform, success=None) -> Placement:
+    """The placement of one object with one goal."""
+    (placement,) = evaluate_placements([item], [target], success or AddS(), [X_WB])
+    return placement
+
+
+def test_add_s_of_a_small_translation_is_its_length():
+    moved = RigidTransform([0.3, -0.4, 0.5])  # Less than half the points' distance.
+    assert add_s(SQUARE, RigidTransform(), moved) == pytest.approx(np.sqrt(0.5))
+
+
+def test_add_s_takes_the_nearest_point_not_the_same_point():
+    # Two points onto their neighbours, two left behind: (0 + 0 + 2 + 2) / 4. ADD would say 2.
+    assert add_s(SQUARE, RigidTransform(), RigidTransform([2.0, 0.0, 0.0])) == pytest.approx(1.0)
+
+
+def test_add_s_measures_from_the_goal_to_the_actual_pose():
+    """The two directions differ for a shape that is not symmetric; equation 9 has this one."""
+    points = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [3.0, 0.0, 0.0]])
+    moved = RigidTransform([3.0, 0.0, 0.0])  # Goal 0, 1, 3; actual 3, 4, 6.
+    assert add_s(points, RigidTransform(), moved) == pytest.approx((3 + 2 + 0) / 3)
+    back = RigidTransform([-3.0, 0.0, 0.0])  # Goal 0, 1, 3; actual -3, -2, 0.
+    assert add_s(points, RigidTransform(), back) == pytest.approx((0 + 1 + 3) / 3)
+
+
+@pytest.mark.parametrize("quarters", [1, 2, 3])
+def test_a_rotation_that_maps_the_object_onto_itself_costs_nothing(quarters: int):
+    rotated = GOAL @ RigidTransform(RollPitchYaw(0, 0, quarters * np.pi / 2), [0, 0, 0])
+    assert add_s(SQUARE, GOAL, rotated) == pytest.approx(0.0, abs=1e-12)
+    assert add_s(SQUARE, GOAL, GOAL @ RigidTransform(RollPitchYaw(0, 0, np.pi / 4), [0, 0, 0])) > 0
+
+
+def test_add_s_does_not_depend_on_the_frame():
+    actual = RigidTransform(RollPitchYaw(0.1, -0.2, 0.9), [0.6, -0.3, 0.1])
+    X = RigidTransform(RollPitchYaw(0.4, 0.5, 0.6), [1.0, 2.0, 3.0])
+    assert add_s(SQUARE, X @ GOAL, X @ actual) == pytest.approx(add_s(SQUARE, GOAL, actual))
+
+
+def test_errors_and_their_signs():
+    there = planar(0.5 + 0.03, -0.1 - 0.04, 0.5 + 0.2, 0.03 - 0.02)
+    placement = place(bar(), goal(0), there)
+    assert placement.position_error == pytest.approx(0.05)
+    assert placement.angle_error == pytest.approx(0.2)
+    assert placement.height_error == pytest.approx(-0.02)
+    assert placement.add_s == pytest.approx(add_s(BAR, GOAL, there))
+    # The short way round.
+    across = goal(0, pose=planar(0, 0, 3.0))
+    assert place(bar(), across, planar(0, 0, -3.0)).angle_error == pytest.approx(2 * math.pi - 6)
+
+
+def test_a_round_object_that_rolls_stays_where_it_is():
+    """The origin is on the table, below the axis; positions are compared on the axis."""
+    angles = np.arange(16) * np.pi / 8
+    ring = np.stack([0 * angles, np.sin(angles), 1 + np.cos(angles)], axis=1)
+    rolled = (
+        GOAL @ RigidTransform(RollPitchYaw(np.pi, 0, 0), [0, 0, 1]) @ RigidTransform([0, 0, -1])
+    )
+    placement = place(PlacedObject("roll", BodyIndex(1), ring), goal(0), rolled)
+    for error in (placement.add_s, placement.position_error, placement.height_error):
+        assert error == pytest.approx(0.0, abs=1e-9)
+
+
+@pytest.mark.parametrize(("symmetry", "strict"), [(1, False), (2, True)])
+def test_a_declared_symmetry_makes_half_a_rotation_nothing(symmetry: int, strict: bool):
+    reversed_ = GOAL @ planar(0, 0, math.pi)
+    placement = place(bar(symmetry=symmetry), goal(0), reversed_)
+    assert placement.success
+    assert placement.strict_success == strict
+    assert abs(placement.angle_error) == pytest.approx(0.0 if strict else math.pi, abs=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("offset", "strict"),
+    [
+        (planar(0, 0, 0, 0.0019), True),
+        (planar(0, 0, 0, 0.0021), False),
+        (planar(0, 0, math.radians(19)), True),
+        (planar(0, 0, math.radians(21)), False),
+    ],
+)
+def test_a_strict_success_is_at_its_height_and_heading(offset: RigidTransform, strict: bool):
+    placement = place(bar(), goal(0), GOAL @ offset, AddS(0.1))
+    assert placement.success
+    assert placement.strict_success == strict
+
+
+def test_success_as_ravens_has_it():
+    success = PoseWithin()
+    assert place(bar(), goal(0), GOAL @ planar(0.009, 0, 0.25, 0.1), success).success
+    assert not place(bar(), goal(0), GOAL @ planar(0.011, 0), success).success
+    assert not place(bar(), goal(0), GOAL @ planar(0, 0, 0.27), success).success
+    anyhow = goal(0, any_heading=True)
+    assert place(bar(), anyhow, GOAL @ planar(0, 0, 2.0), success).strict_success
+
+
+def test_the_share_of_a_volume_in_a_zone():
+    zone = InZone(GOAL, (0.2, 0.2, 0.3), BAR)
+    assert place(bar(), goal(0), GOAL, zone).share == 1.0
+    assert place(bar(), goal(0), GOAL @ planar(0.05, 0), zone).share == 0.5
+    below = place(bar(), goal(0), GOAL @ planar(0, 0, 0, -0.005), zone)
+    assert below.share == 0.5
+    assert not below.success
+
+
+def test_interchangeable_objects_fill_each_others_goals():
+    left, right = planar(0, 0), planar(0, 0.1)
+    goals = [goal(0, 1, pose=left, reward=0.5), goal(0, 1, pose=right, reward=0.5)]
+    objects = [bar(0), bar(1)]
+    for order in ([left, right], [right, left]):
+        placements = evaluate_placements(objects, goals, AddS(), order)
+        assert [item.success for item in placements] == [True, True]
+        assert {item.goal for item in placements} == {0, 1}
+    # What only one may fill, the other does not.
+    fixed = [goal(0, pose=left, reward=0.5), goal(1, pose=right, reward=0.5)]
+    assert not any(item.success for item in evaluate_placements(objects, fixed, AddS(), order))
+
+
+def test_any_pose_of_a_goal_will_do():
+    corners = tuple(GOAL @ planar(0, 0, k * math.pi / 2) for k in range(4))
+    placement = place(bar(), goal(0, poses=corners), corners[2] @ planar(0.002, 0, 0.01))
+    assert placement.pose == 2
+    assert placement.success
+
+
+def test_goals_count_only_after_those_that_come_before():
+    poses = [planar(0, 0), planar(0, 0, 0, 0.01)]
+    goals = [
+        goal(0, pose=poses[0], reward=0.75),
+        goal(1, pose=poses[1], reward=0.25, after=(0,)),
+    ]
+    objects = [bar(0), bar(1)]
+    placements = evaluate_placements(objects, goals, AddS(), poses)
+    assert total_reward(goals, placements) == strict_reward(goals, placements) == 1.0
+    away = evaluate_placements(objects, goals, AddS(), [planar(1, 0), poses[1]])
+    assert total_reward(goals, away) == 0.0
+    assert away[1].add_s == pytest.approx(0.0, abs=1e-12)
+    first = evaluate_placements(objects, goals, AddS(), [poses[0], planar(1, 0)])
+    assert total_reward(goals, first) == 0.75
+
+
+def test_an_object_without_a_goal_has_no_errors():
+    placements = evaluate_placements([bar(0), bar(1)], [goal(0)], AddS(), [GOAL, GOAL])
+    assert placements[1] == Placement()
+    assert dataclasses.replace(placements[0], share=0.0).success is False
