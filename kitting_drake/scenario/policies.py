@@ -1,6 +1,7 @@
-"""The variants of a scenario's `policy:`; each knows how to make its LeafSystem."""
+"""The variants of a scenario's `policy:`; each knows how to make its LeafSystem.
 
-from __future__ import annotations
+Annotations are evaluated here: Drake's YAML loader reads the types of fields, not their texts.
+"""
 
 import hashlib
 import importlib

@@ -67,7 +67,9 @@ def _check_union(schema: Any, value: Any, where: str) -> None:
 def _check_dataclass(schema: Any, value: Any, where: str) -> None:
     if not isinstance(value, dict):
         raise ValueError(f"{where or 'the scenario'} must be a mapping, not {_shown(value)}")
-    hints = typing.get_type_hints(schema)
+    types_by_name = typing.get_type_hints(schema)
+    # A class may annotate what is no field.
+    hints = {item.name: types_by_name[item.name] for item in dataclasses.fields(schema)}
     for key, item in value.items():
         if key == "_tag":
             continue
