@@ -5,6 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from systems.signals import wrap_to_pi
+
 # Peaks of the minimum-jerk polynomial 10 s^3 - 15 s^4 + 6 s^5 over a unit distance in unit time.
 _PEAK_SPEED = 1.875
 _PEAK_ACCELERATION = 10 / np.sqrt(3)
@@ -85,3 +87,18 @@ def ramp(start: float, goal: float, rate: float, elapsed: float) -> tuple[float,
     if travelled >= abs(distance):
         return goal, 0.0
     return start + float(np.copysign(travelled, distance)), float(np.copysign(rate, distance))
+
+
+def nearest_yaws(pick_yaw: float, place_yaw: float) -> tuple[float, float]:
+    """The equivalent yaws that keep the wrist nearest its middle.
+
+    The jaws are alike, so both yaws may be rotated by pi together, and either by 2 pi.
+
+    Returns:
+        (pick, place) in radians, the larger of whose magnitudes is smallest.
+    """
+    candidates = []
+    for half_turn in (0.0, np.pi):
+        pick, place = wrap_to_pi(pick_yaw + half_turn), wrap_to_pi(place_yaw + half_turn)
+        candidates.append((pick, place))
+    return min(candidates, key=lambda yaws: max(abs(yaws[0]), abs(yaws[1])))

@@ -1,9 +1,10 @@
 """The modes of the pick-and-place motion primitive, and its heights, speeds and thresholds."""
 
 import enum
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from systems.bounds import bounded
+from systems.hand_motion import MotionLimits
 from systems.insertion_search import InsertionSearch
 
 
@@ -97,3 +98,17 @@ class PickPlaceParameters:
 
     # After this many actions the planner is done, whatever the policy says; null: the task's.
     max_actions: int | None = bounded(None, 0, 1000)
+
+    def motion_limits(self) -> dict[Mode, MotionLimits]:
+        """The limits of each mode's motion."""
+        yaw = (self.yaw_speed, self.yaw_acceleration)
+        free = MotionLimits(self.linear_speed, self.linear_acceleration, *yaw)
+        limits = dict.fromkeys(Mode, free)
+        carry = MotionLimits(self.carry_speed, self.carry_acceleration, *yaw)
+        limits[Mode.LIFT] = limits[Mode.CARRY] = carry
+        limits[Mode.DESCEND] = replace(free, speed=self.descend_speed)
+        limits[Mode.LOWER] = replace(carry, speed=self.lower_speed)
+        limits[Mode.SEARCH] = replace(
+            limits[Mode.LOWER], yaw_speed=min(self.search.yaw_speed, self.yaw_speed)
+        )
+        return limits

@@ -1,6 +1,5 @@
 """The pick-and-place motion primitive: a state machine that makes smooth, limited motions."""
 
-import dataclasses
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -16,14 +15,14 @@ from pydrake.systems.framework import (
 )
 
 from systems.hand_motion import (
-    MotionLimits,
     braking_time,
     motion_at,
     motion_duration,
+    nearest_yaws,
     ramp,
 )
 from systems.pick_place_parameters import Mode, PickPlaceParameters
-from systems.signals import Observation, PickPlaceAction, PlanarPose, SurfaceHeights, wrap_to_pi
+from systems.signals import Observation, PickPlaceAction, PlanarPose, SurfaceHeights
 from systems.surface_heights import read_surface_heights
 
 _FIELDS = (
@@ -42,21 +41,6 @@ _State: TypeAlias = Any
 """A `_PlannerState`, which is made at run time and is no type to a type checker."""
 
 _START, _GOAL, _START_RATE = slice(3, 7), slice(7, 11), slice(11, 15)
-
-
-def nearest_yaws(pick_yaw: float, place_yaw: float) -> tuple[float, float]:
-    """The equivalent yaws that keep the wrist nearest its middle.
-
-    The jaws are alike, so both yaws may be rotated by pi together, and either by 2 pi.
-
-    Returns:
-        (pick, place) in radians, the larger of whose magnitudes is smallest.
-    """
-    candidates = []
-    for half_turn in (0.0, np.pi):
-        pick, place = wrap_to_pi(pick_yaw + half_turn), wrap_to_pi(place_yaw + half_turn)
-        candidates.append((pick, place))
-    return min(candidates, key=lambda yaws: max(abs(yaws[0]), abs(yaws[1])))
 
 
 class PickPlacePlanner(LeafSystem):
@@ -125,7 +109,7 @@ class PickPlacePlanner(LeafSystem):
         given = parameters.max_actions
         self._max_actions = max_actions if given is None else given
         self._search_steps = parameters.search.steps if insertion else 0
-        self._motions = _motions(parameters)
+        self._motions = parameters.motion_limits()
         model = np.zeros(len(_FIELDS))
         state = _PlannerState(model)
         state[_START] = state[_GOAL] = parameters.home
@@ -420,23 +404,6 @@ class PickPlacePlanner(LeafSystem):
         )
         force_time = self._parameters.force_ramp * (state.goal_force != state.start_force)
         return float(state.start_time + max(state.duration, opening_time, force_time))
-
-
-def _motions(parameters: PickPlaceParameters) -> dict[Mode, MotionLimits]:
-    """The limits of each mode's motion."""
-    yaw = (parameters.yaw_speed, parameters.yaw_acceleration)
-    free = MotionLimits(parameters.linear_speed, parameters.linear_acceleration, *yaw)
-    carry = MotionLimits(parameters.carry_speed, parameters.carry_acceleration, *yaw)
-    limits = dict.fromkeys(Mode, free)
-    limits[Mode.LIFT] = limits[Mode.CARRY] = carry
-    limits[Mode.DESCEND] = MotionLimits(
-        parameters.descend_speed, parameters.linear_acceleration, *yaw
-    )
-    limits[Mode.LOWER] = MotionLimits(parameters.lower_speed, parameters.carry_acceleration, *yaw)
-    limits[Mode.SEARCH] = dataclasses.replace(
-        limits[Mode.LOWER], yaw_speed=min(parameters.search.yaw_speed, parameters.yaw_speed)
-    )
-    return limits
 
 
 def _motion_at(state: _State, time: float) -> NDArray[np.float64]:

@@ -41,8 +41,8 @@ class RestDetector(LeafSystem):
     An object comes to rest when it has been slower than both speeds for `time_to_sleep`, and
     nothing that is not at rest, mover or object, is within `wake_distance` of it: distances of
     oriented bounding boxes, never more than the true ones. It is no longer at rest as soon as
-    something comes that near. The memory (discrete state) is how long each object has been slow, in s, and
-    whether it is at rest.
+    something comes that near. The memory (discrete state) is how long each object has been slow,
+    in s, and whether it is at rest.
     """
 
     def __init__(

@@ -10,9 +10,10 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import Context, DiagramBuilder, EventStatus, LeafSystem
 from pydrake.systems.primitives import LogVectorOutput
 
+from systems.hand_motion import nearest_yaws
 from systems.insertion_search import InsertionSearch
 from systems.pick_place_parameters import Mode, PickPlaceParameters
-from systems.pick_place_planner import PickPlacePlanner, nearest_yaws
+from systems.pick_place_planner import PickPlacePlanner
 from systems.signals import (
     Observation,
     PickPlaceAction,

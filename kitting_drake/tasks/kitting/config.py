@@ -241,7 +241,7 @@ def kitting_scene(
                 X_WB=X_WTools[index],
                 p_BPoints=tool.surface_points(_SURFACE_POINTS),
                 grasps=(tool.grasp,),
-                symmetry=getattr(tool, "symmetry", 1),
+                symmetry=tool.symmetry,
             )
             for name, tool, index in zip(names, tools, order, strict=True)
         ),
