@@ -19,3 +19,7 @@ PALM_SIZE = (0.064, 0.209)
 """Extents of the palm along G's x and y."""
 PALM_HEIGHT = 0.046
 """Of the underside of the palm above the fingertips."""
+FINGERTIP_DISTANCE = 0.1121
+"""Of the fingertip ends from the hand's flange, along G's z."""
+FINGER_BASE_DISTANCE = 0.0584
+"""Of the origin of the finger meshes from the hand's flange, along G's z."""

@@ -53,13 +53,17 @@ def list_tools(args: argparse.Namespace, entries: list[ToolEntry]) -> None:
     table.add_column("name", no_wrap=True)
     table.add_column("category", no_wrap=True)
     table.add_column("split", no_wrap=True)
-    for heading in ("size, mm", "mass, g", "grasp, mm", "symmetry"):
+    for heading in ("size, mm", "mass, g", "grasp, mm"):
         table.add_column(heading, justify="right", no_wrap=True)
     chosen, own = _with_own(entries, args.names)
     descriptions = [_description(args.models, entry.name) for entry in chosen]
     for name in own:
         load_tool(str(user_tools() / name))
         descriptions.append(yaml.safe_load((user_tools() / name / "tool.yaml").read_text()))
+    # Most tools have none, and a terminal is narrow.
+    symmetric = any(d.get("symmetry", 1) != 1 for d in descriptions)
+    if symmetric:
+        table.add_column("symmetry", justify="right", no_wrap=True)
     for d in descriptions:
         size = " x ".join(f"{1e3 * d[key]:.0f}" for key in ("length", "width", "height"))
         grasp = f"{1e3 * d['grasp']['width']:.1f}"
@@ -70,9 +74,8 @@ def list_tools(args: argparse.Namespace, entries: list[ToolEntry]) -> None:
             size,
             f"{1e3 * d['mass']:.0f}",
             grasp,
-            str(d.get("symmetry", 1)),
         )
-        table.add_row(*row)
+        table.add_row(*row, *([str(d.get("symmetry", 1))] if symmetric else []))
     Console().print(table)
 
 

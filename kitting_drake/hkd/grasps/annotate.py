@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 import yaml
-from numpy.typing import NDArray
 from pydrake.geometry import Box, Mesh, Meshcat, MeshcatParams, Rgba, Sphere
 from pydrake.math import RigidTransform, RollPitchYaw
 from rich.console import Console
@@ -17,20 +16,18 @@ from rich.table import Table
 from kitting_drake.common.errors import UserError
 from kitting_drake.common.files import write_whole
 from kitting_drake.common.paths import MODELS
+from kitting_drake.hkd.grasps.grip import find_grip, jaw_axes
 from kitting_drake.hkd.grasps.proposals import (
     FLOOR_CLEARANCE,
     GRASP_DEPTH,
-    PAD_LENGTH,
     GraspProposal,
     propose_grasps,
 )
 from kitting_drake.hkd.tools.generate import generate_tool, load_catalogue
 from kitting_drake.hkd.tools.tool import Grasp, Tool, load_tool
+from systems.hand_geometry import FINGER_BASE_DISTANCE, FINGERTIP_DISTANCE, PAD_LENGTH
 
 _HAND_MESHES = MODELS / "franka_hand" / "meshes"
-_FINGERTIP = 0.1121
-"""From the hand's flange to its fingertips, in metres: see models/franka_hand/README.md."""
-_FINGER_START = 0.0584
 
 
 def measure_grasp(tool: Tool, x: float, y: float, theta: float) -> Grasp | None:
@@ -45,38 +42,18 @@ def measure_grasp(tool: Tool, x: float, y: float, theta: float) -> Grasp | None:
     Returns:
         The grasp amid the faces that are gripped, or None where there is nothing between the pads.
     """
-    along = np.array([math.cos(theta), math.sin(theta), 0.0])
-    across = np.array([-math.sin(theta), math.cos(theta), 0.0])
-    middle = np.array([x, y, 0.0])
-    points = _points_between(tool.triangles - middle, along, PAD_LENGTH / 2)
-    if not len(points):
+    grip = find_grip(tool.triangles, x, y, theta, PAD_LENGTH)
+    if grip is None:
         return None
-    reach = points @ across
-    low, high = float(reach.min()), float(reach.max())
-    centre = middle + (low + high) / 2 * across
+    _, across = jaw_axes(theta)
+    centre = np.array([x, y]) + grip.middle * across
     return Grasp(
         x=float(centre[0]),
         y=float(centre[1]),
         theta=theta,
-        width=high - low,
-        surface_height=float(points[:, 2].max()),
+        width=grip.width,
+        surface_height=grip.top,
     )
-
-
-def _points_between(
-    triangles: NDArray[np.float64], normal: NDArray[np.float64], distance: float
-) -> NDArray[np.float64]:
-    """The corners (m, 3) of what is left of triangles (n, 3, 3) between two parallel planes."""
-    starts, ends = triangles.reshape(-1, 3), np.roll(triangles, -1, axis=1).reshape(-1, 3)
-    start_heights, end_heights = starts @ normal, ends @ normal
-    found = [starts[np.abs(start_heights) <= distance]]
-    for plane in (-distance, distance):
-        crossing = (start_heights < plane) != (end_heights < plane)
-        share = (plane - start_heights[crossing]) / (
-            end_heights[crossing] - start_heights[crossing]
-        )
-        found.append(starts[crossing] + share[:, None] * (ends[crossing] - starts[crossing]))
-    return np.concatenate(found)
 
 
 def save_grasp(tool: Tool, grasp: Grasp, models: Path = MODELS) -> None:
@@ -220,11 +197,11 @@ class AnnotationPage:
             return
         tips = max(grasp.surface_height - GRASP_DEPTH, FLOOR_CLEARANCE)
         X_THand = RigidTransform(
-            RollPitchYaw(math.pi, 0, grasp.theta), [grasp.x, grasp.y, tips + _FINGERTIP]
+            RollPitchYaw(math.pi, 0, grasp.theta), [grasp.x, grasp.y, tips + FINGERTIP_DISTANCE]
         )
         self._meshcat.SetTransform("hand", X_THand)
         for side, turn in (("left", 0.0), ("right", math.pi)):
-            X_HandFinger = RigidTransform(RollPitchYaw(0, 0, turn), [0, 0, _FINGER_START])
+            X_HandFinger = RigidTransform(RollPitchYaw(0, 0, turn), [0, 0, FINGER_BASE_DISTANCE])
             opened = RigidTransform([0, grasp.width / 2, 0])
             self._meshcat.SetTransform(f"hand/{side}", X_HandFinger @ opened)
 

@@ -11,18 +11,26 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from kitting_drake.hkd.grasps.grip import find_grip, jaw_axes
 from kitting_drake.hkd.tools.tool import Grasp
+from systems.hand_geometry import FINGER_LENGTH, FINGERTIP_DEPTH, MAX_OPENING, PAD_LENGTH
+from systems.pick_place_parameters import PickPlaceParameters
 
 Array = NDArray[np.float64]
 
-# The hand. Lengths in m, as everywhere here.
-PAD_LENGTH, FINGER_LENGTH = 0.0176, 0.021
-# The pads reach this far below the tool's top, and never lower than this above the table.
-GRASP_DEPTH, FLOOR_CLEARANCE = 0.010, 0.0015
-# What the jaws can take, with room to spare of their 80 mm, and to feel at all.
-WIDEST, NARROWEST = 0.065, 0.003
-# How far the fingers reach beyond the gripped faces as they let go.
-RELEASE_REACH = 0.006 + 0.015
+# Lengths in m, as everywhere here.
+_PRIMITIVE = PickPlaceParameters()
+
+GRASP_DEPTH = _PRIMITIVE.grasp_depth
+"""How far the pads reach below the tool's top."""
+FLOOR_CLEARANCE = _PRIMITIVE.floor_clearance
+"""The pads are never lower than this above the table."""
+WIDEST = MAX_OPENING - 0.015
+"""What the jaws can take, with a margin on either side."""
+NARROWEST = _PRIMITIVE.minimum_width
+"""What the jaws can feel."""
+RELEASE_REACH = _PRIMITIVE.release_clearance + FINGERTIP_DEPTH
+"""How far the fingertips reach beyond the gripped faces as they let go."""
 
 # Surface that stands back by less than this touches a pad.
 _TOUCH = 0.0003
@@ -101,9 +109,14 @@ def propose_grasps(triangles: Array, center_of_mass: Array) -> list[GraspProposa
             near += _search(points, level, levels, com, float(theta), _TOUCH, place)
         if near:
             result.append(min(near, key=lambda p: p.cost))
-    tops = [_top(triangles, proposal) for proposal in result]
-    result = [replace(p, surface_height=top) for p, top in zip(result, tops, strict=True)]
+    # Heights from the slices are as coarse as their levels.
+    result = [replace(p, surface_height=_top(triangles, p)) for p in result]
     return sorted(result, key=lambda p: p.cost)
+
+
+def _top(triangles: Array, grasp: Grasp) -> float:
+    grip = find_grip(triangles, grasp.x, grasp.y, grasp.theta, PAD_LENGTH)
+    return grasp.surface_height if grip is None else grip.top
 
 
 def _levels(height: float) -> Array:
@@ -145,8 +158,7 @@ def _search(
 
     Surface that stands back by less than `touch` counts as touched.
     """
-    along = np.array([np.cos(theta), np.sin(theta)])
-    across = np.array([-along[1], along[0]])
+    along, across = jaw_axes(theta)
     u, v = points @ along, points @ across
     pad, finger = round(PAD_LENGTH / 2 / _BIN), round(FINGER_LENGTH / 2 / _BIN)
     u_min = u.min() - finger * _BIN
@@ -284,21 +296,6 @@ def _lean(profile: Array, step: float) -> float:
     if above == 0 or profile.argmax() > 0 or not np.isfinite(profile[above]):
         return 0.0
     return float(np.arctan2(profile[0] - profile[above], above * step))
-
-
-def _top(triangles: Array, grasp: Grasp) -> float:
-    """The greatest height of a surface within the pads' length about a grasp."""
-    along = np.array([np.cos(grasp.theta), np.sin(grasp.theta)])
-    u = (triangles[..., :2] - (grasp.x, grasp.y)) @ along
-    z = triangles[..., 2]
-    half = PAD_LENGTH / 2
-    heights = [z[np.abs(u) <= half]]
-    next_u, next_z = np.roll(u, -1, axis=1), np.roll(z, -1, axis=1)
-    for edge in (-half, half):
-        crosses = (u < edge) != (next_u < edge)
-        share = (edge - u[crosses]) / (next_u[crosses] - u[crosses])
-        heights.append(z[crosses] + share * (next_z[crosses] - z[crosses]))
-    return float(np.concatenate(heights).max())
 
 
 def _distinct(proposals: list[GraspProposal]) -> list[GraspProposal]:

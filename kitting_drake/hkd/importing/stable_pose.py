@@ -4,18 +4,17 @@ import numpy as np
 import trimesh
 from manifold3d import CrossSection, Manifold
 from numpy.typing import NDArray
-from scipy.spatial import ConvexHull, QhullError
+from scipy.spatial import QhullError
 
 from kitting_drake.common.errors import UserError
 from kitting_drake.hkd.tools import meshes
+from kitting_drake.hkd.tools.stable_pose import StablePose, stable_poses
 
 Array = NDArray[np.float64]
 
 # Poses whose centre of mass is this little higher than the lowest are as good; of those the one
 # with the broadest support is taken, to this step. For a solid some 180 mm long.
 _EQUAL_HEIGHT_MM, _MARGIN_STEP_MM = 0.3, 0.5
-# Facets whose normals differ by less are one.
-_COPLANAR = 1e-3
 # How far the length may run off the axis of least inertia, and what counts as one direction.
 _SIDEWAYS_DEG, _LIKE_DEG = 25.0, 6.0
 _END = 0.3
@@ -34,10 +33,9 @@ def lie_down(solid: Manifold, category: str) -> Manifold:
     """
     vertices, faces = meshes.vertices_and_faces(solid)
     com = trimesh.triangles.mass_properties(vertices[faces])["center_mass"]
-    z = -_resting_normal(vertices, com)
-    helper = np.eye(3)[np.abs(z).argmin()]
-    x = np.cross(helper, z) / np.linalg.norm(np.cross(helper, z))
-    solid = _turned(solid, np.array([x, np.cross(z, x), z]))
+    pose = _lowest_pose(vertices, com)
+    R_TB = pose.rotation(forward=np.eye(3)[np.abs(pose.normal).argmin()])
+    solid = solid.transform(np.column_stack([R_TB, np.zeros(3)]))
     solid = solid.rotate((0.0, 0.0, -_long_direction_deg(solid.project())))
     if not _works_at_plus_x(solid, category):
         solid = solid.rotate((0.0, 0.0, 180.0))
@@ -57,47 +55,25 @@ def size(solid: Manifold) -> Array:
     return high - low
 
 
-def _turned(solid: Manifold, R: Array) -> Manifold:
-    return solid.transform(np.column_stack([R, np.zeros(3)]))
+def _lowest_pose(vertices: Array, com: Array) -> StablePose:
+    """The stable pose with the lowest centre of mass; of equals, that with the broadest support.
 
-
-def _resting_normal(vertices: Array, com: Array) -> Array:
-    """The outward normal of the hull's facet on which a body lies lowest."""
+    Raises:
+        UserError: there is none.
+    """
     try:
-        hull = ConvexHull(vertices)
+        poses = stable_poses(vertices, com)
     except (QhullError, ValueError) as error:
         raise UserError("the mesh encloses no volume") from error
-    keys = np.round(hull.equations[:, :3] / _COPLANAR).astype(int)
-    _, group = np.unique(keys, axis=0, return_inverse=True)
-    group = group.reshape(-1)
-    poses = []
-    for index in range(group.max() + 1):
-        members = np.flatnonzero(group == index)
-        # The facet that lies outermost stands for all.
-        normal = hull.equations[members[0], :3]
-        reach = vertices[hull.vertices] @ normal
-        height = float(reach.max() - com @ normal)
-        corners = vertices[np.unique(hull.simplices[members])]
-        margin = _margin(corners, normal, com)
-        if margin > 0:
-            poses.append((height, margin, normal))
     if not poses:
         raise UserError("the mesh stands on none of its sides")
-    lowest = min(height for height, _, _ in poses)
-    good = [pose for pose in poses if pose[0] < lowest + _EQUAL_HEIGHT_MM]
-    # Of equals, the one nearest to how the file has it.
-    return max(good, key=lambda pose: (round(pose[1] / _MARGIN_STEP_MM), -round(pose[2][2], 3)))[2]
-
-
-def _margin(corners: Array, normal: Array, com: Array) -> float:
-    """How far the centre of mass is inside the rim of its support, seen along the normal."""
-    first = np.linalg.svd(normal[None])[2][1:]
-    flat = corners @ first.T
-    try:
-        equations = ConvexHull(flat).equations
-    except (QhullError, ValueError):
-        return -1.0
-    return float(-(equations[:, :2] @ (first @ com) + equations[:, 2]).max())
+    lowest = min(pose.height for pose in poses)
+    good = [pose for pose in poses if pose.height < lowest + _EQUAL_HEIGHT_MM]
+    # Of equals again, that nearest to how the file has it.
+    return max(
+        good,
+        key=lambda pose: (round(pose.margin / _MARGIN_STEP_MM), -round(float(pose.normal[2]), 3)),
+    )
 
 
 def _long_direction_deg(outline: CrossSection) -> float:

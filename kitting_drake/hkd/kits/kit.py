@@ -26,10 +26,11 @@ from numpy.typing import NDArray
 from kitting_drake.common.errors import UserError
 from kitting_drake.common.paths import cache_directory
 from kitting_drake.hkd.cache import cached_folder
-from kitting_drake.hkd.grasps.proposals import FINGER_LENGTH, RELEASE_REACH
+from kitting_drake.hkd.grasps.proposals import RELEASE_REACH
 from kitting_drake.hkd.kits.nesting import LONGEST_SIDES, NestedShape, nest
 from kitting_drake.hkd.tools.tool import Tool
 from systems.bounds import bounded
+from systems.hand_geometry import FINGER_LENGTH
 
 SLOTS = {
     "hammer": (0.02, 0.03),

@@ -19,6 +19,7 @@ from manifold3d import CrossSection, JoinType, Manifold, OpType
 from scipy.spatial import ConvexHull, QhullError
 
 from kitting_drake.common.errors import UserError
+from kitting_drake.hkd.grasps.grip import Grip, find_grip, jaw_axes
 from kitting_drake.hkd.tools import hammer, meshes, pliers, screwdriver, wrench
 from kitting_drake.hkd.tools.collision import (
     closed,
@@ -29,7 +30,9 @@ from kitting_drake.hkd.tools.collision import (
 )
 from kitting_drake.hkd.tools.sdf import tool_sdf
 from kitting_drake.hkd.tools.solids import MATERIALS, Part
+from kitting_drake.hkd.tools.stable_pose import stable_poses
 from kitting_drake.hkd.tools.symmetry import symmetry_order
+from systems.hand_geometry import FINGER_LENGTH, PAD_LENGTH
 
 # The cavities of a kit stand this far off a tool's outline: what is narrower than twice this is no
 # part of a cavity, so collision pieces may bridge it.
@@ -43,8 +46,10 @@ GRIP_TOLERANCE_MM = 0.06
 GRIP_CENTRING_MM = 0.2
 # Edges sharper than this are drawn as edges.
 CREASE_ANGLE_DEG = 35.0
-# The jaw pads of the gripper and its fingers, along the tool.
-PAD_LENGTH_MM, FINGER_LENGTH_MM = 18.0, 22.0
+# Along the tool, what is gripped by the pads and passed by the fingers; a little longer than they
+# are, as the hand may stand a little beside the grasp.
+PAD_LENGTH_MM = round(1e3 * PAD_LENGTH + 0.4, 3)
+FINGER_LENGTH_MM = round(1e3 * FINGER_LENGTH + 1.2, 3)
 
 DESIGNS: dict[str, tuple[type, Callable[[Any], list[Part]]]] = {
     "hammer": (hammer.HammerParameters, hammer.build_hammer),
@@ -174,27 +179,16 @@ def mass_properties(parts: list[Part]) -> tuple[float, np.ndarray, np.ndarray]:
     return mass, center, inertia
 
 
-def resting_pose(points: np.ndarray, center_of_mass: np.ndarray) -> np.ndarray:
-    """The rotation R_TD (3 by 3) that lays a body on a table, as near to its design lie as can be.
+def rest_rotation(points: np.ndarray, center_of_mass: np.ndarray) -> np.ndarray:
+    """The rotation R_TD (3, 3) to the stable pose of a body that is nearest to its design pose.
 
-    A body stands on a facet of its hull `points` (n, 3) if its centre of mass is above that facet.
+    Args:
+        points: (n, 3) whose convex hull is the body's, in the design frame D.
+        center_of_mass: (3,) in D.
     """
-    hull = ConvexHull(points)
-    best, best_tilt = np.array([0.0, 0.0, -1.0]), np.inf
-    for simplex, (*normal, offset) in zip(hull.simplices, hull.equations, strict=True):
-        normal = np.array(normal)
-        foot = center_of_mass - (center_of_mass @ normal + offset) * normal
-        corners = points[simplex]
-        weights = np.linalg.lstsq(
-            np.vstack([corners.T, np.ones(3)]), np.append(foot, 1.0), rcond=None
-        )[0]
-        tilt = np.arccos(np.clip(-normal[2], -1.0, 1.0))
-        if weights.min() >= -1e-6 and tilt < best_tilt:
-            best, best_tilt = normal, tilt
-    z = -best
-    x = np.array([1.0, 0.0, 0.0]) - z[0] * z
-    x /= np.linalg.norm(x)
-    return np.array([x, np.cross(z, x), z])
+    poses = stable_poses(points, center_of_mass)
+    nearest = max(poses, key=lambda pose: -pose.normal[2])
+    return nearest.rotation(forward=np.array([1.0, 0.0, 0.0]))
 
 
 def generate_tool(entry: ToolEntry, directory: Path) -> Report:
@@ -203,7 +197,7 @@ def generate_tool(entry: ToolEntry, directory: Path) -> Report:
     hulls = [h for part in parts for h in part.hulls]
     mass, center, inertia = mass_properties(parts)
     # Lie the tool down before its pieces are merged: outline and heights are those of the lie.
-    R_TD = resting_pose(np.vstack(hulls), 1e3 * center)
+    R_TD = rest_rotation(np.vstack(hulls), 1e3 * center)
     whole = _moved(Manifold.batch_boolean([p.solid for p in parts], OpType.Add), R_TD, np.zeros(3))
     if sum(body.volume() > 1e-3 for body in whole.decompose()) != 1:
         raise CatalogueError(f"tool {entry.name}: its parts do not touch")
@@ -221,7 +215,7 @@ def generate_tool(entry: ToolEntry, directory: Path) -> Report:
 
     # Nothing is written of a tool that cannot be used.
     box = np.array(whole.bounding_box()).reshape(2, 3)
-    grip, flatness, overhang, grip_top = _measure_grasp(entry.grasp, whole)
+    grip = _measure_grasp(entry.grasp, whole)
 
     if directory.exists():
         shutil.rmtree(directory)
@@ -240,7 +234,7 @@ def generate_tool(entry: ToolEntry, directory: Path) -> Report:
     solid_hulls = Manifold.batch_boolean([Manifold.hull_points(h) for h in hulls], OpType.Add)
     vertices, faces = meshes.vertices_and_faces(whole)
     symmetry = symmetry_order(1e-3 * vertices[faces])
-    description = _description(entry, box, mass, center, symmetry, grip, grip_top, visuals)
+    description = _description(entry, box, mass, center, symmetry, grip, visuals)
     (directory / "tool.yaml").write_text(yaml.safe_dump(description, sort_keys=False))
     points = np.vstack(hulls)
     return Report(
@@ -252,9 +246,9 @@ def generate_tool(entry: ToolEntry, directory: Path) -> Report:
         inside_mm=furthest(outline, closed(silhouette(hulls), CAVITY_CLEARANCE_MM)),
         bottom_error_mm=points[:, 2].min() - box[0, 2],
         top_error_mm=points[:, 2].max() - box[1, 2],
-        grip_error_mm=_measure_grasp(entry.grasp, solid_hulls)[0] - grip,
-        grip_flatness_mm=flatness,
-        finger_overhang_mm=overhang,
+        grip_error_mm=_measure_grasp(entry.grasp, solid_hulls).width - grip.width,
+        grip_flatness_mm=grip.flatness,
+        finger_overhang_mm=grip.overhang,
         tilt_deg=float(np.degrees(np.arccos(min(1.0, R_TD[2, 2])))),
         support_margin_mm=_support_margin(points, 1e3 * center),
     )
@@ -288,33 +282,56 @@ def _write_visuals(
     return visuals, triangles
 
 
-def _measure_grasp(grasp: GraspEntry, solid: Manifold) -> tuple[float, float, float, float]:
-    """Gripped width, its variation, the fingers' overhang, and height of the top there; mm."""
-    # Into the grasp's frame: y along the closing direction.
-    solid = solid.translate((-grasp.x_mm, -grasp.y_mm, 0.0)).rotate((0.0, 0.0, -grasp.theta_deg))
+@dataclass
+class _GripReport:
+    """What the jaws grip of a tool; lengths in mm."""
 
-    def strip(x: float, length: float) -> np.ndarray:
-        band = CrossSection.square((length, 80.0), True).translate((x, 0.0)).extrude(100.0)
-        return np.array((solid ^ band.translate((0, 0, -1))).bounding_box()).reshape(2, 3)
+    width: float
+    # How much the gripped faces vary along the pads.
+    flatness: float
+    # How far anything beside the pads stands out where the fingers pass.
+    overhang: float
+    # Height of the tool's top there.
+    top: float
 
-    pad, finger = strip(0.0, PAD_LENGTH_MM), strip(0.0, FINGER_LENGTH_MM)
-    slices = [strip(x, 0.5) for x in np.linspace(-0.5, 0.5, 7) * (PAD_LENGTH_MM - 0.5)]
-    width = pad[1, 1] - pad[0, 1]
-    if not 8.0 <= width <= 35.0:
+
+def _measure_grasp(grasp: GraspEntry, solid: Manifold) -> _GripReport:
+    """Measures a grasp on a tool that lies in its frame T.
+
+    Raises:
+        CatalogueError: the jaws cannot hold the tool there.
+    """
+    vertices, faces = meshes.vertices_and_faces(solid)
+    triangles = vertices[faces]
+    theta = np.radians(grasp.theta_deg)
+    along, _ = jaw_axes(theta)
+
+    def grip(offset: float, length: float) -> Grip:
+        x, y = (grasp.x_mm, grasp.y_mm) + offset * along
+        found = find_grip(triangles, x, y, theta, length)
+        if found is None:
+            raise CatalogueError(f"there is nothing to grasp at ({x:.2f}, {y:.2f}) mm")
+        return found
+
+    pad, finger = grip(0.0, PAD_LENGTH_MM), grip(0.0, FINGER_LENGTH_MM)
+    slices = [grip(offset, 0.5) for offset in np.linspace(-0.5, 0.5, 7) * (PAD_LENGTH_MM - 0.5)]
+    if not 8.0 <= pad.width <= 35.0:
         raise CatalogueError(
-            f"the grasp at ({grasp.x_mm}, {grasp.y_mm}) mm holds {width:.1f} mm; "
+            f"the grasp at ({grasp.x_mm}, {grasp.y_mm}) mm holds {pad.width:.1f} mm; "
             "it has to be 8 to 35 mm"
         )
-    middle = 0.5 * (pad[0, 1] + pad[1, 1])
-    if abs(middle) > GRIP_CENTRING_MM:
+    if abs(pad.middle) > GRIP_CENTRING_MM:
         # The jaws would draw the tool over as they close, and put it down as much beside its place.
         raise CatalogueError(
-            f"the grasp at ({grasp.x_mm}, {grasp.y_mm}) mm is not amid the faces it grips, but "
-            f"{middle:+.2f} mm off along the jaws"
+            f"the grasp at ({grasp.x_mm}, {grasp.y_mm}) mm is not centred between the faces that "
+            f"it grips, but {pad.middle:+.2f} mm off along the jaws"
         )
-    flatness = max(np.ptp([s[k, 1] for s in slices]) for k in (0, 1))
-    overhang = max(finger[1, 1] - pad[1, 1], pad[0, 1] - finger[0, 1])
-    return float(width), float(flatness), float(overhang), float(pad[1, 2])
+    return _GripReport(
+        width=pad.width,
+        flatness=float(max(np.ptp([s.low for s in slices]), np.ptp([s.high for s in slices]))),
+        overhang=max(finger.high - pad.high, pad.low - finger.low),
+        top=pad.top,
+    )
 
 
 def _support_margin(points: np.ndarray, center_of_mass: np.ndarray) -> float:
@@ -333,8 +350,7 @@ def _description(
     mass: float,
     center: np.ndarray,
     symmetry: int,
-    grip: float,
-    grip_top: float,
+    grip: _GripReport,
     visuals: list[tuple[str, str]],
 ) -> dict[str, Any]:
     """The content of `tool.yaml`: SI units, frame T."""
@@ -356,8 +372,8 @@ def _description(
             "x": metres(entry.grasp.x_mm),
             "y": metres(entry.grasp.y_mm),
             "theta": round(float(np.radians(entry.grasp.theta_deg)), 6),
-            "width": metres(grip),
-            "surface_height": metres(grip_top),
+            "width": metres(grip.width),
+            "surface_height": metres(grip.top),
         },
         "visual_meshes": [name for name, _ in visuals],
     }

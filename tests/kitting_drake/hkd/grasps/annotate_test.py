@@ -73,7 +73,7 @@ def test_saving_regenerates_a_tool_of_the_catalogue(models: Path):
 
 def test_what_the_catalogue_cannot_have_changes_nothing(models: Path):
     off = Grasp(x=-0.03, y=0.004, theta=0.0, width=0.02, surface_height=0.02)
-    with pytest.raises(UserError, match="not amid"):
+    with pytest.raises(UserError, match="not centred"):
         save_grasp(copied(models), off, models)
     assert (models / "tools" / "catalogue.yaml").read_text() == CATALOGUE
     assert copied(models).grasp == load_tool("flat_screwdriver").grasp

@@ -1,3 +1,4 @@
+import re
 from pathlib import Path
 
 import pytest
@@ -18,6 +19,15 @@ def test_the_catalogue_is_what_is_shipped():
 QUICK = ["claw_hammer", "needle_nose_pliers", "adjustable_wrench", "phillips_screwdriver"]
 
 
+def without_noise(sdf: bytes) -> str:
+    """The text of a model in which what is zero but for rounding, on any machine, is zero."""
+
+    def clean(number: re.Match[str]) -> str:
+        return "0" if abs(float(number[0])) < 1e-15 else number[0]
+
+    return re.sub(r"-?\d+(\.\d+)?e-\d+", clean, sdf.decode())
+
+
 @pytest.mark.parametrize(
     "entry",
     [
@@ -31,7 +41,10 @@ def test_generating_gives_the_committed_files(entry, tmp_path: Path):
     kept = {path.name: path.read_bytes() for path in (MODELS / "tools" / entry.name).iterdir()}
     assert made.keys() == kept.keys()
     for name in kept:
-        assert made[name] == kept[name], name
+        if name.endswith(".sdf"):
+            assert without_noise(made[name]) == without_noise(kept[name]), name
+        else:
+            assert made[name] == kept[name], name
     # What can be touched is what is seen, to a fraction of the clearance.
     assert max(report.outside_mm, report.inside_mm) < 0.35
     assert abs(report.bottom_error_mm) < 0.1

@@ -1,0 +1,74 @@
+"""What the jaws take hold of when they close on a tool from above.
+
+The pads close on whatever reaches furthest between them. So a grip is the extent, across the jaws,
+of the part of the surface that lies between two planes: those through the ends of the pads.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Grip:
+    """The extent of a surface between the jaws, in the unit of its triangles."""
+
+    low: float
+    """The least coordinate along the closing direction, from where the hand is."""
+    high: float
+    top: float
+    """The greatest height."""
+
+    @property
+    def width(self) -> float:
+        """The distance of the faces that are gripped."""
+        return self.high - self.low
+
+    @property
+    def middle(self) -> float:
+        """The coordinate along the closing direction halfway between those faces."""
+        return (self.low + self.high) / 2
+
+
+def find_grip(triangles: Array, x: float, y: float, theta: float, length: float) -> Grip | None:
+    """The grip of pads of a length along the tool, wherever they stand across it.
+
+    Args:
+        triangles: (n, 3, 3) of the surface of a tool in its frame T.
+        x: of the middle of the pads in T.
+        y: the same.
+        theta: the rotation of the hand about T's z, in radians; at zero the jaws close along y.
+        length: of the pads, across the closing direction.
+
+    Returns:
+        The grip, or None where there is nothing between the pads.
+    """
+    along, across = jaw_axes(theta)
+    points = _points_between(triangles - (x, y, 0.0), np.append(along, 0.0), length / 2)
+    if not len(points):
+        return None
+    reach = points[:, :2] @ across
+    return Grip(float(reach.min()), float(reach.max()), float(points[:, 2].max()))
+
+
+def jaw_axes(theta: float) -> tuple[Array, Array]:
+    """The directions (2,) along the pads and across them, in which the jaws close, in T."""
+    along = np.array([np.cos(theta), np.sin(theta)])
+    return along, np.array([-along[1], along[0]])
+
+
+def _points_between(triangles: Array, normal: Array, distance: float) -> Array:
+    """The corners (m, 3) of what is left of triangles (n, 3, 3) between two parallel planes."""
+    starts, ends = triangles.reshape(-1, 3), np.roll(triangles, -1, axis=1).reshape(-1, 3)
+    start_heights, end_heights = starts @ normal, ends @ normal
+    found = [starts[np.abs(start_heights) <= distance]]
+    for plane in (-distance, distance):
+        crossing = (start_heights < plane) != (end_heights < plane)
+        share = (plane - start_heights[crossing]) / (
+            end_heights[crossing] - start_heights[crossing]
+        )
+        found.append(starts[crossing] + share[:, None] * (ends[crossing] - starts[crossing]))
+    return np.concatenate(found)

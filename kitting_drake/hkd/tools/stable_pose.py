@@ -1,0 +1,96 @@
+"""The stable poses of a rigid body on a table.
+
+A body rests on a facet of its convex hull if the centre of mass, seen along the facet's normal, is
+inside the facet. `trimesh.poses.compute_stable_poses` takes every triangle of the hull for a facet
+of its own and ranks the poses by their probability in a random toss; which of them is a tool's is a
+question of heights and of support instead, so this module merges coplanar triangles and tells both.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import ConvexHull, QhullError
+
+Array = NDArray[np.float64]
+
+# Triangles of the hull whose normals differ by less are one facet.
+_COPLANAR = 1e-3
+
+
+@dataclass(frozen=True)
+class StablePose:
+    """A pose in which a body stays, in the body's frame B and in the unit of its points."""
+
+    normal: Array
+    """(3,) of the facet that is the support, out of the body: down, when the body rests."""
+    height: float
+    """Of the centre of mass above the table."""
+    margin: float
+    """The distance of the centre of mass, seen from above, from the rim of its support."""
+
+    def rotation(self, forward: Array) -> Array:
+        """R_TB (3, 3) that brings the normal to -z and a direction into the xz plane, to +x.
+
+        Args:
+            forward: (3,) the direction in B; not along the normal.
+        """
+        z = -self.normal
+        x = forward - (forward @ z) * z
+        x /= np.linalg.norm(x)
+        return np.array([x, np.cross(z, x), z])
+
+
+def stable_poses(points: Array, center_of_mass: Array) -> list[StablePose]:
+    """The stable poses of a body, in no particular but always the same order.
+
+    Args:
+        points: (n, 3) whose convex hull is the body's, in its frame B.
+        center_of_mass: (3,) in B.
+
+    Raises:
+        scipy.spatial.QhullError: the points have no hull with a volume.
+    """
+    hull = ConvexHull(points)
+    normals = hull.equations[:, :3]
+    _, group = np.unique(np.round(normals / _COPLANAR).astype(int), axis=0, return_inverse=True)
+    group = group.reshape(-1)
+    corners = points[hull.vertices]
+    poses = []
+    for index in range(group.max() + 1):
+        members = np.flatnonzero(group == index)
+        support = points[np.unique(hull.simplices[members])]
+        margin = _support_margin(support, normals[members[0]], center_of_mass)
+        if margin <= 0:
+            continue
+        # Of triangles that are nearly coplanar, that below the centre of mass bears the body.
+        shares = [_least_share(hull, points, member, center_of_mass) for member in members]
+        bearing = members[int(np.argmax(shares))]
+        normal = normals[bearing]
+        height = float((corners @ normal).max() - center_of_mass @ normal)
+        poses.append((bearing, StablePose(normal, height, margin)))
+    return [pose for _, pose in sorted(poses, key=lambda item: item[0])]
+
+
+def _support_margin(support: Array, normal: Array, center_of_mass: Array) -> float:
+    """The distance of the centre of mass from the rim of its support, seen along the normal.
+
+    It is negative outside the support, and -1 if that has no area.
+    """
+    axes = np.linalg.svd(normal[None])[2][1:]
+    try:
+        equations = ConvexHull(support @ axes.T).equations
+    except (QhullError, ValueError):
+        return -1.0
+    return float(-(equations[:, :2] @ (axes @ center_of_mass) + equations[:, 2]).max())
+
+
+def _least_share(hull: ConvexHull, points: Array, triangle: int, center_of_mass: Array) -> float:
+    """The least barycentric coordinate of the centre of mass over a triangle of the hull."""
+    *normal, offset = hull.equations[triangle]
+    foot = center_of_mass - (center_of_mass @ np.array(normal) + offset) * np.array(normal)
+    corners = points[hull.simplices[triangle]]
+    coordinates = np.linalg.lstsq(
+        np.vstack([corners.T, np.ones(3)]), np.append(foot, 1.0), rcond=None
+    )[0]
+    return float(coordinates.min())
