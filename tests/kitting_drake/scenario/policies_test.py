@@ -1,53 +1,77 @@
 import dataclasses
+import hashlib
 import subprocess
 import sys
+import types
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from pydrake.common.value import Value
 from safetensors.torch import save_file
 
 from kitting_drake.common.errors import UserError
 from kitting_drake.policies.learned_policy import Decision, LearnedPolicy
 from kitting_drake.policies.weights import load_networks, preferred_type
-from kitting_drake.scenario.policies import describe_learned, make_function, seeds_learned_from
-from kitting_drake.scenario.schema import Learned, PythonPolicy
+from kitting_drake.scenario.policies import (
+    Learned,
+    Oracle,
+    PolicyConfig,
+    PolicySite,
+    PythonPolicy,
+    QuantizedOracle,
+)
+from kitting_drake.tasks import ArrangedKitting
 from systems.signals import Observation, PickPlaceAction, PixelGrid
 
 ROOT = Path(__file__).resolve().parents[3]
 GRID = PixelGrid(rows=33, cols=49)
 
 
+@pytest.fixture(scope="module")
+def site() -> PolicySite:
+    """A cell in which no policy has a body to look at."""
+    scene = ArrangedKitting().make_scene(grid=GRID, seed=0, base=Path())
+    return PolicySite(scene=scene, objects=(), grid=GRID, base=Path())
+
+
 def observation() -> Observation:
     return Observation(np.random.default_rng(0).random((4, *GRID.shape), np.float32), GRID)
+
+
+def action(config: PolicyConfig, site: PolicySite, seen: Observation) -> PickPlaceAction:
+    """What a policy's system makes of an observation."""
+    system = config.make_system(site)
+    context = system.CreateDefaultContext()
+    system.GetInputPort("observation").FixValue(context, Value(seen))
+    return system.GetOutputPort("action").Eval(context)
 
 
 @pytest.mark.parametrize("continuous", [True, False])
 @pytest.mark.parametrize("orientations", [36, 180])
 def test_a_learned_policy_as_the_scenario_says(
-    weights_file: Path, orientations: int, continuous: bool
+    site: PolicySite, weights_file: Path, orientations: int, continuous: bool
 ):
     told: list[Decision] = []
-    config = Learned(weights_file.name, orientations=orientations, continuous=continuous)
-    function = make_function(
-        config,
-        base=weights_file.parent,
-        grid=GRID,
-        watch=lambda _, decision: told.append(decision),
+    site = dataclasses.replace(
+        site, base=weights_file.parent, observer=lambda _, decision: told.append(decision)
     )
+    config = Learned(weights_file.name, orientations=orientations, continuous=continuous)
+    found = action(config, site, observation())
     networks = load_networks(weights_file, preferred_type())
     policy = LearnedPolicy(networks, orientations=orientations, continuous=continuous)
-    action = function(observation())
-    assert action == policy(observation())
-    assert [decision.action for decision in told] == [action]
+    assert found == policy(observation())
+    assert [decision.action for decision in told] == [found]
 
 
-def test_what_cannot_be_had_is_named(weights_file: Path, tmp_path: Path):
+def test_what_cannot_be_had_is_named(site: PolicySite, weights_file: Path, tmp_path: Path):
+    site = dataclasses.replace(site, base=tmp_path)
+
     def refusal(grid: PixelGrid = GRID, **fields: object) -> str:
         with pytest.raises(UserError) as caught:
             config = Learned(**fields)  # type: ignore[arg-type]
-            make_function(config, base=tmp_path, grid=grid, watch=None)
+            config.make_system(dataclasses.replace(site, grid=grid))
         assert "\n" not in str(caught.value)
         return str(caught.value)
 
@@ -71,7 +95,9 @@ def test_what_cannot_be_had_is_named(weights_file: Path, tmp_path: Path):
 
 def test_results_say_what_a_policy_is(weights_file: Path):
     config = Learned(weights_file.name, orientations=36, continuous=False)
-    assert describe_learned(config, base=weights_file.parent) == {
+    base = weights_file.parent
+    assert config.name == "learned"
+    assert config.details(base) == {
         "method": "so2",
         "preset": "tiny",
         "orientations": 36,
@@ -82,12 +108,51 @@ def test_results_say_what_a_policy_is(weights_file: Path):
         "demonstrations": 3,
         "steps": 0,
     }
-    assert seeds_learned_from(config, base=weights_file.parent) == {10_000, 10_001, 10_002}
+    assert config.training_seeds(base) == {10_000, 10_001, 10_002}
+    assert config.digest(base) == f"sha256 {hashlib.sha256(weights_file.read_bytes()).hexdigest()}"
+    with pytest.raises(UserError, match=r"gone\.safetensors"):
+        Learned("gone.safetensors").digest(base)
+    assert Oracle().details(base) == {"method": "oracle"}
+    rounded = QuantizedOracle(orientations=72)
+    assert rounded.name == "quantized_oracle"
+    assert rounded.details(base) == {"method": "quantized_oracle", "orientations": 72}
+    assert (rounded.digest(base), rounded.training_seeds(base)) == (None, set())
 
 
-def test_a_function_of_ones_own_needs_no_networks():
-    config = PythonPolicy("systems.signals:PickPlaceAction")
-    assert make_function(config, base=ROOT, grid=GRID, watch=None) is PickPlaceAction
+STOP = """
+from systems.signals import PickPlaceAction
+
+def act(observation):
+    return PickPlaceAction(stop=True)
+"""
+
+
+def test_a_function_of_ones_own(site: PolicySite, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    path = tmp_path / "policy_of_mine.py"
+    path.write_text(STOP)
+    monkeypatch.syspath_prepend(tmp_path)
+    config = PythonPolicy("policy_of_mine:act")
+    assert action(config, site, observation()) == PickPlaceAction(stop=True)
+    # Results tell one version of it from another.
+    assert config.digest(tmp_path) == f"sha256 {hashlib.sha256(STOP.encode()).hexdigest()}"
+    path.write_text(STOP + "\n# better\n")
+    assert config.digest(tmp_path) != f"sha256 {hashlib.sha256(STOP.encode()).hexdigest()}"
+
+
+@pytest.mark.parametrize(
+    ("function", "message"),
+    [
+        ("no_such_module:policy", "policy.function: cannot import no_such_module:policy"),
+        ("stub_policy:missing", "policy.function: cannot import stub_policy:missing"),
+        ("stub_policy:number", "policy.function: stub_policy:number is not a function"),
+    ],
+)
+def test_a_function_that_cannot_be_had_is_named(
+    site: PolicySite, function: str, message: str, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setitem(sys.modules, "stub_policy", types.SimpleNamespace(number=3))
+    with pytest.raises(UserError, match=message):
+        PythonPolicy(function).make_system(site)
 
 
 def test_who_uses_no_network_does_not_wait_for_torch():

@@ -1,0 +1,55 @@
+import importlib.metadata
+import subprocess
+from pathlib import Path
+
+import pytest
+
+import kitting_drake
+from kitting_drake.common.provenance import commit, versions
+
+
+def git(folder: Path, *arguments: str) -> str:
+    identity = ("-c", "user.name=a", "-c", "user.email=a@example.org")
+    command = ["git", "-C", str(folder), *identity, *arguments]
+    return subprocess.run(command, check=True, capture_output=True, text=True).stdout.strip()
+
+
+@pytest.fixture
+def checkout(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A checkout with one file and one commit, from which the package is imported."""
+    package = tmp_path / "kitting_drake" / "__init__.py"
+    package.parent.mkdir()
+    package.write_text("")
+    git(tmp_path, "init", "--quiet")
+    git(tmp_path, "add", ".")
+    git(tmp_path, "commit", "--quiet", "--message", "first")
+    monkeypatch.setattr(kitting_drake, "__file__", str(package))
+    return tmp_path
+
+
+def test_the_commit_and_whether_it_is_all(checkout: Path):
+    head = git(checkout, "rev-parse", "HEAD")
+    assert len(head) == 40
+    assert commit() == head
+    (checkout / "output.json").write_text("{}")  # No part of the program.
+    assert commit() == head
+    (checkout / "kitting_drake" / "__init__.py").write_text("changed = True\n")
+    assert commit() == f"{head}+"
+
+
+def test_an_installed_package_has_no_commit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(kitting_drake, "__file__", str(tmp_path / "kitting_drake" / "x.py"))
+    assert commit() is None
+
+
+def test_without_git_nothing_is_said(checkout: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setenv("PATH", str(checkout))
+    assert commit() is None
+
+
+def test_versions_are_those_that_results_depend_on():
+    found = versions()
+    assert found.keys() >= {"kitting_drake", "drake", "numpy", "python"}
+    assert found["drake"] == importlib.metadata.version("drake")
+    assert found["kitting_drake"] == kitting_drake.__version__
+    assert all(isinstance(text, str) and text for text in found.values())
