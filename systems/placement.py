@@ -349,12 +349,14 @@ def _measure(
 
 def total_reward(goals: Sequence[Goal], placements: Sequence[Placement]) -> float:
     """The episode's score, 0 to 1."""
-    return sum(goals[item.goal].reward * item.share for item in placements if item.goal is not None)
+    return math.fsum(
+        goals[item.goal].reward * item.share for item in placements if item.goal is not None
+    )
 
 
 def strict_reward(goals: Sequence[Goal], placements: Sequence[Placement]) -> float:
     """The episode's score if only strict successes counted, 0 to 1."""
-    return sum(
+    return math.fsum(
         goals[item.goal].reward
         for item in placements
         if item.goal is not None and item.strict_success
