@@ -69,7 +69,8 @@ def find_cause(
         grasp_point = np.array([item.grasps[0].x, item.grasps[0].y, 0.0])
         # Half a rotation about the grasp leaves the grasp where it was and takes the middle away.
         if min(_gap(X_WB, X_WGoal, middle), _gap(X_WB, X_WGoal, grasp_point)) < _NEAR:
-            rotation = abs(wrap_to_pi(heading(X_WB) - heading(X_WGoal)))
+            # Modulo the tool's symmetry: a reversible one cannot be reversed.
+            rotation = abs(placement.angle_error)
             if rotation > math.pi - _ALIGNED or _tilt(X_WB) > _TILTED:
                 return REVERSED
             if rotation < _ALIGNED:
