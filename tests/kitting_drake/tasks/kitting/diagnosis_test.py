@@ -62,7 +62,7 @@ def test_at_its_own_cavity(scene: Scene, outcome: str):
     for records in ([done], [done, record(scene, "missed")]):
         assert cause(scene, flat(0.004, 0.01, 0.2, 0.012), *records) == "insertion blocked"
         assert cause(scene, flat(0.0, 0.0, math.pi - 0.1), *records) == "reversed"
-        face_down = RigidTransform(RollPitchYaw(math.pi, 0, 0), [0, 0, 0.03])
+        face_down = RigidTransform(RollPitchYaw(math.pi, 0, 0), [0, 0.012, 0.03])
         assert cause(scene, face_down, *records) == "reversed"
 
 
