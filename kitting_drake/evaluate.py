@@ -1,16 +1,17 @@
 """`python -m kitting_drake.evaluate SCENARIO.yaml`: many seeds side by side, and their summary."""
 
-import copy
 import hashlib
+import json
 import os
 import time
 from collections.abc import Iterable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from rich.console import Console
 
-from kitting_drake.common.command_line import FAILED, count_type, run_verb, seed_type
+from kitting_drake.common.command_line import FAILED, count_type, run_command, seed_type
 from kitting_drake.common.errors import UserError
 from kitting_drake.common.files import (
     alone_in,
@@ -21,25 +22,23 @@ from kitting_drake.common.files import (
     write_json,
 )
 from kitting_drake.common.processes import Died, counting_bar, run_apart, side_by_side
-from kitting_drake.episode.episode import run_episode
-from kitting_drake.hkd.tools.tool import load_tool
-from kitting_drake.reporting.summary import Episode, summarise, summary_notes, summary_table
+from kitting_drake.common.provenance import versions
+from kitting_drake.episode import EpisodeResult
+from kitting_drake.episode.chosen import build_chosen, run_chosen
+from kitting_drake.reporting.summary import Episode, summarise
 from kitting_drake.reporting.summary_figure import draw_summary
+from kitting_drake.reporting.terminal import summary_notes, summary_table
 from kitting_drake.scenario.command_line import (
     ChosenScenario,
-    build_chosen,
     choose_scenario,
     output_folder,
     scenario_parser,
-    versions,
 )
-from kitting_drake.scenario.policies import seeds_learned_from, source_of
-from kitting_drake.scenario.schema import Learned, PythonPolicy, ToolsetKitting
 
 
 def main() -> int:
     """Parses the command line and evaluates; returns the exit code."""
-    parser = scenario_parser("evaluate", "Kit with many seeds and summarise.")
+    parser = scenario_parser("evaluate", "Run episodes of many seeds and summarise them.")
     parser.add_argument("--episodes", type=count_type, default=100, help="how many (100)")
     parser.add_argument("--workers", type=count_type, default=os.cpu_count(), help="side by side")
     parser.add_argument("--seed", type=seed_type, help="of the first (default: the scenario's)")
@@ -50,32 +49,45 @@ def main() -> int:
     folder = require_folder(output_folder(arguments, f"{chosen.name}-evaluation"))
     console = Console(quiet=arguments.quiet)
 
-    policy = chosen.scenario.policy
-    if isinstance(policy, Learned):
-        known = seeds_learned_from(policy, base=chosen.base).intersection(seeds)
-        if known:
-            console.print(f"note: the policy has learned from seeds {min(known)} to {max(known)}")
+    known = chosen.scenario.policy.training_seeds(chosen.base).intersection(seeds)
+    if known:
+        console.print(f"note: the policy has learned from seeds {min(known)} to {max(known)}")
     # What cannot be built at all is told at once, not once for each seed.
-    build_chosen(chosen, seed=seeds[0])
-    start = time.perf_counter()
+    success = build_chosen(chosen, seed=seeds[0]).scene.success
     with alone_in(folder):
-        episodes = evaluate(chosen, seeds, folder, workers=arguments.workers, console=console)
-        summary = summarise(episodes, chosen, wall_seconds_total=time.perf_counter() - start)
+        evaluation = evaluate(chosen, seeds, folder, workers=arguments.workers, console=console)
+        episodes = evaluation.episodes
+        summary = summarise(
+            episodes, chosen, success, wall_seconds_total=evaluation.wall_seconds_total
+        )
         write_json(folder / "summary.json", summary)
         draw_summary(summary, episodes, folder / "summary.png")
     console.print(summary_table(summary))
-    console.print(summary_notes(summary), highlight=False)
-    console.print(f"files: {folder}/", highlight=False)
+    console.print(summary_notes(summary), highlight=False, markup=False)
+    console.print(f"files: {folder}/", highlight=False, markup=False)
     failed = [episode for episode in episodes if episode["failure"]]
     if failed:
-        first = failed[0]
-        console.print(f"failed first: seed {first['seed']}: {first['failure']}", highlight=False)
+        console.print(
+            f"failed first: seed {failed[0]['seed']}: {failed[0]['failure']}",
+            highlight=False,
+            markup=False,
+        )
     return FAILED if len(failed) == len(episodes) else 0
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """What `evaluate` returns."""
+
+    episodes: list[Episode]
+    """In the order of the seeds."""
+    wall_seconds_total: float
+    """How long all calls took that worked in the folder, in s."""
 
 
 def evaluate(
     chosen: ChosenScenario, seeds: Iterable[int], folder: Path, *, workers: int, console: Console
-) -> list[Episode]:
+) -> Evaluation:
     """Runs an episode for each seed, each in a process of its own.
 
     Episodes already in `folder/episodes.jsonl` are not run again; one is written there as it ends.
@@ -89,16 +101,14 @@ def evaluate(
         workers: how many run at a time.
         console: for the progress bar.
 
-    Returns:
-        The episodes, in the order of the seeds.
-
     Raises:
         UserError: the folder holds the episodes of another scenario, or of the same with another
-            policy, other tools or other versions; or a process was killed twice.
+            policy, other files or other versions; or a process was killed twice.
     """
     seeds = list(seeds)
     path = folder / "episodes.jsonl"
     claim_folder(folder, "scenario.json", _identity(chosen), of="scenario, policy or version")
+    clock = _WallClock(folder / "wall_seconds.json")
     done = {episode["seed"]: episode for episode in read_lines(path)}
     pending = [seed for seed in seeds if seed not in done]
     queue = iter(pending)
@@ -109,32 +119,53 @@ def evaluate(
         ):
             done[episode["seed"]] = episode
             append_line(path, episode)
+            clock.save()
             progress.advance(task)
-    return [done[seed] for seed in seeds]
+    return Evaluation([done[seed] for seed in seeds], clock.save())
+
+
+class _WallClock:
+    """How long all calls took that worked in a folder; a file keeps the time of earlier ones.
+
+    Of a call that is killed, the time since its last episode ended is not counted: the work of that
+    time is lost too.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._earlier = 0.0
+        self._start = time.perf_counter()
+        if path.exists():
+            try:
+                self._earlier = float(json.loads(path.read_text())["wall_seconds_total"])
+            except (OSError, ValueError, KeyError, TypeError) as error:
+                raise UserError(f"{path} is damaged: delete it") from error
+
+    def save(self) -> float:
+        """Writes the file; returns the time so far, in s."""
+        total = self._earlier + time.perf_counter() - self._start
+        write_json(self._path, {"wall_seconds_total": total})
+        return total
 
 
 def _identity(chosen: ChosenScenario) -> dict[str, Any]:
-    """What tells one evaluation from another: files by what they are, not by where they lie."""
-    identity = {**copy.deepcopy(chosen.described), "versions": versions()}
-    policy, task = chosen.scenario.policy, chosen.scenario.task
-    if isinstance(policy, Learned):
-        identity["policy"]["weights"] = _digest([chosen.base / policy.weights])
-    if isinstance(policy, PythonPolicy):
-        identity["policy"]["source"] = _digest([source_of(policy)])
-    if not isinstance(task, ToolsetKitting):
-        folders = [load_tool(name, chosen.base).directory for name in task.tools]
-        identity["tools"] = [
-            _digest(sorted(path for path in folder.iterdir() if path.is_file()))
-            for folder in folders
-        ]
-    return identity
+    """What tells one evaluation from another: the whole scenario, the content of the files that it
+    depends on, and versions."""
+    scenario = chosen.scenario
+    return {
+        **chosen.described,
+        "versions": versions(),
+        "policy_digest": scenario.policy.digest(chosen.base),
+        "task_digest": _digest(scenario.task.input_files(chosen.base)),
+    }
 
 
 def _digest(paths: Iterable[Path]) -> str:
     """Of the content of files."""
     digest = hashlib.sha256()
     for path in paths:
-        digest.update(path.read_bytes())
+        # Of fixed length each, so that no two sequences of files have the same.
+        digest.update(hashlib.sha256(path.read_bytes()).digest())
     return f"sha256 {digest.hexdigest()}"
 
 
@@ -159,35 +190,31 @@ def _work(chosen: ChosenScenario, seed: int) -> Episode | str:
         cell = build_chosen(chosen, seed=seed)
     except UserError as error:
         return str(error)
-    result = run_episode(
-        cell,
-        scenario=chosen.name,
-        policy=chosen.policy,
-        seed=seed,
-        time_limit=chosen.scenario.time_limit,
-    )
-    return result.as_dict()
+    return run_chosen(chosen, cell, seed=seed).as_dict()
 
 
 def _lost_episode(chosen: ChosenScenario, seed: int, failure: str, seconds: float) -> Episode:
-    return {
-        "scenario": chosen.name,
-        "policy": chosen.policy,
-        "seed": seed,
-        "objects": [],
-        "success_rate": 0.0,
-        "actions": 0,
-        "missed_grasps": 0,
-        "dropped_objects": 0,
-        "actions_taken": [],
-        "sim_seconds": 0.0,
-        "wall_seconds": seconds,
-        "point_contact_pairs": 0,
-        "failure": failure,
-        "timed_out": False,
-        "interrupted": False,
-    }
+    """The episode of which nothing is known but why it failed."""
+    return EpisodeResult(
+        scenario=chosen.name,
+        policy=chosen.policy,
+        seed=seed,
+        objects=[],
+        success_rate=0.0,
+        strict_success_rate=0.0,
+        actions=0,
+        missed_grasps=0,
+        dropped_objects=0,
+        actions_taken=[],
+        sim_seconds=0.0,
+        wall_seconds=seconds,
+        point_contact_pairs=0,
+        moving_at_end=[],
+        failure=failure,
+        timed_out=False,
+        interrupted=False,
+    ).as_dict()
 
 
 if __name__ == "__main__":
-    run_verb(main)
+    run_command(main)

@@ -1,26 +1,16 @@
-"""What many episodes come to: `summary.json` and its table."""
+"""`summary.json`: many episodes in numbers."""
 
 import math
 from collections import Counter
-from pathlib import Path
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from rich.table import Table
 
-from kitting_drake.episode.action_log import CAUSES
-from kitting_drake.hkd.tools.tool import CATEGORIES
-from kitting_drake.scenario.command_line import ChosenScenario, versions
-from kitting_drake.scenario.policies import describe_learned
-from kitting_drake.scenario.schema import (
-    ArrangedKitting,
-    Kitting,
-    Learned,
-    Oracle,
-    PythonPolicy,
-    QuantisedOracle,
-    ToolsetKitting,
-)
+from kitting_drake.common.provenance import commit, versions
+from kitting_drake.reporting.intervals import mean_interval, proportion_interval
+from kitting_drake.scenario.command_line import ChosenScenario
+from systems.placement import STRICT_ANGLE, STRICT_HEIGHT, AddS, SuccessPredicate
 
 Episode = dict[str, Any]
 """A line of `episodes.jsonl`: what `EpisodeResult.as_dict` gives."""
@@ -28,145 +18,213 @@ Episode = dict[str, Any]
 Entry = dict[str, Any]
 """An object or an action of an episode."""
 
-SEEN_TASK = "kitting-seen-toolset"
-UNSEEN_TASK = "kitting-unseen-toolsets"
-"""The tasks of the paper (section V-B.1)."""
-
 FAILED = "failed episode"
-"""The cause of all objects of an episode that failed."""
+TIMED_OUT = "timed out"
+"""The cause of all objects of an episode that failed, or whose time was up."""
 
-DOUBTS = {"proud": ("height_error_mm", 2.0), "turned": ("angle_error_deg", 20.0)}
-"""Why a success may not be one to a person: an error that ADD-S forgives, and beyond what it is
-counted. Proud: it stands so far above (or below) its seat. Turned: it lies so far round, which for
-a tool whose two ends are alike means nothing."""
+UNKNOWN = "unknown"
+"""The category of the object of an episode that failed, when no episode tells what it held."""
+
+AMBIGUITIES = {
+    "protruding": ("height_error_mm", 1e3 * STRICT_HEIGHT),
+    "reversed": ("angle_error_deg", math.degrees(STRICT_ANGLE)),
+}
+"""Why a success may not be strict: an error that the task's own measure forgives, and the magnitude
+beyond which it counts. The angle is modulo the symmetry that the object declares."""
 
 ERRORS = ("add_s_mm", "position_error_mm", "angle_error_deg", "height_error_mm")
 """Of an object where it ended."""
 
-ANSWER_ERRORS = (
+ACTION_ERRORS = (
     "pick_position_error_mm",
     "pick_angle_error_deg",
     "place_position_error_mm",
     "place_angle_error_deg",
 )
-"""Of what a policy answered; see `kitting_drake.episode.action_log.ActionRecord`."""
+"""Of a policy's action; see `kitting_drake.tasks.task.ActionRecord`."""
 
 
 def summarise(
-    episodes: list[Episode], chosen: ChosenScenario, *, wall_seconds_total: float
+    episodes: Sequence[Episode],
+    chosen: ChosenScenario,
+    success: SuccessPredicate,
+    *,
+    wall_seconds_total: float,
 ) -> dict[str, Any]:
-    """What `summary.json` holds.
+    """The content of `summary.json`.
 
-    The success rate is the mean of the episodes' scores, failed episodes counting 0. Its interval
-    is Wilson's, over as many trials as there were objects. Error statistics are over all objects,
-    and all actions, of the episodes that did not fail, missed ones included.
+    Rates are means of the episodes' rewards; an episode that failed or timed out counts 0. Where
+    reward is the share of the objects that are successes, the interval is Wilson's over the
+    objects, as if each were drawn anew. Where it is anything else (partial rewards, weights), it is
+    Student's over the episodes; `ci95_method` says which.
+
+    Errors are those of all objects, and all actions, of the episodes that came to an end, missed
+    ones included; an object that no goal was left for is in no statistic.
 
     Args:
         episodes: at least one.
         chosen: what was run.
-        wall_seconds_total: how long the verb took, in s; `wall_seconds` adds up the episodes'.
+        success: the predicate of the scenario's scenes.
+        wall_seconds_total: how long all calls took that ran the episodes, in s; `wall_seconds` adds
+            up the episodes' own.
     """
-    rate = float(np.mean([episode["success_rate"] for episode in episodes]))
-    whole = [episode for episode in episodes if not episode["failure"]]
-    failed = len(episodes) - len(whole)
-    objects = [item for episode in whole for item in episode["objects"]]
-    actions = [item for episode in whole for item in episode["actions_taken"]]
-    # What a failed episode held is the most that any held: one whose process died cannot tell.
-    held = [Counter(item["category"] for item in episode["objects"]) for episode in episodes]
-    per_episode = {name: max(count[name] for count in held) for name in CATEGORIES}
-    everything = max(sum(per_episode.values()), 1)
+    objects_of = counted_objects(episodes)
+    objects = [item for items in objects_of for item in items]
+    actions = counted_actions(episodes)
+    categories = sorted({item["category"] for item in objects})
+    policy, causes = chosen.scenario.policy, (*chosen.scenario.task.causes, FAILED, TIMED_OUT)
     return {
         "scenario": chosen.name,
-        "task": task_name(chosen.scenario.task),
+        "task": chosen.scenario.task.title,
         "policy": chosen.policy,
-        "scenario_text": chosen.text,
-        "versions": versions(),
-        "policy_details": policy_details(chosen.scenario.policy, chosen.base),
-        "success_threshold_mm": 1e3 * chosen.scenario.task.success_threshold,
+        "policy_details": policy.details(chosen.base),
+        "policy_digest": policy.digest(chosen.base),
+        "success_description": success.description,
+        "success_threshold_mm": 1e3 * success.threshold if isinstance(success, AddS) else None,
         "seeds": [episode["seed"] for episode in episodes],
         "episodes": len(episodes),
-        "failed_episodes": failed,
-        "success_rate": rate,
-        "ci95": wilson_interval(rate, len(episodes) * everything),
-        **_statistics(objects, actions, failed * everything),
+        "failed_episodes": sum(bool(episode["failure"]) for episode in episodes),
+        "timed_out_episodes": sum(episode["timed_out"] for episode in episodes),
+        **_rates(episodes, objects_of),
+        **_statistics(objects, actions, causes),
         "categories": {
-            name: _summarise_category(name, objects, actions, failed * per_episode[name])
-            for name in CATEGORIES
-            if per_episode[name]
+            name: _summarise_category(
+                [item for item in objects if item["category"] == name],
+                [item for item in actions if item["category"] == name],
+                causes,
+            )
+            for name in categories
         },
         "missed_grasps": sum(episode["missed_grasps"] for episode in episodes),
         "dropped_objects": sum(episode["dropped_objects"] for episode in episodes),
+        "moving_at_end": sum(len(episode["moving_at_end"]) for episode in episodes),
         "point_contact_pairs": max(episode["point_contact_pairs"] for episode in episodes),
         "sim_seconds": sum(episode["sim_seconds"] for episode in episodes),
         "wall_seconds": sum(episode["wall_seconds"] for episode in episodes),
         "wall_seconds_total": wall_seconds_total,
+        "versions": versions(),
+        "commit": commit(),
+        "resolved_scenario": chosen.described,
     }
 
 
-def task_name(task: Kitting | ToolsetKitting | ArrangedKitting) -> str:
-    """The paper's name of a task, where it has one: where nothing in it was changed."""
-    if task == Kitting():
-        return SEEN_TASK
-    if task == ToolsetKitting(split="test"):
-        return UNSEEN_TASK
-    if task == ToolsetKitting(split="train"):
-        return "kitting-train-toolsets"
-    return "arranged" if isinstance(task, ArrangedKitting) else "kitting"
+def counted_objects(episodes: Sequence[Episode]) -> list[list[Entry]]:
+    """The objects of each episode that its reward is about: those that a goal was left for.
+
+    In an episode that failed or timed out none is a success, and none has errors. If its process
+    was lost and with it the names of its objects, it held as many of each category as any other
+    episode held at most.
+    """
+    found = [
+        [item for item in episode["objects"] if item["add_s_mm"] is not None]
+        for episode in episodes
+    ]
+    most: Counter[str] = Counter()
+    for objects in found:
+        most |= Counter(item["category"] for item in objects)
+    usual = list(most.elements()) or [UNKNOWN]
+    return [
+        objects if cause is None else _lost(objects, usual, cause)
+        for objects, cause in zip(found, map(_lost_cause, episodes), strict=True)
+    ]
 
 
-def policy_details(
-    policy: Oracle | QuantisedOracle | Learned | PythonPolicy, base: Path
-) -> dict[str, Any] | None:
-    """What tells one policy from another of its kind; None if nothing is known."""
-    if isinstance(policy, Oracle):
-        return {"method": "oracle"}
-    if isinstance(policy, QuantisedOracle):
-        return {"method": "quantised_oracle", "orientations": policy.orientations}
-    if isinstance(policy, Learned):
-        return describe_learned(policy, base=base)
-    return None
+def _lost(objects: list[Entry], usual: list[str], cause: str) -> list[Entry]:
+    categories = [item["category"] for item in objects] or usual
+    return [
+        {"category": name, "success": False, "strict_success": False, "cause": cause}
+        | dict.fromkeys(ERRORS)
+        for name in categories
+    ]
+
+
+def _lost_cause(episode: Episode) -> str | None:
+    if episode["failure"]:
+        return FAILED
+    return TIMED_OUT if episode["timed_out"] else None
+
+
+def counted_actions(episodes: Sequence[Episode]) -> list[Entry]:
+    """The actions of the episodes that neither failed nor timed out."""
+    return [
+        action
+        for episode in episodes
+        if _lost_cause(episode) is None
+        for action in episode["actions_taken"]
+    ]
+
+
+def _rates(episodes: Sequence[Episode], objects_of: list[list[Entry]]) -> dict[str, Any]:
+    """Both rates and their intervals."""
+    scores, strict_scores = (
+        [float(episode[key]) for episode in episodes]
+        for key in ("success_rate", "strict_success_rate")
+    )
+    counts, strict_counts = (
+        [sum(item[key] for item in objects) for objects in objects_of]
+        for key in ("success", "strict_success")
+    )
+    sizes = [len(objects) for objects in objects_of]
+    are_shares = (
+        len(set(sizes)) == 1
+        and sizes[0] > 0
+        and np.allclose([scores, strict_scores], np.array([counts, strict_counts]) / sizes[0])
+    )
+
+    def interval(scores: list[float], counts: list[int]) -> list[float]:
+        if are_shares:
+            return proportion_interval(sum(counts), sum(sizes))
+        return mean_interval(scores)
+
+    return {
+        "success_rate": float(np.mean(scores)),
+        "ci95": interval(scores, counts),
+        "strict_success_rate": float(np.mean(strict_scores)),
+        "strict_ci95": interval(strict_scores, strict_counts),
+        "ci95_method": "Wilson, over objects" if are_shares else "Student, over episodes",
+    }
 
 
 def _summarise_category(
-    category: str, objects: list[Entry], actions: list[Entry], failed: int
+    objects: list[Entry], actions: list[Entry], causes: Sequence[str]
 ) -> dict[str, Any]:
-    """As the summary of all, for the objects of one category."""
-    objects = [item for item in objects if item["category"] == category]
-    actions = [item for item in actions if item["category"] == category]
-    trials = len(objects) + failed
-    rate = sum(item["success"] for item in objects) / trials
+    """The summary of the objects of one category; its rates are shares of them."""
+    successes, strict_successes = (
+        sum(item[key] for item in objects) for key in ("success", "strict_success")
+    )
     return {
-        "objects": trials,
-        "success_rate": rate,
-        "ci95": wilson_interval(rate, trials),
-        **_statistics(objects, actions, failed),
+        "objects": len(objects),
+        "success_rate": successes / len(objects),
+        "ci95": proportion_interval(successes, len(objects)),
+        "strict_success_rate": strict_successes / len(objects),
+        "strict_ci95": proportion_interval(strict_successes, len(objects)),
+        **_statistics(objects, actions, causes),
     }
 
 
-def _statistics(objects: list[Entry], actions: list[Entry], failed: int) -> dict[str, Any]:
-    """Errors and causes; `failed` objects of failed episodes have a cause and no errors."""
-    causes = Counter(item["cause"] for item in objects) + Counter({FAILED: failed})
+def _statistics(
+    objects: list[Entry], actions: list[Entry], causes: Sequence[str]
+) -> dict[str, Any]:
+    found = Counter(item["cause"] for item in objects)
+    ambiguous = Counter(name for item in objects for name in find_ambiguities(item))
     return {
-        **{key: _spread([abs(item[key]) for item in objects]) for key in ERRORS},
-        "answers": {key: _spread([item[key] for item in actions]) for key in ANSWER_ERRORS},
-        "causes": {cause: causes[cause] for cause in (*CAUSES, FAILED)},
-        "doubts": {
-            name: sum(item["success"] and abs(item[key]) > limit for item in objects)
-            for name, (key, limit) in DOUBTS.items()
-        },
+        **{key: _describe(objects, key) for key in ERRORS},
+        "action_errors": {key: _describe(actions, key) for key in ACTION_ERRORS},
+        "causes": {cause: found[cause] for cause in causes},
+        "ambiguous": {name: ambiguous[name] for name in AMBIGUITIES},
     }
 
 
-def wilson_interval(rate: float, trials: int) -> list[float]:
-    """Wilson's 95 % score interval of a proportion."""
-    z = 1.959964
-    centre = (rate + z * z / (2 * trials)) / (1 + z * z / trials)
-    half = z * math.sqrt(rate * (1 - rate) / trials + z * z / (4 * trials**2))
-    half /= 1 + z * z / trials
-    return [max(0.0, centre - half), min(1.0, centre + half)]
+def find_ambiguities(item: Mapping[str, Any]) -> list[str]:
+    """Why an object that is a success is no strict one: some of `AMBIGUITIES`."""
+    if not item["success"] or item["strict_success"]:
+        return []
+    return [name for name, (key, limit) in AMBIGUITIES.items() if abs(item[key]) > limit]
 
 
-def _spread(values: list[float]) -> dict[str, float | None]:
+def _describe(items: list[Entry], key: str) -> dict[str, float | None]:
+    """Median, 95th percentile and maximum of the magnitudes that there are."""
+    values = [abs(item[key]) for item in items if item[key] is not None]
     if not values:
         return {"median": None, "p95": None, "max": None}
     return {
@@ -174,49 +232,3 @@ def _spread(values: list[float]) -> dict[str, float | None]:
         "p95": float(np.percentile(values, 95)),
         "max": float(np.max(values)),
     }
-
-
-def summary_table(summary: dict[str, Any]) -> Table:
-    """The summary for the terminal: a row for each category."""
-    low, high = summary["ci95"]
-    table = Table(
-        title=f"{summary['scenario']} by {summary['policy']}: {summary['episodes']} episodes, "
-        f"{summary['success_rate']:.1%} kitted (95 %: {low:.1%} to {high:.1%}), "
-        f"{summary['failed_episodes']} failed",
-        title_justify="left",
-    )
-    table.add_column("category", no_wrap=True)
-    for heading in ("kitted", "ADD-S mm", "95 %", "position mm", "angle deg", "height mm"):
-        table.add_column(heading, justify="right")
-    categories = summary["categories"]
-    trials = sum(row["objects"] for row in categories.values())
-    for name, row in [*categories.items(), ("all", summary | {"objects": trials})]:
-        if trials:
-            table.add_row(
-                name,
-                f"{round(row['success_rate'] * row['objects'])}/{row['objects']}",
-                number(row["add_s_mm"]["median"]),
-                number(row["add_s_mm"]["p95"]),
-                *(number(row[key]["median"]) for key in ERRORS[1:]),
-            )
-    return table
-
-
-def summary_notes(summary: dict[str, Any]) -> str:
-    """What the terminal tells below the table: why objects were lost, and what was answered."""
-    causes = [f"{count} {cause}" for cause, count in summary["causes"].items() if count]
-    position, angle, place_position, place_angle = (
-        number(summary["answers"][key]["median"]) for key in ANSWER_ERRORS
-    )
-    doubts = [f"{count} {name}" for name, count in summary["doubts"].items() if count]
-    return (
-        f"not kitted: {', '.join(causes) or 'none'}\n"
-        f"kitted, but: {', '.join(doubts) or 'none'}\n"
-        f"answers, median error: pick {position} mm {angle} deg, "
-        f"place {place_position} mm {place_angle} deg"
-    )
-
-
-def number(value: float | None) -> str:
-    """For a table: two digits after the point, or a dash for what there is none of."""
-    return "-" if value is None else f"{value:.2f}"

@@ -7,6 +7,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import types
 from collections.abc import Callable
 from pathlib import Path
 
@@ -18,10 +19,13 @@ from kitting_drake.common.errors import UserError
 from kitting_drake.common.files import alone_in
 from kitting_drake.common.paths import MODELS
 from kitting_drake.common.processes import Died
-from kitting_drake.episode.episode import EpisodeResult
+from kitting_drake.episode import EpisodeResult
 from kitting_drake.reporting.summary import Episode
 from kitting_drake.scenario.command_line import ChosenScenario
-from kitting_drake.scenario.schema import Heightmap, Kitting, Learned, PythonPolicy, Scenario
+from kitting_drake.scenario.policies import Learned, PythonPolicy
+from kitting_drake.scenario.schema import Heightmap, Scenario
+from kitting_drake.tasks import Kitting
+from systems.placement import AddS
 
 CHOSEN = ChosenScenario(Scenario(), Path("mine.yaml"), "mine", None)
 ROOT = Path(__file__).resolve().parents[2]
@@ -44,10 +48,38 @@ def test_goes_on_where_it_was_stopped(tmp_path: Path, monkeypatch: pytest.Monkey
     path = tmp_path / "episodes.jsonl"
     # Killed while the third line was being written.
     path.write_text(path.read_text() + '{"seed": 2, "obj')
-    episodes = evaluation.evaluate(CHOSEN, range(4), tmp_path, workers=1, console=QUIET)
+    done = evaluation.evaluate(CHOSEN, range(4), tmp_path, workers=1, console=QUIET)
     assert ran == [0, 1, 2, 3]
-    assert [item["seed"] for item in episodes] == [0, 1, 2, 3]
+    assert [item["seed"] for item in done.episodes] == [0, 1, 2, 3]
     assert [json.loads(line)["seed"] for line in path.read_text().splitlines()] == [0, 1, 2, 3]
+
+
+def test_the_time_of_all_calls_adds_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    now = 1000.0
+
+    def run(chosen: ChosenScenario, seed: int) -> Episode:
+        nonlocal now
+        if seed == 2:
+            raise KeyboardInterrupt
+        now += 50.0
+        return fake_run(chosen, seed)
+
+    monkeypatch.setattr(evaluation.time, "perf_counter", lambda: now)
+    monkeypatch.setattr(evaluation, "_run_apart", run)
+
+    def total(*seeds: int) -> float:
+        call = evaluation.evaluate(CHOSEN, seeds, tmp_path, workers=1, console=QUIET)
+        return call.wall_seconds_total
+
+    assert total(0) == 50.0
+    with pytest.raises(KeyboardInterrupt):
+        total(0, 1, 2)
+    now += 7000.0
+    # Nothing is left to do; the call that was stopped counts up to its last episode.
+    assert total(0, 1) == 100.0
+    (tmp_path / "wall_seconds.json").write_text("{")
+    with pytest.raises(UserError, match=r"wall_seconds\.json is damaged: delete it"):
+        total(0)
 
 
 def test_a_folder_of_another_scenario_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
@@ -61,7 +93,7 @@ def test_a_folder_of_another_scenario_is_refused(tmp_path: Path, monkeypatch: py
 def test_a_folder_of_other_weights_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(evaluation, "_run_apart", fake_run)
     weights = tmp_path / "policy.safetensors"
-    scenario = Scenario(policy=Learned(weights.name))
+    scenario = Scenario(policy=Learned(weights=weights.name))
     chosen = ChosenScenario(scenario, tmp_path / "mine.yaml", "mine", None)
     folder = tmp_path / "out"
     folder.mkdir()
@@ -81,7 +113,8 @@ def test_a_folder_of_another_program_is_refused(tmp_path: Path, monkeypatch: pyt
     tool = tmp_path / "my_tool"
     shutil.copytree(MODELS / "tools" / "claw_hammer", tool)
     scenario = Scenario(
-        task=Kitting(tools=[str(tool)]), policy=PythonPolicy("policy_of_mine:answer")
+        task=Kitting(tools=[str(tool)]),
+        policy=PythonPolicy(function="policy_of_mine:act"),
     )
     chosen = ChosenScenario(scenario, tmp_path / "mine.yaml", "mine", None)
     folder = tmp_path / "out"
@@ -90,13 +123,13 @@ def test_a_folder_of_another_program_is_refused(tmp_path: Path, monkeypatch: pyt
     def evaluate() -> None:
         evaluation.evaluate(chosen, [0], folder, workers=1, console=QUIET)
 
-    source.write_text("def answer(observation): ...\n")
+    source.write_text("def act(observation): ...\n")
     evaluate()
     evaluate()
-    source.write_text("def answer(observation): return 1\n")
+    source.write_text("def act(observation): return 1\n")
     with pytest.raises(UserError, match="another scenario, policy or version"):
         evaluate()
-    source.write_text("def answer(observation): ...\n")
+    source.write_text("def act(observation): ...\n")
     record = tool / "tool.yaml"
     record.write_text(record.read_text() + "# Another grasp.\n")
     with pytest.raises(UserError, match="another scenario, policy or version"):
@@ -153,6 +186,29 @@ def test_nothing_but_failures_leaves_with_a_failure(
     assert f"failed first: seed {failures.index('no')}: no" in capsys.readouterr().out
 
 
+def test_seeds_that_the_policy_has_learned_from_are_told(
+    tmp_path: Path,
+    weights_file: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+):
+    scenario = tmp_path / "mine.yaml"
+    scenario.write_text(f"Mine: {{policy: !Learned {{weights: {weights_file}}}}}\n")
+    monkeypatch.setattr(evaluation, "_run_apart", fake_run)
+    # Nobody waits for networks that decide nothing.
+    scene = types.SimpleNamespace(scene=types.SimpleNamespace(success=AddS()))
+    monkeypatch.setattr(evaluation, "build_chosen", lambda *_, **__: scene)
+    flags = ["--seed", "10001", "--episodes", "3", "--workers", "1"]
+    monkeypatch.setattr(
+        sys, "argv", ["evaluate", str(scenario), *flags, "--output", str(tmp_path / "out")]
+    )
+    evaluation.main()
+    assert "the policy has learned from seeds 10001 to 10002" in capsys.readouterr().out
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    assert summary["policy_details"]["method"] == "so2"
+    assert summary["policy_digest"].startswith("sha256 ")
+
+
 def test_what_something_else_killed_is_given_a_second_chance(monkeypatch: pytest.MonkeyPatch):
     killed, lost = Died(-signal.SIGKILL), fake_run(CHOSEN, 7)
     answers = [killed, lost, killed, killed]
@@ -176,10 +232,12 @@ def test_two_short_episodes_side_by_side(verb, tmp_path: Path):
     assert summary["success_rate"] == 0.0
     assert math.isclose(summary["sim_seconds"], 0.4)
     assert summary["point_contact_pairs"] == 0
-    assert summary["causes"]["never picked"] == 8
+    assert summary["timed_out_episodes"] == 2
+    assert summary["causes"]["timed out"] == 8
+    assert summary["success_description"] == "ADD-S below 3.5 mm"
     assert summary["wall_seconds_total"] > 0
     assert (tmp_path / "summary.png").read_bytes().startswith(b"\x89PNG")
-    assert "8 never picked" in done.stdout
+    assert "8 timed out" in done.stdout
 
 
 @pytest.mark.slow

@@ -1,29 +1,52 @@
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from matplotlib.colors import to_rgb
 from PIL import Image
 
 from kitting_drake.reporting.summary import summarise
-from kitting_drake.reporting.summary_figure import draw_summary
-from kitting_drake.scenario.command_line import ChosenScenario
-from kitting_drake.scenario.schema import Scenario
+from kitting_drake.reporting.summary_figure import _COLOURS, _looks, draw_summary
+from systems.placement import PoseWithin
+from tests.kitting_drake.reporting.episodes import (
+    ADD_S,
+    CHOSEN,
+    make_episode,
+    make_lost_episode,
+    make_object,
+    make_result,
+)
 
-CHOSEN = ChosenScenario(Scenario(), Path("mine.yaml"), "mine", None)
+NINE = [make_object(f"thing {number}", 0.5 + number) for number in range(9)]
 
 
-@pytest.mark.parametrize("failed", [False, True])
-def test_draws_whatever_there_is(
-    failed: bool, made_up_episode: Callable[..., dict[str, Any]], tmp_path: Path
-):
-    episodes = [made_up_episode(seed, [1.0, 9.0, 500.0, 0.0]) for seed in range(3)]
-    if failed:
-        empty = {"objects": [], "actions_taken": [], "failure": "died", "success_rate": 0.0}
-        episodes = [episode | empty for episode in episodes]
-    path = tmp_path / "summary.png"
-    draw_summary(summarise(episodes, CHOSEN, wall_seconds_total=1.0), episodes, path)
-    pixels = np.asarray(Image.open(path).convert("RGB"))
-    assert pixels.shape[1] > 1000
-    assert (pixels == (0, 114, 178)).all(axis=2).any() != failed  # The hammer's colour.
+@pytest.mark.parametrize(
+    ("episodes", "categories"),
+    [
+        ([make_episode(seed, [1.0, 9.0, 500.0, 0.0]) for seed in range(3)], 4),
+        # More than there are colours, and one that no goal was left for.
+        ([make_result(0, [*NINE, make_object("spare", None)]).as_dict()], 9),
+        ([make_episode(0, [1.0], timed_out=True)], 1),
+        ([make_lost_episode(0)], 1),
+    ],
+)
+def test_draws_whatever_there_is(episodes: list[dict[str, Any]], categories: int, tmp_path: Path):
+    for success in (ADD_S, PoseWithin()):
+        summary = summarise(episodes, CHOSEN, success, wall_seconds_total=1.0)
+        assert len(summary["categories"]) == categories
+        path = tmp_path / "summary.png"
+        draw_summary(summary, episodes, path)
+        pixels = np.asarray(Image.open(path).convert("RGB"))
+        assert pixels.shape[1] > 1000
+        for colour in _COLOURS[: min(categories, len(_COLOURS))]:
+            rgb = np.round(255 * np.array(to_rgb(colour)))
+            assert (pixels == rgb).all(axis=2).any(), colour
+
+
+def test_categories_do_not_look_alike():
+    looks = [look for look, _ in zip(_looks(), range(21), strict=False)]
+    assert len(set(looks)) == 21
+    # In a bar there are no lines, and in a curve no hatches.
+    assert len({(look.colour, look.hatch) for look in looks}) == 21
+    assert len({(look.colour, look.line) for look in looks}) == 21

@@ -1,0 +1,31 @@
+"""95 % confidence intervals of rates."""
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+from scipy import stats
+
+_CONFIDENCE = 0.95
+
+
+def proportion_interval(successes: int, trials: int) -> list[float]:
+    """Wilson's score interval of a proportion, as [low, high]."""
+    interval = stats.binomtest(successes, trials).proportion_ci(_CONFIDENCE, method="wilson")
+    return [float(interval.low), float(interval.high)]
+
+
+def mean_interval(scores: Sequence[float]) -> list[float]:
+    """Student's interval of the mean of scores between 0 and 1, as [low, high].
+
+    Scores that are all alike do not tell how much they vary. Their interval is Wilson's, as if each
+    were a number of successes in one trial: no scores of that mean vary more.
+    """
+    count, mean = len(scores), float(np.mean(scores))
+    if np.ptp(scores) < 1e-9:
+        total = round(mean * count, 6)
+        low, _ = proportion_interval(math.floor(total), count)
+        _, high = proportion_interval(math.ceil(total), count)
+        return [low, high]
+    low, high = stats.t.interval(_CONFIDENCE, count - 1, loc=mean, scale=stats.sem(scores))
+    return [max(0.0, float(low)), min(1.0, float(high))]

@@ -1,0 +1,28 @@
+import pytest
+
+from kitting_drake.reporting.intervals import mean_interval, proportion_interval
+
+
+def test_wilson():
+    # 8 of 10: the textbook's 0.490 to 0.943.
+    assert proportion_interval(8, 10) == pytest.approx([0.4902, 0.9433], abs=1e-4)
+    low, high = proportion_interval(200, 200)
+    assert high == pytest.approx(1.0)
+    assert low == pytest.approx(200 / (200 + 1.959964**2))
+
+
+def test_mean_of_partial_rewards():
+    # t(0.975, 3) = 3.1824, standard error 0.1 / sqrt(3).
+    low, high = mean_interval([0.4, 0.5, 0.5, 0.6])
+    assert (low + high) / 2 == pytest.approx(0.5)
+    assert (high - low) / 2 == pytest.approx(3.1824 * 0.0816497 / 2, rel=1e-4)
+    # A mean of rewards is never outside 0 to 1.
+    assert mean_interval([0.2, 1.0])[1] == 1.0
+
+
+@pytest.mark.parametrize("score", [0.0, 0.43, 1.0])
+@pytest.mark.parametrize("count", [1, 10])
+def test_equal_scores_do_not_make_certain(score: float, count: int):
+    low, high = mean_interval([score] * count)
+    assert low <= score <= high
+    assert high - low > 1 / (count + 4)
