@@ -335,16 +335,15 @@ def _measure(
         angle = wrap_to_pi(heading(X_WB) - heading(X_WGoal))
         if item.symmetry > 1:
             angle = math.remainder(angle, math.tau / item.symmetry)
-    measured = {
-        "goal": goal_index,
-        "pose": pose_index,
-        "add_s": _add_s(item.tree, item.p_BPoints, X_WGoal, X_WB),
-        "position_error": float(np.linalg.norm(offset[:2])),
-        "angle_error": angle,
-        "height_error": float(offset[2]),
-    }
-    share = success.share(Placement(**measured), X_WB)
-    return Placement(**measured, share=share)
+    measured = Placement(
+        goal=goal_index,
+        pose=pose_index,
+        add_s=_add_s(item.tree, item.p_BPoints, X_WGoal, X_WB),
+        position_error=float(np.linalg.norm(offset[:2])),
+        angle_error=angle,
+        height_error=float(offset[2]),
+    )
+    return dataclasses.replace(measured, share=success.share(measured, X_WB))
 
 
 def total_reward(goals: Sequence[Goal], placements: Sequence[Placement]) -> float:

@@ -3,6 +3,7 @@
 import dataclasses as dc
 import typing
 from pathlib import Path
+from typing import Any
 
 import yaml
 from pydrake.common.yaml import yaml_dump, yaml_load, yaml_load_typed
@@ -104,7 +105,7 @@ def _without_mappings(given: dict, current: Task) -> Task:
     for variant in typing.get_args(Task):
         if given["_tag"] == f"!{variant.__name__}" and not isinstance(current, variant):
             fresh = variant()
-            emptied = {
+            emptied: dict[str, Any] = {
                 item.name: {}
                 for item in dc.fields(variant)
                 if item.name in given and isinstance(getattr(fresh, item.name), dict)

@@ -72,7 +72,7 @@ class Scene:
     """After so many actions the episode is over."""
 
     def __post_init__(self) -> None:
-        names = [item.name for item in (*self.objects, *self.fixtures)]
+        names = [item.name for item in self.objects] + [item.name for item in self.fixtures]
         assert len(set(names)) == len(names), f"names must be unique: {names}"
         assert abs(sum(goal.reward for goal in self.goals) - 1) < 1e-9
 

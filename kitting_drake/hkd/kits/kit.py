@@ -1,6 +1,6 @@
 """Kits: a block with a conformal cavity for each tool (section IV-B.2 of the paper).
 
-The paper takes a depth image of the tool from above, fills what lies beneath it, closes the result
+The paper takes a depth image of the tool from above, fills what is beneath it, closes the result
 morphologically, grows it by 2 mm and subtracts it from the block; its authors then cut upward, so
 that the tool can get in. A depth image filled downward and cut upward is a prism over the tool's
 outline. So the outline is taken exactly, as polygons, and closed and grown exactly, by offsetting:
@@ -50,7 +50,7 @@ _TOP_CELL = 0.02
 """Side of the squares into which the top is cut for the contact solver, in metres."""
 _SIZE_STEP = 0.001
 """Nested blocks have a length and a width that are multiples of this, in metres."""
-_FORMAT_VERSION = "7"
+_FORMAT_VERSION = "8"
 """Part of the cache key: changed whenever the same input makes another kit."""
 
 
@@ -290,7 +290,7 @@ def layout_kit(tools: Sequence[Tool], parameters: KitParameters) -> KitLayout:
 
 def _nested_layout(tools: Sequence[Tool], parameters: KitParameters) -> KitLayout:
     def shape(tool: Tool) -> NestedShape:
-        outline = cavity_outline(tool.silhouette, parameters)
+        outline = cavity_outline(tool.footprint, parameters)
         rim = Cavity(outline, 0.0, parameters.height, parameters.lead_in).rim
         return NestedShape(rim, released_fingers(tool))
 
@@ -340,7 +340,7 @@ def kit_cavities(
     poses = layout_kit(tools, parameters).poses if poses is None else poses
     return [
         Cavity(
-            moved_outline(cavity_outline(tool.silhouette, parameters), pose),
+            moved_outline(cavity_outline(tool.footprint, parameters), pose),
             pose.z,
             parameters.height,
             parameters.lead_in,
@@ -370,6 +370,27 @@ def build_block(cavities: Sequence[Cavity], parameters: KitParameters) -> Manifo
     return block
 
 
+def _add_floor(surface: _Surface, cavity: Cavity, cavities: Sequence[Cavity]) -> None:
+    """Adds the bounding rectangle of a cavity's floor, without what is in others as deep or deeper.
+
+    There it would be a shelf, or a second floor in the place of the first.
+    """
+    x_min, y_min, x_max, y_max = cavity.outline.bounds()
+    corners = np.array([(x_min, y_min), (x_max, y_min), (x_max, y_max), (x_min, y_max)])
+    rectangle = CrossSection([corners])
+    floor = rectangle
+    for other in cavities:
+        if other is not cavity and other.floor <= cavity.floor:
+            floor -= other.rim
+    if rectangle.area() - floor.area() < 1e-9:
+        start = surface.add_ring([corners], cavity.floor)
+        surface.add_faces(start + np.array([[0, 2, 1], [0, 3, 2]]))
+        return
+    loops = floor.to_polygons()
+    start = surface.add_ring(loops, cavity.floor)
+    surface.add_faces(start + np.asarray(triangulate(loops))[:, ::-1])
+
+
 def contact_surface(
     cavities: Sequence[Cavity], parameters: KitParameters
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
@@ -377,18 +398,16 @@ def contact_surface(
 
     The same walls, bevels and planes as the block's, cut otherwise. A triangulation of floors and
     top by their outlines has long slivers, whose bounding boxes all overlap, and breaks every
-    contact patch into as many pieces. So a floor is one rectangle that reaches into the solid,
-    where nothing can touch it, and the top is cut into squares first. The underside is left out.
+    contact patch into as many polygons. So a floor is one rectangle that reaches into the solid,
+    where nothing can touch it, but not into another cavity, and the top is cut into squares first.
+    The underside is left out.
     """
     surface = _Surface()
     room = CrossSection.square((parameters.length, parameters.width), True)
     top = room
     for cavity in cavities:
         cavity.add_sides(surface)
-        x_min, y_min, x_max, y_max = cavity.outline.bounds()
-        corners = [(x_min, y_min), (x_max, y_min), (x_max, y_max), (x_min, y_max)]
-        start = surface.add_ring([np.array(corners)], cavity.floor)
-        surface.add_faces(start + np.array([[0, 2, 1], [0, 3, 2]]))
+        _add_floor(surface, cavity, cavities)
         top -= cavity.rim
     # What bounds the cavities from outside bounds the block from inside.
     vertices, faces = surface.arrays()

@@ -143,7 +143,9 @@ class ToolsetKitting(_DrawnKitting):
         names = choices[np.random.default_rng([seed, 1]).integers(len(choices))]
         tools = _load_tools(names, base)
         if self.random_lengths:
-            lengths = np.random.default_rng([seed, 2]).uniform(*self.tool_length, len(tools))
+            least, greatest = self.tool_length
+            rng = np.random.default_rng([seed, 2])
+            lengths = rng.uniform(least, greatest, len(tools))
             tools = [
                 scaled_tool(tool, float(length))
                 for tool, length in zip(tools, lengths, strict=True)
