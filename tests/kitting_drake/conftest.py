@@ -25,11 +25,12 @@ def made_up_episode() -> Callable[..., dict[str, Any]]:
                 "name": f"my_{category}",
                 "category": category,
                 "success": error < 3.5,
+                "strict_success": error < 3.5,
                 "add_s_mm": error,
                 "position_error_mm": error,
                 "angle_error_deg": -error,
                 "height_error_mm": 0.0,
-                "cause": None if error < 3.5 else "jammed",
+                "cause": None if error < 3.5 else "insertion blocked",
             }
             for category, error in errors.items()
         ]
@@ -51,12 +52,17 @@ def made_up_episode() -> Callable[..., dict[str, Any]]:
             "objects": objects,
             "actions_taken": actions,
             "success_rate": 0.0 if failure else succeeded / len(errors_mm),
+            "strict_success_rate": 0.0 if failure else succeeded / len(errors_mm),
+            "actions": len(errors_mm),
             "missed_grasps": 0,
             "dropped_objects": 0,
             "sim_seconds": 30.0,
             "wall_seconds": 10.0,
             "point_contact_pairs": 0,
+            "moving_at_end": [],
             "failure": failure,
+            "timed_out": False,
+            "interrupted": False,
         }
 
     return make

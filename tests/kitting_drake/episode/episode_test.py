@@ -1,0 +1,264 @@
+"""Episodes from their first to their last step. The oracle's need no cameras."""
+
+import dataclasses
+import json
+import sys
+import types
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from kitting_drake.cell import Cell, build_cell
+from kitting_drake.episode import EpisodeObserver, EpisodeResult, ModeChange, run_episode
+from kitting_drake.scenario import Scenario
+from kitting_drake.scenario.policies import PythonPolicy
+from kitting_drake.scenario.schema import Pinhole
+from kitting_drake.tasks import ArrangedKitting
+from kitting_drake.tasks.kitting.sampling import TablePose
+from systems.pick_place_parameters import Mode, PickPlaceParameters
+from systems.signals import Observation, PickPlaceAction, PlanarPose
+
+ONE_TOOL = ArrangedKitting(
+    tools={"combination_wrench": TablePose(x=0.42, y=0.14)}, kit_pose=TablePose(x=0.5, y=-0.1)
+)
+BLIND = Scenario(task=ONE_TOOL, cameras={})
+
+
+def build(scenario: Scenario = BLIND) -> Cell:
+    return build_cell(scenario, seed=0, base=Path())
+
+
+def run(
+    cell: Cell, seconds: float, *observers: EpisodeObserver, scenario: Scenario = BLIND
+) -> EpisodeResult:
+    return run_episode(
+        cell,
+        task=scenario.task,
+        scenario="test",
+        policy="test",
+        seed=0,
+        time_limit=seconds,
+        observers=observers,
+    )
+
+
+@dataclasses.dataclass(frozen=True)
+class Seen:
+    """What is kept of an event, whose context goes on."""
+
+    previous: Mode
+    mode: Mode
+    is_action_start: bool
+    is_stop: bool
+    is_last: bool
+    time: float
+    counts: tuple[float, ...]
+
+
+class Observer:
+    """Keeps what it is told of."""
+
+    def __init__(self, cell: Cell) -> None:
+        self._cell = cell
+        self.seen: list[Seen] = []
+
+    def observe(self, event: ModeChange) -> None:
+        root = event.root_context
+        self.seen.append(
+            Seen(
+                event.previous,
+                event.mode,
+                event.is_action_start,
+                event.is_stop,
+                event.is_last,
+                root.get_time(),
+                tuple(self._cell.diagram.GetOutputPort("counts").Eval(root)),
+            )
+        )
+
+
+@pytest.fixture(scope="module")
+def grasp_to_release() -> tuple[EpisodeResult, Sequence[Seen]]:
+    """The oracle kits one tool, by real physics, without cameras."""
+    cell = build()
+    observer = Observer(cell)
+    return run(cell, 30.0, observer.observe), observer.seen
+
+
+def test_the_oracle_kits_one_tool(grasp_to_release: tuple[EpisodeResult, Sequence[Seen]]):
+    result, _ = grasp_to_release
+    assert (result.failure, result.timed_out, result.interrupted) == (None, False, False)
+    (item,) = result.objects
+    assert (item.name, item.category) == ("combination_wrench", "wrench")
+    assert (item.success, item.strict_success, item.cause) == (True, True, None)
+    assert item.add_s_mm < 2.0
+    assert (result.success_rate, result.strict_success_rate) == (1.0, 1.0)
+    assert (result.actions, result.missed_grasps, result.dropped_objects) == (1, 0, 0)
+    (action,) = result.actions_taken
+    assert (action.object, action.category, action.outcome) == (item.name, "wrench", "placed")
+    assert action.pick_position_error_mm == pytest.approx(0.0, abs=0.1)
+    assert action.place_position_error_mm == pytest.approx(0.0, abs=0.1)
+    assert result.point_contact_pairs == 0
+    assert result.moving_at_end == []
+    assert json.loads(json.dumps(result.as_dict()))["success_rate"] == 1.0
+
+
+def test_modes_are_told_in_order(grasp_to_release: tuple[EpisodeResult, Sequence[Seen]]):
+    _, (*seen, last) = grasp_to_release
+    motion = [Mode.APPROACH, Mode.DESCEND, Mode.CLOSE, Mode.CHECK, Mode.LIFT, Mode.CARRY]
+    motion += [Mode.LOWER, Mode.RELEASE, Mode.RETREAT, Mode.OBSERVE]
+    modes = [event.mode for event in seen if Mode.SEARCH not in (event.mode, event.previous)]
+    assert modes == [*motion, Mode.DONE]
+    # Each goes on where the one before it has ended, and takes its time.
+    assert [event.previous for event in seen] == [Mode.OBSERVE, *(e.mode for e in seen[:-1])]
+    assert sorted({event.time for event in seen}) == [event.time for event in seen]
+    assert [event.is_action_start for event in seen] == [True] + [False] * (len(seen) - 1)
+    assert [event.is_stop for event in seen] == [False] * (len(seen) - 1) + [True]
+    # The last event tells of no change, and is told once.
+    assert not any(event.is_last for event in seen)
+    assert (last.is_last, last.previous, last.mode) == (True, Mode.DONE, Mode.DONE)
+    assert not last.is_action_start
+    assert not last.is_stop
+    # At the start of an action it is counted already.
+    assert [event.counts for event in seen] == [(1.0, 0.0, 0.0)] * len(seen)
+
+
+def test_an_episode_whose_time_is_up_has_no_reward():
+    cell = build()
+    observer = Observer(cell)
+    result = run(cell, 0.5, observer.observe)
+    assert (result.timed_out, result.failure) == (True, None)
+    assert (result.success_rate, result.strict_success_rate) == (0.0, 0.0)
+    assert result.sim_seconds == pytest.approx(0.5)
+    assert (result.objects[0].success, result.objects[0].cause) == (False, "never picked")
+    assert [action.outcome for action in result.actions_taken] == ["unfinished"]
+    assert [event.mode for event in observer.seen] == [Mode.APPROACH, Mode.APPROACH]
+    assert [event.is_last for event in observer.seen] == [False, True]
+
+
+def test_what_is_there_already_counts_only_if_the_episode_ends_well():
+    """Nothing is left to do: the expert says stop at once."""
+    cell = build()
+    (X_WGoal,) = cell.scene.goals[0].poses
+    cell.plant.SetDefaultFloatingBaseBodyPose(cell.plant.get_body(cell.objects[0].body), X_WGoal)
+    observer = Observer(cell)
+    result = run(cell, 5.0, observer.observe)
+    assert (result.success_rate, result.strict_success_rate, result.actions) == (1.0, 1.0, 0)
+    assert result.objects[0].success
+    assert [event.mode for event in observer.seen] == [Mode.DONE, Mode.DONE]
+    assert observer.seen[0].is_stop
+    # The objects have come to rest, and no more time is taken.
+    assert result.sim_seconds < 1.0
+    early = run(cell, 0.1)
+    assert early.objects[0].success
+    assert (early.timed_out, early.success_rate, early.strict_success_rate) == (True, 0.0, 0.0)
+
+
+def raise_at(mode: Mode, error: BaseException) -> EpisodeObserver:
+    def observe(event: ModeChange) -> None:
+        if event.mode == mode and not event.is_last:
+            raise error
+
+    return observe
+
+
+def test_a_simulation_that_fails_ends_the_episode_with_its_reason():
+    cell = build()
+    told = Observer(cell)
+    fails = raise_at(Mode.APPROACH, RuntimeError("the solver did\nnot converge"))
+    result = run(cell, 5.0, fails, told.observe)
+    assert result.failure is not None
+    assert "the solver did not converge" in result.failure
+    assert (result.success_rate, result.strict_success_rate) == (0.0, 0.0)
+    assert (result.interrupted, result.timed_out) == (False, False)
+    assert result.sim_seconds < 1.0
+    assert len(result.objects) == 1
+    assert [event.is_last for event in told.seen] == [True]
+    # Plain numbers, of which JSON can be made.
+    kinds = {type(value) for item in result.objects for value in vars(item).values()}
+    assert kinds == {str, float, bool}
+
+
+def test_an_interrupted_episode_has_a_result():
+    result = run(build(), 5.0, raise_at(Mode.APPROACH, KeyboardInterrupt()))
+    assert result.interrupted
+    assert result.failure is None
+    assert result.sim_seconds < 1.0
+
+
+# Policies that are shown the cell.
+
+SMALL = {
+    name: dataclasses.replace(camera, width=160, height=120, focal_length=112.5)
+    for name, camera in Scenario().cameras.items()
+    if isinstance(camera, Pinhole)
+}
+
+
+class Stub:
+    """A policy that sends the hand to where nothing lies, then says stop."""
+
+    def __init__(self) -> None:
+        self.seen: list[Observation] = []
+
+    def __call__(self, observation: Observation) -> PickPlaceAction:
+        self.seen.append(observation)
+        nothing = PlanarPose(0.3, 0.45, 0.0)
+        return PickPlaceAction(nothing, nothing, stop=len(self.seen) == 2)
+
+
+def install(policy: object, monkeypatch: pytest.MonkeyPatch) -> Scenario:
+    """A scenario with a policy of one's own."""
+    monkeypatch.setitem(sys.modules, "stub_policy", types.SimpleNamespace(policy=policy))
+    return Scenario(
+        task=ArrangedKitting(
+            tools={"claw_hammer": TablePose(x=0.35, y=-0.3)}, kit_pose=TablePose(x=0.55, y=0.0)
+        ),
+        policy=PythonPolicy(function="stub_policy:policy"),
+        planner=PickPlaceParameters(max_actions=5),
+        cameras=SMALL,
+    )
+
+
+@pytest.mark.usefixtures("rendering")
+def test_a_policy_is_asked_only_when_the_planner_has_observed(monkeypatch: pytest.MonkeyPatch):
+    stub = Stub()
+    scenario = install(stub, monkeypatch)
+    cell = build(scenario)
+    asked: list[tuple[Mode, int]] = []
+    result = run(
+        cell,
+        30.0,
+        lambda event: asked.append((event.mode, len(stub.seen))),
+        scenario=scenario,
+    )
+    # Asked once before each of the two modes that follow upon OBSERVE, and at no other time.
+    assert asked[0] == (Mode.APPROACH, 1)
+    assert {count for mode, count in asked[:-2]} == {1}
+    assert asked[-2:] == [(Mode.DONE, 2), (Mode.DONE, 2)]
+    assert (result.actions, result.missed_grasps, result.failure) == (1, 1, None)
+    assert [action.outcome for action in result.actions_taken] == ["missed"]
+    assert result.objects[0].cause == "missed grasp"
+    # It was shown the block, 50 mm high, where it stands, and not the hand.
+    seen = stub.seen[1]
+    row, col = np.round(seen.grid.to_pixel([0.45, 0.08])).astype(int)
+    block = seen.height[row - 8 : row + 9, col - 8 : col + 9]
+    assert np.count_nonzero(block) > 20  # These small images do not reach every pixel.
+    np.testing.assert_allclose(block[block > 0], 0.05, atol=0.004)
+    assert seen.height.max() < 0.07
+
+
+@pytest.mark.usefixtures("rendering")
+def test_a_policy_that_fails_ends_the_episode_with_its_reason(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+):
+    def fail(_: Observation) -> PickPlaceAction:
+        raise ValueError("weights of the wrong shape")
+
+    scenario = install(fail, monkeypatch)
+    result = run(build(scenario), 1.0, scenario=scenario)
+    assert result.failure == "ValueError: weights of the wrong shape"
+    # Its author is told where.
+    assert "in fail" in caplog.text
