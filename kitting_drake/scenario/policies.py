@@ -150,8 +150,7 @@ class Learned(PolicyConfig):
 
         path = site.base / self.weights
         networks = load_networks(path, preferred_type()).to(preferred_device())
-        card = read_weights_file(path).card
-        learned_at = card.get("resolution")
+        learned_at = read_weights_file(path).card.get("resolution")
         resolution = site.grid.resolution
         if learned_at is not None and not math.isclose(learned_at, resolution, rel_tol=1e-6):
             raise UserError(
@@ -163,7 +162,6 @@ class Learned(PolicyConfig):
                 networks,
                 orientations=self.orientations,
                 continuous=self.continuous,
-                stop_threshold=card.get("stop_threshold"),
                 watch=site.observer,
             )
         except ValueError as error:
