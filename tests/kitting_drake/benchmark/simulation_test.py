@@ -1,0 +1,48 @@
+from pathlib import Path
+
+import pytest
+from rich.console import Console
+
+from kitting_drake.benchmark.simulation import PhaseStopwatch, simulation_tables
+from kitting_drake.cell import build_cell
+from kitting_drake.episode import run_episode
+from kitting_drake.scenario.schema import Scenario
+
+
+def test_phases_add_up_to_their_episodes():
+    scenario = Scenario(cameras={}, time_limit=1.5)
+    stopwatch = PhaseStopwatch()
+    simulated = wall = 0.0
+    for seed in range(2):
+        cell = build_cell(scenario, seed=seed, base=Path())
+        stopwatch.start()
+        result = run_episode(
+            cell,
+            task=scenario.task,
+            scenario="mine",
+            policy="oracle",
+            seed=seed,
+            time_limit=scenario.time_limit,
+            observers=[stopwatch.observe],
+        )
+        simulated += result.sim_seconds
+        wall += result.wall_seconds
+    # It ends in the middle of a phase, which counts too.
+    assert list(stopwatch.phases)[:2] == ["observe", "approach"]
+    assert sum(phase[0] for phase in stopwatch.phases.values()) == pytest.approx(simulated)
+    assert sum(phase[1] for phase in stopwatch.phases.values()) == pytest.approx(wall, rel=0.2)
+    assert all(phase[0] > 0 for phase in stopwatch.phases.values())
+
+
+def test_a_phase_that_takes_no_simulated_time_has_no_ratio():
+    measured = {
+        "real_time_rate": 2.0,
+        "phases": {"done": {"simulated_s": 0.0, "wall_s": 0.1, "wall_s_per_simulated_s": None}},
+        "start_up_s": {"cache_empty": 3.0, "cache_filled": 2.0},
+        "images_s": {"rgbd_image": 0.01, "heightmap": 0.02},
+    }
+    console = Console(width=100)
+    with console.capture() as shown:
+        console.print(*simulation_tables(measured))
+    (row,) = (line.split() for line in shown.get().splitlines() if "done" in line)
+    assert row[1::2] == ["done", "0.0", "0.1", "-"]
