@@ -333,16 +333,16 @@ class DemonstrationRecorder:
 
     def demonstration(self, result: EpisodeResult) -> Demonstration | Rejection:
         """The demonstration of the episode, now that it is over; steps that failed are left out."""
-        steps = tuple(
-            DemonstrationStep.of(observation, action, name=item.object, category=item.category)
-            for (observation, action), item in zip(
-                self._actions, result.actions_taken, strict=True
-            )
-            if item.outcome == "placed"
-        )
-        if result.failure or result.success_rate < LEAST_SCORE or not steps:
+        if result.failure or result.success_rate < LEAST_SCORE:
             reason = result.failure or f"the reward was {result.success_rate:.0%}"
             return Rejection(result.seed, result.success_rate, reason)
+        steps = tuple(
+            DemonstrationStep.of(observation, action, name=item.object, category=item.category)
+            for (observation, action), item in zip(self._actions, result.actions_taken, strict=True)
+            if item.outcome == "placed"
+        )
+        if not steps:
+            return Rejection(result.seed, result.success_rate, "there was nothing to do")
         # All goals are filled: whether the expert was asked again or not, nothing is left to do.
         return Demonstration(result.seed, result.success_rate, steps, self._final)
 

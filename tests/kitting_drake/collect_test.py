@@ -6,24 +6,19 @@ import signal
 import subprocess
 import sys
 import time
-import types
 from pathlib import Path
 
 import h5py
 import numpy as np
 import pytest
-from pydrake.math import RigidTransform
-from pydrake.systems.framework import Context
 from rich.console import Console
 
 import kitting_drake.collect as collecting
-from kitting_drake.cell.cell import Cell, build_cell
-from kitting_drake.collect import Collection, Recorder, demonstrate, next_seed
+from kitting_drake.collect import Collection, next_seed
 from kitting_drake.common.errors import UserError
 from kitting_drake.common.files import alone_in
 from kitting_drake.common.processes import Died
 from kitting_drake.common.seeds import DEMONSTRATION_SEEDS, TEST_SEEDS, VALIDATION_SEEDS, seeds_from
-from kitting_drake.episode.episode import run_episode
 from kitting_drake.policies.demonstrations import (
     Demonstration,
     DemonstrationStep,
@@ -31,8 +26,6 @@ from kitting_drake.policies.demonstrations import (
     Rejection,
     read_demonstrations,
 )
-from kitting_drake.scenario.schema import ArrangedKitting, Placement, PythonPolicy, Scenario
-from systems.pick_place_parameters import Mode, PickPlaceParameters
 from systems.signals import Observation, PickPlaceAction, PixelGrid, PlanarPose
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -58,7 +51,7 @@ class Oracle:
         if seed in BAD:
             return Rejection(seed, 0.5, f"{seed} is bad")
         image = np.random.default_rng(seed).random((4, *GRID.shape), np.float32)
-        action = PickPlaceAction(PlanarPose(seed), PlanarPose(0, seed), 0.01)
+        action = PickPlaceAction(PlanarPose(seed), PlanarPose(0, seed))
         step = DemonstrationStep.of(Observation(image, GRID), action, name="a", category="b")
         return Demonstration(seed, 1.0, (step,))
 
@@ -235,7 +228,7 @@ def test_without_rendering_one_sentence(
     monkeypatch.setattr("kitting_drake.cell.cameras.can_render", lambda: False)
     monkeypatch.setattr(sys, "argv", arguments(tmp_path))
     with pytest.raises(SystemExit) as left:
-        collecting.run_verb(collecting.main)
+        collecting.run_command(collecting.main)
     assert left.value.code == 2
     (line,) = capsys.readouterr().err.splitlines()
     assert line.startswith("error: rendering needs the system library libEGL")
@@ -278,99 +271,6 @@ def test_what_is_finished_is_left_alone(
     monkeypatch.setattr(sys, "argv", [*arguments(tmp_path), "--scenario_text", "{time_limit: 2}"])
     with pytest.raises(UserError, match="another scenario"):
         collecting.main()
-
-
-def two_tools(**more: object) -> Cell:
-    task = ArrangedKitting(
-        tools={
-            "claw_hammer": Placement(x=0.35, y=0.3, yaw_deg=90.0),
-            "flat_screwdriver": Placement(x=0.60, y=0.3, yaw_deg=20.0),
-        }
-    )
-    return build_cell(Scenario(task=task, **more), seed=0, base=Path())  # type: ignore[arg-type]
-
-
-# The tools still sink onto the table: no two steps are the same.
-HASTY = PickPlaceParameters(observe_settle=0.02)
-
-
-@pytest.mark.usefixtures("rendering")
-def test_what_is_taken_down_is_what_the_planner_acted_upon():
-    cell = two_tools(planner=HASTY)
-    recorder = Recorder(cell)
-    latched: list[tuple[PlanarPose, PlanarPose]] = []
-
-    def watch(root: Context, mode: Mode) -> None:
-        recorder.watch(root, mode)
-        if mode != Mode.OBSERVE:
-            latched.append(cell.planner.action(cell.planner.GetMyContextFromRoot(root)))
-
-    run_episode(cell, scenario="", policy="", seed=0, time_limit=0.1, watch=watch)
-    (step,) = recorder.steps
-    assert (step.object, step.category) == ("claw_hammer", "hammer")
-    assert (step.pick, step.place) == latched[0]
-    assert step.surface_height == pytest.approx(cell.scene.tools[0].grasp.surface_height, abs=1e-4)
-
-
-@pytest.mark.usefixtures("rendering")
-def test_what_is_taken_down_is_what_a_policy_would_have_seen(monkeypatch: pytest.MonkeyPatch):
-    action = PickPlaceAction(PlanarPose(0.35, 0.3, 0.1), PlanarPose(0.5, 0.0, 0.2), 0.02)
-    seen: list[Observation] = []
-
-    def look(observation: Observation) -> PickPlaceAction:
-        seen.append(observation)
-        return action
-
-    module = types.ModuleType("looking")
-    module.look = look  # type: ignore[attr-defined]
-    monkeypatch.setitem(sys.modules, "looking", module)
-    cell = two_tools(planner=HASTY, policy=PythonPolicy(function="looking:look"))
-    recorder = Recorder(cell)
-    run_episode(cell, scenario="", policy="", seed=0, time_limit=0.1, watch=recorder.watch)
-    (step,) = recorder.steps
-    expected = DemonstrationStep.of(seen[0], action, name="", category="")
-    np.testing.assert_array_equal(step.image, expected.image)
-    assert step.height.max() > 0.04
-    assert (step.pick, step.place, step.surface_height) == (action.pick, action.place, 0.02)
-
-
-@pytest.mark.usefixtures("rendering")
-def test_of_a_grasp_that_is_done_again_the_last_is_kept():
-    cell = two_tools()
-    recorder = Recorder(cell)
-    root = cell.diagram.CreateDefaultContext()
-    plant_context = cell.plant.GetMyMutableContextFromRoot(root)
-
-    def act(*, hammer_x: float | None = None) -> None:
-        if hammer_x is not None:
-            X_WT = RigidTransform(cell.scene.X_WTools[0].rotation(), [hammer_x, 0.3, 0.0])
-            cell.plant.SetFreeBodyPose(plant_context, cell.tool_bodies[0], X_WT)
-        for mode in (Mode.OBSERVE, Mode.OBSERVE, Mode.APPROACH, Mode.DESCEND, Mode.RETREAT):
-            recorder.watch(root, mode)
-
-    act()
-    first = recorder.steps[0]
-    act(hammer_x=0.36)
-    (again,) = recorder.steps
-    assert again.object == first.object == "claw_hammer"
-    assert again.pick.x == pytest.approx(first.pick.x + 0.01)
-    assert (again.image != first.image).any()
-    # In its cavity the hammer is done with, then it jumps out.
-    cell.plant.SetFreeBodyPose(plant_context, cell.tool_bodies[0], cell.scene.X_WGoals[0])
-    act()
-    assert [step.object for step in recorder.steps] == ["claw_hammer", "flat_screwdriver"]
-    act(hammer_x=0.34)
-    assert [step.object for step in recorder.steps] == ["flat_screwdriver", "claw_hammer"]
-    # Nothing is acted upon when the planner is done.
-    recorder.watch(root, Mode.OBSERVE)
-    recorder.watch(root, Mode.DONE)
-    assert len(recorder.steps) == 2
-
-
-@pytest.mark.usefixtures("rendering")
-def test_an_episode_that_places_less_than_all_is_rejected():
-    outcome = demonstrate(two_tools(), seed=3, time_limit=0.3)
-    assert outcome == Rejection(3, 0.0, "0% of the objects were placed")
 
 
 ONE_TOOL = """

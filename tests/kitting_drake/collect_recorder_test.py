@@ -1,0 +1,164 @@
+"""What the oracle's demonstrations are made of: `kitting_drake.collect.DemonstrationRecorder`."""
+
+import dataclasses
+import itertools
+import sys
+import types
+from pathlib import Path
+
+import numpy as np
+import pytest
+from pydrake.systems.framework import Context
+
+from kitting_drake.cell import Cell, build_cell
+from kitting_drake.collect import DemonstrationRecorder
+from kitting_drake.episode import EpisodeObserver, EpisodeResult, ModeChange, run_episode
+from kitting_drake.policies.demonstrations import Demonstration, DemonstrationStep, Rejection
+from kitting_drake.scenario import Scenario
+from kitting_drake.scenario.policies import PythonPolicy
+from kitting_drake.scenario.schema import Pinhole
+from kitting_drake.tasks import ArrangedKitting
+from kitting_drake.tasks.kitting.sampling import TablePose
+from kitting_drake.tasks.task import ActionRecord
+from systems.pick_place_parameters import Mode, PickPlaceParameters
+from systems.signals import Observation, PickPlaceAction, PlanarPose
+
+pytestmark = pytest.mark.usefixtures("rendering")
+
+SMALL = {
+    name: dataclasses.replace(camera, width=160, height=120, focal_length=112.5)
+    for name, camera in Scenario().cameras.items()
+    if isinstance(camera, Pinhole)
+}
+# The tools still sink onto the table: no two steps are the same.
+HASTY = PickPlaceParameters(observe_settle=0.02)
+
+
+def cell_of(*tools: str, **more: object) -> Cell:
+    poses = [TablePose(x=0.42, y=0.14), TablePose(x=0.60, y=0.3, yaw_deg=20.0)]
+    task = ArrangedKitting(tools=dict(zip(tools, poses, strict=False)))
+    scenario = Scenario(task=task, cameras=SMALL, **more)  # type: ignore[arg-type]
+    return build_cell(scenario, seed=0, base=Path())
+
+
+def run(cell: Cell, seconds: float, *observers: EpisodeObserver) -> EpisodeResult:
+    return run_episode(
+        cell,
+        task=ArrangedKitting(),
+        scenario="",
+        policy="",
+        seed=3,
+        time_limit=seconds,
+        observers=observers,
+    )
+
+
+def assert_shows(step: DemonstrationStep, observation: Observation) -> None:
+    expected = DemonstrationStep.of(observation, PickPlaceAction(), name="")
+    np.testing.assert_array_equal(step.image, expected.image)
+
+
+def test_a_demonstration_is_what_was_acted_upon_and_what_was_left():
+    cell = cell_of("combination_wrench", planner=HASTY)
+    recorder = DemonstrationRecorder(cell)
+    latched: list[tuple[PlanarPose, PlanarPose]] = []
+
+    def latch(event: ModeChange) -> None:
+        context = cell.planner.GetMyContextFromRoot(event.root_context)
+        latched.append(cell.planner.action(context))
+
+    result = run(cell, 30.0, recorder.observe, latch)
+    made = recorder.demonstration(result)
+    assert isinstance(made, Demonstration)
+    assert (made.seed, made.score) == (3, 1.0)
+    (step,) = made.steps
+    assert (step.object, step.category) == ("combination_wrench", "wrench")
+    assert (step.pick, step.place) == latched[0]
+    # The wrench is seen at the pick, and where it was not seen at the end.
+    assert made.final is not None
+    row, col = np.round(Scenario().heightmap.grid().to_pixel([step.pick.x, step.pick.y]))
+    here = np.s_[int(row) - 3 : int(row) + 4, int(col) - 3 : int(col) + 4]
+    assert step.height[here].max() > 0.005
+    assert made.final.height[here].max() < 0.003
+
+
+def test_what_is_taken_down_is_what_a_policy_has_seen(monkeypatch: pytest.MonkeyPatch):
+    action = PickPlaceAction(PlanarPose(0.35, 0.3, 0.1), PlanarPose(0.5, 0.0, 0.2))
+    seen: list[Observation] = []
+
+    def look(observation: Observation) -> PickPlaceAction:
+        seen.append(observation)
+        return action
+
+    monkeypatch.setitem(sys.modules, "looking", types.SimpleNamespace(look=look))
+    cell = cell_of("claw_hammer", planner=HASTY, policy=PythonPolicy(function="looking:look"))
+    recorder = DemonstrationRecorder(cell)
+    result = run(cell, 0.1, recorder.observe)
+    made = recorder.demonstration(as_success(result, "placed"))
+    assert isinstance(made, Demonstration)
+    (step,) = made.steps
+    assert_shows(step, seen[0])
+    assert step.height.max() > 0.04
+    assert (step.pick, step.place) == (action.pick, action.place)
+    assert made.final is None  # Nobody was there when it was over.
+
+
+def as_success(result: EpisodeResult, *outcomes: str) -> EpisodeResult:
+    """The result of an episode that ended well, with such actions on one object after another."""
+    actions = [
+        ActionRecord(
+            f"object_{number}", "any", outcome, PlanarPose(), PlanarPose(), None, None, None, None
+        )
+        for number, outcome in enumerate(outcomes)
+    ]
+    return dataclasses.replace(result, success_rate=1.0, failure=None, actions_taken=actions)
+
+
+def test_only_what_was_placed_is_a_step():
+    """Told of actions on two tools that do not move, of which the first fails twice."""
+    cell = cell_of("claw_hammer", "flat_screwdriver")
+    recorder = DemonstrationRecorder(cell)
+    root: Context = cell.diagram.CreateDefaultContext()
+    context = cell.plant.GetMyMutableContextFromRoot(root)
+    seen: list[Observation] = []
+
+    def tell(previous: Mode, mode: Mode, *, is_last: bool = False) -> None:
+        recorder.observe(ModeChange(previous, mode, root, is_last))
+
+    def act() -> None:
+        seen.append(cell.diagram.GetOutputPort("observation").Eval(root))
+        modes = [Mode.OBSERVE, Mode.APPROACH, Mode.DESCEND, Mode.RETREAT, Mode.OBSERVE]
+        for previous, mode in itertools.pairwise(modes):
+            tell(previous, mode)
+
+    def put_at_goal(index: int) -> None:
+        (X_WGoal,) = cell.scene.goals[index].poses
+        body = cell.plant.get_body(cell.objects[index].body)
+        cell.plant.SetFreeBodyPose(context, body, X_WGoal)
+
+    act()
+    act()
+    act()
+    put_at_goal(0)
+    act()
+    put_at_goal(1)
+    left = cell.diagram.GetOutputPort("observation").Eval(root)
+    tell(Mode.OBSERVE, Mode.DONE)
+    tell(Mode.DONE, Mode.DONE, is_last=True)
+    nothing = run(cell, 0.01)
+    result = as_success(nothing, "missed", "dropped", "placed", "placed")
+    made = recorder.demonstration(result)
+    assert isinstance(made, Demonstration)
+    assert [step.object for step in made.steps] == ["object_2", "object_3"]
+    for step, observation in zip(made.steps, seen[2:], strict=True):
+        assert_shows(step, observation)
+    assert (made.steps[0].image != made.steps[1].image).any()
+    assert made.final is not None
+    np.testing.assert_array_equal(made.final.height, left.height)
+    # One that scores less than all, or failed, is none.
+    less = dataclasses.replace(result, success_rate=0.5)
+    assert recorder.demonstration(less) == Rejection(3, 0.5, "the reward was 50%")
+    failed = dataclasses.replace(result, success_rate=0.0, failure="the solver", actions_taken=[])
+    assert recorder.demonstration(failed) == Rejection(3, 0.0, "the solver")
+    aside = as_success(nothing, "missed", "missed", "missed", "missed")
+    assert recorder.demonstration(aside) == Rejection(3, 1.0, "there was nothing to do")
