@@ -1,0 +1,29 @@
+"""Markdown for pages that people also read as source."""
+
+from collections.abc import Sequence
+
+
+def markdown_table(
+    headings: Sequence[str], rows: Sequence[Sequence[str]], left_columns: int = 1
+) -> str:
+    """A table whose source is aligned.
+
+    Args:
+        headings: of the columns.
+        rows: cells.
+        left_columns: how many columns, from the first, are aligned left; the others are aligned
+            right.
+    """
+    widths = [max(map(len, column)) for column in zip(headings, *rows, strict=True)]
+    rule = [
+        "-" * width if index < left_columns else "-" * (width - 1) + ":"
+        for index, width in enumerate(widths)
+    ]
+    lines = [
+        [
+            cell.ljust(width) if index < left_columns else cell.rjust(width)
+            for index, (cell, width) in enumerate(zip(line, widths, strict=True))
+        ]
+        for line in (headings, rule, *rows)
+    ]
+    return "".join(f"| {' | '.join(line)} |\n" for line in lines)

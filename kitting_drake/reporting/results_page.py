@@ -1,0 +1,254 @@
+"""The page of results, docs/results.md: the paper's tables with our runs, from files alone."""
+
+from collections import defaultdict
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from kitting_drake.reporting.markdown import markdown_table
+from kitting_drake.reporting.runs import LEARNED, METHODS, Run
+from kitting_drake.reporting.summary import ACTION_ERRORS, AMBIGUITIES, ERRORS
+from kitting_drake.reporting.terminal import number
+from kitting_drake.tasks import PAPER_TASKS
+
+_ORIENTATIONS = (36, 72, 120, 180)
+_DEMONSTRATIONS = (10, 100)
+"""The parameters that the paper varies (sections V-B.1 and V-C.1)."""
+
+
+@dataclass(frozen=True)
+class _Paper:
+    """The text of the paper (section V-D.1) on a task."""
+
+    heading: str
+    ours: float
+    """Success rate at N = 180 with 100 demonstrations, in percent."""
+    transporter_gain: float
+    """How much better the Equivariant Transporter is on average, in points."""
+
+
+_PAPER = {
+    "kitting-seen-toolset": _Paper("Seen toolset", 96.5, 0.63),
+    "kitting-unseen-toolsets": _Paper("Unseen toolsets", 87.25, 2.16),
+}
+
+_INTRODUCTION = """\
+# Results
+
+Written by `python -m kitting_drake.results` from files alone, each the `summary.json` of one
+`evaluate`; they are listed at the end. Do not edit.
+
+A cell of the first tables is `strict / paper's, episodes`. The strict success rate in percent is
+what a person would sign: the share of the objects that are a success by the paper's measure, within
+2 mm of their height and within 20 degrees of their heading, modulo the symmetry that the object
+declares. The paper's measure (section IV-C) is ADD-S below 3.5 mm alone; it forgives a flat object
+that protrudes, or lies the wrong way round. Episodes that failed or timed out count 0. In brackets
+are 95 % intervals (Wilson's, as if every object of every episode were drawn anew: for *these*
+objects; of objects in general the twenty tools of the test set tell less). `-`: not run. A star:
+actions are refined to sub-pixel and sub-bin accuracy, which the paper does not do; without it they
+are quantized. A dagger: run at another N than it was trained at.
+
+A run is in a task's tables only if nothing but the policy differs from that task of the paper as
+the scenarios have it by default. Any other run is listed under "Other runs", with what differs.
+
+What these policies and the hand do was improved while looking at episodes of the seeds 0 to 99,
+with the tools of the test split: seeds from 100 on are the ones to trust.
+
+The oracle knows the truth. Quantized, it acts in pixels and N orientations: no policy of that N can
+be expected to do better. Exact, it has no N, and its one figure stands in every column.
+
+The paper gives two of these cells as numbers, over 100 episodes each and with the best of its
+checkpoints (section V-C.2). The others are bars of its figure 6, and left out.
+
+Runs of the first turn, which are not comparable with these, are in
+[results_first_turn.md](results_first_turn.md).
+"""
+
+
+def results_page(runs: Sequence[Run], link: str) -> str:
+    """The whole page, in Markdown.
+
+    Args:
+        runs: from `read_runs`; there may be none of a task, or none at all.
+        link: the folder of the files, from the page's own.
+    """
+    sections = [_INTRODUCTION]
+    for task in PAPER_TASKS:
+        sections += _task_sections(task, [run for run in runs if run.paper_task == task])
+    others = [run for run in runs if run.paper_task is None]
+    if others:
+        sections += ["## Other runs\n", _others_table(others)]
+    sections.append("## Files\n")
+    sections.append(_files_table(runs, link) if runs else "There are none yet.\n")
+    return "\n".join(sections)
+
+
+def _task_sections(task: str, runs: list[Run]) -> list[str]:
+    paper = _PAPER[task]
+    sections = [
+        f"## {paper.heading} (`{task}`)\n",
+        _success_table(runs, paper),
+        f"In the paper the Equivariant Transporter is {paper.transporter_gain} points better "
+        "than the SO(2)-equivariant\nmethod, on average over N and demonstrations.\n",
+    ]
+    if runs:
+        sections += [*_most_tested_run(runs), *_causes(runs)]
+    return sections
+
+
+def _success_table(runs: list[Run], paper: _Paper) -> str:
+    cells: dict[tuple[Any, ...], list[Run]] = defaultdict(list)
+    for run in runs:
+        keys = ("preset", "demonstrations", "orientations")
+        cells[run.method, *(run.detail(key) for key in keys)].append(run)
+    orientations = _with_others(_ORIENTATIONS, (n for *_, n in cells))
+
+    def row(method: str, preset: str | None = None, count: int | None = None) -> list[str]:
+        named = [METHODS.get(method, method), preset or "", str(count or "")]
+        # What has no N, as the exact oracle, has one figure for all.
+        any_n = cells.get((method, preset, count, None), [])
+        return named + [
+            _cell(cells.get((method, preset, count, n), []) + any_n) for n in orientations
+        ]
+
+    rows = []
+    for method in LEARNED:
+        mine = [(preset, count) for name, preset, count, _ in cells if name == method]
+        presets = sorted({preset for preset, _ in mine}, key=str) or [None]
+        counts = _with_others(_DEMONSTRATIONS, (count for _, count in mine))
+        rows += [row(method, preset, count) for preset in presets for count in counts]
+        if method == "so2":
+            given = [f"- / {paper.ours:g}" if n == 180 else "" for n in orientations]
+            rows.append(["*paper*, ours", "", "100", *given])
+    others = {key[:3] for key in cells if key[0] not in METHODS}
+    rows += [row(*key) for key in sorted(others, key=str)]
+    rows += [row("quantized_oracle"), row("oracle")]
+    headings = ["method", "preset", "demonstrations", *(f"N = {n}" for n in orientations)]
+    return markdown_table(headings, rows, left_columns=2)
+
+
+def _with_others(usual: Iterable[int], found: Iterable[int | None]) -> list[int]:
+    return sorted({*usual, *(value for value in found if value is not None)})
+
+
+def _cell(runs: list[Run]) -> str:
+    # Runs that differ in nothing but their training are all told: choosing would be flattering.
+    return (
+        "<br>".join(
+            f"{_strict(run.summary)} / {_own(run.summary)}, {run.summary['episodes']}{_marks(run)}"
+            for run in runs
+        )
+        or "-"
+    )
+
+
+def _marks(run: Run) -> str:
+    trained = run.detail("trained_orientations")
+    marks = ["\\*"] if run.detail("continuous") else []
+    if trained is not None and trained != run.detail("orientations"):
+        marks.append("†")
+    return "".join(f" {mark}" for mark in marks)
+
+
+def _strict(summary: dict[str, Any]) -> str:
+    return _rate(summary["strict_success_rate"], summary["strict_ci95"])
+
+
+def _own(summary: dict[str, Any]) -> str:
+    return _rate(summary["success_rate"], summary["ci95"])
+
+
+def _rate(rate: float, interval: Sequence[float]) -> str:
+    low, high = interval
+    return f"{100 * rate:.1f} ({100 * low:.1f} to {100 * high:.1f})"
+
+
+def _most_tested_run(runs: list[Run]) -> list[str]:
+    """Tables by category of the network that was tested most; if there is none, of another run."""
+    learned = [run for run in runs if run.method in LEARNED]
+    # Not the best: of few episodes, that is the luckiest.
+    most = max(learned or runs, key=lambda run: (run.summary["episodes"], run.file))
+    rows = [*most.summary["categories"].items(), ("all", most.summary)]
+
+    def errors(of: dict[str, Any]) -> str:
+        return f"{number(of['median'])}, {number(of['p95'])}"
+
+    placed = [
+        [name, _strict(row), _own(row), *(errors(row[key]) for key in ERRORS)] for name, row in rows
+    ]
+    acted = [
+        [name, *(errors(row["action_errors"][key]) for key in ACTION_ERRORS)] for name, row in rows
+    ]
+    return [
+        f"### By category: {most.label}\n",
+        "How far from their goals the objects ended: median and 95th percentile.\n",
+        markdown_table(
+            [
+                "category",
+                "strict, %",
+                "paper's, %",
+                "ADD-S, mm",
+                "position, mm",
+                "angle, deg",
+                "height, mm",
+            ],
+            placed,
+        ),
+        "How far the policy's actions were from the annotated grasp, and from the goal.\n",
+        markdown_table(["category", "pick, mm", "pick, deg", "place, mm", "place, deg"], acted),
+    ]
+
+
+def _causes(runs: list[Run]) -> list[str]:
+    """Why objects were no strict success: a row for each run, best first."""
+    causes = list(dict.fromkeys(cause for run in runs for cause in run.summary["causes"]))
+    rows = []
+    for run in sorted(runs, key=lambda run: -run.summary["strict_success_rate"]):
+        summary = run.summary
+        objects = sum(row["objects"] for row in summary["categories"].values())
+        rows.append(
+            [run.label, run.seeds, str(objects)]
+            + [str(summary["causes"].get(cause, 0)) for cause in causes]
+            + [str(summary["ambiguous"].get(name, 0)) for name in AMBIGUITIES]
+        )
+    ambiguous = [f"success, but {name}" for name in AMBIGUITIES]
+    return [
+        "### Why objects were no success, or no strict one\n",
+        markdown_table(["run", "seeds", "objects", *causes, *ambiguous], rows, left_columns=2),
+    ]
+
+
+def _others_table(runs: list[Run]) -> str:
+    rows = [
+        [
+            run.file,
+            run.summary["task"],
+            run.label,
+            run.departures_text,
+            run.summary["success_description"],
+            _strict(run.summary),
+            _own(run.summary),
+            str(run.summary["episodes"]),
+            run.seeds,
+        ]
+        for run in runs
+    ]
+    headings = ["file", "task", "run", "what differs", "success", "strict, %", "success, %"]
+    return markdown_table([*headings, "episodes", "seeds"], rows, left_columns=5)
+
+
+def _files_table(runs: Sequence[Run], link: str) -> str:
+    rows = [
+        [
+            f"[{run.file}]({link}/{run.file})",
+            run.summary["task"],
+            run.label,
+            str(run.detail("steps") or ""),
+            str(run.summary["episodes"]),
+            run.seeds,
+            f"{run.summary['wall_seconds'] / 3600:.1f}",
+        ]
+        for run in runs
+    ]
+    headings = ["file", "task", "run", "training steps", "episodes", "seeds", "hours, summed"]
+    return markdown_table(headings, rows, left_columns=3)
