@@ -47,7 +47,7 @@ _MOST_REJECTED = 20
 """So many seeds rejected in a row mean that the oracle cannot do it."""
 
 Demonstrate = Callable[[int], Demonstration | Rejection | Died]
-"""What becomes of a seed; called in a thread."""
+"""Demonstrates a seed; called in a thread."""
 
 
 def main() -> int:
@@ -213,7 +213,7 @@ class Collection:
             self._parts.rmdir()
 
     def summary(self) -> str:
-        """What the one file holds, for people."""
+        """The contents of the one file, for people."""
         contents = read_contents(self.path)
         megabytes = self.path.stat().st_size / 1e6
         return (

@@ -8,7 +8,7 @@ class Grasp:
     """A planar grasp in the frame B of an object that lies as it should."""
 
     x: float
-    """Of the point midway between the pads, in B, in metres."""
+    """Coordinates of the point midway between the pads, in B, in metres."""
     y: float
     theta: float
     """Rotation of the hand about B's z, in radians; at zero the jaws close along B's y."""

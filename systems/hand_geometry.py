@@ -5,9 +5,9 @@ Lengths in metres.
 """
 
 PAD_LENGTH = 0.0176
-"""Of the pads' gripping faces along G's x."""
+"""Length of the pads' gripping faces along G's x."""
 FINGER_LENGTH = 0.0208
-"""Of the fingers along G's x."""
+"""Length of the fingers along G's x."""
 FINGER_DEPTH = 0.0263
 """How far a finger reaches from its pad away from the other, along G's y, at any height above the
 pads."""
@@ -18,8 +18,8 @@ MAX_OPENING = 0.080
 PALM_SIZE = (0.064, 0.209)
 """Extents of the palm along G's x and y."""
 PALM_HEIGHT = 0.046
-"""Of the underside of the palm above the fingertips."""
+"""Height of the underside of the palm above the fingertips."""
 FINGERTIP_DISTANCE = 0.1121
-"""Of the fingertip ends from the hand's flange, along G's z."""
+"""Distance of the fingertip ends from the hand's flange, along G's z."""
 FINGER_BASE_DISTANCE = 0.0584
-"""Of the origin of the finger meshes from the hand's flange, along G's z."""
+"""Distance of the origin of the finger meshes from the hand's flange, along G's z."""

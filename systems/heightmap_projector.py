@@ -110,7 +110,7 @@ class HeightmapProjector(LeafSystem):
 
 
 class _Camera(NamedTuple):
-    """What a depth camera's image means; Drake's camera in the form that the projection needs."""
+    """The meaning of a depth camera's image: Drake's camera in the form that the projection needs."""
 
     u: NDArray[np.float32]
     """(width,): x of the ray through each column at depth 1."""

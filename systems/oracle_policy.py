@@ -140,7 +140,7 @@ class OraclePolicy(LeafSystem):
         output.set_value(PickPlaceAction(stop=True) if plan is None else self._action(plan, poses))
 
     def _plan(self, poses: list[RigidTransform], placements: list[Placement]) -> _Plan | None:
-        """What to do next; None when every goal is filled, or none can be."""
+        """The next thing to do; None when every goal is filled, or none can be."""
         filled = {item.goal for item in placements if item.success}
         failed_there = {
             item.goal

@@ -9,7 +9,7 @@ from systems.insertion_search import InsertionSearch
 
 
 class Mode(enum.IntEnum):
-    """What the planner is doing. The order to DONE is that of a successful pick and place."""
+    """The planner's modes. The order to DONE is that of a successful pick and place."""
 
     OBSERVE = 0
     """Go home, out of the cameras' sight, come to rest, and ask the policy."""

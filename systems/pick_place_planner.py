@@ -131,7 +131,7 @@ class PickPlacePlanner(LeafSystem):
         self.DeclareVectorOutputPort("counts", 3, self._calc_counts, state_only)
 
     def mode(self, context: Context) -> Mode:
-        """What the planner is doing in the given context (its own)."""
+        """The mode in the given context (its own)."""
         return Mode(int(self._state(context).mode))
 
     def action(self, context: Context) -> tuple[PlanarPose, PlanarPose]:

@@ -61,7 +61,7 @@ class PlacedObject:
 
     @cached_property
     def tree(self) -> cKDTree:
-        """Of the points."""
+        """A tree of the points."""
         return cKDTree(self.p_BPoints)
 
 
@@ -102,7 +102,7 @@ class Placement:
     height_error: float = math.inf
     """How far the middle is above the goal's, in metres."""
     share: float = 0.0
-    """Of the goal's reward, 0 to 1, by the success predicate; 0 while a goal that must come
+    """Share of the goal's reward, 0 to 1, by the success predicate; 0 while a goal that must come
     before is not filled."""
 
     @property

@@ -126,7 +126,7 @@ class SurfaceHeights:
     pick_top: float = 0.0
     """The top of what lies under the pick."""
     support: float = 0.0
-    """What that stands on."""
+    """The top of what that stands on."""
     place_rim: float = 0.0
     """The highest surface around the place: the rim of a cavity, if there is one."""
     highest: float = 0.0
@@ -148,7 +148,7 @@ class PickPlaceAction:
     stop: bool = False
     """True: there is nothing left to do, and the poses mean nothing."""
     heights: SurfaceHeights | None = None
-    """Of a policy that knows them from elsewhere (the oracle); used only where nothing is seen."""
+    """Given by the oracle, which knows them; used only where there is no observation."""
 
 
 def wrap_to_pi(angle: float) -> float:

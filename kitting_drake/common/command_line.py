@@ -1,4 +1,4 @@
-"""What every command does the same way; no pydrake here."""
+"""The parts of a command line that all commands share; no pydrake here."""
 
 import argparse
 import contextlib

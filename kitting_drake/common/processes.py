@@ -36,7 +36,7 @@ class Died:
         return self.exit_code in (-signal.SIGKILL, -signal.SIGTERM)
 
     def killed_twice(self, seed: int) -> UserError:
-        """What is to be said when a second chance did not help."""
+        """The error to raise when a second chance did not help."""
         return UserError(
             f"the process of seed {seed} was killed twice, perhaps for want of memory: "
             "give fewer --workers, and it goes on where it was"

@@ -1,4 +1,4 @@
-"""What results depend on beside the scenario: versions, and the commit."""
+"""The provenance of results beside the scenario: versions, and the commit."""
 
 import importlib.metadata
 import platform
@@ -11,7 +11,7 @@ import kitting_drake
 
 
 def versions() -> dict[str, str]:
-    """Of this package, and of what it stands on."""
+    """The versions of this package and of its foundations."""
     return {
         "kitting_drake": kitting_drake.__version__,
         "drake": importlib.metadata.version("drake"),

@@ -1,13 +1,13 @@
 """Which seeds are for what: what a policy has learned from is not what it is tested on."""
 
 TEST_SEEDS = range(10_000)
-"""Of test episodes."""
+"""Seeds of test episodes."""
 
 DEMONSTRATION_SEEDS = range(10_000, 20_000)
-"""Of demonstrations to learn from."""
+"""Seeds of demonstrations to learn from."""
 
 VALIDATION_SEEDS = range(20_000, 30_000)
-"""Of what a choice among trained policies is made by."""
+"""Seeds of the demonstrations by which a checkpoint is chosen."""
 
 
 def seeds_from(first: int) -> range:

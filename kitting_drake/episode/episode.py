@@ -207,7 +207,7 @@ class _Monitor:
         self.done_since: float | None = None
 
     def step(self, root_context: Context) -> EventStatus:
-        """What the simulator calls after every step."""
+        """The callback that the simulator calls after every step."""
         cell = self._cell
         results = self._contact_results.Eval(cell.plant.GetMyContextFromRoot(root_context))
         self.point_contact_pairs = max(self.point_contact_pairs, results.num_point_pair_contacts())

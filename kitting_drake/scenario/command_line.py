@@ -1,4 +1,4 @@
-"""What the command lines of the commands on a scenario share."""
+"""The command line of every command on a scenario."""
 
 import argparse
 import dataclasses
@@ -41,9 +41,9 @@ class ChosenScenario:
     scenario: Scenario
     path: Path
     name: str
-    """Of its file, without the ending, and of the scenario in it if one was named."""
+    """The name of its file, without the ending, and of the scenario in it if one was given."""
     text: str | None
-    """What was merged over it."""
+    """The YAML that was merged over it."""
 
     @property
     def base(self) -> Path:

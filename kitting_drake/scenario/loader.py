@@ -158,7 +158,7 @@ def _load(raw: object, content: str, name: str | None, defaults: Scenario, where
 
 
 def _check_meaning(scenario: Scenario) -> None:
-    """What no type and no range can say."""
+    """Checks what neither types nor ranges say."""
     if scenario.plant.contact_approximation not in ("lagged", "similar", "sap"):
         raise ValueError(
             "plant.contact_approximation must be lagged, similar or sap, "

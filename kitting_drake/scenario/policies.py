@@ -32,20 +32,20 @@ DecisionObserver = Callable[[Observation, "Decision"], None]
 
 @dataclass(frozen=True)
 class PolicySite:
-    """What a policy is made for: the cell as far as it is built."""
+    """The cell as far as it is built when the policy is made."""
 
     scene: Scene
     objects: tuple[PlacedObject, ...]
     """The scene's objects, with their bodies."""
     grid: PixelGrid
-    """Of the observations."""
+    """The pixel grid of the observations."""
     base: Path
     """Where relative paths in the scenario start."""
     observer: DecisionObserver | None = None
 
 
 class PolicyConfig:
-    """What a policy is asked; each variant of the scenario's `policy:` derives from it."""
+    """The interface of a policy; each variant of the scenario's `policy:` derives from it."""
 
     needs_observation: bool = True
     """Whether the system has an input port `observation`; else one called `body_poses`."""
@@ -64,7 +64,7 @@ class PolicyConfig:
         raise NotImplementedError
 
     def details(self, base: Path) -> dict[str, Any]:
-        """What tells one policy from another of its kind, for results.
+        """The details that distinguish policies of a kind, for results.
 
         Raises:
             UserError: its files cannot be read.
@@ -72,7 +72,7 @@ class PolicyConfig:
         return {}
 
     def digest(self, base: Path) -> str | None:
-        """Of the content of the policy's files; None if it has none.
+        """A digest of the content of the policy's files; None if it has none.
 
         Raises:
             UserError: they cannot be read.

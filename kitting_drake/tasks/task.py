@@ -89,7 +89,7 @@ class ActionRecord:
     object: str
     """The object that was lifted; if none was, the one nearest to the pick."""
     category: str
-    """Of the object."""
+    """The category of the object."""
     outcome: str
     """`placed`, `missed` (nothing was grasped), `dropped` (on the way), or `unfinished`."""
     pick: PlanarPose
@@ -106,13 +106,13 @@ class ActionRecord:
 
 
 class TaskConfig:
-    """What a task is asked; each variant of the scenario's `task:` derives from it.
+    """The interface of a task; each variant of the scenario's `task:` derives from it.
 
     A variant is a dataclass of YAML fields with defaults (see `systems.bounds.bounded`).
     """
 
     causes: tuple[str, ...] = (MISSED_GRASP, SLIPPED, MISPLACED, NEVER_PICKED)
-    """What `find_cause` may answer, in the order of tables."""
+    """The answers of `find_cause`, in the order of tables."""
 
     def make_scene(self, *, grid: PixelGrid, seed: int, base: Path) -> Scene:
         """The scene of a seed; the same seed gives the same scene.
@@ -134,7 +134,7 @@ class TaskConfig:
 
     @property
     def learning(self) -> Learning:
-        """What a policy may assume that learns the task from demonstrations."""
+        """The assumptions that a learner of the task may make."""
         return Learning(later_picks_possible=False, curvature=False)
 
     def input_files(self, base: Path) -> list[Path]:

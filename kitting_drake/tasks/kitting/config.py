@@ -30,7 +30,7 @@ UNSEEN = "kitting-unseen-toolsets"
 
 @dataclass
 class _KittingTask(TaskConfig):
-    """What all kitting tasks share."""
+    """The fields and the scoring that all kitting tasks share."""
 
     # The kit block and its cavities.
     kit: KitParameters = field(default_factory=KitParameters)
@@ -63,7 +63,7 @@ class _KittingTask(TaskConfig):
 
 @dataclass
 class _DrawnKitting(_KittingTask):
-    """What tasks share whose tools and kit stand anywhere in the workspace, drawn from the seed."""
+    """The kitting tasks whose tools and kit stand anywhere, in poses drawn from the seed."""
 
     # Least distance between any two of tools and kit, in m.
     spacing: float = bounded(0.008, 0.0, 0.2)

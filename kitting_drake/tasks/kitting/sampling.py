@@ -40,7 +40,7 @@ class TablePose:
 
 @dataclass(frozen=True)
 class _Footprint:
-    """What is covered on the table: by a thing, and by the open hand that grasps it."""
+    """The areas of the table that a thing, and the open hand that grasps it, cover."""
 
     outline: CrossSection
     fingers: CrossSection
@@ -77,7 +77,9 @@ def check_arrangement(
     table = _rectangle(*TABLE)
     placed: dict[str, CrossSection] = {}
     things = {"task.kit_pose": (block_outline(kit), kit_pose)}
-    things |= {f"task.tools.{name}": (tool.silhouette, pose) for name, (tool, pose) in tools.items()}
+    things |= {
+        f"task.tools.{name}": (tool.silhouette, pose) for name, (tool, pose) in tools.items()
+    }
     for name, (outline, pose) in things.items():
         outline = outline.rotate(pose.yaw_deg).translate((pose.x, pose.y))
         if (outline - table).area() > 1e-9:
