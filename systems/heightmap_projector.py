@@ -110,7 +110,7 @@ class HeightmapProjector(LeafSystem):
 
 
 class _Camera(NamedTuple):
-    """The meaning of a depth camera's image: Drake's camera in the form that the projection needs."""
+    """A depth camera in the form that the projection needs."""
 
     u: NDArray[np.float32]
     """(width,): x of the ray through each column at depth 1."""
