@@ -80,17 +80,17 @@ def list_tools(args: argparse.Namespace, entries: list[ToolEntry]) -> None:
 
 
 def generate(args: argparse.Namespace, entries: list[ToolEntry]) -> None:
-    """Regenerates models and prints how true their collision pieces are."""
-    table = Table(caption="outline, top, grip: collision pieces against the visual shape, mm")
+    """Regenerates models and prints how true their collision hulls are."""
+    table = Table(caption="outline, top, grip: collision hulls against the visual shape, mm")
     table.add_column("name", no_wrap=True)
-    for heading in ("triangles", "pieces", "outline", "top", "grip", "tilt, deg"):
+    for heading in ("triangles", "hulls", "outline", "top", "grip", "tilt, deg"):
         table.add_column(heading, justify="right")
     chosen = _chosen(entries, args.names)
     for entry in track(chosen, "generating", console=Console(stderr=True), disable=args.quiet):
         r = generate_tool(entry, args.models / "tools" / entry.name)
         outline = f"+{r.outside_mm:.2f}/-{r.inside_mm:.2f}"
         errors = (f"{v:.2f}" for v in (r.top_error_mm, r.grip_error_mm, r.tilt_deg))
-        table.add_row(entry.name, str(r.triangles), str(r.collision_pieces), outline, *errors)
+        table.add_row(entry.name, str(r.triangles), str(r.collision_hulls), outline, *errors)
     if not args.quiet:
         Console().print(table)
 

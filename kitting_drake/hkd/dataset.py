@@ -20,7 +20,7 @@ from kitting_drake.hkd.tools.toolsets import SPLITS, TOOLSETS_SEED, tool_pools, 
 def build_dataset(folder: Path, progress: Callable[[int, int], None]) -> dict[str, Any]:
     """Writes tools and kits as SDFormat with their meshes, and `manifest.json`.
 
-    The folder appears whole or not at all. Tools are in `tools/NAME/`, kits in `kits/SPLIT_000/`;
+    The folder appears atomically. Tools are in `tools/NAME/`, kits in `kits/SPLIT_000/`;
     meshes are named relatively, so that any part may be moved.
 
     Args:

@@ -77,7 +77,7 @@ class Subject:
 
 
 def tool_subject(tool: Tool) -> Subject:
-    """A tool lying on the table."""
+    """A tool at rest on the table."""
     title = tool.name.replace("_", " ")
     return Subject(title, [(tool.sdf, RigidTransform())], (0.0, 0.0, 0.006), 0.208)
 

@@ -34,13 +34,13 @@ def measure_grasp(tool: Tool, x: float, y: float, theta: float) -> Grasp | None:
     """What the jaws take hold of when they close at a place over a tool.
 
     Args:
-        tool: lying in its frame T.
+        tool: at rest in its frame T.
         x: of the middle of the pads in T, in metres.
-        y: likewise; only its part along the pads counts, as closing jaws draw the tool amid them.
-        theta: turn of the hand about T's z, in radians.
+        y: the same; only its part along the pads counts, as closing jaws centre the tool.
+        theta: the rotation of the hand about T's z, in radians.
 
     Returns:
-        The grasp amid the faces that are gripped, or None where there is nothing between the pads.
+        The grasp centred between the gripped faces; None where there is nothing between the pads.
     """
     grip = find_grip(tool.triangles, x, y, theta, PAD_LENGTH)
     if grip is None:
@@ -59,7 +59,8 @@ def measure_grasp(tool: Tool, x: float, y: float, theta: float) -> Grasp | None:
 def save_grasp(tool: Tool, grasp: Grasp, models: Path = MODELS) -> None:
     """Makes a grasp the tool's annotated one.
 
-    A tool of the catalogue gets it in the catalogue, and is generated anew; another in its record.
+    For a tool of the catalogue the grasp goes there, and the tool is generated again; for any other
+    it goes into the tool's record.
 
     Args:
         tool: the tool.
@@ -132,7 +133,7 @@ class AnnotationPage:
         meshcat.AddSlider("x, mm", -half_length, half_length, 0.25, 1e3 * tool.grasp.x)
         meshcat.AddSlider("y, mm", -half_width, half_width, 0.25, 1e3 * tool.grasp.y)
         theta = math.degrees(math.remainder(tool.grasp.theta, math.pi))
-        meshcat.AddSlider("turn, deg", -90, 90, 0.5, theta)
+        meshcat.AddSlider("rotation, deg", -90, 90, 0.5, theta)
         meshcat.AddButton("save")
         meshcat.AddButton("done")
         self._taken = 0
@@ -140,11 +141,11 @@ class AnnotationPage:
 
     @property
     def grasp(self) -> Grasp | None:
-        """What the sliders say, amid the faces gripped there; None where nothing is gripped."""
-        x, y, turn = (
-            self._meshcat.GetSliderValue(name) for name in ("x, mm", "y, mm", "turn, deg")
+        """The sliders' grasp, centred between the gripped faces; None where nothing is gripped."""
+        x, y, theta_deg = (
+            self._meshcat.GetSliderValue(name) for name in ("x, mm", "y, mm", "rotation, deg")
         )
-        return measure_grasp(self._tool, 1e-3 * x, 1e-3 * y, math.radians(turn))
+        return measure_grasp(self._tool, 1e-3 * x, 1e-3 * y, math.radians(theta_deg))
 
     def clicks(self, button: str) -> int:
         """How often a button was clicked."""
@@ -157,10 +158,10 @@ class AnnotationPage:
             chosen = self._proposals[round(self._meshcat.GetSliderValue("proposal")) - 1]
             self._meshcat.SetSliderValue("x, mm", 1e3 * chosen.x)
             self._meshcat.SetSliderValue("y, mm", 1e3 * chosen.y)
-            turn = math.degrees(math.remainder(chosen.theta, math.pi))
-            self._meshcat.SetSliderValue("turn, deg", turn)
+            theta = math.degrees(math.remainder(chosen.theta, math.pi))
+            self._meshcat.SetSliderValue("rotation, deg", theta)
         values = tuple(
-            self._meshcat.GetSliderValue(name) for name in ("x, mm", "y, mm", "turn, deg")
+            self._meshcat.GetSliderValue(name) for name in ("x, mm", "y, mm", "rotation, deg")
         )
         if values != self._shown:
             self._shown = values
@@ -200,8 +201,8 @@ class AnnotationPage:
             RollPitchYaw(math.pi, 0, grasp.theta), [grasp.x, grasp.y, tips + FINGERTIP_DISTANCE]
         )
         self._meshcat.SetTransform("hand", X_THand)
-        for side, turn in (("left", 0.0), ("right", math.pi)):
-            X_HandFinger = RigidTransform(RollPitchYaw(0, 0, turn), [0, 0, FINGER_BASE_DISTANCE])
+        for side, yaw in (("left", 0.0), ("right", math.pi)):
+            X_HandFinger = RigidTransform(RollPitchYaw(0, 0, yaw), [0, 0, FINGER_BASE_DISTANCE])
             opened = RigidTransform([0, grasp.width / 2, 0])
             self._meshcat.SetTransform(f"hand/{side}", X_HandFinger @ opened)
 
@@ -223,7 +224,7 @@ def proposal_table(tool: Tool, proposals: list[GraspProposal]) -> Table:
         "rank",
         "x mm",
         "y mm",
-        "turn deg",
+        "rotation deg",
         "width mm",
         "from centre of mass mm",
         "cost",
@@ -239,11 +240,11 @@ def proposal_table(tool: Tool, proposals: list[GraspProposal]) -> Table:
 
 
 def _numbers(grasp: Grasp) -> list[str]:
-    turn = math.degrees(math.remainder(grasp.theta, math.pi))
+    theta = math.degrees(math.remainder(grasp.theta, math.pi))
     return [
         f"{1e3 * grasp.x:.1f}",
         f"{1e3 * grasp.y:.1f}",
-        f"{turn:.1f}",
+        f"{theta:.1f}",
         f"{1e3 * grasp.width:.1f}",
     ]
 
@@ -284,4 +285,4 @@ def _save_and_tell(tool: Tool, grasp: Grasp | None, console: Console) -> None:
     except UserError as error:
         console.print(f"not saved: {error}")
     else:
-        console.print(f"saved: {', '.join(_numbers(grasp))} (x, y, turn, width)")
+        console.print(f"saved: {', '.join(_numbers(grasp))} (x, y, rotation, width)")

@@ -1,7 +1,7 @@
 """What the jaws take hold of when they close on a tool from above.
 
 The pads close on whatever reaches furthest between them. So a grip is the extent, across the jaws,
-of the part of the surface that lies between two planes: those through the ends of the pads.
+of the part of the surface between two planes: those through the ends of the pads.
 """
 
 from dataclasses import dataclass

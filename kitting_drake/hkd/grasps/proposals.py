@@ -1,9 +1,9 @@
 """Grasp proposals computed from a tool's surface (section IV-B.3 of the paper).
 
 The jaws of a hand that comes from above close on whatever stands out furthest between them. So for
-a turn theta of the hand and a place u along its pads, all that matters of the tool is how far it
-reaches to either side, at each height: the tool's horizontal slices give that, and where the grasp
-lies along the closing direction follows, because a grasp is amid the faces that it grips.
+a rotation theta of the hand and a place u along its pads, all that matters of the tool is how far
+it reaches to either side, at each height. The tool's horizontal slices give that, and the place of
+the grasp along the closing direction follows, because a grasp is centred between its faces.
 """
 
 from dataclasses import dataclass, field, replace
@@ -34,7 +34,7 @@ RELEASE_REACH = _PRIMITIVE.release_clearance + FINGERTIP_DEPTH
 
 # Surface that stands back by less than this touches a pad.
 _TOUCH = 0.0003
-# The same while the hand is turned in coarse steps.
+# The same while the hand is rotated in coarse steps.
 _COARSE_TOUCH = 0.0008
 # The hand's upper fingers stand this much further out than its pads.
 _FINGER_RECESS = 0.003
@@ -96,7 +96,7 @@ def propose_grasps(triangles: Array, center_of_mass: Array) -> list[GraspProposa
         return []
     com = np.asarray(center_of_mass, dtype=float)[:2]
 
-    # A turn by pi swaps the jaws, which are alike.
+    # A rotation by pi swaps the jaws, which are alike.
     found: list[GraspProposal] = []
     for theta in np.radians(np.arange(-90.0, 90.0, _COARSE_DEG)):
         found += _search(points, level, levels, com, float(theta), _COARSE_TOUCH)
@@ -145,6 +145,55 @@ def _slices(triangles: Array, levels: Array) -> tuple[Array, NDArray[np.int64]]:
     return np.concatenate(all_points), np.concatenate(all_levels)
 
 
+@dataclass(frozen=True)
+class _Reach:
+    """How far a tool reaches to either side along the hand, at each height.
+
+    Coordinates are those of the hand at one rotation: u along the pads, v across them.
+    """
+
+    u_min: float
+    """Where the columns begin; each is `_BIN` long."""
+    left: Array
+    """(columns, levels) the greatest v; -inf where there is nothing."""
+    right: Array
+    """(columns, levels) the least v; inf where there is nothing."""
+
+
+@dataclass(frozen=True)
+class _Hold:
+    """What two pads hold. Lengths in metres; see `GraspProposal`."""
+
+    middle: float
+    """The v halfway between the gripped faces."""
+    width: float
+    top: float
+    contact: float
+    depth: float
+    slope: float
+    overhang: float
+    twist: float
+    """The distance along the pads between where the one and where the other touches, on average."""
+
+
+# To either side of a common edge of columns.
+_PAD_COLUMNS = round(PAD_LENGTH / 2 / _BIN)
+_FINGER_COLUMNS = round(FINGER_LENGTH / 2 / _BIN)
+
+
+def _reach(points: Array, level: NDArray[np.int64], levels: Array, theta: float) -> _Reach:
+    along, across = jaw_axes(theta)
+    u, v = points @ along, points @ across
+    u_min = u.min() - _FINGER_COLUMNS * _BIN
+    columns = int((u.max() - u_min) / _BIN) + _FINGER_COLUMNS + 2
+    bins = ((u - u_min) / _BIN).astype(int)
+    left = np.full((columns, len(levels)), -np.inf)
+    right = np.full((columns, len(levels)), np.inf)
+    np.maximum.at(left, (bins, level), v)
+    np.minimum.at(right, (bins, level), v)
+    return _Reach(u_min, left, right)
+
+
 def _search(
     points: Array,
     level: NDArray[np.int64],
@@ -154,140 +203,119 @@ def _search(
     touch: float,
     near: Array | None = None,
 ) -> list[GraspProposal]:
-    """The acceptable grasps with one turn of the hand: along all of the tool, or about `near`.
+    """The acceptable grasps at one rotation of the hand: along all of the tool, or about `near`.
 
     Surface that stands back by less than `touch` counts as touched.
     """
-    along, across = jaw_axes(theta)
-    u, v = points @ along, points @ across
-    pad, finger = round(PAD_LENGTH / 2 / _BIN), round(FINGER_LENGTH / 2 / _BIN)
-    u_min = u.min() - finger * _BIN
-    columns = int((u.max() - u_min) / _BIN) + finger + 2
-    bins = ((u - u_min) / _BIN).astype(int)
-    left = np.full((columns, len(levels)), -np.inf)
-    right = np.full((columns, len(levels)), np.inf)
-    np.maximum.at(left, (bins, level), v)
-    np.minimum.at(right, (bins, level), v)
-
+    reach = _reach(points, level, levels, theta)
+    first, last = _FINGER_COLUMNS, len(reach.left) - _FINGER_COLUMNS
     if near is None:
-        centres = np.arange(finger, columns - finger, round(_STEP / _BIN))
+        centres = np.arange(first, last, round(_STEP / _BIN))
     else:
-        centres = round((float(near @ along) - u_min) / _BIN) + np.arange(-4, 5, 2)
-        centres = centres[(centres >= finger) & (centres < columns - finger)]
+        along, _ = jaw_axes(theta)
+        centres = round((float(near @ along) - reach.u_min) / _BIN) + np.arange(-4, 5, 2)
+        centres = centres[(centres >= first) & (centres < last)]
     result = []
     for centre in centres:
-        # Bins to either side of the bins' common edge.
-        pads = slice(centre - pad, centre + pad)
-        fingers = slice(centre - finger, centre + finger)
-        span = left[fingers].max() - right[fingers].min()
-        if not NARROWEST <= span <= WIDEST + 2 * _FINGER_RECESS:
-            continue
-        occupied = np.flatnonzero(np.isfinite(left[pads]).any(axis=0))
-        if not len(occupied):
-            continue
-        where = u_min + centre * _BIN
-        judged = _judge(
-            left[pads], right[pads], left[fingers], right[fingers], levels, occupied[-1], touch
-        )
-        if judged is None:
-            continue
-        middle, width, contact, depth, slope, overhang, twist = judged
-        x, y = where * along + middle * across
-        lever = abs(where - float(com @ along))
-        aside = abs(middle - float(com @ across))
-        reach = (
-            abs(y)
-            + (width / 2 + RELEASE_REACH) * abs(np.cos(theta))
-            + (FINGER_LENGTH / 2 * abs(np.sin(theta)))
-        )
-        penalties = {
-            "centre of mass": lever / 0.025 + (lever / 0.040) ** 2 + aside / 0.100,
-            "contact along the pads": 1.2 * (1 - contact),
-            "contact down the pads": 0.6 * (1 - depth),
-            "slope": (slope / np.radians(18.0)) ** 2,
-            "overhang": max(overhang, 0.0) / 0.003,
-            "twist": twist / 0.009,
-            "narrow": max(0.0, 0.008 - width) / 0.005,
-            "wide": max(0.0, width - 0.030) / 0.015,
-            "neighbour in the kit": max(0.0, reach - _LANE) / 0.015,
-        }
-        result.append(
-            GraspProposal(
-                x=float(x),
-                y=float(y),
-                theta=float((theta + np.pi / 2) % np.pi - np.pi / 2),
-                width=float(width),
-                surface_height=float(levels[occupied[-1]]),
-                offset=float(np.hypot(lever, aside)),
-                contact=contact,
-                depth=depth,
-                slope=slope,
-                overhang=overhang,
-                penalties={cause: float(value) for cause, value in penalties.items()},
-            )
-        )
+        hold = _hold(reach, centre, levels, touch)
+        if hold is not None:
+            result.append(_proposal(hold, reach.u_min + centre * _BIN, theta, com))
     return result
 
 
-def _judge(
-    left: Array,
-    right: Array,
-    finger_left: Array,
-    finger_right: Array,
-    levels: Array,
-    top: int,
-    touch: float,
-) -> tuple[float, float, float, float, float, float, float] | None:
-    """What two pads would grip, from how far the tool reaches to either side of them.
+def _proposal(hold: _Hold, u: float, theta: float, com: Array) -> GraspProposal:
+    """What is held where the pads' middle is at `u`, as a grasp with its penalties."""
+    along, across = jaw_axes(theta)
+    x, y = u * along + hold.middle * across
+    lever = abs(u - float(com @ along))
+    aside = abs(hold.middle - float(com @ across))
+    fingers = (
+        abs(y)
+        + (hold.width / 2 + RELEASE_REACH) * abs(np.cos(theta))
+        + (FINGER_LENGTH / 2 * abs(np.sin(theta)))
+    )
+    penalties = {
+        "centre of mass": lever / 0.025 + (lever / 0.040) ** 2 + aside / 0.100,
+        "contact along the pads": 1.2 * (1 - hold.contact),
+        "contact down the pads": 0.6 * (1 - hold.depth),
+        "slope": (hold.slope / np.radians(18.0)) ** 2,
+        "overhang": max(hold.overhang, 0.0) / 0.003,
+        "twist": hold.twist / 0.009,
+        "narrow": max(0.0, 0.008 - hold.width) / 0.005,
+        "wide": max(0.0, hold.width - 0.030) / 0.015,
+        "neighbour in the kit": max(0.0, fingers - _LANE) / 0.015,
+    }
+    return GraspProposal(
+        x=float(x),
+        y=float(y),
+        theta=float((theta + np.pi / 2) % np.pi - np.pi / 2),
+        width=hold.width,
+        surface_height=hold.top,
+        offset=float(np.hypot(lever, aside)),
+        contact=hold.contact,
+        depth=hold.depth,
+        slope=hold.slope,
+        overhang=hold.overhang,
+        penalties={cause: float(value) for cause, value in penalties.items()},
+    )
+
+
+def _hold(reach: _Reach, centre: int, levels: Array, touch: float) -> _Hold | None:
+    """What two pads would hold with their middle at a column; None if they cannot hold it.
+
+    `find_grip` says what is between the pads in all; this, what they touch of it.
 
     Args:
-        left, right: (columns along the pad, levels), -inf and inf where there is nothing.
-        finger_left, finger_right: the same over the length of the fingers.
-        levels: their heights.
-        top: the highest level that is occupied.
+        reach: of the tool.
+        centre: the column at whose lower edge the middle of the pads is.
+        levels: the heights of the slices.
         touch: surface that stands back by less than this counts as touched.
-
-    Returns:
-        None if they cannot hold it; else the middle and the width between the faces, the shares of
-        contact along and down the pads, slope, overhang and twist.
     """
-    step = levels[1] - levels[0]
-    bottom = max(levels[top] + step / 2 - GRASP_DEPTH, FLOOR_CLEARANCE)
-    held = (levels >= bottom) & (levels <= levels[top])
+    fingers = slice(centre - _FINGER_COLUMNS, centre + _FINGER_COLUMNS)
+    finger_left, finger_right = reach.left[fingers], reach.right[fingers]
+    if not NARROWEST <= finger_left.max() - finger_right.min() <= WIDEST + 2 * _FINGER_RECESS:
+        return None
+    pads = slice(centre - _PAD_COLUMNS, centre + _PAD_COLUMNS)
+    occupied = np.flatnonzero(np.isfinite(reach.left[pads]).any(axis=0))
+    if not len(occupied):
+        return None
+    top, step = levels[occupied[-1]], levels[1] - levels[0]
+    bottom = max(top + step / 2 - GRASP_DEPTH, FLOOR_CLEARANCE)
+    held = (levels >= bottom) & (levels <= top)
     if not held.any():
         return None
-    left, right = left[:, held], right[:, held]
+    left, right = reach.left[pads][:, held], reach.right[pads][:, held]
     furthest_left, furthest_right = left.max(), right.min()
     width = furthest_left - furthest_right
     if not NARROWEST <= width <= WIDEST:
         return None
     # Fingers pass outside the tool from its top down to the pads' ends.
     passed = levels >= bottom
-    overhang = float(
-        max(
-            finger_left[:, passed].max() - furthest_left,
-            furthest_right - finger_right[:, passed].min(),
-        )
+    overhang = max(
+        finger_left[:, passed].max() - furthest_left,
+        furthest_right - finger_right[:, passed].min(),
     )
-    if overhang > _FINGER_RECESS:
-        return None
+    slope = max(_lean(left.max(axis=0), step), _lean(-right.min(axis=0), step))
     touch_left, touch_right = left >= furthest_left - touch, right <= furthest_right + touch
     both = touch_left.any(axis=1) & touch_right.any(axis=1)
     contact = float(both.mean())
-    if contact < _LEAST_CONTACT:
+    if overhang > _FINGER_RECESS or slope > _STEEPEST or contact < _LEAST_CONTACT:
         return None
     rows = (touch_left[both].mean(axis=0) + touch_right[both].mean(axis=0)) / 2
-    depth = float(min(1.0, rows.sum() * step / GRASP_DEPTH))
-    slope = max(_lean(left.max(axis=0), step), _lean(-right.min(axis=0), step))
-    if slope > _STEEPEST:
-        return None
     places = np.arange(len(left)) * _BIN
-    twist = abs(
-        np.average(places, weights=touch_left.sum(axis=1))
-        - np.average(places, weights=touch_right.sum(axis=1))
+    twist = np.average(places, weights=touch_left.sum(axis=1)) - np.average(
+        places, weights=touch_right.sum(axis=1)
     )
-    middle = (furthest_left + furthest_right) / 2
-    return float(middle), float(width), contact, depth, slope, overhang, float(twist)
+    return _Hold(
+        middle=float((furthest_left + furthest_right) / 2),
+        width=float(width),
+        top=float(top),
+        contact=contact,
+        depth=float(min(1.0, rows.sum() * step / GRASP_DEPTH)),
+        slope=slope,
+        overhang=float(overhang),
+        twist=float(abs(twist)),
+    )
 
 
 def _lean(profile: Array, step: float) -> float:
@@ -302,9 +330,9 @@ def _distinct(proposals: list[GraspProposal]) -> list[GraspProposal]:
     kept: list[GraspProposal] = []
     for proposal in sorted(proposals, key=lambda p: p.cost):
         for other in kept:
-            turn = (proposal.theta - other.theta + np.pi / 2) % np.pi - np.pi / 2
+            rotation = (proposal.theta - other.theta + np.pi / 2) % np.pi - np.pi / 2
             distance = np.hypot(proposal.x - other.x, proposal.y - other.y)
-            if distance < _DISTINCT and abs(turn) < _DISTINCT_ANGLE:
+            if distance < _DISTINCT and abs(rotation) < _DISTINCT_ANGLE:
                 break
         else:
             kept.append(proposal)

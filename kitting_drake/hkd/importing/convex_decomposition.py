@@ -1,7 +1,7 @@
-"""Convex pieces for a solid of any shape: what a simulator touches.
+"""Approximate convex decomposition of a solid of any shape, for collision.
 
 The solid is cut in two, again and again, until the hull of every part is true to it; then
-`collision.cover` joins what can be joined. Lengths in mm.
+`collision.cover` joins the hulls that can be joined. Lengths in mm.
 """
 
 import numpy as np
@@ -13,7 +13,7 @@ from kitting_drake.hkd.tools.generate import FINGER_LENGTH_MM
 from kitting_drake.hkd.tools.solids import SEGMENTS
 from kitting_drake.hkd.tools.tool import Grasp
 
-# How far a piece may stand out of the tool's outline; the second, if the first needs many pieces.
+# How far a hull may stand out of the tool's outline; the second, if the first needs many hulls.
 OUTLINE_TOLERANCES_MM = (0.30, 0.45)
 _ENOUGH = 30
 # The same for the faces that the jaws grip.
@@ -28,31 +28,31 @@ _MOST_PARTS = 400
 _AREA = 0.02
 
 
-def convex_pieces(solid: Manifold, grasp: Grasp) -> list[np.ndarray]:
-    """Arrays (n, 3) of points whose hulls together fill a tool that lies in its frame T."""
-    pieces: list[np.ndarray] = []
+def decompose(solid: Manifold, grasp: Grasp) -> list[np.ndarray]:
+    """Arrays (n, 3) of points whose hulls together fill a tool at rest in its frame T."""
+    hulls: list[np.ndarray] = []
     for tolerance in OUTLINE_TOLERANCES_MM:
-        pieces = _pieces(solid, grasp, tolerance)
-        if len(pieces) <= _ENOUGH:
+        hulls = _decomposed(solid, grasp, tolerance)
+        if len(hulls) <= _ENOUGH:
             break
-    return pieces
+    return hulls
 
 
-def _pieces(solid: Manifold, grasp: Grasp, tolerance: float) -> list[np.ndarray]:
+def _decomposed(solid: Manifold, grasp: Grasp, tolerance: float) -> list[np.ndarray]:
     outline = closed(solid.project().simplify(0.02), _NOTCH_MM)
     grown = _grown(outline, tolerance)
     jaws = CrossSection.square((FINGER_LENGTH_MM + 2.0, 100.0), True)
     jaws = jaws.rotate(float(np.degrees(grasp.theta))).translate((1e3 * grasp.x, 1e3 * grasp.y))
     allowed = grown - (jaws - _grown(outline, GRIP_TOLERANCE_MM))
     parts = [_vertices(part) for part in _parts(solid.simplify(0.03), allowed)]
-    pieces = []
-    for piece in cover(parts, outline, allowed, tolerance):
+    hulls = []
+    for hull in cover(parts, outline, allowed, tolerance):
         try:
-            pieces.append(thinned(piece, _VERTEX_TOLERANCE_MM))
+            hulls.append(thinned(hull, _VERTEX_TOLERANCE_MM))
         except QhullError:
             # A sliver that has no volume on the grid of vertices.
             continue
-    return sorted(pieces, key=lambda piece: tuple(np.round(piece.mean(axis=0), 3)))
+    return sorted(hulls, key=lambda hull: tuple(np.round(hull.mean(axis=0), 3)))
 
 
 def _grown(profile: CrossSection, distance: float) -> CrossSection:
@@ -83,10 +83,10 @@ def _is_near_its_hull(part: Manifold, allowed: CrossSection) -> bool:
     if (high - low)[:2].max() <= _SMALLEST_MM:
         return True
     hull = part.hull()
-    shadow = hull.project()
-    if (shadow - allowed).area() > _AREA:
+    footprint = hull.project()
+    if (footprint - allowed).area() > _AREA:
         return False
-    return bool(hull.volume() - part.volume() <= HEIGHT_TOLERANCE_MM * shadow.area())
+    return bool(hull.volume() - part.volume() <= HEIGHT_TOLERANCE_MM * footprint.area())
 
 
 def _halves(part: Manifold) -> tuple[Manifold, Manifold]:

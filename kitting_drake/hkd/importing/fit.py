@@ -7,7 +7,7 @@ from manifold3d import Manifold
 
 from kitting_drake.common.errors import UserError
 from kitting_drake.hkd.grasps.proposals import WIDEST, propose_grasps
-from kitting_drake.hkd.importing.stable_pose import placed, size
+from kitting_drake.hkd.importing.stable_pose import centred, size
 from kitting_drake.hkd.kits.kit import KitParameters, layout_kit
 from kitting_drake.hkd.tools import meshes
 from kitting_drake.hkd.tools.tool import Tool
@@ -80,7 +80,7 @@ def fit(
     refusal: UserError | None = None
     for length in lengths:
         factor = length / size(solid)[0]
-        scaled = placed(solid.scale((factor, factor, factor)).simplify(0.01))
+        scaled = centred(solid.scale((factor, factor, factor)).simplify(0.01))
         try:
             _check_size(scaled)
             tool = _tool(category, name, scaled, directory)
@@ -104,7 +104,7 @@ def _check_size(solid: Manifold) -> None:
         )
     if height > HIGHEST_MM:
         raise UserError(
-            f"at {length:.0f} mm length it lies {height:.0f} mm high, and a kit takes "
+            f"at {length:.0f} mm length it is {height:.0f} mm high at rest, and a kit takes "
             f"{HIGHEST_MM:.0f} mm"
         )
 

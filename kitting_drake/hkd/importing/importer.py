@@ -1,9 +1,10 @@
 """`hkd import`: from anyone's mesh to a tool that scenarios can name.
 
-Read and mended (`repair`), laid down flat in a pose in which it stays, turned along x, scaled,
-weighed, given collision pieces (`pieces`) and the best grasp (`grasps`). All of that happens in a
-process of its own, which may fail or hang as it likes: the tool's folder appears whole or not at
-all. Solids are handled in mm and written in metres.
+The mesh is read and repaired (`repair`), brought into the tool frame in a stable pose
+(`stable_pose`), scaled, given the best grasp (`fit`), its mass, and a convex decomposition for
+collision (`convex_decomposition`). All of that happens in a process of its own, which may fail or
+hang as it likes: the tool's folder appears atomically. Solids are handled in mm and written in
+metres.
 """
 
 import hashlib
@@ -21,10 +22,10 @@ import trimesh
 import yaml
 
 from kitting_drake.common.errors import UserError
-from kitting_drake.hkd.importing.convex_decomposition import convex_pieces
+from kitting_drake.hkd.importing.convex_decomposition import decompose
 from kitting_drake.hkd.importing.fit import MATERIALS, fit, lengths_to_try
 from kitting_drake.hkd.importing.repair import NOMINAL_MM, make_solid, read_mesh
-from kitting_drake.hkd.importing.stable_pose import lie_down, size
+from kitting_drake.hkd.importing.stable_pose import size, to_tool_frame
 from kitting_drake.hkd.tools import meshes
 from kitting_drake.hkd.tools.sdf import tool_sdf
 from kitting_drake.hkd.tools.symmetry import symmetry_order
@@ -40,7 +41,7 @@ _MOST_MEMORY = 12 * 2**30
 
 @dataclass(frozen=True)
 class ImportRequest:
-    """What to import, as what."""
+    """A mesh to import, and the tool that it is to become."""
 
     mesh: Path
     category: str
@@ -56,15 +57,15 @@ class ImportRequest:
 
 @dataclass(frozen=True)
 class ImportReport:
-    """What became of it."""
+    """The tool that was made."""
 
     directory: Path
     record: dict[str, Any]
     """The tool's record, as in `tool.yaml`."""
     notes: list[str]
-    """What was assumed and mended, a phrase each."""
-    pieces: int
-    """Of its collision geometry."""
+    """What was assumed and repaired, a phrase each."""
+    collision_hulls: int
+    """The number of convex hulls of its collision geometry."""
 
 
 def import_tool(request: ImportRequest, time_limit: float | None = TIME_LIMIT) -> ImportReport:
@@ -183,7 +184,7 @@ def prepare_tool(request: ImportRequest, name: str, directory: Path) -> Prepared
     """Writes a tool's files into an empty folder.
 
     Returns:
-        Its record, what was assumed and mended, and the number of its collision pieces.
+        Its record, what was assumed and repaired, and the number of its collision hulls.
 
     Raises:
         UserError: it cannot be saved.
@@ -197,7 +198,7 @@ def prepare_tool(request: ImportRequest, name: str, directory: Path) -> Prepared
     except MemoryError as error:
         raise UserError(f"{request.mesh} needs more memory than there is") from error
     except Exception as error:
-        # Whatever geometry fails on: a broken mesh is the user's to mend, not a fault to trace.
+        # Whatever geometry fails on: a broken mesh is the user's to repair, not a fault to trace.
         raise UserError(
             f"{request.mesh} is too broken a mesh to be worked out ({type(error).__name__})"
         ) from error
@@ -211,20 +212,20 @@ def _prepare(request: ImportRequest, name: str, directory: Path) -> Prepared:
         raise UserError("all of the mesh is one point")
     nominal = NOMINAL_MM / longest
     solid, notes = make_solid((vertices - (low + high) / 2) * nominal, faces)
-    solid = lie_down(solid, request.category)
+    solid = to_tool_frame(solid, request.category)
     lengths, assumed = lengths_to_try(size(solid)[0] / nominal, request.length_mm)
     notes = [assumed, *notes]
     tool, solid = fit(request.category, name, solid, lengths, notes, directory)
     density = request.density or DENSITIES[request.category]
     vertices, faces = meshes.vertices_and_faces(solid)
     physics = trimesh.triangles.mass_properties(1e-3 * vertices[faces], density=density)
-    pieces = convex_pieces(solid, tool.grasp)
-    if not pieces:
+    hulls = decompose(solid, tool.grasp)
+    if not hulls:
         raise UserError("the mesh encloses too little volume to be touched")
     collisions = []
-    for index, piece in enumerate(pieces):
+    for index, hull in enumerate(hulls):
         collisions.append(f"collision_{index}.obj")
-        meshes.write_convex_obj(directory / collisions[-1], piece)
+        meshes.write_convex_obj(directory / collisions[-1], hull)
     material = MATERIALS[request.category]
     text = tool_sdf(
         name,
@@ -258,7 +259,7 @@ def _prepare(request: ImportRequest, name: str, directory: Path) -> Prepared:
     }
     (directory / "tool.yaml").write_text(yaml.safe_dump(record, sort_keys=False))
     load_tool(str(directory))
-    return record, notes, len(pieces)
+    return record, notes, len(hulls)
 
 
 def _safe(text: str) -> str:

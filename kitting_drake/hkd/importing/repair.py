@@ -1,8 +1,8 @@
 """Anyone's mesh, read and made one solid: what `hkd import` begins with.
 
-A mesh that is sound is taken as it is. One that is not is taken apart into connected pieces, each
-mended alone (winding, then holes, then pymeshfix) and all united; where that loses any of the shape
-that can be seen, the surface is wrapped instead: filled as voxels, and traced.
+A mesh that is sound is taken as it is. One that is not is split into connected components, each
+repaired alone (winding, then holes, then pymeshfix) and all united; where that loses any of the
+shape that can be seen, the surface is wrapped instead: filled as voxels, and traced.
 """
 
 from pathlib import Path
@@ -15,21 +15,21 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from kitting_drake.common.errors import UserError
-from kitting_drake.hkd.tools.tool import silhouette
+from kitting_drake.hkd.tools.tool import footprint
 
 FORMATS = (".stl", ".obj", ".ply", ".glb", ".gltf")
 MOST_BYTES = 200_000_000
 MOST_TRIANGLES = 2_000_000
-# Solids are mended at this size, whatever the file's units: tolerances below are for it.
+# Solids are repaired at this size, whatever the file's units: tolerances below are for it.
 NOMINAL_MM = 180.0
 
 # Vertices on the same point of this grid are one.
 _MERGE_MM = 1e-3
 # Bodies further apart than this are no one tool; what is smaller than this share is dirt.
 _GAP_MM, _DIRT = 1.5, 0.02
-# A mended mesh may lose this share of any of its three shadows.
+# A repaired mesh may lose this share of any of its projections on the three planes.
 _LOST = 0.03
-_MOST_PIECES = 3000
+_MOST_COMPONENTS = 3000
 _VOXEL_MM = 0.75
 # Less than this share of a box is no solid but a skin.
 _HOLLOW = 0.002
@@ -98,24 +98,24 @@ def make_solid(vertices: Array, faces: Faces) -> tuple[Manifold, list[str]]:
     if len(faces) < 4:
         raise UserError("the mesh encloses no volume")
     notes: list[str] = []
-    pieces = trimesh.graph.connected_components(
+    components = trimesh.graph.connected_components(
         trimesh.graph.face_adjacency(faces), nodes=np.arange(len(faces)), min_len=1
     )
-    solids, mended = [], 0
-    if len(pieces) <= _MOST_PIECES:
-        for piece in sorted(pieces, key=len, reverse=True):
-            sound = _as_manifold(vertices, faces[piece])
+    solids, repaired = [], 0
+    if len(components) <= _MOST_COMPONENTS:
+        for component in sorted(components, key=len, reverse=True):
+            sound = _as_manifold(vertices, faces[component])
             if sound is None:
-                mended += 1
-                sound = _mended(vertices, faces[piece])
+                repaired += 1
+                sound = _repaired(vertices, faces[component])
             if sound is not None:
                 solids.append(sound)
     solid = Manifold.batch_boolean(solids, OpType.Add) if solids else Manifold()
-    if mended:
-        notes.append(f"mended {mended} of {len(pieces)} surfaces")
+    if repaired:
+        notes.append(f"repaired {repaired} of {len(components)} surfaces")
     if len(solids) > 1:
         notes.append(f"united {len(solids)} bodies")
-    if mended or not solids:
+    if repaired or not solids:
         triangles = vertices[faces]
         if _loses(triangles, solid):
             solid = _wrapped(triangles)
@@ -159,7 +159,7 @@ def _is_closed(faces: Faces) -> bool:
     return bool(np.array_equal(keys, opposite) and (np.diff(keys) > 0).all())
 
 
-def _mended(vertices: Array, faces: Faces) -> Manifold | None:
+def _repaired(vertices: Array, faces: Faces) -> Manifold | None:
     mesh = trimesh.Trimesh(vertices, faces, process=False)
     mesh.remove_unreferenced_vertices()
     trimesh.repair.fix_winding(mesh)
@@ -191,7 +191,7 @@ def _loses(triangles: Array, solid: Manifold) -> bool:
     mesh = solid.to_mesh64()
     mine = np.asarray(mesh.vert_properties)[:, :3][np.asarray(mesh.tri_verts).astype(int)]
     for axes in ([0, 1, 2], [0, 2, 1], [1, 2, 0]):
-        seen, kept = silhouette(triangles[:, :, axes]), silhouette(mine[:, :, axes])
+        seen, kept = footprint(triangles[:, :, axes]), footprint(mine[:, :, axes])
         lost, gained = (seen - kept).area(), (kept - seen).area()
         # Filled holes in walls may show: gains count only if large.
         if lost > _LOST * seen.area() or gained > 5 * _LOST * seen.area():
@@ -256,7 +256,7 @@ def _box_volume(solid: Manifold) -> float:
 
 
 def _one_thing(solid: Manifold, notes: list[str]) -> Manifold:
-    """The solid without dirt that lies about it.
+    """The solid without the dirt around it.
 
     Raises:
         UserError: it is several things that stand apart.
@@ -278,5 +278,5 @@ def _one_thing(solid: Manifold, notes: list[str]) -> Manifold:
             f"the mesh holds {len(groups)} things that stand apart: import each from its own file"
         )
     if len(groups) > 1 or crumbs:
-        notes.append("left out dirt that lay about")
+        notes.append("left out the dirt around it")
     return Manifold.batch_boolean(groups[main], OpType.Add)

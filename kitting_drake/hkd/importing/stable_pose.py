@@ -1,4 +1,4 @@
-"""How a solid lies on a table: flat, along x, the working end toward +x."""
+"""The tool frame of a solid: in a stable pose, along x, the working end toward +x."""
 
 import numpy as np
 import trimesh
@@ -21,15 +21,15 @@ _END = 0.3
 """Share of the length that is an end."""
 
 
-def lie_down(solid: Manifold, category: str) -> Manifold:
+def to_tool_frame(solid: Manifold, category: str) -> Manifold:
     """The solid (mm) moved into the frame T of a tool of that category; see `Tool`.
 
-    Of all poses in which it would stay it takes the one that lies lowest. The working end is the
+    Of all stable poses it takes the one with the lowest centre of mass. The working end is the
     wider one of a hammer, the narrower one of pliers and of a screwdriver, and the one nearer the
     centre of mass of a wrench.
 
     Raises:
-        UserError: it is flat, or stands nowhere.
+        UserError: it is flat, or has no stable pose.
     """
     vertices, faces = meshes.vertices_and_faces(solid)
     com = trimesh.triangles.mass_properties(vertices[faces])["center_mass"]
@@ -39,11 +39,11 @@ def lie_down(solid: Manifold, category: str) -> Manifold:
     solid = solid.rotate((0.0, 0.0, -_long_direction_deg(solid.project())))
     if not _works_at_plus_x(solid, category):
         solid = solid.rotate((0.0, 0.0, 180.0))
-    return placed(solid)
+    return centred(solid)
 
 
-def placed(solid: Manifold) -> Manifold:
-    """The solid moved to the origin of the frame T: amid its outline, on the table."""
+def centred(solid: Manifold) -> Manifold:
+    """The solid moved to the origin of the frame T: centred in its bounding box, on the table."""
     low, high = np.array(solid.bounding_box()).reshape(2, 3)
     middle = (low + high) / 2
     return solid.translate((-middle[0], -middle[1], -low[2]))
@@ -66,7 +66,7 @@ def _lowest_pose(vertices: Array, com: Array) -> StablePose:
     except (QhullError, ValueError) as error:
         raise UserError("the mesh encloses no volume") from error
     if not poses:
-        raise UserError("the mesh stands on none of its sides")
+        raise UserError("the mesh has no stable pose")
     lowest = min(pose.height for pose in poses)
     good = [pose for pose in poses if pose.height < lowest + _EQUAL_HEIGHT_MM]
     # Of equals again, that nearest to how the file has it.
@@ -86,8 +86,8 @@ def _long_direction_deg(outline: CrossSection) -> float:
     edges = np.vstack([np.roll(loop, -1, axis=0) - loop for loop in loops])
     lengths = np.linalg.norm(edges, axis=1)
     angles = np.degrees(np.arctan2(edges[:, 1], edges[:, 0]))
-    centred = points - np.average(points, axis=0, weights=lengths)
-    _, axes = np.linalg.eigh((centred * lengths[:, None]).T @ centred)
+    offsets = points - np.average(points, axis=0, weights=lengths)
+    _, axes = np.linalg.eigh((offsets * lengths[:, None]).T @ offsets)
     axis = np.degrees(np.arctan2(axes[1, 1], axes[0, 1]))
     directions = axis + np.arange(-_SIDEWAYS_DEG, _SIDEWAYS_DEG, 0.25)
     apart = (directions[:, None] - angles + 90.0) % 180.0 - 90.0
@@ -111,7 +111,7 @@ def _works_at_plus_x(solid: Manifold, category: str) -> bool:
 
 
 def _width(outline: CrossSection, start: float, end: float) -> float:
-    """The mean width of the hull of what lies between two places along x."""
+    """The mean width of the hull of what is between two places along x."""
     y_min, y_max = outline.bounds()[1], outline.bounds()[3]
     band = CrossSection.square((end - start, y_max - y_min)).translate((start, y_min))
     return float((outline ^ band).hull().area() / (end - start))

@@ -42,7 +42,7 @@ def measure_clearance(
     pose = slot_pose(tool, parameters) if pose is None else pose
     level = (pose.z + parameters.height - parameters.lead_in) / 2
     solid = block.slice(level)
-    outline = moved_outline(tool.silhouette, pose)
+    outline = moved_outline(tool.footprint, pose)
     if (outline ^ solid).area() > 1e-9:
         raise ValueError(f"'{tool.name}' does not fit into its cavity")
     points = np.concatenate([_points_along(loop) for loop in outline.to_polygons()])

@@ -1,9 +1,9 @@
-"""Few convex pieces for a solid that is given as many: what a simulator touches.
+"""Convex decompositions with few hulls, of solids that are given as the union of many.
 
-Lengths in mm; a piece is an array (n, 3) of points that stands for its convex hull. Two pieces may
-be replaced by the hull of both as long as nobody could tell by the shadows: on xy, where the
+Lengths in mm; a hull is an array (n, 3) of points that stands for its convex hull. Two hulls may be
+replaced by the hull of both as long as nobody could tell by the projections: on xy, where the
 outline decides whether the tool enters its cavity, and on xz and yz, where the heights decide what
-it lies on.
+it rests on.
 """
 
 import itertools
@@ -16,18 +16,18 @@ from scipy.spatial import ConvexHull
 
 from kitting_drake.hkd.tools.solids import SEGMENTS
 
-# Grid of the vertices of collision pieces.
+# Grid of the vertices of collision hulls.
 GRID_MM = 0.05
 
 _XY, _XZ, _YZ = [0, 1], [0, 2], [1, 2]
-# Pieces are first joined where that changes next to nothing, which leaves few enough to search.
+# Hulls are first joined where that changes next to nothing, which leaves few enough to search.
 _EXACT_MM = 0.03
 # Area (mm^2) below which a difference of outlines is rounding.
 _AREA = 1e-4
 
 
-def silhouette(hulls: Sequence[np.ndarray], plane: Sequence[int] = _XY) -> CrossSection:
-    """The shadow of a union of convex pieces on a coordinate plane."""
+def projection(hulls: Sequence[np.ndarray], plane: Sequence[int] = _XY) -> CrossSection:
+    """The projection of a union of convex hulls on a coordinate plane."""
     return CrossSection.batch_boolean(
         [CrossSection.hull_points(np.ascontiguousarray(h[:, plane])) for h in hulls],
         manifold3d.OpType.Add,
@@ -58,7 +58,7 @@ def thinned(points: np.ndarray, tolerance: float) -> np.ndarray:
     """Vertices (m, 3) that span the hull of `points` to within about `tolerance` (mm).
 
     What touches the table is chosen first, in the plane, so that a flat bottom stays exactly flat.
-    The result lies on a grid: facets that are almost coplanar become exactly so, or clearly not.
+    The result is on a grid: facets that are almost coplanar become exactly so, or clearly not.
     """
     points = points[ConvexHull(points).vertices]
     touching = np.flatnonzero(points[:, 2] < 1e-3)
@@ -87,8 +87,8 @@ def _farthest(points: np.ndarray, chosen: list[int], tolerance: float) -> list[i
         chosen.append(farthest)
 
 
-class _Piece:
-    """A convex piece, the pieces it was made of, its volume and its box."""
+class _Hull:
+    """A convex hull, the hulls it was made of, its volume and its box."""
 
     def __init__(self, points: np.ndarray, sources: list[np.ndarray] | None = None):
         hull = Manifold.hull_points(np.ascontiguousarray(points))
@@ -97,33 +97,33 @@ class _Piece:
         self.volume = hull.volume()
         self.low, self.high = points.min(axis=0), points.max(axis=0)
 
-    def touches(self, other: "_Piece", gap: float) -> bool:
+    def touches(self, other: "_Hull", gap: float) -> bool:
         return bool(np.all(self.low <= other.high + gap) and np.all(other.low <= self.high + gap))
 
-    def joined(self, other: "_Piece") -> "_Piece":
-        return _Piece(np.vstack([self.points, other.points]), self.sources + other.sources)
+    def joined(self, other: "_Hull") -> "_Hull":
+        return _Hull(np.vstack([self.points, other.points]), self.sources + other.sources)
 
 
 def _grown(profile: CrossSection, distance: float) -> CrossSection:
     return profile.offset(distance, JoinType.Round, circular_segments=SEGMENTS)
 
 
-def _fits(piece: _Piece, allowed: CrossSection, tolerance: float) -> bool:
-    """Whether a joined piece casts the shadows of its sources, within the tolerance."""
-    if (silhouette([piece.points]) - allowed).area() > _AREA:
+def _fits(hull: _Hull, allowed: CrossSection, tolerance: float) -> bool:
+    """Whether a joined hull has the projections of its sources, within the tolerance."""
+    if (projection([hull.points]) - allowed).area() > _AREA:
         return False
     return all(
         (
-            silhouette([piece.points], plane) - _grown(silhouette(piece.sources, plane), tolerance)
+            projection([hull.points], plane) - _grown(projection(hull.sources, plane), tolerance)
         ).area()
         <= _AREA
         for plane in (_XZ, _YZ)
     )
 
 
-def _merged(pieces: list[_Piece], allowed: CrossSection, tolerance: float) -> list[_Piece]:
+def _merged(hulls: list[_Hull], allowed: CrossSection, tolerance: float) -> list[_Hull]:
     """Joins pairs, the one that adds the least volume first, until no pair fits."""
-    alive = dict(enumerate(pieces))
+    alive = dict(enumerate(hulls))
 
     def options(a: int, b: int) -> list[tuple[float, int, int]]:
         if not alive[a].touches(alive[b], tolerance):
@@ -145,25 +145,26 @@ def _merged(pieces: list[_Piece], allowed: CrossSection, tolerance: float) -> li
 def cover(
     hulls: Sequence[np.ndarray], outline: CrossSection, allowed: CrossSection, tolerance: float
 ) -> list[np.ndarray]:
-    """Convex pieces, few and perhaps overlapping, that together fill what `hulls` fill.
+    """Convex hulls, few and perhaps overlapping, that together fill what `hulls` fill.
 
-    Each piece is grown from one of `hulls` by whichever neighbour adds the least volume, as long
-    as its shadow on xy stays within `allowed` and the others move by at most `tolerance` (mm); of
-    all that can be grown, the one that fills the most that is still open is taken, until nothing
-    is open. Pieces that hardly show in any shadow are then left out. Deterministic.
+    Each hull is grown from one of `hulls` by whichever neighbour adds the least volume, as long
+    as its projection on xy stays within `allowed` and the others move by at most `tolerance` (mm);
+    of all that can be grown, the one that fills the most that is still open is taken, until nothing
+    is open. Hulls that hardly show in any projection are then left out. The same input always gives
+    the same hulls.
     """
-    pieces = _merged([_Piece(h) for h in hulls], _grown(outline, _EXACT_MM), _EXACT_MM)
-    grown = [_grow(seed, pieces, allowed, tolerance) for seed in range(len(pieces))]
-    open_pieces, result = set(range(len(pieces))), []
-    while open_pieces:
+    merged = _merged([_Hull(h) for h in hulls], _grown(outline, _EXACT_MM), _EXACT_MM)
+    grown = [_grow(seed, merged, allowed, tolerance) for seed in range(len(merged))]
+    open_hulls, result = set(range(len(merged))), []
+    while open_hulls:
         gains = [
-            round(sum(pieces[i].volume for i in members & open_pieces), 3) for _, members in grown
+            round(sum(merged[i].volume for i in members & open_hulls), 3) for _, members in grown
         ]
         _, members = grown[int(np.argmax(gains))]
         # Span only what is still open: what others fill need not be filled twice.
-        wanted = np.vstack([pieces[i].points for i in sorted(members & open_pieces)])
+        wanted = np.vstack([merged[i].points for i in sorted(members & open_hulls)])
         result.append(wanted)
-        open_pieces -= members
+        open_hulls -= members
     return _pruned(result, 0.5 * tolerance)
 
 
@@ -172,8 +173,8 @@ def runs(
 ) -> list[np.ndarray]:
     """The hulls along a loft through `sections`, (n, 3) each, few and long.
 
-    Neighbours are joined as long as the shadow on xy grows by at most `tolerance`, and the others,
-    which decide nothing beside a cavity's wall, by at most `height_tolerance` (both mm).
+    Neighbours are joined as long as the projection on xy grows by at most `tolerance`, and the
+    others, which decide nothing beside a cavity's wall, by at most `height_tolerance` (both mm).
     """
     pairs = [np.vstack(pair) for pair in itertools.pairwise(sections)]
     result, first = [], 0
@@ -182,8 +183,8 @@ def runs(
             trial = np.vstack(pairs[first : last + 1])
             if all(
                 (
-                    silhouette([trial], plane)
-                    - _grown(silhouette(pairs[first : last + 1], plane), limit)
+                    projection([trial], plane)
+                    - _grown(projection(pairs[first : last + 1], plane), limit)
                 ).area()
                 <= _AREA
                 for plane, limit in (
@@ -198,35 +199,35 @@ def runs(
     return result
 
 
-def _pruned(pieces: list[np.ndarray], tolerance: float) -> list[np.ndarray]:
-    """Leaves out pieces, the smallest first, without which no shadow shrinks by `tolerance`."""
-    whole = [silhouette(pieces, plane) for plane in (_XY, _XZ, _YZ)]
-    kept = list(pieces)
-    for piece in sorted(pieces, key=lambda h: Manifold.hull_points(h).volume()):
-        rest = [h for h in kept if h is not piece]
+def _pruned(hulls: list[np.ndarray], tolerance: float) -> list[np.ndarray]:
+    """Leaves out hulls, the smallest first, without which no projection shrinks by `tolerance`."""
+    wholes = [projection(hulls, plane) for plane in (_XY, _XZ, _YZ)]
+    kept = list(hulls)
+    for hull in sorted(hulls, key=lambda h: Manifold.hull_points(h).volume()):
+        rest = [h for h in kept if h is not hull]
         if rest and all(
-            (shadow - _grown(silhouette(rest, plane), tolerance)).area() <= _AREA
-            for shadow, plane in zip(whole, (_XY, _XZ, _YZ), strict=True)
+            (whole - _grown(projection(rest, plane), tolerance)).area() <= _AREA
+            for whole, plane in zip(wholes, (_XY, _XZ, _YZ), strict=True)
         ):
             kept = rest
     return kept
 
 
 def _grow(
-    seed: int, pieces: list[_Piece], allowed: CrossSection, tolerance: float
+    seed: int, hulls: list[_Hull], allowed: CrossSection, tolerance: float
 ) -> tuple[np.ndarray, set[int]]:
-    """The largest piece that grows from `seed`, and the indices of the pieces that it holds."""
-    current, members = pieces[seed], {seed}
-    candidates = set(range(len(pieces))) - members
+    """The largest hull that grows from `seed`, and the indices of the hulls that it holds."""
+    current, members = hulls[seed], {seed}
+    candidates = set(range(len(hulls))) - members
     while True:
-        near = [i for i in sorted(candidates) if current.touches(pieces[i], tolerance)]
+        near = [i for i in sorted(candidates) if current.touches(hulls[i], tolerance)]
         trials = sorted(
-            (current.joined(pieces[i]).volume - current.volume - pieces[i].volume, i) for i in near
+            (current.joined(hulls[i]).volume - current.volume - hulls[i].volume, i) for i in near
         )
         for _, i in trials:
-            # What does not fit now never will: the piece only grows.
+            # What does not fit now never will: the hull only grows.
             candidates.discard(i)
-            joined = current.joined(pieces[i])
+            joined = current.joined(hulls[i])
             if _fits(joined, allowed, tolerance):
                 current = joined
                 members.add(i)

@@ -5,7 +5,7 @@ from scipy.spatial import cKDTree
 
 from kitting_drake.hkd.tools.tool import Tool
 
-# Both tools are scaled to this length, amid the range of the data set.
+# Both tools are scaled to this length, in the middle of the dataset's range.
 REFERENCE_LENGTH = 0.175
 
 

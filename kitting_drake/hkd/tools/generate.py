@@ -25,7 +25,7 @@ from kitting_drake.hkd.tools.collision import (
     closed,
     cover,
     furthest,
-    silhouette,
+    projection,
     thinned,
 )
 from kitting_drake.hkd.tools.sdf import tool_sdf
@@ -35,9 +35,9 @@ from kitting_drake.hkd.tools.symmetry import symmetry_order
 from systems.hand_geometry import FINGER_LENGTH, PAD_LENGTH
 
 # The cavities of a kit stand this far off a tool's outline: what is narrower than twice this is no
-# part of a cavity, so collision pieces may bridge it.
+# part of a cavity, so collision hulls may bridge it.
 CAVITY_CLEARANCE_MM = 2.0
-# How far joining two collision pieces may move the outline, and thinning their vertices.
+# How far joining two collision hulls may move the outline, and thinning their vertices.
 MERGE_TOLERANCE_MM = 0.25
 VERTEX_TOLERANCE_MM = 0.2
 # The same for the faces that the jaws grip.
@@ -65,7 +65,7 @@ class CatalogueError(UserError):
 
 @dataclass
 class GraspEntry:
-    """A grasp annotated by hand in frame T: the jaws close along +y turned by theta about +z."""
+    """A grasp annotated by hand in frame T: the jaws close along +y rotated by theta about +z."""
 
     x_mm: float = 0.0
     y_mm: float = 0.0
@@ -92,9 +92,9 @@ class Report:
 
     description: dict[str, Any]
     triangles: int
-    collision_pieces: int
+    collision_hulls: int
     collision_triangles: int
-    # The furthest that the collision outline lies outside and inside the visual outline.
+    # The furthest that the collision outline is outside and inside the visual outline.
     outside_mm: float
     inside_mm: float
     # Collision less visual: lowest point, highest point, gripped width.
@@ -105,7 +105,8 @@ class Report:
     # stands out where the fingers pass.
     grip_flatness_mm: float
     finger_overhang_mm: float
-    # Tilt from the design's lie, and distance of the centre of mass from the support's rim.
+    # Tilt of the stable pose from the design's, and distance of the centre of mass from the rim of
+    # its support.
     tilt_deg: float
     support_margin_mm: float
 
@@ -192,28 +193,17 @@ def rest_rotation(points: np.ndarray, center_of_mass: np.ndarray) -> np.ndarray:
 
 
 def generate_tool(entry: ToolEntry, directory: Path) -> Report:
-    """Writes the model of one tool to `directory`, replacing what is there."""
-    parts = build_parts(entry)
-    hulls = [h for part in parts for h in part.hulls]
-    mass, center, inertia = mass_properties(parts)
-    # Lie the tool down before its pieces are merged: outline and heights are those of the lie.
-    R_TD = rest_rotation(np.vstack(hulls), 1e3 * center)
-    whole = _moved(Manifold.batch_boolean([p.solid for p in parts], OpType.Add), R_TD, np.zeros(3))
-    if sum(body.volume() > 1e-3 for body in whole.decompose()) != 1:
-        raise CatalogueError(f"tool {entry.name}: its parts do not touch")
-    box = np.array(whole.bounding_box()).reshape(2, 3)
-    bottom = min((h @ R_TD.T)[:, 2].min() for h in hulls)
-    p_T = -np.array([*box[:, :2].mean(axis=0), bottom])
-    whole = whole.translate(p_T)
-    outline = closed(whole.project(), CAVITY_CLEARANCE_MM)
-    allowed = _allowed(outline, entry.grasp)
-    hulls = cover([h @ R_TD.T + p_T for h in hulls], outline, allowed, MERGE_TOLERANCE_MM)
-    hulls = sorted(
-        (thinned(h, VERTEX_TOLERANCE_MM) for h in hulls),
-        key=lambda h: tuple(np.round(h.mean(axis=0), 3)),
-    )
+    """Writes the model of one tool to `directory`, replacing what is there.
 
-    # Nothing is written of a tool that cannot be used.
+    Raises:
+        CatalogueError: the entry makes no tool that can be used; then nothing is written.
+    """
+    parts = build_parts(entry)
+    mass, center, inertia = mass_properties(parts)
+    # Hulls are merged in the stable pose: outline and heights are those of that pose.
+    R_TD, p_T, whole = _tool_frame(entry, parts, center)
+    outline = closed(whole.project(), CAVITY_CLEARANCE_MM)
+    hulls = _collision_hulls(parts, R_TD, p_T, outline, entry.grasp)
     box = np.array(whole.bounding_box()).reshape(2, 3)
     grip = _measure_grasp(entry.grasp, whole)
 
@@ -231,19 +221,19 @@ def generate_tool(entry: ToolEntry, directory: Path) -> Report:
         tool_sdf(entry.name, mass, center, inertia, visuals, collisions)
     )
 
-    solid_hulls = Manifold.batch_boolean([Manifold.hull_points(h) for h in hulls], OpType.Add)
     vertices, faces = meshes.vertices_and_faces(whole)
     symmetry = symmetry_order(1e-3 * vertices[faces])
     description = _description(entry, box, mass, center, symmetry, grip, visuals)
     (directory / "tool.yaml").write_text(yaml.safe_dump(description, sort_keys=False))
     points = np.vstack(hulls)
+    solid_hulls = Manifold.batch_boolean([Manifold.hull_points(h) for h in hulls], OpType.Add)
     return Report(
         description,
         triangles,
         len(hulls),
         collision_triangles,
-        outside_mm=furthest(silhouette(hulls), outline),
-        inside_mm=furthest(outline, closed(silhouette(hulls), CAVITY_CLEARANCE_MM)),
+        outside_mm=furthest(projection(hulls), outline),
+        inside_mm=furthest(outline, closed(projection(hulls), CAVITY_CLEARANCE_MM)),
         bottom_error_mm=points[:, 2].min() - box[0, 2],
         top_error_mm=points[:, 2].max() - box[1, 2],
         grip_error_mm=_measure_grasp(entry.grasp, solid_hulls).width - grip.width,
@@ -254,8 +244,44 @@ def generate_tool(entry: ToolEntry, directory: Path) -> Report:
     )
 
 
+def _tool_frame(
+    entry: ToolEntry, parts: list[Part], center: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, Manifold]:
+    """R_TD, p_T (mm), and the union of the parts (mm) in the tool frame T.
+
+    Args:
+        entry: of the tool.
+        parts: of the tool in the design frame D.
+        center: of mass, (3,) in D, in metres.
+
+    Raises:
+        CatalogueError: the parts do not touch.
+    """
+    hulls = [h for part in parts for h in part.hulls]
+    R_TD = rest_rotation(np.vstack(hulls), 1e3 * center)
+    whole = _moved(Manifold.batch_boolean([p.solid for p in parts], OpType.Add), R_TD, np.zeros(3))
+    if sum(body.volume() > 1e-3 for body in whole.decompose()) != 1:
+        raise CatalogueError(f"tool {entry.name}: its parts do not touch")
+    box = np.array(whole.bounding_box()).reshape(2, 3)
+    bottom = min((h @ R_TD.T)[:, 2].min() for h in hulls)
+    p_T = -np.array([*box[:, :2].mean(axis=0), bottom])
+    return R_TD, p_T, whole.translate(p_T)
+
+
+def _collision_hulls(
+    parts: list[Part], R_TD: np.ndarray, p_T: np.ndarray, outline: CrossSection, grasp: GraspEntry
+) -> list[np.ndarray]:
+    """The collision hulls (n, 3), few, in T in mm, in an order that depends on nothing else."""
+    hulls = [h @ R_TD.T + p_T for part in parts for h in part.hulls]
+    covering = cover(hulls, outline, _allowed(outline, grasp), MERGE_TOLERANCE_MM)
+    return sorted(
+        (thinned(h, VERTEX_TOLERANCE_MM) for h in covering),
+        key=lambda h: tuple(np.round(h.mean(axis=0), 3)),
+    )
+
+
 def _allowed(outline: CrossSection, grasp: GraspEntry) -> CrossSection:
-    """Where collision pieces may reach: a little out of the outline, not where the jaws grip."""
+    """Where collision hulls may reach: a little out of the outline, not where the jaws grip."""
 
     def grown(distance: float) -> CrossSection:
         return outline.offset(distance, JoinType.Round, circular_segments=96)
@@ -296,7 +322,7 @@ class _GripReport:
 
 
 def _measure_grasp(grasp: GraspEntry, solid: Manifold) -> _GripReport:
-    """Measures a grasp on a tool that lies in its frame T.
+    """Measures a grasp on a tool at rest in its frame T.
 
     Raises:
         CatalogueError: the jaws cannot hold the tool there.

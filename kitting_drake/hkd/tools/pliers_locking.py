@@ -41,10 +41,9 @@ class Locking:
     lever_material: str = "dark_steel"
 
 
-def build_locking(k: Locking) -> list[Part]:
-    """The parts of locking pliers, in mm in the design frame; the body at y > 0."""
-    z, zj, half = k.thickness_mm / 2, k.jaw_thickness_mm / 2, k.flank_width_mm / 2
-    end = -k.body_length_mm
+def _outlines(k: Locking) -> dict[str, np.ndarray]:
+    """The outlines (n, 2) of the flat parts, in mm in the design frame."""
+    half, end = k.flank_width_mm / 2, -k.body_length_mm
     body_inner = half - k.body_depth_mm
     body = fillet(
         [
@@ -101,16 +100,32 @@ def build_locking(k: Locking) -> list[Part]:
     lower = (_jaw([(-10.0, half - 2.0), (0.40 * tip, half - 1.0), (0.84 * tip, 0.66 * half),
                    (0.98 * tip, 0.34 * half)], 0.98 * tip, 3.0, half) * [1.0, -1.0])  # fmt: skip
 
-    def flat(outline: np.ndarray, low: float, high: float, bevel: float) -> Shape:
+    return {
+        "body": body,
+        "handle": handle,
+        "release": release,
+        "link": link,
+        "upper": upper,
+        "lower": lower,
+    }
+
+
+def build_locking(k: Locking) -> list[Part]:
+    """The parts of locking pliers, in mm in the design frame; the body at y > 0."""
+    z, zj, half = k.thickness_mm / 2, k.jaw_thickness_mm / 2, k.flank_width_mm / 2
+    outlines = _outlines(k)
+
+    def flat(name: str, low: float, high: float, bevel: float) -> Shape:
+        outline = outlines[name]
         profile = CrossSection([outline])
         profile = profile if profile.area() > 0 else CrossSection([outline[::-1]])
         return plate(blend(profile, 0.5), low, high, bevel)
 
-    body_shape, handle_shape = flat(body, -z, z, 1.2), flat(handle, -z + 0.8, z - 0.8, 1.2)
-    release_shape = flat(release, -0.5 * z, 0.5 * z, 0.6)
-    link_shape = flat(link, -0.4 * z, 0.4 * z, 0.4)
-    jaws = [flat(o, -zj, zj, 0.8) for o in (upper, lower)]
-    screw, knob = _screw(k, end, half - k.body_depth_mm / 2)
+    body, handle = flat("body", -z, z, 1.2), flat("handle", -z + 0.8, z - 0.8, 1.2)
+    release = flat("release", -0.5 * z, 0.5 * z, 0.6)
+    link = flat("link", -0.4 * z, 0.4 * z, 0.4)
+    upper, lower = (flat(name, -zj, zj, 0.8) for name in ("upper", "lower"))
+    screw, knob = _screw(k, -k.body_length_mm, half - k.body_depth_mm / 2)
     rivets = [
         plate(circle(r, (x, y), 24), -height + 0.1, height + 0.3, 0.3).solid
         for x, y, r, height in (
@@ -122,19 +137,21 @@ def build_locking(k: Locking) -> list[Part]:
     ]
 
     # One slab for all that is flat, thick as the body.
-    def together(outlines: list[np.ndarray]) -> CrossSection:
-        profiles = [CrossSection([o]) + CrossSection([o[::-1]]) for o in outlines]
+    def together(*names: str) -> CrossSection:
+        profiles = [
+            CrossSection([outlines[name]]) + CrossSection([outlines[name][::-1]]) for name in names
+        ]
         return CrossSection.batch_boolean(profiles, OpType.Add)
 
-    slab = slab_hulls(together([body, handle, release, link]), -z, z, 1.2)
-    front = slab_hulls(together([upper, lower]), -zj, zj, 0.8)
+    slab = slab_hulls(together("body", "handle", "release", "link"), -z, z, 1.2)
+    front = slab_hulls(together("upper", "lower"), -zj, zj, 0.8)
     return [
         *(Part(f"rivet_{i}", k.jaw_material, r) for i, r in enumerate(rivets)),
-        Part("body", k.body_material, body_shape.solid, slab),
-        Part("handle", k.body_material, handle_shape.solid),
-        Part("jaws", k.jaw_material, jaws[0].solid + jaws[1].solid, front),
-        Part("release", k.lever_material, release_shape.solid),
-        Part("link", k.jaw_material, link_shape.solid),
+        Part("body", k.body_material, body.solid, slab),
+        Part("handle", k.body_material, handle.solid),
+        Part("jaws", k.jaw_material, upper.solid + lower.solid, front),
+        Part("release", k.lever_material, release.solid),
+        Part("link", k.jaw_material, link.solid),
         Part("screw", k.jaw_material, screw.solid, screw.hulls),
         Part("knob", k.jaw_material, knob.solid, knob.hulls),
     ]

@@ -8,7 +8,7 @@ import numpy as np
 from kitting_drake.hkd.tools.solids import MATERIALS
 
 # Contact, for every tool: Drake's hydroelastic modulus (Pa), dissipation (s/m), margin (m; 0 for
-# none) and friction. Drake 1.51 fails on the margin of finely faceted convex pieces, when it loads
+# none) and friction. Drake 1.51 fails on the margin of finely faceted convex hulls, when it loads
 # or when they touch a mesh; the modulus is low enough that a flat bottom rests quietly without.
 HYDROELASTIC_MODULUS = 1e7
 HUNT_CROSSLEY_DISSIPATION = 20.0
@@ -57,7 +57,7 @@ def tool_sdf(
     """A model with one free link named `tool`, whose frame is the tool frame T.
 
     Mass in kg, centre of mass (3,) in m, inertia about it (3, 3) in kg m^2; visuals: pairs of OBJ
-    file and key of MATERIALS, collisions are OBJ files of convex pieces, all beside the SDFormat,
+    file and key of MATERIALS, collisions are OBJ files of convex hulls, all beside the SDFormat,
     which names them relatively: a tool's folder may be copied and moved.
     """
     moments = "".join(

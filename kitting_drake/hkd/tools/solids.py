@@ -3,7 +3,7 @@
 Everything here is in millimetres and in the *design frame* of a tool: x along the length, working
 end toward +x, z up when the tool lies flat. A shape is built twice from the same numbers: once as
 an exact solid, which is seen and weighed, and once as many small convex point sets that fill it,
-which `collision.cover` later joins into the few convex collision pieces that a simulator wants.
+which `collision.cover` later joins into the few convex collision hulls that a simulator wants.
 """
 
 import itertools

@@ -14,7 +14,7 @@ from scipy.optimize import minimize
 from scipy.spatial import cKDTree
 
 from kitting_drake.hkd.tools.collision import furthest
-from kitting_drake.hkd.tools.tool import silhouette
+from kitting_drake.hkd.tools.tool import footprint
 
 MOST_SURFACE_DISTANCE_MM = 0.5
 """The mean distance of a reversible tool from its half-turn copy is less than this."""
@@ -65,7 +65,7 @@ def measure_reversal(triangles: NDArray[np.float64], *, complete: bool = False) 
         triangles: (n, 3, 3) of the surface in frame T, in metres.
         complete: whether the surfaces are compared where the outlines already differ too much.
     """
-    outline = silhouette(triangles).scale((1e3, 1e3))
+    outline = footprint(triangles).scale((1e3, 1e3))
     copy = outline.rotate(180.0)
 
     def uncommon_area(shift: Shift) -> float:

@@ -27,19 +27,19 @@ class Grasp:
     """Of the point midway between the pads, in metres."""
     y: float
     theta: float
-    """Turn of the hand about T's z, in radians; at zero the jaws close along T's y."""
+    """The rotation of the hand about T's z, in radians; at zero the jaws close along T's y."""
     width: float
     """Distance of the faces that are gripped, in metres."""
     surface_height: float
-    """Height of the tool's top at the grasp above its resting plane, in metres."""
+    """Height of the tool's top at the grasp above the table, in metres."""
 
 
 @dataclass(frozen=True)
 class Tool:
     """One hand tool.
 
-    The tool frame T: z up when the tool lies flat, the resting plane is z = 0, x along the tool's
-    length with the working end at +x, the origin amid the bounding box of its outline.
+    The tool frame T: z up in the tool's stable pose, the table is z = 0, x along the tool's
+    length with the working end at +x, the origin centred in the bounding box of its footprint.
     """
 
     directory: Path
@@ -78,9 +78,14 @@ class Tool:
         return triangles if self.scale == 1.0 else self.scale * triangles
 
     @cached_property
-    def silhouette(self) -> CrossSection:
+    def footprint(self) -> CrossSection:
         """The outline from above, in T, in metres."""
-        return silhouette(self.triangles)
+        return footprint(self.triangles)
+
+    @property
+    def silhouette(self) -> CrossSection:
+        """The former name of `footprint`."""
+        return self.footprint
 
     def surface_points(self, count: int, seed: int = 0) -> NDArray[np.float64]:
         """(count, 3) points of the surface, in T, in metres: by area, the same each time."""
@@ -100,8 +105,8 @@ def _read_triangles(path: Path) -> NDArray[np.float64]:
     return triangles
 
 
-def silhouette(triangles: NDArray[np.float64]) -> CrossSection:
-    """The union of triangles (n, 3, 3) seen along z, whole or broken as their mesh may be."""
+def footprint(triangles: NDArray[np.float64]) -> CrossSection:
+    """The union of triangles (n, 3, 3) seen along z, whether their mesh is closed or not."""
     flat = np.array(triangles[:, :, :2], dtype=float)
     edge_1, edge_2 = flat[:, 1] - flat[:, 0], flat[:, 2] - flat[:, 0]
     area = edge_1[:, 0] * edge_2[:, 1] - edge_1[:, 1] * edge_2[:, 0]

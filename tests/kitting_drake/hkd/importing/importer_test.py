@@ -67,11 +67,11 @@ def test_a_tool_is_as_its_mesh_is(plain: importer.ImportReport):
     np.testing.assert_allclose((points.min(axis=0) + points.max(axis=0))[:2], 0, atol=1e-6)
 
 
-def test_collision_pieces_are_few_convex_and_true(plain: importer.ImportReport):
+def test_collision_hulls_are_few_convex_and_true(plain: importer.ImportReport):
     pieces = [
         trimesh.load_mesh(path, process=False) for path in plain.directory.glob("collision_*.obj")
     ]
-    assert len(pieces) == plain.pieces <= 4
+    assert len(pieces) == plain.collision_hulls <= 4
     assert all(piece.is_watertight and piece.is_convex for piece in pieces)
     together = Manifold.batch_boolean(
         [Manifold.hull_points(np.asarray(piece.vertices)) for piece in pieces],
@@ -79,7 +79,7 @@ def test_collision_pieces_are_few_convex_and_true(plain: importer.ImportReport):
     )
     tool = load_tool(str(plain.directory))
     shadow = together.project()
-    for one, other in ((shadow, tool.silhouette), (tool.silhouette, shadow)):
+    for one, other in ((shadow, tool.footprint), (tool.footprint, shadow)):
         assert (one - other.offset(0.0005, JoinType.Miter)).area() < 1e-9
 
 
@@ -138,14 +138,14 @@ def test_units_are_guessed(length: float, unit: str | None):
     assert guess_unit(length) == unit
 
 
-def test_a_long_tool_is_scaled_and_a_holed_one_mended(tmp_path: Path):
+def test_a_long_tool_is_scaled_and_a_holed_one_repaired(tmp_path: Path):
     mesh = mallet()
     mesh.apply_scale(2.0)
     mesh.update_faces(np.arange(len(mesh.faces)) != 3)
     report = bring(exported(mesh, tmp_path / "open.stl"), tmp_path / "tools")
     assert report.record["length"] == pytest.approx(0.180, abs=1e-6)
     assert report.record["width"] == pytest.approx(0.180 * 50 / 175, abs=1e-4)
-    assert any("mended" in note for note in report.notes)
+    assert any("repaired" in note for note in report.notes)
 
 
 def test_a_broad_tool_keeps_its_length(tmp_path: Path):
@@ -198,7 +198,7 @@ def sheet() -> trimesh.Trimesh:
     ("make", "sentence"),
     [
         (lambda: trimesh.creation.box((180, 20, 2)), "2.0 mm thick, and the hand needs 4 mm"),
-        (lambda: trimesh.creation.box((180, 80, 60)), "lies 60 mm high"),
+        (lambda: trimesh.creation.box((180, 80, 60)), "60 mm high at rest"),
         (lambda: trimesh.creation.box((180, 150, 20)), "(mm wide|no place to hold)"),
         (lambda: trimesh.creation.box((160, 150, 10)), "jaws take 65 mm, finds no place"),
         (sheet, "encloses no volume"),
@@ -370,6 +370,6 @@ def test_real_tools(name: str, tmp_path: Path):
     report = bring(REAL / f"{name}.obj", tmp_path / "tools", category=name.split("/")[0])
     tool = load_tool(str(report.directory))
     assert 0.1499 < tool.length < 0.2001
-    assert report.pieces <= 45
+    assert report.collision_hulls <= 45
     com = yaml.safe_load((tool.directory / "tool.yaml").read_text())["center_of_mass"]
     assert abs(tool.grasp.x - com[0]) < 0.045

@@ -47,7 +47,7 @@ def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def seated_outline(tool: Tool) -> CrossSection:
-    return tool.silhouette.translate(SLOTS[tool.category])
+    return tool.footprint.translate(SLOTS[tool.category])
 
 
 def grown(outline: CrossSection, distance: float) -> CrossSection:
@@ -142,6 +142,38 @@ def test_contact_surface_has_the_walls_of_the_block(tools: list[Tool], lead_in: 
     assert trimesh.Trimesh(**trimesh.triangles.to_kwargs(top)).area == pytest.approx(
         0.28 * 0.26 - rims, abs=1e-7
     )
+
+
+@pytest.mark.parametrize(
+    "names",
+    [
+        # The bounding rectangles of cavities reach into each other.
+        ["chipping_hammer", "tin_snips", "s_wrench", "precision_screwdriver"],
+        ["rip_claw_hammer_fibreglass", "diagonal_cutters", "square_drive_screwdriver"],
+        ["claw_hammer", "t_handle_screwdriver", "tin_snips", "pipe_wrench", "soft_face_mallet"] * 2,
+    ],
+)
+@pytest.mark.parametrize("lead_in", [0.0, 0.001])
+def test_no_part_of_the_contact_surface_is_inside_a_cavity(names: list[str], lead_in: float):
+    parameters = KitParameters(lead_in=lead_in)
+    tools = [load_tool(name) for name in names]
+    layout = layout_kit(tools, parameters)
+    cavities = kit_cavities(tools, parameters, layout.poses)
+    vertices, faces = contact_surface(cavities, layout.parameters)
+    corners = vertices[faces]
+    corners = corners[np.ptp(corners[:, :, 2], axis=1) < 1e-9]
+    heights = corners[:, 0, 2]
+    for cavity in cavities:
+        inner = cavity.outline.offset(-1e-5, JoinType.Miter)
+
+        def inside(chosen: NDArray, inner: CrossSection = inner) -> list[float]:
+            triangles = [CrossSection.hull_points(corner[:, :2]) for corner in corners[chosen]]
+            return [(triangle ^ inner).area() for triangle in triangles]
+
+        assert max(inside(heights > cavity.floor + 1e-6)) < 1e-12
+        # The floor is there once, and whole.
+        floor = inside(np.abs(heights - cavity.floor) < 1e-9)
+        assert sum(floor) == pytest.approx(inner.area(), rel=1e-6)
 
 
 def test_a_kit_is_built_once(tools: list[Tool], cache: Path, monkeypatch: pytest.MonkeyPatch):
@@ -286,7 +318,7 @@ def test_nested_cavities_keep_walls_and_room_for_the_fingers(
     for tool, pose in zip(tools, layout.poses, strict=True):
         assert pose.z == template.height - tool.height
         # From the tool itself: no part of the code under test.
-        shape = tool.silhouette.rotate(np.degrees(pose.yaw)).translate((pose.x, pose.y))
+        shape = tool.footprint.rotate(np.degrees(pose.yaw)).translate((pose.x, pose.y))
         rims.append(grown(shape, template.clearance + template.lead_in))
         turn = tool.grasp.theta + pose.yaw
         X = np.array([[np.cos(pose.yaw), -np.sin(pose.yaw)], [np.sin(pose.yaw), np.cos(pose.yaw)]])

@@ -33,7 +33,7 @@ def test_record_and_meshes_of_shipped_tools_agree(name: str):
     np.testing.assert_allclose(high - low, [tool.length, tool.width, tool.height], atol=2e-4)
     np.testing.assert_allclose((high + low)[:2], 0, atol=2e-4)
     assert low[2] == pytest.approx(0, abs=2e-4)
-    x_min, y_min, x_max, y_max = tool.silhouette.bounds()
+    x_min, y_min, x_max, y_max = tool.footprint.bounds()
     np.testing.assert_allclose([x_min, y_min, x_max, y_max], [*low[:2], *high[:2]], atol=1e-6)
     assert 0.02 < tool.mass < 1.0
     # The grasp is on the tool and within the hand's opening.
