@@ -77,12 +77,12 @@ def main() -> int:
 
 @dataclass(frozen=True)
 class Evaluation:
-    """What `evaluate` returns."""
+    """The result of `evaluate`."""
 
     episodes: list[Episode]
     """In the order of the seeds."""
     wall_seconds_total: float
-    """How long all calls took that worked in the folder, in s."""
+    """The time of all calls that worked in the folder, in s."""
 
 
 def evaluate(
@@ -125,9 +125,9 @@ def evaluate(
 
 
 class _WallClock:
-    """How long all calls took that worked in a folder; a file keeps the time of earlier ones.
+    """Measures the time of all calls that worked in a folder; a file keeps that of earlier ones.
 
-    Of a call that is killed, the time since its last episode ended is not counted: the work of that
+    When a call is killed, the time since its last episode ended is not counted: the work of that
     time is lost too.
     """
 
@@ -149,8 +149,8 @@ class _WallClock:
 
 
 def _identity(chosen: ChosenScenario) -> dict[str, Any]:
-    """What tells one evaluation from another: the whole scenario, the content of the files that it
-    depends on, and versions."""
+    """The identity of an evaluation: the whole scenario, digests of the files that it depends on,
+    and versions."""
     scenario = chosen.scenario
     return {
         **chosen.described,
@@ -161,7 +161,7 @@ def _identity(chosen: ChosenScenario) -> dict[str, Any]:
 
 
 def _digest(paths: Iterable[Path]) -> str:
-    """Of the content of files."""
+    """A digest of the content of files, in their order."""
     digest = hashlib.sha256()
     for path in paths:
         # Of fixed length each, so that no two sequences of files have the same.

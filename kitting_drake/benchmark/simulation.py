@@ -96,7 +96,7 @@ class PhaseStopwatch:
 
 
 def _start_up_times() -> dict[str, float]:
-    """From the shell to the end of a run of a few steps, its Meshcat and files included."""
+    """The times from the shell to the end of a run of a few steps, Meshcat and files included."""
     times = {}
     with tempfile.TemporaryDirectory() as folder:
         # The first run finds nothing in the cache, the second what the first has built.
@@ -111,7 +111,7 @@ def _start_up_times() -> dict[str, float]:
 
 
 def _image_times(scenario: Scenario, seed: int) -> dict[str, float]:
-    """Of one RGB-D image, and of the heightmap from all cameras' images once they are there.
+    """The times of one RGB-D image, and of the heightmap from all cameras' images.
 
     Raises:
         UserError: images cannot be rendered here.

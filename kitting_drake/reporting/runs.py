@@ -61,24 +61,24 @@ class Run:
     summary: dict[str, Any]
 
     def detail(self, key: str) -> Any:
-        """Of the policy; None if not given."""
+        """An entry of the policy's details; None if it has no such entry."""
         return self.summary["policy_details"].get(key)
 
     @property
     def method(self) -> str:
-        """Of the policy: a key of `METHODS`, or what the policy is called."""
+        """The policy's method: a key of `METHODS`, or the policy's name."""
         return self.detail("method") or self.summary["policy"]
 
     @property
     def seeds(self) -> str:
-        """Its first and last."""
+        """The first and the last seed, for a person."""
         seeds = self.summary["seeds"]
         first, last = min(seeds), max(seeds)
         return f"{first} to {last}" if last - first + 1 == len(seeds) else f"{first} .. {last}"
 
     @property
     def label(self) -> str:
-        """What tells it from the other runs of its task, for a person."""
+        """The policy and the parameters that the paper varies, for a person."""
         parts = [METHODS.get(self.method, self.method)]
         for key, text in (
             ("orientations", "N = {}"),
@@ -117,7 +117,7 @@ class Run:
 
 
 def _described(scenario: Scenario) -> dict[str, Any]:
-    """As JSON holds it."""
+    """The scenario as JSON holds it."""
     described = ChosenScenario(scenario, Path(), "", None).described
     return json.loads(json.dumps(described, default=str))
 

@@ -33,7 +33,7 @@ AMBIGUITIES = {
 beyond which it counts. The angle is modulo the symmetry that the object declares."""
 
 ERRORS = ("add_s_mm", "position_error_mm", "angle_error_deg", "height_error_mm")
-"""Of an object where it ended."""
+"""The errors of an object where it ended."""
 
 ACTION_ERRORS = (
     "pick_position_error_mm",
@@ -41,7 +41,7 @@ ACTION_ERRORS = (
     "place_position_error_mm",
     "place_angle_error_deg",
 )
-"""Of a policy's action; see `kitting_drake.tasks.task.ActionRecord`."""
+"""The errors of a policy's action; see `kitting_drake.tasks.task.ActionRecord`."""
 
 
 def summarise(
@@ -205,12 +205,12 @@ def _summarise_category(
 def _statistics(
     objects: list[Entry], actions: list[Entry], causes: Sequence[str]
 ) -> dict[str, Any]:
-    found = Counter(item["cause"] for item in objects)
+    found = Counter(item["cause"] for item in objects if item["cause"] is not None)
     ambiguous = Counter(name for item in objects for name in find_ambiguities(item))
     return {
         **{key: _describe(objects, key) for key in ERRORS},
         "action_errors": {key: _describe(actions, key) for key in ACTION_ERRORS},
-        "causes": {cause: found[cause] for cause in causes},
+        "causes": {cause: found[cause] for cause in dict.fromkeys((*causes, *found))},
         "ambiguous": {name: ambiguous[name] for name in AMBIGUITIES},
     }
 

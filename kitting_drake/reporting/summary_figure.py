@@ -16,7 +16,7 @@ _COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#
 """Seven that all eyes tell apart on white (after Okabe and Ito)."""
 _LINES = ("-", "-.", ":")
 _HATCHES = ("", "////", "....")
-"""By which categories differ once the colours are used up."""
+"""The marks that tell categories apart once the colours are used up."""
 
 _STYLE = {
     "font.size": 9.5,
@@ -38,7 +38,7 @@ _ANGLES = (0.02, 180.0)
 
 @dataclass(frozen=True)
 class _Look:
-    """How a category is drawn."""
+    """The marks of a category."""
 
     colour: str
     line: str
@@ -47,7 +47,7 @@ class _Look:
 
 @dataclass(frozen=True)
 class _Panel:
-    """How one error is drawn."""
+    """The distributions of one error."""
 
     title: str
     unit: str
@@ -179,7 +179,7 @@ def _draw_causes(axis: Any, summary: dict[str, Any], looks: dict[str, _Look]) ->
     causes = list(summary["causes"])
     ends = np.zeros(len(causes))
     for name, category in summary["categories"].items():
-        counts = [category["causes"][cause] for cause in causes]
+        counts = [category["causes"].get(cause, 0) for cause in causes]
         look = looks[name]
         axis.barh(
             causes,

@@ -88,7 +88,8 @@ def summary_table(summary: dict[str, Any]) -> Table:
     table = Table(title=_summary_title(summary), title_justify="left")
     table.add_column("category", no_wrap=True)
     for heading in ("strict", "success", "ADD-S mm", "95 %", *_ERROR_HEADINGS[1:]):
-        table.add_column(heading, justify="right")
+        # In a narrow terminal headings break between words, not within them.
+        table.add_column(heading, justify="right", min_width=max(map(len, heading.split())))
     categories = summary["categories"]
     rows = [(name, row, _counts(row)) for name, row in categories.items()]
     totals = tuple(sum(column) for column in zip(*(counts for *_, counts in rows), strict=True))
@@ -118,7 +119,7 @@ def _summary_title(summary: dict[str, Any]) -> str:
 
 
 def _counts(category: dict[str, Any]) -> tuple[int, int, int]:
-    """Of objects, of strict successes and of successes."""
+    """The numbers of objects, strict successes and successes."""
     objects = category["objects"]
     return (
         objects,

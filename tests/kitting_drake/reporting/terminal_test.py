@@ -56,6 +56,13 @@ def test_an_ambiguous_success_is_no_plain_yes():
     assert all("yellow" in str(word) for word in words[1:4])
 
 
+def test_headings_stay_whole_in_a_narrow_terminal():
+    summary = summarise([make_episode(0, [1.0])], CHOSEN, ADD_S, wall_seconds_total=1.0)
+    shown = captured(summary_table(summary), width=80)
+    assert "position" in shown
+    assert "…" not in shown
+
+
 def test_the_words_below_an_episode():
     console = Console(width=200)
     result = make_result(
