@@ -1,4 +1,4 @@
-"""`python -m kitting_drake.train --demos FILE`: networks from demonstrations; needs no Drake."""
+"""`python -m kitting_drake.train --demos FILE`: trains networks from demonstrations; no Drake."""
 
 import argparse
 import dataclasses
@@ -8,7 +8,7 @@ import pickle
 import time
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
@@ -16,7 +16,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from torch.utils.tensorboard import SummaryWriter
 
-from kitting_drake.common.command_line import count_type, interrupts_wait, run_verb, seed_type
+from kitting_drake.common.command_line import count_type, interrupts_wait, run_command, seed_type
 from kitting_drake.common.errors import UserError
 from kitting_drake.common.files import (
     alone_in,
@@ -31,17 +31,25 @@ from kitting_drake.policies.config import METHODS, PRESETS, NetworkConfig
 from kitting_drake.policies.demonstrations import Demonstrations, read_demonstrations
 from kitting_drake.policies.learned_policy import LearnedPolicy
 from kitting_drake.policies.methods import make_networks
-from kitting_drake.policies.samples import Scene, labelled_images, normalisation, scenes
+from kitting_drake.policies.samples import (
+    Scene,
+    final_observations,
+    labelled_images,
+    normalisation,
+    scenes,
+)
 from kitting_drake.policies.training import Trainer
 from kitting_drake.policies.validation import validate
 from kitting_drake.policies.weights import preferred_device, preferred_type, save_weights
 
+Item = TypeVar("Item")
+
 _CHECKPOINT_EVERY = 100
 """Steps between checkpoints, and between points of the curves."""
 _TABLE = ("task", "heightmap")
-"""The fields of a scenario that, with the seed, say what stands where."""
+"""The fields of a scenario that determine, with the seed, what stands where."""
 _MOST_VALIDATED = 64
-"""Scenes that a validation looks at."""
+"""The most scenes, and the most final observations, that a validation uses."""
 _DAMAGED = (
     OSError,
     EOFError,
@@ -51,16 +59,16 @@ _DAMAGED = (
     ValueError,
     pickle.UnpicklingError,
 )
-"""What reading a checkpoint that is none may raise."""
+"""The exceptions that reading a damaged checkpoint may raise."""
 
 
 @dataclass(frozen=True)
 class Settings:
-    """What tells one training run from another."""
+    """The settings that distinguish one training run from another."""
 
     scenario: str
     demonstrations: int
-    """How many are learned from."""
+    """The number of demonstrations that are learned from."""
     demonstration_seeds: tuple[int, ...]
     validation_seeds: tuple[int, ...]
     method: str
@@ -70,7 +78,11 @@ class Settings:
     learning_rate: float
     decay: bool
     taken_only: bool
+    """Whether later picks of a demonstration are no labels of its earlier observations."""
     rigid: bool
+    """Whether there is no curvature augmentation."""
+    stop: bool
+    """Whether the networks learn from final observations that there is nothing left to pick."""
     validate_every: int
     seed: int
     device: str
@@ -82,25 +94,7 @@ def main() -> int:
     arguments = _parse()
     console = Console(quiet=arguments.quiet)
     learned, held_out = _split(arguments.demos, arguments.demonstrations, arguments.validation)
-    settings = Settings(
-        scenario=learned.origin.scenario_name,
-        demonstrations=len(learned.demonstrations),
-        demonstration_seeds=tuple(item.seed for item in learned.demonstrations),
-        validation_seeds=tuple(item.seed for item in held_out.demonstrations),
-        method=arguments.method,
-        preset=arguments.preset,
-        orientations=arguments.orientations,
-        steps=arguments.steps,
-        learning_rate=arguments.learning_rate,
-        decay=arguments.decay,
-        taken_only=arguments.taken_only,
-        # The Transporter turns whole images: it has no crop in which to bend a tool.
-        rigid=arguments.rigid or arguments.method == "transporter",
-        validate_every=arguments.validate_every,
-        seed=arguments.seed,
-        device=preferred_device().type,
-        compute_type=str(preferred_type()).removeprefix("torch."),
-    )
+    settings = _settings(arguments, learned, held_out)
     folder = require_folder(
         arguments.output or Path("output") / f"{learned.origin.scenario_name}-training"
     )
@@ -115,10 +109,36 @@ def main() -> int:
     return 0
 
 
+def _settings(
+    arguments: argparse.Namespace, learned: Demonstrations, held_out: Demonstrations
+) -> Settings:
+    assumed = learned.origin.learning
+    return Settings(
+        scenario=learned.origin.scenario_name,
+        demonstrations=len(learned.demonstrations),
+        demonstration_seeds=tuple(item.seed for item in learned.demonstrations),
+        validation_seeds=tuple(item.seed for item in held_out.demonstrations),
+        method=arguments.method,
+        preset=arguments.preset,
+        orientations=arguments.orientations,
+        steps=arguments.steps,
+        learning_rate=arguments.learning_rate,
+        decay=arguments.decay,
+        taken_only=arguments.taken_only or not assumed.later_picks_possible,
+        # The Transporter rotates whole images: it has no crop in which an object can be bent.
+        rigid=arguments.rigid or not assumed.curvature or arguments.method == "transporter",
+        stop=bool(final_observations(learned.demonstrations)),
+        validate_every=arguments.validate_every,
+        seed=arguments.seed,
+        device=preferred_device().type,
+        compute_type=str(preferred_type()).removeprefix("torch."),
+    )
+
+
 def _parse() -> argparse.Namespace:
     parser = argparse.ArgumentParser(
         prog="python -m kitting_drake.train",
-        description="Train a policy's networks from demonstrations; run again, it goes on.",
+        description="Train a policy's networks from demonstrations. Run again, it resumes.",
     )
     parser.add_argument(
         "--demos", type=Path, required=True, metavar="FILE.h5", help="what to learn from"
@@ -147,14 +167,14 @@ def _parse() -> argparse.Namespace:
     parser.add_argument(
         "--taken-only",
         action="store_true",
-        help="as the paper: learn of each observation only what was picked then, "
-        "not also what was picked later",
+        help="as in the paper: label each observation with what was picked then, not also with "
+        "what was picked later (always so where the task does not allow it)",
     )
     parser.add_argument(
         "--rigid",
         action="store_true",
-        help="as the paper: augment by motions of the whole scene only, not also by bent tools "
-        "(always so with transporter)",
+        help="as in the paper: augment by motions of the whole scene only, without curvature "
+        "augmentation (always so with transporter, and where the task does not allow it)",
     )
     parser.add_argument(
         "--validate-every", type=count_type, default=500, metavar="STEPS", help="(500)"
@@ -178,7 +198,7 @@ def _rate_type(text: str) -> float:
 def _split(
     path: Path, count: int | None, validation: Path | None
 ) -> tuple[Demonstrations, Demonstrations]:
-    """What to learn from, and what to validate by."""
+    """The demonstrations to learn from, and those to validate by."""
     everything = read_demonstrations(path)
     items = everything.demonstrations
     if not items:
@@ -200,7 +220,7 @@ def _split(
     if not held_out.demonstrations:
         raise UserError(f"{validation} holds no demonstrations: collect some")
     shared = {item.seed for item in held_out.demonstrations} & {item.seed for item in items[:count]}
-    # What stands where depends on these and the seed alone.
+    # These fields and the seed determine what stands where.
     scenarios = [item.origin.scenario for item in (everything, held_out)]
     if shared and all(scenarios[0].get(key) == scenarios[1].get(key) for key in _TABLE):
         raise UserError(
@@ -225,14 +245,17 @@ class _Run:
         self.settings, self.folder, self.console = settings, folder, console
         self._log = folder / "log.jsonl"
         self.grid = demonstrations.origin.grid
-        learned = scenes(demonstrations.demonstrations, self.grid)
-        self.validation_scenes = _spread_out(scenes(held_out.demonstrations, self.grid))
+        learned = _scenes(demonstrations)
         self.samples = labelled_images(learned, taken_only=settings.taken_only)
+        self.finals = final_observations(demonstrations.demonstrations)
+        self.validation_scenes = _evenly_chosen(_scenes(held_out))
+        self.validation_finals = _evenly_chosen(final_observations(held_out.demonstrations))
         try:
             config = NetworkConfig(
                 method=settings.method,
                 preset=settings.preset,
                 orientations=settings.orientations,
+                stop=settings.stop,
                 **normalisation(learned),  # type: ignore[arg-type]
             )
             torch.manual_seed(settings.seed)
@@ -248,7 +271,7 @@ class _Run:
             steps=settings.steps,
             learning_rate=settings.learning_rate,
             decay=settings.decay,
-            rigid=settings.rigid,
+            curvature=not settings.rigid,
         )
         self.best: dict[str, Any] | None = None
         self.seconds = 0.0
@@ -257,6 +280,7 @@ class _Run:
         self.card = {
             **dataclasses.asdict(settings),
             "samples": len(self.samples),
+            "final_observations": len(self.finals),
             "resolution": self.grid.resolution,
             "torch": torch.__version__,
         }
@@ -269,13 +293,7 @@ class _Run:
             self._summarise()
             self.console.print("all steps are done")
             return
-        size = sum(weight.numel() for weight in trainer.networks.parameters())
-        self.console.print(
-            f"{settings.method}, {settings.preset}: {size:,} parameters; {len(self.samples)} "
-            f"samples of {settings.demonstrations} demonstrations; "
-            f"{len(self.validation_scenes)} scenes to validate by",
-            highlight=False,
-        )
+        self._introduce()
         progress = Progress(
             TextColumn("{task.description}"),
             BarColumn(),
@@ -286,35 +304,22 @@ class _Run:
             transient=True,
             disable=not self.console.is_terminal,
         )
-        recent = self.recent
         start, begun = time.perf_counter() - self.seconds, trainer.step_count
         clock = time.perf_counter()
         writer = SummaryWriter(str(self.folder / "tensorboard"), purge_step=begun + 1)
         with writer, progress, interrupts_wait() as interrupted:
             task = progress.add_task("steps", total=settings.steps, completed=begun, speed="")
             while trainer.step_count < settings.steps:
-                recent.append(trainer.step(self.samples))
+                self._step()
                 step = trainer.step_count
                 last = step == settings.steps
                 speed = (step - begun) / (time.perf_counter() - clock)
                 progress.update(task, completed=step, speed=f"{speed:.2f} a second")
-                if not all(np.isfinite(list(recent[-1].values()))):
-                    raise UserError(
-                        f"a loss is no longer a number at step {step}: lower --learning-rate"
-                    )
                 if step % settings.validate_every == 0 or last:
-                    report = self._validate()
-                    for name, value in report.items():
-                        writer.add_scalar(f"validation/{name}", value, step)
+                    report = self._validate(writer)
                     progress.print(_report_line(step, report), highlight=False)
                 if step % _CHECKPOINT_EVERY == 0 or last:
-                    means = {
-                        name: float(np.mean([item[name] for item in recent])) for name in recent[0]
-                    }
-                    recent.clear()
-                    for name, value in means.items():
-                        writer.add_scalar(f"loss/{name}", value, step)
-                    append_line(self._log, {"step": step, **means})
+                    self._log_losses(writer)
                 if interrupted() or step % _CHECKPOINT_EVERY == 0 or last:
                     self.seconds = time.perf_counter() - start
                     self._save()
@@ -323,20 +328,55 @@ class _Run:
                     raise KeyboardInterrupt
         self._summarise()
 
+    def _introduce(self) -> None:
+        size = sum(weight.numel() for weight in self.trainer.networks.parameters())
+        finals = f" and {len(self.finals)} final observations" if self.settings.stop else ""
+        self.console.print(
+            f"{self.settings.method}, {self.settings.preset}: {size:,} parameters; "
+            f"{len(self.samples)} samples{finals} of {self.settings.demonstrations} "
+            f"demonstrations; {len(self.validation_scenes)} scenes to validate by",
+            highlight=False,
+        )
+
+    def _step(self) -> None:
+        losses = self.trainer.step(self.samples, self.finals)
+        self.recent.append(losses)
+        if not all(np.isfinite(list(losses.values()))):
+            raise UserError(
+                f"a loss is no longer a number at step {self.trainer.step_count}: "
+                "lower --learning-rate"
+            )
+
+    def _log_losses(self, writer: SummaryWriter) -> None:
+        """The mean of each loss since the last point of the curves, over the steps that have it."""
+        step = self.trainer.step_count
+        names = {name: None for losses in self.recent for name in losses}
+        means = {
+            name: float(np.mean([losses[name] for losses in self.recent if name in losses]))
+            for name in names
+        }
+        self.recent.clear()
+        for name, value in means.items():
+            writer.add_scalar(f"loss/{name}", value, step)
+        append_line(self._log, {"step": step, **means})
+
     def _summarise(self) -> None:
         summary = {**self.card, "best": self.best, "wall_seconds": self.seconds}
         write_json(self.folder / "summary.json", summary)
 
-    def _validate(self) -> dict[str, float]:
-        networks = self.trainer.networks.eval()
+    def _validate(self, writer: SummaryWriter) -> dict[str, float]:
+        networks, step = self.trainer.networks.eval(), self.trainer.step_count
         policy = LearnedPolicy(networks, orientations=self.settings.orientations)
-        report = validate(policy, self.validation_scenes, self.grid)
-        chosen = {"step": self.trainer.step_count, **report}
-        if self.best is None or report["displacement_mm"] < self.best["displacement_mm"]:
+        report = validate(policy, self.validation_scenes, self.validation_finals)
+        chosen = {"step": step, **report}
+        if self.best is None or report["cost_mm"] < self.best["cost_mm"]:
             self.best = chosen
-            card = {**self.card, "validation": chosen}
+            threshold = report.get("stop_threshold")
+            card = {**self.card, "validation": chosen, "stop_threshold": threshold}
             save_weights(self.folder / "policy.safetensors", networks, card)
         append_line(self._log, chosen)
+        for name, value in report.items():
+            writer.add_scalar(f"validation/{name}", value, step)
         return report
 
     def _resume(self) -> None:
@@ -367,20 +407,32 @@ class _Run:
         write_whole(self.folder / "checkpoint.pt", buffer.getvalue())
 
 
-def _spread_out(observed: list[Scene]) -> list[Scene]:
-    """Evenly chosen ones, if there are too many."""
-    count = min(len(observed), _MOST_VALIDATED)
-    return [observed[i * len(observed) // count] for i in range(count)]
+def _scenes(demonstrations: Demonstrations) -> list[Scene]:
+    origin = demonstrations.origin
+    return scenes(
+        demonstrations.demonstrations,
+        origin.grid,
+        later_picks_possible=origin.learning.later_picks_possible,
+    )
+
+
+def _evenly_chosen(items: list[Item]) -> list[Item]:
+    """All of them, or evenly chosen ones if there are too many to validate by."""
+    count = min(len(items), _MOST_VALIDATED)
+    return [items[i * len(items) // count] for i in range(count)]
 
 
 def _report_line(step: int, report: dict[str, float]) -> str:
+    stops = ""
+    if "stop_threshold" in report:
+        stops = f"; {report['false_stops']:.0f} false and {report['missed_stops']:.0f} missed stops"
     return (
         f"step {step}: median errors of the pick {report['median_pick_mm']:.1f} mm, "
         f"{report['median_pick_deg']:.2f} deg, of the place {report['median_place_mm']:.1f} mm, "
-        f"{report['median_turn_deg']:.2f} deg; "
-        f"mean displacement {report['displacement_mm']:.2f} mm"
+        f"{report['median_rotation_deg']:.2f} deg; "
+        f"mean displacement {report['displacement_mm']:.2f} mm{stops}"
     )
 
 
 if __name__ == "__main__":
-    run_verb(main)
+    run_command(main)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import torch
@@ -9,33 +10,36 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from kitting_drake.policies.fibres import Fibre, Scalar
-from kitting_drake.policies.steerable import BlurPool, Convolution
+from kitting_drake.policies.steerable import BlurPool, Convolution, MixedPrecision
 from kitting_drake.policies.unet import ResidualBlock
 
 
 @dataclass(frozen=True)
 class AngleNetSize:
-    """How deep and wide a pick-angle network is."""
+    """The depth and width of a pick-angle network."""
 
     stages: tuple[tuple[int, ...], ...]
-    """Fields of each layer; a pooling between stages."""
+    """The number of fields of each layer, stage by stage; there is a pooling between stages."""
     kernel: int = 7
-    """Side of each layer's kernels, in pixels."""
+    """The side of each layer's kernels, in pixels."""
     readout: int = 7
-    """Side of the last layer's kernels."""
-    whole: bool = False
-    """The last layer's kernel covers all that is left, instead of a mean being taken after it."""
+    """The side of the last layer's kernel, in pixels."""
+    full_readout: bool = False
+    """Whether the last layer's kernel covers the whole feature map. Otherwise the last layer is
+    padded, and the mean over its output is taken."""
     residual: bool = False
-    """A stage of two layers is a residual block, with a shortcut of the same kernels where the
-    number of fields changes; the first stage, which takes scalars, must be of another kind."""
+    """Whether a stage of two layers is a residual block, with a convolution of the same kernel size
+    as its shortcut where the number of fields changes. The first stage takes scalars and must then
+    have another number of layers."""
 
     def __post_init__(self) -> None:
         if self.residual and len(self.stages[0]) == 2:
-            raise ValueError("the first stage takes scalars, which no residual block does")
+            raise ValueError("the first stage takes scalars and cannot be a residual block")
 
 
-class AngleNet(nn.Module):
-    """A crop to one vector of the output fibre, which turns as the crop turns."""
+class AngleNet(MixedPrecision):
+    """Maps a crop to one vector of the output fibre, equivariantly (equation 3): as the crop is
+    rotated by r, the vector is transformed by the fibre's representation rho(r)."""
 
     def __init__(
         self,
@@ -63,7 +67,7 @@ class AngleNet(nn.Module):
             stages.append(layers)
         self.stages = nn.ModuleList(stages)
         self.pool = BlurPool()
-        padding = 0 if size.whole else size.readout // 2
+        padding = 0 if size.full_readout else size.readout // 2
         self.readout = convolution(*before, 1, out_fibre, size.readout, padding=padding)
 
     def forward(self, crop: Tensor) -> Tensor:
@@ -74,7 +78,11 @@ class AngleNet(nn.Module):
             if index:
                 features = self.pool(features)
             for layer in layers:
-                # A block has an ELU of its own.
+                # A residual block ends with an ELU of its own.
                 is_block = isinstance(layer, ResidualBlock)
                 features = layer(features) if is_block else F.elu_(layer(features))
+        # The readout always computes in float32: angles need more than eight bits.
         return self.readout(features.float()).mean(dim=(2, 3))
+
+    def reduced_precision_parts(self) -> Iterator[nn.Module]:
+        yield self.stages

@@ -1,37 +1,40 @@
 """Lifting and cross-correlation: the placing module's last step (equations 7 and 8 of the paper).
 
-`cross_correlation` is the plain one. `search` gives its largest values without computing all of it:
-a coarse volume, at half the resolution and a fixed number of turns, is correlated by FFT, and the
-plain correlation is evaluated around the coarse volume's best cells only, at any N. Its cost hardly
-grows with N.
+`cross_correlation` computes the plain correlation. `search` finds its largest values without
+computing all of it: a coarse volume, at half the resolution and a fixed number of rotations, is
+correlated by FFT, and the plain correlation is evaluated around the coarse volume's best cells
+only, at any N. The cost of the search hardly grows with N.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 import torch.nn.functional as F
+from scipy.fft import next_fast_len
 from torch import Tensor
 
 from kitting_drake.policies.steerable import BlurPool
 
 KERNEL = 65
-"""Side of the part of the crop's encoding that is correlated, in pixels."""
-COARSE_TURNS = 48
-"""Turns of the coarse volume."""
+"""The side of the part of the crop's encoding that is correlated, in pixels."""
+COARSE_ROTATIONS = 48
+"""The number of rotations of the coarse volume."""
 _REACH = 4
-"""How far around a coarse cell the search looks, in pixels."""
+"""How far around a cell of the coarse volume the plain correlation is evaluated, in pixels."""
 
 
 def lift(encoding: Tensor, angles: Tensor, size: int) -> Tensor:
-    """R_N (equation 7): the encoding turned about its middle, bilinearly sampled.
+    """R_N (equation 7): the encoding rotated about its middle, bilinearly sampled.
 
     Args:
         encoding: (1, channels, side, side), of odd side: the middle is a pixel.
         angles: (n,), counter-clockwise, in radians.
-        size: side of what is kept around the middle, odd, in pixels.
+        size: the side of the part around the middle that is kept, odd, in pixels.
 
     Returns:
         (n, channels, size, size).
@@ -41,7 +44,7 @@ def lift(encoding: Tensor, angles: Tensor, size: int) -> Tensor:
     offsets = torch.arange(-reach, reach + 1, dtype=encoding.dtype, device=encoding.device)
     row, col = torch.meshgrid(offsets, offsets, indexing="ij")
     cos, sin = torch.cos(angles)[:, None, None], torch.sin(angles)[:, None, None]
-    # Where each pixel comes from: turned back. grid_sample wants (col, row) from -1 to 1.
+    # Each pixel is taken from where the inverse rotation brings it, as (col, row) from -1 to 1.
     source = torch.stack([cos * col - sin * row, cos * row + sin * col], dim=-1)
     grid = source * (2 / (side - 1))
     stack = encoding.expand(len(angles), -1, -1, -1)
@@ -49,7 +52,7 @@ def lift(encoding: Tensor, angles: Tensor, size: int) -> Tensor:
 
 
 def cross_correlation(scene: Tensor, kernels: Tensor) -> Tensor:
-    """Equation 8, plainly.
+    """Equation 8, computed directly.
 
     Args:
         scene: (1, channels, rows, cols), phi(o_t).
@@ -63,29 +66,23 @@ def cross_correlation(scene: Tensor, kernels: Tensor) -> Tensor:
 
 
 def cross_correlation_fft(scene: Tensor, kernels: Tensor) -> Tensor:
-    """The same as `cross_correlation`, by fast Fourier transforms."""
+    """Equation 8 by fast Fourier transforms: the same as `cross_correlation`."""
     rows, cols = scene.shape[-2:]
     size = kernels.shape[-1]
-    shape = (_fast_length(rows + size - 1), _fast_length(cols + size - 1))
+    shape = (next_fast_len(rows + size - 1, real=True), next_fast_len(cols + size - 1, real=True))
     spectrum = torch.fft.rfft2(scene, s=shape) * torch.fft.rfft2(kernels, s=shape).conj()
     volume = torch.fft.irfft2(spectrum.sum(1), s=shape)
     return torch.roll(volume, (size // 2, size // 2), (1, 2))[:, :rows, :cols] / KERNEL
 
 
-def _fast_length(length: int) -> int:
-    """The next length of small prime factors."""
-    while True:
-        rest = length
-        for factor in (2, 3, 5):
-            while rest % factor == 0:
-                rest //= factor
-        if rest == 1:
-            return length
-        length += 1
+def rotation_angles(count: int, like: Tensor, phase: float = 0.0) -> Tensor:
+    """(count,): evenly spaced angles over a full rotation, in radians.
 
-
-def turns(count: int, like: Tensor, phase: float = 0.0) -> Tensor:
-    """(count,): evenly spaced angles over a full turn, in radians, from `phase` of their step."""
+    Args:
+        count: how many.
+        like: a tensor of the same type and on the same device.
+        phase: the first angle, in steps.
+    """
     steps = torch.arange(count, dtype=like.dtype, device=like.device) + phase
     return steps * (math.tau / count)
 
@@ -94,7 +91,7 @@ _halve = BlurPool()
 
 
 def coarse_volume(scene: Tensor, encoding: Tensor, angles: Tensor) -> Tensor:
-    """The correlation of both at half the resolution, scaled to stand for the full one.
+    """The correlation at half the resolution, scaled to approximate the plain one.
 
     Args:
         scene: (1, channels, rows, cols), odd sides.
@@ -112,14 +109,31 @@ def coarse_volume(scene: Tensor, encoding: Tensor, angles: Tensor) -> Tensor:
 def window(
     scene: Tensor, encoding: Tensor, angles: Tensor, corner: tuple[int, int], shape: tuple[int, int]
 ) -> Tensor:
-    """A window of the plain correlation.
+    """A window of the plain correlation with the rotated encoding of a crop.
 
     Args:
         scene: (1, channels, rows, cols).
         encoding: (1, channels, side, side).
         angles: (n,).
         corner: the window's first pixel (row, col); may lie outside the scene, which is zero there.
-        shape: its rows and cols.
+        shape: the window's rows and cols.
+
+    Returns:
+        (n, *shape).
+    """
+    return kernel_window(scene, lift(encoding, angles, KERNEL), corner, shape)
+
+
+def kernel_window(
+    scene: Tensor, kernels: Tensor, corner: tuple[int, int], shape: tuple[int, int]
+) -> Tensor:
+    """A window of the plain correlation with given kernels.
+
+    Args:
+        scene: (1, channels, rows, cols).
+        kernels: (n, channels, KERNEL, KERNEL).
+        corner: as for `window`.
+        shape: as for `window`.
 
     Returns:
         (n, *shape).
@@ -130,13 +144,12 @@ def window(
     horizontal = _overlap(corner[1] - reach, shape[1] + 2 * reach, cols)
     part = scene[:, :, vertical[0], horizontal[0]]
     padded = F.pad(part, (*horizontal[1], *vertical[1]))
-    # So large a kernel is much slower in channels_last, as U-nets leave their outputs.
-    kernels = lift(encoding, angles, KERNEL)
+    # U-nets leave their outputs in channels_last, in which so large a kernel is much slower.
     return F.conv2d(padded.contiguous(), kernels.contiguous())[0] / KERNEL
 
 
 def _overlap(start: int, length: int, side: int) -> tuple[slice, tuple[int, int]]:
-    """What of a span lies on an axis of `side` pixels, and how much of it lies before and after."""
+    """The part of a span that lies on an axis of `side` pixels, and what lies before and after."""
     first = min(max(start, 0), side)
     last = min(max(start + length, first), side)
     before = min(max(-start, 0), length)
@@ -145,23 +158,66 @@ def _overlap(start: int, length: int, side: int) -> tuple[slice, tuple[int, int]
 
 @dataclass(frozen=True)
 class Candidate:
-    """The plain correlation around one of its peaks."""
+    """A window of the plain correlation around one of its peaks."""
 
     scores: Tensor
-    """(n, rows, cols): of the window."""
+    """(n, rows, cols), for n successive rotations."""
     first_bin: int
-    """The turn of `scores[0]`, in bins; may be negative or past the last: turns are cyclic."""
+    """The rotation of `scores[0]`, in bins; it is cyclic, so it may be negative or exceed N."""
     corner: tuple[int, int]
     """The pixel (row, col) of `scores[:, 0, 0]`; all pixels lie in the scene."""
 
     def best(self) -> tuple[float, int, int, int]:
-        """(score, bin, row, col) of the largest."""
-        index = int(self.scores.argmax())
-        rows, cols = self.scores.shape[1:]
-        turn, rest = divmod(index, rows * cols)
-        row, col = divmod(rest, cols)
-        score = float(self.scores[turn, row, col])
-        return score, self.first_bin + turn, self.corner[0] + row, self.corner[1] + col
+        """(score, bin, row, col) of the largest score."""
+        rotation, row, col = _argmax(self.scores)
+        score = float(self.scores[rotation, row, col])
+        return score, self.first_bin + rotation, self.corner[0] + row, self.corner[1] + col
+
+
+def _argmax(volume: Tensor) -> tuple[int, int, int]:
+    rotation, row, col = np.unravel_index(int(volume.argmax()), volume.shape)
+    return int(rotation), int(row), int(col)
+
+
+def peaks(volume: Tensor, count: int) -> Iterator[tuple[int, int, int]]:
+    """(rotation, row, col) of the largest values of a volume, largest first, none next to another.
+
+    Args:
+        volume: (n, rows, cols), over a full rotation.
+        count: how many.
+    """
+    remaining = volume.clone()
+    for _ in range(count):
+        rotation, row, col = _argmax(remaining)
+        around = [(rotation + step) % len(volume) for step in (-1, 0, 1)]
+        remaining[around, max(row - 1, 0) : row + 2, max(col - 1, 0) : col + 2] = -math.inf
+        yield rotation, row, col
+
+
+def finer_bins(rotation: int, coarse: int, orientations: int) -> tuple[int, int]:
+    """The first and last bin at N orientations of what lies between a coarse rotation's neighbours.
+
+    Args:
+        rotation: the coarse rotation, in coarse bins.
+        coarse: the number of coarse bins over a full rotation.
+        orientations: N.
+    """
+    first = math.floor((rotation - 1) * orientations / coarse)
+    return first, math.ceil((rotation + 1) * orientations / coarse)
+
+
+def window_around(
+    pixel: tuple[int, int], shape: tuple[int, int]
+) -> tuple[tuple[int, int], tuple[int, int]]:
+    """The corner (row, col) and shape (rows, cols) of the window around a pixel, kept in an image.
+
+    Args:
+        pixel: (row, col).
+        shape: the image's rows and cols.
+    """
+    top, left = max(pixel[0] - _REACH, 0), max(pixel[1] - _REACH, 0)
+    bottom, right = min(pixel[0] + _REACH + 1, shape[0]), min(pixel[1] + _REACH + 1, shape[1])
+    return (top, left), (bottom - top, right - left)
 
 
 def search(
@@ -178,29 +234,20 @@ def search(
         scene: (1, channels, rows, cols), odd sides, phi(o_t).
         encoding: (1, channels, side, side), psi(c).
         orientations: N.
-        shape: rows and cols to look in, from the first on; by default all.
-        candidates: how many of the coarse volume's peaks are looked at.
+        shape: the rows and cols, from the first ones on, that are searched; by default all.
+        candidates: how many of the coarse volume's peaks are refined.
 
     Returns:
-        The candidates, and the coarse volume (COARSE_TURNS, about rows / 2, about cols / 2).
+        The candidates, and the coarse volume (COARSE_ROTATIONS, about rows / 2, about cols / 2).
     """
     rows, cols = shape or scene.shape[-2:]
-    volume = coarse_volume(scene, encoding, turns(COARSE_TURNS, scene))
+    volume = coarse_volume(scene, encoding, rotation_angles(COARSE_ROTATIONS, scene))
     volume = volume[:, : rows // 2 + 1, : cols // 2 + 1]
     found = []
-    remaining = volume.clone()
-    for _ in range(candidates):
-        index = int(remaining.argmax())
-        turn, rest = divmod(index, remaining.shape[1] * remaining.shape[2])
-        row, col = divmod(rest, remaining.shape[2])
-        around = [(turn + step) % COARSE_TURNS for step in (-1, 0, 1)]
-        remaining[around, max(row - 1, 0) : row + 2, max(col - 1, 0) : col + 2] = -math.inf
-        first = math.floor((turn - 1) * orientations / COARSE_TURNS)
-        last = math.ceil((turn + 1) * orientations / COARSE_TURNS)
-        top, left = max(2 * row - _REACH, 0), max(2 * col - _REACH, 0)
-        bottom, right = min(2 * row + _REACH + 1, rows), min(2 * col + _REACH + 1, cols)
+    for rotation, row, col in peaks(volume, candidates):
+        first, last = finer_bins(rotation, COARSE_ROTATIONS, orientations)
+        corner, size = window_around((2 * row, 2 * col), (rows, cols))
         bins = torch.arange(first, last + 1, dtype=scene.dtype, device=scene.device)
         angles = bins * (math.tau / orientations)
-        scores = window(scene, encoding, angles, (top, left), (bottom - top, right - left))
-        found.append(Candidate(scores, first, (top, left)))
+        found.append(Candidate(window(scene, encoding, angles, corner, size), first, corner))
     return sorted(found, key=lambda item: -item.best()[0]), volume

@@ -35,8 +35,8 @@ FORMAT_VERSION = 2
 
 
 @dataclass(frozen=True)
-class _Recorded:
-    """An observation as the file holds it: colours in 8 bits."""
+class Recorded:
+    """An observation as the file holds it, with colours in 8 bits."""
 
     rgb: NDArray[np.uint8]
     """(3, rows, cols)."""
@@ -53,7 +53,7 @@ class _Recorded:
 
 
 @dataclass(frozen=True)
-class DemonstrationStep(_Recorded):
+class DemonstrationStep(Recorded):
     """One observation, and what the expert did."""
 
     pick: PlanarPose
@@ -68,28 +68,24 @@ class DemonstrationStep(_Recorded):
         observation: Observation, action: PickPlaceAction, *, name: str, category: str = ""
     ) -> DemonstrationStep:
         """A step as it happened; colours are rounded to 8 bits."""
-        return DemonstrationStep(
-            rgb=_eight_bits(observation.rgb),
-            height=observation.height.copy(),
-            pick=action.pick,
-            place=action.place,
-            object=name,
-            category=category,
-        )
+        seen = record(observation)
+        return DemonstrationStep(seen.rgb, seen.height, action.pick, action.place, name, category)
 
 
 @dataclass(frozen=True)
-class FinalObservation(_Recorded):
+class FinalObservation(Recorded):
     """What was seen when the expert said that nothing is left to do (`PickPlaceAction.stop`)."""
 
     @staticmethod
     def of(observation: Observation) -> FinalObservation:
         """The observation; colours are rounded to 8 bits."""
-        return FinalObservation(_eight_bits(observation.rgb), observation.height.copy())
+        seen = record(observation)
+        return FinalObservation(seen.rgb, seen.height)
 
 
-def _eight_bits(rgb: NDArray[np.float32]) -> NDArray[np.uint8]:
-    return np.rint(rgb * 255).astype(np.uint8)
+def record(observation: Observation) -> Recorded:
+    """An observation with its colours rounded to 8 bits."""
+    return Recorded(np.rint(observation.rgb * 255).astype(np.uint8), observation.height.copy())
 
 
 @dataclass(frozen=True)

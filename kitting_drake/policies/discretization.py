@@ -1,7 +1,7 @@
-"""The group discretization operation of the paper (section III-B.2), and what lies beyond it.
+"""The group discretization operation of the paper (section III-B.2), and its continuous limit.
 
-The number of orientations N is a property of the question, not of the network: the same
-coefficients answer at any N that the band limit allows, and at none, by the maximum of the series.
+The number of orientations N is no property of the network: the same Fourier coefficients can be
+discretized at any N that the band limit allows, and the maximum of the series needs no N at all.
 """
 
 from __future__ import annotations
@@ -23,17 +23,17 @@ def discretization_matrix(
     """Q of the paper, the matrix of Dis from SO(2) to C_N (equations 5, 6) or of its quotient form.
 
     Args:
-        orientations: N, the bins over a full turn.
+        orientations: N, the number of bins over a full rotation.
         frequencies: j of the irreps, ascending.
-        quotient: 2 for SO(2)/C_2 to C_N/C_2: only bins 0 to N/2 - 1 are asked for, and every
-            frequency must be even. The angles are 2 pi i / N all the same.
+        quotient: 2 for SO(2)/C_2 to C_N/C_2: the matrix has bins 0 to N/2 - 1 only, at the same
+            angles 2 pi i / N, and every frequency must be even.
 
     Returns:
         (N / quotient, d).
 
     Raises:
-        ValueError: N is not a multiple of `quotient`, a frequency does not live on the quotient, or
-            N / quotient is smaller than d, which aliases (Nyquist).
+        ValueError: N is not a multiple of `quotient`, a frequency is no multiple of it either, or N
+            / quotient is smaller than d, which aliases (Nyquist).
     """
     if orientations < 1 or orientations % quotient:
         raise ValueError(f"{orientations} orientations are not a multiple of {quotient}")
@@ -56,13 +56,13 @@ def discretization_matrix(
 def discretize(
     coefficients: Tensor, orientations: int, frequencies: Sequence[int], *, quotient: int = 1
 ) -> Tensor:
-    """Dis (equation 6): an irrep vector to a regular one.
+    """Dis (equation 6): maps an irrep vector to a regular one.
 
     Args:
         coefficients: (..., d).
         orientations: as for `discretization_matrix`.
-        frequencies: likewise.
-        quotient: likewise.
+        frequencies: as for `discretization_matrix`.
+        quotient: as for `discretization_matrix`.
 
     Returns:
         (..., N / quotient): the function at the angles 2 pi i / N.
@@ -72,16 +72,16 @@ def discretize(
 
 
 def series_maximum(coefficients: NDArray[np.float64], frequencies: Sequence[int]) -> float:
-    """The angle at which a Fourier series is largest: no bins at all.
+    """The angle at which a Fourier series is largest, exactly and not only among N bins.
 
     Args:
         coefficients: (d,), in the order of `fourier_basis`.
         frequencies: ascending.
 
     Returns:
-        Radians in [0, 2 pi); of several equal maxima (a quotient has them) the first.
+        Radians in [0, 2 pi): the first of several equal maxima, which there are on a quotient.
     """
-    # What has a period of a part of a turn is looked at over that part.
+    # A series of a shorter period, as on a quotient, is searched over one period.
     period = math.gcd(*frequencies) or 1
     reduced = np.array(frequencies) // period
     count = 32 * max(int(reduced.max()), 1)
@@ -94,7 +94,7 @@ def series_maximum(coefficients: NDArray[np.float64], frequencies: Sequence[int]
 
     best, largest = 0.0, -math.inf
     for peak in peaks:
-        # Newton's steps, none beyond the neighbouring samples.
+        # Newton's method; no step leads beyond the neighbouring samples.
         angle = math.tau * float(peak) / count
         for _ in range(8):
             terms = evaluate(angle)
@@ -109,7 +109,7 @@ def series_maximum(coefficients: NDArray[np.float64], frequencies: Sequence[int]
         value = float(evaluate(angle).real.sum())
         if value > largest + 1e-12 * float(np.ptp(values)):
             best, largest = angle, value
-    # Zero from below is zero.
+    # An angle just below a full rotation is zero, up to rounding.
     best %= math.tau
     return 0.0 if math.tau - best < 1e-9 else best / period
 

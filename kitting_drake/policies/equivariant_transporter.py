@@ -1,8 +1,8 @@
 """The Equivariant Transporter, the first baseline of the paper (section V-C.3).
 
-The paper's own method but for its fields: regular ones of C_6 where an answer is invariant, and
-regular ones of C_N / C_2 all through the angle network, which N is thereby built into: its weights,
-its kernels and its time grow with N.
+It differs from the paper's own method in its fields: regular fields of C_6 where the output is
+invariant, and regular fields of C_N / C_2 throughout the angle network. N is thereby part of the
+architecture: the angle network's parameters, kernels and time grow with N.
 """
 
 from __future__ import annotations
@@ -19,14 +19,14 @@ from kitting_drake.policies.steerable import Convolution, SteerableConv2d
 from kitting_drake.policies.unet import UNet
 
 _ORDER = 6
-"""Of the group whose regular fields the U-nets have."""
+"""The order of the group whose regular fields the U-nets have."""
 
 
 class EquivariantTransporterNetworks(FactoredNetworks):
     """Networks of regular fields.
 
-    At the preset "paper" the angle network has 0.90, 1.81, 3.01 and 4.51 million parameters at
-    N = 36, 72, 120 and 180, as the authors'.
+    With the preset "paper" the angle network has 0.90, 1.81, 3.01 and 4.51 million parameters at
+    N = 36, 72, 120 and 180, as the authors' has.
     """
 
     def __init__(self, config: NetworkConfig, convolution: Convolution = SteerableConv2d) -> None:
@@ -43,8 +43,8 @@ class EquivariantTransporterNetworks(FactoredNetworks):
         """Raises ValueError if the networks were made for another N."""
         if orientations != self.config.orientations:
             raise ValueError(
-                f"this Equivariant Transporter answers at {self.config.orientations} orientations, "
-                f"not at {orientations}: train one for that"
+                f"this Equivariant Transporter predicts at {self.config.orientations} "
+                f"orientations, not at {orientations}: train one for that"
             )
 
     def crop_angle_logits(self, crops: Tensor, orientations: int) -> Tensor:

@@ -1,8 +1,8 @@
-"""The SO(2) networks of escnn's own modules, as they come: what folding is measured against.
+"""The SO(2) networks built of escnn's own modules: the reference that folding is measured against.
 
-Built from networks of this package and with their weights, so that both are the same function:
-coefficients travel between the layers, and FourierELU transforms every feature map to samples and
-back. Nothing but the benchmark and the tests needs this.
+They are built from networks of this package and have the same weights, so that both are the same
+function. Between escnn's layers there are Fourier coefficients, and FourierELU transforms every
+feature map to samples and back. Only the benchmark and the tests need this module.
 """
 
 from __future__ import annotations
@@ -26,15 +26,15 @@ with warnings.catch_warnings():
     from escnn import nn as enn
 
 _SIGMA = 0.66
-"""Of the poolings' blur, in pixels: `BlurPool`'s."""
+"""Standard deviation of the blur of the poolings, in pixels, as in `BlurPool`."""
 
 
 def as_escnn(networks: SO2Networks, autocast: torch.dtype | None = None) -> Networks:
-    """The same networks, of escnn's modules.
+    """The same networks, built of escnn's modules.
 
     Args:
         networks: made with `SteerableConv2d`; their weights are copied.
-        autocast: the type that torch's automatic mixed precision computes in; None: float32.
+        autocast: the type for torch's automatic mixed precision; None: float32.
     """
     reference = make_networks(networks.config)
     for name, network in networks.named_children():
@@ -46,7 +46,7 @@ def as_escnn(networks: SO2Networks, autocast: torch.dtype | None = None) -> Netw
 
 
 class EscnnUNet(nn.Module):
-    """A `UNet`, of escnn's modules."""
+    """A `UNet` built of escnn's modules."""
 
     def __init__(self, source: UNet, autocast: torch.dtype | None = None) -> None:
         super().__init__()
@@ -72,22 +72,22 @@ class EscnnUNet(nn.Module):
                     features = self.pools[index - 1](features)
                 features = block(features)
             for block in self.up:
-                # escnn's R2Upsampling calls the same, but must know the size when it is made.
+                # escnn's R2Upsampling computes the same, but must know the size when it is made.
                 larger = enn.GeometricTensor(upsample(features.tensor), features.type)
                 features = block(enn.tensor_directsum([larger, levels.pop()]))
-            # To escnn, frequency 0 alone and the trivial representation are two types.
+            # For escnn, frequency 0 alone and the trivial representation are different types.
             scalars = enn.GeometricTensor(features.tensor, self.mix.in_type)
             return self.out(self.mix_elu(self.mix(scalars))).tensor.float()
 
 
 class _EscnnBlock(nn.Module):
-    """A `ResidualBlock`, of escnn's modules."""
+    """A `ResidualBlock` built of escnn's modules."""
 
     def __init__(self, source: nn.Module, *, invariant: bool = False) -> None:
         """
         Args:
             source: the block.
-            invariant: only the invariant part is wanted of what comes out.
+            invariant: whether the output is only the invariant part.
         """
         super().__init__()
         assert isinstance(source, ResidualBlock)
@@ -109,7 +109,7 @@ class _EscnnBlock(nn.Module):
 
 
 class EscnnAngleNet(nn.Module):
-    """An `AngleNet` of irreps, of escnn's modules."""
+    """An `AngleNet` of irreps built of escnn's modules."""
 
     def __init__(self, source: AngleNet, autocast: torch.dtype | None = None) -> None:
         super().__init__()
@@ -150,7 +150,7 @@ def _field_type(fibre: Fibre, count: int) -> enn.FieldType:
 
 
 def _convolution(source: nn.Module) -> enn.R2Conv:
-    """The same convolution, of the same weights: their order is escnn's."""
+    """The same convolution with the same weights, whose order is escnn's."""
     assert isinstance(source, SteerableConv2d)
     out_fields, in_fields, _ = source.weights.shape
     layer = enn.R2Conv(
@@ -172,7 +172,7 @@ def _convolution(source: nn.Module) -> enn.R2Conv:
 
 
 def _fourier_elu(source: nn.Module, *, invariant: bool = False) -> enn.FourierELU:
-    """The nonlinearity after a convolution, at as many samples as travel there."""
+    """The nonlinearity after a convolution, at as many samples as its output fibre has."""
     assert isinstance(source, SteerableConv2d)
     assert isinstance(source.out_fibre, Irreps)
     return enn.FourierELU(

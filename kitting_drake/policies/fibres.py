@@ -1,8 +1,8 @@
-"""What a field carries at each pixel: the fibre, and how it travels between layers.
+"""The fibre of a feature field: what the field carries at each pixel, and how it is stored.
 
 Fields of irreps are stored as *samples* of the function that their coefficients describe, so that a
 pointwise nonlinearity acts on them directly (see `steerable.py`). Everything here is plain linear
-algebra: an exported network needs it, and no group library.
+algebra: inference needs no group library.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 
 class Fibre(Protocol):
-    """The representation that one field turns with, and the numbers that stand for it."""
+    """The representation by which one field transforms, and how its vectors are stored."""
 
     def __hash__(self) -> int: ...
 
@@ -27,16 +27,17 @@ class Fibre(Protocol):
 
     @property
     def channels(self) -> int:
-        """Numbers that travel for one field."""
+        """The number of channels in which one field is stored."""
 
     def synthesis(self) -> NDArray[np.float64]:
-        """(channels, size): what travels, from a vector of the representation."""
+        """(channels, size): from a vector of the representation to the stored channels."""
 
     def analysis(self) -> NDArray[np.float64]:
-        """(size, channels): its left inverse, which drops what the representation cannot hold."""
+        """(size, channels): the left inverse of `synthesis`, which projects."""
 
     def invariant(self) -> NDArray[np.float64]:
-        """(channels,): the functional that no turn changes, scaled as the authors' Fourier ELU."""
+        """(channels,): the functional that is invariant to rotations: it gives the coefficient of
+        frequency 0, scaled as in escnn's Fourier ELU."""
 
 
 @dataclass(frozen=True)
@@ -66,7 +67,8 @@ class Irreps:
     frequencies: tuple[int, ...]
     """j of each rho_j, ascending."""
     samples: int = 0
-    """How many evenly spaced samples of the band-limited function travel; 0: coefficients do."""
+    """How many evenly spaced samples of the band-limited function are stored; 0: the coefficients
+    themselves are."""
 
     def __post_init__(self) -> None:
         if list(self.frequencies) != sorted(set(self.frequencies)) or min(self.frequencies) < 0:
@@ -99,13 +101,13 @@ class Irreps:
 
     def invariant(self) -> NDArray[np.float64]:
         if not self.samples:
-            raise ValueError("a field of coefficients is read by its first, not by its mean")
+            raise ValueError("the invariant of a field of coefficients is the first of them")
         return np.full(self.samples, math.sqrt(self.size) / self.samples)
 
 
 @dataclass(frozen=True)
 class Regular:
-    """The regular representation of C_N, or of its quotient C_N / C_q: N / q numbers permuted."""
+    """The regular representation of C_N or of its quotient C_N / C_q: it permutes N / q numbers."""
 
     order: int
     quotient: int = 1

@@ -4,9 +4,10 @@ Between regular fields of C_N, or of C_N / C_q, with M = N / q channels, every s
 
     K[m, n](x) = kappa[(n - m) mod M](R_m^-1 x),
 
-R_m being the turn by 2 pi m / N: the kernels that lead to channel 0 are free, and those that lead
-to channel m are the same ones, turned. It is escnn's space; its basis, M B kernels of M^2 numbers a
-pixel, would fill the memory at N = 180. Here are but B patterns, turned M ways.
+where R_m is the rotation by 2 pi m / N: the kernels to output channel 0 are free, and those to
+channel m are the same kernels, rotated. This is the same space of kernels as escnn's. escnn's basis
+of it, M B kernels of M^2 numbers a pixel, would not fit into memory at N = 180; here only B
+patterns in M rotations are stored.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ from kitting_drake.policies.steerable import ExpandedConv2d, kernel_basis
 
 
 class GroupConv2d(ExpandedConv2d):
-    """What `SteerableConv2d` is, for regular fields of one group and scalars."""
+    """The counterpart of `SteerableConv2d` for regular fields of one cyclic group, and scalars."""
 
     basis: Tensor
 
@@ -40,19 +41,19 @@ class GroupConv2d(ExpandedConv2d):
     ) -> None:
         """
         Args:
-            in_fields: how many fields come in.
-            in_fibre: what each carries.
-            out_fields: how many go out.
-            out_fibre: what each carries; of both fibres, one may be scalar.
-            size: side of the kernel, odd, in pixels.
-            padding: of the image by zeros; by default the image keeps its size.
-            bias: one for each field.
-            gain: of the initial weights' standard deviation.
+            in_fields: the number of input fields.
+            in_fibre: the fibre of each of them.
+            out_fields: the number of output fields.
+            out_fibre: the fibre of each of them; one of the two fibres may be scalar.
+            size: the side of the kernel, odd, in pixels.
+            padding: zeros around the image, in pixels; by default the image keeps its size.
+            bias: whether each output field has a bias.
+            gain: a factor of the initial weights' standard deviation.
         """
         fibres = [fibre for fibre in (in_fibre, out_fibre) if not isinstance(fibre, Scalar)]
         if not fibres or not isinstance(fibres[0], Regular) or fibres[0] != fibres[-1]:
             raise ValueError(f"no group convolution leads from {in_fibre} to {out_fibre}")
-        basis = turned_patterns(fibres[0], size)
+        basis = rotated_patterns(fibres[0], size)
         scale = math.sqrt(2 / (in_fields * in_fibre.channels * float(basis[0].square().sum())))
         taps = basis.shape[1] * (len(basis) if len(fibres) == 2 else 1)
         weights = torch.randn(out_fields, in_fields, taps) * (gain * scale)
@@ -66,42 +67,44 @@ class GroupConv2d(ExpandedConv2d):
         elif isinstance(self.out_fibre, Scalar):
             kernel = torch.einsum("oib,nbxy->oxyin", self.weights, self.basis)
         else:
-            # Windows of kappa, written down twice: that of m begins at -m.
+            # kappa is repeated once, so that its cyclic shifts are windows of it; that of m starts
+            # at -m.
             kappa = self.weights.unflatten(2, self.basis.shape[:2])
             cyclic = torch.cat([kappa, kappa], dim=2).unfold(2, len(self.basis), 1)
             kernel = torch.einsum("oimbn,mbxy->omxyin", cyclic[:, :, 1:].flip(2), self.basis)
-        # In the order of channels_last, which convolutions want.
+        # In the memory order of channels_last, in which convolutions are fastest.
         size = self.basis.shape[-1]
         channels = self.weights.shape[0] * self.out_fibre.channels
         return kernel.reshape(channels, size, size, -1).permute(0, 3, 1, 2)
 
 
 @functools.lru_cache(maxsize=16)
-def turned_patterns(fibre: Regular, size: int) -> Tensor:
-    """escnn's circular harmonics that live on the quotient, turned by all the group.
+def rotated_patterns(fibre: Regular, size: int) -> Tensor:
+    """escnn's circular harmonics that are invariant under C_q, rotated by all of C_N / C_q.
 
     Args:
-        fibre: C_N / C_q: a pattern must look the same after 1 / q of a full turn.
-        size: side of the kernel, odd, in pixels.
+        fibre: C_N / C_q, the regular representation whose kernels are wanted.
+        size: the side of the kernel, odd, in pixels.
 
     Returns:
-        (M, B, size, size), float64: B patterns, each turned counter-clockwise by 2 pi m / N.
+        (M, B, size, size), float64: B patterns, each rotated counter-clockwise by 2 pi m / N.
     """
     reach = size // 2
-    # A bound: by default escnn keeps far fewer, about as many as the radius has pixels.
+    # An upper bound: escnn itself keeps about as many frequencies as the radius has pixels.
     frequencies = tuple(range(0, 3 * reach + 1, fibre.quotient))
     pairs = kernel_basis(Scalar(), Irreps(frequencies), size)[:, :, 0]
     angles = 2 * math.pi * torch.arange(fibre.size, dtype=torch.float64) / fibre.order
-    turned = []
+    rotated = []
     row = 0
     for j in frequencies:
-        # A kernel from scalars to rho_j: (p, q)(R x) = rho_j(R) (p, q)(x), so p turns within it.
+        # For a kernel (p, q) from scalars to rho_j, (p, q)(R x) = rho_j(R) (p, q)(x): the rotated p
+        # is a combination of p and q.
         block = pairs[:, row : row + (2 if j else 1)]
         block = block[block.abs().amax(dim=(1, 2, 3)) > 1e-9]
         first, last = block[:, 0], block[:, -1]
         cos, sin = torch.cos(j * angles), torch.sin(j * angles)
-        turned.append(torch.einsum("m,bxy->mbxy", cos, first))
+        rotated.append(torch.einsum("m,bxy->mbxy", cos, first))
         if j:
-            turned[-1] += torch.einsum("m,bxy->mbxy", sin, last)
+            rotated[-1] += torch.einsum("m,bxy->mbxy", sin, last)
         row += 2 if j else 1
-    return torch.cat(turned, dim=1)
+    return torch.cat(rotated, dim=1)

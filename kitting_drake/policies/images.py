@@ -1,6 +1,6 @@
-"""Pixels: crops, and the augmentation of a labelled image.
+"""Labelled images, crops of them, and data augmentation.
 
-Positions are continuous (row, col) with pixel centres at whole numbers, turns are
+Positions are continuous (row, col) with pixel centres at whole numbers, and rotations are
 counter-clockwise: both as `systems.signals.PixelGrid` has them. There is no other convention here.
 """
 
@@ -18,100 +18,129 @@ from systems.signals import PickPlaceAction, PixelGrid
 Image = NDArray[np.float32]
 """(4, rows, cols): red, green, blue in [0, 1] and height in metres."""
 
-_BEND = 0.2
-"""Standard deviation of both coefficients of a bend."""
-_FARTHEST_BENT = 1.4
-"""No bend grows from here on, in half sides of the crop: the distance of its corners."""
+_CURVATURE_STD = 0.2
+"""Standard deviation of both coefficients of a curvature."""
+_FARTHEST_CURVED = 1.4
+"""The distance from the pick beyond which no displacement grows, in half sides of the crop: that of
+the crop's corners."""
+_ROTATION_STD = math.radians(60)
+"""Standard deviation of augmentation's rotations, in radians (as in the authors' code)."""
+_SHIFT_STD = 1 / 6
+"""Standard deviation of augmentation's shifts, in sides of the image (as in the authors' code)."""
 
 
 @dataclass(frozen=True)
 class LabelledImage:
-    """An observation and what the expert did, in pixels."""
+    """An observation and the expert's action, in pixels."""
 
     image: Image
     pick: NDArray[np.float64]
     """(row, col)."""
     pick_theta: float
-    """Of the gripper, in radians; a half turn more is the same."""
+    """The angle of the gripper, in radians; adding pi gives the same grasp."""
     place: NDArray[np.float64]
-    """(row, col) that the point under the gripper goes to."""
-    turn: float
-    """By how much the object turns on its way, in radians."""
+    """(row, col) that the object's point under the gripper is brought to."""
+    rotation: float
+    """The rotation of the object between pick and place, in radians."""
     other_picks: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 2)))
-    """(n, 2): where other objects might be picked instead."""
+    """(n, 2): where other objects could be picked instead."""
     other_thetas: NDArray[np.float64] = field(default_factory=lambda: np.zeros(0))
-    """(n,): at which angles."""
+    """(n,): the angles of the gripper there."""
     motion: Motion | None = None
-    """How the scene was moved, if it was."""
-    bends: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 2)))
-    """(1 + n, 2): how the object of each pick may be bent, see `bent_crop`; or none."""
+    """The motion of the scene by which the image was augmented, if it was."""
+    curvatures: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 2)))
+    """(1 + n, 2): a curvature for the object of each pick (see `curved_crop`), or none at all."""
 
     @classmethod
     def from_action(cls, image: Image, action: PickPlaceAction, grid: PixelGrid) -> LabelledImage:
-        """The labels of an action."""
+        """The labels that correspond to an action."""
         return cls(
             image=image,
             pick=grid.to_pixel((action.pick.x, action.pick.y)),
             pick_theta=action.pick.theta,
             place=grid.to_pixel((action.place.x, action.place.y)),
-            turn=action.place.theta - action.pick.theta,
+            rotation=action.place.theta - action.pick.theta,
         )
 
     def place_of(self, pixel: NDArray[np.float64]) -> NDArray[np.float64]:
-        """(row, col) that another point of the object, now at `pixel`, goes to."""
-        return self.place + rotation(self.turn) @ (pixel - self.pick)
+        """(row, col) that the object's point which is now at `pixel` is brought to."""
+        return self.place + rotation_matrix(self.rotation) @ (pixel - self.pick)
 
-    def bent_crop(self, index: int, pixel: tuple[int, int], side: int) -> Image:
-        """(channels, side, side) around a pixel near pick 0 or one of the others, its object bent.
+    def curved_crop(self, index: int, pixel: tuple[int, int], side: int) -> Image:
+        """A crop in which the object is bent: curvature augmentation.
 
-        Under a bend (a, b) what is seen at u along the gripper, in half sides of the crop from the
-        pick, lay a u^2 + b u^3 half sides further across it. At the pick nothing moves and nothing
-        turns: the label stays exact, while the object's far ends say less about it.
+        For a curvature (a, b), let u be the distance from the pick along the gripper's angle, in
+        half sides of the crop. The crop shows at u what lies a u^2 + b u^3 half sides further
+        across. At the pick itself position and direction stay the same, so the label is exact,
+        while the far ends of the object become less informative.
+
+        Args:
+            index: 0 for the pick, 1 + i for other pick i.
+            pixel: the middle of the crop, near that pick.
+            side: of the crop, odd, in pixels.
+
+        Returns:
+            (channels, side, side).
         """
         reach = side // 2
         picks = np.vstack([self.pick, self.other_picks])
-        axes = rotation(np.append(self.pick_theta, self.other_thetas)[index])
+        axes = rotation_matrix(np.append(self.pick_theta, self.other_thetas)[index])
         offsets = np.arange(-reach, reach + 1)
         grid = np.stack(np.meshgrid(offsets, offsets, indexing="ij"), axis=-1) + pixel
         along, across = np.moveaxis((grid - picks[index]) @ axes, -1, 0)
-        u = np.clip(along / reach, -_FARTHEST_BENT, _FARTHEST_BENT)
-        square, cube = self.bends[index]
+        u = np.clip(along / reach, -_FARTHEST_CURVED, _FARTHEST_CURVED)
+        square, cube = self.curvatures[index]
         across = across + reach * (square * u**2 + cube * u**3)
-        bent = np.stack([along, across], axis=-1) @ axes.T + picks[index]
+        source = np.stack([along, across], axis=-1) @ axes.T + picks[index]
         if self.motion is None:
-            return nearest(self.image, bent)
+            return nearest(self.image, source)
+        # One lookup in the original image instead of two in a row.
         rows, cols = self.image.shape[1:]
-        inside = ((bent > -0.5) & (bent < (rows - 0.5, cols - 0.5))).all(axis=-1)
-        return nearest(self.motion.image, self.motion.before(bent)) * inside
+        inside = ((source > -0.5) & (source < (rows - 0.5, cols - 0.5))).all(axis=-1)
+        return nearest(self.motion.image, self.motion.before(source)) * inside
 
 
 @dataclass(frozen=True)
 class Motion:
-    """A turn of an image about its middle, and then a shift."""
+    """An SE(2) motion of an image: a rotation about its middle followed by a shift."""
 
     image: Image
-    """As it was before."""
+    """The image before the motion."""
     angle: float
     """Counter-clockwise, in radians."""
     shift: NDArray[np.float64]
     """(row, col), in pixels."""
 
+    @classmethod
+    def draw(cls, image: Image, random: np.random.Generator) -> Motion:
+        """A random motion, normally distributed."""
+        rows, cols = image.shape[1:]
+        angle = random.normal(0.0, _ROTATION_STD)
+        return cls(image, angle, random.normal(0.0, (rows * _SHIFT_STD, cols * _SHIFT_STD)))
+
     @property
     def middle(self) -> NDArray[np.float64]:
-        """(row, col) of the image's."""
+        """(row, col) of the middle of the image."""
         return (np.array(self.image.shape[1:]) - 1) / 2
 
     def after(self, pixels: NDArray[np.float64]) -> NDArray[np.float64]:
-        """(..., 2): where positions (..., 2) of the image come to lie."""
-        return (pixels - self.middle) @ rotation(self.angle).T + self.middle + self.shift
+        """(..., 2): where the motion brings positions (..., 2)."""
+        rotated = (pixels - self.middle) @ rotation_matrix(self.angle).T
+        return rotated + self.middle + self.shift
 
     def before(self, pixels: NDArray[np.float64]) -> NDArray[np.float64]:
-        """(..., 2): its inverse."""
-        return (pixels - self.middle - self.shift) @ rotation(self.angle) + self.middle
+        """(..., 2): where positions (..., 2) come from; the inverse of `after`."""
+        return (pixels - self.middle - self.shift) @ rotation_matrix(self.angle) + self.middle
+
+    def moved_image(self) -> Image:
+        """The image after the motion, of the same size."""
+        rows, cols = self.image.shape[1:]
+        target = np.stack(np.meshgrid(np.arange(rows), np.arange(cols), indexing="ij"), axis=-1)
+        return nearest(self.image, self.before(target))
 
 
-def rotation(angle: float) -> NDArray[np.float64]:
-    """(2, 2): turns (row, col) vectors counter-clockwise."""
+def rotation_matrix(angle: float) -> NDArray[np.float64]:
+    """(2, 2): rotates (row, col) vectors counter-clockwise by an angle in radians."""
     cos, sin = math.cos(angle), math.sin(angle)
     return np.array([[cos, -sin], [sin, cos]])
 
@@ -130,15 +159,15 @@ def crop(image: Image, centre: tuple[int, int], side: int) -> Image:
 
 
 def nearest(image: Image, source: NDArray[np.float64]) -> Image:
-    """An image's pixels at other places: the nearest, as a blend of two heights is one that no
-    scene has.
+    """An image resampled at other positions, by nearest neighbours: interpolating between two
+    heights would make up a height that is nowhere in the scene.
 
     Args:
         image: (channels, rows, cols).
-        source: (n, m, 2): the position (row, col) that each new pixel comes from.
+        source: (n, m, 2): the position (row, col) that each new pixel is taken from.
 
     Returns:
-        (channels, n, m); zero, as if unseen, where that is outside the image.
+        (channels, n, m); zero, as if unseen, where that position is outside the image.
     """
     rows, cols = image.shape[1:]
     row, col = np.rint(source).astype(int).transpose(2, 0, 1)
@@ -147,53 +176,52 @@ def nearest(image: Image, source: NDArray[np.float64]) -> Image:
 
 
 def move(sample: LabelledImage, angle: float, shift: NDArray[np.float64]) -> LabelledImage:
-    """The scene turned about the image's middle and then shifted; the labels move exactly.
+    """A sample after a motion of the scene; its labels are moved exactly.
 
     Args:
         sample: what to move.
-        angle: counter-clockwise, in radians.
+        angle: of the rotation about the image's middle, counter-clockwise, in radians.
         shift: (row, col), in pixels.
     """
-    motion = Motion(sample.image, angle, np.asarray(shift, float))
-    rows, cols = sample.image.shape[1:]
-    target = np.stack(np.meshgrid(np.arange(rows), np.arange(cols), indexing="ij"), axis=-1)
+    return _moved(sample, Motion(sample.image, angle, np.asarray(shift, float)))
+
+
+def _moved(sample: LabelledImage, motion: Motion) -> LabelledImage:
     return dataclasses.replace(
         sample,
-        image=nearest(sample.image, motion.before(target)),
+        image=motion.moved_image(),
         pick=motion.after(sample.pick),
-        pick_theta=sample.pick_theta + angle,
+        pick_theta=sample.pick_theta + motion.angle,
         place=motion.after(sample.place),
         other_picks=motion.after(sample.other_picks),
-        other_thetas=sample.other_thetas + angle,
+        other_thetas=sample.other_thetas + motion.angle,
         motion=motion,
     )
 
 
 def augment(
-    sample: LabelledImage, random: np.random.Generator, *, rigid: bool = False
+    sample: LabelledImage, random: np.random.Generator, *, curvature: bool = False
 ) -> LabelledImage:
-    """A random SE(2) motion of the scene that keeps both labels inside the image, and bends.
+    """A sample after a random SE(2) motion of the scene that keeps both labels inside the image.
 
-    The turn is normal with 60 degrees, the shift with a sixth of the image's sides; both are drawn
-    again while a label is outside. A sample for which a hundred draws are not enough stays where it
-    is. Pick angles are learned from the objects as they are and from bent ones (see `bent_crop`):
-    those to come will have handles of other shapes.
+    The motion is drawn again while a label is outside. A sample for which a hundred draws are not
+    enough stays where it is.
 
     Args:
         sample: what to augment.
         random: for all draws.
-        rigid: as the paper, bend nothing.
+        curvature: also draw curvatures (see `LabelledImage.curved_crop`), so that pick angles are
+            learned from bent objects as well: this is not in the paper.
     """
     rows, cols = sample.image.shape[1:]
     result = sample
     for _ in range(100):
-        angle = random.normal(0.0, math.radians(60))
-        shift = random.normal(0.0, (rows / 6, cols / 6))
-        ends = Motion(sample.image, angle, shift).after(np.stack([sample.pick, sample.place]))
+        motion = Motion.draw(sample.image, random)
+        ends = motion.after(np.stack([sample.pick, sample.place]))
         if (ends >= 0).all() and (ends <= (rows - 1, cols - 1)).all():
-            result = move(sample, angle, shift)
+            result = _moved(sample, motion)
             break
-    if rigid:
+    if not curvature:
         return result
-    bends = random.normal(0.0, _BEND, (1 + len(sample.other_picks), 2))
-    return dataclasses.replace(result, bends=bends)
+    curvatures = random.normal(0.0, _CURVATURE_STD, (1 + len(sample.other_picks), 2))
+    return dataclasses.replace(result, curvatures=curvatures)

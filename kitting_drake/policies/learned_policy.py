@@ -1,7 +1,8 @@
-"""The learned policy as a function from an observation to an action (section III-A)."""
+"""The learned policy: a function from an observation to an action (section III-A of the paper)."""
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -12,31 +13,39 @@ import torch.nn.functional as F
 from numpy.typing import NDArray
 from torch import Tensor
 
-from kitting_drake.policies.correlation import Candidate, search
-from kitting_drake.policies.images import rotation
+from kitting_drake.policies.correlation import Candidate
+from kitting_drake.policies.images import rotation_matrix
 from kitting_drake.policies.networks import Networks
 from systems.signals import Observation, PickPlaceAction, PlanarPose, wrap_to_pi
 
 
 @dataclass(frozen=True)
 class Decision:
-    """An answer, and the maps that it was read from."""
+    """An action, and the distributions that it was read from."""
 
     action: PickPlaceAction
+    """Where it says stop, its poses and all that follows are what the policy would have done."""
     pick_map: NDArray[np.float32]
     """(rows, cols): p(u, v), the picking module's probabilities."""
     angle_curve: NDArray[np.float32]
     """(n,): p(theta | u, v) at the angles pi i / n."""
     place_map: NDArray[np.float32]
-    """(rows, cols): the best score over all turns, in nats below the best of all; coarse."""
+    """(rows, cols): the best score over all rotations, in nats below the best of all; coarse."""
     pick_pixel: NDArray[np.float64]
     """(row, col)."""
     place_pixel: NDArray[np.float64]
     """(row, col)."""
+    log_odds: float | None = None
+    """That there is something to pick; None where the networks cannot tell."""
+
+    @property
+    def stop(self) -> bool:
+        """Whether there is nothing left to pick."""
+        return self.action.stop
 
 
 class LearnedPolicy:
-    """Networks as what a `PickPlacePolicy` wraps: without memory."""
+    """Networks as the function that a `PickPlacePolicy` evaluates; it has no memory."""
 
     def __init__(
         self,
@@ -48,13 +57,14 @@ class LearnedPolicy:
     ) -> None:
         """
         Args:
-            networks: for inference.
+            networks: for inference; their `stop_threshold` says when the policy stops.
             orientations: N.
-            continuous: answer between pixels and bins (not in the paper) instead of on them.
-            watch: told of each decision.
+            continuous: refine the action beyond pixels and orientation bins (sub-pixel and sub-bin
+                refinement, not in the paper) instead of quantizing it.
+            watch: called with each observation and decision.
 
         Raises:
-            ValueError: the networks cannot answer at N orientations.
+            ValueError: the networks cannot predict at N orientations.
         """
         networks.check_orientations(orientations)
         self._networks = networks
@@ -67,48 +77,60 @@ class LearnedPolicy:
         decision = self.decide(observation)
         if self._watch is not None:
             self._watch(observation, decision)
-        return decision.action
+        return PickPlaceAction(stop=True) if decision.stop else decision.action
+
+    @torch.inference_mode()
+    def log_odds(self, observation: Observation) -> float | None:
+        """The log-odds that there is something to pick; None where the networks cannot tell."""
+        return self._networks.predict_pick(observation.image, self._orientations).log_odds
 
     @torch.inference_mode()
     def decide(self, observation: Observation) -> Decision:
-        """The action, and the maps that it was read from."""
+        """The action, and the distributions that it was read from."""
         networks = self._networks
         image = observation.image
-        logits = networks.position_logits(image, self._orientations)
+        picking = networks.predict_pick(image, self._orientations)
+        logits = picking.position
         rows, cols = logits.shape
         row, col = divmod(int(logits.argmax()), cols)
         pixel = np.array([row, col], float)
 
-        angles, between = networks.angle_answer(image, (row, col), self._orientations)
+        angles, refined = picking.angle((row, col))
         theta = int(angles.argmax()) * math.tau / self._orientations
         pick = pixel
         if self._continuous:
-            theta = theta if between is None else between
+            theta = theta if refined is None else refined
             pick = expected_position(logits, (row, col))
 
-        # The crop is around the pixel: what is said of its middle is carried over to the pick.
-        scene, encoding = networks.encode_scene(image), networks.encode_crop(image, (row, col))
-        candidates, volume = search(scene, encoding, self._orientations, shape=(rows, cols))
-        turn, place = best_placement(candidates[0], self._orientations, self._continuous)
-        place = place + rotation(turn) @ (pick - pixel)
+        # The crop is centred on a pixel. Its predicted motion applies to the refined pick too.
+        placing = networks.predict_place(image, (row, col), self._orientations)
+        rotation, place = best_placement(
+            placing.candidates[0], self._orientations, self._continuous
+        )
+        place = place + rotation_matrix(rotation) @ (pick - pixel)
+        action = make_action(observation, pick, theta, place, rotation)
+        odds, threshold = picking.log_odds, networks.stop_threshold
+        stop = odds is not None and threshold is not None and odds < threshold
+        score_map = placing.score_map - placing.score_map.max()
         return Decision(
-            action=make_action(observation, pick, theta, place, turn),
+            action=dataclasses.replace(action, stop=stop),
             pick_map=F.softmax(logits.flatten(), 0).view(rows, cols).float().cpu().numpy(),
             angle_curve=F.softmax(angles, 0).float().cpu().numpy(),
-            place_map=_place_map(volume, (rows, cols)),
+            place_map=score_map.float().cpu().numpy(),
             pick_pixel=pick,
             place_pixel=place,
+            log_odds=odds,
         )
 
 
 def expected_position(logits: Tensor, pixel: tuple[int, int]) -> NDArray[np.float64]:
-    """The mean position of the probability around a pixel, its neighbours included.
+    """Sub-pixel refinement: the mean position under the softmax over a pixel and its neighbours.
 
-    Networks trained with labels that are spread over the pixels around them answer so between them.
+    Networks that are trained with interpolated labels (see `losses`) predict this mean.
 
     Args:
         logits: (rows, cols).
-        pixel: of the maximum.
+        pixel: (row, col) of the maximum.
 
     Returns:
         (row, col).
@@ -119,18 +141,18 @@ def expected_position(logits: Tensor, pixel: tuple[int, int]) -> NDArray[np.floa
 def best_placement(
     candidate: Candidate, orientations: int, continuous: bool
 ) -> tuple[float, NDArray[np.float64]]:
-    """A candidate's turn in radians and its position (row, col): the best bin, or between bins."""
-    _, turn, row, col = candidate.best()
-    answer = np.array([turn, row, col], float)
+    """A candidate's rotation in radians and its position (row, col), quantized or refined."""
+    _, rotation, row, col = candidate.best()
+    found = np.array([rotation, row, col], float)
     if continuous:
         origin = np.array([candidate.first_bin, *candidate.corner])
-        best = (turn - candidate.first_bin, row - candidate.corner[0], col - candidate.corner[1])
-        answer = origin + _local_mean(candidate.scores, best)
-    return wrap_to_pi(answer[0] * math.tau / orientations), answer[1:]
+        index = found.astype(int) - origin
+        found = origin + _local_mean(candidate.scores, (index[0], index[1], index[2]))
+    return wrap_to_pi(found[0] * math.tau / orientations), found[1:]
 
 
 def _local_mean(logits: Tensor, index: tuple[int, int, int]) -> NDArray[np.float64]:
-    """The mean index of the softmax over an entry and its neighbours."""
+    """The mean index under the softmax over an entry and its neighbours."""
     starts = [max(i - 1, 0) for i in index]
     part = logits[
         starts[0] : index[0] + 2, starts[1] : index[1] + 2, starts[2] : index[2] + 2
@@ -145,16 +167,17 @@ def make_action(
     pick: NDArray[np.float64],
     theta: float,
     place: NDArray[np.float64],
-    turn: float,
+    rotation: float,
 ) -> PickPlaceAction:
-    """The action of an answer in pixels.
+    """The action of a prediction in pixels. Heights are left to the planner, which reads them off
+    the observation for every policy.
 
     Args:
         observation: what was seen.
         pick: (row, col).
         theta: of the gripper at the pick, in radians.
         place: (row, col).
-        turn: of the object, in radians.
+        rotation: of the object, in radians.
     """
     grid = observation.grid
     pick_x, pick_y = grid.to_world(pick)
@@ -162,13 +185,5 @@ def make_action(
     theta = wrap_to_pi(theta)
     return PickPlaceAction(
         pick=PlanarPose(float(pick_x), float(pick_y), theta),
-        place=PlanarPose(float(place_x), float(place_y), theta + turn),
+        place=PlanarPose(float(place_x), float(place_y), theta + rotation),
     )
-
-
-def _place_map(volume: Tensor, shape: tuple[int, int]) -> NDArray[np.float32]:
-    best = volume.amax(0)
-    size = (2 * best.shape[0] - 1, 2 * best.shape[1] - 1)
-    full = F.interpolate(best[None, None], size=size, mode="bilinear", align_corners=True)[0, 0]
-    full = full - full.max()
-    return full[: shape[0], : shape[1]].float().cpu().numpy()

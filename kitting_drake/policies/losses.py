@@ -1,7 +1,12 @@
-"""Cross-entropies over pixels, bins and both (section V-C.1 of the paper).
+"""Cross-entropy losses over pixels, orientations and both (section V-C.1 of the paper).
 
-A label between pixels or bins is spread over its neighbours in proportion (linearly), so that the
-most likely *place between them* is the label; a label on a pixel is one-hot, as in the paper.
+A label between two pixels or orientations becomes a soft label: it is interpolated linearly between
+its neighbours, so that the mean of the best prediction is the label. A label on a pixel is one-hot,
+as in the paper.
+
+Networks that can stop have one more class beside the pixels, "nothing to pick", whose logit is the
+constant `NOTHING_LOGIT`. The cross-entropy over all classes is then the sum of two losses: the one
+over the pixels alone, and `presence_loss` of the log-odds that there is something to pick.
 """
 
 from __future__ import annotations
@@ -9,27 +14,34 @@ from __future__ import annotations
 import math
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from kitting_drake.policies.correlation import (
-    COARSE_TURNS,
+    COARSE_ROTATIONS,
     coarse_volume,
-    turns,
+    rotation_angles,
     window,
 )
 
+NOTHING_LOGIT = math.log(160 * 320)
+"""The logit of "nothing to pick". Fresh networks, whose logits are nearly zero, then find it about
+as likely as that there is something to pick in an image of the paper's size."""
+
 _WINDOW = 17
-"""Side of the window of the plain correlation around a label, in pixels."""
+"""The side of the window of the plain correlation around a label, in pixels."""
 _FINE_REACH = math.radians(10)
-"""How far from the label's turn the window reaches."""
+"""How far from the label's rotation the window reaches, in radians."""
 
 
-def spread(position: float, count: int, *, cyclic: bool = False) -> list[tuple[int, float]]:
-    """A position between whole numbers as (index, weight) pairs of its neighbours.
+def interpolate_label(
+    position: float, count: int, *, cyclic: bool = False
+) -> list[tuple[int, float]]:
+    """A position between whole numbers as (index, weight) pairs: linear interpolation.
 
     Args:
-        position: in units of the bins.
-        count: how many bins there are; weight outside goes to the outermost.
+        position: in bins.
+        count: the number of bins; weight beyond them goes to the outermost.
         cyclic: whether bin `count` is bin 0.
     """
     first = math.floor(position)
@@ -41,7 +53,7 @@ def spread(position: float, count: int, *, cyclic: bool = False) -> list[tuple[i
 
 
 def soft_label(*axes: list[tuple[int, float]], like: Tensor) -> Tensor:
-    """The outer product of several spread positions, shaped as `like`."""
+    """The outer product of one interpolated label for each axis, shaped as `like`."""
     label = torch.zeros_like(like)
     corners: list[tuple[tuple[int, ...], float]] = [((), 1.0)]
     for axis in axes:
@@ -54,8 +66,29 @@ def soft_label(*axes: list[tuple[int, float]], like: Tensor) -> Tensor:
 
 
 def cross_entropy(logits: Tensor, label: Tensor) -> Tensor:
-    """Of a distribution over all entries of `logits`, against one shaped alike."""
+    """The cross-entropy of a softmax over all entries of `logits`, for a label of their shape."""
     return logits.flatten().logsumexp(0) - (label * logits).sum()
+
+
+def log_odds(logits: Tensor, orientations: int = 1) -> Tensor:
+    """The log-odds that there is something to pick, against the class "nothing to pick".
+
+    Args:
+        logits: of all actions: (rows, cols), or (orientations, rows, cols) where a method has
+            logits of both at once.
+        orientations: over which the logits range; the odds do not depend on how many there are.
+    """
+    return logits.flatten().logsumexp(0) - math.log(orientations) - NOTHING_LOGIT
+
+
+def presence_loss(odds: Tensor, *, present: bool) -> Tensor:
+    """The cross-entropy of the classes "something to pick" and "nothing to pick".
+
+    Args:
+        odds: see `log_odds`.
+        present: whether there is something to pick.
+    """
+    return F.softplus(-odds if present else odds)
 
 
 def position_loss(logits: Tensor, *pixels: tuple[float, float]) -> Tensor:
@@ -63,15 +96,18 @@ def position_loss(logits: Tensor, *pixels: tuple[float, float]) -> Tensor:
 
     Args:
         logits: (rows, cols).
-        pixels: the labels (row, col), between pixels or on one, equally likely.
+        pixels: the labels (row, col), which need not be whole numbers; all are equally likely.
     """
     rows, cols = logits.shape
-    labels = [soft_label(spread(row, rows), spread(col, cols), like=logits) for row, col in pixels]
+    labels = [
+        soft_label(interpolate_label(row, rows), interpolate_label(col, cols), like=logits)
+        for row, col in pixels
+    ]
     return cross_entropy(logits, torch.stack(labels).mean(0))
 
 
 def angle_loss(logits: Tensor, theta: float, orientations: int) -> Tensor:
-    """Cross-entropy over the bins of f_theta, a half turn being none.
+    """Cross-entropy over the orientations of f_theta, modulo pi.
 
     Args:
         logits: (N / 2,), at the angles 2 pi i / N.
@@ -79,7 +115,7 @@ def angle_loss(logits: Tensor, theta: float, orientations: int) -> Tensor:
         orientations: N.
     """
     bins = theta / (math.tau / orientations)
-    label = soft_label(spread(bins, orientations // 2, cyclic=True), like=logits)
+    label = soft_label(interpolate_label(bins, orientations // 2, cyclic=True), like=logits)
     return cross_entropy(logits, label)
 
 
@@ -87,40 +123,40 @@ def place_loss(
     scene: Tensor,
     encoding: Tensor,
     pixel: tuple[float, float],
-    turn: float,
+    rotation: float,
     orientations: int,
     generator: torch.Generator,
 ) -> Tensor:
-    """Cross-entropy over all pixels and turns of f_place (equation 8), estimated.
+    """Cross-entropy over all pixels and rotations of f_place (equation 8), estimated.
 
-    Near the label every bin is computed; everywhere else the coarse volume's cells stand for the
-    bins that they cover. The coarse volume has a cross-entropy of its own, as the search at
-    inference starts from it.
+    Near the label the plain correlation is computed at every pixel and rotation. Everywhere else
+    the cells of the coarse volume stand for the pixels and rotations that they cover. The coarse
+    volume has a cross-entropy loss of its own besides, as the search at inference starts from it.
 
     Args:
         scene: (1, channels, rows, cols), phi(o_t).
         encoding: (1, channels, side, side), psi(c).
         pixel: the label (row, col).
-        turn: the label, in radians.
+        rotation: the label, in radians.
         orientations: N.
-        generator: where the window and the coarse turns lie about the label is drawn.
+        generator: draws where the window and the coarse rotations lie about the label.
     """
     draws = torch.rand(3, generator=generator).tolist()
-    phase = draws[0]
-    coarse = coarse_volume(scene, encoding, turns(COARSE_TURNS, scene, phase))
-    coarse_bin = turn / (math.tau / COARSE_TURNS) - phase
+    coarse_angles = rotation_angles(COARSE_ROTATIONS, scene, draws[0])
+    coarse = coarse_volume(scene, encoding, coarse_angles)
+    coarse_bin = rotation / (math.tau / COARSE_ROTATIONS) - draws[0]
     label = soft_label(
-        spread(coarse_bin, COARSE_TURNS, cyclic=True),
-        spread(pixel[0] / 2, coarse.shape[1]),
-        spread(pixel[1] / 2, coarse.shape[2]),
+        interpolate_label(coarse_bin, COARSE_ROTATIONS, cyclic=True),
+        interpolate_label(pixel[0] / 2, coarse.shape[1]),
+        interpolate_label(pixel[1] / 2, coarse.shape[2]),
         like=coarse,
     )
     coarse_loss = cross_entropy(coarse, label)
 
     step = math.tau / orientations
-    first = math.ceil((turn - _FINE_REACH) / step)
-    first = min(first, math.floor(turn / step))
-    last = max(math.floor((turn + _FINE_REACH) / step), math.floor(turn / step) + 1)
+    first = math.ceil((rotation - _FINE_REACH) / step)
+    first = min(first, math.floor(rotation / step))
+    last = max(math.floor((rotation + _FINE_REACH) / step), math.floor(rotation / step) + 1)
     margin = _WINDOW // 2
     # The label lies anywhere in the middle half of the window.
     top = round(pixel[0]) - margin + round((draws[1] - 0.5) * margin)
@@ -128,40 +164,51 @@ def place_loss(
     angles = torch.arange(first, last + 1, dtype=scene.dtype, device=scene.device) * step
     fine = window(scene, encoding, angles, (top, left), (_WINDOW, _WINDOW))
     label = soft_label(
-        spread(turn / step - first, len(angles)),
-        spread(pixel[0] - top, _WINDOW),
-        spread(pixel[1] - left, _WINDOW),
+        interpolate_label(rotation / step - first, len(angles)),
+        interpolate_label(pixel[0] - top, _WINDOW),
+        interpolate_label(pixel[1] - left, _WINDOW),
         like=fine,
     )
 
-    # Coarse cells stand for the bins outside the window.
-    stands_for = math.log(4 * orientations / COARSE_TURNS)
-    row = torch.arange(coarse.shape[1], device=scene.device) * 2 - top
-    col = torch.arange(coarse.shape[2], device=scene.device) * 2 - left
-    away = torch.remainder(turns(COARSE_TURNS, scene, phase) - turn + math.pi, math.tau) - math.pi
-    covered = (
-        (away.abs() < _FINE_REACH)[:, None, None]
-        & ((row >= 0) & (row < _WINDOW))[None, :, None]
-        & ((col >= 0) & (col < _WINDOW))[None, None, :]
-    )
+    # Coarse cells stand for what lies outside the window.
+    stands_for = math.log(4 * orientations / COARSE_ROTATIONS)
+    covered = _covered(coarse, coarse_angles - rotation, (top, left))
     outside = (coarse + stands_for).masked_fill(covered, -torch.inf)
     everything = torch.cat([fine.flatten(), outside.flatten()]).logsumexp(0)
     return coarse_loss + everything - (label * fine).sum()
 
 
+def _covered(coarse: Tensor, differences: Tensor, corner: tuple[int, int]) -> Tensor:
+    """Which cells of a coarse volume lie in the window around a label.
+
+    Args:
+        coarse: (n, rows, cols), at half the resolution.
+        differences: (n,), of the cells' rotations to the label's, in radians.
+        corner: the window's first pixel (row, col).
+    """
+    row = torch.arange(coarse.shape[1], device=coarse.device) * 2 - corner[0]
+    col = torch.arange(coarse.shape[2], device=coarse.device) * 2 - corner[1]
+    away = torch.remainder(differences + math.pi, math.tau) - math.pi
+    return (
+        (away.abs() < _FINE_REACH)[:, None, None]
+        & ((row >= 0) & (row < _WINDOW))[None, :, None]
+        & ((col >= 0) & (col < _WINDOW))[None, None, :]
+    )
+
+
 def joint_loss(
     logits: Tensor, *labels: tuple[list[tuple[int, float]], tuple[float, float]]
 ) -> Tensor:
-    """Cross-entropy over bins and pixels at once, as the Transporter's f_pick has it.
+    """Cross-entropy over orientations and pixels at once, as in the Transporter.
 
     Args:
-        logits: (bins, rows, cols).
-        labels: for each its bins as (index, weight) pairs (see `spread`) and its pixel (row, col);
-            all equally likely.
+        logits: (orientations, rows, cols).
+        labels: for each its orientation as (index, weight) pairs (see `interpolate_label`) and its
+            pixel (row, col); all are equally likely.
     """
     _, rows, cols = logits.shape
     parts = [
-        soft_label(bins, spread(row, rows), spread(col, cols), like=logits)
+        soft_label(bins, interpolate_label(row, rows), interpolate_label(col, cols), like=logits)
         for bins, (row, col) in labels
     ]
     return cross_entropy(logits, torch.stack(parts).mean(0))

@@ -1,4 +1,4 @@
-"""Networks by the names that configs and command lines use."""
+"""The methods by the names that configs and command lines use."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _METHODS: dict[str, Callable[[NetworkConfig, Convolution], Networks]] = {
 
 
 def make_networks(config: NetworkConfig, convolution: Convolution = SteerableConv2d) -> Networks:
-    """The networks of a config, with fresh weights.
+    """Makes the networks of a config, with fresh weights.
 
     Args:
         config: what to make.

@@ -1,90 +1,134 @@
-"""What a demonstration says about each observation in it."""
+"""Training samples: the labels that demonstrations give each of their observations."""
 
 from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from typing import overload
 
 import numpy as np
 from numpy.typing import NDArray
 
 from kitting_drake.policies.config import NetworkConfig
-from kitting_drake.policies.demonstrations import Demonstration
+from kitting_drake.policies.demonstrations import Demonstration, FinalObservation, Recorded
 from kitting_drake.policies.images import Image, LabelledImage
-from systems.signals import PickPlaceAction, PixelGrid
+from systems.signals import Observation, PickPlaceAction, PixelGrid
 
 
 @dataclass(frozen=True)
 class Scene:
-    """One observation, and all that an expert might do next."""
+    """One observation, and the actions that an expert may take next."""
 
-    image: Image
-    targets: tuple[LabelledImage, ...]
-    """First what the expert did. What it did later it might have done at once: an object that it
-    picks later lies where it lay."""
+    recorded: Recorded
+    actions: tuple[PickPlaceAction, ...]
+    """First the one that the expert took."""
+    grid: PixelGrid
+
+    @property
+    def observation(self) -> Observation:
+        """The observation; made anew each time."""
+        return Observation(self.recorded.image, self.grid)
+
+    @property
+    def targets(self) -> tuple[LabelledImage, ...]:
+        """A label for each of the actions; the image is made anew each time, once for all."""
+        image = self.recorded.image
+        return tuple(LabelledImage.from_action(image, action, self.grid) for action in self.actions)
 
 
-def scenes(demonstrations: Iterable[Demonstration], grid: PixelGrid) -> list[Scene]:
-    """Every observation of some demonstrations."""
+def scenes(
+    demonstrations: Iterable[Demonstration], grid: PixelGrid, *, later_picks_possible: bool
+) -> list[Scene]:
+    """Every observation of some demonstrations in which there is something to pick.
+
+    Args:
+        demonstrations: of an expert.
+        grid: of their observations.
+        later_picks_possible: see `Learning`: an object that is picked later lies where it lay, so
+            that the expert's later actions are possible at once.
+    """
     result = []
     for demonstration in demonstrations:
-        actions = [PickPlaceAction(step.pick, step.place) for step in demonstration.steps]
+        actions = tuple(PickPlaceAction(step.pick, step.place) for step in demonstration.steps)
         for index, step in enumerate(demonstration.steps):
-            image = step.image
-            targets = tuple(
-                LabelledImage.from_action(image, action, grid) for action in actions[index:]
-            )
-            result.append(Scene(image, targets))
+            last = len(actions) if later_picks_possible else index + 1
+            result.append(Scene(step, actions[index:last], grid))
     return result
 
 
-def labelled_images(observed: Iterable[Scene], *, taken_only: bool) -> list[LabelledImage]:
-    """What there is to learn from.
+def final_observations(demonstrations: Iterable[Demonstration]) -> list[FinalObservation]:
+    """The observations of some demonstrations in which there is nothing left to pick."""
+    return [item.final for item in demonstrations if item.final is not None]
+
+
+def labelled_images(observed: Iterable[Scene], *, taken_only: bool) -> Sequence[LabelledImage]:
+    """The samples to learn from; their images are made when a sample is asked for.
 
     Args:
         observed: the observations.
-        taken_only: as the paper, one sample for each observation, of the action that was taken;
-            else one for each possible action, which knows of the others.
+        taken_only: as in the paper, one sample for each observation, of the action that the expert
+            took; otherwise one for each possible action, which knows of the others.
     """
-    samples = []
-    for scene in observed:
-        if taken_only:
-            samples.append(scene.targets[0])
-            continue
-        for target in scene.targets:
-            others = [other for other in scene.targets if other is not target]
-            samples.append(
-                dataclasses.replace(
-                    target,
-                    other_picks=np.array([item.pick for item in others]).reshape(-1, 2),
-                    other_thetas=np.array([item.pick_theta for item in others]),
-                )
-            )
-    return samples
+    return _Samples(list(observed), taken_only)
+
+
+class _Samples(Sequence[LabelledImage]):
+    """Observations take up far less memory in 8 bits than as images."""
+
+    def __init__(self, observed: list[Scene], taken_only: bool) -> None:
+        self._observed, self._taken_only = observed, taken_only
+        self._indices = [
+            (scene, target)
+            for scene, item in enumerate(observed)
+            for target in range(1 if taken_only else len(item.actions))
+        ]
+
+    def __len__(self) -> int:
+        return len(self._indices)
+
+    @overload
+    def __getitem__(self, index: int) -> LabelledImage: ...
+
+    @overload
+    def __getitem__(self, index: slice) -> Sequence[LabelledImage]: ...
+
+    def __getitem__(self, index: int | slice) -> LabelledImage | Sequence[LabelledImage]:
+        if isinstance(index, slice):
+            return [self[i] for i in range(*index.indices(len(self)))]
+        scene, chosen = self._indices[index]
+        targets = self._observed[scene].targets
+        if self._taken_only:
+            return targets[chosen]
+        others = [other for i, other in enumerate(targets) if i != chosen]
+        return dataclasses.replace(
+            targets[chosen],
+            other_picks=np.array([other.pick for other in others]).reshape(-1, 2),
+            other_thetas=np.array([other.pick_theta for other in others]),
+        )
 
 
 def normalisation(observed: list[Scene]) -> dict[str, float]:
-    """The fields of a `NetworkConfig` that say how its inputs are distributed."""
-    colour, colour_deviation = _moments(scene.image[:3] for scene in observed)
-    height, height_deviation = _moments(scene.image[3] for scene in observed)
+    """The fields of a `NetworkConfig` by which inputs are normalised."""
+    colour, colour_std = _moments(scene.recorded.image[:3] for scene in observed)
+    height, height_std = _moments(scene.recorded.height for scene in observed)
     default = NetworkConfig()
     return {
         "colour_mean": colour,
-        "colour_deviation": colour_deviation or default.colour_deviation,
+        "colour_std": colour_std or default.colour_std,
         "height_mean": height,
-        "height_deviation": height_deviation or default.height_deviation,
+        "height_std": height_std or default.height_std,
     }
 
 
-def _moments(images: Iterable[NDArray[np.float32]]) -> tuple[float, float]:
-    """Mean and standard deviation of all pixels of some images of one shape, one in memory."""
+def _moments(images: Iterable[Image] | Iterable[NDArray[np.float32]]) -> tuple[float, float]:
+    """Mean and standard deviation over all pixels of some images of one shape, one in memory."""
     means, squares = [], []
     for image in images:
         means.append(image.mean(dtype=float))
         squares.append(np.square(image, dtype=float).mean())
     mean = float(np.mean(means))
     variance = float(np.mean(squares)) - mean**2
-    # Of pixels that are all alike, rounding is left over.
+    # Where all pixels are alike, the difference is a rounding error.
     return mean, math.sqrt(variance) if variance > 1e-12 else 0.0

@@ -1,13 +1,13 @@
 """Steerable convolutions that run as plain ones.
 
-A kernel is a combination of escnn's basis kernels. The Fourier transforms that a pointwise
-nonlinearity needs on either side are folded into it,
+A kernel is a linear combination of escnn's basis kernels. The Fourier transforms that a pointwise
+nonlinearity needs before and after it are folded into the kernels,
 
     kernel' = synthesis_out . kernel . analysis_in,
 
-so that samples travel between layers and ELU acts on them directly, without a transform of the
-feature map around it: the same function as escnn's R2Conv followed by FourierELU, of the same
-weights.
+so that feature maps are stored as samples and ELU acts on them directly, without a transform of the
+feature map around it. With the same weights this is the same function as escnn's R2Conv followed by
+FourierELU.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from __future__ import annotations
 import functools
 import math
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
 import numpy as np
 import torch
@@ -25,12 +25,12 @@ from torch import Tensor, nn
 from kitting_drake.policies.fibres import Fibre, Irreps, Regular, Scalar
 
 Convolution = Callable[..., nn.Module]
-"""An `ExpandedConv2d`, or `PlainConv2d`: makes a layer from (in_fields, in_fibre, out_fields,
-out_fibre, size, padding=..., bias=...)."""
+"""A class of layers: `SteerableConv2d`, `GroupConv2d` or `PlainConv2d`. It makes a layer from
+(in_fields, in_fibre, out_fields, out_fibre, size, padding=..., bias=..., gain=...)."""
 
 
 class ExpandedConv2d(nn.Module):
-    """A convolution between fields, while it is trained: of fewer weights than its kernel has."""
+    """A trainable convolution between fields, whose kernel is computed from fewer weights."""
 
     def __init__(
         self,
@@ -68,7 +68,7 @@ class ExpandedConv2d(nn.Module):
 
 
 class SteerableConv2d(ExpandedConv2d):
-    """A convolution between fields that commutes with turns (equation 3), of escnn's basis."""
+    """An equivariant convolution between fields (equation 3), in escnn's basis of kernels."""
 
     basis: Tensor
 
@@ -86,17 +86,18 @@ class SteerableConv2d(ExpandedConv2d):
     ) -> None:
         """
         Args:
-            in_fields: how many fields come in.
-            in_fibre: what each carries.
-            out_fields: how many go out.
-            out_fibre: what each carries.
-            size: side of the kernel, odd, in pixels.
-            padding: of the image by zeros; by default the image keeps its size.
-            bias: one for each field, on its invariant part; needs samples or a scalar.
-            gain: of the initial weights' standard deviation.
+            in_fields: the number of input fields.
+            in_fibre: the fibre of each of them.
+            out_fields: the number of output fields.
+            out_fibre: the fibre of each of them.
+            size: the side of the kernel, odd, in pixels.
+            padding: zeros around the image, in pixels; by default the image keeps its size.
+            bias: whether each output field has a bias, on its invariant part. The output fibre must
+                be stored as samples or be scalar.
+            gain: a factor of the initial weights' standard deviation.
         """
         basis = kernel_basis(in_fibre, out_fibre, size)
-        # The samples of a field are not independent: as many as its coefficients are.
+        # He initialisation. The samples of a field are no more independent than its coefficients.
         repeated = in_fibre.channels / in_fibre.size
         gathered = in_fields * float(basis.square().sum()) * repeated / out_fibre.channels
         scale = math.sqrt(2 / gathered)
@@ -114,7 +115,7 @@ def expand_kernel(weights: Tensor, basis: Tensor) -> Tensor:
 
     Args:
         weights: (out fields, in fields, D).
-        basis: (D, out channels, in channels, size, size) of one field each.
+        basis: (D, out channels, in channels, size, size), from one field to one field.
 
     Returns:
         (out fields * out channels, in fields * in channels, size, size).
@@ -129,7 +130,11 @@ def expand_kernel(weights: Tensor, basis: Tensor) -> Tensor:
 
 
 class PlainConv2d(nn.Conv2d):
-    """What an `ExpandedConv2d` becomes for inference: it computes in the type of its input."""
+    """What an `ExpandedConv2d` becomes for inference: an ordinary convolution.
+
+    It computes in the type of its input. If its weights are of another type, they are cast at every
+    call; `MixedPrecision.cast` casts them once.
+    """
 
     def __init__(
         self,
@@ -153,15 +158,14 @@ class PlainConv2d(nn.Conv2d):
 
     def forward(self, features: Tensor) -> Tensor:
         """(batch, in channels, rows, cols) to (batch, out channels, rows, cols)."""
-        if self.weight.dtype != features.dtype:
-            # A layer always sees the same type: once is enough.
-            self.to(features.dtype).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
-        return super().forward(features)
+        weight = self.weight.to(features.dtype)
+        bias = None if self.bias is None else self.bias.to(features.dtype)
+        return F.conv2d(features, weight, bias, padding=self.padding)
 
 
 @functools.lru_cache(maxsize=64)
 def kernel_basis(in_fibre: Fibre, out_fibre: Fibre, size: int) -> Tensor:
-    """escnn's basis of the steerable kernels between two fields, transforms folded in.
+    """escnn's basis of the steerable kernels between two fields, with the transforms folded in.
 
     Returns:
         (D, out channels, in channels, size, size), float64.
@@ -204,7 +208,7 @@ def kernel_basis(in_fibre: Fibre, out_fibre: Fibre, size: int) -> Tensor:
         frequencies_cutoff=frequencies_cutoff(in_fibre, out_fibre, size),
     )
     with torch.no_grad():
-        # A kernel for each unit vector of weights.
+        # Unit vectors of weights give the basis kernels one by one.
         units = torch.eye(convolution.weights.numel())
         stack = torch.vmap(convolution.basisexpansion)(units).unflatten(-1, (size, size)).double()
     synthesis = torch.from_numpy(out_fibre.synthesis())
@@ -213,12 +217,14 @@ def kernel_basis(in_fibre: Fibre, out_fibre: Fibre, size: int) -> Tensor:
 
 
 def frequencies_cutoff(in_fibre: Fibre, out_fibre: Fibre, size: int) -> float | None:
-    """How many times a ring's radius the angular frequency of its kernels may be; None: escnn's own
-    choice.
+    """The largest angular frequency of the kernels on a ring of pixels, in units of its radius.
 
-    A kernel of frequency k leads from rho_i to rho_j with j up to i + k: where escnn's choice would
-    leave the highest frequencies of the answer zero for ever, just as much as these need of the
-    outermost ring. More only brings in what the pixels cannot hold.
+    A kernel of angular frequency k maps rho_i to rho_j with j up to i + k. Where escnn's own limit
+    would leave the highest frequencies of the output zero for ever, the limit is raised to exactly
+    what these need on the outermost ring; any higher frequency would alias on the pixels.
+
+    Returns:
+        The limit; None for escnn's own.
     """
     if not (isinstance(in_fibre, Irreps) and isinstance(out_fibre, Irreps)):
         return None
@@ -229,8 +235,21 @@ def frequencies_cutoff(in_fibre: Fibre, out_fibre: Fibre, size: int) -> float | 
     return missing / radius if missing > radius else None
 
 
+class MixedPrecision(nn.Module):
+    """A network that computes in the type of its input, except for parts that stay in float32."""
+
+    def reduced_precision_parts(self) -> Iterator[nn.Module]:
+        """The submodules that compute in the type of the input."""
+        raise NotImplementedError
+
+    def cast(self, compute_type: torch.dtype) -> None:
+        """Casts these submodules for good, for inputs of a type."""
+        for part in self.reduced_precision_parts():
+            part.to(compute_type).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+
+
 class BandLimit(nn.Module):
-    """Drops from each field's samples what its irreps cannot hold (ELU makes high frequencies)."""
+    """Projects the samples of each field onto its irreps, as ELU introduces higher frequencies."""
 
     projection: Tensor
 
@@ -245,7 +264,7 @@ class BandLimit(nn.Module):
         )
 
     def forward(self, features: Tensor) -> Tensor:
-        """(batch, fields * channels, rows, cols), and the same back."""
+        """(batch, fields * channels, rows, cols) to the same shape."""
         if self.trivial:
             return features
         last = features.permute(0, 2, 3, 1)
@@ -255,7 +274,7 @@ class BandLimit(nn.Module):
 
 
 class InvariantPart(nn.Module):
-    """The part of each field that no turn changes."""
+    """Takes the part of each field that is invariant to rotations: its frequency 0."""
 
     functional: Tensor
 
@@ -275,9 +294,10 @@ class InvariantPart(nn.Module):
 
 
 class BlurPool(nn.Module):
-    """Antialiased pooling to every other pixel, the outermost among them.
+    """Antialiased pooling to every other pixel, the outermost ones included.
 
-    A side of 2 n + 1 pixels becomes n + 1, so that a quarter turn about the middle is exact.
+    A side of 2 n + 1 pixels becomes n + 1, so that equivariance to rotations by 90 degrees about
+    the middle of the image is exact.
     """
 
     kernel: Tensor
@@ -297,7 +317,7 @@ class BlurPool(nn.Module):
 
 
 def upsample(features: Tensor) -> Tensor:
-    """Bilinear, the inverse of `BlurPool`'s sizes: n + 1 pixels become 2 n + 1."""
+    """Bilinear upsampling from n + 1 pixels to 2 n + 1: inverts `BlurPool`'s change of size."""
     rows, cols = features.shape[2:]
     return F.interpolate(
         features, size=(2 * rows - 1, 2 * cols - 1), mode="bilinear", align_corners=True

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import torch
@@ -14,29 +15,30 @@ from kitting_drake.policies.steerable import (
     BlurPool,
     Convolution,
     InvariantPart,
+    MixedPrecision,
     upsample,
 )
 
 STRIDE = 16
-"""A side of the image must be a multiple of this, and one more."""
+"""The sides of an image must be one more than a multiple of this, in pixels."""
 
 
 @dataclass(frozen=True)
 class UNetSize:
-    """How wide a U-net is."""
+    """The width of a U-net."""
 
     down: tuple[int, int, int, int, int] = (16, 32, 64, 128, 128)
-    """Fields of the five blocks on the way down, a pooling between them."""
+    """The number of fields of each of the five blocks of the encoder, with poolings between."""
     up: tuple[int, int, int, int] = (64, 32, 16, 16)
-    """Fields of the four blocks on the way up."""
+    """The number of fields of each of the four blocks of the decoder."""
     head: int = 16
-    """Scalars before the last layer."""
+    """The number of scalar channels before the last layer."""
     skip: int = 3
-    """Side of the kernel that widens a residual block's shortcut, in pixels."""
+    """The side of the kernel in a residual block's shortcut that changes the number of fields."""
 
 
 class ResidualBlock(nn.Module):
-    """Two convolutions beside a shortcut, and ELU after each."""
+    """Two convolutions with a shortcut beside them, and ELU after each."""
 
     def __init__(
         self,
@@ -49,7 +51,7 @@ class ResidualBlock(nn.Module):
     ) -> None:
         super().__init__()
         self.first = convolution(fields_in, fibre, fields, fibre, size)
-        # Without normalisation, nine blocks at full gain would blow the features up.
+        # There is no normalisation: nine blocks at full gain would let the features grow too large.
         self.second = convolution(fields, fibre, fields, fibre, size, gain=0.5)
         self.shortcut = (
             BandLimit(fibre)
@@ -63,10 +65,10 @@ class ResidualBlock(nn.Module):
         return F.elu_(hidden + self.shortcut(features))
 
 
-class UNet(nn.Module):
-    """Scalar images to scalar images, through fields of one fibre: 21 layers.
+class UNet(MixedPrecision):
+    """Maps scalar images to scalar images through hidden fields of one fibre, in 21 layers.
 
-    Commutes with turns of the image: its output is a scalar field.
+    It commutes with rotations of the image (equation 3): its input and output are trivial fields.
     """
 
     def __init__(
@@ -114,6 +116,10 @@ class UNet(nn.Module):
             features = block(features)
         for block in self.up:
             features = block(torch.cat([upsample(features), levels.pop()], dim=1))
-        # The last two layers are small, and their output wants more than eight bits.
+        # The last two layers are small and always compute in float32: logits need more than eight
+        # bits.
         scalars = self.invariant(features).float()
         return self.out(F.elu(self.mix(scalars)))
+
+    def reduced_precision_parts(self) -> Iterator[nn.Module]:
+        yield from (self.lift, self.down, self.up)

@@ -1,4 +1,4 @@
-"""How far a policy's answers are from an expert's, on observations that it did not learn from."""
+"""How far a policy's predictions are from an expert's, on observations not trained on."""
 
 from __future__ import annotations
 
@@ -6,43 +6,51 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
+from kitting_drake.policies.demonstrations import FinalObservation
 from kitting_drake.policies.images import LabelledImage
 from kitting_drake.policies.learned_policy import Decision, LearnedPolicy
 from kitting_drake.policies.samples import Scene
-from systems.signals import Observation, PixelGrid
+from systems.signals import Observation
 
-ERRORS = ("pick_mm", "pick_deg", "place_mm", "turn_deg", "displacement_mm")
-"""What `answer_errors` gives."""
+ERRORS = ("pick_mm", "pick_deg", "place_mm", "rotation_deg", "displacement_mm")
+"""The names of what `prediction_errors` returns."""
 
 _ARM = 50.0
-"""Mean distance of a tool's points from its grasp, in mm: what an angle moves."""
+"""The mean distance of a tool's points from its grasp, in mm: what an error of an angle moves."""
 _LOST = 20.0
-"""A displacement beyond this is as bad as this, in mm."""
+"""An object that is displaced by this much or more is lost, however far it is, in mm."""
 
 
-def answer_errors(decision: Decision, scene: Scene, grid: PixelGrid) -> NDArray[np.float64]:
-    """Errors of an answer against the target whose pick is nearest.
+def prediction_errors(
+    decision: Decision, targets: Sequence[LabelledImage], millimetres: float
+) -> NDArray[np.float64]:
+    """Errors of a prediction against the target whose pick is nearest, as if it did not stop.
+
+    Args:
+        decision: the prediction.
+        targets: the expert's possible actions.
+        millimetres: the side of a pixel.
 
     Returns:
-        (5,), as `ERRORS` names them: distance of the pick; angle of the pick, up to a half turn;
-        distance of the object, where it is put, from where the expert puts it; its angle; and how
-        far its points end up from where they should, all errors together, no more than 20 mm.
+        (5,), as `ERRORS` names them: the pick's distance from the target's; the pick angle's error
+        modulo pi; the distance of the object, where it is put, from where the expert puts it; the
+        error of its rotation; and the displacement of the object's points due to all of these, at
+        most 20 mm.
     """
-    millimetres = 1e3 * grid.resolution
 
     def distance(target: LabelledImage) -> float:
         return float(np.hypot(*(decision.pick_pixel - target.pick)))
 
-    target = min(scene.targets, key=distance)
+    target = min(targets, key=distance)
     action = decision.action
     angle = math.remainder(action.pick.theta - target.pick_theta, math.pi)
-    turn = math.remainder(action.place.theta - action.pick.theta - target.turn, math.tau)
+    rotation = math.remainder(action.place.theta - action.pick.theta - target.rotation, math.tau)
     goal = target.place_of(decision.pick_pixel)
     place = float(np.hypot(*(decision.place_pixel - goal))) * millimetres
     pick = distance(target) * millimetres
-    displacement = place + _ARM * (abs(angle) + abs(turn))
+    displacement = place + _ARM * (abs(angle) + abs(rotation))
     if pick > _LOST:
         displacement = _LOST
     return np.array(
@@ -50,27 +58,80 @@ def answer_errors(decision: Decision, scene: Scene, grid: PixelGrid) -> NDArray[
             pick,
             abs(math.degrees(angle)),
             place,
-            abs(math.degrees(turn)),
+            abs(math.degrees(rotation)),
             min(displacement, _LOST),
         ]
     )
 
 
-def validate(policy: LearnedPolicy, scenes: Sequence[Scene], grid: PixelGrid) -> dict[str, float]:
-    """Errors over some scenes.
+def choose_stop_threshold(present: ArrayLike, absent: ArrayLike) -> float | None:
+    """The log-odds below which a policy should stop.
+
+    Args:
+        present: the log-odds of scenes in which there is something to pick.
+        absent: the log-odds of final observations, in which there is not.
 
     Returns:
-        For each of `ERRORS` its median, as `median_...`, its 95th percentile, as `p95_...`, and as
-        `displacement_mm` the mean displacement, by which a policy is chosen.
+        The threshold with the fewest errors. It is midway between the log-odds on either side of
+        it. Of several such thresholds it is the lowest: an action too many costs less than an
+        object that stays where it is. None where either kind is missing: never stop.
     """
-    errors = np.array(
-        [
-            answer_errors(policy.decide(Observation(scene.image, grid)), scene, grid)
-            for scene in scenes
-        ]
-    )
-    report = {"displacement_mm": float(errors[:, -1].mean())}
-    for name, column in zip(ERRORS, errors.T, strict=True):
+    present, absent = np.sort(np.asarray(present, float)), np.sort(np.asarray(absent, float))
+    if not len(present) or not len(absent):
+        return None
+    values = np.unique(np.concatenate([present, absent]))
+    middles = (values[:-1] + values[1:]) / 2
+    thresholds = np.concatenate([[values[0] - 1.0], middles, [values[-1] + 1.0]])
+    false_stops = np.searchsorted(present, thresholds)
+    missed_stops = len(absent) - np.searchsorted(absent, thresholds)
+    return float(thresholds[np.argmin(false_stops + missed_stops)])
+
+
+def validate(
+    policy: LearnedPolicy, scenes: Sequence[Scene], finals: Sequence[FinalObservation] = ()
+) -> dict[str, float]:
+    """Validates a policy on scenes with something to pick, and on final observations.
+
+    Args:
+        policy: what to validate; whether it has a threshold for stopping already does not matter.
+        scenes: at least one.
+        finals: in which there is nothing left to pick; none if the networks cannot stop.
+
+    Returns:
+        For each of `ERRORS` its median over the scenes, as `median_...`, its 95th percentile, as
+        `p95_...`, and as `displacement_mm` the mean displacement. Where there are final
+        observations, also the `stop_threshold` chosen for them, and how many scenes are judged
+        wrongly with it: `false_stops`, in which there is something to pick, and `missed_stops`.
+        And `cost_mm`, by which a checkpoint is chosen: the mean displacement over all scenes and
+        final observations, where what is judged wrongly counts as lost (20 mm) and a final
+        observation that is judged rightly as 0.
+    """
+    errors, present = [], []
+    for scene in scenes:
+        targets = scene.targets
+        decision = policy.decide(Observation(targets[0].image, scene.grid))
+        errors.append(prediction_errors(decision, targets, 1e3 * scene.grid.resolution))
+        present.append(decision.log_odds)
+    table = np.array(errors)
+    displacements = table[:, -1]
+    report = {"displacement_mm": float(displacements.mean())}
+    for name, column in zip(ERRORS, table.T, strict=True):
         report[f"median_{name}"] = float(np.median(column))
         report[f"p95_{name}"] = float(np.percentile(column, 95))
+    report["cost_mm"] = report["displacement_mm"]
+    grid = scenes[0].grid
+    absent = [policy.log_odds(Observation(final.image, grid)) for final in finals]
+    threshold = None
+    if None not in present and None not in absent:
+        threshold = choose_stop_threshold(present, absent)  # type: ignore[arg-type]
+    if threshold is not None:
+        stopped = np.array(present, float) < threshold
+        missed = int((np.array(absent, float) >= threshold).sum())
+        costs = np.where(stopped, _LOST, displacements).sum() + _LOST * missed
+        report |= {
+            "cost_mm": float(costs / (len(scenes) + len(finals))),
+            "stop_threshold": threshold,
+            "false_stops": int(stopped.sum()),
+            "missed_stops": missed,
+        }
     return report

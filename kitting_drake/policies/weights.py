@@ -1,13 +1,15 @@
 """Trained networks as files: safetensors, loaded as plain convolutions without any group library.
 
-A file holds what was trained, in its own small coordinates, and the few kernel bases that turn them
-into plain convolutions: a tenth of what the plain kernels would take (4 of 37 MB, preset small).
+A file holds the trained weights, which are coefficients of kernel bases, and these few bases, from
+which the plain kernels are expanded. That is a tenth of what the plain kernels would take (4 MB
+instead of 37 for the preset "small").
 """
 
 from __future__ import annotations
 
 import dataclasses
 import json
+import math
 import textwrap
 from dataclasses import dataclass
 from pathlib import Path
@@ -28,6 +30,11 @@ from kitting_drake.policies.steerable import PlainConv2d, SteerableConv2d, expan
 FORMAT = "kitting_drake policy"
 FORMAT_VERSION = 1
 
+_RENAMED = {"colour_deviation": "colour_std", "height_deviation": "height_std"}
+"""Config fields of older files, by the names that they have now."""
+_ADDED = ("stop",)
+"""Config fields that older files lack: they take their defaults."""
+
 
 @dataclass(frozen=True)
 class WeightsFile:
@@ -35,16 +42,17 @@ class WeightsFile:
 
     config: NetworkConfig
     card: dict[str, Any]
-    """Where the weights come from: data, seeds, steps, validation."""
+    """Where the weights come from: data, seeds, steps, validation. Its `stop_threshold`, if there
+    is one, is `Networks.stop_threshold`."""
 
 
 def save_weights(path: Path, networks: Networks, card: dict[str, Any]) -> None:
     """Writes networks, as they are trained, to a file.
 
     Args:
-        path: where; there whole or not at all.
+        path: the file, which is written atomically.
         networks: made with steerable convolutions.
-        card: for people, and for results; anything that JSON takes.
+        card: see `WeightsFile`; anything that JSON takes.
     """
     tensors: dict[str, Tensor] = {}
     bases: dict[str, str] = {}
@@ -82,13 +90,13 @@ def save_weights(path: Path, networks: Networks, card: dict[str, Any]) -> None:
 
 
 def _plain_size(layer: SteerableConv2d) -> int:
-    """How many numbers its plain kernel has."""
+    """The number of entries of a layer's plain kernel."""
     pairs = layer.weights.shape[0] * layer.weights.shape[1]
     return pairs * layer.basis[0].numel()
 
 
 def read_weights_file(path: Path) -> WeightsFile:
-    """Reads what a file says beside the weights, which is quick.
+    """Reads what a file says beside the weights, without reading these.
 
     Raises:
         UserError: the file cannot be used.
@@ -102,7 +110,7 @@ def load_networks(path: Path, compute_type: torch.dtype = torch.float32) -> Netw
 
     Args:
         path: a file that `save_weights` wrote.
-        compute_type: of the convolutions.
+        compute_type: of the convolutions; the weights are cast to it once, here.
 
     Raises:
         UserError: the file cannot be read, is not such a file, or its weights are not those of the
@@ -110,7 +118,32 @@ def load_networks(path: Path, compute_type: torch.dtype = torch.float32) -> Netw
     """
     metadata, tensors = _read(path, tensors=True)
     config = _config(path, metadata)
-    bases = _json(path, metadata, "bases")
+    threshold = _stop_threshold(path, metadata)
+    state = _plain_state(path, tensors, _json(path, metadata, "bases"))
+    try:
+        networks = make_networks(config, PlainConv2d)
+    except (TypeError, ValueError) as error:
+        raise UserError(f"{path}: its config cannot be used: {error}") from error
+    try:
+        networks.load_state_dict(state)
+    except RuntimeError as error:
+        # Torch lists every tensor that does not fit; the first is enough.
+        first = textwrap.shorten(str(error).splitlines()[1], 150, placeholder=" ...")
+        raise UserError(
+            f"{path}: the weights are not those of a {config.preset} {config.method} network: "
+            f"{first}"
+        ) from error
+    if not all(bool(value.isfinite().all()) for value in state.values()):
+        raise UserError(f"{path}: the weights are not all finite numbers")
+    networks.stop_threshold = threshold
+    networks.freeze(compute_type)
+    return networks
+
+
+def _plain_state(
+    path: Path, tensors: dict[str, Tensor], bases: dict[str, Any]
+) -> dict[str, Tensor]:
+    """The state of networks of plain convolutions: kernels expanded from their bases."""
     state = {}
     for name, tensor in tensors.items():
         layer, _, kind = name.rpartition(".")
@@ -124,33 +157,16 @@ def load_networks(path: Path, compute_type: torch.dtype = torch.float32) -> Netw
             state[f"{layer}.weight"] = expand_kernel(tensor, basis)
         else:
             state[name] = tensor
-    try:
-        networks = make_networks(config, PlainConv2d)
-    except (TypeError, ValueError) as error:
-        raise UserError(f"{path}: its config cannot be used: {error}") from error
-    try:
-        networks.load_state_dict(state)
-    except RuntimeError as error:
-        # Torch tells of every tensor.
-        first = textwrap.shorten(str(error).splitlines()[1], 150, placeholder=" ...")
-        raise UserError(
-            f"{path}: the weights are not those of a {config.preset} {config.method} network: "
-            f"{first}"
-        ) from error
-    if not all(bool(value.isfinite().all()) for value in state.values()):
-        raise UserError(f"{path}: the weights are not all finite numbers")
-    networks.compute_type = compute_type
-    networks.eval().requires_grad_(False)
-    return networks
+    return state
 
 
 def preferred_device() -> torch.device:
-    """The accelerator where there is one, else the CPU: where networks are trained and asked."""
+    """The device to train and infer on: an accelerator where there is one, else the CPU."""
     return torch.device("cuda" if torch.cuda.is_available() else "cpu")
 
 
 def preferred_type() -> torch.dtype:
-    """bfloat16 where the preferred device computes in it, else float32."""
+    """The type to compute in: bfloat16 where the preferred device is fast in it, else float32."""
     if preferred_device().type == "cuda":
         return torch.bfloat16 if torch.cuda.is_bf16_supported() else torch.float32
     fast = torch.backends.cpu.get_cpu_capability() in ("AVX512", "AMX") and (
@@ -191,12 +207,23 @@ def _json(path: Path, metadata: dict[str, str], key: str) -> dict[str, Any]:
 
 
 def _config(path: Path, metadata: dict[str, str]) -> NetworkConfig:
-    values = _json(path, metadata, "config")
+    values = {
+        _RENAMED.get(name, name): value for name, value in _json(path, metadata, "config").items()
+    }
     known = {item.name for item in dataclasses.fields(NetworkConfig)}
-    if set(values) != known:
+    if not known.difference(_ADDED) <= set(values) <= known:
         raise UserError(f"{path}: its config must have the fields {', '.join(sorted(known))}")
     try:
         values["angle_frequencies"] = tuple(values["angle_frequencies"])
         return NetworkConfig(**values)
     except (TypeError, ValueError) as error:
         raise UserError(f"{path}: its config cannot be used: {error}") from error
+
+
+def _stop_threshold(path: Path, metadata: dict[str, str]) -> float | None:
+    value = _json(path, metadata, "card").get("stop_threshold")
+    if value is None:
+        return None
+    if not isinstance(value, int | float) or not math.isfinite(value):
+        raise UserError(f"{path}: the stop_threshold of its card is {value!r}, not a number")
+    return float(value)

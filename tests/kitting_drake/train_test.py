@@ -21,6 +21,8 @@ from kitting_drake.common.files import alone_in
 from kitting_drake.policies.demonstrations import (
     Demonstration,
     DemonstrationStep,
+    FinalObservation,
+    Learning,
     Origin,
     write_demonstrations,
 )
@@ -30,22 +32,24 @@ from systems.signals import Observation, PickPlaceAction, PixelGrid, PlanarPose
 
 ROOT = Path(__file__).resolve().parents[2]
 GRID = PixelGrid(rows=33, cols=49)
-ORIGIN = Origin("mine", {"time_limit": 1.0}, GRID, 10, {})
+LEARNING = Learning(later_picks_possible=True, curvature=True)
+ORIGIN = Origin("mine", {"time_limit": 1.0}, GRID, 10, {}, LEARNING)
 ONE_THREAD = os.environ | {"OMP_NUM_THREADS": "1"}
 LOSSES = {"pick_position", "pick_angle", "place"}
 
 
-def demonstration(seed: int) -> Demonstration:
-    """Of two steps."""
+def demonstration(seed: int, *, final: bool = True) -> Demonstration:
+    """A demonstration of two steps."""
     rng = np.random.default_rng(seed)
     steps = []
     for _ in range(2):
         pick, place = GRID.to_world(rng.uniform(5, 28, (2, 2)))
-        theta, turn = rng.uniform(-3, 3, 2)
-        action = PickPlaceAction(PlanarPose(*pick, theta), PlanarPose(*place, theta + turn))
+        theta, rotation = rng.uniform(-3, 3, 2)
+        action = PickPlaceAction(PlanarPose(*pick, theta), PlanarPose(*place, theta + rotation))
         seen = Observation(rng.random((4, *GRID.shape), np.float32), GRID)
         steps.append(DemonstrationStep.of(seen, action, name="a", category="b"))
-    return Demonstration(seed, 1.0, tuple(steps))
+    empty = Observation(np.full((4, *GRID.shape), 0.5, np.float32), GRID)
+    return Demonstration(seed, 1.0, tuple(steps), FinalObservation.of(empty) if final else None)
 
 
 def write(path: Path, seeds: Iterable[int], origin: Origin = ORIGIN) -> Path:
@@ -60,7 +64,7 @@ def demos(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def words(demos: Path, folder: Path, *more: object) -> list[str]:
-    """What is written after `python -m kitting_drake.train`."""
+    """The arguments of `python -m kitting_drake.train`."""
     flags = ("--preset", "tiny", "--steps", 4, "--validate-every", 3, "--learning-rate", "0.01")
     return [str(word) for word in ("--demos", demos, "--output", folder, *flags, *more)]
 
@@ -74,7 +78,7 @@ def train(demos: Path, folder: Path, *more: object) -> None:
 
 @pytest.fixture(scope="module")
 def trained(demos: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The folder of a run that has come to its end."""
+    """The folder of a finished run."""
     torch.set_num_threads(1)
     folder = tmp_path_factory.mktemp("trained")
     train(demos, folder)
@@ -83,7 +87,7 @@ def trained(demos: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def folder(trained: Path, tmp_path: Path) -> Path:
-    """The same, to be changed."""
+    """A copy of it, to be changed."""
     return Path(shutil.copytree(trained, tmp_path / "run"))
 
 
@@ -91,7 +95,7 @@ def log(folder: Path) -> list[dict[str, Any]]:
     return [json.loads(line) for line in (folder / "log.jsonl").read_text().splitlines()]
 
 
-def test_leaves_a_policy_and_what_it_comes_from(trained: Path):
+def test_leaves_a_policy_and_its_origin(trained: Path):
     assert sorted(path.name for path in trained.iterdir()) == [
         ".lock",
         "checkpoint.pt",
@@ -108,35 +112,75 @@ def test_leaves_a_policy_and_what_it_comes_from(trained: Path):
     assert file.card["demonstrations"] == 3
     assert file.card["demonstration_seeds"] == [10, 11, 12]
     assert file.card["validation_seeds"] == [13]
-    # Of the first observation of two, either object may be picked.
+    # In the first of two observations either object may be picked.
     assert file.card["samples"] == 3 * 3
+    assert file.card["final_observations"] == 3
+    assert not (file.card["taken_only"] or file.card["rigid"])
+    assert file.config.stop
+    threshold = file.card.pop("stop_threshold")
+    assert isinstance(threshold, float)
+    assert load_networks(trained / "policy.safetensors").stop_threshold == threshold
     summary = json.loads((trained / "summary.json").read_text())
-    assert summary["best"] == file.card.pop("validation")
+    best = file.card.pop("validation")
+    assert summary["best"] == best
+    assert best["stop_threshold"] == threshold
+    # Two scenes, and one final observation.
+    assert 0 <= best["false_stops"] + best["missed_stops"] <= 3
     assert summary.items() >= file.card.items()
     assert summary["wall_seconds"] > 0
-    load_networks(trained / "policy.safetensors")
+
+
+@pytest.mark.parametrize(
+    ("learning", "flags", "taken_only", "rigid"),
+    [
+        (Learning(), (), True, True),
+        (Learning(later_picks_possible=True), (), False, True),
+        (Learning(curvature=True), (), True, False),
+        (LEARNING, ("--taken-only", "--rigid"), True, True),
+    ],
+)
+def test_the_task_says_what_training_may_assume(
+    learning: Learning, flags: tuple[str, ...], taken_only: bool, rigid: bool, tmp_path: Path
+):
+    path = tmp_path / "demonstrations.h5"
+    items = [demonstration(seed, final=False) for seed in (10, 11)]
+    write_demonstrations(path, dataclasses.replace(ORIGIN, learning=learning), items)
+    train(path, tmp_path / "run", "--steps", 1, *flags)
+    file = read_weights_file(tmp_path / "run" / "policy.safetensors")
+    assert (file.card["taken_only"], file.card["rigid"]) == (taken_only, rigid)
+    assert file.card["samples"] == (2 if taken_only else 3)
+    # Without final observations nobody learns to stop.
+    assert not file.config.stop
+    assert file.card["stop_threshold"] is None
+    assert "false_stops" not in file.card["validation"]
 
 
 def test_the_curves(trained: Path):
     lines = log(trained)
     assert [line["step"] for line in lines] == [2, 3, 4, 4]
     assert [line.keys() >= LOSSES for line in lines] == [True, False, False, True]
+    assert [line.keys() >= {"cost_mm", "stop_threshold"} for line in lines] == [
+        False,
+        True,
+        True,
+        False,
+    ]
     events = EventAccumulator(str(trained / "tensorboard"))
     events.Reload()
-    assert {tag for tag in events.Tags()["scalars"] if tag.startswith("loss/")} == {
-        f"loss/{name}" for name in LOSSES
-    }
+    # The loss of final observations too, in case a step had one.
+    tags = {tag for tag in events.Tags()["scalars"] if tag.startswith("loss/")}
+    assert tags - {"loss/stop"} == {f"loss/{name}" for name in LOSSES}
     for tag, key in (("loss/place", "place"), ("validation/displacement_mm", "displacement_mm")):
         points = [(event.step, event.value) for event in events.Scalars(tag)]
-        told = [(line["step"], pytest.approx(line[key])) for line in lines if key in line]
-        assert points == told
+        logged = [(line["step"], pytest.approx(line[key])) for line in lines if key in line]
+        assert points == logged
 
 
-def test_run_again_it_has_nothing_to_do(
+def test_a_finished_run_has_nothing_to_do(
     demos: Path, folder: Path, capsys: pytest.CaptureFixture[str]
 ):
     before = {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
-    # Killed between the last checkpoint and this.
+    # As if killed between the last checkpoint and the summary.
     (folder / "summary.json").unlink()
     train(demos, folder)
     assert capsys.readouterr().out.startswith("all steps are done\n")
@@ -148,7 +192,7 @@ def tensors(folder: Path) -> dict[str, torch.Tensor]:
 
 
 def assert_same_outcome(folder: Path, other: Path) -> None:
-    """To the bit."""
+    """Equal bit by bit."""
     assert (folder / "log.jsonl").read_text() == (other / "log.jsonl").read_text()
     one, two = tensors(folder), tensors(other)
     assert all(torch.equal(one[name], two[name]) for name in one.keys() | two.keys())
@@ -188,7 +232,7 @@ def test_ctrl_c_loses_no_step(
 
 
 @pytest.mark.parametrize("stop", [1, 3])
-def test_stopped_it_goes_on_as_if_it_had_not(
+def test_a_stopped_run_resumes_as_if_it_had_not_been_stopped(
     demos: Path, trained: Path, tmp_path: Path, stop: int, monkeypatch: pytest.MonkeyPatch
 ):
     step = Trainer.step
@@ -202,7 +246,7 @@ def test_stopped_it_goes_on_as_if_it_had_not(
         patch.setattr(Trainer, "step", step_or_stop)
         with pytest.raises(KeyboardInterrupt):
             train(demos, tmp_path)
-    # Killed while a line was being written.
+    # As if killed while a line was being written.
     with (tmp_path / "log.jsonl").open("a") as file:
         file.write('{"step": 9, "pla')
     train(demos, tmp_path)
@@ -221,8 +265,8 @@ def test_demonstrations_of_another_task_may_have_the_same_seeds(demos: Path, tmp
 NO_DRAKE = """
 import sys
 sys.modules["pydrake"] = None
-from kitting_drake.train import main, run_verb
-run_verb(main)
+from kitting_drake.train import main, run_command
+run_command(main)
 """
 
 
@@ -234,7 +278,7 @@ def test_trains_where_drake_is_not_installed(demos: Path, tmp_path: Path):
     assert (tmp_path / "policy.safetensors").exists()
 
 
-# What cannot be used.
+# Input that cannot be used.
 
 
 @pytest.fixture
@@ -246,7 +290,7 @@ def refused(
     def run(*arguments: Any) -> str:
         monkeypatch.setattr(sys, "argv", ["train", *words(*arguments)])
         with pytest.raises(SystemExit) as left:
-            training.run_verb(training.main)
+            training.run_command(training.main)
         assert left.value.code == 2
         (line,) = capsys.readouterr().err.splitlines()
         assert line.startswith("error: ")
@@ -269,13 +313,13 @@ def test_refuses(
     demos: Path, tmp_path: Path, refused: Callable[..., str], flags: tuple, sentence: str
 ):
     assert sentence in refused(demos, tmp_path, *flags)
-    # The folder may be used for what is asked for instead.
+    # The folder can still be used for another run.
     assert not list(tmp_path.iterdir())
 
 
 VALIDATIONS = {
     "overlapping": (range(13, 15), ORIGIN, "share the seed 13: validation needs other ones"),
-    # Who moves faster does so at the same table.
+    # A time limit does not change what stands where.
     "the same tables": (
         range(13, 15),
         dataclasses.replace(ORIGIN, scenario={"time_limit": 2.0}),
@@ -291,7 +335,7 @@ VALIDATIONS = {
 
 
 @pytest.mark.parametrize("case", VALIDATIONS)
-def test_validation_by_what_does_not_do_is_refused(
+def test_unsuitable_validation_demonstrations_are_refused(
     demos: Path, tmp_path: Path, refused: Callable[..., str], case: str
 ):
     seeds, origin, sentence = VALIDATIONS[case]
@@ -313,7 +357,7 @@ def test_a_folder_of_another_run_is_refused(
     assert (folder / "settings.json").read_bytes() == before
 
 
-def test_what_the_same_seeds_gave_in_another_scenario_is_another_run(
+def test_the_same_seeds_of_another_scenario_are_another_run(
     folder: Path, tmp_path: Path, refused: Callable[..., str]
 ):
     origin = dataclasses.replace(ORIGIN, scenario={"time_limit": 2.0})
@@ -345,7 +389,7 @@ def test_a_damaged_checkpoint_is_refused(
     assert f"{path} cannot be taken up again: delete {folder}" in refused(demos, folder)
 
 
-def test_a_loss_that_is_no_number_ends_it(
+def test_a_loss_that_is_no_number_ends_the_run(
     demos: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     monkeypatch.setattr(Trainer, "step", lambda *_: {"place": float("nan")})
@@ -354,18 +398,18 @@ def test_a_loss_that_is_no_number_ends_it(
     assert not (tmp_path / "checkpoint.pt").exists()
 
 
-# Checkpoints are a second apart, and no displacement is too large to tell from another.
+# Checkpoints are a second apart, and no displacement is so large that others are equal to it.
 KILLABLE = """
 from kitting_drake import train
 from kitting_drake.policies import validation
 train._CHECKPOINT_EVERY = 3
 validation._LOST = 1e9
-train.run_verb(train.main)
+train.run_command(train.main)
 """
 
 
 @pytest.mark.slow
-def test_killed_again_and_again_it_ends_as_it_would_have(
+def test_a_run_that_is_killed_again_and_again_ends_as_if_it_had_not_been(
     demos: Path, tmp_path: Path, kill_at_random: Callable[..., None]
 ):
     whole, killed = tmp_path / "whole", tmp_path / "killed"
@@ -380,5 +424,5 @@ def test_killed_again_and_again_it_ends_as_it_would_have(
         kill_at_random(start(killed), killed / "log.jsonl", rng, changes=rng.randrange(4))
     assert start(killed).wait() == 0
     assert_same_outcome(killed, whole)
-    # The best is not one that every run begins with.
+    # The best checkpoint is not simply the first one.
     assert json.loads((whole / "summary.json").read_text())["best"]["step"] > 20

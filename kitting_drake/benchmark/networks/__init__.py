@@ -1,6 +1,7 @@
-"""What the networks cost here and now: figure 6(c) of the paper, and what lies beside it.
+"""The cost of the networks on this machine: figure 6(c) of the paper, and what goes with it.
 
-All figures come from one run on one machine, and what is compared takes turns. Needs no Drake.
+All figures come from one run on one machine, and alternatives that are compared are timed in
+alternation. Drake is not needed.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ from kitting_drake.policies.weights import preferred_device, preferred_type
 
 
 def benchmark_networks(plan: Plan, console: Console) -> dict[str, Any]:
-    """Measures everything that `benchmark networks` shows.
+    """Measures all that `benchmark networks` shows.
 
     Times are in seconds of wall time, rates in operations a second; a multiply-accumulate is two
     operations.
@@ -40,7 +41,7 @@ def benchmark_networks(plan: Plan, console: Console) -> dict[str, Any]:
     """
     device = preferred_device()
     machine = describe_machine(device)
-    scene, grid = observed_scene(plan.demonstrations)
+    scene = observed_scene(plan.demonstrations)
     types = sorted({preferred_type(), torch.float32}, key=str)
     presets = [plan.preset]
     if plan.compared_preset not in (None, plan.preset):
@@ -52,14 +53,14 @@ def benchmark_networks(plan: Plan, console: Console) -> dict[str, Any]:
         "preset": plan.preset,
         "repeats": plan.repeats,
         "budget_s": plan.budget,
-        "observation": str(plan.demonstrations or "drawn"),
+        "observation": str(plan.demonstrations or "synthetic"),
     }
     columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
     with (
         tempfile.TemporaryDirectory() as folder,
         Progress(*columns, console=console, transient=True, disable=console.quiet) as progress,
     ):
-        bench = Bench(plan, device, Path(folder), scene, grid)
+        bench = Bench(plan, device, Path(folder), scene)
 
         def peak() -> dict[str, dict[str, float]]:
             side = plan.peak_side * (4 if device.type == "cuda" else 1)

@@ -1,4 +1,4 @@
-"""What the measurements of a benchmark share: the plan, the machine and what is looked at."""
+"""What the measurements of a benchmark share: the plan, the machine and the observation."""
 
 from __future__ import annotations
 
@@ -17,36 +17,37 @@ from kitting_drake.benchmark.networks.timing import Timing, memory_bytes, time_e
 from kitting_drake.common.errors import UserError
 from kitting_drake.policies import config as sizes
 from kitting_drake.policies.config import PRESETS
-from kitting_drake.policies.demonstrations import read_demonstrations
-from kitting_drake.policies.images import Image, LabelledImage, crop, rotation
+from kitting_drake.policies.demonstrations import read_demonstrations, record
+from kitting_drake.policies.images import Image, crop, rotation_matrix
 from kitting_drake.policies.networks import Networks
 from kitting_drake.policies.samples import Scene, scenes
 from kitting_drake.policies.weights import load_networks, preferred_type, save_weights
-from systems.signals import Observation, PixelGrid
+from systems.signals import Observation, PickPlaceAction, PixelGrid, PlanarPose
 
 _EXPECTED_SHARE = 0.3
-"""Of the machine's peak: what a network is expected to reach when its time is predicted."""
+"""The share of the machine's peak that networks are assumed to reach when times are predicted."""
 
 
 @dataclass(frozen=True)
 class Plan:
-    """What to measure, and how carefully."""
+    """What to measure, and how often."""
 
     preset: str = "small"
     compared_preset: str | None = "paper"
-    """One more, of which only the models that answer the pick angle are measured."""
+    """Another preset, of which only the models that predict the pick angle are measured."""
     orientations: tuple[int, ...] = (36, 72, 120, 180)
     """N of section V-B.1 of the paper."""
     finer: int = 720
-    """N at which the paper's own method alone is asked."""
+    """N at which only the paper's own method is measured as well."""
     repeats: int = 9
-    """Of which the median is taken."""
+    """The number of timings of which the median is taken."""
     peak_side: int = 2048
-    """Of the matrices whose product shows the machine's peak; fourfold on an accelerator."""
+    """The side of the matrices whose product shows the machine's peak; four times that on an
+    accelerator."""
     budget: float = 60.0
-    """Seconds that a figure may take; what is predicted to take longer is left out."""
+    """The time that a figure may take, in seconds; what is predicted to take longer is left out."""
     demonstrations: Path | None = None
-    """Where the observation comes from; None: it is drawn."""
+    """The file that the observation is taken from; None: it is synthetic."""
 
     def __post_init__(self) -> None:
         if self.preset not in PRESETS:
@@ -60,36 +61,34 @@ class Bench:
     plan: Plan
     device: torch.device
     folder: Path
-    """For the weights of exported networks."""
+    """The folder for the weights of exported networks."""
     scene: Scene
-    grid: PixelGrid
     peak: dict[torch.dtype, dict[str, float]] = field(default_factory=dict)
-    """By type: what `measure_peak` gives."""
+    """What `measure_peak` returns, by type."""
 
-    @property
-    def image(self) -> Image:
-        return self.scene.image
+    def __post_init__(self) -> None:
+        self.image: Image = self.scene.recorded.image
 
     @property
     def pixel(self) -> tuple[int, int]:
-        """(row, col) of the pick."""
+        """(row, col) of the expert's pick."""
         row, col = np.rint(self.scene.targets[0].pick).astype(int)
         return int(row), int(col)
 
     def observe(self) -> Observation:
-        """The scene as if seen anew: networks may remember what they saw."""
-        return Observation(self.image.copy(), self.grid)
+        """What is decided upon."""
+        return Observation(self.image, self.scene.grid)
 
     def time_each(
         self, functions: dict[Any, Callable[[], object]], *, training: bool = False
     ) -> dict[Any, Timing]:
-        """`timing.time_each`, as carefully as planned."""
+        """`timing.time_each` with the plan's repeats and budget."""
         plan = self.plan
         with torch.inference_mode(not training):
             return time_each(functions, self.device, repeats=plan.repeats, budget=plan.budget)
 
     def inputs(self, networks: Networks) -> dict[str, Tensor]:
-        """Each network's."""
+        """The input of each network."""
         scene = networks.prepare(self.image)
         return {
             "alpha": scene,
@@ -99,16 +98,16 @@ class Bench:
         }
 
     def export(self, networks: Networks, type_: torch.dtype) -> Networks:
-        """What evaluation runs: saved, and loaded as plain convolutions."""
+        """The networks as evaluation runs them: saved, and loaded as plain convolutions."""
         path = self.folder / "networks.safetensors"
         save_weights(path, networks, {})
         return load_networks(path, type_).to(self.device)
 
     def why_not(self, outlined: Networks, operations: int) -> str | None:
-        """Why something is not timed, if it is not.
+        """The reason not to time something, if there is one.
 
         Args:
-            outlined: its networks, without values.
+            outlined: its networks, on the meta device.
             operations: of one run.
         """
         seconds = operations / (_EXPECTED_SHARE * self.peak[preferred_type()]["best"])
@@ -121,33 +120,32 @@ class Bench:
 
 
 def times_of(timing: Timing | None) -> dict[str, Any]:
-    """As JSON holds it."""
+    """A timing as the results hold it."""
     return dataclasses.asdict(timing) if timing else {"seconds": None}
 
 
 def type_name(type_: torch.dtype) -> str:
-    """As JSON holds it: `float32`."""
+    """A type as the results hold it, for example `float32`."""
     return str(type_).removeprefix("torch.")
 
 
-def observed_scene(path: Path | None) -> tuple[Scene, PixelGrid]:
-    """What is decided upon: the first observation of a demonstration, or one that is drawn.
+def observed_scene(path: Path | None) -> Scene:
+    """The first observation of a demonstration, or a synthetic one.
 
     Raises:
         UserError: the demonstrations cannot be used.
     """
     if path is None:
-        grid = PixelGrid()
-        return drawn_scene(grid), grid
+        return synthetic_scene(PixelGrid())
     demonstrations = read_demonstrations(path, 1)
     grid = demonstrations.origin.grid
-    observed = scenes(demonstrations.demonstrations, grid)
+    observed = scenes(demonstrations.demonstrations, grid, later_picks_possible=True)
     if not observed:
         raise UserError(f"{path} holds no demonstration")
-    return observed[0], grid
+    return observed[0]
 
 
-def drawn_scene(grid: PixelGrid) -> Scene:
+def synthetic_scene(grid: PixelGrid) -> Scene:
     """Four bars of a tool's size on a table, and a block with cavities for them."""
     random = np.random.default_rng(0)
     pixel = np.stack(np.meshgrid(np.arange(grid.rows), np.arange(grid.cols), indexing="ij"), -1)
@@ -155,8 +153,8 @@ def drawn_scene(grid: PixelGrid) -> Scene:
     image[3] = 0.0
 
     def bar(middle: NDArray[np.float64], angle: float, length: float, width: float) -> Any:
-        """Which pixels (rows, cols) are in it; lengths in metres, along the rows at angle 0."""
-        along, across = np.moveaxis(np.abs((pixel - middle) @ rotation(angle)), -1, 0)
+        """The pixels (rows, cols) of a bar; lengths in metres, along the rows at angle 0."""
+        along, across = np.moveaxis(np.abs((pixel - middle) @ rotation_matrix(angle)), -1, 0)
         half = 0.5 * np.array([length, width]) / grid.resolution
         return (along <= half[0]) & (across <= half[1])
 
@@ -164,7 +162,7 @@ def drawn_scene(grid: PixelGrid) -> Scene:
     kit = np.array([0.5 * rows, 0.25 * cols])
     block = bar(kit, 0.0, 0.26, 0.28)
     image[:3, block], image[3, block] = 0.6, 0.05
-    targets = []
+    actions = []
     for index in range(4):
         pick = np.array([(0.2 + 0.2 * index) * rows, 0.75 * cols])
         place = kit + (0.0, (index - 1.5) * 0.06 / grid.resolution)
@@ -173,5 +171,8 @@ def drawn_scene(grid: PixelGrid) -> Scene:
         image[3, cavity] = 0.03
         image[:3, tool] = random.uniform(0.1, 0.9, (3, 1))
         image[3, tool] = 0.02
-        targets.append(LabelledImage(image, pick=pick, pick_theta=theta, place=place, turn=-theta))
-    return Scene(image, tuple(targets))
+        (pick_x, pick_y), (place_x, place_y) = grid.to_world([pick, place])
+        actions.append(
+            PickPlaceAction(PlanarPose(pick_x, pick_y, theta), PlanarPose(place_x, place_y, 0.0))
+        )
+    return Scene(record(Observation(image, grid)), tuple(actions), grid)

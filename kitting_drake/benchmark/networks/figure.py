@@ -1,4 +1,4 @@
-"""The picture of `benchmark networks`: figure 6(c) of the paper, and what lies beside it."""
+"""The figure of `benchmark networks`: figure 6(c) of the paper, and what goes with it."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from kitting_drake.benchmark.networks.tables import (
 from kitting_drake.common.files import write_whole
 
 _METHODS = {"so2": "#009e73", "equivariant_transporter": "#e69f00", "transporter": "#56646f"}
-"""Colours that all eyes tell apart; the first two are the paper's green and orange."""
+"""Colours for the colour-blind too; the first two are the paper's green and orange."""
 _PARTS = {
     "pick_position": "#0072b2",
     "pick_angle": "#d55e00",
@@ -54,7 +54,7 @@ def draw_networks(measured: dict[str, Any], path: Path) -> None:
     Raises:
         UserError: the file cannot be written.
     """
-    # Imported here: the other verbs should not wait for it.
+    # Imported here, because it takes long and other commands do not need it.
     import matplotlib
     from matplotlib.figure import Figure
 
@@ -72,8 +72,8 @@ def draw_networks(measured: dict[str, Any], path: Path) -> None:
             height_ratios=(1.0, 0.9, 0.75),
         )
         figure.suptitle(
-            f"What the networks cost: {place}, {threads}, "
-            f"{measured['inference_type']} where not said otherwise",
+            f"Cost of the networks: {place}, {threads}, "
+            f"{measured['inference_type']} unless stated otherwise",
             x=0.01,
             horizontalalignment="left",
             fontsize=13,
@@ -88,13 +88,13 @@ def draw_networks(measured: dict[str, Any], path: Path) -> None:
 
 
 def _draw_pick_angle(axis: Any, measured: dict[str, Any], preset: str) -> None:
-    """Bars of parameters, lines of time."""
+    """Parameters as bars, and times as lines."""
     from matplotlib.ticker import LogLocator
 
     rows = [row for row in measured["pick_angle"] if row["preset"] == preset]
     counts = sorted({row["orientations"] for row in rows})
     places = {n: index for index, n in enumerate(counts)}
-    # The Transporter has no model of the angle alone: its time belongs here, its size does not.
+    # The Transporter has no model of the angle alone: only the time of its picking is comparable.
     barred = [method for method in _METHODS if method != "transporter"]
     width = 0.32
     for index, method in enumerate(barred):
@@ -158,7 +158,7 @@ def _draw_pick_angle(axis: Any, measured: dict[str, Any], preset: str) -> None:
             )
     low, high = times.get_ylim()
     times.set_ylim(low * (low / high) ** 0.3, high * (high / low) ** 0.3)
-    # A tick for each decade, or three where there are few decades.
+    # One tick for each decade, or three where there are few decades.
     times.yaxis.set_major_locator(LogLocator(subs=(1.0,) if high > 100 * low else (1.0, 2.0, 5.0)))
     times.yaxis.set_major_formatter(lambda seconds, _: seconds_text(seconds))
     times.minorticks_off()
@@ -166,13 +166,13 @@ def _draw_pick_angle(axis: Any, measured: dict[str, Any], preset: str) -> None:
 
 
 def _draw_decisions(axis: Any, measured: dict[str, Any]) -> None:
-    """A bar for each method and N, of the parts; a bar that is far too long is cut."""
+    """A stacked bar of the parts for each method and N; a bar that is far too long is cut off."""
     rows = [row for row in measured["decision"] if row["seconds"]]
     if not rows:
         axis.text(0.5, 0.5, "every decision takes too long here", horizontalalignment="center")
         return
     others = [row["seconds"] for row in rows if row["method"] != "transporter"]
-    # Leaves room for the legend.
+    # This leaves room for the legend.
     limit = 1.5e3 * max(others or [row["seconds"] for row in rows])
     place, places, labels, groups = 0.0, [], [], {}
     for method in dict.fromkeys(row["method"] for row in rows):
@@ -219,7 +219,7 @@ def _draw_decisions(axis: Any, measured: dict[str, Any]) -> None:
 
 
 def _draw_folding(axis: Any, measured: dict[str, Any]) -> None:
-    """Bars of how many times faster than plain escnn, a group for each measure."""
+    """The speed-ups over plain escnn as bars, a group for each measure."""
     folding = measured["folding"]
     rungs = list(folding["rungs"])
     height = 0.8 / len(rungs)
@@ -240,12 +240,12 @@ def _draw_folding(axis: Any, measured: dict[str, Any]) -> None:
     axis.axvline(1.0, color="0.5", linewidth=0.8, linestyle="--")
     axis.grid(True, axis="x")
     axis.set_xlabel("times faster than plain escnn in float32")
-    axis.set_title(f"The same networks, of escnn and folded, preset {measured['preset']}")
+    axis.set_title(f"The same networks, plain escnn and folded, preset {measured['preset']}")
     axis.legend(loc="upper center", bbox_to_anchor=(0.5, -0.09), ncols=len(rungs), fontsize=8.5)
 
 
 def _draw_levels(axis: Any, measured: dict[str, Any]) -> None:
-    """Bars of alpha's time by level, the convolutions' share of the peak written on them."""
+    """Alpha's time by level as bars, labelled with the convolutions' share of the peak."""
     levels = measured["alpha_levels"]["levels"]
     names = [row["level"] for row in levels]
     convolution = [1e3 * row["convolution_s"] for row in levels]

@@ -1,4 +1,4 @@
-"""What an answer costs at N orientations: figure 6(c) of the paper, and the whole decision."""
+"""The cost of a prediction at N orientations: figure 6(c) of the paper, and the whole decision."""
 
 from __future__ import annotations
 
@@ -6,32 +6,36 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 import torch
+from torch import nn
 
 from kitting_drake.benchmark.networks.bench import Bench, Plan, times_of
 from kitting_drake.benchmark.networks.timing import Timing, count_operations, read_clock
-from kitting_drake.policies.config import METHODS, NetworkConfig
+from kitting_drake.policies.config import METHODS, PICK_CROP, NetworkConfig
+from kitting_drake.policies.images import crop
 from kitting_drake.policies.learned_policy import LearnedPolicy
 from kitting_drake.policies.methods import make_networks
 from kitting_drake.policies.networks import FactoredNetworks, Networks
 from kitting_drake.policies.steerable import PlainConv2d
+from kitting_drake.policies.transporter import TransporterNetworks, encodings_per_decision
 from kitting_drake.policies.weights import preferred_type
 
 PARTS = {
-    "pick_position": "position_logits",
-    "pick_angle": "angle_answer",
-    "phi": "encode_scene",
-    "psi": "encode_crop",
+    "pick_position": ("alpha", "f_pick"),
+    "pick_angle": ("beta",),
+    "phi": ("phi",),
+    "psi": ("psi",),
 }
-"""Of a decision, by the method of `Networks` that computes it; the rest of it is `search`."""
+"""The networks that compute each part of a decision. The rest of a decision is `search`: the
+correlation, what is read off the networks' outputs, and the preparation of their inputs."""
 
 _MADE_FOR_N = ("equivariant_transporter",)
-"""Methods whose networks depend on N; the others' are asked at any N."""
+"""Methods of whose architecture N is a part; the other methods' networks predict at any N."""
 
 
 def measure_pick_angles(bench: Bench, preset: str) -> list[dict[str, Any]]:
-    """Parameters and inference time of what answers the pick angle.
+    """Parameters and inference time of the models that predict the pick angle.
 
-    For the Transporter that is all of its picking: one network, given the scene at every angle.
+    For the Transporter that is all of its picking: one network that takes the scene at every angle.
 
     Returns:
         A row for each method and N.
@@ -47,16 +51,18 @@ def measure_pick_angles(bench: Bench, preset: str) -> list[dict[str, Any]]:
         del trained, losses, models
 
         outlined = _without_others(_outlined(config), names)
-        operations = {n: count_operations(_ask_angle(outlined, bench, n)) for n in orientations}
+        operations = {
+            n: count_operations(_compute_angles(outlined, bench, n)) for n in orientations
+        }
         skipped = {n: bench.why_not(outlined, count) for n, count in operations.items()}
         timings: dict[int, Timing] = {}
         if not all(skipped.values()):
-            # Fresh weights take as long as any, and writing some of these would take gigabytes.
+            # Fresh weights take as long as trained ones; some of these would be files of gigabytes.
             networks = _without_others(make_networks(config, PlainConv2d), names).to(bench.device)
-            networks.compute_type = preferred_type()
-            networks.eval().requires_grad_(False)
-            asked = {n: _ask_angle(networks, bench, n) for n in orientations if not skipped[n]}
-            timings = bench.time_each(asked)
+            networks.freeze(preferred_type())
+            timings = bench.time_each(
+                {n: _predict_angle(networks, bench, n) for n in orientations if not skipped[n]}
+            )
         rows += [
             {
                 "preset": preset,
@@ -73,7 +79,7 @@ def measure_pick_angles(bench: Bench, preset: str) -> list[dict[str, Any]]:
 
 
 def _cells(plan: Plan) -> Iterator[tuple[str, tuple[int, ...]]]:
-    """Each method, with the N at which one set of its networks is asked."""
+    """Each method, with the N at which one set of its networks is measured."""
     for method in METHODS:
         if method in _MADE_FOR_N:
             yield from ((method, (n,)) for n in plan.orientations)
@@ -84,21 +90,32 @@ def _cells(plan: Plan) -> Iterator[tuple[str, tuple[int, ...]]]:
 
 
 def _outlined(config: NetworkConfig) -> Networks:
-    """Plain networks without values: shapes pass through them at no cost."""
+    """Plain networks on the meta device: their operations are counted without being carried out."""
     with torch.device("meta"):
         return make_networks(config, PlainConv2d).to("meta").requires_grad_(False)
 
 
 def _without_others(networks: Networks, names: set[str]) -> Networks:
-    """The same, of its children only those named: the others' gigabytes are given back."""
+    """The networks with none but the named children; the memory of the others is freed."""
     for name in [name for name, _ in networks.named_children() if name not in names]:
         delattr(networks, name)
     return networks
 
 
-def _ask_angle(networks: Networks, bench: Bench, orientations: int) -> Callable[[], object]:
-    """The angle at a known pixel, of an image that was not seen before."""
-    return lambda: networks.angle_logits(bench.image.copy(), bench.pixel, orientations)
+def _compute_angles(networks: Networks, bench: Bench, orientations: int) -> Callable[[], object]:
+    """The computation of all angles at a known pixel; nothing is read off the result, which has no
+    values on the meta device."""
+    if isinstance(networks, FactoredNetworks):
+        crops = networks.prepare(crop(bench.image, bench.pixel, PICK_CROP))
+        return lambda: networks.crop_angle_logits(crops, orientations)
+    return _predict_angle(networks, bench, orientations)
+
+
+def _predict_angle(networks: Networks, bench: Bench, orientations: int) -> Callable[[], object]:
+    """The prediction of the angle at a known pixel."""
+    if isinstance(networks, FactoredNetworks):
+        return lambda: networks.predict_angle(bench.image, bench.pixel, orientations)
+    return lambda: networks.predict_pick(bench.image, orientations).angle(bench.pixel)
 
 
 def measure_decisions(bench: Bench) -> list[dict[str, Any]]:
@@ -111,9 +128,7 @@ def measure_decisions(bench: Bench) -> list[dict[str, Any]]:
     for method, orientations in _cells(bench.plan):
         config = NetworkConfig(method, bench.plan.preset, max(orientations))
         outlined = _outlined(config)
-        operations = {
-            n: count_operations(_ask_everything(outlined, bench, n)) for n in orientations
-        }
+        operations = {n: count_operations(_compute_all(outlined, bench, n)) for n in orientations}
         skipped = {n: bench.why_not(outlined, count) for n, count in operations.items()}
         timings: dict[int, Timing] = {}
         runs: dict[int, list[dict[str, float]]] = {n: [] for n in orientations}
@@ -121,8 +136,9 @@ def measure_decisions(bench: Bench) -> list[dict[str, Any]]:
         parameters = sum(weight.numel() for weight in trained.parameters())
         if not all(skipped.values()):
             watched = _WatchedPolicy(bench, bench.export(trained, preferred_type()))
-            asked = {n: watched.deciding(n, runs[n]) for n in orientations if not skipped[n]}
-            timings = bench.time_each(asked)
+            timings = bench.time_each(
+                {n: watched.deciding(n, runs[n]) for n in orientations if not skipped[n]}
+            )
         for n in orientations:
             timing = timings.get(n)
             counted = runs[n][-timing.runs :] if timing else []
@@ -142,41 +158,50 @@ def measure_decisions(bench: Bench) -> list[dict[str, Any]]:
     return rows
 
 
-def _ask_everything(networks: Networks, bench: Bench, orientations: int) -> Callable[[], object]:
-    """All that a decision asks of the networks, the search left out."""
+def _compute_all(networks: Networks, bench: Bench, orientations: int) -> Callable[[], object]:
+    """All that the networks compute for a decision; the search is left out."""
+    angles = _compute_angles(networks, bench, orientations)
 
-    def ask() -> None:
-        # The Transporter's networks answer both at once.
+    def compute() -> None:
+        # The Transporter computes positions and angles at once.
         if isinstance(networks, FactoredNetworks):
-            networks.position_logits(bench.image, orientations)
-        networks.angle_logits(bench.image, bench.pixel, orientations)
+            networks.position_logits(bench.image)
+        angles()
         networks.encode_scene(bench.image)
-        networks.encode_crop(bench.image, bench.pixel)
+        if isinstance(networks, TransporterNetworks):
+            rotations = [0.0] * encodings_per_decision(orientations)
+            networks.encode_crops(bench.image, bench.pixel, rotations)
+        else:
+            networks.encode_crop(bench.image, bench.pixel)
 
-    return ask
+    return compute
 
 
 class _WatchedPolicy:
-    """Decides, and notes the time of each part."""
+    """A policy that takes the time of each part of its decisions."""
 
     def __init__(self, bench: Bench, networks: Networks) -> None:
         self._bench, self._device = bench, bench.device
         self._networks = networks
         self._parts: dict[str, float] = {}
-        for part, method in PARTS.items():
-            setattr(networks, method, self._watched(part, getattr(networks, method)))
+        self._start = 0.0
+        for part, names in PARTS.items():
+            for name, network in networks.named_children():
+                if name in names:
+                    network.register_forward_pre_hook(self._before)
+                    network.register_forward_hook(self._after(part))
 
-    def _watched(self, part: str, method: Callable[..., Any]) -> Callable[..., Any]:
-        def call(*arguments: Any) -> Any:
-            start = read_clock(self._device)
-            answer = method(*arguments)
-            self._parts[part] = self._parts.get(part, 0.0) + read_clock(self._device) - start
-            return answer
+    def _before(self, module: nn.Module, inputs: Any) -> None:
+        self._start = read_clock(self._device)
 
-        return call
+    def _after(self, part: str) -> Callable[..., None]:
+        def hook(module: nn.Module, inputs: Any, output: Any) -> None:
+            self._parts[part] += read_clock(self._device) - self._start
+
+        return hook
 
     def deciding(self, orientations: int, runs: list[dict[str, float]]) -> Callable[[], object]:
-        """A decision at N, that adds the seconds of its parts to `runs`."""
+        """A decision at N, which appends the seconds of its parts to `runs`."""
         policy = LearnedPolicy(self._networks, orientations=orientations)
 
         def decide() -> None:
@@ -191,14 +216,14 @@ class _WatchedPolicy:
 
 
 def growth(rows: list[dict[str, Any]], orientations: tuple[int, ...]) -> list[dict[str, Any]]:
-    """How much more the largest N costs than the smallest.
+    """The cost at the largest N relative to that at the smallest.
 
     Args:
         rows: of `measure_pick_angles` or `measure_decisions`.
         orientations: N.
 
     Returns:
-        A row for each preset and method: ratios, or None where one of both was not measured.
+        A row for each preset and method: ratios, or None where one of the two was not measured.
     """
     ends = (min(orientations), max(orientations))
     cells = {(row["preset"], row["method"], row["orientations"]): row for row in rows}

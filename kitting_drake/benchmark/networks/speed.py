@@ -1,4 +1,4 @@
-"""How fast the paper's networks run: beside plain escnn, and beside the machine's peak."""
+"""The speed of the paper's networks, relative to plain escnn and to the machine's peak."""
 
 from __future__ import annotations
 
@@ -24,24 +24,25 @@ from kitting_drake.policies.unet import UNet
 from kitting_drake.policies.weights import preferred_type
 
 MEASURES = ("training_step", "alpha_training_step", "decision", "alpha_inference")
-"""What is timed of each way to run the same networks."""
+"""What is timed for each way to run the same networks."""
 
 
 def measure_folding(bench: Bench) -> dict[str, Any]:
-    """The paper's networks as escnn's modules run them, and as this package does.
+    """Times the paper's networks built of escnn's modules, and as this package runs them.
 
-    The weights are the same, and so is what is computed, up to rounding.
+    Their weights are the same, and so is what they compute, up to rounding.
 
     Returns:
-        `rungs`, by name: the time of each of `MEASURES`; `speed_up`, likewise: how many times
-        faster than plain escnn in float32; `alpha_difference`: by how much alpha's answer differs
-        from that one's, of its standard deviation; `alpha_operations`, of one inference.
+        By way of running them, `rungs`: the time of each of `MEASURES`; `speed_up`: how many times
+        faster than plain escnn in float32 each of them is; `alpha_difference`: the difference of
+        alpha's output from plain escnn's, relative to its standard deviation; and
+        `alpha_operations` of one inference.
     """
     config = NetworkConfig("so2", bench.plan.preset)
     ours = make_networks(config)
     assert isinstance(ours, SO2Networks)
     types = [type_ for type_ in (torch.float32, torch.bfloat16) if type_ in bench.peak]
-    # Trained, and for inference. escnn in eval mode keeps the kernels that it has expanded.
+    # Pairs for training and for inference. escnn in eval mode keeps the kernels it has expanded.
     ways: dict[str, tuple[Networks, Networks]] = {}
     for type_ in types:
         autocast = None if type_ == torch.float32 else type_
@@ -73,11 +74,11 @@ def measure_folding(bench: Bench) -> dict[str, Any]:
     }
     baseline = next(iter(ways))
     with torch.inference_mode():
-        answers = {
-            name: networks.position_logits(bench.image, config.orientations)
+        outputs = {
+            name: networks.predict_pick(bench.image, config.orientations).position
             for name, networks in exported.items()
         }
-    exact = answers[baseline]
+    exact = outputs[baseline]
     return {
         "rungs": {
             name: {measure: times_of(timings[measure][name]) for measure in MEASURES}
@@ -91,10 +92,10 @@ def measure_folding(bench: Bench) -> dict[str, Any]:
             for name in ways
         },
         "alpha_difference": {
-            name: float((answer - exact).std() / exact.std()) for name, answer in answers.items()
+            name: float((output - exact).std() / exact.std()) for name, output in outputs.items()
         },
         "alpha_operations": {
-            # Types do not change them, and autocast cannot be counted.
+            # Those of autocast cannot be counted, but they are the same.
             name: count_operations(_inferring(*_alpha(exported[f"{name}_float32"], bench)))
             for name in ("escnn", "ours")
         },
@@ -102,20 +103,20 @@ def measure_folding(bench: Bench) -> dict[str, Any]:
 
 
 def _alpha(networks: Networks, bench: Bench) -> tuple[nn.Module, Tensor]:
-    """The network, and what it is given."""
+    """The network alpha, and its input."""
     return networks.get_submodule("alpha"), bench.inputs(networks)["alpha"]
 
 
 def _computing_in(networks: Networks, type_: torch.dtype) -> Networks:
-    """A copy, to train."""
+    """A copy that computes in another type, to be trained."""
     networks = copy.deepcopy(networks)
     networks.compute_type = type_
     return networks
 
 
 def _training(networks: Networks, scene: Scene) -> Callable[[], object]:
-    """A training step of all four networks, augmentation and losses included: always the same."""
-    trainer = Trainer(networks, seed=0)
+    """One and the same training step of all four networks, augmentation and losses included."""
+    trainer = Trainer(networks, seed=0, curvature=True)
     samples = labelled_images([scene], taken_only=False)
 
     def step() -> None:
@@ -147,7 +148,7 @@ def _deciding(networks: Networks, bench: Bench) -> Callable[[], object]:
 
 
 def measure_shares(bench: Bench) -> list[dict[str, Any]]:
-    """What share of the machine's peak the paper's networks reach.
+    """The share of the machine's peak that the paper's networks reach.
 
     Returns:
         A row for each network, type and mode (`inference`, `training`).
@@ -182,11 +183,11 @@ def measure_shares(bench: Bench) -> list[dict[str, Any]]:
 
 
 def measure_levels(bench: Bench) -> dict[str, Any]:
-    """Alpha's inference, level by level of the U-net and layer by layer.
+    """Times alpha's inference, level by level of the U-net and layer by layer.
 
     Returns:
-        `levels` and `layers`; of a level, `convolution_s` is in its convolutions and `rest_s` in
-        all else (ELU, sums, resampling, concatenation). The times are medians.
+        `levels` and `layers`. A level's `convolution_s` is the time in its convolutions, `rest_s`
+        that in all else (ELU, sums, resampling, concatenation). The times are medians.
     """
     type_ = preferred_type()
     networks = bench.export(make_networks(NetworkConfig("so2", bench.plan.preset)), type_)
@@ -196,10 +197,10 @@ def measure_levels(bench: Bench) -> dict[str, Any]:
     features = bench.inputs(networks)["alpha"]
     runs = []
     with torch.inference_mode():
-        for turn in range(bench.plan.repeats + 2):
+        for repeat in range(bench.plan.repeats + 2):
             seconds = watch.run(features)
-            # Two to warm up.
-            if turn >= 2:
+            # The first two runs warm up.
+            if repeat >= 2:
                 runs.append(seconds)
     median = {name: float(np.median([run[name] for run in runs])) for name in runs[0]}
     layers, levels = [], []
@@ -236,16 +237,16 @@ def measure_levels(bench: Bench) -> dict[str, Any]:
 
 
 class _UNetWatch:
-    """Hooks that note when each level and each convolution of a U-net begins and ends."""
+    """Hooks that record when each level and each convolution of a U-net begins and ends."""
 
     def __init__(self, network: UNet, device: torch.device) -> None:
         self._network, self._device = network, device
         self._starts: dict[str, float] = {}
         self._ends: dict[str, float] = {}
         self.operations: dict[str, int] = {}
-        """Of each convolution."""
+        """The number of operations of each convolution."""
         self.types: dict[str, torch.dtype] = {}
-        """That each computes in."""
+        """The type that each convolution computes in."""
         self._blocks = {
             f"{way}.{i}": f"{way} {i + 1}" for way, n in (("down", 5), ("up", 4)) for i in range(n)
         }
@@ -288,7 +289,7 @@ class _UNetWatch:
             for names in self.layers.values()
             for name in names
         }
-        # What lies before a block (resampling, concatenation) belongs to it.
+        # The resampling and concatenation before a block belong to it.
         seconds["input"] = self._starts["down.0"] - start
         before = self._starts["down.0"]
         for block, level in self._blocks.items():

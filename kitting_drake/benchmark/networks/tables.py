@@ -1,4 +1,4 @@
-"""What `benchmark networks` measured, for the terminal."""
+"""The results of `benchmark networks` as tables for the terminal."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ MEASURE_NAMES = {
 
 
 def network_tables(measured: dict[str, Any]) -> list[Table]:
-    """All of them.
+    """All tables.
 
     Args:
         measured: what `benchmark_networks` returns.
@@ -42,7 +42,7 @@ def network_tables(measured: dict[str, Any]) -> list[Table]:
 
 
 def seconds_text(seconds: float | None) -> str:
-    """Three digits, in the unit that suits."""
+    """A time with three digits, in s or ms."""
     if seconds is None:
         return "-"
     if seconds >= 100:
@@ -51,7 +51,7 @@ def seconds_text(seconds: float | None) -> str:
 
 
 def count_text(count: float) -> str:
-    """Three digits and a thousand's power: k, M, G, T."""
+    """A count with three digits and a prefix: k, M, G or T."""
     for power, letter in ((1e12, "T"), (1e9, "G"), (1e6, "M"), (1e3, "k")):
         if count >= power:
             return f"{count / power:.3g} {letter}"
@@ -59,7 +59,7 @@ def count_text(count: float) -> str:
 
 
 def _table(title: str, *headings: str) -> Table:
-    """Words on the left in the first column, numbers on the right in the others."""
+    """A table whose first column holds words, left-aligned, and the others numbers."""
     table = Table(title=title, title_justify="left")
     for index, heading in enumerate(headings):
         table.add_column(heading, justify="right" if index else "left", no_wrap=not index)
@@ -67,7 +67,7 @@ def _table(title: str, *headings: str) -> Table:
 
 
 def _milliseconds_text(seconds: float | None) -> str:
-    """Without the unit."""
+    """A time in ms, without the unit."""
     if seconds is None:
         return "-"
     return f"{1e3 * seconds:.0f}" if seconds >= 0.1 else f"{1e3 * seconds:.2g}"
@@ -84,7 +84,7 @@ def _growth(measured: dict[str, Any], name: str, preset: str, method: str) -> di
 
 def _pick_angle_table(measured: dict[str, Any], preset: str) -> Table:
     table = _table(
-        f"what answers the pick angle, preset {preset} (the Transporter: all its picking); "
+        f"models that predict the pick angle, preset {preset} (Transporter: all of its picking); "
         "MAC: multiply-accumulates",
         "method",
         "N",
@@ -166,7 +166,7 @@ def _folding_table(measured: dict[str, Any]) -> Table:
         ]
         table.add_row(title, *cells)
     differences = (folding["alpha_difference"][rung] for rung in rungs)
-    table.add_row("difference of alpha's answer", *(f"{value:.1e}" for value in differences))
+    table.add_row("difference of alpha's output", *(f"{value:.1e}" for value in differences))
     return table
 
 

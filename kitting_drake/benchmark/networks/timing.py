@@ -1,4 +1,4 @@
-"""Clocks, counters and the machine's own limits, for benchmarks of networks; needs no Drake."""
+"""Timing, counting of operations, and the machine's peak, for benchmarks of networks."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ from torch.utils.flop_counter import flop_registry
 Name = TypeVar("Name")
 
 _WARM_UPS = 2
-"""Runs before the first that counts, at most: kernels are chosen, weights laid out."""
+"""The most runs before the first that counts, in which kernels are chosen and memory laid out."""
 _PEAK_RUNS = 15
-"""Of which the fastest shows the peak."""
+"""The number of runs of which the fastest shows the peak."""
 
 
 @dataclass(frozen=True)
 class Timing:
-    """How long something took, in seconds of wall time."""
+    """The wall time that something took, in seconds."""
 
     seconds: float
     """The median."""
@@ -36,12 +36,12 @@ class Timing:
 
     @classmethod
     def of(cls, times: list[float]) -> Timing:
-        """Of single runs."""
+        """The timing of some runs."""
         return cls(float(np.median(times)), min(times), max(times), len(times))
 
 
 def read_clock(device: torch.device) -> float:
-    """Seconds, when all that was asked of the device is done."""
+    """Seconds, once the device has finished all work that it was given."""
     if device.type == "cuda":
         torch.cuda.synchronize(device)
     return time.perf_counter()
@@ -54,36 +54,36 @@ def time_each(
     repeats: int,
     budget: float,
 ) -> dict[Name, Timing]:
-    """Times functions in turns, so that whatever else the machine does falls on all of them.
+    """Times functions in alternation, so that other load on the machine affects all of them alike.
 
     Args:
         functions: what to run.
-        device: where they compute.
+        device: on which they compute.
         repeats: how often each is timed, after warming up.
-        budget: seconds after which a function is not run once more.
+        budget: the time after which a function is not run again, in seconds.
     """
     spent = dict.fromkeys(functions, 0.0)
     times: dict[Name, list[float]] = {name: [] for name in functions}
     warm_ups = min(_WARM_UPS, repeats)
-    for turn in range(warm_ups + repeats):
+    for repeat in range(warm_ups + repeats):
         for name, function in functions.items():
-            if turn and spent[name] > budget:
+            if repeat and spent[name] > budget:
                 continue
             start = read_clock(device)
             function()
             elapsed = read_clock(device) - start
             spent[name] += elapsed
-            if turn == 0 or turn >= warm_ups:
+            if repeat == 0 or repeat >= warm_ups:
                 times[name].append(elapsed)
-    # The first counts only where there was no time for another.
+    # The first run counts only where there was no time for another one.
     return {name: Timing.of(runs[1:] or runs) for name, runs in times.items()}
 
 
 def count_operations(function: Callable[[], object]) -> int:
-    """Floating-point operations of a function's convolutions and products of matrices.
+    """The number of floating-point operations of a function's convolutions and matrix products.
 
-    A multiply-accumulate is two. Backward passes within the function are counted. Does not see what
-    runs in `torch.inference_mode`.
+    A multiply-accumulate counts as two. Backward passes within the function are counted. What runs
+    in `torch.inference_mode` cannot be counted.
     """
     with _OperationCounter() as counter:
         function()
@@ -91,7 +91,7 @@ def count_operations(function: Callable[[], object]) -> int:
 
 
 class _OperationCounter(TorchDispatchMode):
-    """Torch's own FlopCounterMode knows the formulas too, but takes ten times as long."""
+    """Counts by torch's formulas; torch's own FlopCounterMode takes ten times as long."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -109,16 +109,16 @@ class _OperationCounter(TorchDispatchMode):
 
 
 def measure_peak(type_: torch.dtype, device: torch.device, *, side: int) -> dict[str, float]:
-    """What the machine reaches at best, in operations a second.
+    """The machine's peak, in operations a second.
 
     Args:
         type_: to compute in.
-        device: where.
-        side: of the matrices; the convolution is of an eighth as many channels.
+        device: to compute on.
+        side: of the matrices; the convolution has an eighth as many channels.
 
     Returns:
-        Of a product of large square matrices as `matmul`, of a wide 3x3 convolution in
-        channels_last as `convolution`, and of the better as `best`.
+        `matmul`, the rate of a product of large square matrices, `convolution`, that of a wide 3x3
+        convolution in channels_last, and `best`, the better of the two.
     """
     channels = side // 8
     matrix = torch.randn(side, side, device=device, dtype=type_)
@@ -140,7 +140,7 @@ def measure_peak(type_: torch.dtype, device: torch.device, *, side: int) -> dict
 
 
 def describe_machine(device: torch.device) -> dict[str, Any]:
-    """What the figures were measured on."""
+    """The machine that the figures were measured on."""
     return {
         "cpu": _cpu_name(),
         "cores": len(os.sched_getaffinity(0)),
@@ -148,13 +148,13 @@ def describe_machine(device: torch.device) -> dict[str, Any]:
         "device": torch.cuda.get_device_name(device) if device.type == "cuda" else "cpu",
         "torch": torch.__version__,
         "python": platform.python_version(),
-        # What others did: 0 on a machine of one's own, before anything was measured.
+        # The load by other programs: 0 on an idle machine, before anything is measured.
         "load_before": os.getloadavg()[0],
     }
 
 
 def memory_bytes(device: torch.device) -> int:
-    """Of the whole machine, or of the accelerator if it has less."""
+    """The memory of the machine, or of the accelerator if that is less."""
     size = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
     if device.type == "cuda":
         size = min(size, torch.cuda.get_device_properties(device).total_memory)

@@ -13,7 +13,7 @@ from PIL import Image
 from rich.console import Console
 
 from kitting_drake.benchmark.networks import benchmark_networks
-from kitting_drake.benchmark.networks.bench import Plan, drawn_scene
+from kitting_drake.benchmark.networks.bench import Plan, synthetic_scene
 from kitting_drake.benchmark.networks.figure import draw_networks
 from kitting_drake.benchmark.networks.tables import count_text, network_tables, seconds_text
 from kitting_drake.benchmark.networks.timing import count_operations, time_each
@@ -33,7 +33,7 @@ MEASURES = {"training_step", "alpha_training_step", "decision", "alpha_inference
 
 @pytest.fixture(scope="module")
 def measured(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
-    """A benchmark of next to nothing, on a demonstration of a small image."""
+    """The smallest benchmark, on a demonstration of a small image."""
     torch.set_num_threads(1)
     path = tmp_path_factory.mktemp("benchmark") / "demonstrations.h5"
     x, y = GRID.to_world((16.0, 24.0))
@@ -41,7 +41,6 @@ def measured(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
         Observation(np.random.default_rng(0).random((4, *GRID.shape), np.float32), GRID),
         PickPlaceAction(PlanarPose(x, y, 0.3), PlanarPose(x, y, 1.0)),
         name="hammer_0",
-        category="hammer",
     )
     origin = Origin("mine", {}, GRID, 10, {})
     write_demonstrations(path, origin, [Demonstration(10, 1.0, (step,))])
@@ -57,7 +56,7 @@ def measured(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     return benchmark_networks(plan, Console(quiet=True))
 
 
-def test_says_on_what_it_was_measured(measured: dict[str, Any]):
+def test_describes_the_machine(measured: dict[str, Any]):
     machine = measured["machine"]
     assert set(machine) == {
         "cpu",
@@ -92,7 +91,7 @@ def test_only_the_equivariant_transporter_grows(measured: dict[str, Any]):
     assert growth["so2"]["from"] == 26
     assert growth["so2"]["to"] == 30
     assert growth["so2"]["parameters"] == 1
-    # Its discretization alone.
+    # Only its discretization depends on N.
     assert growth["so2"]["operations"] == pytest.approx(1, abs=1e-3)
     assert growth["equivariant_transporter"]["parameters"] == pytest.approx(30 / 26, rel=0.05)
     assert growth["equivariant_transporter"]["operations"] == pytest.approx((30 / 26) ** 2, rel=0.1)
@@ -102,9 +101,27 @@ def test_only_the_equivariant_transporter_grows(measured: dict[str, Any]):
 
 def test_a_decision_is_the_sum_of_its_parts(measured: dict[str, Any]):
     for row in measured["decision"]:
-        assert set(row["parts"]) == {"pick_position", "pick_angle", "phi", "psi", "search"}
-        assert all(seconds > 0 for seconds in row["parts"].values())
-        assert sum(row["parts"].values()) <= row["slowest"]
+        parts = dict(row["parts"])
+        assert set(parts) == {"pick_position", "pick_angle", "phi", "psi", "search"}
+        assert sum(parts.values()) <= row["slowest"]
+        # The Transporter has one network for both position and angle.
+        joint = parts.pop("pick_angle") == 0
+        assert joint == (row["method"] == "transporter")
+        assert all(seconds > 0 for seconds in parts.values())
+
+
+def test_the_transporter_encodes_every_rotated_crop(measured: dict[str, Any]):
+    few, many = (row for row in measured["decision"] if row["method"] == "transporter")
+    angle = {
+        row["orientations"]: row["operations"]
+        for row in measured["pick_angle"]
+        if row["method"] == "transporter"
+    }
+    # Besides picking, phi is computed once and psi N times.
+    placing = [row["operations"] - angle[row["orientations"]] for row in (few, many)]
+    crop = (placing[1] - placing[0]) / (30 - 26)
+    assert placing[0] - 26 * crop > 0
+    assert placing[0] - 26 * crop == pytest.approx(placing[1] - 30 * crop)
 
 
 def test_folding_computes_the_same(measured: dict[str, Any]):
@@ -125,8 +142,8 @@ def test_shares_of_the_peak(measured: dict[str, Any]):
     rows = {(row["network"], row["type"], row["mode"]): row for row in measured["share_of_peak"]}
     for name in ("alpha", "beta", "phi", "psi"):
         infer, train = rows[name, "float32", "inference"], rows[name, "float32", "training"]
-        # Backwards is twice as much as forwards, but that the image needs no gradient; and kernels
-        # are expanded.
+        # The backward pass costs twice the forward pass, except that the image needs no gradient.
+        # Training also expands the kernels.
         assert 2.5 < train["operations"] / infer["operations"] < 5
         peak = measured["peak"]["float32"]["best"]
         assert infer["share"] == pytest.approx(infer["operations"] / infer["seconds"] / peak)
@@ -136,7 +153,7 @@ def test_levels_hold_all_layers(measured: dict[str, Any]):
     levels, layers = measured["alpha_levels"]["levels"], measured["alpha_levels"]["layers"]
     blocks = [f"down {i}" for i in range(1, 6)] + [f"up {i}" for i in range(1, 5)]
     assert [row["level"] for row in levels] == ["input", *blocks, "head"]
-    # 21 on the way, and seven on shortcuts.
+    # 21 layers, and seven convolutions in shortcuts.
     assert len(layers) == 21 + sum(row["layer"].endswith("shortcut") for row in layers)
     assert sum(row["operations"] for row in layers) == sum(row["operations"] for row in levels)
     for row in levels:
@@ -144,7 +161,7 @@ def test_levels_hold_all_layers(measured: dict[str, Any]):
         assert row["convolution_s"] > 0
 
 
-def test_draws_and_prints_whatever_there_is(measured: dict[str, Any], tmp_path: Path):
+def test_draws_and_prints_what_was_measured(measured: dict[str, Any], tmp_path: Path):
     measured = copy.deepcopy(measured)
     for row in measured["pick_angle"] + measured["decision"]:
         if row["method"] == "transporter":
@@ -157,14 +174,14 @@ def test_draws_and_prints_whatever_there_is(measured: dict[str, Any], tmp_path: 
     assert console.export_text().count("not run: ~99 s") == 4
 
 
-def test_the_drawn_scene_has_its_picks_on_tools():
-    scene = drawn_scene(PixelGrid())
+def test_the_synthetic_scene_has_its_picks_on_tools():
+    scene = synthetic_scene(PixelGrid())
     assert len(scene.targets) == 4
     for target in scene.targets:
         row, col = np.rint(target.pick).astype(int)
-        assert scene.image[3, row, col] == pytest.approx(0.02)
+        assert target.image[3, row, col] == pytest.approx(0.02)
         row, col = np.rint(target.place).astype(int)
-        assert scene.image[3, row, col] == pytest.approx(0.03)
+        assert target.image[3, row, col] == pytest.approx(0.03)
 
 
 def test_counts_operations():
@@ -172,7 +189,7 @@ def test_counts_operations():
     assert count_operations(lambda: matrix @ matrix.T) == 2 * 3 * 5 * 3
 
 
-def test_stops_when_there_is_no_time_left():
+def test_stops_when_the_budget_is_spent():
     ran = []
     timings = time_each(
         {name: lambda name=name: ran.append(name) for name in "ab"},
@@ -195,7 +212,7 @@ def test_counts():
     assert [count_text(count) for count in (12, 4_540_000, 2.3e12)] == ["12", "4.54 M", "2.3 T"]
 
 
-def test_an_unknown_preset_is_told(
+def test_an_unknown_preset_is_refused(
     verb: Callable[..., subprocess.CompletedProcess[str]], tmp_path: Path
 ):
     done = verb("benchmark", "networks", "--preset", "huge", "--output", tmp_path)

@@ -1,4 +1,4 @@
-"""Fresh weights are the same in every test, and tests that run side by side share the cores."""
+"""Every test starts from the same random state, on one thread: tests run in parallel."""
 
 import pytest
 import torch

@@ -11,42 +11,42 @@ from kitting_drake.policies.correlation import (
     cross_correlation,
     cross_correlation_fft,
     lift,
+    rotation_angles,
     search,
-    turns,
     window,
 )
-from kitting_drake.policies.images import rotation
-from tests.kitting_drake.policies.turning import smooth_image
+from kitting_drake.policies.images import rotation_matrix
+from tests.kitting_drake.policies.equivariance import smooth_image
 
 SCENE = (81, 97)
 SIDE = 97
 
 
 def random_pair(seed: int, blur: int = 3) -> tuple[Tensor, Tensor]:
-    """A scene and the encoding of a crop, smooth as networks make them, and nothing alike."""
+    """An unrelated pair of a scene and a crop's encoding, as smooth as networks make them."""
     scene = smooth_image(113, seed=2 * seed, channels=3, blur=blur)
     encoding = smooth_image(SIDE, seed=2 * seed + 1, channels=3, blur=blur)
     return scene[:, :, 16:, 8:][:, :, : SCENE[0], : SCENE[1]], encoding
 
 
 def plain_volume(scene: Tensor, encoding: Tensor, orientations: int) -> Tensor:
-    """Equations 7 and 8, a few turns at a time."""
+    """Equations 7 and 8, a few rotations at a time."""
     parts = [
         cross_correlation_fft(scene, lift(encoding, angles, KERNEL))
-        for angles in turns(orientations, scene).split(30)
+        for angles in rotation_angles(orientations, scene).split(30)
     ]
     return torch.cat(parts)
 
 
 def test_lifts_counter_clockwise():
     encoding = torch.randn(1, 2, 33, 33)
-    lifted = lift(encoding, turns(4, encoding), 33)
+    lifted = lift(encoding, rotation_angles(4, encoding), 33)
     for quarters in range(4):
         expected = encoding[0].rot90(quarters, (1, 2))
         torch.testing.assert_close(lifted[quarters], expected, atol=1e-4, rtol=0)
 
 
-def test_a_point_turns_as_labels_do():
+def test_a_point_is_rotated_as_labels_are():
     encoding = torch.zeros(1, 1, 41, 41)
     offset = np.array([9, 4])
     encoding[0, 0, 20 + offset[0], 20 + offset[1]] = 1
@@ -54,7 +54,7 @@ def test_a_point_turns_as_labels_do():
         lifted = lift(encoding, torch.tensor([angle]), 35)[0, 0]
         row, col = torch.meshgrid(*(torch.arange(-17.0, 18),) * 2, indexing="ij")
         centroid = [float((lifted * axis).sum() / lifted.sum()) for axis in (row, col)]
-        np.testing.assert_allclose(centroid, rotation(angle) @ offset, atol=0.2)
+        np.testing.assert_allclose(centroid, rotation_matrix(angle) @ offset, atol=0.2)
 
 
 def test_correlates_as_equation_8_says():
@@ -91,7 +91,7 @@ def test_a_window_is_a_part_of_the_whole(corner: tuple[int, int], shape: tuple[i
     torch.testing.assert_close(inside, expected, atol=1e-4 * float(whole.std()), rtol=0)
 
 
-def test_a_window_beyond_the_scene_sees_what_reaches_into_it():
+def test_a_window_may_lie_outside_the_scene():
     scene, encoding = random_pair(0)
     wide = torch.nn.functional.pad(scene, (20, 20, 20, 20))
     angles = torch.tensor([1.0])
@@ -101,13 +101,13 @@ def test_a_window_beyond_the_scene_sees_what_reaches_into_it():
         torch.testing.assert_close(found, expected, atol=1e-3, rtol=0)
 
 
-def test_the_coarse_volume_stands_for_the_plain_one():
+def test_the_coarse_volume_approximates_the_plain_one():
     scene, encoding = random_pair(1)
-    angles = turns(8, scene)
+    angles = rotation_angles(8, scene)
     coarse = coarse_volume(scene, encoding, angles)
     plain = cross_correlation(scene, lift(encoding, angles, KERNEL))[:, ::2, ::2]
     assert coarse.shape == plain.shape
-    # Of the encodings' finest detail the coarse one knows nothing.
+    # The coarse one lacks the finest detail of the encodings.
     assert (coarse - plain).std() < 0.1 * plain.std()
 
 
@@ -119,18 +119,18 @@ def test_the_search_finds_the_plain_maximum(orientations: int, seed: int):
     volume = plain_volume(scene, encoding, orientations)
     expected = np.unravel_index(int(volume.argmax()), volume.shape)
     candidates, _ = search(scene, encoding, orientations)
-    score, turn, row, col = candidates[0].best()
-    assert (turn % orientations, row, col) == expected
+    score, rotation, row, col = candidates[0].best()
+    assert (rotation % orientations, row, col) == expected
     assert score == pytest.approx(float(volume.max()), rel=1e-4)
     scores = [candidate.best()[0] for candidate in candidates]
     assert scores == sorted(scores, reverse=True)
 
 
 @pytest.mark.parametrize("pixel", [(40, 50), (0, 0), (80, 96), (3, 95)])
-@pytest.mark.parametrize("turn", [0, 7, 71])
-def test_the_search_finds_the_crop_itself(pixel: tuple[int, int], turn: int):
+@pytest.mark.parametrize("rotation", [0, 7, 71])
+def test_the_search_finds_the_crop_itself(pixel: tuple[int, int], rotation: int):
     _, encoding = random_pair(5)
-    angle = turn * math.tau / 72
+    angle = rotation * math.tau / 72
     stamp = lift(encoding, torch.tensor([angle]), KERNEL)
     canvas = torch.zeros(1, 3, SCENE[0] + KERNEL - 1, SCENE[1] + KERNEL - 1)
     canvas[:, :, pixel[0] :, pixel[1] :][:, :, :KERNEL, :KERNEL] = stamp
@@ -138,16 +138,16 @@ def test_the_search_finds_the_crop_itself(pixel: tuple[int, int], turn: int):
     scene = canvas[:, :, reach:-reach, reach:-reach]
     candidates, _ = search(scene, encoding, 72)
     _, found, row, col = candidates[0].best()
-    # Half of what is at an edge is not seen, and half is enough to a bin.
+    # At an edge, where half of the crop is not seen, the rotation may be off by a bin.
     assert (row, col) == pixel
-    assert (found - turn + 36) % 72 - 36 in (-1, 0, 1)
+    assert (found - rotation + 36) % 72 - 36 in (-1, 0, 1)
 
 
-def test_the_search_stays_where_it_may_look():
+def test_the_search_stays_within_the_given_shape():
     scene, encoding = random_pair(2)
     for shape in [(40, 96), (80, 33)]:
         volume = plain_volume(scene, encoding, 36)[:, : shape[0], : shape[1]]
         expected = np.unravel_index(int(volume.argmax()), volume.shape)
         candidates, _ = search(scene, encoding, 36, shape=shape)
-        _, turn, row, col = candidates[0].best()
-        assert (turn % 36, row, col) == expected
+        _, rotation, row, col = candidates[0].best()
+        assert (rotation % 36, row, col) == expected

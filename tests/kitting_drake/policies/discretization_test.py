@@ -33,7 +33,7 @@ def value(
     return total
 
 
-def turned(
+def rotated(
     coefficients: NDArray[np.float64], frequencies: tuple[int, ...], angle: float
 ) -> NDArray[np.float64]:
     """rho_irrep(angle) of equations 1 and 4, applied."""
@@ -56,7 +56,7 @@ def test_discretizes_equation_5(frequencies: tuple[int, ...]):
         np.testing.assert_allclose(values, value(coefficients, frequencies, angles), atol=1e-12)
 
 
-def test_the_quotient_asks_for_the_angles_below_a_half_turn():
+def test_the_quotient_has_the_angles_below_pi():
     coefficients = random_series(0, QUOTIENT)
     full = discretization_matrix(36, QUOTIENT) @ coefficients
     half = discretization_matrix(36, QUOTIENT, quotient=2) @ coefficients
@@ -86,15 +86,17 @@ def test_refuses(orientations: int, frequencies: tuple[int, ...], quotient: int,
 
 
 @pytest.mark.parametrize(("frequencies", "quotient"), [(PAPER, 1), (QUOTIENT, 2)])
-def test_a_turn_by_k_bins_shifts_the_answer_by_k(frequencies: tuple[int, ...], quotient: int):
+def test_a_rotation_by_k_bins_shifts_the_distribution_by_k(
+    frequencies: tuple[int, ...], quotient: int
+):
     coefficients = random_series(1, frequencies)
     matrix = discretization_matrix(72, frequencies, quotient=quotient)
     for k in (1, 5, 35, 71):
-        moved = matrix @ turned(coefficients, frequencies, 2 * np.pi * k / 72)
+        moved = matrix @ rotated(coefficients, frequencies, 2 * np.pi * k / 72)
         np.testing.assert_allclose(moved, np.roll(matrix @ coefficients, k), atol=1e-11)
 
 
-def test_one_vector_answers_at_every_n():
+def test_one_vector_is_discretized_at_every_n():
     coefficients = torch.from_numpy(np.stack([random_series(seed, PAPER) for seed in range(4)]))
     coarse, fine = (discretize(coefficients, n, PAPER) for n in (36, 720))
     assert coarse.shape == (4, 36)
@@ -137,7 +139,7 @@ def test_of_two_equal_maxima_the_first():
         coefficients = random_series(seed, QUOTIENT)
         assert 0 <= series_maximum(coefficients, QUOTIENT) < np.pi
     for angle in (0.0, 1e-9, 0.003, np.pi / 2, np.pi - 0.003):
-        peak = turned(np.array([0.0, 1, 0]), (0, 2), angle)
+        peak = rotated(np.array([0.0, 1, 0]), (0, 2), angle)
         assert series_maximum(peak, (0, 2)) == pytest.approx(angle, abs=1e-7)
 
 

@@ -26,7 +26,7 @@ def sample() -> LabelledImage:
         pick=np.array([20.3, 30.6]),
         pick_theta=0.7,
         place=np.array([25.2, 40.1]),
-        turn=2.1,
+        rotation=2.1,
         other_picks=np.array([[33.0, 12.5]]),
         other_thetas=np.array([1.9]),
     )
@@ -42,25 +42,25 @@ def test_is_made_by_its_name():
 
 
 @pytest.mark.parametrize("name", ["alpha", "phi", "psi"])
-def test_encodings_turn_by_halves_with_the_image(name: str):
-    # Of the turns that C_6 knows, this is the one that a grid does not blur.
+def test_encodings_are_equivariant_to_rotations_by_180_degrees(name: str):
+    # This is the one rotation of C_6 that needs no interpolation on a grid.
     network = getattr(make_networks(TINY), name)
     image = torch.randn(1, 4, 33, 49)
     assert_near(network(image.rot90(2, (2, 3))), network(image).rot90(2, (2, 3)))
 
 
 @pytest.mark.parametrize("orientations", [4, 12, 36])
-def test_angles_turn_by_quarters_with_the_crop(orientations: int):
+def test_angles_are_equivariant_to_rotations_by_90_degrees(orientations: int):
     config = NetworkConfig(TINY.method, "tiny", orientations)
     network = make_networks(config)
     crop = torch.randn(2, 4, PICK_CROP, PICK_CROP)
     with torch.no_grad():
-        answer = network.crop_angle_logits(crop, orientations)
-        turned = network.crop_angle_logits(crop.rot90(1, (2, 3)), orientations)
+        logits = network.crop_angle_logits(crop, orientations)
+        rotated = network.crop_angle_logits(crop.rot90(1, (2, 3)), orientations)
         half = network.crop_angle_logits(crop.rot90(2, (2, 3)), orientations)
-    assert answer.shape == (2, orientations // 2)
-    assert_near(turned, answer.roll(orientations // 4, 1))
-    assert_near(half, answer)
+    assert logits.shape == (2, orientations // 2)
+    assert_near(rotated, logits.roll(orientations // 4, 1))
+    assert_near(half, logits)
 
 
 @pytest.mark.parametrize(
@@ -86,17 +86,19 @@ def test_parameters_of_the_angle_network_grow_with_n(preset: str):
     assert count(180) > 4 * count(36)
 
 
-def test_answers_at_its_own_n_alone():
+def test_predicts_at_its_own_n_alone():
     networks = make_networks(TINY)
     image = sample().image
     networks.check_orientations(N)
-    assert networks.position_logits(image, N).shape == image.shape[1:]
-    assert networks.angle_logits(image, (20, 30), N).shape == (N // 2,)
-    assert networks.angle_answer(image, (20, 30), N)[1] is None
-    with pytest.raises(ValueError, match="answers at 12 orientations, not at 36"):
+    picking = networks.predict_pick(image, N)
+    assert picking.position.shape == image.shape[1:]
+    angles, refined = picking.angle((20, 30))
+    assert angles.shape == (N // 2,)
+    assert refined is None
+    with pytest.raises(ValueError, match="predicts at 12 orientations, not at 36"):
         networks.check_orientations(36)
     with pytest.raises(ValueError, match="not at 36"):
-        networks.angle_logits(image, (20, 30), 36)
+        networks.predict_pick(image, 36).angle((20, 30))
 
 
 def losses(steps: int) -> list[dict[str, float]]:
@@ -127,8 +129,8 @@ def test_comes_back_from_a_file_as_plain_convolutions(tmp_path: Path):
     image = sample().image
     with torch.no_grad():
         for ask in (
-            lambda item: item.position_logits(image, N),
-            lambda item: item.angle_logits(image, (20, 30), N),
+            lambda item: item.position_logits(image),
+            lambda item: item.predict_angle(image, (20, 30), N).logits,
             lambda item: item.encode_scene(image),
             lambda item: item.encode_crop(image, (20, 30)),
         ):

@@ -40,23 +40,23 @@ def test_analysis_undoes_synthesis(fibre: Fibre):
     np.testing.assert_allclose(fibre.analysis() @ fibre.synthesis(), np.eye(fibre.size), atol=1e-12)
 
 
-def turn(fibre: Fibre, step: int) -> NDArray[np.float64]:
-    """(channels, channels): a turn by so many of the steps between channels."""
-    return np.roll(np.eye(fibre.channels), step, axis=0)
+def rotation(fibre: Fibre, steps: int) -> NDArray[np.float64]:
+    """(channels, channels): a rotation by so many of the steps between channels."""
+    return np.roll(np.eye(fibre.channels), steps, axis=0)
 
 
 @pytest.mark.parametrize("fibre", [fibre for fibre in FIBRES if fibre.channels > 7], ids=str)
-def test_what_is_invariant_does_not_turn(fibre: Fibre):
+def test_the_invariant_does_not_depend_on_rotation(fibre: Fibre):
     functional = fibre.invariant()
-    np.testing.assert_allclose(functional @ turn(fibre, 1), functional)
-    # Of what the fibre holds, this is the first coefficient, as the authors' Fourier ELU reads it.
+    np.testing.assert_allclose(functional @ rotation(fibre, 1), functional)
+    # It is the first coefficient, as in escnn's Fourier ELU.
     first = functional @ fibre.synthesis()
     if isinstance(fibre, Irreps):
         np.testing.assert_allclose(first, np.eye(fibre.size)[0], atol=1e-12)
 
 
 def test_coefficients_have_no_mean():
-    with pytest.raises(ValueError, match="coefficients is read by its first"):
+    with pytest.raises(ValueError, match="coefficients is the first of them"):
         Irreps((0, 1)).invariant()
 
 

@@ -10,7 +10,7 @@ QUOTIENT = Regular(8, quotient=2)
 
 
 def kernels(layer: GroupConv2d) -> Tensor:
-    """(D, numbers): the layer's own basis, a weight at a time."""
+    """(D, entries): the layer's basis of kernels, from one unit vector of weights after another."""
     count = layer.weights.shape[-1]
     rows = []
     with torch.no_grad():
@@ -40,8 +40,8 @@ def test_spans_the_kernels_of_escnn(fibre: Regular, size: int, direction: str):
     assert ranks == [len(ours)] * 3
 
 
-def turn(features: Tensor, fibre: Fibre) -> Tensor:
-    """A quarter turn of a feature field (equation 2): of the picture and of each field."""
+def rotate(features: Tensor, fibre: Fibre) -> Tensor:
+    """A feature field rotated by 90 degrees (equation 2): the image, and each of the fields."""
     fields = features.rot90(1, (2, 3)).unflatten(1, (-1, fibre.channels))
     if isinstance(fibre, Regular):
         fields = fields.roll(fibre.order // 4, 2)
@@ -50,7 +50,7 @@ def turn(features: Tensor, fibre: Fibre) -> Tensor:
 
 @pytest.mark.parametrize("group", [QUOTIENT, Regular(12), Regular(180, quotient=2)], ids=str)
 @pytest.mark.parametrize("direction", ["lift", "between", "project"])
-def test_commutes_with_a_quarter_turn(group: Regular, direction: str):
+def test_rotations_by_90_degrees_are_exact(group: Regular, direction: str):
     pair: tuple[Fibre, Fibre] = {
         "lift": (Scalar(), group),
         "between": (group, group),
@@ -60,8 +60,8 @@ def test_commutes_with_a_quarter_turn(group: Regular, direction: str):
     assert layer.bias is not None
     torch.nn.init.normal_(layer.bias)
     features = torch.randn(1, 2 * pair[0].channels, 9, 11)
-    expected = turn(layer(features), pair[1])
-    torch.testing.assert_close(layer(turn(features, pair[0])), expected, atol=1e-5, rtol=1e-5)
+    expected = rotate(layer(features), pair[1])
+    torch.testing.assert_close(layer(rotate(features, pair[0])), expected, atol=1e-5, rtol=1e-5)
     assert expected.std() > 0.1
 
 

@@ -4,7 +4,14 @@ import math
 import numpy as np
 import pytest
 
-from kitting_drake.policies.images import LabelledImage, Motion, augment, crop, move, rotation
+from kitting_drake.policies.images import (
+    LabelledImage,
+    Motion,
+    augment,
+    crop,
+    move,
+    rotation_matrix,
+)
 from systems.signals import PickPlaceAction, PixelGrid, PlanarPose
 
 ROWS, COLS = 61, 91
@@ -12,7 +19,7 @@ MIDDLE = np.array([(ROWS - 1) / 2, (COLS - 1) / 2])
 
 
 def marked(pick: tuple[float, float], place: tuple[float, float]) -> LabelledImage:
-    """An image whose height is a round hill at each of the labels, of 1 m and 2 m."""
+    """An image whose height has a round hill at each of the labels, 1 m and 2 m high."""
     row, col = np.meshgrid(np.arange(ROWS), np.arange(COLS), indexing="ij")
     height = sum(
         top * np.exp(-((row - at[0]) ** 2 + (col - at[1]) ** 2) / 8)
@@ -26,7 +33,7 @@ SAMPLE = marked((20.0, 30.0), (38.25, 55.5))
 
 
 def hill(sample: LabelledImage, near: np.ndarray) -> np.ndarray:
-    """The middle of the hill around a position."""
+    """The middle of the hill near a position."""
     row, col = np.rint(near).astype(int)
     rows, cols = np.arange(row - 6, row + 7), np.arange(col - 6, col + 7)
     weights = sample.image[3][np.ix_(rows, cols)]
@@ -36,9 +43,9 @@ def hill(sample: LabelledImage, near: np.ndarray) -> np.ndarray:
 
 def test_rotation_is_counter_clockwise_on_a_picture_with_row_0_on_top():
     down, right = np.array([1.0, 0]), np.array([0, 1.0])
-    np.testing.assert_allclose(rotation(math.pi / 2) @ down, right, atol=1e-12)
+    np.testing.assert_allclose(rotation_matrix(math.pi / 2) @ down, right, atol=1e-12)
     image = np.zeros((3, 3))
-    image[2, 1] = 1  # Below the middle, which a counter-clockwise turn brings to its right.
+    image[2, 1] = 1  # Below the middle, which a counter-clockwise rotation brings to its right.
     assert np.rot90(image)[1, 2] == 1
 
 
@@ -50,11 +57,11 @@ def test_labels_of_an_action():
     np.testing.assert_allclose(sample.pick, (40.25, 100.5))
     np.testing.assert_allclose(sample.place, (90.0, 200.0))
     assert sample.pick_theta == 2.0
-    assert sample.turn == -3.5
+    assert sample.rotation == -3.5
 
 
-def test_other_points_of_the_object_go_along():
-    # A quarter turn: what is below the pick comes to the right of the place.
+def test_other_points_of_the_object_move_rigidly_with_it():
+    # A rotation by 90 degrees: what is below the pick comes to the right of the place.
     sample = LabelledImage(
         SAMPLE.image, np.array([10.0, 20]), 0.0, np.array([40.0, 50]), math.pi / 2
     )
@@ -82,9 +89,9 @@ def test_what_is_at_the_labels_moves_with_them():
         np.testing.assert_allclose(hill(moved, moved.pick), moved.pick, atol=0.3)
         np.testing.assert_allclose(hill(moved, moved.place), moved.place, atol=0.3)
         assert moved.pick_theta == pytest.approx(0.3 + angle)
-        assert moved.turn == 1.1
-        # The relation between pick and place has turned, and nothing else.
-        expected = rotation(angle) @ (np.array([36.5, 52.25]) - (27.0, 40.0))
+        assert moved.rotation == 1.1
+        # The vector from pick to place has rotated, and nothing else.
+        expected = rotation_matrix(angle) @ (np.array([36.5, 52.25]) - (27.0, 40.0))
         np.testing.assert_allclose(moved.place - moved.pick, expected)
 
 
@@ -103,17 +110,17 @@ def test_other_objects_move_too():
     np.testing.assert_allclose(moved.other_thetas, np.array([0.1, 0.2]) + math.pi / 2)
 
 
-def test_a_half_turn_is_exact():
+def test_a_rotation_by_180_degrees_is_exact():
     moved = move(SAMPLE, math.pi, np.zeros(2))
     np.testing.assert_array_equal(moved.image, SAMPLE.image[:, ::-1, ::-1])
     np.testing.assert_allclose(moved.pick, 2 * MIDDLE - SAMPLE.pick)
 
 
-def test_no_height_is_made_up():
+def test_heights_are_not_interpolated():
     moved = move(SAMPLE, 0.7, np.array([0.4, -0.3]))
     assert set(np.unique(moved.image[3])) <= {0, *np.unique(SAMPLE.image[3])}
     assert moved.image.dtype == np.float32
-    # What comes in from outside was not seen.
+    # What comes in from outside the image was not seen.
     np.testing.assert_array_equal(moved.image[:, 0, 0], 0)
 
 
@@ -139,27 +146,29 @@ def test_augmentation_is_that_of_the_seed():
     assert not np.array_equal(one.pick, other.pick)
 
 
-def test_a_sample_that_cannot_stay_inside_is_left_alone():
+def test_a_sample_that_cannot_stay_inside_is_not_moved():
     sample = LabelledImage(SAMPLE.image, np.array([-30.0, 0]), 0.3, np.array([90.0, 90]), 1.1)
-    assert augment(sample, np.random.default_rng(0), rigid=True) is sample
+    assert augment(sample, np.random.default_rng(0)) is sample
 
 
 def barred(theta: float) -> LabelledImage:
-    """A long bar, 6 pixels wide, that is held by its middle."""
+    """A long bar, 6 pixels wide, that is picked by its middle."""
     row, col = np.meshgrid(np.arange(ROWS), np.arange(COLS), indexing="ij")
     offsets = np.stack([row, col], axis=-1) - MIDDLE
-    across = offsets @ rotation(theta)[:, 1]
+    across = offsets @ rotation_matrix(theta)[:, 1]
     height = np.where(np.abs(across) < 3, 0.02, 0)
     image = np.stack([height] * 4).astype(np.float32)
     return LabelledImage(image, MIDDLE, theta, np.array([10.0, 20]), 0.0)
 
 
 def middle_line(image: np.ndarray, theta: float, u: float) -> float:
-    """How far across the bar is, at u pixels along its direction at the middle of a crop."""
+    """The offset of the bar's middle line, at u pixels along its direction from a crop's middle."""
     side = image.shape[1]
     across = np.linspace(-12, 12, 97)
     points = (
-        side // 2 + np.array([u, 0]) @ rotation(theta).T + across[:, None] * rotation(theta)[:, 1]
+        side // 2
+        + np.array([u, 0]) @ rotation_matrix(theta).T
+        + across[:, None] * rotation_matrix(theta)[:, 1]
     )
     row, col = np.rint(points).astype(int).T
     return float(across[image[3, row, col] > 0].mean())
@@ -168,12 +177,12 @@ def middle_line(image: np.ndarray, theta: float, u: float) -> float:
 @pytest.mark.parametrize("theta", [0.0, 0.7, 2.0])
 @pytest.mark.parametrize("moved", [False, True])
 @pytest.mark.parametrize("index", [0, 1])
-def test_a_bend_keeps_the_object_at_its_pick_and_its_direction_there(
+def test_curvature_keeps_the_objects_position_and_direction_at_its_pick(
     theta: float, moved: bool, index: int
 ):
     sample = barred(theta)
     if index:
-        # The bar is another object than the one that is picked.
+        # The bar is one of the other objects, not the one that is picked.
         sample = dataclasses.replace(
             sample,
             pick=np.array([10.0, 80.0]),
@@ -184,31 +193,32 @@ def test_a_bend_keeps_the_object_at_its_pick_and_its_direction_there(
     if moved:
         sample = move(sample, 0.4, np.array([2.0, -3]))
         theta += 0.4
-    bends = np.array([[-0.5, 0.5]] * index + [[0.3, -0.1]])
-    sample = dataclasses.replace(sample, bends=bends)
+    curvatures = np.array([[-0.5, 0.5]] * index + [[0.3, -0.1]])
+    sample = dataclasses.replace(sample, curvatures=curvatures)
     row, col = np.rint(sample.other_picks[0] if index else sample.pick).astype(int)
-    bent = sample.bent_crop(index, (int(row), int(col)), 41)
-    start = middle_line(bent, theta, 0)
+    curved = sample.curved_crop(index, (int(row), int(col)), 41)
+    start = middle_line(curved, theta, 0)
     for u in (-16, -8, -3, 3, 8, 16):
         v = u / 20
-        # The object goes the other way than where its pixels are fetched from.
+        # The object is displaced against the direction in which its pixels are looked up.
         expected = -20 * (0.3 * v**2 - 0.1 * v**3)
-        assert middle_line(bent, theta, u) - start == pytest.approx(expected, abs=1.2)
+        assert middle_line(curved, theta, u) - start == pytest.approx(expected, abs=1.2)
 
 
-def test_without_a_bend_it_is_the_crop():
+def test_without_curvature_it_is_the_crop():
     sample = move(SAMPLE, 0.6, np.array([3.0, -2]))
     pixel = (22, 31)
     expected = crop(sample.image, pixel, 41)
-    straight = dataclasses.replace(sample, bends=np.zeros((1, 2)))
-    np.testing.assert_array_equal(straight.bent_crop(0, pixel, 41), expected)
+    straight = dataclasses.replace(sample, curvatures=np.zeros((1, 2)))
+    np.testing.assert_array_equal(straight.curved_crop(0, pixel, 41), expected)
 
 
-def test_every_object_has_a_bend_of_its_own():
+def test_every_object_has_a_curvature_of_its_own():
     others = np.array([[20.0, 60], [40, 30]])
     sample = dataclasses.replace(SAMPLE, other_picks=others, other_thetas=np.zeros(2))
-    assert len(np.unique(augment(sample, np.random.default_rng(0)).bends)) == 6
-    assert not len(augment(sample, np.random.default_rng(0), rigid=True).bends)
+    curved = augment(sample, np.random.default_rng(0), curvature=True)
+    assert len(np.unique(curved.curvatures)) == 6
+    assert not len(augment(sample, np.random.default_rng(0)).curvatures)
 
 
 def test_a_motion_is_undone():

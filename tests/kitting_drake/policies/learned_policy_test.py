@@ -17,9 +17,9 @@ from kitting_drake.policies.learned_policy import (
     expected_position,
 )
 from kitting_drake.policies.methods import make_networks
-from kitting_drake.policies.networks import Networks
+from kitting_drake.policies.networks import AnglePrediction, Networks, PickPrediction
 from kitting_drake.policies.steerable import PlainConv2d
-from systems.signals import Observation, PixelGrid
+from systems.signals import Observation, PickPlaceAction, PixelGrid
 
 # No defaults, no two numbers alike.
 GRID = PixelGrid(x_min=0.3, y_min=-0.2, resolution=0.004, rows=97, cols=129, z_min=0.02, z_max=0.3)
@@ -27,10 +27,10 @@ PICK = (61.3, 22.4)
 GOAL = np.array([40, 90])
 N = 72
 BIN = math.tau / N
-TURN = 19
+ROTATION = 19
 THETA = math.radians(62.0)
 ARMS = ((0, 0), (0, 18), (9, 0))
-"""Where (row, col) from the pick the encodings have their blobs, each in a channel of its own."""
+"""The (row, col) from the pick of the encodings' blobs, each in a channel of its own."""
 
 
 def blob(shape: tuple[int, int], centre: tuple[float, float] | NDArray[np.float64]) -> Tensor:
@@ -39,43 +39,46 @@ def blob(shape: tuple[int, int], centre: tuple[float, float] | NDArray[np.float6
 
 
 def linear(shape: tuple[int, ...], label: tuple[float, ...]) -> Tensor:
-    """Logits of a network that has learned a label between entries, spread linearly."""
+    """Logits of a network that has learned an interpolated label."""
     offsets = torch.meshgrid(*map(torch.arange, shape), indexing="ij")
     shares = [(1 - (n - at).abs()).clamp(min=0) for n, at in zip(offsets, label, strict=True)]
     return torch.stack(shares).prod(0).double().log().float()
 
 
-def turned(vector: tuple[float, float] | NDArray[np.float64], angle: float) -> NDArray[np.float64]:
-    """A (row, col) vector turned counter-clockwise about world +z; rows run along x, cols y."""
+def rotated(vector: tuple[float, float] | NDArray[np.float64], angle: float) -> NDArray[np.float64]:
+    """A (row, col) vector rotated counter-clockwise about world +z; rows run along x, cols y."""
     row, col = vector
     cos, sin = math.cos(angle), math.sin(angle)
     return np.array([cos * row - sin * col, sin * row + cos * col])
 
 
 class Known(Networks):
-    """Says what it is told to; its encodings fit at GOAL and nowhere else."""
+    """Networks with given predictions, whose encodings fit at GOAL and nowhere else."""
 
     def __init__(
-        self, *, pick: tuple[float, float] = PICK, theta: float = THETA, turn: float = TURN * BIN
+        self,
+        *,
+        pick: tuple[float, float] = PICK,
+        theta: float = THETA,
+        rotation: float = ROTATION * BIN,
+        refines_angles: bool = True,
+        log_odds: float | None = None,
     ) -> None:
         super().__init__(NetworkConfig(preset="tiny"))
-        self._pick, self._theta, self._turn = pick, theta, turn
+        self._pick, self._theta, self._rotation = pick, theta, rotation
+        self._refines_angles, self._log_odds = refines_angles, log_odds
         self.crops: list[tuple[int, int]] = []
 
-    def position_logits(self, image: Image, orientations: int) -> Tensor:
-        return linear(image.shape[1:], self._pick)
+    def predict_pick(self, image: Image, orientations: int) -> PickPrediction:
+        def angle(pixel: tuple[int, int]) -> AnglePrediction:
+            angles = torch.arange(orientations // 2) * (math.tau / orientations)
+            logits = 9 * torch.cos(2 * (angles - self._theta))
+            return AnglePrediction(logits, self._theta if self._refines_angles else None)
 
-    def angle_logits(self, image: Image, pixel: tuple[int, int], orientations: int) -> Tensor:
-        angles = torch.arange(orientations // 2) * (math.tau / orientations)
-        return 9 * torch.cos(2 * (angles - self._theta))
-
-    def angle_answer(
-        self, image: Image, pixel: tuple[int, int], orientations: int
-    ) -> tuple[Tensor, float | None]:
-        return self.angle_logits(image, pixel, orientations), self._theta
+        return PickPrediction(linear(image.shape[1:], self._pick), angle, self._log_odds)
 
     def encode_scene(self, image: Image) -> Tensor:
-        ends = [GOAL + turned(arm, self._turn) for arm in ARMS]
+        ends = [GOAL + rotated(arm, self._rotation) for arm in ARMS]
         return 99 * torch.stack([blob(GRID.shape, end) for end in ends])[None]
 
     def encode_crop(self, image: Image, pixel: tuple[int, int]) -> Tensor:
@@ -94,37 +97,37 @@ def decide(networks: Networks, *, continuous: bool, seen: Observation | None = N
     return policy.decide(seen or observation())
 
 
-def test_the_discrete_answer_is_a_pixel_and_a_bin():
+def test_a_quantized_action_is_a_pixel_and_a_bin():
     found = decide(Known(), continuous=False)
     np.testing.assert_array_equal(found.pick_pixel, [61, 22])
     np.testing.assert_allclose(found.place_pixel, GOAL, atol=1e-9)
     action = found.action
     assert action.pick.theta / BIN == pytest.approx(12)
-    assert (action.place.theta - action.pick.theta) / BIN == pytest.approx(TURN)
+    assert (action.place.theta - action.pick.theta) / BIN == pytest.approx(ROTATION)
     assert not action.stop
 
 
-def test_the_continuous_answer_lies_between_them():
-    networks = Known(turn=(TURN + 0.4) * BIN)
+def test_a_continuous_action_is_refined_beyond_them():
+    networks = Known(rotation=(ROTATION + 0.4) * BIN)
     found = decide(networks, continuous=True)
     assert networks.crops == [(61, 22)]
     np.testing.assert_allclose(found.pick_pixel, PICK, atol=1e-5)
     action = found.action
     assert action.pick.theta == pytest.approx(THETA)
-    turn = (action.place.theta - action.pick.theta) / BIN
-    assert 0 < turn - TURN < 1
+    rotation = (action.place.theta - action.pick.theta) / BIN
+    assert 0 < rotation - ROTATION < 1
     discrete = decide(networks, continuous=False)
     assert np.abs(found.place_pixel - discrete.place_pixel).max() < 1.5
 
 
-@pytest.mark.parametrize("turn", [0, TURN, 40, N - 1])
-def test_the_place_takes_over_how_far_the_pick_is_beside_its_pixel(turn: int):
-    """What is told of the crop's middle is carried over to the pick, turned as the object is."""
+@pytest.mark.parametrize("bins", [0, ROTATION, 40, N - 1])
+def test_the_offset_of_a_refined_pick_is_rotated_to_the_place(bins: int):
+    """The motion of the crop's middle, a pixel, is applied to the refined pick."""
     at_the_pixel, beside_it = (
-        decide(Known(pick=pick, turn=turn * BIN), continuous=True) for pick in ((61, 22), PICK)
+        decide(Known(pick=pick, rotation=bins * BIN), continuous=True) for pick in ((61, 22), PICK)
     )
     found = beside_it.place_pixel - at_the_pixel.place_pixel
-    np.testing.assert_allclose(found, turned((0.3, 0.4), turn * BIN), atol=0.01)
+    np.testing.assert_allclose(found, rotated((0.3, 0.4), bins * BIN), atol=0.01)
 
 
 def test_poses_are_in_the_world():
@@ -135,7 +138,7 @@ def test_poses_are_in_the_world():
         assert pose.y == pytest.approx(-0.2 + 0.004 * (pixel[1] + 0.5))
 
 
-def test_the_maps_say_what_the_answer_was_read_from():
+def test_the_maps_are_what_the_action_was_read_from():
     found = decide(Known(), continuous=True)
     assert found.pick_map.shape == found.place_map.shape == GRID.shape
     assert found.pick_map.sum() == pytest.approx(1, abs=1e-5)
@@ -148,29 +151,50 @@ def test_the_maps_say_what_the_answer_was_read_from():
     assert found.angle_curve.argmax() == 12
 
 
-def test_a_method_without_angles_between_bins_answers_with_a_bin(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(Known, "angle_answer", Networks.angle_answer)
-    found = decide(Known(), continuous=True)
+def test_a_method_of_discrete_angles_predicts_a_bin():
+    found = decide(Known(refines_angles=False), continuous=True)
     assert found.action.pick.theta / BIN == pytest.approx(12)
     np.testing.assert_allclose(found.pick_pixel, PICK, atol=1e-5)
 
 
 @pytest.mark.parametrize(
+    ("log_odds", "threshold", "stop"),
+    [(-2.1, -2.0, True), (-1.9, -2.0, False), (None, -2.0, False), (-99.0, None, False)],
+)
+def test_stops_where_the_odds_that_there_is_something_to_pick_are_below_the_threshold(
+    log_odds: float | None, threshold: float | None, stop: bool
+):
+    networks = Known(log_odds=log_odds)
+    networks.stop_threshold = threshold
+    policy = LearnedPolicy(networks, orientations=N)
+    assert policy.log_odds(observation()) == log_odds
+    found = policy.decide(observation())
+    assert (found.stop, found.log_odds) == (stop, log_odds)
+    # What it would have done is still told.
+    np.testing.assert_allclose(
+        found.place_pixel, GOAL + rotated((0.3, 0.4), ROTATION * BIN), atol=0.1
+    )
+    action = policy(observation())
+    assert action == (PickPlaceAction(stop=True) if stop else found.action)
+    assert action.heights is None
+
+
+@pytest.mark.parametrize(
     "pixel", [(3.0, 4.0), (3.5, 4.5), (2.7, 4.1), (0.0, 0.2), (6.0, 7.9), (5.6, 8.0), (0.5, 0.0)]
 )
-def test_a_position_spread_bilinearly_is_found_again(pixel: tuple[float, float]):
+def test_an_interpolated_position_is_found_again(pixel: tuple[float, float]):
     logits = linear((7, 9), pixel)
     row, col = divmod(int(logits.argmax()), 9)
     np.testing.assert_allclose(expected_position(logits, (row, col)), pixel, atol=1e-5)
 
 
-def test_a_position_is_not_drawn_to_what_lies_elsewhere():
-    """Two objects may be picked alike: between them is neither."""
+def test_a_position_does_not_depend_on_other_peaks():
+    """Two objects may be picked equally well, and there is none between them."""
     two = (linear((9, 9), (2, 2)).exp() + linear((9, 9), (2, 6)).exp()).log()
     np.testing.assert_allclose(expected_position(two, (2, 2)), (2, 2), atol=1e-5)
 
 
-# First bin, corner, and where the label is in them.
+# The first bin, the corner, and the label relative to them.
 PLACEMENTS = [
     (10, (5, 7), (2.3, 3.6, 4.4)),
     (-4, (0, 0), (3.0, 0.0, 0.4)),
@@ -179,28 +203,28 @@ PLACEMENTS = [
 
 
 @pytest.mark.parametrize(("first", "corner", "label"), PLACEMENTS)
-def test_a_placement_spread_linearly_is_found_again(
+def test_an_interpolated_placement_is_found_again(
     first: int, corner: tuple[int, int], label: tuple[float, float, float]
 ):
     candidate = Candidate(linear((7, 9, 9), label), first, corner)
-    turn, position = best_placement(candidate, N, continuous=True)
-    assert math.remainder(turn - (first + label[0]) * BIN, math.tau) == pytest.approx(0, abs=1e-6)
-    assert abs(turn) <= math.pi
+    rotation, position = best_placement(candidate, N, continuous=True)
+    expected = (first + label[0]) * BIN
+    assert math.remainder(rotation - expected, math.tau) == pytest.approx(0, abs=1e-6)
+    assert abs(rotation) <= math.pi
     np.testing.assert_allclose(position, np.add(corner, label[1:]), atol=1e-5)
-    turn, position = best_placement(candidate, N, continuous=False)
+    rotation, position = best_placement(candidate, N, continuous=False)
     nearest = np.rint(label)
-    assert math.remainder(turn - (first + nearest[0]) * BIN, math.tau) == pytest.approx(0)
+    assert math.remainder(rotation - (first + nearest[0]) * BIN, math.tau) == pytest.approx(0)
     np.testing.assert_array_equal(position, corner + nearest[1:])
 
 
 def plain_networks(compute_type: torch.dtype) -> Networks:
-    networks = make_networks(NetworkConfig(preset="tiny"), PlainConv2d).requires_grad_(False)
-    networks.compute_type = compute_type
+    networks = make_networks(NetworkConfig(preset="tiny"), PlainConv2d)
+    networks.freeze(compute_type)
     return networks
 
 
-def test_what_was_asked_before_does_not_matter():
-    """Of networks that compute in another type than the one that their weights come in."""
+def test_decisions_do_not_depend_on_earlier_ones():
     policy = LearnedPolicy(plain_networks(torch.bfloat16), orientations=N)
     random = np.random.default_rng(0)
     one, other = (
@@ -211,7 +235,7 @@ def test_what_was_asked_before_does_not_matter():
     assert policy(one) == first
 
 
-def test_an_image_that_may_not_be_written_to_is_left_as_it_is():
+def test_a_read_only_image_is_accepted_and_not_changed():
     image = np.random.default_rng(0).random((4, *GRID.shape), np.float32)
     before = image.copy()
     image.flags.writeable = False
@@ -220,7 +244,7 @@ def test_an_image_that_may_not_be_written_to_is_left_as_it_is():
 
 
 class Distracted(Known):
-    """Its encodings fit best where nothing was seen: below and beside the image."""
+    """Networks whose encodings fit best in the padding, below and beside the image."""
 
     def encode_scene(self, image: Image) -> Tensor:
         scene = super().encode_scene(image)
@@ -229,7 +253,7 @@ class Distracted(Known):
 
 @pytest.mark.parametrize("continuous", [True, False])
 def test_the_place_lies_in_the_image(continuous: bool):
-    """The networks see it padded to sides that they can halve."""
+    """The networks take the image padded to sides that they can halve."""
     grid = dataclasses.replace(GRID, rows=70, cols=110)
     seen = Observation(np.zeros((4, *grid.shape), np.float32), grid)
     found = decide(Distracted(), continuous=continuous, seen=seen)
@@ -242,12 +266,12 @@ def test_the_place_lies_in_the_image(continuous: bool):
     ("orientations", "message"),
     [(24, r"at least 26 are needed \(Nyquist\)"), (37, "not a multiple of 2")],
 )
-def test_an_n_that_the_networks_cannot_answer_is_refused(orientations: int, message: str):
+def test_an_n_at_which_the_networks_cannot_predict_is_refused(orientations: int, message: str):
     with pytest.raises(ValueError, match=message):
         LearnedPolicy(Known(), orientations=orientations)
 
 
-def test_who_watches_is_told_of_every_decision():
+def test_every_decision_is_reported_to_watch():
     told: list[tuple[Observation, Decision]] = []
     policy = LearnedPolicy(
         Known(), orientations=N, watch=lambda seen, decision: told.append((seen, decision))

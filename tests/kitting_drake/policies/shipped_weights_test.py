@@ -15,7 +15,7 @@ from kitting_drake.policies.methods import make_networks
 from kitting_drake.policies.networks import SO2Networks
 from kitting_drake.policies.weights import load_networks, read_weights_file
 from systems.signals import Observation, PixelGrid
-from tests.kitting_drake.policies.turning import relative_error, smooth_image, turn_image
+from tests.kitting_drake.policies.equivariance import relative_error, rotate_image, smooth_image
 
 SHIPPED = sorted((MODELS / "policies").glob("*.safetensors"))
 DATA = Path(__file__).parent / "data"
@@ -27,10 +27,10 @@ GOLDEN = {
     "kitting_unseen": ((59.508, 219.945), 40.767, (69.721, 123.693), -146.098),
 }
 """The pick (row, col) and its angle, and the place (row, col) and the rotation, in degrees, that
-the weights decided on these observations when they were shipped (float32)."""
+the weights predicted for these observations when they were shipped (float32)."""
 
 
-def test_there_is_one_for_each_task():
+def test_there_is_one_file_for_each_task():
     assert [path.stem for path in SHIPPED] == ["kitting_seen", "kitting_unseen"]
 
 
@@ -43,6 +43,7 @@ def test_no_test_seed_was_learned_from(path: Path):
     assert file.card["demonstrations"] == len(file.card["demonstration_seeds"]) == 100
     learned = {*file.card["demonstration_seeds"], *file.card["validation_seeds"]}
     assert not learned.intersection(TEST_SEEDS)
+    # Their cards have an older name for the error of the rotation.
     assert file.card["validation"]["median_turn_deg"] < 0.5
 
 
@@ -58,9 +59,10 @@ def test_decides_as_when_it_was_shipped(path: Path):
     action = found.action
     np.testing.assert_allclose(found.pick_pixel, pick, atol=1 / 3)
     np.testing.assert_allclose(found.place_pixel, place, atol=1 / 3)
-    turned = action.place.theta - action.pick.theta
+    difference = action.place.theta - action.pick.theta
+    assert not found.stop
     assert abs(math.remainder(math.degrees(action.pick.theta) - angle, 180)) < 1
-    assert abs(math.remainder(math.degrees(turned) - rotation, 360)) < 1
+    assert abs(math.remainder(math.degrees(difference) - rotation, 360)) < 1
 
 
 @pytest.mark.parametrize("path", SHIPPED, ids=lambda path: path.stem)
@@ -74,10 +76,10 @@ def test_training_keeps_them_equivariant(path: Path):
         errors = []
         for networks in (fresh, trained):
             network = getattr(networks, name)
-            answer = network(image)
-            assert relative_error(network(turn_image(image, 90)), turn_image(answer, 90)) < 1e-4
+            output = network(image)
+            assert relative_error(network(rotate_image(image, 90)), rotate_image(output, 90)) < 1e-4
             errors += [
-                relative_error(network(turn_image(image, degrees)), turn_image(answer, degrees))
+                relative_error(network(rotate_image(image, degrees)), rotate_image(output, degrees))
                 for degrees in (15, 30, 45)
             ]
         print(path.stem, name, "fresh, then trained:", *(f"{error:.3f}" for error in errors))
@@ -86,7 +88,7 @@ def test_training_keeps_them_equivariant(path: Path):
 
 @pytest.mark.parametrize("path", SHIPPED, ids=lambda path: path.stem)
 @torch.inference_mode()
-def test_training_makes_pick_angles_turn(path: Path):
+def test_training_makes_pick_angles_more_equivariant(path: Path):
     trained = load_networks(path)
     torch.manual_seed(0)
     fresh = make_networks(trained.config).eval()
@@ -97,7 +99,7 @@ def test_training_makes_pick_angles_turn(path: Path):
             assert isinstance(networks, SO2Networks)
             logits = networks.crop_angle_logits(crop, 72)[0]
             for degrees in (15, 30, 45):
-                found = networks.crop_angle_logits(turn_image(crop, degrees), 72)[0]
+                found = networks.crop_angle_logits(rotate_image(crop, degrees), 72)[0]
                 deviation = (found - logits.roll(degrees // 5)).norm()
                 errors[name].append(float(deviation / (logits - logits.mean()).norm()))
     medians = {name: float(np.median(values)) for name, values in errors.items()}

@@ -17,7 +17,7 @@ from kitting_drake.policies.steerable import (
     expand_kernel,
     upsample,
 )
-from tests.kitting_drake.policies.turning import relative_error, smooth_image, turn_image
+from tests.kitting_drake.policies.equivariance import relative_error, rotate_image, smooth_image
 
 FREQUENCIES = (0, 1, 2, 3)
 SAMPLES = Irreps(FREQUENCIES, samples=8)
@@ -27,13 +27,13 @@ def random_features(*shape: int) -> Tensor:
     return torch.randn(*shape, generator=torch.Generator().manual_seed(0))
 
 
-def quarter_turn(features: Tensor) -> Tensor:
-    """Of the picture; the fields stay as they are."""
+def rotate_by_90(features: Tensor) -> Tensor:
+    """The image rotated; the fields stay as they are."""
     return features.rot90(1, (2, 3))
 
 
-def turn_fields(features: Tensor, fibre: Fibre, degrees: float = 90) -> Tensor:
-    """Each field's channels turned, the picture left as it is."""
+def rotate_fields(features: Tensor, fibre: Fibre, degrees: float = 90) -> Tensor:
+    """Each field's channels transformed; the image stays as it is."""
     if isinstance(fibre, Irreps):
         blocks = []
         for j in fibre.frequencies:
@@ -62,13 +62,13 @@ def turn_fields(features: Tensor, fibre: Fibre, degrees: float = 90) -> Tensor:
     ],
     ids=str,
 )
-def test_commutes_with_a_quarter_turn(fibre_in: Fibre, fibre_out: Fibre, size: int):
+def test_rotations_by_90_degrees_are_exact(fibre_in: Fibre, fibre_out: Fibre, size: int):
     layer = SteerableConv2d(2, fibre_in, 3, fibre_out, size)
     features = BandLimit(fibre_in)(random_features(1, 2 * fibre_in.channels, 11, 13))
-    expected = turn_fields(quarter_turn(layer(features)), fibre_out)
-    found = layer(turn_fields(quarter_turn(features), fibre_in))
+    expected = rotate_fields(rotate_by_90(layer(features)), fibre_out)
+    found = layer(rotate_fields(rotate_by_90(features), fibre_in))
     torch.testing.assert_close(found, expected, atol=1e-5, rtol=1e-5)
-    # Not because nothing comes out.
+    # The output is not simply zero.
     assert expected.std() > 0.1
 
 
@@ -78,22 +78,22 @@ def test_commutes_with_a_quarter_turn(fibre_in: Fibre, fibre_out: Fibre, size: i
     [(Scalar(), SAMPLES), (SAMPLES, SAMPLES), (SAMPLES, Irreps((0, 2, 4)))],
     ids=str,
 )
-def test_nearly_commutes_with_other_turns(fibre_in: Fibre, fibre_out: Fibre, degrees: int):
+def test_other_rotations_are_nearly_exact(fibre_in: Fibre, fibre_out: Fibre, degrees: int):
     layer = SteerableConv2d(1, fibre_in, 2, fibre_out, 5)
     features = BandLimit(fibre_in)(smooth_image(65, channels=fibre_in.channels))
-    expected = turn_fields(turn_image(layer(features), degrees), fibre_out, degrees)
-    found = layer(turn_fields(turn_image(features, degrees), fibre_in, degrees))
+    expected = rotate_fields(rotate_image(layer(features), degrees), fibre_out, degrees)
+    found = layer(rotate_fields(rotate_image(features, degrees), fibre_in, degrees))
     assert relative_error(found.detach(), expected.detach()) < 0.05
 
 
 @pytest.mark.parametrize(("samples", "tolerance"), [(8, 0.25), (12, 0.05), (16, 0.02)])
-def test_the_nonlinearity_nearly_commutes_with_turns(samples: int, tolerance: float):
+def test_the_nonlinearity_is_nearly_equivariant(samples: int, tolerance: float):
     fibre = Irreps(FREQUENCIES, samples)
     limit = BandLimit(fibre)
     features = limit(smooth_image(33, channels=samples))
     for degrees in (5, 10, 22.5, 30):
-        expected = turn_fields(limit(F.elu(features)), fibre, degrees)
-        found = limit(F.elu(turn_fields(features, fibre, degrees)))
+        expected = rotate_fields(limit(F.elu(features)), fibre, degrees)
+        found = limit(F.elu(rotate_fields(features, fibre, degrees)))
         assert relative_error(found, expected) < tolerance
 
 
@@ -129,7 +129,7 @@ def test_two_layers_are_those_of_escnn():
     coefficients = torch.einsum("fs,nksxy->nkfxy", analysis, found.unflatten(1, (3, 8)))
     torch.testing.assert_close(coefficients.flatten(1, 2), expected, atol=1e-5, rtol=1e-5)
     assert expected.std() > 0.1
-    # A band limit is what escnn's layer does beyond the ELU.
+    # escnn's layer ends with a projection onto the irreps, which is `BandLimit`.
     synthesis = torch.from_numpy(SAMPLES.synthesis()).float()
     limited = torch.einsum("sf,nkfxy->nksxy", synthesis, expected.unflatten(1, (3, 7)))
     torch.testing.assert_close(BandLimit(SAMPLES)(found), limited.flatten(1, 2), atol=1e-5, rtol=0)
@@ -143,7 +143,7 @@ def test_the_first_gain_does_not_depend_on_the_samples(samples: int):
     fibre = Irreps(FREQUENCIES, samples)
     layer = SteerableConv2d(32, fibre, 32, fibre, 3)
     features = BandLimit(fibre)(random_features(1, 32 * samples, 32, 32))
-    # He's, which ELU takes back.
+    # He initialisation's gain, which compensates the nonlinearity.
     gain = float(layer(features).detach().std() / features.std())
     assert gain == pytest.approx(2**0.5, rel=0.1)
 
@@ -159,9 +159,14 @@ def test_becomes_a_plain_layer(bias: bool):
     plain.load_state_dict(state)
     features = random_features(1, 16, 9, 11)
     torch.testing.assert_close(plain(features), layer(features), atol=1e-5, rtol=0)
+    before = {name: value.clone() for name, value in plain.state_dict().items()}
     half = plain(features.bfloat16())
     assert half.dtype == torch.bfloat16
     torch.testing.assert_close(half.float(), layer(features), atol=0.05, rtol=0.05)
+    # Computing in another type has not changed the layer.
+    for name, value in plain.state_dict().items():
+        assert value.dtype == torch.float32
+        assert torch.equal(value, before[name])
 
 
 def test_groups_do_not_mix():
@@ -171,7 +176,7 @@ def test_groups_do_not_mix():
 
 
 @pytest.mark.parametrize("sides", [(9, 9), (17, 33), (5, 3)])
-def test_half_the_resolution_and_back_commute_with_a_quarter_turn(sides: tuple[int, int]):
+def test_resampling_is_equivariant_to_rotations_by_90_degrees(sides: tuple[int, int]):
     features = random_features(1, 2, *sides)
     pool = BlurPool()
     halved = pool(features)
@@ -179,7 +184,7 @@ def test_half_the_resolution_and_back_commute_with_a_quarter_turn(sides: tuple[i
     assert upsample(halved).shape == features.shape
     for function in (pool, upsample):
         torch.testing.assert_close(
-            function(quarter_turn(features)), quarter_turn(function(features)), atol=1e-6, rtol=0
+            function(rotate_by_90(features)), rotate_by_90(function(features)), atol=1e-6, rtol=0
         )
 
 

@@ -5,15 +5,22 @@ import numpy as np
 import pytest
 import torch
 
+from kitting_drake.policies import training
 from kitting_drake.policies.config import METHODS
+from kitting_drake.policies.demonstrations import FinalObservation
 from kitting_drake.policies.methods import make_networks
 from kitting_drake.policies.training import Trainer
-from tests.kitting_drake.policies.scenes import config, scene
+from systems.signals import Observation
+from tests.kitting_drake.policies.scenes import config, final_scene, scene
+
+FINALS = [FinalObservation.of(Observation(final_scene(seed))) for seed in range(2)]
 
 
-def trainer(*, weights: int = 0, method: str = "so2", **arguments: Any) -> Trainer:
+def trainer(
+    *, weights: int = 0, method: str = "so2", stop: bool = False, **arguments: Any
+) -> Trainer:
     torch.manual_seed(weights)
-    return Trainer(make_networks(config(method)), **{"seed": 0, **arguments})
+    return Trainer(make_networks(config(method, stop=stop)), **{"seed": 0, **arguments})
 
 
 def assert_same(one: Trainer, other: Trainer) -> None:
@@ -21,7 +28,7 @@ def assert_same(one: Trainer, other: Trainer) -> None:
     assert all(torch.equal(a, b) for a, b in pairs)
 
 
-def test_a_seed_says_all():
+def test_all_draws_are_those_of_the_seed():
     samples = [scene(0), scene(1)]
     one, same, other = trainer(), trainer(), trainer(seed=1)
     losses = [[item.step(samples) for _ in range(2)] for item in (one, same, other)]
@@ -29,19 +36,57 @@ def test_a_seed_says_all():
     assert_same(one, same)
 
 
-@pytest.mark.parametrize("decay", [False, True])
-def test_a_run_that_is_taken_up_goes_on_bit_by_bit(decay: bool):
+@pytest.mark.parametrize(("decay", "stop"), [(False, False), (True, True)])
+def test_a_resumed_run_continues_bit_by_bit(
+    decay: bool, stop: bool, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr(training, "_STOP_PROBABILITY", 0.5)
     samples = [scene(0), scene(1)]
     whole, before, after = (
-        trainer(weights=weights, steps=4, decay=decay, learning_rate=1e-2) for weights in (0, 0, 1)
+        trainer(weights=weights, steps=4, decay=decay, stop=stop, learning_rate=1e-2)
+        for weights in (0, 0, 1)
     )
-    expected = [whole.step(samples) for _ in range(4)]
-    found = [before.step(samples) for _ in range(2)]
+    expected = [whole.step(samples, FINALS) for _ in range(4)]
+    found = [before.step(samples, FINALS) for _ in range(2)]
     after.load_state_dict(copy.deepcopy(before.state_dict()))
-    found += [after.step(samples) for _ in range(2)]
+    found += [after.step(samples, FINALS) for _ in range(2)]
     assert found == expected
     assert after.step_count == 4
     assert_same(after, whole)
+    # Some steps had a final observation and some had none, unless the networks cannot stop.
+    assert {"stop" in losses for losses in found} == ({True, False} if stop else {False})
+
+
+def test_a_final_observation_trains_where_to_pick_and_changes_nothing_else(
+    monkeypatch: pytest.MonkeyPatch,
+):
+    outcomes = []
+    for probability in (0.0, 1.0):
+        monkeypatch.setattr(training, "_STOP_PROBABILITY", probability)
+        learner = trainer(stop=True, learning_rate=1e-3)
+        losses = learner.step([scene(0)], FINALS)
+        outcomes.append((losses, copy.deepcopy(learner.networks.state_dict())))
+    (without, before), (with_final, after) = outcomes
+    assert with_final.pop("stop") > 0
+    assert with_final == without
+    changed = {name.split(".")[0] for name in before if not torch.equal(before[name], after[name])}
+    assert changed == {"alpha"}
+
+
+def test_one_step_in_eight_has_a_final_observation(monkeypatch: pytest.MonkeyPatch):
+    learner = trainer(stop=True)
+    monkeypatch.setattr(learner.networks, "losses", lambda *_: iter(()))
+    drawn = []
+    draw = learner._draw_final
+    monkeypatch.setattr(
+        learner, "_draw_final", lambda *arguments: drawn.append(draw(*arguments)) or drawn[-1]
+    )
+    for _ in range(400):
+        learner.step([scene(0)], FINALS)
+    images = [image for image in drawn if image is not None]
+    assert 30 < len(images) < 75
+    # Each after a motion of its own.
+    assert len({image.tobytes() for image in images}) == len(images)
 
 
 def test_the_rate_is_that_of_the_step():
@@ -75,8 +120,8 @@ def test_every_weight_is_trained_by_one_loss(method: str):
     Trainer(networks, seed=0).step([scene(0)])
     after = networks.state_dict()
     unmoved = {name for name in before if torch.equal(before[name], after[name])}
-    # A softmax does not see what is added to all logits: rounding alone moves these.
-    assert unmoved <= {"alpha.out.bias", "pick.out.third.bias", "pick.out.shortcut.bias"}
+    # A softmax does not depend on what is added to all logits: only rounding moves these.
+    assert unmoved <= {"alpha.out.bias", "f_pick.out.third.bias", "f_pick.out.shortcut.bias"}
 
 
 def test_the_learning_rate_rises_and_falls_to_nothing():
@@ -87,5 +132,5 @@ def test_the_learning_rate_rises_and_falls_to_nothing():
     assert max(rates) == pytest.approx(1e-4, rel=0.05)
     assert (np.diff(rates[100:]) < 0).all()
     assert rates[1000] == pytest.approx(0, abs=1e-12)
-    # What is trained on beyond the end does not start to rise again.
+    # Beyond the last step it does not rise again.
     assert decaying.rate(1500) == pytest.approx(0, abs=1e-12)

@@ -7,9 +7,16 @@ import pytest
 import torch
 from torch import Tensor
 
-from kitting_drake.policies.config import PRESETS, NetworkConfig
-from kitting_drake.policies.images import Image, LabelledImage, rotation
-from kitting_drake.policies.losses import joint_loss, spread
+from kitting_drake.policies import transporter as transporter_module
+from kitting_drake.policies.config import PLACE_CROP, PRESETS, NetworkConfig
+from kitting_drake.policies.correlation import KERNEL, cross_correlation, lift
+from kitting_drake.policies.images import Image, LabelledImage, rotation_matrix
+from kitting_drake.policies.losses import (
+    interpolate_label,
+    joint_loss,
+    log_odds,
+    presence_loss,
+)
 from kitting_drake.policies.methods import make_networks
 from kitting_drake.policies.training import Trainer
 from kitting_drake.policies.transporter import (
@@ -18,11 +25,14 @@ from kitting_drake.policies.transporter import (
     TransporterNetworks,
     canvas_shape,
     draw_bins,
-    turned,
+    encodings_per_decision,
+    rotated,
+    rotated_crops,
 )
 from kitting_drake.policies.weights import load_networks, save_weights
 
 N = 8
+STEP = math.tau / N
 TINY = NetworkConfig(method="transporter", preset="tiny", orientations=N)
 ANGLES = [0.0, 0.3, math.pi / 2, 2.0, -0.7, 4.0]
 
@@ -40,7 +50,7 @@ def sample() -> LabelledImage:
         pick=np.array([14.3, 22.6]),
         pick_theta=0.7,
         place=np.array([20.2, 10.1]),
-        turn=2.1,
+        rotation=2.1,
         other_picks=np.array([[20.0, 12.5]]),
         other_thetas=np.array([3.0]),
     )
@@ -58,23 +68,23 @@ def centroid(image: Tensor) -> Tensor:
 
 
 @pytest.mark.parametrize("angle", ANGLES)
-def test_a_point_turns_about_the_middle(angle: float):
+def test_a_point_is_rotated_about_the_middle(angle: float):
     shape = (60, 101)
     point = np.array([22.3, 61.8])
     canvas = canvas_shape(shape, angle)
-    image = turned(blob(shape, (point[0], point[1])), angle, canvas)
+    image = rotated(blob(shape, (point[0], point[1])), angle, canvas)
     middle, canvas_middle = (np.array(sides) / 2 - 0.5 for sides in (shape, canvas))
-    expected = rotation(angle) @ (point - middle) + canvas_middle
+    expected = rotation_matrix(angle) @ (point - middle) + canvas_middle
     assert image.shape[2:] == canvas
     np.testing.assert_allclose(centroid(image), expected, atol=1e-3)
-    back = turned(image, -angle, shape)
+    back = rotated(image, -angle, shape)
     np.testing.assert_allclose(centroid(back), point, atol=1e-3)
 
 
-def test_a_quarter_turn_is_exact():
+def test_a_rotation_by_90_degrees_is_exact():
     image = torch.randn(1, 4, 8, 13)
     assert canvas_shape((8, 13), math.pi / 2) == (13, 8)
-    found = turned(image, math.pi / 2, (13, 8))
+    found = rotated(image, math.pi / 2, (13, 8))
     torch.testing.assert_close(found, image.rot90(1, (2, 3)), atol=1e-5, rtol=0)
 
 
@@ -84,7 +94,7 @@ def test_the_canvas_holds_every_pixel_and_hardly_more(angle: float):
     canvas = np.array(canvas_shape(shape, angle))
     half = np.array(shape) / 2 - 0.5
     corners = np.array([(a, b) for a in (-1, 1) for b in (-1, 1)]) * half
-    needed = 2 * np.abs(corners @ rotation(angle).T).max(0) + 1
+    needed = 2 * np.abs(corners @ rotation_matrix(angle).T).max(0) + 1
     assert (canvas > needed - 1e-5).all()
     assert (canvas < needed + 1).all()
 
@@ -105,12 +115,12 @@ def test_has_43_layers():
 
 
 @torch.no_grad()
-def test_the_volume_turns_by_quarters_with_the_scene():
+def test_the_volume_is_equivariant_to_rotations_by_90_degrees():
     networks = transporter().eval()
     image = sample().image
     volume = networks.pick_volume(image, N)
     assert volume.shape == (N // 2, *image.shape[1:])
-    # Bins that a quarter turn takes beyond half a turn are seen upside down by ordinary networks.
+    # Ordinary networks do not know that beyond pi the angles are the same as before.
     found = networks.pick_volume(np.rot90(image, axes=(1, 2)).copy(), N)[N // 4 :]
     expected = volume[: N // 4].rot90(1, (1, 2))
     assert expected.std() > 1e-3
@@ -122,62 +132,149 @@ def test_picks_the_best_of_the_volume():
     networks = transporter().eval()
     image = sample().image
     volume = networks.pick_volume(image, N)
-    logits = networks.position_logits(image, N)
-    row, col = divmod(int(logits.argmax()), logits.shape[1])
-    angles = networks.angle_logits(image, (row, col), N)
+    picking = networks.predict_pick(image, N)
+    row, col = divmod(int(picking.position.argmax()), picking.position.shape[1])
+    angles = picking.angle((row, col)).logits
     assert angles.shape == (N // 2,)
     assert angles.max() == volume.max()
-    # Its weights know nothing of N.
-    assert networks.angle_logits(image, (row, col), 36).shape == (18,)
-    torch.testing.assert_close(networks.angle_logits(image, (row, col), 16)[::2], angles)
+    # N is no part of the architecture.
+    finer = networks.predict_pick(image, 16).angle((row, col)).logits
+    torch.testing.assert_close(finer[::2], angles)
     with pytest.raises(ValueError, match="even"):
         networks.check_orientations(9)
 
 
 @torch.no_grad()
-def test_a_decision_looks_once_and_the_next_one_anew(monkeypatch: pytest.MonkeyPatch):
+def test_position_and_angle_come_from_one_volume_and_nothing_is_remembered(
+    monkeypatch: pytest.MonkeyPatch,
+):
     networks = transporter().eval()
     image = sample().image.copy()
-    looks = []
-    scores = networks._scores
+    computed = []
+    scores = networks._pick_scores
 
-    def look(image: Image, theta: float) -> torch.Tensor:
-        looks.append(theta)
+    def watched(image: Image, theta: float) -> torch.Tensor:
+        computed.append(theta)
         return scores(image, theta)
 
-    monkeypatch.setattr(networks, "_scores", look)
-    before = networks.position_logits(image, N)
-    angles = networks.angle_logits(image, (20, 30), N)
-    assert len(looks) == N // 2
-    assert angles.max() == before[20, 30]
-    # A camera may fill the same buffer again.
+    monkeypatch.setattr(networks, "_pick_scores", watched)
+    before = networks.predict_pick(image, N)
+    angles = before.angle((20, 30)).logits
+    assert len(computed) == N // 2
+    assert angles.max() == before.position[20, 30]
+    # The same array may hold another image the next time.
     image[:] = image[:, ::-1].copy()
-    assert not torch.equal(networks.position_logits(image, N), before)
-    state = {name: value + 0.1 for name, value in networks.state_dict().items()}
-    networks.load_state_dict(state)
-    assert not torch.equal(networks.angle_logits(image, (20, 30), N), angles)
+    assert not torch.equal(networks.predict_pick(image, N).position, before.position)
 
 
-def test_draws_stand_for_all_turns():
+@pytest.mark.parametrize("angle", ANGLES)
+def test_crops_are_those_of_the_rotated_scene(angle: float):
+    """A point is rotated about the pick, which is in the middle of the crop."""
+    pixel, point = (50, 70), np.array([58.0, 49.0])
+    scene = blob((101, 121), (point[0], point[1]))
+    (found,) = rotated_crops(scene, pixel, [angle])
+    middle = np.full(2, PLACE_CROP // 2)
+    expected = middle + rotation_matrix(angle) @ (point - pixel)
+    np.testing.assert_allclose(centroid(found[None]), expected, atol=1e-3)
+
+
+def test_no_corner_of_a_rotated_crop_is_missing():
+    scene = torch.ones(1, 4, 161, 161)
+    crops = rotated_crops(scene, (80, 80), [0.0, math.radians(30), math.radians(45)])
+    assert crops.shape == (3, 4, PLACE_CROP, PLACE_CROP)
+    torch.testing.assert_close(crops, torch.ones_like(crops))
+
+
+@torch.no_grad()
+@pytest.mark.parametrize("orientations", [8, 36])
+def test_places_where_the_correlation_with_all_rotated_crops_is_best(orientations: int):
+    networks = transporter().eval()
+    image, pixel = sample().image, (14, 22)
+    rows, cols = image.shape[1:]
+    placing = networks.predict_place(image, pixel, orientations)
+    angles = [i * math.tau / orientations for i in range(orientations)]
+    kernels = networks.encode_crops(image, pixel, angles)
+    # Rotating the crop is not the same as rotating its encoding.
+    rotated_encodings = lift(networks.encode_crop(image, pixel), torch.tensor(angles), KERNEL)
+    assert (kernels[1:] - rotated_encodings[1:]).norm() > 0.01 * kernels[1:].norm()
+    volume = cross_correlation(networks.encode_scene(image), kernels)[:, :rows, :cols]
+    score, rotation, row, col = placing.candidates[0].best()
+    assert score == pytest.approx(float(volume.max()), rel=1e-4)
+    assert volume[rotation % orientations, row, col] == pytest.approx(score, rel=1e-4)
+    torch.testing.assert_close(placing.score_map, volume.amax(0), rtol=1e-4, atol=1e-4)
+
+
+@torch.no_grad()
+def test_finer_rotations_than_36_are_searched_around_the_best_of_them(
+    monkeypatch: pytest.MonkeyPatch,
+):
+    networks = transporter().eval()
+    image, pixel = sample().image, (14, 22)
+    encoded = []
+    encode = networks.encode_crops
+
+    def watched(image: Image, pixel: tuple[int, int], angles: list[float]) -> torch.Tensor:
+        encoded.extend(angles)
+        return encode(image, pixel, angles)
+
+    monkeypatch.setattr(networks, "encode_crops", watched)
+    placing = networks.predict_place(image, pixel, 180)
+    assert len(encoded) == encodings_per_decision(180) == 36 + 3 * 11
+    best = placing.candidates[0]
+    score, rotation, row, col = best.best()
+    assert score >= placing.score_map.max() - 1e-4
+    # Its scores are those of the bins that it names.
+    kernels = encode(image, pixel, [rotation * math.tau / 180])
+    volume = cross_correlation(networks.encode_scene(image), kernels)
+    assert volume[0, row, col] == pytest.approx(score, rel=1e-4)
+
+
+def test_drawn_bins_stand_for_all():
     step = math.tau / 180
     drawn = draw_bins({89, 0, 30}, 90, step, np.random.default_rng(0))
     assert [drawn[bin_] for bin_ in (0, 30, 89)] == [0, 0, 0]
     assert len(drawn) == 7
     assert sum(math.exp(weight) for weight in drawn.values()) == pytest.approx(90)
-    apart = [min(abs(bin_ - 30), bin_, 89 - bin_) <= 5 for bin_ in drawn if bin_ not in (0, 30, 89)]
-    assert apart == [True, True, False, False]
+    near = [min(abs(bin_ - 30), bin_, 89 - bin_) <= 5 for bin_ in drawn if bin_ not in (0, 30, 89)]
+    assert near == [True, True, False, False]
     everything = draw_bins({0, 1}, 4, math.tau / 8, np.random.default_rng(0))
     assert everything == dict.fromkeys(range(4), 0.0)
+    # Of a place, bins are cyclic over the full rotation.
+    drawn = draw_bins({0}, 180, step, np.random.default_rng(0))
+    near = [min(bin_, 180 - bin_) <= 5 for bin_ in drawn if bin_]
+    assert near == [True, True, False, False]
+    # Without labels, as in a final observation, some stand for all.
+    drawn = draw_bins(set(), 90, step, np.random.default_rng(0))
+    assert sum(math.exp(weight) for weight in drawn.values()) == pytest.approx(90)
 
 
-def test_the_loss_is_that_of_the_whole_volume_where_all_turns_are_drawn():
-    networks = transporter()
+def test_the_losses_are_those_of_the_whole_volumes_where_all_bins_are_drawn(
+    monkeypatch: pytest.MonkeyPatch,
+):
+    monkeypatch.setattr(transporter_module, "_DRAWS", N)
+    networks = transporter(dataclasses.replace(TINY, stop=True))
     one = dataclasses.replace(sample(), other_picks=np.zeros((0, 2)), other_thetas=np.zeros(0))
-    (name, loss), _ = networks.losses(one, np.random.default_rng(0))
-    assert name == "pick"
-    bins = spread(one.pick_theta / (math.tau / N), N // 2, cyclic=True)
-    expected = joint_loss(networks.pick_volume(one.image, N), (bins, tuple(one.pick)))
-    assert float(loss().detach()) == pytest.approx(float(expected.detach()), rel=1e-5)
+    (name, pick_loss), _ = networks.losses(one, np.random.default_rng(0))
+    assert name == networks.picking == "pick"
+    volume = networks.pick_volume(one.image, N)
+    bins = interpolate_label(one.pick_theta / STEP, N // 2, cyclic=True)
+    odds = log_odds(volume, N // 2)
+    expected = joint_loss(volume, (bins, (14.3, 22.6))) + presence_loss(odds, present=True)
+    torch.testing.assert_close(pick_loss(), expected)
+    with torch.no_grad():
+        assert networks.predict_pick(one.image, N).log_odds == pytest.approx(odds.item(), rel=1e-5)
+    torch.testing.assert_close(
+        networks.stop_loss(one.image, np.random.default_rng(0)), presence_loss(odds, present=False)
+    )
+
+    pixel = (15, 22)
+    kernels = networks.encode_crops(one.image, pixel, [i * STEP for i in range(N)])
+    volume = cross_correlation(networks.encode_scene(one.image), kernels)
+    row, col = one.place + rotation_matrix(one.rotation) @ (pixel - one.pick)
+    bins = interpolate_label(one.rotation / STEP, N, cyclic=True)
+    torch.testing.assert_close(
+        networks.place_loss(one, pixel, 0), joint_loss(volume, (bins, (row, col)))
+    )
 
 
 def losses(steps: int) -> list[dict[str, float]]:
@@ -216,7 +313,7 @@ def test_comes_back_from_a_file(tmp_path: Path):
 
 
 @torch.no_grad()
-def test_computes_in_sixteen_bits():
+def test_computes_in_bfloat16():
     networks = transporter().eval()
     image = sample().image
     expected = networks.pick_volume(image, N)

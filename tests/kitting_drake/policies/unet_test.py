@@ -6,7 +6,7 @@ from kitting_drake.policies.config import PRESETS
 from kitting_drake.policies.fibres import Fibre, Irreps, Regular
 from kitting_drake.policies.steerable import SteerableConv2d
 from kitting_drake.policies.unet import UNet
-from tests.kitting_drake.policies.turning import relative_error, smooth_image, turn_image
+from tests.kitting_drake.policies.equivariance import relative_error, rotate_image, smooth_image
 
 BAND_3 = Irreps((0, 1, 2, 3), samples=8)
 
@@ -31,7 +31,7 @@ def test_has_the_papers_size():
 
 @pytest.mark.parametrize("fibre", [BAND_3, Regular(8)], ids=str)
 @pytest.mark.parametrize("sides", [(49, 49), (33, 65)])
-def test_quarter_turns_are_exact(fibre: Fibre, sides: tuple[int, int]):
+def test_rotations_by_90_degrees_are_exact(fibre: Fibre, sides: tuple[int, int]):
     network = tiny_unet(fibre)
     image = torch.randn(1, 4, *sides)
     for quarters in (1, 2, 3):
@@ -41,16 +41,16 @@ def test_quarter_turns_are_exact(fibre: Fibre, sides: tuple[int, int]):
 
 
 @pytest.mark.parametrize("samples", [8, 16])
-def test_other_turns_are_nearly_exact(samples: int):
+def test_other_rotations_are_nearly_exact(samples: int):
     errors = []
     for seed in range(3):
         torch.manual_seed(seed)
         network = tiny_unet(Irreps((0, 1, 2, 3), samples))
         image = smooth_image(97, seed=seed)
         with torch.no_grad():
-            answer = network(image)
+            output = network(image)
             errors += [
-                relative_error(network(turn_image(image, degrees)), turn_image(answer, degrees))
+                relative_error(network(rotate_image(image, degrees)), rotate_image(output, degrees))
                 for degrees in (15, 30, 45)
             ]
     # What remains is the aliasing of four poolings.
@@ -62,9 +62,9 @@ def test_computes_in_the_type_of_the_image():
     network = tiny_unet()
     image = smooth_image(49)
     with torch.no_grad():
-        answer, half = network(image), network(image.bfloat16())
+        output, half = network(image), network(image.bfloat16())
     assert half.dtype == torch.float32
-    assert relative_error(half, answer) < 0.1
+    assert relative_error(half, output) < 0.1
 
 
 @pytest.mark.parametrize("sides", [(48, 49), (49, 50), (32, 32)])

@@ -29,9 +29,9 @@ TINY = NetworkConfig(
     preset="tiny",
     orientations=72,
     colour_mean=0.4,
-    colour_deviation=0.3,
+    colour_std=0.3,
     height_mean=0.01,
-    height_deviation=0.02,
+    height_std=0.02,
 )
 SMALL = dataclasses.replace(TINY, preset="small")
 CARD = {"scenario": "mine", "demonstration_seeds": [10_000, 10_001], "steps": 7}
@@ -39,7 +39,7 @@ CARD = {"scenario": "mine", "demonstration_seeds": [10_000, 10_001], "steps": 7}
 
 @functools.cache
 def trained(config: NetworkConfig) -> Networks:
-    """Networks none of whose weights is what it was at first: biases begin as zero."""
+    """Networks none of whose weights has its initial value; biases would be zero."""
     torch.manual_seed(0)
     networks = make_networks(config)
     with torch.no_grad():
@@ -62,13 +62,14 @@ def file(tmp_path: Path) -> Path:
 
 
 def maps(networks: Networks, image: NDArray[np.float32]) -> dict[str, Tensor]:
-    """All that networks are asked for."""
+    """All that networks predict."""
     pixel = (20, 70)
-    logits, maximum = networks.angle_answer(image, pixel, 36)
+    picking = networks.predict_pick(image, 36)
+    angles = picking.angle(pixel)
     return {
-        "position": networks.position_logits(image, 36),
-        "angle": logits,
-        "angle, continuous": torch.tensor(maximum),
+        "position": picking.position,
+        "angle": angles.logits,
+        "refined angle": torch.tensor(angles.refined),
         "scene": networks.encode_scene(image),
         "crop": networks.encode_crop(image, pixel),
     }
@@ -76,13 +77,13 @@ def maps(networks: Networks, image: NDArray[np.float32]) -> dict[str, Tensor]:
 
 def assert_close(found: dict[str, Tensor], expected: dict[str, Tensor], relative: float) -> None:
     for name, values in expected.items():
-        assert values.dim() == 0 or values.std() > 0, f"{name} says nothing"
+        assert values.dim() == 0 or values.std() > 0, f"{name} is constant"
         atol = relative * float(values.abs().max())
         torch.testing.assert_close(found[name], values, atol=atol, rtol=0, msg=lambda text: text)
 
 
 @pytest.mark.parametrize("config", [TINY, SMALL], ids=lambda config: config.preset)
-def test_what_is_loaded_answers_as_what_was_trained(config: NetworkConfig, tmp_path: Path):
+def test_loaded_networks_predict_what_the_trained_ones_do(config: NetworkConfig, tmp_path: Path):
     path = tmp_path / "policy.safetensors"
     save_weights(path, trained(config), CARD)
     loaded = load_networks(path)
@@ -91,22 +92,27 @@ def test_what_is_loaded_answers_as_what_was_trained(config: NetworkConfig, tmp_p
     assert_close(maps(loaded, image), maps(trained(config), image), 1e-5)
 
 
-def test_bfloat16_answers_nearly_the_same_every_time(file: Path):
+def test_bfloat16_predicts_nearly_the_same_every_time(file: Path):
     loaded = load_networks(file, torch.bfloat16)
+    types = {name: value.dtype for name, value in loaded.state_dict().items()}
+    # Weights are cast when they are loaded; the last layers stay in float32.
+    assert {types["alpha.lift.weight"], types["beta.stages.0.0.weight"]} == {torch.bfloat16}
+    assert {types["alpha.out.weight"], types["beta.readout.weight"]} == {torch.float32}
     image = observation(0).image
     first = maps(loaded, image)
     assert_close(first, maps(trained(TINY), image), 0.05)
     maps(loaded, observation(1).image)
     assert_close(maps(loaded, image), first, 0.0)
+    assert {name: value.dtype for name, value in loaded.state_dict().items()} == types
 
 
-def test_nothing_learns_in_what_is_loaded(file: Path):
+def test_loaded_networks_are_not_trained(file: Path):
     loaded = load_networks(file)
     assert not loaded.training
     assert not any(weight.requires_grad for weight in loaded.parameters())
 
 
-def test_a_file_says_what_it_is(file: Path):
+def test_a_file_has_its_config_and_card(file: Path):
     found = read_weights_file(file)
     assert found.config == TINY
     assert found.card == CARD
@@ -129,6 +135,33 @@ def test_a_small_policy_is_a_small_file(tmp_path: Path):
     assert path.stat().st_size < 4 * 2**20
     plain = sum(weight.numel() * 4 for weight in load_networks(path).parameters())
     assert path.stat().st_size < plain / 8
+
+
+def test_older_files_are_read(file: Path):
+    """Their config has older names for some fields and lacks others."""
+    tensors, metadata = content(file)
+    config = json.loads(metadata["config"])
+    for old, new in (("colour_deviation", "colour_std"), ("height_deviation", "height_std")):
+        config[old] = config.pop(new)
+    del config["stop"]
+    metadata["config"] = json.dumps(config)
+    save_file(tensors, file, metadata)
+    found = load_networks(file)
+    assert found.config == TINY
+    assert not found.config.stop
+    assert found.stop_threshold is None
+
+
+def test_the_threshold_for_stopping_comes_with_the_weights(tmp_path: Path):
+    path = tmp_path / "policy.safetensors"
+    networks = trained(dataclasses.replace(TINY, stop=True))
+    save_weights(path, networks, CARD | {"stop_threshold": -1.5})
+    loaded = load_networks(path)
+    assert loaded.config.stop
+    assert loaded.stop_threshold == -1.5
+    image = observation(0).image
+    expected = networks.predict_pick(image, 36).log_odds
+    assert loaded.predict_pick(image, 36).log_odds == pytest.approx(expected, abs=1e-3)
 
 
 NO_LIBRARIES = """
@@ -175,7 +208,7 @@ def refusal(path: Path) -> str:
     message = str(caught.value)
     assert str(path) in message
     assert "\n" not in message
-    # A person reads to its end.
+    # It is short enough to be read.
     assert len(message) < 300 + len(str(path)), message
     return message
 
@@ -206,7 +239,7 @@ def test_weights_of_another_program_are_refused(file: Path, metadata: Metadata |
 
 
 def reconfigured(**fields: Any) -> Callable[[Tensors, Metadata], None]:
-    """Spoils a file's config; a field that is None goes."""
+    """Spoils a file's config; a field that is None is removed."""
 
     def spoil(_: Tensors, metadata: Metadata) -> None:
         config = json.loads(metadata["config"]) | fields
@@ -217,7 +250,7 @@ def reconfigured(**fields: Any) -> Callable[[Tensors, Metadata], None]:
 
 
 def described(**entries: str) -> Callable[[Tensors, Metadata], None]:
-    """Spoils what a file says beside the weights."""
+    """Spoils a file's metadata."""
     return lambda _, metadata: metadata.update(entries)
 
 
@@ -253,6 +286,10 @@ SPOILT = {
     "config no mapping": (described(config="[1]"), "its config cannot be read"),
     "bases no mapping": (described(bases="null"), "its bases cannot be read"),
     "bases no names": (described(bases='{"alpha.lift": [1]}'), NOT_THOSE),
+    "threshold no number": (
+        described(card='{"stop_threshold": "low"}'),
+        "the stop_threshold of its card is 'low', not a number",
+    ),
     "unknown method": (reconfigured(method="magic"), "method must be one of so2, "),
     "unknown preset": (reconfigured(preset="vast"), "preset must be one of paper, small, tiny"),
     "missing field": (
@@ -276,7 +313,7 @@ SPOILT = {
     "no weight": (without("alpha.lift"), NOT_THOSE),
     "no bias": (without("out.bias"), NOT_THOSE),
     "one too many": (lambda tensors, _: tensors.update(gamma=torch.zeros(1)), NOT_THOSE),
-    "weight turned": (changed("out.weight", lambda old: old.transpose(0, 1)), NOT_THOSE),
+    "weight transposed": (changed("out.weight", lambda old: old.transpose(0, 1)), NOT_THOSE),
     "weight for another basis": (changed("mix.weights", lambda old: old[..., 1:]), "do not fit"),
     "weight for more": (changed("mix.weights", lambda old: old.repeat(2, 1, 1)), NOT_THOSE),
     "oblong basis": (changed("basis.", lambda old: old[..., 1:]), "do not fit"),
@@ -290,7 +327,7 @@ SPOILT = {
 
 @pytest.fixture(scope="module")
 def both_kinds(tmp_path_factory: pytest.TempPathFactory) -> tuple[Tensors, Metadata]:
-    """What a file holds some of whose layers are plain, and some steerable."""
+    """The content of a file that has both plain and steerable layers."""
     path = tmp_path_factory.mktemp("weights") / "policy.safetensors"
     save_weights(path, trained(TINY), CARD)
     return content(path)

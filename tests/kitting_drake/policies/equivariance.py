@@ -1,4 +1,4 @@
-"""Pictures to turn, and how much a turn changes what is made of them."""
+"""Images to rotate, and errors of equivariance."""
 
 import math
 
@@ -10,13 +10,13 @@ from kitting_drake.policies.correlation import lift
 
 
 def distance_from_middle(side: int) -> Tensor:
-    """(side, side), in halves of the side."""
+    """(side, side), in units of half the side."""
     offset = torch.arange(side, dtype=torch.float32) - side // 2
     return torch.hypot(offset[:, None], offset[None, :]) / (side / 2)
 
 
 def smooth_image(side: int, *, seed: int = 0, channels: int = 4, blur: int = 6) -> Tensor:
-    """(1, channels, side, side): random, without detail below `blur` pixels, zero near the edge."""
+    """(1, channels, side, side): random, no detail below `blur` pixels, zero near the edge."""
     generator = torch.Generator().manual_seed(seed)
     reach = 3 * blur
     noise = torch.randn(channels, 1, side + 2 * reach, side + 2 * reach, generator=generator)
@@ -26,8 +26,8 @@ def smooth_image(side: int, *, seed: int = 0, channels: int = 4, blur: int = 6) 
     return (noise / noise.std() * disc).transpose(0, 1)
 
 
-def turn_image(image: Tensor, degrees: float) -> Tensor:
-    """Counter-clockwise about the middle of a square: exactly where it can be."""
+def rotate_image(image: Tensor, degrees: float) -> Tensor:
+    """A square image rotated counter-clockwise about its middle, exactly by 90 degrees."""
     quarters, rest = divmod(degrees, 90)
     if rest == 0:
         return image.rot90(int(quarters), (2, 3))
@@ -35,7 +35,7 @@ def turn_image(image: Tensor, degrees: float) -> Tensor:
 
 
 def relative_error(found: Tensor, expected: Tensor) -> float:
-    """Of square pictures, in an interior disc: the deviation, in parts of the picture's own."""
+    """The error of square images in an interior disc, relative to their own variation."""
     disc = distance_from_middle(expected.shape[-1]) < 0.7
     variation = expected[..., disc] - expected[..., disc].mean(-1, keepdim=True)
     return float((found - expected)[..., disc].norm() / variation.norm())
