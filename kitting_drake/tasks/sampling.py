@@ -1,0 +1,195 @@
+"""Poses on the table drawn from a seed: free of each other, and within reach of the open hand."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+from pydrake.math import RigidTransform, RollPitchYaw
+
+from kitting_drake.common.errors import UserError
+from kitting_drake.tasks.task import TABLE
+from systems.grasp import Grasp
+from systems.hand_geometry import FINGER_DEPTH, FINGER_LENGTH, MAX_OPENING, PALM_SIZE
+from systems.signals import PixelGrid
+
+_TRIES = 200
+_RESTARTS = 50
+
+Polygon = NDArray[np.float64]
+"""(n, 2) corners of a convex polygon, counter-clockwise, in metres."""
+
+
+def rectangle(
+    length: float, width: float, *, x: float = 0.0, y: float = 0.0, theta: float = 0.0
+) -> Polygon:
+    """A rectangle with its middle at (x, y), rotated by theta radians."""
+    corners = np.array([(1, 1), (-1, 1), (-1, -1), (1, -1)]) * (length / 2, width / 2)
+    return _moved(corners, x, y, theta)
+
+
+def disc(radius: float, *, sides: int = 16) -> Polygon:
+    """A regular polygon around a disc about the origin."""
+    angles = np.arange(sides) * math.tau / sides
+    corners = radius / math.cos(math.pi / sides) * np.column_stack([np.cos(angles), np.sin(angles)])
+    return np.asarray(corners)
+
+
+def separation(a: Polygon, b: Polygon) -> float:
+    """How far apart two convex polygons are, in metres.
+
+    Returns:
+        The widest gap between them along a normal of one of their sides: never more than their
+        distance, and negative if and only if they overlap.
+    """
+    gaps = [
+        ((corners @ normals.T).min(axis=0) - (own @ normals.T).max(axis=0)).max()
+        for own, corners in ((a, b), (b, a))
+        for normals in (_normals(own),)
+    ]
+    return float(max(gaps))
+
+
+@dataclass(frozen=True)
+class Footprint:
+    """What something covers on the table, in its own frame, in metres."""
+
+    body: tuple[Polygon, ...]
+    """Convex pieces of its outline."""
+    grasps: tuple[Grasp, ...] = ()
+    """Where the hand takes hold of it, or puts something down on it: the open fingers come near
+    nothing else there."""
+    tall: bool = False
+    """Whether it is, or will be built, so high that the palm must not come over it either."""
+
+    @cached_property
+    def fingers(self) -> tuple[Polygon, ...]:
+        """What the open fingers, and the room between them, cover at each of the grasps."""
+        return self._at_grasps((FINGER_LENGTH, MAX_OPENING + 2 * FINGER_DEPTH))
+
+    @cached_property
+    def palm(self) -> tuple[Polygon, ...]:
+        """What the palm covers at each of the grasps."""
+        return self._at_grasps(PALM_SIZE)
+
+    def moved(self, x: float, y: float, yaw: float) -> Placed:
+        """The footprint at a pose on the table."""
+
+        def move(polygons: tuple[Polygon, ...]) -> tuple[Polygon, ...]:
+            return tuple(_moved(polygon, x, y, yaw) for polygon in polygons)
+
+        return Placed(move(self.body), move(self.fingers), move(self.palm), self.tall)
+
+    def _at_grasps(self, size: tuple[float, float]) -> tuple[Polygon, ...]:
+        return tuple(rectangle(*size, x=g.x, y=g.y, theta=g.theta) for g in self.grasps)
+
+
+@dataclass(frozen=True)
+class Placed:
+    """A footprint in the world."""
+
+    body: tuple[Polygon, ...]
+    fingers: tuple[Polygon, ...]
+    palm: tuple[Polygon, ...]
+    tall: bool
+
+    def is_within(self, lower: NDArray[np.float64], upper: NDArray[np.float64]) -> bool:
+        """Whether the body is within a rectangle along the axes, given by its corners."""
+        return all(
+            bool((polygon >= lower).all() and (polygon <= upper).all()) for polygon in self.body
+        )
+
+    def is_clear_of(self, other: Placed, spacing: float) -> bool:
+        """Whether both stand so far apart, and neither is in the way of the hand at the other."""
+        return (
+            _are_apart(self.body, other.body, spacing)
+            and _are_apart(self.fingers, other.body, 0.0)
+            and _are_apart(self.body, other.fingers, 0.0)
+            and not (other.tall and not _are_apart(self.palm, other.body, 0.0))
+            and not (self.tall and not _are_apart(self.body, other.palm, 0.0))
+        )
+
+
+def draw_poses(
+    footprints: Sequence[Footprint],
+    *,
+    grid: PixelGrid,
+    rng: np.random.Generator,
+    spacing: float = 0.01,
+) -> list[RigidTransform]:
+    """Draws poses on the table, within the workspace, with headings all around.
+
+    No two bodies come nearer than the spacing, and the open hand at each grasp touches nothing but
+    what it grasps.
+
+    Args:
+        footprints: of what is to be placed, in the order in which it is drawn: the large first.
+        grid: the workspace.
+        rng: for all draws.
+        spacing: least distance between any two bodies, in metres.
+
+    Returns:
+        X_W of each.
+
+    Raises:
+        UserError: no free space was found.
+    """
+    lower = np.maximum((grid.x_min, grid.y_min), TABLE[0])
+    upper = np.minimum((grid.x_max, grid.y_max), TABLE[1])
+    for _ in range(_RESTARTS):
+        placed: list[Placed] = []
+        poses: list[RigidTransform] = []
+        for footprint in footprints:
+            found = _draw_pose(footprint, placed, lower, upper, rng, spacing)
+            if found is None:
+                break
+            x, y, yaw = found
+            placed.append(footprint.moved(x, y, yaw))
+            poses.append(RigidTransform(RollPitchYaw(0, 0, yaw), [x, y, 0]))
+        else:
+            return poses
+    raise UserError(
+        f"there is no free space in the workspace for the {len(footprints)} things of the task: "
+        "enlarge heightmap.rows and heightmap.cols"
+    )
+
+
+def _draw_pose(
+    footprint: Footprint,
+    placed: Sequence[Placed],
+    lower: NDArray[np.float64],
+    upper: NDArray[np.float64],
+    rng: np.random.Generator,
+    spacing: float,
+) -> tuple[float, float, float] | None:
+    """A free (x, y, yaw); None if none was found."""
+    if (upper <= lower).any():
+        return None
+    for _ in range(_TRIES):
+        x, y = (float(value) for value in rng.uniform(lower, upper))
+        yaw = float(rng.uniform(-math.pi, math.pi))
+        candidate = footprint.moved(x, y, yaw)
+        if candidate.is_within(lower, upper) and all(
+            candidate.is_clear_of(other, spacing) for other in placed
+        ):
+            return x, y, yaw
+    return None
+
+
+def _moved(polygon: Polygon, x: float, y: float, theta: float) -> Polygon:
+    cos, sin = math.cos(theta), math.sin(theta)
+    return polygon @ np.array([[cos, sin], [-sin, cos]]) + (x, y)
+
+
+def _normals(polygon: Polygon) -> NDArray[np.float64]:
+    sides = np.roll(polygon, -1, axis=0) - polygon
+    normals = np.column_stack([sides[:, 1], -sides[:, 0]])
+    return np.asarray(normals / np.linalg.norm(normals, axis=1, keepdims=True))
+
+
+def _are_apart(a: Sequence[Polygon], b: Sequence[Polygon], distance: float) -> bool:
+    return all(separation(one, other) >= distance for one in a for other in b)
