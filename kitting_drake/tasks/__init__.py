@@ -1,8 +1,20 @@
 """Tasks: what stands on the table, what is to be brought about, and when it is success."""
 
 from kitting_drake.tasks.kitting.config import ArrangedKitting, Kitting, ToolsetKitting
+from kitting_drake.tasks.ravens.align_box_corner import AlignBoxCorner
+from kitting_drake.tasks.ravens.block_insertion import BlockInsertion
+from kitting_drake.tasks.ravens.place_red_in_green import PlaceRedInGreen
+from kitting_drake.tasks.ravens.stack_block_pyramid import StackBlockPyramid
 
-Task = Kitting | ToolsetKitting | ArrangedKitting
+Task = (
+    Kitting
+    | ToolsetKitting
+    | ArrangedKitting
+    | AlignBoxCorner
+    | BlockInsertion
+    | PlaceRedInGreen
+    | StackBlockPyramid
+)
 """The variants of a scenario's `task:`; the first is the default."""
 
 PAPER_TASKS = {task.title: task for task in (Kitting(), ToolsetKitting(split="test"))}

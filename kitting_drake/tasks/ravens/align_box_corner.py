@@ -1,0 +1,83 @@
+"""align-box-corner: a box of any size is put with a corner into a marker on the table."""
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from pydrake.math import RigidTransform, RollPitchYaw
+
+from kitting_drake.common.paths import MODELS
+from kitting_drake.tasks.ravens.boxes import box_footprint, box_grasps, box_object, random_brown
+from kitting_drake.tasks.ravens.ravens_task import PoseTask
+from kitting_drake.tasks.sampling import Footprint, draw_poses, rectangle
+from kitting_drake.tasks.task import Fixture, Scene
+from systems.bounds import bounded
+from systems.grasp import Grasp
+from systems.placement import Goal
+from systems.signals import PixelGrid
+
+_ARM_LENGTH, _ARM_WIDTH = 0.055, 0.005
+"""Of the marker, in metres."""
+
+
+@dataclass
+class AlignBoxCorner(PoseTask):
+    """A box is put with a corner into a marker, in any of the four ways."""
+
+    # Least and greatest length of the horizontal edges of the box, in m.
+    box_sides: list[float] = bounded([0.03, 0.07], 0.01, 0.07)
+
+    # Least and greatest height of the box, in m.
+    box_height: list[float] = bounded([0.03, 0.06], 0.015, 0.1)
+
+    def make_scene(self, *, grid: PixelGrid, seed: int, base: Path) -> Scene:
+        shape_rng = np.random.default_rng([seed, 1])
+        length, width = shape_rng.uniform(*self.box_sides, 2).round(4)
+        size = (float(length), float(width), round(shape_rng.uniform(*self.box_height), 4))
+        colour = random_brown(shape_rng)
+        X_WMarker, X_WBox = draw_poses(
+            [_marker_footprint(size), box_footprint(size)],
+            grid=grid,
+            rng=np.random.default_rng(seed),
+        )
+        poses = tuple(X_WMarker @ X_MarkerBox for X_MarkerBox in corner_poses(size))
+        return Scene(
+            objects=(box_object("box", "box", size, colour, X_WBox),),
+            fixtures=(Fixture("marker", MODELS / "ravens" / "corner_marker.sdf", X_WMarker),),
+            goals=(Goal(name="corner in marker", objects=(0,), poses=poses, reward=1.0),),
+            success=self.success,
+            max_actions=3,
+        )
+
+    def validate(self) -> None:
+        for name in ("box_sides", "box_height"):
+            least, greatest = getattr(self, name)
+            if least > greatest:
+                raise ValueError(f"task.{name} must be the least and then the greatest")
+
+
+def corner_poses(size: tuple[float, float, float]) -> list[RigidTransform]:
+    """The four poses of a box, in the marker's frame, with a corner in the marker."""
+    poses = []
+    for turns in range(4):
+        x, y = (size[0], size[1]) if turns % 2 == 0 else (size[1], size[0])
+        poses.append(RigidTransform(RollPitchYaw(0, 0, turns * math.pi / 2), [x / 2, y / 2, 0]))
+    return poses
+
+
+def _marker_footprint(size: tuple[float, float, float]) -> Footprint:
+    """The marker and, around it, all boxes that may stand there, and the hand that puts them."""
+    longest = max(size[:2])
+    side = max(_ARM_LENGTH - _ARM_WIDTH, longest)
+    middle = (side - _ARM_WIDTH) / 2
+    grasps = []
+    for X_MarkerBox in corner_poses(size):
+        x, y, _ = X_MarkerBox.translation()
+        yaw = RollPitchYaw(X_MarkerBox.rotation()).yaw_angle()
+        grasps += [
+            Grasp(x, y, yaw + grasp.theta, grasp.width, grasp.surface_height)
+            for grasp in box_grasps(size)
+        ]
+    square = rectangle(side + _ARM_WIDTH, side + _ARM_WIDTH, x=middle, y=middle)
+    return Footprint((square,), tuple(grasps))

@@ -1,0 +1,77 @@
+"""block-insertion: an L-shaped block is put into a fixture with walls around it."""
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from kitting_drake.common.paths import MODELS
+from kitting_drake.tasks.ravens.boxes import box_points
+from kitting_drake.tasks.ravens.ravens_task import PoseTask
+from kitting_drake.tasks.sampling import Footprint, draw_poses, rectangle
+from kitting_drake.tasks.task import Fixture, Scene, SceneObject
+from systems.grasp import Grasp
+from systems.placement import Goal
+from systems.signals import PixelGrid
+
+_ARMS = (((0.08, 0.03, 0.04), (0.025, 0.0)), ((0.03, 0.05, 0.04), (0.0, 0.04)))
+"""Size and middle of the two boxes of the block, in metres: see `models/ravens/l_block.sdf`."""
+_HEIGHT = 0.04
+_WALL_HEIGHT = 0.02
+_GRASPS = (
+    Grasp(x=0.035, y=0.0, theta=0.0, width=0.03, surface_height=_HEIGHT),
+    Grasp(x=0.0, y=0.035, theta=math.pi / 2, width=0.03, surface_height=_HEIGHT),
+)
+"""On either arm, as near to the centre of mass as leaves the fingers room in the corner."""
+
+_BLOCK = Footprint(tuple(rectangle(*size[:2], x=x, y=y) for size, (x, y) in _ARMS), _GRASPS)
+_FIXTURE = Footprint(
+    (rectangle(0.102, 0.052, x=0.025), rectangle(0.052, 0.052, y=0.05)),
+    _GRASPS,
+)
+
+
+@dataclass
+class BlockInsertion(PoseTask):
+    """An L-shaped block is put into a fixture."""
+
+    def make_scene(self, *, grid: PixelGrid, seed: int, base: Path) -> Scene:
+        X_WFixture, X_WBlock = draw_poses(
+            [_FIXTURE, _BLOCK], grid=grid, rng=np.random.default_rng(seed)
+        )
+        block = SceneObject(
+            name="block",
+            category="block",
+            model=MODELS / "ravens" / "l_block.sdf",
+            X_WB=X_WBlock,
+            p_BPoints=_surface_points(),
+            grasps=_GRASPS,
+        )
+        goal = Goal(
+            name="block in fixture",
+            objects=(0,),
+            poses=(X_WFixture,),
+            reward=1.0,
+            rim_height=_WALL_HEIGHT,
+        )
+        return Scene(
+            objects=(block,),
+            fixtures=(Fixture("fixture", MODELS / "ravens" / "l_fixture.sdf", X_WFixture),),
+            goals=(goal,),
+            success=self.success,
+            max_actions=3,
+        )
+
+
+def _surface_points() -> np.ndarray:
+    """(m, 3) points of the block's surface, in its frame, in metres."""
+    (long_size, long_middle), (short_size, short_middle) = _ARMS
+    long_points = box_points(long_size) + (*long_middle, 0.0)
+    short_points = box_points(short_size) + (*short_middle, 0.0)
+    # The face where the two meet is inside the block.
+    seam = long_size[1] / 2
+    on_seam = np.isclose(long_points[:, 1], seam) & (np.abs(long_points[:, 0]) < short_size[0] / 2)
+    return np.concatenate(
+        [long_points[~on_seam], short_points[~np.isclose(short_points[:, 1], seam)]]
+    )

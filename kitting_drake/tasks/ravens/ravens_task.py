@@ -1,0 +1,65 @@
+"""What the tasks of Ravens share."""
+
+import math
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from pydrake.math import RigidTransform
+
+from kitting_drake.tasks.task import MISPLACED, ActionRecord, Scene, TaskConfig
+from systems.bounds import bounded
+from systems.placement import Placement, PoseWithin
+
+TOPPLED = "toppled"
+PREREQUISITE_MISSING = "prerequisite missing"
+
+_UPRIGHT = math.cos(math.radians(20.0))
+"""The cosine of the tilt beyond which an object has toppled."""
+
+
+@dataclass
+class RavensTask(TaskConfig):
+    """A task of Ravens: its name, and why its objects fail."""
+
+    causes = (*TaskConfig.causes[:-1], TOPPLED, PREREQUISITE_MISSING, TaskConfig.causes[-1])
+
+    @property
+    def title(self) -> str:
+        words = re.findall("[A-Z][a-z]*", type(self).__name__)
+        name = "-".join(words).lower()
+        return name if self == type(self)() else f"{name}, changed"
+
+    def find_cause(
+        self,
+        scene: Scene,
+        index: int,
+        X_WB: Sequence[RigidTransform],
+        placement: Placement,
+        records: Sequence[ActionRecord],
+    ) -> str:
+        cause = super().find_cause(scene, index, X_WB, placement, records)
+        if cause != MISPLACED:
+            return cause
+        if X_WB[index].rotation().matrix()[2, 2] < _UPRIGHT:
+            return TOPPLED
+        if scene.success.share(placement, X_WB[index]) > 1 - 1e-9:
+            # It is where it belongs, before what has to be there first.
+            return PREREQUISITE_MISSING
+        return cause
+
+
+@dataclass
+class PoseTask(RavensTask):
+    """A task whose objects are to come to rest in given poses."""
+
+    # An object is in place within this distance of its goal, seen from above, in m, ...
+    position_threshold: float = bounded(0.01, 1e-4, 0.5)
+
+    # ... and within this angle of its heading, modulo the object's symmetry, in degrees.
+    angle_threshold_deg: float = bounded(15.0, 0.1, 180.0)
+
+    @property
+    def success(self) -> PoseWithin:
+        """The task's success predicate."""
+        return PoseWithin(self.position_threshold, math.radians(self.angle_threshold_deg))

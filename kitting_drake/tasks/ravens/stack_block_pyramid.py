@@ -1,0 +1,79 @@
+"""stack-block-pyramid: six cubes of six colours are stacked on a base, row by row."""
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from pydrake.math import RigidTransform, RollPitchYaw
+
+from kitting_drake.common.paths import MODELS
+from kitting_drake.tasks.ravens.boxes import COLOURS, CUBE_FOOTPRINT, CUBE_SIDE, cube_object
+from kitting_drake.tasks.ravens.ravens_task import PoseTask
+from kitting_drake.tasks.sampling import Footprint, draw_poses, rectangle
+from kitting_drake.tasks.task import Fixture, Scene
+from systems.grasp import Grasp
+from systems.placement import Goal
+from systems.signals import PixelGrid
+
+_ROWS = (("purple", "blue", "green"), ("yellow", "orange"), ("red",))
+"""The colours of the rows, from the bottom up."""
+_PITCH = 0.05
+"""Between the cubes of a row, along y of the base, in metres."""
+_BASE_SIZE = (0.05, 0.15, 0.005)
+
+_BASE = Footprint(
+    (rectangle(*_BASE_SIZE[:2]),),
+    tuple(Grasp(0.0, y, math.pi / 2, CUBE_SIDE, CUBE_SIDE) for y in (-_PITCH, 0.0, _PITCH)),
+    tall=True,
+)
+
+
+@dataclass
+class StackBlockPyramid(PoseTask):
+    """Six cubes are stacked to a pyramid."""
+
+    def make_scene(self, *, grid: PixelGrid, seed: int, base: Path) -> Scene:
+        names = [name for row in _ROWS for name in row]
+        X_WBase, *X_WCubes = draw_poses(
+            [_BASE] + [CUBE_FOOTPRINT] * len(names), grid=grid, rng=np.random.default_rng(seed)
+        )
+        return Scene(
+            objects=tuple(
+                cube_object(f"{name}_cube", COLOURS[name], X_WCube)
+                for name, X_WCube in zip(names, X_WCubes, strict=True)
+            ),
+            fixtures=(Fixture("base", MODELS / "ravens" / "pyramid_base.sdf", X_WBase),),
+            goals=_goals(X_WBase),
+            success=self.success,
+            max_actions=12,
+        )
+
+
+def _goals(X_WBase: RigidTransform) -> tuple[Goal, ...]:
+    """A goal for each place of the pyramid, row by row.
+
+    Any cube of a row may be at any place of it. A row counts once the one below it is complete.
+    """
+    goals: list[Goal] = []
+    below: tuple[int, ...] = ()
+    first = 0
+    for level, row in enumerate(_ROWS):
+        cubes = tuple(range(first, first + len(row)))
+        for place in range(len(row)):
+            y = (place - (len(row) - 1) / 2) * _PITCH
+            z = _BASE_SIZE[2] + level * CUBE_SIDE
+            goals.append(
+                Goal(
+                    name=f"row {level + 1}, place {place + 1}",
+                    objects=cubes,
+                    poses=tuple(
+                        X_WBase @ RigidTransform(RollPitchYaw(0, 0, turn * math.pi / 2), [0, y, z])
+                        for turn in range(4)
+                    ),
+                    reward=1 / 6,
+                    after=below,
+                )
+            )
+        below, first = cubes, first + len(row)
+    return tuple(goals)

@@ -1,0 +1,136 @@
+"""Rewards of the tasks of Ravens, whole and partial, and why objects fail; no physics."""
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+
+import pytest
+from pydrake.math import RigidTransform, RollPitchYaw
+from pydrake.multibody.tree import BodyIndex
+
+from kitting_drake.tasks import (
+    AlignBoxCorner,
+    BlockInsertion,
+    PlaceRedInGreen,
+    StackBlockPyramid,
+)
+from kitting_drake.tasks.ravens.ravens_task import PREREQUISITE_MISSING, TOPPLED
+from kitting_drake.tasks.task import MISPLACED, NEVER_PICKED, ActionRecord, Scene, TaskConfig
+from systems.placement import PlacedObject, Placement, evaluate_placements, total_reward
+from systems.signals import PixelGrid, PlanarPose
+
+
+def make_scene(task: TaskConfig, seed: int = 0) -> Scene:
+    return task.make_scene(grid=PixelGrid(), seed=seed, base=Path())
+
+
+def initial_poses(scene: Scene) -> list[RigidTransform]:
+    return [item.X_WB for item in scene.objects]
+
+
+def placements(scene: Scene, poses: Sequence[RigidTransform]) -> list[Placement]:
+    objects = [
+        PlacedObject(item.name, BodyIndex(index), item.p_BPoints, item.symmetry)
+        for index, item in enumerate(scene.objects)
+    ]
+    return evaluate_placements(objects, scene.goals, scene.success, poses)
+
+
+def reward(scene: Scene, poses: Sequence[RigidTransform]) -> float:
+    return total_reward(scene.goals, placements(scene, poses))
+
+
+def moved(X_WB: RigidTransform, *, x: float = 0.0, z: float = 0.0, yaw_deg: float = 0.0):
+    """Rotated about its own origin, then moved along world x and z."""
+    rotation = RigidTransform(RollPitchYaw(0, 0, math.radians(yaw_deg)), [0, 0, 0])
+    return RigidTransform([x, 0, z]) @ X_WB @ rotation
+
+
+@pytest.mark.parametrize("kind", [AlignBoxCorner, BlockInsertion])
+def test_one_object_is_in_place_within_10_mm_and_15_degrees(kind: type[TaskConfig]):
+    scene = make_scene(kind())
+    assert reward(scene, initial_poses(scene)) == 0
+    for X_WGoal in scene.goals[0].poses:
+        assert reward(scene, [X_WGoal]) == 1
+        assert reward(scene, [moved(X_WGoal, x=0.009, z=0.02)]) == 1
+        assert reward(scene, [moved(X_WGoal, x=0.011)]) == 0
+    (X_WGoal, *_) = scene.goals[0].poses
+    # The middle of the L-block is beside the origin about which it is rotated here.
+    assert reward(scene, [moved(X_WGoal, yaw_deg=14 if kind is AlignBoxCorner else 10)]) == 1
+    assert reward(scene, [moved(X_WGoal, yaw_deg=16)]) == 0
+
+
+def test_a_box_may_have_any_of_its_corners_in_the_marker():
+    scene = make_scene(AlignBoxCorner())
+    (marker,) = scene.fixtures
+    corners = []
+    for X_WGoal in scene.goals[0].poses:
+        p_MarkerPoints = (marker.X_WF.inverse() @ X_WGoal).multiply(scene.objects[0].p_BPoints.T)
+        assert p_MarkerPoints.min(axis=1) == pytest.approx([0, 0, 0], abs=1e-12)
+        corners.append((X_WGoal.inverse() @ marker.X_WF.translation())[:2])
+    assert {tuple(math.copysign(1, value) for value in corner) for corner in corners} == {
+        (1, 1),
+        (1, -1),
+        (-1, 1),
+        (-1, -1),
+    }
+
+
+def test_each_red_cube_in_any_green_bowl_has_its_share():
+    scene = next(
+        s for s in (make_scene(PlaceRedInGreen(), i) for i in range(50)) if len(s.goals) == 3
+    )
+    bowls, poses = scene.goals[0].poses, initial_poses(scene)
+    assert reward(scene, poses) == 0
+    poses[0] = moved(bowls[0], x=0.049, yaw_deg=77)
+    assert reward(scene, poses) == pytest.approx(1 / 3)
+    poses[1] = moved(bowls[1], x=-0.049)
+    assert reward(scene, poses) == pytest.approx(2 / 3)
+    # Two in one bowl count as well.
+    poses[2] = moved(bowls[1], x=0.03)
+    assert reward(scene, poses) == pytest.approx(1)
+    poses[2] = moved(bowls[1], x=0.051)
+    assert reward(scene, poses) == pytest.approx(2 / 3)
+    # A cube of another colour is worth nothing.
+    poses[2], poses[3] = scene.objects[2].X_WB, bowls[2]
+    assert reward(scene, poses) == pytest.approx(2 / 3)
+
+
+def test_a_pyramid_counts_row_by_row():
+    scene = make_scene(StackBlockPyramid())
+    places = [goal.poses[0] for goal in scene.goals]
+    start = initial_poses(scene)
+    assert reward(scene, start) == 0
+    for done, expected in enumerate([0, 1 / 6, 2 / 6, 3 / 6, 4 / 6, 5 / 6, 1]):
+        assert reward(scene, places[:done] + start[done:]) == pytest.approx(expected)
+    # Within a row places may be exchanged, and quarter turns cannot be told.
+    exchanged = [places[2], moved(places[0], yaw_deg=90), places[1], *places[3:]]
+    assert reward(scene, exchanged) == pytest.approx(1)
+    # A cube of another row may not stand in for it, ...
+    wrong = [places[5], *places[1:5], places[0]]
+    assert reward(scene, wrong) == pytest.approx(2 / 6)
+    # ... and what is above an incomplete row does not count.
+    assert reward(scene, [start[0], *places[1:]]) == pytest.approx(2 / 6)
+
+
+def test_cubes_of_the_pyramid_touch_those_below():
+    scene = make_scene(StackBlockPyramid())
+    heights = [goal.poses[0].translation()[2] for goal in scene.goals]
+    assert heights == pytest.approx([0.005] * 3 + [0.045] * 2 + [0.085])
+
+
+def test_causes_of_failure():
+    task = StackBlockPyramid()
+    scene = make_scene(task)
+    places = [goal.poses[0] for goal in scene.goals]
+    tilted = places[3] @ RigidTransform(RollPitchYaw(math.pi / 2, 0, 0), [0, 0, 0])
+    poses = [scene.objects[0].X_WB, *places[1:3], tilted, places[4], moved(places[5], x=0.02)]
+    measured = placements(scene, poses)
+    pose = PlanarPose()
+    records = [
+        ActionRecord(item.name, "cube", "placed", pose, pose, 0.0, 0.0, 0.0, 0.0)
+        for item in scene.objects[1:]
+    ]
+    causes = [task.find_cause(scene, i, poses, measured[i], records) for i in (0, 3, 4, 5)]
+    assert causes == [NEVER_PICKED, TOPPLED, PREREQUISITE_MISSING, MISPLACED]
+    assert set(causes) <= set(task.causes)

@@ -1,0 +1,215 @@
+"""What the scenes of the tasks of Ravens promise, checked on the geometry that the plant has."""
+
+import dataclasses
+import functools
+from pathlib import Path
+
+import numpy as np
+import pytest
+from pydrake.geometry import HydroelasticContactRepresentation
+from pydrake.math import RigidTransform
+from pydrake.systems.analysis import Simulator
+
+from kitting_drake.cell import Cell, build_cell
+from kitting_drake.common.errors import UserError
+from kitting_drake.scenario.schema import Scenario
+from kitting_drake.tasks import (
+    AlignBoxCorner,
+    BlockInsertion,
+    PlaceRedInGreen,
+    StackBlockPyramid,
+)
+from kitting_drake.tasks.task import Scene, TaskConfig
+from systems.grasp import Grasp
+from systems.oracle_policy import gripper_pose
+from systems.pick_place_parameters import PickPlaceParameters
+from systems.signals import PixelGrid
+
+TASKS = [AlignBoxCorner, BlockInsertion, PlaceRedInGreen, StackBlockPyramid]
+SEEDS = range(3)
+
+each_task = pytest.mark.parametrize("kind", TASKS)
+
+
+def make_scene(task: TaskConfig, seed: int) -> Scene:
+    return task.make_scene(grid=PixelGrid(), seed=seed, base=Path())
+
+
+@functools.cache
+def shared_cell(kind: type[TaskConfig], seed: int) -> Cell:
+    return build_cell(Scenario(task=kind(), cameras={}), seed=seed, base=Path())
+
+
+class Posed:
+    """A scene whose objects and hand are put where a test wants them.
+
+    Objects float a little above what they stand on, the higher the more: what rests on something
+    does not touch it, and any contact is one that should not be.
+    """
+
+    def __init__(self, kind: type[TaskConfig], seed: int) -> None:
+        cell = shared_cell(kind, seed)
+        self.scene, self._plant, self._bodies = cell.scene, cell.plant, cell.objects
+        self._root = cell.diagram.CreateDefaultContext()
+        self._context = cell.plant.GetMyMutableContextFromRoot(self._root)
+        self.poses = [item.X_WB for item in self.scene.objects]
+        for index, X_WB in enumerate(self.poses):
+            self.put(index, X_WB)
+
+    def put(self, index: int, X_WB: RigidTransform) -> None:
+        self.poses[index] = X_WB
+        raised = RigidTransform([0, 0, 0.0015 + 0.05 * X_WB.translation()[2]]) @ X_WB
+        body = self._plant.get_body(self._bodies[index].body)
+        self._plant.SetFreeBodyPose(self._context, body, raised)
+
+    def take_away(self, index: int) -> None:
+        self.put(index, RigidTransform([index, 3.0, 1.0]))
+
+    def put_hand(self, index: int, grasp: Grasp, opening: float) -> None:
+        """Puts the hand to where it grasps an object; an opening in metres."""
+        gripper = gripper_pose(self.poses[index], grasp)
+        z = self.poses[index].translation()[2] + grasp.surface_height
+        z -= PickPlaceParameters().grasp_depth
+        self._plant.SetPositions(
+            self._context,
+            self._plant.GetModelInstanceByName("franka_hand"),
+            [gripper.x, gripper.y, z, gripper.theta, opening / 2, opening / 2],
+        )
+
+    def contacts(self) -> set[tuple[str, ...]]:
+        """The pairs of bodies that touch, by name."""
+        query = self._plant.get_geometry_query_input_port().Eval(self._context)
+        inspector = query.inspector()
+        surfaces = query.ComputeContactSurfaces(HydroelasticContactRepresentation.kPolygon)
+        return {
+            tuple(
+                str(self._plant.GetBodyFromFrameId(inspector.GetFrameId(geometry)).scoped_name())
+                for geometry in (surface.id_M(), surface.id_N())
+            )
+            for surface in surfaces
+        }
+
+
+@each_task
+def test_the_seed_is_the_scene(kind: type[TaskConfig]):
+    def drawn(seed: int) -> tuple:
+        scene = make_scene(kind(), seed)
+        return (
+            [(item.name, item.model, item.X_WB.GetAsMatrix4().tolist()) for item in scene.objects],
+            [(it.name, it.model, it.X_WF.GetAsMatrix4().tolist()) for it in scene.fixtures],
+        )
+
+    assert drawn(3) == drawn(3)
+    assert drawn(3) != drawn(4)
+
+
+@each_task
+def test_everything_lies_in_the_workspace(kind: type[TaskConfig]):
+    for seed in range(10):
+        scene = make_scene(kind(), seed)
+        for item in scene.objects:
+            corners = item.X_WB.multiply(item.p_BPoints.T)
+            assert 0.25 <= corners[0].min() < corners[0].max() <= 0.75, seed
+            assert -0.5 <= corners[1].min() < corners[1].max() <= 0.5, seed
+            assert corners[2].min() == pytest.approx(item.X_WB.translation()[2])
+        for goal in scene.goals:
+            points = scene.objects[goal.objects[0]].p_BPoints.T
+            for X_WGoal in goal.poses:
+                assert PixelGrid().contains(X_WGoal.multiply(points)[:2].T).all(), seed
+
+
+@each_task
+@pytest.mark.parametrize("seed", SEEDS)
+def test_objects_are_free_and_the_open_hand_reaches_them(kind: type[TaskConfig], seed: int):
+    """One after another, from the top, by any of its grasps; and nothing touches to begin with."""
+    posed = Posed(kind, seed)
+    assert posed.contacts() == set()
+    opening = PickPlaceParameters().open_width
+    height = [X_WB.translation()[2] for X_WB in posed.poses]
+    for index in sorted(posed.scene.goal_objects, key=lambda index: -height[index]):
+        for grasp in posed.scene.objects[index].grasps:
+            posed.put_hand(index, grasp, opening)
+            assert posed.contacts() == set(), (index, grasp)
+        # The jaws do go around it.
+        posed.put_hand(index, grasp, grasp.width - 0.002)
+        assert len(posed.contacts()) >= 2
+        posed.take_away(index)
+
+
+@each_task
+@pytest.mark.parametrize("seed", SEEDS)
+def test_goals_are_free_of_each_other_and_of_the_hand(kind: type[TaskConfig], seed: int):
+    """They are filled in their order, by a hand that opens as it lets go."""
+    posed = Posed(kind, seed)
+    filled: set[int] = set()
+    taken: list[np.ndarray] = []
+    for goal in posed.scene.goals:
+        index = next(index for index in goal.objects if index not in filled)
+        filled.add(index)
+        X_WGoal = next(
+            X for X in goal.poses if all(np.linalg.norm(X.translation() - p) > 0.01 for p in taken)
+        )
+        taken.append(X_WGoal.translation())
+        posed.put(index, X_WGoal)
+        obstructed = []
+        for grasp in posed.scene.objects[index].grasps:
+            posed.put_hand(index, grasp, grasp.width + 2 * PickPlaceParameters().release_clearance)
+            obstructed.append(posed.contacts())
+        assert set() in obstructed, goal.name
+
+
+@each_task
+def test_objects_come_to_rest_at_once(kind: type[TaskConfig]):
+    """Light and stiff boxes must not chatter on the table: what rests costs nothing."""
+    cell = shared_cell(kind, 1)
+    simulator = Simulator(cell.diagram)
+    simulator.AdvanceTo(0.4)
+    assert cell.at_rest(simulator.get_context()).all()
+    for X_WB, item in zip(
+        cell.object_poses(simulator.get_context()), cell.scene.objects, strict=True
+    ):
+        assert X_WB.IsNearlyEqualTo(item.X_WB, 1e-5)
+
+
+def test_surface_points_span_the_object():
+    """Positions are compared in the middle of their bounding box, rewards depend on it."""
+    block = make_scene(BlockInsertion(), 0).objects[0]
+    np.testing.assert_allclose(block.p_BPoints.min(axis=0), [-0.015, -0.015, 0], atol=1e-12)
+    np.testing.assert_allclose(block.p_BPoints.max(axis=0), [0.065, 0.065, 0.04], atol=1e-12)
+    box = make_scene(AlignBoxCorner(), 0).objects[0]
+    span = np.ptp(box.p_BPoints, axis=0)
+    assert 0.03 <= span[0] <= 0.07
+    assert 0.03 <= span[1] <= 0.07
+    assert 0.03 <= span[2] <= 0.06
+    assert box.symmetry == 2
+    assert [grasp.width for grasp in box.grasps] == pytest.approx(sorted(span[:2]))
+
+
+def test_red_in_green_draws_bowls_cubes_and_distractors():
+    counts = set()
+    for seed in range(20):
+        scene = make_scene(PlaceRedInGreen(), seed)
+        red = [item for item in scene.objects if item.name.endswith("_red")]
+        green = [item for item in scene.fixtures if item.name.endswith("_green")]
+        assert [scene.objects.index(item) for item in red] == list(scene.goal_objects)
+        assert len(scene.goals) == len(red) <= len(green) == len(scene.goals[0].poses) <= 3
+        assert len(scene.objects) + len(scene.fixtures) == len(red) + len(green) + 10
+        counts.add((len(green), len(red)))
+    assert len(counts) >= 5
+
+
+@each_task
+def test_only_the_task_as_it_is_has_the_name_of_the_literature(kind: type[TaskConfig]):
+    task = kind()
+    assert task.title == "".join(f"-{c.lower()}" if c.isupper() else c for c in kind.__name__)[1:]
+    changes = [item for item in dataclasses.fields(task) if isinstance(item.default, int | float)]
+    for change in changes:
+        changed = dataclasses.replace(task, **{change.name: getattr(task, change.name) / 2})
+        assert changed.title == f"{task.title}, changed"
+
+
+def test_ranges_the_wrong_way_round_are_told():
+    with pytest.raises(ValueError, match=r"task\.box_sides must be the least and then"):
+        AlignBoxCorner(box_sides=[0.06, 0.04]).validate()
+    with pytest.raises(UserError, match="no free space"):
+        PlaceRedInGreen().make_scene(grid=PixelGrid(rows=50, cols=100), seed=0, base=Path())
