@@ -89,8 +89,6 @@ def draw_networks(measured: dict[str, Any], path: Path) -> None:
 
 def _draw_pick_angle(axis: Any, measured: dict[str, Any], preset: str) -> None:
     """Parameters as bars, and times as lines."""
-    from matplotlib.ticker import LogLocator
-
     rows = [row for row in measured["pick_angle"] if row["preset"] == preset]
     counts = sorted({row["orientations"] for row in rows})
     places = {n: index for index, n in enumerate(counts)}
@@ -123,7 +121,13 @@ def _draw_pick_angle(axis: Any, measured: dict[str, Any], preset: str) -> None:
     axis.set_xlabel("orientations N")
     axis.set_title(f"Pick angle: parameters and time, preset {preset}")
 
-    times = axis.twinx()
+    _draw_times(axis.twinx(), rows, places)
+
+
+def _draw_times(times: Any, rows: list[dict[str, Any]], places: dict[int, int]) -> None:
+    """A line for each method, labelled with its times."""
+    from matplotlib.ticker import LogLocator
+
     times.spines["right"].set_visible(True)
     times.set_yscale("log")
     times.set_ylabel("time of an inference (lines)")

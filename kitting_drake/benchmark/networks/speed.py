@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from kitting_drake.benchmark.networks.bench import Bench, times_of, type_name
-from kitting_drake.benchmark.networks.timing import count_operations, read_clock
+from kitting_drake.benchmark.networks.timing import Timing, count_operations, read_clock
 from kitting_drake.policies.config import NetworkConfig
 from kitting_drake.policies.escnn_reference import as_escnn
 from kitting_drake.policies.learned_policy import LearnedPolicy
@@ -38,44 +38,13 @@ def measure_folding(bench: Bench) -> dict[str, Any]:
         alpha's output from plain escnn's, relative to its standard deviation; and
         `alpha_operations` of one inference.
     """
-    config = NetworkConfig("so2", bench.plan.preset)
-    ours = make_networks(config)
-    assert isinstance(ours, SO2Networks)
-    types = [type_ for type_ in (torch.float32, torch.bfloat16) if type_ in bench.peak]
-    # Pairs for training and for inference. escnn in eval mode keeps the kernels it has expanded.
-    ways: dict[str, tuple[Networks, Networks]] = {}
-    for type_ in types:
-        autocast = None if type_ == torch.float32 else type_
-        plain = as_escnn(ours, autocast).eval().requires_grad_(False)
-        ways[f"escnn_{type_name(type_)}"] = (as_escnn(ours, autocast), plain)
-    for type_ in types:
-        ways[f"ours_{type_name(type_)}"] = (_computing_in(ours, type_), bench.export(ours, type_))
-    for pair in ways.values():
-        for networks in pair:
-            networks.to(bench.device)
-
-    trained = {name: pair[0] for name, pair in ways.items()}
+    ways = _ways(bench)
     exported = {name: pair[1] for name, pair in ways.items()}
-    timings = {
-        "training_step": bench.time_each(
-            {name: _training(networks, bench.scene) for name, networks in trained.items()},
-            training=True,
-        ),
-        "alpha_training_step": bench.time_each(
-            {name: _stepping(*_alpha(networks, bench)) for name, networks in trained.items()},
-            training=True,
-        ),
-        "decision": bench.time_each(
-            {name: _deciding(networks, bench) for name, networks in exported.items()}
-        ),
-        "alpha_inference": bench.time_each(
-            {name: _inferring(*_alpha(networks, bench)) for name, networks in exported.items()}
-        ),
-    }
+    timings = _time_ways(bench, ways)
     baseline = next(iter(ways))
     with torch.inference_mode():
         outputs = {
-            name: networks.predict_pick(bench.image, config.orientations).position
+            name: networks.predict_pick(bench.image, networks.config.orientations).position
             for name, networks in exported.items()
         }
     exact = outputs[baseline]
@@ -99,6 +68,49 @@ def measure_folding(bench: Bench) -> dict[str, Any]:
             name: count_operations(_inferring(*_alpha(exported[f"{name}_float32"], bench)))
             for name in ("escnn", "ours")
         },
+    }
+
+
+def _ways(bench: Bench) -> dict[str, tuple[Networks, Networks]]:
+    """The same networks in each way to run them: one for training, and one for inference."""
+    ours = make_networks(NetworkConfig("so2", bench.plan.preset))
+    assert isinstance(ours, SO2Networks)
+    types = [type_ for type_ in (torch.float32, torch.bfloat16) if type_ in bench.peak]
+    ways: dict[str, tuple[Networks, Networks]] = {}
+    for type_ in types:
+        autocast = None if type_ == torch.float32 else type_
+        # In evaluation mode escnn keeps the kernels that it has expanded.
+        plain = as_escnn(ours, autocast).eval().requires_grad_(False)
+        ways[f"escnn_{type_name(type_)}"] = (as_escnn(ours, autocast), plain)
+    for type_ in types:
+        ways[f"ours_{type_name(type_)}"] = (_computing_in(ours, type_), bench.export(ours, type_))
+    for pair in ways.values():
+        for networks in pair:
+            networks.to(bench.device)
+    return ways
+
+
+def _time_ways(
+    bench: Bench, ways: dict[str, tuple[Networks, Networks]]
+) -> dict[str, dict[str, Timing]]:
+    """Each of `MEASURES` for each way to run the networks."""
+    trained = {name: pair[0] for name, pair in ways.items()}
+    exported = {name: pair[1] for name, pair in ways.items()}
+    return {
+        "training_step": bench.time_each(
+            {name: _training(networks, bench.scene) for name, networks in trained.items()},
+            training=True,
+        ),
+        "alpha_training_step": bench.time_each(
+            {name: _stepping(*_alpha(networks, bench)) for name, networks in trained.items()},
+            training=True,
+        ),
+        "decision": bench.time_each(
+            {name: _deciding(networks, bench) for name, networks in exported.items()}
+        ),
+        "alpha_inference": bench.time_each(
+            {name: _inferring(*_alpha(networks, bench)) for name, networks in exported.items()}
+        ),
     }
 
 
