@@ -18,12 +18,7 @@ from pydrake.geometry import (
     SceneGraph,
 )
 from pydrake.math import RigidTransform
-from pydrake.multibody.parsing import Parser
-from pydrake.multibody.plant import (
-    AddMultibodyPlant,
-    MultibodyPlant,
-    MultibodyPlantConfig,
-)
+from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import RigidBody
 from pydrake.systems.framework import Context, Diagram, DiagramBuilder, LeafSystem
 from pydrake.systems.sensors import RgbdSensor
@@ -39,8 +34,8 @@ from kitting_drake.cell.cameras import (
     depth_camera,
     picture_camera,
 )
+from kitting_drake.cell.plant import add_models, add_plant, bounding_box, set_initial_poses
 from kitting_drake.common.errors import UserError
-from kitting_drake.common.paths import MODELS
 from kitting_drake.scenario.policies import DecisionObserver, PolicySite
 from kitting_drake.scenario.schema import Scenario
 from kitting_drake.tasks.task import Scene
@@ -48,12 +43,11 @@ from systems.heightmap_projector import HeightmapProjector
 from systems.pick_place_planner import PickPlacePlanner
 from systems.placement import PlacedObject, Placement
 from systems.placement_monitor import PlacementMonitor
-from systems.rest_detector import BoundedBody, RestDetector
+from systems.rest_detector import RestDetector
 from systems.signals import PixelGrid
 from systems.trajectory_controller import TrajectoryController
 
 MESHCAT_PERIOD = 1 / 32
-_X_WTABLE = RigidTransform([0.5, 0.0, 0.0])
 
 
 @dataclass(frozen=True)
@@ -152,24 +146,18 @@ def build_cell(
     builder = DiagramBuilder()
 
     # The plant: table, fixtures, objects, hand.
-    plant, scene_graph = _add_plant(builder, scenario)
-    objects, still_bodies = _add_models(plant, scene)
+    plant, scene_graph = add_plant(builder, scenario)
+    objects, still_bodies = add_models(plant, scene)
     plant.Finalize()
-    _set_initial_poses(plant, scenario, scene, objects)
+    set_initial_poses(plant, scenario, scene, objects)
 
-    # Cameras and policy.
-    site = PolicySite(scene=scene, objects=objects, grid=grid, base=base, observer=observer)
+    # Cameras, policy, planner and controller.
     projector = None
     if scenario.policy.needs_observation or (scenario.cameras and can_render()):
         projector = _add_cameras(builder, scenario, scene_graph, grid)
         builder.ExportOutput(projector.GetOutputPort("observation"), "observation")
-    policy = builder.AddNamedSystem("policy", scenario.policy.make_system(site))
-    if scenario.policy.needs_observation:
-        assert projector is not None
-        builder.Connect(projector.GetOutputPort("observation"), policy.GetInputPort("observation"))
-    else:
-        builder.Connect(plant.get_body_poses_output_port(), policy.GetInputPort("body_poses"))
-
+    site = PolicySite(scene=scene, objects=objects, grid=grid, base=base, observer=observer)
+    policy = _add_policy(builder, scenario, site, plant, projector)
     planner = _add_planner_and_controller(builder, scenario, scene, plant, policy, projector)
 
     # Score and rest.
@@ -214,6 +202,23 @@ def build_cell(
     )
 
 
+def _add_policy(
+    builder: DiagramBuilder,
+    scenario: Scenario,
+    site: PolicySite,
+    plant: MultibodyPlant,
+    projector: HeightmapProjector | None,
+) -> LeafSystem:
+    """Adds the scenario's policy, connected to what it looks at."""
+    policy = builder.AddNamedSystem("policy", scenario.policy.make_system(site))
+    if scenario.policy.needs_observation:
+        assert projector is not None
+        builder.Connect(projector.GetOutputPort("observation"), policy.GetInputPort("observation"))
+    else:
+        builder.Connect(plant.get_body_poses_output_port(), policy.GetInputPort("body_poses"))
+    return policy
+
+
 def _add_planner_and_controller(
     builder: DiagramBuilder,
     scenario: Scenario,
@@ -249,62 +254,6 @@ def _add_planner_and_controller(
     return planner
 
 
-def _add_plant(builder: DiagramBuilder, scenario: Scenario) -> tuple[MultibodyPlant, SceneGraph]:
-    config = MultibodyPlantConfig(
-        time_step=scenario.plant.time_step,
-        # Strict: a pair that cannot be hydroelastic is an error, not a point contact in disguise.
-        contact_model="hydroelastic",
-        discrete_contact_approximation=scenario.plant.contact_approximation,
-    )
-    return AddMultibodyPlant(config, builder)
-
-
-def _add_models(
-    plant: MultibodyPlant, scene: Scene
-) -> tuple[tuple[PlacedObject, ...], tuple[RigidBody, ...]]:
-    """Adds everything that the plant holds.
-
-    Returns:
-        The scene's objects with their bodies, and the bodies that never move.
-    """
-    parser = Parser(plant)
-    # The same model may be there several times.
-    parser.SetAutoRenaming(True)
-    parser.package_map().AddPackageXml(str(MODELS / "package.xml"))
-    still = [_add_body(plant, parser, MODELS / "table" / "table.sdf")]
-    plant.WeldFrames(plant.world_frame(), still[0].body_frame(), _X_WTABLE)
-    for fixture in scene.fixtures:
-        still.append(_add_body(plant, parser, fixture.model))
-        plant.WeldFrames(plant.world_frame(), still[-1].body_frame(), fixture.X_WF)
-    objects = []
-    for item in scene.objects:
-        body = _add_body(plant, parser, item.model)
-        objects.append(PlacedObject(item.name, body.index(), item.p_BPoints, item.symmetry))
-    parser.AddModels(str(MODELS / "franka_hand" / "franka_hand.sdf"))
-    return tuple(objects), tuple(still)
-
-
-def _add_body(plant: MultibodyPlant, parser: Parser, model: Path) -> RigidBody:
-    try:
-        (instance,) = parser.AddModels(str(model))
-        (body,) = plant.GetBodyIndices(instance)
-    except (RuntimeError, ValueError) as error:
-        reason = str(error).splitlines()[0]
-        raise UserError(f"task: {model} cannot be loaded: {reason}") from error
-    return plant.get_body(body)
-
-
-def _set_initial_poses(
-    plant: MultibodyPlant, scenario: Scenario, scene: Scene, objects: tuple[PlacedObject, ...]
-) -> None:
-    for placed, item in zip(objects, scene.objects, strict=True):
-        plant.SetDefaultFloatingBaseBodyPose(plant.get_body(placed.body), item.X_WB)
-    for joint, position in zip(("x", "y", "z", "yaw"), scenario.planner.home, strict=True):
-        plant.GetJointByName(joint).set_default_positions([position])
-    for joint in ("left_finger_slide", "right_finger_slide"):
-        plant.GetJointByName(joint).set_default_positions([scenario.planner.open_width / 2])
-
-
 def _make_controller(scenario: Scenario, plant: MultibodyPlant) -> TrajectoryController:
     config = scenario.controller
     context = plant.CreateDefaultContext()
@@ -334,26 +283,13 @@ def _make_rest_detector(
 ) -> RestDetector:
     hand = [plant.GetBodyByName(name) for name in ("hand", "left_finger", "right_finger")]
     return RestDetector(
-        objects=[_bounded(plant, scene_graph, plant.get_body(item.body)) for item in objects],
-        movers=[_bounded(plant, scene_graph, body) for body in hand],
+        objects=[bounding_box(plant, scene_graph, plant.get_body(item.body)) for item in objects],
+        movers=[bounding_box(plant, scene_graph, body) for body in hand],
         linear_speed=scenario.sleep.linear_speed,
         angular_speed=scenario.sleep.angular_speed,
         time_to_sleep=scenario.sleep.time_to_sleep,
         wake_distance=scenario.sleep.wake_distance,
     )
-
-
-def _bounded(plant: MultibodyPlant, scene_graph: SceneGraph, body: RigidBody) -> BoundedBody:
-    inspector = scene_graph.model_inspector()
-    corners = []
-    for geometry in plant.GetCollisionGeometriesForBody(body):
-        box = inspector.GetObbInGeometryFrame(geometry)
-        half = np.asarray(box.half_width())
-        signs = np.array(np.meshgrid(*[(-1, 1)] * 3)).reshape(3, -1)
-        X_BBox = inspector.GetPoseInFrame(geometry) @ box.pose()
-        corners.append(X_BBox.multiply(half[:, None] * signs))
-    points = np.concatenate(corners, axis=1)
-    return BoundedBody(body.index(), points.min(axis=1), points.max(axis=1))
 
 
 def _add_cameras(

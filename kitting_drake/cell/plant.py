@@ -1,0 +1,97 @@
+"""The cell's plant: table, fixtures, objects and hand."""
+
+from pathlib import Path
+
+import numpy as np
+from pydrake.geometry import SceneGraph
+from pydrake.math import RigidTransform
+from pydrake.multibody.parsing import Parser
+from pydrake.multibody.plant import AddMultibodyPlant, MultibodyPlant, MultibodyPlantConfig
+from pydrake.multibody.tree import RigidBody
+from pydrake.systems.framework import DiagramBuilder
+
+from kitting_drake.common.errors import UserError
+from kitting_drake.common.paths import MODELS
+from kitting_drake.scenario.schema import Scenario
+from kitting_drake.tasks.task import Scene
+from systems.placement import PlacedObject
+from systems.rest_detector import BoundedBody
+
+_X_WTABLE = RigidTransform([0.5, 0.0, 0.0])
+
+
+def add_plant(builder: DiagramBuilder, scenario: Scenario) -> tuple[MultibodyPlant, SceneGraph]:
+    """Adds an empty plant, in strictly hydroelastic contact."""
+    config = MultibodyPlantConfig(
+        time_step=scenario.plant.time_step,
+        # Strict: a pair that cannot be hydroelastic is an error, not a point contact in disguise.
+        contact_model="hydroelastic",
+        discrete_contact_approximation=scenario.plant.contact_approximation,
+    )
+    return AddMultibodyPlant(config, builder)
+
+
+def add_models(
+    plant: MultibodyPlant, scene: Scene
+) -> tuple[tuple[PlacedObject, ...], tuple[RigidBody, ...]]:
+    """Adds the table, the scene's fixtures and objects, and the hand.
+
+    Returns:
+        The scene's objects with their bodies, and the bodies that never move.
+
+    Raises:
+        UserError: a model cannot be loaded, or is not of one link.
+    """
+    parser = Parser(plant)
+    # The same model may be there several times.
+    parser.SetAutoRenaming(True)
+    parser.package_map().AddPackageXml(str(MODELS / "package.xml"))
+    still = [_add_body(plant, parser, MODELS / "table" / "table.sdf")]
+    plant.WeldFrames(plant.world_frame(), still[0].body_frame(), _X_WTABLE)
+    for fixture in scene.fixtures:
+        still.append(_add_body(plant, parser, fixture.model))
+        plant.WeldFrames(plant.world_frame(), still[-1].body_frame(), fixture.X_WF)
+    objects = []
+    for item in scene.objects:
+        body = _add_body(plant, parser, item.model)
+        objects.append(PlacedObject(item.name, body.index(), item.p_BPoints, item.symmetry))
+    parser.AddModels(str(MODELS / "franka_hand" / "franka_hand.sdf"))
+    return tuple(objects), tuple(still)
+
+
+def _add_body(plant: MultibodyPlant, parser: Parser, model: Path) -> RigidBody:
+    try:
+        instances = parser.AddModels(str(model))
+    except (RuntimeError, ValueError) as error:
+        reason = str(error).splitlines()[0]
+        raise UserError(f"task: {model} cannot be loaded: {reason}") from error
+    bodies = [body for instance in instances for body in plant.GetBodyIndices(instance)]
+    if len(bodies) != 1:
+        raise UserError(f"task: {model} has {len(bodies)} links: it must have one")
+    return plant.get_body(bodies[0])
+
+
+def set_initial_poses(
+    plant: MultibodyPlant, scenario: Scenario, scene: Scene, objects: tuple[PlacedObject, ...]
+) -> None:
+    """Makes the scene's poses, and the hand at home with open jaws, the plant's default state."""
+    for placed, item in zip(objects, scene.objects, strict=True):
+        plant.SetDefaultFloatingBaseBodyPose(plant.get_body(placed.body), item.X_WB)
+    for joint, position in zip(("x", "y", "z", "yaw"), scenario.planner.home, strict=True):
+        plant.GetJointByName(joint).set_default_positions([position])
+    for joint in ("left_finger_slide", "right_finger_slide"):
+        plant.GetJointByName(joint).set_default_positions([scenario.planner.open_width / 2])
+
+
+def bounding_box(plant: MultibodyPlant, scene_graph: SceneGraph, body: RigidBody) -> BoundedBody:
+    """A body with a box around its collision geometry."""
+    inspector = scene_graph.model_inspector()
+    corners = []
+    for geometry in plant.GetCollisionGeometriesForBody(body):
+        box = inspector.GetObbInGeometryFrame(geometry)
+        half = np.asarray(box.half_width())
+        signs = np.array(np.meshgrid(*[(-1, 1)] * 3)).reshape(3, -1)
+        X_BBox = inspector.GetPoseInFrame(geometry) @ box.pose()
+        corners.append(X_BBox.multiply(half[:, None] * signs))
+    points = np.concatenate(corners, axis=1)
+    return BoundedBody(body.index(), points.min(axis=1), points.max(axis=1))
