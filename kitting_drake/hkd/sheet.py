@@ -64,15 +64,15 @@ def camera_pose(
 
 @dataclass(frozen=True)
 class Subject:
-    """What a picture of the sheet shows."""
+    """The content of one picture of the sheet."""
 
     title: str
     models: Sequence[tuple[Path, RigidTransform]]
-    """SDFormat files of one link each, and where their frames are, in metres."""
+    """SDFormat files of one link each, and the poses of their frames."""
     target: tuple[float, float, float]
-    """What the camera looks at, in metres."""
+    """The point that the camera looks at, in metres."""
     size: float
-    """How much of it the picture shows, side to side, in metres."""
+    """The width of the view at the target, in metres."""
     elevation_deg: float = 38.0
 
 

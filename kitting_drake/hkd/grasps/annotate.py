@@ -31,7 +31,7 @@ _HAND_MESHES = MODELS / "franka_hand" / "meshes"
 
 
 def measure_grasp(tool: Tool, x: float, y: float, theta: float) -> Grasp | None:
-    """What the jaws take hold of when they close at a place over a tool.
+    """The grasp that results when the jaws close at a place over a tool.
 
     Args:
         tool: at rest in its frame T.

@@ -1,4 +1,4 @@
-"""What the jaws take hold of when they close on a tool from above.
+"""The grip: the faces between which the jaws hold a tool from above.
 
 The pads close on whatever reaches furthest between them. So a grip is the extent, across the jaws,
 of the part of the surface between two planes: those through the ends of the pads.

@@ -26,9 +26,9 @@ GRASP_DEPTH = _PRIMITIVE.grasp_depth
 FLOOR_CLEARANCE = _PRIMITIVE.floor_clearance
 """The pads are never lower than this above the table."""
 WIDEST = MAX_OPENING - 0.015
-"""What the jaws can take, with a margin on either side."""
+"""The greatest width that the jaws take, with a margin on either side."""
 NARROWEST = _PRIMITIVE.minimum_width
-"""What the jaws can feel."""
+"""The least width that the hand can tell from nothing between its pads."""
 RELEASE_REACH = _PRIMITIVE.release_clearance + FINGERTIP_DEPTH
 """How far the fingertips reach beyond the gripped faces as they let go."""
 
@@ -54,7 +54,7 @@ _DISTINCT, _DISTINCT_ANGLE = 0.012, np.radians(20.0)
 
 @dataclass(frozen=True)
 class GraspProposal(Grasp):
-    """A grasp in frame T with what speaks for and against it."""
+    """A grasp in frame T with the figures that speak for and against it."""
 
     offset: float
     """Distance of the centre of mass from the grasp, seen from above, in metres."""
@@ -67,11 +67,11 @@ class GraspProposal(Grasp):
     overhang: float
     """How far the tool stands out past the gripped faces beside the pads, in metres."""
     penalties: dict[str, float] = field(default_factory=dict)
-    """What makes up the cost, by cause."""
+    """The parts of the cost, by cause."""
 
     @property
     def cost(self) -> float:
-        """By which proposals are ranked: none is perfect, above 3 is poor."""
+        """The sum of the penalties, by which proposals are ranked; above 3 is poor."""
         return sum(self.penalties.values())
 
     @property
@@ -153,7 +153,7 @@ class _Reach:
     """
 
     u_min: float
-    """Where the columns begin; each is `_BIN` long."""
+    """The u at which the columns begin; each is `_BIN` long."""
     left: Array
     """(columns, levels) the greatest v; -inf where there is nothing."""
     right: Array
@@ -162,7 +162,7 @@ class _Reach:
 
 @dataclass(frozen=True)
 class _Hold:
-    """What two pads hold. Lengths in metres; see `GraspProposal`."""
+    """The hold of two pads on a tool. Lengths in metres; see `GraspProposal`."""
 
     middle: float
     """The v halfway between the gripped faces."""
@@ -224,7 +224,7 @@ def _search(
 
 
 def _proposal(hold: _Hold, u: float, theta: float, com: Array) -> GraspProposal:
-    """What is held where the pads' middle is at `u`, as a grasp with its penalties."""
+    """The proposal that a hold makes where the pads' middle is at `u`, with its penalties."""
     along, across = jaw_axes(theta)
     x, y = u * along + hold.middle * across
     lever = abs(u - float(com @ along))
@@ -261,9 +261,9 @@ def _proposal(hold: _Hold, u: float, theta: float, com: Array) -> GraspProposal:
 
 
 def _hold(reach: _Reach, centre: int, levels: Array, touch: float) -> _Hold | None:
-    """What two pads would hold with their middle at a column; None if they cannot hold it.
+    """The hold of two pads with their middle at a column; None if they cannot hold the tool.
 
-    `find_grip` says what is between the pads in all; this, what they touch of it.
+    `find_grip` tells the extent of all that is between the pads; this, how they touch it.
 
     Args:
         reach: of the tool.

@@ -1,1 +1,1 @@
-"""From anyone's mesh to a tool."""
+"""Importing: tools from meshes of any origin."""

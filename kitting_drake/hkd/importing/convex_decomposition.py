@@ -102,7 +102,7 @@ def _halves(part: Manifold) -> tuple[Manifold, Manifold]:
             normal = np.eye(3)[axis]
             halves = part.split_by_plane(tuple(normal), low[axis] + share * size[axis])
             volume = sum(body.hull().volume() for half in halves for body in half.decompose())
-            # Of equal cuts the middle one, which leaves the smallest parts.
+            # Among equal cuts the middle one, which leaves the smallest parts.
             volume *= 1.0 + 0.02 * abs(share - 0.5)
             if volume < best_volume:
                 best, best_volume = halves, volume
@@ -111,7 +111,7 @@ def _halves(part: Manifold) -> tuple[Manifold, Manifold]:
 
 
 def _steps(shares: np.ndarray) -> list[float]:
-    """Where many vertices are in one plane, of a part from 0 to 1: at a shoulder or a jaw's end."""
+    """Places, from 0 to 1, of planes with many vertices: of a shoulder, or of a jaw's end."""
     within = shares[(shares > 0.08) & (shares < 0.92)]
     values, counts = np.unique(np.round(within, 3), return_counts=True)
     order = np.argsort(-counts, kind="stable")[:3]

@@ -18,7 +18,7 @@ MATERIALS = {
     "wrench": "polished_steel",
     "screwdriver": "steel",
 }
-"""What an imported tool of a category looks like."""
+"""The material of which an imported tool of a category seems to be."""
 
 SCALED_LENGTHS_MM = (180.0, 170.0, 160.0, 150.0)
 """A tool is scaled to the first of these at which the hand can hold it and a kit take it."""
@@ -33,7 +33,7 @@ _CREASE_ANGLE_DEG = 35.0
 
 
 def guess_unit(length: float) -> str | None:
-    """In what a hand tool of this length may have been measured, or None if in nothing usual.
+    """The unit in which a hand tool of this length was measured, or None if in nothing usual.
 
     Inches and centimetres overlap; a length below 12 is taken for inches, above for centimetres.
     """

@@ -32,7 +32,7 @@ from kitting_drake.hkd.tools.symmetry import symmetry_order
 from kitting_drake.hkd.tools.tool import CATEGORIES, load_tool, tool_names, user_tools
 
 DENSITIES = {"hammer": 3000.0, "pliers": 6000.0, "wrench": 7850.0, "screwdriver": 2000.0}
-"""What a tool of a category weighs on average, handle and all, in kg/m^3."""
+"""The mean density of a tool of a category, with its handle, in kg/m^3."""
 
 TIME_LIMIT = 55.0
 """Seconds after which the geometry is given up."""
@@ -46,11 +46,11 @@ class ImportRequest:
     mesh: Path
     category: str
     name: str | None = None
-    """Of the tool; from the file's if None."""
+    """The tool's name; that of the file if None."""
     length_mm: float | None = None
-    """To scale it to; see `fit.lengths_to_try` for None."""
+    """The length to scale it to; see `fit.lengths_to_try` for None."""
     density: float | None = None
-    """In kg/m^3; see `DENSITIES` for None."""
+    """The mean density in kg/m^3; see `DENSITIES` for None."""
     output: Path | None = None
     """The folder of tools to write into; `user_tools` if None."""
 
@@ -63,7 +63,7 @@ class ImportReport:
     record: dict[str, Any]
     """The tool's record, as in `tool.yaml`."""
     notes: list[str]
-    """What was assumed and repaired, a phrase each."""
+    """The assumptions and repairs that were made, a phrase each."""
     collision_hulls: int
     """The number of convex hulls of its collision geometry."""
 
@@ -184,7 +184,7 @@ def prepare_tool(request: ImportRequest, name: str, directory: Path) -> Prepared
     """Writes a tool's files into an empty folder.
 
     Returns:
-        Its record, what was assumed and repaired, and the number of its collision hulls.
+        Its record, the assumptions and repairs that were made, and the number of collision hulls.
 
     Raises:
         UserError: it cannot be saved.

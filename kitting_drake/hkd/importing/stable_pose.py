@@ -24,7 +24,7 @@ _END = 0.3
 def to_tool_frame(solid: Manifold, category: str) -> Manifold:
     """The solid (mm) moved into the frame T of a tool of that category; see `Tool`.
 
-    Of all stable poses it takes the one with the lowest centre of mass. The working end is the
+    The pose is the stable one with the lowest centre of mass. The working end is the
     wider one of a hammer, the narrower one of pliers and of a screwdriver, and the one nearer the
     centre of mass of a wrench.
 
@@ -69,7 +69,7 @@ def _lowest_pose(vertices: Array, com: Array) -> StablePose:
         raise UserError("the mesh has no stable pose")
     lowest = min(pose.height for pose in poses)
     good = [pose for pose in poses if pose.height < lowest + _EQUAL_HEIGHT_MM]
-    # Of equals again, that nearest to how the file has it.
+    # Among equals again, the one nearest to the pose in the file.
     return max(
         good,
         key=lambda pose: (round(pose.margin / _MARGIN_STEP_MM), -round(float(pose.normal[2]), 3)),

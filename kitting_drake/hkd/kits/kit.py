@@ -38,14 +38,14 @@ SLOTS = {
     "wrench": (0.0, -0.09),
     "screwdriver": (0.0, 0.09),
 }
-"""Where the tool of each category goes: (x, y) of its frame T in the kit frame, in metres."""
+"""(x, y) of the frame T of the tool of each category in the kit frame, in metres."""
 
 MOST_TOOLS = 12
 """The largest number of tools in a kit."""
 
 _ARC_SEGMENTS = 64
 _DIGITS = 7
-"""Of coordinates in files, after the point."""
+"""The number of decimals of coordinates in files."""
 _TOP_CELL = 0.02
 """Side of the squares into which the top is cut for the contact solver, in metres."""
 _SIZE_STEP = 0.001
@@ -85,10 +85,9 @@ class KitParameters:
 
 @dataclass(frozen=True)
 class CavityPose:
-    """The pose of a seated tool's frame T in the kit frame K."""
+    """The pose of a seated tool's frame T in the kit frame K; lengths in metres."""
 
     x: float
-    """In metres."""
     y: float
     z: float
     yaw: float = 0.0
@@ -102,7 +101,7 @@ class KitLayout:
     parameters: KitParameters
     """The template, with the length and the width that the block has."""
     poses: tuple[CavityPose, ...]
-    """Of the tools, in their order."""
+    """The poses of the seated tools, in their order."""
 
 
 @dataclass(frozen=True)
@@ -223,7 +222,7 @@ class Cavity:
     """A bevelled pit in the kit frame, in metres."""
 
     outline: CrossSection
-    """Of the wall."""
+    """The outline of the wall."""
     floor: float
     """Heights in the kit frame."""
     top: float
@@ -313,7 +312,7 @@ def _nested_layout(tools: Sequence[Tool], parameters: KitParameters) -> KitLayou
 
 
 def released_fingers(tool: Tool) -> CrossSection:
-    """What the fingers cover as they let go of a tool at its annotated grasp, in T, in metres.
+    """The area under the fingers as they let go of a tool at its annotated grasp, in T, in metres.
 
     One rectangle for each finger, from the gripped face outward.
     """

@@ -34,7 +34,7 @@ _ELONGATION_COST = 0.10
 """How much more area a square may have than a rectangle whose sides are as two to one."""
 _ARC_SEGMENTS = 64
 _REACH = 1.02 * CELL / math.sqrt(2)
-"""From any point to the centre of its cell, at most, in metres, and some for rounding."""
+"""The greatest distance of a point from the centre of its cell, with some for rounding."""
 
 Mask = NDArray[np.bool_]
 Spectrum = NDArray[np.complexfloating]
@@ -42,7 +42,7 @@ Spectrum = NDArray[np.complexfloating]
 
 @dataclass(frozen=True)
 class NestedShape:
-    """What takes room, in metres."""
+    """A shape to place; lengths in metres."""
 
     outline: CrossSection
     """It keeps its distance from all other outlines."""
@@ -69,7 +69,7 @@ class Nesting:
     width: float
     """Along y."""
     poses: tuple[NestedPose, ...]
-    """In the order of the shapes."""
+    """The poses, in the order of the shapes."""
 
 
 def nest(shapes: Sequence[NestedShape], wall: float) -> Nesting | None:
@@ -128,7 +128,7 @@ class _Part:
         x_min, y_min, x_max, y_max = (walled + keep_out).bounds()
         self.inset = (_cells(y_low - y_min), _cells(x_low - x_min))
         self.corner = np.array([x_low, y_low])
-        """Of the outline with its wall in the rotated shape's frame, (x, y), in metres."""
+        """(x, y) of the lower left corner of the outline with its wall, in the rotated frame."""
         start = self.corner - CELL * np.array(self.inset[::-1])
         counts = (_cells(y_max - start[1]), _cells(x_max - start[0]))
         self.solid = _rasterized(solid, start, counts)

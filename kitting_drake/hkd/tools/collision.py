@@ -57,8 +57,8 @@ def furthest(inner: CrossSection, outer: CrossSection) -> float:
 def thinned(points: np.ndarray, tolerance: float) -> np.ndarray:
     """Vertices (m, 3) that span the hull of `points` to within about `tolerance` (mm).
 
-    What touches the table is chosen first, in the plane, so that a flat bottom stays exactly flat.
-    The result is on a grid: facets that are almost coplanar become exactly so, or clearly not.
+    The points on the table are chosen first, in the plane, so that a flat bottom stays flat. The
+    result is on a grid: facets that are almost coplanar become exactly so, or clearly not.
     """
     points = points[ConvexHull(points).vertices]
     touching = np.flatnonzero(points[:, 2] < 1e-3)
@@ -225,7 +225,7 @@ def _grow(
             (current.joined(hulls[i]).volume - current.volume - hulls[i].volume, i) for i in near
         )
         for _, i in trials:
-            # What does not fit now never will: the hull only grows.
+            # A hull that does not fit now never will: the joined one only grows.
             candidates.discard(i)
             joined = current.joined(hulls[i])
             if _fits(joined, allowed, tolerance):

@@ -88,7 +88,7 @@ class ToolEntry:
 
 @dataclass
 class Report:
-    """What generating one tool measured; lengths in mm."""
+    """Measurements of a generated tool; lengths in mm."""
 
     description: dict[str, Any]
     triangles: int
@@ -281,7 +281,7 @@ def _collision_hulls(
 
 
 def _allowed(outline: CrossSection, grasp: GraspEntry) -> CrossSection:
-    """Where collision hulls may reach: a little out of the outline, not where the jaws grip."""
+    """The region of the collision hulls: a little more than the outline, but not at the grip."""
 
     def grown(distance: float) -> CrossSection:
         return outline.offset(distance, JoinType.Round, circular_segments=96)
@@ -310,7 +310,7 @@ def _write_visuals(
 
 @dataclass
 class _GripReport:
-    """What the jaws grip of a tool; lengths in mm."""
+    """Measurements of a grasp; lengths in mm."""
 
     width: float
     # How much the gripped faces vary along the pads.

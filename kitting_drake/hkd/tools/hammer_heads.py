@@ -1,6 +1,6 @@
 """Heads of hammers: a block about the eye, and an end toward either side.
 
-An end is built toward +y, which is the side of the striking face; the other one is turned over.
+An end is built toward +y, which is the side of the striking face; the other one is flipped.
 The head's axis is y; a section's height is along x, its thickness along z.
 """
 
@@ -100,22 +100,16 @@ def build_head(
     )
     root = (0.94 * cheek_height, 0.9 * thickness, 0.8 * half)
     parts, steel = [], [cheeks]
-    for name, end, turned in (("front", front, False), ("back", back, True)):
+    for name, end, flipped in (("front", front, False), ("back", back, True)):
         body, tip = ENDS[end.kind](end, *root)
-        if turned:
-            body, tip = _turned(body), _turned(tip) if tip else None
+        if flipped:
+            # The same end on the other side, so that up stays up along x.
+            body, tip = body.flipped(), tip.flipped() if tip else None
         steel.append(body)
         if tip:
             parts.append(Part(f"{name}_tip", end.tip_material, tip.solid, tip.hulls))
     solid = Manifold.batch_boolean([s.solid for s in steel], OpType.Add)
     return [*parts, Part("head", material, solid, [h for s in steel for h in s.hulls])]
-
-
-def _turned(shape: Shape) -> Shape:
-    """The same end on the other side: turned over about x, so that up stays up along x."""
-    return Shape(
-        shape.solid.rotate((180, 0, 0)), [h * np.array([1.0, -1.0, -1.0]) for h in shape.hulls]
-    )
 
 
 def _bell(e: HeadEnd, height: float, thickness: float, start: float) -> tuple[Shape, Shape]:

@@ -82,9 +82,10 @@ def build_pliers(p: PliersParameters) -> list[Part]:
         levers = _typed(Levers, p.levers or {}, "levers")
         return build_levers(levers, _typed(Jaws, p.jaws or {}, "jaws"))
     upper = _lever(p)
-    lower = _turned_over(upper)
+    # The second lever is the first, flipped.
+    lower = upper.flipped()
     grip = _grip(p)
-    other_grip = _turned_over(grip)
+    other_grip = grip.flipped()
     rivet = _rivet(p)
     return [
         Part("rivet", p.rivet_material, rivet.solid, rivet.hulls),
@@ -93,12 +94,6 @@ def build_pliers(p: PliersParameters) -> list[Part]:
         Part("upper_grip", p.grip_material, grip.solid, grip.hulls),
         Part("lower_grip", p.grip_material, other_grip.solid, other_grip.hulls),
     ]
-
-
-def _turned_over(shape: Shape) -> Shape:
-    """The second lever is the first, turned half a turn about x."""
-    flip = np.array([1.0, -1.0, -1.0])
-    return Shape(shape.solid.rotate((180, 0, 0)), [h * flip for h in shape.hulls])
 
 
 def _handle_path(p: PliersParameters, count: int) -> np.ndarray:
@@ -156,7 +151,7 @@ def _jaw_profile(p: PliersParameters) -> np.ndarray:
     start = p.joint_front_mm
 
     def gap(x: float) -> float:
-        """Half the opening: the jaws have turned about the rivet."""
+        """Half the opening: the jaws have rotated about the rivet."""
         return 0.5 * p.tip_gap_mm * x / length
 
     back = [

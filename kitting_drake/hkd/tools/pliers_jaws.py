@@ -28,7 +28,7 @@ class Jaws:
     # Depth and pitch of the serrations.
     tooth_mm: float = 0.9
     pitch_mm: float = 2.2
-    # Both jaws are turned by this about where they leave the joint, and bend further by this
+    # Both jaws are rotated by this about where they leave the joint, and bend further by this
     # toward the tip.
     turn_deg: float = 0.0
     bend_deg: float = 0.0
@@ -45,7 +45,7 @@ def upper_jaw(j: Jaws, start: float, half: float) -> np.ndarray:
 
 
 def bent(j: Jaws, outline: np.ndarray, start: float) -> np.ndarray:
-    """An outline turned about the joint, and bent along a circle from there."""
+    """An outline rotated about the joint, and bent along a circle from there."""
     if not j.turn_deg and not j.bend_deg:
         return outline
     # Straight edges bend too.
@@ -73,7 +73,7 @@ def bent(j: Jaws, outline: np.ndarray, start: float) -> np.ndarray:
 
 
 def _opening(j: Jaws) -> Callable[[float], float]:
-    """Half the opening along x: the jaws have turned about the rivet."""
+    """Half the opening along x: the jaws have rotated about the rivet."""
     return lambda x: 0.5 * j.gap_mm * max(0.0, x) / j.length_mm
 
 

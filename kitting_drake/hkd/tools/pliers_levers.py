@@ -76,16 +76,11 @@ def build_levers(v: Levers, j: Jaws) -> list[Part]:
     parts = [Part("rivet", v.rivet_material, rivet.solid, [] if hidden else rivet.hulls), steel]
     if v.grip_length_mm:
         sleeve = _sleeve(v)
-        for name, s in (("upper_grip", sleeve), ("lower_grip", _turned_over(sleeve))):
+        for name, s in (("upper_grip", sleeve), ("lower_grip", sleeve.flipped())):
             parts.append(Part(name, v.grip_material, s.solid, s.hulls))
     if v.spring:
         parts.append(Part("spring", v.rivet_material, _spring(v)))
     return parts
-
-
-def _turned_over(shape: Shape) -> Shape:
-    flip = np.array([1.0, -1.0, -1.0])
-    return Shape(shape.solid.rotate((180, 0, 0)), [h * flip for h in shape.hulls])
 
 
 def handle_path(v: Levers) -> np.ndarray:
@@ -142,7 +137,7 @@ def _lap_outline(v: Levers) -> np.ndarray:
 
 
 def _jaw_outlines(v: Levers, j: Jaws) -> tuple[np.ndarray, np.ndarray]:
-    """The outlines of the upper and the lower jaw, turned and bent as they are."""
+    """The outlines of the upper and the lower jaw, rotated and bent as they are."""
     outline = upper_jaw(j, v.joint_front_mm, v.joint_width_mm / 2)
     mirrored = (outline * np.array([1.0, -1.0]))[::-1]
     upper, lower = (bent(j, o, v.joint_front_mm) for o in (outline, mirrored))

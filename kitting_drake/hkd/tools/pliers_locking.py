@@ -171,7 +171,7 @@ def _screw(k: Locking, end: float, y: float) -> tuple[Shape, Shape]:
     """The adjusting screw behind the body: a thread and a knurled knob."""
     radius = k.screw_diameter_mm / 2
 
-    def turned(stations: list[tuple[float, float]], segments: int) -> list[np.ndarray]:
+    def revolved(stations: list[tuple[float, float]], segments: int) -> list[np.ndarray]:
         return [across_x(circle(r, segments=segments), x, y) for x, r in stations]
 
     thread = [(end + 4.0, 0.6 * radius)]
@@ -183,10 +183,10 @@ def _screw(k: Locking, end: float, y: float) -> tuple[Shape, Shape]:
                       for x in (end + 4.0, end - 13.0)])  # fmt: skip
     knob = [(end - 12.0, 0.8 * radius), (end - 13.0, radius), (end - 21.0, radius),
             (end - 22.5, 0.8 * radius)]  # fmt: skip
-    solid = loft(turned(knob, 24)).solid
+    solid = loft(revolved(knob, 24)).solid
     for angle in np.arange(0.0, 360.0, 30.0):
         notch = plate(circle(0.7, segments=8), -20.0, 0.0, 0.1).solid.rotate((0, 90, 0))
         notch = notch.translate((end - 2.0, 0.0, radius)).rotate((angle, 0, 0))
         solid -= notch.translate((0.0, y, 0.0))
-    hull = np.vstack(turned(knob, 8))
-    return Shape(loft(turned(thread, 20)).solid, [stem]), Shape(solid, [hull])
+    hull = np.vstack(revolved(knob, 8))
+    return Shape(loft(revolved(thread, 20)).solid, [stem]), Shape(solid, [hull])

@@ -151,13 +151,13 @@ def _offset_driver(p: ScrewdriverParameters) -> list[Part]:
         path = [((0.0, 0.0), 0.0), *((tuple(q), a) for q, a in zip(turn, bend, strict=True))]
         sections = [across_path(bar, point, angle) for point, angle in path]
         for share, width, thick in ((0.3, 1.0, 0.7), (0.85, 1.0, 0.22), (1.0, 1.0, 0.18)):
-            # One tip stands upright, the other lies flat: for one quarter turn after another.
+            # One tip is upright, the other flat: for one quarter turn after another.
             profile = bar * ((thick, width) if side > 0 else (width, thick))
             sections.append(
                 across_path(profile, (half, radius + share * (reach - radius)), bend[-1])
             )
-        turned = [s * (side, side, 1.0) for s in sections]
-        shape = loft(turned)
+        rotated = [s * (side, side, 1.0) for s in sections]
+        shape = loft(rotated)
         parts.append(Part("blade", p.shaft_material, shape.solid, shape.hulls))
     if p.handle_length_mm > 0:
         grip = rounded_rectangle(p.handle_width_mm, p.handle_width_mm, p.corner_radius_mm, 3)

@@ -64,7 +64,7 @@ def _prismatic(outline: CrossSection) -> Callable[[float, float, float, float, f
             [(0.2 * length, diameter), (0.0, min(reach, diameter))],
         )
         prism = tip.extrude(length, 0, 0.0, (1.0, 1.0)).rotate((0.0, 90.0, 0.0))
-        # As the prism is turned: what was up looks to -z.
+        # The prism is rotated: its top looks to -z.
         hull = CrossSection.hull_points(points).to_polygons()[0][:, ::-1] * (1.0, -1.0)
         ends = np.vstack([across_x(hull, end - length), across_x(hull, end)])
         return Shape(blade.solid + prism.translate((end - length, 0.0, 0.0)), [*blade.hulls, ends])

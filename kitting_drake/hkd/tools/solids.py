@@ -22,7 +22,7 @@ SEGMENTS = 48
 
 
 class Material(NamedTuple):
-    """What a part is made of: density (kg/m^3) and diffuse colour (r, g, b, a in [0, 1])."""
+    """The material of a part: density (kg/m^3) and diffuse colour (r, g, b, a in [0, 1])."""
 
     density: float
     rgba: tuple[float, float, float, float]
@@ -68,6 +68,11 @@ class Shape(NamedTuple):
 
     solid: Manifold
     hulls: list[np.ndarray]
+
+    def flipped(self) -> "Shape":
+        """The shape rotated by half a turn about x."""
+        flip = np.array([1.0, -1.0, -1.0])
+        return Shape(self.solid.rotate((180, 0, 0)), [h * flip for h in self.hulls])
 
 
 # --- Profiles: closed polygons in the plane, (n, 2), counter-clockwise. ---

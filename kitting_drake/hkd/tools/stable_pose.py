@@ -23,9 +23,9 @@ class StablePose:
     """A pose in which a body stays, in the body's frame B and in the unit of its points."""
 
     normal: Array
-    """(3,) of the facet that is the support, out of the body: down, when the body rests."""
+    """(3,) the outward normal of the facet that is the support: down, when the body rests."""
     height: float
-    """Of the centre of mass above the table."""
+    """The height of the centre of mass above the table."""
     margin: float
     """The distance of the centre of mass, seen from above, from the rim of its support."""
 
@@ -63,7 +63,7 @@ def stable_poses(points: Array, center_of_mass: Array) -> list[StablePose]:
         margin = _support_margin(support, normals[members[0]], center_of_mass)
         if margin <= 0:
             continue
-        # Of triangles that are nearly coplanar, that below the centre of mass bears the body.
+        # Among nearly coplanar triangles, the one below the centre of mass bears the body.
         shares = [_least_share(hull, points, member, center_of_mass) for member in members]
         bearing = members[int(np.argmax(shares))]
         normal = normals[bearing]

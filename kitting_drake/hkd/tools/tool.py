@@ -24,7 +24,7 @@ class Grasp:
     """An annotated grasp in the tool frame T; see `Tool` for the frame."""
 
     x: float
-    """Of the point midway between the pads, in metres."""
+    """The point midway between the pads, in metres."""
     y: float
     theta: float
     """The rotation of the hand about T's z, in radians; at zero the jaws close along T's y."""
@@ -53,14 +53,14 @@ class Tool:
     width: float
     height: float
     mass: float
-    """In kg."""
+    """The mass in kg."""
     grasp: Grasp
     visual_meshes: tuple[Path, ...]
     symmetry: int = 1
     """The order of the rotational symmetry about T's z: 1 for none; 2 for a reversible tool, for
     which a half turn in its cavity is the same placement."""
     scale: float = 1.0
-    """Of the visual meshes, whose files have the lengths of the tool as it was made."""
+    """The scale of the visual meshes, whose files have the lengths of the tool as it was made."""
 
     @property
     def sdf(self) -> Path:

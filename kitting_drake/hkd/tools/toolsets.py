@@ -9,7 +9,7 @@ SPLITS = ("train", "test")
 TOOLSET_COUNT = 100
 """Toolsets, and so kits, of each split."""
 TOOLSETS_SEED = 2024
-"""What the toolsets are drawn from."""
+"""The seed of the drawing."""
 
 
 def tool_pools(split: str) -> dict[str, list[str]]:

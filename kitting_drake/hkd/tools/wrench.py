@@ -77,7 +77,7 @@ def build_wrench(p: WrenchParameters) -> list[Part]:
         if p.panel_depth_mm > 0:
             solid -= _panel(p, side)
         elif p.panel_depth_mm < 0:
-            # It lies lower than the heads: nothing touches it but the eye.
+            # It is lower than the heads, so that nothing touches it.
             solid += _panel(p, side)
     return [*front.inserts, *back.inserts, Part("wrench", p.material, solid, hulls)]
 
@@ -107,9 +107,9 @@ def _shoulders(p: WrenchParameters, head: Head, side: int) -> CrossSection:
 
 
 def _shank_cells(p: WrenchParameters) -> list[CrossSection]:
-    """What cuts the shank into convex pieces; none unless both its ends are simple.
+    """The profiles that cut the shank into convex parts; none unless both its ends are simple.
 
-    What lies within a thicker head is left to the head.
+    The shank within a thicker head is left to the head.
     """
     half, far = p.center_distance_mm / 2, 100.0
     if p.swing_mm:
@@ -131,12 +131,12 @@ def _shank_cells(p: WrenchParameters) -> list[CrossSection]:
 
 
 def _rectangle(x_low: float, x_high: float) -> CrossSection:
-    """All that lies between two x."""
+    """All between two x."""
     return CrossSection.square((x_high - x_low, 200.0)).translate((x_low, -100.0))
 
 
 def _swung_ends(p: WrenchParameters, bend: float) -> list[CrossSection]:
-    """What cuts an S-shaped shank's ends off at its bends, and off its heads at right angles."""
+    """The profiles that cut off the ends of an S-shaped shank, at its bends and at its heads."""
     half = p.center_distance_mm / 2
     cells = []
     for head, side in ((p.front, 1), (p.back, -1)):

@@ -49,12 +49,12 @@ class HeadShape:
     cut: CrossSection
     # Parts that take their room from the forging: jaws, screws, rings.
     inserts: list[Part] = field(default_factory=list)
-    # What cuts the head into convex pieces, for collision; triangles if empty.
+    # The profiles that cut the head into convex parts, for collision; triangles if empty.
     cells: list[CrossSection] = field(default_factory=list)
 
 
 def head_shape(head: Head, x: float, heading_deg: float, bevel_mm: float) -> HeadShape:
-    """The head at (x, 0), its axis turned by `heading_deg` (and its own angle) from +x.
+    """The head at (x, 0), its axis rotated by `heading_deg` (and its own angle) from +x.
 
     Raises:
         ValueError: there is no such kind of head.
@@ -158,7 +158,7 @@ def _ratchet(head: Head, x: float, turn_deg: float, bevel: float) -> HeadShape:
     shape = _box(head, x, turn_deg, bevel)
     top, outer = head.thickness_mm / 2, head.diameter_mm / 2 - bevel
     radius = 0.68 * head.size_mm + 0.8
-    # The ring lies a little deeper than the housing that it turns in.
+    # The ring is a little deeper than the housing that it turns in.
     bore = CrossSection([circle(radius)])
     ring = plate(CrossSection([circle(radius + 0.02)]) - _socket(head), -top + 0.6, top - 0.6, 0.4)
     shape.cut = bore.translate((x, 0.0))
