@@ -351,6 +351,13 @@ def test_nested_cavities_keep_walls_and_room_for_the_fingers(
         assert sum(rim.area() for rim in rims) > 0.3 * size.prod()
 
 
+def test_a_category_without_a_slot_is_nested(tools: list[Tool]):
+    chisel = dataclasses.replace(tools[3], category="chisel")
+    layout = layout_kit([tools[0], chisel], PARAMETERS)
+    assert layout.parameters != PARAMETERS
+    assert len(layout.poses) == 2
+
+
 def test_nested_kits_are_the_same_each_time_and_load(cache: Path):
     tools = [load_tool(name) for name in SEVEN]
     kit = make_kit(tools, PARAMETERS)
