@@ -16,7 +16,12 @@ from kitting_drake.cell.cameras import require_rendering
 from kitting_drake.common.command_line import count_type, run_command, seed_type
 from kitting_drake.common.errors import UserError
 from kitting_drake.common.files import alone_in, claim_folder, require_folder, write_json
-from kitting_drake.common.processes import Died, counting_bar, run_apart, side_by_side
+from kitting_drake.common.processes import (
+    ProcessCrashed,
+    counting_bar,
+    run_in_subprocess,
+    side_by_side,
+)
 from kitting_drake.common.provenance import versions
 from kitting_drake.common.seeds import DEMONSTRATION_SEEDS, seeds_from
 from kitting_drake.episode import EpisodeResult, ModeChange
@@ -46,7 +51,7 @@ LEAST_SCORE = 0.99
 _MOST_REJECTED = 20
 """So many seeds rejected in a row mean that the oracle cannot do it."""
 
-Demonstrate = Callable[[int], Demonstration | Rejection | Died]
+Demonstrate = Callable[[int], Demonstration | Rejection | ProcessCrashed]
 """Demonstrates a seed; called in a thread."""
 
 
@@ -79,7 +84,7 @@ def main() -> int:
             return 0
         collection.collect(
             arguments.demos,
-            lambda seed: run_apart(_demonstrate, chosen, seed),
+            lambda seed: run_in_subprocess(_demonstrate, chosen, seed),
             workers=arguments.workers,
             console=console,
         )
@@ -179,7 +184,7 @@ class Collection:
                 lambda seed: (seed, demonstrate(seed)), draw, workers=workers
             ):
                 working.remove(seed)
-                if not isinstance(outcome, Died):
+                if not isinstance(outcome, ProcessCrashed):
                     self._keep(outcome)
                 elif seed in died:
                     self._keep(_reject_dead(seed, outcome))
@@ -291,7 +296,7 @@ def _origin(chosen: ChosenScenario, first_seed: int) -> Origin:
     )
 
 
-def _reject_dead(seed: int, dead: Died) -> Rejection:
+def _reject_dead(seed: int, dead: ProcessCrashed) -> Rejection:
     if dead.was_killed:
         raise dead.killed_twice(seed)
     return Rejection(seed, 0.0, f"its process ended with exit code {dead.exit_code}")

@@ -21,7 +21,12 @@ from kitting_drake.common.files import (
     require_folder,
     write_json,
 )
-from kitting_drake.common.processes import Died, counting_bar, run_apart, side_by_side
+from kitting_drake.common.processes import (
+    ProcessCrashed,
+    counting_bar,
+    run_in_subprocess,
+    side_by_side,
+)
 from kitting_drake.common.provenance import versions
 from kitting_drake.episode import EpisodeResult
 from kitting_drake.episode.chosen import build_chosen, run_chosen
@@ -115,7 +120,9 @@ def evaluate(
     with counting_bar(console, "episodes") as progress:
         task = progress.add_task("", total=len(seeds), completed=len(seeds) - len(pending))
         for episode in side_by_side(
-            lambda seed: _run_apart(chosen, seed), lambda: next(queue, None), workers=workers
+            lambda seed: _run_in_subprocess(chosen, seed),
+            lambda: next(queue, None),
+            workers=workers,
         ):
             done[episode["seed"]] = episode
             append_line(path, episode)
@@ -169,15 +176,15 @@ def _digest(paths: Iterable[Path]) -> str:
     return f"sha256 {digest.hexdigest()}"
 
 
-def _run_apart(chosen: ChosenScenario, seed: int) -> Episode:
+def _run_in_subprocess(chosen: ChosenScenario, seed: int) -> Episode:
     """Runs one episode in a fresh process and waits for it."""
     start = time.perf_counter()
-    outcome = run_apart(_work, chosen, seed)
-    if isinstance(outcome, Died) and outcome.was_killed:
-        outcome = run_apart(_work, chosen, seed)
-        if isinstance(outcome, Died) and outcome.was_killed:
+    outcome = run_in_subprocess(_work, chosen, seed)
+    if isinstance(outcome, ProcessCrashed) and outcome.was_killed:
+        outcome = run_in_subprocess(_work, chosen, seed)
+        if isinstance(outcome, ProcessCrashed) and outcome.was_killed:
             raise outcome.killed_twice(seed)
-    if isinstance(outcome, Died):
+    if isinstance(outcome, ProcessCrashed):
         outcome = f"the process of the episode ended with exit code {outcome.exit_code}"
     if isinstance(outcome, str):
         return _lost_episode(chosen, seed, outcome, time.perf_counter() - start)

@@ -11,7 +11,7 @@ from pathlib import Path
 from rich.console import Console
 
 from kitting_drake.common.command_line import run_command
-from kitting_drake.common.files import write_whole
+from kitting_drake.common.files import write_atomically
 from kitting_drake.reporting.results_page import results_page
 from kitting_drake.reporting.runs import read_runs
 
@@ -39,7 +39,7 @@ def main() -> int:
     arguments = parser.parse_args()
     runs = read_runs(arguments.results)
     link = os.path.relpath(arguments.results, arguments.output.parent)
-    write_whole(arguments.output, results_page(runs, link))
+    write_atomically(arguments.output, results_page(runs, link))
     Console(quiet=arguments.quiet).print(
         f"{len(runs)} summaries: {arguments.output}", highlight=False, markup=False
     )

@@ -14,7 +14,7 @@ from kitting_drake.cell import Cell
 from kitting_drake.cell.cameras import render_picture, save_png
 from kitting_drake.common.command_line import FAILED, INTERRUPTED, run_command, seed_type
 from kitting_drake.common.errors import UserError
-from kitting_drake.common.files import require_folder, write_json, write_whole
+from kitting_drake.common.files import require_folder, write_atomically, write_json
 from kitting_drake.episode import ModeChange
 from kitting_drake.episode.chosen import build_chosen, run_chosen
 from kitting_drake.reporting.terminal import print_episode
@@ -28,9 +28,7 @@ if TYPE_CHECKING:
 
 def main() -> int:
     """Parses the command line and runs the episode; returns the exit code."""
-    parser = scenario_parser(
-        "run", "Run an episode, watch it in Meshcat, keep a replay."
-    )
+    parser = scenario_parser("run", "Run an episode, watch it in Meshcat, keep a replay.")
     parser.add_argument("--seed", type=seed_type, help="of the scene (default: the scenario's)")
     parser.add_argument(
         "--no-meshcat", action="store_true", help="show nothing, and leave no replay.html"
@@ -85,7 +83,7 @@ def main() -> int:
     if meshcat is not None:
         meshcat.StopRecording()
         meshcat.PublishRecording()
-        write_whole(folder / "replay.html", meshcat.StaticHtml())
+        write_atomically(folder / "replay.html", meshcat.StaticHtml())
     if arguments.picture and progress.last_context is not None:
         context = cell.scene_graph.GetMyMutableContextFromRoot(progress.last_context)
         save_png(render_picture(cell.scene_graph, context), arguments.picture)
@@ -108,7 +106,7 @@ def _save_decisions(folder: Path, decisions: "list[tuple[Observation, Decision]]
 
         for number, (observation, decision) in enumerate(decisions, start=1):
             picture = draw_decision(observation, decision)
-            write_whole(folder / f"decision_{number:02}.png", picture)
+            write_atomically(folder / f"decision_{number:02}.png", picture)
 
 
 def _check_endings(picture: Path | None, video: Path | None) -> None:
@@ -149,7 +147,7 @@ def draw_diagram(diagram: Diagram, path: Path) -> None:
     """
     source = diagram.GetGraphvizString(max_depth=1)
     if path.suffix == ".dot":
-        write_whole(path, source)
+        write_atomically(path, source)
         return
     if path.suffix not in (".svg", ".png", ".pdf"):
         raise UserError(f"--graphviz writes .svg, .png, .pdf and .dot files, not '{path}'")
@@ -161,7 +159,7 @@ def draw_diagram(diagram: Diagram, path: Path) -> None:
     drawn = subprocess.run(
         ["dot", f"-T{path.suffix[1:]}"], input=source.encode(), capture_output=True, check=True
     )
-    write_whole(path, drawn.stdout)
+    write_atomically(path, drawn.stdout)
 
 
 class _EpisodeProgress:

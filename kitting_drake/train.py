@@ -24,8 +24,8 @@ from kitting_drake.common.files import (
     claim_folder,
     read_lines,
     require_folder,
+    write_atomically,
     write_json,
-    write_whole,
 )
 from kitting_drake.policies.config import METHODS, PRESETS, NetworkConfig
 from kitting_drake.policies.demonstrations import Demonstrations, read_demonstrations
@@ -393,7 +393,7 @@ class _Run:
         except _DAMAGED as error:
             raise UserError(f"{path} cannot be taken up again: delete {self.folder}") from error
         kept = [line for line in read_lines(self._log) if line["step"] <= self.trainer.step_count]
-        write_whole(self._log, "".join(json.dumps(line) + "\n" for line in kept))
+        write_atomically(self._log, "".join(json.dumps(line) + "\n" for line in kept))
 
     def _save(self) -> None:
         buffer = io.BytesIO()
@@ -404,7 +404,7 @@ class _Run:
             "recent": self.recent,
         }
         torch.save(state, buffer)
-        write_whole(self.folder / "checkpoint.pt", buffer.getvalue())
+        write_atomically(self.folder / "checkpoint.pt", buffer.getvalue())
 
 
 def _scenes(demonstrations: Demonstrations) -> list[Scene]:

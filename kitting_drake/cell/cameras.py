@@ -24,7 +24,7 @@ from pydrake.systems.framework import Context
 from pydrake.systems.sensors import CameraInfo
 
 from kitting_drake.common.errors import UserError
-from kitting_drake.common.files import write_whole
+from kitting_drake.common.files import write_atomically
 from kitting_drake.scenario.schema import LookAt, Pinhole
 
 OVERVIEW = LookAt(position=[1.62, -0.95, 1.13], target=[0.48, -0.02, 0.06])
@@ -163,4 +163,4 @@ def save_png(pixels: NDArray[np.uint8], path: Path) -> None:
     """
     buffer = io.BytesIO()
     Image.fromarray(pixels).save(buffer, "PNG")
-    write_whole(path, buffer.getvalue())
+    write_atomically(path, buffer.getvalue())

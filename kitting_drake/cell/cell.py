@@ -186,7 +186,7 @@ def build_cell(
         add_picture_renderer(scene_graph)
     video_writer = None if video is None else _add_video(builder, scene_graph, video)
     diagram = builder.Build()
-    diagram.set_name("kitting_cell")
+    diagram.set_name("cell")
     return Cell(
         diagram=diagram,
         plant=plant,

@@ -1,4 +1,4 @@
-"""Writing files that are there whole or not at all, in folders of one thing and one process."""
+"""Files written atomically, in folders of one thing and one process."""
 
 import contextlib
 import fcntl
@@ -12,7 +12,7 @@ from typing import Any
 from kitting_drake.common.errors import UserError
 
 
-def write_whole(path: Path, content: str | bytes) -> None:
+def write_atomically(path: Path, content: str | bytes) -> None:
     """Writes a file beside its place and moves it there, making its folder if need be.
 
     Raises:
@@ -35,8 +35,8 @@ def write_whole(path: Path, content: str | bytes) -> None:
 
 
 def write_json(path: Path, value: Any) -> None:
-    """Writes JSON for people to read; see `write_whole`."""
-    write_whole(path, json.dumps(value, indent=2) + "\n")
+    """Writes JSON for people to read; see `write_atomically`."""
+    write_atomically(path, json.dumps(value, indent=2) + "\n")
 
 
 def require_folder(path: Path) -> Path:
@@ -136,7 +136,7 @@ def read_lines(path: Path) -> list[Any]:
     content = path.read_text()
     whole = content[: content.rfind("\n") + 1]
     if whole != content:
-        write_whole(path, whole)
+        write_atomically(path, whole)
     try:
         return [json.loads(line) for line in whole.splitlines()]
     except ValueError as error:

@@ -24,7 +24,7 @@ _THREADS = "OMP_NUM_THREADS"
 
 
 @dataclass(frozen=True)
-class Died:
+class ProcessCrashed:
     """A process that ended without a result."""
 
     exit_code: int | None
@@ -32,7 +32,7 @@ class Died:
 
     @property
     def was_killed(self) -> bool:
-        """By something else, for want of memory perhaps: not by what it did."""
+        """Whether something else killed it, for want of memory perhaps: not its own doing."""
         return self.exit_code in (-signal.SIGKILL, -signal.SIGTERM)
 
     def killed_twice(self, seed: int) -> UserError:
@@ -43,7 +43,9 @@ class Died:
         )
 
 
-def run_apart(function: Callable[..., _Result], *arguments: object) -> _Result | Died:
+def run_in_subprocess(
+    function: Callable[..., _Result], *arguments: object
+) -> _Result | ProcessCrashed:
     """Calls a function in a fresh process, and waits for it.
 
     Args:
@@ -64,7 +66,7 @@ def run_apart(function: Callable[..., _Result], *arguments: object) -> _Result |
     except (EOFError, OSError):
         # OSError: it died in the middle of its answer.
         process.join()
-        return Died(process.exitcode)
+        return ProcessCrashed(process.exitcode)
     finally:
         process.join()
 
@@ -78,7 +80,7 @@ def side_by_side(
     early, by Ctrl-C say, the processes at work are killed: nobody waits for what they find.
 
     Args:
-        function: called in a thread: lets `run_apart` do the work.
+        function: called in a thread: lets `run_in_subprocess` do the work.
         draw: the next item; asked when a thread is free, in the caller's thread. None: none now,
             ask again after the next result; it is over when none is at work.
         workers: how many threads.

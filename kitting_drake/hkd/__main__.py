@@ -188,7 +188,11 @@ def main() -> int:
     annotator.set_defaults(function=annotate)
     importer = verbs.add_parser("import", help=import_mesh.__doc__)
     importer.add_argument("mesh", type=Path, metavar="MESH", help="the mesh's file")
-    importer.add_argument("--category", choices=CATEGORIES, required=True, help="of the tool")
+    importer.add_argument(
+        "--category",
+        required=True,
+        help=f"of the tool: {', '.join(CATEGORIES)}, or a name of your own",
+    )
     importer.add_argument("--name", help="of the tool (default: the file's)")
     importer.add_argument(
         "--output",

@@ -26,7 +26,7 @@ from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.sensors import CameraInfo
 
 from kitting_drake.cell.cameras import require_rendering
-from kitting_drake.common.files import write_whole
+from kitting_drake.common.files import write_atomically
 from kitting_drake.hkd.kits.kit import Kit, KitParameters
 from kitting_drake.hkd.tools.tool import Tool
 
@@ -175,4 +175,4 @@ def write_sheet(subjects: Sequence[Subject], output: Path) -> None:
     picture = io.BytesIO()
     figure.savefig(picture, format="png", dpi=130 if len(subjects) <= 12 else 60)
     plt.close(figure)
-    write_whole(output, picture.getvalue())
+    write_atomically(output, picture.getvalue())

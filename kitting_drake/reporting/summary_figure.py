@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from kitting_drake.common.files import write_whole
+from kitting_drake.common.files import write_atomically
 from kitting_drake.reporting.summary import Entry, Episode, counted_actions, counted_objects
 
 _COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#8c6d1f")
@@ -104,7 +104,7 @@ def draw_summary(summary: dict[str, Any], episodes: Sequence[Episode], path: Pat
         figure.legend(handles, labels, loc="outside lower center", ncols=min(len(labels), 5))
         figure.savefig(image, format="png", dpi=150)
         plt.close(figure)
-    write_whole(path, image.getvalue())
+    write_atomically(path, image.getvalue())
 
 
 def _looks() -> Iterable[_Look]:

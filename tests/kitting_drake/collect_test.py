@@ -17,7 +17,7 @@ import kitting_drake.collect as collecting
 from kitting_drake.collect import Collection, next_seed
 from kitting_drake.common.errors import UserError
 from kitting_drake.common.files import alone_in
-from kitting_drake.common.processes import Died
+from kitting_drake.common.processes import ProcessCrashed
 from kitting_drake.common.seeds import DEMONSTRATION_SEEDS, TEST_SEEDS, VALIDATION_SEEDS, seeds_from
 from kitting_drake.policies.demonstrations import (
     Demonstration,
@@ -42,7 +42,7 @@ class Oracle:
         self.asked: list[int] = []
         self._killed_after = killed_after
 
-    def __call__(self, seed: int) -> Demonstration | Rejection | Died:
+    def __call__(self, seed: int) -> Demonstration | Rejection | ProcessCrashed:
         if len(self.asked) == self._killed_after:
             raise KeyboardInterrupt
         self.asked.append(seed)
@@ -192,10 +192,10 @@ class Mortal(Oracle):
         super().__init__()
         self._deaths, self._exit_code = deaths, exit_code
 
-    def __call__(self, seed: int) -> Demonstration | Rejection | Died:
+    def __call__(self, seed: int) -> Demonstration | Rejection | ProcessCrashed:
         outcome = super().__call__(seed)
         dies = seed == 12 and self.asked.count(12) <= self._deaths
-        return Died(self._exit_code) if dies else outcome
+        return ProcessCrashed(self._exit_code) if dies else outcome
 
 
 @pytest.mark.parametrize("exit_code", [1, -signal.SIGKILL])
@@ -258,7 +258,7 @@ def test_what_is_finished_is_left_alone(
     monkeypatch.chdir(ROOT)
     monkeypatch.setattr(collecting, "require_rendering", lambda: None)
     monkeypatch.setattr(collecting, "build_chosen", lambda *_, **__: None)
-    monkeypatch.setattr(collecting, "run_apart", lambda _, __, seed: Oracle()(seed))
+    monkeypatch.setattr(collecting, "run_in_subprocess", lambda _, __, seed: Oracle()(seed))
     monkeypatch.setattr(sys, "argv", arguments(tmp_path, "--demos", 3, "--seed", 10))
     assert collecting.main() == 0
     assert "holds 3 demonstrations, 1 seed rejected; " in capsys.readouterr().out

@@ -18,7 +18,7 @@ import kitting_drake.evaluate as evaluation
 from kitting_drake.common.errors import UserError
 from kitting_drake.common.files import alone_in
 from kitting_drake.common.paths import MODELS
-from kitting_drake.common.processes import Died
+from kitting_drake.common.processes import ProcessCrashed
 from kitting_drake.episode import EpisodeResult
 from kitting_drake.reporting.summary import Episode
 from kitting_drake.scenario.command_line import ChosenScenario
@@ -43,7 +43,7 @@ def test_goes_on_where_it_was_stopped(tmp_path: Path, monkeypatch: pytest.Monkey
         ran.append(seed)
         return fake_run(chosen, seed)
 
-    monkeypatch.setattr(evaluation, "_run_apart", run)
+    monkeypatch.setattr(evaluation, "_run_in_subprocess", run)
     evaluation.evaluate(CHOSEN, [0, 1], tmp_path, workers=1, console=QUIET)
     path = tmp_path / "episodes.jsonl"
     # Killed while the third line was being written.
@@ -65,7 +65,7 @@ def test_the_time_of_all_calls_adds_up(tmp_path: Path, monkeypatch: pytest.Monke
         return fake_run(chosen, seed)
 
     monkeypatch.setattr(evaluation.time, "perf_counter", lambda: now)
-    monkeypatch.setattr(evaluation, "_run_apart", run)
+    monkeypatch.setattr(evaluation, "_run_in_subprocess", run)
 
     def total(*seeds: int) -> float:
         call = evaluation.evaluate(CHOSEN, seeds, tmp_path, workers=1, console=QUIET)
@@ -83,7 +83,7 @@ def test_the_time_of_all_calls_adds_up(tmp_path: Path, monkeypatch: pytest.Monke
 
 
 def test_a_folder_of_another_scenario_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(evaluation, "_run_apart", fake_run)
+    monkeypatch.setattr(evaluation, "_run_in_subprocess", fake_run)
     evaluation.evaluate(CHOSEN, [0], tmp_path, workers=1, console=QUIET)
     other = ChosenScenario(Scenario(time_limit=1.0), Path("mine.yaml"), "mine", None)
     with pytest.raises(UserError, match="another scenario"):
@@ -91,7 +91,7 @@ def test_a_folder_of_another_scenario_is_refused(tmp_path: Path, monkeypatch: py
 
 
 def test_a_folder_of_other_weights_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(evaluation, "_run_apart", fake_run)
+    monkeypatch.setattr(evaluation, "_run_in_subprocess", fake_run)
     weights = tmp_path / "policy.safetensors"
     scenario = Scenario(policy=Learned(weights=weights.name))
     chosen = ChosenScenario(scenario, tmp_path / "mine.yaml", "mine", None)
@@ -107,7 +107,7 @@ def test_a_folder_of_other_weights_is_refused(tmp_path: Path, monkeypatch: pytes
 
 def test_a_folder_of_another_program_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """The scenario is the same to the letter; what it names is not."""
-    monkeypatch.setattr(evaluation, "_run_apart", fake_run)
+    monkeypatch.setattr(evaluation, "_run_in_subprocess", fake_run)
     monkeypatch.syspath_prepend(tmp_path)
     source = tmp_path / "policy_of_mine.py"
     tool = tmp_path / "my_tool"
@@ -152,7 +152,7 @@ def die(chosen: ChosenScenario, seed: int) -> None:
 
 def test_an_episode_whose_process_dies_is_a_failed_one(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(evaluation, "_work", die)
-    lost = evaluation._run_apart(CHOSEN, 7)
+    lost = evaluation._run_in_subprocess(CHOSEN, 7)
     assert lost.keys() == {field.name for field in dataclasses.fields(EpisodeResult)}
     assert lost["seed"] == 7
     assert lost["success_rate"] == 0.0
@@ -161,7 +161,7 @@ def test_an_episode_whose_process_dies_is_a_failed_one(monkeypatch: pytest.Monke
 
 def test_a_scene_that_cannot_be_set_is_a_failed_episode():
     scenario = Scenario(heightmap=Heightmap(rows=110, cols=110))
-    lost = evaluation._run_apart(dataclasses.replace(CHOSEN, scenario=scenario), 7)
+    lost = evaluation._run_in_subprocess(dataclasses.replace(CHOSEN, scenario=scenario), 7)
     assert "there is no free space in the workspace" in lost["failure"]
 
 
@@ -179,7 +179,7 @@ def test_nothing_but_failures_leaves_with_a_failure(
     def run(chosen: ChosenScenario, seed: int) -> Episode:
         return fake_run(chosen, seed) | {"failure": failures[seed]}
 
-    monkeypatch.setattr(evaluation, "_run_apart", run)
+    monkeypatch.setattr(evaluation, "_run_in_subprocess", run)
     flags = ["--episodes", "2", "--workers", "1", "--output", str(tmp_path / "out")]
     monkeypatch.setattr(sys, "argv", ["evaluate", str(scenario), *flags])
     assert evaluation.main() == code
@@ -194,7 +194,7 @@ def test_seeds_that_the_policy_has_learned_from_are_told(
 ):
     scenario = tmp_path / "mine.yaml"
     scenario.write_text(f"Mine: {{policy: !Learned {{weights: {weights_file}}}}}\n")
-    monkeypatch.setattr(evaluation, "_run_apart", fake_run)
+    monkeypatch.setattr(evaluation, "_run_in_subprocess", fake_run)
     # Nobody waits for networks that decide nothing.
     scene = types.SimpleNamespace(scene=types.SimpleNamespace(success=AddS()))
     monkeypatch.setattr(evaluation, "build_chosen", lambda *_, **__: scene)
@@ -210,12 +210,12 @@ def test_seeds_that_the_policy_has_learned_from_are_told(
 
 
 def test_what_something_else_killed_is_given_a_second_chance(monkeypatch: pytest.MonkeyPatch):
-    killed, lost = Died(-signal.SIGKILL), fake_run(CHOSEN, 7)
+    killed, lost = ProcessCrashed(-signal.SIGKILL), fake_run(CHOSEN, 7)
     answers = [killed, lost, killed, killed]
-    monkeypatch.setattr(evaluation, "run_apart", lambda *_: answers.pop(0))
-    assert evaluation._run_apart(CHOSEN, 7) == lost
+    monkeypatch.setattr(evaluation, "run_in_subprocess", lambda *_: answers.pop(0))
+    assert evaluation._run_in_subprocess(CHOSEN, 7) == lost
     with pytest.raises(UserError, match="seed 7 was killed twice, perhaps for want of memory"):
-        evaluation._run_apart(CHOSEN, 7)
+        evaluation._run_in_subprocess(CHOSEN, 7)
 
 
 def test_two_short_episodes_side_by_side(verb, tmp_path: Path):

@@ -13,7 +13,7 @@ from kitting_drake.benchmark.networks.tables import (
     count_text,
     seconds_text,
 )
-from kitting_drake.common.files import write_whole
+from kitting_drake.common.files import write_atomically
 
 _METHODS = {"so2": "#009e73", "equivariant_transporter": "#e69f00", "transporter": "#56646f"}
 """Colours for the colour-blind too; the first two are the paper's green and orange."""
@@ -84,7 +84,7 @@ def draw_networks(measured: dict[str, Any], path: Path) -> None:
         _draw_folding(axes["folding"], measured)
         _draw_levels(axes["levels"], measured)
         figure.savefig(image, format="png", dpi=150)
-    write_whole(path, image.getvalue())
+    write_atomically(path, image.getvalue())
 
 
 def _draw_pick_angle(axis: Any, measured: dict[str, Any], preset: str) -> None:

@@ -14,7 +14,7 @@ from rich.console import Console
 from rich.table import Table
 
 from kitting_drake.common.errors import UserError
-from kitting_drake.common.files import write_whole
+from kitting_drake.common.files import write_atomically
 from kitting_drake.common.paths import MODELS
 from kitting_drake.hkd.grasps.grip import find_grip, jaw_axes
 from kitting_drake.hkd.grasps.proposals import (
@@ -24,7 +24,8 @@ from kitting_drake.hkd.grasps.proposals import (
     propose_grasps,
 )
 from kitting_drake.hkd.tools.generate import generate_tool, load_catalogue
-from kitting_drake.hkd.tools.tool import Grasp, Tool, load_tool
+from kitting_drake.hkd.tools.tool import Tool, load_tool
+from systems.grasp import Grasp
 from systems.hand_geometry import FINGER_BASE_DISTANCE, FINGERTIP_DISTANCE, PAD_LENGTH
 
 _HAND_MESHES = MODELS / "franka_hand" / "meshes"
@@ -76,16 +77,16 @@ def save_grasp(tool: Tool, grasp: Grasp, models: Path = MODELS) -> None:
         record["grasp"] = {key: round(value, 6) for key, value in dataclasses.asdict(grasp).items()}
         # Importing again is not to undo it.
         record["annotated"] = True
-        write_whole(record_path, yaml.safe_dump(record, sort_keys=False))
+        write_atomically(record_path, yaml.safe_dump(record, sort_keys=False))
         return
     path = models / "tools" / "catalogue.yaml"
     before = path.read_text()
-    write_whole(path, with_grasp(before, tool.name, grasp))
+    write_atomically(path, with_grasp(before, tool.name, grasp))
     try:
         entry = next(entry for entry in load_catalogue(path) if entry.name == tool.name)
         generate_tool(entry, tool.directory)
     except UserError:
-        write_whole(path, before)
+        write_atomically(path, before)
         raise
 
 

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kitting_drake.hkd.grasps.grip import find_grip, jaw_axes
-from kitting_drake.hkd.tools.tool import Grasp
+from systems.grasp import Grasp
 from systems.hand_geometry import FINGER_LENGTH, FINGERTIP_DEPTH, MAX_OPENING, PAD_LENGTH
 from systems.pick_place_parameters import PickPlaceParameters
 

@@ -11,7 +11,7 @@ from scipy.spatial import QhullError
 from kitting_drake.hkd.tools.collision import closed, cover, thinned
 from kitting_drake.hkd.tools.generate import FINGER_LENGTH_MM
 from kitting_drake.hkd.tools.solids import SEGMENTS
-from kitting_drake.hkd.tools.tool import Grasp
+from systems.grasp import Grasp
 
 # How far a hull may stand out of the tool's outline; the second, if the first needs many hulls.
 OUTLINE_TOLERANCES_MM = (0.30, 0.45)

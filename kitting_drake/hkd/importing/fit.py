@@ -12,14 +12,6 @@ from kitting_drake.hkd.kits.kit import KitParameters, layout_kit
 from kitting_drake.hkd.tools import meshes
 from kitting_drake.hkd.tools.tool import Tool
 
-MATERIALS = {
-    "hammer": "steel",
-    "pliers": "steel",
-    "wrench": "polished_steel",
-    "screwdriver": "steel",
-}
-"""The material of which an imported tool of a category seems to be."""
-
 SCALED_LENGTHS_MM = (180.0, 170.0, 160.0, 150.0)
 """A tool is scaled to the first of these at which the hand can hold it and a kit take it."""
 KEPT_LENGTHS_MM = (150.0, 200.0)
@@ -47,6 +39,12 @@ def guess_unit(length: float) -> str | None:
         if low <= length <= high:
             return unit
     return None
+
+
+def material_of(category: str) -> str:
+    """The material of which an imported tool of a category seems to be: a key of `MATERIALS` of
+    `hkd.tools.solids`."""
+    return "polished_steel" if category == "wrench" else "steel"
 
 
 def lengths_to_try(length: float, wanted_mm: float | None) -> tuple[list[float], str]:
@@ -116,7 +114,7 @@ def _tool(category: str, name: str, solid: Manifold, directory: Path) -> Tool:
         UserError: it cannot be grasped.
     """
     length, width, height = (round(1e-3 * float(extent), 6) for extent in size(solid))
-    visual = directory / f"{MATERIALS[category]}.obj"
+    visual = directory / f"{material_of(category)}.obj"
     meshes.write_smooth_obj(visual, solid, _CREASE_ANGLE_DEG)
     vertices, faces = meshes.vertices_and_faces(solid)
     triangles = 1e-3 * vertices[faces]

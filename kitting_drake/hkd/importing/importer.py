@@ -23,16 +23,18 @@ import yaml
 
 from kitting_drake.common.errors import UserError
 from kitting_drake.hkd.importing.convex_decomposition import decompose
-from kitting_drake.hkd.importing.fit import MATERIALS, fit, lengths_to_try
+from kitting_drake.hkd.importing.fit import fit, lengths_to_try, material_of
 from kitting_drake.hkd.importing.repair import NOMINAL_MM, make_solid, read_mesh
 from kitting_drake.hkd.importing.stable_pose import size, to_tool_frame
 from kitting_drake.hkd.tools import meshes
 from kitting_drake.hkd.tools.sdf import tool_sdf
 from kitting_drake.hkd.tools.symmetry import symmetry_order
-from kitting_drake.hkd.tools.tool import CATEGORIES, load_tool, tool_names, user_tools
+from kitting_drake.hkd.tools.tool import check_category, load_tool, tool_names, user_tools
 
 DENSITIES = {"hammer": 3000.0, "pliers": 6000.0, "wrench": 7850.0, "screwdriver": 2000.0}
 """The mean density of a tool of a category, with its handle, in kg/m^3."""
+OTHER_DENSITY = 3000.0
+"""The same for a tool of any other category."""
 
 TIME_LIMIT = 55.0
 """Seconds after which the geometry is given up."""
@@ -78,8 +80,7 @@ def import_tool(request: ImportRequest, time_limit: float | None = TIME_LIMIT) -
     Raises:
         UserError: it cannot be saved, and nothing was written.
     """
-    if request.category not in CATEGORIES:
-        raise UserError(f"category '{request.category}' is none of {', '.join(CATEGORIES)}")
+    check_category(request.category)
     name = _checked_name(request)
     for flag, value, low, high in (
         ("--length_mm", request.length_mm, 20.0, 250.0),
@@ -216,7 +217,7 @@ def _prepare(request: ImportRequest, name: str, directory: Path) -> Prepared:
     lengths, assumed = lengths_to_try(size(solid)[0] / nominal, request.length_mm)
     notes = [assumed, *notes]
     tool, solid = fit(request.category, name, solid, lengths, notes, directory)
-    density = request.density or DENSITIES[request.category]
+    density = request.density or DENSITIES.get(request.category, OTHER_DENSITY)
     vertices, faces = meshes.vertices_and_faces(solid)
     physics = trimesh.triangles.mass_properties(1e-3 * vertices[faces], density=density)
     hulls = decompose(solid, tool.grasp)
@@ -226,7 +227,7 @@ def _prepare(request: ImportRequest, name: str, directory: Path) -> Prepared:
     for index, hull in enumerate(hulls):
         collisions.append(f"collision_{index}.obj")
         meshes.write_convex_obj(directory / collisions[-1], hull)
-    material = MATERIALS[request.category]
+    material = material_of(request.category)
     text = tool_sdf(
         name,
         physics["mass"],

@@ -2,6 +2,7 @@
 
 import difflib
 import os
+import re
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -14,24 +15,10 @@ from numpy.typing import NDArray
 
 from kitting_drake.common.errors import UserError
 from kitting_drake.common.paths import MODELS
+from systems.grasp import Grasp
 
 CATEGORIES = ("hammer", "pliers", "wrench", "screwdriver")
-"""The four categories of the paper (section IV-B.1)."""
-
-
-@dataclass(frozen=True)
-class Grasp:
-    """An annotated grasp in the tool frame T; see `Tool` for the frame."""
-
-    x: float
-    """The point midway between the pads, in metres."""
-    y: float
-    theta: float
-    """The rotation of the hand about T's z, in radians; at zero the jaws close along T's y."""
-    width: float
-    """Distance of the faces that are gripped, in metres."""
-    surface_height: float
-    """Height of the tool's top at the grasp above the table, in metres."""
+"""The four categories of the paper (section IV-B.1). A tool of one's own may be of any other."""
 
 
 @dataclass(frozen=True)
@@ -45,7 +32,7 @@ class Tool:
     directory: Path
     name: str
     category: str
-    """One of `CATEGORIES`."""
+    """One of `CATEGORIES`, or a name of one's own: small letters, digits and underscores."""
     split: str
     """`train` or `test` (section IV-B.1 of the paper), or `user` for a tool of one's own."""
     length: float
@@ -81,11 +68,6 @@ class Tool:
     def footprint(self) -> CrossSection:
         """The outline from above, in T, in metres."""
         return footprint(self.triangles)
-
-    @property
-    def silhouette(self) -> CrossSection:
-        """The former name of `footprint`."""
-        return self.footprint
 
     def surface_points(self, count: int, seed: int = 0) -> NDArray[np.float64]:
         """(count, 3) points of the surface, in T, in metres: by area, the same each time."""
@@ -155,13 +137,22 @@ def load_tool(name: str, base: Path | None = None) -> Tool:
     for path in (tool.sdf, *tool.visual_meshes):
         if not path.is_file():
             raise UserError(f"the tool '{name}' lacks its file {path}")
-    if tool.category not in CATEGORIES:
-        raise UserError(
-            f"{record_path}: category '{tool.category}' is none of {', '.join(CATEGORIES)}"
-        )
+    try:
+        check_category(tool.category)
+    except UserError as error:
+        raise UserError(f"{record_path}: {error}") from error
     if tool.symmetry < 1:
         raise UserError(f"{record_path}: symmetry is {tool.symmetry}, and has to be 1 or more")
     return tool
+
+
+def check_category(category: str) -> None:
+    """Raises UserError for what is no name of a category."""
+    if not re.fullmatch(r"[a-z][a-z0-9_]{0,31}", category):
+        raise UserError(
+            f"category '{category}' has to be a name of small letters, digits and underscores, "
+            f"as {', '.join(CATEGORIES)} are"
+        )
 
 
 def tool_names() -> list[str]:

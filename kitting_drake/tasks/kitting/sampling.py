@@ -78,7 +78,7 @@ def check_arrangement(
     placed: dict[str, CrossSection] = {}
     things = {"task.kit_pose": (block_outline(kit), kit_pose)}
     things |= {
-        f"task.tools.{name}": (tool.silhouette, pose) for name, (tool, pose) in tools.items()
+        f"task.tools.{name}": (tool.footprint, pose) for name, (tool, pose) in tools.items()
     }
     for name, (outline, pose) in things.items():
         outline = outline.rotate(pose.yaw_deg).translate((pose.x, pose.y))
@@ -184,7 +184,7 @@ def _tool_footprint(tool: Tool) -> _Footprint:
 
     open_fingers = (FINGER_LENGTH, MAX_OPENING + 2 * FINGER_DEPTH)
     # The hull is coarser than the outline and never smaller.
-    return _Footprint(tool.silhouette.hull(), at_grasp(open_fingers), at_grasp(PALM_SIZE))
+    return _Footprint(tool.footprint.hull(), at_grasp(open_fingers), at_grasp(PALM_SIZE))
 
 
 def _rectangle(lower: tuple[float, float], upper: tuple[float, float]) -> CrossSection:

@@ -10,15 +10,15 @@ from kitting_drake.common.files import (
     claim_folder,
     read_lines,
     require_folder,
+    write_atomically,
     write_json,
-    write_whole,
 )
 
 
 def test_writes_and_replaces_in_a_new_folder(tmp_path: Path):
     path = tmp_path / "new" / "deep" / "results.json"
     write_json(path, {"a": 1})
-    write_whole(path, "short")
+    write_atomically(path, "short")
     assert path.read_text() == "short"
     assert [item.name for item in path.parent.iterdir()] == [path.name]
 
@@ -27,14 +27,14 @@ def test_what_was_there_stays_whole_when_writing_fails(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     path = tmp_path / "results.json"
-    write_whole(path, "before")
+    write_atomically(path, "before")
 
     def full(*_: object) -> None:
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(os, "replace", full)
     with pytest.raises(UserError, match=r"cannot write .*results\.json: No space left"):
-        write_whole(path, "after")
+        write_atomically(path, "after")
     assert path.read_text() == "before"
     assert list(tmp_path.iterdir()) == [path]
 

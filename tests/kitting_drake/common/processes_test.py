@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from kitting_drake.common.processes import Died, run_apart, side_by_side
+from kitting_drake.common.processes import ProcessCrashed, run_in_subprocess, side_by_side
 
 ROOT = Path(__file__).resolve().parents[3]
 
@@ -29,14 +29,14 @@ def leave() -> None:
 
 
 def test_the_result_comes_back_from_another_process():
-    assert run_apart(add, 2, 3) == 5
-    process, _ = run_apart(process_and_threads)
+    assert run_in_subprocess(add, 2, 3) == 5
+    process, _ = run_in_subprocess(process_and_threads)
     assert process != os.getpid()
 
 
 def test_a_process_that_dies_takes_nothing_with_it():
-    assert run_apart(kill_itself) == Died(-signal.SIGKILL)
-    assert run_apart(leave) == Died(3)
+    assert run_in_subprocess(kill_itself) == ProcessCrashed(-signal.SIGKILL)
+    assert run_in_subprocess(leave) == ProcessCrashed(3)
 
 
 @pytest.mark.parametrize(("workers", "threads"), [(2, "1"), (1, "7")])
@@ -46,7 +46,7 @@ def test_side_by_side_processes_compute_in_one_thread(
     monkeypatch.setenv("OMP_NUM_THREADS", "7")
     items = iter([0])
     ((_, found),) = side_by_side(
-        lambda _: run_apart(process_and_threads), lambda: next(items, None), workers=workers
+        lambda _: run_in_subprocess(process_and_threads), lambda: next(items, None), workers=workers
     )
     assert found == threads
     assert os.environ["OMP_NUM_THREADS"] == "7"
@@ -80,7 +80,7 @@ def test_who_ends_early_does_not_wait():
     items = iter([60.0, 0.0])
     start = time.monotonic()
     for _ in side_by_side(
-        lambda item: run_apart(time.sleep, item), lambda: next(items, None), workers=2
+        lambda item: run_in_subprocess(time.sleep, item), lambda: next(items, None), workers=2
     ):
         break
     assert time.monotonic() - start < 30.0
@@ -88,10 +88,10 @@ def test_who_ends_early_does_not_wait():
 
 _PROGRAM = """
 import sys, time
-from kitting_drake.common.processes import run_apart
+from kitting_drake.common.processes import run_in_subprocess
 
 if __name__ == "__main__":
-    run_apart(time.sleep, 60)
+    run_in_subprocess(time.sleep, 60)
 """
 
 

@@ -8,7 +8,8 @@ import yaml
 from kitting_drake.common.errors import UserError
 from kitting_drake.common.paths import MODELS
 from kitting_drake.hkd.grasps.annotate import measure_grasp, save_grasp, with_grasp
-from kitting_drake.hkd.tools.tool import Grasp, Tool, load_tool
+from kitting_drake.hkd.tools.tool import Tool, load_tool
+from systems.grasp import Grasp
 
 CATALOGUE = (MODELS / "tools" / "catalogue.yaml").read_text()
 GRASP = Grasp(x=-0.0205, y=0.0, theta=math.radians(0.5), width=0.02, surface_height=0.02)

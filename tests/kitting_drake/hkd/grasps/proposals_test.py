@@ -6,7 +6,8 @@ from numpy.typing import NDArray
 
 from kitting_drake.hkd.grasps.proposals import WIDEST, propose_grasps
 from kitting_drake.hkd.tools.meshes import vertices_and_faces
-from kitting_drake.hkd.tools.tool import Grasp, load_tool
+from kitting_drake.hkd.tools.tool import load_tool
+from systems.grasp import Grasp
 
 
 def bar(length: float, width: float, height: float) -> Manifold:

@@ -67,6 +67,16 @@ def test_a_tool_is_as_its_mesh_is(plain: importer.ImportReport):
     np.testing.assert_allclose((points.min(axis=0) + points.max(axis=0))[:2], 0, atol=1e-6)
 
 
+def test_a_category_of_ones_own(tmp_path: Path):
+    mesh = exported(mallet(), tmp_path / "mallet.stl")
+    tool = load_tool(str(bring(mesh, tmp_path / "tools", category="carvers_mallet").directory))
+    assert tool.category == "carvers_mallet"
+    assert tool.mass == pytest.approx(mallet().volume * 1e-9 * importer.OTHER_DENSITY, rel=1e-4)
+    with pytest.raises(UserError, match="category 'Carver' has to be a name of small letters"):
+        bring(mesh, tmp_path / "tools", category="Carver", name="other")
+    assert left_in(tmp_path / "tools") == ["mallet"]
+
+
 def test_collision_hulls_are_few_convex_and_true(plain: importer.ImportReport):
     pieces = [
         trimesh.load_mesh(path, process=False) for path in plain.directory.glob("collision_*.obj")

@@ -81,7 +81,7 @@ def test_a_path_is_not_a_name(copy: Path, tmp_path: Path):
 @pytest.mark.parametrize(
     ("fields", "message"),
     [
-        ({"category": "spoon"}, r"tool\.yaml: category 'spoon' is none of hammer"),
+        ({"category": "A spoon"}, r"tool\.yaml: category 'A spoon' has to be a name"),
         ({"symmetry": 0}, r"tool\.yaml: symmetry is 0, and has to be 1 or more"),
         ({"mass": "heavy"}, r"tool\.yaml is not a tool record"),
         ({"grasp": {"x": 0.0}}, r"tool\.yaml is not a tool record"),

@@ -52,7 +52,7 @@ def check_free(kit: Kit, tools: list[Tool], drawn: Drawn, where: str) -> None:
     """Everything is whole in the workspace, with space between, and open hands have room too."""
     X_WKit, X_WTools = drawn
     block = placed(block_outline(kit), X_WKit)
-    outlines = [placed(t.silhouette, X) for t, X in zip(tools, X_WTools, strict=True)]
+    outlines = [placed(t.footprint, X) for t, X in zip(tools, X_WTools, strict=True)]
     shapes = [block, *outlines]
     for i, shape in enumerate(shapes):
         x_min, y_min, x_max, y_max = shape.bounds()
