@@ -21,7 +21,7 @@ from safetensors.torch import save
 from torch import Tensor
 
 from kitting_drake.common.errors import UserError
-from kitting_drake.common.files import write_whole
+from kitting_drake.common.files import write_atomically
 from kitting_drake.policies.config import NetworkConfig
 from kitting_drake.policies.methods import make_networks
 from kitting_drake.policies.networks import Networks
@@ -86,7 +86,7 @@ def save_weights(path: Path, networks: Networks, card: dict[str, Any]) -> None:
         "card": json.dumps(card),
     }
     plain = {key: value.detach().cpu().float().contiguous() for key, value in tensors.items()}
-    write_whole(path, save(plain, metadata))
+    write_atomically(path, save(plain, metadata))
 
 
 def _plain_size(layer: SteerableConv2d) -> int:

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydrake.math import RigidTransform
 
-from kitting_drake.common.files import write_whole
+from kitting_drake.common.files import write_atomically
 from kitting_drake.common.paths import MODELS, cache_directory
 from kitting_drake.tasks.sampling import Footprint, rectangle
 from kitting_drake.tasks.task import SceneObject
@@ -196,5 +196,5 @@ def _cached(text: str) -> Path:
     digest = hashlib.sha256(text.encode()).hexdigest()
     path = cache_directory() / "models" / "ravens" / f"{digest[:24]}.sdf"
     if not path.exists() or path.read_text() != text:
-        write_whole(path, text)
+        write_atomically(path, text)
     return path
