@@ -100,8 +100,9 @@ def validate(
     Returns:
         For each of `ERRORS` its median over the scenes, as `median_...`, its 95th percentile, as
         `p95_...`, and as `displacement_mm` the mean displacement. Where there are final
-        observations, also the `stop_threshold` chosen for them, and how many scenes are judged
-        wrongly with it: `false_stops`, in which there is something to pick, and `missed_stops`.
+        observations, also the `stop_threshold` chosen for them, by how many nats the two kinds
+        are separated, as `stop_margin` (negative: they overlap), and how many scenes are judged
+        wrongly: `false_stops`, in which there is something to pick, and `missed_stops`.
         And `cost_mm`, by which a checkpoint is chosen: the mean displacement over all scenes and
         final observations, where what is judged wrongly counts as lost (20 mm) and a final
         observation that is judged rightly as 0.
@@ -121,17 +122,30 @@ def validate(
     report["cost_mm"] = report["displacement_mm"]
     grid = scenes[0].grid
     absent = [policy.log_odds(Observation(final.image, grid)) for final in finals]
-    threshold = None
-    if None not in present and None not in absent:
-        threshold = choose_stop_threshold(present, absent)  # type: ignore[arg-type]
-    if threshold is not None:
-        stopped = np.array(present, float) < threshold
-        missed = int((np.array(absent, float) >= threshold).sum())
-        costs = np.where(stopped, _LOST, displacements).sum() + _LOST * missed
-        report |= {
-            "cost_mm": float(costs / (len(scenes) + len(finals))),
-            "stop_threshold": threshold,
-            "false_stops": int(stopped.sum()),
-            "missed_stops": missed,
-        }
+    # Where the networks cannot tell, there are no odds.
+    if absent and None not in (*present, *absent):
+        report |= _stop_report(np.array(present, float), np.array(absent, float), displacements)
     return report
+
+
+def _stop_report(
+    present: NDArray[np.float64], absent: NDArray[np.float64], displacements: NDArray[np.float64]
+) -> dict[str, float]:
+    """The part of `validate`'s report that is about stopping.
+
+    Args:
+        present: the log-odds of scenes in which there is something to pick.
+        absent: those of final observations.
+        displacements: of the scenes, in mm.
+    """
+    threshold = choose_stop_threshold(present, absent)
+    assert threshold is not None
+    stopped, missed = present < threshold, int((absent >= threshold).sum())
+    costs = np.where(stopped, _LOST, displacements).sum() + _LOST * missed
+    return {
+        "cost_mm": float(costs / (len(present) + len(absent))),
+        "stop_threshold": threshold,
+        "stop_margin": float(present.min() - absent.max()),
+        "false_stops": int(stopped.sum()),
+        "missed_stops": missed,
+    }

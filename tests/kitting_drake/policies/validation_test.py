@@ -106,6 +106,7 @@ def test_scenes_that_are_judged_wrongly_are_counted_and_cost_as_if_lost():
     report = validate(policy, [SCENE] * 3, [final] * 4)  # type: ignore[arg-type]
     assert report["stop_threshold"] == pytest.approx(-2.5)
     assert (report["false_stops"], report["missed_stops"]) == (0, 1)
+    assert report["stop_margin"] == pytest.approx(-2.0 - 4.0)
     assert report["displacement_mm"] == pytest.approx(2 / 3)
     assert report["cost_mm"] == pytest.approx((0 + 0 + 2 + 20) / 7)
 
