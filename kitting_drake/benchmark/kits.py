@@ -8,14 +8,10 @@ from rich.console import Console
 from rich.progress import track
 from rich.table import Table
 
+from kitting_drake.hkd.kits.block import build_block, contact_surface
 from kitting_drake.hkd.kits.clearance import measure_clearance
-from kitting_drake.hkd.kits.kit import (
-    KitParameters,
-    build_block,
-    contact_surface,
-    kit_cavities,
-    layout_kit,
-)
+from kitting_drake.hkd.kits.layout import kit_cavities, layout_kit
+from kitting_drake.hkd.kits.parameters import KitParameters
 from kitting_drake.hkd.tools.tool import load_tool
 from kitting_drake.hkd.tools.toolsets import SPLITS, toolsets
 

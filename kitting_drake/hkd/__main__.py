@@ -98,7 +98,8 @@ def generate(args: argparse.Namespace, entries: list[ToolEntry]) -> None:
 def sheet(args: argparse.Namespace, entries: list[ToolEntry]) -> None:
     """Renders the contact sheet."""
     # Imported here: Drake is slow to load, and only this verb needs it.
-    from kitting_drake.hkd.kits.kit import KitParameters, make_kit
+    from kitting_drake.hkd.kits.kit import make_kit
+    from kitting_drake.hkd.kits.parameters import KitParameters
     from kitting_drake.hkd.sheet import kit_subject, tool_subject, write_sheet
 
     if args.kits:

@@ -12,7 +12,8 @@ from typing import Any
 import kitting_drake
 from kitting_drake.common.errors import UserError
 from kitting_drake.common.files import write_json
-from kitting_drake.hkd.kits.kit import Kit, KitParameters, make_kit
+from kitting_drake.hkd.kits.kit import Kit, make_kit
+from kitting_drake.hkd.kits.parameters import KitParameters
 from kitting_drake.hkd.tools.tool import Tool, load_tool
 from kitting_drake.hkd.tools.toolsets import SPLITS, TOOLSETS_SEED, tool_pools, toolsets
 

@@ -27,7 +27,8 @@ from pydrake.systems.sensors import CameraInfo
 
 from kitting_drake.cell.cameras import require_rendering
 from kitting_drake.common.files import write_atomically
-from kitting_drake.hkd.kits.kit import Kit, KitParameters
+from kitting_drake.hkd.kits.kit import Kit
+from kitting_drake.hkd.kits.parameters import KitParameters
 from kitting_drake.hkd.tools.tool import Tool
 
 _BACKGROUND = (0.97, 0.97, 0.96)

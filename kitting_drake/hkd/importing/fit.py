@@ -8,7 +8,8 @@ from manifold3d import Manifold
 from kitting_drake.common.errors import UserError
 from kitting_drake.hkd.grasps.proposals import WIDEST, propose_grasps
 from kitting_drake.hkd.importing.stable_pose import centred, size
-from kitting_drake.hkd.kits.kit import KitParameters, layout_kit
+from kitting_drake.hkd.kits.layout import layout_kit
+from kitting_drake.hkd.kits.parameters import KitParameters
 from kitting_drake.hkd.tools import meshes
 from kitting_drake.hkd.tools.tool import Tool
 

@@ -6,7 +6,8 @@ import numpy as np
 from manifold3d import CrossSection, Manifold
 from numpy.typing import NDArray
 
-from kitting_drake.hkd.kits.kit import CavityPose, KitParameters, moved_outline, slot_pose
+from kitting_drake.hkd.kits.layout import CavityPose, moved_outline, slot_pose
+from kitting_drake.hkd.kits.parameters import KitParameters
 from kitting_drake.hkd.tools.tool import Tool
 
 _STEP = 0.00025

@@ -15,7 +15,8 @@ from kitting_drake.hkd.grasps.annotate import save_grasp
 from kitting_drake.hkd.importing import importer
 from kitting_drake.hkd.importing.fit import guess_unit
 from kitting_drake.hkd.importing.importer import ImportRequest, import_tool
-from kitting_drake.hkd.kits.kit import KitParameters, layout_kit
+from kitting_drake.hkd.kits.layout import layout_kit
+from kitting_drake.hkd.kits.parameters import KitParameters
 from kitting_drake.hkd.tools.meshes import vertices_and_faces
 from kitting_drake.hkd.tools.tool import load_tool, user_tool_names
 

@@ -11,17 +11,11 @@ from numpy.typing import NDArray
 
 from kitting_drake.common.errors import UserError
 from kitting_drake.hkd.kits import kit as kit_module
+from kitting_drake.hkd.kits.block import Cavity, build_block, contact_surface
 from kitting_drake.hkd.kits.clearance import measure_clearance
-from kitting_drake.hkd.kits.kit import (
-    SLOTS,
-    Cavity,
-    KitParameters,
-    build_block,
-    contact_surface,
-    kit_cavities,
-    layout_kit,
-    make_kit,
-)
+from kitting_drake.hkd.kits.kit import make_kit
+from kitting_drake.hkd.kits.layout import SLOTS, kit_cavities, layout_kit
+from kitting_drake.hkd.kits.parameters import KitParameters
 from kitting_drake.hkd.tools.scaling import scaled_tool
 from kitting_drake.hkd.tools.tool import Tool, load_tool
 

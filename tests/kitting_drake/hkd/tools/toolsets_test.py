@@ -1,8 +1,10 @@
 import pytest
 
 from kitting_drake.common.errors import UserError
+from kitting_drake.hkd.kits.block import build_block
 from kitting_drake.hkd.kits.clearance import measure_clearance
-from kitting_drake.hkd.kits.kit import KitParameters, build_block, kit_cavities
+from kitting_drake.hkd.kits.layout import kit_cavities
+from kitting_drake.hkd.kits.parameters import KitParameters
 from kitting_drake.hkd.tools import toolsets as toolsets_module
 from kitting_drake.hkd.tools.tool import CATEGORIES, load_tool
 from kitting_drake.hkd.tools.toolsets import SPLITS, TOOLSET_COUNT, tool_pools, toolsets

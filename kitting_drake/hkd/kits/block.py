@@ -1,0 +1,185 @@
+"""The kit block: its solid, and the surface that the contact solver likes."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from manifold3d import CrossSection, JoinType, Manifold, Mesh, triangulate
+from numpy.typing import NDArray
+
+from kitting_drake.hkd.kits.parameters import KitParameters
+
+ARC_SEGMENTS = 64
+"""How many straight edges a rounded outline has around a full circle."""
+_TOP_CELL = 0.02
+"""Side of the squares into which the top is cut for the contact solver, in metres."""
+
+
+class _Surface:
+    """Triangles that grow ring by ring. Lengths in metres, normals out of the cavity's solid."""
+
+    def __init__(self) -> None:
+        self._vertices: list[NDArray[np.float64]] = []
+        self._faces: list[NDArray[np.int64]] = []
+        self._count = 0
+
+    def add_vertices(self, vertices: NDArray[np.float64]) -> int:
+        """Adds (n, 3) vertices; returns the index of the first."""
+        self._vertices.append(vertices)
+        self._count += len(vertices)
+        return self._count - len(vertices)
+
+    def add_faces(self, faces: NDArray[np.int64]) -> None:
+        """Adds (n, 3) faces."""
+        self._faces.append(faces)
+
+    def add_ring(self, loops: list[NDArray[np.float64]], z: float) -> int:
+        """Adds the vertices of closed loops at a height; returns the index of the first."""
+        flat = np.concatenate(loops)
+        return self.add_vertices(np.column_stack([flat, np.full(len(flat), z)]))
+
+    def add_walls(self, loops: list[NDArray[np.float64]], lower: int, upper: int) -> None:
+        """Joins two rings of the same loops by upright walls."""
+        start = 0
+        for loop in loops:
+            here = start + np.arange(len(loop))
+            there = start + (np.arange(len(loop)) + 1) % len(loop)
+            self.add_faces(np.column_stack([lower + here, lower + there, upper + there]))
+            self.add_faces(np.column_stack([lower + here, upper + there, upper + here]))
+            start += len(loop)
+
+    def add_bevel(
+        self,
+        outer_loops: list[NDArray[np.float64]],
+        outer: int,
+        inner_loops: list[NDArray[np.float64]],
+        inner: int,
+    ) -> None:
+        """Joins a ring to a narrower and lower one: the flat band between the loops, let down."""
+        band = np.asarray(triangulate(outer_loops + [loop[::-1] for loop in inner_loops]))
+        starts = np.cumsum([0, *map(len, inner_loops[:-1])])
+        inner_index = [
+            inner + start + np.arange(len(loop))[::-1]
+            for start, loop in zip(starts, inner_loops, strict=True)
+        ]
+        outer_index = outer + np.arange(sum(map(len, outer_loops)))
+        self.add_faces(np.concatenate([outer_index, *inner_index])[band][:, ::-1])
+
+    def arrays(self) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+        """Vertices (n, 3) and faces (m, 3)."""
+        return np.concatenate(self._vertices), np.concatenate(self._faces)
+
+
+@dataclass(frozen=True)
+class Cavity:
+    """A bevelled pit in the kit frame, in metres."""
+
+    outline: CrossSection
+    """The outline of the wall."""
+    floor: float
+    """Heights in the kit frame."""
+    top: float
+    lead_in: float
+    """Width and depth of the bevel around the rim; none at zero."""
+
+    @property
+    def rim(self) -> CrossSection:
+        """The outline at the very top."""
+        if self.lead_in <= 0:
+            return self.outline
+        return self.outline.offset(self.lead_in, JoinType.Round, circular_segments=ARC_SEGMENTS)
+
+    def add_sides(self, surface: _Surface) -> tuple[int, int]:
+        """Adds wall and bevel; returns the first vertices of the floor's ring and of the rim's."""
+        wall_loops, rim_loops = self.outline.to_polygons(), self.rim.to_polygons()
+        floor = surface.add_ring(wall_loops, self.floor)
+        if self.lead_in <= 0:
+            rim = surface.add_ring(rim_loops, self.top)
+            surface.add_walls(wall_loops, floor, rim)
+            return floor, rim
+        shoulder = surface.add_ring(wall_loops, self.top - self.lead_in)
+        surface.add_walls(wall_loops, floor, shoulder)
+        rim = surface.add_ring(rim_loops, self.top)
+        surface.add_bevel(rim_loops, rim, wall_loops, shoulder)
+        return floor, rim
+
+    def cutter(self) -> Manifold:
+        """The solid to subtract from the block."""
+        surface = _Surface()
+        floor, rim = self.add_sides(surface)
+        rim_loops = self.rim.to_polygons()
+        above = surface.add_ring(rim_loops, self.top + 0.01)
+        surface.add_walls(rim_loops, rim, above)
+        surface.add_faces(np.asarray(triangulate(self.outline.to_polygons()))[:, ::-1] + floor)
+        surface.add_faces(np.asarray(triangulate(rim_loops)) + above)
+        vertices, faces = surface.arrays()
+        return Manifold(Mesh(vertices.astype(np.float32), faces.astype(np.uint32)))
+
+
+def build_block(cavities: Sequence[Cavity], parameters: KitParameters) -> Manifold:
+    """The kit block in the frame K, in metres: watertight, one body.
+
+    Args:
+        cavities: to cut out.
+        parameters: whose length and width are the block's; see `KitLayout.parameters`.
+    """
+    size = (parameters.length, parameters.width, parameters.height)
+    block = Manifold.cube(size, True).translate((0, 0, parameters.height / 2))
+    for cavity in cavities:
+        block -= cavity.cutter()
+    return block
+
+
+def _add_floor(surface: _Surface, cavity: Cavity, cavities: Sequence[Cavity]) -> None:
+    """Adds the bounding rectangle of a cavity's floor, without what is in others as deep or deeper.
+
+    There it would be a shelf, or a second floor in the place of the first.
+    """
+    x_min, y_min, x_max, y_max = cavity.outline.bounds()
+    corners = np.array([(x_min, y_min), (x_max, y_min), (x_max, y_max), (x_min, y_max)])
+    rectangle = CrossSection([corners])
+    floor = rectangle
+    for other in cavities:
+        if other is not cavity and other.floor <= cavity.floor:
+            floor -= other.rim
+    if rectangle.area() - floor.area() < 1e-9:
+        start = surface.add_ring([corners], cavity.floor)
+        surface.add_faces(start + np.array([[0, 2, 1], [0, 3, 2]]))
+        return
+    loops = floor.to_polygons()
+    start = surface.add_ring(loops, cavity.floor)
+    surface.add_faces(start + np.asarray(triangulate(loops))[:, ::-1])
+
+
+def contact_surface(
+    cavities: Sequence[Cavity], parameters: KitParameters
+) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """The block's outside as the contact solver likes it: vertices (n, 3) and faces (m, 3).
+
+    The same walls, bevels and planes as the block's, cut otherwise. A triangulation of floors and
+    top by their outlines has long slivers, whose bounding boxes all overlap, and breaks every
+    contact patch into as many polygons. So a floor is one rectangle that reaches into the solid,
+    where nothing can touch it, but not into another cavity, and the top is cut into squares first.
+    The underside is left out.
+    """
+    surface = _Surface()
+    room = CrossSection.square((parameters.length, parameters.width), True)
+    top = room
+    for cavity in cavities:
+        cavity.add_sides(surface)
+        _add_floor(surface, cavity, cavities)
+        top -= cavity.rim
+    # What bounds the cavities from outside bounds the block from inside.
+    vertices, faces = surface.arrays()
+    block = _Surface()
+    block.add_faces(block.add_vertices(vertices) + faces[:, ::-1])
+    loops = room.to_polygons()
+    block.add_walls(loops, block.add_ring(loops, 0.0), block.add_ring(loops, parameters.height))
+    for x in np.arange(-parameters.length / 2, parameters.length / 2, _TOP_CELL):
+        for y in np.arange(-parameters.width / 2, parameters.width / 2, _TOP_CELL):
+            cell = top ^ CrossSection.square((_TOP_CELL, _TOP_CELL)).translate((x, y))
+            if cell.area() > 1e-10:
+                loops = cell.to_polygons()
+                start = block.add_ring(loops, parameters.height)
+                block.add_faces(start + np.asarray(triangulate(loops)))
+    return block.arrays()

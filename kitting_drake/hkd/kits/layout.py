@@ -1,0 +1,194 @@
+"""Where the cavities of a kit are, and their outlines.
+
+A toolset, one tool of each of the paper's categories at most, takes the slots of a template. Any
+other tools, and tools that are too big for their slots, are nested on a block of their own size.
+"""
+
+import dataclasses
+import itertools
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from manifold3d import CrossSection, JoinType
+from numpy.typing import NDArray
+
+from kitting_drake.common.errors import UserError
+from kitting_drake.hkd.grasps.proposals import RELEASE_REACH
+from kitting_drake.hkd.kits.block import ARC_SEGMENTS, Cavity
+from kitting_drake.hkd.kits.nesting import LONGEST_SIDES, NestedShape, nest
+from kitting_drake.hkd.kits.parameters import KitParameters
+from kitting_drake.hkd.tools.tool import Tool
+from systems.hand_geometry import FINGER_LENGTH
+
+SLOTS = {
+    "hammer": (0.02, 0.03),
+    "pliers": (0.0, -0.03),
+    "wrench": (0.0, -0.09),
+    "screwdriver": (0.0, 0.09),
+}
+"""(x, y) of the frame T of the tool of each category in the kit frame, in metres."""
+
+MOST_TOOLS = 12
+"""The largest number of tools in a kit."""
+
+_SIZE_STEP = 0.001
+"""Nested blocks have a length and a width that are multiples of this, in metres."""
+
+
+@dataclass(frozen=True)
+class CavityPose:
+    """The pose of a seated tool's frame T in the kit frame K; lengths in metres."""
+
+    x: float
+    y: float
+    z: float
+    yaw: float = 0.0
+    """The rotation about K's z, in radians."""
+
+
+@dataclass(frozen=True)
+class KitLayout:
+    """How large a kit block is, and where its cavities are."""
+
+    parameters: KitParameters
+    """The template, with the length and the width that the block has."""
+    poses: tuple[CavityPose, ...]
+    """The poses of the seated tools, in their order."""
+
+
+def slot_pose(tool: Tool, parameters: KitParameters) -> CavityPose:
+    """The pose of a tool in the slot of its category: its top is flush with the block's.
+
+    Raises:
+        KeyError: there is no slot for the tool's category.
+    """
+    x, y = SLOTS[tool.category]
+    return CavityPose(x, y, parameters.height - tool.height)
+
+
+def cavity_outline(outline: CrossSection, parameters: KitParameters) -> CrossSection:
+    """The outline of a tool, closed and grown by the clearance.
+
+    A hole through the tool leaves no pillar standing in its cavity, thin and of no use.
+    """
+    closing, clearance = parameters.closing_radius, parameters.clearance
+    # Simplified first and last only: each time costs up to the tolerance.
+    grown = outline.simplify(parameters.tolerance / 4).offset(
+        closing + clearance, JoinType.Round, circular_segments=ARC_SEGMENTS
+    )
+    closed = grown.offset(-closing, JoinType.Round, circular_segments=ARC_SEGMENTS)
+    # Loops around holes run clockwise, and have negative areas.
+    loops = [loop for loop in closed.to_polygons() if _signed_area(loop) > 0]
+    return CrossSection(loops).simplify(parameters.tolerance)
+
+
+def _signed_area(loop: NDArray[np.float64]) -> float:
+    x, y = loop.T
+    return float(np.dot(x, np.roll(y, -1)) - np.dot(y, np.roll(x, -1))) / 2
+
+
+def layout_kit(tools: Sequence[Tool], parameters: KitParameters) -> KitLayout:
+    """Chooses the block's size and the poses of the tools: in their slots, or else nested.
+
+    Raises:
+        UserError: there are no tools or too many, one is too high for the block, or no block is
+            large enough for them all.
+    """
+    if not 1 <= len(tools) <= MOST_TOOLS:
+        raise UserError(f"a kit holds 1 to {MOST_TOOLS} tools, not {len(tools)}")
+    for tool in tools:
+        if parameters.height - tool.height < parameters.minimum_wall:
+            raise UserError(
+                f"'{tool.name}' is {1e3 * tool.height:.1f} mm high and leaves less than "
+                f"kit.minimum_wall, {1e3 * parameters.minimum_wall:.1f} mm, below it in a block of "
+                f"{1e3 * parameters.height:.1f} mm"
+            )
+    categories = [tool.category for tool in tools]
+    if len(set(categories)) == len(categories) and set(categories) <= set(SLOTS):
+        slots = tuple(slot_pose(tool, parameters) for tool in tools)
+        if _has_walls(kit_cavities(tools, parameters, slots), parameters):
+            return KitLayout(parameters, slots)
+    return _nested_layout(tools, parameters)
+
+
+def _nested_layout(tools: Sequence[Tool], parameters: KitParameters) -> KitLayout:
+    def shape(tool: Tool) -> NestedShape:
+        outline = cavity_outline(tool.footprint, parameters)
+        rim = Cavity(outline, 0.0, parameters.height, parameters.lead_in).rim
+        return NestedShape(rim, released_fingers(tool))
+
+    wall = max(parameters.minimum_wall, parameters.nested_wall)
+    nesting = nest([shape(tool) for tool in tools], wall)
+    if nesting is None:
+        names = ", ".join(f"'{tool.name}'" for tool in tools)
+        sides = " by ".join(f"{1e3 * side:.0f}" for side in LONGEST_SIDES)
+        raise UserError(f"{names} do not fit into one kit: its block may be {sides} mm at most")
+    length, width = (
+        _SIZE_STEP * math.ceil(side / _SIZE_STEP) for side in (nesting.length, nesting.width)
+    )
+    return KitLayout(
+        dataclasses.replace(parameters, length=length, width=width),
+        tuple(
+            CavityPose(pose.x, pose.y, parameters.height - tool.height, math.radians(pose.yaw_deg))
+            for tool, pose in zip(tools, nesting.poses, strict=True)
+        ),
+    )
+
+
+def released_fingers(tool: Tool) -> CrossSection:
+    """The area under the fingers as they let go of a tool at its annotated grasp, in T, in metres.
+
+    One rectangle for each finger, from the gripped face outward.
+    """
+    fingers = CrossSection()
+    for side in (-1, 1):
+        middle = side * (tool.grasp.width + RELEASE_REACH) / 2
+        fingers += CrossSection.square((FINGER_LENGTH, RELEASE_REACH), True).translate((0, middle))
+    return fingers.rotate(math.degrees(tool.grasp.theta)).translate((tool.grasp.x, tool.grasp.y))
+
+
+def kit_cavities(
+    tools: Sequence[Tool], parameters: KitParameters, poses: Sequence[CavityPose] | None = None
+) -> list[Cavity]:
+    """The cavity of each tool.
+
+    Args:
+        tools: of the kit.
+        parameters: of the kit.
+        poses: of the seated tools; those of `layout_kit` if None.
+
+    Raises:
+        UserError: the tools make no kit; see `layout_kit`.
+    """
+    poses = layout_kit(tools, parameters).poses if poses is None else poses
+    return [
+        Cavity(
+            moved_outline(cavity_outline(tool.footprint, parameters), pose),
+            pose.z,
+            parameters.height,
+            parameters.lead_in,
+        )
+        for tool, pose in zip(tools, poses, strict=True)
+    ]
+
+
+def moved_outline(outline: CrossSection, pose: CavityPose) -> CrossSection:
+    """An outline in a tool's frame T as it is in the kit frame K when the tool is seated."""
+    if pose.yaw:
+        outline = outline.rotate(math.degrees(pose.yaw))
+    return outline.translate((pose.x, pose.y))
+
+
+def _has_walls(cavities: Sequence[Cavity], parameters: KitParameters) -> bool:
+    """Whether there is a wall between any two cavities, and around them in the block."""
+    half_wall = parameters.minimum_wall / 2
+    grown = [
+        cavity.rim.offset(half_wall, JoinType.Round, circular_segments=ARC_SEGMENTS)
+        for cavity in cavities
+    ]
+    room = CrossSection.square((parameters.length, parameters.width), True)
+    return all((outline - room).area() <= 1e-9 for outline in grown) and all(
+        (one ^ other).area() <= 1e-9 for one, other in itertools.combinations(grown, 2)
+    )
