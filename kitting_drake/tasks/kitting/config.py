@@ -8,7 +8,8 @@ import numpy as np
 from pydrake.math import RigidTransform, RollPitchYaw
 
 from kitting_drake.common.errors import UserError
-from kitting_drake.hkd.kits.kit import Kit, KitParameters, make_kit
+from kitting_drake.hkd.kits.kit import Kit, make_kit
+from kitting_drake.hkd.kits.parameters import KitParameters
 from kitting_drake.hkd.tools.scaling import scaled_tool
 from kitting_drake.hkd.tools.tool import Tool, load_tool
 from kitting_drake.hkd.tools.toolsets import SPLITS, toolsets

@@ -77,9 +77,7 @@ def check_arrangement(
     table = _rectangle(*TABLE)
     placed: dict[str, CrossSection] = {}
     things = {"task.kit_pose": (block_outline(kit), kit_pose)}
-    things |= {
-        f"task.tools.{name}": (tool.footprint, pose) for name, (tool, pose) in tools.items()
-    }
+    things |= {f"task.tools.{name}": (tool.footprint, pose) for name, (tool, pose) in tools.items()}
     for name, (outline, pose) in things.items():
         outline = outline.rotate(pose.yaw_deg).translate((pose.x, pose.y))
         if (outline - table).area() > 1e-9:
