@@ -71,7 +71,7 @@ def _simulation(arguments: argparse.Namespace, console: Console, folder: Path) -
 
 
 def _kits(arguments: argparse.Namespace, console: Console, folder: Path) -> list[Table]:
-    from kitting_drake.benchmark.kits import benchmark_kits, kits_table
+    from kitting_drake.hkd.kits.benchmark import benchmark_kits, kits_table
 
     _use_one_core()
     measured = benchmark_kits(arguments.kits, console)

@@ -146,7 +146,7 @@ def observed_scene(path: Path | None) -> Scene:
 
 
 def synthetic_scene(grid: PixelGrid) -> Scene:
-    """Four bars of a tool's size on a table, and a block with cavities for them."""
+    """Four bars on a table, and a block with a hole for each."""
     random = np.random.default_rng(0)
     pixel = np.stack(np.meshgrid(np.arange(grid.rows), np.arange(grid.cols), indexing="ij"), -1)
     image = np.full((4, *grid.shape), 0.4, np.float32)
@@ -159,16 +159,16 @@ def synthetic_scene(grid: PixelGrid) -> Scene:
         return (along <= half[0]) & (across <= half[1])
 
     rows, cols = grid.shape
-    kit = np.array([0.5 * rows, 0.25 * cols])
-    block = bar(kit, 0.0, 0.26, 0.28)
+    middle = np.array([0.5 * rows, 0.25 * cols])
+    block = bar(middle, 0.0, 0.26, 0.28)
     image[:3, block], image[3, block] = 0.6, 0.05
     actions = []
     for index in range(4):
         pick = np.array([(0.2 + 0.2 * index) * rows, 0.75 * cols])
-        place = kit + (0.0, (index - 1.5) * 0.06 / grid.resolution)
+        place = middle + (0.0, (index - 1.5) * 0.06 / grid.resolution)
         theta = float(random.uniform(0.3, 1.2))
-        cavity, tool = bar(place, 0.0, 0.17, 0.03), bar(pick, theta, 0.17, 0.025)
-        image[3, cavity] = 0.03
+        hole, tool = bar(place, 0.0, 0.17, 0.03), bar(pick, theta, 0.17, 0.025)
+        image[3, hole] = 0.03
         image[:3, tool] = random.uniform(0.1, 0.9, (3, 1))
         image[3, tool] = 0.02
         (pick_x, pick_y), (place_x, place_y) = grid.to_world([pick, place])
