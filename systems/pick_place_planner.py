@@ -232,7 +232,8 @@ class PickPlacePlanner(LeafSystem):
     def _set_heights(self, state: _State, heights: SurfaceHeights) -> None:
         parameters = self._parameters
         floor = heights.table + parameters.floor_clearance
-        state.grasp_z = max(heights.pick_top - parameters.grasp_depth, floor)
+        share = parameters.grasp_depth_share * (heights.pick_top - heights.support)
+        state.grasp_z = max(heights.pick_top - max(parameters.grasp_depth, share), floor)
         state.table_z, state.support_z = heights.table, heights.support
         state.rim_z = heights.place_rim
         hanging = max(state.grasp_z - heights.support, 0.0)

@@ -25,7 +25,7 @@ from systems.signals import (
 PICK, PLACE = PlanarPose(0.4, 0.3, 0.5), PlanarPose(0.55, -0.2, -0.8)
 HEIGHTS = SurfaceHeights(pick_top=0.05)
 ACTION = PickPlaceAction(PICK, PLACE, heights=HEIGHTS)
-PARAMETERS = PickPlaceParameters()
+PARAMETERS = PickPlaceParameters(grasp_depth_share=0.0)
 TEN = 10
 """Actions that the planner of most tests may take."""
 GRASP_Z = 0.05 - PARAMETERS.grasp_depth
@@ -378,6 +378,14 @@ def test_descent_stops_where_something_is_touched():
     z = run.output("desired_motion")[2]
     late = PARAMETERS.descend_speed / 64
     assert touched - late < z - PARAMETERS.floor_clearance <= touched
+
+
+@pytest.mark.parametrize(("height", "depth"), [(0.02, 0.010), (0.04, 0.016)])
+def test_high_objects_are_gripped_deeper(height: float, depth: float):
+    heights = SurfaceHeights(pick_top=0.03 + height, support=0.03)
+    answer = dataclasses.replace(ACTION, heights=heights)
+    run = Run(answer=answer, parameters=PickPlaceParameters()).until(Mode.CLOSE)
+    assert run.output("desired_motion")[2] == pytest.approx(0.03 + height - depth)
 
 
 def test_descent_to_a_flat_object_keeps_off_the_floor():
