@@ -46,10 +46,10 @@ class PickPlaceParameters:
     travel_height: float = bounded(0.115, 0.05, 0.5)
     travel_clearance: float = bounded(0.015, 0.0, 0.1)
 
-    # How far below the top of an object the fingertips grip, in m; deeper where this share of the
-    # object's height above its support is more: the pads are to be near the widest of a round
-    # handle.
+    # How far below the top of an object the fingertips grip, in m: this share of its height above
+    # its support, within these limits. On a round handle the pads are to be near its widest.
     grasp_depth: float = bounded(0.010, 0.001, 0.05)
+    max_grasp_depth: float = bounded(0.018, 0.001, 0.05)
     grasp_depth_share: float = bounded(0.4, 0.0, 1.0)
 
     # The fingertips stay this far above the table, in m.

@@ -233,7 +233,8 @@ class PickPlacePlanner(LeafSystem):
         parameters = self._parameters
         floor = heights.table + parameters.floor_clearance
         share = parameters.grasp_depth_share * (heights.pick_top - heights.support)
-        state.grasp_z = max(heights.pick_top - max(parameters.grasp_depth, share), floor)
+        depth = max(parameters.grasp_depth, min(share, parameters.max_grasp_depth))
+        state.grasp_z = max(heights.pick_top - depth, floor)
         state.table_z, state.support_z = heights.table, heights.support
         state.rim_z = heights.place_rim
         hanging = max(state.grasp_z - heights.support, 0.0)

@@ -380,7 +380,7 @@ def test_descent_stops_where_something_is_touched():
     assert touched - late < z - PARAMETERS.floor_clearance <= touched
 
 
-@pytest.mark.parametrize(("height", "depth"), [(0.02, 0.010), (0.04, 0.016)])
+@pytest.mark.parametrize(("height", "depth"), [(0.02, 0.010), (0.04, 0.016), (0.09, 0.018)])
 def test_high_objects_are_gripped_deeper(height: float, depth: float):
     heights = SurfaceHeights(pick_top=0.03 + height, support=0.03)
     answer = dataclasses.replace(ACTION, heights=heights)
