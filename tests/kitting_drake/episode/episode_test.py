@@ -55,6 +55,7 @@ class Seen:
     is_last: bool
     time: float
     counts: tuple[float, ...]
+    asleep: bool
 
 
 class Observer:
@@ -66,6 +67,7 @@ class Observer:
 
     def observe(self, event: ModeChange) -> None:
         root = event.root_context
+        body = self._cell.plant.get_body(self._cell.objects[0].body)
         self.seen.append(
             Seen(
                 event.previous,
@@ -75,6 +77,7 @@ class Observer:
                 event.is_last,
                 root.get_time(),
                 tuple(self._cell.diagram.GetOutputPort("counts").Eval(root)),
+                body.is_locked(self._cell.plant.GetMyContextFromRoot(root)),
             )
         )
 
@@ -123,6 +126,16 @@ def test_modes_are_told_in_order(grasp_to_release: tuple[EpisodeResult, Sequence
     assert not last.is_stop
     # At the start of an action it is counted already.
     assert [event.counts for event in seen] == [(1.0, 0.0, 0.0)] * len(seen)
+
+
+def test_a_tool_sleeps_until_the_hand_comes(
+    grasp_to_release: tuple[EpisodeResult, Sequence[Seen]],
+):
+    asleep = {event.mode: event.asleep for event in grasp_to_release[1]}
+    held = [Mode.CHECK, Mode.LIFT, Mode.CARRY, Mode.LOWER, Mode.RELEASE]
+    assert asleep[Mode.DESCEND]
+    assert not any(asleep[mode] for mode in held)
+    assert asleep[Mode.DONE]
 
 
 def test_an_episode_whose_time_is_up_has_no_reward():
