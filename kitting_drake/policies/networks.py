@@ -260,7 +260,7 @@ class FactoredNetworks(Networks):
         return PickPrediction(
             position=logits,
             angle=lambda pixel: self.predict_angle(image, pixel, orientations),
-            log_odds=float(log_odds(logits)) if self.config.stop else None,
+            log_odds=float(log_odds(logits.detach())) if self.config.stop else None,
         )
 
     def pick_losses(

@@ -24,7 +24,7 @@ DATA = Path(__file__).parent / "data"
 
 GOLDEN = {
     "kitting_seen": ((19.884, 24.756), 57.352, (60.774, 177.633), -151.384),
-    "kitting_unseen": ((59.508, 219.945), 40.767, (69.721, 123.693), -146.098),
+    "kitting_unseen": ((59.612, 219.980), 41.040, (69.570, 123.653), -146.237),
 }
 """The pick (row, col) and its angle, and the place (row, col) and the rotation, in degrees, that
 the weights predicted for these observations when they were shipped (float32)."""
@@ -40,11 +40,11 @@ def test_no_test_seed_was_learned_from(path: Path):
     assert file.config == NetworkConfig(
         **{**file.config.as_dict(), "method": "so2", "preset": "small", "orientations": 180}
     )
-    assert file.card["demonstrations"] == len(file.card["demonstration_seeds"]) == 100
+    assert file.card["demonstrations"] == len(file.card["demonstration_seeds"]) > 90
     learned = {*file.card["demonstration_seeds"], *file.card["validation_seeds"]}
     assert not learned.intersection(TEST_SEEDS)
-    # Their cards have an older name for the error of the rotation.
-    assert file.card["validation"]["median_turn_deg"] < 0.5
+    assert file.card["validation"]["median_rotation_deg"] < 0.5
+    assert file.card["validation"]["false_stops"] == file.card["validation"]["missed_stops"] == 0
 
 
 @pytest.mark.parametrize("path", SHIPPED, ids=lambda path: path.stem)
