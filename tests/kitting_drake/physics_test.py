@@ -70,6 +70,7 @@ def test_the_oracle_kits_all_four_and_does_so_again():
     assert first.point_contact_pairs == 0
 
 
+@pytest.mark.slow
 def test_sleep_changes_nothing_that_counts():
     """A tool is kitted beside one that rests, and is or is not frozen."""
     task = ArrangedKitting(
