@@ -10,6 +10,7 @@ import torch
 from kitting_drake.common.paths import MODELS
 from kitting_drake.common.seeds import TEST_SEEDS
 from kitting_drake.policies.config import PICK_CROP, NetworkConfig
+from kitting_drake.policies.demonstrations import Recorded
 from kitting_drake.policies.learned_policy import LearnedPolicy
 from kitting_drake.policies.methods import make_networks
 from kitting_drake.policies.networks import SO2Networks
@@ -47,13 +48,29 @@ def test_no_test_seed_was_learned_from(path: Path):
     assert file.card["validation"]["false_stops"] == file.card["validation"]["missed_stops"] == 0
 
 
+def stored_observation(name: str) -> Observation:
+    stored = np.load(DATA / f"{name}.npz")
+    recorded = Recorded(stored["rgb"], stored["height_tenth_mm"].astype(np.float32) * 1e-4)
+    return Observation(recorded.image, PixelGrid())
+
+
+def test_stops_when_all_tools_are_in_the_kit():
+    """The last observation of a demonstration with a validation seed (20011)."""
+    networks = load_networks(MODELS / "policies" / "kitting_unseen.safetensors")
+    policy = LearnedPolicy(networks, orientations=180)
+    names = ("kitting_unseen_final", "kitting_unseen")
+    finished, unfinished = (policy(stored_observation(name)) for name in names)
+    assert finished.stop
+    assert not unfinished.stop
+    # The threshold is nearly four nats away from either.
+    odds = [policy.log_odds(stored_observation(name)) for name in names]
+    assert odds[0] < networks.stop_threshold - 2 < networks.stop_threshold + 2 < odds[1]
+
+
 @pytest.mark.parametrize("path", SHIPPED, ids=lambda path: path.stem)
 def test_decides_as_when_it_was_shipped(path: Path):
-    stored = np.load(DATA / f"{path.stem}.npz")
-    colours = stored["rgb"].astype(np.float32) / 255
-    height = stored["height_tenth_mm"].astype(np.float32) * 1e-4
-    seen = Observation(np.concatenate([colours, height[None]]), PixelGrid())
-    found = LearnedPolicy(load_networks(path), orientations=180).decide(seen)
+    policy = LearnedPolicy(load_networks(path), orientations=180)
+    found = policy.decide(stored_observation(path.stem))
 
     pick, angle, place, rotation = GOLDEN[path.stem]
     action = found.action
