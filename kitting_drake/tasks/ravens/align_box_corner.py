@@ -33,8 +33,9 @@ class AlignBoxCorner(PoseTask):
 
     def make_scene(self, *, grid: PixelGrid, seed: int, base: Path) -> Scene:
         shape_rng = np.random.default_rng([seed, 1])
-        length, width = shape_rng.uniform(*self.box_sides, 2).round(4)
-        size = (float(length), float(width), round(shape_rng.uniform(*self.box_height), 4))
+        least, greatest = np.transpose([self.box_sides, self.box_sides, self.box_height])
+        length, width, height = (float(side) for side in shape_rng.uniform(least, greatest))
+        size = (round(length, 4), round(width, 4), round(height, 4))
         colour = random_brown(shape_rng)
         X_WMarker, X_WBox = draw_poses(
             [_marker_footprint(size), box_footprint(size)],
