@@ -24,7 +24,7 @@ DATA = Path(__file__).parent / "data"
 `rgb` (3, rows, cols), 8 bits, and `height_tenth_mm` (rows, cols), in tenths of a millimetre."""
 
 GOLDEN = {
-    "kitting_seen": ((19.884, 24.756), 57.352, (60.774, 177.633), -151.384),
+    "kitting_seen": ((19.879, 24.805), 57.140, (60.811, 177.621), -151.209),
     "kitting_unseen": ((59.612, 219.980), 41.040, (69.570, 123.653), -146.237),
 }
 """The pick (row, col) and its angle, and the place (row, col) and the rotation, in degrees, that
