@@ -3,6 +3,7 @@
 from kitting_drake.tasks.kitting.config import ArrangedKitting, Kitting, ToolsetKitting
 from kitting_drake.tasks.ravens.align_box_corner import AlignBoxCorner
 from kitting_drake.tasks.ravens.block_insertion import BlockInsertion
+from kitting_drake.tasks.ravens.palletizing_boxes import PalletizingBoxes
 from kitting_drake.tasks.ravens.place_red_in_green import PlaceRedInGreen
 from kitting_drake.tasks.ravens.stack_block_pyramid import StackBlockPyramid
 
@@ -14,6 +15,7 @@ Task = (
     | BlockInsertion
     | PlaceRedInGreen
     | StackBlockPyramid
+    | PalletizingBoxes
 )
 """The variants of a scenario's `task:`; the first is the default."""
 

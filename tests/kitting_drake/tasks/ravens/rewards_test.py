@@ -11,9 +11,11 @@ from pydrake.multibody.tree import BodyIndex
 from kitting_drake.tasks import (
     AlignBoxCorner,
     BlockInsertion,
+    PalletizingBoxes,
     PlaceRedInGreen,
     StackBlockPyramid,
 )
+from kitting_drake.tasks.ravens.palletizing_boxes import volume_points
 from kitting_drake.tasks.ravens.ravens_task import PREREQUISITE_MISSING, TOPPLED
 from kitting_drake.tasks.task import MISPLACED, NEVER_PICKED, ActionRecord, Scene, TaskConfig
 from systems.placement import PlacedObject, Placement, evaluate_placements, total_reward
@@ -117,6 +119,31 @@ def test_cubes_of_the_pyramid_touch_those_below():
     scene = make_scene(StackBlockPyramid())
     heights = [goal.poses[0].translation()[2] for goal in scene.goals]
     assert heights == pytest.approx([0.005] * 3 + [0.045] * 2 + [0.085])
+
+
+def test_boxes_count_by_what_of_them_is_on_the_pallet():
+    scene = make_scene(PalletizingBoxes())
+    places = [goal.poses[0] for goal in scene.goals]
+    start = initial_poses(scene)
+    assert reward(scene, start) == 0
+    assert reward(scene, places) == pytest.approx(1)
+    # Each counts by itself, wherever in the zone it is and whichever it is, ...
+    assert reward(scene, [*start[:17], places[17]]) == pytest.approx(1 / 18)
+    tilted = RigidTransform(RollPitchYaw(0.4, 0.3, 0.2), [0.45, 0.25, 0.15])
+    assert reward(scene, [tilted, *start[1:]]) == pytest.approx(1 / 18)
+    # ... and in part: of five rows of points along its length two are beyond the edge at x = 0.65.
+    over_the_edge = RigidTransform([0.645, 0.25, 0.04])
+    assert reward(scene, [over_the_edge, *start[1:]]) == pytest.approx(3 / 5 / 18)
+    assert reward(scene, [moved(over_the_edge, x=0.05), *start[1:]]) == 0
+    # Nothing counts above 0.30 m.
+    assert reward(scene, [moved(places[0], z=0.30), *start[1:]]) == 0
+
+
+def test_boxes_are_filled_with_points_20_mm_apart():
+    points = volume_points((0.085, 0.04, 0.04))
+    assert points.shape == (20, 3)
+    assert points.min(axis=0) == pytest.approx([-0.04, -0.01, 0.01])
+    assert points.max(axis=0) == pytest.approx([0.04, 0.01, 0.03])
 
 
 def test_causes_of_failure():
