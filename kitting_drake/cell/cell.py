@@ -1,5 +1,6 @@
 """From a scenario to the Diagram of the kitting cell: the only place where systems are wired."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -85,30 +86,43 @@ class Cell:
     def apply_sleep(self, root_context: Context) -> None:
         """Freezes the objects that are at rest and thaws the others.
 
-        A frozen object's joint is locked and its contact with table and fixtures is not computed;
-        what comes near it still collides with it. No LeafSystem may touch another's part of a
-        context, hence a function for the simulator's monitor.
+        A frozen object's joint is locked, and its contact with table, fixtures and other frozen
+        objects is not computed; what comes near it still collides with it. No LeafSystem may touch
+        another's part of a context, hence a function for the simulator's monitor.
         """
         if not self.sleep:
             return
         plant_context = self.plant.GetMyMutableContextFromRoot(root_context)
-        for item, resting in zip(self.objects, self.at_rest(root_context), strict=True):
-            body = self.plant.get_body(item.body)
-            if resting == body.is_locked(plant_context):
-                continue
-            filters = self.scene_graph.collision_filter_manager(
-                self.scene_graph.GetMyMutableContextFromRoot(root_context)
-            )
-            own = GeometrySet(self.plant.GetCollisionGeometriesForBody(body))
-            still = GeometrySet()
-            for other in self.still_bodies:
-                still.Add(self.plant.GetCollisionGeometriesForBody(other))
+        bodies = [self.plant.get_body(item.body) for item in self.objects]
+        at_rest = self.at_rest(root_context)
+        changed = [
+            (body, resting)
+            for body, resting in zip(bodies, at_rest, strict=True)
+            if resting != body.is_locked(plant_context)
+        ]
+        if not changed:
+            return
+        filters = self.scene_graph.collision_filter_manager(
+            self.scene_graph.GetMyMutableContextFromRoot(root_context)
+        )
+        # First those that wake, as they are free of all; then those that fall asleep.
+        for body, resting in sorted(changed, key=lambda change: bool(change[1])):
+            own = self._geometry([body])
             if resting:
                 body.Lock(plant_context)
-                filters.Apply(CollisionFilterDeclaration().ExcludeBetween(own, still))
+                frozen = [other for other in bodies if other.is_locked(plant_context)]
+                others = self._geometry([*self.still_bodies, *frozen])
+                filters.Apply(CollisionFilterDeclaration().ExcludeBetween(own, others))
             else:
                 body.Unlock(plant_context)
-                filters.Apply(CollisionFilterDeclaration().AllowBetween(own, still))
+                others = self._geometry([*self.still_bodies, *bodies])
+                filters.Apply(CollisionFilterDeclaration().AllowBetween(own, others))
+
+    def _geometry(self, bodies: Sequence[RigidBody]) -> GeometrySet:
+        geometry = GeometrySet()
+        for body in bodies:
+            geometry.Add(self.plant.GetCollisionGeometriesForBody(body))
+        return geometry
 
 
 def build_cell(
