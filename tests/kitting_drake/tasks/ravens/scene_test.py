@@ -67,10 +67,10 @@ class Posed:
         self.put(index, RigidTransform([index, 3.0, 1.0]))
 
     def put_hand(self, index: int, grasp: Grasp, opening: float) -> None:
-        """Puts the hand to where it grasps an object; an opening in metres."""
+        """Puts the hand as deep as it ever grips to where it grasps an object; an opening in m."""
         gripper = gripper_pose(self.poses[index], grasp)
         z = self.poses[index].translation()[2] + grasp.surface_height
-        z -= PickPlaceParameters().grasp_depth
+        z -= PickPlaceParameters().max_grasp_depth
         self._plant.SetPositions(
             self._context,
             self._plant.GetModelInstanceByName("franka_hand"),
