@@ -19,6 +19,7 @@ from kitting_drake.scenario import Scenario, load_scenario
 from kitting_drake.scenario.policies import Learned, PythonPolicy, QuantizedOracle
 from kitting_drake.scenario.schema import Pinhole, Sleep
 from kitting_drake.tasks import Kitting
+from kitting_drake.tasks.ravens.palletizing_boxes import PalletizingBoxes
 from kitting_drake.tasks.task import TABLE
 from systems.placement import Placement
 from systems.signals import Observation, PickPlaceAction
@@ -181,6 +182,29 @@ def test_what_lies_still_goes_to_sleep(cell: Cell):
         cell.plant.GetMyContextFromRoot(root)
     )
     assert results.num_hydroelastic_contacts() == 0
+
+
+def test_a_sleeping_stack_costs_nothing_and_wakes_together():
+    cell = build(Scenario(task=PalletizingBoxes(layers=2), cameras={}))
+
+    def contacts(root: Context) -> int:
+        context = cell.plant.GetMyContextFromRoot(root)
+        port = cell.plant.get_contact_results_output_port()
+        return port.Eval(context).num_hydroelastic_contacts()
+
+    counts: list[int] = []
+    root = advance(cell, 0.6, lambda root: counts.append(contacts(root)))
+    assert max(counts) == 12
+    assert counts[-1] == 0
+    assert all(locked(cell, root))
+    # One that wakes touches those that still sleep: the highest box is the last.
+    top = len(cell.objects) - 1
+    detector = cell.rest_detector.GetMyMutableContextFromRoot(root)
+    detector.get_mutable_discrete_state().get_mutable_vector(1).SetAtIndex(top, 0.0)
+    cell.apply_sleep(root)
+    assert locked(cell, root) == [True] * top + [False]
+    Simulator(cell.diagram, root).AdvanceTo(root.get_time() + 0.01)
+    assert contacts(root) == 1
 
 
 def test_sleep_can_be_switched_off():
