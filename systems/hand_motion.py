@@ -1,5 +1,7 @@
-"""Smooth motions of the hand in (x, y, z, yaw), and how short its limits let them be."""
+"""Smooth, time-optimal motions of the hand in (x, y, z, yaw) within limits."""
 
+import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -7,77 +9,172 @@ from numpy.typing import NDArray
 
 from systems.signals import wrap_to_pi
 
-# Peaks of the minimum-jerk polynomial 10 s^3 - 15 s^4 + 6 s^5 over a unit distance in unit time.
-_PEAK_SPEED = 1.875
-_PEAK_ACCELERATION = 10 / np.sqrt(3)
+SMOOTHING = 1 / 16
+"""Time in which an acceleration builds up or falls away, in s."""
+
+PARTS = (slice(0, 2), slice(2, 3), slice(3, 4))
+"""The parts of a motion that have a time course each: along (x, y), z and yaw."""
 
 
 @dataclass(frozen=True)
 class MotionLimits:
-    """The most that a motion may reach: m/s, m/s^2, rad/s, rad/s^2."""
+    """The most that a motion may reach: m/s, m/s^2 (in the plane, and along z), rad/s, rad/s^2."""
 
     speed: float
     acceleration: float
     yaw_speed: float
     yaw_acceleration: float
 
+    def of_parts(self) -> tuple[tuple[float, float], ...]:
+        """Speed and acceleration of each of the `PARTS`."""
+        linear = (self.speed, self.acceleration)
+        return (linear, linear, (self.yaw_speed, self.yaw_acceleration))
+
+
+def travel(
+    distance: float, speed: float, acceleration: float, elapsed: float
+) -> tuple[float, float, float]:
+    """How far, how fast and at which acceleration one is, on the way from rest to rest.
+
+    The velocity is a trapezoid (or a triangle, where the distance is too short to reach the speed),
+    averaged over the last `SMOOTHING` seconds, so that the acceleration is a trapezoid too. It is a
+    sum of truncated cubics, one for each of the eight corners of the acceleration.
+
+    Args:
+        distance: to go, not negative, in m or rad.
+        speed: the most, in units per s.
+        acceleration: the most, in units per s^2.
+        elapsed: since the start, in s; before it one is at rest at the start.
+    """
+    if elapsed <= 0 or distance <= 0:
+        return 0.0, 0.0, 0.0
+    if elapsed >= travel_time(distance, speed, acceleration):
+        return distance, 0.0, 0.0
+    top = min(speed, math.sqrt(distance * acceleration))
+    ramp_time, cruise_end = top / acceleration, distance / top
+    position = velocity = change = 0.0
+    for start, sign in (
+        (0.0, 1.0),
+        (ramp_time, -1.0),
+        (cruise_end, -1.0),
+        (cruise_end + ramp_time, 1.0),
+    ):
+        for begin, weight in ((start, sign), (start + SMOOTHING, -sign)):
+            since = elapsed - begin
+            if since > 0:
+                position += weight * since**3
+                velocity += weight * since**2
+                change += weight * since
+    jerk = acceleration / SMOOTHING
+    return jerk / 6 * position, jerk / 2 * velocity, jerk * change
+
+
+def travel_time(distance: float, speed: float, acceleration: float) -> float:
+    """How long `travel` takes, in s."""
+    if distance <= 0:
+        return 0.0
+    top = min(speed, math.sqrt(distance * acceleration))
+    return distance / top + top / acceleration + SMOOTHING
+
+
+def time_to_reach(part: float, distance: float, speed: float, acceleration: float) -> float:
+    """When `travel` has gone a part of its distance, in s after its start."""
+    low, high = 0.0, travel_time(distance, speed, acceleration)
+    if part >= distance:
+        return high
+    while high - low > 1e-4:
+        middle = (low + high) / 2
+        low, high = (
+            (middle, high)
+            if travel(distance, speed, acceleration, middle)[0] < part
+            else (low, middle)
+        )
+    return high
+
+
+def braking_time(rate: NDArray[np.float64], limits: MotionLimits) -> float:
+    """The shortest time in which all parts of a motion come to rest, in s.
+
+    The velocity falls along a cubic, unaccelerated at both ends: what moves goes on for half of
+    the way that it would have gone in this time.
+
+    Args:
+        rate: (4) velocity: vx, vy, vz, vyaw.
+        limits: of acceleration.
+    """
+    return 1.5 * max(
+        float(np.linalg.norm(rate[part])) / acceleration
+        for part, (_, acceleration) in zip(PARTS, limits.of_parts(), strict=True)
+    )
+
 
 def motion_at(
     start: NDArray[np.float64],
     goal: NDArray[np.float64],
     start_rate: NDArray[np.float64],
-    duration: float,
+    limits: MotionLimits,
+    delays: NDArray[np.float64],
     elapsed: float,
 ) -> NDArray[np.float64]:
-    """The quintic from a start, at its rate, to rest at a goal, unaccelerated at both ends.
+    """The motion from a start, at its rate, to rest at a goal.
 
-    From rest it is the minimum-jerk motion.
+    It brakes (see `braking_time`) from its rate, and each of its `PARTS` goes the rest of the way
+    to the goal by `travel`, from its delay on; both are added up.
 
     Args:
         start: (4) position.
         goal: (4) position.
         start_rate: (4) velocity at the start.
-        duration: in s; at zero the goal is reached at once.
+        limits: which each part keeps.
+        delays: (3) when each part begins, in s after the start.
         elapsed: since the start, in s.
 
     Returns:
         (12) position, velocity, acceleration.
     """
-    if duration <= 0:
-        return np.concatenate([goal, np.zeros(8)])
-    s = min(max(elapsed / duration, 0.0), 1.0)
-    delta = goal - start
-    t = duration
-    return np.concatenate(
-        [
-            start
-            + s**3 * (10 + s * (6 * s - 15)) * delta
-            + s * (1 + s**2 * (s * (8 - 3 * s) - 6)) * t * start_rate,
-            30 * s**2 * (1 - s) ** 2 / t * delta
-            + (1 + s**2 * (s * (32 - 15 * s) - 18)) * start_rate,
-            60 * s * (1 - s) * (1 - 2 * s) / t**2 * delta
-            + s * (s * (96 - 60 * s) - 36) / t * start_rate,
-        ]
-    )
+    position, velocity, acceleration = start.copy(), np.zeros(4), np.zeros(4)
+    braking = braking_time(start_rate, limits)
+    if braking > 0:
+        s = min(max(elapsed / braking, 0.0), 1.0)
+        position += start_rate * braking * (s - s**3 + s**4 / 2)
+        velocity += start_rate * (1 - s**2 * (3 - 2 * s))
+        acceleration -= start_rate * 6 * s * (1 - s) / braking
+    for part, delta, distance, limit, delay in _ways(start, goal, start_rate, limits, delays):
+        if distance > 0:
+            gone, rate, change = travel(distance, *limit, elapsed - delay)
+            position[part] += delta * (gone / distance)
+            velocity[part] += delta * (rate / distance)
+            acceleration[part] += delta * (change / distance)
+    return np.concatenate([position, velocity, acceleration])
 
 
-def motion_duration(displacement: NDArray[np.float64], limits: MotionLimits) -> float:
-    """The shortest minimum-jerk motion over (dx, dy, dz, dyaw) within the limits, in s."""
-    distance, turn = float(np.linalg.norm(displacement[:3])), abs(float(displacement[3]))
-    return max(
-        _PEAK_SPEED * distance / limits.speed,
-        np.sqrt(_PEAK_ACCELERATION * distance / limits.acceleration),
-        _PEAK_SPEED * turn / limits.yaw_speed,
-        np.sqrt(_PEAK_ACCELERATION * turn / limits.yaw_acceleration),
-    )
+def motion_duration(
+    start: NDArray[np.float64],
+    goal: NDArray[np.float64],
+    start_rate: NDArray[np.float64],
+    limits: MotionLimits,
+    delays: NDArray[np.float64],
+) -> float:
+    """How long `motion_at` takes to come to rest, in s."""
+    ends = [
+        delay + travel_time(distance, *limit)
+        for _, _, distance, limit, delay in _ways(start, goal, start_rate, limits, delays)
+        if distance > 0
+    ]
+    return max(ends + [braking_time(start_rate, limits)])
 
 
-def braking_time(rate: NDArray[np.float64], limits: MotionLimits) -> float:
-    """The shortest `motion_at` from (vx, vy, vz, vyaw) to rest half as far as it would go, in s."""
-    return 1.5 * max(
-        float(np.linalg.norm(rate[:3])) / limits.acceleration,
-        abs(float(rate[3])) / limits.yaw_acceleration,
-    )
+def _ways(
+    start: NDArray[np.float64],
+    goal: NDArray[np.float64],
+    start_rate: NDArray[np.float64],
+    limits: MotionLimits,
+    delays: NDArray[np.float64],
+) -> Iterator[tuple[slice, NDArray[np.float64], float, tuple[float, float], float]]:
+    """For each part: which, its way from where braking ends, how far that is, limits, delay."""
+    ways = goal - start - start_rate * braking_time(start_rate, limits) / 2
+    for part, limit, delay in zip(PARTS, limits.of_parts(), delays, strict=True):
+        yield part, ways[part], float(np.linalg.norm(ways[part])), limit, float(delay)
 
 
 def ramp(start: float, goal: float, rate: float, elapsed: float) -> tuple[float, float]:
@@ -89,16 +186,37 @@ def ramp(start: float, goal: float, rate: float, elapsed: float) -> tuple[float,
     return start + float(np.copysign(travelled, distance)), float(np.copysign(rate, distance))
 
 
-def nearest_yaws(pick_yaw: float, place_yaw: float) -> tuple[float, float]:
-    """The equivalent yaws that keep the wrist nearest its middle.
+def shortest_yaws(
+    pick_yaw: float, place_yaw: float, present_yaw: float, limit: float
+) -> tuple[float, float]:
+    """The equivalent yaws that the wrist reaches, within its limit, by rotating least.
 
     The jaws are alike, so both yaws may be rotated by pi together, and either by 2 pi.
 
+    Args:
+        pick_yaw: in rad.
+        place_yaw: in rad.
+        present_yaw: where the wrist is now, in rad.
+        limit: of the magnitude of both; pi at least, so that there is always an answer.
+
     Returns:
-        (pick, place) in radians, the larger of whose magnitudes is smallest.
+        (pick, place) in rad.
     """
     candidates = []
-    for half_turn in (0.0, np.pi):
-        pick, place = wrap_to_pi(pick_yaw + half_turn), wrap_to_pi(place_yaw + half_turn)
-        candidates.append((pick, place))
-    return min(candidates, key=lambda yaws: max(abs(yaws[0]), abs(yaws[1])))
+    for half_turn in (0.0, math.pi):
+        for pick in _within(pick_yaw + half_turn, limit):
+            for place in _within(place_yaw + half_turn, limit):
+                candidates.append((pick, place))
+    # Of equal ways, that which stays nearest to the middle.
+    return min(
+        candidates,
+        key=lambda yaws: (
+            round(abs(yaws[0] - present_yaw) + abs(yaws[1] - yaws[0]), 6),
+            max(abs(yaws[0]), abs(yaws[1])),
+        ),
+    )
+
+
+def _within(yaw: float, limit: float) -> list[float]:
+    yaw = wrap_to_pi(yaw)
+    return [turned for turned in (yaw - math.tau, yaw, yaw + math.tau) if abs(turned) <= limit]

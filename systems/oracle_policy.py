@@ -266,11 +266,14 @@ class OraclePolicy(LeafSystem):
         ]
         rim = plan.goal.rim_height
         bottom = poses[plan.index].translation()[2]
+        highest = max(*tops, *([] if rim is None else [rim]), 0.0)
         return SurfaceHeights(
             pick_top=bottom + plan.grasp.surface_height,
             support=bottom,
             place_rim=0.0 if rim is None else rim,
-            highest=max(*tops, *([] if rim is None else [rim]), 0.0),
+            near_pick=highest,
+            near_place=highest,
+            highest=highest,
         )
 
 

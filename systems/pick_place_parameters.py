@@ -12,9 +12,9 @@ class Mode(enum.IntEnum):
     """The planner's modes. The order to DONE is that of a successful pick and place."""
 
     OBSERVE = 0
-    """Go home, out of the cameras' sight, come to rest, and ask the policy."""
+    """Wait out of the cameras' sight, and ask the policy."""
     APPROACH = 1
-    """Move over the pick pose, jaws open."""
+    """Move to just above the pick, and open the jaws."""
     DESCEND = 2
     """Go down to the grasp height, or until something is touched."""
     CLOSE = 3
@@ -22,13 +22,14 @@ class Mode(enum.IntEnum):
     CHECK = 4
     """Look whether there is something between the pads."""
     LIFT = 5
+    """Go up until the object clears everything."""
     CARRY = 6
-    """Move over the place pose and turn."""
+    """Move to just above the place, and rotate."""
     LOWER = 7
     """Go down until something is touched."""
     RELEASE = 8
     RETREAT = 9
-    """Straight up from where the hand is."""
+    """Go up, and out of the cameras' sight."""
     DONE = 10
     SEARCH = 11
     """Insertion was blocked: feel for the cavity, see `InsertionSearch`."""
@@ -39,12 +40,15 @@ class PickPlaceParameters:
     """Heights, speeds and thresholds of the motion primitive."""
 
     # Where the hand waits while the cameras look: x, y, height of the fingertips (m), yaw (rad).
-    home: list[float] = bounded([0.35, 0.0, 0.52, 0.0], -2.0, 2.0)
+    # There it begins; later it returns to this x and height, and keeps its y and yaw.
+    home: list[float] = bounded([0.5, 0.0, 0.4, 0.0], -2.0, 2.0)
 
-    # Least height of the fingertips while crossing the table, in m. It is more where the highest
-    # surface of o_t, what hangs below the fingertips and travel_clearance ask for more.
-    travel_height: float = bounded(0.115, 0.05, 0.5)
+    # What crosses the table, fingertips or what hangs below them, stays this far above the highest
+    # surface of o_t, in m ...
     travel_clearance: float = bounded(0.015, 0.0, 0.1)
+
+    # ... and comes down fast to this far above what o_t shows around its goal, in m.
+    hover_clearance: float = bounded(0.010, 0.001, 0.1)
 
     # How far below the top of an object the fingertips grip, in m: this share of its height above
     # its support, within these limits. On a round handle the pads are to be near its widest.
@@ -70,17 +74,18 @@ class PickPlaceParameters:
     # A vertical contact force beyond the payload's weight that means "touched", in N.
     contact_threshold: float = bounded(4.0, 0.5, 100.0)
 
-    # Highest linear speed (m/s) and acceleration (m/s^2) in free space.
-    linear_speed: float = bounded(1.0, 0.01, 1.7)
-    linear_acceleration: float = bounded(6.0, 0.1, 13.0)
+    # Highest linear speed (m/s) and acceleration (m/s^2) in free space, in the plane and along z
+    # each: both together stay within the 1.7 m/s and 13 m/s^2 of a Franka arm.
+    linear_speed: float = bounded(1.2, 0.01, 1.2)
+    linear_acceleration: float = bounded(8.0, 0.1, 9.0)
 
     # The same with an object in the hand.
-    carry_speed: float = bounded(0.6, 0.01, 1.7)
-    carry_acceleration: float = bounded(3.0, 0.1, 13.0)
+    carry_speed: float = bounded(1.2, 0.01, 1.2)
+    carry_acceleration: float = bounded(5.0, 0.1, 9.0)
 
     # Highest yaw speed (rad/s) and acceleration (rad/s^2).
-    yaw_speed: float = bounded(2.0, 0.01, 2.5)
-    yaw_acceleration: float = bounded(8.0, 0.1, 25.0)
+    yaw_speed: float = bounded(2.5, 0.01, 2.5)
+    yaw_acceleration: float = bounded(20.0, 0.1, 25.0)
 
     # Highest speed of the two guarded motions, in m/s.
     descend_speed: float = bounded(0.20, 0.005, 1.0)
@@ -96,7 +101,7 @@ class PickPlaceParameters:
     force_ramp: float = bounded(0.15, 0.0, 5.0)
 
     # The hand must rest this long, in s: before the cameras look, and before the payload is tared.
-    observe_settle: float = bounded(0.25, 0.0, 10.0)
+    observe_settle: float = bounded(0.10, 0.0, 10.0)
     tare_settle: float = bounded(0.10, 0.0, 10.0)
 
     # After this many actions the planner is done, whatever the policy says; null: the task's.

@@ -15,11 +15,13 @@ from pydrake.systems.framework import (
 )
 
 from systems.hand_motion import (
+    PARTS,
     braking_time,
     motion_at,
     motion_duration,
-    nearest_yaws,
     ramp,
+    shortest_yaws,
+    time_to_reach,
 )
 from systems.pick_place_parameters import Mode, PickPlaceParameters
 from systems.signals import Observation, PickPlaceAction, PlanarPose, SurfaceHeights
@@ -30,9 +32,10 @@ _FIELDS = (
     + [f"start_{axis}" for axis in ("x", "y", "z", "yaw")]
     + [f"goal_{axis}" for axis in ("x", "y", "z", "yaw")]
     + [f"start_rate_{axis}" for axis in ("x", "y", "z", "yaw")]
+    + ["delay_xy", "delay_z", "delay_yaw"]
     + ["start_opening", "goal_opening", "start_force", "goal_force"]
     + ["pick_x", "pick_y", "pick_yaw", "place_x", "place_y", "place_yaw", "grasp_z"]
-    + ["travel_z", "table_z", "support_z", "rim_z"]
+    + ["travel_z", "clear_z", "pick_hover_z", "place_hover_z", "table_z", "support_z", "rim_z"]
     + ["hold_z", "touch_z", "search_step"]
     + ["payload", "actions", "missed", "dropped"]
 )
@@ -40,7 +43,14 @@ _PlannerState = namedview("PlannerState", _FIELDS)
 _State: TypeAlias = Any
 """A `_PlannerState`, which is made at run time and is no type to a type checker."""
 
-_START, _GOAL, _START_RATE = slice(3, 7), slice(7, 11), slice(11, 15)
+_START, _GOAL, _START_RATE, _DELAYS = slice(3, 7), slice(7, 11), slice(11, 15), slice(15, 18)
+
+_YAW_LIMIT = 3.4
+"""How far the wrist may rotate either way, in rad: just short of its joint limit."""
+_NEARLY_THERE = 0.02
+"""So near to where it goes, in m, the hand may sink below what the rest of the way has to clear."""
+_OVERSHOOT = 0.05
+"""How far above the travel height a lift aims, in m, as the hand crosses that without a stop."""
 
 
 class PickPlacePlanner(LeafSystem):
@@ -65,7 +75,8 @@ class PickPlacePlanner(LeafSystem):
     - `hand_contact_force` (6): contact as generalized force on the same coordinates, in N and N m:
       what a force-torque sensor at the wrist and one in each finger would read. Up is positive.
     - `action` (abstract, `PickPlaceAction`): evaluated only at the moment in which the planner,
-      at rest at home, asks for it. Nothing upstream (policy, cameras) is computed at other times.
+      at rest out of the cameras' sight, asks for it. Nothing upstream (policy, cameras) is computed
+      at other times.
     - `observation` (abstract, `Observation`): o_t, evaluated together with the action: the heights
       under the pick and around the place are read off it. Where it is not connected, as where
       nothing can be rendered, the action must bring its own.
@@ -75,16 +86,17 @@ class PickPlacePlanner(LeafSystem):
     - `mode` (1): a `Mode`.
     - `counts` (3): actions begun, grasps missed, objects dropped.
 
-    Every motion is a straight line in (x, y, z, yaw) with a minimum-jerk profile, at rest at both
-    ends (a `RETREAT` from an object that was lost brakes first), as short as the limits on speed
-    and acceleration allow. The two guarded motions, `DESCEND` and `LOWER`, stop dead where the
-    vertical contact force rises `contact_threshold` above the payload's weight, and hold the height
-    reached: no known height of table, kit or cavity tells them where to stop. Where places are
-    insertions, and the object comes to stand on the rim around its place, the hand feels for the
-    cavity (`SEARCH`) and lowers again once the resistance ends. A grasp is good if the pads stand
-    further apart than `minimum_width` and both feel at least half of the grasp force; when it is
-    not, or is lost on the way, the hand rises, opens on the way home and observes again, which
-    counts as an action.
+    Every motion is as short as the limits on speed and acceleration allow, and smooth (see
+    `systems.hand_motion`): in the plane along a straight line, while height and yaw have time
+    courses of their own. What goes up clears the highest surface of o_t before it travels, and what
+    travels sinks when it is nearly there, to just above what o_t shows around its goal
+    (`APPROACH`, `CARRY`). From there two guarded motions, `DESCEND` and `LOWER`, stop dead where
+    the vertical contact force rises `contact_threshold` above the payload's weight, and hold the
+    height reached: no known height of table, kit or cavity tells them where to stop. Where places
+    are insertions, and the object comes to stand on the rim around its place, the hand feels for
+    the cavity (`SEARCH`) and lowers again once the resistance ends. A grasp is good if the pads
+    stand further apart than `minimum_width` and both feel at least half of the grasp force; when it
+    is not, or is lost on the way, the hand retreats and observes again, which counts as an action.
 
     All memory is one vector of discrete state.
     """
@@ -114,7 +126,6 @@ class PickPlacePlanner(LeafSystem):
         state = _PlannerState(model)
         state[_START] = state[_GOAL] = parameters.home
         state.start_opening = state.goal_opening = parameters.open_width
-        state.travel_z = parameters.travel_height
         self._state_index = self.DeclareDiscreteState(model)
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
 
@@ -149,7 +160,7 @@ class PickPlacePlanner(LeafSystem):
 
     def _calc_motion(self, context: Context, output: BasicVector) -> None:
         state = self._state(context)
-        output.SetFromVector(_motion_at(state, context.get_time()))
+        output.SetFromVector(self._motion_at(state, context.get_time()))
 
     def _calc_opening(self, context: Context, output: BasicVector) -> None:
         state = self._state(context)
@@ -211,7 +222,9 @@ class PickPlacePlanner(LeafSystem):
         if action.stop:
             self._begin(state, Mode.DONE, time)
             return
-        pick_yaw, place_yaw = nearest_yaws(action.pick.theta, action.place.theta)
+        pick_yaw, place_yaw = shortest_yaws(
+            action.pick.theta, action.place.theta, float(state.goal_yaw), _YAW_LIMIT
+        )
         state.pick_x, state.pick_y, state.pick_yaw = action.pick.x, action.pick.y, pick_yaw
         state.place_x, state.place_y, state.place_yaw = action.place.x, action.place.y, place_yaw
         self._set_heights(state, self._heights(context, action))
@@ -237,9 +250,12 @@ class PickPlacePlanner(LeafSystem):
         state.grasp_z = max(heights.pick_top - depth, floor)
         state.table_z, state.support_z = heights.table, heights.support
         state.rim_z = heights.place_rim
+        state.clear_z = heights.highest + parameters.travel_clearance
         hanging = max(state.grasp_z - heights.support, 0.0)
-        state.travel_z = max(
-            parameters.travel_height, heights.highest + hanging + parameters.travel_clearance
+        state.travel_z = state.clear_z + hanging
+        state.pick_hover_z = max(heights.near_pick, heights.pick_top) + parameters.hover_clearance
+        state.place_hover_z = (
+            max(heights.near_place, heights.place_rim) + hanging + parameters.hover_clearance
         )
 
     def _follow(self, context, state, time, hand, contact) -> None:
@@ -252,9 +268,7 @@ class PickPlacePlanner(LeafSystem):
             self._begin(state, Mode.CLOSE, time, z=hand[2])
             # Back off a little: pressed fingertips would not close.
             state.goal_z += self._parameters.floor_clearance
-            state.duration = motion_duration(
-                state[_GOAL] - state[_START], self._motions[Mode.CLOSE]
-            )
+            self._set_times(state)
         elif time >= self._arrival(state):
             self._begin(state, Mode.CLOSE, time)
 
@@ -281,8 +295,9 @@ class PickPlacePlanner(LeafSystem):
         if not self._is_held(hand, contact):
             state.dropped += 1
             self._begin(state, Mode.RETREAT, time)
-        elif state.mode == Mode.LIFT and time >= self._arrival(state):
-            self._begin(state, Mode.CARRY, time)
+        elif state.mode == Mode.LIFT:
+            if self._brakes_above(state, time, state.travel_z):
+                self._begin(state, Mode.CARRY, time)
         elif time >= self._arrival(state) + self._parameters.tare_settle:
             state.payload = contact[2]
             self._begin(state, Mode.LOWER, time)
@@ -320,6 +335,11 @@ class PickPlacePlanner(LeafSystem):
         left = state.search_step < self._search_steps
         return left and self._parameters.search.is_on_rim(float(bottom), float(state.rim_z))
 
+    def _brakes_above(self, state: _State, time: float, height: float) -> bool:
+        """Whether the hand, braking from now on, would come to rest above a height."""
+        now, rate, _ = np.split(self._motion_at(state, time), 3)
+        return bool(now[2] + rate[2] * braking_time(rate, self._motions[Mode.LIFT]) / 2 >= height)
+
     def _is_held(self, hand: NDArray[np.float64], contact: NDArray[np.float64]) -> bool:
         # Contact pushes the fingers apart: along their positive axes.
         pressed = contact[4:6].min() > self._parameters.grasp_force / 2
@@ -343,7 +363,7 @@ class PickPlacePlanner(LeafSystem):
             opening: hold the jaws at this opening from now on, in m.
         """
         parameters = self._parameters
-        now, rate, _ = np.split(_motion_at(state, time), 3)
+        now, rate, _ = np.split(self._motion_at(state, time), 3)
         now_opening, _ = ramp(
             state.start_opening,
             state.goal_opening,
@@ -359,15 +379,14 @@ class PickPlacePlanner(LeafSystem):
         state.mode = mode
         state.start_time = time
         state[_START] = now
-        state[_GOAL] = now
         state[_START_RATE] = rate
+        # Unless the mode says otherwise: come to rest.
+        state[_GOAL] = now + rate * braking_time(rate, self._motions[mode]) / 2
         state.start_opening = state.goal_opening = now_opening
 
-        if mode == Mode.OBSERVE:
-            state[_GOAL] = parameters.home
+        if mode == Mode.APPROACH:
+            state[_GOAL] = (state.pick_x, state.pick_y, state.pick_hover_z, state.pick_yaw)
             state.goal_opening = parameters.open_width
-        elif mode == Mode.APPROACH:
-            state[_GOAL] = (state.pick_x, state.pick_y, state.travel_z, state.pick_yaw)
         elif mode == Mode.DESCEND:
             state.goal_z = state.grasp_z
         elif mode == Mode.CLOSE:
@@ -375,29 +394,53 @@ class PickPlacePlanner(LeafSystem):
         elif mode == Mode.CHECK:
             state.goal_force = parameters.grasp_force
         elif mode == Mode.LIFT:
-            state.goal_z = state.travel_z
+            state.goal_z = state.travel_z + _OVERSHOOT
         elif mode == Mode.CARRY:
-            state[_GOAL] = (state.place_x, state.place_y, state.travel_z, state.place_yaw)
+            state[_GOAL] = (state.place_x, state.place_y, state.place_hover_z, state.place_yaw)
         elif mode == Mode.LOWER:
             state.goal_z = state.table_z + parameters.floor_clearance
         elif mode == Mode.SEARCH:
             state.goal_yaw = state.place_yaw + parameters.search.yaw_offset(int(state.search_step))
             state.goal_z = state.touch_z - parameters.search.press
-        elif mode in (Mode.RELEASE, Mode.RETREAT):
-            state.goal_force = 0.0
+        elif mode == Mode.RELEASE:
             state.goal_opening = min(
                 now_opening + 2 * parameters.release_clearance, parameters.open_width
             )
-            if mode == Mode.RETREAT:
-                state.goal_opening = now_opening
-                state.goal_z = state.travel_z
+        elif mode == Mode.RETREAT:
+            state.goal_x, _, home_z, _ = parameters.home
+            state.goal_z = max(home_z, state.travel_z)
+        if mode in (Mode.RELEASE, Mode.RETREAT):
+            state.goal_force = 0.0
+        self._set_times(state)
+
+    def _set_times(self, state: _State) -> None:
+        """Sets when each part of the present mode's motion begins, and how long all of it takes."""
+        mode = Mode(int(state.mode))
         limits = self._motions[mode]
-        state.duration = max(
-            motion_duration(state[_GOAL] - state[_START], limits), braking_time(rate, limits)
+        rate = np.asarray(state[_START_RATE])
+        braking = braking_time(rate, limits)
+        # What moves comes to rest first.
+        delays = np.array([braking * bool(rate[part].any()) for part in PARTS])
+        ways = np.abs(state[_GOAL] - state[_START] - rate * braking / 2)
+        across, height = float(np.linalg.norm(ways[:2])), float(ways[2])
+        of_plane, of_height, _ = limits.of_parts()
+        if mode == Mode.CARRY:
+            # The lift that it goes on from is all but done by half of the braking.
+            delays = np.maximum(delays, braking / 2)
+        if mode in (Mode.APPROACH, Mode.CARRY):
+            # Sink when it is nearly there.
+            clear = state.clear_z if mode == Mode.APPROACH else state.travel_z
+            nearly_there = delays[0] + time_to_reach(across - _NEARLY_THERE, across, *of_plane)
+            sinks = height - (clear - state.goal_z)
+            delays[1] = max(delays[1], nearly_there - time_to_reach(sinks, height, *of_height))
+        elif mode == Mode.RETREAT:
+            # Rise first.
+            rises = height - (state.goal_z - state.travel_z)
+            delays[0] = max(delays[0], delays[1] + time_to_reach(rises, height, *of_height))
+        state[_DELAYS] = delays
+        state.duration = motion_duration(
+            np.asarray(state[_START]), np.asarray(state[_GOAL]), rate, limits, delays
         )
-        if mode == Mode.RETREAT:
-            # Called off on the way: come to rest where braking ends.
-            state[_GOAL] += rate * state.duration / 2 * np.array([1.0, 1.0, 0.0, 1.0])
 
     def _arrival(self, state: _State) -> float:
         """When the motion, the jaws and the force of the present mode have arrived, in s."""
@@ -407,9 +450,13 @@ class PickPlacePlanner(LeafSystem):
         force_time = self._parameters.force_ramp * (state.goal_force != state.start_force)
         return float(state.start_time + max(state.duration, opening_time, force_time))
 
-
-def _motion_at(state: _State, time: float) -> NDArray[np.float64]:
-    """q_d, v_d, a_d (12) of the present mode's motion."""
-    return motion_at(
-        state[_START], state[_GOAL], state[_START_RATE], state.duration, time - state.start_time
-    )
+    def _motion_at(self, state: _State, time: float) -> NDArray[np.float64]:
+        """q_d, v_d, a_d (12) of the present mode's motion."""
+        return motion_at(
+            state[_START],
+            state[_GOAL],
+            state[_START_RATE],
+            self._motions[Mode(int(state.mode))],
+            state[_DELAYS],
+            time - state.start_time,
+        )

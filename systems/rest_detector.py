@@ -7,7 +7,6 @@ import numpy as np
 from numpy.typing import NDArray
 from pydrake.common.value import Value
 from pydrake.math import RigidTransform
-from pydrake.multibody.math import SpatialVelocity
 from pydrake.multibody.tree import BodyIndex
 from pydrake.systems.framework import Context, DiscreteValues, EventStatus, LeafSystem
 
@@ -31,18 +30,19 @@ class RestDetector(LeafSystem):
         name: RestDetector
         input_ports:
         - body_poses
-        - body_spatial_velocities
         output_ports:
         - at_rest
 
-    - `body_poses`, `body_spatial_velocities`: the plant's ports of these names.
+    - `body_poses`: the plant's port of this name.
     - `at_rest` (n): 1 for an object that is at rest, else 0, in the order of `objects`.
 
-    An object comes to rest when it has been slower than both speeds for `time_to_sleep`, and
-    nothing that is not at rest, mover or object, is within `wake_distance` of it: distances of
-    oriented bounding boxes, never more than the true ones. It is no longer at rest as soon as
-    something comes that near. The memory (discrete state) is how long each object has been slow,
-    in s, and whether it is at rest.
+    An object comes to rest when for `time_to_sleep` it has stayed within both tolerances of one
+    pose, and nothing that is not at rest, mover or object, is within `wake_distance` of it:
+    distances of oriented bounding boxes, never more than the true ones. It is no longer at rest as
+    soon as something comes that near. Displacements are compared, not velocities: an object that
+    trembles in place, as on a step too long for its stiffness, goes nowhere. The memory (discrete
+    state) is the pose that each object has stayed near, since when, in s, and whether it is at
+    rest.
     """
 
     def __init__(
@@ -50,8 +50,8 @@ class RestDetector(LeafSystem):
         *,
         objects: Sequence[BoundedBody],
         movers: Sequence[BoundedBody],
-        linear_speed: float,
-        angular_speed: float,
+        position_tolerance: float,
+        angle_tolerance: float,
         time_to_sleep: float,
         wake_distance: float,
         period: float = 1 / 64,
@@ -60,8 +60,8 @@ class RestDetector(LeafSystem):
         Args:
             objects: what may come to rest; n of them.
             movers: what never does: the links of the hand.
-            linear_speed: of the body origin, in m/s.
-            angular_speed: in rad/s.
+            position_tolerance: of the body origin, in m.
+            angle_tolerance: in rad.
             time_to_sleep: in s.
             wake_distance: in m. What moves faster than this in a period may touch an object before
                 it wakes: for that long the object stands as firm as a rock.
@@ -73,16 +73,16 @@ class RestDetector(LeafSystem):
         self._bodies = [int(item.body) for item in bodies]
         self._centres = np.array([(item.p_BLower + item.p_BUpper) / 2 for item in bodies])
         self._half_sizes = np.array([(item.p_BUpper - item.p_BLower) / 2 for item in bodies])
-        self._linear_speed = linear_speed
-        self._angular_speed = angular_speed
+        self._position_tolerance = position_tolerance
+        # A rotation by an angle a differs from none by 2 sqrt(2) sin(a / 2) in Frobenius norm.
+        self._rotation_tolerance = 2 * np.sqrt(2) * np.sin(angle_tolerance / 2)
         self._time_to_sleep = time_to_sleep
         self._wake_distance = wake_distance
         self._period = period
         self._poses = self.DeclareAbstractInputPort("body_poses", Value([RigidTransform()]))
-        self._velocities = self.DeclareAbstractInputPort(
-            "body_spatial_velocities", Value([SpatialVelocity()])
-        )
-        self._slow_for = self.DeclareDiscreteState(self._count)
+        # Nothing is near infinity: the first look finds every object elsewhere.
+        self._anchors = self.DeclareDiscreteState(np.full(12 * self._count, np.inf))
+        self._still_for = self.DeclareDiscreteState(self._count)
         self._at_rest = self.DeclareDiscreteState(self._count)
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
         self.DeclareStateOutputPort("at_rest", self._at_rest)
@@ -93,17 +93,18 @@ class RestDetector(LeafSystem):
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> EventStatus:
         n = self._count
-        velocities = self._velocities.Eval(context)
-        slow_for = discrete_state.get_mutable_value(self._slow_for)
-        for i, body in enumerate(self._bodies[:n]):
-            velocity = velocities[body]
-            slow = (
-                np.linalg.norm(velocity.translational()) < self._linear_speed
-                and np.linalg.norm(velocity.rotational()) < self._angular_speed
-            )
-            slow_for[i] = slow_for[i] + self._period if slow else 0.0
-        resting = slow_for >= self._time_to_sleep - self._period / 2
-        near = self._near(context)
+        poses = self._poses.Eval(context)
+        X = np.array([poses[body].GetAsMatrix34() for body in self._bodies])
+        anchors = discrete_state.get_mutable_value(self._anchors).reshape(n, 3, 4)
+        still_for = discrete_state.get_mutable_value(self._still_for)
+        moved = X[:n] - anchors
+        stayed = (np.linalg.norm(moved[:, :, 3], axis=1) <= self._position_tolerance) & (
+            np.linalg.norm(moved[:, :, :3], axis=(1, 2)) <= self._rotation_tolerance
+        )
+        anchors[~stayed] = X[:n][~stayed]
+        still_for[:] = np.where(stayed, still_for + self._period, 0.0)
+        resting = still_for >= self._time_to_sleep - self._period / 2
+        near = self._near(X)
         # An awake object wakes its neighbours, and they theirs.
         for _ in range(n):
             awake = np.concatenate([~resting, np.ones(len(self._bodies) - n, bool)])
@@ -114,11 +115,13 @@ class RestDetector(LeafSystem):
         discrete_state.get_mutable_value(self._at_rest)[:] = resting
         return EventStatus.Succeeded()
 
-    def _near(self, context: Context) -> NDArray[np.bool_]:
-        """(n, bodies) which bodies' boxes are within the wake distance of each object's."""
-        poses = self._poses.Eval(context)
-        rotations = np.array([poses[body].rotation().matrix() for body in self._bodies])
-        origins = np.array([poses[body].translation() for body in self._bodies])
+    def _near(self, X: NDArray[np.float64]) -> NDArray[np.bool_]:
+        """(n, bodies) which bodies' boxes are within the wake distance of each object's.
+
+        Args:
+            X: (bodies, 3, 4) X_WB of each.
+        """
+        rotations, origins = X[:, :, :3], X[:, :, 3]
         centres = origins + np.einsum("bij,bj->bi", rotations, self._centres)
         halves = self._half_sizes
         # (i, j) pairs of objects and bodies; the widest gap along the six face normals of a pair is

@@ -129,6 +129,10 @@ class SurfaceHeights:
     """The top of what that stands on."""
     place_rim: float = 0.0
     """The highest surface around the place: the rim of a cavity, if there is one."""
+    near_pick: float = 0.0
+    """The highest surface that open jaws over the pick are above."""
+    near_place: float = 0.0
+    """The highest surface that an object over its place is above."""
     highest: float = 0.0
     """The highest surface of the workspace."""
     table: float = 0.0

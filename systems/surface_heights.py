@@ -9,6 +9,10 @@ _PICK_REACH = 1
 """How far around the pick pixel its top is looked for, in pixels."""
 _RIM_REACH = 0.025
 """How far around the place its rim is looked for, in metres."""
+_PICK_CLEARANCE_REACH = 0.07
+"""How far around the pick the open jaws must clear what is there, in metres."""
+_PLACE_CLEARANCE_REACH = 0.125
+"""How far around the place what is held must clear what is there, in metres."""
 _SUPPORT_REACH = 0.08
 """How far around the pick what it stands on is looked for, in metres."""
 _SUPPORT_SHARE = 10.0
@@ -33,7 +37,12 @@ def read_surface_heights(
     height, grid = observation.height, observation.grid
     reach = {
         name: max(1, round(metres / grid.resolution))
-        for name, metres in (("rim", _RIM_REACH), ("support", _SUPPORT_REACH))
+        for name, metres in (
+            ("rim", _RIM_REACH),
+            ("support", _SUPPORT_REACH),
+            ("near_pick", _PICK_CLEARANCE_REACH),
+            ("near_place", _PLACE_CLEARANCE_REACH),
+        )
     }
     at_pick, at_place = (grid.to_pixel((pose.x, pose.y)) for pose in (pick, place))
     around_pick = _around(height, at_pick, reach["support"])
@@ -42,6 +51,9 @@ def read_surface_heights(
         pick_top=grid.z_min + float(_around(height, at_pick, _PICK_REACH).max(initial=0.0)),
         support=grid.z_min + support,
         place_rim=grid.z_min + float(_around(height, at_place, reach["rim"]).max(initial=0.0)),
+        near_pick=grid.z_min + float(_around(height, at_pick, reach["near_pick"]).max(initial=0.0)),
+        near_place=grid.z_min
+        + float(_around(height, at_place, reach["near_place"]).max(initial=0.0)),
         highest=grid.z_min + float(height.max(initial=0.0)),
         table=grid.z_min + float(np.percentile(height, _TABLE_SHARE)),
     )

@@ -182,8 +182,7 @@ def build_cell(
     rest_detector = builder.AddNamedSystem(
         "rest_detector", _make_rest_detector(scenario, plant, scene_graph, objects)
     )
-    for port in ("body_poses", "body_spatial_velocities"):
-        builder.Connect(plant.GetOutputPort(port), rest_detector.GetInputPort(port))
+    builder.Connect(plant.get_body_poses_output_port(), rest_detector.GetInputPort("body_poses"))
 
     for system, ports in (
         (policy, ["action"]),
@@ -299,8 +298,8 @@ def _make_rest_detector(
     return RestDetector(
         objects=[bounding_box(plant, scene_graph, plant.get_body(item.body)) for item in objects],
         movers=[bounding_box(plant, scene_graph, body) for body in hand],
-        linear_speed=scenario.sleep.linear_speed,
-        angular_speed=scenario.sleep.angular_speed,
+        position_tolerance=scenario.sleep.position_tolerance,
+        angle_tolerance=scenario.sleep.angle_tolerance,
         time_to_sleep=scenario.sleep.time_to_sleep,
         wake_distance=scenario.sleep.wake_distance,
     )

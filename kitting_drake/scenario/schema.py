@@ -90,7 +90,7 @@ class Plant:
     """The physics."""
 
     # Discrete step, in s. Powers of two divide every other period of the cell exactly.
-    time_step: float = bounded(0.00390625, 1e-5, 0.02)
+    time_step: float = bounded(0.0078125, 1e-5, 0.02)
 
     # Drake's approximation of contact: lagged, similar or sap.
     contact_approximation: str = "lagged"
@@ -102,11 +102,11 @@ class Sleep:
 
     enabled: bool = True
 
-    # An object is at rest below these speeds (m/s, rad/s) ...
-    linear_speed: float = bounded(0.002, 0.0, 1.0)
-    angular_speed: float = bounded(0.05, 0.0, 10.0)
+    # An object is at rest when it has stayed this near (m, rad) to one pose ...
+    position_tolerance: float = bounded(0.0005, 0.0, 0.01)
+    angle_tolerance: float = bounded(0.02, 0.0, 1.0)
 
-    # ... that have lasted this long, in s.
+    # ... for this long, in s.
     time_to_sleep: float = bounded(0.25, 0.0, 10.0)
 
     # It wakes when the hand, or an object that is awake, comes this near, in m.

@@ -10,7 +10,6 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import Context, DiagramBuilder, EventStatus, LeafSystem
 from pydrake.systems.primitives import LogVectorOutput
 
-from systems.hand_motion import nearest_yaws
 from systems.insertion_search import InsertionSearch
 from systems.pick_place_parameters import Mode, PickPlaceParameters
 from systems.pick_place_planner import PickPlacePlanner
@@ -23,12 +22,14 @@ from systems.signals import (
 )
 
 PICK, PLACE = PlanarPose(0.4, 0.3, 0.5), PlanarPose(0.55, -0.2, -0.8)
-HEIGHTS = SurfaceHeights(pick_top=0.05)
+HEIGHTS = SurfaceHeights(pick_top=0.05, highest=0.06)
 ACTION = PickPlaceAction(PICK, PLACE, heights=HEIGHTS)
 PARAMETERS = PickPlaceParameters(grasp_depth_share=0.0)
 TEN = 10
 """Actions that the planner of most tests may take."""
 GRASP_Z = 0.05 - PARAMETERS.grasp_depth
+HANGING = GRASP_Z
+"""How far what is held reaches below the fingertips: it stood on the table."""
 WIDTH, WEIGHT = 0.02, 6.0
 NO_TOUCH = -1.0
 
@@ -228,8 +229,8 @@ def test_where_the_hand_goes():
     assert run.output("closing_force")[0] == PARAMETERS.grasp_force
     assert run.output("desired_opening")[0] == pytest.approx(WIDTH, abs=1e-3)
     run.until(Mode.LOWER)
-    over_place = [PLACE.x, PLACE.y, PARAMETERS.travel_height]
-    np.testing.assert_allclose(run.output("desired_motion")[:3], over_place, atol=1e-5)
+    over_place = [PLACE.x, PLACE.y, HANGING + PARAMETERS.hover_clearance]
+    np.testing.assert_allclose(run.output("desired_motion")[:3], over_place, atol=1e-4)
     context = run.planner.GetMyContextFromRoot(run.simulator.get_context())
     pick, place = run.planner.action(context)
     assert (pick.x, pick.y, pick.theta) == (PICK.x, PICK.y, pytest.approx(turned))
@@ -240,11 +241,15 @@ def test_where_the_hand_goes():
     assert run.output("closing_force")[0] == 0
     opened = WIDTH + 2 * PARAMETERS.release_clearance
     assert run.output("desired_opening")[0] == pytest.approx(opened, abs=1e-3)
+    yaw = run.output("desired_motion")[3]
     run.finish()
-    np.testing.assert_allclose(run.output("desired_motion"), [*PARAMETERS.home, *np.zeros(8)])
+    home_x, _, home_z, _ = PARAMETERS.home
+    np.testing.assert_allclose(
+        run.output("desired_motion"), [home_x, PLACE.y, home_z, yaw, *np.zeros(8)], atol=1e-9
+    )
 
 
-@pytest.mark.parametrize("height", [0.02, 0.055])
+@pytest.mark.parametrize("height", [0.02, 0.045])
 def test_lowering_stops_where_something_is_touched(height: float):
     run = Run(World(touch_place=height)).until(Mode.RELEASE)
     z = run.output("desired_motion")[2]
@@ -356,14 +361,40 @@ def test_heights_are_read_off_the_observation_where_there_is_one():
 
 
 @pytest.mark.parametrize("tallest", [0.05, 0.16])
-def test_what_hangs_below_the_hand_clears_the_highest_surface(tallest: float):
-    run = Run(observation=seen(pick=0.06, tallest=tallest)).until(Mode.CARRY)
-    z = run.output("desired_motion")[2]
-    bottom = z - (0.06 - PARAMETERS.grasp_depth)
-    assert z >= PARAMETERS.travel_height - 1e-9
-    assert bottom >= tallest + PARAMETERS.travel_clearance - 1e-6
-    run.until(Mode.LOWER)
-    assert run.output("desired_motion")[2] == pytest.approx(z, abs=1e-5)
+def test_what_crosses_the_table_clears_the_highest_surface(tallest: float):
+    """But for the last two centimetres, which are over what o_t shows around the goal."""
+    run = Run(observation=seen(pick=0.06, place=0.03, tallest=tallest)).finish()
+    q = run.log.FindLog(run.simulator.get_context()).data()[:3]
+    times = run.log.FindLog(run.simulator.get_context()).sample_times()
+    begins = {mode: time for time, mode in reversed(run.modes)}
+    hanging = 0.06 - PARAMETERS.grasp_depth
+
+    def lowest(mode: Mode, before: PlanarPose | None, after: PlanarPose | None) -> float:
+        """The lowest that the fingertips are in a mode and away from where it begins and ends."""
+        during = (times >= begins[mode]) & (times < begins[Mode((mode + 1) % Mode.DONE)])
+        for pose in (before, after):
+            if pose is not None:
+                during &= np.hypot(q[0] - pose.x, q[1] - pose.y) > 0.025
+        return float(q[2, during].min())
+
+    free = tallest + PARAMETERS.travel_clearance - 1e-3
+    assert lowest(Mode.APPROACH, None, PICK) >= free
+    assert lowest(Mode.CARRY, PICK, PLACE) >= free + hanging
+    hover = PARAMETERS.hover_clearance
+    at_pick, at_place = (
+        float(np.interp(begins[mode], times, q[2])) for mode in (Mode.DESCEND, Mode.LOWER)
+    )
+    assert at_pick == pytest.approx(0.06 + hover, abs=1e-4)
+    assert at_place == pytest.approx(0.03 + hanging + hover, abs=1e-4)
+
+
+def test_the_hand_rises_before_it_leaves_the_place():
+    run = Run(observation=seen(pick=0.06, tallest=0.16)).until(Mode.RETREAT)
+    while run.sequence[-1] == Mode.RETREAT:
+        x, y, z = run.output("desired_motion")[:3]
+        assert y == pytest.approx(PLACE.y)
+        assert z >= 0.16 or x == pytest.approx(PLACE.x)
+        run.simulator.AdvanceTo(run.simulator.get_context().get_time() + 1 / 128)
 
 
 def test_an_action_without_heights_needs_an_observation():
@@ -467,51 +498,24 @@ def test_motion_is_smooth_and_within_the_limits_of_its_mode(answer: PickPlaceAct
         difference = (after - before) / step
         mean_v, mean_a = (before[4:8] + v) / 2, (before[8:12] + a) / 2
         np.testing.assert_allclose(difference[:4], mean_v, atol=1e-3)
-        np.testing.assert_allclose(difference[4:8], mean_a, atol=0.15)
-        for speed in (np.linalg.norm(v[:3]), np.linalg.norm(difference[:3])):
+        np.testing.assert_allclose(difference[4:8], mean_a, atol=0.3)
+        for part in (slice(0, 2), slice(2, 3)):  # In the plane, and along z.
+            speed, acceleration = np.linalg.norm(v[part]), np.linalg.norm(a[part])
             assert speed <= speeds[mode] * 1.0001, mode
-            fastest[mode] = max(fastest.get(mode, 0.0), speed)
-        for acceleration in (np.linalg.norm(a[:3]), np.linalg.norm(difference[4:7])):
             assert acceleration <= accelerations[mode] * 1.0001, mode
+            fastest[mode] = max(fastest.get(mode, 0.0), speed)
+        # A Franka arm's own limits.
+        assert np.linalg.norm(v[:3]) <= 1.7
+        assert np.linalg.norm(a[:3]) <= 13.0
         assert abs(v[3]) <= p.yaw_speed * 1.0001
         assert abs(a[3]) <= p.yaw_acceleration * 1.0001
         turning = max(turning, abs(v[3]))
     # Limits that are never reached would say nothing, and cost time.
-    assert fastest[Mode.DESCEND] == pytest.approx(p.descend_speed, rel=1e-2)
     assert fastest[Mode.LOWER] == pytest.approx(p.lower_speed, rel=1e-2)
     if answer is FAR:
         assert fastest[Mode.CARRY] == pytest.approx(p.carry_speed, rel=1e-2)
     else:
         assert turning == pytest.approx(p.yaw_speed, rel=1e-2)
-
-
-@pytest.mark.parametrize(
-    ("pick", "place", "expected"),
-    [
-        (0.1, 0.4, (0.1, 0.4)),
-        (3.0, -3.0, (3.0 - np.pi, np.pi - 3.0)),  # 8 degrees each way, not 172.
-        (0.2, 0.2 + np.pi, None),  # A half turn is a half turn: the object's ends differ.
-        (5.0, 11.0, None),
-        (-np.pi / 2, np.pi, None),
-    ],
-)
-def test_nearest_yaws(pick: float, place: float, expected: tuple[float, float] | None):
-    turned = nearest_yaws(pick, place)
-    if expected is not None:
-        np.testing.assert_allclose(turned, expected)
-    # The same grasp and the same turn of what is held...
-    half_turns = (turned[0] - pick) / np.pi
-    assert half_turns == pytest.approx(round(half_turns))
-    turns = ((turned[1] - turned[0]) - (place - pick)) / (2 * np.pi)
-    assert turns == pytest.approx(round(turns))
-    # ... and no equivalent pair stays nearer to zero.
-    equivalents = [
-        max(abs(pick + np.pi * half + 2 * np.pi * i), abs(place + np.pi * half + 2 * np.pi * j))
-        for half in (0, 1)
-        for i in range(-3, 4)
-        for j in range(-3, 4)
-    ]
-    assert max(map(abs, turned)) == pytest.approx(min(equivalents))
 
 
 def test_reset_and_rerun_give_equal_logs():

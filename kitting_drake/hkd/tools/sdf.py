@@ -9,8 +9,9 @@ from kitting_drake.hkd.tools.solids import MATERIALS
 
 # Contact, for every tool: Drake's hydroelastic modulus (Pa), dissipation (s/m), margin (m; 0 for
 # none) and friction. Drake 1.51 fails on the margin of finely faceted convex hulls, when it loads
-# or when they touch a mesh; the modulus is low enough that a flat bottom rests quietly without.
-HYDROELASTIC_MODULUS = 1e7
+# or when they touch a mesh; the modulus is low enough that a flat bottom rests quietly without,
+# on steps of 1/128 s.
+HYDROELASTIC_MODULUS = 2e6
 HUNT_CROSSLEY_DISSIPATION = 20.0
 HYDROELASTIC_MARGIN = 0.0
 FRICTION = 0.5
