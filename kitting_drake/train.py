@@ -81,6 +81,8 @@ class Settings:
     """Whether later picks of a demonstration are no labels of its earlier observations."""
     rigid: bool
     """Whether there is no curvature augmentation."""
+    reflection: bool
+    """Whether half of the samples are mirror images."""
     stop: bool
     """Whether the networks learn from final observations that there is nothing left to pick."""
     validate_every: int
@@ -127,6 +129,7 @@ def _settings(
         taken_only=arguments.taken_only or not assumed.later_picks_possible,
         # The Transporter rotates whole images: it has no crop in which an object can be bent.
         rigid=arguments.rigid or not assumed.curvature or arguments.method == "transporter",
+        reflection=assumed.reflection and not arguments.rigid,
         stop=bool(final_observations(learned.demonstrations)),
         validate_every=arguments.validate_every,
         seed=arguments.seed,
@@ -173,8 +176,8 @@ def _parse() -> argparse.Namespace:
     parser.add_argument(
         "--rigid",
         action="store_true",
-        help="as in the paper: augment by motions of the whole scene only, without curvature "
-        "augmentation (always so with transporter, and where the task does not allow it)",
+        help="as in the paper: augment by motions of the whole scene only, not by curvature (never "
+        "with transporter) and reflection (neither where the task does not allow it)",
     )
     parser.add_argument(
         "--validate-every", type=count_type, default=500, metavar="STEPS", help="(500)"
@@ -272,6 +275,7 @@ class _Run:
             learning_rate=settings.learning_rate,
             decay=settings.decay,
             curvature=not settings.rigid,
+            reflection=settings.reflection,
         )
         self.best: dict[str, Any] | None = None
         self.seconds = 0.0

@@ -199,8 +199,35 @@ def _moved(sample: LabelledImage, motion: Motion) -> LabelledImage:
     )
 
 
+def reflect(sample: LabelledImage) -> LabelledImage:
+    """The mirror image of a sample, columns reversed; its labels are those of the mirrored scene.
+
+    A reflection turns every rotation about. For networks that are equivariant to rotations only it
+    is a new scene, of objects of other shapes.
+    """
+    last = sample.image.shape[2] - 1
+
+    def mirrored(pixels: NDArray[np.float64]) -> NDArray[np.float64]:
+        return np.stack([pixels[..., 0], last - pixels[..., 1]], axis=-1)
+
+    return dataclasses.replace(
+        sample,
+        image=np.ascontiguousarray(sample.image[:, :, ::-1]),
+        pick=mirrored(sample.pick),
+        pick_theta=-sample.pick_theta,
+        place=mirrored(sample.place),
+        rotation=-sample.rotation,
+        other_picks=mirrored(sample.other_picks),
+        other_thetas=-sample.other_thetas,
+    )
+
+
 def augment(
-    sample: LabelledImage, random: np.random.Generator, *, curvature: bool = False
+    sample: LabelledImage,
+    random: np.random.Generator,
+    *,
+    curvature: bool = False,
+    reflection: bool = False,
 ) -> LabelledImage:
     """A sample after a random SE(2) motion of the scene that keeps both labels inside the image.
 
@@ -212,7 +239,10 @@ def augment(
         random: for all draws.
         curvature: also draw curvatures (see `LabelledImage.curved_crop`), so that pick angles are
             learned from bent objects as well: this is not in the paper.
+        reflection: reflect every other sample first: this is not in the paper.
     """
+    if reflection and random.random() < 0.5:
+        sample = reflect(sample)
     rows, cols = sample.image.shape[1:]
     result = sample
     for _ in range(100):

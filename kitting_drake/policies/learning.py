@@ -18,3 +18,6 @@ class Learning:
     curvature: bool = False
     """Objects may be bent in the image to augment pick angles: objects of the task come in slightly
     different shapes and bent ones are picked alike. True for hand tools, false for blocks."""
+    reflection: bool = False
+    """Mirror images of scenes are scenes of the task as well, and their objects are handled alike.
+    True for hand tools of many shapes."""

@@ -35,6 +35,7 @@ class Trainer:
         learning_rate: float = 1e-4,
         decay: bool = False,
         curvature: bool = False,
+        reflection: bool = False,
     ) -> None:
         """
         Args:
@@ -45,6 +46,7 @@ class Trainer:
             decay: let the learning rate fall to zero over the steps (half a cosine, after a rise
                 over the first hundred) instead of keeping it constant.
             curvature: see `augment`.
+            reflection: see `augment`.
         """
         self.networks = networks
         self.seed = seed
@@ -52,6 +54,7 @@ class Trainer:
         self.learning_rate = learning_rate
         self.decay = decay
         self.curvature = curvature
+        self.reflection = reflection
         self.step_count = 0
         self.optimisers = {
             name: torch.optim.Adam(
@@ -86,7 +89,12 @@ class Trainer:
             Each loss, in nats; `stop`, that of a final observation, only where there was one.
         """
         random = np.random.default_rng([self.seed, self.step_count])
-        sample = augment(samples[random.integers(len(samples))], random, curvature=self.curvature)
+        sample = augment(
+            samples[random.integers(len(samples))],
+            random,
+            curvature=self.curvature,
+            reflection=self.reflection,
+        )
         # Has draws of its own, so that the sample is the same with and without final observations.
         stop_random = np.random.default_rng([self.seed, self.step_count, 1])
         final = self._draw_final(finals, stop_random)

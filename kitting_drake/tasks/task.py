@@ -135,7 +135,7 @@ class TaskConfig:
     @property
     def learning(self) -> Learning:
         """The assumptions that a learner of the task may make."""
-        return Learning(later_picks_possible=False, curvature=False)
+        return Learning()
 
     def input_files(self, base: Path) -> list[Path]:
         """The files, beside those of the project, that the scenes depend on.

@@ -134,23 +134,31 @@ def test_leaves_a_policy_and_its_origin(trained: Path):
 
 
 @pytest.mark.parametrize(
-    ("learning", "flags", "taken_only", "rigid"),
+    ("learning", "flags", "taken_only", "rigid", "reflection"),
     [
-        (Learning(), (), True, True),
-        (Learning(later_picks_possible=True), (), False, True),
-        (Learning(curvature=True), (), True, False),
-        (LEARNING, ("--taken-only", "--rigid"), True, True),
+        (Learning(), (), True, True, False),
+        (Learning(later_picks_possible=True), (), False, True, False),
+        (Learning(curvature=True), (), True, False, False),
+        (Learning(reflection=True), (), True, True, True),
+        (Learning(reflection=True), ("--rigid",), True, True, False),
+        (LEARNING, ("--taken-only", "--rigid"), True, True, False),
     ],
 )
 def test_the_task_says_what_training_may_assume(
-    learning: Learning, flags: tuple[str, ...], taken_only: bool, rigid: bool, tmp_path: Path
+    learning: Learning,
+    flags: tuple[str, ...],
+    taken_only: bool,
+    rigid: bool,
+    reflection: bool,
+    tmp_path: Path,
 ):
     path = tmp_path / "demonstrations.h5"
     items = [demonstration(seed, final=False) for seed in (10, 11)]
     write_demonstrations(path, dataclasses.replace(ORIGIN, learning=learning), items)
     train(path, tmp_path / "run", "--steps", 1, *flags)
     file = read_weights_file(tmp_path / "run" / "policy.safetensors")
-    assert (file.card["taken_only"], file.card["rigid"]) == (taken_only, rigid)
+    found = (file.card["taken_only"], file.card["rigid"], file.card["reflection"])
+    assert found == (taken_only, rigid, reflection)
     assert file.card["samples"] == (2 if taken_only else 3)
     # Without final observations nobody learns to stop.
     assert not file.config.stop

@@ -43,7 +43,7 @@ class _KittingTask(TaskConfig):
 
     @property
     def learning(self) -> Learning:
-        return Learning(later_picks_possible=True, curvature=True)
+        return Learning(later_picks_possible=True, curvature=True, reflection=True)
 
     def find_cause(
         self,

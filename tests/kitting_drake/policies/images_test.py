@@ -10,6 +10,7 @@ from kitting_drake.policies.images import (
     augment,
     crop,
     move,
+    reflect,
     rotation_matrix,
 )
 from systems.signals import PickPlaceAction, PixelGrid, PlanarPose
@@ -219,6 +220,39 @@ def test_every_object_has_a_curvature_of_its_own():
     curved = augment(sample, np.random.default_rng(0), curvature=True)
     assert len(np.unique(curved.curvatures)) == 6
     assert not len(augment(sample, np.random.default_rng(0)).curvatures)
+
+
+@pytest.mark.parametrize("theta", [0.0, 0.7, 2.0])
+def test_reflection_mirrors_what_is_seen_and_the_labels(theta: float):
+    sample = dataclasses.replace(
+        SAMPLE, other_picks=np.array([[20.0, 60]]), other_thetas=np.array([0.2])
+    )
+    mirrored = reflect(sample)
+    for name in ("pick", "place"):
+        at = getattr(mirrored, name)
+        np.testing.assert_allclose(hill(mirrored, at), at, atol=0.02)
+    assert (mirrored.pick_theta, mirrored.rotation) == (-0.3, -1.1)
+    np.testing.assert_array_equal(mirrored.other_picks, [[20.0, COLS - 1 - 60]])
+    # A bar that is gripped at an angle is gripped alike in the mirror.
+    bar = reflect(barred(theta))
+    middles = [middle_line(bar.image, bar.pick_theta, u) for u in (-12, 0, 12)]
+    np.testing.assert_allclose(middles, middles[1], atol=0.8)
+    # What a rotation of the object does is undone in the mirror by the opposite one.
+    beside = sample.pick + (3.0, -2.0)
+    across = np.array([0, COLS - 1]) + beside * (1, -1)
+    expected = np.array([0, COLS - 1]) + sample.place_of(beside) * (1, -1)
+    np.testing.assert_allclose(mirrored.place_of(across), expected)
+    twice = reflect(mirrored)
+    np.testing.assert_array_equal(twice.image, sample.image)
+    np.testing.assert_array_equal(twice.place, sample.place)
+
+
+def test_half_of_the_samples_are_reflected_where_they_may_be():
+    random = np.random.default_rng(0)
+    rotations = [augment(SAMPLE, random, reflection=True).rotation for _ in range(60)]
+    assert set(rotations) == {SAMPLE.rotation, -SAMPLE.rotation}
+    assert 20 < rotations.count(SAMPLE.rotation) < 40
+    assert augment(SAMPLE, random).rotation == SAMPLE.rotation
 
 
 def test_a_motion_is_undone():

@@ -182,7 +182,7 @@ def test_only_what_is_unchanged_is_called_as_in_the_paper():
 @pytest.mark.parametrize("task", [Kitting(), ToolsetKitting(), ArrangedKitting()])
 def test_what_kitting_says_of_itself(task: TaskConfig):
     task.validate()
-    assert task.learning == Learning(later_picks_possible=True, curvature=True)
+    assert task.learning == Learning(later_picks_possible=True, curvature=True, reflection=True)
     assert task.causes == diagnosis.CAUSES
     scene = draw(0, task)
     away = placements(scene, [item.X_WB for item in scene.objects])
