@@ -12,14 +12,62 @@ from pydrake.systems.framework import Context, DiscreteValues, EventStatus, Leaf
 
 
 @dataclass(frozen=True)
+class Box:
+    """An oriented box around a piece of a body's collision geometry."""
+
+    X_BBox: RigidTransform
+    half_size: NDArray[np.float64]
+    """(3,) half of its sides, in metres."""
+
+
+@dataclass(frozen=True)
 class BoundedBody:
-    """A body and a box around its collision geometry."""
+    """A body and the boxes around its collision geometry."""
 
     body: BodyIndex
-    p_BLower: NDArray[np.float64]
-    """(3,) lower corner of the box, in the body frame, in metres."""
-    p_BUpper: NDArray[np.float64]
-    """(3,) upper corner."""
+    boxes: Sequence[Box]
+
+
+class _Boxes:
+    """Boxes as arrays: k of them, fixed in frames."""
+
+    def __init__(self, boxes: Sequence[Box]) -> None:
+        self.poses = np.array([box.X_BBox.GetAsMatrix34() for box in boxes])
+        self.halves = np.array([box.half_size for box in boxes], float)
+
+    def posed(self, X: NDArray[np.float64]) -> tuple[NDArray, NDArray, NDArray]:
+        """Rotations (k, 3, 3), centres (k, 3) and half sizes, for one frame or one frame each.
+
+        Args:
+            X: (3, 4) or (k, 3, 4), the pose of the frame.
+        """
+        rotations = X[..., :3] @ self.poses[:, :, :3]
+        centres = np.einsum("...ij,...j->...i", X[..., :3], self.poses[:, :, 3]) + X[..., 3]
+        return rotations, centres, self.halves
+
+    def enclosing(self) -> Box:
+        """One box around all, along the axes of the frame."""
+        reach = np.einsum("kij,kj->ki", np.abs(self.poses[:, :, :3]), self.halves)
+        lower = (self.poses[:, :, 3] - reach).min(axis=0)
+        upper = (self.poses[:, :, 3] + reach).max(axis=0)
+        return Box(RigidTransform((lower + upper) / 2), (upper - lower) / 2)
+
+
+def _gaps(
+    first: tuple[NDArray, NDArray, NDArray], second: tuple[NDArray, NDArray, NDArray]
+) -> NDArray[np.float64]:
+    """(a, b) lower bounds of the distances of a boxes from b others, in metres.
+
+    The widest gap along the six face normals of a pair.
+    """
+    (R_i, centres_i, halves_i), (R_j, centres_j, halves_j) = first, second
+    apart = centres_i[:, None] - centres_j[None]
+    relative = np.abs(np.einsum("aki,bkj->abij", R_i, R_j))
+    along_i = np.abs(np.einsum("aki,abk->abi", R_i, apart)) - halves_i[:, None]
+    along_i -= np.einsum("abij,bj->abi", relative, halves_j)
+    along_j = np.abs(np.einsum("bkj,abk->abj", R_j, apart)) - halves_j[None]
+    along_j -= np.einsum("abij,ai->abj", relative, halves_i)
+    return np.maximum(along_i.max(axis=2), along_j.max(axis=2))
 
 
 class RestDetector(LeafSystem):
@@ -38,11 +86,11 @@ class RestDetector(LeafSystem):
 
     An object comes to rest when for `time_to_sleep` it has stayed within both tolerances of one
     pose, and nothing that is not at rest, mover or object, is within `wake_distance` of it:
-    distances of oriented bounding boxes, never more than the true ones. It is no longer at rest as
-    soon as something comes that near. Displacements are compared, not velocities: an object that
-    trembles in place, as on a step too long for its stiffness, goes nowhere. The memory (discrete
-    state) is the pose that each object has stayed near, since when, in s, and whether it is at
-    rest.
+    distances of the oriented boxes of their pieces, never more than the true ones. It is no longer
+    at rest as soon as something comes that near. Displacements are compared, not velocities: an
+    object that trembles in place, as on a step too long for its stiffness, goes nowhere. The memory
+    (discrete state) is the pose that each object has stayed near, since when, in s, and whether it
+    is at rest.
     """
 
     def __init__(
@@ -71,8 +119,8 @@ class RestDetector(LeafSystem):
         self._count = len(objects)
         bodies = [*objects, *movers]
         self._bodies = [int(item.body) for item in bodies]
-        self._centres = np.array([(item.p_BLower + item.p_BUpper) / 2 for item in bodies])
-        self._half_sizes = np.array([(item.p_BUpper - item.p_BLower) / 2 for item in bodies])
+        self._pieces = [_Boxes(item.boxes) for item in bodies]
+        self._wholes = _Boxes([pieces.enclosing() for pieces in self._pieces])
         self._position_tolerance = position_tolerance
         # A rotation by an angle a differs from none by 2 sqrt(2) sin(a / 2) in Frobenius norm.
         self._rotation_tolerance = 2 * np.sqrt(2) * np.sin(angle_tolerance / 2)
@@ -104,44 +152,38 @@ class RestDetector(LeafSystem):
         anchors[~stayed] = X[:n][~stayed]
         still_for[:] = np.where(stayed, still_for + self._period, 0.0)
         resting = still_for >= self._time_to_sleep - self._period / 2
-        near = self._near(X)
-        # An awake object wakes its neighbours, and they theirs.
-        for _ in range(n):
-            awake = np.concatenate([~resting, np.ones(len(self._bodies) - n, bool)])
-            woken = resting & (near & awake).any(axis=1)
-            if not woken.any():
-                break
-            resting &= ~woken
+        self._wake(X, resting)
         discrete_state.get_mutable_value(self._at_rest)[:] = resting
         return EventStatus.Succeeded()
 
-    def _near(self, X: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """(n, bodies) which bodies' boxes are within the wake distance of each object's.
+    def _wake(self, X: NDArray[np.float64], resting: NDArray[np.bool_]) -> None:
+        """Clears what rests, and has something near it that does not.
 
         Args:
             X: (bodies, 3, 4) X_WB of each.
+            resting: (n,) written.
         """
-        rotations, origins = X[:, :, :3], X[:, :, 3]
-        centres = origins + np.einsum("bij,bj->bi", rotations, self._centres)
-        halves = self._half_sizes
-        # (i, j) pairs of objects and bodies; the widest gap along the six face normals of a pair is
-        # a lower bound of the distance of their boxes.
-        n, bodies = self._count, len(self._bodies)
-        shape = (n, bodies, 3, 3)
-        axes = np.concatenate(
-            [
-                np.broadcast_to(rotations[:n, None], shape),
-                np.broadcast_to(rotations[None], shape),
-            ],
-            axis=3,
+        n = self._count
+        rotations, centres, halves = self._wholes.posed(X)
+        near = (
+            _gaps((rotations[:n], centres[:n], halves[:n]), (rotations, centres, halves))
+            < self._wake_distance
         )
-        offsets = np.abs(np.einsum("ijka,ijk->ija", axes, centres[:n, None] - centres[None]))
-        reach_i = np.einsum(
-            "ijab,ib->ija", np.abs(np.einsum("ijka,ikb->ijab", axes, rotations[:n])), halves[:n]
-        )
-        reach_j = np.einsum(
-            "ijab,jb->ija", np.abs(np.einsum("ijka,jkb->ijab", axes, rotations)), halves
-        )
-        near = (offsets - reach_i - reach_j).max(axis=2) < self._wake_distance
-        near[np.arange(n), np.arange(n)] = False
-        return near
+        # An awake object wakes its neighbours, and they theirs. That wholes are near is cheap to
+        # see; whether pieces are is looked at where it matters.
+        for _ in range(n):
+            awake = np.concatenate([~resting, np.ones(len(self._bodies) - n, bool)])
+            woken = False
+            for i, j in np.argwhere(near & resting[:, None] & awake):
+                if resting[i] and self._are_near(X, i, j):
+                    resting[i] = False
+                    woken = True
+                else:
+                    near[i, j] = False
+            if not woken:
+                break
+
+    def _are_near(self, X: NDArray[np.float64], i: int, j: int) -> bool:
+        """Whether pieces of two bodies are within the wake distance of each other."""
+        gaps = _gaps(self._pieces[i].posed(X[i]), self._pieces[j].posed(X[j]))
+        return bool(gaps.min() < self._wake_distance)

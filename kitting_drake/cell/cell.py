@@ -35,7 +35,7 @@ from kitting_drake.cell.cameras import (
     depth_camera,
     picture_camera,
 )
-from kitting_drake.cell.plant import add_models, add_plant, bounding_box, set_initial_poses
+from kitting_drake.cell.plant import add_models, add_plant, bounded_body, set_initial_poses
 from kitting_drake.common.errors import UserError
 from kitting_drake.scenario.policies import DecisionObserver, PolicySite
 from kitting_drake.scenario.schema import Scenario
@@ -296,8 +296,8 @@ def _make_rest_detector(
 ) -> RestDetector:
     hand = [plant.GetBodyByName(name) for name in ("hand", "left_finger", "right_finger")]
     return RestDetector(
-        objects=[bounding_box(plant, scene_graph, plant.get_body(item.body)) for item in objects],
-        movers=[bounding_box(plant, scene_graph, body) for body in hand],
+        objects=[bounded_body(plant, scene_graph, plant.get_body(item.body)) for item in objects],
+        movers=[bounded_body(plant, scene_graph, body) for body in hand],
         position_tolerance=scenario.sleep.position_tolerance,
         angle_tolerance=scenario.sleep.angle_tolerance,
         time_to_sleep=scenario.sleep.time_to_sleep,

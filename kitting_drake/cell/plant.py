@@ -15,7 +15,7 @@ from kitting_drake.common.paths import MODELS
 from kitting_drake.scenario.schema import Scenario
 from kitting_drake.tasks.task import Scene
 from systems.placement import PlacedObject
-from systems.rest_detector import BoundedBody
+from systems.rest_detector import BoundedBody, Box
 
 _X_WTABLE = RigidTransform([0.5, 0.0, 0.0])
 
@@ -83,15 +83,12 @@ def set_initial_poses(
         plant.GetJointByName(joint).set_default_positions([scenario.planner.open_width / 2])
 
 
-def bounding_box(plant: MultibodyPlant, scene_graph: SceneGraph, body: RigidBody) -> BoundedBody:
-    """A body with a box around its collision geometry."""
+def bounded_body(plant: MultibodyPlant, scene_graph: SceneGraph, body: RigidBody) -> BoundedBody:
+    """A body with the boxes around its collision geometry."""
     inspector = scene_graph.model_inspector()
-    corners = []
+    boxes = []
     for geometry in plant.GetCollisionGeometriesForBody(body):
         box = inspector.GetObbInGeometryFrame(geometry)
-        half = np.asarray(box.half_width())
-        signs = np.array(np.meshgrid(*[(-1, 1)] * 3)).reshape(3, -1)
         X_BBox = inspector.GetPoseInFrame(geometry) @ box.pose()
-        corners.append(X_BBox.multiply(half[:, None] * signs))
-    points = np.concatenate(corners, axis=1)
-    return BoundedBody(body.index(), points.min(axis=1), points.max(axis=1))
+        boxes.append(Box(X_BBox, np.asarray(box.half_width())))
+    return BoundedBody(body.index(), boxes)

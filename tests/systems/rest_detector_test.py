@@ -5,7 +5,7 @@ from pydrake.math import RigidTransform, RollPitchYaw
 from pydrake.multibody.tree import BodyIndex
 from pydrake.systems.analysis import Simulator
 
-from systems.rest_detector import BoundedBody, RestDetector
+from systems.rest_detector import BoundedBody, Box, RestDetector
 
 PATIENCE = 0.25
 LEFT, RIGHT, HAND = 1, 2, 3
@@ -17,10 +17,10 @@ class Table:
     """Two bars 20 cm long and 2 cm wide, 20 cm apart, and a hand; their poses set by hand."""
 
     def __init__(self) -> None:
-        half = np.array([0.1, 0.01, 0.01])
+        bar = Box(RigidTransform(), np.array([0.1, 0.01, 0.01]))
         self.detector = RestDetector(
-            objects=[BoundedBody(BodyIndex(i), -half, half) for i in (LEFT, RIGHT)],
-            movers=[BoundedBody(BodyIndex(HAND), np.full(3, -0.02), np.full(3, 0.02))],
+            objects=[BoundedBody(BodyIndex(i), [bar]) for i in (LEFT, RIGHT)],
+            movers=[BoundedBody(BodyIndex(HAND), [Box(RigidTransform(), np.full(3, 0.02))])],
             position_tolerance=POSITION,
             angle_tolerance=ANGLE,
             time_to_sleep=PATIENCE,
@@ -134,3 +134,33 @@ def test_nearness_is_that_of_turned_boxes():
     assert table.at_rest_after(1.0) == [True, True]
     table.poses[HAND] = RigidTransform(turn, normal * (0.01 + 0.02 + BESIDE))
     assert table.at_rest_after(1 / 64) == [False, True]
+
+
+def test_what_is_between_pieces_is_not_near():
+    """A hook of two bars: the hand in its bend is within the box around both."""
+    hook = [
+        Box(RigidTransform([0.1, 0, 0]), np.array([0.1, 0.01, 0.01])),
+        Box(
+            RigidTransform(RollPitchYaw(0, 0, np.pi / 2), [0, 0.1, 0]), np.array([0.1, 0.01, 0.01])
+        ),
+    ]
+    detector = RestDetector(
+        objects=[BoundedBody(BodyIndex(LEFT), hook)],
+        movers=[BoundedBody(BodyIndex(RIGHT), [Box(RigidTransform(), np.full(3, 0.02))])],
+        position_tolerance=POSITION,
+        angle_tolerance=ANGLE,
+        time_to_sleep=PATIENCE,
+        wake_distance=0.006,
+    )
+    simulator = Simulator(detector)
+    context = simulator.get_mutable_context()
+
+    def rests(p_WHand: list[float]) -> bool:
+        poses = [RigidTransform(), RigidTransform(), RigidTransform(p_WHand)]
+        detector.GetInputPort("body_poses").FixValue(context, Value(poses))
+        simulator.AdvanceTo(context.get_time() + 0.5)
+        return bool(detector.at_rest(context)[0])
+
+    assert rests([0.1, 0.1, 0.0])
+    assert not rests([0.1, 0.01 + 0.02 + BESIDE, 0.0])
+    assert not rests([0.01 + 0.02 + BESIDE, 0.1, 0.0])

@@ -11,8 +11,11 @@ from kitting_drake.hkd.kits.parameters import KitParameters
 
 ARC_SEGMENTS = 64
 """How many straight edges a rounded outline has around a full circle."""
-_TOP_CELL = 0.02
-"""Side of the squares into which the top is cut for the contact solver, in metres."""
+_CELL = 0.02
+"""The longest wall, and the side of the squares of the top, for the contact solver, in metres."""
+
+Triangles = tuple[NDArray[np.float64], NDArray[np.int64]]
+"""Vertices (n, 3), in metres, and faces (m, 3)."""
 
 
 class _Surface:
@@ -65,8 +68,8 @@ class _Surface:
         outer_index = outer + np.arange(sum(map(len, outer_loops)))
         self.add_faces(np.concatenate([outer_index, *inner_index])[band][:, ::-1])
 
-    def arrays(self) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-        """Vertices (n, 3) and faces (m, 3)."""
+    def arrays(self) -> Triangles:
+        """All of them."""
         return np.concatenate(self._vertices), np.concatenate(self._faces)
 
 
@@ -89,9 +92,15 @@ class Cavity:
             return self.outline
         return self.outline.offset(self.lead_in, JoinType.Round, circular_segments=ARC_SEGMENTS)
 
-    def add_sides(self, surface: _Surface) -> tuple[int, int]:
-        """Adds wall and bevel; returns the first vertices of the floor's ring and of the rim's."""
-        wall_loops, rim_loops = self.outline.to_polygons(), self.rim.to_polygons()
+    def add_sides(self, surface: _Surface, longest: float = np.inf) -> tuple[int, int]:
+        """Adds wall and bevel; returns the first vertices of the floor's ring and of the rim's.
+
+        Args:
+            surface: grows.
+            longest: no edge of the outlines is to be longer, in metres.
+        """
+        wall_loops = _subdivided(self.outline.to_polygons(), longest)
+        rim_loops = _subdivided(self.rim.to_polygons(), longest)
         floor = surface.add_ring(wall_loops, self.floor)
         if self.lead_in <= 0:
             rim = surface.add_ring(rim_loops, self.top)
@@ -114,6 +123,19 @@ class Cavity:
         surface.add_faces(np.asarray(triangulate(rim_loops)) + above)
         vertices, faces = surface.arrays()
         return Manifold(Mesh(vertices.astype(np.float32), faces.astype(np.uint32)))
+
+
+def _subdivided(loops: list[NDArray[np.float64]], longest: float) -> list[NDArray[np.float64]]:
+    """The same closed loops with vertices added, so that no edge is longer."""
+    result = []
+    for loop in loops:
+        edges = np.roll(loop, -1, axis=0) - loop
+        counts = np.maximum(1, np.ceil(np.linalg.norm(edges, axis=1) / longest)).astype(int)
+        steps = np.concatenate([np.arange(count) / count for count in counts])
+        result.append(
+            np.repeat(loop, counts, axis=0) + steps[:, None] * np.repeat(edges, counts, axis=0)
+        )
+    return result
 
 
 def build_block(cavities: Sequence[Cavity], parameters: KitParameters) -> Manifold:
@@ -151,35 +173,44 @@ def _add_floor(surface: _Surface, cavity: Cavity, cavities: Sequence[Cavity]) ->
     surface.add_faces(start + np.asarray(triangulate(loops))[:, ::-1])
 
 
-def contact_surface(
-    cavities: Sequence[Cavity], parameters: KitParameters
-) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """The block's outside as the contact solver likes it: vertices (n, 3) and faces (m, 3).
+def contact_surfaces(cavities: Sequence[Cavity], parameters: KitParameters) -> dict[str, Triangles]:
+    """The block as the contact solver likes it: sides of the cavities, floors, top and outside.
 
-    The same walls, bevels and planes as the block's, cut otherwise. A triangulation of floors and
-    top by their outlines has long slivers, whose bounding boxes all overlap, and breaks every
-    contact patch into as many polygons. So a floor is one rectangle that reaches into the solid,
-    where nothing can touch it, but not into another cavity, and the top is cut into squares first.
-    The underside is left out.
+    The same walls, bevels and planes as the block's, cut otherwise. What costs is how many bounding
+    boxes of a few neighbouring triangles an object overlaps. A triangulation of floors and top by
+    their outlines has long slivers, whose boxes all overlap, and breaks every contact patch into as
+    many polygons; and a large triangle together with a small one has a large box. So a floor is one
+    rectangle that reaches into the solid, where nothing can touch it, but not into another cavity;
+    top and walls are cut into small pieces; and what is large is apart from what is small. The
+    underside is left out.
     """
-    surface = _Surface()
+    sides, floors, top, outside = _Surface(), _Surface(), _Surface(), _Surface()
     room = CrossSection.square((parameters.length, parameters.width), True)
-    top = room
+    plane = room
     for cavity in cavities:
-        cavity.add_sides(surface)
-        _add_floor(surface, cavity, cavities)
-        top -= cavity.rim
-    # What bounds the cavities from outside bounds the block from inside.
-    vertices, faces = surface.arrays()
-    block = _Surface()
-    block.add_faces(block.add_vertices(vertices) + faces[:, ::-1])
-    loops = room.to_polygons()
-    block.add_walls(loops, block.add_ring(loops, 0.0), block.add_ring(loops, parameters.height))
-    for x in np.arange(-parameters.length / 2, parameters.length / 2, _TOP_CELL):
-        for y in np.arange(-parameters.width / 2, parameters.width / 2, _TOP_CELL):
-            cell = top ^ CrossSection.square((_TOP_CELL, _TOP_CELL)).translate((x, y))
+        cavity.add_sides(sides, _CELL)
+        _add_floor(floors, cavity, cavities)
+        plane -= cavity.rim
+    for x in np.arange(-parameters.length / 2, parameters.length / 2, _CELL):
+        for y in np.arange(-parameters.width / 2, parameters.width / 2, _CELL):
+            cell = plane ^ CrossSection.square((_CELL, _CELL)).translate((x, y))
             if cell.area() > 1e-10:
                 loops = cell.to_polygons()
-                start = block.add_ring(loops, parameters.height)
-                block.add_faces(start + np.asarray(triangulate(loops)))
-    return block.arrays()
+                start = top.add_ring(loops, parameters.height)
+                top.add_faces(start + np.asarray(triangulate(loops)))
+    loops = _subdivided(room.to_polygons(), _CELL)
+    outside.add_walls(
+        loops, outside.add_ring(loops, 0.0), outside.add_ring(loops, parameters.height)
+    )
+    # What bounds the cavities from outside bounds the block from inside.
+    return {
+        "sides": _reversed(sides),
+        "floors": _reversed(floors),
+        "top": top.arrays(),
+        "outside": outside.arrays(),
+    }
+
+
+def _reversed(surface: _Surface) -> Triangles:
+    vertices, faces = surface.arrays()
+    return vertices, faces[:, ::-1]

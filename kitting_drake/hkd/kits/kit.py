@@ -20,14 +20,14 @@ from numpy.typing import NDArray
 from kitting_drake.common.errors import UserError
 from kitting_drake.common.paths import cache_directory
 from kitting_drake.hkd.cache import cached_folder
-from kitting_drake.hkd.kits.block import build_block, contact_surface
+from kitting_drake.hkd.kits.block import build_block, contact_surfaces
 from kitting_drake.hkd.kits.layout import CavityPose, KitLayout, kit_cavities, layout_kit
 from kitting_drake.hkd.kits.parameters import KitParameters
 from kitting_drake.hkd.tools.tool import Tool
 
 _DIGITS = 7
 """The number of decimals of coordinates in files."""
-_FORMAT_VERSION = "8"
+_FORMAT_VERSION = "9"
 """Part of the cache key: changed whenever the same input makes another kit."""
 
 
@@ -96,7 +96,15 @@ def _content_key(tools: Sequence[Tool], parameters: KitParameters) -> str:
 
 
 _LAYOUT = "layout.json"
-_FILES = ("kit.obj", "contact.obj", "block.obj", "cavities.obj", "kit.sdf", _LAYOUT)
+_CONTACT = ("sides", "floors", "top", "outside")
+_FILES = (
+    "kit.obj",
+    *(f"contact_{name}.obj" for name in _CONTACT),
+    "block.obj",
+    "cavities.obj",
+    "kit.sdf",
+    _LAYOUT,
+)
 
 _SDF = """<?xml version="1.0"?>
 <sdf version="1.9" xmlns:drake="http://drake.mit.edu">
@@ -110,8 +118,13 @@ _SDF = """<?xml version="1.0"?>
         <geometry><mesh><uri>cavities.obj</uri></mesh></geometry>
         <material><diffuse>0.95 0.62 0.10 1</diffuse></material>
       </visual>
-      <collision name="kit">
-        <geometry><mesh><uri>contact.obj</uri></mesh></geometry>
+{collisions}    </link>
+  </model>
+</sdf>
+"""
+
+_COLLISION = """      <collision name="{name}">
+        <geometry><mesh><uri>contact_{name}.obj</uri></mesh></geometry>
         <drake:proximity_properties>
           <drake:rigid_hydroelastic/>
           <drake:hunt_crossley_dissipation>5.0</drake:hunt_crossley_dissipation>
@@ -119,9 +132,6 @@ _SDF = """<?xml version="1.0"?>
           <drake:mu_dynamic>0.3</drake:mu_dynamic>
         </drake:proximity_properties>
       </collision>
-    </link>
-  </model>
-</sdf>
 """
 
 
@@ -137,14 +147,16 @@ def _write(tools: Sequence[Tool], layout: KitLayout, directory: Path) -> None:
     a, b, c = faces.T
     faces = faces[(a != b) & (b != c) & (c != a)]
     _write_obj(directory / "kit.obj", vertices, faces, normals=False)
-    _write_obj(directory / "contact.obj", *contact_surface(cavities, parameters), normals=False)
+    for name, triangles in contact_surfaces(cavities, parameters).items():
+        _write_obj(directory / f"contact_{name}.obj", *triangles, normals=False)
     # Two colours, as tool foam has: what is inside the block's faces is a cavity.
     bounds = np.array(block.bounding_box()).reshape(2, 3)
     centres = vertices[faces].mean(axis=1)
     on_hull = np.isclose(centres[:, None], bounds[None], atol=1e-6).any(axis=(1, 2))
     _write_obj(directory / "block.obj", vertices, faces[on_hull], normals=True)
     _write_obj(directory / "cavities.obj", vertices, faces[~on_hull], normals=True)
-    (directory / "kit.sdf").write_text(_SDF)
+    collisions = "".join(_COLLISION.format(name=name) for name in _CONTACT)
+    (directory / "kit.sdf").write_text(_SDF.format(collisions=collisions))
     described = {"length": parameters.length, "width": parameters.width}
     poses = [dataclasses.asdict(pose) for pose in layout.poses]
     (directory / _LAYOUT).write_text(json.dumps({**described, "poses": poses}, indent=2) + "\n")

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from kitting_drake.common.errors import UserError
 from kitting_drake.hkd.kits import kit as kit_module
-from kitting_drake.hkd.kits.block import Cavity, build_block, contact_surface
+from kitting_drake.hkd.kits.block import Cavity, build_block, contact_surfaces
 from kitting_drake.hkd.kits.clearance import measure_clearance
 from kitting_drake.hkd.kits.kit import make_kit
 from kitting_drake.hkd.kits.layout import SLOTS, kit_cavities, layout_kit
@@ -107,6 +107,16 @@ def test_clearance_is_a_parameter(tools: list[Tool]):
     )
 
 
+def contact_surface(cavities: list[Cavity], parameters: KitParameters) -> tuple[NDArray, NDArray]:
+    """All of its parts."""
+    meshes = [
+        trimesh.Trimesh(*part, process=False)
+        for part in contact_surfaces(cavities, parameters).values()
+    ]
+    whole = trimesh.util.concatenate(meshes)
+    return whole.vertices, whole.faces
+
+
 @pytest.mark.parametrize("lead_in", [0.0, 0.001])
 def test_contact_surface_has_the_walls_of_the_block(tools: list[Tool], lead_in: float):
     parameters = KitParameters(lead_in=lead_in)
@@ -182,7 +192,7 @@ def test_a_kit_is_built_once(tools: list[Tool], cache: Path, monkeypatch: pytest
         patch.setattr(kit_module, "_write", fail)
         assert make_kit(tools, PARAMETERS).sdf == first.sdf
     # The machine went down before the content was on the disk.
-    path = first.sdf.with_name("contact.obj")
+    path = first.sdf.with_name("contact_sides.obj")
     content = path.read_bytes()
     path.write_bytes(b"")
     make_kit(tools, PARAMETERS)
@@ -226,7 +236,8 @@ def test_two_that_build_the_same_kit_at_once_both_get_it(
         kits = list(pool.map(lambda _: make_kit(tools[:1], PARAMETERS), range(2)))
     assert kits[0].sdf == kits[1].sdf
     assert list(cache.iterdir()) == [kits[0].sdf.parent]
-    names = {"kit.sdf", "kit.obj", "block.obj", "cavities.obj", "contact.obj", "layout.json"}
+    contact = {f"contact_{part}.obj" for part in ("sides", "floors", "top", "outside")}
+    names = {"kit.sdf", "kit.obj", "block.obj", "cavities.obj", *contact, "layout.json"}
     assert {path.name for path in kits[0].sdf.parent.iterdir()} == names
 
 
