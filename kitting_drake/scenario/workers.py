@@ -17,11 +17,9 @@ from kitting_drake.scenario.shipping import pack
 def add_workers_flags(parser: argparse.ArgumentParser) -> None:
     """Adds the flags that say where to run; one excludes the other."""
     flags = parser.add_mutually_exclusive_group()
+    # No default: argparse would not see the conflict when it is given as a value.
     flags.add_argument(
-        "--workers",
-        type=count_type,
-        default=os.cpu_count(),
-        help=f"how many side by side ({os.cpu_count()})",
+        "--workers", type=count_type, help=f"how many side by side ({os.cpu_count()})"
     )
     flags.add_argument(
         "--ray",
@@ -43,7 +41,7 @@ def open_workers(
         UserError: there is no such cluster, or it cannot take the work.
     """
     if arguments.ray is None:
-        with LocalWorkers(arguments.workers) as local:
+        with LocalWorkers(arguments.workers or os.cpu_count() or 1) as local:
             yield local, chosen
         return
     with tempfile.TemporaryDirectory() as folder:
