@@ -3,6 +3,7 @@
 import importlib
 import logging
 import operator
+import os
 import pickle
 import platform
 import signal
@@ -64,18 +65,21 @@ class RayWorkers:
         Raises:
             UserError: Ray is not installed, there is no such cluster, or it refuses the archive.
         """
+        # When a node dies, Ray prints why; without this, pages of that node's log, too.
+        os.environ.setdefault("RAY_DEDUP_LOGS_SKIP_REGEX", "Raylet is terminated")
         try:
             self._ray = importlib.import_module("ray")
         except ImportError as error:
             raise UserError(
                 "--ray needs Ray, which is not installed: pip install 'kitting_drake[cluster]'"
             ) from error
-        _require_answer(self._address)
+        address = _find_cluster(self._address)
         try:
             self._ray.init(
-                address=self._address,
+                address=address,
                 runtime_env=self._runtime_env,
                 logging_level=logging.ERROR,
+                log_to_driver=False,
             )
         except (ConnectionError, RuntimeError, ValueError) as error:
             reason = next(iter(str(error).strip().splitlines()), type(error).__name__)
@@ -122,20 +126,33 @@ class RayWorkers:
                 self._ray.cancel(answer, force=True)
 
 
-def _require_answer(address: str) -> None:
-    """Raises UserError if nobody listens; Ray itself would try for long and then abort."""
+def _find_cluster(address: str) -> str:
+    """The address of a cluster that answers: where there is none, Ray itself would try for minutes.
+
+    Raises:
+        UserError: nobody listens there, or this machine knows of none.
+    """
+    found = address
     if address == "auto":
-        return
-    host, _, port = address.removeprefix("ray://").rpartition(":")
+        services = importlib.import_module("ray._private.services")
+        try:
+            found = services.get_ray_address_from_environment("auto", None)
+        except ConnectionError as error:
+            raise UserError(
+                "--ray auto: this machine is no node of a cluster: start one as docs/cluster.md says"
+            ) from error
+    host, _, port = found.removeprefix("ray://").rpartition(":")
     if not host or not port.isdecimal():
-        raise UserError(f"--ray takes auto, HOST:PORT or ray://HOST:PORT, not '{address}'")
+        raise UserError(f"--ray takes auto, HOST:PORT or ray://HOST:PORT, not '{found}'")
     try:
         socket.create_connection((host, int(port)), timeout=_PATIENCE).close()
     except (OSError, OverflowError) as error:
         reason = getattr(error, "strerror", None) or error
         raise UserError(
-            f"--ray {address}: there is no cluster ({reason}): start one, see docs/cluster.md"
+            f"--ray {address}: there is no cluster at {host}:{port} ({reason}): start one as "
+            "docs/cluster.md says"
         ) from error
+    return found
 
 
 def _name(function: Callable[..., object]) -> tuple[str, str]:

@@ -8,7 +8,7 @@ import socket
 import sys
 import threading
 import types
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -35,6 +35,7 @@ class FakeRay(types.ModuleType):
 
     def __init__(self) -> None:
         super().__init__("ray")
+        self.address = ""
         self.options: dict[str, Any] = {}
         self.cpus: dict[str, float] = {"CPU": 3.0}
         self.error: Exception | None = None
@@ -70,10 +71,17 @@ class FakeRay(types.ModuleType):
 
 
 @pytest.fixture
-def ray(monkeypatch: pytest.MonkeyPatch) -> FakeRay:
+def ray(monkeypatch: pytest.MonkeyPatch) -> Iterator[FakeRay]:
     fake = FakeRay()
     monkeypatch.setitem(sys.modules, "ray", fake)
-    return fake
+    monkeypatch.setitem(
+        sys.modules,
+        "ray._private.services",
+        types.SimpleNamespace(get_ray_address_from_environment=lambda *_: fake.address),
+    )
+    with socket.create_server(("127.0.0.1", 0)) as head:
+        fake.address = f"127.0.0.1:{head.getsockname()[1]}"
+        yield fake
 
 
 def workers(address: str = "auto") -> RayWorkers:
@@ -169,8 +177,17 @@ def test_where_nobody_listens_one_sentence(prefix: str, ray: FakeRay):
     with socket.socket() as listener:
         listener.bind(("127.0.0.1", 0))
         port = listener.getsockname()[1]
-    with pytest.raises(UserError, match=rf"127.0.0.1:{port}: there is no cluster \(Connection re"):
+    with pytest.raises(UserError, match=rf"no cluster at 127.0.0.1:{port} \(Connection re"):
         workers(f"{prefix}127.0.0.1:{port}").__enter__()
+
+
+def test_a_cluster_that_is_gone_is_told_of(ray: FakeRay):
+    with socket.socket() as listener:
+        listener.bind(("127.0.0.1", 0))
+        # As after a power cut: the machine remembers where it was.
+        ray.address = f"127.0.0.1:{listener.getsockname()[1]}"
+    with pytest.raises(UserError, match=f"--ray auto: there is no cluster at {ray.address}"):
+        workers().__enter__()
 
 
 def test_a_cluster_that_refuses_is_told_of(ray: FakeRay):
