@@ -139,7 +139,7 @@ def _find_cluster(address: str) -> str:
             found = services.get_ray_address_from_environment("auto", None)
         except ConnectionError as error:
             raise UserError(
-                "--ray auto: this machine is no node of a cluster: start one as docs/cluster.md says"
+                "--ray auto: there is no cluster on this machine: start one as docs/cluster.md says"
             ) from error
     host, _, port = found.removeprefix("ray://").rpartition(":")
     if not host or not port.isdecimal():
