@@ -4,7 +4,6 @@ import contextlib
 import dataclasses
 import itertools
 import json
-import os
 import time
 from collections.abc import Callable, Container, Iterable, Sized
 from pathlib import Path
@@ -18,8 +17,8 @@ from kitting_drake.common.errors import UserError
 from kitting_drake.common.files import alone_in, claim_folder, require_folder, write_json
 from kitting_drake.common.processes import (
     ProcessCrashed,
+    Workers,
     counting_bar,
-    run_in_subprocess,
     side_by_side,
 )
 from kitting_drake.common.provenance import versions
@@ -43,6 +42,7 @@ from kitting_drake.scenario.command_line import (
     scenario_parser,
 )
 from kitting_drake.scenario.policies import Oracle
+from kitting_drake.scenario.workers import add_workers_flags, open_workers
 from systems.signals import Observation, PickPlaceAction
 
 LEAST_SCORE = 0.99
@@ -59,7 +59,7 @@ def main() -> int:
     """Parses the command line and collects; returns the exit code."""
     parser = scenario_parser("collect", "Collect demonstrations of the oracle.")
     parser.add_argument("--demos", type=count_type, default=100, help="how many (100)")
-    parser.add_argument("--workers", type=count_type, default=os.cpu_count(), help="side by side")
+    add_workers_flags(parser)
     parser.add_argument(
         "--seed",
         type=seed_type,
@@ -82,12 +82,13 @@ def main() -> int:
         if collection.assembled >= arguments.demos:
             console.print(f"nothing to do: {collection.summary()}", highlight=False, soft_wrap=True)
             return 0
-        collection.collect(
-            arguments.demos,
-            lambda seed: run_in_subprocess(_demonstrate, chosen, seed),
-            workers=arguments.workers,
-            console=console,
-        )
+        with open_workers(arguments, chosen) as (workers, sent):
+            collection.collect(
+                arguments.demos,
+                lambda seed: workers.run(_demonstrate, sent, seed),
+                workers=workers,
+                console=console,
+            )
     seconds = time.perf_counter() - start
     console.print(f"{collection.summary()}; {seconds:.0f} s", highlight=False, soft_wrap=True)
     return 0
@@ -151,7 +152,7 @@ class Collection:
         self._remove_parts([*contents.seeds, *(item.seed for item in contents.rejected)])
 
     def collect(
-        self, count: int, demonstrate: Demonstrate, *, workers: int, console: Console
+        self, count: int, demonstrate: Demonstrate, *, workers: Workers, console: Console
     ) -> None:
         """Makes the demonstrations that are missing, and the one file of them all.
 
@@ -161,7 +162,7 @@ class Collection:
         Args:
             count: how many there shall be.
             demonstrate: makes one; called in threads.
-            workers: how many at a time.
+            workers: say how many at a time.
             console: for the progress bar.
 
         Raises:

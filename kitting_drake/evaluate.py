@@ -2,9 +2,8 @@
 
 import hashlib
 import json
-import os
 import time
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -23,8 +22,8 @@ from kitting_drake.common.files import (
 )
 from kitting_drake.common.processes import (
     ProcessCrashed,
+    Workers,
     counting_bar,
-    run_in_subprocess,
     side_by_side,
 )
 from kitting_drake.common.provenance import versions
@@ -39,13 +38,17 @@ from kitting_drake.scenario.command_line import (
     output_folder,
     scenario_parser,
 )
+from kitting_drake.scenario.workers import add_workers_flags, open_workers
+
+Run = Callable[[int], Episode]
+"""Runs the episode of a seed; called in a thread."""
 
 
 def main() -> int:
     """Parses the command line and evaluates; returns the exit code."""
     parser = scenario_parser("evaluate", "Run episodes of many seeds and summarise them.")
     parser.add_argument("--episodes", type=count_type, default=100, help="how many (100)")
-    parser.add_argument("--workers", type=count_type, default=os.cpu_count(), help="side by side")
+    add_workers_flags(parser)
     parser.add_argument("--seed", type=seed_type, help="of the first (default: the scenario's)")
     arguments = parser.parse_args()
     chosen = choose_scenario(arguments)
@@ -60,7 +63,15 @@ def main() -> int:
     # What cannot be built at all is told at once, not once for each seed.
     success = build_chosen(chosen, seed=seeds[0]).scene.success
     with alone_in(folder):
-        evaluation = evaluate(chosen, seeds, folder, workers=arguments.workers, console=console)
+        with open_workers(arguments, chosen) as (workers, sent):
+            evaluation = evaluate(
+                chosen,
+                seeds,
+                folder,
+                lambda seed: run_in_worker(workers, sent, seed),
+                workers=workers,
+                console=console,
+            )
         episodes = evaluation.episodes
         summary = summarise(
             episodes, chosen, success, wall_seconds_total=evaluation.wall_seconds_total
@@ -91,19 +102,24 @@ class Evaluation:
 
 
 def evaluate(
-    chosen: ChosenScenario, seeds: Iterable[int], folder: Path, *, workers: int, console: Console
+    chosen: ChosenScenario,
+    seeds: Iterable[int],
+    folder: Path,
+    run: Run,
+    *,
+    workers: Workers,
+    console: Console,
 ) -> Evaluation:
-    """Runs an episode for each seed, each in a process of its own.
+    """Runs an episode for each seed.
 
     Episodes already in `folder/episodes.jsonl` are not run again; one is written there as it ends.
-    A process that dies leaves a failed episode with its reason; one that something else killed is
-    given a second chance.
 
     Args:
         chosen: the scenario.
         seeds: one episode each.
         folder: where `episodes.jsonl` is; must not hold those of anything else.
-        workers: how many run at a time.
+        run: runs one; called in threads.
+        workers: say how many run at a time.
         console: for the progress bar.
 
     Raises:
@@ -119,11 +135,7 @@ def evaluate(
     queue = iter(pending)
     with counting_bar(console, "episodes") as progress:
         task = progress.add_task("", total=len(seeds), completed=len(seeds) - len(pending))
-        for episode in side_by_side(
-            lambda seed: _run_in_subprocess(chosen, seed),
-            lambda: next(queue, None),
-            workers=workers,
-        ):
+        for episode in side_by_side(run, lambda: next(queue, None), workers=workers):
             done[episode["seed"]] = episode
             append_line(path, episode)
             clock.save()
@@ -176,12 +188,24 @@ def _digest(paths: Iterable[Path]) -> str:
     return f"sha256 {digest.hexdigest()}"
 
 
-def _run_in_subprocess(chosen: ChosenScenario, seed: int) -> Episode:
-    """Runs one episode in a fresh process and waits for it."""
+def run_in_worker(workers: Workers, chosen: ChosenScenario, seed: int) -> Episode:
+    """Runs one episode in a process of its own and waits for it.
+
+    A process that dies leaves a failed episode with its reason; one that something else killed is
+    given a second chance.
+
+    Args:
+        workers: where.
+        chosen: the scenario as they find it.
+        seed: the episode's.
+
+    Raises:
+        UserError: the process was killed twice.
+    """
     start = time.perf_counter()
-    outcome = run_in_subprocess(_work, chosen, seed)
+    outcome = workers.run(_work, chosen, seed)
     if isinstance(outcome, ProcessCrashed) and outcome.was_killed:
-        outcome = run_in_subprocess(_work, chosen, seed)
+        outcome = workers.run(_work, chosen, seed)
         if isinstance(outcome, ProcessCrashed) and outcome.was_killed:
             raise outcome.killed_twice(seed)
     if isinstance(outcome, ProcessCrashed):

@@ -1,6 +1,5 @@
 """Work in fresh processes, several side by side: what takes it down takes no other with it."""
 
-import contextlib
 import multiprocessing
 import os
 import signal
@@ -10,7 +9,7 @@ from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from multiprocessing.connection import wait as wait_for
-from typing import TypeVar
+from typing import Protocol, Self, TypeVar
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
@@ -21,6 +20,9 @@ _Item = TypeVar("_Item")
 _Result = TypeVar("_Result")
 
 _THREADS = "OMP_NUM_THREADS"
+
+_MOST_AT_WORK = 1000
+"""Each occupies a thread here, wherever it is at work."""
 
 
 @dataclass(frozen=True)
@@ -39,7 +41,7 @@ class ProcessCrashed:
         """The error to raise when a second chance did not help."""
         return UserError(
             f"the process of seed {seed} was killed twice, perhaps for want of memory: "
-            "give fewer --workers, and it goes on where it was"
+            "give fewer --workers, or nodes fewer CPUs, and it goes on where it was"
         )
 
 
@@ -71,25 +73,85 @@ def run_in_subprocess(
         process.join()
 
 
+class Workers(Protocol):
+    """A place where functions run in fresh processes: this machine, or a cluster."""
+
+    def capacity(self) -> int:
+        """How many processes it has room for now; at least 1."""
+
+    def run(self, function: Callable[..., _Result], *arguments: object) -> _Result | ProcessCrashed:
+        """Calls a function as `run_in_subprocess` does; may be called in many threads at once.
+
+        Raises:
+            UserError: the place is not fit for it.
+        """
+
+    def stop(self) -> None:
+        """Kills what is at work, and lets nothing begin any more: nobody waits for what it finds.
+
+        `run` returns a `ProcessCrashed` that was killed.
+        """
+
+
+class LocalWorkers:
+    """This machine, as `Workers`. Inside its `with`, several processes use one thread each."""
+
+    def __init__(self, count: int) -> None:
+        """
+        Args:
+            count: how many processes at a time.
+        """
+        self._count = count
+        self._stopped = False
+        self._threads_before: str | None = None
+
+    def __enter__(self) -> Self:
+        self._threads_before = os.environ.get(_THREADS)
+        if self._count > 1:
+            # For the processes to come: this one has long read the variable.
+            os.environ[_THREADS] = "1"
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._threads_before is not None:
+            os.environ[_THREADS] = self._threads_before
+        else:
+            os.environ.pop(_THREADS, None)
+
+    def capacity(self) -> int:
+        return self._count
+
+    def run(self, function: Callable[..., _Result], *arguments: object) -> _Result | ProcessCrashed:
+        if self._stopped:
+            return ProcessCrashed(-signal.SIGKILL)
+        return run_in_subprocess(function, *arguments)
+
+    def stop(self) -> None:
+        self._stopped = True
+        for process in multiprocessing.active_children():
+            process.kill()
+
+
 def side_by_side(
-    function: Callable[[_Item], _Result], draw: Callable[[], _Item | None], *, workers: int
+    function: Callable[[_Item], _Result], draw: Callable[[], _Item | None], *, workers: Workers
 ) -> Iterator[_Result]:
     """Calls a function with one item after another, in threads; results come as they end.
 
-    With more than one worker, processes started meanwhile compute in one thread each. When it ends
-    early, by Ctrl-C say, the processes at work are killed: nobody waits for what they find.
+    When it ends early, by Ctrl-C say, the workers are stopped.
 
     Args:
-        function: called in a thread: lets `run_in_subprocess` do the work.
-        draw: the next item; asked when a thread is free, in the caller's thread. None: none now,
-            ask again after the next result; it is over when none is at work.
-        workers: how many threads.
+        function: called in a thread: lets `workers` do the work.
+        draw: the next item; asked when there is room, in the caller's thread. None: none now, ask
+            again after the next result; it is over when none is at work.
+        workers: say how many threads.
     """
-    with _one_thread_each(workers > 1), ThreadPoolExecutor(workers) as pool:
+    with ThreadPoolExecutor(_MOST_AT_WORK) as pool:
         working: set[Future[_Result]] = set()
         try:
             while True:
-                while len(working) < workers and (item := draw()) is not None:
+                # Machines may have come, or gone.
+                most = min(workers.capacity(), _MOST_AT_WORK)
+                while len(working) < most and (item := draw()) is not None:
                     working.add(pool.submit(function, item))
                 if not working:
                     return
@@ -97,8 +159,7 @@ def side_by_side(
                 for future in ended:
                     yield future.result()
         except BaseException:
-            for process in multiprocessing.active_children():
-                process.kill()
+            workers.stop()
             raise
 
 
@@ -127,18 +188,3 @@ def _end_with_parent() -> None:
     assert parent is not None
     wait_for([parent.sentinel])
     os._exit(1)
-
-
-@contextlib.contextmanager
-def _one_thread_each(wanted: bool) -> Iterator[None]:
-    """Lets processes started inside use one thread; this one has long read the variable."""
-    before = os.environ.get(_THREADS)
-    if wanted:
-        os.environ[_THREADS] = "1"
-    try:
-        yield
-    finally:
-        if wanted and before is None:
-            del os.environ[_THREADS]
-        elif before is not None:
-            os.environ[_THREADS] = before

@@ -44,11 +44,13 @@ class ChosenScenario:
     """The name of its file, without the ending, and of the scenario in it if one was given."""
     text: str | None
     """The YAML that was merged over it."""
+    moved_to: Path | None = None
+    """Where relative paths in the scenario start, if not in the folder of its file."""
 
     @property
     def base(self) -> Path:
         """Where relative paths in the scenario start."""
-        return self.path.resolve().parent
+        return (self.moved_to or self.path.resolve().parent).resolve()
 
     @property
     def policy(self) -> str:

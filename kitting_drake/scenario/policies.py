@@ -79,6 +79,14 @@ class PolicyConfig:
         """
         return None
 
+    def input_files(self, base: Path) -> list[Path]:
+        """The files that it reads, beside those of the project; not its modules."""
+        return []
+
+    def modules(self) -> list[str]:
+        """The modules that it imports, beside those of the project and of what that requires."""
+        return []
+
     def training_seeds(self, base: Path) -> set[int]:
         """The seeds of the demonstrations that it was trained, or chosen, with.
 
@@ -185,6 +193,9 @@ class Learned(PolicyConfig):
     def digest(self, base: Path) -> str | None:
         return _digest(base / self.weights)
 
+    def input_files(self, base: Path) -> list[Path]:
+        return [base / self.weights]
+
     def training_seeds(self, base: Path) -> set[int]:
         from kitting_drake.policies.weights import read_weights_file
 
@@ -224,6 +235,9 @@ class PythonPolicy(PolicyConfig):
         if spec is None or spec.origin is None:
             raise UserError(f"policy.function: there is no file of the module {module}")
         return _digest(Path(spec.origin))
+
+    def modules(self) -> list[str]:
+        return [self.function.partition(":")[0]]
 
     def validate(self) -> None:
         module, _, function = self.function.partition(":")

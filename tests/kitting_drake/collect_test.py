@@ -17,7 +17,7 @@ import kitting_drake.collect as collecting
 from kitting_drake.collect import Collection, next_seed
 from kitting_drake.common.errors import UserError
 from kitting_drake.common.files import alone_in
-from kitting_drake.common.processes import ProcessCrashed
+from kitting_drake.common.processes import LocalWorkers, ProcessCrashed
 from kitting_drake.common.seeds import DEMONSTRATION_SEEDS, TEST_SEEDS, VALIDATION_SEEDS, seeds_from
 from kitting_drake.policies.demonstrations import (
     Demonstration,
@@ -58,7 +58,7 @@ class Oracle:
 
 def collect(folder: Path, count: int, oracle: Oracle | None = None, workers: int = 1) -> Oracle:
     oracle = oracle or Oracle()
-    Collection(folder, ORIGIN).collect(count, oracle, workers=workers, console=QUIET)
+    Collection(folder, ORIGIN).collect(count, oracle, workers=LocalWorkers(workers), console=QUIET)
     return oracle
 
 
@@ -258,7 +258,7 @@ def test_what_is_finished_is_left_alone(
     monkeypatch.chdir(ROOT)
     monkeypatch.setattr(collecting, "require_rendering", lambda: None)
     monkeypatch.setattr(collecting, "build_chosen", lambda *_, **__: None)
-    monkeypatch.setattr(collecting, "run_in_subprocess", lambda _, __, seed: Oracle()(seed))
+    monkeypatch.setattr(LocalWorkers, "run", lambda _, __, ___, seed: Oracle()(seed))
     monkeypatch.setattr(sys, "argv", arguments(tmp_path, "--demos", 3, "--seed", 10))
     assert collecting.main() == 0
     assert "holds 3 demonstrations, 1 seed rejected; " in capsys.readouterr().out

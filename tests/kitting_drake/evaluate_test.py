@@ -8,7 +8,7 @@ import signal
 import subprocess
 import sys
 import types
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 
 import pytest
@@ -18,7 +18,7 @@ import kitting_drake.evaluate as evaluation
 from kitting_drake.common.errors import UserError
 from kitting_drake.common.files import alone_in
 from kitting_drake.common.paths import MODELS
-from kitting_drake.common.processes import ProcessCrashed
+from kitting_drake.common.processes import LocalWorkers, ProcessCrashed, Workers
 from kitting_drake.episode import EpisodeResult
 from kitting_drake.reporting.summary import Episode
 from kitting_drake.scenario.command_line import ChosenScenario
@@ -32,23 +32,28 @@ ROOT = Path(__file__).resolve().parents[2]
 QUIET = Console(quiet=True)
 
 
-def fake_run(chosen: ChosenScenario, seed: int) -> Episode:
-    return evaluation._lost_episode(chosen, seed, "made up", 2.0)
+def fake_run(seed: int) -> Episode:
+    return evaluation._lost_episode(CHOSEN, seed, "made up", 2.0)
 
 
-def test_goes_on_where_it_was_stopped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def evaluate(
+    chosen: ChosenScenario, seeds: Iterable[int], folder: Path, run: evaluation.Run = fake_run
+) -> evaluation.Evaluation:
+    return evaluation.evaluate(chosen, seeds, folder, run, workers=LocalWorkers(1), console=QUIET)
+
+
+def test_goes_on_where_it_was_stopped(tmp_path: Path):
     ran = []
 
-    def run(chosen: ChosenScenario, seed: int) -> Episode:
+    def run(seed: int) -> Episode:
         ran.append(seed)
-        return fake_run(chosen, seed)
+        return fake_run(seed)
 
-    monkeypatch.setattr(evaluation, "_run_in_subprocess", run)
-    evaluation.evaluate(CHOSEN, [0, 1], tmp_path, workers=1, console=QUIET)
+    evaluate(CHOSEN, [0, 1], tmp_path, run)
     path = tmp_path / "episodes.jsonl"
     # Killed while the third line was being written.
     path.write_text(path.read_text() + '{"seed": 2, "obj')
-    done = evaluation.evaluate(CHOSEN, range(4), tmp_path, workers=1, console=QUIET)
+    done = evaluate(CHOSEN, range(4), tmp_path, run)
     assert ran == [0, 1, 2, 3]
     assert [item["seed"] for item in done.episodes] == [0, 1, 2, 3]
     assert [json.loads(line)["seed"] for line in path.read_text().splitlines()] == [0, 1, 2, 3]
@@ -57,19 +62,17 @@ def test_goes_on_where_it_was_stopped(tmp_path: Path, monkeypatch: pytest.Monkey
 def test_the_time_of_all_calls_adds_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     now = 1000.0
 
-    def run(chosen: ChosenScenario, seed: int) -> Episode:
+    def run(seed: int) -> Episode:
         nonlocal now
         if seed == 2:
             raise KeyboardInterrupt
         now += 50.0
-        return fake_run(chosen, seed)
+        return fake_run(seed)
 
     monkeypatch.setattr(evaluation.time, "perf_counter", lambda: now)
-    monkeypatch.setattr(evaluation, "_run_in_subprocess", run)
 
     def total(*seeds: int) -> float:
-        call = evaluation.evaluate(CHOSEN, seeds, tmp_path, workers=1, console=QUIET)
-        return call.wall_seconds_total
+        return evaluate(CHOSEN, seeds, tmp_path, run).wall_seconds_total
 
     assert total(0) == 50.0
     with pytest.raises(KeyboardInterrupt):
@@ -82,16 +85,14 @@ def test_the_time_of_all_calls_adds_up(tmp_path: Path, monkeypatch: pytest.Monke
         total(0)
 
 
-def test_a_folder_of_another_scenario_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(evaluation, "_run_in_subprocess", fake_run)
-    evaluation.evaluate(CHOSEN, [0], tmp_path, workers=1, console=QUIET)
+def test_a_folder_of_another_scenario_is_refused(tmp_path: Path):
+    evaluate(CHOSEN, [0], tmp_path)
     other = ChosenScenario(Scenario(time_limit=1.0), Path("mine.yaml"), "mine", None)
     with pytest.raises(UserError, match="another scenario"):
-        evaluation.evaluate(other, [0], tmp_path, workers=1, console=QUIET)
+        evaluate(other, [0], tmp_path)
 
 
-def test_a_folder_of_other_weights_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(evaluation, "_run_in_subprocess", fake_run)
+def test_a_folder_of_other_weights_is_refused(tmp_path: Path):
     weights = tmp_path / "policy.safetensors"
     scenario = Scenario(policy=Learned(weights=weights.name))
     chosen = ChosenScenario(scenario, tmp_path / "mine.yaml", "mine", None)
@@ -99,15 +100,14 @@ def test_a_folder_of_other_weights_is_refused(tmp_path: Path, monkeypatch: pytes
     folder.mkdir()
     weights.write_bytes(b"trained")
     for seeds in ([0], [0, 1]):
-        evaluation.evaluate(chosen, seeds, folder, workers=1, console=QUIET)
+        evaluate(chosen, seeds, folder)
     weights.write_bytes(b"trained anew")
     with pytest.raises(UserError, match="another scenario"):
-        evaluation.evaluate(chosen, [0, 1, 2], folder, workers=1, console=QUIET)
+        evaluate(chosen, [0, 1, 2], folder)
 
 
 def test_a_folder_of_another_program_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """The scenario is the same to the letter; what it names is not."""
-    monkeypatch.setattr(evaluation, "_run_in_subprocess", fake_run)
     monkeypatch.syspath_prepend(tmp_path)
     source = tmp_path / "policy_of_mine.py"
     tool = tmp_path / "my_tool"
@@ -120,20 +120,20 @@ def test_a_folder_of_another_program_is_refused(tmp_path: Path, monkeypatch: pyt
     folder = tmp_path / "out"
     folder.mkdir()
 
-    def evaluate() -> None:
-        evaluation.evaluate(chosen, [0], folder, workers=1, console=QUIET)
+    def again() -> None:
+        evaluate(chosen, [0], folder)
 
     source.write_text("def act(observation): ...\n")
-    evaluate()
-    evaluate()
+    again()
+    again()
     source.write_text("def act(observation): return 1\n")
     with pytest.raises(UserError, match="another scenario, policy or version"):
-        evaluate()
+        again()
     source.write_text("def act(observation): ...\n")
     record = tool / "tool.yaml"
     record.write_text(record.read_text() + "# Another grasp.\n")
     with pytest.raises(UserError, match="another scenario, policy or version"):
-        evaluate()
+        again()
 
 
 def test_two_do_not_evaluate_into_one_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
@@ -152,7 +152,7 @@ def die(chosen: ChosenScenario, seed: int) -> None:
 
 def test_an_episode_whose_process_dies_is_a_failed_one(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(evaluation, "_work", die)
-    lost = evaluation._run_in_subprocess(CHOSEN, 7)
+    lost = evaluation.run_in_worker(LocalWorkers(1), CHOSEN, 7)
     assert lost.keys() == {field.name for field in dataclasses.fields(EpisodeResult)}
     assert lost["seed"] == 7
     assert lost["success_rate"] == 0.0
@@ -161,7 +161,8 @@ def test_an_episode_whose_process_dies_is_a_failed_one(monkeypatch: pytest.Monke
 
 def test_a_scene_that_cannot_be_set_is_a_failed_episode():
     scenario = Scenario(heightmap=Heightmap(rows=110, cols=110))
-    lost = evaluation._run_in_subprocess(dataclasses.replace(CHOSEN, scenario=scenario), 7)
+    chosen = dataclasses.replace(CHOSEN, scenario=scenario)
+    lost = evaluation.run_in_worker(LocalWorkers(1), chosen, 7)
     assert "there is no free space in the workspace" in lost["failure"]
 
 
@@ -176,10 +177,10 @@ def test_nothing_but_failures_leaves_with_a_failure(
     scenario = tmp_path / "mine.yaml"
     scenario.write_text("Mine: {}\n")
 
-    def run(chosen: ChosenScenario, seed: int) -> Episode:
-        return fake_run(chosen, seed) | {"failure": failures[seed]}
+    def run(_: Workers, __: ChosenScenario, seed: int) -> Episode:
+        return fake_run(seed) | {"failure": failures[seed]}
 
-    monkeypatch.setattr(evaluation, "_run_in_subprocess", run)
+    monkeypatch.setattr(evaluation, "run_in_worker", run)
     flags = ["--episodes", "2", "--workers", "1", "--output", str(tmp_path / "out")]
     monkeypatch.setattr(sys, "argv", ["evaluate", str(scenario), *flags])
     assert evaluation.main() == code
@@ -194,7 +195,7 @@ def test_seeds_that_the_policy_has_learned_from_are_told(
 ):
     scenario = tmp_path / "mine.yaml"
     scenario.write_text(f"Mine: {{policy: !Learned {{weights: {weights_file}}}}}\n")
-    monkeypatch.setattr(evaluation, "_run_in_subprocess", fake_run)
+    monkeypatch.setattr(evaluation, "run_in_worker", lambda _, __, seed: fake_run(seed))
     # Nobody waits for networks that decide nothing.
     scene = types.SimpleNamespace(scene=types.SimpleNamespace(success=AddS()))
     monkeypatch.setattr(evaluation, "build_chosen", lambda *_, **__: scene)
@@ -210,12 +211,13 @@ def test_seeds_that_the_policy_has_learned_from_are_told(
 
 
 def test_what_something_else_killed_is_given_a_second_chance(monkeypatch: pytest.MonkeyPatch):
-    killed, lost = ProcessCrashed(-signal.SIGKILL), fake_run(CHOSEN, 7)
+    killed, lost = ProcessCrashed(-signal.SIGKILL), fake_run(7)
     answers = [killed, lost, killed, killed]
-    monkeypatch.setattr(evaluation, "run_in_subprocess", lambda *_: answers.pop(0))
-    assert evaluation._run_in_subprocess(CHOSEN, 7) == lost
+    workers = LocalWorkers(1)
+    monkeypatch.setattr(workers, "run", lambda *_: answers.pop(0))
+    assert evaluation.run_in_worker(workers, CHOSEN, 7) == lost
     with pytest.raises(UserError, match="seed 7 was killed twice, perhaps for want of memory"):
-        evaluation._run_in_subprocess(CHOSEN, 7)
+        evaluation.run_in_worker(workers, CHOSEN, 7)
 
 
 def test_two_short_episodes_side_by_side(verb, tmp_path: Path):

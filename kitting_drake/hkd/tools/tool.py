@@ -163,7 +163,11 @@ def tool_names() -> list[str]:
 def user_tools() -> Path:
     """The folder of the user's own tools: `$KITTING_DRAKE_TOOLS`, or one in `~/.local/share`."""
     given = os.environ.get("KITTING_DRAKE_TOOLS")
-    return Path(given) if given else Path.home() / ".local" / "share" / "kitting_drake" / "tools"
+    return (
+        Path(given).absolute()
+        if given
+        else Path.home() / ".local" / "share" / "kitting_drake" / "tools"
+    )
 
 
 def user_tool_names() -> list[str]:

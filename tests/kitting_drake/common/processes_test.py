@@ -7,7 +7,12 @@ from pathlib import Path
 
 import pytest
 
-from kitting_drake.common.processes import ProcessCrashed, run_in_subprocess, side_by_side
+from kitting_drake.common.processes import (
+    LocalWorkers,
+    ProcessCrashed,
+    run_in_subprocess,
+    side_by_side,
+)
 
 ROOT = Path(__file__).resolve().parents[3]
 
@@ -39,20 +44,34 @@ def test_a_process_that_dies_takes_nothing_with_it():
     assert run_in_subprocess(leave) == ProcessCrashed(3)
 
 
-@pytest.mark.parametrize(("workers", "threads"), [(2, "1"), (1, "7")])
+@pytest.mark.parametrize(("count", "threads"), [(2, "1"), (1, "7")])
 def test_side_by_side_processes_compute_in_one_thread(
-    workers: int, threads: str, monkeypatch: pytest.MonkeyPatch
+    count: int, threads: str, monkeypatch: pytest.MonkeyPatch
 ):
     monkeypatch.setenv("OMP_NUM_THREADS", "7")
     items = iter([0])
-    ((_, found),) = side_by_side(
-        lambda _: run_in_subprocess(process_and_threads), lambda: next(items, None), workers=workers
-    )
+    with LocalWorkers(count) as workers:
+        ((_, found),) = side_by_side(
+            lambda _: workers.run(process_and_threads), lambda: next(items, None), workers=workers
+        )
     assert found == threads
     assert os.environ["OMP_NUM_THREADS"] == "7"
 
 
-def test_more_is_asked_for_after_every_result():
+class Growing(LocalWorkers):
+    """Has room for one, then for two."""
+
+    def __init__(self) -> None:
+        super().__init__(1)
+        self.asked = 0
+
+    def capacity(self) -> int:
+        self.asked += 1
+        return min(self.asked, 2)
+
+
+@pytest.mark.parametrize("workers", [LocalWorkers(2), Growing()])
+def test_more_is_asked_for_after_every_result(workers: LocalWorkers):
     wanted, given, most = {0, 1, 2}, [], []
 
     def draw() -> int | None:
@@ -60,30 +79,36 @@ def test_more_is_asked_for_after_every_result():
         if number not in wanted:
             return None
         given.append(number)
+        most.append(len(given) - len(ended))
         return number
 
     def work(item: int) -> int:
         time.sleep(0.01)
         return item
 
-    ended = []
-    for item in side_by_side(work, draw, workers=2):
+    ended: list[int] = []
+    for item in side_by_side(work, draw, workers=workers):
         ended.append(item)
-        most.append(len(given) - len(ended))
         if item == 2:
             wanted |= {3}
     assert sorted(ended) == [0, 1, 2, 3]
-    assert max(most) <= 2
+    assert max(most) == 2
 
 
 def test_who_ends_early_does_not_wait():
     items = iter([60.0, 0.0])
+    workers = LocalWorkers(2)
+
+    def sleep_again_if_killed(seconds: float) -> None:
+        while workers.run(time.sleep, seconds) == ProcessCrashed(-signal.SIGKILL):
+            if workers.run(time.sleep, seconds) is not None:
+                break
+
     start = time.monotonic()
-    for _ in side_by_side(
-        lambda item: run_in_subprocess(time.sleep, item), lambda: next(items, None), workers=2
-    ):
+    for _ in side_by_side(sleep_again_if_killed, lambda: next(items, None), workers=workers):
         break
     assert time.monotonic() - start < 30.0
+    assert workers.run(time.sleep, 60.0) == ProcessCrashed(-signal.SIGKILL)
 
 
 _PROGRAM = """

@@ -1,0 +1,198 @@
+"""`RayWorkers` without Ray: `tests/kitting_drake/cluster_test.py` has a real cluster."""
+
+import functools
+import os
+import pickle
+import signal
+import socket
+import sys
+import threading
+import types
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import kitting_drake.common.cluster as cluster
+from kitting_drake.common.cluster import RayWorkers
+from kitting_drake.common.errors import UserError
+from kitting_drake.common.processes import ProcessCrashed
+from kitting_drake.common.provenance import versions
+
+KILLED = ProcessCrashed(-signal.SIGKILL)
+
+
+class FakeRay(types.ModuleType):
+    """As much of Ray as is used; a task is done when its answer is asked for."""
+
+    class exceptions:  # noqa: N801
+        class RayError(Exception): ...
+
+        class RayTaskError(RayError): ...
+
+        class RuntimeEnvSetupError(RayError): ...
+
+    def __init__(self) -> None:
+        super().__init__("ray")
+        self.address = ""
+        self.options: dict[str, Any] = {}
+        self.cpus: dict[str, float] = {"CPU": 3.0}
+        self.error: Exception | None = None
+        self.begun, self.cancelled = threading.Event(), threading.Event()
+        self.waits = False
+
+    def init(self, **options: Any) -> None:
+        self.options = options
+        if self.error is not None:
+            raise self.error
+
+    def shutdown(self) -> None: ...
+
+    def cluster_resources(self) -> dict[str, float]:
+        return self.cpus
+
+    def remote(self, **_: Any) -> Callable[..., Any]:
+        return lambda function: types.SimpleNamespace(
+            remote=lambda *arguments: functools.partial(function, *arguments)
+        )
+
+    def get(self, task: Callable[[], Any]) -> Any:
+        if self.waits:
+            self.begun.set()
+            assert self.cancelled.wait(30.0)
+            raise self.exceptions.RayError
+        if self.error is not None:
+            raise self.error
+        return task()
+
+    def cancel(self, _: object, *, force: bool) -> None:
+        self.cancelled.set()
+
+
+@pytest.fixture
+def ray(monkeypatch: pytest.MonkeyPatch) -> Iterator[FakeRay]:
+    fake = FakeRay()
+    monkeypatch.setitem(sys.modules, "ray", fake)
+    monkeypatch.setitem(
+        sys.modules,
+        "ray._private.services",
+        types.SimpleNamespace(get_ray_address_from_environment=lambda *_: fake.address),
+    )
+    with socket.create_server(("127.0.0.1", 0)) as head:
+        fake.address = f"127.0.0.1:{head.getsockname()[1]}"
+        yield fake
+
+
+def workers(address: str = "auto") -> RayWorkers:
+    return RayWorkers(address, Path("package.zip"), {"HERE": "there"})
+
+
+def test_a_function_runs_in_a_process_of_its_own(ray: FakeRay):
+    with workers() as there:
+        assert there.run(os.getpid) not in (os.getpid(), None)
+        assert there.run(os._exit, 3) == ProcessCrashed(3)
+    assert ray.options["runtime_env"] == {
+        "working_dir": "package.zip",
+        "env_vars": {"OMP_NUM_THREADS": "1", "HERE": "there"},
+    }
+
+
+def test_there_is_room_for_as_many_as_there_are_cpus(ray: FakeRay):
+    with workers() as there:
+        assert there.capacity() == 3
+        # A task that waits is what makes a cluster grow.
+        ray.cpus = {}
+        assert there.capacity() == 1
+
+
+def test_what_is_lost_for_good_was_killed(ray: FakeRay):
+    with workers() as there:
+        ray.error = ray.exceptions.RayError("its nodes died, again and again")
+        assert there.run(os.getpid) == KILLED
+
+
+def test_a_worker_that_cannot_begin_is_told_of(ray: FakeRay):
+    with workers() as there:
+        ray.error = ray.exceptions.RayTaskError("A traceback\nNo module named 'rich'")
+        with pytest.raises(UserError, match="node of the cluster cannot work: No module named 'r"):
+            there.run(os.getpid)
+
+
+def test_nobody_waits_for_those_that_are_stopped(ray: FakeRay):
+    found: list[object] = []
+    with workers() as there:
+        ray.waits = True
+        thread = threading.Thread(target=lambda: found.append(there.run(os.getpid)))
+        thread.start()
+        assert ray.begun.wait(30.0)
+        there.stop()
+        thread.join()
+        assert found == [KILLED]
+        assert there.run(os.getpid) == KILLED
+
+
+def test_a_node_with_other_versions_is_named(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr("platform.node", lambda: "second")
+    wanted = versions() | {"drake": "0.1"}
+    outcome = pickle.loads(cluster._answer(wanted, pickle.dumps(("os", "getpid", ()))))
+    assert outcome.reason.startswith(f"the node second has drake {versions()['drake']}, this ")
+
+
+def test_a_node_without_a_package_is_named(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr("platform.node", lambda: "second")
+    call = pickle.dumps(("no_such_module", "work", ()))
+    outcome = pickle.loads(cluster._answer(versions(), call))
+    assert outcome.reason == (
+        "the node second cannot import what it needs: No module named 'no_such_module': "
+        "install it there"
+    )
+
+
+def test_a_function_of_the_main_module_has_the_name_of_its_file(monkeypatch: pytest.MonkeyPatch):
+    main = types.ModuleType("__main__")
+    main.__spec__ = types.SimpleNamespace(name="kitting_drake.collect")  # type: ignore[assignment]
+    monkeypatch.setitem(sys.modules, "__main__", main)
+
+    def work() -> None: ...
+
+    work.__module__, work.__qualname__ = "__main__", "work"
+    assert cluster._name(work) == ("kitting_drake.collect", "work")
+
+
+def test_without_ray_one_sentence(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setitem(sys.modules, "ray", None)
+    with pytest.raises(UserError, match=r"not installed: pip install 'kitting_drake\[cluster\]'"):
+        workers().__enter__()
+
+
+@pytest.mark.parametrize("address", ["local", "here:", ":6379", "here:port"])
+def test_an_address_is_told_from_other_words(address: str, ray: FakeRay):
+    with pytest.raises(UserError, match=f"--ray takes auto, HOST:PORT or .*, not '{address}'"):
+        workers(address).__enter__()
+
+
+@pytest.mark.parametrize("prefix", ["", "ray://"])
+def test_where_nobody_listens_one_sentence(prefix: str, ray: FakeRay):
+    with socket.socket() as listener:
+        listener.bind(("127.0.0.1", 0))
+        port = listener.getsockname()[1]
+    with pytest.raises(UserError, match=rf"no cluster at 127.0.0.1:{port} \(Connection re"):
+        workers(f"{prefix}127.0.0.1:{port}").__enter__()
+
+
+def test_a_cluster_that_is_gone_is_told_of(ray: FakeRay):
+    with socket.socket() as listener:
+        listener.bind(("127.0.0.1", 0))
+        # As after a power cut: the machine remembers where it was.
+        ray.address = f"127.0.0.1:{listener.getsockname()[1]}"
+    with pytest.raises(UserError, match=f"--ray auto: there is no cluster at {ray.address}"):
+        workers().__enter__()
+
+
+def test_a_cluster_that_refuses_is_told_of(ray: FakeRay):
+    ray.error = ConnectionError("Could not find any running Ray instance.\nAnd more.")
+    with pytest.raises(
+        UserError, match=r"--ray auto: cannot .*: Could not find any running Ray .*"
+    ):
+        workers().__enter__()

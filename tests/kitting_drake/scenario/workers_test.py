@@ -1,0 +1,34 @@
+import argparse
+from pathlib import Path
+
+import pytest
+
+from kitting_drake.common.processes import LocalWorkers
+from kitting_drake.scenario.command_line import ChosenScenario
+from kitting_drake.scenario.schema import Scenario
+from kitting_drake.scenario.workers import add_workers_flags, open_workers
+
+
+def parse(*flags: str) -> argparse.Namespace:
+    parser = argparse.ArgumentParser()
+    add_workers_flags(parser)
+    return parser.parse_args(flags)
+
+
+@pytest.mark.parametrize(("flags", "count"), [(("--workers", "3"), 3), ((), 7)])
+def test_processes_of_this_machine(
+    flags: tuple[str, ...], count: int, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr("os.cpu_count", lambda: 7)
+    chosen = ChosenScenario(Scenario(), Path("mine.yaml"), "mine", None)
+    with open_workers(parse(*flags), chosen) as (workers, sent):
+        assert isinstance(workers, LocalWorkers)
+        assert workers.capacity() == count
+        assert sent is chosen
+
+
+@pytest.mark.parametrize("count", range(1, 5))
+def test_a_cluster_takes_no_number_of_workers(count: int, capsys: pytest.CaptureFixture[str]):
+    with pytest.raises(SystemExit):
+        parse("--ray", "auto", "--workers", str(count))
+    assert "argument --workers: not allowed with argument --ray" in capsys.readouterr().err
