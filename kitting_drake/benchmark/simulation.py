@@ -7,6 +7,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -17,33 +18,63 @@ from rich.table import Table
 from kitting_drake.cell import Cell, build_cell
 from kitting_drake.cell.cameras import require_rendering
 from kitting_drake.common.paths import SCENARIOS
+from kitting_drake.common.provenance import versions
 from kitting_drake.episode import ModeChange, run_episode
 from kitting_drake.scenario.loader import load_scenario
 from kitting_drake.scenario.schema import Scenario
 
 _SCENARIO = SCENARIOS / "kitting_oracle.yaml"
+_LEARNED = SCENARIOS / "kitting_seen.yaml"
 
 
 def benchmark_simulation(episodes: int, seed: int, console: Console) -> dict[str, Any]:
-    """Measures everything that `benchmark simulation` shows, in seconds of wall time.
+    """Measures everything that `benchmark simulation` shows.
 
     Args:
-        episodes: how many whole episodes of the oracle to run.
+        episodes: how many whole episodes to run of the oracle, and as many of the learned policy.
         seed: of the first; the others follow.
         console: for progress.
     """
-    scenario = load_scenario(_SCENARIO)
+    # Before PyTorch is loaded: one thread, as `evaluate` gives each of its workers.
+    os.environ["OMP_NUM_THREADS"] = "1"
     stopwatch = PhaseStopwatch()
-    simulated = wall = 0.0
+    return {
+        "machine": f"{platform.machine()}, {os.cpu_count()} cores",
+        "python": platform.python_version(),
+        "drake": versions()["drake"],
+        "episodes": episodes,
+        "policies": {
+            "oracle": _whole_episodes(_SCENARIO, episodes, seed, stopwatch, console),
+            "learned": _whole_episodes(_LEARNED, episodes, seed, PhaseStopwatch(), console),
+        },
+        "phases": {
+            name: {
+                "simulated_s": simulated,
+                "wall_s": wall,
+                "wall_s_per_simulated_s": wall / simulated if simulated else None,
+            }
+            for name, (simulated, wall) in stopwatch.phases.items()
+        },
+        "start_up_s": _start_up_times(),
+        "images_s": _image_times(load_scenario(_SCENARIO), seed),
+    }
+
+
+def _whole_episodes(
+    path: Path, episodes: int, seed: int, stopwatch: "PhaseStopwatch", console: Console
+) -> dict[str, Any]:
+    """What whole episodes cost, for each object that was kitted; building the cell is apart."""
+    scenario = load_scenario(path)
+    simulated = wall = kitted = 0.0
     for number in track(
-        range(episodes), "episodes", console=console, transient=True, disable=console.quiet
+        range(episodes), path.stem, console=console, transient=True, disable=console.quiet
     ):
         cell = _build(scenario, seed + number)
         stopwatch.start()
         result = run_episode(
             cell,
             task=scenario.task,
-            scenario=_SCENARIO.stem,
+            scenario=path.stem,
             policy=scenario.policy.name,
             seed=seed + number,
             time_limit=scenario.time_limit,
@@ -51,21 +82,12 @@ def benchmark_simulation(episodes: int, seed: int, console: Console) -> dict[str
         )
         simulated += result.sim_seconds
         wall += result.wall_seconds
+        kitted += sum(item.strict_success for item in result.objects)
     return {
-        "machine": f"{platform.machine()}, {os.cpu_count()} cores, one used",
-        "python": platform.python_version(),
-        "episodes": episodes,
+        "objects": int(kitted),
+        "wall_s_per_object": wall / kitted if kitted else None,
         "real_time_rate": simulated / wall,
-        "phases": {
-            name: {
-                "simulated_s": phase_simulated,
-                "wall_s": phase_wall,
-                "wall_s_per_simulated_s": phase_wall / phase_simulated if phase_simulated else None,
-            }
-            for name, (phase_simulated, phase_wall) in stopwatch.phases.items()
-        },
-        "start_up_s": _start_up_times(),
-        "images_s": _image_times(scenario, seed),
+        "objects_per_simulated_hour": 3600 * kitted / simulated,
     }
 
 
@@ -151,10 +173,20 @@ def _timed(function: Callable[[], None]) -> float:
 
 def simulation_tables(measured: dict[str, Any]) -> list[Table]:
     """For the terminal."""
-    phases = Table(
-        title=f"whole episodes: {measured['real_time_rate']:.2f} times real time on one core",
-        title_justify="left",
-    )
+    whole = Table(title="whole episodes, one thread", title_justify="left")
+    whole.add_column("policy")
+    for heading in ("objects", "wall s per object", "real-time rate", "objects per simulated hour"):
+        whole.add_column(heading, justify="right")
+    for name, row in measured["policies"].items():
+        wall = row["wall_s_per_object"]
+        whole.add_row(
+            name,
+            str(row["objects"]),
+            "-" if wall is None else f"{wall:.2f}",
+            f"{row['real_time_rate']:.1f}",
+            f"{row['objects_per_simulated_hour']:.0f}",
+        )
+    phases = Table(title="the oracle's episodes by phase", title_justify="left")
     phases.add_column("phase")
     for heading in ("simulated s", "wall s", "wall s per simulated s"):
         phases.add_column(heading, justify="right")
@@ -174,4 +206,4 @@ def simulation_tables(measured: dict[str, Any]) -> list[Table]:
     once.add_row("the same, everything in the cache", f"{start['cache_filled']:.2f}")
     once.add_row("one RGB-D image", f"{images['rgbd_image']:.3f}")
     once.add_row("heightmap from all cameras' images", f"{images['heightmap']:.3f}")
-    return [phases, once]
+    return [whole, phases, once]

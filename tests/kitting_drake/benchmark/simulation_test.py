@@ -34,9 +34,22 @@ def test_phases_add_up_to_their_episodes():
     assert all(phase[0] > 0 for phase in stopwatch.phases.values())
 
 
-def test_a_phase_that_takes_no_simulated_time_has_no_ratio():
+def test_tables_of_the_terminal():
     measured = {
-        "real_time_rate": 2.0,
+        "policies": {
+            "oracle": {
+                "objects": 8,
+                "wall_s_per_object": 1.234,
+                "real_time_rate": 5.06,
+                "objects_per_simulated_hour": 800.4,
+            },
+            "learned": {
+                "objects": 0,
+                "wall_s_per_object": None,
+                "real_time_rate": 2.0,
+                "objects_per_simulated_hour": 0.0,
+            },
+        },
         "phases": {"done": {"simulated_s": 0.0, "wall_s": 0.1, "wall_s_per_simulated_s": None}},
         "start_up_s": {"cache_empty": 3.0, "cache_filled": 2.0},
         "images_s": {"rgbd_image": 0.01, "heightmap": 0.02},
@@ -44,5 +57,7 @@ def test_a_phase_that_takes_no_simulated_time_has_no_ratio():
     console = Console(width=100)
     with console.capture() as shown:
         console.print(*simulation_tables(measured))
-    (row,) = (line.split() for line in shown.get().splitlines() if "done" in line)
-    assert row[1::2] == ["done", "0.0", "0.1", "-"]
+    rows = {row[1]: row[1::2] for line in shown.get().splitlines() if (row := line.split())[1:]}
+    assert rows["done"] == ["done", "0.0", "0.1", "-"]
+    assert rows["oracle"] == ["oracle", "8", "1.23", "5.1", "800"]
+    assert rows["learned"] == ["learned", "0", "-", "2.0", "0"]
