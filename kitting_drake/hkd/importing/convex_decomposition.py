@@ -1,92 +1,122 @@
 """Approximate convex decomposition of a solid of any shape, for collision.
 
-The solid is cut in two, again and again, until the hull of every part is true to it; then
-`collision.cover` joins the hulls that can be joined. Lengths in mm.
+Hydroelastic contact costs time by the hull and by the facet, so there is a budget of both. First
+come the hulls that the outline seen from above needs (`convex_cover`), which decides whether the
+tool enters its cavity; what is left of the budget is spent on heights. Every hull is that of some
+of the solid's own points, so the tool rests on a table as the solid does. Lengths in mm.
 """
+
+from dataclasses import dataclass
 
 import numpy as np
 from manifold3d import CrossSection, JoinType, Manifold
 from scipy.spatial import QhullError
 
-from kitting_drake.hkd.tools.collision import closed, cover, thinned
+from kitting_drake.hkd.importing.convex_cover import convex_cover
+from kitting_drake.hkd.tools.collision import closed, furthest, projection, thinned
 from kitting_drake.hkd.tools.generate import FINGER_LENGTH_MM
 from kitting_drake.hkd.tools.solids import SEGMENTS
 from systems.grasp import Grasp
 
-# How far a hull may stand out of the tool's outline; the second, if the first needs many hulls.
-OUTLINE_TOLERANCES_MM = (0.30, 0.45)
-_ENOUGH = 30
-# The same for the faces that the jaws grip.
-GRIP_TOLERANCE_MM = 0.12
-# How much a part's hull may add to it above and below, on average over its outline.
-HEIGHT_TOLERANCE_MM = 0.5
+MOST_HULLS = 16
+"""The number of hulls that a tool gets; only an outline that needs more, at the last of
+`OUTLINE_TOLERANCES_MM`, gets more."""
+OUTLINE_TOLERANCES_MM = ((0.26, 0.12), (0.30, 0.2), (0.4, 0.2), (0.6, 0.3), (0.9, 0.3))
+"""How far hulls may be off the outline, and off the faces that the jaws grip, before their vertices
+are thinned; each pair is tried if the one before needs too many hulls."""
+ADDED_SHARE = 0.02
+"""How much of a tool's volume one hull may add to it, above and below."""
+# A hull has at most so many vertices, if that moves no vertex by more than the last of the
+# tolerances; the outline's is its own.
+_MOST_VERTICES = 30
+_VERTEX_TOLERANCES_MM = (0.2, 0.3, 0.45, 0.6)
+_OUTLINE_VERTEX_TOLERANCE_MM = 0.08
 # Notches narrower than twice this are no part of a cavity: they may be bridged.
 _NOTCH_MM = 2.0
-_VERTEX_TOLERANCE_MM = 0.2
-_SMALLEST_MM, _SMALLEST_VOLUME = 2.5, 0.5
-_MOST_PARTS = 400
-_AREA = 0.02
+_SMALLEST_VOLUME = 0.5
 
 
-def decompose(solid: Manifold, grasp: Grasp) -> list[np.ndarray]:
-    """Arrays (n, 3) of points whose hulls together fill a tool at rest in its frame T."""
-    hulls: list[np.ndarray] = []
-    for tolerance in OUTLINE_TOLERANCES_MM:
-        hulls = _decomposed(solid, grasp, tolerance)
-        if len(hulls) <= _ENOUGH:
-            break
-    return hulls
+@dataclass(frozen=True)
+class Decomposition:
+    """Convex hulls that together stand for a solid."""
+
+    hulls: list[np.ndarray]
+    """Arrays (n, 3) of their vertices, in mm."""
+    outline_deviation_mm: float
+    """The furthest that their outline, seen from above, is from the solid's; 5 mm at most."""
 
 
-def _decomposed(solid: Manifold, grasp: Grasp, tolerance: float) -> list[np.ndarray]:
-    outline = closed(solid.project().simplify(0.02), _NOTCH_MM)
-    grown = _grown(outline, tolerance)
+def decompose(solid: Manifold, grasp: Grasp) -> Decomposition:
+    """Few convex hulls of few facets that together fill a tool.
+
+    Args:
+        solid: the tool at rest in its frame T, in mm.
+        grasp: where the jaws grip it, in T.
+    """
+    solid = solid.simplify(0.03)
+    outline = closed(solid.project().simplify(0.02), _NOTCH_MM).simplify(0.02)
     jaws = CrossSection.square((FINGER_LENGTH_MM + 2.0, 100.0), True)
     jaws = jaws.rotate(float(np.degrees(grasp.theta))).translate((1e3 * grasp.x, 1e3 * grasp.y))
-    allowed = grown - (jaws - _grown(outline, GRIP_TOLERANCE_MM))
-    parts = [_vertices(part) for part in _parts(solid.simplify(0.03), allowed)]
+    polygons: list[CrossSection] = []
+    for tolerance, grip in OUTLINE_TOLERANCES_MM:
+        inner = _grown(outline, -tolerance) + (_grown(outline, -grip) ^ jaws)
+        outer = _grown(outline, tolerance) - (jaws - _grown(outline, grip))
+        polygons = convex_cover(inner, outer, outline)
+        if len(polygons) <= MOST_HULLS:
+            break
+    parts = _split_by_height([_within(solid, polygon) for polygon in polygons])
     hulls = []
-    for hull in cover(parts, outline, allowed, tolerance):
+    for part in parts:
         try:
-            hulls.append(thinned(hull, _VERTEX_TOLERANCE_MM))
+            hulls.append(_thinned(np.asarray(part.hull().to_mesh64().vert_properties)[:, :3]))
         except QhullError:
             # A sliver that has no volume on the grid of vertices.
             continue
-    return sorted(hulls, key=lambda hull: tuple(np.round(hull.mean(axis=0), 3)))
+    hulls.sort(key=lambda hull: tuple(np.round(hull.mean(axis=0), 3)))
+    return Decomposition(hulls, _deviation(hulls, outline))
+
+
+def _deviation(hulls: list[np.ndarray], outline: CrossSection) -> float:
+    if not hulls:
+        return np.inf
+    seen = projection(hulls)
+    return max(furthest(seen, outline), furthest(outline, closed(seen, _NOTCH_MM)))
 
 
 def _grown(profile: CrossSection, distance: float) -> CrossSection:
     return profile.offset(distance, JoinType.Round, circular_segments=SEGMENTS)
 
 
-def _vertices(solid: Manifold) -> np.ndarray:
-    return np.asarray(solid.hull().to_mesh64().vert_properties)[:, :3]
+def _within(solid: Manifold, polygon: CrossSection) -> Manifold:
+    low, high = np.array(solid.bounding_box()).reshape(2, 3)[:, 2]
+    return solid ^ polygon.extrude(high - low + 2.0).translate((0.0, 0.0, low - 1.0))
 
 
-def _parts(solid: Manifold, allowed: CrossSection) -> list[Manifold]:
-    """Parts of a solid whose hulls stay within `allowed`, seen from above, and near its heights."""
-    done: list[Manifold] = []
-    waiting = solid.decompose()
-    while waiting:
-        part = waiting.pop()
-        if part.volume() < _SMALLEST_VOLUME:
-            continue
-        if len(done) + len(waiting) > _MOST_PARTS or _is_near_its_hull(part, allowed):
-            done.append(part)
-            continue
-        waiting += [body for half in _halves(part) for body in half.decompose()]
-    return done
+def _split_by_height(parts: list[Manifold]) -> list[Manifold]:
+    """The parts, those whose hulls add most above and below cut in two, while hulls are left."""
+    parts = [part for part in parts if part.volume() >= _SMALLEST_VOLUME]
+    most = ADDED_SHARE * sum(part.volume() for part in parts)
+    added = [_added_volume(part) for part in parts]
+    while len(parts) < MOST_HULLS and max(added, default=0.0) > most:
+        worst = int(np.argmax(added))
+        halves = [half for half in _halves(parts.pop(worst)) if half.volume() >= _SMALLEST_VOLUME]
+        added.pop(worst)
+        parts += halves
+        added += [_added_volume(half) for half in halves]
+    return parts
 
 
-def _is_near_its_hull(part: Manifold, allowed: CrossSection) -> bool:
-    low, high = np.array(part.bounding_box()).reshape(2, 3)
-    if (high - low)[:2].max() <= _SMALLEST_MM:
-        return True
-    hull = part.hull()
-    footprint = hull.project()
-    if (footprint - allowed).area() > _AREA:
-        return False
-    return bool(hull.volume() - part.volume() <= HEIGHT_TOLERANCE_MM * footprint.area())
+def _added_volume(part: Manifold) -> float:
+    return float(part.hull().volume() - part.volume())
+
+
+def _thinned(points: np.ndarray) -> np.ndarray:
+    result = points
+    for tolerance in _VERTEX_TOLERANCES_MM:
+        result = thinned(points, tolerance, _OUTLINE_VERTEX_TOLERANCE_MM)
+        if len(result) <= _MOST_VERTICES:
+            break
+    return result
 
 
 def _halves(part: Manifold) -> tuple[Manifold, Manifold]:
@@ -101,7 +131,7 @@ def _halves(part: Manifold) -> tuple[Manifold, Manifold]:
         for share in (0.35, 0.5, 0.65, *_steps((vertices[:, axis] - low[axis]) / size[axis])):
             normal = np.eye(3)[axis]
             halves = part.split_by_plane(tuple(normal), low[axis] + share * size[axis])
-            volume = sum(body.hull().volume() for half in halves for body in half.decompose())
+            volume = sum(half.hull().volume() for half in halves)
             # Among equal cuts the middle one, which leaves the smallest parts.
             volume *= 1.0 + 0.02 * abs(share - 0.5)
             if volume < best_volume:

@@ -23,6 +23,8 @@ THINNEST_MM, HIGHEST_MM = 4.0, 45.0
 
 _UNITS = {"mm": 1.0, "m": 1000.0, "cm": 10.0, "inches": 25.4}
 _CREASE_ANGLE_DEG = 35.0
+# How far decimating may move a surface; each is tried if the one before leaves more triangles.
+_DECIMATION_TOLERANCES_MM, _ENOUGH_TRIANGLES = (0.01, 0.02, 0.04), 10_000
 
 
 def guess_unit(length: float) -> str | None:
@@ -79,7 +81,7 @@ def fit(
     refusal: UserError | None = None
     for length in lengths:
         factor = length / size(solid)[0]
-        scaled = centred(solid.scale((factor, factor, factor)).simplify(0.01))
+        scaled = centred(_decimated(solid.scale((factor, factor, factor))))
         try:
             _check_size(scaled)
             tool = _tool(category, name, scaled, directory)
@@ -92,6 +94,16 @@ def fit(
         return tool, scaled
     assert refusal is not None
     raise refusal
+
+
+def _decimated(solid: Manifold) -> Manifold:
+    """The solid without triangles that hardly show; a very fine one is made a little coarser."""
+    simple = solid
+    for tolerance in _DECIMATION_TOLERANCES_MM:
+        simple = solid.simplify(tolerance)
+        if simple.num_tri() <= _ENOUGH_TRIANGLES:
+            break
+    return simple
 
 
 def _check_size(solid: Manifold) -> None:

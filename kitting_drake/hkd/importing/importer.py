@@ -39,6 +39,8 @@ OTHER_DENSITY = 3000.0
 TIME_LIMIT = 55.0
 """Seconds after which the geometry is given up."""
 _MOST_MEMORY = 12 * 2**30
+# Collision hulls that are further off the outline than this are worth a note.
+_TRUE_OUTLINE_MM = 0.35
 
 
 @dataclass(frozen=True)
@@ -220,11 +222,16 @@ def _prepare(request: ImportRequest, name: str, directory: Path) -> Prepared:
     density = request.density or DENSITIES.get(request.category, OTHER_DENSITY)
     vertices, faces = meshes.vertices_and_faces(solid)
     physics = trimesh.triangles.mass_properties(1e-3 * vertices[faces], density=density)
-    hulls = decompose(solid, tool.grasp)
-    if not hulls:
+    collision = decompose(solid, tool.grasp)
+    if not collision.hulls:
         raise UserError("the mesh encloses too little volume to be touched")
+    if collision.outline_deviation_mm > _TRUE_OUTLINE_MM:
+        notes.append(
+            f"its {len(collision.hulls)} collision hulls are up to "
+            f"{collision.outline_deviation_mm:.2f} mm off its outline"
+        )
     collisions = []
-    for index, hull in enumerate(hulls):
+    for index, hull in enumerate(collision.hulls):
         collisions.append(f"collision_{index}.obj")
         meshes.write_convex_obj(directory / collisions[-1], hull)
     material = material_of(request.category)
@@ -255,12 +262,13 @@ def _prepare(request: ImportRequest, name: str, directory: Path) -> Prepared:
             "file": request.mesh.name,
             "sha256": hashlib.sha256(request.mesh.read_bytes()).hexdigest(),
             "density": float(density),
+            "outline_deviation": round(1e-3 * collision.outline_deviation_mm, 6),
             "notes": notes,
         },
     }
     (directory / "tool.yaml").write_text(yaml.safe_dump(record, sort_keys=False))
     load_tool(str(directory))
-    return record, notes, len(hulls)
+    return record, notes, len(collision.hulls)
 
 
 def _safe(text: str) -> str:

@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from kitting_drake.common.errors import UserError
-from kitting_drake.hkd.tools.tool import footprint
 
 FORMATS = (".stl", ".obj", ".ply", ".glb", ".gltf")
 MOST_BYTES = 200_000_000
@@ -29,6 +28,8 @@ _MERGE_MM = 1e-3
 _GAP_MM, _DIRT = 1.5, 0.02
 # A repaired mesh may lose this share of any of its projections on the three planes.
 _LOST = 0.03
+# Projections are compared in pixels of this size.
+_PIXEL_MM = 0.5
 _MOST_COMPONENTS = 3000
 _VOXEL_MM = 0.75
 # Less than this share of a box is no solid but a skin.
@@ -175,13 +176,19 @@ def _repaired(vertices: Array, faces: Faces) -> Manifold | None:
             np.ascontiguousarray(mesh.faces, dtype=np.int32),
         )
         fixer.fill_small_boundaries(0, False)
-        fixer.clean(10, 3)
-        new_vertices, new_faces = fixer.return_arrays()
+        solid = _fixed(fixer)
+        if solid is None:
+            # Slow, and what it removes beside, surfaces through one another, does no harm here.
+            fixer.clean(10, 3)
+            solid = _fixed(fixer)
     except RuntimeError:
         return None
-    if len(new_faces) < 4:
-        return None
-    return _as_manifold(np.asarray(new_vertices, dtype=float), np.asarray(new_faces, np.int64))
+    return solid
+
+
+def _fixed(fixer: pymeshfix.PyTMesh) -> Manifold | None:
+    vertices, faces = fixer.return_arrays()
+    return _as_manifold(np.asarray(vertices, dtype=float), np.asarray(faces, np.int64))
 
 
 def _loses(triangles: Array, solid: Manifold) -> bool:
@@ -190,13 +197,33 @@ def _loses(triangles: Array, solid: Manifold) -> bool:
         return True
     mesh = solid.to_mesh64()
     mine = np.asarray(mesh.vert_properties)[:, :3][np.asarray(mesh.tri_verts).astype(int)]
-    for axes in ([0, 1, 2], [0, 2, 1], [1, 2, 0]):
-        seen, kept = footprint(triangles[:, :, axes]), footprint(mine[:, :, axes])
-        lost, gained = (seen - kept).area(), (kept - seen).area()
+    low = triangles.min(axis=(0, 1)) - 2 * _PIXEL_MM
+    pixels, my_pixels = (
+        np.round((_sampled(surface, _PIXEL_MM) - low) / _PIXEL_MM).astype(int)
+        for surface in (triangles, mine)
+    )
+    shape = np.maximum(pixels.max(axis=0), my_pixels.max(axis=0)) + 3
+    around = ndimage.generate_binary_structure(2, 2)
+    for axes in ([0, 1], [0, 2], [1, 2]):
+        seen, kept = (np.zeros(shape[axes], dtype=bool) for _ in range(2))
+        seen[tuple(pixels[:, axes].T)] = True
+        kept[tuple(my_pixels[:, axes].T)] = True
+        # A pixel at the rim may be hit in one and missed in the other.
+        lost = (seen & ~ndimage.binary_dilation(kept, around)).sum()
+        gained = (kept & ~ndimage.binary_dilation(seen, around)).sum()
         # Filled holes in walls may show: gains count only if large.
-        if lost > _LOST * seen.area() or gained > 5 * _LOST * seen.area():
+        if lost > _LOST * seen.sum() or gained > 5 * _LOST * seen.sum():
             return True
     return False
+
+
+def _sampled(triangles: Array, step: float) -> Array:
+    """Points (n, 3) of a surface, so many that hardly a square of a side of `step` has none."""
+    corners = triangles.reshape(-1, 3)
+    mesh = trimesh.Trimesh(corners, np.arange(len(corners)).reshape(-1, 3), process=False)
+    count = int(min(4e6, 12 * mesh.area / step**2)) + 1
+    points, _ = trimesh.sample.sample_surface(mesh, count, seed=0)
+    return np.vstack([points, corners])
 
 
 def _wrapped(triangles: Array) -> Manifold:
@@ -205,11 +232,8 @@ def _wrapped(triangles: Array) -> Manifold:
     margin = 5 * _VOXEL_MM
     low = corners.min(axis=0) - margin
     shape = np.ceil((corners.max(axis=0) + margin - low) / _VOXEL_MM).astype(int) + 1
-    mesh = trimesh.Trimesh(corners, np.arange(len(corners)).reshape(-1, 3), process=False)
-    count = int(min(4e6, 12 * mesh.area / _VOXEL_MM**2)) + 1
-    points, _ = trimesh.sample.sample_surface(mesh, count, seed=0)
     filled = np.zeros(shape, dtype=bool)
-    skin = np.round((np.vstack([points, corners]) - low) / _VOXEL_MM).astype(int)
+    skin = np.round((_sampled(triangles, _VOXEL_MM) - low) / _VOXEL_MM).astype(int)
     filled[tuple(skin.T)] = True
     ball = ndimage.generate_binary_structure(3, 1)
     filled = ndimage.binary_closing(filled, ball, iterations=3)

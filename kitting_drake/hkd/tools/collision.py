@@ -54,17 +54,26 @@ def furthest(inner: CrossSection, outer: CrossSection) -> float:
     return high
 
 
-def thinned(points: np.ndarray, tolerance: float) -> np.ndarray:
+def thinned(
+    points: np.ndarray, tolerance: float, outline_tolerance: float | None = None
+) -> np.ndarray:
     """Vertices (m, 3) that span the hull of `points` to within about `tolerance` (mm).
 
     The points on the table are chosen first, in the plane, so that a flat bottom stays flat. The
     result is on a grid: facets that are almost coplanar become exactly so, or clearly not.
+
+    Args:
+        points: (n, 3).
+        tolerance: in mm.
+        outline_tolerance: that of the outline seen from above, if it has one of its own, in mm.
     """
     points = points[ConvexHull(points).vertices]
     touching = np.flatnonzero(points[:, 2] < 1e-3)
     seeds: list[int] = []
     if len(touching) > 2:
         seeds = list(touching[_farthest(points[touching, :2], [], tolerance)])
+    if outline_tolerance is not None:
+        seeds = _farthest(points[:, :2], seeds, outline_tolerance)
     chosen = points[_farthest(points, seeds, tolerance)]
     snapped = np.round(np.round(chosen / GRID_MM) * GRID_MM, 3) + 0.0
     return np.unique(snapped[ConvexHull(snapped).vertices], axis=0)

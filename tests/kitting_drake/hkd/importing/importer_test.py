@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import trimesh
 import yaml
-from manifold3d import JoinType, Manifold, OpType
+from manifold3d import Manifold, OpType
 
 from kitting_drake.common.errors import UserError
 from kitting_drake.hkd.grasps.annotate import save_grasp
@@ -17,6 +17,7 @@ from kitting_drake.hkd.importing.fit import guess_unit
 from kitting_drake.hkd.importing.importer import ImportRequest, import_tool
 from kitting_drake.hkd.kits.layout import layout_kit
 from kitting_drake.hkd.kits.parameters import KitParameters
+from kitting_drake.hkd.tools.collision import closed, furthest
 from kitting_drake.hkd.tools.meshes import vertices_and_faces
 from kitting_drake.hkd.tools.tool import load_tool, user_tool_names
 
@@ -89,9 +90,12 @@ def test_collision_hulls_are_few_convex_and_true(plain: importer.ImportReport):
         OpType.Add,
     )
     tool = load_tool(str(plain.directory))
-    shadow = together.project()
-    for one, other in ((shadow, tool.footprint), (tool.footprint, shadow)):
-        assert (one - other.offset(0.0005, JoinType.Miter)).area() < 1e-9
+    # A cavity, 2 mm off, sees no sharp notch.
+    shadow = closed(together.project().scale((1e3, 1e3)), 2.0)
+    outline = closed(tool.footprint.scale((1e3, 1e3)), 2.0)
+    deviation = max(furthest(shadow, outline), furthest(outline, shadow))
+    assert deviation <= 0.35
+    assert 1e3 * plain.record["imported"]["outline_deviation"] == pytest.approx(deviation, abs=0.1)
 
 
 def test_the_model_loads_where_it_is(plain: importer.ImportReport):
@@ -192,6 +196,21 @@ def test_one_body_is_made_of_several_and_of_a_soup(tmp_path: Path):
     assert any("wrapped" in note for note in report.notes)
     for key in ("length", "width", "height"):
         assert report.record[key] == pytest.approx(united[key], abs=1.2e-3)
+
+
+def test_a_mesh_of_many_triangles_is_decimated(tmp_path: Path):
+    mesh = mallet().subdivide_to_size(0.8)
+    assert len(mesh.faces) > 50_000
+    # Bumps of a tenth of a millimetre, as a scan has.
+    waves = np.sin(mesh.vertices @ np.random.default_rng(0).normal(0, 1, (3, 3)))
+    mesh.vertices = mesh.vertices + 0.05 * waves
+    report = bring(exported(mesh, tmp_path / "scan.stl"), tmp_path / "tools")
+    tool = load_tool(str(report.directory))
+    assert len(tool.triangles) < 20_000
+    shape = trimesh.load_mesh(tmp_path / "scan.stl")
+    assert tool.mass == pytest.approx(1e-9 * shape.volume * importer.DENSITIES["hammer"], rel=2e-3)
+    assert (tool.length, tool.width) == pytest.approx(tuple(1e-3 * shape.extents[:2]), abs=1e-4)
+    assert report.collision_hulls <= 5
 
 
 def apart() -> trimesh.Trimesh:
@@ -381,6 +400,7 @@ def test_real_tools(name: str, tmp_path: Path):
     report = bring(REAL / f"{name}.obj", tmp_path / "tools", category=name.split("/")[0])
     tool = load_tool(str(report.directory))
     assert 0.1499 < tool.length < 0.2001
-    assert report.collision_hulls <= 45
+    assert report.collision_hulls <= 16
+    assert report.record["imported"]["outline_deviation"] <= 0.00035
     com = yaml.safe_load((tool.directory / "tool.yaml").read_text())["center_of_mass"]
     assert abs(tool.grasp.x - com[0]) < 0.045

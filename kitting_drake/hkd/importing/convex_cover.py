@@ -1,0 +1,167 @@
+"""Few convex polygons that cover an outline, give or take a tolerance. Lengths in mm."""
+
+import numpy as np
+from manifold3d import CrossSection, OpType
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+# Area (mm^2) below which a difference of outlines is rounding.
+_AREA = 0.02
+# Cuts are tried through this many corners, at this many angles.
+_CORNERS, _ANGLES = 6, 8
+_FAR = 1e3
+# Cells smaller than this are not cut again, and none where there are so many.
+_SMALLEST_MM, _MOST_CELLS = 1.0, 150
+# How far, in steps, each edge of a polygon is pushed out in the end.
+_PUSHES_MM = (0.8, 0.4, 0.2, 0.1)
+
+
+def convex_cover(
+    inner: CrossSection, outer: CrossSection, outline: CrossSection
+) -> list[CrossSection]:
+    """Convex polygons that together cover `inner` and stay within `outer`.
+
+    The inner region is cut until the hull of every cell is within the outer one; hulls are grown
+    from the cells, and the largest are kept. Between the two regions they follow the outline as
+    far as they can. The same input always gives the same polygons.
+
+    Args:
+        inner: what has to be covered; without holes.
+        outer: what may be covered; it contains `inner`.
+        outline: what should be; between the two.
+    """
+    cells = _cells(inner, outer)
+    grown = [_grown(seed, cells, outer) for seed in range(len(cells))]
+    areas = [cell.area() for cell in cells]
+    still_open, chosen = set(range(len(cells))), []
+    while still_open:
+        gains = [round(sum(areas[i] for i in cover & still_open), 3) for cover in grown]
+        cover = grown[int(np.argmax(gains))] & still_open
+        chosen.append(_hull([cells[i] for i in sorted(cover)]))
+        still_open -= cover
+    pushed = [_pushed(polygon, outline, outer) for polygon in chosen]
+    return _needed(pushed, inner)
+
+
+def _hull(profiles: list[CrossSection]) -> CrossSection:
+    return CrossSection.batch_hull(profiles)
+
+
+def _fits(profile: CrossSection, outer: CrossSection) -> bool:
+    return bool((profile - outer).area() <= _AREA)
+
+
+def _cells(inner: CrossSection, outer: CrossSection) -> list[CrossSection]:
+    """Parts of `inner` whose hulls are within `outer`."""
+    done: list[CrossSection] = []
+    waiting = inner.decompose()
+    while waiting:
+        part = waiting.pop()
+        if part.area() <= _AREA:
+            continue
+        small = np.ptp(_corners(part), axis=0).max() < _SMALLEST_MM
+        if small or len(done) + len(waiting) > _MOST_CELLS or _fits(part.hull(), outer):
+            done.append(part)
+        else:
+            waiting += _best_cut(part, outer)
+    return done
+
+
+def _corners(profile: CrossSection) -> Array:
+    return np.vstack(profile.to_polygons())
+
+
+def _best_cut(part: CrossSection, outer: CrossSection) -> list[CrossSection]:
+    """The pieces of a part, by the cut that leaves the least of their hulls outside `outer`."""
+    best, least = [part.hull()], np.inf
+    for point in _notches(part):
+        for angle in np.arange(_ANGLES) * 180.0 / _ANGLES:
+            half = CrossSection.square((_FAR, _FAR)).translate((-_FAR / 2, 0.0)).rotate(angle)
+            half = half.translate(tuple(point))
+            pieces = [p for side in (part ^ half, part - half) for p in side.decompose()]
+            hulls = [piece.hull() for piece in pieces]
+            excess = sum((hull - outer).area() for hull in hulls)
+            if len(pieces) > 1 and excess < least:
+                best, least = pieces, excess
+    return best
+
+
+def _notches(part: CrossSection) -> list[Array]:
+    """The middle of a part, and the corners, apart from one another, deepest in its hull."""
+    corners = _corners(part)
+    hull = _corners(part.hull())
+    edges = np.roll(hull, -1, axis=0) - hull
+    normals = np.column_stack([edges[:, 1], -edges[:, 0]])
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    depth = ((hull * normals).sum(axis=1) - corners @ normals.T).min(axis=1)
+    spacing = 0.1 * np.ptp(corners, axis=0).max()
+    # The middle comes first: of equal cuts, halving leaves the fewest cells of an arc.
+    chosen = [0.5 * (corners.min(axis=0) + corners.max(axis=0))]
+    for index in np.argsort(-depth, kind="stable"):
+        if all(np.linalg.norm(corners[index] - other) > spacing for other in chosen[1:]):
+            chosen.append(corners[index])
+            if len(chosen) > _CORNERS:
+                break
+    return chosen
+
+
+def _grown(seed: int, cells: list[CrossSection], outer: CrossSection) -> set[int]:
+    """The cells that one hull within `outer` can hold: the seed, then what adds the least area."""
+    hull, members, candidates = cells[seed].hull(), {seed}, set(range(len(cells))) - {seed}
+    while True:
+        trials = []
+        for i in sorted(candidates):
+            joined = _hull([hull, cells[i]])
+            trials.append((joined.area() - hull.area() - (cells[i] - hull).area(), i, joined))
+        for _, i, joined in sorted(trials, key=lambda trial: trial[:2]):
+            # A hull that does not fit now never will: it only grows.
+            candidates.discard(i)
+            if _fits(joined, outer):
+                hull = joined
+                members.add(i)
+                break
+        else:
+            return members
+
+
+def _pushed(polygon: CrossSection, outline: CrossSection, outer: CrossSection) -> CrossSection:
+    """The polygon with its edges moved out, as far as that makes it truer to the outline."""
+    corners = _corners(polygon.simplify(0.05))
+    edges = np.roll(corners, -1, axis=0) - corners
+    normals = np.column_stack([edges[:, 1], -edges[:, 0]])
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    offsets = (corners * normals).sum(axis=1)
+
+    def score(candidate: CrossSection) -> float:
+        """The area of the outline that it covers, less what it covers beside."""
+        return float(2 * (candidate ^ outline).area() - candidate.area())
+
+    best, best_score = polygon, score(polygon)
+    for push in _PUSHES_MM:
+        for k in np.argsort(-np.linalg.norm(edges, axis=1), kind="stable"):
+            trial = offsets.copy()
+            trial[k] += push
+            hull = _hull([polygon, (_between(normals, trial) ^ outline)])
+            if score(hull) > best_score and _fits(hull, outer):
+                best, best_score, offsets = hull, score(hull), trial
+    return best
+
+
+def _between(normals: Array, offsets: Array) -> CrossSection:
+    """The region of all points p with normals @ p <= offsets, of edges in order."""
+    result = CrossSection.square((_FAR, _FAR), True)
+    for (x, y), offset in zip(normals, offsets, strict=True):
+        half = CrossSection.square((_FAR, 2 * _FAR)).translate((offset, -_FAR))
+        result -= half.rotate(float(np.degrees(np.arctan2(y, x))))
+    return result
+
+
+def _needed(polygons: list[CrossSection], inner: CrossSection) -> list[CrossSection]:
+    """The polygons without those, the smallest first, that the others make superfluous."""
+    kept = list(polygons)
+    for polygon in sorted(polygons, key=CrossSection.area):
+        rest = [other for other in kept if other is not polygon]
+        if rest and (inner - CrossSection.batch_boolean(rest, OpType.Add)).area() <= _AREA:
+            kept = rest
+    return kept

@@ -1,0 +1,64 @@
+import numpy as np
+import pytest
+from manifold3d import CrossSection, Manifold, OpType
+
+from kitting_drake.hkd.importing.convex_decomposition import MOST_HULLS, decompose
+from kitting_drake.hkd.tools.collision import furthest, projection
+from systems.grasp import Grasp
+
+GRASP = Grasp(x=-0.02, y=0.0, theta=0.0, width=0.02, surface_height=0.012)
+
+
+def union(hulls: list[np.ndarray]) -> Manifold:
+    return Manifold.batch_boolean([Manifold.hull_points(hull) for hull in hulls], OpType.Add)
+
+
+def bent_handle() -> Manifold:
+    """An arc of 20 mm by 12 mm whose middle is at the grasp."""
+    ring = CrossSection.circle(160.0, 400) - CrossSection.circle(140.0, 400)
+    arc = ring ^ CrossSection.square((140.0, 100.0), True).translate((0.0, 150.0))
+    return arc.translate((-20.0, -150.0)).extrude(12.0)
+
+
+def stepped() -> Manifold:
+    """A straight bar whose half is three times as high as the other: one outline, two heights."""
+    return Manifold.cube((80, 20, 10)).translate((-80, -10, 0)) + Manifold.cube(
+        (80, 20, 30)
+    ).translate((0, -10, 0))
+
+
+@pytest.mark.parametrize("solid", [bent_handle(), stepped()])
+def test_the_outline_is_as_true_as_it_says(solid: Manifold):
+    found = decompose(solid, GRASP)
+    outline, seen = solid.project(), projection(found.hulls)
+    deviation = max(furthest(seen, outline), furthest(outline, seen))
+    assert found.outline_deviation_mm == pytest.approx(deviation, abs=0.05)
+    assert deviation <= 0.35
+    assert len(found.hulls) <= 8
+    assert all(len(hull) <= 40 for hull in found.hulls)
+
+
+def test_heights_get_hulls_of_their_own():
+    solid = stepped()
+    together = union(decompose(solid, GRASP).hulls)
+    assert (together - solid).volume() < 0.02 * solid.volume()
+    assert (solid - together).volume() < 0.02 * solid.volume()
+
+
+def test_the_bottom_stays_flat_and_nothing_is_below_it():
+    solid = bent_handle()
+    points = np.vstack(decompose(solid, GRASP).hulls)
+    assert points[:, 2].min() == 0.0
+    bottom = CrossSection.hull_points(points[points[:, 2] == 0.0][:, :2])
+    assert furthest(solid.project().hull(), bottom) < 0.4
+
+
+def test_an_outline_of_too_many_corners_is_told():
+    # A comb whose gaps are too broad to be bridged.
+    teeth = [
+        Manifold.cube((4, 30, 10)).translate((10.0 * index - 95.0, -40, 0)) for index in range(20)
+    ]
+    comb = Manifold.batch_boolean([Manifold.cube((200, 20, 10), True), *teeth], OpType.Add)
+    found = decompose(comb.translate((0, 0, 5)), GRASP)
+    assert len(found.hulls) > MOST_HULLS
+    assert found.outline_deviation_mm == pytest.approx(1.0, abs=0.5)
