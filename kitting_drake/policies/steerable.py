@@ -16,17 +16,24 @@ import functools
 import math
 import warnings
 from collections.abc import Callable, Iterator
+from typing import Any
 
 import numpy as np
 import torch
 import torch.nn.functional as F
+from numpy.typing import NDArray
 from torch import Tensor, nn
+from torch.autograd.function import once_differentiable
 
 from kitting_drake.policies.fibres import Fibre, Irreps, Regular, Scalar
 
 Convolution = Callable[..., nn.Module]
 """A class of layers: `SteerableConv2d`, `GroupConv2d` or `PlainConv2d`. It makes a layer from
 (in_fields, in_fibre, out_fields, out_fibre, size, padding=..., bias=..., gain=...)."""
+
+
+_TOGETHER = 64
+"""The most channels that `BandLimit` and `InvariantPart` take in one product."""
 
 
 class ExpandedConv2d(nn.Module):
@@ -253,24 +260,15 @@ class BandLimit(nn.Module):
 
     projection: Tensor
 
-    def __init__(self, fibre: Fibre) -> None:
+    def __init__(self, fibre: Fibre, fields: int) -> None:
         super().__init__()
         projection = fibre.synthesis() @ fibre.analysis()
         self.trivial = bool(np.allclose(projection, np.eye(len(projection))))
-        self.register_buffer(
-            "projection",
-            torch.from_numpy(projection).to(torch.get_default_dtype()),
-            persistent=False,
-        )
+        self.register_buffer("projection", _of_several_fields(projection, fields), persistent=False)
 
     def forward(self, features: Tensor) -> Tensor:
         """(batch, fields * channels, rows, cols) to the same shape."""
-        if self.trivial:
-            return features
-        last = features.permute(0, 2, 3, 1)
-        projection = self.projection.to(features.dtype)
-        fields = last.reshape(-1, len(projection)) @ projection
-        return fields.view(last.shape).permute(0, 3, 1, 2)
+        return features if self.trivial else _multiply_fields(features, self.projection)
 
 
 class InvariantPart(nn.Module):
@@ -278,19 +276,36 @@ class InvariantPart(nn.Module):
 
     functional: Tensor
 
-    def __init__(self, fibre: Fibre) -> None:
+    def __init__(self, fibre: Fibre, fields: int) -> None:
         super().__init__()
-        self.register_buffer(
-            "functional",
-            torch.from_numpy(fibre.invariant()).to(torch.get_default_dtype()),
-            persistent=False,
-        )
+        functional = fibre.invariant()[:, None]
+        self.register_buffer("functional", _of_several_fields(functional, fields), persistent=False)
 
     def forward(self, features: Tensor) -> Tensor:
         """(batch, fields * channels, rows, cols) to (batch, fields, rows, cols)."""
-        last = features.permute(0, 2, 3, 1)
-        fields = last.unflatten(3, (-1, len(self.functional)))
-        return (fields @ self.functional.to(features.dtype)).permute(0, 3, 1, 2)
+        return _multiply_fields(features, self.functional)
+
+
+def _of_several_fields(matrix: NDArray[np.float64], fields: int) -> Tensor:
+    """What a matrix does to each of a few fields, as one matrix for their channels together.
+
+    With its zeros, a product with about 64 channels takes half as long as one with eight.
+    """
+    together = math.gcd(fields, max(_TOGETHER // len(matrix), 1))
+    blocks = np.kron(np.eye(together), matrix)
+    return torch.from_numpy(blocks).to(torch.get_default_dtype())
+
+
+def _multiply_fields(features: Tensor, matrix: Tensor) -> Tensor:
+    """Multiplies the channels of fields at each pixel, from the left, by a matrix.
+
+    Args:
+        features: (batch, fields * channels, rows, cols), in channels_last.
+        matrix: of `_of_several_fields`.
+    """
+    last = features.permute(0, 2, 3, 1)
+    product = last.reshape(-1, len(matrix)) @ matrix.to(features.dtype)
+    return product.view(*last.shape[:3], -1).permute(0, 3, 1, 2)
 
 
 class BlurPool(nn.Module):
@@ -311,9 +326,28 @@ class BlurPool(nn.Module):
 
     def forward(self, features: Tensor) -> Tensor:
         """(batch, channels, rows, cols), odd sides, to half the resolution."""
+        return _Blur.apply(features, self.kernel)
+
+
+class _Blur(torch.autograd.Function):
+    """The convolution of `BlurPool`, with a gradient that is always computed in float32: on a CPU
+    that of depthwise convolutions takes six times as long in bfloat16."""
+
+    @staticmethod
+    def forward(ctx: Any, features: Tensor, kernel: Tensor) -> Tensor:
         channels = features.shape[1]
-        kernel = self.kernel.to(features.dtype).expand(channels, 1, 5, 5)
-        return F.conv2d(features, kernel, stride=2, padding=2, groups=channels)
+        ctx.kernel = kernel.expand(channels, 1, 5, 5)
+        weight = ctx.kernel.to(features.dtype)
+        return F.conv2d(features, weight, stride=2, padding=2, groups=channels)
+
+    @staticmethod
+    @once_differentiable  # type: ignore[untyped-decorator]
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None]:
+        channels = gradient.shape[1]
+        result = F.conv_transpose2d(
+            gradient.float(), ctx.kernel.float(), stride=2, padding=2, groups=channels
+        )
+        return result.to(gradient.dtype), None
 
 
 def upsample(features: Tensor) -> Tensor:

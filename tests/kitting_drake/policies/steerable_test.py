@@ -64,7 +64,7 @@ def rotate_fields(features: Tensor, fibre: Fibre, degrees: float = 90) -> Tensor
 )
 def test_rotations_by_90_degrees_are_exact(fibre_in: Fibre, fibre_out: Fibre, size: int):
     layer = SteerableConv2d(2, fibre_in, 3, fibre_out, size)
-    features = BandLimit(fibre_in)(random_features(1, 2 * fibre_in.channels, 11, 13))
+    features = BandLimit(fibre_in, 2)(random_features(1, 2 * fibre_in.channels, 11, 13))
     expected = rotate_fields(rotate_by_90(layer(features)), fibre_out)
     found = layer(rotate_fields(rotate_by_90(features), fibre_in))
     torch.testing.assert_close(found, expected, atol=1e-5, rtol=1e-5)
@@ -80,7 +80,7 @@ def test_rotations_by_90_degrees_are_exact(fibre_in: Fibre, fibre_out: Fibre, si
 )
 def test_other_rotations_are_nearly_exact(fibre_in: Fibre, fibre_out: Fibre, degrees: int):
     layer = SteerableConv2d(1, fibre_in, 2, fibre_out, 5)
-    features = BandLimit(fibre_in)(smooth_image(65, channels=fibre_in.channels))
+    features = BandLimit(fibre_in, 1)(smooth_image(65, channels=fibre_in.channels))
     expected = rotate_fields(rotate_image(layer(features), degrees), fibre_out, degrees)
     found = layer(rotate_fields(rotate_image(features, degrees), fibre_in, degrees))
     assert relative_error(found.detach(), expected.detach()) < 0.05
@@ -89,7 +89,7 @@ def test_other_rotations_are_nearly_exact(fibre_in: Fibre, fibre_out: Fibre, deg
 @pytest.mark.parametrize(("samples", "tolerance"), [(8, 0.25), (12, 0.05), (16, 0.02)])
 def test_the_nonlinearity_is_nearly_equivariant(samples: int, tolerance: float):
     fibre = Irreps(FREQUENCIES, samples)
-    limit = BandLimit(fibre)
+    limit = BandLimit(fibre, 1)
     features = limit(smooth_image(33, channels=samples))
     for degrees in (5, 10, 22.5, 30):
         expected = rotate_fields(limit(F.elu(features)), fibre, degrees)
@@ -132,9 +132,9 @@ def test_two_layers_are_those_of_escnn():
     # escnn's layer ends with a projection onto the irreps, which is `BandLimit`.
     synthesis = torch.from_numpy(SAMPLES.synthesis()).float()
     limited = torch.einsum("sf,nkfxy->nksxy", synthesis, expected.unflatten(1, (3, 7)))
-    torch.testing.assert_close(BandLimit(SAMPLES)(found), limited.flatten(1, 2), atol=1e-5, rtol=0)
+    torch.testing.assert_close(BandLimit(SAMPLES, 3)(found), limited.flatten(1, 2), atol=1e-5, rtol=0)
     torch.testing.assert_close(
-        InvariantPart(SAMPLES)(found), expected.unflatten(1, (3, 7))[:, :, 0], atol=1e-5, rtol=0
+        InvariantPart(SAMPLES, 3)(found), expected.unflatten(1, (3, 7))[:, :, 0], atol=1e-5, rtol=0
     )
 
 
@@ -142,7 +142,7 @@ def test_two_layers_are_those_of_escnn():
 def test_the_first_gain_does_not_depend_on_the_samples(samples: int):
     fibre = Irreps(FREQUENCIES, samples)
     layer = SteerableConv2d(32, fibre, 32, fibre, 3)
-    features = BandLimit(fibre)(random_features(1, 32 * samples, 32, 32))
+    features = BandLimit(fibre, 32)(random_features(1, 32 * samples, 32, 32))
     # He initialisation's gain, which compensates the nonlinearity.
     gain = float(layer(features).detach().std() / features.std())
     assert gain == pytest.approx(2**0.5, rel=0.1)
