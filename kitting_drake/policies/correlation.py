@@ -249,10 +249,14 @@ def peaks(volume: Tensor, count: int) -> Iterator[tuple[int, int, int]]:
         count: how many.
     """
     remaining = volume.clone()
+    best = volume.amax(0)
     for _ in range(count):
-        rotation, row, col = _argmax(remaining)
+        _, row, col = _argmax(best[None])
+        rotation = int(remaining[:, row, col].argmax())
         around = [(rotation + step) % len(volume) for step in (-1, 0, 1)]
-        remaining[around, max(row - 1, 0) : row + 2, max(col - 1, 0) : col + 2] = -math.inf
+        rows, cols = slice(max(row - 1, 0), row + 2), slice(max(col - 1, 0), col + 2)
+        remaining[around, rows, cols] = -math.inf
+        best[rows, cols] = remaining[:, rows, cols].amax(0)
         yield rotation, row, col
 
 

@@ -54,8 +54,9 @@ class ExpandedConv2d(nn.Module):
         self.weights = nn.Parameter(weights)
         self.bias = nn.Parameter(torch.zeros(len(weights))) if bias else None
 
-    def kernel(self) -> Tensor:
-        """(out channels, in channels, size, size): what a plain convolution takes."""
+    def kernel(self, dtype: torch.dtype = torch.float32) -> Tensor:
+        """(out channels, in channels, size, size), in channels_last: what a plain convolution
+        takes."""
         raise NotImplementedError
 
     def channel_bias(self) -> Tensor | None:
@@ -64,11 +65,10 @@ class ExpandedConv2d(nn.Module):
 
     def forward(self, features: Tensor) -> Tensor:
         """(batch, in channels, rows, cols) to (batch, out channels, rows, cols)."""
-        kernel = self.kernel().to(features.dtype, memory_format=torch.channels_last)
         bias = self.channel_bias()
         return F.conv2d(
             features,
-            kernel,
+            self.kernel(features.dtype),
             None if bias is None else bias.to(features.dtype),
             padding=self.padding,
         )
@@ -110,30 +110,37 @@ class SteerableConv2d(ExpandedConv2d):
         scale = math.sqrt(2 / gathered)
         weights = torch.randn(out_fields, in_fields, len(basis)) * (gain * scale)
         super().__init__(in_fibre, out_fibre, size, padding, weights, bias)
-        self.register_buffer("basis", basis.to(torch.get_default_dtype()), persistent=False)
+        # In the memory order that `expand_kernel` needs.
+        order = basis.permute(0, 1, 3, 4, 2).to(torch.get_default_dtype()).contiguous()
+        self.register_buffer("basis", order.permute(0, 1, 4, 2, 3), persistent=False)
 
-    def kernel(self) -> Tensor:
-        """(out channels, in channels, size, size): what a plain convolution takes."""
-        return expand_kernel(self.weights, self.basis)
+    def kernel(self, dtype: torch.dtype = torch.float32) -> Tensor:
+        return expand_kernel(self.weights, self.basis, dtype)
 
 
-def expand_kernel(weights: Tensor, basis: Tensor) -> Tensor:
+def expand_kernel(
+    weights: Tensor, basis: Tensor, dtype: torch.dtype = torch.float32
+) -> Tensor:
     """A plain kernel from weights in a basis.
 
     Args:
         weights: (out fields, in fields, D).
         basis: (D, out channels, in channels, size, size), from one field to one field.
+        dtype: of the kernel.
 
     Returns:
-        (out fields * out channels, in fields * in channels, size, size).
+        (out fields * out channels, in fields * in channels, size, size), in channels_last.
     """
     out_fields, in_fields, _ = weights.shape
     _, out_channels, in_channels, size, _ = basis.shape
-    kernel = weights.flatten(0, 1) @ basis.flatten(1)
-    kernel = kernel.view(out_fields, in_fields, out_channels, in_channels, size, size)
-    return kernel.transpose(1, 2).reshape(
-        out_fields * out_channels, in_fields * in_channels, size, size
+    kernel = weights.flatten(0, 1) @ basis.permute(0, 1, 3, 4, 2).flatten(1)
+    # Before the fields are interleaved, which is then cheaper.
+    kernel = kernel.to(dtype)
+    kernel = kernel.view(out_fields, in_fields, out_channels, size, size, in_channels)
+    kernel = kernel.permute(0, 2, 3, 4, 1, 5).reshape(
+        out_fields * out_channels, size, size, in_fields * in_channels
     )
+    return kernel.permute(0, 3, 1, 2)
 
 
 class PlainConv2d(nn.Conv2d):
@@ -353,6 +360,12 @@ class _Blur(torch.autograd.Function):
 def upsample(features: Tensor) -> Tensor:
     """Bilinear upsampling from n + 1 pixels to 2 n + 1: inverts `BlurPool`'s change of size."""
     rows, cols = features.shape[2:]
-    return F.interpolate(
+    larger = F.interpolate(
         features, size=(2 * rows - 1, 2 * cols - 1), mode="bilinear", align_corners=True
     )
+    if larger.requires_grad:
+        # That of a part of a concatenation has gaps, with which torch takes many times as long.
+        larger.register_hook(
+            lambda gradient: gradient.contiguous(memory_format=torch.channels_last)
+        )
+    return larger

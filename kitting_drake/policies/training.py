@@ -58,6 +58,7 @@ class Trainer:
                 [weight for module in modules for weight in module.parameters()],
                 lr=learning_rate,
                 betas=BETAS,
+                fused=True,
             )
             for name, modules in networks.modules_by_loss().items()
         }
