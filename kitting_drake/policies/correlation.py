@@ -97,7 +97,7 @@ class _FourierCorrelation(torch.autograd.Function):
         return _first_lags(total, shape, (rows - height + 1, cols - width + 1))
 
     @staticmethod
-    @once_differentiable  # type: ignore[untyped-decorator]
+    @once_differentiable
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, Tensor]:
         """The gradients of the scene and of the kernels."""
         conjugate, spectra = ctx.saved_tensors

@@ -118,9 +118,7 @@ class SteerableConv2d(ExpandedConv2d):
         return expand_kernel(self.weights, self.basis, dtype)
 
 
-def expand_kernel(
-    weights: Tensor, basis: Tensor, dtype: torch.dtype = torch.float32
-) -> Tensor:
+def expand_kernel(weights: Tensor, basis: Tensor, dtype: torch.dtype = torch.float32) -> Tensor:
     """A plain kernel from weights in a basis.
 
     Args:
@@ -348,7 +346,7 @@ class _Blur(torch.autograd.Function):
         return F.conv2d(features, weight, stride=2, padding=2, groups=channels)
 
     @staticmethod
-    @once_differentiable  # type: ignore[untyped-decorator]
+    @once_differentiable
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None]:
         channels = gradient.shape[1]
         result = F.conv_transpose2d(

@@ -132,7 +132,9 @@ def test_two_layers_are_those_of_escnn():
     # escnn's layer ends with a projection onto the irreps, which is `BandLimit`.
     synthesis = torch.from_numpy(SAMPLES.synthesis()).float()
     limited = torch.einsum("sf,nkfxy->nksxy", synthesis, expected.unflatten(1, (3, 7)))
-    torch.testing.assert_close(BandLimit(SAMPLES, 3)(found), limited.flatten(1, 2), atol=1e-5, rtol=0)
+    torch.testing.assert_close(
+        BandLimit(SAMPLES, 3)(found), limited.flatten(1, 2), atol=1e-5, rtol=0
+    )
     torch.testing.assert_close(
         InvariantPart(SAMPLES, 3)(found), expected.unflatten(1, (3, 7))[:, :, 0], atol=1e-5, rtol=0
     )
@@ -188,6 +190,31 @@ def test_resampling_is_equivariant_to_rotations_by_90_degrees(sides: tuple[int, 
         )
 
 
+@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
+def test_gradients_of_resampling_are_those_of_the_plain_operations(dtype: torch.dtype):
+    features = random_features(1, 3, 9, 17).to(dtype)
+    pool = BlurPool()
+    kernel = pool.kernel.expand(3, 1, 5, 5)
+
+    def plain_pool(features: torch.Tensor) -> torch.Tensor:
+        return F.conv2d(features, kernel, stride=2, padding=2, groups=3)
+
+    def plain_upsample(features: torch.Tensor) -> torch.Tensor:
+        return F.interpolate(features, size=(17, 33), mode="bilinear", align_corners=True)
+
+    for function, plain in ((pool, plain_pool), (upsample, plain_upsample)):
+        wanted = torch.randn(plain(features.float()).shape)
+        gradients = []
+        for way, precision in ((function, dtype), (plain, torch.float32)):
+            leaf = features.clone().to(precision).requires_grad_()
+            # As where features are concatenated: the gradient is a part of a larger one.
+            output = torch.cat([way(leaf), way(leaf.detach())], dim=1)
+            output.backward(torch.cat([wanted, wanted], dim=1).to(precision))
+            gradients.append(leaf.grad.float())
+        tolerance = 1e-5 if dtype == torch.float32 else 0.03
+        torch.testing.assert_close(*gradients, atol=tolerance, rtol=tolerance)
+
+
 def test_pooling_keeps_constants_and_drops_chequers():
     chequers = (-1.0) ** (torch.arange(33)[:, None] + torch.arange(33))
     inside = (slice(None), slice(None), slice(1, -1), slice(1, -1))
@@ -208,3 +235,6 @@ def test_expands_any_basis():
     assert kernel.shape == (8, 18, 3, 3)
     expected = (weights[1, 2, :, None, None, None, None] * basis).sum(0)
     torch.testing.assert_close(kernel[4:8, 12:18], expected)
+    assert kernel.is_contiguous(memory_format=torch.channels_last)
+    cast = expand_kernel(weights, basis, torch.bfloat16)
+    torch.testing.assert_close(cast, kernel.bfloat16(), atol=0, rtol=0)
