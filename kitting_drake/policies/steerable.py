@@ -176,6 +176,7 @@ class PlainConv2d(nn.Conv2d):
 
 
 @functools.lru_cache(maxsize=64)
+@torch.inference_mode(False)  # escnn keeps tensors for later, and those are for any mode.
 def kernel_basis(in_fibre: Fibre, out_fibre: Fibre, size: int) -> Tensor:
     """escnn's basis of the steerable kernels between two fields, with the transforms folded in.
 
