@@ -41,20 +41,21 @@ class Stored:
     The file stays open meanwhile, so that nothing changes when another one takes its place.
     """
 
-    dataset: h5py.Dataset
+    file: h5py.File
+    dataset: str
+    """The name of a dataset. An open dataset would keep what was read of it in memory."""
+    shape: tuple[int, ...]
+    """The array's shape."""
+    dtype: np.dtype[Any]
+    """The type of its entries."""
     row: int | None = None
     """The row of the dataset that is meant; None: the whole dataset."""
 
-    @property
-    def shape(self) -> tuple[int, ...]:
-        """The array's shape."""
-        whole: tuple[int, ...] = self.dataset.shape
-        return whole if self.row is None else whole[1:]
-
-    @property
-    def dtype(self) -> np.dtype[Any]:
-        """The type of its entries."""
-        return np.dtype(self.dataset.dtype)
+    @classmethod
+    def of(cls, dataset: h5py.Dataset, row: int | None = None) -> Stored:
+        """A dataset, or a row of it."""
+        shape = dataset.shape if row is None else dataset.shape[1:]
+        return cls(dataset.file, dataset.name, shape, dataset.dtype, row)
 
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray[Any]:
         """The array, read from the file.
@@ -63,9 +64,9 @@ class Stored:
             UserError: the file cannot be read any more.
         """
         try:
-            values = self.dataset[() if self.row is None else self.row]
-        except (OSError, RuntimeError) as error:
-            raise UserError(f"cannot read {self.dataset} any more: {error}") from error
+            values = self.file[self.dataset][() if self.row is None else self.row]
+        except (OSError, LookupError, RuntimeError) as error:
+            raise UserError(f"cannot read {self.dataset} again: {error}") from error
         return np.asarray(values, dtype)
 
 
@@ -361,16 +362,16 @@ def _read_group(group: h5py.Group, grid: PixelGrid) -> Demonstration:
     final = None
     if "final_rgb" in group:
         final = FinalObservation(
-            rgb=Stored(_checked(group, "final_rgb", (3, *grid.shape))),
-            height=Stored(_checked(group, "final_height", grid.shape)),
+            rgb=Stored.of(_checked(group, "final_rgb", (3, *grid.shape))),
+            height=Stored.of(_checked(group, "final_height", grid.shape)),
         )
     return Demonstration(
         seed=int(group.attrs["seed"]),
         score=float(group.attrs["score"]),
         steps=tuple(
             DemonstrationStep(
-                rgb=Stored(rgb, row),
-                height=Stored(height, row),
+                rgb=Stored.of(rgb, row),
+                height=Stored.of(height, row),
                 pick=PlanarPose(*map(float, pick)),
                 place=PlanarPose(*map(float, place)),
                 object=str(name),
