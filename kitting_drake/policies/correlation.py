@@ -11,12 +11,14 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
 import torch.nn.functional as F
 from scipy.fft import next_fast_len
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 
 from kitting_drake.policies.steerable import BlurPool
 
@@ -67,12 +69,69 @@ def cross_correlation(scene: Tensor, kernels: Tensor) -> Tensor:
 
 def cross_correlation_fft(scene: Tensor, kernels: Tensor) -> Tensor:
     """Equation 8 by fast Fourier transforms: the same as `cross_correlation`."""
-    rows, cols = scene.shape[-2:]
-    size = kernels.shape[-1]
-    shape = (next_fast_len(rows + size - 1, real=True), next_fast_len(cols + size - 1, real=True))
-    spectrum = torch.fft.rfft2(scene, s=shape) * torch.fft.rfft2(kernels, s=shape).conj()
-    volume = torch.fft.irfft2(spectrum.sum(1), s=shape)
-    return torch.roll(volume, (size // 2, size // 2), (1, 2))[:, :rows, :cols] / KERNEL
+    reach = kernels.shape[-1] // 2
+    return _FourierCorrelation.apply(F.pad(scene[0], 4 * (reach,)), kernels) / KERNEL
+
+
+class _FourierCorrelation(torch.autograd.Function):
+    """Cross-correlation without padding, by fast Fourier transforms.
+
+    Its gradients are transforms of real signals as well, and no transform reads or writes rows that
+    are zero or not wanted. Autograd through `torch.fft` would do three times the work.
+    """
+
+    @staticmethod
+    def forward(ctx: Any, scene: Tensor, kernels: Tensor) -> Tensor:
+        """(channels, rows, cols) and (n, channels, height, width) to
+        (n, rows - height + 1, cols - width + 1)."""
+        rows, cols = scene.shape[-2:]
+        shape = (next_fast_len(rows, real=True), next_fast_len(cols, real=True))
+        conjugate = _spectrum(scene, shape).conj_physical()
+        spectra = _spectrum(kernels, shape)
+        total = conjugate[0] * spectra[:, 0]
+        for channel in range(1, len(conjugate)):
+            total.addcmul_(conjugate[channel], spectra[:, channel])
+        ctx.save_for_backward(conjugate, spectra)
+        ctx.shapes = shape, scene.shape[-2:], kernels.shape[-2:]
+        height, width = kernels.shape[-2:]
+        return _first_lags(total, shape, (rows - height + 1, cols - width + 1))
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, Tensor]:
+        """The gradients of the scene and of the kernels."""
+        conjugate, spectra = ctx.saved_tensors
+        shape, scene_shape, kernel_shape = ctx.shapes
+        spectrum = _spectrum(gradient, shape)
+        total = torch.zeros_like(conjugate)
+        for part, kernel in zip(spectrum, spectra, strict=True):
+            total.addcmul_(part, kernel)
+        rows, cols = scene_shape
+        return (
+            torch.fft.irfft2(total.mT, s=shape)[:, :rows, :cols],
+            _first_lags(conjugate * spectrum[:, None], shape, kernel_shape),
+        )
+
+
+def _spectrum(signals: Tensor, shape: tuple[int, int]) -> Tensor:
+    """The transposed `torch.fft.rfft2` of signals that are padded with zeros to a shape."""
+    along_rows = torch.fft.rfft(signals, n=shape[1]).mT
+    # Transposed, each transform reads and writes neighbouring numbers.
+    return torch.fft.fft(F.pad(along_rows, (0, shape[0] - signals.shape[-2])))
+
+
+def _first_lags(spectra: Tensor, shape: tuple[int, int], lags: tuple[int, int]) -> Tensor:
+    """The first entries of correlations.
+
+    Args:
+        spectra: the complex conjugates of their spectra, transposed.
+        shape: rows and cols of the transforms.
+        lags: how many rows and cols of the correlations are wanted.
+    """
+    # The inverse transform of a conjugate is the conjugate of the transform.
+    along_cols = torch.fft.fft(spectra, norm="forward")[..., : lags[0]]
+    conjugate = along_cols.mT.contiguous().conj_physical_()
+    return torch.fft.irfft(conjugate, n=shape[1])[..., : lags[1]]
 
 
 def rotation_angles(count: int, like: Tensor, phase: float = 0.0) -> Tensor:
@@ -144,6 +203,9 @@ def kernel_window(
     horizontal = _overlap(corner[1] - reach, shape[1] + 2 * reach, cols)
     part = scene[:, :, vertical[0], horizontal[0]]
     padded = F.pad(part, (*horizontal[1], *vertical[1]))
+    if kernels.requires_grad:
+        # Plain gradients of so large a kernel take three times as long.
+        return _FourierCorrelation.apply(padded[0], kernels) / KERNEL
     # U-nets leave their outputs in channels_last, in which so large a kernel is much slower.
     return F.conv2d(padded.contiguous(), kernels.contiguous())[0] / KERNEL
 
@@ -187,10 +249,14 @@ def peaks(volume: Tensor, count: int) -> Iterator[tuple[int, int, int]]:
         count: how many.
     """
     remaining = volume.clone()
+    best = volume.amax(0)
     for _ in range(count):
-        rotation, row, col = _argmax(remaining)
+        _, row, col = _argmax(best[None])
+        rotation = int(remaining[:, row, col].argmax())
         around = [(rotation + step) % len(volume) for step in (-1, 0, 1)]
-        remaining[around, max(row - 1, 0) : row + 2, max(col - 1, 0) : col + 2] = -math.inf
+        rows, cols = slice(max(row - 1, 0), row + 2), slice(max(col - 1, 0), col + 2)
+        remaining[around, rows, cols] = -math.inf
+        best[rows, cols] = remaining[:, rows, cols].amax(0)
         yield rotation, row, col
 
 

@@ -35,20 +35,57 @@ FORMAT_VERSION = 2
 
 
 @dataclass(frozen=True)
-class Recorded:
-    """An observation as the file holds it, with colours in 8 bits."""
+class Stored:
+    """An array that stays in its file and is read whenever NumPy asks for it.
 
-    rgb: NDArray[np.uint8]
+    The file stays open meanwhile, so that nothing changes when another one takes its place.
+    """
+
+    file: h5py.File
+    dataset: str
+    """The name of a dataset. An open dataset would keep what was read of it in memory."""
+    shape: tuple[int, ...]
+    """The array's shape."""
+    dtype: np.dtype[Any]
+    """The type of its entries."""
+    row: int | None = None
+    """The row of the dataset that is meant; None: the whole dataset."""
+
+    @classmethod
+    def of(cls, dataset: h5py.Dataset, row: int | None = None) -> Stored:
+        """A dataset, or a row of it."""
+        shape = dataset.shape if row is None else dataset.shape[1:]
+        return cls(dataset.file, dataset.name, shape, dataset.dtype, row)
+
+    def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray[Any]:
+        """The array, read from the file.
+
+        Raises:
+            UserError: the file cannot be read any more.
+        """
+        try:
+            values = self.file[self.dataset][() if self.row is None else self.row]
+        except (OSError, LookupError, RuntimeError) as error:
+            raise UserError(f"cannot read {self.dataset} again: {error}") from error
+        return np.asarray(values, dtype)
+
+
+@dataclass(frozen=True)
+class Recorded:
+    """An observation as the file holds it, with colours in 8 bits: in memory, or in the file."""
+
+    rgb: NDArray[np.uint8] | Stored
     """(3, rows, cols)."""
-    height: NDArray[np.float32]
+    height: NDArray[np.float32] | Stored
     """(rows, cols), metres above `grid.z_min`."""
 
     @property
     def image(self) -> NDArray[np.float32]:
-        """(4, rows, cols), as `Observation.image`: colours in [0, 1], height in metres."""
+        """(4, rows, cols), as `Observation.image`: colours in [0, 1], height in metres; made, and
+        read where it is stored, each time."""
         image = np.empty((4, *self.height.shape), np.float32)
-        np.divide(self.rgb, 255, out=image[:3], dtype=np.float32)
-        image[3] = self.height
+        np.divide(np.asarray(self.rgb), 255, out=image[:3], dtype=np.float32)
+        image[3] = np.asarray(self.height)
         return image
 
 
@@ -145,7 +182,7 @@ class Contents:
 
 
 def read_demonstrations(path: Path, first: int | None = None) -> Demonstrations:
-    """Reads a file of demonstrations.
+    """Reads and checks a file of demonstrations; its images stay in the file (see `Stored`).
 
     Args:
         path: the file.
@@ -154,7 +191,7 @@ def read_demonstrations(path: Path, first: int | None = None) -> Demonstrations:
     Raises:
         UserError: the file cannot be used.
     """
-    with _opened(path) as file:
+    with _opened(path, keep=True) as file:
         contents = _contents(file)
         seeds = contents.seeds[:first]
         demonstrations = tuple(
@@ -264,15 +301,21 @@ def _write_images(
 
 
 @contextlib.contextmanager
-def _opened(path: Path) -> Iterator[h5py.File]:
-    """A file of demonstrations to read; whatever is wrong with it becomes a UserError."""
+def _opened(path: Path, *, keep: bool = False) -> Iterator[h5py.File]:
+    """A file of demonstrations to read; whatever is wrong with it becomes a UserError.
+
+    Args:
+        path: the file.
+        keep: leave it open for as long as anything refers to its datasets.
+    """
     if not path.is_file():
         raise UserError(f"there is no file {path}: make it by python -m kitting_drake.collect")
     foreign = f"{path} is no file of demonstrations: make one by python -m kitting_drake.collect"
     try:
         if not h5py.is_hdf5(path):
             raise UserError(foreign)
-        with h5py.File(path, "r") as file:
+        file = h5py.File(path, "r")
+        with contextlib.nullcontext() if keep else file:
             if file.attrs.get("format") != FORMAT:
                 raise UserError(foreign)
             version = file.attrs["format_version"]
@@ -313,41 +356,39 @@ def _read_group(group: h5py.Group, grid: PixelGrid) -> Demonstration:
     steps = len(texts[0])
     if not steps:
         raise ValueError(f"{group.name} holds no step")
-    columns = (
-        _numbers(group, "rgb", (steps, 3, *grid.shape)),
-        _numbers(group, "height", (steps, *grid.shape)),
-        _numbers(group, "pick", (steps, 3)),
-        _numbers(group, "place", (steps, 3)),
-    )
+    rgb = _checked(group, "rgb", (steps, 3, *grid.shape))
+    height = _checked(group, "height", (steps, *grid.shape))
+    actions = [_checked(group, name, (steps, 3))[()] for name in ("pick", "place")]
     final = None
     if "final_rgb" in group:
         final = FinalObservation(
-            rgb=_numbers(group, "final_rgb", (3, *grid.shape)),
-            height=_numbers(group, "final_height", grid.shape),
+            rgb=Stored.of(_checked(group, "final_rgb", (3, *grid.shape))),
+            height=Stored.of(_checked(group, "final_height", grid.shape)),
         )
     return Demonstration(
         seed=int(group.attrs["seed"]),
         score=float(group.attrs["score"]),
         steps=tuple(
             DemonstrationStep(
-                rgb=rgb,
-                height=height,
+                rgb=Stored.of(rgb, row),
+                height=Stored.of(height, row),
                 pick=PlanarPose(*map(float, pick)),
                 place=PlanarPose(*map(float, place)),
                 object=str(name),
                 category=str(category),
             )
-            for rgb, height, pick, place, name, category in zip(*columns, *texts, strict=True)
+            for row, (pick, place, name, category) in enumerate(zip(*actions, *texts, strict=True))
         ),
         final=final,
     )
 
 
-def _numbers(group: h5py.Group, name: str, shape: tuple[int, ...]) -> NDArray[Any]:
+def _checked(group: h5py.Group, name: str, shape: tuple[int, ...]) -> h5py.Dataset:
     """A dataset of some shape, all of whose entries are finite."""
-    values = group[name][()]
+    dataset = group[name]
+    values = dataset[()]
     if values.shape != shape:
         raise ValueError(f"{group.name}/{name} is of the shape {values.shape}")
     if not np.isfinite(values).all():
         raise ValueError(f"{group.name}/{name} holds what is no number")
-    return values
+    return dataset

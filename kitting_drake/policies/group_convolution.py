@@ -60,8 +60,7 @@ class GroupConv2d(ExpandedConv2d):
         super().__init__(in_fibre, out_fibre, size, padding, weights, bias)
         self.register_buffer("basis", basis.to(torch.get_default_dtype()), persistent=False)
 
-    def kernel(self) -> Tensor:
-        """(out channels, in channels, size, size): what a plain convolution takes."""
+    def kernel(self, dtype: torch.dtype = torch.float32) -> Tensor:
         if isinstance(self.in_fibre, Scalar):
             kernel = torch.einsum("oib,mbxy->omxyi", self.weights, self.basis)
         elif isinstance(self.out_fibre, Scalar):
@@ -72,10 +71,9 @@ class GroupConv2d(ExpandedConv2d):
             kappa = self.weights.unflatten(2, self.basis.shape[:2])
             cyclic = torch.cat([kappa, kappa], dim=2).unfold(2, len(self.basis), 1)
             kernel = torch.einsum("oimbn,mbxy->omxyin", cyclic[:, :, 1:].flip(2), self.basis)
-        # In the memory order of channels_last, in which convolutions are fastest.
         size = self.basis.shape[-1]
         channels = self.weights.shape[0] * self.out_fibre.channels
-        return kernel.reshape(channels, size, size, -1).permute(0, 3, 1, 2)
+        return kernel.to(dtype).reshape(channels, size, size, -1).permute(0, 3, 1, 2)
 
 
 @functools.lru_cache(maxsize=16)

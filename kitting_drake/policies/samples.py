@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from kitting_drake.policies.config import NetworkConfig
 from kitting_drake.policies.demonstrations import Demonstration, FinalObservation, Recorded
-from kitting_drake.policies.images import Image, LabelledImage
+from kitting_drake.policies.images import LabelledImage
 from systems.signals import Observation, PickPlaceAction, PixelGrid
 
 
@@ -75,7 +75,7 @@ def labelled_images(observed: Iterable[Scene], *, taken_only: bool) -> Sequence[
 
 
 class _Samples(Sequence[LabelledImage]):
-    """Observations take up far less memory in 8 bits than as images."""
+    """Samples that are made of their observations when they are asked for."""
 
     def __init__(self, observed: list[Scene], taken_only: bool) -> None:
         self._observed, self._taken_only = observed, taken_only
@@ -111,9 +111,11 @@ class _Samples(Sequence[LabelledImage]):
 
 def normalisation(observed: list[Scene]) -> dict[str, float]:
     """The fields of a `NetworkConfig` by which inputs are normalised."""
-    colour, colour_std = _moments(scene.recorded.image[:3] for scene in observed)
-    height, height_std = _moments(scene.recorded.height for scene in observed)
+    # One image in memory at a time.
+    images = (scene.recorded.image for scene in observed)
+    moments = np.array([[_moments(image[:3]), _moments(image[3])] for image in images])
     default = NetworkConfig()
+    (colour, colour_std), (height, height_std) = map(_mean_and_std, moments.transpose(1, 2, 0))
     return {
         "colour_mean": colour,
         "colour_std": colour_std or default.colour_std,
@@ -122,13 +124,18 @@ def normalisation(observed: list[Scene]) -> dict[str, float]:
     }
 
 
-def _moments(images: Iterable[Image] | Iterable[NDArray[np.float32]]) -> tuple[float, float]:
-    """Mean and standard deviation over all pixels of some images of one shape, one in memory."""
-    means, squares = [], []
-    for image in images:
-        means.append(image.mean(dtype=float))
-        squares.append(np.square(image, dtype=float).mean())
-    mean = float(np.mean(means))
-    variance = float(np.mean(squares)) - mean**2
-    # Where all pixels are alike, the difference is a rounding error.
-    return mean, math.sqrt(variance) if variance > 1e-12 else 0.0
+def _moments(values: NDArray[np.float32]) -> tuple[float, float]:
+    """The means of some values and of their squares."""
+    return float(values.mean(dtype=float)), float(np.square(values, dtype=float).mean())
+
+
+def _mean_and_std(moments: NDArray[np.float64]) -> tuple[float, float]:
+    """Mean and standard deviation from what `_moments` returns for equal shares of all values.
+
+    Args:
+        moments: (2, n).
+    """
+    mean, square = moments.mean(axis=1)
+    variance = float(square) - float(mean) ** 2
+    # Where all values are alike, the difference is a rounding error.
+    return float(mean), math.sqrt(variance) if variance > 1e-12 else 0.0

@@ -16,17 +16,24 @@ import functools
 import math
 import warnings
 from collections.abc import Callable, Iterator
+from typing import Any
 
 import numpy as np
 import torch
 import torch.nn.functional as F
+from numpy.typing import NDArray
 from torch import Tensor, nn
+from torch.autograd.function import once_differentiable
 
 from kitting_drake.policies.fibres import Fibre, Irreps, Regular, Scalar
 
 Convolution = Callable[..., nn.Module]
 """A class of layers: `SteerableConv2d`, `GroupConv2d` or `PlainConv2d`. It makes a layer from
 (in_fields, in_fibre, out_fields, out_fibre, size, padding=..., bias=..., gain=...)."""
+
+
+_TOGETHER = 64
+"""The most channels that `BandLimit` and `InvariantPart` take in one product."""
 
 
 class ExpandedConv2d(nn.Module):
@@ -47,8 +54,9 @@ class ExpandedConv2d(nn.Module):
         self.weights = nn.Parameter(weights)
         self.bias = nn.Parameter(torch.zeros(len(weights))) if bias else None
 
-    def kernel(self) -> Tensor:
-        """(out channels, in channels, size, size): what a plain convolution takes."""
+    def kernel(self, dtype: torch.dtype = torch.float32) -> Tensor:
+        """(out channels, in channels, size, size), in channels_last: what a plain convolution
+        takes."""
         raise NotImplementedError
 
     def channel_bias(self) -> Tensor | None:
@@ -57,11 +65,10 @@ class ExpandedConv2d(nn.Module):
 
     def forward(self, features: Tensor) -> Tensor:
         """(batch, in channels, rows, cols) to (batch, out channels, rows, cols)."""
-        kernel = self.kernel().to(features.dtype, memory_format=torch.channels_last)
         bias = self.channel_bias()
         return F.conv2d(
             features,
-            kernel,
+            self.kernel(features.dtype),
             None if bias is None else bias.to(features.dtype),
             padding=self.padding,
         )
@@ -103,30 +110,35 @@ class SteerableConv2d(ExpandedConv2d):
         scale = math.sqrt(2 / gathered)
         weights = torch.randn(out_fields, in_fields, len(basis)) * (gain * scale)
         super().__init__(in_fibre, out_fibre, size, padding, weights, bias)
-        self.register_buffer("basis", basis.to(torch.get_default_dtype()), persistent=False)
+        # In the memory order that `expand_kernel` needs.
+        order = basis.permute(0, 1, 3, 4, 2).to(torch.get_default_dtype()).contiguous()
+        self.register_buffer("basis", order.permute(0, 1, 4, 2, 3), persistent=False)
 
-    def kernel(self) -> Tensor:
-        """(out channels, in channels, size, size): what a plain convolution takes."""
-        return expand_kernel(self.weights, self.basis)
+    def kernel(self, dtype: torch.dtype = torch.float32) -> Tensor:
+        return expand_kernel(self.weights, self.basis, dtype)
 
 
-def expand_kernel(weights: Tensor, basis: Tensor) -> Tensor:
+def expand_kernel(weights: Tensor, basis: Tensor, dtype: torch.dtype = torch.float32) -> Tensor:
     """A plain kernel from weights in a basis.
 
     Args:
         weights: (out fields, in fields, D).
         basis: (D, out channels, in channels, size, size), from one field to one field.
+        dtype: of the kernel.
 
     Returns:
-        (out fields * out channels, in fields * in channels, size, size).
+        (out fields * out channels, in fields * in channels, size, size), in channels_last.
     """
     out_fields, in_fields, _ = weights.shape
     _, out_channels, in_channels, size, _ = basis.shape
-    kernel = weights.flatten(0, 1) @ basis.flatten(1)
-    kernel = kernel.view(out_fields, in_fields, out_channels, in_channels, size, size)
-    return kernel.transpose(1, 2).reshape(
-        out_fields * out_channels, in_fields * in_channels, size, size
+    kernel = weights.flatten(0, 1) @ basis.permute(0, 1, 3, 4, 2).flatten(1)
+    # Before the fields are interleaved, which is then cheaper.
+    kernel = kernel.to(dtype)
+    kernel = kernel.view(out_fields, in_fields, out_channels, size, size, in_channels)
+    kernel = kernel.permute(0, 2, 3, 4, 1, 5).reshape(
+        out_fields * out_channels, size, size, in_fields * in_channels
     )
+    return kernel.permute(0, 3, 1, 2)
 
 
 class PlainConv2d(nn.Conv2d):
@@ -164,6 +176,7 @@ class PlainConv2d(nn.Conv2d):
 
 
 @functools.lru_cache(maxsize=64)
+@torch.inference_mode(False)  # escnn keeps tensors for later, and those are for any mode.
 def kernel_basis(in_fibre: Fibre, out_fibre: Fibre, size: int) -> Tensor:
     """escnn's basis of the steerable kernels between two fields, with the transforms folded in.
 
@@ -253,24 +266,15 @@ class BandLimit(nn.Module):
 
     projection: Tensor
 
-    def __init__(self, fibre: Fibre) -> None:
+    def __init__(self, fibre: Fibre, fields: int) -> None:
         super().__init__()
         projection = fibre.synthesis() @ fibre.analysis()
         self.trivial = bool(np.allclose(projection, np.eye(len(projection))))
-        self.register_buffer(
-            "projection",
-            torch.from_numpy(projection).to(torch.get_default_dtype()),
-            persistent=False,
-        )
+        self.register_buffer("projection", _of_several_fields(projection, fields), persistent=False)
 
     def forward(self, features: Tensor) -> Tensor:
         """(batch, fields * channels, rows, cols) to the same shape."""
-        if self.trivial:
-            return features
-        last = features.permute(0, 2, 3, 1)
-        projection = self.projection.to(features.dtype)
-        fields = last.reshape(-1, len(projection)) @ projection
-        return fields.view(last.shape).permute(0, 3, 1, 2)
+        return features if self.trivial else _multiply_fields(features, self.projection)
 
 
 class InvariantPart(nn.Module):
@@ -278,19 +282,36 @@ class InvariantPart(nn.Module):
 
     functional: Tensor
 
-    def __init__(self, fibre: Fibre) -> None:
+    def __init__(self, fibre: Fibre, fields: int) -> None:
         super().__init__()
-        self.register_buffer(
-            "functional",
-            torch.from_numpy(fibre.invariant()).to(torch.get_default_dtype()),
-            persistent=False,
-        )
+        functional = fibre.invariant()[:, None]
+        self.register_buffer("functional", _of_several_fields(functional, fields), persistent=False)
 
     def forward(self, features: Tensor) -> Tensor:
         """(batch, fields * channels, rows, cols) to (batch, fields, rows, cols)."""
-        last = features.permute(0, 2, 3, 1)
-        fields = last.unflatten(3, (-1, len(self.functional)))
-        return (fields @ self.functional.to(features.dtype)).permute(0, 3, 1, 2)
+        return _multiply_fields(features, self.functional)
+
+
+def _of_several_fields(matrix: NDArray[np.float64], fields: int) -> Tensor:
+    """What a matrix does to each of a few fields, as one matrix for their channels together.
+
+    With its zeros, a product with about 64 channels takes half as long as one with eight.
+    """
+    together = math.gcd(fields, max(_TOGETHER // len(matrix), 1))
+    blocks = np.kron(np.eye(together), matrix)
+    return torch.from_numpy(blocks).to(torch.get_default_dtype())
+
+
+def _multiply_fields(features: Tensor, matrix: Tensor) -> Tensor:
+    """Multiplies the channels of fields at each pixel, from the left, by a matrix.
+
+    Args:
+        features: (batch, fields * channels, rows, cols), in channels_last.
+        matrix: of `_of_several_fields`.
+    """
+    last = features.permute(0, 2, 3, 1)
+    product = last.reshape(-1, len(matrix)) @ matrix.to(features.dtype)
+    return product.view(*last.shape[:3], -1).permute(0, 3, 1, 2)
 
 
 class BlurPool(nn.Module):
@@ -311,14 +332,39 @@ class BlurPool(nn.Module):
 
     def forward(self, features: Tensor) -> Tensor:
         """(batch, channels, rows, cols), odd sides, to half the resolution."""
+        return _Blur.apply(features, self.kernel)
+
+
+class _Blur(torch.autograd.Function):
+    """The convolution of `BlurPool`, with a gradient that is always computed in float32: on a CPU
+    that of depthwise convolutions takes six times as long in bfloat16."""
+
+    @staticmethod
+    def forward(ctx: Any, features: Tensor, kernel: Tensor) -> Tensor:
         channels = features.shape[1]
-        kernel = self.kernel.to(features.dtype).expand(channels, 1, 5, 5)
-        return F.conv2d(features, kernel, stride=2, padding=2, groups=channels)
+        ctx.kernel = kernel.expand(channels, 1, 5, 5)
+        weight = ctx.kernel.to(features.dtype)
+        return F.conv2d(features, weight, stride=2, padding=2, groups=channels)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None]:
+        channels = gradient.shape[1]
+        result = F.conv_transpose2d(
+            gradient.float(), ctx.kernel.float(), stride=2, padding=2, groups=channels
+        )
+        return result.to(gradient.dtype), None
 
 
 def upsample(features: Tensor) -> Tensor:
     """Bilinear upsampling from n + 1 pixels to 2 n + 1: inverts `BlurPool`'s change of size."""
     rows, cols = features.shape[2:]
-    return F.interpolate(
+    larger = F.interpolate(
         features, size=(2 * rows - 1, 2 * cols - 1), mode="bilinear", align_corners=True
     )
+    if larger.requires_grad:
+        # That of a part of a concatenation has gaps, with which torch takes many times as long.
+        larger.register_hook(
+            lambda gradient: gradient.contiguous(memory_format=torch.channels_last)
+        )
+    return larger

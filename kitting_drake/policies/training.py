@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -19,11 +21,39 @@ _STOP_PROBABILITY = 1 / 8
 """The probability that a training step also learns from a final observation."""
 
 
+@dataclass(frozen=True)
+class _Draw:
+    """What a step learns from."""
+
+    sample: LabelledImage
+    random: np.random.Generator
+    """For the draws of the losses."""
+    final: Image | None
+    """A final observation, if the step has one."""
+    stop_random: np.random.Generator
+    """For the draws of its loss."""
+
+
+@dataclass(frozen=True)
+class _Prepared:
+    """What is being prepared for a later step."""
+
+    step: int
+    samples: Sequence[LabelledImage]
+    finals: Sequence[FinalObservation]
+    draw: Future[_Draw]
+
+    def of(self, samples: Sequence[LabelledImage], finals: Sequence[FinalObservation]) -> bool:
+        """Whether it is drawn from these very samples and final observations."""
+        return self.samples is samples and self.finals is finals
+
+
 class Trainer:
     """Networks and their optimisers, an Adam for each loss.
 
     All random draws of a step depend on the seed and the step's number alone, so that a run which
-    is resumed continues as if it had not been interrupted.
+    is resumed continues as if it had not been interrupted. What a step learns from is prepared in
+    another thread, during the step before.
     """
 
     def __init__(
@@ -56,11 +86,14 @@ class Trainer:
         self.curvature = curvature
         self.reflection = reflection
         self.step_count = 0
+        self._thread = ThreadPoolExecutor(1, thread_name_prefix="samples")
+        self._prepared: _Prepared | None = None
         self.optimisers = {
             name: torch.optim.Adam(
                 [weight for module in modules for weight in module.parameters()],
                 lr=learning_rate,
                 betas=BETAS,
+                fused=True,
             )
             for name, modules in networks.modules_by_loss().items()
         }
@@ -88,19 +121,10 @@ class Trainer:
         Returns:
             Each loss, in nats; `stop`, that of a final observation, only where there was one.
         """
-        random = np.random.default_rng([self.seed, self.step_count])
-        sample = augment(
-            samples[random.integers(len(samples))],
-            random,
-            curvature=self.curvature,
-            reflection=self.reflection,
-        )
-        # Has draws of its own, so that the sample is the same with and without final observations.
-        stop_random = np.random.default_rng([self.seed, self.step_count, 1])
-        final = self._draw_final(finals, stop_random)
+        draw = self._take(samples, finals)
         self.networks.train()
         values = {}
-        for name, loss_of in self.networks.losses(sample, random):
+        for name, loss_of in self.networks.losses(draw.sample, draw.random):
             optimiser = self.optimisers[name]
             for group in optimiser.param_groups:
                 group["lr"] = self.rate(self.step_count)
@@ -108,13 +132,40 @@ class Trainer:
             loss = loss_of()
             loss.backward()
             values[name] = float(loss.detach())
-            if name == self.networks.picking and final is not None:
-                stop_loss = self.networks.stop_loss(final, stop_random)
+            if name == self.networks.picking and draw.final is not None:
+                stop_loss = self.networks.stop_loss(draw.final, draw.stop_random)
                 stop_loss.backward()
                 values["stop"] = float(stop_loss.detach())
             optimiser.step()
         self.step_count += 1
         return values
+
+    def _take(self, samples: Sequence[LabelledImage], finals: Sequence[FinalObservation]) -> _Draw:
+        """What this step learns from; the preparation of what the next one does begins."""
+        prepared = self._prepared
+        if prepared and prepared.step == self.step_count and prepared.of(samples, finals):
+            draw = prepared.draw.result()
+        else:
+            draw = self._draw(self.step_count, samples, finals)
+        following = self.step_count + 1
+        future = self._thread.submit(self._draw, following, samples, finals)
+        self._prepared = _Prepared(following, samples, finals, future)
+        return draw
+
+    def _draw(
+        self, step: int, samples: Sequence[LabelledImage], finals: Sequence[FinalObservation]
+    ) -> _Draw:
+        """What a step learns from: a sample at random, augmented, and perhaps what ends it all."""
+        random = np.random.default_rng([self.seed, step])
+        sample = augment(
+            samples[random.integers(len(samples))],
+            random,
+            curvature=self.curvature,
+            reflection=self.reflection,
+        )
+        # Has draws of its own, so that the sample is the same with and without final observations.
+        stop_random = np.random.default_rng([self.seed, step, 1])
+        return _Draw(sample, random, self._draw_final(finals, stop_random), stop_random)
 
     def _draw_final(
         self, finals: Sequence[FinalObservation], random: np.random.Generator

@@ -54,7 +54,7 @@ class ResidualBlock(nn.Module):
         # There is no normalisation: nine blocks at full gain would let the features grow too large.
         self.second = convolution(fields, fibre, fields, fibre, size, gain=0.5)
         self.shortcut = (
-            BandLimit(fibre)
+            BandLimit(fibre, fields)
             if fields_in == fields
             else convolution(fields_in, fibre, fields, fibre, skip, gain=0.7)
         )
@@ -94,7 +94,7 @@ class UNet(MixedPrecision):
             for a, b, c in zip(below, beside, up, strict=True)
         )
         self.pool = BlurPool()
-        self.invariant = InvariantPart(fibre)
+        self.invariant = InvariantPart(fibre, up[-1])
         self.mix = convolution(up[-1], Scalar(), size.head, Scalar(), 3, bias=True)
         self.out = convolution(size.head, Scalar(), out_channels, Scalar(), 1, bias=True, gain=0.1)
 

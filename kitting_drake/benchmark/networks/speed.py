@@ -11,6 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from kitting_drake.benchmark.networks.bench import Bench, times_of, type_name
+from kitting_drake.benchmark.networks.convolutions import Convolutions
 from kitting_drake.benchmark.networks.timing import Timing, count_operations, read_clock
 from kitting_drake.policies.config import NetworkConfig
 from kitting_drake.policies.escnn_reference import as_escnn
@@ -34,9 +35,11 @@ def measure_folding(bench: Bench) -> dict[str, Any]:
 
     Returns:
         By way of running them, `rungs`: the time of each of `MEASURES`; `speed_up`: how many times
-        faster than plain escnn in float32 each of them is; `alpha_difference`: the difference of
-        alpha's output from plain escnn's, relative to its standard deviation; and
-        `alpha_operations` of one inference.
+        faster than plain escnn in float32 each of them is; `convolution_share`: for ours, the share
+        of the time of a training step and of a decision that its convolutions alone take, by plain
+        torch on tensors of the same shapes and type; `alpha_difference`: the difference of alpha's
+        output from plain escnn's, relative to its standard deviation; and `alpha_operations` of one
+        inference.
     """
     ways = _ways(bench)
     exported = {name: pair[1] for name, pair in ways.items()}
@@ -59,6 +62,14 @@ def measure_folding(bench: Bench) -> dict[str, Any]:
                 for measure in MEASURES
             }
             for name in ways
+        },
+        "convolution_share": {
+            name: {
+                "training_step": _convolution_share(_training(pair[0], bench.scene), bench, True),
+                "decision": _convolution_share(_deciding(pair[1], bench), bench, False),
+            }
+            for name, pair in ways.items()
+            if name.startswith("ours")
         },
         "alpha_difference": {
             name: float((output - exact).std() / exact.std()) for name, output in outputs.items()
@@ -114,6 +125,16 @@ def _time_ways(
     }
 
 
+def _convolution_share(function: Callable[[], object], bench: Bench, training: bool) -> float:
+    """The share of a function's time that its convolutions take when they are computed alone."""
+    convolutions = Convolutions.of(function)
+    # In alternation with the function, so that other load on the machine affects both alike.
+    functions: dict[Any, Callable[[], object]] = {"all": function}
+    functions |= convolutions.alone(bench.device)
+    timings = bench.time_each(functions, training=training)
+    return convolutions.seconds(timings) / timings["all"].seconds
+
+
 def _alpha(networks: Networks, bench: Bench) -> tuple[nn.Module, Tensor]:
     """The network alpha, and its input."""
     return networks.get_submodule("alpha"), bench.inputs(networks)["alpha"]
@@ -127,15 +148,11 @@ def _computing_in(networks: Networks, type_: torch.dtype) -> Networks:
 
 
 def _training(networks: Networks, scene: Scene) -> Callable[[], object]:
-    """One and the same training step of all four networks, augmentation and losses included."""
+    """Training steps of all four networks, augmentation and losses included: the same ones,
+    whatever the networks."""
     trainer = Trainer(networks, seed=0, curvature=True)
     samples = labelled_images([scene], taken_only=False)
-
-    def step() -> None:
-        trainer.step_count = 0
-        trainer.step(samples)
-
-    return step
+    return lambda: trainer.step(samples)
 
 
 def _stepping(network: nn.Module, features: Tensor) -> Callable[[], object]:

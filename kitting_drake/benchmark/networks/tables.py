@@ -165,6 +165,10 @@ def _folding_table(measured: dict[str, Any]) -> Table:
             for rung in rungs
         ]
         table.add_row(title, *cells)
+    for name in ("training_step", "decision"):
+        shares = folding["convolution_share"]
+        cells = [f"{shares[rung][name]:.0%}" if rung in shares else "-" for rung in rungs]
+        table.add_row(f"{MEASURE_NAMES[name]}: share of its convolutions", *cells)
     differences = (folding["alpha_difference"][rung] for rung in rungs)
     table.add_row("difference of alpha's output", *(f"{value:.1e}" for value in differences))
     return table

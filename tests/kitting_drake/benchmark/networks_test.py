@@ -14,6 +14,7 @@ from rich.console import Console
 
 from kitting_drake.benchmark.networks import benchmark_networks
 from kitting_drake.benchmark.networks.bench import Plan, synthetic_scene
+from kitting_drake.benchmark.networks.convolutions import Convolutions
 from kitting_drake.benchmark.networks.figure import draw_networks
 from kitting_drake.benchmark.networks.tables import count_text, network_tables, seconds_text
 from kitting_drake.benchmark.networks.timing import count_operations, time_each
@@ -131,6 +132,11 @@ def test_folding_computes_the_same(measured: dict[str, Any]):
     assert list(folding["rungs"]) == list(folding["speed_up"]) == rungs
     for rung in rungs:
         assert set(folding["rungs"][rung]) == set(folding["speed_up"][rung]) == MEASURES
+    shares = folding["convolution_share"]
+    assert list(shares) == [rung for rung in rungs if rung.startswith("ours")]
+    for share in shares.values():
+        assert set(share) == {"training_step", "decision"}
+        assert all(value > 0 for value in share.values())
     assert set(folding["speed_up"]["escnn_float32"].values()) == {1.0}
     assert folding["alpha_difference"]["ours_float32"] < 1e-4
     # Eight samples travel for seven coefficients.
@@ -187,6 +193,33 @@ def test_the_synthetic_scene_has_its_picks_on_tools():
 def test_counts_operations():
     matrix = torch.ones(3, 5)
     assert count_operations(lambda: matrix @ matrix.T) == 2 * 3 * 5 * 3
+
+
+def test_records_the_convolutions_of_a_function_but_no_depthwise_ones():
+    image, kernel = torch.ones(1, 3, 9, 9), torch.ones(4, 3, 3, 3, requires_grad=True)
+    filters = torch.ones(4, 1, 3, 3)
+
+    def function() -> None:
+        for _ in range(2):
+            features = torch.nn.functional.conv2d(image, kernel)
+            torch.nn.functional.conv2d(features, filters, groups=4).sum().backward()
+
+    convolutions = Convolutions.of(function)
+    found = {call[0].name(): count for call, count in convolutions.calls.items()}
+    assert found == {"aten::convolution": 2, "aten::convolution_backward": 2}
+    device = torch.device("cpu")
+    functions = convolutions.alone(device)
+    outputs = {call[0].name(): run() for call, run in functions.items()}
+    assert outputs["aten::convolution"].shape == (1, 4, 7, 7)
+    image_gradient, kernel_gradient, _ = outputs["aten::convolution_backward"]
+    assert image_gradient is None
+    assert kernel_gradient.shape == kernel.shape
+    timings = time_each(functions, device, repeats=1, budget=1.0)
+    total = sum(timing.seconds for timing in timings.values())
+    assert convolutions.seconds(timings) == pytest.approx(2 * total)
+    with torch.inference_mode():
+        found = Convolutions.of(lambda: torch.nn.functional.conv2d(image, kernel))
+    assert len(found.calls) == 1
 
 
 def test_stops_when_the_budget_is_spent():

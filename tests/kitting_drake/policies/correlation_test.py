@@ -76,6 +76,28 @@ def test_fourier_transforms_give_the_same(sides: tuple[int, int], size: int):
     torch.testing.assert_close(fast, plain, atol=1e-5 * float(plain.std()), rtol=0)
 
 
+@pytest.mark.parametrize(("sides", "size"), [((21, 33), 5), ((7, 30), 9)])
+def test_so_are_their_gradients(sides: tuple[int, int], size: int):
+    scene, kernels = torch.randn(1, 3, *sides), torch.randn(4, 3, size, size)
+    weights = torch.randn(4, *sides)
+    gradients = []
+    for correlate in (cross_correlation, cross_correlation_fft):
+        leaves = [item.clone().requires_grad_() for item in (scene, kernels)]
+        (correlate(*leaves) * weights).sum().backward()
+        gradients.append([leaf.grad for leaf in leaves])
+    for plain, fast in zip(*gradients, strict=True):
+        torch.testing.assert_close(fast, plain, atol=1e-5 * float(plain.std()), rtol=1e-4)
+
+
+def test_a_window_is_the_same_where_gradients_are_wanted():
+    scene, encoding = random_pair(0)
+    arguments = (torch.tensor([0.0, 0.7]), (-3, 40), (9, 17))
+    plain = window(scene, encoding, *arguments)
+    found = window(scene, encoding.clone().requires_grad_(), *arguments)
+    assert found.requires_grad
+    torch.testing.assert_close(found, plain, atol=1e-5 * float(plain.std()), rtol=0)
+
+
 @pytest.mark.parametrize(
     ("corner", "shape"),
     [((30, 40), (5, 9)), ((0, 0), (4, 4)), ((77, 90), (4, 7)), ((0, 50), SCENE)],

@@ -14,6 +14,7 @@ from kitting_drake.policies.demonstrations import (
     Learning,
     Origin,
     Rejection,
+    Stored,
     merge_demonstrations,
     read_contents,
     read_demonstrations,
@@ -93,6 +94,20 @@ def test_what_is_written_is_read(tmp_path: Path):
         assert_same(found, expected)
     assert read_contents(path).seeds == (10, 12)
     assert [item.seed for item in read_demonstrations(path, first=1).demonstrations] == [10]
+
+
+def test_images_stay_in_the_file_that_was_read(tmp_path: Path):
+    path = written(tmp_path)
+    read = read_demonstrations(path).demonstrations
+    # Neither a new file in its place nor none at all makes a difference.
+    write_demonstrations(path, ORIGIN, [demonstration(99)])
+    path.unlink()
+    for found, expected in zip(read, [demonstration(10), demonstration(12)], strict=True):
+        taken = found.steps[1]
+        assert isinstance(taken.rgb, Stored)
+        assert isinstance(taken.height, Stored)
+        assert taken.image is not taken.image
+        np.testing.assert_array_equal(taken.image, expected.steps[1].image)
 
 
 def test_the_layout_of_the_file(tmp_path: Path):

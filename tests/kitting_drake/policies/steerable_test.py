@@ -64,7 +64,7 @@ def rotate_fields(features: Tensor, fibre: Fibre, degrees: float = 90) -> Tensor
 )
 def test_rotations_by_90_degrees_are_exact(fibre_in: Fibre, fibre_out: Fibre, size: int):
     layer = SteerableConv2d(2, fibre_in, 3, fibre_out, size)
-    features = BandLimit(fibre_in)(random_features(1, 2 * fibre_in.channels, 11, 13))
+    features = BandLimit(fibre_in, 2)(random_features(1, 2 * fibre_in.channels, 11, 13))
     expected = rotate_fields(rotate_by_90(layer(features)), fibre_out)
     found = layer(rotate_fields(rotate_by_90(features), fibre_in))
     torch.testing.assert_close(found, expected, atol=1e-5, rtol=1e-5)
@@ -80,7 +80,7 @@ def test_rotations_by_90_degrees_are_exact(fibre_in: Fibre, fibre_out: Fibre, si
 )
 def test_other_rotations_are_nearly_exact(fibre_in: Fibre, fibre_out: Fibre, degrees: int):
     layer = SteerableConv2d(1, fibre_in, 2, fibre_out, 5)
-    features = BandLimit(fibre_in)(smooth_image(65, channels=fibre_in.channels))
+    features = BandLimit(fibre_in, 1)(smooth_image(65, channels=fibre_in.channels))
     expected = rotate_fields(rotate_image(layer(features), degrees), fibre_out, degrees)
     found = layer(rotate_fields(rotate_image(features, degrees), fibre_in, degrees))
     assert relative_error(found.detach(), expected.detach()) < 0.05
@@ -89,7 +89,7 @@ def test_other_rotations_are_nearly_exact(fibre_in: Fibre, fibre_out: Fibre, deg
 @pytest.mark.parametrize(("samples", "tolerance"), [(8, 0.25), (12, 0.05), (16, 0.02)])
 def test_the_nonlinearity_is_nearly_equivariant(samples: int, tolerance: float):
     fibre = Irreps(FREQUENCIES, samples)
-    limit = BandLimit(fibre)
+    limit = BandLimit(fibre, 1)
     features = limit(smooth_image(33, channels=samples))
     for degrees in (5, 10, 22.5, 30):
         expected = rotate_fields(limit(F.elu(features)), fibre, degrees)
@@ -132,9 +132,11 @@ def test_two_layers_are_those_of_escnn():
     # escnn's layer ends with a projection onto the irreps, which is `BandLimit`.
     synthesis = torch.from_numpy(SAMPLES.synthesis()).float()
     limited = torch.einsum("sf,nkfxy->nksxy", synthesis, expected.unflatten(1, (3, 7)))
-    torch.testing.assert_close(BandLimit(SAMPLES)(found), limited.flatten(1, 2), atol=1e-5, rtol=0)
     torch.testing.assert_close(
-        InvariantPart(SAMPLES)(found), expected.unflatten(1, (3, 7))[:, :, 0], atol=1e-5, rtol=0
+        BandLimit(SAMPLES, 3)(found), limited.flatten(1, 2), atol=1e-5, rtol=0
+    )
+    torch.testing.assert_close(
+        InvariantPart(SAMPLES, 3)(found), expected.unflatten(1, (3, 7))[:, :, 0], atol=1e-5, rtol=0
     )
 
 
@@ -142,7 +144,7 @@ def test_two_layers_are_those_of_escnn():
 def test_the_first_gain_does_not_depend_on_the_samples(samples: int):
     fibre = Irreps(FREQUENCIES, samples)
     layer = SteerableConv2d(32, fibre, 32, fibre, 3)
-    features = BandLimit(fibre)(random_features(1, 32 * samples, 32, 32))
+    features = BandLimit(fibre, 32)(random_features(1, 32 * samples, 32, 32))
     # He initialisation's gain, which compensates the nonlinearity.
     gain = float(layer(features).detach().std() / features.std())
     assert gain == pytest.approx(2**0.5, rel=0.1)
@@ -188,6 +190,31 @@ def test_resampling_is_equivariant_to_rotations_by_90_degrees(sides: tuple[int, 
         )
 
 
+@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
+def test_gradients_of_resampling_are_those_of_the_plain_operations(dtype: torch.dtype):
+    features = random_features(1, 3, 9, 17).to(dtype)
+    pool = BlurPool()
+    kernel = pool.kernel.expand(3, 1, 5, 5)
+
+    def plain_pool(features: torch.Tensor) -> torch.Tensor:
+        return F.conv2d(features, kernel, stride=2, padding=2, groups=3)
+
+    def plain_upsample(features: torch.Tensor) -> torch.Tensor:
+        return F.interpolate(features, size=(17, 33), mode="bilinear", align_corners=True)
+
+    for function, plain in ((pool, plain_pool), (upsample, plain_upsample)):
+        wanted = torch.randn(plain(features.float()).shape)
+        gradients = []
+        for way, precision in ((function, dtype), (plain, torch.float32)):
+            leaf = features.clone().to(precision).requires_grad_()
+            # As where features are concatenated: the gradient is a part of a larger one.
+            output = torch.cat([way(leaf), way(leaf.detach())], dim=1)
+            output.backward(torch.cat([wanted, wanted], dim=1).to(precision))
+            gradients.append(leaf.grad.float())
+        tolerance = 1e-5 if dtype == torch.float32 else 0.03
+        torch.testing.assert_close(*gradients, atol=tolerance, rtol=tolerance)
+
+
 def test_pooling_keeps_constants_and_drops_chequers():
     chequers = (-1.0) ** (torch.arange(33)[:, None] + torch.arange(33))
     inside = (slice(None), slice(None), slice(1, -1), slice(1, -1))
@@ -208,3 +235,6 @@ def test_expands_any_basis():
     assert kernel.shape == (8, 18, 3, 3)
     expected = (weights[1, 2, :, None, None, None, None] * basis).sum(0)
     torch.testing.assert_close(kernel[4:8, 12:18], expected)
+    assert kernel.is_contiguous(memory_format=torch.channels_last)
+    cast = expand_kernel(weights, basis, torch.bfloat16)
+    torch.testing.assert_close(cast, kernel.bfloat16(), atol=0, rtol=0)

@@ -73,6 +73,17 @@ def test_a_final_observation_trains_where_to_pick_and_changes_nothing_else(
     assert changed == {"alpha"}
 
 
+def test_what_is_prepared_is_only_for_the_step_and_the_samples_that_it_was_drawn_for():
+    samples, others = [scene(0), scene(1)], [scene(2)]
+    one, other = trainer(), trainer()
+    for learner, first in ((one, samples), (other, others)):
+        learner.step(first)
+        learner.load_state_dict(copy.deepcopy(trainer().state_dict()))
+    assert one.step(others) == other.step(others)
+    one.step_count = other.step_count = 7
+    assert one.step(samples) == other.step(samples)
+
+
 def test_one_step_in_eight_has_a_final_observation(monkeypatch: pytest.MonkeyPatch):
     learner = trainer(stop=True)
     monkeypatch.setattr(learner.networks, "losses", lambda *_: iter(()))
@@ -81,8 +92,9 @@ def test_one_step_in_eight_has_a_final_observation(monkeypatch: pytest.MonkeyPat
     monkeypatch.setattr(
         learner, "_draw_final", lambda *arguments: drawn.append(draw(*arguments)) or drawn[-1]
     )
+    samples = [scene(0)]
     for _ in range(400):
-        learner.step([scene(0)], FINALS)
+        learner.step(samples, FINALS)
     images = [image for image in drawn if image is not None]
     assert 30 < len(images) < 75
     # Each after a motion of its own.
