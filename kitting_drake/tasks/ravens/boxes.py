@@ -69,7 +69,7 @@ _MODEL = """<?xml version="1.0"?>
         <geometry><box><size>{size}</size></box></geometry>
         <drake:proximity_properties>
           <drake:compliant_hydroelastic/>
-          <drake:hydroelastic_modulus>1e7</drake:hydroelastic_modulus>
+          <drake:hydroelastic_modulus>2e6</drake:hydroelastic_modulus>
           <drake:hunt_crossley_dissipation>20</drake:hunt_crossley_dissipation>
           <drake:hydroelastic_margin>5e-4</drake:hydroelastic_margin>
           <drake:mu_static>{friction:.6g}</drake:mu_static>

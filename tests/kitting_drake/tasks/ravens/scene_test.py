@@ -169,7 +169,7 @@ def test_objects_come_to_rest_at_once(kind: type[TaskConfig]):
     for X_WB, item in zip(
         cell.object_poses(simulator.get_context()), cell.scene.objects, strict=True
     ):
-        assert X_WB.IsNearlyEqualTo(item.X_WB, 1e-4)
+        assert X_WB.IsNearlyEqualTo(item.X_WB, 3e-4)
 
 
 def test_surface_points_span_the_object():
