@@ -102,9 +102,11 @@ def braking_time(rate: NDArray[np.float64], limits: MotionLimits) -> float:
         rate: (4) velocity: vx, vy, vz, vyaw.
         limits: of acceleration.
     """
+    vx, vy, vz, vyaw = map(float, rate)
     return 1.5 * max(
-        float(np.linalg.norm(rate[part])) / acceleration
-        for part, (_, acceleration) in zip(PARTS, limits.of_parts(), strict=True)
+        math.hypot(vx, vy) / limits.acceleration,
+        abs(vz) / limits.acceleration,
+        abs(vyaw) / limits.yaw_acceleration,
     )
 
 
@@ -174,7 +176,7 @@ def _ways(
     """For each part: which, its way from where braking ends, how far that is, limits, delay."""
     ways = goal - start - start_rate * braking_time(start_rate, limits) / 2
     for part, limit, delay in zip(PARTS, limits.of_parts(), delays, strict=True):
-        yield part, ways[part], float(np.linalg.norm(ways[part])), limit, float(delay)
+        yield part, ways[part], math.hypot(*ways[part]), limit, float(delay)
 
 
 def ramp(start: float, goal: float, rate: float, elapsed: float) -> tuple[float, float]:

@@ -452,6 +452,8 @@ class PickPlacePlanner(LeafSystem):
 
     def _motion_at(self, state: _State, time: float) -> NDArray[np.float64]:
         """q_d, v_d, a_d (12) of the present mode's motion."""
+        if time >= state.start_time + state.duration:
+            return np.concatenate([state[_GOAL], np.zeros(8)])
         return motion_at(
             state[_START],
             state[_GOAL],

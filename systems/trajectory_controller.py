@@ -120,11 +120,10 @@ class TrajectoryController(LeafSystem):
             - press
         )
         limit = self._finger_force_limit
+        finger = min(max(finger, -limit), limit)
         output.SetFromVector(
-            np.concatenate(
-                [
-                    np.clip(axes, -self._force_limit, self._force_limit),
-                    np.full(FINGERS, np.clip(finger, -limit, limit)),
-                ]
-            )
+            [
+                *np.minimum(np.maximum(axes, -self._force_limit), self._force_limit).tolist(),
+                *[finger] * FINGERS,
+            ]
         )

@@ -1,5 +1,6 @@
 """From a scenario to the Diagram of the kitting cell: the only place where systems are wired."""
 
+import functools
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -93,8 +94,8 @@ class Cell:
         if not self.sleep:
             return
         plant_context = self.plant.GetMyMutableContextFromRoot(root_context)
-        bodies = [self.plant.get_body(item.body) for item in self.objects]
-        at_rest = self.at_rest(root_context)
+        bodies = self._bodies
+        at_rest = self.at_rest(root_context).tolist()
         changed = [
             (body, resting)
             for body, resting in zip(bodies, at_rest, strict=True)
@@ -106,7 +107,7 @@ class Cell:
             self.scene_graph.GetMyMutableContextFromRoot(root_context)
         )
         # First those that wake, as they are free of all; then those that fall asleep.
-        for body, resting in sorted(changed, key=lambda change: bool(change[1])):
+        for body, resting in sorted(changed, key=lambda change: change[1]):
             own = self._geometry([body])
             if resting:
                 body.Lock(plant_context)
@@ -117,6 +118,11 @@ class Cell:
                 body.Unlock(plant_context)
                 others = self._geometry([*self.still_bodies, *bodies])
                 filters.Apply(CollisionFilterDeclaration().AllowBetween(own, others))
+
+    @functools.cached_property
+    def _bodies(self) -> list[RigidBody]:
+        """Of the scene's objects."""
+        return [self.plant.get_body(item.body) for item in self.objects]
 
     def _geometry(self, bodies: Sequence[RigidBody]) -> GeometrySet:
         geometry = GeometrySet()
