@@ -24,11 +24,11 @@ MOST_HULLS = 16
 OUTLINE_TOLERANCES_MM = ((0.26, 0.12), (0.30, 0.2), (0.4, 0.2), (0.6, 0.3), (0.9, 0.3))
 """How far hulls may be off the outline, and off the faces that the jaws grip, before their vertices
 are thinned; each pair is tried if the one before needs too many hulls."""
-ADDED_SHARE = 0.02
+ADDED_SHARE = 0.05
 """How much of a tool's volume one hull may add to it, above and below."""
 # A hull has at most so many vertices, if that moves no vertex by more than the last of the
 # tolerances; the outline's is its own.
-_MOST_VERTICES = 30
+_MOST_VERTICES = 20
 _VERTEX_TOLERANCES_MM = (0.2, 0.3, 0.45, 0.6)
 _OUTLINE_VERTEX_TOLERANCE_MM = 0.08
 # Notches narrower than twice this are no part of a cavity: they may be bridged.
