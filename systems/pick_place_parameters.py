@@ -97,8 +97,8 @@ class PickPlaceParameters:
     # Speed of one finger, in m/s.
     finger_speed: float = bounded(0.05, 0.005, 0.05)
 
-    # Time in which the grasp force builds up, and falls away again, in s. A heavy object that is let
-    # go of slowly swings about the pads.
+    # Time in which the grasp force builds up, and falls away again, in s. A heavy object that is
+    # let go of slowly swings about the pads.
     force_ramp: float = bounded(0.03, 0.0, 5.0)
 
     # The hand must rest this long, in s: before the cameras look, and before the payload is tared.
