@@ -230,10 +230,15 @@ def test_ctrl_c_loses_no_step(
             os.kill(os.getpid(), signal.SIGINT)
         return step(self, *arguments)
 
-    with monkeypatch.context() as patch:
-        patch.setattr(Trainer, "step", step_and_interrupt)
-        with pytest.raises(KeyboardInterrupt):
-            train(demos, tmp_path)
+    # A shell that starts the tests in the background has them ignore Ctrl-C.
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        with monkeypatch.context() as patch:
+            patch.setattr(Trainer, "step", step_and_interrupt)
+            with pytest.raises(KeyboardInterrupt):
+                train(demos, tmp_path)
+    finally:
+        signal.signal(signal.SIGINT, before)
     assert "stopped after step 3: the same command goes on there" in capsys.readouterr().out
     state = torch.load(tmp_path / "checkpoint.pt", weights_only=True)
     assert state["trainer"]["step_count"] == 3
