@@ -63,7 +63,7 @@ def benchmark_simulation(episodes: int, seed: int, console: Console) -> dict[str
 def _whole_episodes(
     path: Path, episodes: int, seed: int, stopwatch: "PhaseStopwatch", console: Console
 ) -> dict[str, Any]:
-    """Runs whole episodes, and divides their cost by the objects kitted; building cells is apart."""
+    """Runs whole episodes; gives their cost for each object kitted, without building the cell."""
     scenario = load_scenario(path)
     simulated = wall = kitted = 0.0
     for number in track(
