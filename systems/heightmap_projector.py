@@ -51,7 +51,7 @@ class HeightmapProjector(LeafSystem):
       that no camera saw, but whose two neighbours along x or along y were both seen, with heights
       within SAME_SURFACE of each other, is such a gap and gets the mean of the two, or of the
       higher pair. Nothing wider than one pixel is bridged: a shadow stays zero in all four
-      channels.
+      channels, and is not `valid`.
 
     The colour camera must be registered with the depth camera: same intrinsics, same pose.
     """
@@ -92,9 +92,9 @@ class HeightmapProjector(LeafSystem):
             color = self._EvalImage(context, f"color_image_{name}", camera)
             depth = self._EvalImage(context, f"depth_image_{name}", camera)
             views.append(_see(color.reshape(-1, 4), depth[:, :, 0], X_WB, camera, self._grid))
-        image = _fuse(np.stack(views))
-        image.flags.writeable = False
-        output.set_value(Observation(image=image, grid=self._grid))
+        image, valid = _fuse(np.stack(views))
+        image.flags.writeable = valid.flags.writeable = False
+        output.set_value(Observation(image=image, grid=self._grid, valid=valid))
 
     def _EvalImage(self, context: Context, port: str, camera: "_Camera") -> NDArray:
         """The image's data, (height, width, channels)."""
@@ -190,8 +190,8 @@ def _see(
     return view.reshape(4, *grid.shape)
 
 
-def _fuse(views: NDArray[np.float32]) -> NDArray[np.float32]:
-    """The Observation's image (4, rows, cols) of the cameras' (n, 4, rows, cols)."""
+def _fuse(views: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+    """The Observation's image (4, rows, cols) of the cameras' (n, 4, rows, cols), and its mask."""
     height = views[:, 3].max(axis=0)
     seen = height >= 0
     on_top = (views[:, 3] >= 0) & (views[:, 3] >= height - np.float32(SAME_SURFACE))
@@ -199,7 +199,7 @@ def _fuse(views: NDArray[np.float32]) -> NDArray[np.float32]:
     image[:3] = (views[:, :3] * on_top[:, None]).sum(axis=0) / np.maximum(on_top.sum(axis=0), 1)
     image[3] = np.where(seen, height, 0)
     _bridge_gaps(image, seen)
-    return image
+    return image, seen
 
 
 def _bridge_gaps(image: NDArray[np.float32], seen: NDArray[np.bool_]) -> None:
@@ -220,3 +220,4 @@ def _bridge_gaps(image: NDArray[np.float32], seen: NDArray[np.bool_]) -> None:
         fill = np.where(bridge, mean, fill)
         fill_height = np.where(bridge, mean[3], fill_height)
     image[:, row, col] = fill
+    seen[row, col] = fill_height >= 0

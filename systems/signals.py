@@ -85,6 +85,13 @@ class Observation:
     """(4, rows, cols): red, green, blue in [0, 1], and height above `grid.z_min` in metres.
     A pixel that no camera sees is zero in all four."""
     grid: PixelGrid = field(default_factory=PixelGrid)
+    valid: NDArray[np.bool_] = None  # type: ignore[assignment]
+    """(rows, cols): the pixels that some camera sees. Where it is not given, those that are not
+    zero in all four."""
+
+    def __post_init__(self) -> None:
+        if self.valid is None:
+            object.__setattr__(self, "valid", self.image.any(axis=0))
 
     @property
     def rgb(self) -> NDArray[np.float32]:

@@ -2,6 +2,7 @@
 
 import ctypes
 import io
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -53,14 +54,19 @@ def require_rendering() -> None:
         )
 
 
-def add_observation_renderer(scene_graph: SceneGraph) -> str:
+def add_observation_renderer(scene_graph: SceneGraph, lights: Sequence[LightParameter] = ()) -> str:
     """Adds the engine that the policy sees by, plain and quick; returns its name.
+
+    Args:
+        scene_graph: to add it to.
+        lights: none: one at each camera.
 
     Raises:
         UserError: images cannot be rendered here.
     """
     require_rendering()
-    scene_graph.AddRenderer("observation", MakeRenderEngineVtk(RenderEngineVtkParams()))
+    parameters = RenderEngineVtkParams(lights=list(lights))
+    scene_graph.AddRenderer("observation", MakeRenderEngineVtk(parameters))
     return "observation"
 
 

@@ -26,6 +26,7 @@ from pydrake.systems.framework import Context, Diagram, DiagramBuilder, LeafSyst
 from pydrake.systems.sensors import RgbdSensor
 from pydrake.visualization import VideoWriter
 
+from kitting_drake.cell.appearance import lights_of, paint_surfaces
 from kitting_drake.cell.cameras import (
     OVERVIEW,
     add_film_renderer,
@@ -46,10 +47,17 @@ from systems.pick_place_planner import PickPlacePlanner
 from systems.placement import PlacedObject, Placement
 from systems.placement_monitor import PlacementMonitor
 from systems.rest_detector import RestDetector
+from systems.sensor_noise import SensorNoise
 from systems.signals import PixelGrid
 from systems.trajectory_controller import TrajectoryController
 
 MESHCAT_PERIOD = 1 / 32
+_IMAGES = {
+    "color_image": "color_image",
+    "depth_image_32f": "depth_image",
+    "body_pose_in_world": "body_pose_in_world",
+}
+"""A camera's output ports, and the projector's input ports but for the camera's name."""
 
 
 @dataclass(frozen=True)
@@ -167,14 +175,19 @@ def build_cell(
 
     # The plant: table, fixtures, objects, hand.
     plant, scene_graph = add_plant(builder, scenario)
-    objects, still_bodies = add_models(plant, scene)
+    objects, still_bodies = add_models(plant, scene, scenario.plant, seed)
     plant.Finalize()
     set_initial_poses(plant, scenario, scene, objects)
+    groups = {still_bodies[0].index(): "table"}
+    for fixture, body in zip(scene.fixtures, still_bodies[1:], strict=True):
+        groups[body.index()] = f"fixtures/{fixture.name}"
+    groups |= {item.body: f"objects/{item.name}" for item in objects}
+    paint_surfaces(plant, scene_graph, scenario.appearance, groups, seed)
 
     # Cameras, policy, planner and controller.
     projector = None
     if scenario.policy.needs_observation or (scenario.cameras and can_render()):
-        projector = _add_cameras(builder, scenario, scene_graph, grid)
+        projector = _add_cameras(builder, scenario, scene_graph, grid, seed)
         builder.ExportOutput(projector.GetOutputPort("observation"), "observation")
     site = PolicySite(scene=scene, objects=objects, grid=grid, base=base, observer=observer)
     policy = _add_policy(builder, scenario, site, plant, projector)
@@ -312,16 +325,21 @@ def _make_rest_detector(
 
 
 def _add_cameras(
-    builder: DiagramBuilder, scenario: Scenario, scene_graph: SceneGraph, grid: PixelGrid
+    builder: DiagramBuilder,
+    scenario: Scenario,
+    scene_graph: SceneGraph,
+    grid: PixelGrid,
+    seed: int,
 ) -> HeightmapProjector:
     if not scenario.cameras:
         raise UserError("cameras is empty: the heightmap needs at least one")
-    renderer = add_observation_renderer(scene_graph)
+    lights = lights_of(scenario.appearance, seed)
+    renderer = add_observation_renderer(scene_graph, lights)
     cameras = {name: depth_camera(config, renderer) for name, config in scenario.cameras.items()}
     projector = builder.AddNamedSystem(
         "heightmap_projector", HeightmapProjector(cameras=cameras, grid=grid)
     )
-    for name, config in scenario.cameras.items():
+    for number, (name, config) in enumerate(scenario.cameras.items()):
         sensor = builder.AddNamedSystem(
             f"camera_{name}",
             RgbdSensor(
@@ -332,12 +350,23 @@ def _add_cameras(
             ),
         )
         builder.Connect(scene_graph.get_query_output_port(), sensor.query_object_input_port())
-        for output, port in (
-            ("color_image", "color_image"),
-            ("depth_image_32f", "depth_image"),
-            ("body_pose_in_world", "body_pose_in_world"),
-        ):
-            builder.Connect(sensor.GetOutputPort(output), projector.GetInputPort(f"{port}_{name}"))
+        source: LeafSystem = sensor
+        use_labels = bool(scenario.appearance.sheen)
+        if use_labels or not scenario.sensor_noise.is_none:
+            source = builder.AddNamedSystem(
+                f"sensor_noise_{name}",
+                SensorNoise(
+                    parameters=scenario.sensor_noise,
+                    camera=cameras[name],
+                    seed=seed,
+                    number=number,
+                    use_labels=use_labels,
+                ),
+            )
+            for port in (*_IMAGES, *(["label_image"] if use_labels else [])):
+                builder.Connect(sensor.GetOutputPort(port), source.GetInputPort(port))
+        for output, port in _IMAGES.items():
+            builder.Connect(source.GetOutputPort(output), projector.GetInputPort(f"{port}_{name}"))
     return projector
 
 

@@ -10,14 +10,18 @@ from pydrake.multibody.plant import AddMultibodyPlant, MultibodyPlant, Multibody
 from pydrake.multibody.tree import RigidBody
 from pydrake.systems.framework import DiagramBuilder
 
+from kitting_drake.cell.variation import varied_model
 from kitting_drake.common.errors import UserError
 from kitting_drake.common.paths import MODELS
-from kitting_drake.scenario.schema import Scenario
+from kitting_drake.scenario.schema import Plant, Scenario
 from kitting_drake.tasks.task import Scene
 from systems.placement import PlacedObject
 from systems.rest_detector import BoundedBody, Box
 
 _X_WTABLE = RigidTransform([0.5, 0.0, 0.0])
+
+_VARIATION_STREAM = 13
+"""Stream of the seed: what is drawn here changes nothing else that is drawn."""
 
 
 def add_plant(builder: DiagramBuilder, scenario: Scenario) -> tuple[MultibodyPlant, SceneGraph]:
@@ -32,9 +36,15 @@ def add_plant(builder: DiagramBuilder, scenario: Scenario) -> tuple[MultibodyPla
 
 
 def add_models(
-    plant: MultibodyPlant, scene: Scene
+    plant: MultibodyPlant, scene: Scene, variation: Plant, seed: int
 ) -> tuple[tuple[PlacedObject, ...], tuple[RigidBody, ...]]:
     """Adds the table, the scene's fixtures and objects, and the hand.
+
+    Args:
+        plant: not finalized yet.
+        scene: the episode's.
+        variation: says how much friction and mass vary; the hand's do not.
+        seed: of their draws.
 
     Returns:
         The scene's objects with their bodies, and the bodies that never move.
@@ -46,22 +56,40 @@ def add_models(
     # The same model may be there several times.
     parser.SetAutoRenaming(True)
     parser.package_map().AddPackageXml(str(MODELS / "package.xml"))
-    still = [_add_body(plant, parser, MODELS / "table" / "table.sdf")]
+    rng = np.random.default_rng([seed, _VARIATION_STREAM])
+
+    def add(model: Path) -> RigidBody:
+        friction, mass = 1 + rng.uniform(-1, 1, 2) * (
+            variation.friction_variation,
+            variation.mass_variation,
+        )
+        if friction == mass == 1:
+            return _add_body(parser, plant, model)
+        text = varied_model(model, friction=float(friction), mass=float(mass))
+        return _add_body(parser, plant, model, text)
+
+    still = [add(MODELS / "table" / "table.sdf")]
     plant.WeldFrames(plant.world_frame(), still[0].body_frame(), _X_WTABLE)
     for fixture in scene.fixtures:
-        still.append(_add_body(plant, parser, fixture.model))
+        still.append(add(fixture.model))
         plant.WeldFrames(plant.world_frame(), still[-1].body_frame(), fixture.X_WF)
     objects = []
     for item in scene.objects:
-        body = _add_body(plant, parser, item.model)
+        body = add(item.model)
         objects.append(PlacedObject(item.name, body.index(), item.p_BPoints, item.symmetry))
     parser.AddModels(str(MODELS / "franka_hand" / "franka_hand.sdf"))
     return tuple(objects), tuple(still)
 
 
-def _add_body(plant: MultibodyPlant, parser: Parser, model: Path) -> RigidBody:
+def _add_body(
+    parser: Parser, plant: MultibodyPlant, model: Path, text: str | None = None
+) -> RigidBody:
+    """Adds a model of one link from its file, or from a text that replaces it."""
     try:
-        instances = parser.AddModels(str(model))
+        if text is None:
+            instances = parser.AddModels(str(model))
+        else:
+            instances = parser.AddModelsFromString(text, "sdf")
     except (RuntimeError, ValueError) as error:
         reason = str(error).splitlines()[0]
         raise UserError(f"task: {model} cannot be loaded: {reason}") from error

@@ -108,6 +108,9 @@ class NetworkConfig:
     """j_c of the U-nets' fields."""
     angle_frequencies: tuple[int, ...] = ANGLE_FREQUENCIES
     """The frequencies of beta's output."""
+    colour: bool = True
+    """Whether the networks see colours; if not, what no camera saw is filled in for them (see
+    `matching.segmentation.fill_unseen`)."""
     stop: bool = False
     """Whether the picking module has a class "nothing to pick" (see `losses.log_odds`)."""
 
@@ -123,6 +126,11 @@ class NetworkConfig:
             raise ValueError("means and standard deviations must be finite")
         if min(scales) <= 0:
             raise ValueError("a standard deviation must be positive")
+
+    @property
+    def channels(self) -> int:
+        """Of the networks' inputs: red, green, blue and height, or height alone."""
+        return 4 if self.colour else 1
 
     def as_dict(self) -> dict[str, Any]:
         """The fields, as JSON takes them."""

@@ -34,10 +34,10 @@ class EquivariantTransporterNetworks(FactoredNetworks):
         preset = self.preset
         fibre, angle_fibre = Regular(_ORDER), Regular(config.orientations, quotient=2)
         grouped = GroupConv2d if convolution is SteerableConv2d else convolution
-        self.alpha = UNet(4, 1, fibre, preset.unet, convolution)
-        self.beta = AngleNet(4, angle_fibre, angle_fibre, preset.group_angle, grouped)
-        self.phi = UNet(4, sizes.FEATURES, fibre, preset.unet, convolution)
-        self.psi = UNet(4, sizes.FEATURES, fibre, preset.unet, convolution)
+        self.alpha = UNet(config.channels, 1, fibre, preset.unet, convolution)
+        self.beta = AngleNet(config.channels, angle_fibre, angle_fibre, preset.group_angle, grouped)
+        self.phi = UNet(config.channels, sizes.FEATURES, fibre, preset.unet, convolution)
+        self.psi = UNet(config.channels, sizes.FEATURES, fibre, preset.unet, convolution)
 
     def check_orientations(self, orientations: int) -> None:
         """Raises ValueError if the networks were made for another N."""

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from systems.signals import PickPlaceAction, PixelGrid
+from systems.signals import Observation, PickPlaceAction, PixelGrid, PlanarPose, wrap_to_pi
 
 Image = NDArray[np.float32]
 """(4, rows, cols): red, green, blue in [0, 1] and height in metres."""
@@ -98,6 +98,34 @@ class LabelledImage:
         rows, cols = self.image.shape[1:]
         inside = ((source > -0.5) & (source < (rows - 0.5, cols - 0.5))).all(axis=-1)
         return nearest(self.motion.image, self.motion.before(source)) * inside
+
+
+def make_action(
+    observation: Observation,
+    pick: NDArray[np.float64],
+    theta: float,
+    place: NDArray[np.float64],
+    rotation: float,
+) -> PickPlaceAction:
+    """The action of a prediction in pixels: the inverse of `LabelledImage.from_action`.
+
+    Heights are left to the planner, which reads them off the observation for every policy.
+
+    Args:
+        observation: what was seen.
+        pick: (row, col).
+        theta: of the gripper at the pick, in radians.
+        place: (row, col).
+        rotation: of the object, in radians.
+    """
+    grid = observation.grid
+    pick_x, pick_y = grid.to_world(pick)
+    place_x, place_y = grid.to_world(place)
+    theta = wrap_to_pi(theta)
+    return PickPlaceAction(
+        pick=PlanarPose(float(pick_x), float(pick_y), theta),
+        place=PlanarPose(float(place_x), float(place_y), theta + rotation),
+    )
 
 
 @dataclass(frozen=True)

@@ -14,9 +14,11 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from kitting_drake.policies.correlation import Candidate
-from kitting_drake.policies.images import rotation_matrix
+from kitting_drake.policies.images import Image, make_action, rotation_matrix
+from kitting_drake.policies.matching.refinement import refine_place
+from kitting_drake.policies.matching.segmentation import fill_unseen
 from kitting_drake.policies.networks import Networks
-from systems.signals import Observation, PickPlaceAction, PlanarPose, wrap_to_pi
+from systems.signals import Observation, PickPlaceAction, wrap_to_pi
 
 
 @dataclass(frozen=True)
@@ -53,6 +55,7 @@ class LearnedPolicy:
         *,
         orientations: int = 180,
         continuous: bool = True,
+        fit_outlines: bool = False,
         watch: Callable[[Observation, Decision], None] | None = None,
     ) -> None:
         """
@@ -61,6 +64,8 @@ class LearnedPolicy:
             orientations: N.
             continuous: refine the action beyond pixels and orientation bins (sub-pixel and sub-bin
                 refinement, not in the paper) instead of quantizing it.
+            fit_outlines: refine the place by the outlines of object and recess, where they agree
+                (`refine_place`, not in the paper).
             watch: called with each observation and decision.
 
         Raises:
@@ -70,6 +75,7 @@ class LearnedPolicy:
         self._networks = networks
         self._orientations = orientations
         self._continuous = continuous
+        self._fit_outlines = fit_outlines
         self._watch = watch
 
     def __call__(self, observation: Observation) -> PickPlaceAction:
@@ -82,13 +88,21 @@ class LearnedPolicy:
     @torch.inference_mode()
     def log_odds(self, observation: Observation) -> float | None:
         """The log-odds that there is something to pick; None where the networks cannot tell."""
-        return self._networks.predict_pick(observation.image, self._orientations).log_odds
+        image = self._input(observation)
+        return self._networks.predict_pick(image, self._orientations).log_odds
+
+    def _input(self, observation: Observation) -> Image:
+        """What the networks see of an observation."""
+        if self._networks.config.colour:
+            return observation.image
+        filled = fill_unseen(observation.height, observation.valid)
+        return np.concatenate([observation.rgb, filled[None]])
 
     @torch.inference_mode()
     def decide(self, observation: Observation) -> Decision:
         """The action, and the distributions that it was read from."""
         networks = self._networks
-        image = observation.image
+        image = self._input(observation)
         picking = networks.predict_pick(image, self._orientations)
         logits = picking.position
         rows, cols = logits.shape
@@ -108,6 +122,10 @@ class LearnedPolicy:
             placing.candidates[0], self._orientations, self._continuous
         )
         place = place + rotation_matrix(rotation) @ (pick - pixel)
+        if self._fit_outlines:
+            fitted = refine_place(observation, pick, rotation, place)
+            if fitted is not None:
+                rotation, place = fitted.rotation, fitted.place
         action = make_action(observation, pick, theta, place, rotation)
         odds, threshold = picking.log_odds, networks.stop_threshold
         stop = odds is not None and threshold is not None and odds < threshold
@@ -160,30 +178,3 @@ def _local_mean(logits: Tensor, index: tuple[int, int, int]) -> NDArray[np.float
     weights = F.softmax(part.flatten(), 0).view(part.shape).cpu().numpy()
     offsets = np.stack(np.meshgrid(*(np.arange(n) for n in part.shape), indexing="ij"))
     return np.array(starts) + (offsets * weights).sum(axis=(1, 2, 3))
-
-
-def make_action(
-    observation: Observation,
-    pick: NDArray[np.float64],
-    theta: float,
-    place: NDArray[np.float64],
-    rotation: float,
-) -> PickPlaceAction:
-    """The action of a prediction in pixels. Heights are left to the planner, which reads them off
-    the observation for every policy.
-
-    Args:
-        observation: what was seen.
-        pick: (row, col).
-        theta: of the gripper at the pick, in radians.
-        place: (row, col).
-        rotation: of the object, in radians.
-    """
-    grid = observation.grid
-    pick_x, pick_y = grid.to_world(pick)
-    place_x, place_y = grid.to_world(place)
-    theta = wrap_to_pi(theta)
-    return PickPlaceAction(
-        pick=PlanarPose(float(pick_x), float(pick_y), theta),
-        place=PlanarPose(float(place_x), float(place_y), theta + rotation),
-    )

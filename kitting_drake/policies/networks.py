@@ -118,7 +118,7 @@ class Networks(nn.Module):
             image: (4, rows, cols), as `Observation.image`.
 
         Returns:
-            (1, 4, rows, cols): see `prepare_batch`.
+            (1, channels, rows, cols): see `prepare_batch`.
         """
         return self.prepare_batch(torch.from_numpy(np.array(image, order="C"))[None])
 
@@ -129,15 +129,17 @@ class Networks(nn.Module):
             images: (n, 4, rows, cols), each as `Observation.image`.
 
         Returns:
-            (n, 4, rows, cols): normalised, in `compute_type`, on `device`, and padded below and on
-            the right, with what unseen pixels hold, to sides that a U-net takes.
+            (n, channels, rows, cols): normalised, in `compute_type`, on `device`, and padded below
+            and on the right, with what unseen pixels hold, to sides that a U-net takes.
         """
         config = self.config
         rows, cols = images.shape[2:]
         padding = (0, (1 - cols) % STRIDE, 0, (1 - rows) % STRIDE)
-        mean = images.new_tensor([config.colour_mean] * 3 + [config.height_mean])
-        std = images.new_tensor([config.colour_std] * 3 + [config.height_std])
-        normalised = (F.pad(images, padding) - mean[:, None, None]) / std[:, None, None]
+        channels = config.channels
+        seen = F.pad(images[:, -channels:], padding)
+        mean = images.new_tensor([config.colour_mean] * 3 + [config.height_mean])[-channels:]
+        std = images.new_tensor([config.colour_std] * 3 + [config.height_std])[-channels:]
+        normalised = (seen - mean[:, None, None]) / std[:, None, None]
         return normalised.to(self.device, self.compute_type)
 
     def encode_scene(self, image: Image) -> Tensor:
@@ -320,10 +322,10 @@ class SO2Networks(FactoredNetworks):
         fibre = Irreps(tuple(range(config.band + 1)), preset.samples)
         angle_fibre = Irreps(tuple(range(preset.angle_band + 1)), preset.angle_samples)
         angle_output = Irreps(config.angle_frequencies)
-        self.alpha = UNet(4, 1, fibre, preset.unet, convolution)
-        self.beta = AngleNet(4, angle_fibre, angle_output, preset.angle, convolution)
-        self.phi = UNet(4, sizes.FEATURES, fibre, preset.unet, convolution)
-        self.psi = UNet(4, sizes.FEATURES, fibre, preset.unet, convolution)
+        self.alpha = UNet(config.channels, 1, fibre, preset.unet, convolution)
+        self.beta = AngleNet(config.channels, angle_fibre, angle_output, preset.angle, convolution)
+        self.phi = UNet(config.channels, sizes.FEATURES, fibre, preset.unet, convolution)
+        self.psi = UNet(config.channels, sizes.FEATURES, fibre, preset.unet, convolution)
 
     def crop_angle_logits(self, crops: Tensor, orientations: int) -> Tensor:
         frequencies = self.config.angle_frequencies

@@ -72,9 +72,9 @@ class TransporterNetworks(Networks):
         """
         super().__init__(config)
         widths = self.preset.resnet
-        self.f_pick = ResNet(4, 1, widths)
-        self.phi = ResNet(4, sizes.FEATURES, widths)
-        self.psi = ResNet(4, sizes.FEATURES, widths)
+        self.f_pick = ResNet(config.channels, 1, widths)
+        self.phi = ResNet(config.channels, sizes.FEATURES, widths)
+        self.psi = ResNet(config.channels, sizes.FEATURES, widths)
 
     def check_orientations(self, orientations: int) -> None:
         """Raises ValueError if N is odd: N / 2 of them must span half a rotation."""

@@ -32,7 +32,7 @@ FORMAT_VERSION = 1
 
 _RENAMED = {"colour_deviation": "colour_std", "height_deviation": "height_std"}
 """Config fields of older files, by the names that they have now."""
-_ADDED = ("stop",)
+_ADDED = ("colour", "stop")
 """Config fields that older files lack: they take their defaults."""
 
 

@@ -9,6 +9,7 @@ import numpy as np
 
 from kitting_drake.common.paths import SCENARIOS
 from kitting_drake.scenario.loader import load_scenario
+from kitting_drake.scenario.perturbations import LEVELS, NAMES
 from kitting_drake.scenario.schema import Scenario
 
 
@@ -23,6 +24,11 @@ def scenario_parser(command: str, description: str) -> argparse.ArgumentParser:
     )
     parser.add_argument(
         "--scenario_text", metavar="YAML", help="fields merged over the scenario's own"
+    )
+    parser.add_argument(
+        "--perturb",
+        metavar="NAME[:LEVEL],...",
+        help=f"make the world less perfect: {', '.join(NAMES)}; {', '.join(LEVELS)} (moderate)",
     )
     parser.add_argument(
         "--output",
@@ -44,6 +50,8 @@ class ChosenScenario:
     """The name of its file, without the ending, and of the scenario in it if one was given."""
     text: str | None
     """The YAML that was merged over it."""
+    perturbed: str | None = None
+    """The perturbations that it has, as `--perturb` names them."""
     moved_to: Path | None = None
     """Where relative paths in the scenario start, if not in the folder of its file."""
 
@@ -92,9 +100,9 @@ def choose_scenario(arguments: argparse.Namespace) -> ChosenScenario:
         # An installed wheel carries its scenarios; `scenarios/x.yaml` means them anywhere.
         path = SCENARIOS / path.name
     name: str | None = arguments.scenario_name
-    scenario = load_scenario(path, name, arguments.scenario_text)
+    scenario = load_scenario(path, name, arguments.scenario_text, arguments.perturb)
     label = path.stem if name is None else f"{path.stem}:{name}"
-    return ChosenScenario(scenario, path, label, arguments.scenario_text)
+    return ChosenScenario(scenario, path, label, arguments.scenario_text, arguments.perturb)
 
 
 def output_folder(arguments: argparse.Namespace, name: str) -> Path:

@@ -9,13 +9,16 @@ import yaml
 from pydrake.common.yaml import yaml_dump, yaml_load, yaml_load_typed
 
 from kitting_drake.common.errors import UserError
+from kitting_drake.scenario.perturbations import perturbation
 from kitting_drake.scenario.schema import LookAt, Scenario
 from kitting_drake.scenario.yaml_check import check_yaml
 from kitting_drake.tasks import Task
 from systems.bounds import check_bounds
 
 
-def load_scenario(path: Path, name: str | None = None, text: str | None = None) -> Scenario:
+def load_scenario(
+    path: Path, name: str | None = None, text: str | None = None, perturb: str | None = None
+) -> Scenario:
     """Reads a scenario.
 
     Args:
@@ -23,6 +26,7 @@ def load_scenario(path: Path, name: str | None = None, text: str | None = None) 
         name: which one; the first when None.
         text: YAML merged over it: mappings field by field, all else replaced; a tag that is not
             given is that of what is merged over.
+        perturb: perturbations (see `scenario.perturbations`), merged over it before `text`.
 
     Raises:
         UserError: the file cannot be used; names the file and the field.
@@ -46,6 +50,9 @@ def load_scenario(path: Path, name: str | None = None, text: str | None = None) 
     if name not in root:
         raise UserError(f"{path} has no scenario '{name}': use one of {', '.join(names)}")
     scenario = _load(root[name], content, name, Scenario(), f"{path}: {name}")
+    if perturb is not None:
+        raw, defaults = _onto(perturbation(perturb, scenario), scenario)
+        scenario = _load(raw, yaml_dump(raw), None, defaults, "--perturb")
     if text is not None:
         raw, defaults = _onto(_parse(text, "--scenario_text"), scenario)
         scenario = _load(raw, yaml_dump(raw), None, defaults, "--scenario_text")
@@ -173,6 +180,7 @@ def _check_meaning(scenario: Scenario) -> None:
     if scenario.heightmap.z_max <= scenario.heightmap.z_min:
         raise ValueError("heightmap.z_max must be above heightmap.z_min")
     scenario.task.validate()
+    scenario.appearance.validate()
     for key, camera in scenario.cameras.items():
         if isinstance(camera, LookAt) and camera.position[:2] == camera.target[:2]:
             raise ValueError(

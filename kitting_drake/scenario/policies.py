@@ -146,6 +146,10 @@ class Learned(PolicyConfig):
     # among pixel centres and the N orientations.
     continuous: bool = True
 
+    # With `continuous`: refine the place by fitting the outline of the object, as o_t shows it, to
+    # that of the recess, where the two agree (the paper does not).
+    fit_outlines: bool = True
+
     def make_system(self, site: PolicySite) -> LeafSystem:
         # Only who uses a network waits for torch.
         from kitting_drake.policies.learned_policy import LearnedPolicy
@@ -170,6 +174,7 @@ class Learned(PolicyConfig):
                 networks,
                 orientations=self.orientations,
                 continuous=self.continuous,
+                fit_outlines=self.continuous and self.fit_outlines,
                 watch=site.observer,
             )
         except ValueError as error:
@@ -185,6 +190,7 @@ class Learned(PolicyConfig):
             "preset": file.config.preset,
             "orientations": self.orientations,
             "continuous": self.continuous,
+            "fit_outlines": self.continuous and self.fit_outlines,
             "trained_orientations": file.config.orientations,
             "compute_type": str(preferred_type()).removeprefix("torch."),
             **{key: file.card.get(key) for key in ("scenario", "demonstrations", "steps")},
@@ -205,6 +211,19 @@ class Learned(PolicyConfig):
     def validate(self) -> None:
         if not self.weights:
             raise ValueError("policy.weights is empty: name a file that train wrote")
+
+
+@dataclass
+class ShapeMatching(PolicyConfig):
+    """Training-free: outlines of the loose objects, seen by height, fitted to those of cavities."""
+
+    def make_system(self, site: PolicySite) -> LeafSystem:
+        from kitting_drake.policies.matching.policy import ShapeMatchingPolicy
+
+        return PickPlacePolicy(policy=ShapeMatchingPolicy())
+
+    def details(self, base: Path) -> dict[str, Any]:
+        return {"method": "shape_matching"}
 
 
 @dataclass
@@ -245,7 +264,7 @@ class PythonPolicy(PolicyConfig):
             raise ValueError(f"policy.function must be module:function, not '{self.function}'")
 
 
-Policy = Oracle | QuantizedOracle | Learned | PythonPolicy
+Policy = Oracle | QuantizedOracle | Learned | ShapeMatching | PythonPolicy
 """The variants of a scenario's `policy:`; the first is the default."""
 
 

@@ -8,10 +8,12 @@ Units are SI; angles that a person writes are in degrees, and the field says so.
 
 import dataclasses as dc
 
+from kitting_drake.scenario.appearance import Appearance
 from kitting_drake.scenario.policies import Oracle, Policy
 from kitting_drake.tasks import Kitting, Task
 from systems.bounds import bounded
 from systems.pick_place_parameters import PickPlaceParameters
+from systems.sensor_noise import SensorNoiseParameters
 from systems.signals import PixelGrid
 
 _ANGLE = (-360.0, 360.0)
@@ -95,6 +97,11 @@ class Plant:
     # Drake's approximation of contact: lagged, similar or sap.
     contact_approximation: str = "lagged"
 
+    # Each model's friction coefficients, and its mass, are multiplied by factors drawn from the
+    # seed: between 1 minus and 1 plus these.
+    friction_variation: float = bounded(0.0, 0.0, 0.9)
+    mass_variation: float = bounded(0.0, 0.0, 0.9)
+
 
 @dc.dataclass
 class Sleep:
@@ -129,7 +136,7 @@ class Scenario:
     # What stands on the table, and what is to be done with it; see kitting_drake/tasks/.
     task: Task = dc.field(default_factory=Kitting)
 
-    # Who decides: !Oracle, !QuantizedOracle, !Learned or !PythonPolicy.
+    # Who decides: !Oracle, !QuantizedOracle, !Learned, !ShapeMatching or !PythonPolicy.
     policy: Policy = dc.field(default_factory=Oracle)
 
     # The RGB-D cameras by name: !Pinhole or !LookAt. These three are those of Ravens.
@@ -140,6 +147,12 @@ class Scenario:
             "right": Pinhole(position=[0.0, -0.5, 0.75], rpy_deg=[40.0, 180.0, 135.0]),
         }
     )
+
+    # What the cameras and their calibration add to a perfect image.
+    sensor_noise: SensorNoiseParameters = dc.field(default_factory=SensorNoiseParameters)
+
+    # Colours, sheen and lights.
+    appearance: Appearance = dc.field(default_factory=Appearance)
 
     # What the policy sees.
     heightmap: Heightmap = dc.field(default_factory=Heightmap)

@@ -1,5 +1,6 @@
 """The kitting tasks: which tools, which kit, where they stand, and when a tool is kitted."""
 
+import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -15,7 +16,12 @@ from kitting_drake.hkd.tools.tool import Tool, load_tool
 from kitting_drake.hkd.tools.toolsets import SPLITS, toolsets
 from kitting_drake.policies.learning import Learning
 from kitting_drake.tasks.kitting import diagnosis
-from kitting_drake.tasks.kitting.sampling import TablePose, check_arrangement, draw_poses
+from kitting_drake.tasks.kitting.sampling import (
+    TablePose,
+    check_arrangement,
+    draw_distractors,
+    draw_poses,
+)
 from kitting_drake.tasks.task import ActionRecord, Fixture, Scene, SceneObject, TaskConfig
 from systems.bounds import bounded
 from systems.placement import AddS, Goal, Placement
@@ -75,6 +81,9 @@ class _DrawnKitting(_KittingTask):
     # The order in which an oracle takes the tools: drawn from the seed, or as listed.
     random_order: bool = True
 
+    # Boxes that have no business on the table; fewer where there is no room.
+    distractors: int = bounded(0, 0, 12)
+
     def _draw_scene(self, tools: list[Tool], grid: PixelGrid, seed: int) -> Scene:
         kit = self._kit_of(tools)
         rng = np.random.default_rng(seed)
@@ -87,7 +96,17 @@ class _DrawnKitting(_KittingTask):
             rng=rng,
         )
         order = rng.permutation(len(tools)) if self.random_order else np.arange(len(tools))
-        return kitting_scene(kit, X_WKit, X_WTools, order, self.success_threshold)
+        distractors = draw_distractors(
+            self.distractors,
+            kit,
+            X_WKit,
+            tools,
+            X_WTools,
+            grid=grid,
+            rng=np.random.default_rng([seed, 3]),
+        )
+        scene = kitting_scene(kit, X_WKit, X_WTools, order, self.success_threshold)
+        return dataclasses.replace(scene, objects=(*scene.objects, *distractors))
 
 
 @dataclass

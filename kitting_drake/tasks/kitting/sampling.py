@@ -10,13 +10,16 @@ from pydrake.math import RigidTransform, RollPitchYaw
 from kitting_drake.common.errors import UserError
 from kitting_drake.hkd.kits.kit import Kit
 from kitting_drake.hkd.tools.tool import Tool
-from kitting_drake.tasks.task import TABLE
+from kitting_drake.tasks.boxes import box_object
+from kitting_drake.tasks.task import TABLE, SceneObject
 from systems.bounds import bounded
 from systems.hand_geometry import FINGER_DEPTH, FINGER_LENGTH, MAX_OPENING, PALM_SIZE
 from systems.signals import PixelGrid
 
 _TRIES = 300
 _RESTARTS = 60
+_DISTRACTOR_SPACING = 0.01
+"""Least distance of a distractor from all else, in metres."""
 _MANY = 6
 """With more tools than this, those that are hardest to place are drawn first."""
 
@@ -171,6 +174,58 @@ def _draw_pose(
         if not blocked and not (placed and _overlap(candidate.palm, placed[0].outline)):
             return pose, candidate
     return None
+
+
+def draw_distractors(
+    count: int,
+    kit: Kit,
+    X_WKit: RigidTransform,
+    tools: Sequence[Tool],
+    X_WTools: Sequence[RigidTransform],
+    *,
+    grid: PixelGrid,
+    rng: np.random.Generator,
+) -> list[SceneObject]:
+    """Boxes of any size and colour that have no business on the table.
+
+    They keep clear of kit and tools and of the hand that grasps a tool. Where there is no room for
+    as many, there are fewer.
+
+    Args:
+        count: how many.
+        kit: the kit.
+        X_WKit: its pose.
+        tools: the tools.
+        X_WTools: their poses.
+        grid: the workspace.
+        rng: for all draws.
+    """
+    room = _rectangle((grid.x_min, grid.y_min), (grid.x_max, grid.y_max)) ^ _rectangle(*TABLE)
+    placed = [_Footprint(block_outline(kit), CrossSection(), CrossSection()).moved(_pose(X_WKit))]
+    placed += [
+        _tool_footprint(tool).moved(_pose(X)) for tool, X in zip(tools, X_WTools, strict=True)
+    ]
+    objects = []
+    for number in range(1, count + 1):
+        length, width, height = rng.uniform((0.015, 0.015, 0.008), (0.07, 0.07, 0.045)).tolist()
+        colour = tuple(rng.uniform(0.05, 0.95, 3).tolist())
+        outline = CrossSection.square((length, width), True)
+        shape = _Footprint(outline, CrossSection(), CrossSection())
+        found = _draw_pose(shape, placed, room, grid, _DISTRACTOR_SPACING, 180.0, rng)
+        if found is None:
+            continue
+        pose, footprint = found
+        placed.append(footprint)
+        size = (length, width, height)
+        objects.append(
+            box_object(f"distractor_{number}", "distractor", size, colour, pose.transform())
+        )
+    return objects
+
+
+def _pose(X: RigidTransform) -> TablePose:
+    x, y, _ = X.translation()
+    return TablePose(x=x, y=y, yaw_deg=float(np.rad2deg(RollPitchYaw(X.rotation()).yaw_angle())))
 
 
 def _tool_footprint(tool: Tool) -> _Footprint:

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from kitting_drake.common.paths import MODELS
-from kitting_drake.tasks.ravens.boxes import box_points
+from kitting_drake.tasks.boxes import box_points
 from kitting_drake.tasks.ravens.ravens_task import PoseTask
 from kitting_drake.tasks.sampling import Footprint, draw_poses, rectangle
 from kitting_drake.tasks.task import Fixture, Scene, SceneObject

@@ -10,7 +10,7 @@ from pydrake.math import RigidTransform, RollPitchYaw
 
 from kitting_drake.common.errors import UserError
 from kitting_drake.common.paths import MODELS
-from kitting_drake.tasks.ravens.boxes import box_object, random_brown
+from kitting_drake.tasks.boxes import box_object, random_brown
 from kitting_drake.tasks.ravens.ravens_task import RavensTask
 from kitting_drake.tasks.task import Fixture, Scene
 from systems.bounds import bounded

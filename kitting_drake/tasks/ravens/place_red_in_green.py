@@ -7,7 +7,7 @@ import numpy as np
 from pydrake.math import RigidTransform
 
 from kitting_drake.policies.learning import Learning
-from kitting_drake.tasks.ravens.boxes import COLOURS, CUBE_FOOTPRINT, coloured, cube_object
+from kitting_drake.tasks.boxes import COLOURS, CUBE_FOOTPRINT, coloured, cube_object
 from kitting_drake.tasks.ravens.ravens_task import RavensTask
 from kitting_drake.tasks.sampling import Footprint, disc, draw_poses
 from kitting_drake.tasks.task import Fixture, Scene, SceneObject

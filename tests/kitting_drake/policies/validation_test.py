@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from kitting_drake.policies.demonstrations import FinalObservation, record
-from kitting_drake.policies.images import Image, rotation_matrix
-from kitting_drake.policies.learned_policy import Decision, make_action
+from kitting_drake.policies.images import Image, make_action, rotation_matrix
+from kitting_drake.policies.learned_policy import Decision
 from kitting_drake.policies.samples import Scene
 from kitting_drake.policies.validation import (
     ERRORS,

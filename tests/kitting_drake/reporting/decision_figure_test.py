@@ -5,7 +5,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from kitting_drake.policies.learned_policy import Decision, make_action
+from kitting_drake.policies.images import make_action
+from kitting_drake.policies.learned_policy import Decision
 from kitting_drake.reporting.decision_figure import draw_decision
 from systems.signals import Observation, PickPlaceAction, PixelGrid
 

@@ -38,6 +38,7 @@ def test_a_chosen_scenario_describes_all_of_itself(tmp_path: Path):
         "weights": "w",
         "orientations": 180,
         "continuous": True,
+        "fit_outlines": True,
     }
     task = described["task"]
     assert (task["_tag"], task["split"], task["spacing"]) == ("!ToolsetKitting", "train", 0.008)

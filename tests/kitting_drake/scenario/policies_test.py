@@ -102,6 +102,7 @@ def test_results_say_what_a_policy_is(weights_file: Path):
         "preset": "tiny",
         "orientations": 36,
         "continuous": False,
+        "fit_outlines": False,
         "trained_orientations": 72,
         "compute_type": str(preferred_type()).removeprefix("torch."),
         "scenario": "mine",

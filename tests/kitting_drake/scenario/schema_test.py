@@ -54,6 +54,11 @@ def check_given(
         item_kind = typing.get_args(kind)[1]
         below = [check_given(item_kind, raw[k], loaded[k], None, f"{where}.{k}") for k in raw]
         return set().union(*below)
+    if typing.get_origin(kind) is list and dataclasses.is_dataclass(typing.get_args(kind)[0]):
+        item_kind = typing.get_args(kind)[0]
+        pairs = enumerate(zip(raw, loaded, strict=True))
+        below = [check_given(item_kind, r, v, None, f"{where}[{i}]") for i, (r, v) in pairs]
+        return set().union(*below)
     if not dataclasses.is_dataclass(kind):
         assert raw == loaded, where
         assert loaded != default, f"{where} is the default"

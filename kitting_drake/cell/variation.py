@@ -1,0 +1,45 @@
+"""Models with other friction and mass than their files say."""
+
+import xml.etree.ElementTree as ElementTree
+from pathlib import Path
+
+from kitting_drake.common.errors import UserError
+
+_DRAKE = "http://drake.mit.edu"
+
+
+def varied_model(path: Path, *, friction: float, mass: float) -> str:
+    """The SDFormat text of a model, with friction coefficients and inertia scaled.
+
+    Args:
+        path: of the model.
+        friction: factor of all friction coefficients.
+        mass: factor of all masses and moments of inertia.
+
+    Raises:
+        UserError: the file is no SDFormat that can be read.
+    """
+    ElementTree.register_namespace("drake", _DRAKE)
+    try:
+        text = path.read_text()
+        if "xmlns:drake" not in text:
+            # Drake's parser does not ask for it.
+            text = text.replace("<sdf ", f'<sdf xmlns:drake="{_DRAKE}" ', 1)
+        root = ElementTree.fromstring(text)
+        for name in ("mu_static", "mu_dynamic"):
+            for element in root.iter(f"{{{_DRAKE}}}{name}"):
+                _scale(element, friction)
+        for inertial in root.iter("inertial"):
+            for element in (*inertial.iter("mass"), *(inertial.find("inertia") or ())):
+                _scale(element, mass)
+    except (OSError, ElementTree.ParseError, ValueError, TypeError) as error:
+        raise UserError(f"task: {path} cannot be read: {error}") from error
+    for uri in root.iter("uri"):
+        if uri.text and "://" not in uri.text:
+            # A text has no folder of its own.
+            uri.text = (path.resolve().parent / uri.text).as_uri()
+    return ElementTree.tostring(root, encoding="unicode")
+
+
+def _scale(element: ElementTree.Element, factor: float) -> None:
+    element.text = f"{factor * float(element.text or ''):.12g}"

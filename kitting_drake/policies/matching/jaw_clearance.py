@@ -1,0 +1,186 @@
+"""Grasps of an object that o_t allows: the jaws open, come down, close and find faces.
+
+At each place and angle the heights along the jaws' way are read off o_t. What rises above the
+fingertips is in the way of a finger, or it is what is gripped; the grasp is centred between its
+faces, as closing jaws would centre it.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from kitting_drake.policies.matching.segmentation import Region, Segmentation
+from systems.hand_geometry import FINGERTIP_DEPTH, MAX_OPENING, PAD_LENGTH
+from systems.pick_place_parameters import PickPlaceParameters
+
+Array = NDArray[np.float64]
+
+_PRIMITIVE = PickPlaceParameters()
+_ANGLES = 36
+_MOST_PLACES = 80
+_REACH = 0.055
+"""Grasps are looked for this near to the object's middle, in metres."""
+_STEP = 0.0015
+"""Between samples across the jaws, in metres."""
+_LINES = 5
+"""Lines of samples along the pads' length."""
+_WIDEST = MAX_OPENING - 0.010
+"""The widest grip, with a margin on either side for the fingers to come down, in metres."""
+_GAP = 0.004
+"""Beside the gripped faces this much is edge, not obstacle, in metres."""
+_FINGER_MARGIN = 0.003
+"""Space left beyond the fingers of the open jaws, in metres."""
+_STRAIGHT = 0.003
+"""A face that stands back by less than this along the pads touches them, in metres."""
+
+
+@dataclass(frozen=True)
+class JawGrasp:
+    """A grasp that the jaws can take, in pixels of o_t."""
+
+    pixel: Array
+    """(row, col), midway between the faces."""
+    theta: float
+    """Of the gripper, in radians; adding pi gives the same grasp."""
+    width: float
+    """Between the faces, in metres."""
+    cost: float
+    """How far from the middle it is and how crooked its faces are; without a unit, 0 is best."""
+
+
+def jaw_grasps(segmentation: Segmentation, region: Region, resolution: float) -> list[JawGrasp]:
+    """The grasps of an object, the best first; empty if there is none.
+
+    Args:
+        segmentation: of the observation.
+        region: one of its objects.
+        resolution: of a pixel, in metres.
+    """
+    relief = segmentation.relief
+    pixels = region.pixels
+    weights = np.maximum(relief[region.mask], 1e-3)
+    middle = np.average(pixels, axis=0, weights=weights)
+    distance = np.linalg.norm(pixels - middle, axis=1) * resolution
+    near = pixels[distance < max(_REACH, distance.min() + resolution)]
+    places = near[:: max(1, math.ceil(len(near) / _MOST_PLACES))].astype(float)
+
+    thetas = np.arange(_ANGLES) * math.pi / _ANGLES
+    place, theta = (item.ravel() for item in np.meshgrid(np.arange(len(places)), thetas))
+    found = _grip(relief, places[place.astype(int)], theta, middle, resolution)
+    if found is None:
+        return []
+    return sorted(found, key=lambda item: item.cost)
+
+
+def refine_grasp(
+    segmentation: Segmentation, grasp: JawGrasp, middle: Array, resolution: float
+) -> JawGrasp:
+    """A grasp at the angle at which its faces are parallel to the pads, within a few degrees.
+
+    Args:
+        segmentation: of the observation.
+        grasp: one of `jaw_grasps`.
+        middle: (row, col) of the object.
+        resolution: of a pixel, in metres.
+    """
+    offsets = np.radians(np.linspace(-6, 6, 13))
+    thetas = grasp.theta + offsets
+    found = _grip(
+        segmentation.relief, np.repeat(grasp.pixel[None], 13, axis=0), thetas, middle, resolution
+    )
+    return min([grasp, *(found or [])], key=lambda item: item.cost)
+
+
+def _tip_height(top: Array) -> Array:
+    """Where the fingertips go, above the table: as the planner, on an object that stands on it."""
+    depth = np.clip(
+        _PRIMITIVE.grasp_depth_share * top, _PRIMITIVE.grasp_depth, _PRIMITIVE.max_grasp_depth
+    )
+    return np.maximum(top - depth, _PRIMITIVE.floor_clearance)
+
+
+def _grip(
+    relief: NDArray[np.float32], places: Array, thetas: Array, middle: Array, resolution: float
+) -> list[JawGrasp] | None:
+    """The grasps among places (n, 2) and angles (n,) that the jaws can take."""
+    raised = ndimage.maximum_filter(relief, 3)
+    top = raised[tuple(np.rint(places).astype(int).T)].astype(float)
+    tip = np.maximum(_tip_height(top), 0.003)
+
+    along = np.column_stack([np.cos(thetas), np.sin(thetas)])
+    across = np.column_stack([-np.sin(thetas), np.cos(thetas)])
+    half = MAX_OPENING / 2 + FINGERTIP_DEPTH + _FINGER_MARGIN + 0.02
+    s = np.arange(-half, half + _STEP / 2, _STEP)
+    u = np.linspace(-PAD_LENGTH / 2, PAD_LENGTH / 2, _LINES)
+    positions = (
+        places[:, None, None, :]
+        + along[:, None, None, :] * (u / resolution)[None, :, None, None]
+        + across[:, None, None, :] * (s / resolution)[None, None, :, None]
+    )
+    heights = ndimage.map_coordinates(
+        relief, np.moveaxis(positions, -1, 0), order=1, mode="constant", cval=0.0
+    )
+    occupied = heights > (tip - 0.0005)[:, None, None]  # (n, lines, samples)
+    anywhere = occupied.any(axis=1)
+    centre = len(s) // 2
+    first = centre - _run(anywhere[:, centre::-1])
+    last = centre + _run(anywhere[:, centre:])
+    held = anywhere[:, centre] & (first > 0) & (last < len(s) - 1)
+    left, right = s[np.maximum(first, 0)], s[np.minimum(last, len(s) - 1)]
+    width, shift = right - left + _STEP, (left + right) / 2
+
+    index = np.arange(len(s))[None]
+    beside = (s[None] > (shift + MAX_OPENING / 2 + FINGERTIP_DEPTH + _FINGER_MARGIN)[:, None]) | (
+        s[None] < (shift - MAX_OPENING / 2 - FINGERTIP_DEPTH - _FINGER_MARGIN)[:, None]
+    )
+    own = (index >= first[:, None]) & (index <= last[:, None])
+    blocked = (anywhere & ~own & ~beside).any(axis=1)
+    fits = held & ~blocked & (width <= _WIDEST) & (width >= _PRIMITIVE.minimum_width)
+    if not fits.any():
+        return None
+
+    # How straight the faces are along the pads: each line's own run about the middle.
+    inside = occupied & own[:, None, :]
+    low = np.where(inside.any(axis=2), s[inside.argmax(axis=2)], np.nan)
+    high = np.where(inside.any(axis=2), s[len(s) - 1 - inside[:, :, ::-1].argmax(axis=2)], np.nan)
+    touch = (low < left[:, None] + _STRAIGHT) & (high > right[:, None] - _STRAIGHT)
+    contact = touch.mean(axis=1)
+    with np.errstate(invalid="ignore"):
+        lean = np.nan_to_num(np.abs(_slope(u, low)) + np.abs(_slope(u, high)), nan=1.0)
+        twist = np.nan_to_num(np.abs(_slope(u, low) + _slope(u, high)), nan=1.0)
+    centres = places + across * (shift / resolution)[:, None]
+    arm = (centres - middle) * resolution
+    lever = np.abs((arm * along).sum(axis=1))
+    aside = np.abs((arm * across).sum(axis=1))
+    cost = (
+        lever / 0.025
+        + (lever / 0.040) ** 2
+        + aside / 0.050
+        + 1.2 * (1 - contact)
+        + 2.0 * lean
+        + 4.0 * twist
+        + np.maximum(0.0, width - 0.035) / 0.015
+    )
+    fits &= contact > 0
+    return [
+        JawGrasp(centres[i], float(thetas[i]), float(width[i]), float(cost[i]))
+        for i in np.flatnonzero(fits)
+    ]
+
+
+def _run(occupied: NDArray[np.bool_]) -> NDArray[np.intp]:
+    """(n,) the index of the last of the leading True values of each row."""
+    free = ~occupied
+    ends = free.argmax(axis=1)
+    return np.where(free.any(axis=1), ends - 1, occupied.shape[1] - 1)
+
+
+def _slope(u: Array, values: Array) -> Array:
+    """(n,) the least-squares slopes of values (n, lines) over u (lines,); nan where one is."""
+    centred = u - u.mean()
+    return (values * centred).sum(axis=1) / (centred**2).sum()

@@ -1,0 +1,88 @@
+"""The training-free policy: outlines matched to recesses, jaws where o_t leaves them room."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import linear_sum_assignment
+
+from kitting_drake.policies.images import make_action
+from kitting_drake.policies.matching.jaw_clearance import jaw_grasps
+from kitting_drake.policies.matching.registration import (
+    Outline,
+    Registration,
+    coarse_cost,
+    register,
+    trace_outline,
+)
+from kitting_drake.policies.matching.segmentation import Region, segment
+from systems.signals import Observation, PickPlaceAction
+
+_WORST_COST = 0.0024
+"""An outline and a recess that differ by more than this on average do not belong together, in
+metres."""
+_HEIGHT_WEIGHT = 0.1
+"""By how much a difference of an object's height and a recess's depth adds to the cost."""
+_PROMISING = 2.0
+"""A recess is registered if its coarse cost is at most this many times the least of the object."""
+
+
+class ShapeMatchingPolicy:
+    """A function from an observation to an action that needs neither training nor colour.
+
+    Loose objects and recesses are segmented by height. Every outline is registered to every recess,
+    and a linear assignment chooses which object goes into which. Of the pairs that fit, the one
+    whose outlines agree best, and which the jaws can take, is next. It stops where nothing is left
+    that fits. It has no memory.
+    """
+
+    def __call__(self, observation: Observation) -> PickPlaceAction:
+        """The action; both gripper poses are in the world."""
+        segmentation = segment(observation)
+        resolution = observation.grid.resolution
+        outlines = [trace_outline(o.mask, resolution, close=True) for o in segmentation.objects]
+        recesses = [trace_outline(c.mask, resolution) for c in segmentation.recesses]
+        pairs = match(segmentation.objects, outlines, segmentation.recesses, recesses)
+        for index, fit in pairs:
+            grasps = jaw_grasps(segmentation, segmentation.objects[index], resolution)
+            if grasps:
+                best = grasps[0]
+                place = fit.moved(best.pixel)
+                return make_action(observation, best.pixel, best.theta, place, fit.rotation)
+        return PickPlaceAction(stop=True)
+
+
+def match(
+    objects: Sequence[Region],
+    outlines: Sequence[Outline],
+    regions: Sequence[Region],
+    recesses: Sequence[Outline],
+) -> list[tuple[int, Registration]]:
+    """Which objects go where: indices and registrations, the best fit first.
+
+    Args:
+        objects: the loose ones.
+        outlines: theirs, closed.
+        regions: the recesses.
+        recesses: their outlines.
+    """
+    if not objects or not regions:
+        return []
+    coarse = np.array([[coarse_cost(o, c) for c in recesses] for o in outlines])
+    fits: dict[tuple[int, int], Registration] = {}
+    costs = np.full(coarse.shape, 10 * _WORST_COST)
+    for i, j in np.argwhere(coarse <= _PROMISING * coarse.min(axis=1, keepdims=True)):
+        fits[i, j] = register(outlines[i], recesses[j])
+        difference = abs(objects[i].height - regions[j].height)
+        costs[i, j] = fits[i, j].cost + _HEIGHT_WEIGHT * difference
+    chosen = _assign(costs)
+    good = [(i, j) for i, j in chosen if costs[i, j] < _WORST_COST]
+    return [(int(i), fits[i, j]) for i, j in sorted(good, key=lambda pair: costs[pair])]
+
+
+def _assign(costs: NDArray[np.float64]) -> list[tuple[int, int]]:
+    """The pairs of the assignment with the least sum; more than `_WORST_COST` is as none."""
+    rows, cols = linear_sum_assignment(np.minimum(costs, _WORST_COST))
+    return list(zip(rows.tolist(), cols.tolist(), strict=True))

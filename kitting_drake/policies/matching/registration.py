@@ -1,0 +1,205 @@
+"""Registration of an object's outline to a recess's, to fractions of a pixel.
+
+Both outlines are signed distances on a grid finer than o_t's. A recess is cut as the object's
+outline, closed and grown by a clearance (`hkd.kits.layout.cavity_outline`); so the object's is
+closed first, and what remains is an offset, which is fitted too: the clearance, and half a pixel by
+which seeing only what is highest fattens objects and thins recesses.
+
+The cost is the mean of a robust function of the difference of the signed distances about the
+object's outline; its minimum over (rotation, row, col, offset) is found by Gauss-Newton from the
+best of many rotations.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from kitting_drake.policies.images import rotation_matrix
+from kitting_drake.policies.matching.segmentation import Mask
+
+Array = NDArray[np.float64]
+
+_SUBSAMPLING = 3
+"""Fine pixels in a pixel of o_t."""
+_CLOSING_RADIUS = 0.008
+"""Notches of an object narrower than twice this are not in its recess, in metres."""
+_BAND = 0.006
+"""The cost is taken at points within this of the object's outline, in metres."""
+_FARTHEST = 0.012
+"""Distances are clipped to this, in metres."""
+_ROBUST = 0.002
+"""Differences beyond this count linearly, in metres."""
+_LARGEST_OFFSET = 0.004
+"""The offset of the outlines is within plus or minus this, in metres."""
+_POINTS, _COARSE_POINTS = 700, 160
+_ROTATIONS = 72
+_STARTS = 3
+_ITERATIONS = 15
+
+
+@dataclass(frozen=True)
+class Outline:
+    """The outline of a region as signed distances; metres, negative inside."""
+
+    distance: NDArray[np.float32]
+    """(m, n) on the fine grid."""
+    gradient: tuple[NDArray[np.float32], NDArray[np.float32]]
+    """Along its rows and columns, per fine pixel."""
+    origin: Array
+    """(row, col) in pixels of o_t of the fine pixel (0, 0)."""
+    middle: Array
+    """(row, col) the centroid of what is inside."""
+    points: Array
+    """(p, 2) positions (row, col) near the outline, in pixels of o_t, evenly spread."""
+    values: Array
+    """(p,) their signed distances."""
+
+    def sample(self, field: NDArray[np.float32], positions: Array, outside: float) -> Array:
+        """(n,) one of its fields at positions (n, 2) in pixels of o_t."""
+        fine = ((positions - self.origin) * _SUBSAMPLING).T
+        return ndimage.map_coordinates(field, fine, order=1, mode="constant", cval=outside)
+
+
+@dataclass(frozen=True)
+class Registration:
+    """Where an object's outline fits a recess's: positions p of o_t go to R(rotation) p + shift."""
+
+    rotation: float
+    """Counter-clockwise, in radians."""
+    shift: Array
+    """(row, col), in pixels."""
+    cost: float
+    """The mean robust difference of the outlines, in metres."""
+
+    def moved(self, pixel: Array) -> Array:
+        """Where a position (row, col) of the object is brought to."""
+        return rotation_matrix(self.rotation) @ pixel + self.shift
+
+
+def trace_outline(mask: Mask, resolution: float, *, close: bool = False) -> Outline:
+    """The outline of a region.
+
+    Args:
+        mask: (rows, cols), True somewhere.
+        resolution: of its pixels, in metres.
+        close: bridge the notches that a recess for this object would not have.
+    """
+    margin = math.ceil((_FARTHEST + _CLOSING_RADIUS) / resolution) + 1
+    rows, cols = np.nonzero(mask)
+    corner = np.array([rows.min(), cols.min()]) - margin
+    size = np.array([rows.max(), cols.max()]) + margin + 1 - corner
+    crop = np.zeros(size, np.float32)
+    crop[rows - corner[0], cols - corner[1]] = 1
+    fine = ndimage.zoom(crop, _SUBSAMPLING, order=1, mode="nearest", grid_mode=True) > 0.5
+    step = resolution / _SUBSAMPLING
+    if close:
+        grown = ndimage.distance_transform_edt(~fine) * step <= _CLOSING_RADIUS
+        fine = ndimage.distance_transform_edt(grown) * step > _CLOSING_RADIUS
+    outside = ndimage.distance_transform_edt(~fine)
+    distance = (outside - ndimage.distance_transform_edt(fine)) * step
+    # The outline runs between a pixel inside and one outside.
+    distance = np.clip(distance - np.sign(distance) * step / 2, -_FARTHEST, _FARTHEST)
+    distance = ndimage.gaussian_filter(distance, 1.0).astype(np.float32)
+    # Fine pixel (0, 0) is a corner of pixel `corner`.
+    origin = corner - 0.5 + 0.5 / _SUBSAMPLING
+    near = np.argwhere(np.abs(distance) < _BAND)
+    chosen = near[:: max(1, len(near) // _POINTS)]
+    along_row, along_col = np.gradient(distance)
+    return Outline(
+        distance=distance,
+        gradient=(along_row, along_col),
+        origin=origin,
+        middle=np.argwhere(fine).mean(axis=0) / _SUBSAMPLING + origin,
+        points=chosen / _SUBSAMPLING + origin,
+        values=distance[tuple(chosen.T)].astype(float),
+    )
+
+
+def register(
+    outline: Outline, recess: Outline, *, starts: tuple[tuple[float, Array], ...] = ()
+) -> Registration:
+    """The best fit of an object's outline to a recess's.
+
+    Args:
+        outline: the object's, closed.
+        recess: the recess's.
+        starts: rotations and shifts to begin at; without any, all rotations about the middles are
+            tried and the best are refined.
+    """
+    begins = starts or _coarse_starts(outline, recess)
+    found = [_refine(outline, recess, rotation, shift) for rotation, shift in begins]
+    return min(found, key=lambda item: item.cost)
+
+
+def coarse_cost(outline: Outline, recess: Outline) -> float:
+    """About the cost of `register`, in metres, quickly."""
+    return float(_coarse(outline, recess)[0].min())
+
+
+def _coarse(outline: Outline, recess: Outline) -> tuple[Array, Array]:
+    """The cost at each of the coarse rotations about the middles, and the rotations."""
+    step = max(1, len(outline.points) // _COARSE_POINTS)
+    offsets = outline.points[::step] - outline.middle
+    angles = np.arange(_ROTATIONS) * math.tau / _ROTATIONS
+    cos, sin = np.cos(angles)[:, None], np.sin(angles)[:, None]
+    rows = cos * offsets[:, 0] - sin * offsets[:, 1] + recess.middle[0]
+    cols = sin * offsets[:, 0] + cos * offsets[:, 1] + recess.middle[1]
+    positions = np.stack([rows, cols], axis=-1).reshape(-1, 2)
+    there = recess.sample(recess.distance, positions, _FARTHEST).reshape(rows.shape)
+    difference = there - outline.values[::step]
+    difference -= np.clip(
+        np.median(difference, axis=1, keepdims=True), -_LARGEST_OFFSET, _LARGEST_OFFSET
+    )
+    return np.abs(difference).mean(axis=1), angles
+
+
+def _coarse_starts(outline: Outline, recess: Outline) -> list[tuple[float, Array]]:
+    costs, angles = _coarse(outline, recess)
+    lowest = (costs <= np.roll(costs, 1)) & (costs < np.roll(costs, -1))
+    candidates = np.flatnonzero(lowest)
+    best = candidates[np.argsort(costs[candidates])][:_STARTS]
+    return [
+        (float(angle), recess.middle - rotation_matrix(float(angle)) @ outline.middle)
+        for angle in angles[best]
+    ]
+
+
+def _refine(outline: Outline, recess: Outline, rotation: float, shift: Array) -> Registration:
+    """Gauss-Newton over (rotation about the object's middle, row, col, offset), reweighted."""
+    arms = outline.points - outline.middle
+    place = rotation_matrix(rotation) @ outline.middle + shift
+    offset, cost = 0.0, math.inf
+    best = (rotation, place)
+    for _ in range(_ITERATIONS):
+        turned = arms @ rotation_matrix(rotation).T
+        positions = turned + place
+        there = recess.sample(recess.distance, positions, _FARTHEST)
+        residual = there - outline.values
+        if not np.isfinite(cost):
+            offset = float(np.clip(np.median(residual), -_LARGEST_OFFSET, _LARGEST_OFFSET))
+        residual = residual - offset
+        weight = 1 / np.maximum(1, np.abs(residual) / _ROBUST)
+        now = float((weight * np.abs(residual)).mean())
+        if now < cost:
+            improved = cost - now
+            cost, best = now, (rotation, place)
+            if improved < 1e-6:
+                break
+        by_row = recess.sample(recess.gradient[0], positions, 0.0) * _SUBSAMPLING
+        by_col = recess.sample(recess.gradient[1], positions, 0.0) * _SUBSAMPLING
+        by_rotation = by_col * turned[:, 0] - by_row * turned[:, 1]
+        jacobian = np.column_stack([by_rotation, by_row, by_col, -np.ones(len(residual))])
+        weighted = jacobian * weight[:, None]
+        normal = weighted.T @ jacobian
+        normal += np.diag(1e-4 * np.diag(normal) + 1e-12)
+        step = np.linalg.solve(normal, -weighted.T @ residual)
+        rotation += float(np.clip(step[0], -0.1, 0.1))
+        place = place + np.clip(step[1:3], -3, 3)
+        offset = float(np.clip(offset + step[3], -_LARGEST_OFFSET, _LARGEST_OFFSET))
+    rotation, place = best
+    return Registration(rotation, place - rotation_matrix(rotation) @ outline.middle, cost)

@@ -1,0 +1,218 @@
+"""Segmentation of o_t by height alone: table, fixture, loose objects, recesses.
+
+No colour is used, and no network. The fixture is the largest plateau above the table; what rises
+beside it is a loose object; what lies below its top is a recess, or what is left of one.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+from scipy.spatial import ConvexHull, QhullError
+
+from systems.signals import Observation
+
+Mask = NDArray[np.bool_]
+Plane = NDArray[np.float64]
+"""(3,): the height at (row, col) is `plane @ (row, col, 1)`, in metres."""
+
+_PLANE_BAND = 0.004
+"""Pixels within this of a plane belong to it, in metres."""
+_LEAST_FIXTURE_HEIGHT = 0.015
+"""A plateau lower than this above the table is no fixture, in metres."""
+_LEAST_FIXTURE_AREA = 0.003
+"""The same for its area, in square metres."""
+_OBJECT_HEIGHT = 0.003
+"""What rises by more than this above the table is an object, in metres."""
+_RECESS_DEPTH = 0.003
+"""What is deeper than this below the top of the fixture is a recess, in metres."""
+_LEAST_AREA = 0.0004
+"""Smaller regions are noise, in square metres."""
+_FIXTURE_MARGIN = 0.006
+"""Closer to the fixture's outline than this is neither table nor recess, in metres."""
+_CLEAN = 0.0005
+"""Heights with less noise than this are taken as they are, in metres."""
+_NEIGHBOURS = np.ones((3, 3), bool)
+
+
+@dataclass(frozen=True)
+class Region:
+    """A connected region of pixels: a loose object or a recess."""
+
+    mask: Mask
+    """(rows, cols)."""
+    height: float
+    """By how much the object rises above the table, or the recess's floor lies below the top of the
+    fixture: the 90th percentile, in metres."""
+
+    @property
+    def pixels(self) -> NDArray[np.intp]:
+        """(n, 2): row and column of each."""
+        return np.argwhere(self.mask)
+
+
+@dataclass(frozen=True)
+class Segmentation:
+    """What stands where in an observation."""
+
+    table: Plane
+    fixture: Mask
+    """(rows, cols) the fixture; nowhere if there is none."""
+    top: Plane
+    """Of the fixture."""
+    objects: tuple[Region, ...]
+    """Loose, on the table."""
+    recesses: tuple[Region, ...]
+    """Regions below the top of the fixture. One that a seated object fills leaves fragments, which
+    are among them."""
+    relief: NDArray[np.float32]
+    """(rows, cols) height above the table plane, in metres, with what was not seen filled in."""
+
+
+def segment(observation: Observation) -> Segmentation:
+    """Segments an observation.
+
+    Args:
+        observation: o_t.
+
+    Returns:
+        The segmentation. Where no plateau stands out there is no fixture and there are no recesses.
+    """
+    resolution = observation.grid.resolution
+    height = fill_unseen(observation.height, observation.valid)
+    table = _fit_table(height)
+    relief = (height - _plane_heights(table, height.shape)).astype(np.float32)
+    noise = _noise(relief)
+    if noise > _CLEAN:
+        # A median would erase what is one pixel wide: only where it must be.
+        height = ndimage.median_filter(height, 3, mode="nearest")
+        relief = ndimage.median_filter(relief, 3, mode="nearest")
+
+    fixture, top = _find_fixture(height, relief, resolution)
+    margin = _FIXTURE_MARGIN / resolution
+    outside = ndimage.distance_transform_edt(~fixture) if fixture.any() else None
+    least = max(_OBJECT_HEIGHT, 3 * noise)
+    loose = relief > least
+    if outside is not None:
+        loose &= outside > margin
+    depth = np.zeros_like(relief)
+    if fixture.any():
+        depth = (_plane_heights(top, height.shape) - height).astype(np.float32)
+        depth[ndimage.distance_transform_edt(fixture) <= margin / 2] = 0
+    return Segmentation(
+        table=table,
+        fixture=fixture,
+        top=top,
+        objects=_regions(loose, relief, resolution),
+        recesses=_regions(depth > max(_RECESS_DEPTH, 3 * noise), depth, resolution),
+        relief=relief,
+    )
+
+
+def fill_unseen(height: NDArray[np.float32], valid: Mask) -> NDArray[np.float32]:
+    """Heights with the pixels that no camera saw filled in from around them.
+
+    What is hidden is hidden by something higher: a hole takes the lowest of its neighbours, from
+    its border inwards.
+
+    Args:
+        height: (rows, cols).
+        valid: (rows, cols), where it was seen.
+    """
+    if valid.all() or not valid.any():
+        return height
+    filled = np.where(valid, height, np.inf).astype(np.float32)
+    missing = ~valid
+    for _ in range(max(height.shape)):
+        lowest = ndimage.minimum_filter(filled, footprint=_NEIGHBOURS, mode="nearest")
+        filled = np.where(missing, lowest, filled)
+        missing = ~np.isfinite(filled)
+        if not missing.any():
+            break
+    return filled
+
+
+def _noise(relief: NDArray[np.float32]) -> float:
+    """The standard deviation of the heights of the table, robustly."""
+    flat = np.abs(relief[np.abs(relief) < 3 * _PLANE_BAND])
+    return 1.4826 * float(np.median(flat)) if flat.size else 0.0
+
+
+def _plane_heights(plane: Plane, shape: tuple[int, ...]) -> NDArray[np.float64]:
+    return plane[0] * np.arange(shape[0])[:, None] + plane[1] * np.arange(shape[1]) + plane[2]
+
+
+def _fit_plane(height: NDArray[np.float32], start: float, where: Mask) -> Plane:
+    """A plane through most of some pixels, by least squares on those near it, three times."""
+    plane = np.array([0.0, 0.0, start])
+    rows, cols = np.nonzero(where)
+    design = np.column_stack([rows, cols, np.ones(len(rows))])
+    values = height[rows, cols]
+    for band in (2 * _PLANE_BAND, _PLANE_BAND, _PLANE_BAND):
+        near = np.abs(values - design @ plane) < band
+        if near.sum() < 100:
+            break
+        plane = np.linalg.lstsq(design[near], values[near], rcond=None)[0]
+    return plane
+
+
+def _mode(values: NDArray[np.float32]) -> float:
+    """The height about which most values lie."""
+    width = 0.001
+    low = float(values.min())
+    counts = np.bincount(((values - low) / width).astype(int))
+    smooth = np.convolve(counts, np.ones(5), "same")
+    return low + (int(smooth.argmax()) + 0.5) * width
+
+
+def _fit_table(height: NDArray[np.float32]) -> Plane:
+    low = height[height <= np.median(height)]
+    return _fit_plane(height, _mode(low), np.ones(height.shape, bool))
+
+
+def _find_fixture(
+    height: NDArray[np.float32], relief: NDArray[np.float32], resolution: float
+) -> tuple[Mask, Plane]:
+    """The convex hull of the largest plateau, and the plane of its top."""
+    none = np.zeros(height.shape, bool), np.zeros(3)
+    high = relief > _LEAST_FIXTURE_HEIGHT
+    if high.sum() * resolution**2 < _LEAST_FIXTURE_AREA:
+        return none
+    level = _mode(relief[high])
+    plateau = ndimage.binary_opening(np.abs(relief - level) < _PLANE_BAND, _NEIGHBOURS)
+    # A recess from rim to rim must not cut it in two.
+    labels, count = ndimage.label(ndimage.binary_closing(plateau, _NEIGHBOURS, 3), _NEIGHBOURS)
+    if not count:
+        return none
+    sizes = np.bincount(labels[plateau], minlength=count + 1)
+    sizes[0] = 0
+    plateau &= labels == sizes.argmax()
+    if plateau.sum() * resolution**2 < _LEAST_FIXTURE_AREA:
+        return none
+    try:
+        hull = ConvexHull(np.argwhere(plateau))
+    except QhullError:
+        return none
+    rows, cols = np.indices(height.shape)
+    fixture = np.ones(height.shape, bool)
+    for a, b, offset in hull.equations:
+        fixture &= a * rows + b * cols + offset <= 0.5
+    start = float(np.median(height[plateau]))
+    return fixture, _fit_plane(height, start, plateau)
+
+
+def _regions(mask: Mask, relief: NDArray[np.float32], resolution: float) -> tuple[Region, ...]:
+    """The connected regions of a mask that are large enough, the largest first."""
+    labels, count = ndimage.label(mask, _NEIGHBOURS)
+    sizes = np.bincount(labels.ravel(), minlength=count + 1)
+    sizes[0] = 0
+    result = []
+    for label in np.argsort(-sizes, kind="stable"):
+        if sizes[label] * resolution**2 < _LEAST_AREA:
+            break
+        region = labels == label
+        result.append(Region(region, float(np.percentile(relief[region], 90))))
+    return tuple(result)

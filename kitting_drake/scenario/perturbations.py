@@ -1,0 +1,107 @@
+"""Named overlays of scenario fields that make the world less perfect: the flag `--perturb`.
+
+Nothing here could not be written in YAML; what is drawn, is drawn from the episode's seed.
+"""
+
+import dataclasses as dc
+from typing import Any
+
+from kitting_drake.common.errors import UserError
+from kitting_drake.scenario.schema import Scenario
+
+LEVELS = ("mild", "moderate", "severe")
+
+_DRAWN = {"_tag": "!Drawn"}
+_OVERLAYS: dict[str, tuple[dict[str, Any], ...]] = {
+    "colour": (
+        {"appearance": {"paints": {"*": {**_DRAWN, "spread": 0.15}}}},
+        {"appearance": {"paints": {"*": _DRAWN}}},
+        # What stands is of one colour, insides and outsides.
+        {"appearance": {"paints": {"*": _DRAWN, "fixtures/*": {**_DRAWN, "shared": True}}}},
+    ),
+    "light": (
+        {"appearance": {"drawn_lights": 0.3}},
+        {"appearance": {"drawn_lights": 0.6}},
+        {"appearance": {"drawn_lights": 0.9}},
+    ),
+    "depth_noise": tuple(
+        {
+            "sensor_noise": {
+                "depth_std": 0.001 * scale,
+                "depth_step": 0.0005 * scale,
+                "flying_share": 0.1 * scale,
+            }
+        }
+        for scale in (1, 2, 4)
+    ),
+    "depth_holes": (
+        {"sensor_noise": {"hole_share": 0.01, "steepest_deg": 85.0}},
+        {"sensor_noise": {"hole_share": 0.03, "steepest_deg": 80.0}},
+        {"sensor_noise": {"hole_share": 0.08, "steepest_deg": 70.0}},
+    ),
+    "calibration": tuple(
+        {
+            "sensor_noise": {
+                "rig_position_error": 0.001 * scale,
+                "rig_angle_error_deg": 0.1 * scale,
+                "camera_position_error": 0.0004 * scale,
+                "camera_angle_error_deg": 0.04 * scale,
+            }
+        }
+        for scale in (1, 3, 6)
+    ),
+    "friction": tuple({"plant": {"friction_variation": share}} for share in (0.15, 0.3, 0.5)),
+    "mass": tuple({"plant": {"mass_variation": share}} for share in (0.15, 0.3, 0.5)),
+    "distractors": tuple({"task": {"distractors": count}} for count in (2, 4, 8)),
+}
+
+NAMES = (*_OVERLAYS, "all")
+
+
+def perturbation(text: str, scenario: Scenario) -> dict[str, Any]:
+    """The overlay that `--perturb` names, as a mapping of fields; tags are under `_tag`.
+
+    Args:
+        text: `NAME[:LEVEL]`, several separated by commas; without a level it is `moderate`. `all`
+            is all that the scenario has fields for.
+        scenario: what it will be laid over.
+
+    Raises:
+        UserError: there is no such name or level, one is given twice, or the scenario's task has
+            no such field.
+    """
+    levels: dict[str, str] = {}
+    for item in text.split(","):
+        name, colon, level = item.strip().partition(":")
+        level = level if colon else "moderate"
+        if name not in NAMES:
+            raise UserError(f"--perturb: there is no '{name}': use {', '.join(NAMES)}")
+        if level not in LEVELS:
+            raise UserError(f"--perturb: {name} has no level '{level}': use {', '.join(LEVELS)}")
+        if name in levels:
+            raise UserError(f"--perturb: {name} is given twice")
+        levels[name] = level
+    everything = levels.pop("all", None)
+    if everything is not None:
+        chosen = {name: everything for name in _OVERLAYS if _applies(name, scenario)}
+        levels = chosen | levels
+    overlay: dict[str, Any] = {}
+    for name, level in levels.items():
+        if not _applies(name, scenario):
+            task = type(scenario.task).__name__
+            raise UserError(f"--perturb: the task !{task} has no {name}")
+        _merge(overlay, _OVERLAYS[name][LEVELS.index(level)])
+    return overlay
+
+
+def _applies(name: str, scenario: Scenario) -> bool:
+    fields = {item.name for item in dc.fields(scenario.task)}
+    return "task" not in _OVERLAYS[name][0] or name in fields
+
+
+def _merge(into: dict[str, Any], given: dict[str, Any]) -> None:
+    for key, value in given.items():
+        if isinstance(value, dict) and isinstance(into.get(key), dict):
+            _merge(into[key], value)
+        else:
+            into[key] = dict(value) if isinstance(value, dict) else value

@@ -1,0 +1,295 @@
+"""What a real RGB-D camera adds to an ideal one: noise, holes, and a calibration that is off."""
+
+import dataclasses as dc
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+from pydrake.common.value import AbstractValue, Value
+from pydrake.geometry import DepthRenderCamera
+from pydrake.math import RigidTransform, RotationMatrix
+from pydrake.systems.framework import Context, LeafSystem
+from pydrake.systems.sensors import ImageDepth32F, ImageLabel16I, ImageRgba8U
+from scipy import ndimage
+
+from systems.bounds import bounded
+
+SHEEN_LABELS = 20000
+"""A render label of this plus a percentage is that of a surface of so much sheen."""
+
+_TIME_RESOLUTION = 1e-6
+"""Images that are farther apart than this, in seconds, have noise of their own."""
+_HOLE_RADIUS = 3.0
+"""Standard deviation of the smooth field whose highest parts are holes, in pixels."""
+_EDGE = 0.015
+"""Neighbouring depths that differ by more than this are an edge, in metres."""
+
+
+@dc.dataclass
+class SensorNoiseParameters:
+    """The imperfections of the RGB-D cameras and of their calibration. All zero: none."""
+
+    # Standard deviation of the depth at 1 m, in m; it grows with the square of the depth, as that
+    # of a stereo camera does.
+    depth_std: float = bounded(0.0, 0.0, 0.1)
+
+    # Neighbouring pixels err alike: standard deviation of the smoothing kernel, in pixels.
+    correlation: float = bounded(1.5, 0.0, 20.0)
+
+    # Depths come in steps: their size at 1 m, in m; it grows with the square of the depth.
+    depth_step: float = bounded(0.0, 0.0, 0.1)
+
+    # The share of pixels beside an edge whose depth lies anywhere between both sides.
+    flying_share: float = bounded(0.0, 0.0, 1.0)
+
+    # The share of all pixels that are holes, without depth; a hole is some pixels wide.
+    hole_share: float = bounded(0.0, 0.0, 0.9)
+
+    # A surface seen at more than this angle from its normal gives no depth, in degrees.
+    steepest_deg: float = bounded(90.0, 1.0, 90.0)
+
+    # Standard deviation of the gain of each colour channel, as a share.
+    white_balance_std: float = bounded(0.0, 0.0, 1.0)
+
+    # By how much the pose that is believed of each camera is off, in m and degrees; in a direction
+    # drawn for each.
+    camera_position_error: float = bounded(0.0, 0.0, 0.1)
+    camera_angle_error_deg: float = bounded(0.0, 0.0, 20.0)
+
+    # By how much all of them are off together, about the middle of the workspace.
+    rig_position_error: float = bounded(0.0, 0.0, 0.1)
+    rig_angle_error_deg: float = bounded(0.0, 0.0, 20.0)
+
+    @property
+    def is_none(self) -> bool:
+        """Whether nothing is changed."""
+        return not any(
+            (
+                self.depth_std,
+                self.depth_step,
+                self.flying_share,
+                self.hole_share,
+                self.steepest_deg < 90,
+                self.white_balance_std,
+                self.camera_position_error,
+                self.camera_angle_error_deg,
+                self.rig_position_error,
+                self.rig_angle_error_deg,
+            )
+        )
+
+
+class SensorNoise(LeafSystem):
+    """Stands between an RgbdSensor and what reads it, and makes its images imperfect.
+
+    .. pydrake_system::
+
+        name: SensorNoise
+        input_ports:
+        - color_image
+        - depth_image_32f
+        - label_image (optional)
+        - body_pose_in_world
+        output_ports:
+        - color_image
+        - depth_image_32f
+        - body_pose_in_world
+
+    The outputs are what the sensor's are, so that it can take their place. The law:
+
+    - Depth z gets noise of standard deviation `depth_std (z / 1 m)^2`, smoothed over `correlation`
+      pixels and scaled back, and is rounded to multiples of `depth_step (z / 1 m)^2`.
+    - Beside an edge (a step of more than 15 mm within a pixel) a share `flying_share` of the pixels
+      gets a depth anywhere between the two sides.
+    - Holes, with depth 0 (Drake's too close): blobs over `hole_share` of the image; what is seen at
+      more than `steepest_deg` from its normal; and, where `label_image` is connected, blobs over a
+      share of the surfaces with sheen: of a label of SHEEN_LABELS + p, p percent.
+    - Each colour channel is multiplied by a gain, normally distributed about one.
+    - `body_pose_in_world` is the pose that calibration *believes*: `X_Rig X_WB X_Camera`, with
+      errors of the given size in directions drawn once. The images show the world from the true
+      pose.
+
+    All is drawn from the seed, the camera's number and the time, to the microsecond: what is pulled
+    again is the same again, and there is no state.
+    """
+
+    def __init__(
+        self,
+        *,
+        parameters: SensorNoiseParameters,
+        camera: DepthRenderCamera,
+        seed: int,
+        number: int,
+        workspace_middle: tuple[float, float] = (0.5, 0.0),
+        use_labels: bool = False,
+    ) -> None:
+        """
+        Args:
+            parameters: of the noise.
+            camera: the sensor's depth camera.
+            seed: of all draws.
+            number: of the camera; the error of the rig does not depend on it.
+            workspace_middle: (x, y) in the world about which the rig is rotated, in metres.
+            use_labels: declare the input port `label_image`.
+        """
+        super().__init__()
+        self._parameters = parameters
+        self._seed, self._number = seed, number
+        info = camera.core().intrinsics()
+        self._focal = (info.focal_x(), info.focal_y())
+        self._shape = (info.height(), info.width())
+        middle = RigidTransform([*workspace_middle, 0.0])
+        rig = _pose_error(
+            np.random.default_rng([seed, 1]),
+            parameters.rig_position_error,
+            parameters.rig_angle_error_deg,
+        )
+        self._X_rig = middle @ rig @ middle.inverse()
+        own = np.random.default_rng([seed, 2, number])
+        self._X_camera = _pose_error(
+            own, parameters.camera_position_error, parameters.camera_angle_error_deg
+        )
+        gains = 1 + parameters.white_balance_std * own.standard_normal(3)
+        self._gains = np.maximum(gains, 0).astype(np.float32)
+
+        self._color = self.DeclareAbstractInputPort("color_image", Value(ImageRgba8U()))
+        self._depth = self.DeclareAbstractInputPort("depth_image_32f", Value(ImageDepth32F()))
+        self._label = None
+        if use_labels:
+            self._label = self.DeclareAbstractInputPort("label_image", Value(ImageLabel16I()))
+        self._pose = self.DeclareAbstractInputPort("body_pose_in_world", Value(RigidTransform()))
+        height, width = self._shape
+        self.DeclareAbstractOutputPort(
+            "color_image",
+            lambda: Value(ImageRgba8U(width, height)),
+            self._calc_color,
+            {self._color.ticket()},
+        )
+        depends = {self._depth.ticket(), self.time_ticket()}
+        if self._label is not None:
+            depends.add(self._label.ticket())
+        self.DeclareAbstractOutputPort(
+            "depth_image_32f",
+            lambda: Value(ImageDepth32F(width, height)),
+            self._calc_depth,
+            depends,
+        )
+        self.DeclareAbstractOutputPort(
+            "body_pose_in_world",
+            lambda: Value(RigidTransform()),
+            self._calc_pose,
+            {self._pose.ticket()},
+        )
+
+    def _calc_pose(self, context: Context, output: AbstractValue) -> None:
+        X_WB: RigidTransform = self._pose.Eval(context)
+        output.set_value(self._X_rig @ X_WB @ self._X_camera)
+
+    def _calc_color(self, context: Context, output: AbstractValue) -> None:
+        data = np.asarray(self._color.Eval(context).data)
+        image = ImageRgba8U(data.shape[1], data.shape[0])
+        seen = image.mutable_data
+        seen[:] = data
+        if self._parameters.white_balance_std:
+            gained = data[:, :, :3] * self._gains
+            seen[:, :, :3] = np.minimum(np.rint(gained), 255).astype(np.uint8)
+        output.set_value(image)
+
+    def _calc_depth(self, context: Context, output: AbstractValue) -> None:
+        data = np.asarray(self._depth.Eval(context).data)
+        image = ImageDepth32F(data.shape[1], data.shape[0])
+        frame = round(context.get_time() / _TIME_RESOLUTION)
+        random = np.random.default_rng([self._seed, 3, self._number, frame])
+        sheen = None
+        if self._label is not None:
+            labels = np.asarray(self._label.Eval(context).data)[:, :, 0].astype(np.int32)
+            sheen = np.where(
+                (labels > SHEEN_LABELS) & (labels <= SHEEN_LABELS + 100),
+                (labels - SHEEN_LABELS) / 100,
+                0.0,
+            ).astype(np.float32)
+        image.mutable_data[:, :, 0] = noisy_depth(
+            data[:, :, 0], self._parameters, self._focal, random, sheen
+        )
+        output.set_value(image)
+
+
+def noisy_depth(
+    depth: NDArray[np.float32],
+    parameters: SensorNoiseParameters,
+    focal: tuple[float, float],
+    random: np.random.Generator,
+    sheen: NDArray[np.float32] | None = None,
+) -> NDArray[np.float32]:
+    """A depth image as an imperfect camera sees it; see `SensorNoise` for the law.
+
+    Args:
+        depth: (height, width), in metres; 0 and infinity are no depth.
+        parameters: of the noise.
+        focal: focal lengths along x and y, in pixels.
+        random: for all draws.
+        sheen: (height, width), the share of holes on each surface, if there is any sheen.
+    """
+    seen = np.isfinite(depth) & (depth > 0)
+    z = np.where(seen, depth, 1.0).astype(np.float32)
+    hole = np.zeros(depth.shape, bool)
+    if parameters.steepest_deg < 90:
+        by_row, by_col = np.gradient(z)
+        # The tangent of the angle of incidence, nearly, for a ray along the optical axis.
+        tangent = np.hypot(by_row * focal[1], by_col * focal[0]) / z
+        hole |= tangent > math.tan(math.radians(parameters.steepest_deg))
+    noisy = z
+    if parameters.flying_share:
+        low, high = ndimage.minimum_filter(z, 3), ndimage.maximum_filter(z, 3)
+        flying = (high - low > _EDGE) & (random.random(z.shape) < parameters.flying_share)
+        mixed = low + (high - low) * random.random(z.shape, dtype=np.float32)
+        noisy = np.where(flying, mixed, noisy)
+        hole &= ~flying
+    square = z * z
+    if parameters.depth_std:
+        noisy = noisy + parameters.depth_std * square * _smooth(random, z.shape, parameters)
+    if parameters.depth_step:
+        step = parameters.depth_step * square
+        noisy = np.rint(noisy / step) * step
+    if parameters.hole_share or sheen is not None:
+        field = _unit_field(random, z.shape, _HOLE_RADIUS)
+        share = np.full(z.shape, parameters.hole_share, np.float32)
+        if sheen is not None:
+            share = np.maximum(share, sheen)
+        hole |= field > _upper_quantile(share)
+    return np.where(hole | ~seen, np.where(seen, 0.0, depth), noisy).astype(np.float32)
+
+
+def _smooth(
+    random: np.random.Generator, shape: tuple[int, ...], parameters: SensorNoiseParameters
+) -> NDArray[np.float32]:
+    return _unit_field(random, shape, parameters.correlation)
+
+
+def _unit_field(
+    random: np.random.Generator, shape: tuple[int, ...], radius: float
+) -> NDArray[np.float32]:
+    """Normally distributed values of unit variance, smoothed over some pixels."""
+    values = random.standard_normal(shape, dtype=np.float32)
+    if radius <= 0:
+        return values
+    smooth = ndimage.gaussian_filter(values, radius, mode="wrap", truncate=3.0)
+    return smooth / max(float(smooth.std()), 1e-12)
+
+
+def _upper_quantile(share: NDArray[np.float32]) -> NDArray[np.float32]:
+    """What a share of normally distributed values exceeds."""
+    from scipy.special import ndtri
+
+    return ndtri(1 - np.clip(share, 1e-9, 1 - 1e-9)).astype(np.float32)
+
+
+def _pose_error(random: np.random.Generator, distance: float, angle_deg: float) -> RigidTransform:
+    """A shift and a rotation of the given size, each in a random direction."""
+    shift, axis = random.standard_normal(3), random.standard_normal(3)
+    axis /= np.linalg.norm(axis)
+    half = math.radians(angle_deg) / 2
+    from pydrake.common.eigen_geometry import Quaternion
+
+    turn = Quaternion(np.append(math.cos(half), math.sin(half) * axis))
+    return RigidTransform(RotationMatrix(turn), distance * shift / np.linalg.norm(shift))

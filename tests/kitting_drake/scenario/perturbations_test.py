@@ -1,0 +1,66 @@
+from pathlib import Path
+
+import pytest
+
+from kitting_drake.common.errors import UserError
+from kitting_drake.common.paths import SCENARIOS
+from kitting_drake.scenario.appearance import Drawn
+from kitting_drake.scenario.loader import load_scenario
+from kitting_drake.scenario.perturbations import LEVELS, NAMES
+from kitting_drake.scenario.schema import Scenario
+from kitting_drake.tasks import Kitting
+
+KITTING = SCENARIOS / "kitting_unseen.yaml"
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_every_level_is_a_scenario_of_its_own(name: str):
+    seen = [load_scenario(KITTING, perturb=f"{name}:{level}") for level in LEVELS]
+    assert load_scenario(KITTING) not in seen
+    assert all(one != other for i, one in enumerate(seen) for other in seen[:i])
+    assert load_scenario(KITTING, perturb=name) == seen[1]
+
+
+def test_moderate_is_a_careful_calibration_of_a_real_camera():
+    scenario = load_scenario(KITTING, perturb="all")
+    noise = scenario.sensor_noise
+    assert (noise.depth_std, noise.hole_share) == (0.002, 0.03)
+    assert (noise.rig_position_error, noise.rig_angle_error_deg) == pytest.approx((0.003, 0.3))
+    assert (scenario.plant.friction_variation, scenario.plant.mass_variation) == (0.3, 0.3)
+    assert scenario.task.distractors == 4
+    assert scenario.appearance.paints == {"*": Drawn()}
+
+
+def test_several_are_laid_over_each_other_and_the_text_over_all():
+    text = "{sensor_noise: {hole_share: 0.2}}"
+    noise = load_scenario(KITTING, None, text, "depth_noise:mild,depth_holes").sensor_noise
+    assert (noise.depth_std, noise.steepest_deg, noise.hole_share) == (0.001, 80.0, 0.2)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("fog", "there is no 'fog': use colour, light"),
+        ("mass:hard", "mass has no level 'hard': use mild, moderate, severe"),
+        ("mass,mass:mild", "mass is given twice"),
+        ("", "there is no ''"),
+    ],
+)
+def test_a_mistake_is_told(text: str, message: str):
+    with pytest.raises(UserError, match=message):
+        load_scenario(KITTING, perturb=text)
+
+
+def test_a_task_without_distractors(tmp_path: Path):
+    ravens = SCENARIOS / "ravens.yaml"
+    with pytest.raises(UserError, match="the task !BlockInsertion has no distractors"):
+        load_scenario(ravens, "BlockInsertion", perturb="distractors")
+    # All that there is.
+    assert load_scenario(ravens, "BlockInsertion", perturb="all").plant.mass_variation == 0.3
+
+
+def test_by_default_nothing_is_perturbed():
+    scenario = Scenario()
+    assert scenario.sensor_noise.is_none
+    assert not scenario.appearance.paints
+    assert Kitting().distractors == 0

@@ -1,0 +1,156 @@
+import math
+
+import numpy as np
+import pytest
+from pydrake.common.value import Value
+from pydrake.geometry import ClippingRange, DepthRange, DepthRenderCamera, RenderCameraCore
+from pydrake.math import RigidTransform, RollPitchYaw
+from pydrake.systems.sensors import CameraInfo, ImageDepth32F, ImageLabel16I, ImageRgba8U
+
+from systems.sensor_noise import SHEEN_LABELS, SensorNoise, SensorNoiseParameters, noisy_depth
+
+WIDTH, HEIGHT, FOCAL = 160, 120, 112.0
+POSE = RigidTransform(RollPitchYaw(0.8, 3.0, -1.5), [1.0, 0.1, 0.75])
+
+
+def camera() -> DepthRenderCamera:
+    info = CameraInfo(WIDTH, HEIGHT, FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2)
+    core = RenderCameraCore("none", info, ClippingRange(0.01, 10.0), RigidTransform())
+    return DepthRenderCamera(core, DepthRange(0.01, 10.0))
+
+
+def system(*, seed: int = 3, number: int = 0, use_labels: bool = False, **noise: float):
+    parameters = SensorNoiseParameters(**noise)
+    return SensorNoise(
+        parameters=parameters, camera=camera(), seed=seed, number=number, use_labels=use_labels
+    )
+
+
+def context_of(noise: SensorNoise, depth: np.ndarray, color: int = 100):
+    context = noise.CreateDefaultContext()
+    image = ImageDepth32F(WIDTH, HEIGHT)
+    image.mutable_data[:, :, 0] = depth
+    noise.GetInputPort("depth_image_32f").FixValue(context, Value(image))
+    colours = ImageRgba8U(WIDTH, HEIGHT)
+    colours.mutable_data[:] = color
+    noise.GetInputPort("color_image").FixValue(context, Value(colours))
+    noise.GetInputPort("body_pose_in_world").FixValue(context, Value(POSE))
+    return context
+
+
+def depth_of(noise: SensorNoise, context) -> np.ndarray:
+    return np.array(noise.GetOutputPort("depth_image_32f").Eval(context).data[:, :, 0])
+
+
+def test_ports_are_those_of_a_sensor():
+    noise = system(use_labels=True)
+    inputs = [noise.get_input_port(i).get_name() for i in range(noise.num_input_ports())]
+    outputs = [noise.get_output_port(i).get_name() for i in range(noise.num_output_ports())]
+    assert inputs == ["color_image", "depth_image_32f", "label_image", "body_pose_in_world"]
+    assert outputs == ["color_image", "depth_image_32f", "body_pose_in_world"]
+    assert system().num_input_ports() == 3
+
+
+def test_without_noise_everything_passes():
+    noise = system()
+    depth = np.linspace(0.5, 1.5, WIDTH * HEIGHT, dtype=np.float32).reshape(HEIGHT, WIDTH)
+    depth[0, 0], depth[0, 1] = 0, np.inf
+    context = context_of(noise, depth)
+    np.testing.assert_array_equal(depth_of(noise, context), depth)
+    assert noise.GetOutputPort("body_pose_in_world").Eval(context).IsExactlyEqualTo(POSE)
+    assert (noise.GetOutputPort("color_image").Eval(context).data == 100).all()
+
+
+def test_noise_grows_with_the_square_of_depth():
+    noise = system(depth_std=0.002)
+    for distance in (0.5, 1.0, 2.0):
+        seen = depth_of(noise, context_of(noise, np.full((HEIGHT, WIDTH), distance)))
+        assert seen.std() == pytest.approx(0.002 * distance**2, rel=0.02)
+        # Neighbours err alike.
+        left, right = seen[:, :-1].ravel(), seen[:, 1:].ravel()
+        assert np.corrcoef(left, right)[0, 1] > 0.7
+
+
+def test_it_repeats_itself_and_differs_by_time_seed_and_camera():
+    flat = np.full((HEIGHT, WIDTH), 0.9)
+
+    def seen(time: float = 0.5, **arguments: int) -> np.ndarray:
+        noise = system(depth_std=0.001, hole_share=0.05, **arguments)
+        context = context_of(noise, flat)
+        context.SetTime(time)
+        return depth_of(noise, context)
+
+    np.testing.assert_array_equal(seen(), seen())
+    for other in (seen(time=0.625), seen(seed=4), seen(number=1)):
+        assert (other != seen()).mean() > 0.9
+
+
+def test_holes_have_their_share_and_steep_and_shiny_surfaces_more():
+    flat = np.full((HEIGHT, WIDTH), 1.0, np.float32)
+    random = np.random.default_rng(0)
+    shares = [
+        (noisy_depth(flat, SensorNoiseParameters(hole_share=0.05), (FOCAL, FOCAL), random) == 0)
+        for _ in range(20)
+    ]
+    assert np.mean(shares) == pytest.approx(0.05, rel=0.15)
+    # A plane that recedes by 60 degrees more than a fronto-parallel one.
+    steep = np.tile(1 + np.arange(WIDTH) / FOCAL * math.tan(math.radians(75)), (HEIGHT, 1))
+    seen = noisy_depth(
+        steep.astype(np.float32), SensorNoiseParameters(steepest_deg=60.0), (FOCAL, FOCAL), random
+    )
+    assert (seen[:, : WIDTH // 8] == 0).all()
+    noise = system(use_labels=True)
+    context = context_of(noise, flat)
+    labels = ImageLabel16I(WIDTH, HEIGHT)
+    labels.mutable_data[:] = 7
+    labels.mutable_data[:, WIDTH // 2 :] = SHEEN_LABELS + 60
+    noise.GetInputPort("label_image").FixValue(context, Value(labels))
+    holes = depth_of(noise, context) == 0
+    assert not holes[:, : WIDTH // 2].any()
+    assert 0.45 < holes[:, WIDTH // 2 :].mean() < 0.75
+
+
+def test_pixels_fly_only_beside_edges():
+    step = np.full((HEIGHT, WIDTH), 1.0, np.float32)
+    step[:, WIDTH // 2 :] = 0.9
+    seen = noisy_depth(
+        step, SensorNoiseParameters(flying_share=0.5), (FOCAL, FOCAL), np.random.default_rng(1)
+    )
+    changed = seen != step
+    assert changed[:, WIDTH // 2 - 1 : WIDTH // 2 + 1].mean() == pytest.approx(0.5, abs=0.12)
+    assert changed.sum() == changed[:, WIDTH // 2 - 1 : WIDTH // 2 + 1].sum()
+    assert (seen >= 0.9 - 1e-6).all()
+    assert (seen <= 1.0 + 1e-6).all()
+
+
+def test_calibration_is_off_by_what_was_asked():
+    def believed(number: int, **errors: float) -> RigidTransform:
+        noise = system(number=number, **errors)
+        context = context_of(noise, np.ones((HEIGHT, WIDTH)))
+        return noise.GetOutputPort("body_pose_in_world").Eval(context)
+
+    rig = [
+        believed(number, rig_position_error=0.003, rig_angle_error_deg=0.3) @ POSE.inverse()
+        for number in (0, 1)
+    ]
+    # The same for all cameras, about the middle of the workspace.
+    assert rig[0].IsNearlyEqualTo(rig[1], 1e-12)
+    assert np.linalg.norm(rig[0] @ np.array([0.5, 0, 0]) - (0.5, 0, 0)) == pytest.approx(0.003)
+    angle = rig[0].rotation().ToAngleAxis().angle()
+    assert math.degrees(angle) == pytest.approx(0.3, rel=1e-4)
+    own = [
+        POSE.inverse() @ believed(n, camera_position_error=0.001, camera_angle_error_deg=0.1)
+        for n in (0, 1)
+    ]
+    assert not own[0].IsNearlyEqualTo(own[1], 1e-5)
+    for error in own:
+        assert np.linalg.norm(error.translation()) == pytest.approx(0.001)
+
+
+def test_colours_are_out_of_balance():
+    noise = system(white_balance_std=0.2)
+    seen = noise.GetOutputPort("color_image").Eval(context_of(noise, np.ones((HEIGHT, WIDTH)))).data
+    channels = seen.reshape(-1, 4)
+    assert (channels == channels[0]).all()
+    assert len(set(channels[0, :3].tolist())) == 3
+    assert channels[0, 3] == 100
