@@ -8,7 +8,7 @@ import pickle
 import time
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 import torch
@@ -28,28 +28,20 @@ from kitting_drake.common.files import (
     write_json,
 )
 from kitting_drake.policies.config import METHODS, PRESETS, NetworkConfig
-from kitting_drake.policies.demonstrations import Demonstrations, read_demonstrations
 from kitting_drake.policies.learned_policy import LearnedPolicy
 from kitting_drake.policies.methods import make_networks
-from kitting_drake.policies.samples import (
-    Scene,
-    final_observations,
-    labelled_images,
-    normalisation,
-    scenes,
-)
+from kitting_drake.policies.samples import normalisation
 from kitting_drake.policies.training import Trainer
+from kitting_drake.policies.training_data import TrainingData, read_training_data
 from kitting_drake.policies.validation import validate
 from kitting_drake.policies.weights import preferred_device, preferred_type, save_weights
 
-Item = TypeVar("Item")
-
 _CHECKPOINT_EVERY = 100
 """Steps between checkpoints, and between points of the curves."""
-_TABLE = ("task", "heightmap")
-"""The fields of a scenario that determine, with the seed, what stands where."""
 _MOST_VALIDATED = 64
 """The most scenes, and the most final observations, that a validation uses."""
+_MOST_NORMALISED = 512
+"""The most scenes whose images tell by what inputs are normalised."""
 _DAMAGED = (
     OSError,
     EOFError,
@@ -68,7 +60,7 @@ class Settings:
 
     scenario: str
     demonstrations: int
-    """The number of demonstrations that are learned from."""
+    """The number of demonstrations, or of static scenes, that are learned from."""
     demonstration_seeds: tuple[int, ...]
     validation_seeds: tuple[int, ...]
     method: str
@@ -83,6 +75,8 @@ class Settings:
     """Whether there is no curvature augmentation."""
     reflection: bool
     """Whether half of the samples are mirror images."""
+    colour: bool
+    """Whether the networks see colours."""
     stop: bool
     """Whether the networks learn from final observations that there is nothing left to pick."""
     validate_every: int
@@ -98,12 +92,12 @@ def main() -> int:
     learned, held_out = _split(arguments.demos, arguments.demonstrations, arguments.validation)
     settings = _settings(arguments, learned, held_out)
     folder = require_folder(
-        arguments.output or Path("output") / f"{learned.origin.scenario_name}-training"
+        arguments.output or Path("output") / f"{learned.scenario}-training".replace(" ", "_")
     )
     run = _Run(settings, learned, held_out, folder, console)
     with alone_in(folder):
         # Scenarios of one name may differ, and with them what the same seeds give.
-        origins = [item.origin.scenario for item in (learned, held_out)]
+        origins = [item.origin for item in (learned, held_out)]
         described = {**dataclasses.asdict(settings), "origins": origins}
         claim_folder(folder, "settings.json", described, of="training run")
         run.train()
@@ -112,14 +106,14 @@ def main() -> int:
 
 
 def _settings(
-    arguments: argparse.Namespace, learned: Demonstrations, held_out: Demonstrations
+    arguments: argparse.Namespace, learned: TrainingData, held_out: TrainingData
 ) -> Settings:
-    assumed = learned.origin.learning
+    assumed = learned.learning
     return Settings(
-        scenario=learned.origin.scenario_name,
-        demonstrations=len(learned.demonstrations),
-        demonstration_seeds=tuple(item.seed for item in learned.demonstrations),
-        validation_seeds=tuple(item.seed for item in held_out.demonstrations),
+        scenario=learned.scenario,
+        demonstrations=learned.count,
+        demonstration_seeds=learned.seeds,
+        validation_seeds=held_out.seeds,
         method=arguments.method,
         preset=arguments.preset,
         orientations=arguments.orientations,
@@ -130,7 +124,8 @@ def _settings(
         # The Transporter rotates whole images: it has no crop in which an object can be bent.
         rigid=arguments.rigid or not assumed.curvature or arguments.method == "transporter",
         reflection=assumed.reflection and not arguments.rigid,
-        stop=bool(final_observations(learned.demonstrations)),
+        colour=learned.colour,
+        stop=bool(learned.finals(1)),
         validate_every=arguments.validate_every,
         seed=arguments.seed,
         device=preferred_device().type,
@@ -144,7 +139,11 @@ def _parse() -> argparse.Namespace:
         description="Train a policy's networks from demonstrations. Run again, it resumes.",
     )
     parser.add_argument(
-        "--demos", type=Path, required=True, metavar="FILE.h5", help="what to learn from"
+        "--demos",
+        type=Path,
+        required=True,
+        metavar="FILE.h5",
+        help="what to learn from: what collect or draw_scenes wrote",
     )
     parser.add_argument(
         "--demonstrations",
@@ -200,36 +199,30 @@ def _rate_type(text: str) -> float:
 
 def _split(
     path: Path, count: int | None, validation: Path | None
-) -> tuple[Demonstrations, Demonstrations]:
-    """The demonstrations to learn from, and those to validate by."""
-    everything = read_demonstrations(path)
-    items = everything.demonstrations
-    if not items:
-        raise UserError(f"{path} holds no demonstrations: collect some")
+) -> tuple[TrainingData, TrainingData]:
+    """The data to learn from, and those to validate by."""
+    everything = read_training_data(path)
+    total = everything.count
     if count is None:
-        count = len(items) if validation else len(items) - max(1, len(items) // 11)
-    if len(items) < count:
-        raise UserError(f"{path} holds {len(items)} demonstrations, not {count}: collect more")
-    learned = dataclasses.replace(everything, demonstrations=items[:count])
+        count = total if validation else total - max(1, total // 11)
+    if total < count:
+        raise UserError(f"{path} holds {total} demonstrations, not {count}: collect more")
+    learned = everything.part(0, count)
     if validation is None:
-        kept = items[count : count + max(1, count // 10)]
-        if not kept or not count:
+        kept = everything.part(count, count + max(1, count // 10))
+        if not kept.count or not count:
             raise UserError(
-                f"of {len(items)} in {path}, {count} to learn from leave none to validate by: "
+                f"of {total} in {path}, {count} to learn from leave none to validate by: "
                 "collect more, or give --validation"
             )
-        return learned, dataclasses.replace(everything, demonstrations=kept)
-    held_out = read_demonstrations(validation)
-    if not held_out.demonstrations:
-        raise UserError(f"{validation} holds no demonstrations: collect some")
-    shared = {item.seed for item in held_out.demonstrations} & {item.seed for item in items[:count]}
-    # These fields and the seed determine what stands where.
-    scenarios = [item.origin.scenario for item in (everything, held_out)]
-    if shared and all(scenarios[0].get(key) == scenarios[1].get(key) for key in _TABLE):
+        return learned, kept
+    held_out = read_training_data(validation)
+    shared = learned.shares_scenes(held_out)
+    if shared is not None:
         raise UserError(
-            f"{validation} and {path} share the seed {min(shared)}: validation needs other ones"
+            f"{validation} and {path} share the seed {shared}: validation needs other ones"
         )
-    if held_out.origin.grid != everything.origin.grid:
+    if held_out.grid != everything.grid:
         raise UserError(f"{validation} and {path} have different pixel grids")
     return learned, held_out
 
@@ -240,26 +233,26 @@ class _Run:
     def __init__(
         self,
         settings: Settings,
-        demonstrations: Demonstrations,
-        held_out: Demonstrations,
+        learned: TrainingData,
+        held_out: TrainingData,
         folder: Path,
         console: Console,
     ) -> None:
         self.settings, self.folder, self.console = settings, folder, console
         self._log = folder / "log.jsonl"
-        self.grid = demonstrations.origin.grid
-        learned = _scenes(demonstrations)
-        self.samples = labelled_images(learned, taken_only=settings.taken_only)
-        self.finals = final_observations(demonstrations.demonstrations)
-        self.validation_scenes = _evenly_chosen(_scenes(held_out))
-        self.validation_finals = _evenly_chosen(final_observations(held_out.demonstrations))
+        self.grid = learned.grid
+        self.samples = learned.samples(taken_only=settings.taken_only)
+        self.finals = learned.finals()
+        self.validation_scenes = held_out.scenes(_MOST_VALIDATED)
+        self.validation_finals = held_out.finals(_MOST_VALIDATED)
         try:
             config = NetworkConfig(
                 method=settings.method,
                 preset=settings.preset,
                 orientations=settings.orientations,
+                colour=settings.colour,
                 stop=settings.stop,
-                **normalisation(learned),  # type: ignore[arg-type]
+                **normalisation(learned.scenes(_MOST_NORMALISED)),  # type: ignore[arg-type]
             )
             torch.manual_seed(settings.seed)
             networks = make_networks(config)
@@ -409,21 +402,6 @@ class _Run:
         }
         torch.save(state, buffer)
         write_atomically(self.folder / "checkpoint.pt", buffer.getvalue())
-
-
-def _scenes(demonstrations: Demonstrations) -> list[Scene]:
-    origin = demonstrations.origin
-    return scenes(
-        demonstrations.demonstrations,
-        origin.grid,
-        later_picks_possible=origin.learning.later_picks_possible,
-    )
-
-
-def _evenly_chosen(items: list[Item]) -> list[Item]:
-    """All of them, or evenly chosen ones if there are too many to validate by."""
-    count = min(len(items), _MOST_VALIDATED)
-    return [items[i * len(items) // count] for i in range(count)]
 
 
 def _report_line(step: int, report: dict[str, float]) -> str:

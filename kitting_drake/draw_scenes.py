@@ -1,0 +1,135 @@
+"""`python -m kitting_drake.draw_scenes`: static scenes of random tools, to train a generalist."""
+
+import argparse
+import os
+from pathlib import Path
+
+from rich.console import Console
+
+from kitting_drake.cell.cameras import require_rendering
+from kitting_drake.common.command_line import count_type, run_command, seed_type
+from kitting_drake.common.errors import UserError
+from kitting_drake.common.files import alone_in, claim_folder, require_folder
+from kitting_drake.common.processes import (
+    LocalWorkers,
+    ProcessCrashed,
+    counting_bar,
+    side_by_side,
+)
+from kitting_drake.common.provenance import versions
+from kitting_drake.policies.static_scenes import (
+    StaticScenes,
+    read_static_scenes,
+    write_static_scenes,
+)
+from kitting_drake.tasks.kitting.static_scenes import draw_batch
+from systems.signals import PixelGrid
+
+_MOST_BATCHES = 10_000
+"""No batch has so few scenes that more than this would be needed."""
+
+
+def main() -> int:
+    """Parses the command line and draws; returns the exit code."""
+    arguments = _parse()
+    console = Console(quiet=arguments.quiet)
+    require_rendering()
+    folder = require_folder(arguments.output)
+    with alone_in(folder):
+        claim_folder(folder, "settings.json", {"seed": arguments.seed}, of="set of scenes")
+        path = folder / "scenes.h5"
+        parts = _Parts(folder / "parts", arguments.seed)
+        with LocalWorkers(arguments.workers or os.cpu_count() or 1) as workers:
+            parts.draw(arguments.scenes, workers, console)
+        scenes = parts.assemble(arguments.scenes, path)
+    finals = sum(not len(scene.actions) for scene in scenes)
+    console.print(
+        f"{path} holds {len(scenes)} scenes, in {finals} of them nothing is left to do",
+        highlight=False,
+    )
+    return 0
+
+
+class _Parts:
+    """A file for each batch of scenes; they stay, so that more can be asked for later."""
+
+    def __init__(self, folder: Path, seed: int) -> None:
+        self._folder, self._seed = folder, seed
+        folder.mkdir(exist_ok=True)
+        self._counts = {
+            int(path.stem.removeprefix("batch_")): len(read_static_scenes(path).scenes)
+            for path in folder.glob("batch_*.h5")
+        }
+
+    def path(self, batch: int) -> Path:
+        return self._folder / f"batch_{batch:06d}.h5"
+
+    def draw(self, count: int, workers: LocalWorkers, console: Console) -> None:
+        """Draws batches until those without a gap before them hold so many scenes."""
+        begun = set(self._counts)
+
+        def next_batch() -> int | None:
+            if sum(self._counts.values()) >= count:
+                return None
+            batch = next(i for i in range(_MOST_BATCHES) if i not in begun)
+            begun.add(batch)
+            return batch
+
+        def draw(batch: int) -> tuple[int, int | ProcessCrashed]:
+            return batch, workers.run(_draw_part, self.path(batch), self._seed + batch)
+
+        with counting_bar(console, "scenes") as progress:
+            drawn = min(count, sum(self._counts.values()))
+            task = progress.add_task("", total=count, completed=drawn)
+            for batch, outcome in side_by_side(draw, next_batch, workers=workers):
+                if isinstance(outcome, ProcessCrashed):
+                    raise UserError(
+                        f"the process of batch {batch} ended without a result "
+                        f"(exit code {outcome.exit_code}): the same command goes on there"
+                    )
+                self._counts[batch] = outcome
+                progress.update(task, completed=min(count, sum(self._counts.values())))
+
+    def assemble(self, count: int, path: Path) -> list:
+        """Writes the one file of the first so many scenes; returns them."""
+        scenes = [
+            scene
+            for batch in sorted(self._counts)
+            for scene in read_static_scenes(self.path(batch)).scenes
+        ][:count]
+        content = StaticScenes(PixelGrid(), tuple(scenes), self._seed, versions())
+        _write(path, content)
+        return scenes
+
+
+def _draw_part(path: Path, seed: int) -> int:
+    scenes = tuple(draw_batch(seed))
+    _write(path, StaticScenes(PixelGrid(), scenes, seed, versions()))
+    return len(scenes)
+
+
+def _write(path: Path, content: StaticScenes) -> None:
+    """Writes a file atomically."""
+    scratch = path.with_name(f".{path.name}")
+    write_static_scenes(scratch, content)
+    scratch.replace(path)
+
+
+def _parse() -> argparse.Namespace:
+    parser = argparse.ArgumentParser(
+        prog="python -m kitting_drake.draw_scenes",
+        description="Draw static scenes of random tools and kits, to train a generalist. "
+        "Run again, it goes on.",
+    )
+    parser.add_argument("--scenes", type=count_type, default=3000, help="how many (3000)")
+    parser.add_argument("--seed", type=seed_type, default=0, help="of all draws (0)")
+    parser.add_argument(
+        "--workers", type=count_type, help=f"how many side by side ({os.cpu_count()})"
+    )
+    parser.add_argument("--output", type=Path, required=True, metavar="DIR")
+    parser.add_argument("--quiet", action="store_true", help="print nothing but errors")
+    return parser.parse_args()
+
+
+if __name__ == "__main__":
+    run_command(main)

@@ -1,0 +1,153 @@
+"""What a training run learns from and validates by: demonstrations, or static scenes."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+
+from kitting_drake.common.errors import UserError
+from kitting_drake.policies.demonstrations import (
+    Demonstration,
+    Demonstrations,
+    FinalObservation,
+    Recorded,
+    read_demonstrations,
+)
+from kitting_drake.policies.images import LabelledImage
+from kitting_drake.policies.learning import Learning
+from kitting_drake.policies.samples import (
+    Scene,
+    final_observations,
+    labelled_images,
+    scenes,
+)
+from kitting_drake.policies.static_scenes import (
+    StaticSamples,
+    StaticScenes,
+    is_static_scenes,
+    read_static_scenes,
+)
+from systems.signals import PickPlaceAction, PixelGrid, PlanarPose
+
+Item = TypeVar("Item")
+
+STATIC = "static scenes"
+_TABLE = ("task", "heightmap")
+"""The fields of a scenario that determine, with the seed, what stands where."""
+
+
+@dataclass(frozen=True)
+class TrainingData:
+    """Observations and labels of one origin."""
+
+    scenario: str
+    origin: dict[str, Any]
+    """The scenario's fields, as JSON has them."""
+    grid: PixelGrid
+    learning: Learning
+    colour: bool
+    """Whether there are colours to learn from."""
+    seeds: tuple[int, ...]
+    """Of the demonstrations, or the first seed of static scenes."""
+    items: tuple[Demonstration, ...] | StaticScenes
+
+    @property
+    def count(self) -> int:
+        """How many demonstrations, or static scenes."""
+        return len(self.items.scenes if isinstance(self.items, StaticScenes) else self.items)
+
+    def part(self, first: int, last: int) -> TrainingData:
+        """Some of them."""
+        if isinstance(self.items, StaticScenes):
+            chosen = dataclasses.replace(self.items, scenes=self.items.scenes[first:last])
+            return dataclasses.replace(self, items=chosen)
+        items = self.items[first:last]
+        return dataclasses.replace(self, items=items, seeds=tuple(item.seed for item in items))
+
+    def scenes(self, most: int | None = None) -> list[Scene]:
+        """The observations in which there is something to pick.
+
+        Args:
+            most: evenly chosen ones if there are more than this.
+        """
+        if not isinstance(self.items, StaticScenes):
+            possible = self.learning.later_picks_possible
+            found = scenes(self.items, self.grid, later_picks_possible=possible)
+            return evenly_chosen(found, most)
+        result = []
+        loose = [scene for scene in self.items.scenes if len(scene.actions)]
+        for scene in evenly_chosen(loose, most):
+            actions = tuple(
+                PickPlaceAction(PlanarPose(*row[2:5]), PlanarPose(*row[5:8]))
+                for row in scene.actions.tolist()
+            )
+            result.append(Scene(_recorded(Recorded, scene.image), actions, self.grid))
+        return result
+
+    def finals(self, most: int | None = None) -> list[FinalObservation]:
+        """The observations in which there is nothing left to pick; `most` as for `scenes`."""
+        if not isinstance(self.items, StaticScenes):
+            return evenly_chosen(final_observations(self.items), most)
+        seated = [scene for scene in self.items.scenes if not len(scene.actions)]
+        return [_recorded(FinalObservation, item.image) for item in evenly_chosen(seated, most)]
+
+    def samples(self, *, taken_only: bool) -> Sequence[LabelledImage]:
+        """What to learn from, of the observations in which there is something to pick."""
+        if isinstance(self.items, StaticScenes):
+            return StaticSamples(self.items)
+        return labelled_images(self.scenes(), taken_only=taken_only)
+
+    def shares_scenes(self, other: TrainingData) -> int | None:
+        """A seed of which both hold the same scene; None if there is none."""
+        shared = set(self.seeds) & set(other.seeds)
+        same = all(self.origin.get(key) == other.origin.get(key) for key in _TABLE)
+        return min(shared) if shared and same else None
+
+
+def evenly_chosen(items: list[Item], most: int | None) -> list[Item]:
+    """All of them, or evenly chosen ones if there are more than `most`."""
+    count = len(items) if most is None else min(len(items), most)
+    return [items[i * len(items) // count] for i in range(count)]
+
+
+def _recorded(kind: Any, image: np.ndarray) -> Any:
+    return kind(np.zeros((3, *image.shape[1:]), np.uint8), image[3])
+
+
+def read_training_data(path: Path) -> TrainingData:
+    """Reads a file of demonstrations or of static scenes.
+
+    Raises:
+        UserError: it is neither, cannot be read, or is empty.
+    """
+    if is_static_scenes(path):
+        content = read_static_scenes(path)
+        data = TrainingData(
+            scenario=STATIC,
+            origin={"task": STATIC},
+            grid=content.grid,
+            learning=Learning(later_picks_possible=True, curvature=True, reflection=True),
+            colour=False,
+            seeds=(content.first_seed,),
+            items=content,
+        )
+    else:
+        demonstrations: Demonstrations = read_demonstrations(path)
+        origin = demonstrations.origin
+        data = TrainingData(
+            scenario=origin.scenario_name,
+            origin=origin.scenario,
+            grid=origin.grid,
+            learning=origin.learning,
+            colour=True,
+            seeds=tuple(item.seed for item in demonstrations.demonstrations),
+            items=demonstrations.demonstrations,
+        )
+    if not data.count:
+        raise UserError(f"{path} holds no demonstrations: collect some")
+    return data
