@@ -15,6 +15,7 @@ from torch import Tensor
 
 from kitting_drake.policies.correlation import Candidate
 from kitting_drake.policies.images import Image, make_action, rotation_matrix
+from kitting_drake.policies.matching.policy import something_fits
 from kitting_drake.policies.matching.refinement import refine_place
 from kitting_drake.policies.matching.segmentation import fill_unseen
 from kitting_drake.policies.networks import Networks
@@ -65,7 +66,8 @@ class LearnedPolicy:
             continuous: refine the action beyond pixels and orientation bins (sub-pixel and sub-bin
                 refinement, not in the paper) instead of quantizing it.
             fit_outlines: refine the place by the outlines of object and recess, where they agree
-                (`refine_place`, not in the paper).
+                (`refine_place`), and do not stop while they show an object that certainly fits
+                (`something_fits`). Not in the paper.
             watch: called with each observation and decision.
 
         Raises:
@@ -129,6 +131,8 @@ class LearnedPolicy:
         action = make_action(observation, pick, theta, place, rotation)
         odds, threshold = picking.log_odds, networks.stop_threshold
         stop = odds is not None and threshold is not None and odds < threshold
+        if stop and self._fit_outlines:
+            stop = not something_fits(observation)
         score_map = placing.score_map - placing.score_map.max()
         return Decision(
             action=dataclasses.replace(action, stop=stop),

@@ -147,7 +147,8 @@ class Learned(PolicyConfig):
     continuous: bool = True
 
     # With `continuous`: refine the place by fitting the outline of the object, as o_t shows it, to
-    # that of the recess, where the two agree (the paper does not).
+    # that of the recess, where the two agree, and do not stop while an object certainly fits into
+    # one (the paper does neither).
     fit_outlines: bool = True
 
     def make_system(self, site: PolicySite) -> LeafSystem:

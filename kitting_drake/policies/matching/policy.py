@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
@@ -11,18 +9,19 @@ from scipy.optimize import linear_sum_assignment
 from kitting_drake.policies.images import make_action
 from kitting_drake.policies.matching.jaw_clearance import jaw_grasps
 from kitting_drake.policies.matching.registration import (
-    Outline,
     Registration,
     coarse_cost,
     register,
     trace_outline,
 )
-from kitting_drake.policies.matching.segmentation import Region, segment
+from kitting_drake.policies.matching.segmentation import Segmentation, segment
 from systems.signals import Observation, PickPlaceAction
 
 _WORST_COST = 0.0024
 """An outline and a recess that differ by more than this on average do not belong together, in
 metres."""
+_CERTAIN_COST = 0.0012
+"""Those that differ by less certainly do."""
 _HEIGHT_WEIGHT = 0.1
 """By how much a difference of an object's height and a recess's depth adds to the cost."""
 _PROMISING = 2.0
@@ -42,10 +41,7 @@ class ShapeMatchingPolicy:
         """The action; both gripper poses are in the world."""
         segmentation = segment(observation)
         resolution = observation.grid.resolution
-        outlines = [trace_outline(o.mask, resolution, close=True) for o in segmentation.objects]
-        recesses = [trace_outline(c.mask, resolution) for c in segmentation.recesses]
-        pairs = match(segmentation.objects, outlines, segmentation.recesses, recesses)
-        for index, fit in pairs:
+        for index, fit in match(segmentation, resolution):
             grasps = jaw_grasps(segmentation, segmentation.objects[index], resolution)
             if grasps:
                 best = grasps[0]
@@ -54,22 +50,24 @@ class ShapeMatchingPolicy:
         return PickPlaceAction(stop=True)
 
 
-def match(
-    objects: Sequence[Region],
-    outlines: Sequence[Outline],
-    regions: Sequence[Region],
-    recesses: Sequence[Outline],
-) -> list[tuple[int, Registration]]:
-    """Which objects go where: indices and registrations, the best fit first.
+def something_fits(observation: Observation) -> bool:
+    """Whether a loose object certainly belongs into a recess that is free."""
+    pairs = match(segment(observation), observation.grid.resolution)
+    return any(fit.cost < _CERTAIN_COST for _, fit in pairs)
+
+
+def match(segmentation: Segmentation, resolution: float) -> list[tuple[int, Registration]]:
+    """Which loose objects go where: their indices and registrations, the best fit first.
 
     Args:
-        objects: the loose ones.
-        outlines: theirs, closed.
-        regions: the recesses.
-        recesses: their outlines.
+        segmentation: of an observation.
+        resolution: of its pixels, in metres.
     """
+    objects, regions = segmentation.objects, segmentation.recesses
     if not objects or not regions:
         return []
+    outlines = [trace_outline(item.mask, resolution, close=True) for item in objects]
+    recesses = [trace_outline(item.mask, resolution) for item in regions]
     coarse = np.array([[coarse_cost(o, c) for c in recesses] for o in outlines])
     fits: dict[tuple[int, int], Registration] = {}
     costs = np.full(coarse.shape, 10 * _WORST_COST)

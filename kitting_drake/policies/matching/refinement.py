@@ -22,7 +22,7 @@ Array = NDArray[np.float64]
 
 _WORST_COST = 0.0018
 """Outlines that differ by more on average say nothing, in metres."""
-_HALF_TURN_GAIN = 0.88
+_HALF_TURN_GAIN = 0.95
 """The half turn is taken if its cost is at most this share of the other's."""
 _LARGEST_SHIFT = 0.010
 """A correction moves the object's middle by at most this, in metres, ..."""
