@@ -12,7 +12,7 @@ from kitting_drake.common.errors import UserError
 from kitting_drake.reporting.summary import ERRORS
 from kitting_drake.scenario.command_line import ChosenScenario
 from kitting_drake.scenario.schema import Scenario
-from kitting_drake.tasks import PAPER_TASKS
+from kitting_drake.tasks import PAPER_TASKS, RAVENS_TASKS
 
 METHODS = {
     "so2": "SO(2)-equivariant (ours)",
@@ -28,6 +28,15 @@ LEARNED = ("so2", "equivariant_transporter", "transporter")
 
 _NOT_THE_TASK = ("policy", "random_seed", "target_realtime_rate")
 """The fields of a scenario in which runs of one task may differ."""
+
+_ADDED = (
+    "task.distractors",
+    "plant.friction_variation",
+    "plant.mass_variation",
+    "sensor_noise",
+    "appearance",
+)
+"""Fields that older runs lack; their defaults are what there was before them."""
 
 _MOST_SHOWN = 4
 """So many differences of one run are listed; more are counted."""
@@ -92,12 +101,18 @@ class Run:
     @cached_property
     def departures(self) -> list[str]:
         """Where its scenario differs, but for the policy, from that of the paper's task of its
-        kind; or, if the paper has none, from the default one, but for the task."""
+        kind, or from the Ravens task; or, if the paper has none, from the default one, but for the
+        task."""
         found = self.summary["resolved_scenario"]
         for task in PAPER_TASKS.values():
             expected = _described(Scenario(task=task))
             if found["task"]["_tag"] == expected["task"]["_tag"]:
                 return _differences(_without(found), _without(expected))
+        for other in RAVENS_TASKS:
+            expected = _described(Scenario(task=other))
+            if found["task"]["_tag"] == expected["task"]["_tag"]:
+                # The longest of them has a limit of its own.
+                return _differences(_without(found, "time_limit"), _without(expected, "time_limit"))
         expected = _described(Scenario())
         return _differences(_without(found, "task"), _without(expected, "task"))
 
@@ -137,6 +152,8 @@ def _differences(found: Any, expected: Any, path: str = "") -> list[str]:
     differences = []
     for key in dict.fromkeys((*expected, *found)):
         here = f"{path}.{key}" if path else key
+        if key not in found and here in _ADDED:
+            continue
         if key not in found:
             differences.append(f"{here}: not there")
         elif key not in expected:

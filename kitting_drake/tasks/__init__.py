@@ -21,3 +21,12 @@ Task = (
 
 PAPER_TASKS = {task.title: task for task in (Kitting(), ToolsetKitting(split="test"))}
 """The tasks of the paper (section V-B.1) by their titles; nothing in them is changed."""
+
+RAVENS_TASKS = (
+    BlockInsertion(),
+    PlaceRedInGreen(),
+    PalletizingBoxes(),
+    AlignBoxCorner(),
+    StackBlockPyramid(),
+)
+"""The Ravens tasks (section V-B.2), in the order of table I; nothing in them is changed."""
