@@ -118,6 +118,8 @@ class PickPlaceParameters:
         limits[Mode.DESCEND] = replace(free, speed=self.descend_speed)
         limits[Mode.LOWER] = replace(carry, speed=self.lower_speed)
         limits[Mode.SEARCH] = replace(
-            limits[Mode.LOWER], yaw_speed=min(self.search.yaw_speed, self.yaw_speed)
+            limits[Mode.LOWER],
+            speed=min(self.search.speed, self.lower_speed),
+            yaw_speed=min(self.search.yaw_speed, self.yaw_speed),
         )
         return limits

@@ -5,7 +5,7 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 from pydrake.common.containers import namedview
-from pydrake.common.value import Value
+from pydrake.common.value import AbstractValue, Value
 from pydrake.systems.framework import (
     BasicVector,
     Context,
@@ -47,6 +47,8 @@ _START, _GOAL, _START_RATE, _DELAYS = slice(3, 7), slice(7, 11), slice(11, 15), 
 
 _YAW_LIMIT = 3.4
 """How far the wrist may rotate either way, in rad: just short of its joint limit."""
+_MOST_FAILED = 16
+"""So many failed picks are remembered."""
 _NEARLY_THERE = 0.02
 """So near to where it goes, in m, the hand may sink below what the rest of the way has to clear."""
 _OVERSHOOT = 0.05
@@ -70,6 +72,7 @@ class PickPlacePlanner(LeafSystem):
         - closing_force
         - mode
         - counts
+        - failed_picks
 
     - `hand_state` (12): positions then velocities of (x, y, z, yaw, left finger, right finger).
     - `hand_contact_force` (6): contact as generalized force on the same coordinates, in N and N m:
@@ -85,6 +88,8 @@ class PickPlacePlanner(LeafSystem):
     - `closing_force` (1): what each pad presses beyond that, in N.
     - `mode` (1): a `Mode`.
     - `counts` (3): actions begun, grasps missed, objects dropped.
+    - `failed_picks` (abstract, a tuple of `PlanarPose`): where a grasp was missed or lost, the
+      latest last, at most 16 of them: for a policy that is to try another.
 
     Every motion is as short as the limits on speed and acceleration allow, and smooth (see
     `systems.hand_motion`): in the plane along a straight line, while height and yaw have time
@@ -98,7 +103,7 @@ class PickPlacePlanner(LeafSystem):
     stand further apart than `minimum_width` and both feel at least half of the grasp force; when it
     is not, or is lost on the way, the hand retreats and observes again, which counts as an action.
 
-    All memory is one vector of discrete state.
+    All memory is discrete state: one vector, and the failed picks.
     """
 
     def __init__(
@@ -140,6 +145,14 @@ class PickPlacePlanner(LeafSystem):
         state_only = {self.discrete_state_ticket(self._state_index)}
         self.DeclareVectorOutputPort("mode", 1, self._calc_mode, state_only)
         self.DeclareVectorOutputPort("counts", 3, self._calc_counts, state_only)
+        # A row for each: x, y, theta. Those after the last are not numbers.
+        self._failed_index = self.DeclareDiscreteState(np.full(3 * _MOST_FAILED, np.nan))
+        self.DeclareAbstractOutputPort(
+            "failed_picks",
+            lambda: Value(()),
+            self._calc_failed_picks,
+            {self.discrete_state_ticket(self._failed_index)},
+        )
 
     def mode(self, context: Context) -> Mode:
         """The mode in the given context (its own)."""
@@ -190,6 +203,11 @@ class PickPlacePlanner(LeafSystem):
         state = self._state(context)
         output.SetFromVector([state.actions, state.missed, state.dropped])
 
+    def _calc_failed_picks(self, context: Context, output: AbstractValue) -> None:
+        rows = context.get_discrete_state(self._failed_index).get_value().reshape(-1, 3)
+        kept = rows[~np.isnan(rows[:, 0])].tolist()
+        output.set_value(tuple(PlanarPose(*row) for row in kept))
+
     # The state machine.
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> EventStatus:
@@ -209,7 +227,14 @@ class PickPlacePlanner(LeafSystem):
             Mode.SEARCH: self._search,
         }.get(mode, self._follow)
         if mode != Mode.DONE:
+            failed = state.missed + state.dropped
             step(context, state, time, hand, contact)
+            if state.missed + state.dropped > failed:
+                rows = discrete_state.get_mutable_value(self._failed_index).reshape(-1, 3)
+                known = np.flatnonzero(np.isnan(rows[:, 0]))
+                if not len(known):
+                    rows[:-1] = rows[1:].copy()
+                rows[known[0] if len(known) else -1] = state.pick_x, state.pick_y, state.pick_yaw
         return EventStatus.Succeeded()
 
     def _observe(self, context, state, time, hand, contact) -> None:
@@ -400,7 +425,9 @@ class PickPlacePlanner(LeafSystem):
         elif mode == Mode.LOWER:
             state.goal_z = state.table_z + parameters.floor_clearance
         elif mode == Mode.SEARCH:
-            state.goal_yaw = state.place_yaw + parameters.search.yaw_offset(int(state.search_step))
+            x, y, yaw = parameters.search.offset(int(state.search_step))
+            state.goal_x, state.goal_y = state.place_x + x, state.place_y + y
+            state.goal_yaw = state.place_yaw + yaw
             state.goal_z = state.touch_z - parameters.search.press
         elif mode == Mode.RELEASE:
             state.goal_opening = min(

@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Callable
+from typing import Any
 
 from pydrake.common.value import AbstractValue, Value
 from pydrake.systems.framework import Context, LeafSystem
 
 from systems.signals import Observation, PickPlaceAction
+
+PolicyFunction = Callable[..., PickPlaceAction]
+"""Called with an `Observation`; and, if it takes a second argument, with a tuple of the
+`PlanarPose`s at which a grasp failed before, the latest last."""
 
 
 class PickPlacePolicy(LeafSystem):
@@ -18,17 +24,20 @@ class PickPlacePolicy(LeafSystem):
         name: PickPlacePolicy
         input_ports:
         - observation
+        - failed_picks (if the function takes them)
         output_ports:
         - action
 
     - `observation` (abstract, `Observation`): o_t.
+    - `failed_picks` (abstract, a tuple of `PlanarPose`): where a grasp failed before.
     - `action` (abstract, `PickPlaceAction`): the policy's answer.
 
     Pulled: the callable runs when the port is evaluated, once for each new observation. It lives
-    outside the Context, which must stay cheap to copy, and must therefore not remember anything.
+    outside the Context, which must stay cheap to copy, and must therefore not remember anything:
+    what there is to remember comes in by a port.
     """
 
-    def __init__(self, *, policy: Callable[[Observation], PickPlaceAction]) -> None:
+    def __init__(self, *, policy: PolicyFunction) -> None:
         """
         Args:
             policy: a function without memory. What it raises ends the evaluation of the port; an
@@ -36,20 +45,33 @@ class PickPlacePolicy(LeafSystem):
         """
         super().__init__()
         self._policy = policy
-        observation = self.DeclareAbstractInputPort("observation", Value(Observation()))
-        self._observation = observation
+        self._observation = self.DeclareAbstractInputPort("observation", Value(Observation()))
+        self._inputs = [self._observation]
+        if _takes_two(policy):
+            self._inputs.append(self.DeclareAbstractInputPort("failed_picks", Value(())))
         self.DeclareAbstractOutputPort(
             "action",
             lambda: Value(PickPlaceAction()),
             self._calc_action,
-            {observation.ticket()},
+            {port.ticket() for port in self._inputs},
         )
 
     def _calc_action(self, context: Context, output: AbstractValue) -> None:
-        action = self._policy(self._observation.Eval(context))
+        action = self._policy(*(port.Eval(context) for port in self._inputs))
         if not isinstance(action, PickPlaceAction):
             raise TypeError(
                 f"the policy {self._policy!r} answered with {type(action).__name__}, "
                 "not a PickPlaceAction"
             )
         output.set_value(action)
+
+
+def _takes_two(policy: Callable[..., Any]) -> bool:
+    """Whether a function takes a second argument by its place."""
+    try:
+        parameters = list(inspect.signature(policy).parameters.values())
+    except (TypeError, ValueError):
+        # Some built-in functions do not tell.
+        return False
+    placed = (inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD)
+    return sum(item.kind in placed for item in parameters) >= 2

@@ -272,6 +272,8 @@ def _add_planner_and_controller(
     controller = builder.AddNamedSystem("controller", _make_controller(scenario, plant))
     hand_state = plant.get_state_output_port(hand)
     builder.Connect(policy.GetOutputPort("action"), planner.GetInputPort("action"))
+    if policy.HasInputPort("failed_picks"):
+        builder.Connect(planner.GetOutputPort("failed_picks"), policy.GetInputPort("failed_picks"))
     if projector is not None:
         builder.Connect(projector.GetOutputPort("observation"), planner.GetInputPort("observation"))
     builder.Connect(hand_state, planner.GetInputPort("hand_state"))

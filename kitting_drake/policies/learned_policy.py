@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,11 +15,14 @@ from torch import Tensor
 
 from kitting_drake.policies.correlation import Candidate
 from kitting_drake.policies.images import Image, make_action, rotation_matrix
-from kitting_drake.policies.matching.policy import something_fits
+from kitting_drake.policies.matching.policy import RETRY_DISTANCE, something_fits
 from kitting_drake.policies.matching.refinement import refine_place
 from kitting_drake.policies.matching.segmentation import fill_unseen
 from kitting_drake.policies.networks import Networks
-from systems.signals import Observation, PickPlaceAction, wrap_to_pi
+from systems.signals import Observation, PickPlaceAction, PixelGrid, PlanarPose, wrap_to_pi
+
+_NEVER = -math.inf
+"""The logit of a pixel that must not be chosen."""
 
 
 @dataclass(frozen=True)
@@ -80,9 +83,16 @@ class LearnedPolicy:
         self._fit_outlines = fit_outlines
         self._watch = watch
 
-    def __call__(self, observation: Observation) -> PickPlaceAction:
-        """The action; both gripper poses are in the world."""
-        decision = self.decide(observation)
+    def __call__(
+        self, observation: Observation, failed_picks: Sequence[PlanarPose] = ()
+    ) -> PickPlaceAction:
+        """The action; both gripper poses are in the world.
+
+        Args:
+            observation: o_t.
+            failed_picks: where a grasp failed before: there it is not tried again.
+        """
+        decision = self.decide(observation, failed_picks)
         if self._watch is not None:
             self._watch(observation, decision)
         return PickPlaceAction(stop=True) if decision.stop else decision.action
@@ -101,13 +111,16 @@ class LearnedPolicy:
         return np.concatenate([observation.rgb, filled[None]])
 
     @torch.inference_mode()
-    def decide(self, observation: Observation) -> Decision:
-        """The action, and the distributions that it was read from."""
+    def decide(self, observation: Observation, failed_picks: Sequence[PlanarPose] = ()) -> Decision:
+        """The action, and the distributions that it was read from; see `__call__`."""
         networks = self._networks
         image = self._input(observation)
         picking = networks.predict_pick(image, self._orientations)
         logits = picking.position
         rows, cols = logits.shape
+        if failed_picks:
+            near = near_failed(observation.grid, failed_picks)
+            logits = logits.masked_fill(torch.from_numpy(near).to(logits.device), _NEVER)
         row, col = divmod(int(logits.argmax()), cols)
         pixel = np.array([row, col], float)
 
@@ -143,6 +156,16 @@ class LearnedPolicy:
             place_pixel=place,
             log_odds=odds,
         )
+
+
+def near_failed(grid: PixelGrid, failed_picks: Sequence[PlanarPose]) -> NDArray[np.bool_]:
+    """(rows, cols): the pixels that are too near to a failed pick to try again."""
+    rows, cols = np.indices(grid.shape)
+    world = grid.to_world(np.stack([rows, cols], axis=-1))
+    near = np.zeros(grid.shape, bool)
+    for pick in failed_picks:
+        near |= np.linalg.norm(world - (pick.x, pick.y), axis=-1) < RETRY_DISTANCE
+    return near
 
 
 def expected_position(logits: Tensor, pixel: tuple[int, int]) -> NDArray[np.float64]:

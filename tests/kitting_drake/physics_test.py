@@ -180,7 +180,9 @@ def test_a_tool_that_the_closing_jaws_rotated_is_rotated_into_its_cavity(
     amplitude: float, kitted: bool
 ):
     task = Misjudged(tools={"s_wrench": TablePose(x=0.36, y=0.3, yaw_deg=75.0)})
-    planner = PickPlaceParameters(search=InsertionSearch(amplitude=amplitude), max_actions=1)
+    planner = PickPlaceParameters(
+        search=InsertionSearch(amplitude=amplitude, reach=0.0), max_actions=1
+    )
     result = run(Scenario(task=task, planner=planner, cameras={}), time_limit=60.0)
     assert result.success_rate == float(kitted)
     if not kitted:

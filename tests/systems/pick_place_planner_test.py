@@ -199,7 +199,8 @@ def test_ports():
         "mode": 1,
         "counts": 3,
     }
-    assert planner.num_output_ports() == len(outputs)
+    assert planner.num_output_ports() == len(outputs) + 1
+    assert planner.GetOutputPort("failed_picks").Eval(planner.CreateDefaultContext()) == ()
     for name, size in outputs.items():
         assert planner.GetOutputPort(name).size() == size
 
@@ -303,11 +304,17 @@ def test_a_search_in_vain_ends_where_it_began():
     assert run.sequence[-2] == Mode.SEARCH
     q = run.output("desired_motion")[:4]
     assert q[2] == pytest.approx(ON_THE_RIM, abs=2.5e-3)
-    assert q[3] == pytest.approx(PLACE.theta)
-    # Both ways, as far as it may.
-    yaws = run.log.FindLog(run.simulator.get_context()).data()[3] - PLACE.theta
-    searched = yaws[-(3 * 128) :]
-    assert searched.min() == pytest.approx(-PARAMETERS.search.amplitude, abs=1e-3)
+    np.testing.assert_allclose(q[[0, 1, 3]], (PLACE.x, PLACE.y, PLACE.theta), atol=1e-9)
+    # Both ways, and around, as far as it may.
+    began = next(time for time, mode in run.modes if mode == Mode.SEARCH)
+    log = run.log.FindLog(run.simulator.get_context())
+    searched = log.data()[:4, log.sample_times() > began]
+    search = PARAMETERS.search
+    assert (searched[3] - PLACE.theta).min() == pytest.approx(-search.amplitude, abs=1e-3)
+    strayed = np.hypot(searched[0] - PLACE.x, searched[1] - PLACE.y)
+    assert strayed.max() == pytest.approx(search.reach, abs=1e-4)
+    assert np.ptp(searched[0]) > 1.5 * search.reach
+    assert np.ptp(searched[1]) > 1.5 * search.reach
     assert run.finish().sequence[-1] == Mode.DONE
 
 
@@ -317,7 +324,9 @@ def test_a_search_in_vain_ends_where_it_began():
     ids=["in its cavity", "no insertion", "not wanted"],
 )
 def test_nothing_is_searched_for(touched: float, insertion: bool, amplitude: float):
-    parameters = dataclasses.replace(PARAMETERS, search=InsertionSearch(amplitude=amplitude))
+    parameters = dataclasses.replace(
+        PARAMETERS, search=InsertionSearch(amplitude=amplitude, reach=amplitude / 30)
+    )
     run = Run(
         World(touch_place=touched),
         answer=OVER_A_CAVITY,
@@ -431,6 +440,14 @@ def test_a_missed_grasp_is_counted_and_tried_again():
     missed = [*PICK_AND_PLACE[: PICK_AND_PLACE.index(Mode.CHECK) + 1], Mode.RETREAT]
     assert run.sequence == [*missed, *PICK_AND_PLACE, Mode.OBSERVE, Mode.DONE]
     assert run.counts == [2, 1, 0]
+    assert run.output("failed_picks") == (PICK,)
+
+
+def test_the_latest_failed_picks_are_remembered():
+    world = World(width=lambda attempt, mode: 0.0)
+    run = Run(world, actions=20, parameters=dataclasses.replace(PARAMETERS, max_actions=20))
+    assert run.finish().counts == [20, 20, 0]
+    assert run.output("failed_picks") == (PICK,) * 16
 
 
 def test_an_object_dropped_while_searching_is_counted():

@@ -56,3 +56,20 @@ def test_what_the_policy_raises_comes_through():
     policy.GetInputPort("observation").FixValue(context, Value(Observation()))
     with pytest.raises(KeyError, match="no such weight"):
         policy.GetOutputPort("action").Eval(context)
+
+
+def test_a_function_of_two_arguments_is_told_where_grasps_failed():
+    told = []
+
+    def answer(_: Observation, failed_picks: tuple[PlanarPose, ...]) -> PickPlaceAction:
+        told.append(failed_picks)
+        return ACTION
+
+    policy = PickPlacePolicy(policy=answer)
+    assert policy.num_input_ports() == 2
+    context = policy.CreateDefaultContext()
+    policy.GetInputPort("observation").FixValue(context, Value(Observation()))
+    for failed in ((), (PlanarPose(0.4, 0.1, 0.2),)):
+        policy.GetInputPort("failed_picks").FixValue(context, Value(failed))
+        assert policy.GetOutputPort("action").Eval(context) == ACTION
+    assert told == [(), (PlanarPose(0.4, 0.1, 0.2),)]

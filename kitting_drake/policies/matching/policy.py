@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
@@ -15,8 +17,10 @@ from kitting_drake.policies.matching.registration import (
     trace_outline,
 )
 from kitting_drake.policies.matching.segmentation import Segmentation, segment
-from systems.signals import Observation, PickPlaceAction
+from systems.signals import Observation, PickPlaceAction, PlanarPose
 
+RETRY_DISTANCE = 0.010
+"""A grasp is not tried again this near to where one failed, in metres."""
 _WORST_COST = 0.0024
 """An outline and a recess that differ by more than this on average do not belong together, in
 metres."""
@@ -37,17 +41,35 @@ class ShapeMatchingPolicy:
     that fits. It has no memory.
     """
 
-    def __call__(self, observation: Observation) -> PickPlaceAction:
-        """The action; both gripper poses are in the world."""
+    def __call__(
+        self, observation: Observation, failed_picks: Sequence[PlanarPose] = ()
+    ) -> PickPlaceAction:
+        """The action; both gripper poses are in the world.
+
+        Args:
+            observation: o_t.
+            failed_picks: where a grasp failed before: there it is not tried again.
+        """
+        places = np.array([(pick.x, pick.y) for pick in failed_picks]).reshape(-1, 2)
+        failed = observation.grid.to_pixel(places)
         segmentation = segment(observation)
         resolution = observation.grid.resolution
         for index, fit in match(segmentation, resolution):
-            grasps = jaw_grasps(segmentation, segmentation.objects[index], resolution)
+            grasps = [
+                grasp
+                for grasp in jaw_grasps(segmentation, segmentation.objects[index], resolution)
+                if _distance(failed, grasp.pixel) * resolution > RETRY_DISTANCE
+            ]
             if grasps:
                 best = grasps[0]
                 place = fit.moved(best.pixel)
                 return make_action(observation, best.pixel, best.theta, place, fit.rotation)
         return PickPlaceAction(stop=True)
+
+
+def _distance(positions: NDArray[np.float64], pixel: NDArray[np.float64]) -> float:
+    """From the nearest of positions (n, 2), of which there may be none."""
+    return float(np.linalg.norm(positions - pixel, axis=1).min(initial=np.inf))
 
 
 def something_fits(observation: Observation) -> bool:

@@ -19,7 +19,7 @@ from kitting_drake.policies.learned_policy import (
 from kitting_drake.policies.methods import make_networks
 from kitting_drake.policies.networks import AnglePrediction, Networks, PickPrediction
 from kitting_drake.policies.steerable import PlainConv2d
-from systems.signals import Observation, PickPlaceAction, PixelGrid
+from systems.signals import Observation, PickPlaceAction, PixelGrid, PlanarPose
 
 # No defaults, no two numbers alike.
 GRID = PixelGrid(x_min=0.3, y_min=-0.2, resolution=0.004, rows=97, cols=129, z_min=0.02, z_max=0.3)
@@ -281,3 +281,13 @@ def test_every_decision_is_reported_to_watch():
     ((observed, decision),) = told
     assert observed is seen
     assert decision.action is action
+
+
+def test_where_a_grasp_failed_another_is_tried():
+    networks = Known()
+    policy = LearnedPolicy(networks, orientations=N, continuous=False)
+    seen = Observation(np.zeros((4, *GRID.shape), np.float32), GRID)
+    first = policy(seen)
+    second = policy(seen, [first.pick])
+    assert math.dist((first.pick.x, first.pick.y), (second.pick.x, second.pick.y)) > 0.0099
+    assert policy(seen, [PlanarPose(first.pick.x + 0.02, first.pick.y, 0.0)]) == first

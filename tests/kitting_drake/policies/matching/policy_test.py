@@ -74,6 +74,17 @@ def test_its_action_brings_a_tool_to_its_place(seen):
     assert angle < math.radians(2)
 
 
+def test_where_a_grasp_failed_another_is_tried(seen):
+    observation, _ = seen
+    tried = []
+    for _ in range(3):
+        action = ShapeMatchingPolicy()(observation, tried)
+        assert not action.stop
+        for pick in tried:
+            assert math.dist((pick.x, pick.y), (action.pick.x, action.pick.y)) > 0.0099
+        tried.append(action.pick)
+
+
 def test_it_stops_where_nothing_is_left(seen):
     observation, _ = seen
     image = observation.image.copy()
