@@ -71,6 +71,11 @@ class PickPlaceParameters:
     # Less than this between the pads is nothing at all, in m.
     minimum_width: float = bounded(0.003, 0.0, 0.08)
 
+    # How hard the closed jaws press an object down that is not seated, in N, and how far below its
+    # top they may go, in m.
+    press_force: float = bounded(30.0, 1.0, 140.0)
+    press_depth: float = bounded(0.020, 0.001, 0.05)
+
     # A vertical contact force beyond the payload's weight that means "touched", in N.
     contact_threshold: float = bounded(4.0, 0.5, 100.0)
 

@@ -35,9 +35,10 @@ _FIELDS = (
     + ["delay_xy", "delay_z", "delay_yaw"]
     + ["start_opening", "goal_opening", "start_force", "goal_force"]
     + ["pick_x", "pick_y", "pick_yaw", "place_x", "place_y", "place_yaw", "grasp_z"]
-    + ["travel_z", "clear_z", "pick_hover_z", "place_hover_z", "table_z", "support_z", "rim_z"]
+    + ["travel_z", "clear_z", "pick_top_z"]
+    + ["pick_hover_z", "place_hover_z", "table_z", "support_z", "rim_z"]
     + ["hold_z", "touch_z", "search_step"]
-    + ["payload", "actions", "missed", "dropped"]
+    + ["payload", "actions", "missed", "dropped", "press"]
 )
 _PlannerState = namedview("PlannerState", _FIELDS)
 _State: TypeAlias = Any
@@ -88,8 +89,8 @@ class PickPlacePlanner(LeafSystem):
     - `closing_force` (1): what each pad presses beyond that, in N.
     - `mode` (1): a `Mode`.
     - `counts` (3): actions begun, grasps missed, objects dropped.
-    - `failed_picks` (abstract, a tuple of `PlanarPose`): where a grasp was missed or lost, the
-      latest last, at most 16 of them: for a policy that is to try another.
+    - `failed_picks` (abstract, a tuple of `PlanarPose`): where a grasp was missed or lost, or an
+      object pressed down, the latest last, at most 16 of them: for a policy that is to try another.
 
     Every motion is as short as the limits on speed and acceleration allow, and smooth (see
     `systems.hand_motion`): in the plane along a straight line, while height and yaw have time
@@ -102,6 +103,7 @@ class PickPlacePlanner(LeafSystem):
     the cavity (`SEARCH`) and lowers again once the resistance ends. A grasp is good if the pads
     stand further apart than `minimum_width` and both feel at least half of the grasp force; when it
     is not, or is lost on the way, the hand retreats and observes again, which counts as an action.
+    An action that says `press` ends with `DESCEND`, with closed jaws and as hard as `press_force`.
 
     All memory is discrete state: one vector, and the failed picks.
     """
@@ -229,7 +231,8 @@ class PickPlacePlanner(LeafSystem):
         if mode != Mode.DONE:
             failed = state.missed + state.dropped
             step(context, state, time, hand, contact)
-            if state.missed + state.dropped > failed:
+            has_pressed = mode == Mode.DESCEND and state.mode == Mode.RETREAT
+            if has_pressed or state.missed + state.dropped > failed:
                 rows = discrete_state.get_mutable_value(self._failed_index).reshape(-1, 3)
                 known = np.flatnonzero(np.isnan(rows[:, 0]))
                 if not len(known):
@@ -253,7 +256,7 @@ class PickPlacePlanner(LeafSystem):
         state.pick_x, state.pick_y, state.pick_yaw = action.pick.x, action.pick.y, pick_yaw
         state.place_x, state.place_y, state.place_yaw = action.place.x, action.place.y, place_yaw
         self._set_heights(state, self._heights(context, action))
-        state.search_step = 0
+        state.search_step, state.press = 0, action.press
         state.actions += 1
         self._begin(state, Mode.APPROACH, time)
 
@@ -273,6 +276,7 @@ class PickPlacePlanner(LeafSystem):
         share = parameters.grasp_depth_share * (heights.pick_top - heights.support)
         depth = max(parameters.grasp_depth, min(share, parameters.max_grasp_depth))
         state.grasp_z = max(heights.pick_top - depth, floor)
+        state.pick_top_z = heights.pick_top
         state.table_z, state.support_z = heights.table, heights.support
         state.rim_z = heights.place_rim
         state.clear_z = heights.highest + parameters.travel_clearance
@@ -289,7 +293,10 @@ class PickPlacePlanner(LeafSystem):
             self._begin(state, following, time)
 
     def _descend(self, context, state, time, hand, contact) -> None:
-        if contact[2] > self._parameters.contact_threshold:
+        if state.press:
+            if contact[2] > self._parameters.press_force or time >= self._arrival(state):
+                self._begin(state, Mode.RETREAT, time)
+        elif contact[2] > self._parameters.contact_threshold:
             self._begin(state, Mode.CLOSE, time, z=hand[2])
             # Back off a little: pressed fingertips would not close.
             state.goal_z += self._parameters.floor_clearance
@@ -411,9 +418,11 @@ class PickPlacePlanner(LeafSystem):
 
         if mode == Mode.APPROACH:
             state[_GOAL] = (state.pick_x, state.pick_y, state.pick_hover_z, state.pick_yaw)
-            state.goal_opening = parameters.open_width
+            state.goal_opening = 0.0 if state.press else parameters.open_width
         elif mode == Mode.DESCEND:
             state.goal_z = state.grasp_z
+            if state.press:
+                state.goal_z = state.pick_top_z - parameters.press_depth
         elif mode == Mode.CLOSE:
             state.goal_opening = 0.0
         elif mode == Mode.CHECK:

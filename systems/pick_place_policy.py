@@ -13,7 +13,7 @@ from systems.signals import Observation, PickPlaceAction
 
 PolicyFunction = Callable[..., PickPlaceAction]
 """Called with an `Observation`; and, if it takes a second argument, with a tuple of the
-`PlanarPose`s at which a grasp failed before, the latest last."""
+`PlanarPose`s at which a grasp failed before, the latest last; without it where none is known."""
 
 
 class PickPlacePolicy(LeafSystem):
@@ -24,7 +24,7 @@ class PickPlacePolicy(LeafSystem):
         name: PickPlacePolicy
         input_ports:
         - observation
-        - failed_picks (if the function takes them)
+        - failed_picks (if the function takes them; optional)
         output_ports:
         - action
 
@@ -46,18 +46,20 @@ class PickPlacePolicy(LeafSystem):
         super().__init__()
         self._policy = policy
         self._observation = self.DeclareAbstractInputPort("observation", Value(Observation()))
-        self._inputs = [self._observation]
+        tickets = {self._observation.ticket()}
+        self._failed_picks = None
         if _takes_two(policy):
-            self._inputs.append(self.DeclareAbstractInputPort("failed_picks", Value(())))
+            self._failed_picks = self.DeclareAbstractInputPort("failed_picks", Value(()))
+            tickets.add(self._failed_picks.ticket())
         self.DeclareAbstractOutputPort(
-            "action",
-            lambda: Value(PickPlaceAction()),
-            self._calc_action,
-            {port.ticket() for port in self._inputs},
+            "action", lambda: Value(PickPlaceAction()), self._calc_action, tickets
         )
 
     def _calc_action(self, context: Context, output: AbstractValue) -> None:
-        action = self._policy(*(port.Eval(context) for port in self._inputs))
+        arguments = [self._observation.Eval(context)]
+        if self._failed_picks is not None and self._failed_picks.HasValue(context):
+            arguments.append(self._failed_picks.Eval(context))
+        action = self._policy(*arguments)
         if not isinstance(action, PickPlaceAction):
             raise TypeError(
                 f"the policy {self._policy!r} answered with {type(action).__name__}, "

@@ -158,6 +158,8 @@ class PickPlaceAction:
     place: PlanarPose = field(default_factory=PlanarPose)
     stop: bool = False
     """True: there is nothing left to do, and the poses mean nothing."""
+    press: bool = False
+    """True: push down at the pick with closed jaws, and nothing else; the place means nothing."""
     heights: SurfaceHeights | None = None
     """Given by the oracle, which knows them; used only where there is no observation."""
 

@@ -62,6 +62,15 @@ class ActionLog:
             self._find_lifted(event)
         elif event.mode == Mode.RELEASE:
             self.records[-1].outcome = "placed"
+        elif event.mode == Mode.RETREAT and event.previous == Mode.DESCEND:
+            self.records[-1] = dataclasses.replace(
+                self.records[-1],
+                outcome="pressed",
+                pick_position_error_mm=None,
+                pick_angle_error_deg=None,
+                place_position_error_mm=None,
+                place_angle_error_deg=None,
+            )
         elif event.mode == Mode.RETREAT and event.previous != Mode.RELEASE:
             self.records[-1].outcome = "missed" if event.previous == Mode.CHECK else "dropped"
 

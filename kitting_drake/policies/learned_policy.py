@@ -16,6 +16,7 @@ from torch import Tensor
 from kitting_drake.policies.correlation import Candidate
 from kitting_drake.policies.images import Image, make_action, rotation_matrix
 from kitting_drake.policies.matching.policy import RETRY_DISTANCE, something_fits
+from kitting_drake.policies.matching.recovery import recovery_action
 from kitting_drake.policies.matching.refinement import refine_place
 from kitting_drake.policies.matching.segmentation import fill_unseen
 from kitting_drake.policies.networks import Networks
@@ -60,6 +61,7 @@ class LearnedPolicy:
         orientations: int = 180,
         continuous: bool = True,
         fit_outlines: bool = False,
+        recover: bool = False,
         watch: Callable[[Observation, Decision], None] | None = None,
     ) -> None:
         """
@@ -71,6 +73,7 @@ class LearnedPolicy:
             fit_outlines: refine the place by the outlines of object and recess, where they agree
                 (`refine_place`), and do not stop while they show an object that certainly fits
                 (`something_fits`). Not in the paper.
+            recover: first mend what is not seated (`recovery_action`). Not in the paper.
             watch: called with each observation and decision.
 
         Raises:
@@ -81,6 +84,7 @@ class LearnedPolicy:
         self._orientations = orientations
         self._continuous = continuous
         self._fit_outlines = fit_outlines
+        self._recover = recover
         self._watch = watch
 
     def __call__(
@@ -92,6 +96,10 @@ class LearnedPolicy:
             observation: o_t.
             failed_picks: where a grasp failed before: there it is not tried again.
         """
+        if self._recover:
+            mending = recovery_action(observation, failed_picks)
+            if mending is not None:
+                return mending
         decision = self.decide(observation, failed_picks)
         if self._watch is not None:
             self._watch(observation, decision)

@@ -31,12 +31,18 @@ _NOT_THE_TASK = ("policy", "random_seed", "target_realtime_rate")
 
 _ADDED = (
     "task.distractors",
+    "task.tries",
+    "planner.press_force",
+    "planner.press_depth",
+    "planner.search.reach",
+    "planner.search.speed",
     "plant.friction_variation",
     "plant.mass_variation",
     "sensor_noise",
     "appearance",
 )
-"""Fields that older runs lack; their defaults are what there was before them."""
+"""Fields that older runs lack; their defaults change nothing in what those did, but that a search
+that was in vain goes on in a spiral."""
 
 _MOST_SHOWN = 4
 """So many differences of one run are listed; more are counted."""

@@ -151,6 +151,10 @@ class Learned(PolicyConfig):
     # one (the paper does neither).
     fit_outlines: bool = True
 
+    # First mend what the last action left undone, as o_t shows it: press down what protrudes, take
+    # out what cannot be pressed down. It takes actions: see the task's `tries`.
+    recover: bool = False
+
     def make_system(self, site: PolicySite) -> LeafSystem:
         # Only who uses a network waits for torch.
         from kitting_drake.policies.learned_policy import LearnedPolicy
@@ -176,6 +180,7 @@ class Learned(PolicyConfig):
                 orientations=self.orientations,
                 continuous=self.continuous,
                 fit_outlines=self.continuous and self.fit_outlines,
+                recover=self.recover,
                 watch=site.observer,
             )
         except ValueError as error:
@@ -192,6 +197,7 @@ class Learned(PolicyConfig):
             "orientations": self.orientations,
             "continuous": self.continuous,
             "fit_outlines": self.continuous and self.fit_outlines,
+            "recover": self.recover,
             "trained_orientations": file.config.orientations,
             "compute_type": str(preferred_type()).removeprefix("torch."),
             **{key: file.card.get(key) for key in ("scenario", "demonstrations", "steps")},
@@ -218,13 +224,16 @@ class Learned(PolicyConfig):
 class ShapeMatching(PolicyConfig):
     """Training-free: outlines of the loose objects, seen by height, fitted to those of cavities."""
 
+    # First mend what the last action left undone, as for !Learned.
+    recover: bool = False
+
     def make_system(self, site: PolicySite) -> LeafSystem:
         from kitting_drake.policies.matching.policy import ShapeMatchingPolicy
 
-        return PickPlacePolicy(policy=ShapeMatchingPolicy())
+        return PickPlacePolicy(policy=ShapeMatchingPolicy(recover=self.recover))
 
     def details(self, base: Path) -> dict[str, Any]:
-        return {"method": "shape_matching"}
+        return {"method": "shape_matching", "recover": self.recover}
 
 
 @dataclass

@@ -91,7 +91,8 @@ class ActionRecord:
     category: str
     """The category of the object."""
     outcome: str
-    """`placed`, `missed` (nothing was grasped), `dropped` (on the way), or `unfinished`."""
+    """`placed`, `missed` (nothing was grasped), `dropped` (on the way), `pressed` (down, where it
+    is), or `unfinished`."""
     pick: PlanarPose
     place: PlanarPose
     pick_position_error_mm: float | None
@@ -177,7 +178,8 @@ class TaskConfig:
 
 def last_action_on(name: str, records: Sequence[ActionRecord]) -> ActionRecord | str:
     """The last action that held an object; or why there is none, as a cause."""
-    own = [item for item in records if item.object == name and item.outcome != "unfinished"]
+    grasped = [item for item in records if item.outcome not in ("unfinished", "pressed")]
+    own = [item for item in grasped if item.object == name]
     held = [item for item in own if item.outcome != "missed"]
     if held:
         return held[-1]

@@ -550,3 +550,23 @@ def test_reset_and_rerun_give_equal_logs():
     run.finish()
     np.testing.assert_array_equal(run.log.FindLog(context).data(), first)
     assert (run.counts, run.modes) == (counts, modes)
+
+
+def test_an_object_is_pressed_down_with_closed_jaws():
+    answer = dataclasses.replace(ACTION, press=True)
+    run = Run(World(touch_pick=0.047, stiffness=1e4), answer=answer, actions=1)
+    run.until(Mode.DESCEND)
+    assert run.output("desired_opening")[0] == pytest.approx(0.0, abs=1e-3)
+    run.until(Mode.RETREAT)
+    assert run.sequence == [Mode.OBSERVE, Mode.APPROACH, Mode.DESCEND, Mode.RETREAT]
+    # 30 N on 10 kN/m, and a period further at most.
+    z = run.output("desired_motion")[2]
+    assert 0.047 - 0.003 - PARAMETERS.descend_speed / 64 - 1e-3 < z < 0.047 - 0.003
+    assert run.finish().counts == [1, 0, 0]
+    assert run.output("failed_picks") == (PICK,)
+
+
+def test_a_press_that_meets_nothing_ends_at_its_depth():
+    run = Run(answer=dataclasses.replace(ACTION, press=True), actions=1).until(Mode.RETREAT)
+    z = run.output("desired_motion")[2]
+    assert z == pytest.approx(HEIGHTS.pick_top - PARAMETERS.press_depth, abs=2e-3)

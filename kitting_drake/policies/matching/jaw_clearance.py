@@ -31,8 +31,8 @@ _LINES = 5
 """Lines of samples along the pads' length."""
 _WIDEST = MAX_OPENING - 0.010
 """The widest grip, with a margin on either side for the fingers to come down, in metres."""
-_GAP = 0.004
-"""Beside the gripped faces this much is edge, not obstacle, in metres."""
+_LOWEST = 0.003
+"""What rises by less than this above its support is in nobody's way, in metres."""
 _FINGER_MARGIN = 0.003
 """Space left beyond the fingers of the open jaws, in metres."""
 _STRAIGHT = 0.003
@@ -53,64 +53,63 @@ class JawGrasp:
     """How far from the middle it is and how crooked its faces are; without a unit, 0 is best."""
 
 
-def jaw_grasps(segmentation: Segmentation, region: Region, resolution: float) -> list[JawGrasp]:
+def jaw_grasps(
+    segmentation: Segmentation, region: Region, resolution: float, *, support: float = 0.0
+) -> list[JawGrasp]:
     """The grasps of an object, the best first; empty if there is none.
 
     Args:
         segmentation: of the observation.
-        region: one of its objects.
+        region: what is to be gripped.
         resolution: of a pixel, in metres.
+        support: height above the table of what the object stands on, in metres.
     """
     relief = segmentation.relief
     pixels = region.pixels
-    weights = np.maximum(relief[region.mask], 1e-3)
+    weights = np.maximum(relief[region.mask] - support, 1e-3)
     middle = np.average(pixels, axis=0, weights=weights)
     distance = np.linalg.norm(pixels - middle, axis=1) * resolution
     near = pixels[distance < max(_REACH, distance.min() + resolution)]
     places = near[:: max(1, math.ceil(len(near) / _MOST_PLACES))].astype(float)
 
+    def grip(places: Array, thetas: Array) -> list[JawGrasp]:
+        found = _grip(relief, places, thetas, middle, resolution, support)
+        return sorted(found, key=lambda item: item.cost)
+
     thetas = np.arange(_ANGLES) * math.pi / _ANGLES
     place, theta = (item.ravel() for item in np.meshgrid(np.arange(len(places)), thetas))
-    found = _grip(relief, places[place.astype(int)], theta, middle, resolution)
-    if found is None:
+    found = grip(places[place.astype(int)], theta)
+    if not found:
         return []
-    return sorted(found, key=lambda item: item.cost)
+    # The best at the angle at which its faces are parallel to the pads.
+    best = found[0]
+    nearby = best.theta + np.radians(np.linspace(-4, 4, 9))
+    refined = grip(np.repeat(best.pixel[None], len(nearby), axis=0), nearby)
+    return sorted([*refined, *found], key=lambda item: item.cost)
 
 
-def refine_grasp(
-    segmentation: Segmentation, grasp: JawGrasp, middle: Array, resolution: float
-) -> JawGrasp:
-    """A grasp at the angle at which its faces are parallel to the pads, within a few degrees.
-
-    Args:
-        segmentation: of the observation.
-        grasp: one of `jaw_grasps`.
-        middle: (row, col) of the object.
-        resolution: of a pixel, in metres.
-    """
-    offsets = np.radians(np.linspace(-6, 6, 13))
-    thetas = grasp.theta + offsets
-    found = _grip(
-        segmentation.relief, np.repeat(grasp.pixel[None], 13, axis=0), thetas, middle, resolution
-    )
-    return min([grasp, *(found or [])], key=lambda item: item.cost)
-
-
-def _tip_height(top: Array) -> Array:
-    """Where the fingertips go, above the table: as the planner, on an object that stands on it."""
+def _tip_height(top: Array, support: float) -> Array:
+    """Where the fingertips go, above the table: as the planner has it, but not below a support."""
     depth = np.clip(
-        _PRIMITIVE.grasp_depth_share * top, _PRIMITIVE.grasp_depth, _PRIMITIVE.max_grasp_depth
+        _PRIMITIVE.grasp_depth_share * (top - support),
+        _PRIMITIVE.grasp_depth,
+        _PRIMITIVE.max_grasp_depth,
     )
-    return np.maximum(top - depth, _PRIMITIVE.floor_clearance)
+    return np.maximum(top - depth, support + _LOWEST)
 
 
 def _grip(
-    relief: NDArray[np.float32], places: Array, thetas: Array, middle: Array, resolution: float
-) -> list[JawGrasp] | None:
+    relief: NDArray[np.float32],
+    places: Array,
+    thetas: Array,
+    middle: Array,
+    resolution: float,
+    support: float,
+) -> list[JawGrasp]:
     """The grasps among places (n, 2) and angles (n,) that the jaws can take."""
     raised = ndimage.maximum_filter(relief, 3)
     top = raised[tuple(np.rint(places).astype(int).T)].astype(float)
-    tip = np.maximum(_tip_height(top), 0.003)
+    tip = _tip_height(top, support)
 
     along = np.column_stack([np.cos(thetas), np.sin(thetas)])
     across = np.column_stack([-np.sin(thetas), np.cos(thetas)])
@@ -142,7 +141,7 @@ def _grip(
     blocked = (anywhere & ~own & ~beside).any(axis=1)
     fits = held & ~blocked & (width <= _WIDEST) & (width >= _PRIMITIVE.minimum_width)
     if not fits.any():
-        return None
+        return []
 
     # How straight the faces are along the pads: each line's own run about the middle.
     inside = occupied & own[:, None, :]

@@ -10,6 +10,7 @@ from scipy.optimize import linear_sum_assignment
 
 from kitting_drake.policies.images import make_action
 from kitting_drake.policies.matching.jaw_clearance import jaw_grasps
+from kitting_drake.policies.matching.recovery import recovery_action
 from kitting_drake.policies.matching.registration import (
     Registration,
     coarse_cost,
@@ -21,10 +22,10 @@ from systems.signals import Observation, PickPlaceAction, PlanarPose
 
 RETRY_DISTANCE = 0.010
 """A grasp is not tried again this near to where one failed, in metres."""
-_WORST_COST = 0.0024
+_WORST_COST = 0.0016
 """An outline and a recess that differ by more than this on average do not belong together, in
 metres."""
-_CERTAIN_COST = 0.0012
+_CERTAIN_COST = 0.0010
 """Those that differ by less certainly do."""
 _HEIGHT_WEIGHT = 0.1
 """By how much a difference of an object's height and a recess's depth adds to the cost."""
@@ -41,6 +42,13 @@ class ShapeMatchingPolicy:
     that fits. It has no memory.
     """
 
+    def __init__(self, *, recover: bool = False) -> None:
+        """
+        Args:
+            recover: first mend what is not seated (`recovery_action`).
+        """
+        self._recover = recover
+
     def __call__(
         self, observation: Observation, failed_picks: Sequence[PlanarPose] = ()
     ) -> PickPlaceAction:
@@ -50,6 +58,10 @@ class ShapeMatchingPolicy:
             observation: o_t.
             failed_picks: where a grasp failed before: there it is not tried again.
         """
+        if self._recover:
+            mending = recovery_action(observation, failed_picks)
+            if mending is not None:
+                return mending
         places = np.array([(pick.x, pick.y) for pick in failed_picks]).reshape(-1, 2)
         failed = observation.grid.to_pixel(places)
         segmentation = segment(observation)

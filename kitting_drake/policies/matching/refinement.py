@@ -20,7 +20,7 @@ from systems.signals import Observation, wrap_to_pi
 
 Array = NDArray[np.float64]
 
-_WORST_COST = 0.0018
+_WORST_COST = 0.0016
 """Outlines that differ by more on average say nothing, in metres."""
 _HALF_TURN_GAIN = 0.95
 """The half turn is taken if its cost is at most this share of the other's."""

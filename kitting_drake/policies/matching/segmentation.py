@@ -29,8 +29,12 @@ _OBJECT_HEIGHT = 0.003
 """What rises by more than this above the table is an object, in metres."""
 _RECESS_DEPTH = 0.003
 """What is deeper than this below the top of the fixture is a recess, in metres."""
+_PROTRUSION = 0.002
+"""What rises by more than this above the top of the fixture is not seated, in metres."""
 _LEAST_AREA = 0.0004
 """Smaller regions are noise, in square metres."""
+_LEAST_PROTRUDING = 0.00012
+"""The same for what protrudes: perhaps one end of an object."""
 _FIXTURE_MARGIN = 0.006
 """Closer to the fixture's outline than this is neither table nor recess, in metres."""
 _CLEAN = 0.0005
@@ -68,6 +72,9 @@ class Segmentation:
     recesses: tuple[Region, ...]
     """Regions below the top of the fixture. One that a seated object fills leaves fragments, which
     are among them."""
+    protruding: tuple[Region, ...]
+    """What stands out of the fixture, the highest first: objects that are not seated. Their height
+    is that above its top."""
     relief: NDArray[np.float32]
     """(rows, cols) height above the table plane, in metres, with what was not seen filled in."""
 
@@ -99,15 +106,28 @@ def segment(observation: Observation) -> Segmentation:
     if outside is not None:
         loose &= outside > margin
     depth = np.zeros_like(relief)
+    rise = np.zeros_like(relief)
+    hidden = np.zeros(relief.shape, bool)
     if fixture.any():
         depth = (_plane_heights(top, height.shape) - height).astype(np.float32)
-        depth[ndimage.distance_transform_edt(fixture) <= margin / 2] = 0
+        inside = ndimage.distance_transform_edt(fixture) > margin / 2
+        depth[~inside] = 0
+        # What no camera sees into is the bottom of a recess, where it is part of one.
+        hidden = inside & ~observation.valid
+        rise[fixture] = -depth[fixture]
+    deep = depth > max(_RECESS_DEPTH, 3 * noise)
     return Segmentation(
         table=table,
         fixture=fixture,
         top=top,
         objects=_regions(loose, relief, resolution),
-        recesses=_regions(depth > max(_RECESS_DEPTH, 3 * noise), depth, resolution),
+        recesses=_regions(deep | hidden, depth, resolution, core=deep),
+        protruding=tuple(
+            sorted(
+                _regions(rise > max(_PROTRUSION, 3 * noise), rise, resolution, _LEAST_PROTRUDING),
+                key=lambda region: -region.height,
+            )
+        ),
         relief=relief,
     )
 
@@ -204,15 +224,30 @@ def _find_fixture(
     return fixture, _fit_plane(height, start, plateau)
 
 
-def _regions(mask: Mask, relief: NDArray[np.float32], resolution: float) -> tuple[Region, ...]:
-    """The connected regions of a mask that are large enough, the largest first."""
+def _regions(
+    mask: Mask,
+    relief: NDArray[np.float32],
+    resolution: float,
+    least: float = _LEAST_AREA,
+    core: Mask | None = None,
+) -> tuple[Region, ...]:
+    """The connected regions of a mask that are large enough, the largest first.
+
+    Args:
+        mask: (rows, cols).
+        relief: by which their heights are measured, within the core.
+        resolution: of a pixel, in metres.
+        least: area of a region within the core, in square metres.
+        core: the part of the mask that counts; all of it if None.
+    """
+    core = mask if core is None else core
     labels, count = ndimage.label(mask, _NEIGHBOURS)
-    sizes = np.bincount(labels.ravel(), minlength=count + 1)
+    sizes = np.bincount(labels[core], minlength=count + 1)
     sizes[0] = 0
     result = []
     for label in np.argsort(-sizes, kind="stable"):
-        if sizes[label] * resolution**2 < _LEAST_AREA:
+        if sizes[label] * resolution**2 < least:
             break
         region = labels == label
-        result.append(Region(region, float(np.percentile(relief[region], 90))))
+        result.append(Region(region, float(np.percentile(relief[region & core], 90))))
     return tuple(result)

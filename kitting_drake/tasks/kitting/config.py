@@ -42,6 +42,9 @@ class _KittingTask(TaskConfig):
     # The kit block and its cavities.
     kit: KitParameters = field(default_factory=KitParameters)
 
+    # How many actions the episode may take for each tool; the paper's tasks allow one.
+    tries: int = bounded(1, 1, 10)
+
     # ADD-S below this is a success (section IV-C of the paper), in m.
     success_threshold: float = bounded(0.0035, 1e-6, 1.0)
 
@@ -106,7 +109,11 @@ class _DrawnKitting(_KittingTask):
             rng=np.random.default_rng([seed, 3]),
         )
         scene = kitting_scene(kit, X_WKit, X_WTools, order, self.success_threshold)
-        return dataclasses.replace(scene, objects=(*scene.objects, *distractors))
+        return dataclasses.replace(
+            scene,
+            objects=(*scene.objects, *distractors),
+            max_actions=self.tries * len(tools),
+        )
 
 
 @dataclass
@@ -204,13 +211,14 @@ class ArrangedKitting(_KittingTask):
             self.kit_pose,
             dict(zip(self.tools, zip(tools, poses, strict=True), strict=True)),
         )
-        return kitting_scene(
+        scene = kitting_scene(
             kit,
             self.kit_pose.transform(),
             [pose.transform() for pose in poses],
             np.arange(len(tools)),
             self.success_threshold,
         )
+        return dataclasses.replace(scene, max_actions=self.tries * len(tools))
 
     def input_files(self, base: Path) -> list[Path]:
         return _tool_files(self.tools, base)

@@ -39,6 +39,7 @@ def test_a_chosen_scenario_describes_all_of_itself(tmp_path: Path):
         "orientations": 180,
         "continuous": True,
         "fit_outlines": True,
+        "recover": False,
     }
     task = described["task"]
     assert (task["_tag"], task["split"], task["spacing"]) == ("!ToolsetKitting", "train", 0.008)

@@ -103,6 +103,7 @@ def test_results_say_what_a_policy_is(weights_file: Path):
         "orientations": 36,
         "continuous": False,
         "fit_outlines": False,
+        "recover": False,
         "trained_orientations": 72,
         "compute_type": str(preferred_type()).removeprefix("torch."),
         "scenario": "mine",

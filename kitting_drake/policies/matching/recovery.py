@@ -1,0 +1,94 @@
+"""What became of the last action, as the next o_t tells it, and what to do about it.
+
+An object that stands out of the fixture is not seated. Where it stands out by little, it is pressed
+down once; where it stands out by more, or pressing did not help, it is taken out and laid on the
+table, from where it is tried again. Geometry alone, by height: not in the paper.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from kitting_drake.policies.images import make_action
+from kitting_drake.policies.matching.jaw_clearance import jaw_grasps
+from kitting_drake.policies.matching.segmentation import Region, Segmentation, segment
+from systems.signals import Observation, PickPlaceAction, PlanarPose
+
+Array = NDArray[np.float64]
+
+_PRESSED = 0.012
+"""What stands out by more than this is taken out instead of being pressed down, in metres."""
+_TRIED = 0.020
+"""A press or a grasp this near to a tried one is the same, in metres."""
+_ROOM = 0.045
+"""The least distance of where an object is laid from all else, in metres."""
+
+
+def recovery_action(
+    observation: Observation, tried: Sequence[PlanarPose] = ()
+) -> PickPlaceAction | None:
+    """What mends the worst of what is not seated; None if nothing is wrong or can be mended.
+
+    Args:
+        observation: o_t.
+        tried: where grasps failed, and where was pressed, before.
+    """
+    segmentation = segment(observation)
+    for region in segmentation.protruding:
+        pressed = _press(observation, segmentation, region)
+        if region.height <= _PRESSED and not _is_near(pressed.pick, tried):
+            return pressed
+        taken = _take_out(observation, segmentation, region, tried)
+        if taken is not None:
+            return taken
+    return None
+
+
+def _press(observation: Observation, segmentation: Segmentation, region: Region) -> PickPlaceAction:
+    """Presses on the highest part of what stands out."""
+    pixels = region.pixels
+    heights = segmentation.relief[region.mask]
+    highest = pixels[heights >= np.percentile(heights, 80)].astype(float)
+    middle = highest[np.linalg.norm(highest - np.median(highest, axis=0), axis=1).argmin()]
+    action = make_action(observation, middle, 0.0, middle, 0.0)
+    return replace(action, press=True)
+
+
+def _take_out(
+    observation: Observation,
+    segmentation: Segmentation,
+    region: Region,
+    tried: Sequence[PlanarPose],
+) -> PickPlaceAction | None:
+    """Grips what stands out, and lays it where there is room on the table."""
+    free = _free_place(segmentation, observation.grid.resolution)
+    if free is None:
+        return None
+    top = float(np.median(segmentation.relief[segmentation.fixture]))
+    for grasp in jaw_grasps(segmentation, region, observation.grid.resolution, support=top):
+        action = make_action(observation, grasp.pixel, grasp.theta, free, 0.0)
+        if not _is_near(action.pick, tried):
+            return action
+    return None
+
+
+def _free_place(segmentation: Segmentation, resolution: float) -> Array | None:
+    """The (row, col) farthest from everything; None if there is no room."""
+    taken = segmentation.fixture.copy()
+    for region in segmentation.objects:
+        taken |= region.mask
+    # Beyond the image nothing may lie.
+    distance = ndimage.distance_transform_edt(~np.pad(taken, 1, constant_values=True))[1:-1, 1:-1]
+    if distance.max() * resolution < _ROOM:
+        return None
+    return np.array(np.unravel_index(int(distance.argmax()), distance.shape), float)
+
+
+def _is_near(pick: PlanarPose, tried: Sequence[PlanarPose]) -> bool:
+    return any(math.dist((pick.x, pick.y), (item.x, item.y)) < _TRIED for item in tried)

@@ -1,0 +1,65 @@
+import math
+
+import numpy as np
+import pytest
+
+from kitting_drake.policies.matching.recovery import recovery_action
+from kitting_drake.policies.matching.segmentation import segment
+from systems.signals import Observation, PixelGrid
+
+GRID = PixelGrid()
+TOP = 0.05
+
+
+def observed(rise: float = 0.0) -> Observation:
+    """A block with a recess in which an object stands, `rise` above the top, and a loose object."""
+    height = np.zeros(GRID.shape, np.float32)
+    height[40:120, 60:140] = TOP
+    height[60:66, 75:125] = TOP - 0.02
+    height[90:98, 75:125] = TOP - 0.02
+    height[91:97, 77:123] = TOP + rise
+    height[100:106, 220:270] = 0.02
+    image = np.zeros((4, *GRID.shape), np.float32)
+    image[3] = height
+    return Observation(image, GRID, np.ones(GRID.shape, bool))
+
+
+def is_on_object(action) -> bool:
+    row, col = GRID.to_pixel((action.pick.x, action.pick.y))
+    return 90 < row < 97 and 76 < col < 123
+
+
+@pytest.mark.parametrize("rise", [-0.003, 0.0, 0.0015])
+def test_what_is_seated_is_left_alone(rise: float):
+    assert recovery_action(observed(rise)) is None
+    assert recovery_action(Observation()) is None
+
+
+def test_what_protrudes_a_little_is_pressed_down_once():
+    first = recovery_action(observed(0.006))
+    assert first is not None
+    assert first.press
+    assert is_on_object(first)
+    second = recovery_action(observed(0.006), [first.pick])
+    assert second is None or not second.press
+
+
+@pytest.mark.parametrize("rise", [0.014, 0.018])
+def test_what_protrudes_by_more_is_laid_on_the_table(rise: float):
+    action = recovery_action(observed(rise))
+    assert action is not None
+    assert not action.press
+    assert is_on_object(action)
+    row, col = np.rint(GRID.to_pixel((action.place.x, action.place.y))).astype(int)
+    around = observed().height[row - 12 : row + 13, col - 12 : col + 13]
+    assert around.shape == (25, 25)
+    assert around.max() == 0
+    # Where that grasp failed, another is tried.
+    other = recovery_action(observed(rise), [action.pick])
+    if other is not None:
+        assert math.dist((other.pick.x, other.pick.y), (action.pick.x, action.pick.y)) > 0.019
+
+
+def test_the_segmentation_tells_how_far_it_protrudes():
+    (region,) = segment(observed(0.006)).protruding
+    assert region.height == pytest.approx(0.006, abs=5e-4)
