@@ -30,7 +30,7 @@ def varied_model(path: Path, *, friction: float, mass: float) -> str:
             for element in root.iter(f"{{{_DRAKE}}}{name}"):
                 _scale(element, friction)
         for inertial in root.iter("inertial"):
-            for element in (*inertial.iter("mass"), *(inertial.find("inertia") or ())):
+            for element in (*inertial.iter("mass"), *inertial.findall("inertia/*")):
                 _scale(element, mass)
     except (OSError, ElementTree.ParseError, ValueError, TypeError) as error:
         raise UserError(f"task: {path} cannot be read: {error}") from error

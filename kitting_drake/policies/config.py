@@ -121,6 +121,8 @@ class NetworkConfig:
             raise ValueError(f"preset must be one of {', '.join(PRESETS)}, not '{self.preset}'")
         if self.orientations < 2 or self.orientations % 2:
             raise ValueError(f"orientations must be an even number, not {self.orientations}")
+        if not isinstance(self.colour, bool):
+            raise ValueError(f"colour must be true or false, not '{self.colour}'")
         scales = (self.colour_std, self.height_std)
         if not all(map(math.isfinite, (self.colour_mean, self.height_mean, *scales))):
             raise ValueError("means and standard deviations must be finite")

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 from pydrake.systems.framework import LeafSystem
 
 from kitting_drake.common.errors import UserError
+from kitting_drake.common.paths import MODELS
 from kitting_drake.tasks.task import Scene
 from systems.action_quantizer import ActionQuantizer
 from systems.bounds import bounded
@@ -25,6 +26,9 @@ from systems.signals import Observation, PixelGrid
 
 if TYPE_CHECKING:
     from kitting_drake.policies.learned_policy import Decision
+
+GENERALIST = MODELS / "policies" / "generalist.safetensors"
+"""The weights of the policy for anybody's tools, trained on static scenes."""
 
 DecisionObserver = Callable[[Observation, "Decision"], None]
 """Told of every decision of a learned policy."""
@@ -136,7 +140,8 @@ class QuantizedOracle(PolicyConfig):
 class Learned(PolicyConfig):
     """Networks trained by `train`."""
 
-    # Their file, as `train` writes it; relative to the scenario's folder.
+    # Their file, as `train` writes it; relative to the scenario's folder. Empty: the project's
+    # own generalist.
     weights: str = ""
 
     # N: picks and rotations are among 2 pi i / N. The paper's own method takes any N.
@@ -165,13 +170,13 @@ class Learned(PolicyConfig):
             read_weights_file,
         )
 
-        path = site.base / self.weights
+        path = self._path(site.base)
         networks = load_networks(path, preferred_type()).to(preferred_device())
         learned_at = read_weights_file(path).card.get("resolution")
         resolution = site.grid.resolution
         if learned_at is not None and not math.isclose(learned_at, resolution, rel_tol=1e-6):
             raise UserError(
-                f"heightmap.resolution is {resolution:g} m, and the policy of {self.weights} "
+                f"heightmap.resolution is {resolution:g} m, and the policy of {path.name} "
                 f"learned from pixels of {learned_at:g} m"
             )
         try:
@@ -190,7 +195,7 @@ class Learned(PolicyConfig):
     def details(self, base: Path) -> dict[str, Any]:
         from kitting_drake.policies.weights import preferred_type, read_weights_file
 
-        file = read_weights_file(base / self.weights)
+        file = read_weights_file(self._path(base))
         return {
             "method": file.config.method,
             "preset": file.config.preset,
@@ -204,20 +209,19 @@ class Learned(PolicyConfig):
         }
 
     def digest(self, base: Path) -> str | None:
-        return _digest(base / self.weights)
+        return _digest(self._path(base))
 
     def input_files(self, base: Path) -> list[Path]:
-        return [base / self.weights]
+        return [self._path(base)] if self.weights else []
 
     def training_seeds(self, base: Path) -> set[int]:
         from kitting_drake.policies.weights import read_weights_file
 
-        card = read_weights_file(base / self.weights).card
+        card = read_weights_file(self._path(base)).card
         return {*card.get("demonstration_seeds", ()), *card.get("validation_seeds", ())}
 
-    def validate(self) -> None:
-        if not self.weights:
-            raise ValueError("policy.weights is empty: name a file that train wrote")
+    def _path(self, base: Path) -> Path:
+        return base / self.weights if self.weights else GENERALIST
 
 
 @dataclass

@@ -106,7 +106,7 @@ def scaled_sdf(text: str, directory: Path, factor: float) -> str:
     for inertial in root.iter("inertial"):
         for mass in inertial.iter("mass"):
             _scale_numbers(mass, [factor**3])
-        for moment in inertial.find("inertia") or ():
+        for moment in inertial.findall("inertia/*"):
             _scale_numbers(moment, [factor**5])
     return '<?xml version="1.0"?>\n' + ElementTree.tostring(root, encoding="unicode") + "\n"
 

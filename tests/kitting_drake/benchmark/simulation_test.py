@@ -30,7 +30,7 @@ def test_phases_add_up_to_their_episodes():
     # It ends in the middle of a phase, which counts too.
     assert list(stopwatch.phases)[:2] == ["observe", "approach"]
     assert sum(phase[0] for phase in stopwatch.phases.values()) == pytest.approx(simulated)
-    assert sum(phase[1] for phase in stopwatch.phases.values()) == pytest.approx(wall, rel=0.2)
+    assert sum(phase[1] for phase in stopwatch.phases.values()) == pytest.approx(wall, rel=0.5)
     assert all(phase[0] > 0 for phase in stopwatch.phases.values())
 
 

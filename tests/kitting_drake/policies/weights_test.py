@@ -297,9 +297,10 @@ SPOILT = {
         "its config must have the fields angle_frequencies, ",
     ),
     "unknown field": (
-        reconfigured(colour="red"),
+        reconfigured(shade="red"),
         "its config must have the fields angle_frequencies, ",
     ),
+    "text for a truth value": (reconfigured(colour="red"), "colour must be true or false"),
     "text for a number": (reconfigured(height_mean="high"), "its config cannot be used"),
     "number for a list": (reconfigured(angle_frequencies=3), "its config cannot be used"),
     "odd N": (reconfigured(orientations=37), "orientations must be an even number, not 37"),

@@ -163,7 +163,6 @@ BAD = {
         "A: {policy: !Learned {weights: w, orientations: 4000}}",
         ["policy.orientations", "3600"],
     ),
-    "no weights": ("A: {policy: !Learned {}}", ["policy.weights is empty", "train"]),
     "blind": (
         "A: {policy: !Learned {weights: w}, cameras: {}}",
         ["cameras is empty: this policy needs at least one"],
