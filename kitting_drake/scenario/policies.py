@@ -226,7 +226,7 @@ class Learned(PolicyConfig):
 
 @dataclass
 class ShapeMatching(PolicyConfig):
-    """Training-free: outlines of the loose objects, seen by height, fitted to those of cavities."""
+    """Training-free: outlines of the loose objects, seen by height, fitted to those of recesses."""
 
     # First mend what the last action left undone, as for !Learned.
     recover: bool = False

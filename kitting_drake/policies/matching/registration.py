@@ -1,7 +1,7 @@
 """Registration of an object's outline to a recess's, to fractions of a pixel.
 
 Both outlines are signed distances on a grid finer than o_t's. A recess is cut as the object's
-outline, closed and grown by a clearance (`hkd.kits.layout.cavity_outline`); so the object's is
+outline, closed and grown by a clearance (see `kitting_drake.hkd.kits.layout`); so the object's is
 closed first, and what remains is an offset, which is fitted too: the clearance, and half a pixel by
 which seeing only what is highest fattens objects and thins recesses.
 
