@@ -92,13 +92,15 @@ def segment(observation: Observation) -> Segmentation:
     height = fill_unseen(observation.height, observation.valid)
     table = _fit_table(height)
     relief = (height - _plane_heights(table, height.shape)).astype(np.float32)
-    noise = _noise(relief)
+    fixture, top = _find_fixture(height, relief, resolution)
+    # Of the table and, as what lies lower than the grid reads as flat, of the fixture's top too.
+    rises = (height - _plane_heights(top, height.shape))[fixture]
+    noise = max(_noise(relief), _noise(rises))
     if noise > _CLEAN:
         # A median would erase what is one pixel wide: only where it must be.
         height = ndimage.median_filter(height, 3, mode="nearest")
         relief = ndimage.median_filter(relief, 3, mode="nearest")
-
-    fixture, top = _find_fixture(height, relief, resolution)
+        fixture, top = _find_fixture(height, relief, resolution)
     margin = _FIXTURE_MARGIN / resolution
     outside = ndimage.distance_transform_edt(~fixture) if fixture.any() else None
     least = max(_OBJECT_HEIGHT, 3 * noise)
@@ -124,7 +126,7 @@ def segment(observation: Observation) -> Segmentation:
         recesses=_regions(deep | hidden, depth, resolution, core=deep),
         protruding=tuple(
             sorted(
-                _regions(rise > max(_PROTRUSION, 3 * noise), rise, resolution, _LEAST_PROTRUDING),
+                _regions(rise > max(_PROTRUSION, 4 * noise), rise, resolution, _LEAST_PROTRUDING),
                 key=lambda region: -region.height,
             )
         ),
@@ -155,8 +157,8 @@ def fill_unseen(height: NDArray[np.float32], valid: Mask) -> NDArray[np.float32]
     return filled
 
 
-def _noise(relief: NDArray[np.float32]) -> float:
-    """The standard deviation of the heights of the table, robustly."""
+def _noise(relief: NDArray[np.floating]) -> float:
+    """The standard deviation of heights above a plane that most of them belong to, robustly."""
     flat = np.abs(relief[np.abs(relief) < 3 * _PLANE_BAND])
     return 1.4826 * float(np.median(flat)) if flat.size else 0.0
 
