@@ -17,7 +17,7 @@ from kitting_drake.policies.correlation import Candidate
 from kitting_drake.policies.images import Image, make_action, rotation_matrix
 from kitting_drake.policies.matching.policy import RETRY_DISTANCE, something_fits
 from kitting_drake.policies.matching.recovery import recovery_action
-from kitting_drake.policies.matching.refinement import refine_place
+from kitting_drake.policies.matching.refinement import refine_grasp, refine_place
 from kitting_drake.policies.matching.segmentation import fill_unseen
 from kitting_drake.policies.networks import Networks
 from systems.signals import Observation, PickPlaceAction, PixelGrid, PlanarPose, wrap_to_pi
@@ -71,7 +71,8 @@ class LearnedPolicy:
             continuous: refine the action beyond pixels and orientation bins (sub-pixel and sub-bin
                 refinement, not in the paper) instead of quantizing it.
             fit_outlines: refine the place by the outlines of object and recess, where they agree
-                (`refine_place`), and do not stop while they show an object that certainly fits
+                (`refine_place`), and the grasp by what room there is for the jaws
+                (`refine_grasp`); and do not stop while an object certainly fits
                 (`something_fits`). Not in the paper.
             recover: first mend what is not seated (`recovery_action`). Not in the paper.
             watch: called with each observation and decision.
@@ -138,6 +139,10 @@ class LearnedPolicy:
         if self._continuous:
             theta = theta if refined is None else refined
             pick = expected_position(logits, (row, col))
+        if self._fit_outlines and not failed_picks:
+            grasp = refine_grasp(observation, pick, theta)
+            if grasp is not None:
+                pick, theta = grasp.pick, grasp.theta
 
         # The crop is centred on a pixel. Its predicted motion applies to the refined pick too.
         placing = networks.predict_place(image, (row, col), self._orientations)

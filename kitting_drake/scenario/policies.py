@@ -152,8 +152,8 @@ class Learned(PolicyConfig):
     continuous: bool = True
 
     # With `continuous`: refine the place by fitting the outline of the object, as o_t shows it, to
-    # that of the recess, where the two agree, and do not stop while an object certainly fits into
-    # one (the paper does neither).
+    # that of the recess, where the two agree, and the grasp by the room that there is for the jaws;
+    # and do not stop while an object certainly fits into a recess (the paper does none of these).
     fit_outlines: bool = True
 
     # First mend what the last action left undone, as o_t shows it: press down what protrudes, take

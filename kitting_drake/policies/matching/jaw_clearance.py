@@ -160,7 +160,7 @@ def _grip(
         lever / 0.025
         + (lever / 0.040) ** 2
         + aside / 0.050
-        + 1.2 * (1 - contact)
+        + 2.4 * (1 - contact)
         + 2.0 * lean
         + 4.0 * twist
         + np.maximum(0.0, width - 0.035) / 0.015

@@ -1,4 +1,5 @@
-"""Refinement of a place that a network predicted, by fitting the object's outline to the recess.
+"""Refinement of what a network predicted: the place by fitting the object's outline to the recess,
+and the grasp by what room o_t leaves the jaws.
 
 Not in the paper. It corrects by millimetres and degrees, and tells a place from the one a half turn
 away, which differs only at the object's ends. Where the outlines do not agree, as with a recess
@@ -14,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kitting_drake.policies.images import rotation_matrix
+from kitting_drake.policies.matching.jaw_clearance import JawGrasp, jaw_grasps
 from kitting_drake.policies.matching.registration import Registration, register, trace_outline
 from kitting_drake.policies.matching.segmentation import Region, segment
 from systems.signals import Observation, wrap_to_pi
@@ -28,6 +30,10 @@ _LARGEST_SHIFT = 0.010
 """A correction moves the object's middle by at most this, in metres, ..."""
 _LARGEST_ROTATION = math.radians(10)
 """... and rotates it by at most this, but for a half turn."""
+_LEVER = 0.03
+"""A rotation of the jaws by a radian counts as this way, in metres."""
+_POOR = 0.1
+"""A cost of a grasp of one counts as this way, in metres."""
 _NEAR = 6.0
 """A position this near to a region, in pixels, belongs to it."""
 
@@ -91,3 +97,40 @@ def _nearest(regions: tuple[Region, ...], pixel: Array) -> Region | None:
         if distance < least:
             best, least = region, distance
     return best
+
+
+@dataclass(frozen=True)
+class RefinedGrasp:
+    """A grasp that the jaws can take."""
+
+    pick: Array
+    """(row, col)."""
+    theta: float
+    """In radians."""
+
+
+def refine_grasp(observation: Observation, pick: Array, theta: float) -> RefinedGrasp | None:
+    """A grasp near to a predicted one for which o_t leaves the jaws room; None if there is none.
+
+    Args:
+        observation: o_t.
+        pick: (row, col) predicted.
+        theta: of the gripper, predicted, in radians.
+    """
+    segmentation = segment(observation)
+    resolution = observation.grid.resolution
+    taken = _nearest(segmentation.objects, pick)
+    if taken is None:
+        return None
+
+    def departure(grasp: JawGrasp) -> float:
+        """What it takes to go there instead, in metres, and how poor the grasp is there."""
+        distance = float(np.linalg.norm(grasp.pixel - pick)) * resolution
+        turned = abs(math.remainder(grasp.theta - theta, math.pi))
+        return distance + _LEVER * turned + _POOR * grasp.cost
+
+    grasps = jaw_grasps(segmentation, taken, resolution)
+    if not grasps:
+        return None
+    best = min(grasps, key=departure)
+    return RefinedGrasp(best.pixel, best.theta)

@@ -14,7 +14,7 @@ from kitting_drake.cell.cameras import can_render
 from kitting_drake.common.paths import SCENARIOS
 from kitting_drake.policies.images import rotation_matrix
 from kitting_drake.policies.matching.policy import ShapeMatchingPolicy
-from kitting_drake.policies.matching.refinement import refine_place
+from kitting_drake.policies.matching.refinement import refine_grasp, refine_place
 from kitting_drake.policies.matching.segmentation import fill_unseen, segment
 from kitting_drake.scenario.loader import load_scenario
 from systems.signals import Observation, PixelGrid
@@ -115,6 +115,23 @@ def test_a_place_that_is_nearly_right_or_reversed_is_put_right(seen, turn: float
         assert found is not None
         assert np.linalg.norm(found.place - place) * grid.resolution < 0.003
         assert abs(math.remainder(found.rotation - rotation, math.tau)) < math.radians(2)
+
+
+def test_a_grasp_with_no_room_for_the_jaws_moves_to_where_there_is(seen):
+    observation, scene = seen
+    grid = observation.grid
+    for index, (lies, _) in enumerate(true_places(scene)):
+        grasp = scene.objects[index].grasps[0]
+        pick = grid.to_pixel(rotation_matrix(lies[2]) @ (grasp.x, grasp.y) + lies[:2])
+        theta = lies[2] + grasp.theta
+        near = refine_grasp(observation, pick, theta)
+        assert near is not None
+        assert np.linalg.norm(near.pick - pick) * grid.resolution < 0.04
+        # Along the handle instead of across it, the jaws would close on nothing.
+        along = refine_grasp(observation, pick, theta + math.pi / 2)
+        assert along is not None
+        assert abs(math.remainder(along.theta - theta, math.pi)) < math.radians(40)
+    assert refine_grasp(Observation(), np.array([80.0, 160.0]), 0.0) is None
 
 
 def test_a_place_without_a_recess_stays(seen):
