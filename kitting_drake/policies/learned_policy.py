@@ -15,7 +15,7 @@ from torch import Tensor
 
 from kitting_drake.policies.correlation import Candidate
 from kitting_drake.policies.images import Image, make_action, rotation_matrix
-from kitting_drake.policies.matching.policy import RETRY_DISTANCE, something_fits
+from kitting_drake.policies.matching.policy import RETRY_DISTANCE, belonging, something_fits
 from kitting_drake.policies.matching.recovery import recovery_action
 from kitting_drake.policies.matching.refinement import refine_grasp, refine_place
 from kitting_drake.policies.matching.segmentation import fill_unseen
@@ -74,7 +74,8 @@ class LearnedPolicy:
                 (`refine_place`), and the grasp by what room there is for the jaws
                 (`refine_grasp`); and do not stop while an object certainly fits
                 (`something_fits`). Not in the paper.
-            recover: first mend what is not seated (`recovery_action`). Not in the paper.
+            recover: first mend what is not seated (`recovery_action`); pick only what belongs
+                into a recess, and stop when nothing does (`belonging`). Not in the paper.
             watch: called with each observation and decision.
 
         Raises:
@@ -130,6 +131,9 @@ class LearnedPolicy:
         if failed_picks:
             near = near_failed(observation.grid, failed_picks)
             logits = logits.masked_fill(torch.from_numpy(near).to(logits.device), _NEVER)
+        wanted = belonging(observation) if self._recover else None
+        if wanted is not None and wanted.any():
+            logits = logits.masked_fill(torch.from_numpy(~wanted).to(logits.device), _NEVER)
         row, col = divmod(int(logits.argmax()), cols)
         pixel = np.array([row, col], float)
 
@@ -157,7 +161,9 @@ class LearnedPolicy:
         action = make_action(observation, pick, theta, place, rotation)
         odds, threshold = picking.log_odds, networks.stop_threshold
         stop = odds is not None and threshold is not None and odds < threshold
-        if stop and self._fit_outlines:
+        if wanted is not None:
+            stop = not wanted.any()
+        elif stop and self._fit_outlines:
             stop = not something_fits(observation)
         score_map = placing.score_map - placing.score_map.max()
         return Decision(

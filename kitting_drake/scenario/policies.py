@@ -157,7 +157,8 @@ class Learned(PolicyConfig):
     fit_outlines: bool = True
 
     # First mend what the last action left undone, as o_t shows it: press down what protrudes, take
-    # out what cannot be pressed down. It takes actions: see the task's `tries`.
+    # out what cannot be pressed down. It takes actions: see the task's `tries`. And pick only what
+    # fits into a recess; stop when nothing does.
     recover: bool = False
 
     def make_system(self, site: PolicySite) -> LeafSystem:
@@ -179,13 +180,15 @@ class Learned(PolicyConfig):
                 f"heightmap.resolution is {resolution:g} m, and the policy of {path.name} "
                 f"learned from pixels of {learned_at:g} m"
             )
+        # Outlines and recesses mean something only where objects are inserted.
+        insertion = any(goal.rim_height is not None for goal in site.scene.goals)
         try:
             function = LearnedPolicy(
                 networks,
                 orientations=self.orientations,
                 continuous=self.continuous,
-                fit_outlines=self.continuous and self.fit_outlines,
-                recover=self.recover,
+                fit_outlines=insertion and self.continuous and self.fit_outlines,
+                recover=insertion and self.recover,
                 watch=site.observer,
             )
         except ValueError as error:

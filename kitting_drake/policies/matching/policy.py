@@ -22,7 +22,7 @@ from systems.signals import Observation, PickPlaceAction, PlanarPose
 
 RETRY_DISTANCE = 0.010
 """A grasp is not tried again this near to where one failed, in metres."""
-_WORST_COST = 0.0016
+_WORST_COST = 0.0017
 """An outline and a recess that differ by more than this on average do not belong together, in
 metres."""
 _CERTAIN_COST = 0.0010
@@ -88,6 +88,22 @@ def something_fits(observation: Observation) -> bool:
     """Whether a loose object certainly belongs into a recess that is free."""
     pairs = match(segment(observation), observation.grid.resolution)
     return any(fit.cost < _CERTAIN_COST for _, fit in pairs)
+
+
+def belonging(observation: Observation) -> NDArray[np.bool_] | None:
+    """(rows, cols): the loose objects that belong into a recess, by the assignment of `match`; what
+    else lies about is no business of a policy. None where nothing is seen that has recesses.
+
+    Args:
+        observation: o_t.
+    """
+    segmentation = segment(observation)
+    if not segmentation.fixture.any():
+        return None
+    mask = np.zeros(observation.height.shape, bool)
+    for index, _ in match(segmentation, observation.grid.resolution):
+        mask |= segmentation.objects[index].mask
+    return mask
 
 
 def match(segmentation: Segmentation, resolution: float) -> list[tuple[int, Registration]]:

@@ -34,6 +34,8 @@ _LEVER = 0.03
 """A rotation of the jaws by a radian counts as this way, in metres."""
 _POOR = 0.1
 """A cost of a grasp of one counts as this way, in metres."""
+_SAME_PLACE, _SAME_ANGLE = 0.008, math.radians(8)
+"""Grasps that are nearer to each other than this, in metres and radians, are the same."""
 _NEAR = 6.0
 """A position this near to a region, in pixels, belongs to it."""
 
@@ -110,7 +112,7 @@ class RefinedGrasp:
 
 
 def refine_grasp(observation: Observation, pick: Array, theta: float) -> RefinedGrasp | None:
-    """A grasp near to a predicted one for which o_t leaves the jaws room; None if there is none.
+    """A better grasp than a predicted one, for which o_t leaves the jaws room; None if there is none.
 
     Args:
         observation: o_t.
@@ -133,4 +135,8 @@ def refine_grasp(observation: Observation, pick: Array, theta: float) -> Refined
     if not grasps:
         return None
     best = min(grasps, key=departure)
+    distance = float(np.linalg.norm(best.pixel - pick)) * resolution
+    if distance < _SAME_PLACE and abs(math.remainder(best.theta - theta, math.pi)) < _SAME_ANGLE:
+        # A network reads the angle off more pixels.
+        return None
     return RefinedGrasp(best.pixel, best.theta)

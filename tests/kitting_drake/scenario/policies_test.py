@@ -60,7 +60,10 @@ def test_a_learned_policy_as_the_scenario_says(
     config = Learned(weights_file.name, orientations=orientations, continuous=continuous)
     found = action(config, site, observation())
     networks = load_networks(weights_file, preferred_type())
-    policy = LearnedPolicy(networks, orientations=orientations, continuous=continuous)
+    # Quantized actions are those of the networks alone.
+    policy = LearnedPolicy(
+        networks, orientations=orientations, continuous=continuous, fit_outlines=continuous
+    )
     assert found == policy(observation())
     assert [decision.action for decision in told] == [found]
 
