@@ -112,7 +112,7 @@ class RefinedGrasp:
 
 
 def refine_grasp(observation: Observation, pick: Array, theta: float) -> RefinedGrasp | None:
-    """A better grasp than a predicted one, for which o_t leaves the jaws room; None if there is none.
+    """A better grasp than a predicted one, for which o_t leaves the jaws room; None: there is none.
 
     Args:
         observation: o_t.
