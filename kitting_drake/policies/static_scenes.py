@@ -28,6 +28,9 @@ from kitting_drake.policies.images import LabelledImage
 from kitting_drake.policies.matching.segmentation import fill_unseen
 from systems.signals import Observation, PixelGrid
 
+STATIC = "static scenes"
+"""What the card of weights that learned from them has for a scenario's name."""
+
 FORMAT = "kitting_drake static scenes"
 FORMAT_VERSION = 1
 

@@ -27,6 +27,7 @@ from kitting_drake.policies.samples import (
     scenes,
 )
 from kitting_drake.policies.static_scenes import (
+    STATIC,
     StaticSamples,
     StaticScenes,
     is_static_scenes,
@@ -36,7 +37,6 @@ from systems.signals import PickPlaceAction, PixelGrid, PlanarPose
 
 Item = TypeVar("Item")
 
-STATIC = "static scenes"
 _TABLE = ("task", "heightmap")
 """The fields of a scenario that determine, with the seed, what stands where."""
 

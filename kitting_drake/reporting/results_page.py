@@ -130,7 +130,7 @@ def _success_table(runs: list[Run], paper: _Paper) -> str:
         if method == "so2":
             given = [f"- / {paper.ours:g}" if n == 180 else "" for n in orientations]
             rows.append(["*paper*, ours", "", "100", *given])
-    others = {key[:3] for key in cells if key[0] not in METHODS}
+    others = {key[:3] for key in cells if key[0] not in (*LEARNED, "quantized_oracle", "oracle")}
     rows += [row(*key) for key in sorted(others, key=str)]
     rows += [row("quantized_oracle"), row("oracle")]
     headings = ["method", "preset", "demonstrations", *(f"N = {n}" for n in orientations)]

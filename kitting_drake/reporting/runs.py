@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from kitting_drake.common.errors import UserError
+from kitting_drake.policies.static_scenes import STATIC
 from kitting_drake.reporting.summary import ERRORS
 from kitting_drake.scenario.command_line import ChosenScenario
 from kitting_drake.scenario.schema import Scenario
@@ -18,6 +19,8 @@ METHODS = {
     "so2": "SO(2)-equivariant (ours)",
     "equivariant_transporter": "Equivariant Transporter",
     "transporter": "Transporter",
+    "generalist": "generalist, of static scenes",
+    "shape_matching": "shape matching, of nothing",
     "quantized_oracle": "oracle, quantized",
     "oracle": "oracle, exact",
 }
@@ -82,6 +85,8 @@ class Run:
     @property
     def method(self) -> str:
         """The policy's method: a key of `METHODS`, or the policy's name."""
+        if self.detail("scenario") == STATIC:
+            return "generalist"
         return self.detail("method") or self.summary["policy"]
 
     @property
@@ -97,7 +102,10 @@ class Run:
         parts = [METHODS.get(self.method, self.method)]
         for key, text in (
             ("orientations", "N = {}"),
-            ("demonstrations", "{} demonstrations"),
+            (
+                "demonstrations",
+                f"{{}} {'scenes' if self.method == 'generalist' else 'demonstrations'}",
+            ),
             ("preset", "preset {}"),
         ):
             if self.detail(key) is not None:
