@@ -32,7 +32,7 @@ _LARGEST_ROTATION = math.radians(10)
 """... and rotates it by at most this, but for a half turn."""
 _LEVER = 0.03
 """A rotation of the jaws by a radian counts as this way, in metres."""
-_POOR = 0.1
+_POOR = 0.03
 """A cost of a grasp of one counts as this way, in metres."""
 _SAME_PLACE, _SAME_ANGLE = 0.008, math.radians(8)
 """Grasps that are nearer to each other than this, in metres and radians, are the same."""
@@ -112,7 +112,8 @@ class RefinedGrasp:
 
 
 def refine_grasp(observation: Observation, pick: Array, theta: float) -> RefinedGrasp | None:
-    """A better grasp than a predicted one, for which o_t leaves the jaws room; None: there is none.
+    """A grasp near a predicted one for which o_t leaves the jaws no room; None if it does leave it,
+    or there is none.
 
     Args:
         observation: o_t.
@@ -127,16 +128,18 @@ def refine_grasp(observation: Observation, pick: Array, theta: float) -> Refined
 
     def departure(grasp: JawGrasp) -> float:
         """What it takes to go there instead, in metres, and how poor the grasp is there."""
-        distance = float(np.linalg.norm(grasp.pixel - pick)) * resolution
         turned = abs(math.remainder(grasp.theta - theta, math.pi))
+        distance = float(np.linalg.norm(grasp.pixel - pick)) * resolution
         return distance + _LEVER * turned + _POOR * grasp.cost
 
+    def is_same(grasp: JawGrasp) -> bool:
+        distance = float(np.linalg.norm(grasp.pixel - pick)) * resolution
+        turned = abs(math.remainder(grasp.theta - theta, math.pi))
+        return distance < _SAME_PLACE and turned < _SAME_ANGLE
+
     grasps = jaw_grasps(segmentation, taken, resolution)
-    if not grasps:
+    # A network knows more of a grasp than that the jaws have room: where they have, it stays.
+    if not grasps or any(is_same(grasp) for grasp in grasps):
         return None
     best = min(grasps, key=departure)
-    distance = float(np.linalg.norm(best.pixel - pick)) * resolution
-    if distance < _SAME_PLACE and abs(math.remainder(best.theta - theta, math.pi)) < _SAME_ANGLE:
-        # A network reads the angle off more pixels.
-        return None
     return RefinedGrasp(best.pixel, best.theta)
