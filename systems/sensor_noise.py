@@ -5,12 +5,14 @@ import math
 
 import numpy as np
 from numpy.typing import NDArray
+from pydrake.common.eigen_geometry import Quaternion
 from pydrake.common.value import AbstractValue, Value
 from pydrake.geometry import DepthRenderCamera
 from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.systems.framework import Context, LeafSystem
 from pydrake.systems.sensors import ImageDepth32F, ImageLabel16I, ImageRgba8U
 from scipy import ndimage
+from scipy.special import ndtri
 
 from systems.bounds import bounded
 
@@ -247,7 +249,9 @@ def noisy_depth(
         hole &= ~flying
     square = z * z
     if parameters.depth_std:
-        noisy = noisy + parameters.depth_std * square * _smooth(random, z.shape, parameters)
+        noisy = noisy + parameters.depth_std * square * _unit_field(
+            random, z.shape, parameters.correlation
+        )
     if parameters.depth_step:
         step = parameters.depth_step * square
         noisy = np.rint(noisy / step) * step
@@ -258,12 +262,6 @@ def noisy_depth(
             share = np.maximum(share, sheen)
         hole |= field > _upper_quantile(share)
     return np.where(hole | ~seen, np.where(seen, 0.0, depth), noisy).astype(np.float32)
-
-
-def _smooth(
-    random: np.random.Generator, shape: tuple[int, ...], parameters: SensorNoiseParameters
-) -> NDArray[np.float32]:
-    return _unit_field(random, shape, parameters.correlation)
 
 
 def _unit_field(
@@ -279,8 +277,6 @@ def _unit_field(
 
 def _upper_quantile(share: NDArray[np.float32]) -> NDArray[np.float32]:
     """What a share of normally distributed values exceeds."""
-    from scipy.special import ndtri
-
     return ndtri(1 - np.clip(share, 1e-9, 1 - 1e-9)).astype(np.float32)
 
 
@@ -289,7 +285,5 @@ def _pose_error(random: np.random.Generator, distance: float, angle_deg: float) 
     shift, axis = random.standard_normal(3), random.standard_normal(3)
     axis /= np.linalg.norm(axis)
     half = math.radians(angle_deg) / 2
-    from pydrake.common.eigen_geometry import Quaternion
-
     turn = Quaternion(np.append(math.cos(half), math.sin(half) * axis))
     return RigidTransform(RotationMatrix(turn), distance * shift / np.linalg.norm(shift))

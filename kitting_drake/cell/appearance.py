@@ -137,7 +137,7 @@ def _colour(paint: Paint, own: Rgba, rng: np.random.Generator) -> Rgba:
 def _recolour(
     plant: MultibodyPlant, scene_graph: SceneGraph, geometry: GeometryId, colour: Rgba
 ) -> None:
-    """Of what the cameras see, and of what a person sees in Meshcat."""
+    """Recolours what the cameras see, and what a person sees in Meshcat."""
     inspector = scene_graph.model_inspector()
     seen = PerceptionProperties(inspector.GetPerceptionProperties(geometry))
     seen.UpdateProperty("phong", "diffuse", colour)

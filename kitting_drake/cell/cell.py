@@ -21,7 +21,7 @@ from pydrake.geometry import (
 )
 from pydrake.math import RigidTransform
 from pydrake.multibody.plant import MultibodyPlant
-from pydrake.multibody.tree import RigidBody
+from pydrake.multibody.tree import BodyIndex, RigidBody
 from pydrake.systems.framework import Context, Diagram, DiagramBuilder, LeafSystem
 from pydrake.systems.sensors import RgbdSensor
 from pydrake.visualization import VideoWriter
@@ -178,10 +178,7 @@ def build_cell(
     objects, still_bodies = add_models(plant, scene, scenario.plant, seed)
     plant.Finalize()
     set_initial_poses(plant, scenario, scene, objects)
-    groups = {still_bodies[0].index(): "table"}
-    for fixture, body in zip(scene.fixtures, still_bodies[1:], strict=True):
-        groups[body.index()] = f"fixtures/{fixture.name}"
-    groups |= {item.body: f"objects/{item.name}" for item in objects}
+    groups = _surface_groups(scene, still_bodies, objects)
     paint_surfaces(plant, scene_graph, scenario.appearance, groups, seed)
 
     # Cameras, policy, planner and controller.
@@ -232,6 +229,16 @@ def build_cell(
         sleep=scenario.sleep.enabled,
         video_writer=video_writer,
     )
+
+
+def _surface_groups(
+    scene: Scene, still_bodies: Sequence[RigidBody], objects: Sequence[PlacedObject]
+) -> dict[BodyIndex, str]:
+    """The names by which a scenario's `appearance` calls the bodies' surfaces."""
+    groups = {still_bodies[0].index(): "table"}
+    for fixture, body in zip(scene.fixtures, still_bodies[1:], strict=True):
+        groups[body.index()] = f"fixtures/{fixture.name}"
+    return groups | {item.body: f"objects/{item.name}" for item in objects}
 
 
 def _add_policy(
@@ -362,6 +369,7 @@ def _add_cameras(
                     camera=cameras[name],
                     seed=seed,
                     number=number,
+                    workspace_middle=((grid.x_min + grid.x_max) / 2, (grid.y_min + grid.y_max) / 2),
                     use_labels=use_labels,
                 ),
             )

@@ -18,7 +18,7 @@ from kitting_drake.policies.images import Image, make_action, rotation_matrix
 from kitting_drake.policies.matching.policy import RETRY_DISTANCE, belonging, something_fits
 from kitting_drake.policies.matching.recovery import recovery_action
 from kitting_drake.policies.matching.refinement import refine_grasp, refine_place
-from kitting_drake.policies.matching.segmentation import fill_unseen
+from kitting_drake.policies.matching.segmentation import Segmentation, fill_unseen, segment
 from kitting_drake.policies.networks import Networks
 from systems.signals import Observation, PickPlaceAction, PixelGrid, PlanarPose, wrap_to_pi
 
@@ -98,11 +98,12 @@ class LearnedPolicy:
             observation: o_t.
             failed_picks: where a grasp failed before: there it is not tried again.
         """
-        if self._recover:
-            mending = recovery_action(observation, failed_picks)
+        segmentation = self._segment(observation)
+        if self._recover and segmentation is not None:
+            mending = recovery_action(observation, segmentation, failed_picks)
             if mending is not None:
                 return mending
-        decision = self.decide(observation, failed_picks)
+        decision = self._decide(observation, segmentation, failed_picks)
         if self._watch is not None:
             self._watch(observation, decision)
         return PickPlaceAction(stop=True) if decision.stop else decision.action
@@ -120,9 +121,24 @@ class LearnedPolicy:
         filled = fill_unseen(observation.height, observation.valid)
         return np.concatenate([observation.rgb, filled[None]])
 
-    @torch.inference_mode()
+    def _segment(self, observation: Observation) -> Segmentation | None:
+        """The segmentation of an observation, where geometry has a say."""
+        return segment(observation) if self._fit_outlines or self._recover else None
+
     def decide(self, observation: Observation, failed_picks: Sequence[PlanarPose] = ()) -> Decision:
-        """The action, and the distributions that it was read from; see `__call__`."""
+        """The action of the networks, and the distributions that it was read from; see `__call__`,
+        which may mend something first."""
+        return self._decide(observation, self._segment(observation), failed_picks)
+
+    @torch.inference_mode()
+    def _decide(
+        self,
+        observation: Observation,
+        segmentation: Segmentation | None,
+        failed_picks: Sequence[PlanarPose],
+    ) -> Decision:
+        resolution = observation.grid.resolution
+        outlines = segmentation if self._fit_outlines else None
         networks = self._networks
         image = self._input(observation)
         picking = networks.predict_pick(image, self._orientations)
@@ -131,7 +147,9 @@ class LearnedPolicy:
         if failed_picks:
             near = near_failed(observation.grid, failed_picks)
             logits = logits.masked_fill(torch.from_numpy(near).to(logits.device), _NEVER)
-        wanted = belonging(observation) if self._recover else None
+        wanted = None
+        if self._recover and segmentation is not None:
+            wanted = belonging(segmentation, resolution)
         if wanted is not None and wanted.any():
             logits = logits.masked_fill(torch.from_numpy(~wanted).to(logits.device), _NEVER)
         row, col = divmod(int(logits.argmax()), cols)
@@ -143,8 +161,8 @@ class LearnedPolicy:
         if self._continuous:
             theta = theta if refined is None else refined
             pick = expected_position(logits, (row, col))
-        if self._fit_outlines and not failed_picks:
-            grasp = refine_grasp(observation, pick, theta)
+        if outlines is not None and not failed_picks:
+            grasp = refine_grasp(outlines, pick, theta, resolution)
             if grasp is not None:
                 pick, theta = grasp.pick, grasp.theta
 
@@ -154,8 +172,8 @@ class LearnedPolicy:
             placing.candidates[0], self._orientations, self._continuous
         )
         place = place + rotation_matrix(rotation) @ (pick - pixel)
-        if self._fit_outlines:
-            fitted = refine_place(observation, pick, rotation, place)
+        if outlines is not None:
+            fitted = refine_place(outlines, pick, rotation, place, resolution)
             if fitted is not None:
                 rotation, place = fitted.rotation, fitted.place
         action = make_action(observation, pick, theta, place, rotation)
@@ -163,8 +181,8 @@ class LearnedPolicy:
         stop = odds is not None and threshold is not None and odds < threshold
         if wanted is not None:
             stop = not wanted.any()
-        elif stop and self._fit_outlines:
-            stop = not something_fits(observation)
+        elif stop and outlines is not None:
+            stop = not something_fits(outlines, resolution)
         score_map = placing.score_map - placing.score_map.max()
         return Decision(
             action=dataclasses.replace(action, stop=stop),

@@ -47,8 +47,6 @@ class JawGrasp:
     """(row, col), midway between the faces."""
     theta: float
     """Of the gripper, in radians; adding pi gives the same grasp."""
-    width: float
-    """Between the faces, in metres."""
     cost: float
     """How far from the middle it is and how crooked its faces are; without a unit, 0 is best."""
 
@@ -166,10 +164,7 @@ def _grip(
         + np.maximum(0.0, width - 0.035) / 0.015
     )
     fits &= contact > 0
-    return [
-        JawGrasp(centres[i], float(thetas[i]), float(width[i]), float(cost[i]))
-        for i in np.flatnonzero(fits)
-    ]
+    return [JawGrasp(centres[i], float(thetas[i]), float(cost[i])) for i in np.flatnonzero(fits)]
 
 
 def _run(occupied: NDArray[np.bool_]) -> NDArray[np.intp]:

@@ -58,13 +58,13 @@ class ShapeMatchingPolicy:
             observation: o_t.
             failed_picks: where a grasp failed before: there it is not tried again.
         """
+        segmentation = segment(observation)
         if self._recover:
-            mending = recovery_action(observation, failed_picks)
+            mending = recovery_action(observation, segmentation, failed_picks)
             if mending is not None:
                 return mending
         places = np.array([(pick.x, pick.y) for pick in failed_picks]).reshape(-1, 2)
         failed = observation.grid.to_pixel(places)
-        segmentation = segment(observation)
         resolution = observation.grid.resolution
         for index, fit in match(segmentation, resolution):
             grasps = [
@@ -84,24 +84,19 @@ def _distance(positions: NDArray[np.float64], pixel: NDArray[np.float64]) -> flo
     return float(np.linalg.norm(positions - pixel, axis=1).min(initial=np.inf))
 
 
-def something_fits(observation: Observation) -> bool:
-    """Whether a loose object certainly belongs into a recess that is free."""
-    pairs = match(segment(observation), observation.grid.resolution)
-    return any(fit.cost < _CERTAIN_COST for _, fit in pairs)
+def something_fits(segmentation: Segmentation, resolution: float) -> bool:
+    """Whether a loose object certainly belongs into a recess that is free; see `match`."""
+    return any(fit.cost < _CERTAIN_COST for _, fit in match(segmentation, resolution))
 
 
-def belonging(observation: Observation) -> NDArray[np.bool_] | None:
+def belonging(segmentation: Segmentation, resolution: float) -> NDArray[np.bool_] | None:
     """(rows, cols): the loose objects that belong into a recess, by the assignment of `match`; what
     else lies about is no business of a policy. None where nothing is seen that has recesses.
-
-    Args:
-        observation: o_t.
     """
-    segmentation = segment(observation)
     if not segmentation.fixture.any():
         return None
-    mask = np.zeros(observation.height.shape, bool)
-    for index, _ in match(segmentation, observation.grid.resolution):
+    mask = np.zeros(segmentation.fixture.shape, bool)
+    for index, _ in match(segmentation, resolution):
         mask |= segmentation.objects[index].mask
     return mask
 

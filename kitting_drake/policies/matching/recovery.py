@@ -17,7 +17,7 @@ from scipy import ndimage
 
 from kitting_drake.policies.images import make_action
 from kitting_drake.policies.matching.jaw_clearance import jaw_grasps
-from kitting_drake.policies.matching.segmentation import Region, Segmentation, segment
+from kitting_drake.policies.matching.segmentation import Region, Segmentation
 from systems.signals import Observation, PickPlaceAction, PlanarPose
 
 Array = NDArray[np.float64]
@@ -31,15 +31,15 @@ _ROOM = 0.045
 
 
 def recovery_action(
-    observation: Observation, tried: Sequence[PlanarPose] = ()
+    observation: Observation, segmentation: Segmentation, tried: Sequence[PlanarPose] = ()
 ) -> PickPlaceAction | None:
     """What mends the worst of what is not seated; None if nothing is wrong or can be mended.
 
     Args:
         observation: o_t.
+        segmentation: of it.
         tried: where grasps failed, and where was pressed, before.
     """
-    segmentation = segment(observation)
     for region in segmentation.protruding:
         pressed = _press(observation, segmentation, region)
         if region.height <= _PRESSED and not _is_near(pressed.pick, tried):

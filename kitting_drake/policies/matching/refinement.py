@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from kitting_drake.policies.images import rotation_matrix
 from kitting_drake.policies.matching.jaw_clearance import JawGrasp, jaw_grasps
 from kitting_drake.policies.matching.registration import Registration, register, trace_outline
-from kitting_drake.policies.matching.segmentation import Region, segment
-from systems.signals import Observation, wrap_to_pi
+from kitting_drake.policies.matching.segmentation import Region, Segmentation
+from systems.signals import wrap_to_pi
 
 Array = NDArray[np.float64]
 
@@ -51,18 +51,17 @@ class RefinedPlace:
 
 
 def refine_place(
-    observation: Observation, pick: Array, rotation: float, place: Array
+    segmentation: Segmentation, pick: Array, rotation: float, place: Array, resolution: float
 ) -> RefinedPlace | None:
     """A predicted place, refined; None where the outlines cannot tell.
 
     Args:
-        observation: o_t.
+        segmentation: of o_t.
         pick: (row, col).
         rotation: predicted, of the object, in radians.
         place: (row, col) predicted for the object's point under the pick.
+        resolution: of a pixel, in metres.
     """
-    segmentation = segment(observation)
-    resolution = observation.grid.resolution
     taken = _nearest(segmentation.objects, pick)
     if taken is None:
         return None
@@ -84,9 +83,7 @@ def refine_place(
     best, reverse = fit(rotation, goal), fit(rotation + math.pi, target.middle)
     if reverse is not None and (best is None or reverse.cost < _HALF_TURN_GAIN * best.cost):
         best = reverse
-    if best is None:
-        return None
-    if best.cost > _WORST_COST:
+    if best is None or best.cost > _WORST_COST:
         return None
     return RefinedPlace(wrap_to_pi(best.rotation), best.moved(pick))
 
@@ -111,35 +108,37 @@ class RefinedGrasp:
     """In radians."""
 
 
-def refine_grasp(observation: Observation, pick: Array, theta: float) -> RefinedGrasp | None:
+def refine_grasp(
+    segmentation: Segmentation, pick: Array, theta: float, resolution: float
+) -> RefinedGrasp | None:
     """A grasp near a predicted one for which o_t leaves the jaws no room; None if it does leave it,
     or there is none.
 
     Args:
-        observation: o_t.
+        segmentation: of o_t.
         pick: (row, col) predicted.
         theta: of the gripper, predicted, in radians.
+        resolution: of a pixel, in metres.
     """
-    segmentation = segment(observation)
-    resolution = observation.grid.resolution
     taken = _nearest(segmentation.objects, pick)
     if taken is None:
         return None
 
-    def departure(grasp: JawGrasp) -> float:
-        """What it takes to go there instead, in metres, and how poor the grasp is there."""
-        turned = abs(math.remainder(grasp.theta - theta, math.pi))
+    def away(grasp: JawGrasp) -> tuple[float, float]:
+        """The distance from the predicted grasp, in metres, and the rotation, in radians."""
         distance = float(np.linalg.norm(grasp.pixel - pick)) * resolution
-        return distance + _LEVER * turned + _POOR * grasp.cost
+        return distance, abs(math.remainder(grasp.theta - theta, math.pi))
 
-    def is_same(grasp: JawGrasp) -> bool:
-        distance = float(np.linalg.norm(grasp.pixel - pick)) * resolution
-        turned = abs(math.remainder(grasp.theta - theta, math.pi))
+    def is_same(distance: float, turned: float) -> bool:
         return distance < _SAME_PLACE and turned < _SAME_ANGLE
+
+    def departure(grasp: JawGrasp) -> float:
+        distance, turned = away(grasp)
+        return distance + _LEVER * turned + _POOR * grasp.cost
 
     grasps = jaw_grasps(segmentation, taken, resolution)
     # A network knows more of a grasp than that the jaws have room: where they have, it stays.
-    if not grasps or any(is_same(grasp) for grasp in grasps):
+    if not grasps or any(is_same(*away(grasp)) for grasp in grasps):
         return None
     best = min(grasps, key=departure)
     return RefinedGrasp(best.pixel, best.theta)

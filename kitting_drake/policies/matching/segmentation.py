@@ -62,11 +62,8 @@ class Region:
 class Segmentation:
     """What stands where in an observation."""
 
-    table: Plane
     fixture: Mask
     """(rows, cols) the fixture; nowhere if there is none."""
-    top: Plane
-    """Of the fixture."""
     objects: tuple[Region, ...]
     """Loose, on the table."""
     recesses: tuple[Region, ...]
@@ -119,9 +116,7 @@ def segment(observation: Observation) -> Segmentation:
         rise[fixture] = -depth[fixture]
     deep = depth > max(_RECESS_DEPTH, 3 * noise)
     return Segmentation(
-        table=table,
         fixture=fixture,
-        top=top,
         objects=_regions(loose, relief, resolution),
         recesses=_regions(deep | hidden, depth, resolution, core=deep),
         protruding=tuple(

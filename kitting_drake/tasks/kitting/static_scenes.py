@@ -29,7 +29,12 @@ from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.primitives import ConstantValueSource
 from pydrake.systems.sensors import ImageRgba8U, RgbdSensor
 
-from kitting_drake.cell.cameras import add_observation_renderer, camera_pose, depth_camera
+from kitting_drake.cell.cameras import (
+    add_observation_renderer,
+    camera_pose,
+    depth_camera,
+    require_rendering,
+)
 from kitting_drake.common.errors import UserError
 from kitting_drake.common.paths import MODELS
 from kitting_drake.hkd.kits.block import build_block
@@ -47,10 +52,9 @@ from systems.heightmap_projector import HeightmapProjector
 from systems.sensor_noise import SensorNoise, SensorNoiseParameters
 from systems.signals import Observation, PixelGrid
 
-TOOLS_A_BATCH = 12
+_TOOLS_A_BATCH = 12
 _TOOLSETS_A_BATCH = 10
 _SCENES_A_TOOLSET = 4
-SCENES_A_BATCH = _TOOLSETS_A_BATCH * _SCENES_A_TOOLSET
 """At most: a toolset for which there is no room is left out."""
 
 _COUNTS = np.array([1, 2, 4, 12, 4, 3, 2, 1, 1], float)
@@ -69,10 +73,11 @@ def draw_batch(seed: int) -> Iterator[StaticScene]:
     Raises:
         UserError: images cannot be rendered here.
     """
+    require_rendering()
     rng = np.random.default_rng([seed, 0])
     catalogue = load_catalogue(MODELS / "tools" / "catalogue.yaml")
     entries = [entry for entry in catalogue if entry.split == "train"]
-    tools = [draw_tool(entries, rng, f"tool_{index}") for index in range(TOOLS_A_BATCH)]
+    tools = [draw_tool(entries, rng, f"tool_{index}") for index in range(_TOOLS_A_BATCH)]
     for number in range(_TOOLSETS_A_BATCH):
         count = 1 + int(rng.choice(len(_COUNTS), p=_COUNTS / _COUNTS.sum()))
         chosen = [tools[i] for i in rng.choice(len(tools), count, replace=False)]
@@ -83,9 +88,7 @@ def draw_batch(seed: int) -> Iterator[StaticScene]:
             kit = _draw_kit(chosen, rng)
             for scene in range(_SCENES_A_TOOLSET):
                 yield _draw_scene(kit, chosen, rng, noise_seed=100 * number + scene)
-        except UserError as error:
-            if "rendering" in str(error):
-                raise
+        except UserError:
             # There is no room for so many such tools.
             continue
 

@@ -111,7 +111,9 @@ def test_a_place_that_is_nearly_right_or_reversed_is_put_right(seen, turn: float
                 key=lambda item: np.linalg.norm(item.pixels - place, axis=1).min(),
             )
             off = 2 * recess.pixels.mean(axis=0) - off
-        found = refine_place(observation, pick, rotation + turn + 0.05, off)
+        found = refine_place(
+            segment(observation), pick, rotation + turn + 0.05, off, grid.resolution
+        )
         assert found is not None
         assert np.linalg.norm(found.place - place) * grid.resolution < 0.003
         assert abs(math.remainder(found.rotation - rotation, math.tau)) < math.radians(2)
@@ -124,14 +126,16 @@ def test_a_grasp_with_no_room_for_the_jaws_moves_to_where_there_is(seen):
         grasp = scene.objects[index].grasps[0]
         pick = grid.to_pixel(rotation_matrix(lies[2]) @ (grasp.x, grasp.y) + lies[:2])
         theta = lies[2] + grasp.theta
-        near = refine_grasp(observation, pick, theta)
+        near = refine_grasp(segment(observation), pick, theta, grid.resolution)
         if near is not None:
             assert np.linalg.norm(near.pick - pick) * grid.resolution < 0.04
         # Along the handle instead of across it, the jaws would close on nothing.
-        along = refine_grasp(observation, pick, theta + math.pi / 2)
+        along = refine_grasp(segment(observation), pick, theta + math.pi / 2, grid.resolution)
         assert along is not None
         assert abs(math.remainder(along.theta - theta, math.pi)) < math.radians(40)
-    assert refine_grasp(Observation(), np.array([80.0, 160.0]), 0.0) is None
+    assert (
+        refine_grasp(segment(Observation()), np.array([80.0, 160.0]), 0.0, grid.resolution) is None
+    )
 
 
 def test_a_place_without_a_recess_stays(seen):
@@ -141,7 +145,9 @@ def test_a_place_without_a_recess_stays(seen):
     pick = grid.to_pixel(lies[:2])
     far = segment(observation).fixture
     away = np.argwhere(~far)[np.linalg.norm(np.argwhere(~far) - pick, axis=1).argmax()]
-    assert refine_place(observation, pick, 0.3, away.astype(float)) is None
+    assert (
+        refine_place(segment(observation), pick, 0.3, away.astype(float), grid.resolution) is None
+    )
 
 
 def test_holes_take_the_lowest_of_their_neighbours():

@@ -24,6 +24,10 @@ def observed(rise: float = 0.0) -> Observation:
     return Observation(image, GRID, np.ones(GRID.shape, bool))
 
 
+def mending(observation: Observation, tried=()):
+    return recovery_action(observation, segment(observation), tried)
+
+
 def is_on_object(action) -> bool:
     row, col = GRID.to_pixel((action.pick.x, action.pick.y))
     return 90 < row < 97 and 76 < col < 123
@@ -31,22 +35,22 @@ def is_on_object(action) -> bool:
 
 @pytest.mark.parametrize("rise", [-0.003, 0.0, 0.0015])
 def test_what_is_seated_is_left_alone(rise: float):
-    assert recovery_action(observed(rise)) is None
-    assert recovery_action(Observation()) is None
+    assert mending(observed(rise)) is None
+    assert mending(Observation()) is None
 
 
 def test_what_protrudes_a_little_is_pressed_down_once():
-    first = recovery_action(observed(0.006))
+    first = mending(observed(0.006))
     assert first is not None
     assert first.press
     assert is_on_object(first)
-    second = recovery_action(observed(0.006), [first.pick])
+    second = mending(observed(0.006), [first.pick])
     assert second is None or not second.press
 
 
 @pytest.mark.parametrize("rise", [0.014, 0.018])
 def test_what_protrudes_by_more_is_laid_on_the_table(rise: float):
-    action = recovery_action(observed(rise))
+    action = mending(observed(rise))
     assert action is not None
     assert not action.press
     assert is_on_object(action)
@@ -55,7 +59,7 @@ def test_what_protrudes_by_more_is_laid_on_the_table(rise: float):
     assert around.shape == (25, 25)
     assert around.max() == 0
     # Where that grasp failed, another is tried.
-    other = recovery_action(observed(rise), [action.pick])
+    other = mending(observed(rise), [action.pick])
     if other is not None:
         assert math.dist((other.pick.x, other.pick.y), (action.pick.x, action.pick.y)) > 0.019
 
