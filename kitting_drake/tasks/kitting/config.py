@@ -15,11 +15,12 @@ from kitting_drake.hkd.tools.scaling import scaled_tool
 from kitting_drake.hkd.tools.tool import Tool, load_tool
 from kitting_drake.hkd.tools.toolsets import SPLITS, toolsets
 from kitting_drake.policies.learning import Learning
+from kitting_drake.tasks.boxes import box_object
 from kitting_drake.tasks.kitting import diagnosis
 from kitting_drake.tasks.kitting.sampling import (
     TablePose,
     check_arrangement,
-    draw_distractors,
+    draw_boxes,
     draw_poses,
 )
 from kitting_drake.tasks.task import ActionRecord, Fixture, Scene, SceneObject, TaskConfig
@@ -99,7 +100,7 @@ class _DrawnKitting(_KittingTask):
             rng=rng,
         )
         order = rng.permutation(len(tools)) if self.random_order else np.arange(len(tools))
-        distractors = draw_distractors(
+        boxes = draw_boxes(
             self.distractors,
             kit,
             X_WKit,
@@ -108,6 +109,10 @@ class _DrawnKitting(_KittingTask):
             grid=grid,
             rng=np.random.default_rng([seed, 3]),
         )
+        distractors = [
+            box_object(f"distractor_{number}", "distractor", box.size, box.colour, box.X_WB)
+            for number, box in enumerate(boxes, start=1)
+        ]
         scene = kitting_scene(kit, X_WKit, X_WTools, order, self.success_threshold)
         return dataclasses.replace(
             scene,

@@ -10,8 +10,7 @@ from pydrake.math import RigidTransform, RollPitchYaw
 from kitting_drake.common.errors import UserError
 from kitting_drake.hkd.kits.kit import Kit
 from kitting_drake.hkd.tools.tool import Tool
-from kitting_drake.tasks.boxes import box_object
-from kitting_drake.tasks.task import TABLE, SceneObject
+from kitting_drake.tasks.task import TABLE
 from systems.bounds import bounded
 from systems.hand_geometry import FINGER_DEPTH, FINGER_LENGTH, MAX_OPENING, PALM_SIZE
 from systems.signals import PixelGrid
@@ -19,7 +18,7 @@ from systems.signals import PixelGrid
 _TRIES = 300
 _RESTARTS = 60
 _DISTRACTOR_SPACING = 0.01
-"""Least distance of a distractor from all else, in metres."""
+"""Least distance of a drawn box from all else, in metres."""
 _MANY = 6
 """With more tools than this, those that are hardest to place are drawn first."""
 
@@ -176,7 +175,18 @@ def _draw_pose(
     return None
 
 
-def draw_distractors(
+@dataclass(frozen=True)
+class DrawnBox:
+    """A box on the table, drawn at random."""
+
+    size: tuple[float, float, float]
+    """Along its axes, in metres."""
+    colour: tuple[float, float, float]
+    X_WB: RigidTransform
+    """Pose of the middle of its bottom."""
+
+
+def draw_boxes(
     count: int,
     kit: Kit,
     X_WKit: RigidTransform,
@@ -185,7 +195,7 @@ def draw_distractors(
     *,
     grid: PixelGrid,
     rng: np.random.Generator,
-) -> list[SceneObject]:
+) -> list[DrawnBox]:
     """Boxes of any size and colour that have no business on the table.
 
     They keep clear of kit and tools and of the hand that grasps a tool. Where there is no room for
@@ -205,10 +215,10 @@ def draw_distractors(
     placed += [
         _tool_footprint(tool).moved(_pose(X)) for tool, X in zip(tools, X_WTools, strict=True)
     ]
-    objects = []
-    for number in range(1, count + 1):
+    boxes = []
+    for _ in range(count):
         length, width, height = rng.uniform((0.015, 0.015, 0.008), (0.07, 0.07, 0.045)).tolist()
-        colour = tuple(rng.uniform(0.05, 0.95, 3).tolist())
+        red, green, blue = rng.uniform(0.05, 0.95, 3).tolist()
         outline = CrossSection.square((length, width), True)
         shape = _Footprint(outline, CrossSection(), CrossSection())
         found = _draw_pose(shape, placed, room, grid, _DISTRACTOR_SPACING, 180.0, rng)
@@ -216,11 +226,8 @@ def draw_distractors(
             continue
         pose, footprint = found
         placed.append(footprint)
-        size = (length, width, height)
-        objects.append(
-            box_object(f"distractor_{number}", "distractor", size, colour, pose.transform())
-        )
-    return objects
+        boxes.append(DrawnBox((length, width, height), (red, green, blue), pose.transform()))
+    return boxes
 
 
 def _pose(X: RigidTransform) -> TablePose:

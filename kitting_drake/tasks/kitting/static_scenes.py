@@ -1,8 +1,9 @@
 """Static scenes to learn from: random tools and kits, rendered where they stand; no physics.
 
 Tools are drawn (`hkd.tools.random_tools`), a kit is laid out for some of them, and several scenes
-are rendered of it: other poses, other tools already seated, another camera noise. The labels are
-geometry: every grasp that leaves the jaws room, and the pose that seats the tool.
+are rendered of it: other poses, other tools already seated, other things lying about that have no
+cavity, another camera noise. The labels are geometry: every grasp that leaves the jaws room, and
+the pose that seats the tool.
 """
 
 import math
@@ -11,7 +12,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from manifold3d import CrossSection
+from manifold3d import CrossSection, Manifold
 from numpy.typing import NDArray
 from pydrake.common import MemoryFile
 from pydrake.common.value import Value
@@ -46,7 +47,7 @@ from kitting_drake.hkd.tools.meshes import vertices_and_faces
 from kitting_drake.hkd.tools.random_tools import RandomTool, draw_tool
 from kitting_drake.policies.static_scenes import StaticScene
 from kitting_drake.scenario.schema import Scenario
-from kitting_drake.tasks.kitting.sampling import draw_poses
+from kitting_drake.tasks.kitting.sampling import DrawnBox, draw_boxes, draw_poses
 from systems.hand_geometry import FINGER_DEPTH, FINGER_LENGTH, MAX_OPENING
 from systems.heightmap_projector import HeightmapProjector
 from systems.sensor_noise import SensorNoise, SensorNoiseParameters
@@ -57,8 +58,14 @@ _TOOLSETS_A_BATCH = 10
 _SCENES_A_TOOLSET = 4
 """At most: a toolset for which there is no room is left out."""
 
-_COUNTS = np.array([1, 2, 4, 12, 4, 3, 2, 1, 1], float)
-"""How often kits of 1, 2, ... 9 tools are drawn: mostly of four."""
+_COUNTS = np.array([2, 4, 8, 24, 8, 6, 4, 2, 2, 1, 1, 1], float)
+"""How often kits of 1, 2, ... 12 tools are drawn: mostly of four."""
+_MOST_LOOSE = 8
+"""Of more tools than this the others are seated: the workspace has no room for all."""
+_CLUTTERED = 0.5
+"""The share of scenes with things that have no cavity, ..."""
+_MOST_STRANGERS, _MOST_BOXES = 2, 6
+"""... at most so many other tools, and boxes."""
 _WALL = 0.003
 _IN_CAVITY = 0.0008
 """Standard deviation of where a seated tool lies in its clearance, in metres."""
@@ -86,8 +93,9 @@ def draw_batch(seed: int) -> Iterator[StaticScene]:
             chosen = [replace(tool, category="drawn") for tool in chosen]
         try:
             kit = _draw_kit(chosen, rng)
+            others = [tool for tool in tools if all(tool.name != own.name for own in chosen)]
             for scene in range(_SCENES_A_TOOLSET):
-                yield _draw_scene(kit, chosen, rng, noise_seed=100 * number + scene)
+                yield _draw_scene(kit, chosen, others, rng, noise_seed=100 * number + scene)
         except UserError:
             # There is no room for so many such tools.
             continue
@@ -96,8 +104,8 @@ def draw_batch(seed: int) -> Iterator[StaticScene]:
 @dataclass(frozen=True)
 class _DrawnKit:
     kit: Kit
-    texts: tuple[str, ...]
-    """The Wavefront text of the block, and of each tool."""
+    text: str
+    """The Wavefront text of the block."""
 
 
 def _draw_kit(tools: Sequence[RandomTool], rng: np.random.Generator) -> _DrawnKit:
@@ -110,53 +118,70 @@ def _draw_kit(tools: Sequence[RandomTool], rng: np.random.Generator) -> _DrawnKi
     )
     layout = layout_kit(tools, parameters)
     block = build_block(kit_cavities(tools, layout.parameters, layout.poses), layout.parameters)
-    vertices, faces = vertices_and_faces(block)
-    texts = [_obj(vertices, faces)]
-    for tool in tools:
-        corners = tool.triangles.reshape(-1, 3)
-        texts.append(_obj(corners, np.arange(len(corners)).reshape(-1, 3)))
-    return _DrawnKit(Kit(Path("kit.sdf"), tuple(tools), layout), tuple(texts))
+    return _DrawnKit(Kit(Path("kit.sdf"), tuple(tools), layout), _solid_text(block))
 
 
 def _draw_scene(
-    drawn: _DrawnKit, tools: Sequence[RandomTool], rng: np.random.Generator, noise_seed: int
+    drawn: _DrawnKit,
+    tools: Sequence[RandomTool],
+    others: Sequence[RandomTool],
+    rng: np.random.Generator,
+    noise_seed: int,
 ) -> StaticScene:
+    """A scene of a kit, its tools, and perhaps some of the others, for which it has no cavity."""
     grid = PixelGrid()
     kit = drawn.kit
-    count = len(tools)
-    seated = rng.permutation(count)[: int(rng.integers(0, count + 1))]
-    if rng.random() < 0.5:
-        seated = seated[: len(seated) // 2]
-    loose = [index for index in range(count) if index not in seated]
+    loose = _draw_loose(len(tools), rng)
+    strangers: list[RandomTool] = []
+    box_count = 0
+    if rng.random() < _CLUTTERED:
+        room = max(0, min(_MOST_LOOSE - len(loose), len(others)))
+        count = min(int(rng.integers(0, _MOST_STRANGERS + 1)), room)
+        strangers = [others[i] for i in rng.choice(len(others), count, replace=False)]
+        box_count = int(rng.integers(0, _MOST_BOXES + 1))
+    lying = [*(tools[index] for index in loose), *strangers]
     X_WKit, X_WTools = draw_poses(
         kit,
-        [tools[index] for index in loose],
+        lying,
         grid=grid,
         spacing=float(rng.uniform(0.004, 0.02)),
         yaw_range_deg=180.0,
         rng=rng,
     )
+    boxes = draw_boxes(box_count, kit, X_WKit, lying, X_WTools, grid=grid, rng=rng)
     X_WGoals = []
-    for index in range(count):
+    for index in range(len(tools)):
         pose = kit.goal(index)
         X_WGoals.append(
             X_WKit @ RigidTransform(RollPitchYaw(0, 0, pose.yaw), [pose.x, pose.y, pose.z])
         )
-    X_WT = dict(zip(loose, X_WTools, strict=True))
-    for index in seated:
+    bodies = [(drawn.text, X_WKit)]
+    bodies += [(_text(tool), X) for tool, X in zip(lying, X_WTools, strict=True)]
+    for index in sorted(set(range(len(tools))) - set(loose)):
         dx, dy = np.clip(rng.normal(0, _IN_CAVITY, 2), -0.0015, 0.0015)
-        X_WT[index] = RigidTransform([dx, dy, 0.0]) @ X_WGoals[index]
-    bodies = [(drawn.texts[0], X_WKit)]
-    bodies += [(drawn.texts[1 + index], X) for index, X in X_WT.items()]
+        bodies.append((_text(tools[index]), RigidTransform([dx, dy, 0.0]) @ X_WGoals[index]))
+    bodies += [(_solid_text(_box(box)), box.X_WB) for box in boxes]
     observation = render(bodies, grid, _draw_noise(rng), noise_seed)
 
-    fixtures = [_standing(CrossSection.square(kit.size[:2], True), X_WKit)]
-    fixtures += [_standing(tools[i].footprint.hull(), X_WT[i]) for i in loose]
+    standing = [_standing(CrossSection.square(kit.size[:2], True), X_WKit)]
+    standing += [
+        _standing(tool.footprint.hull(), X) for tool, X in zip(lying, X_WTools, strict=True)
+    ]
+    standing += [_standing(CrossSection.square(box.size[:2], True), box.X_WB) for box in boxes]
     actions = []
     for place, index in enumerate(loose):
-        others = [item for k, item in enumerate(fixtures) if k != place + 1]
-        actions += _actions(place, tools[index], X_WT[index], X_WGoals[index], others)
+        around = [item for k, item in enumerate(standing) if k != place + 1]
+        actions += _actions(place, tools[index], X_WTools[place], X_WGoals[index], around)
     return StaticScene.of(observation, np.array(actions).reshape(-1, 8))
+
+
+def _draw_loose(count: int, rng: np.random.Generator) -> list[int]:
+    """Which of so many tools are not seated yet."""
+    order = rng.permutation(count)
+    seated = int(rng.integers(0, count + 1))
+    if rng.random() < 0.5:
+        seated //= 2
+    return sorted(order[max(seated, count - _MOST_LOOSE) :].tolist())
 
 
 def _actions(
@@ -270,6 +295,19 @@ def render(
     builder.ExportOutput(projector.GetOutputPort("observation"), "observation")
     diagram = builder.Build()
     return diagram.GetOutputPort("observation").Eval(diagram.CreateDefaultContext())
+
+
+def _box(box: DrawnBox) -> Manifold:
+    return Manifold.cube(box.size, True).translate((0, 0, box.size[2] / 2))
+
+
+def _text(tool: RandomTool) -> str:
+    corners = tool.triangles.reshape(-1, 3)
+    return _obj(corners, np.arange(len(corners)).reshape(-1, 3))
+
+
+def _solid_text(solid: Manifold) -> str:
+    return _obj(*vertices_and_faces(solid))
 
 
 def _obj(vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> str:

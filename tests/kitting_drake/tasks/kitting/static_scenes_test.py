@@ -51,7 +51,7 @@ def scenes() -> list[StaticScene]:
     rng = np.random.default_rng(1)
     tools = [draw_tool(ENTRIES, rng, str(index)) for index in range(3)]
     kit = static_scenes._draw_kit(tools, rng)
-    return [static_scenes._draw_scene(kit, tools, rng, seed) for seed in range(6)]
+    return [static_scenes._draw_scene(kit, tools, (), rng, seed) for seed in range(6)]
 
 
 def test_picks_are_on_tools_and_places_in_the_kit(scenes: list[StaticScene]):
@@ -77,7 +77,7 @@ def test_a_place_brings_the_tool_into_a_cavity_of_its_shape():
     kit = static_scenes._draw_kit(tools, rng)
     free = 0
     while not free:
-        scene = static_scenes._draw_scene(kit, tools, rng, 0)
+        scene = static_scenes._draw_scene(kit, tools, (), rng, 0)
         if len(np.unique(scene.actions[:, 0])) < 2:
             continue
         height = scene.image[3]
