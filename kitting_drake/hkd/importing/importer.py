@@ -2,12 +2,13 @@
 
 The mesh is read and repaired (`repair`), brought into the tool frame in a stable pose
 (`stable_pose`), scaled, given the best grasp (`fit`), its mass, and a convex decomposition for
-collision (`convex_decomposition`). All of that happens in a process of its own, which may fail or
-hang as it likes: the tool's folder appears atomically. Solids are handled in mm and written in
-metres.
+collision (`convex_decomposition`), and laid as it comes to rest (`resting_pose`). All of that
+happens in a process of its own, which may fail or hang as it likes: the tool's folder appears
+atomically. Solids are handled in mm and written in metres.
 """
 
 import hashlib
+import math
 import multiprocessing
 import os
 import re
@@ -18,13 +19,16 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import trimesh
 import yaml
+from manifold3d import Manifold
 
 from kitting_drake.common.errors import UserError
 from kitting_drake.hkd.importing.convex_decomposition import decompose
 from kitting_drake.hkd.importing.fit import fit, lengths_to_try, material_of
 from kitting_drake.hkd.importing.repair import NOMINAL_MM, make_solid, read_mesh
+from kitting_drake.hkd.importing.resting_pose import resting_tilt
 from kitting_drake.hkd.importing.stable_pose import size, to_tool_frame
 from kitting_drake.hkd.tools import meshes
 from kitting_drake.hkd.tools.sdf import tool_sdf
@@ -39,6 +43,8 @@ OTHER_DENSITY = 3000.0
 TIME_LIMIT = 55.0
 """Seconds after which the geometry is given up."""
 _MOST_MEMORY = 12 * 2**30
+# A tool is laid anew where it comes to rest by more than this, in degrees, at most so often.
+_SAME_POSE_DEG, _LAYINGS = 2.0, 3
 # Collision hulls that are further off the outline than this are worth a note.
 _TRUE_OUTLINE_MM = 0.35
 
@@ -218,6 +224,39 @@ def _prepare(request: ImportRequest, name: str, directory: Path) -> Prepared:
     solid = to_tool_frame(solid, request.category)
     lengths, assumed = lengths_to_try(size(solid)[0] / nominal, request.length_mm)
     notes = [assumed, *notes]
+    first, wanted = solid, lengths
+    laid: list[str] = []
+    for _ in range(_LAYINGS):
+        _empty(directory)
+        prepared, fitted = _write(request, name, directory, solid, lengths, [*notes, *laid])
+        tilt = resting_tilt(directory / f"{name}.sdf")
+        angle = math.degrees(math.acos(np.clip(tilt[2, 2], -1.0, 1.0)))
+        if angle <= _SAME_POSE_DEG:
+            return prepared
+        solid = fitted.transform(np.column_stack([tilt, np.zeros(3)]))
+        lengths = [size(solid)[0]]
+        laid = [f"laid as it comes to rest, which is {angle:.0f} degrees tilted"]
+    # It rolls wherever it is laid: then it is laid as low as it can be.
+    _empty(directory)
+    notes.append("it rolls on a table")
+    return _write(request, name, directory, first, wanted, notes)[0]
+
+
+def _empty(directory: Path) -> None:
+    for file in directory.iterdir():
+        file.unlink()
+
+
+def _write(
+    request: ImportRequest,
+    name: str,
+    directory: Path,
+    solid: Manifold,
+    lengths: list[float],
+    notes: list[str],
+) -> tuple[Prepared, Manifold]:
+    """Writes the files of a solid (mm) that lies in the tool frame; returns it as it was fitted."""
+    notes = list(notes)
     tool, solid = fit(request.category, name, solid, lengths, notes, directory)
     density = request.density or DENSITIES.get(request.category, OTHER_DENSITY)
     vertices, faces = meshes.vertices_and_faces(solid)
@@ -268,7 +307,7 @@ def _prepare(request: ImportRequest, name: str, directory: Path) -> Prepared:
     }
     (directory / "tool.yaml").write_text(yaml.safe_dump(record, sort_keys=False))
     load_tool(str(directory))
-    return record, notes, len(collision.hulls)
+    return (record, notes, len(collision.hulls)), solid
 
 
 def _safe(text: str) -> str:

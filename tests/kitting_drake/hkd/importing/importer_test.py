@@ -15,6 +15,7 @@ from kitting_drake.hkd.grasps.annotate import save_grasp
 from kitting_drake.hkd.importing import importer
 from kitting_drake.hkd.importing.fit import guess_unit
 from kitting_drake.hkd.importing.importer import ImportRequest, import_tool
+from kitting_drake.hkd.importing.resting_pose import resting_tilt
 from kitting_drake.hkd.kits.layout import layout_kit
 from kitting_drake.hkd.kits.parameters import KitParameters
 from kitting_drake.hkd.tools.collision import closed, furthest
@@ -404,3 +405,19 @@ def test_real_tools(name: str, tmp_path: Path):
     assert report.record["imported"]["outline_deviation"] <= 0.00035
     com = yaml.safe_load((tool.directory / "tool.yaml").read_text())["center_of_mass"]
     assert abs(tool.grasp.x - com[0]) < 0.045
+
+
+def test_a_balanced_tool_is_laid_as_it_comes_to_rest(tmp_path: Path):
+    """A thick handle holds a long shaft up, by less than a millimetre: it tips at a touch."""
+    handle = Manifold.cube((40, 30, 30), True).translate((-20, 0, 0))
+    shaft = Manifold.cube((97, 12, 12), True).translate((48.5, 0, 0))
+    whole = (handle + shaft).translate((-28.5, 0, 15)).scale((1.2, 1.2, 1.2))
+    mesh = trimesh.Trimesh(*vertices_and_faces(whole), process=False)
+    report = bring(exported(mesh, tmp_path / "d.stl"), tmp_path / "tools", category="screwdriver")
+    assert any("comes to rest" in note for note in report.notes)
+    tilt = resting_tilt(report.directory / "d.sdf")
+    assert np.degrees(np.arccos(tilt[2, 2])) < 2
+    tool = load_tool(str(report.directory))
+    # The shaft's end is on the table now.
+    low = tool.triangles.reshape(-1, 3)
+    assert low[low[:, 0] > 0.9 * low[:, 0].max()][:, 2].min() < 0.001

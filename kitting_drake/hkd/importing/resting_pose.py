@@ -1,0 +1,62 @@
+"""The pose in which an imported tool comes to rest, as the physics has it.
+
+A stable pose of a rigid solid may be one that a tool does not keep: a screwdriver balanced on its
+handle tips at a touch. So the tool is dropped by a little onto a table, and where it ends otherwise
+than it was laid, that is how it lies.
+"""
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from pydrake.geometry import (
+    AddContactMaterial,
+    AddRigidHydroelasticProperties,
+    HalfSpace,
+    ProximityProperties,
+)
+from pydrake.math import RigidTransform, RollPitchYaw
+from pydrake.multibody.parsing import Parser
+from pydrake.multibody.plant import (
+    AddMultibodyPlant,
+    CoulombFriction,
+    MultibodyPlantConfig,
+)
+from pydrake.systems.analysis import Simulator
+from pydrake.systems.framework import DiagramBuilder
+
+_DROP = 0.002
+"""In metres."""
+_SETTLE = 2.0
+"""Time in which a tool comes to rest, in seconds."""
+_STEP = 1 / 128
+_FRICTION = 0.5
+
+
+def resting_tilt(sdf: Path) -> NDArray[np.float64]:
+    """R (3, 3): how a tool that is dropped in its frame's pose has tilted when it has come to rest;
+    its rotation about z is left out.
+
+    Args:
+        sdf: SDFormat of the tool, one link whose frame lies on the table.
+    """
+    builder = DiagramBuilder()
+    config = MultibodyPlantConfig(time_step=_STEP, contact_model="hydroelastic")
+    plant, _ = AddMultibodyPlant(config, builder)
+    (model,) = Parser(plant).AddModels(str(sdf))
+    ground = ProximityProperties()
+    AddRigidHydroelasticProperties(ground)
+    AddContactMaterial(friction=CoulombFriction(_FRICTION, _FRICTION), properties=ground)
+    plant.RegisterCollisionGeometry(
+        plant.world_body(), RigidTransform(), HalfSpace(), "ground", ground
+    )
+    plant.Finalize()
+    simulator = Simulator(builder.Build())
+    context = plant.GetMyMutableContextFromRoot(simulator.get_mutable_context())
+    (index,) = plant.GetBodyIndices(model)
+    body = plant.get_body(index)
+    plant.SetFreeBodyPose(context, body, RigidTransform([0, 0, _DROP]))
+    simulator.AdvanceTo(_SETTLE)
+    rotation = plant.EvalBodyPoseInWorld(context, body).rotation()
+    yaw = RollPitchYaw(rotation).yaw_angle()
+    return RollPitchYaw(0, 0, -yaw).ToRotationMatrix().matrix() @ rotation.matrix()
