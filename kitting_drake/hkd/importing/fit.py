@@ -2,15 +2,16 @@
 
 from pathlib import Path
 
-import trimesh
 from manifold3d import Manifold
 
 from kitting_drake.common.errors import UserError
 from kitting_drake.hkd.grasps.proposals import WIDEST, propose_grasps
+from kitting_drake.hkd.importing.materials import bodies_of
 from kitting_drake.hkd.importing.stable_pose import centred, size
 from kitting_drake.hkd.kits.layout import layout_kit
 from kitting_drake.hkd.kits.parameters import KitParameters
 from kitting_drake.hkd.tools import meshes
+from kitting_drake.hkd.tools.mass import mass_properties
 from kitting_drake.hkd.tools.tool import Tool
 
 SCALED_LENGTHS_MM = (180.0, 170.0, 160.0, 150.0)
@@ -72,6 +73,7 @@ def fit(
     lengths: list[float],
     notes: list[str],
     directory: Path,
+    density: float | None = None,
 ) -> tuple[Tool, Manifold]:
     """The tool, with its visual mesh written, at the first length at which it can be used.
 
@@ -84,7 +86,7 @@ def fit(
         scaled = centred(_decimated(solid.scale((factor, factor, factor))))
         try:
             _check_size(scaled)
-            tool = _tool(category, name, scaled, directory)
+            tool = _tool(category, name, scaled, directory, density)
             layout_kit([tool], KitParameters())
         except UserError as error:
             refusal = refusal or error
@@ -120,7 +122,9 @@ def _check_size(solid: Manifold) -> None:
         )
 
 
-def _tool(category: str, name: str, solid: Manifold, directory: Path) -> Tool:
+def _tool(
+    category: str, name: str, solid: Manifold, directory: Path, density: float | None
+) -> Tool:
     """A tool with its visual mesh written and its best grasp.
 
     Raises:
@@ -131,7 +135,7 @@ def _tool(category: str, name: str, solid: Manifold, directory: Path) -> Tool:
     meshes.write_smooth_obj(visual, solid, _CREASE_ANGLE_DEG)
     vertices, faces = meshes.vertices_and_faces(solid)
     triangles = 1e-3 * vertices[faces]
-    com = trimesh.triangles.mass_properties(triangles)["center_mass"]
+    _, com, _ = mass_properties(bodies_of(solid, category, density))
     proposals = propose_grasps(triangles, com)
     if not proposals:
         raise UserError(

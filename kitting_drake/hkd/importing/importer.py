@@ -20,25 +20,21 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import trimesh
 import yaml
 from manifold3d import Manifold
 
 from kitting_drake.common.errors import UserError
 from kitting_drake.hkd.importing.convex_decomposition import decompose
 from kitting_drake.hkd.importing.fit import fit, lengths_to_try, material_of
+from kitting_drake.hkd.importing.materials import bodies_of
 from kitting_drake.hkd.importing.repair import NOMINAL_MM, make_solid, read_mesh
 from kitting_drake.hkd.importing.resting_pose import resting_tilt
 from kitting_drake.hkd.importing.stable_pose import size, to_tool_frame
 from kitting_drake.hkd.tools import meshes
+from kitting_drake.hkd.tools.mass import mass_properties
 from kitting_drake.hkd.tools.sdf import tool_sdf
 from kitting_drake.hkd.tools.symmetry import symmetry_order
 from kitting_drake.hkd.tools.tool import check_category, load_tool, tool_names, user_tools
-
-DENSITIES = {"hammer": 3000.0, "pliers": 6000.0, "wrench": 7850.0, "screwdriver": 2000.0}
-"""The mean density of a tool of a category, with its handle, in kg/m^3."""
-OTHER_DENSITY = 3000.0
-"""The same for a tool of any other category."""
 
 TIME_LIMIT = 55.0
 """Seconds after which the geometry is given up."""
@@ -47,6 +43,7 @@ _MOST_MEMORY = 12 * 2**30
 _SAME_POSE_DEG, _LAYINGS = 2.0, 3
 # Collision hulls that are further off the outline than this are worth a note.
 _TRUE_OUTLINE_MM = 0.35
+_FRONTS = {"hammer": "its head", "screwdriver": "its blade"}
 
 
 @dataclass(frozen=True)
@@ -60,7 +57,7 @@ class ImportRequest:
     length_mm: float | None = None
     """The length to scale it to; see `fit.lengths_to_try` for None."""
     density: float | None = None
-    """The mean density in kg/m^3; see `DENSITIES` for None."""
+    """The mean density in kg/m^3; see `materials` for None."""
     output: Path | None = None
     """The folder of tools to write into; `user_tools` if None."""
 
@@ -257,10 +254,13 @@ def _write(
 ) -> tuple[Prepared, Manifold]:
     """Writes the files of a solid (mm) that lies in the tool frame; returns it as it was fitted."""
     notes = list(notes)
-    tool, solid = fit(request.category, name, solid, lengths, notes, directory)
-    density = request.density or DENSITIES.get(request.category, OTHER_DENSITY)
+    category, density = request.category, request.density
+    tool, solid = fit(category, name, solid, lengths, notes, directory, density)
+    bodies = bodies_of(solid, category, density)
+    mass, center, inertia = mass_properties(bodies)
+    if len(bodies) > 1:
+        notes.append(f"{_FRONTS[category]} taken to be steel, its handle light")
     vertices, faces = meshes.vertices_and_faces(solid)
-    physics = trimesh.triangles.mass_properties(1e-3 * vertices[faces], density=density)
     collision = decompose(solid, tool.grasp)
     if not collision.hulls:
         raise UserError("the mesh encloses too little volume to be touched")
@@ -276,9 +276,9 @@ def _write(
     material = material_of(request.category)
     text = tool_sdf(
         name,
-        physics["mass"],
-        physics["center_mass"],
-        physics["inertia"],
+        mass,
+        center,
+        inertia,
         [(tool.visual_meshes[0].name, material)],
         collisions,
     )
@@ -292,15 +292,15 @@ def _write(
         "length": tool.length,
         "width": tool.width,
         "height": tool.height,
-        "mass": round(float(physics["mass"]), 6),
-        "center_of_mass": [round(float(v), 6) + 0.0 for v in physics["center_mass"]],
+        "mass": round(float(mass), 6),
+        "center_of_mass": [round(float(v), 6) + 0.0 for v in center],
         "symmetry": symmetry_order(1e-3 * vertices[faces]),
         "grasp": {key: round(float(value), 6) for key, value in vars(tool.grasp).items()},
         "visual_meshes": [path.name for path in tool.visual_meshes],
         "imported": {
             "file": request.mesh.name,
             "sha256": hashlib.sha256(request.mesh.read_bytes()).hexdigest(),
-            "density": float(density),
+            "density": round(float(mass / (1e-9 * solid.volume())), 1),
             "outline_deviation": round(1e-3 * collision.outline_deviation_mm, 6),
             "notes": notes,
         },

@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import trimesh
 import yaml
 from manifold3d import CrossSection, JoinType, Manifold, OpType
 from scipy.spatial import ConvexHull, QhullError
@@ -28,6 +27,7 @@ from kitting_drake.hkd.tools.collision import (
     projection,
     thinned,
 )
+from kitting_drake.hkd.tools.mass import Body, mass_properties
 from kitting_drake.hkd.tools.sdf import tool_sdf
 from kitting_drake.hkd.tools.solids import MATERIALS, Part
 from kitting_drake.hkd.tools.stable_pose import stable_poses
@@ -163,21 +163,9 @@ def build_parts(entry: ToolEntry) -> list[Part]:
     return result
 
 
-def mass_properties(parts: list[Part]) -> tuple[float, np.ndarray, np.ndarray]:
-    """Mass (kg), centre of mass (m) and rotational inertia about it (kg m^2, 3 by 3)."""
-    bodies = []
-    for part in parts:
-        vertices, faces = meshes.vertices_and_faces(part.solid)
-        density = MATERIALS[part.material].density
-        p = trimesh.triangles.mass_properties(1e-3 * vertices[faces], density=density)
-        bodies.append((p["mass"], p["center_mass"], p["inertia"]))
-    mass = sum(m for m, _, _ in bodies)
-    center = sum(m * c for m, c, _ in bodies) / mass
-    inertia = np.zeros((3, 3))
-    for m, c, about_center in bodies:
-        d = c - center
-        inertia += about_center + m * (d @ d * np.eye(3) - np.outer(d, d))
-    return mass, center, inertia
+def homogeneous(parts: list[Part]) -> list[Body]:
+    """The parts of a tool and their densities."""
+    return [(part.solid, MATERIALS[part.material].density) for part in parts]
 
 
 def rest_rotation(points: np.ndarray, center_of_mass: np.ndarray) -> np.ndarray:
@@ -199,7 +187,7 @@ def generate_tool(entry: ToolEntry, directory: Path) -> Report:
         CatalogueError: the entry makes no tool that can be used; then nothing is written.
     """
     parts = build_parts(entry)
-    mass, center, inertia = mass_properties(parts)
+    mass, center, inertia = mass_properties(homogeneous(parts))
     # Hulls are merged in the stable pose: outline and heights are those of that pose.
     R_TD, p_T, whole = _tool_frame(entry, parts, center)
     outline = closed(whole.project(), CAVITY_CLEARANCE_MM)

@@ -23,9 +23,10 @@ from kitting_drake.hkd.tools.generate import (
     DESIGNS,
     ToolEntry,
     build_parts,
-    mass_properties,
+    homogeneous,
     rest_rotation,
 )
+from kitting_drake.hkd.tools.mass import mass_properties
 from kitting_drake.hkd.tools.meshes import vertices_and_faces
 from kitting_drake.hkd.tools.tool import Tool
 
@@ -94,7 +95,7 @@ def _attempt(
         entry = entries[rng.integers(len(entries))]
         category = entry.category
         parts = build_parts(_varied(entry, rng))
-        center = 1e3 * mass_properties(parts)[1]
+        center = 1e3 * mass_properties(homogeneous(parts))[1]
         whole = Manifold.batch_boolean([part.solid for part in parts], OpType.Add)
     if sum(body.volume() > 1e-3 for body in whole.decompose()) != 1:
         return None

@@ -60,10 +60,11 @@ def test_a_tool_is_as_its_mesh_is(plain: importer.ImportReport):
     tool = load_tool(str(plain.directory))
     assert (tool.name, tool.category, tool.split) == ("mallet", "hammer", "user")
     assert (tool.length, tool.width, tool.height) == pytest.approx((0.175, 0.050, 0.016), abs=1e-5)
-    volume = mallet().volume * 1e-9
-    assert tool.mass == pytest.approx(volume * importer.DENSITIES["hammer"], rel=1e-4)
-    # The head is the working end.
-    assert plain.record["center_of_mass"][0] > 0.01
+    # The head is the working end, and heavy.
+    head = 1e-9 * 26 * 50 * 16
+    handle = 1e-9 * mallet().volume - head
+    assert tool.mass == pytest.approx(7850 * head + 1200 * handle, rel=0.03)
+    assert plain.record["center_of_mass"][0] > 0.05
     assert tool.grasp.width == pytest.approx(0.020, abs=2e-4)
     points = tool.triangles.reshape(-1, 3)
     np.testing.assert_allclose(points.min(axis=0)[2], 0, atol=1e-6)
@@ -205,11 +206,11 @@ def test_a_mesh_of_many_triangles_is_decimated(tmp_path: Path):
     # Bumps of a tenth of a millimetre, as a scan has.
     waves = np.sin(mesh.vertices @ np.random.default_rng(0).normal(0, 1, (3, 3)))
     mesh.vertices = mesh.vertices + 0.05 * waves
-    report = bring(exported(mesh, tmp_path / "scan.stl"), tmp_path / "tools")
+    report = bring(exported(mesh, tmp_path / "scan.stl"), tmp_path / "tools", density=3000.0)
     tool = load_tool(str(report.directory))
     assert len(tool.triangles) < 20_000
     shape = trimesh.load_mesh(tmp_path / "scan.stl")
-    assert tool.mass == pytest.approx(1e-9 * shape.volume * importer.DENSITIES["hammer"], rel=2e-3)
+    assert tool.mass == pytest.approx(1e-9 * shape.volume * 3000, rel=2e-3)
     assert (tool.length, tool.width) == pytest.approx(tuple(1e-3 * shape.extents[:2]), abs=1e-4)
     assert report.collision_hulls <= 5
 

@@ -1,0 +1,28 @@
+"""Mass, centre of mass and inertia of rigid bodies that are made of homogeneous ones."""
+
+from collections.abc import Iterable
+
+import numpy as np
+import trimesh
+from manifold3d import Manifold
+
+from kitting_drake.hkd.tools.meshes import vertices_and_faces
+
+Body = tuple[Manifold, float]
+"""A solid in mm, and its density in kg/m^3."""
+
+
+def mass_properties(bodies: Iterable[Body]) -> tuple[float, np.ndarray, np.ndarray]:
+    """Mass (kg), centre of mass (m) and rotational inertia about it (kg m^2, 3 by 3)."""
+    single = []
+    for solid, density in bodies:
+        vertices, faces = vertices_and_faces(solid)
+        p = trimesh.triangles.mass_properties(1e-3 * vertices[faces], density=density)
+        single.append((p["mass"], p["center_mass"], p["inertia"]))
+    mass = sum(m for m, _, _ in single)
+    center = sum(m * c for m, c, _ in single) / mass
+    inertia = np.zeros((3, 3))
+    for m, c, about_center in single:
+        d = c - center
+        inertia += about_center + m * (d @ d * np.eye(3) - np.outer(d, d))
+    return mass, center, inertia
