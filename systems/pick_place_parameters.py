@@ -68,8 +68,8 @@ class PickPlaceParameters:
     # How hard each pad presses on what it holds, in N.
     grasp_force: float = bounded(30.0, 1.0, 140.0)
 
-    # Less than this between the pads is nothing at all, in m.
-    minimum_width: float = bounded(0.003, 0.0, 0.08)
+    # Less than this between the pressing pads is nothing at all, in m. They dent what is thin.
+    minimum_width: float = bounded(0.0015, 0.0, 0.08)
 
     # How hard the closed jaws press an object down that is not seated, in N, and how far below its
     # top they may go, in m.

@@ -27,8 +27,8 @@ FLOOR_CLEARANCE = _PRIMITIVE.floor_clearance
 """The pads are never lower than this above the table."""
 WIDEST = MAX_OPENING - 0.015
 """The greatest width that the jaws take, with a margin on either side."""
-NARROWEST = _PRIMITIVE.minimum_width
-"""The least width that the hand can tell from nothing between its pads."""
+NARROWEST = 0.003
+"""The least width that is worth a grasp."""
 RELEASE_REACH = _PRIMITIVE.release_clearance + FINGERTIP_DEPTH
 """How far the fingertips reach beyond the gripped faces as they let go."""
 

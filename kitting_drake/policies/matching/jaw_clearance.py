@@ -31,6 +31,8 @@ _LINES = 5
 """Lines of samples along the pads' length."""
 _WIDEST = MAX_OPENING - 0.010
 """The widest grip, with a margin on either side for the fingers to come down, in metres."""
+_NARROWEST = 0.003
+"""The least width that is worth a grasp, in metres."""
 _LOWEST = 0.003
 """What rises by less than this above its support is in nobody's way, in metres."""
 _FINGER_MARGIN = 0.003
@@ -137,7 +139,7 @@ def _grip(
     )
     own = (index >= first[:, None]) & (index <= last[:, None])
     blocked = (anywhere & ~own & ~beside).any(axis=1)
-    fits = held & ~blocked & (width <= _WIDEST) & (width >= _PRIMITIVE.minimum_width)
+    fits = held & ~blocked & (width <= _WIDEST) & (width >= _NARROWEST)
     if not fits.any():
         return []
 

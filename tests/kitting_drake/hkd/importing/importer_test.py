@@ -15,6 +15,7 @@ from kitting_drake.hkd.grasps.annotate import save_grasp
 from kitting_drake.hkd.importing import importer
 from kitting_drake.hkd.importing.fit import guess_unit
 from kitting_drake.hkd.importing.importer import ImportRequest, import_tool
+from kitting_drake.hkd.importing.materials import OTHER_DENSITY
 from kitting_drake.hkd.importing.resting_pose import resting_tilt
 from kitting_drake.hkd.kits.layout import layout_kit
 from kitting_drake.hkd.kits.parameters import KitParameters
@@ -63,7 +64,7 @@ def test_a_tool_is_as_its_mesh_is(plain: importer.ImportReport):
     # The head is the working end, and heavy.
     head = 1e-9 * 26 * 50 * 16
     handle = 1e-9 * mallet().volume - head
-    assert tool.mass == pytest.approx(7850 * head + 1200 * handle, rel=0.03)
+    assert tool.mass == pytest.approx(7850 * head + 1200 * handle, rel=0.05)
     assert plain.record["center_of_mass"][0] > 0.05
     assert tool.grasp.width == pytest.approx(0.020, abs=2e-4)
     points = tool.triangles.reshape(-1, 3)
@@ -75,7 +76,7 @@ def test_a_category_of_ones_own(tmp_path: Path):
     mesh = exported(mallet(), tmp_path / "mallet.stl")
     tool = load_tool(str(bring(mesh, tmp_path / "tools", category="carvers_mallet").directory))
     assert tool.category == "carvers_mallet"
-    assert tool.mass == pytest.approx(mallet().volume * 1e-9 * importer.OTHER_DENSITY, rel=1e-4)
+    assert tool.mass == pytest.approx(mallet().volume * 1e-9 * OTHER_DENSITY, rel=1e-4)
     with pytest.raises(UserError, match="category 'Carver' has to be a name of small letters"):
         bring(mesh, tmp_path / "tools", category="Carver", name="other")
     assert left_in(tmp_path / "tools") == ["mallet"]
