@@ -74,8 +74,8 @@ class LearnedPolicy:
                 (`refine_place`), and the grasp by what room there is for the jaws
                 (`refine_grasp`); and do not stop while an object certainly fits
                 (`something_fits`). Not in the paper.
-            recover: first mend what is not seated (`recovery_action`); pick only what belongs
-                into a recess, and stop when nothing does (`belonging`). Not in the paper.
+            recover: first mend what is not seated (`recovery_action`), and pick what belongs into
+                a recess before anything else (`belonging`). Not in the paper.
             watch: called with each observation and decision.
 
         Raises:
@@ -150,7 +150,9 @@ class LearnedPolicy:
         wanted = None
         if self._recover and segmentation is not None:
             wanted = belonging(segmentation, resolution)
-        if wanted is not None and wanted.any():
+        if wanted is not None and not wanted.any():
+            wanted = None
+        if wanted is not None:
             logits = logits.masked_fill(torch.from_numpy(~wanted).to(logits.device), _NEVER)
         row, col = divmod(int(logits.argmax()), cols)
         pixel = np.array([row, col], float)
@@ -180,7 +182,7 @@ class LearnedPolicy:
         odds, threshold = picking.log_odds, networks.stop_threshold
         stop = odds is not None and threshold is not None and odds < threshold
         if wanted is not None:
-            stop = not wanted.any()
+            stop = False
         elif stop and outlines is not None:
             stop = not something_fits(outlines, resolution)
         score_map = placing.score_map - placing.score_map.max()

@@ -35,6 +35,7 @@ _NOT_THE_TASK = ("policy", "random_seed", "target_realtime_rate")
 _ADDED = (
     "task.distractors",
     "task.tries",
+    "task.pool",
     "planner.press_force",
     "planner.press_depth",
     "planner.search.reach",

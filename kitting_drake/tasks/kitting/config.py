@@ -1,6 +1,7 @@
 """The kitting tasks: which tools, which kit, where they stand, and when a tool is kitted."""
 
 import dataclasses
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -69,7 +70,7 @@ class _KittingTask(TaskConfig):
         try:
             return make_kit(tools, self.kit)
         except UserError as error:
-            raise UserError(f"task.tools: {error}") from error
+            raise UserError(f"{field}: {error}") from error
 
 
 @dataclass
@@ -154,8 +155,11 @@ class Kitting(_DrawnKitting):
 class ToolsetKitting(_DrawnKitting):
     """Tools and kit drawn from the seed too, out of a pool: kitting-unseen-toolsets."""
 
-    # The pool: train or test (section IV-B.1 of the paper).
+    # The pool: train or test (section IV-B.1 of the paper) ...
     split: str = "test"
+
+    # ... or tools of one's own, names or paths of tool folders: of each of their categories one.
+    pool: list[str] = field(default_factory=list)
 
     # Whether each tool's length is drawn, within tool_length in m (section IV-B.2); else it is
     # that of the dataset.
@@ -169,7 +173,7 @@ class ToolsetKitting(_DrawnKitting):
         return "kitting-train-toolsets" if self == ToolsetKitting(split="train") else "kitting"
 
     def make_scene(self, *, grid: PixelGrid, seed: int, base: Path) -> Scene:
-        choices = toolsets(self.split)
+        choices = self._toolsets(base)
         # Streams of their own: the poses of a seed depend neither on how many toolsets there are
         # nor on the lengths.
         names = choices[np.random.default_rng([seed, 1]).integers(len(choices))]
@@ -183,6 +187,17 @@ class ToolsetKitting(_DrawnKitting):
                 for tool, length in zip(tools, lengths, strict=True)
             ]
         return self._draw_scene(tools, grid, seed)
+
+    def _toolsets(self, base: Path) -> list[tuple[str, ...]]:
+        if not self.pool:
+            return toolsets(self.split)
+        kinds: dict[str, list[str]] = {}
+        for name, tool in zip(self.pool, _load_tools(self.pool, base, "task.pool"), strict=True):
+            kinds.setdefault(tool.category, []).append(name)
+        return list(itertools.product(*kinds.values()))
+
+    def input_files(self, base: Path) -> list[Path]:
+        return _tool_files(self.pool, base)
 
     def validate(self) -> None:
         if self.split not in SPLITS:
@@ -301,16 +316,18 @@ def _unique_names(tools: Sequence[Tool]) -> list[str]:
     return names
 
 
-def _load_tools(names: Sequence[str] | dict[str, TablePose], base: Path) -> list[Tool]:
-    loaded = {name: _load_tool(name, base) for name in dict.fromkeys(names)}
+def _load_tools(
+    names: Sequence[str] | dict[str, TablePose], base: Path, field: str = "task.tools"
+) -> list[Tool]:
+    loaded = {name: _load_tool(name, base, field) for name in dict.fromkeys(names)}
     return [loaded[name] for name in names]
 
 
-def _load_tool(name: str, base: Path) -> Tool:
+def _load_tool(name: str, base: Path, field: str) -> Tool:
     try:
         return load_tool(name, base)
     except UserError as error:
-        raise UserError(f"task.tools: {error}") from error
+        raise UserError(f"{field}: {error}") from error
 
 
 def _tool_files(names: Sequence[str] | dict[str, TablePose], base: Path) -> list[Path]:

@@ -6,6 +6,7 @@ from pydrake.math import RigidTransform, RollPitchYaw
 from pydrake.multibody.tree import BodyIndex
 
 from kitting_drake.common.errors import UserError
+from kitting_drake.common.paths import MODELS
 from kitting_drake.hkd.tools.tool import CATEGORIES, load_tool, tool_names
 from kitting_drake.policies.learning import Learning
 from kitting_drake.tasks import ArrangedKitting, Kitting, ToolsetKitting
@@ -154,6 +155,16 @@ def test_toolsets_are_drawn_from_their_split():
         lengths = [float(np.ptp(item.p_BPoints[:, 0])) for item in scene.objects]
         assert all(0.145 < length < 0.201 for length in lengths)
     assert len(drawn) > 6
+
+
+def test_toolsets_are_drawn_from_a_pool():
+    pool = ["ball_peen_hammer", "club_hammer", str(MODELS / "tools" / "t_handle_screwdriver")]
+    task = ToolsetKitting(pool=pool, random_lengths=False)
+    drawn = {tuple(sorted(names(draw(seed, task)))) for seed in range(6)}
+    assert drawn == {(hammer, "t_handle_screwdriver") for hammer in pool[:2]}
+    assert any(path.name == "club_hammer.sdf" for path in task.input_files(BASE))
+    with pytest.raises(UserError, match=r"task\.pool.*no_such_tool"):
+        draw(0, ToolsetKitting(pool=["no_such_tool"]))
 
 
 def test_lengths_are_drawn_only_if_asked_for():
