@@ -1,4 +1,4 @@
-"""`python -m kitting_drake.benchmark simulation | networks | kits`: tables of measured figures."""
+"""`python -m kitting_drake.benchmark simulation | networks | kits | recovery`: measured tables."""
 
 import argparse
 import os
@@ -10,6 +10,7 @@ from rich.table import Table
 
 from kitting_drake.common.command_line import count_type, run_command, seed_type
 from kitting_drake.common.files import require_folder, write_json
+from kitting_drake.scenario.command_line import add_scenario_flags, choose_scenario
 
 
 def main() -> int:
@@ -17,7 +18,12 @@ def main() -> int:
     arguments = _parser().parse_args()
     console = Console(quiet=arguments.quiet)
     folder = require_folder(arguments.output)
-    measure = {"simulation": _simulation, "networks": _networks, "kits": _kits}[arguments.benchmark]
+    measure = {
+        "simulation": _simulation,
+        "networks": _networks,
+        "kits": _kits,
+        "recovery": _recovery,
+    }[arguments.benchmark]
     tables = measure(arguments, console, folder)
     for table in tables:
         console.print(table)
@@ -50,7 +56,13 @@ def _parser() -> argparse.ArgumentParser:
         "kits", help="building time, clearance and size of the dataset's kits"
     )
     kits.add_argument("--kits", type=count_type, help="how many of each split (default: all)")
-    for benchmark in (simulation, networks, kits):
+    recovery = benchmarks.add_parser(
+        "recovery", help="what a policy makes of actions that go wrong"
+    )
+    add_scenario_flags(recovery)
+    recovery.add_argument("--episodes", type=count_type, default=10, help="of each kind (10)")
+    recovery.add_argument("--seed", type=seed_type, default=0, help="of the first (0)")
+    for benchmark in (simulation, networks, kits, recovery):
         benchmark.add_argument(
             "--output", type=Path, default=Path("output/benchmark"), help="where the files go"
         )
@@ -92,6 +104,18 @@ def _networks(arguments: argparse.Namespace, console: Console, folder: Path) -> 
 
     draw_networks(measured, folder / "networks.png")
     return network_tables(measured)
+
+
+def _recovery(arguments: argparse.Namespace, console: Console, folder: Path) -> list[Table]:
+    from kitting_drake.benchmark.recovery import benchmark_recovery, recovery_table
+
+    chosen = choose_scenario(arguments)
+    measured = benchmark_recovery(
+        chosen.scenario, chosen.base, arguments.episodes, arguments.seed, console
+    )
+    measured |= {"scenario": chosen.name, "perturbed": chosen.perturbed, "text": chosen.text}
+    write_json(folder / "recovery.json", measured)
+    return [recovery_table(measured)]
 
 
 def _use_one_core() -> None:

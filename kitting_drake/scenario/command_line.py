@@ -18,6 +18,19 @@ def scenario_parser(command: str, description: str) -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog=f"python -m kitting_drake.{command}", description=description
     )
+    add_scenario_flags(parser)
+    parser.add_argument(
+        "--output",
+        type=Path,
+        metavar="DIR",
+        help="where all files go (default: output/ and the scenario's name)",
+    )
+    parser.add_argument("--quiet", action="store_true", help="print nothing but errors")
+    return parser
+
+
+def add_scenario_flags(parser: argparse.ArgumentParser) -> None:
+    """Adds the flags that say which scenario."""
     parser.add_argument("scenario", type=Path, metavar="SCENARIO.yaml", help="the scenario's file")
     parser.add_argument(
         "--scenario_name", metavar="NAME", help="which scenario of the file (default: the first)"
@@ -30,14 +43,6 @@ def scenario_parser(command: str, description: str) -> argparse.ArgumentParser:
         metavar="NAME[:LEVEL],...",
         help=f"make the world less perfect: {', '.join(NAMES)}; {', '.join(LEVELS)} (moderate)",
     )
-    parser.add_argument(
-        "--output",
-        type=Path,
-        metavar="DIR",
-        help="where all files go (default: output/ and the scenario's name)",
-    )
-    parser.add_argument("--quiet", action="store_true", help="print nothing but errors")
-    return parser
 
 
 @dataclasses.dataclass(frozen=True)

@@ -1,0 +1,43 @@
+from pathlib import Path
+
+import numpy as np
+import pytest
+from pydrake.common.value import Value
+from rich.console import Console
+
+from kitting_drake.benchmark.recovery import ActionOffset, benchmark_recovery, recovery_table
+from kitting_drake.cell.cameras import can_render
+from kitting_drake.scenario.policies import ShapeMatching
+from kitting_drake.scenario.schema import Scenario
+from kitting_drake.tasks import Kitting
+from systems.signals import PickPlaceAction, PlanarPose
+
+
+def test_an_offset_shifts_an_action_until_it_is_stopped():
+    system = ActionOffset(np.array([0.01, 0.02, -0.03, 0.04]))
+    context = system.CreateDefaultContext()
+    action = PickPlaceAction(pick=PlanarPose(0.1, 0.2, 0.3), place=PlanarPose(0.4, 0.5, 0.6))
+    system.GetInputPort("action").FixValue(context, Value(action))
+    shifted = system.GetOutputPort("action").Eval(context)
+    assert shifted.pick == PlanarPose(pytest.approx(0.11), pytest.approx(0.22), 0.3)
+    assert shifted.place == PlanarPose(pytest.approx(0.37), pytest.approx(0.54), 0.6)
+    system.stop(context)
+    assert system.GetOutputPort("action").Eval(context) == action
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not can_render(), reason="images cannot be rendered here")
+def test_a_policy_that_recovers_does_and_leaves_alone_what_is_well():
+    scenario = Scenario(
+        task=Kitting(tools=["claw_hammer", "combination_wrench"], tries=3),
+        policy=ShapeMatching(recover=True),
+    )
+    measured = benchmark_recovery(scenario, Path(), 2, 0, Console(quiet=True))
+    for name, count in measured["disturbances"].items():
+        assert count["touched"] == 0, name
+        assert count["recovered"] == count["disturbed"], name
+        assert count["disturbed"] == (0 if name == "nothing" else 2)
+    # A missed grasp takes another action.
+    actions = {name: count["actions"] for name, count in measured["disturbances"].items()}
+    assert actions["grasp off by 40 mm"] > actions["nothing"] == 4
+    assert recovery_table(measured).row_count == 4
