@@ -1,4 +1,5 @@
-"""`python -m kitting_drake.results`: docs/results.md, from the summaries in docs/results/.
+"""`python -m kitting_drake.results`: docs/results.md, from the summaries in docs/results/, and the
+table of docs/robustness.md.
 
 Each file there is a copy of a `summary.json` of `evaluate`, under any name. Nothing in the tables
 comes from anywhere else, but the paper's own figures.
@@ -13,6 +14,7 @@ from rich.console import Console
 from kitting_drake.common.command_line import run_command
 from kitting_drake.common.files import write_atomically
 from kitting_drake.reporting.results_page import results_page
+from kitting_drake.reporting.robustness import robustness_table, with_figures
 from kitting_drake.reporting.runs import read_runs
 
 
@@ -40,6 +42,10 @@ def main() -> int:
     runs = read_runs(arguments.results)
     link = os.path.relpath(arguments.results, arguments.output.parent)
     write_atomically(arguments.output, results_page(runs, link))
+    robustness = arguments.output.with_name("robustness.md")
+    if robustness.exists():
+        page = with_figures(robustness.read_text(), robustness_table(runs))
+        write_atomically(robustness, page)
     Console(quiet=arguments.quiet).print(
         f"{len(runs)} summaries: {arguments.output}", highlight=False, markup=False
     )

@@ -125,15 +125,15 @@ class Run:
         task."""
         found = self.summary["resolved_scenario"]
         for task in PAPER_TASKS.values():
-            expected = _described(Scenario(task=task))
+            expected = described(Scenario(task=task))
             if found["task"]["_tag"] == expected["task"]["_tag"]:
                 return _differences(_without(found), _without(expected))
         for other in RAVENS_TASKS:
-            expected = _described(Scenario(task=other))
+            expected = described(Scenario(task=other))
             if found["task"]["_tag"] == expected["task"]["_tag"]:
                 # The longest of them has a limit of its own.
                 return _differences(_without(found, "time_limit"), _without(expected, "time_limit"))
-        expected = _described(Scenario())
+        expected = described(Scenario())
         return _differences(_without(found, "task"), _without(expected, "task"))
 
     @property
@@ -151,10 +151,15 @@ class Run:
         return f"{shown}; and {more} more" if more > 0 else shown
 
 
-def _described(scenario: Scenario) -> dict[str, Any]:
+def described(scenario: Scenario) -> dict[str, Any]:
     """The scenario as JSON holds it."""
-    described = ChosenScenario(scenario, Path(), "", None).described
-    return json.loads(json.dumps(described, default=str))
+    fields = ChosenScenario(scenario, Path(), "", None).described
+    return json.loads(json.dumps(fields, default=str))
+
+
+def scenario_differences(found: dict[str, Any], expected: dict[str, Any]) -> list[str]:
+    """The fields, policy aside, in which two scenarios differ, as `described` has them."""
+    return _differences(_without(found), _without(expected))
 
 
 def _without(scenario: dict[str, Any], *more: str) -> dict[str, Any]:

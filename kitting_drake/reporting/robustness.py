@@ -1,0 +1,77 @@
+"""The table of what each perturbation costs each policy: a part of `docs/robustness.md`."""
+
+from collections import defaultdict
+from collections.abc import Sequence
+from typing import Any
+
+from kitting_drake.common.errors import UserError
+from kitting_drake.common.paths import SCENARIOS
+from kitting_drake.reporting.markdown import markdown_table
+from kitting_drake.reporting.runs import Run, described, scenario_differences
+from kitting_drake.scenario.loader import load_scenario
+from kitting_drake.scenario.perturbations import LEVELS, NAMES
+
+_BEGIN, _END = "<!-- figures -->\n", "<!-- end of figures -->\n"
+_AS_IT_IS = "as it is"
+_COLUMNS = {
+    "so2": "of 100 demonstrations",
+    "generalist": "generalist",
+    "shape_matching": "shape matching",
+}
+_TRIES = 2
+
+
+def robustness_table(runs: Sequence[Run]) -> str:
+    """Strict success on unseen toolsets, with two tries a tool and policies that recover.
+
+    Args:
+        runs: all; those that are none of these are left out.
+    """
+    expected = _expected()
+    cells: dict[str, dict[str, str]] = defaultdict(dict)
+    seeds: set[str] = set()
+    for run in runs:
+        if run.method not in _COLUMNS or not run.detail("recover"):
+            continue
+        found = run.summary["resolved_scenario"]
+        label = next((k for k, v in expected.items() if not scenario_differences(found, v)), None)
+        if label is None:
+            continue
+        low, high = (100 * value for value in run.summary["strict_ci95"])
+        share = 100 * run.summary["strict_success_rate"]
+        cells[label][run.method] = f"{share:.1f} ({low:.0f} to {high:.0f})"
+        seeds.add(f"{run.summary['episodes']} episodes from seed {min(run.summary['seeds'])}")
+    if not cells:
+        return "No runs yet.\n"
+    rows = [
+        [label, *(cells[label].get(method, "-") for method in _COLUMNS)]
+        for label in expected
+        if label in cells
+    ]
+    table = markdown_table(["perturbation", *_COLUMNS.values()], rows)
+    return f"{table}\n{'; '.join(sorted(seeds))}.\n"
+
+
+def with_figures(page: str, figures: str) -> str:
+    """A page with the text between its two marks replaced.
+
+    Raises:
+        UserError: it lacks the marks.
+    """
+    head, begin, rest = page.partition(_BEGIN)
+    _, end, tail = rest.partition(_END)
+    if not begin or not end:
+        raise UserError(f"the page on robustness lacks {_BEGIN.strip()} and {_END.strip()}")
+    return f"{head}{begin}{figures}{end}{tail}"
+
+
+def _expected() -> dict[str, dict[str, Any]]:
+    """The scenario of each row, as JSON holds it."""
+    labels: dict[str, str | None] = {_AS_IT_IS: None}
+    for level in LEVELS:
+        labels |= {f"`{name}:{level}`": f"{name}:{level}" for name in NAMES}
+    path, text = SCENARIOS / "kitting_unseen.yaml", f"{{task: {{tries: {_TRIES}}}}}"
+    return {
+        label: described(load_scenario(path, text=text, perturb=perturb))
+        for label, perturb in labels.items()
+    }
