@@ -9,7 +9,7 @@ from rich.console import Console
 from rich.table import Table
 
 from kitting_drake.common.command_line import count_type, run_command, seed_type
-from kitting_drake.common.files import require_folder, write_json
+from kitting_drake.common.files import require_folder, write_atomically, write_json
 from kitting_drake.scenario.command_line import add_scenario_flags, choose_scenario
 
 
@@ -110,11 +110,13 @@ def _recovery(arguments: argparse.Namespace, console: Console, folder: Path) -> 
     from kitting_drake.benchmark.recovery import benchmark_recovery, recovery_table
 
     chosen = choose_scenario(arguments)
-    measured = benchmark_recovery(
+    measured, strips = benchmark_recovery(
         chosen.scenario, chosen.base, arguments.episodes, arguments.seed, console
     )
     measured |= {"scenario": chosen.name, "perturbed": chosen.perturbed, "text": chosen.text}
     write_json(folder / "recovery.json", measured)
+    if strips:
+        write_atomically(folder / "recovery.png", strips)
     return [recovery_table(measured)]
 
 

@@ -8,6 +8,7 @@ object is kitted at the end all the same, and how often an object that was kitte
 import dataclasses
 import enum
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, cast
@@ -25,6 +26,7 @@ from scipy.spatial import cKDTree
 from kitting_drake.cell import Cell, build_cell
 from kitting_drake.episode import ModeChange, run_episode
 from kitting_drake.episode.action_log import nearest_object
+from kitting_drake.reporting.action_strip import ActionStrip, Frame, draw_strips
 from kitting_drake.reporting.intervals import proportion_interval
 from kitting_drake.scenario.policies import Policy, PolicyConfig, PolicySite
 from kitting_drake.scenario.schema import Scenario
@@ -201,6 +203,9 @@ class _Adversary:
         self.victim = None
 
 
+_Strip = tuple[str, Sequence[Frame], Sequence[str]]
+
+
 @dataclass
 class _Count:
     recovered: int = 0
@@ -214,8 +219,11 @@ class _Count:
 
 def benchmark_recovery(
     scenario: Scenario, base: Path, episodes: int, seed: int, console: Console
-) -> dict[str, Any]:
+) -> tuple[dict[str, Any], bytes]:
     """Runs episodes with each disturbance.
+
+    Returns the figures, and a PNG of one episode of each as a strip of frames: the one that took
+    the most actions, but recovered.
 
     Args:
         scenario: with the policy that is to recover.
@@ -225,18 +233,25 @@ def benchmark_recovery(
         console: for progress.
     """
     counts = {kind: _Count() for kind in Disturbance}
+    strips: dict[Disturbance, _Strip] = {}
     runs = [(kind, seed + number) for kind in Disturbance for number in range(episodes)]
     for kind, number in track(runs, "episodes", console=console, disable=console.quiet):
-        _run(scenario, base, kind, number, counts[kind])
-    return {
+        strip = _run(scenario, base, kind, number, counts[kind])
+        if strip is not None and len(strip[1]) > len(strips.get(kind, ("", (), ()))[1]):
+            strips[kind] = strip
+    measured = {
         "episodes": episodes,
         "seed": seed,
         "policy": {"name": scenario.policy.name, **scenario.policy.details(base)},
         "disturbances": {kind.value: dataclasses.asdict(count) for kind, count in counts.items()},
     }
+    return measured, draw_strips(list(strips.values())) if strips else b""
 
 
-def _run(scenario: Scenario, base: Path, kind: Disturbance, seed: int, count: _Count) -> None:
+def _run(
+    scenario: Scenario, base: Path, kind: Disturbance, seed: int, count: _Count
+) -> _Strip | None:
+    """Runs an episode and counts; returns it as a strip if everything was kitted."""
     rng = np.random.default_rng([seed, list(Disturbance).index(kind)])
     way = rng.uniform(0, math.tau)
     direction = np.array([math.cos(way), math.sin(way)])
@@ -250,6 +265,7 @@ def _run(scenario: Scenario, base: Path, kind: Disturbance, seed: int, count: _C
     )
     cell = build_cell(disturbed, seed=seed, base=base)
     adversary = _Adversary(cell, kind, offset, rng)
+    strip = ActionStrip(cell)
     result = run_episode(
         cell,
         task=scenario.task,
@@ -257,7 +273,7 @@ def _run(scenario: Scenario, base: Path, kind: Disturbance, seed: int, count: _C
         policy=scenario.policy.name,
         seed=seed,
         time_limit=scenario.time_limit,
-        observers=[adversary.observe],
+        observers=[adversary.observe, strip.observe],
     )
     strict = {item.name for item in result.objects if item.strict_success}
     if adversary.victim is not None and kind != Disturbance.NONE:
@@ -269,6 +285,9 @@ def _run(scenario: Scenario, base: Path, kind: Disturbance, seed: int, count: _C
     count.seated += len(adversary.seated)
     count.touched += len(adversary.touched | (adversary.seated - ended))
     count.actions += result.actions
+    if len(strict) < len(result.objects):
+        return None
+    return kind.value, strip.frames, [record.outcome for record in result.actions_taken]
 
 
 def recovery_table(measured: dict[str, Any]) -> Table:

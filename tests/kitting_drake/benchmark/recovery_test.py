@@ -32,7 +32,8 @@ def test_a_policy_that_recovers_does_and_leaves_alone_what_is_well():
         task=Kitting(tools=["claw_hammer", "combination_wrench"], tries=3),
         policy=ShapeMatching(recover=True),
     )
-    measured = benchmark_recovery(scenario, Path(), 2, 0, Console(quiet=True))
+    measured, strips = benchmark_recovery(scenario, Path(), 2, 0, Console(quiet=True))
+    assert strips.startswith(b"\x89PNG")
     for name, count in measured["disturbances"].items():
         assert count["touched"] == 0, name
         assert count["recovered"] == count["disturbed"], name
