@@ -2,6 +2,7 @@
 
 import argparse
 import dataclasses
+import hashlib
 import io
 import json
 import pickle
@@ -30,11 +31,18 @@ from kitting_drake.common.files import (
 from kitting_drake.policies.config import METHODS, PRESETS, NetworkConfig
 from kitting_drake.policies.learned_policy import LearnedPolicy
 from kitting_drake.policies.methods import make_networks
+from kitting_drake.policies.networks import Networks
 from kitting_drake.policies.samples import normalisation
 from kitting_drake.policies.training import Trainer
 from kitting_drake.policies.training_data import TrainingData, read_training_data
 from kitting_drake.policies.validation import validate
-from kitting_drake.policies.weights import preferred_device, preferred_type, save_weights
+from kitting_drake.policies.weights import (
+    load_trainable,
+    preferred_device,
+    preferred_type,
+    read_weights_file,
+    save_weights,
+)
 
 _CHECKPOINT_EVERY = 100
 """Steps between checkpoints, and between points of the curves."""
@@ -81,6 +89,8 @@ class Settings:
     """Whether the networks learn from final observations that there is nothing left to pick."""
     validate_every: int
     seed: int
+    start: str | None
+    """A digest of the weights that training begins with; None: fresh ones."""
     device: str
     compute_type: str
 
@@ -94,7 +104,7 @@ def main() -> int:
     folder = require_folder(
         arguments.output or Path("output") / f"{learned.scenario}-training".replace(" ", "_")
     )
-    run = _Run(settings, learned, held_out, folder, console)
+    run = _Run(settings, learned, held_out, folder, console, arguments.start)
     with alone_in(folder):
         # Scenarios of one name may differ, and with them what the same seeds give.
         origins = [item.origin for item in (learned, held_out)]
@@ -109,6 +119,7 @@ def _settings(
     arguments: argparse.Namespace, learned: TrainingData, held_out: TrainingData
 ) -> Settings:
     assumed = learned.learning
+    begun = None if arguments.start is None else _checked_start(arguments, learned)
     return Settings(
         scenario=learned.scenario,
         demonstrations=learned.count,
@@ -124,13 +135,30 @@ def _settings(
         # The Transporter rotates whole images: it has no crop in which an object can be bent.
         rigid=arguments.rigid or not assumed.curvature or arguments.method == "transporter",
         reflection=assumed.reflection and not arguments.rigid,
-        colour=learned.colour,
-        stop=bool(learned.finals(1)),
+        colour=learned.colour if begun is None else begun.colour,
+        stop=bool(learned.finals(1)) if begun is None else begun.stop,
         validate_every=arguments.validate_every,
         seed=arguments.seed,
+        start=None if begun is None else _digest(arguments.start),
         device=preferred_device().type,
         compute_type=str(preferred_type()).removeprefix("torch."),
     )
+
+
+def _checked_start(arguments: argparse.Namespace, learned: TrainingData) -> NetworkConfig:
+    """The config of the weights to begin with, which must be those that the flags ask for."""
+    config = read_weights_file(arguments.start).config
+    for flag in ("method", "preset", "orientations"):
+        given, found = getattr(arguments, flag), getattr(config, flag)
+        if given != found:
+            raise UserError(f"{arguments.start} has {flag} {found}: give --{flag} {found}")
+    if config.colour and not learned.colour:
+        raise UserError(f"{arguments.start} looks at colours, and {arguments.demos} has none")
+    return config
+
+
+def _digest(path: Path) -> str:
+    return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
 def _parse() -> argparse.Namespace:
@@ -157,6 +185,14 @@ def _parse() -> argparse.Namespace:
         metavar="FILE.h5",
         help="demonstrations to choose a checkpoint by (default: those of --demos that come after "
         "the ones learned from, a tenth as many)",
+    )
+    parser.add_argument(
+        "--from",
+        dest="start",
+        type=Path,
+        metavar="FILE.safetensors",
+        help="weights to begin with, such as models/policies/generalist.safetensors (default: "
+        "fresh ones)",
     )
     parser.add_argument("--method", choices=METHODS, default="so2")
     parser.add_argument("--preset", choices=PRESETS, default="small", help="size of the networks")
@@ -227,6 +263,25 @@ def _split(
     return learned, held_out
 
 
+def _fresh(settings: Settings, learned: TrainingData) -> Networks:
+    """Networks with fresh weights."""
+    try:
+        config = NetworkConfig(
+            method=settings.method,
+            preset=settings.preset,
+            orientations=settings.orientations,
+            colour=settings.colour,
+            stop=settings.stop,
+            **normalisation(learned.scenes(_MOST_NORMALISED)),  # type: ignore[arg-type]
+        )
+        torch.manual_seed(settings.seed)
+        networks = make_networks(config)
+        networks.check_orientations(settings.orientations)
+    except ValueError as error:
+        raise UserError(f"--orientations {settings.orientations}: {error}") from error
+    return networks
+
+
 class _Run:
     """A training run and its files."""
 
@@ -237,6 +292,7 @@ class _Run:
         held_out: TrainingData,
         folder: Path,
         console: Console,
+        start: Path | None,
     ) -> None:
         self.settings, self.folder, self.console = settings, folder, console
         self._log = folder / "log.jsonl"
@@ -245,20 +301,7 @@ class _Run:
         self.finals = learned.finals()
         self.validation_scenes = held_out.scenes(_MOST_VALIDATED)
         self.validation_finals = held_out.finals(_MOST_VALIDATED)
-        try:
-            config = NetworkConfig(
-                method=settings.method,
-                preset=settings.preset,
-                orientations=settings.orientations,
-                colour=settings.colour,
-                stop=settings.stop,
-                **normalisation(learned.scenes(_MOST_NORMALISED)),  # type: ignore[arg-type]
-            )
-            torch.manual_seed(settings.seed)
-            networks = make_networks(config)
-            networks.check_orientations(settings.orientations)
-        except ValueError as error:
-            raise UserError(f"--orientations {settings.orientations}: {error}") from error
+        networks = _fresh(settings, learned) if start is None else load_trainable(start)
         networks.to(settings.device)
         networks.compute_type = preferred_type()
         self.trainer = Trainer(

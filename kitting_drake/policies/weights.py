@@ -25,7 +25,12 @@ from kitting_drake.common.files import write_atomically
 from kitting_drake.policies.config import NetworkConfig
 from kitting_drake.policies.methods import make_networks
 from kitting_drake.policies.networks import Networks
-from kitting_drake.policies.steerable import PlainConv2d, SteerableConv2d, expand_kernel
+from kitting_drake.policies.steerable import (
+    ExpandedConv2d,
+    PlainConv2d,
+    SteerableConv2d,
+    expand_kernel,
+)
 
 FORMAT = "kitting_drake policy"
 FORMAT_VERSION = 1
@@ -138,6 +143,51 @@ def load_networks(path: Path, compute_type: torch.dtype = torch.float32) -> Netw
     networks.stop_threshold = threshold
     networks.freeze(compute_type)
     return networks
+
+
+def load_trainable(path: Path) -> Networks:
+    """Networks as they are trained, to go on from a file's weights.
+
+    The optimisers' state is not in a file: training begins anew, from these weights.
+
+    Args:
+        path: a file that `save_weights` wrote.
+
+    Raises:
+        UserError: as `load_networks`.
+    """
+    plain = load_networks(path)
+    networks = make_networks(plain.config)
+    stored = dict(plain.named_modules())
+    with torch.no_grad():
+        for name, module in networks.named_modules():
+            if isinstance(module, ExpandedConv2d):
+                layer = stored[name]
+                _fit_weights(module, layer.weight)
+                if module.bias is not None:
+                    module.bias.copy_(layer.bias[:: module.out_fibre.channels])
+        rest = dict(plain.named_parameters())
+        expanded = {n for n, m in networks.named_modules() if isinstance(m, ExpandedConv2d)}
+        for name, parameter in networks.named_parameters():
+            if name.rpartition(".")[0] not in expanded:
+                parameter.copy_(rest[name])
+    return networks
+
+
+def _fit_weights(layer: ExpandedConv2d, kernel: Tensor) -> None:
+    """Sets a layer's weights to those of a plain kernel that came from it."""
+    out_fields, in_fields = layer.weights.shape[:2]
+    out_channels, in_channels = layer.out_fibre.channels, layer.in_fibre.channels
+    shape = layer.weights.shape[2:]
+    rows = []
+    for unit in torch.eye(shape.numel()):
+        # All blocks of fields are alike then: the first is what this weight brings.
+        layer.weights.copy_(unit.view(shape).expand_as(layer.weights))
+        rows.append(layer.kernel()[:out_channels, :in_channels].flatten())
+    blocks = kernel.reshape(out_fields, out_channels, in_fields, in_channels, *kernel.shape[2:])
+    targets = blocks.transpose(1, 2).flatten(2).flatten(0, 1)
+    found = torch.linalg.lstsq(torch.stack(rows).double().T, targets.double().T).solution
+    layer.weights.copy_(found.T.reshape(layer.weights.shape))
 
 
 def _plain_state(

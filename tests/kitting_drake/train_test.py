@@ -133,6 +133,22 @@ def test_leaves_a_policy_and_its_origin(trained: Path):
     assert summary["wall_seconds"] > 0
 
 
+def test_begins_with_the_weights_of_a_file(
+    trained: Path, demos: Path, tmp_path: Path, refused: Callable[..., str]
+):
+    start = trained / "policy.safetensors"
+    few = ("--steps", 1, "--learning-rate", "1e-6")
+    train(demos, tmp_path / "on", "--from", start, *few)
+    old, new = (load_networks(path).state_dict() for path in (start, tmp_path / "on" / start.name))
+    for name, values in old.items():
+        torch.testing.assert_close(new[name], values, atol=1e-4, rtol=1e-3)
+    card = read_weights_file(tmp_path / "on" / start.name).card
+    assert len(card["start"]) == 64
+    assert "give --orientations 180" in refused(
+        demos, tmp_path / "no", "--from", start, "--orientations", 36
+    )
+
+
 @pytest.mark.parametrize(
     ("learning", "flags", "taken_only", "rigid", "reflection"),
     [

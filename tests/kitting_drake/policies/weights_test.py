@@ -16,11 +16,16 @@ from safetensors.torch import save_file
 from torch import Tensor
 
 from kitting_drake.common.errors import UserError
-from kitting_drake.policies.config import NetworkConfig
+from kitting_drake.policies.config import METHODS, NetworkConfig
 from kitting_drake.policies.learned_policy import LearnedPolicy
 from kitting_drake.policies.methods import make_networks
 from kitting_drake.policies.networks import Networks
-from kitting_drake.policies.weights import load_networks, read_weights_file, save_weights
+from kitting_drake.policies.weights import (
+    load_networks,
+    load_trainable,
+    read_weights_file,
+    save_weights,
+)
 from systems.signals import Observation, PixelGrid
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -90,6 +95,19 @@ def test_loaded_networks_predict_what_the_trained_ones_do(config: NetworkConfig,
     assert loaded.config == config
     image = observation(0).image
     assert_close(maps(loaded, image), maps(trained(config), image), 1e-5)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_training_goes_on_from_a_file(method: str, tmp_path: Path):
+    """The weights behind expanded kernels are found again."""
+    networks = trained(dataclasses.replace(TINY, method=method))
+    save_weights(tmp_path / "first.safetensors", networks, {})
+    again = load_trainable(tmp_path / "first.safetensors")
+    assert again.config == networks.config
+    for name, parameter in networks.named_parameters():
+        found = again.get_parameter(name)
+        torch.testing.assert_close(found.detach(), parameter, atol=1e-5, rtol=1e-4, msg=name)
+        assert found.requires_grad
 
 
 def test_bfloat16_predicts_nearly_the_same_every_time(file: Path):
