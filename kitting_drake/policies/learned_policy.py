@@ -19,7 +19,7 @@ from kitting_drake.policies.matching.policy import RETRY_DISTANCE, belonging, so
 from kitting_drake.policies.matching.recovery import recovery_action
 from kitting_drake.policies.matching.refinement import refine_grasp, refine_place
 from kitting_drake.policies.matching.segmentation import Segmentation, fill_unseen, segment
-from kitting_drake.policies.networks import Networks
+from kitting_drake.policies.networks import Networks, PickPrediction
 from systems.signals import Observation, PickPlaceAction, PixelGrid, PlanarPose, wrap_to_pi
 
 _NEVER = -math.inf
@@ -137,64 +137,111 @@ class LearnedPolicy:
         segmentation: Segmentation | None,
         failed_picks: Sequence[PlanarPose],
     ) -> Decision:
-        resolution = observation.grid.resolution
-        outlines = segmentation if self._fit_outlines else None
-        networks = self._networks
         image = self._input(observation)
-        picking = networks.predict_pick(image, self._orientations)
+        picking = self._networks.predict_pick(image, self._orientations)
         logits = picking.position
-        rows, cols = logits.shape
         if failed_picks:
-            near = near_failed(observation.grid, failed_picks)
-            logits = logits.masked_fill(torch.from_numpy(near).to(logits.device), _NEVER)
-        wanted = None
-        if self._recover and segmentation is not None:
+            logits = _without(logits, near_failed(observation.grid, failed_picks))
+        outlines = segmentation if self._fit_outlines else None
+        resolution = observation.grid.resolution
+        refine_pick = not failed_picks
+        choice = self._choose(image, picking, logits, outlines, resolution, refine_pick)
+        belongs = choice.fits
+        if self._recover and segmentation is not None and not belongs:
+            # The network's favourite may have no business here: what does, goes first.
             wanted = belonging(segmentation, resolution)
-        if wanted is not None and not wanted.any():
-            wanted = None
-        if wanted is not None:
-            logits = logits.masked_fill(torch.from_numpy(~wanted).to(logits.device), _NEVER)
-        row, col = divmod(int(logits.argmax()), cols)
-        pixel = np.array([row, col], float)
+            belongs = wanted is not None and bool(wanted.any())
+            if wanted is not None and belongs:
+                logits = _without(logits, ~wanted)
+                choice = self._choose(image, picking, logits, outlines, resolution, refine_pick)
+        odds, threshold = picking.log_odds, self._networks.stop_threshold
+        stop = odds is not None and threshold is not None and odds < threshold
+        if stop and self._recover:
+            stop = not belongs
+        elif stop and outlines is not None:
+            stop = not something_fits(outlines, resolution)
+        action = make_action(observation, choice.pick, choice.theta, choice.place, choice.rotation)
+        return Decision(
+            action=dataclasses.replace(action, stop=stop),
+            pick_map=F.softmax(logits.flatten(), 0).view(logits.shape).float().cpu().numpy(),
+            angle_curve=choice.angle_curve,
+            place_map=choice.place_map,
+            pick_pixel=choice.pick,
+            place_pixel=choice.place,
+            log_odds=odds,
+        )
 
+    def _choose(
+        self,
+        image: Image,
+        picking: PickPrediction,
+        logits: Tensor,
+        outlines: Segmentation | None,
+        resolution: float,
+        refine_pick: bool,
+    ) -> _Choice:
+        """The best action among the pixels that logits leave.
+
+        Args:
+            image: what the networks see.
+            picking: what they predict of it.
+            logits: (rows, cols), of the pick.
+            outlines: to refine by; None: not refined by outlines.
+            resolution: of a pixel, in metres.
+            refine_pick: whether a grasp moves to where the jaws have room.
+        """
+        row, col = divmod(int(logits.argmax()), logits.shape[1])
+        pixel = np.array([row, col], float)
         angles, refined = picking.angle((row, col))
         theta = int(angles.argmax()) * math.tau / self._orientations
         pick = pixel
         if self._continuous:
             theta = theta if refined is None else refined
             pick = expected_position(logits, (row, col))
-        if outlines is not None and not failed_picks:
+        if outlines is not None and refine_pick:
             grasp = refine_grasp(outlines, pick, theta, resolution)
             if grasp is not None:
                 pick, theta = grasp.pick, grasp.theta
 
         # The crop is centred on a pixel. Its predicted motion applies to the refined pick too.
-        placing = networks.predict_place(image, (row, col), self._orientations)
+        placing = self._networks.predict_place(image, (row, col), self._orientations)
         rotation, place = best_placement(
             placing.candidates[0], self._orientations, self._continuous
         )
         place = place + rotation_matrix(rotation) @ (pick - pixel)
+        fits = False
         if outlines is not None:
             fitted = refine_place(outlines, pick, rotation, place, resolution)
             if fitted is not None:
-                rotation, place = fitted.rotation, fitted.place
-        action = make_action(observation, pick, theta, place, rotation)
-        odds, threshold = picking.log_odds, networks.stop_threshold
-        stop = odds is not None and threshold is not None and odds < threshold
-        if wanted is not None:
-            stop = False
-        elif stop and outlines is not None:
-            stop = not something_fits(outlines, resolution)
-        score_map = placing.score_map - placing.score_map.max()
-        return Decision(
-            action=dataclasses.replace(action, stop=stop),
-            pick_map=F.softmax(logits.flatten(), 0).view(rows, cols).float().cpu().numpy(),
+                rotation, place, fits = fitted.rotation, fitted.place, True
+        return _Choice(
+            pick=pick,
+            theta=theta,
+            place=place,
+            rotation=rotation,
+            fits=fits,
             angle_curve=F.softmax(angles, 0).float().cpu().numpy(),
-            place_map=score_map.float().cpu().numpy(),
-            pick_pixel=pick,
-            place_pixel=place,
-            log_odds=odds,
+            place_map=(placing.score_map - placing.score_map.max()).float().cpu().numpy(),
         )
+
+
+@dataclass(frozen=True)
+class _Choice:
+    """An action in pixels, and what it was read from; see `Decision`."""
+
+    pick: NDArray[np.float64]
+    theta: float
+    place: NDArray[np.float64]
+    rotation: float
+    fits: bool
+    """Whether the outlines of object and recess agree."""
+    angle_curve: NDArray[np.float32]
+    place_map: NDArray[np.float32]
+
+
+def _without(logits: Tensor, mask: NDArray[np.bool_]) -> Tensor:
+    """Logits by which no pixel of a mask is chosen."""
+    return logits.masked_fill(torch.from_numpy(mask).to(logits.device), _NEVER)
 
 
 def near_failed(grid: PixelGrid, failed_picks: Sequence[PlanarPose]) -> NDArray[np.bool_]:
