@@ -66,7 +66,7 @@ def findings(check: Check) -> list[Finding]:
                 "disagreement",
                 f"{1e3 * height:+.2f} mm",
                 _verdict(height),
-                "in height; seen at a slant, one edge is drawn twice as far apart",
+                "in height: an edge that both see at a slant is drawn twice, about as far apart",
             )
         )
     for (one, other), shift in check.block_shifts.items():
