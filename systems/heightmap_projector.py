@@ -1,7 +1,7 @@
 """From the cameras' images to the orthographic heightmap that the policies look at."""
 
 from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,10 +11,8 @@ from pydrake.math import RigidTransform
 from pydrake.systems.framework import Context, LeafSystem
 from pydrake.systems.sensors import ImageDepth32F, ImageRgba8U
 
+from systems.heightmap import DepthRays, View, project
 from systems.signals import Observation, PixelGrid
-
-SAME_SURFACE = 0.01
-"""Heights that differ by less than this, in metres, may belong to one surface."""
 
 
 class HeightmapProjector(LeafSystem):
@@ -72,7 +70,11 @@ class HeightmapProjector(LeafSystem):
         if not cameras:
             raise ValueError("HeightmapProjector needs at least one camera")
         self._grid = PixelGrid() if grid is None else grid
-        self._cameras = {name: _Camera.FromDrake(camera) for name, camera in cameras.items()}
+        self._rays = {name: _rays(camera) for name, camera in cameras.items()}
+        self._X_BD = {
+            name: RigidTransform(camera.core().sensor_pose_in_camera_body())
+            for name, camera in cameras.items()
+        }
         for name in cameras:
             self.DeclareAbstractInputPort(f"color_image_{name}", Value(ImageRgba8U()))
             self.DeclareAbstractInputPort(f"depth_image_{name}", Value(ImageDepth32F()))
@@ -87,20 +89,19 @@ class HeightmapProjector(LeafSystem):
 
     def _CalcObservation(self, context: Context, output: AbstractValue) -> None:
         views = []
-        for name, camera in self._cameras.items():
+        for name, rays in self._rays.items():
             X_WB: Any = self.GetInputPort(f"body_pose_in_world_{name}").Eval(context)
-            color = self._EvalImage(context, f"color_image_{name}", camera)
-            depth = self._EvalImage(context, f"depth_image_{name}", camera)
-            views.append(_see(color.reshape(-1, 4), depth[:, :, 0], X_WB, camera, self._grid))
-        image, valid = _fuse(np.stack(views))
-        image.flags.writeable = valid.flags.writeable = False
-        output.set_value(Observation(image=image, grid=self._grid, valid=valid))
+            color = self._EvalImage(context, f"color_image_{name}", rays)
+            depth = self._EvalImage(context, f"depth_image_{name}", rays)
+            X_WD = X_WB.multiply(self._X_BD[name]).GetAsMatrix4()
+            views.append(View(color, depth[:, :, 0], X_WD, rays))
+        output.set_value(project(views, self._grid))
 
-    def _EvalImage(self, context: Context, port: str, camera: "_Camera") -> NDArray:
+    def _EvalImage(self, context: Context, port: str, rays: DepthRays) -> NDArray:
         """The image's data, (height, width, channels)."""
         image: Any = self.GetInputPort(port).Eval(context)
         data = np.asarray(image.data)
-        height, width = camera.v.size, camera.u.size
+        height, width = rays.shape
         if data.shape[:2] != (height, width):
             raise ValueError(
                 f"{port} of HeightmapProjector is {data.shape[1]}x{data.shape[0]} pixels (width x "
@@ -109,115 +110,11 @@ class HeightmapProjector(LeafSystem):
         return data
 
 
-class _Camera(NamedTuple):
-    """A depth camera in the form that the projection needs."""
-
-    u: NDArray[np.float32]
-    """(width,): x of the ray through each column at depth 1."""
-    v: NDArray[np.float32]
-    """(height,): y of the ray through each row at depth 1."""
-    min_depth: float
-    max_depth: float
-    X_BD: RigidTransform
-
-    @staticmethod
-    def FromDrake(camera: DepthRenderCamera) -> "_Camera":
-        core = camera.core()
-        info = core.intrinsics()
-        u = (np.arange(info.width()) + 0.5 - info.center_x()) / info.focal_x()
-        v = (np.arange(info.height()) + 0.5 - info.center_y()) / info.focal_y()
-        return _Camera(
-            u=u.astype(np.float32),
-            v=v.astype(np.float32),
-            min_depth=camera.depth_range().min_depth(),
-            max_depth=camera.depth_range().max_depth(),
-            X_BD=RigidTransform(core.sensor_pose_in_camera_body()),
-        )
-
-
-def _see(
-    color: NDArray[np.uint8],
-    depth: NDArray[np.float32],
-    X_WB: RigidTransform,
-    camera: _Camera,
-    grid: PixelGrid,
-) -> NDArray[np.float32]:
-    """One camera's heightmap: (4, rows, cols) red, green, blue, height; height -1 where unseen.
-
-    `PixelGrid.to_pixel` is affine, as is the rigid transform: so they are applied once, to the
-    camera's centre and axes, and a pixel's grid coordinates are then linear in its depth.
-    """
-    X_WD = X_WB.multiply(camera.X_BD)
-    p_WD = X_WD.translation()
-    ends = X_WD.multiply(np.eye(3)).T  # World points one metre along each axis of the camera.
-    origin = np.append(grid.to_pixel(p_WD[:2]), p_WD[2] - grid.z_min)
-    axes = np.column_stack([grid.to_pixel(ends[:, :2]), ends[:, 2] - grid.z_min]) - origin
-    origin[:2] += 0.5  # So that truncation finds the pixel whose centre is nearest.
-
-    def coordinate(k: int) -> NDArray[np.float32]:
-        a, b, c = (np.float32(value) for value in axes[:, k])
-        direction = np.add.outer(b * camera.v + c, a * camera.u)
-        direction *= depth
-        direction += np.float32(origin[k])
-        return direction
-
-    with np.errstate(invalid="ignore", over="ignore"):
-        row, col, z = coordinate(0), coordinate(1), coordinate(2)
-    point = np.flatnonzero(
-        (depth >= camera.min_depth)
-        & (depth <= camera.max_depth)
-        & (row >= 0)
-        & (row < grid.rows)
-        & (col >= 0)
-        & (col < grid.cols)
-        & (z <= grid.z_max - grid.z_min)
+def _rays(camera: DepthRenderCamera) -> DepthRays:
+    info, depth_range = camera.core().intrinsics(), camera.depth_range()
+    return DepthRays.from_pinhole(
+        size=(info.width(), info.height()),
+        focal=(info.focal_x(), info.focal_y()),
+        centre=(info.center_x(), info.center_y()),
+        depth_range=(depth_range.min_depth(), depth_range.max_depth()),
     )
-    row, col, z = (values.ravel()[point] for values in (row, col, z))
-    cell = row.astype(np.int64) * grid.cols + col.astype(np.int64)
-
-    # The bits of a float32 >= +0 are in the order of its value: with the height's bits above the
-    # point's index in one integer, a single maximum finds the highest point and its colour.
-    z = np.maximum(z, 0) + np.float32(0)  # Adding 0 turns -0 into +0.
-    key = (z.view(np.int32).astype(np.int64) << 32) | point
-    highest = np.full(grid.rows * grid.cols, -1, np.int64)
-    np.maximum.at(highest, cell, key)
-
-    view = np.zeros((4, highest.size), np.float32)
-    view[3] = -1
-    seen = np.flatnonzero(highest >= 0)
-    view[:3, seen] = color[highest[seen] & 0xFFFFFFFF, :3].T / np.float32(255)
-    view[3, seen] = (highest[seen] >> 32).astype(np.int32).view(np.float32)
-    return view.reshape(4, *grid.shape)
-
-
-def _fuse(views: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-    """The Observation's image (4, rows, cols) of the cameras' (n, 4, rows, cols), and its mask."""
-    height = views[:, 3].max(axis=0)
-    seen = height >= 0
-    on_top = (views[:, 3] >= 0) & (views[:, 3] >= height - np.float32(SAME_SURFACE))
-    image = np.empty_like(views[0])
-    image[:3] = (views[:, :3] * on_top[:, None]).sum(axis=0) / np.maximum(on_top.sum(axis=0), 1)
-    image[3] = np.where(seen, height, 0)
-    _bridge_gaps(image, seen)
-    return image, seen
-
-
-def _bridge_gaps(image: NDArray[np.float32], seen: NDArray[np.bool_]) -> None:
-    """Fills, in place, single unseen pixels between two that belong together."""
-    row, col = np.nonzero(~seen)
-    padded_image = np.pad(image, ((0, 0), (1, 1), (1, 1)))
-    padded_seen = np.pad(seen, 1)
-    fill = np.zeros((4, row.size), np.float32)
-    fill_height = np.full(row.size, -1, np.float32)
-    for along_row, along_col in ((1, 0), (0, 1)):
-        before = (row + 1 - along_row, col + 1 - along_col)
-        after = (row + 1 + along_row, col + 1 + along_col)
-        one, other = padded_image[:, *before], padded_image[:, *after]
-        mean = (one + other) / 2
-        bridge = padded_seen[before] & padded_seen[after]
-        bridge &= np.abs(one[3] - other[3]) <= SAME_SURFACE
-        bridge &= mean[3] > fill_height
-        fill = np.where(bridge, mean, fill)
-        fill_height = np.where(bridge, mean[3], fill_height)
-    image[:, row, col] = fill
-    seen[row, col] = fill_height >= 0

@@ -23,6 +23,7 @@ from systems.hand_motion import (
     shortest_yaws,
     time_to_reach,
 )
+from systems.motion_heights import motion_heights
 from systems.pick_place_parameters import Mode, PickPlaceParameters
 from systems.signals import Observation, PickPlaceAction, PlanarPose, SurfaceHeights
 from systems.surface_heights import read_surface_heights
@@ -271,21 +272,12 @@ class PickPlacePlanner(LeafSystem):
         return action.heights
 
     def _set_heights(self, state: _State, heights: SurfaceHeights) -> None:
-        parameters = self._parameters
-        floor = heights.table + parameters.floor_clearance
-        share = parameters.grasp_depth_share * (heights.pick_top - heights.support)
-        depth = max(parameters.grasp_depth, min(share, parameters.max_grasp_depth))
-        state.grasp_z = max(heights.pick_top - depth, floor)
-        state.pick_top_z = heights.pick_top
+        motion = motion_heights(heights, self._parameters)
+        state.grasp_z, state.pick_top_z = motion.grasp, heights.pick_top
         state.table_z, state.support_z = heights.table, heights.support
         state.rim_z = heights.place_rim
-        state.clear_z = heights.highest + parameters.travel_clearance
-        hanging = max(state.grasp_z - heights.support, 0.0)
-        state.travel_z = state.clear_z + hanging
-        state.pick_hover_z = max(heights.near_pick, heights.pick_top) + parameters.hover_clearance
-        state.place_hover_z = (
-            max(heights.near_place, heights.place_rim) + hanging + parameters.hover_clearance
-        )
+        state.clear_z, state.travel_z = motion.clear, motion.travel
+        state.pick_hover_z, state.place_hover_z = motion.pick_hover, motion.place_hover
 
     def _follow(self, context, state, time, hand, contact) -> None:
         if time >= self._arrival(state):

@@ -13,6 +13,9 @@ def _data_root() -> Path:
 MODELS = _data_root() / "models"
 """Hand, table and tools; also the folder of the ROS package `kitting_models`."""
 
+GENERALIST = MODELS / "policies" / "generalist.safetensors"
+"""The weights of the policy for anybody's tools, trained on static scenes."""
+
 SCENARIOS = _data_root() / "scenarios"
 """The scenarios that come with the project."""
 

@@ -12,7 +12,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from systems.signals import Observation
+from systems.signals import Observation, PickPlaceAction, PixelGrid
 
 if TYPE_CHECKING:
     from kitting_drake.policies.learned_policy import Decision
@@ -39,19 +39,46 @@ def draw_decision(observation: Observation, decision: Decision) -> bytes:
     if title:
         figure.suptitle(title, x=0.01, horizontalalignment="left", fontsize=11)
     colours = np.clip(observation.rgb.transpose(1, 2, 0), 0, 1)
-    _show(axes["colour"], "observation: colour")
-    axes["colour"].imshow(colours)
-    _show(axes["height"], "observation: height")
-    axes["height"].imshow(1e3 * observation.height, cmap="viridis")
+    _draw_observation(axes["colour"], axes["height"], observation)
     if not decision.stop:
         for name in ("colour", "height"):
-            _draw_action(axes[name], decision, observation.grid.resolution)
+            _draw_grippers(axes[name], observation.grid, decision.action)
     _draw_maps(axes["pick"], axes["place"], decision, colours)
     _draw_angles(axes["angle"], decision)
+    return _as_png(figure)
+
+
+def draw_action(observation: Observation, action: PickPlaceAction) -> bytes:
+    """The observation with both gripper poses, for a decision that has no maps.
+
+    Returns:
+        A PNG.
+    """
+    figure = Figure(figsize=(12, 3.5), layout="constrained", dpi=110)
+    axes = figure.subplot_mosaic([["colour", "height"]])
+    said = "press" if action.press else "pick and place"
+    figure.suptitle(
+        "stop" if action.stop else said, x=0.01, horizontalalignment="left", fontsize=11
+    )
+    _draw_observation(axes["colour"], axes["height"], observation)
+    if not action.stop:
+        for axis in axes.values():
+            _draw_grippers(axis, observation.grid, action)
+    return _as_png(figure)
+
+
+def _as_png(figure: Figure) -> bytes:
     buffer = io.BytesIO()
     with matplotlib.rc_context({"font.size": 9}):
         figure.savefig(buffer, format="png")
     return buffer.getvalue()
+
+
+def _draw_observation(colour: Axes, height: Axes, observation: Observation) -> None:
+    _show(colour, "observation: colour")
+    colour.imshow(np.clip(observation.rgb.transpose(1, 2, 0), 0, 1))
+    _show(height, "observation: height")
+    height.imshow(1e3 * observation.height, cmap="viridis")
 
 
 def _title(decision: Decision) -> str:
@@ -114,15 +141,18 @@ def _show(axes: Axes, title: str) -> None:
     axes.spines[:].set_visible(False)
 
 
-def _draw_action(axes: Axes, decision: Decision, resolution: float) -> None:
+def _draw_grippers(axes: Axes, grid: PixelGrid, action: PickPlaceAction) -> None:
     """The gripper at pick and at place, and an arrow from one to the other."""
-    reach = _JAWS / resolution
-    _draw_gripper(axes, decision.pick_pixel, decision.action.pick.theta, reach, _PICK)
-    _draw_gripper(axes, decision.place_pixel, decision.action.place.theta, reach, _PLACE)
+    reach = _JAWS / grid.resolution
+    pick, place = (grid.to_pixel((pose.x, pose.y)) for pose in (action.pick, action.place))
+    _draw_gripper(axes, pick, action.pick.theta, reach, _PICK)
+    if action.press:
+        return
+    _draw_gripper(axes, place, action.place.theta, reach, _PLACE)
     axes.annotate(
         "",
-        xy=tuple(decision.place_pixel[::-1]),
-        xytext=tuple(decision.pick_pixel[::-1]),
+        xy=tuple(place[::-1]),
+        xytext=tuple(pick[::-1]),
         arrowprops={
             "arrowstyle": "->",
             "color": "white",

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 from pydrake.systems.framework import LeafSystem
 
 from kitting_drake.common.errors import UserError
-from kitting_drake.common.paths import MODELS
+from kitting_drake.common.paths import GENERALIST
 from kitting_drake.tasks.task import Scene
 from systems.action_quantizer import ActionQuantizer
 from systems.bounds import bounded
@@ -26,9 +26,6 @@ from systems.signals import Observation, PixelGrid
 
 if TYPE_CHECKING:
     from kitting_drake.policies.learned_policy import Decision
-
-GENERALIST = MODELS / "policies" / "generalist.safetensors"
-"""The weights of the policy for anybody's tools, trained on static scenes."""
 
 DecisionObserver = Callable[[Observation, "Decision"], None]
 """Told of every decision of a learned policy."""

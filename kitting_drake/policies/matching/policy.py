@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,6 +34,16 @@ _PROMISING = 2.0
 """A recess is registered if its coarse cost is at most this many times the least of the object."""
 
 
+@dataclass(frozen=True)
+class Matched:
+    """An action, and how well the outlines behind it agree."""
+
+    action: PickPlaceAction
+    agreement: float | None = None
+    """1: the outlines of object and recess are the same; 0: they differ by as much as they may.
+    None where no outlines were matched: the action mends something, or stops."""
+
+
 class ShapeMatchingPolicy:
     """A function from an observation to an action that needs neither training nor colour.
 
@@ -58,11 +69,15 @@ class ShapeMatchingPolicy:
             observation: o_t.
             failed_picks: where a grasp failed before: there it is not tried again.
         """
+        return self.decide(observation, failed_picks).action
+
+    def decide(self, observation: Observation, failed_picks: Sequence[PlanarPose] = ()) -> Matched:
+        """The action, and how well the outlines behind it agree; see `__call__`."""
         segmentation = segment(observation)
         if self._recover:
             mending = recovery_action(observation, segmentation, failed_picks)
             if mending is not None:
-                return mending
+                return Matched(mending)
         places = np.array([(pick.x, pick.y) for pick in failed_picks]).reshape(-1, 2)
         failed = observation.grid.to_pixel(places)
         resolution = observation.grid.resolution
@@ -75,8 +90,9 @@ class ShapeMatchingPolicy:
             if grasps:
                 best = grasps[0]
                 place = fit.moved(best.pixel)
-                return make_action(observation, best.pixel, best.theta, place, fit.rotation)
-        return PickPlaceAction(stop=True)
+                action = make_action(observation, best.pixel, best.theta, place, fit.rotation)
+                return Matched(action, min(max(1 - fit.cost / _WORST_COST, 0.0), 1.0))
+        return Matched(PickPlaceAction(stop=True))
 
 
 def _distance(positions: NDArray[np.float64], pixel: NDArray[np.float64]) -> float:

@@ -1,0 +1,201 @@
+"""The cameras of a bench: intrinsics and poses, read from YAML and written to it."""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+from numpy.typing import NDArray
+
+from kitting_drake.bench.layouts import Intrinsics, has_intrinsics, read_intrinsics, read_pose
+from kitting_drake.bench.yaml_values import number, read_yaml, whole_number
+from kitting_drake.common.errors import UserError
+from kitting_drake.common.files import write_atomically
+from systems.heightmap import DepthRays
+from systems.signals import PixelGrid
+
+Array = NDArray[np.float64]
+
+_UNDISTORTED = 1e-4
+"""A ray is found when its pixel is met to this, at depth 1."""
+_HEIGHT = PixelGrid().z_max - PixelGrid().z_min
+"""What rises above the table by more than this is left out, unless the calibration says more."""
+
+
+@dataclass(frozen=True)
+class BenchCamera:
+    """An RGB-D camera: colour and depth are registered, so that one lens stands for both."""
+
+    name: str
+    intrinsics: Intrinsics
+    X_BC: Array
+    """(4, 4) the optical frame C (x right, y down, z forward) in the robot's base frame B."""
+    depth_scale: float = 0.001
+    """Metres that a step of a 16-bit depth image stands for."""
+    min_depth: float = 0.01
+    max_depth: float = 10.0
+    """Depths outside these are none, in metres."""
+
+    @cached_property
+    def rays(self) -> DepthRays:
+        """The pixels' rays.
+
+        Raises:
+            UserError: the distortion cannot be undone.
+        """
+        lens = self.intrinsics
+        # From whole numbers at the pixels' centres to the corner of the image.
+        plain = DepthRays.from_pinhole(
+            size=lens.size,
+            focal=lens.focal,
+            centre=(lens.centre[0] + 0.5, lens.centre[1] + 0.5),
+            depth_range=(self.min_depth, self.max_depth),
+        )
+        if not lens.distortion:
+            return plain
+        u, v = (np.broadcast_to(item, plain.shape).astype(float) for item in (plain.u, plain.v))
+        x, y = _undistort(u, v, lens.distortion, self.name)
+        return plain._replace(u=x.astype(np.float32), v=y.astype(np.float32))
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """All cameras of a bench, and the workspace that they look at."""
+
+    cameras: tuple[BenchCamera, ...]
+    grid: PixelGrid
+    """The pixels of o_t; its `z_min` is the height of the table in the base frame."""
+
+    @property
+    def table_height(self) -> float:
+        """The height of the table in the base frame, in metres."""
+        return self.grid.z_min
+
+
+def read_calibration(path: Path, *, table_height: float | None = None) -> Calibration:
+    """Reads a calibration; `docs/bench.md` shows the layouts.
+
+    Args:
+        path: the file.
+        table_height: of the table in the base frame, in metres; None: the file's, or zero.
+
+    Raises:
+        UserError: a field is missing or cannot be; names the file and the field.
+    """
+    content = read_yaml(path)
+    if "cameras" in content:
+        entries = content["cameras"]
+        if not isinstance(entries, dict) or not entries:
+            raise UserError(f"{path}: cameras must be a mapping from names to cameras")
+    else:
+        entries = {str(content.get("camera_name", "camera")): content}
+    cameras = tuple(_read_camera(path, str(name), node) for name, node in entries.items())
+    if table_height is None:
+        table_height = number(content.get("table_height", 0.0), f"{path}: table_height")
+    return Calibration(cameras, _read_grid(path, content.get("workspace", {}), table_height))
+
+
+def _read_camera(path: Path, name: str, node: Any) -> BenchCamera:
+    where = f"{path}: camera {name}"
+    if not isinstance(node, dict):
+        raise UserError(f"{where} must be a mapping of fields")
+    lens = node
+    if "camera_info" in node:
+        file = path.parent / str(node["camera_info"])
+        lens = read_yaml(file)
+        if not has_intrinsics(lens):
+            raise UserError(f"{where}: {file} holds no camera_matrix and no k")
+    limits = {
+        key: number(node[key], f"{where}: {key}")
+        for key in ("depth_scale", "min_depth", "max_depth")
+        if key in node
+    }
+    if any(value <= 0 for value in limits.values()):
+        raise UserError(f"{where}: depth_scale, min_depth and max_depth must be positive")
+    return BenchCamera(name, read_intrinsics(lens, where), read_pose(node, where), **limits)
+
+
+def _read_grid(path: Path, node: Any, table_height: float) -> PixelGrid:
+    known = ("x_min", "y_min", "resolution", "rows", "cols", "max_height")
+    if not isinstance(node, dict) or not set(node) <= set(known):
+        raise UserError(f"{path}: workspace has the fields {', '.join(known)}, and no others")
+    values: dict[str, Any] = {}
+    for key, value in node.items():
+        read = whole_number if key in ("rows", "cols") else number
+        values[key] = read(value, f"{path}: workspace.{key}")
+    top = table_height + values.pop("max_height", _HEIGHT)
+    try:
+        return PixelGrid(**values, z_min=table_height, z_max=top)
+    except ValueError as error:
+        raise UserError(f"{path}: workspace: {error}") from error
+
+
+def write_calibration(path: Path, calibration: Calibration) -> None:
+    """Writes a calibration in our own layout, to the last bit.
+
+    Raises:
+        UserError: the file cannot be written.
+    """
+    grid = calibration.grid
+    content: dict[str, Any] = {
+        "table_height": float(grid.z_min),
+        "workspace": {
+            **{key: getattr(grid, key) for key in ("x_min", "y_min", "resolution", "rows", "cols")},
+            "max_height": float(grid.z_max - grid.z_min),
+        },
+        "cameras": {},
+    }
+    for camera in calibration.cameras:
+        lens = camera.intrinsics
+        content["cameras"][camera.name] = {
+            **dict(zip(("width", "height"), lens.size, strict=True)),
+            **dict(zip(("fx", "fy"), map(float, lens.focal), strict=True)),
+            **dict(zip(("cx", "cy"), map(float, lens.centre), strict=True)),
+            "distortion": list(lens.distortion),
+            "depth_scale": camera.depth_scale,
+            "min_depth": camera.min_depth,
+            "max_depth": camera.max_depth,
+            "camera_to_base": np.asarray(camera.X_BC).tolist(),
+        }
+    write_atomically(path, yaml.safe_dump(content, sort_keys=False, default_flow_style=None))
+
+
+def with_poses(calibration: Calibration, poses: dict[str, Array]) -> Calibration:
+    """A calibration with other poses of some of its cameras."""
+    cameras = tuple(
+        dataclasses.replace(camera, X_BC=poses.get(camera.name, camera.X_BC))
+        for camera in calibration.cameras
+    )
+    return dataclasses.replace(calibration, cameras=cameras)
+
+
+def _undistort(u: Array, v: Array, distortion: tuple[float, ...], name: str) -> tuple[Array, Array]:
+    """Where rays at depth 1 really go, which a lens shows at (u, v); as cv2.undistortPoints."""
+    k1, k2, p1, p2, k3, k4, k5, k6 = (*distortion, *(0.0,) * (8 - len(distortion)))
+
+    def factors(x: Array, y: Array) -> tuple[Array, Array, Array]:
+        square = x * x + y * y
+        radial = (1 + square * (k1 + square * (k2 + square * k3))) / (
+            1 + square * (k4 + square * (k5 + square * k6))
+        )
+        along = 2 * p1 * x * y + p2 * (square + 2 * x * x)
+        return radial, along, p1 * (square + 2 * y * y) + 2 * p2 * x * y
+
+    x, y = u.copy(), v.copy()
+    with np.errstate(all="ignore"):
+        for _ in range(30):
+            radial, shift_x, shift_y = factors(x, y)
+            x, y = (u - shift_x) / radial, (v - shift_y) / radial
+        radial, shift_x, shift_y = factors(x, y)
+        missed = np.hypot(x * radial + shift_x - u, y * radial + shift_y - v)
+    if not (missed < _UNDISTORTED).all():
+        raise UserError(
+            f"camera {name}: its distortion cannot be undone over the whole image: check the order "
+            "k1, k2, p1, p2, k3, or rectify the images"
+        )
+    return x, y

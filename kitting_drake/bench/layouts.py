@@ -1,0 +1,177 @@
+"""Intrinsics and poses of cameras out of YAML: OpenCV's layout, ROS's CameraInfo, and our own."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from kitting_drake.bench.yaml_values import matrix, number, numbers, whole_number
+from kitting_drake.common.errors import UserError
+
+Array = NDArray[np.float64]
+
+_ORTHOGONAL = 1e-3
+"""By how much the entries of R^T R may differ from the identity's."""
+_MODELS = ("plumb_bob", "rational_polynomial", "radtan", "none", "")
+_COEFFICIENTS = (0, 4, 5, 8)
+
+
+@dataclass(frozen=True)
+class Intrinsics:
+    """The numbers of a lens; positions in an image are whole at the pixels' centres."""
+
+    size: tuple[int, int]
+    """(width, height), in pixels."""
+    focal: tuple[float, float]
+    """(fx, fy), in pixels."""
+    centre: tuple[float, float]
+    """(cx, cy), in pixels."""
+    distortion: tuple[float, ...] = ()
+    """k1, k2, p1, p2, k3, k4, k5, k6, as OpenCV and ROS order them; fewer, or none."""
+
+
+def has_intrinsics(node: dict[str, Any]) -> bool:
+    """Whether a mapping holds intrinsics in some layout."""
+    return any(key in node for key in ("fx", "camera_matrix", "k", "K"))
+
+
+def read_intrinsics(node: dict[str, Any], where: str) -> Intrinsics:
+    """The intrinsics in a mapping, in any of the three layouts.
+
+    Raises:
+        UserError: they are not all there, or cannot be; names the field.
+    """
+    if "fx" in node:
+        fx, fy, cx, cy = (
+            number(_get(node, key, where), f"{where}: {key}") for key in ("fx", "fy", "cx", "cy")
+        )
+    else:
+        key = _first(node, "camera_matrix", "k", "K")
+        if key is None:
+            raise UserError(
+                f"{where} has no intrinsics: give fx, fy, cx, cy, or camera_matrix, or k"
+            )
+        K = matrix(node[key], 3, 3, f"{where}: {key}")
+        fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
+    if "image_size" in node:
+        width, height = matrix(node["image_size"], 1, 2, f"{where}: image_size")[0].tolist()
+    else:
+        across, down = _first(node, "width", "image_width"), _first(node, "height", "image_height")
+        if across is None or down is None:
+            raise UserError(f"{where} has no image size: give width and height, in pixels")
+        width, height = node[across], node[down]
+    if fx <= 0 or fy <= 0:
+        raise UserError(f"{where}: focal lengths must be positive, not {fx:g} and {fy:g}")
+    size = whole_number(width, f"{where}: width"), whole_number(height, f"{where}: height")
+    if not (0 <= cx <= size[0] and 0 <= cy <= size[1]):
+        raise UserError(
+            f"{where}: the principal point ({cx:g}, {cy:g}) is outside the image of "
+            f"{size[0]}x{size[1]} pixels: are the intrinsics those of another resolution?"
+        )
+    return Intrinsics(size, (fx, fy), (cx, cy), _read_distortion(node, where))
+
+
+def _read_distortion(node: dict[str, Any], where: str) -> tuple[float, ...]:
+    model = node.get("distortion_model") or ""
+    if model not in _MODELS:
+        raise UserError(
+            f"{where}: distortion_model {model} cannot be read: rectify the images, and give "
+            "distortion: []"
+        )
+    key = _first(node, "distortion", "distortion_coefficients", "dist_coeffs", "d", "D")
+    if key is None:
+        return ()
+    values = tuple(numbers(node[key], f"{where}: {key}").tolist())
+    if not any(values):
+        return ()
+    if len(values) not in _COEFFICIENTS:
+        raise UserError(f"{where}: {key} must hold 0, 4, 5 or 8 numbers, not {len(values)}")
+    return values
+
+
+def read_pose(node: dict[str, Any], where: str) -> Array:
+    """(4, 4) the pose of the camera's optical frame in the base frame, in any of the layouts.
+
+    Raises:
+        UserError: there is none, or its rotation is none; names the field.
+    """
+    if "R_cam2base" in node:
+        X = np.eye(4)
+        X[:3, :3] = matrix(node["R_cam2base"], 3, 3, f"{where}: R_cam2base")
+        X[:3, 3] = numbers(_get(node, "t_cam2base", where), f"{where}: t_cam2base")[:3]
+        return _checked(X, f"{where}: R_cam2base")
+    key = _first(node, "camera_to_base", "pose", "transform", "base_to_camera")
+    if key is None:
+        raise UserError(
+            f"{where} has no pose: give camera_to_base (4 x 4), or pose with position and "
+            "quaternion_xyzw or rpy_deg"
+        )
+    value, label = node[key], f"{where}: {key}"
+    if isinstance(value, dict) and "data" not in value:
+        X = _pose_of_parts(value, label)
+    else:
+        X = matrix(value, 4, 4, label)
+    X = _checked(X, label)
+    return np.linalg.inv(X) if key == "base_to_camera" else X
+
+
+def _pose_of_parts(value: dict[str, Any], where: str) -> Array:
+    if isinstance(value.get("pose"), dict):
+        # geometry_msgs/PoseStamped, and PoseWithCovariance.
+        value = value["pose"]
+    if isinstance(value.get("transform"), dict):
+        value = value["transform"]
+    at = _first(value, "position", "translation")
+    if at is None:
+        raise UserError(f"{where} has no position: three numbers in metres")
+    X = np.eye(4)
+    X[:3, 3] = matrix(value[at], 1, 3, f"{where}.{at}")[0]
+    key = _first(value, "orientation", "quaternion_xyzw", "rotation", "rpy_deg", "rvec")
+    if key is None:
+        raise UserError(f"{where} has no rotation: give quaternion_xyzw, rpy_deg, rotation or rvec")
+    turn = numbers(value[key], f"{where}.{key}")
+    if key in ("rpy_deg", "rvec"):
+        turn = matrix(value[key], 1, 3, f"{where}.{key}")[0]
+        # Roll, pitch and yaw are about the fixed axes x, y and z, in this order, as in ROS.
+        rotation = (
+            Rotation.from_euler("xyz", turn, degrees=True)
+            if key == "rpy_deg"
+            else Rotation.from_rotvec(turn)
+        )
+        X[:3, :3] = rotation.as_matrix()
+    elif turn.size == 9 and key == "rotation":
+        X[:3, :3] = turn.reshape(3, 3)
+    elif turn.size == 4:
+        if abs(np.linalg.norm(turn) - 1) > _ORTHOGONAL:
+            raise UserError(f"{where}.{key} must be a unit quaternion x, y, z, w")
+        X[:3, :3] = Rotation.from_quat(turn).as_matrix()
+    else:
+        raise UserError(f"{where}.{key} must be a quaternion x, y, z, w, not {turn.size} numbers")
+    return X
+
+
+def _checked(X: Array, where: str) -> Array:
+    R = X[:3, :3]
+    if np.abs(R.T @ R - np.eye(3)).max() > _ORTHOGONAL or np.linalg.det(R) < 0:
+        raise UserError(f"{where} is no rigid pose: its rotation is not orthonormal")
+    if not np.allclose(X[3], [0, 0, 0, 1]):
+        raise UserError(f"{where}: the last row of a pose must be 0 0 0 1")
+    if np.linalg.norm(X[:3, 3]) > 20:
+        far = math.ceil(np.linalg.norm(X[:3, 3]))
+        raise UserError(f"{where}: the camera is {far} m from the base: positions are in metres")
+    return X
+
+
+def _get(node: dict[str, Any], key: str, where: str) -> Any:
+    if key not in node:
+        raise UserError(f"{where} lacks '{key}'")
+    return node[key]
+
+
+def _first(node: dict[str, Any], *keys: str) -> str | None:
+    return next((key for key in keys if key in node), None)

@@ -1,0 +1,145 @@
+"""Whether cameras see the workspace, and whether their depths can be metres."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from kitting_drake.bench.calibration import BenchCamera, Calibration
+from kitting_drake.bench.frames import Frame
+from kitting_drake.common.errors import UserError
+from systems.heightmap import View
+from systems.signals import PixelGrid
+
+Array = NDArray[np.float64]
+
+_LEAST_SEEN = 0.01
+"""A camera that sees less than this share of the workspace looks elsewhere."""
+_LEAST_DEPTH = 0.01
+"""The same for the share of pixels towards the workspace that have any depth."""
+_NEAREST, _FARTHEST = 0.8, 1.25
+"""Depths, as shares of that of the table, that may be something on the table, or a pose that is
+off: beyond these the unit is wrong, or the pose."""
+_WIDEST = 0.15
+"""Half of these shares lie within a range as narrow as this, or what is seen is no table."""
+_STEP = 4
+"""Every so many pixels are enough to judge by."""
+_OPTICAL = np.eye(4)
+_OPTICAL[:3, :3] = Rotation.from_euler("xyz", [-90, 0, -90], degrees=True).as_matrix()
+"""The optical frame in a camera's body frame as ROS has it (x forward, y left, z up)."""
+
+
+def make_views(frames: Mapping[str, Frame], calibration: Calibration) -> list[View]:
+    """The cameras' views, once it is plausible that they show the workspace.
+
+    Raises:
+        UserError: a camera has no frame, sees nothing of the workspace, or has no depths or depths
+            in another unit.
+    """
+    views = []
+    for camera in calibration.cameras:
+        frame = frames.get(camera.name)
+        if frame is None:
+            raise UserError(f"there is no frame of camera {camera.name}")
+        _check_pose(camera, calibration.grid)
+        _check_depth(frame, camera, calibration.grid)
+        views.append(View(frame.color, frame.depth, camera.X_BC, camera.rays))
+    return views
+
+
+def table_depth(
+    camera: BenchCamera, X_BC: Array, grid: PixelGrid, step: int = 1
+) -> NDArray[np.float64]:
+    """(height, width): the depth of the table where a pixel looks at the workspace, in metres, by
+    the camera's pose alone; NaN elsewhere. Of every `step`th pixel along rows and columns."""
+    rays = camera.rays
+    u, v = (item[::step, ::step] for item in np.broadcast_arrays(rays.u, rays.v))
+    directions = np.stack([u, v, np.ones_like(u)], axis=-1) @ X_BC[:3, :3].T
+    with np.errstate(divide="ignore", invalid="ignore"):
+        depth = (grid.z_min - X_BC[2, 3]) / directions[..., 2]
+        xy = X_BC[:2, 3] + depth[..., None] * directions[..., :2]
+        seen = (depth > 0) & grid.contains(xy)
+    return np.where(seen, depth, np.nan)
+
+
+def _share_seen(camera: BenchCamera, X_BC: Array, grid: PixelGrid) -> float:
+    """The share of the workspace's pixels, at the table's height, that are in the image."""
+    rows, cols = np.meshgrid(np.arange(0, grid.rows, 4), np.arange(0, grid.cols, 4), indexing="ij")
+    xy = grid.to_world(np.stack([rows.ravel(), cols.ravel()], axis=-1))
+    p_C = (np.column_stack([xy, np.full(len(xy), grid.z_min)]) - X_BC[:3, 3]) @ X_BC[:3, :3]
+    lens, before = camera.intrinsics, p_C[:, 2] > 0
+    x, y = (p_C[before, :2] / p_C[before, 2:]).T * np.array(lens.focal)[:, None]
+    inside = (np.abs(x + lens.centre[0] - lens.size[0] / 2) <= lens.size[0] / 2) & (
+        np.abs(y + lens.centre[1] - lens.size[1] / 2) <= lens.size[1] / 2
+    )
+    return float(inside.sum() / len(xy))
+
+
+def _check_pose(camera: BenchCamera, grid: PixelGrid) -> None:
+    X_BC = camera.X_BC
+    if _share_seen(camera, X_BC, grid) >= _LEAST_SEEN and X_BC[2, 3] > grid.z_min:
+        return
+    others = {
+        "its inverse would: is it the pose of the base in the camera?": np.linalg.inv(X_BC),
+        "it would if this were the pose of ROS's body frame: give that of the optical frame, z "
+        "forward": X_BC @ _OPTICAL,
+        "it would if the pose were in millimetres: positions are in metres": np.vstack(
+            [np.column_stack([X_BC[:3, :3], X_BC[:3, 3] / 1e3]), X_BC[3:]]
+        ),
+    }
+    hints = [
+        text
+        for text, X in others.items()
+        if X[2, 3] > grid.z_min and _share_seen(camera, X, grid) >= 0.1
+    ]
+    if hints:
+        hint = hints[0]
+    elif X_BC[2, 3] <= grid.z_min:
+        hint = f"it is {1e3 * (grid.z_min - X_BC[2, 3]):.0f} mm below the table"
+    elif X_BC[2, 2] > 0:
+        hint = "it looks upwards"
+    else:
+        x, y, _ = X_BC[:3, 3] + X_BC[:3, 2] * (grid.z_min - X_BC[2, 3]) / X_BC[2, 2]
+        hint = f"it looks at ({x:.2f}, {y:.2f}) m on the table"
+    raise UserError(
+        f"by its pose camera {camera.name} sees nothing of the workspace "
+        f"({grid.x_min:g} to {grid.x_max:g}, {grid.y_min:g} to {grid.y_max:g} m): {hint}"
+    )
+
+
+def _check_depth(frame: Frame, camera: BenchCamera, grid: PixelGrid) -> None:
+    expected = table_depth(camera, camera.X_BC, grid, _STEP)
+    towards = np.isfinite(expected)
+    depth = frame.depth[::_STEP, ::_STEP][towards]
+    with np.errstate(invalid="ignore"):
+        returned = np.isfinite(depth) & (depth > 0)
+    if returned.mean() < _LEAST_DEPTH:
+        raise UserError(
+            f"depth of camera {camera.name} is all zero or NaN where it looks at the workspace"
+        )
+    ratios = depth[returned] / expected[towards][returned]
+    low, ratio, high = (float(value) for value in np.percentile(ratios, (25, 50, 75)))
+    if _NEAREST <= ratio <= _FARTHEST:
+        if high - low <= _WIDEST:
+            return
+        raise UserError(
+            f"by its pose camera {camera.name} sees no table: half of its depths are from "
+            f"{low:.2f} to {high:.2f} times that of the table: check the pose (or is it the "
+            "inverse, that of the base in the camera?)"
+        )
+    found = float(np.median(depth[returned]))
+    told = (
+        f"depth of camera {camera.name} is {found:.3g} m, the median, where by its pose the table"
+    )
+    told += f" is {found / ratio:.3g} m away"
+    if 500 < ratio < 2000:
+        hint = "these are millimetres: a .npy file holds metres, and depth_scale is metres a step"
+    elif 1 / 2000 < ratio < 1 / 500 or found < 1.5 * camera.depth_scale:
+        hint = "these are metres: a 16-bit PNG holds steps of depth_scale, of 1 mm by default"
+    else:
+        scale = camera.depth_scale / ratio
+        hint = f"check the pose, table_height and depth_scale (of {scale:.2g} it would agree)"
+    raise UserError(f"{told}: {hint}")

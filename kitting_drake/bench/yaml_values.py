@@ -1,0 +1,111 @@
+"""YAML as OpenCV, ROS and people write it, and numbers out of it."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+from numpy.typing import NDArray
+
+from kitting_drake.common.errors import UserError
+
+Array = NDArray[np.float64]
+
+
+class _Loader(yaml.SafeLoader):
+    """Plain YAML, and the matrices of `cv2.FileStorage`."""
+
+
+def _opencv_matrix(loader: yaml.SafeLoader, node: yaml.Node) -> Any:
+    return loader.construct_mapping(node, deep=True)
+
+
+_Loader.add_constructor("tag:yaml.org,2002:opencv-matrix", _opencv_matrix)
+
+
+def read_yaml(path: Path) -> dict[str, Any]:
+    """The mapping of a YAML file; of several documents, the first.
+
+    Raises:
+        UserError: it cannot be read, or is no mapping.
+    """
+    try:
+        text = path.read_text()
+    except (OSError, UnicodeDecodeError) as error:
+        reason = getattr(error, "strerror", None) or "it is not text"
+        raise UserError(f"cannot read {path}: {reason}") from error
+    if text.startswith("%YAML:"):
+        # What cv2.FileStorage writes as a first line is no YAML directive.
+        text = text.partition("\n")[2]
+    try:
+        first = next(iter(yaml.load_all(text, _Loader)), None)
+    except yaml.YAMLError as error:
+        mark = getattr(error, "problem_mark", None)
+        where = f" line {mark.line + 1}:" if mark else ""
+        problem = getattr(error, "problem", None) or "it is not YAML"
+        raise UserError(f"{path}:{where} {problem}") from error
+    if not isinstance(first, dict):
+        raise UserError(f"{path} must hold a mapping of fields, such as 'cameras:'")
+    return first
+
+
+def number(value: Any, where: str) -> float:
+    """A finite number.
+
+    Raises:
+        UserError: it is none; names the field.
+    """
+    try:
+        # YAML 1.1 takes 4e2 for a text.
+        result = float(value) if not isinstance(value, bool) else math.nan
+    except (TypeError, ValueError):
+        result = math.nan
+    if not math.isfinite(result):
+        raise UserError(f"{where} must be a finite number, not {value!r}")
+    return result
+
+
+def whole_number(value: Any, where: str) -> int:
+    """A whole number of 1 or more.
+
+    Raises:
+        UserError: it is none; names the field.
+    """
+    result = number(value, where)
+    if result < 1 or result != int(result):
+        raise UserError(f"{where} must be a whole number of 1 or more, not {value!r}")
+    return int(result)
+
+
+def numbers(value: Any, where: str) -> Array:
+    """A flat array of finite numbers: of a list, of a list of lists, of a matrix as OpenCV and ROS
+    write it (`rows`, `cols`, `data`), or of a mapping with x, y, z and perhaps w.
+
+    Raises:
+        UserError: they are none; names the field.
+    """
+    if isinstance(value, dict) and "data" in value:
+        value = value["data"]
+    elif isinstance(value, dict) and {"x", "y", "z"} <= set(value):
+        value = [value[key] for key in "xyzw" if key in value]
+    if not isinstance(value, list):
+        raise UserError(f"{where} must be a list of numbers, not {value!r}")
+    flat = [item for row in value for item in (row if isinstance(row, list) else [row])]
+    return np.array([number(item, where) for item in flat])
+
+
+def matrix(value: Any, rows: int, cols: int, where: str) -> Array:
+    """(rows, cols) of `numbers`.
+
+    Raises:
+        UserError: there are not as many.
+    """
+    flat = numbers(value, where)
+    if flat.size != rows * cols:
+        raise UserError(
+            f"{where} must hold {rows * cols} numbers ({rows} x {cols}), not {flat.size}"
+        )
+    return flat.reshape(rows, cols)

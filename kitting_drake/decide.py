@@ -1,0 +1,142 @@
+"""`python -m kitting_drake.decide FRAME... --camera CALIBRATION.yaml`: one look, one action.
+
+A real camera's frames become one pick and place in the robot's frame; no Drake. See docs/bench.md.
+"""
+
+import argparse
+import time
+from pathlib import Path
+
+from rich.console import Console
+
+from kitting_drake.bench import (
+    BenchPolicy,
+    ShapeMatching,
+    decide,
+    load_policy,
+    read_calibration,
+    read_frames,
+)
+from kitting_drake.bench.check import check_cameras
+from kitting_drake.bench.kit_block import Block
+from kitting_drake.bench.report import print_check, print_decision, save_check
+from kitting_drake.common.command_line import count_type, run_command
+from kitting_drake.common.errors import UserError
+from kitting_drake.common.files import require_folder, write_atomically, write_json
+
+
+def main() -> int:
+    """Parses the command line, and decides or checks; returns the exit code."""
+    arguments = _parser().parse_args()
+    console = Console(quiet=arguments.quiet)
+    folder = require_folder(arguments.output)
+    calibration = read_calibration(arguments.camera, table_height=arguments.table_height)
+    block = _block(arguments)
+    frames = read_frames(arguments.frames, calibration)
+    if arguments.check:
+        checked = check_cameras(frames, calibration, block)
+        save_check(folder, checked)
+        print_check(console, checked)
+        console.print(f"files: {folder}/", highlight=False)
+        return 0
+
+    policy = _policy(arguments)
+    begun = time.perf_counter()
+    decision = decide(frames, calibration, policy)
+    seconds = time.perf_counter() - begun
+    record = {
+        "units": "metres and radians, in the base frame; docs/bench.md",
+        "policy": policy.name,
+        "seconds": round(seconds, 3),
+        **decision.as_dict(),
+    }
+    write_json(folder / "action.json", record)
+    write_atomically(folder / "decision.png", decision.draw())
+    print_decision(console, record)
+    console.print(f"files: {folder}/", highlight=False)
+    return 0
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="python -m kitting_drake.decide",
+        description="Decide one pick and place from a real camera's frames, or check the cameras.",
+    )
+    parser.add_argument(
+        "frames",
+        type=Path,
+        nargs="+",
+        metavar="FRAME",
+        help="a folder, or a colour image and a depth image for each camera",
+    )
+    parser.add_argument(
+        "--camera",
+        type=Path,
+        required=True,
+        metavar="CALIBRATION.yaml",
+        help="intrinsics and poses of the cameras",
+    )
+    parser.add_argument(
+        "--output", type=Path, default=Path("output/decide"), metavar="DIR", help="where files go"
+    )
+    policy = parser.add_mutually_exclusive_group()
+    policy.add_argument("--weights", type=Path, metavar="FILE", help="networks (the generalist's)")
+    policy.add_argument("--shape_matching", action="store_true", help="decide by outlines alone")
+    parser.add_argument(
+        "--orientations", type=count_type, default=180, metavar="N", help="of the networks (180)"
+    )
+    parser.add_argument(
+        "--no_outlines", action="store_true", help="refine nothing: for tasks without cavities"
+    )
+    parser.add_argument("--recover", action="store_true", help="first mend what is not seated")
+    parser.add_argument(
+        "--table_height", type=float, metavar="Z", help="in the base frame, in m (the file's, or 0)"
+    )
+    parser.add_argument(
+        "--check", action="store_true", help="check the cameras: the table in the frame is empty"
+    )
+    parser.add_argument(
+        "--kit_size_mm",
+        type=float,
+        nargs=3,
+        metavar=("L", "W", "H"),
+        help="with --check: a block of this size lies on the table",
+    )
+    parser.add_argument(
+        "--kit_pose",
+        type=float,
+        nargs=3,
+        metavar=("X", "Y", "YAW"),
+        help="with --kit_size_mm: the block's middle in the base frame, in m, and its yaw, in rad",
+    )
+    parser.add_argument("--quiet", action="store_true", help="print nothing but errors")
+    return parser
+
+
+def _policy(arguments: argparse.Namespace) -> BenchPolicy:
+    if arguments.shape_matching:
+        return ShapeMatching(recover=arguments.recover)
+    return load_policy(
+        arguments.weights,
+        orientations=arguments.orientations,
+        fit_outlines=not arguments.no_outlines,
+        recover=arguments.recover,
+    )
+
+
+def _block(arguments: argparse.Namespace) -> Block | None:
+    if arguments.kit_size_mm is None:
+        if arguments.kit_pose is not None:
+            raise UserError("--kit_pose needs --kit_size_mm")
+        return None
+    if not arguments.check:
+        raise UserError("--kit_size_mm needs --check")
+    if not all(0 < side < 1000 for side in arguments.kit_size_mm):
+        raise UserError("--kit_size_mm takes length, width and height between 0 and 1000 mm")
+    length, width, height = (side / 1e3 for side in arguments.kit_size_mm)
+    pose = None if arguments.kit_pose is None else tuple(arguments.kit_pose)
+    return Block((length, width, height), pose)
+
+
+if __name__ == "__main__":
+    run_command(main)

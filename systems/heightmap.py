@@ -1,0 +1,173 @@
+"""The arithmetic of o_t: from the images of RGB-D cameras to the orthographic heightmap.
+
+No pydrake here: `HeightmapProjector` computes it in the cell, `kitting_drake.bench` on a robot's
+own frames, and both get the same bits from the same images, intrinsics and poses.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from systems.signals import Observation, PixelGrid
+
+SAME_SURFACE = 0.01
+"""Heights that differ by less than this, in metres, may belong to one surface."""
+
+
+class DepthRays(NamedTuple):
+    """A depth camera in the form that the projection needs.
+
+    The point that a pixel sees is `depth * (u, v, 1)` in the camera's optical frame D: x points
+    right in the image, y down, z forward.
+    """
+
+    u: NDArray[np.float32]
+    """(1, width), or (height, width) where lenses distort: x of each pixel's ray at depth 1."""
+    v: NDArray[np.float32]
+    """(height, 1), or (height, width): y of each pixel's ray at depth 1."""
+    min_depth: float
+    """A depth below this is no point, in metres."""
+    max_depth: float
+    """Nor is one beyond this, in metres."""
+
+    @staticmethod
+    def from_pinhole(
+        *,
+        size: tuple[int, int],
+        focal: tuple[float, float],
+        centre: tuple[float, float],
+        depth_range: tuple[float, float],
+    ) -> DepthRays:
+        """The rays of a camera without distortion.
+
+        Args:
+            size: (width, height) in pixels.
+            focal: (fx, fy) in pixels.
+            centre: (cx, cy) in pixels, where image pixel (u, v) covers [u, u+1) x [v, v+1). OpenCV,
+                ROS and RealSense count from the pixels' centres: their cx is less by a half.
+            depth_range: least and largest depth, in metres.
+        """
+        u = (np.arange(size[0]) + 0.5 - centre[0]) / focal[0]
+        v = (np.arange(size[1]) + 0.5 - centre[1]) / focal[1]
+        return DepthRays(
+            u.astype(np.float32)[None],
+            v.astype(np.float32)[:, None],
+            depth_range[0],
+            depth_range[1],
+        )
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """(height, width) of the images."""
+        return self.v.shape[0], self.u.shape[1]
+
+
+class View(NamedTuple):
+    """What one camera saw, and from where."""
+
+    color: NDArray[np.uint8]
+    """(height, width, 3 or more): red, green, blue."""
+    depth: NDArray[np.float32]
+    """(height, width) along the optical axis, in metres; 0, infinity and NaN are no depth."""
+    X_WD: NDArray[np.float64]
+    """(4, 4) pose of the camera's optical frame in the world."""
+    rays: DepthRays
+
+
+def project(views: Sequence[View], grid: PixelGrid) -> Observation:
+    """o_t, by the law that `HeightmapProjector` states.
+
+    Args:
+        views: of the cameras, at least one.
+        grid: the pixels of the heightmap.
+    """
+    image, valid = _fuse(np.stack([_see(view, grid) for view in views]))
+    image.flags.writeable = valid.flags.writeable = False
+    return Observation(image=image, grid=grid, valid=valid)
+
+
+def _see(view: View, grid: PixelGrid) -> NDArray[np.float32]:
+    """One camera's heightmap: (4, rows, cols) red, green, blue, height; height -1 where unseen.
+
+    `PixelGrid.to_pixel` is affine, as is the rigid transform: so they are applied once, to the
+    camera's centre and axes, and a pixel's grid coordinates are then linear in its depth.
+    """
+    rays, depth = view.rays, view.depth
+    p_WD = view.X_WD[:3, 3]
+    ends = view.X_WD[:3, :3].T + p_WD  # World points one metre along each axis of the camera.
+    origin = np.append(grid.to_pixel(p_WD[:2]), p_WD[2] - grid.z_min)
+    axes = np.column_stack([grid.to_pixel(ends[:, :2]), ends[:, 2] - grid.z_min]) - origin
+    origin[:2] += 0.5  # So that truncation finds the pixel whose centre is nearest.
+
+    def coordinate(k: int) -> NDArray[np.float32]:
+        a, b, c = (np.float32(value) for value in axes[:, k])
+        direction = (b * rays.v + c) + a * rays.u
+        direction *= depth
+        direction += np.float32(origin[k])
+        return direction
+
+    with np.errstate(invalid="ignore", over="ignore"):
+        row, col, z = coordinate(0), coordinate(1), coordinate(2)
+    point = np.flatnonzero(
+        (depth >= rays.min_depth)
+        & (depth <= rays.max_depth)
+        & (row >= 0)
+        & (row < grid.rows)
+        & (col >= 0)
+        & (col < grid.cols)
+        & (z <= grid.z_max - grid.z_min)
+    )
+    row, col, z = (values.ravel()[point] for values in (row, col, z))
+    cell = row.astype(np.int64) * grid.cols + col.astype(np.int64)
+
+    # The bits of a float32 >= +0 are in the order of its value: with the height's bits above the
+    # point's index in one integer, a single maximum finds the highest point and its colour.
+    z = np.maximum(z, 0) + np.float32(0)  # Adding 0 turns -0 into +0.
+    key = (z.view(np.int32).astype(np.int64) << 32) | point
+    highest = np.full(grid.rows * grid.cols, -1, np.int64)
+    np.maximum.at(highest, cell, key)
+
+    color = view.color.reshape(-1, view.color.shape[-1])
+    seen_image = np.zeros((4, highest.size), np.float32)
+    seen_image[3] = -1
+    seen = np.flatnonzero(highest >= 0)
+    seen_image[:3, seen] = color[highest[seen] & 0xFFFFFFFF, :3].T / np.float32(255)
+    seen_image[3, seen] = (highest[seen] >> 32).astype(np.int32).view(np.float32)
+    return seen_image.reshape(4, *grid.shape)
+
+
+def _fuse(views: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+    """The Observation's image (4, rows, cols) of the cameras' (n, 4, rows, cols), and its mask."""
+    height = views[:, 3].max(axis=0)
+    seen = height >= 0
+    on_top = (views[:, 3] >= 0) & (views[:, 3] >= height - np.float32(SAME_SURFACE))
+    image = np.empty_like(views[0])
+    image[:3] = (views[:, :3] * on_top[:, None]).sum(axis=0) / np.maximum(on_top.sum(axis=0), 1)
+    image[3] = np.where(seen, height, 0)
+    _bridge_gaps(image, seen)
+    return image, seen
+
+
+def _bridge_gaps(image: NDArray[np.float32], seen: NDArray[np.bool_]) -> None:
+    """Fills, in place, single unseen pixels between two that belong together."""
+    row, col = np.nonzero(~seen)
+    padded_image = np.pad(image, ((0, 0), (1, 1), (1, 1)))
+    padded_seen = np.pad(seen, 1)
+    fill = np.zeros((4, row.size), np.float32)
+    fill_height = np.full(row.size, -1, np.float32)
+    for along_row, along_col in ((1, 0), (0, 1)):
+        before = (row + 1 - along_row, col + 1 - along_col)
+        after = (row + 1 + along_row, col + 1 + along_col)
+        one, other = padded_image[:, *before], padded_image[:, *after]
+        mean = (one + other) / 2
+        bridge = padded_seen[before] & padded_seen[after]
+        bridge &= np.abs(one[3] - other[3]) <= SAME_SURFACE
+        bridge &= mean[3] > fill_height
+        fill = np.where(bridge, mean, fill)
+        fill_height = np.where(bridge, mean[3], fill_height)
+    image[:, row, col] = fill
+    seen[row, col] = fill_height >= 0
