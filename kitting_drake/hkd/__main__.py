@@ -135,7 +135,7 @@ def annotate(args: argparse.Namespace, entries: list[ToolEntry]) -> None:
 
 
 def import_mesh(args: argparse.Namespace, entries: list[ToolEntry]) -> None:
-    """Makes a tool that scenarios can name from a mesh: STL, OBJ, PLY or GLB."""
+    """Makes a tool of a mesh (STL, OBJ, PLY, GLB) or of an outline (SVG, DXF)."""
     from kitting_drake.hkd.importing.importer import ImportRequest, import_tool
 
     console = Console(quiet=args.quiet, highlight=False)
@@ -146,6 +146,7 @@ def import_mesh(args: argparse.Namespace, entries: list[ToolEntry]) -> None:
         length_mm=args.length_mm,
         density=args.density,
         output=args.output,
+        height_mm=args.height_mm,
     )
     with Console(stderr=True, quiet=args.quiet).status(f"importing {args.mesh}"):
         report = import_tool(request)
@@ -187,8 +188,14 @@ def main() -> int:
     annotator = verbs.add_parser("annotate", help=annotate.__doc__)
     annotator.add_argument("name", metavar="NAME", help="a tool's name, or its folder")
     annotator.set_defaults(function=annotate)
-    importer = verbs.add_parser("import", help=import_mesh.__doc__)
-    importer.add_argument("mesh", type=Path, metavar="MESH", help="the mesh's file")
+    _describe_import(verbs.add_parser("import", help=import_mesh.__doc__))
+    args = parser.parse_args()
+    args.function(args, load_catalogue(args.models / "tools" / "catalogue.yaml"))
+    return 0
+
+
+def _describe_import(importer: argparse.ArgumentParser) -> None:
+    importer.add_argument("mesh", type=Path, metavar="FILE", help="the mesh's or the outline's")
     importer.add_argument(
         "--category",
         required=True,
@@ -202,16 +209,16 @@ def main() -> int:
         help="the folder of tools to add it to (default: $KITTING_DRAKE_TOOLS, or one's own)",
     )
     importer.add_argument(
-        "--length_mm", type=float, help="to scale it to (default: its own, if 150 to 200, or 180)"
+        "--length_mm",
+        type=float,
+        help="to scale it to (default: an outline's own; a mesh's, if 150 to 200, or 180)",
     )
+    importer.add_argument("--height_mm", type=float, help="how high to extrude an outline")
     importer.add_argument(
         "--density", type=float, metavar="KG_M3", help="of it all (default: the category's)"
     )
     importer.add_argument("--quiet", action="store_true", help="print nothing but errors")
     importer.set_defaults(function=import_mesh)
-    args = parser.parse_args()
-    args.function(args, load_catalogue(args.models / "tools" / "catalogue.yaml"))
-    return 0
 
 
 if __name__ == "__main__":
