@@ -160,6 +160,31 @@ def import_mesh(args: argparse.Namespace, entries: list[ToolEntry]) -> None:
     console.print(f"files: {report.directory}/; name it '{named}' in a scenario", soft_wrap=True)
 
 
+def kit(args: argparse.Namespace, entries: list[ToolEntry]) -> None:
+    """Makes a kit of 1 to 12 tools: to print (STL, 3MF), to cut (DXF, SVG) and to simulate."""
+    from kitting_drake.hkd.fabrication.export import KitRequest, export_kit
+
+    console = Console(quiet=args.quiet, highlight=False)
+    request = KitRequest(
+        tools=tuple(args.tools),
+        output=args.output,
+        clearance_mm=args.clearance_mm,
+        wall_mm=args.wall_mm,
+        block_mm=tuple(args.block_mm) if args.block_mm else None,
+        notches=args.notches,
+        labels=args.labels,
+    )
+    with Console(stderr=True, quiet=args.quiet).status("making the kit"):
+        design = export_kit(request)
+    size = " x ".join(f"{side:g}" for side in design.size_mm)
+    files = "kit.stl, kit.3mf, cavities.dxf, cavities.svg, kit.png"
+    console.print(f"a block of {size} mm in {args.output}/: {files}", soft_wrap=True)
+    for note in design.notes:
+        console.print(f"  {note}", markup=False, soft_wrap=True)
+    scenario = args.output / "scenario.yaml"
+    console.print(f"try it: python -m kitting_drake.run {scenario}", soft_wrap=True)
+
+
 def main() -> int:
     """Runs one verb; returns the exit status."""
     parser = argparse.ArgumentParser(prog="python -m kitting_drake.hkd", description=__doc__)
@@ -189,6 +214,7 @@ def main() -> int:
     annotator.add_argument("name", metavar="NAME", help="a tool's name, or its folder")
     annotator.set_defaults(function=annotate)
     _describe_import(verbs.add_parser("import", help=import_mesh.__doc__))
+    _describe_kit(verbs.add_parser("kit", help=kit.__doc__))
     args = parser.parse_args()
     args.function(args, load_catalogue(args.models / "tools" / "catalogue.yaml"))
     return 0
@@ -219,6 +245,30 @@ def _describe_import(importer: argparse.ArgumentParser) -> None:
     )
     importer.add_argument("--quiet", action="store_true", help="print nothing but errors")
     importer.set_defaults(function=import_mesh)
+
+
+def _describe_kit(maker: argparse.ArgumentParser) -> None:
+    maker.add_argument(
+        "tools", nargs="+", metavar="TOOL", help="names, or folders of imported tools"
+    )
+    maker.add_argument("--output", type=Path, required=True, metavar="DIR", help="the kit's folder")
+    maker.add_argument(
+        "--clearance_mm", type=float, help="between a tool and its cavity's wall (default: 2)"
+    )
+    maker.add_argument(
+        "--wall_mm", type=float, help="between cavities, and around them (default: 6)"
+    )
+    maker.add_argument(
+        "--block_mm",
+        type=float,
+        nargs=3,
+        metavar=("LENGTH", "WIDTH", "HEIGHT"),
+        help="the block (default: as small as can be, 50 high)",
+    )
+    maker.add_argument("--notches", action="store_true", help="add finger notches")
+    maker.add_argument("--labels", action="store_true", help="engrave the tools' names")
+    maker.add_argument("--quiet", action="store_true", help="print nothing but errors")
+    maker.set_defaults(function=kit)
 
 
 if __name__ == "__main__":
