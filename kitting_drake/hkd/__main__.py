@@ -9,6 +9,7 @@ from rich.progress import Progress, track
 from rich.table import Table
 
 from kitting_drake.common.command_line import count_type, run_command
+from kitting_drake.common.errors import UserError
 from kitting_drake.common.paths import MODELS
 from kitting_drake.hkd.tools.generate import (
     CatalogueError,
@@ -164,7 +165,6 @@ def kit(args: argparse.Namespace, entries: list[ToolEntry]) -> None:
     """Makes a kit of 1 to 12 tools: to print (STL, 3MF), to cut (DXF, SVG) and to simulate."""
     from kitting_drake.hkd.fabrication.export import KitRequest, export_kit
 
-    console = Console(quiet=args.quiet, highlight=False)
     request = KitRequest(
         tools=tuple(args.tools),
         output=args.output,
@@ -176,13 +176,34 @@ def kit(args: argparse.Namespace, entries: list[ToolEntry]) -> None:
     )
     with Console(stderr=True, quiet=args.quiet).status("making the kit"):
         design = export_kit(request)
+    if args.quiet:
+        return
+    console = Console(highlight=False)
     size = " x ".join(f"{side:g}" for side in design.size_mm)
     files = "kit.stl, kit.3mf, cavities.dxf, cavities.svg, kit.png"
     console.print(f"a block of {size} mm in {args.output}/: {files}", soft_wrap=True)
     for note in design.notes:
         console.print(f"  {note}", markup=False, soft_wrap=True)
-    scenario = args.output / "scenario.yaml"
-    console.print(f"try it: python -m kitting_drake.run {scenario}", soft_wrap=True)
+    _check_scenario(args.output / "scenario.yaml", console)
+
+
+def _check_scenario(path: Path, console: Console) -> None:
+    """Says how to run a kit's scenario, or that the cell's table is too small for it."""
+    # Imported here, and used by no other part of the dataset: tasks are made of it.
+    from kitting_drake.scenario.loader import load_scenario
+    from systems.signals import PixelGrid
+
+    scenario = load_scenario(path)
+    try:
+        scenario.task.make_scene(grid=PixelGrid(), seed=0, base=path.parent)
+    except UserError:
+        console.print(
+            "  the simulated table has no room for this block and its tools: `run` takes a smaller "
+            "one or fewer tools",
+            soft_wrap=True,
+        )
+    else:
+        console.print(f"try it: python -m kitting_drake.run {path}", soft_wrap=True)
 
 
 def main() -> int:

@@ -178,8 +178,17 @@ def test_every_file_is_the_same_block_in_millimetres(full: Path):
     svg = ElementTree.parse(full / "cavities.svg").getroot()
     assert svg.get("width") == f"{length:g}mm"
     assert svg.get("viewBox") == f"0 0 {length:g} {width:g}"
-    layers = {layer.dxf.name for layer in ezdxf.readfile(full / "cavities.dxf").layers}
-    assert {group.get("id") for group in svg.iterfind("{*}g")} <= layers
+    drawn = {
+        (entity.dxf.layer, round(x, 4), round(width - y, 4))
+        for entity in ezdxf.readfile(full / "cavities.dxf").modelspace()
+        for x, y in entity.get_points("xy")
+    }
+    assert drawn == {
+        (group.get("id"), round(float(x), 4), round(float(y), 4))
+        for group in svg.iterfind("{*}g")
+        for path in group.iterfind("{*}path")
+        for x, y in re.findall(r"[ML] (\S+) (\S+)", path.get("d"))
+    }
     Image.open(io.BytesIO((full / "kit.png").read_bytes())).verify()
 
 
