@@ -9,6 +9,7 @@ from rich.progress import Progress, track
 from rich.table import Table
 
 from kitting_drake.common.command_line import count_type, run_command
+from kitting_drake.common.errors import UserError
 from kitting_drake.common.paths import MODELS
 from kitting_drake.hkd.tools.generate import (
     CatalogueError,
@@ -135,7 +136,7 @@ def annotate(args: argparse.Namespace, entries: list[ToolEntry]) -> None:
 
 
 def import_mesh(args: argparse.Namespace, entries: list[ToolEntry]) -> None:
-    """Makes a tool that scenarios can name from a mesh: STL, OBJ, PLY or GLB."""
+    """Makes a tool of a mesh (STL, OBJ, PLY, GLB) or of an outline (SVG, DXF)."""
     from kitting_drake.hkd.importing.importer import ImportRequest, import_tool
 
     console = Console(quiet=args.quiet, highlight=False)
@@ -146,6 +147,7 @@ def import_mesh(args: argparse.Namespace, entries: list[ToolEntry]) -> None:
         length_mm=args.length_mm,
         density=args.density,
         output=args.output,
+        height_mm=args.height_mm,
     )
     with Console(stderr=True, quiet=args.quiet).status(f"importing {args.mesh}"):
         report = import_tool(request)
@@ -157,6 +159,51 @@ def import_mesh(args: argparse.Namespace, entries: list[ToolEntry]) -> None:
         console.print(f"  {note}", markup=False)
     named = d["name"] if args.output is None else report.directory.resolve()
     console.print(f"files: {report.directory}/; name it '{named}' in a scenario", soft_wrap=True)
+
+
+def kit(args: argparse.Namespace, entries: list[ToolEntry]) -> None:
+    """Makes a kit of 1 to 12 tools: to print (STL, 3MF), to cut (DXF, SVG) and to simulate."""
+    from kitting_drake.hkd.fabrication.export import KitRequest, export_kit
+
+    request = KitRequest(
+        tools=tuple(args.tools),
+        output=args.output,
+        clearance_mm=args.clearance_mm,
+        wall_mm=args.wall_mm,
+        block_mm=tuple(args.block_mm) if args.block_mm else None,
+        notches=args.notches,
+        labels=args.labels,
+    )
+    with Console(stderr=True, quiet=args.quiet).status("making the kit"):
+        design = export_kit(request)
+    if args.quiet:
+        return
+    console = Console(highlight=False)
+    size = " x ".join(f"{side:g}" for side in design.size_mm)
+    files = "kit.stl, kit.3mf, cavities.dxf, cavities.svg, kit.png"
+    console.print(f"a block of {size} mm in {args.output}/: {files}", soft_wrap=True)
+    for note in design.notes:
+        console.print(f"  {note}", markup=False, soft_wrap=True)
+    _check_scenario(args.output / "scenario.yaml", console)
+
+
+def _check_scenario(path: Path, console: Console) -> None:
+    """Says how to run a kit's scenario, or that the cell's table is too small for it."""
+    # Imported here, and used by no other part of the dataset: tasks are made of it.
+    from kitting_drake.scenario.loader import load_scenario
+    from systems.signals import PixelGrid
+
+    scenario = load_scenario(path)
+    try:
+        scenario.task.make_scene(grid=PixelGrid(), seed=0, base=path.parent)
+    except UserError:
+        console.print(
+            "  the simulated table has no room for this block and its tools: `run` takes a smaller "
+            "one or fewer tools",
+            soft_wrap=True,
+        )
+    else:
+        console.print(f"try it: python -m kitting_drake.run {path}", soft_wrap=True)
 
 
 def main() -> int:
@@ -187,8 +234,15 @@ def main() -> int:
     annotator = verbs.add_parser("annotate", help=annotate.__doc__)
     annotator.add_argument("name", metavar="NAME", help="a tool's name, or its folder")
     annotator.set_defaults(function=annotate)
-    importer = verbs.add_parser("import", help=import_mesh.__doc__)
-    importer.add_argument("mesh", type=Path, metavar="MESH", help="the mesh's file")
+    _describe_import(verbs.add_parser("import", help=import_mesh.__doc__))
+    _describe_kit(verbs.add_parser("kit", help=kit.__doc__))
+    args = parser.parse_args()
+    args.function(args, load_catalogue(args.models / "tools" / "catalogue.yaml"))
+    return 0
+
+
+def _describe_import(importer: argparse.ArgumentParser) -> None:
+    importer.add_argument("mesh", type=Path, metavar="FILE", help="the mesh's or the outline's")
     importer.add_argument(
         "--category",
         required=True,
@@ -202,16 +256,40 @@ def main() -> int:
         help="the folder of tools to add it to (default: $KITTING_DRAKE_TOOLS, or one's own)",
     )
     importer.add_argument(
-        "--length_mm", type=float, help="to scale it to (default: its own, if 150 to 200, or 180)"
+        "--length_mm",
+        type=float,
+        help="to scale it to (default: an outline's own; a mesh's, if 150 to 200, or 180)",
     )
+    importer.add_argument("--height_mm", type=float, help="how high to extrude an outline")
     importer.add_argument(
         "--density", type=float, metavar="KG_M3", help="of it all (default: the category's)"
     )
     importer.add_argument("--quiet", action="store_true", help="print nothing but errors")
     importer.set_defaults(function=import_mesh)
-    args = parser.parse_args()
-    args.function(args, load_catalogue(args.models / "tools" / "catalogue.yaml"))
-    return 0
+
+
+def _describe_kit(maker: argparse.ArgumentParser) -> None:
+    maker.add_argument(
+        "tools", nargs="+", metavar="TOOL", help="names, or folders of imported tools"
+    )
+    maker.add_argument("--output", type=Path, required=True, metavar="DIR", help="the kit's folder")
+    maker.add_argument(
+        "--clearance_mm", type=float, help="between a tool and its cavity's wall (default: 2)"
+    )
+    maker.add_argument(
+        "--wall_mm", type=float, help="between cavities, and around them (default: 6)"
+    )
+    maker.add_argument(
+        "--block_mm",
+        type=float,
+        nargs=3,
+        metavar=("LENGTH", "WIDTH", "HEIGHT"),
+        help="the block (default: as small as can be, 50 high)",
+    )
+    maker.add_argument("--notches", action="store_true", help="add finger notches")
+    maker.add_argument("--labels", action="store_true", help="engrave the tools' names")
+    maker.add_argument("--quiet", action="store_true", help="print nothing but errors")
+    maker.set_defaults(function=kit)
 
 
 if __name__ == "__main__":

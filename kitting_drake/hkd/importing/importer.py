@@ -1,10 +1,10 @@
-"""`hkd import`: from anyone's mesh to a tool that scenarios can name.
+"""`hkd import`: from anyone's mesh, or outline, to a tool that scenarios can name.
 
-The mesh is read and repaired (`repair`), brought into the tool frame in a stable pose
-(`stable_pose`), scaled, given the best grasp (`fit`), its mass, and a convex decomposition for
-collision (`convex_decomposition`), and laid as it comes to rest (`resting_pose`). All of that
-happens in a process of its own, which may fail or hang as it likes: the tool's folder appears
-atomically. Solids are handled in mm and written in metres.
+The mesh is read and repaired (`repair`), or extruded from an outline (`outline`), brought into the
+tool frame in a stable pose (`stable_pose`), scaled, given the best grasp (`fit`), its mass, and a
+convex decomposition for collision (`convex_decomposition`), and laid as it comes to rest
+(`resting_pose`). All of that happens in a process of its own, which may fail or hang as it likes:
+the tool's folder appears atomically. Solids are handled in mm and written in metres.
 """
 
 import hashlib
@@ -25,8 +25,15 @@ from manifold3d import Manifold
 
 from kitting_drake.common.errors import UserError
 from kitting_drake.hkd.importing.convex_decomposition import decompose
-from kitting_drake.hkd.importing.fit import fit, lengths_to_try, material_of
+from kitting_drake.hkd.importing.fit import (
+    HIGHEST_MM,
+    THINNEST_MM,
+    fit,
+    lengths_to_try,
+    material_of,
+)
 from kitting_drake.hkd.importing.materials import bodies_of
+from kitting_drake.hkd.importing.outline import extruded, is_outline, read_outline
 from kitting_drake.hkd.importing.repair import NOMINAL_MM, make_solid, read_mesh
 from kitting_drake.hkd.importing.resting_pose import resting_tilt
 from kitting_drake.hkd.importing.stable_pose import size, to_tool_frame
@@ -60,6 +67,8 @@ class ImportRequest:
     """The mean density in kg/m^3; see `materials` for None."""
     output: Path | None = None
     """The folder of tools to write into; `user_tools` if None."""
+    height_mm: float | None = None
+    """How high to extrude it, if it is an outline."""
 
 
 @dataclass(frozen=True)
@@ -90,9 +99,11 @@ def import_tool(request: ImportRequest, time_limit: float | None = TIME_LIMIT) -
     for flag, value, low, high in (
         ("--length_mm", request.length_mm, 20.0, 250.0),
         ("--density", request.density, 50.0, 25000.0),
+        ("--height_mm", request.height_mm, THINNEST_MM, HIGHEST_MM),
     ):
         if value is not None and not low <= value <= high:
             raise UserError(f"{flag} {value:g} is out of range: give {low:g} to {high:g}")
+    _check_height(request)
     folder = request.output or user_tools()
     final = folder / name
     if final.exists() and not _is_import(final):
@@ -120,6 +131,13 @@ def import_tool(request: ImportRequest, time_limit: float | None = TIME_LIMIT) -
         for path in new_folders:
             if path.is_dir() and not any(path.iterdir()):
                 path.rmdir()
+
+
+def _check_height(request: ImportRequest) -> None:
+    if is_outline(request.mesh) and request.height_mm is None:
+        raise UserError(f"{request.mesh} is an outline: give --height_mm, how high the tool is")
+    if not is_outline(request.mesh) and request.height_mm is not None:
+        raise UserError(f"--height_mm is for outlines (SVG, DXF), and {request.mesh} is none")
 
 
 def _checked_name(request: ImportRequest) -> str:
@@ -211,7 +229,7 @@ def prepare_tool(request: ImportRequest, name: str, directory: Path) -> Prepared
 
 
 def _prepare(request: ImportRequest, name: str, directory: Path) -> Prepared:
-    vertices, faces = read_mesh(request.mesh)
+    vertices, faces = _surface(request)
     low, high = vertices.min(axis=0), vertices.max(axis=0)
     longest = float((high - low).max())
     if not longest > 1e-12:
@@ -219,7 +237,12 @@ def _prepare(request: ImportRequest, name: str, directory: Path) -> Prepared:
     nominal = NOMINAL_MM / longest
     solid, notes = make_solid((vertices - (low + high) / 2) * nominal, faces)
     solid = to_tool_frame(solid, request.category)
-    lengths, assumed = lengths_to_try(size(solid)[0] / nominal, request.length_mm)
+    length = size(solid)[0] / nominal
+    if is_outline(request.mesh):
+        lengths = [length]
+        assumed = f"an outline, {length:.0f} mm long and made {request.height_mm:g} mm high"
+    else:
+        lengths, assumed = lengths_to_try(length, request.length_mm)
     notes = [assumed, *notes]
     first, wanted = solid, lengths
     laid: list[str] = []
@@ -237,6 +260,14 @@ def _prepare(request: ImportRequest, name: str, directory: Path) -> Prepared:
     _empty(directory)
     notes.append("it rolls on a table")
     return _write(request, name, directory, first, wanted, notes)[0]
+
+
+def _surface(request: ImportRequest) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices (n, 3) and triangles (m, 3) of a mesh, in its own units, or of an outline in mm."""
+    if not is_outline(request.mesh):
+        return read_mesh(request.mesh)
+    assert request.height_mm is not None
+    return extruded(read_outline(request.mesh, request.length_mm), request.height_mm)
 
 
 def _empty(directory: Path) -> None:

@@ -53,7 +53,10 @@ def read_mesh(path: Path) -> tuple[Array, Faces]:
     if not path.is_file():
         raise UserError(f"{path} is a folder or no common file: give a mesh ({kinds})")
     if path.suffix.lower() not in FORMATS:
-        raise UserError(f"{path} is none of the kinds of mesh that can be read: {kinds}")
+        raise UserError(
+            f"{path} is none of the kinds of mesh that can be read ({kinds}), nor an outline "
+            "(SVG, DXF)"
+        )
     if size == 0:
         raise UserError(f"{path} is empty")
     if size > MOST_BYTES:

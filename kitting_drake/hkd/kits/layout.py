@@ -1,7 +1,8 @@
 """Where the cavities of a kit are, and their outlines.
 
 A toolset, one tool of each of the paper's categories at most, takes the slots of a template. Any
-other tools, and tools that are too big for their slots, are nested on a block of their own size.
+other tools, tools that are too big for their slots, and all where `always_nested` says so, are
+nested: on a block of their own size, or on one of a given size.
 """
 
 import dataclasses
@@ -17,7 +18,7 @@ from numpy.typing import NDArray
 from kitting_drake.common.errors import UserError
 from kitting_drake.hkd.grasps.proposals import RELEASE_REACH
 from kitting_drake.hkd.kits.block import ARC_SEGMENTS, Cavity
-from kitting_drake.hkd.kits.nesting import LONGEST_SIDES, NestedShape, nest
+from kitting_drake.hkd.kits.nesting import LONGEST_SIDES, NestedShape, Nesting, nest, nest_on
 from kitting_drake.hkd.kits.parameters import KitParameters
 from kitting_drake.hkd.tools.tool import Tool
 from systems.hand_geometry import FINGER_LENGTH
@@ -106,7 +107,8 @@ def layout_kit(tools: Sequence[Tool], parameters: KitParameters) -> KitLayout:
                 f"{1e3 * parameters.height:.1f} mm"
             )
     categories = [tool.category for tool in tools]
-    if len(set(categories)) == len(categories) and set(categories) <= set(SLOTS):
+    unlike = len(set(categories)) == len(categories) and set(categories) <= set(SLOTS)
+    if unlike and not parameters.always_nested:
         slots = tuple(slot_pose(tool, parameters) for tool in tools)
         if _has_walls(kit_cavities(tools, parameters, slots), parameters):
             return KitLayout(parameters, slots)
@@ -119,15 +121,13 @@ def _nested_layout(tools: Sequence[Tool], parameters: KitParameters) -> KitLayou
         rim = Cavity(outline, 0.0, parameters.height, parameters.lead_in).rim
         return NestedShape(rim, released_fingers(tool))
 
-    wall = max(parameters.minimum_wall, parameters.nested_wall)
-    nesting = nest([shape(tool) for tool in tools], wall)
-    if nesting is None:
-        names = ", ".join(f"'{tool.name}'" for tool in tools)
-        sides = " by ".join(f"{1e3 * side:.0f}" for side in LONGEST_SIDES)
-        raise UserError(f"{names} do not fit into one kit: its block may be {sides} mm at most")
-    length, width = (
-        _SIZE_STEP * math.ceil(side / _SIZE_STEP) for side in (nesting.length, nesting.width)
-    )
+    shapes = [shape(tool) for tool in tools]
+    if parameters.fixed_size:
+        nesting = _nested_on_given_block(tools, shapes, parameters)
+        length, width = parameters.length, parameters.width
+    else:
+        nesting = _nested_on_least_block(tools, shapes, parameters)
+        length, width = _block_sides(nesting)
     return KitLayout(
         dataclasses.replace(parameters, length=length, width=width),
         tuple(
@@ -135,6 +135,52 @@ def _nested_layout(tools: Sequence[Tool], parameters: KitParameters) -> KitLayou
             for tool, pose in zip(tools, nesting.poses, strict=True)
         ),
     )
+
+
+def _wall(parameters: KitParameters) -> float:
+    return max(parameters.minimum_wall, parameters.nested_wall)
+
+
+def _block_sides(nesting: Nesting) -> tuple[float, float]:
+    """The sides, in metres, of the smallest block that takes a nesting."""
+    length, width = (
+        _SIZE_STEP * math.ceil(side / _SIZE_STEP) for side in (nesting.length, nesting.width)
+    )
+    return length, width
+
+
+def _nested_on_least_block(
+    tools: Sequence[Tool], shapes: Sequence[NestedShape], parameters: KitParameters
+) -> Nesting:
+    nesting = nest(shapes, _wall(parameters))
+    if nesting is None:
+        sides = " by ".join(f"{1e3 * side:.0f}" for side in LONGEST_SIDES)
+        raise UserError(
+            f"{_quoted(tools)} do not fit into one kit: its block may be {sides} mm at most"
+        )
+    return nesting
+
+
+def _nested_on_given_block(
+    tools: Sequence[Tool], shapes: Sequence[NestedShape], parameters: KitParameters
+) -> Nesting:
+    nesting = nest_on(shapes, _wall(parameters), (parameters.length, parameters.width))
+    if nesting is None:
+        free = nest(shapes, _wall(parameters))
+        advice = "take fewer tools, or a thinner wall"
+        if free is not None:
+            sides = " by ".join(f"{1e3 * side:.0f}" for side in _block_sides(free))
+            advice = f"{sides} mm would do"
+        given = f"{1e3 * parameters.length:g} by {1e3 * parameters.width:g} mm"
+        raise UserError(
+            f"there is no room for {_quoted(tools)} on a block of {given} with walls of "
+            f"{1e3 * _wall(parameters):g} mm: {advice}"
+        )
+    return nesting
+
+
+def _quoted(tools: Sequence[Tool]) -> str:
+    return ", ".join(f"'{tool.name}'" for tool in tools)
 
 
 def released_fingers(tool: Tool) -> CrossSection:

@@ -7,6 +7,7 @@ mask of what is taken is not zero, and a fast Fourier transform gives that for t
 masks are conservative, so what the raster allows keeps its distances in the continuum too.
 """
 
+import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -104,6 +105,54 @@ def nest(shapes: Sequence[NestedShape], wall: float) -> Nesting | None:
     return None
 
 
+def nest_on(
+    shapes: Sequence[NestedShape], wall: float, room: tuple[float, float]
+) -> Nesting | None:
+    """Places shapes on a rectangle of a given size; None where no way to do so is found.
+
+    Args:
+        shapes: at least one.
+        wall: see `nest`.
+        room: the rectangle's length along x and width along y, in metres.
+
+    Returns:
+        The nesting in the middle of the rectangle, whose size it has.
+    """
+    parts = [[_Part(shape, yaw, wall) for yaw in _YAWS_DEG] for shape in shapes]
+    sizes = [int(rotated[0].walled.sum()) for rotated in parts]
+    extents = [max(rotated[0].size) for rotated in parts]
+    largest_first = sorted(range(len(shapes)), key=lambda i: -sizes[i])
+    longest_first = sorted(range(len(shapes)), key=lambda i: -extents[i])
+    # Masks are conservative: what does not fit on the raster by a cell or two may do so in truth.
+    for order, lengthwise, excess in itertools.product(
+        (largest_first, longest_first), (True, False), (0, 1, 2)
+    ):
+        length, width = room if lengthwise else room[::-1]
+        strip = (int(width / CELL) + excess, int(length / CELL) + excess)
+        placements = _fill_strip(parts, order, strip, math.inf)
+        if placements is None:
+            continue
+        fitted = _on(_tightened(shapes, placements, wall), room, lengthwise)
+        if fitted is not None:
+            return fitted
+    least = nest(shapes, wall)
+    return least and (_on(least, room, True) or _on(least, room, False))
+
+
+def _on(nesting: Nesting, room: tuple[float, float], lengthwise: bool) -> Nesting | None:
+    """A nesting in the middle of a larger rectangle, rotated or not; None if it is too large."""
+    length, width = room if lengthwise else room[::-1]
+    if nesting.length > length + 1e-9 or nesting.width > width + 1e-9:
+        return None
+    return Nesting(
+        *room, nesting.poses if lengthwise else tuple(map(_quarter_turned, nesting.poses))
+    )
+
+
+def _quarter_turned(pose: NestedPose) -> NestedPose:
+    return NestedPose(-pose.y, pose.x, (pose.yaw_deg + 90) % 360)
+
+
 def _cost(length: float, width: float) -> float:
     ratio = max(length, width) / min(length, width)
     return length * width * (1.0 + _ELONGATION_COST * (ratio - 1.0))
@@ -131,9 +180,9 @@ class _Part:
         """(x, y) of the lower left corner of the outline with its wall, in the rotated frame."""
         start = self.corner - CELL * np.array(self.inset[::-1])
         counts = (_cells(y_max - start[1]), _cells(x_max - start[0]))
-        self.solid = _rasterized(solid, start, counts)
-        self.walled = _rasterized(walled, start, counts)
-        self.keep_out = _rasterized(keep_out, start, counts)
+        self.solid = rasterized(solid, start, counts)
+        self.walled = rasterized(walled, start, counts)
+        self.keep_out = rasterized(keep_out, start, counts)
         self._spectra: dict[tuple[int, int], tuple[Spectrum, Spectrum]] = {}
 
     def spectra(self, canvas: tuple[int, int]) -> tuple[Spectrum, Spectrum]:
@@ -164,11 +213,23 @@ def _grown(outline: CrossSection, distance: float) -> CrossSection:
     return outline.offset(distance, JoinType.Round, circular_segments=_ARC_SEGMENTS)
 
 
-def _rasterized(outline: CrossSection, start: NDArray[np.float64], counts: tuple[int, int]) -> Mask:
-    """Which cells have their centres inside an outline; the raster's corner is at `start`."""
+def rasterized(
+    outline: CrossSection,
+    start: NDArray[np.float64],
+    counts: tuple[int, int],
+    cell: float = CELL,
+) -> Mask:
+    """Which cells have their centres inside an outline.
+
+    Args:
+        outline: in metres; not empty.
+        start: (x, y) of the raster's corner, in metres.
+        counts: of the raster's cells along y and x.
+        cell: the side of one, in metres.
+    """
     loops = outline.to_polygons()
-    a = (np.concatenate(loops) - start) / CELL - 0.5
-    b = (np.concatenate([np.roll(loop, -1, axis=0) for loop in loops]) - start) / CELL - 0.5
+    a = (np.concatenate(loops) - start) / cell - 0.5
+    b = (np.concatenate([np.roll(loop, -1, axis=0) for loop in loops]) - start) / cell - 0.5
     rows = np.arange(counts[0])[:, None]
     row, edge = np.nonzero((a[:, 1] <= rows) != (b[:, 1] <= rows))
     (a_x, a_y), (b_x, b_y) = a[edge].T, b[edge].T

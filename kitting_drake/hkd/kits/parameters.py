@@ -10,7 +10,8 @@ class KitParameters:
     """The template of the kit block. Lengths in m."""
 
     # The block's extents along x, y and z. The length and the width are those of a block with the
-    # slots of a toolset; where tools are nested instead, the block gets a size of its own.
+    # slots of a toolset; where tools are nested instead, the block gets a size of its own, unless
+    # `fixed_size`.
     length: float = bounded(0.280, 0.05, 1.0)
     width: float = bounded(0.260, 0.05, 1.0)
     height: float = bounded(0.050, 0.01, 0.2)
@@ -32,3 +33,9 @@ class KitParameters:
 
     # The same between two nested cavities, and around them.
     nested_wall: float = bounded(0.006, 0.001, 0.05)
+
+    # Whether tools are nested even where they could take the slots of a toolset.
+    always_nested: bool = False
+
+    # Whether a nested block has the length and the width above; else it is as small as can be.
+    fixed_size: bool = False

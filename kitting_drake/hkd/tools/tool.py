@@ -55,14 +55,23 @@ class Tool:
         return self.directory / f"{self.name}.sdf"
 
     @cached_property
+    def parts(self) -> tuple[tuple[str, NDArray[np.float64]], ...]:
+        """The material of each part, and the triangles (n, 3, 3) of its surface, in T, in metres.
+
+        Raises:
+            UserError: a file that is not a mesh.
+        """
+        read = [(path.stem, _read_triangles(path)) for path in self.visual_meshes]
+        return tuple((name, t if self.scale == 1.0 else self.scale * t) for name, t in read)
+
+    @cached_property
     def triangles(self) -> NDArray[np.float64]:
         """(n, 3, 3) the triangles of the visual surface, in T, in metres.
 
         Raises:
             UserError: a file that is not a mesh.
         """
-        triangles = np.concatenate([_read_triangles(path) for path in self.visual_meshes])
-        return triangles if self.scale == 1.0 else self.scale * triangles
+        return np.concatenate([triangles for _, triangles in self.parts])
 
     @cached_property
     def footprint(self) -> CrossSection:

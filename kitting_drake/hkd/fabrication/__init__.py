@@ -1,0 +1,1 @@
+"""Kits to print and to cut: solids, drawings and all else that `hkd kit` writes."""

@@ -1,0 +1,109 @@
+"""What is cut out of a kit's block where it is to be printed or milled: more than is simulated.
+
+To the cavities, which are those of the simulated kit, come finger notches and engraved labels.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from manifold3d import CrossSection, Manifold
+from numpy.typing import NDArray
+
+from kitting_drake.hkd.fabrication.labels import engrave_labels
+from kitting_drake.hkd.fabrication.notches import cut_notches
+from kitting_drake.hkd.fabrication.recess import Recess
+from kitting_drake.hkd.kits.block import Cavity, build_block
+from kitting_drake.hkd.kits.kit import Kit
+from kitting_drake.hkd.kits.layout import kit_cavities
+from kitting_drake.hkd.kits.parameters import KitParameters
+
+_ABOVE = 0.01
+"""How far cutters reach out of the block, in metres."""
+_FINEST = 2e-6
+"""Details of the solid are no smaller than this, in metres."""
+_DIGITS = 4
+"""Decimals of coordinates in files, in millimetres."""
+
+
+@dataclass(frozen=True)
+class Design:
+    """A kit block as it is made."""
+
+    kit: Kit
+    cavities: tuple[Cavity, ...]
+    recesses: tuple[Recess, ...]
+    """All that is cut from above: the cavities first, in the tools' order."""
+    notes: tuple[str, ...]
+    """What had no room, a sentence each."""
+
+    @property
+    def size_mm(self) -> tuple[float, float, float]:
+        """Length, width and height of the block."""
+        length, width, height = (round(1e3 * extent, _DIGITS) for extent in self.kit.size)
+        return length, width, height
+
+    def depth_mm(self, recess: Recess) -> float:
+        """How deep a recess is below the block's top, to a hundredth."""
+        return round(1e3 * (self.kit.parameters.height - recess.floor), 2)
+
+
+def design_kit(kit: Kit, *, notches: bool = False, labels: bool = False) -> Design:
+    """The block of a kit, with notches and labels where they are wanted and there is room."""
+    cavities = tuple(kit_cavities(kit.tools, kit.parameters, kit.layout.poses))
+    recesses = [
+        Recess("cavity", tool.name, cavity.outline, cavity.floor)
+        for tool, cavity in zip(kit.tools, cavities, strict=True)
+    ]
+    notes: list[str] = []
+    for wanted, cut in ((notches, cut_notches), (labels, engrave_labels)):
+        if wanted:
+            added, refused = cut(kit, cavities, tuple(recesses))
+            recesses += added
+            notes += refused
+    return Design(kit, cavities, tuple(recesses), tuple(notes))
+
+
+def solid(design: Design) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """The block's surface in the frame of the files: see `in_block`.
+
+    Returns:
+        Vertices (n, 3) in millimetres, and triangles (m, 3): watertight, wound outward.
+    """
+    parameters = design.kit.parameters
+    block = build_block(design.cavities, parameters)
+    for recess in design.recesses:
+        if recess.kind != "cavity":
+            depth = parameters.height - recess.floor + _ABOVE
+            block -= Manifold.extrude(recess.outline, depth).translate((0, 0, recess.floor))
+    # Points that files cannot tell apart must not be two: what is that small goes first.
+    mesh = block.simplify(_FINEST).to_mesh64()
+    corners = 1e3 * np.asarray(mesh.vert_properties, dtype=float)[:, :3]
+    corners[:, :2] = in_block(corners[:, :2] / 1e3, parameters)
+    vertices, index = np.unique(np.round(corners, _DIGITS) + 0.0, axis=0, return_inverse=True)
+    faces = index.reshape(-1)[np.asarray(mesh.tri_verts, dtype=np.int64)]
+    a, b, c = faces.T
+    return vertices, faces[(a != b) & (b != c) & (c != a)]
+
+
+def in_block(points: NDArray[np.float64], parameters: KitParameters) -> NDArray[np.float64]:
+    """Points (n, 2) of the kit frame, in metres, as they are in files, in millimetres.
+
+    There the origin is the lower left corner of the block's bottom, because many slicers and
+    mills take no negative coordinates.
+    """
+    return np.round(1e3 * (points + np.array([parameters.length, parameters.width]) / 2), _DIGITS)
+
+
+def loops_mm(outline: CrossSection, parameters: KitParameters) -> list[NDArray[np.float64]]:
+    """The closed loops (n, 2), in mm, of an outline in the kit frame; see `in_block`."""
+    return [in_block(np.asarray(loop), parameters) for loop in outline.to_polygons()]
+
+
+def layers(design: Design) -> dict[tuple[str, float], list[Recess]]:
+    """The recesses by kind and by depth in mm, in the order in which they are drawn."""
+    groups: dict[tuple[str, float], list[Recess]] = {}
+    for recess in design.recesses:
+        groups.setdefault((recess.kind, design.depth_mm(recess)), []).append(recess)
+    kinds: Sequence[str] = ("cavity", "notch", "label")
+    return dict(sorted(groups.items(), key=lambda item: (kinds.index(item[0][0]), item[0][1])))

@@ -1,0 +1,94 @@
+"""The outlines of all that is cut from a kit block: DXF and SVG in true millimetres.
+
+A layer, or group, holds what is of one kind and of one depth below the block's top. Cavities are
+drawn as their walls are; the bevel around their rims is in the solids only.
+"""
+
+import io
+from html import escape
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kitting_drake.common.extras import import_extra
+from kitting_drake.hkd.fabrication.design import Design, layers, loops_mm
+
+_NAMES = {"cavity": "CAVITIES", "notch": "NOTCHES", "label": "LABELS"}
+# AutoCAD's colour indices: cavities in cyan and on, what is shallow apart.
+_BLOCK_COLOUR, _CAVITY_COLOURS, _NOTCH_COLOUR, _LABEL_COLOUR = 7, (4, 3, 6, 2, 150, 80), 30, 1
+_STROKES = {"cavity": "#0b5fa5", "notch": "#d9480f", "label": "#2b8a3e"}
+
+
+def layer_name(kind: str, depth: float) -> str:
+    """The name of a layer, for instance `CAVITIES_17.62_MM_DEEP`."""
+    return f"{_NAMES[kind]}_{depth:.2f}_MM_DEEP"
+
+
+def dxf_text(design: Design) -> str:
+    """A DXF of release 2010: closed polylines, a layer per depth, and the block on layer BLOCK.
+
+    Raises:
+        UserError: ezdxf is not installed.
+    """
+    ezdxf = import_extra("ezdxf", "units", purpose="DXF", extra="fabrication")
+    document = ezdxf.new("R2010", units=ezdxf.units.MM)
+    document.header["$INSUNITS"] = int(ezdxf.units.MM)
+    document.header["$MEASUREMENT"] = 1
+    space = document.modelspace()
+    document.layers.add("BLOCK", color=_BLOCK_COLOUR)
+    space.add_lwpolyline(_block(design).tolist(), close=True, dxfattribs={"layer": "BLOCK"})
+    cavities = 0
+    for (kind, depth), recesses in layers(design).items():
+        name = layer_name(kind, depth)
+        colour = {"notch": _NOTCH_COLOUR, "label": _LABEL_COLOUR}.get(kind)
+        if colour is None:
+            colour = _CAVITY_COLOURS[cavities % len(_CAVITY_COLOURS)]
+            cavities += 1
+        document.layers.add(name, color=colour)
+        for recess in recesses:
+            for loop in loops_mm(recess.outline, design.kit.parameters):
+                space.add_lwpolyline(loop.tolist(), close=True, dxfattribs={"layer": name})
+    length, width, _ = design.size_mm
+    document.header["$EXTMIN"], document.header["$EXTMAX"] = (0, 0, 0), (length, width, 0)
+    document.set_modelspace_vport(height=1.1 * max(length, width), center=(length / 2, width / 2))
+    text = io.StringIO()
+    document.write(text)
+    return text.getvalue()
+
+
+def svg_text(design: Design) -> str:
+    """An SVG whose user unit is a millimetre: a group per depth, a path per recess."""
+    length, width, height = design.size_mm
+    lines = [
+        '<?xml version="1.0" encoding="UTF-8"?>',
+        f'<svg xmlns="http://www.w3.org/2000/svg" version="1.1" width="{length:g}mm" '
+        f'height="{width:g}mm" viewBox="0 0 {length:g} {width:g}">',
+        f"  <title>Kit of {escape(', '.join(tool.name for tool in design.kit.tools))}</title>",
+        f"  <desc>Block of {length:g} by {width:g} by {height:g} mm; 1 unit is 1 mm.</desc>",
+        '  <g id="BLOCK" fill="none" stroke="#000000" stroke-width="0.1">',
+        f'    <path d="{_path(_block(design), width)}"/>',
+        "  </g>",
+    ]
+    for (kind, depth), recesses in layers(design).items():
+        stroke = _STROKES[kind]
+        lines.append(
+            f'  <g id="{layer_name(kind, depth)}" fill="{stroke}" fill-opacity="0.12" '
+            f'fill-rule="evenodd" stroke="{stroke}" stroke-width="0.1">'
+        )
+        for recess in recesses:
+            loops = loops_mm(recess.outline, design.kit.parameters)
+            path = " ".join(_path(loop, width) for loop in loops)
+            lines.append(f'    <path d="{path}"><title>{escape(recess.tool)}</title></path>')
+        lines.append("  </g>")
+    return "\n".join([*lines, "</svg>", ""])
+
+
+def _block(design: Design) -> NDArray[np.float64]:
+    length, width, _ = design.size_mm
+    return np.array([(0, 0), (length, 0), (length, width), (0, width)])
+
+
+def _path(loop: NDArray[np.float64], width: float) -> str:
+    """A closed path; y points down in an SVG."""
+    points = " L ".join(f"{x:.4f} {width - y:.4f}" for x, y in loop)
+    return f"M {points} Z"

@@ -1,0 +1,200 @@
+"""Engraved labels: the name of each tool on the block beside its cavity, or on its floor."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from manifold3d import CrossSection, FillRule, JoinType
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from kitting_drake.hkd.fabrication.recess import Recess
+from kitting_drake.hkd.kits.block import Cavity
+from kitting_drake.hkd.kits.kit import Kit
+from kitting_drake.hkd.kits.nesting import rasterized
+
+DEPTH = 0.0006
+"""How deep letters are engraved, in metres."""
+CAP_HEIGHTS = (0.007, 0.006, 0.005, 0.004)
+"""The heights of capital letters that are tried, in metres."""
+
+_MARGIN, _EDGE = 0.0014, 0.004
+"""The least distance of letters from recesses, and from the block's edge, in metres."""
+_CELL = 0.0007
+"""The side of the cells in which places are looked for, in metres."""
+_FARTHEST = 0.03
+"""A label is no further than this from its cavity, in metres."""
+_PLAINLY = 1.5
+"""How many times as far from other cavities as from its own a label is at least."""
+# A label may be this much further away for each unit that its letters are higher; and one that is
+# read from the side has to be nearer than one that is read from the front.
+# It is rather beside its cavity's middle than beside its end.
+_DISTANCE_FOR_HEIGHT, _FROM_THE_SIDE, _OFF_THE_MIDDLE = 6.0, 0.006, 0.1
+_FONT_SIZE = 100.0
+
+
+@dataclass(frozen=True)
+class _Lettering:
+    """A text of a given height, its lower left corner at the origin; in metres."""
+
+    outline: CrossSection
+    cap_height: float
+    rotated: bool
+    """Whether it is read from the side."""
+
+    @property
+    def size(self) -> tuple[float, float]:
+        """Extents along x and y."""
+        _, _, x, y = self.outline.bounds()
+        return x, y
+
+
+@dataclass(frozen=True)
+class _Raster:
+    """Where labels may be on a block: masks (rows along y, columns along x)."""
+
+    start: NDArray[np.float64]
+    """(x, y) of the corner, in metres."""
+    counts: tuple[int, int]
+
+    def mask(self, outline: CrossSection) -> NDArray[np.bool_]:
+        """The cells inside an outline."""
+        if outline.is_empty():
+            return np.zeros(self.counts, dtype=bool)
+        return rasterized(outline, self.start, self.counts, _CELL)
+
+
+def engrave_labels(
+    kit: Kit, cavities: Sequence[Cavity], taken: Sequence[Recess]
+) -> tuple[list[Recess], list[str]]:
+    """A label for each tool of a kit.
+
+    Args:
+        kit: whose tools have the names.
+        cavities: of the tools, in their order.
+        taken: recesses from which labels keep their distance: notches.
+
+    Returns:
+        The labels, and a sentence for each tool for which there is room for none.
+    """
+    parameters = kit.parameters
+    sides = np.array([parameters.length, parameters.width])
+    rows, columns = (int(side / _CELL) for side in sides[::-1])
+    raster = _Raster(-sides / 2, (rows, columns))
+    rims = [raster.mask(cavity.rim) for cavity in cavities]
+    margin = CrossSection.square(tuple(sides - 2 * _EDGE), True)
+    for outline in (*(c.rim for c in cavities), *(r.outline for r in taken)):
+        margin -= outline.offset(_MARGIN, JoinType.Round)
+    free = raster.mask(margin)
+    notched = CrossSection()
+    for recess in taken:
+        if recess.kind == "notch":
+            notched += recess.outline.offset(_MARGIN, JoinType.Round)
+    distances = [_distance(rim) for rim in rims]
+    labels, notes = [], []
+    for index, (tool, cavity) in enumerate(zip(kit.tools, cavities, strict=True)):
+        choices = _letterings(tool.name.replace("_", " "))
+        cost = distances[index]
+        possible = cost <= _FARTHEST
+        for other in (*distances[:index], *distances[index + 1 :]):
+            possible &= _PLAINLY * cost < other
+        cost = np.where(possible, cost + _OFF_THE_MIDDLE * _from_middle(rims[index]), np.inf)
+        top = _placed(choices, free, raster, cost)
+        if top is not None:
+            free &= ~raster.mask(top.offset(3 * _MARGIN, JoinType.Round))
+            labels.append(Recess("label", tool.name, top, parameters.height - DEPTH))
+            continue
+        floor = cavity.outline.offset(-_MARGIN, JoinType.Round) - notched
+        inside = raster.mask(floor)
+        # In a cavity the best place is the one furthest from its wall.
+        depth = ndimage.distance_transform_edt(inside) * _CELL
+        bottom = _placed(choices, inside, raster, depth.max() - depth)
+        if bottom is not None:
+            labels.append(Recess("label", tool.name, bottom, cavity.floor - DEPTH))
+        else:
+            notes.append(
+                f"there is no room for a label of '{tool.name}': give it a shorter name, or the "
+                "block thicker walls"
+            )
+    return labels, notes
+
+
+def _distance(mask: NDArray[np.bool_]) -> NDArray[np.float64]:
+    """The distance of each cell from a mask, in metres."""
+    return ndimage.distance_transform_edt(~mask) * _CELL
+
+
+def _from_middle(mask: NDArray[np.bool_]) -> NDArray[np.float64]:
+    """The distance of each cell from the middle of a mask's bounding box, in metres."""
+    rows, columns = np.nonzero(mask)
+    row, column = (rows.min() + rows.max()) / 2, (columns.min() + columns.max()) / 2
+    y, x = np.indices(mask.shape)
+    return np.hypot(y - row, x - column) * _CELL
+
+
+def _placed(
+    choices: Sequence[_Lettering],
+    free: NDArray[np.bool_],
+    raster: _Raster,
+    costs: NDArray[np.float64],
+) -> CrossSection | None:
+    """The best choice of a text where all of its rectangle is free; None if there is none.
+
+    Args:
+        choices: of one text.
+        free: the cells that it may cover.
+        raster: of the cells.
+        costs: of the text's middle by where it is, in metres; infinite where it may not be.
+    """
+    blocked = np.pad(np.cumsum(np.cumsum(~free, axis=0), axis=1), ((1, 0), (1, 0)))
+    best, lowest = None, np.inf
+    for choice in choices:
+        columns, rows = (int(np.ceil(extent / _CELL)) for extent in choice.size)
+        if rows > free.shape[0] or columns > free.shape[1]:
+            continue
+        count = (
+            blocked[rows:, columns:]
+            - blocked[:-rows, columns:]
+            - blocked[rows:, :-columns]
+            + blocked[:-rows, :-columns]
+        )
+        middle = np.s_[
+            rows // 2 : rows // 2 + count.shape[0], columns // 2 : columns // 2 + count.shape[1]
+        ]
+        cost = np.where(count == 0, costs[middle], np.inf)
+        if not np.isfinite(cost).any():
+            continue
+        row, column = np.unravel_index(int(np.argmin(cost)), cost.shape)
+        total = cost[row, column] - _DISTANCE_FOR_HEIGHT * choice.cap_height
+        total += _FROM_THE_SIDE * choice.rotated
+        if total < lowest:
+            corner = raster.start + _CELL * np.array([column, row])
+            best, lowest = choice.outline.translate((float(corner[0]), float(corner[1]))), total
+    return best
+
+
+def _letterings(text: str) -> list[_Lettering]:
+    """A text at all the heights that are tried, to be read from the front and from the side."""
+    # Imported here: it takes a while, and only labels need it.
+    from matplotlib.font_manager import FontProperties
+    from matplotlib.textpath import TextPath
+
+    # Strokes have to be wide enough for a nozzle of 0.4 mm.
+    font = FontProperties(family="DejaVu Sans", weight="bold")
+
+    def glyphs(letters: str) -> CrossSection:
+        path = TextPath((0, 0), letters, size=_FONT_SIZE, prop=font)
+        loops = [loop[:-1] for loop in path.to_polygons() if len(loop) > 3]
+        return CrossSection(loops, FillRule.NonZero)
+
+    _, low, _, high = glyphs("H").bounds()
+    drawn = glyphs(text)
+    letterings = []
+    for cap_height in CAP_HEIGHTS:
+        scale = cap_height / (high - low)
+        upright = drawn.scale((scale, scale)).simplify(1e-5)
+        for outline in (upright, upright.rotate(90)):
+            x, y, _, _ = outline.bounds()
+            rotated = outline is not upright
+            letterings.append(_Lettering(outline.translate((-x, -y)), cap_height, rotated))
+    return letterings

@@ -1,0 +1,82 @@
+"""A kit block as STL and as 3MF, in millimetres, for slicers."""
+
+import io
+import zipfile
+from xml.sax.saxutils import escape, quoteattr
+
+import numpy as np
+import trimesh
+from numpy.typing import NDArray
+
+Triangles = tuple[NDArray[np.float64], NDArray[np.int64]]
+"""Vertices (n, 3) in millimetres, and faces (m, 3)."""
+
+_STAMP = (1980, 1, 1, 0, 0, 0)
+"""The time in the archive's entries: the same kit makes the same file."""
+
+_CONTENT_TYPES = """<?xml version="1.0" encoding="UTF-8"?>
+<Types xmlns="http://schemas.openxmlformats.org/package/2006/content-types">
+ <Default Extension="rels" \
+ContentType="application/vnd.openxmlformats-package.relationships+xml"/>
+ <Default Extension="model" ContentType="application/vnd.ms-package.3dmanufacturing-3dmodel+xml"/>
+</Types>
+"""
+_RELATIONSHIPS = """<?xml version="1.0" encoding="UTF-8"?>
+<Relationships xmlns="http://schemas.openxmlformats.org/package/2006/relationships">
+ <Relationship Target="/3D/3dmodel.model" Id="rel0" \
+Type="http://schemas.microsoft.com/3dmanufacturing/2013/01/3dmodel"/>
+</Relationships>
+"""
+_MODEL = """<?xml version="1.0" encoding="UTF-8"?>
+<model unit="millimeter" xml:lang="en-US" \
+xmlns="http://schemas.microsoft.com/3dmanufacturing/core/2015/02">
+ <metadata name="Title">{title}</metadata>
+ <metadata name="Application">kitting_drake</metadata>
+ <resources>
+  <object id="1" type="model" name={name}>
+   <mesh>
+    <vertices>
+{vertices}
+    </vertices>
+    <triangles>
+{triangles}
+    </triangles>
+   </mesh>
+  </object>
+ </resources>
+ <build><item objectid="1"/></build>
+</model>
+"""
+
+
+def stl_bytes(surface: Triangles) -> bytes:
+    """A binary STL."""
+    data = trimesh.Trimesh(*surface, process=False).export(file_type="stl")
+    assert isinstance(data, bytes)
+    return data
+
+
+def threemf_bytes(surface: Triangles, title: str) -> bytes:
+    """A 3MF archive of one object, by the core specification 1.3.
+
+    trimesh writes 3MF too, but needs lxml for it, and gives it no unit.
+    """
+    vertices, faces = surface
+    corners = "\n".join(
+        f'     <vertex x="{x:.4f}" y="{y:.4f}" z="{z:.4f}"/>' for x, y, z in vertices
+    )
+    triangles = "\n".join(f'     <triangle v1="{a}" v2="{b}" v3="{c}"/>' for a, b, c in faces)
+    model = _MODEL.format(
+        title=escape(title), name=quoteattr(title), vertices=corners, triangles=triangles
+    )
+    archive = io.BytesIO()
+    with zipfile.ZipFile(archive, "w", zipfile.ZIP_DEFLATED) as file:
+        for path, text in (
+            ("[Content_Types].xml", _CONTENT_TYPES),
+            ("_rels/.rels", _RELATIONSHIPS),
+            ("3D/3dmodel.model", model),
+        ):
+            entry = zipfile.ZipInfo(path, _STAMP)
+            entry.compress_type = zipfile.ZIP_DEFLATED
+            file.writestr(entry, text)
+    return archive.getvalue()

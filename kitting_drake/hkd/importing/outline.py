@@ -1,0 +1,217 @@
+"""Outlines of tools, drawn in SVG or DXF: read in true millimetres, and extruded to solids."""
+
+import math
+import xml.etree.ElementTree as ElementTree
+from collections.abc import Iterable
+from pathlib import Path
+
+import numpy as np
+from manifold3d import CrossSection, FillRule, Manifold
+from numpy.typing import NDArray
+
+from kitting_drake.common.errors import UserError
+from kitting_drake.common.extras import import_extra
+
+OUTLINE_FORMATS = (".svg", ".dxf")
+LENGTHS_MM = (20.0, 250.0)
+"""How long an imported outline may be."""
+
+_MM_PER_PIXEL = 25.4 / 96
+"""CSS has 96 pixels to an inch, and so has an SVG without units."""
+_JOIN_MM = 0.1
+"""Ends of curves that are no further apart than this are joined."""
+_FLAT_MM = 0.01
+"""Curves are drawn with straight edges that stray at most about this far."""
+_STEP_MM = 0.25
+_MOST_STEPS = 400
+_MOST_BYTES = 20_000_000
+_LEAST_AREA_MM2 = 1.0
+
+Curve = NDArray[np.float64]
+"""The points (n, 2) of a curve, in mm, y up."""
+
+
+def is_outline(path: Path) -> bool:
+    """Whether a file is a drawing, by its name."""
+    return path.suffix.lower() in OUTLINE_FORMATS
+
+
+def read_outline(path: Path, length_mm: float | None = None) -> CrossSection:
+    """The area that a drawing's closed curves enclose, in mm: the largest, less those inside it.
+
+    An SVG is measured by its width, height and viewBox, a DXF by its $INSUNITS: without those, in
+    pixels of 1/96 inch and in millimetres. Lines, arcs and open polylines whose ends meet are
+    joined.
+
+    Args:
+        path: of the drawing.
+        length_mm: to scale the longer side of the outline's bounding box to; its own if None.
+
+    Raises:
+        UserError: no such file, not a drawing, an open curve, or not the outline of one tool.
+    """
+    try:
+        size = path.stat().st_size
+    except (OSError, ValueError) as error:
+        raise UserError(f"there is no file {path}: give a drawing (SVG, DXF)") from error
+    if size > _MOST_BYTES:
+        raise UserError(f"{path} has {size / 1e6:.0f} MB, and an outline takes far less")
+    read = _svg_curves if path.suffix.lower() == ".svg" else _dxf_curves
+    curves = [curve for curve in read(path) if len(curve) > 1 and np.isfinite(curve).all()]
+    if not curves:
+        raise UserError(f"{path} holds no curves: text and pictures have to be made paths first")
+    return _scaled(_enclosed(_joined(curves, path), path), length_mm, path)
+
+
+def extruded(outline: CrossSection, height_mm: float) -> tuple[NDArray, NDArray]:
+    """Vertices (n, 3), in mm, and triangles (m, 3) of the upright prism over an outline."""
+    mesh = Manifold.extrude(outline, height_mm).to_mesh64()
+    vertices = np.asarray(mesh.vert_properties, dtype=float)[:, :3]
+    return vertices, np.asarray(mesh.tri_verts, dtype=np.int64)
+
+
+def _scaled(outline: CrossSection, length_mm: float | None, path: Path) -> CrossSection:
+    """An outline at the length asked for.
+
+    Raises:
+        UserError: none was asked for, and by its units it is no hand tool's.
+    """
+    x_min, y_min, x_max, y_max = outline.bounds()
+    longest = max(x_max - x_min, y_max - y_min)
+    if length_mm is not None:
+        return outline.scale((length_mm / longest, length_mm / longest))
+    low, high = LENGTHS_MM
+    if not low <= longest <= high:
+        raise UserError(
+            f"{path} is {longest:.4g} mm long by its own units, and {low:g} to {high:g} mm are "
+            "taken: give --length_mm, or set the drawing's units"
+        )
+    return outline
+
+
+def _svg_curves(path: Path) -> list[Curve]:
+    svgelements = import_extra("svgelements", purpose="SVG", extra="fabrication")
+    try:
+        root = ElementTree.parse(path).getroot()
+        if root.tag.rsplit("}", 1)[-1] != "svg":
+            raise ValueError("the root is no svg element")
+        # Without a width of its own an SVG is as large as its viewBox says, in pixels.
+        box = root.get("viewBox", "0 0 1000 1000").replace(",", " ").split()
+        drawing = svgelements.SVG.parse(str(path), width=float(box[2]), height=float(box[3]))
+        shapes = [e for e in drawing.elements() if isinstance(e, svgelements.Shape)]
+        curves = [
+            _MM_PER_PIXEL * np.array(points) * (1, -1)
+            for shape in shapes
+            for part in svgelements.Path(shape).as_subpaths()
+            if (points := _sampled(svgelements.Path(part), _MM_PER_PIXEL))
+        ]
+    except MemoryError:
+        raise
+    except Exception as error:
+        # Readers fail on broken files in as many ways as there are.
+        raise UserError(f"{path} cannot be read as SVG") from error
+    return curves
+
+
+def _sampled(path: Iterable, mm: float) -> list[tuple[float, float]]:
+    """Points of a subpath of svgelements, in its units, each of which is `mm` long."""
+    points: list[tuple[float, float]] = []
+    for segment in path:
+        if segment.end is None:
+            continue
+        straight = type(segment).__name__ in ("Move", "Line", "Close")
+        steps = 1
+        if not straight:
+            length = mm * segment.length(error=1e-3)
+            steps = min(_MOST_STEPS, max(8, math.ceil(length / _STEP_MM)))
+        for share in np.arange(1, steps + 1) / steps:
+            point = segment.end if straight else segment.point(float(share))
+            points.append((float(point.x), float(point.y)))
+    return points
+
+
+def _dxf_curves(path: Path) -> list[Curve]:
+    ezdxf = import_extra(
+        "ezdxf", "disassemble", "path", "units", purpose="DXF", extra="fabrication"
+    )
+    try:
+        document = ezdxf.readfile(path)
+        units = ezdxf.units.InsertUnits(int(document.header.get("$INSUNITS", 0)))
+        mm = 1.0
+        if units != ezdxf.units.InsertUnits.Unitless:
+            mm = ezdxf.units.conversion_factor(units, ezdxf.units.InsertUnits.Millimeters)
+        curves = []
+        for entity in ezdxf.disassemble.recursive_decompose(document.modelspace()):
+            try:
+                curve = ezdxf.path.make_path(entity)
+            except TypeError:
+                # Text, dimensions and the like are no curves.
+                continue
+            for part in curve.sub_paths():
+                points = [(mm * p.x, mm * p.y) for p in part.flattening(_FLAT_MM / mm)]
+                curves.append(np.array(points).reshape(-1, 2))
+    except MemoryError:
+        raise
+    except Exception as error:
+        raise UserError(f"{path} cannot be read as DXF") from error
+    return curves
+
+
+def _joined(curves: list[Curve], path: Path) -> list[Curve]:
+    """Closed curves, made of all of these by joining ends that meet.
+
+    Raises:
+        UserError: one stays open.
+    """
+    # A lone point, as some programs leave behind, is no curve.
+    curves = [curve for curve in curves if np.ptp(curve, axis=0).max() > _JOIN_MM]
+    loops = [curve for curve in curves if _is_closed(curve)]
+    chains = [curve for curve in curves if not _is_closed(curve)]
+    while chains:
+        chain = chains.pop()
+        while not _is_closed(chain) and chains:
+            ends = np.array([(other[0], other[-1]) for other in chains])
+            gaps = np.linalg.norm(ends - chain[-1], axis=2)
+            index, end = np.unravel_index(int(np.argmin(gaps)), gaps.shape)
+            if gaps[index, end] > _JOIN_MM:
+                break
+            other = chains.pop(int(index))
+            chain = np.concatenate([chain, other if end == 0 else other[::-1]])
+        if not _is_closed(chain):
+            gap = float(np.linalg.norm(chain[-1] - chain[0]))
+            raise UserError(
+                f"{path} has an open curve, whose ends are {gap:.2f} mm apart: close it, or delete "
+                "what is no outline"
+            )
+        loops.append(chain)
+    return loops
+
+
+def _is_closed(curve: Curve) -> bool:
+    return len(curve) > 2 and bool(np.linalg.norm(curve[-1] - curve[0]) <= _JOIN_MM)
+
+
+def _enclosed(loops: list[Curve], path: Path) -> CrossSection:
+    """The area inside the largest of closed curves and outside the others.
+
+    Raises:
+        UserError: a curve is not inside the largest, or that encloses nothing, or several things.
+    """
+    areas = [CrossSection([loop], FillRule.EvenOdd) for loop in loops]
+    areas.sort(key=lambda area: -area.area())
+    if not areas or areas[0].area() < _LEAST_AREA_MM2:
+        raise UserError(f"{path} holds no closed curve that encloses anything")
+    outer, *holes = areas
+    if len(outer.decompose()) > 1:
+        raise UserError(f"{path}: its outline crosses itself")
+    for hole in holes:
+        if (hole - outer).area() > 0.01 * hole.area():
+            raise UserError(
+                f"{path} has a curve that is not inside the largest one: draw the outline of one "
+                "tool alone"
+            )
+    # The same curve drawn twice, as a fill and as a stroke, is no hole.
+    for hole in holes:
+        if hole.area() < 0.999 * areas[0].area():
+            outer -= hole
+    return outer.simplify(_FLAT_MM)

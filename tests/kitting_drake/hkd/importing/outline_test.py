@@ -1,0 +1,133 @@
+from pathlib import Path
+
+import ezdxf
+import numpy as np
+import pytest
+
+from kitting_drake.common.errors import UserError
+from kitting_drake.hkd.importing.importer import ImportReport, ImportRequest, import_tool
+from kitting_drake.hkd.importing.outline import read_outline
+from kitting_drake.hkd.tools.tool import load_tool
+
+BAR = '<rect x="5" y="10" width="160" height="20"/>'
+
+
+def drawing(folder: Path, content: str, size: str = 'width="200mm" height="80mm"') -> Path:
+    """An SVG whose viewBox is 200 by 80."""
+    path = folder / "tool.svg"
+    path.write_text(
+        f'<svg xmlns="http://www.w3.org/2000/svg" {size} viewBox="0 0 200 80">{content}</svg>'
+    )
+    return path
+
+
+def stadium(folder: Path, units: int, scale: float) -> Path:
+    """A slot of 160 by 20 mm with a hole of 8 mm, of lines and arcs in no order."""
+    document = ezdxf.new(units=units)
+    space = document.modelspace()
+    space.add_line((0, 0), (140 * scale, 0))
+    space.add_arc((0, 10 * scale), 10 * scale, 90, 270)
+    space.add_line((140 * scale, 20 * scale), (0, 20 * scale))
+    space.add_circle((0, 10 * scale), 4 * scale)
+    space.add_text("not an outline")
+    space.add_arc((140 * scale, 10 * scale), 10 * scale, -90, 90)
+    path = folder / "tool.dxf"
+    document.saveas(path)
+    return path
+
+
+def size(path: Path) -> tuple[float, float]:
+    x_min, y_min, x_max, y_max = read_outline(path).bounds()
+    return x_max - x_min, y_max - y_min
+
+
+@pytest.mark.parametrize(
+    ("measures", "mm"),
+    [
+        ('width="200mm" height="80mm"', 1.0),
+        ('width="10cm" height="4cm"', 0.5),
+        ('width="200" height="80"', 25.4 / 96),
+        ("", 25.4 / 96),
+        ('width="100%" height="100%"', 25.4 / 96),
+    ],
+)
+def test_an_svg_is_measured_by_its_width(measures: str, mm: float, tmp_path: Path):
+    assert size(drawing(tmp_path, BAR, measures)) == pytest.approx((160 * mm, 20 * mm), rel=1e-4)
+
+
+def test_y_points_up_and_transforms_count(tmp_path: Path):
+    # A triangle whose right angle is below, on the left, as it is seen.
+    path = drawing(tmp_path, '<path transform="rotate(0) translate(10)" d="M0 70 h150 L0 20 z"/>')
+    assert read_outline(path).bounds() == pytest.approx((10, -70, 160, -20), abs=1e-3)
+
+
+@pytest.mark.parametrize(("units", "scale"), [(4, 1.0), (1, 1 / 25.4), (5, 0.1), (0, 1.0)])
+def test_a_dxf_is_measured_by_its_units_and_its_pieces_are_joined(
+    units: int, scale: float, tmp_path: Path
+):
+    outline = read_outline(stadium(tmp_path, units, scale))
+    x_min, y_min, x_max, y_max = outline.bounds()
+    assert (x_max - x_min, y_max - y_min) == pytest.approx((160, 20), abs=0.02)
+    assert outline.area() == pytest.approx(140 * 20 + np.pi * (10**2 - 4**2), rel=1e-3)
+
+
+def test_splines_and_blocks_are_read(tmp_path: Path):
+    document = ezdxf.new(units=4)
+    block = document.blocks.new("TOOL")
+    block.add_spline([(0, 0), (60, -8), (160, 0), (165, 12), (60, 14), (-8, 11), (0, 0)])
+    document.modelspace().add_blockref("TOOL", (100, 0))
+    document.saveas(tmp_path / "tool.dxf")
+    x_min, _, x_max, _ = read_outline(tmp_path / "tool.dxf").bounds()
+    assert x_min > 85
+    assert 160 < x_max - x_min < 190
+
+
+@pytest.mark.parametrize(
+    ("content", "sentence"),
+    [
+        ('<path d="M10 10 H170 V30 H10"/>', "open curve, whose ends are 20.00 mm apart"),
+        (BAR + '<rect y="50" width="150" height="20"/>', "not inside the largest one"),
+        ("<text>wrench</text>", "holds no curves"),
+        ('<path d="M0 0 L160 40 V0 L0 40 z"/>', "crosses itself"),
+        ('<path d="M0 0 H160 z"/>', "encloses"),
+        ("<g>", "cannot be read as SVG"),
+        ('<rect width="9" height="5"/>', "9 mm long by its own units"),
+    ],
+)
+def test_what_is_no_outline_is_told_in_a_sentence(content: str, sentence: str, tmp_path: Path):
+    with pytest.raises(UserError, match=sentence):
+        read_outline(drawing(tmp_path, content))
+
+
+def test_what_is_no_dxf_is_told_in_a_sentence(tmp_path: Path):
+    (tmp_path / "tool.dxf").write_text("no drawing")
+    with pytest.raises(UserError, match="cannot be read as DXF"):
+        read_outline(tmp_path / "tool.dxf")
+    with pytest.raises(UserError, match="there is no file"):
+        read_outline(tmp_path / "none.dxf")
+
+
+def bring(path: Path, **options: float) -> ImportReport:
+    request = ImportRequest(path, "bar", output=path.parent / "tools", **options)
+    return import_tool(request, time_limit=None)
+
+
+def test_an_outline_becomes_a_tool_of_its_size(tmp_path: Path):
+    path = drawing(tmp_path, '<rect width="110" height="14"/><circle cx="8" cy="7" r="3"/>')
+    tool = load_tool(str(bring(path, height_mm=12.0).directory))
+    # A mesh of 110 mm would be scaled; who draws an outline has measured the tool.
+    assert (tool.length, tool.width, tool.height) == pytest.approx((0.110, 0.014, 0.012), abs=2e-5)
+    assert tool.footprint.area() == pytest.approx(1e-6 * (110 * 14 - 9 * np.pi), rel=1e-2)
+    longer = load_tool(str(bring(path, height_mm=12.0, length_mm=165.0).directory))
+    assert (longer.length, longer.height) == pytest.approx((0.165, 0.012), abs=2e-5)
+
+
+def test_only_outlines_have_and_need_a_height(tmp_path: Path):
+    path = drawing(tmp_path, BAR)
+    with pytest.raises(UserError, match="give --height_mm"):
+        bring(path)
+    with pytest.raises(UserError, match="--height_mm 60 is out of range"):
+        bring(path, height_mm=60.0)
+    with pytest.raises(UserError, match="--height_mm is for outlines"):
+        bring(tmp_path / "tool.stl", height_mm=10.0)
+    assert not (tmp_path / "tools").exists()
