@@ -275,7 +275,8 @@ class PickPlacePlanner(LeafSystem):
         motion = motion_heights(heights, self._parameters)
         state.grasp_z, state.pick_top_z = motion.grasp, heights.pick_top
         state.table_z, state.support_z = heights.table, heights.support
-        state.rim_z = heights.place_rim
+        # What stands a little below a doubtful rim may stand on it.
+        state.rim_z = heights.place_rim - heights.doubt
         state.clear_z, state.travel_z = motion.clear, motion.travel
         state.pick_hover_z, state.place_hover_z = motion.pick_hover, motion.place_hover
 

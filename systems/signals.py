@@ -144,6 +144,8 @@ class SurfaceHeights:
     """The highest surface of the workspace."""
     table: float = 0.0
     """The table, below which nothing goes."""
+    doubt: float = 0.0
+    """How far these heights may be off each other; zero where o_t has neither noise nor tilt."""
 
 
 @dataclass(frozen=True)

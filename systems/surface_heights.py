@@ -2,6 +2,7 @@
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import ndimage
 
 from systems.signals import Observation, PlanarPose, SurfaceHeights
 
@@ -19,6 +20,20 @@ _SUPPORT_SHARE = 10.0
 """The percentile of the heights around a pick that is taken for its support's."""
 _TABLE_SHARE = 5.0
 """The percentile of all heights that is taken for the table's."""
+_CLEAN = 0.0003
+"""A standard deviation of less is no noise, in metres."""
+_SMOOTHED = 9
+"""Noise is what departs from the mean over so many pixels, along rows and columns."""
+_NOISY_RIM_SHARE, _NOISY_RIM_BIAS = 90.0, 1.0
+"""Of the pixels around a place some two thirds are its rim: the percentile of all that is so many
+standard deviations above the middle of these."""
+_TABLE_BAND = 0.008
+"""Pixels within this of the table's height belong to it, however it is tilted, in metres."""
+_LEAST_TABLE, _FITS = 500, 3
+_LEVEL = 0.0003
+"""A tilt that brings less than this at the border is none, in metres."""
+_TILT_DOUBT, _MOST_DOUBT = 0.3, 0.0025
+"""Heights may be off by this share of what a tilt brought, and by at most this, in metres."""
 
 
 def read_surface_heights(
@@ -29,12 +44,17 @@ def read_surface_heights(
     The support of an object is the height that a tenth of the pixels around it do not exceed; so
     an object in the middle of others is taken to stand on what they stand on.
 
+    Tops are the highest of some pixels. Where o_t is noisy that would be the noise: then they are
+    medians and percentiles, corrected by what these are off in such noise. The table is level; a
+    tilt that o_t shows is one of the calibration, and is taken away. Neither is done where there is
+    nothing to correct.
+
     Args:
         observation: o_t.
         pick: of the gripper, in the world.
         place: of the gripper, in the world. One off the grid has heights of zero.
     """
-    height, grid = observation.height, observation.grid
+    grid = observation.grid
     reach = {
         name: max(1, round(metres / grid.resolution))
         for name, metres in (
@@ -44,19 +64,64 @@ def read_surface_heights(
             ("near_place", _PLACE_CLEARANCE_REACH),
         )
     }
+    height, noise, doubt = _level(observation.height)
     at_pick, at_place = (grid.to_pixel((pose.x, pose.y)) for pose in (pick, place))
     around_pick = _around(height, at_pick, reach["support"])
-    support = float(np.percentile(around_pick, _SUPPORT_SHARE)) if around_pick.size else 0.0
+    top, rim = _around(height, at_pick, _PICK_REACH), _around(height, at_place, reach["rim"])
+    support = _percentile(around_pick, _SUPPORT_SHARE)
+    table = _percentile(height, _TABLE_SHARE)
+    if noise:
+        pick_top = _percentile(top, 50.0)
+        place_rim = _percentile(rim, _NOISY_RIM_SHARE) - _NOISY_RIM_BIAS * noise
+    else:
+        pick_top, place_rim = float(top.max(initial=0.0)), float(rim.max(initial=0.0))
     return SurfaceHeights(
-        pick_top=grid.z_min + float(_around(height, at_pick, _PICK_REACH).max(initial=0.0)),
+        pick_top=grid.z_min + pick_top,
         support=grid.z_min + support,
-        place_rim=grid.z_min + float(_around(height, at_place, reach["rim"]).max(initial=0.0)),
+        place_rim=grid.z_min + place_rim,
         near_pick=grid.z_min + float(_around(height, at_pick, reach["near_pick"]).max(initial=0.0)),
         near_place=grid.z_min
         + float(_around(height, at_place, reach["near_place"]).max(initial=0.0)),
         highest=grid.z_min + float(height.max(initial=0.0)),
-        table=grid.z_min + float(np.percentile(height, _TABLE_SHARE)),
+        table=grid.z_min + table,
+        doubt=doubt,
     )
+
+
+def _percentile(values: NDArray[np.float32], share: float) -> float:
+    return float(np.percentile(values, share)) if values.size else 0.0
+
+
+def _level(height: NDArray[np.float32]) -> tuple[NDArray[np.float32], float, float]:
+    """Heights (rows, cols) without the tilt of the table, the standard deviation of their noise,
+    and what they may still be off; the same heights and zeros where there is neither."""
+    away = np.abs(height - ndimage.uniform_filter(height, _SMOOTHED, mode="nearest"))
+    noise = 1.4826 * float(np.median(away))
+    if noise < _CLEAN:
+        noise = 0.0
+    tilt = _tilt(height, noise)
+    largest = float(np.abs(tilt).max())
+    if largest < _LEVEL:
+        return height, noise, min(noise, _MOST_DOUBT)
+    doubt = min(noise + _TILT_DOUBT * largest, _MOST_DOUBT)
+    return (height - tilt).astype(np.float32), noise, doubt
+
+
+def _tilt(height: NDArray[np.float32], noise: float) -> NDArray[np.float64]:
+    """(rows, cols): by how much a plane through the table departs from its height in the middle."""
+    table = np.percentile(height, _TABLE_SHARE) + noise
+    rows, cols = (axis - axis.mean() for axis in np.indices(height.shape, np.float64))
+    near = np.abs(height - table) < _TABLE_BAND + 3 * noise
+    slope = np.zeros(2)
+    for _ in range(_FITS):
+        if near.sum() < _LEAST_TABLE:
+            break
+        design = np.column_stack([rows[near], cols[near], np.ones(near.sum())])
+        plane = np.linalg.lstsq(design, height[near], rcond=None)[0]
+        slope = plane[:2]
+        residual = height - (rows * slope[0] + cols * slope[1] + plane[2])
+        near = np.abs(residual) < _TABLE_BAND / 2 + 2 * noise
+    return rows * slope[0] + cols * slope[1]
 
 
 def _around(
