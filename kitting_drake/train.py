@@ -44,6 +44,8 @@ from kitting_drake.policies.weights import (
     save_weights,
 )
 
+WEIGHTS = "policy.safetensors"
+"""The best weights, in the folder of a training run."""
 _CHECKPOINT_EVERY = 100
 """Steps between checkpoints, and between points of the curves."""
 _MOST_VALIDATED = 64
@@ -99,6 +101,9 @@ def main() -> int:
     """Parses the command line and trains; returns the exit code."""
     arguments = _parse()
     console = Console(quiet=arguments.quiet)
+    if arguments.demos is None:
+        _export(arguments, arguments.weights or arguments.output / WEIGHTS, console)
+        return 0
     learned, held_out = _split(arguments.demos, arguments.demonstrations, arguments.validation)
     settings = _settings(arguments, learned, held_out)
     folder = require_folder(
@@ -111,8 +116,21 @@ def main() -> int:
         described = {**dataclasses.asdict(settings), "origins": origins}
         claim_folder(folder, "settings.json", described, of="training run")
         run.train()
+    if arguments.export:
+        _export(arguments, folder / WEIGHTS, console)
     console.print(f"files: {folder}/", highlight=False)
     return 0
+
+
+def _export(arguments: argparse.Namespace, weights: Path, console: Console) -> None:
+    """Writes weights in another format, to the folder `onnx` beside them, or in --output."""
+    # Who exports nothing does not wait for it.
+    from kitting_drake.policies.onnx_export import export_onnx
+
+    folder = (arguments.output or weights.parent) / "onnx"
+    with console.status(f"exporting {weights.name}"):
+        export_onnx(weights, folder)
+    console.print(f"networks as ONNX: {folder}/", highlight=False)
 
 
 def _settings(
@@ -169,7 +187,6 @@ def _parse() -> argparse.Namespace:
     parser.add_argument(
         "--demos",
         type=Path,
-        required=True,
         metavar="FILE.h5",
         help="what to learn from: what collect or draw_scenes wrote",
     )
@@ -219,8 +236,24 @@ def _parse() -> argparse.Namespace:
     )
     parser.add_argument("--seed", type=seed_type, default=0, help="of weights and draws (0)")
     parser.add_argument("--output", type=Path, metavar="DIR", help="where all files go")
+    parser.add_argument(
+        "--export",
+        choices=("onnx",),
+        help="also write the networks for other programs, to the folder onnx in --output; without "
+        "--demos those trained in --output before, or of --weights, without training",
+    )
+    parser.add_argument(
+        "--weights", type=Path, metavar="FILE", help="what to export, without --demos"
+    )
     parser.add_argument("--quiet", action="store_true", help="print nothing but errors")
-    return parser.parse_args()
+    arguments = parser.parse_args()
+    if arguments.demos is None and not arguments.export:
+        parser.error("--demos says what to learn from")
+    if arguments.demos is None and not (arguments.weights or arguments.output):
+        parser.error("--export needs --demos to train first, or --output or --weights to export")
+    if arguments.weights and (arguments.demos or not arguments.export):
+        parser.error("--weights is for --export without --demos")
+    return arguments
 
 
 def _rate_type(text: str) -> float:
@@ -413,7 +446,7 @@ class _Run:
             self.best = chosen
             threshold = report.get("stop_threshold")
             card = {**self.card, "validation": chosen, "stop_threshold": threshold}
-            save_weights(self.folder / "policy.safetensors", networks, card)
+            save_weights(self.folder / WEIGHTS, networks, card)
         append_line(self._log, chosen)
         for name, value in report.items():
             writer.add_scalar(f"validation/{name}", value, step)

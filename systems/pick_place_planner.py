@@ -1,5 +1,6 @@
 """The pick-and-place motion primitive: a state machine that makes smooth, limited motions."""
 
+import math
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -135,6 +136,7 @@ class PickPlacePlanner(LeafSystem):
         state[_START] = state[_GOAL] = parameters.home
         state.start_opening = state.goal_opening = parameters.open_width
         self._state_index = self.DeclareDiscreteState(model)
+        self._period = period
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
 
         self._hand_state = self.DeclareVectorInputPort("hand_state", 12)
@@ -167,6 +169,16 @@ class PickPlacePlanner(LeafSystem):
         return (
             PlanarPose(float(state.pick_x), float(state.pick_y), float(state.pick_yaw)),
             PlanarPose(float(state.place_x), float(state.place_y), float(state.place_yaw)),
+        )
+
+    def asks_now(self, context: Context) -> bool:
+        """Whether its next update, due at the context's time (its own), evaluates `action`."""
+        state, time = self._state(context), context.get_time()
+        return bool(
+            state.mode == Mode.OBSERVE
+            and state.actions < self._max_actions
+            and self._has_settled(state, time)
+            and math.remainder(time, self._period) == 0.0
         )
 
     def _state(self, context: Context) -> _State:
@@ -242,7 +254,7 @@ class PickPlacePlanner(LeafSystem):
         return EventStatus.Succeeded()
 
     def _observe(self, context, state, time, hand, contact) -> None:
-        if time < self._arrival(state) + self._parameters.observe_settle:
+        if not self._has_settled(state, time):
             return
         if state.actions >= self._max_actions:
             self._begin(state, Mode.DONE, time)
@@ -260,6 +272,10 @@ class PickPlacePlanner(LeafSystem):
         state.search_step, state.press = 0, action.press
         state.actions += 1
         self._begin(state, Mode.APPROACH, time)
+
+    def _has_settled(self, state: _State, time: float) -> bool:
+        """Whether the hand has been at rest out of sight for long enough to observe."""
+        return time >= self._arrival(state) + self._parameters.observe_settle
 
     def _heights(self, context: Context, action: PickPlaceAction) -> SurfaceHeights:
         if self._observation.HasValue(context):

@@ -1,4 +1,4 @@
-"""`python -m kitting_drake.benchmark simulation | networks | kits | recovery`: measured tables."""
+"""`python -m kitting_drake.benchmark simulation | networks | kits | recovery | mujoco`."""
 
 import argparse
 import os
@@ -23,6 +23,7 @@ def main() -> int:
         "networks": _networks,
         "kits": _kits,
         "recovery": _recovery,
+        "mujoco": _mujoco,
     }[arguments.benchmark]
     tables = measure(arguments, console, folder)
     for table in tables:
@@ -62,7 +63,15 @@ def _parser() -> argparse.ArgumentParser:
     add_scenario_flags(recovery)
     recovery.add_argument("--episodes", type=count_type, default=10, help="of each kind (10)")
     recovery.add_argument("--seed", type=seed_type, default=0, help="of the first (0)")
-    for benchmark in (simulation, networks, kits, recovery):
+    opinion = benchmarks.add_parser(
+        "mujoco", help="whether tools come to rest in MuJoCo where they do here"
+    )
+    opinion.add_argument("--placements", type=count_type, default=50, help="how many (50)")
+    opinion.add_argument("--seed", type=seed_type, default=0, help="of the first (0)")
+    opinion.add_argument(
+        "--orientations", type=count_type, help="round the oracle's actions to so many (no)"
+    )
+    for benchmark in (simulation, networks, kits, recovery, opinion):
         benchmark.add_argument(
             "--output", type=Path, default=Path("output/benchmark"), help="where the files go"
         )
@@ -118,6 +127,14 @@ def _recovery(arguments: argparse.Namespace, console: Console, folder: Path) -> 
     if strips:
         write_atomically(folder / "recovery.png", strips)
     return [recovery_table(measured)]
+
+
+def _mujoco(arguments: argparse.Namespace, console: Console, folder: Path) -> list[Table]:
+    from kitting_drake.benchmark.second_opinion import ask_mujoco, opinion_table
+
+    measured = ask_mujoco(arguments.placements, arguments.seed, arguments.orientations, console)
+    write_json(folder / "mujoco.json", measured)
+    return [opinion_table(measured)]
 
 
 def _use_one_core() -> None:

@@ -250,10 +250,10 @@ def _add_policy(
 ) -> LeafSystem:
     """Adds the scenario's policy, connected to what it looks at."""
     policy = builder.AddNamedSystem("policy", scenario.policy.make_system(site))
-    if scenario.policy.needs_observation:
+    if policy.HasInputPort("observation"):
         assert projector is not None
         builder.Connect(projector.GetOutputPort("observation"), policy.GetInputPort("observation"))
-    else:
+    if policy.HasInputPort("body_poses"):
         builder.Connect(plant.get_body_poses_output_port(), policy.GetInputPort("body_poses"))
     return policy
 
@@ -281,7 +281,7 @@ def _add_planner_and_controller(
     builder.Connect(policy.GetOutputPort("action"), planner.GetInputPort("action"))
     if policy.HasInputPort("failed_picks"):
         builder.Connect(planner.GetOutputPort("failed_picks"), policy.GetInputPort("failed_picks"))
-    if projector is not None:
+    if projector is not None and scenario.policy.planner_observes:
         builder.Connect(projector.GetOutputPort("observation"), planner.GetInputPort("observation"))
     builder.Connect(hand_state, planner.GetInputPort("hand_state"))
     builder.Connect(

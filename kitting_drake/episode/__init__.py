@@ -1,6 +1,6 @@
 """One episode: running it, recording its actions, scoring it."""
 
-from kitting_drake.episode.episode import EpisodeResult, run_episode
+from kitting_drake.episode.episode import Episode, EpisodeResult, run_episode
 from kitting_drake.episode.events import EpisodeObserver, ModeChange
 
-__all__ = ["EpisodeObserver", "EpisodeResult", "ModeChange", "run_episode"]
+__all__ = ["Episode", "EpisodeObserver", "EpisodeResult", "ModeChange", "run_episode"]

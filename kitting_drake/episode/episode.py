@@ -104,53 +104,131 @@ def run_episode(
         realtime_rate: 1 for real time, 0 for as fast as possible.
         observers: told of every event.
     """
-    simulator = Simulator(cell.diagram)
-    simulator.set_target_realtime_rate(realtime_rate)
-    log = ActionLog(cell)
-    monitor = _Monitor(cell, [log.observe, *observers])
-    simulator.set_monitor(monitor.step)
-    failure, timed_out, interrupted = None, False, False
-    start = time.perf_counter()
-    try:
-        simulator.Initialize()
-        simulator.AdvanceTo(time_limit)
-        timed_out = monitor.done_since is None
-    except KeyboardInterrupt:
-        interrupted = True
-    except (Exception, SystemExit) as error:
-        # Drake's own errors are RuntimeErrors; what a policy raises may be anything, and its author
-        # wants to know where.
-        failure = " ".join(f"{type(error).__name__}: {error}".split())
-        if not isinstance(error, RuntimeError):
-            logging.getLogger(__name__).exception("the episode of seed %d failed", seed)
-    wall_seconds = time.perf_counter() - start
-    context = simulator.get_context()
-    monitor.tell(context, is_last=True)
-    placements = cell.placements(context)
-    counts = cell.planner.GetOutputPort("counts").Eval(cell.planner.GetMyContextFromRoot(context))
-    lost = failure is not None or timed_out
-    at_rest = cell.at_rest(context)
-    return EpisodeResult(
+    episode = Episode(
+        cell,
+        task=task,
         scenario=scenario,
         policy=policy,
         seed=seed,
-        objects=object_results(cell, task, context, log.records),
-        success_rate=0.0 if lost else total_reward(cell.scene.goals, placements),
-        strict_success_rate=0.0 if lost else strict_reward(cell.scene.goals, placements),
-        actions=int(counts[0]),
-        missed_grasps=int(counts[1]),
-        dropped_objects=int(counts[2]),
-        actions_taken=log.records,
-        sim_seconds=context.get_time(),
-        wall_seconds=wall_seconds,
-        point_contact_pairs=monitor.point_contact_pairs,
-        moving_at_end=[
-            item.name for item, rests in zip(cell.objects, at_rest, strict=True) if not rests
-        ],
-        failure=failure,
-        timed_out=timed_out,
-        interrupted=interrupted,
+        time_limit=time_limit,
+        realtime_rate=realtime_rate,
+        observers=observers,
     )
+    episode.advance()
+    return episode.result()
+
+
+class Episode:
+    """An episode under way: `run_episode` in parts, for who decides between them."""
+
+    def __init__(
+        self,
+        cell: Cell,
+        *,
+        task: TaskConfig,
+        scenario: str,
+        policy: str,
+        seed: int,
+        time_limit: float,
+        realtime_rate: float = 0.0,
+        observers: Sequence[EpisodeObserver] = (),
+        pauses: bool = False,
+    ) -> None:
+        """
+        Args:
+            cell: as for `run_episode`, and so are the others but for the last.
+            task: see there.
+            scenario: see there.
+            policy: see there.
+            seed: see there.
+            time_limit: see there.
+            realtime_rate: see there.
+            observers: see there.
+            pauses: whether `advance` returns each time the planner asks for an action.
+        """
+        self._cell, self._task, self._time_limit = cell, task, time_limit
+        self._names = {"scenario": scenario, "policy": policy, "seed": seed}
+        self._simulator = Simulator(cell.diagram)
+        self._simulator.set_target_realtime_rate(realtime_rate)
+        self._log = ActionLog(cell)
+        self._monitor = _Monitor(cell, [self._log.observe, *observers], pauses=pauses)
+        self._simulator.set_monitor(self._monitor.step)
+        self._failure: str | None = None
+        self._wall_seconds = 0.0
+        self._has_begun = False
+        self.timed_out = self.interrupted = self.is_over = False
+
+    @property
+    def context(self) -> Context:
+        """The context of the cell's Diagram."""
+        return self._simulator.get_mutable_context()
+
+    @property
+    def failure(self) -> str | None:
+        """Why the simulation could not go on, if it could not."""
+        return self._failure
+
+    def advance(self) -> None:
+        """Goes on to the end of the episode, or, where it pauses, to when the planner asks.
+
+        At a pause the action must be given before the next call.
+
+        Raises:
+            RuntimeError: the episode is over.
+        """
+        if self.is_over:
+            raise RuntimeError("the episode is over")
+        start = time.perf_counter()
+        try:
+            self._monitor.is_paused = False
+            if not self._has_begun:
+                self._has_begun = True
+                self._simulator.Initialize()
+            if not self._monitor.is_paused:
+                self._simulator.AdvanceTo(self._time_limit)
+            self.is_over = not self._monitor.is_paused
+            self.timed_out = self.is_over and self._monitor.done_since is None
+        except KeyboardInterrupt:
+            self.is_over = self.interrupted = True
+        except (Exception, SystemExit) as error:
+            # Drake's own errors are RuntimeErrors; what a policy raises may be anything, and its
+            # author wants to know where.
+            self._failure = " ".join(f"{type(error).__name__}: {error}".split())
+            self.is_over = True
+            if not isinstance(error, RuntimeError):
+                seed = self._names["seed"]
+                logging.getLogger(__name__).exception("the episode of seed %d failed", seed)
+        self._wall_seconds += time.perf_counter() - start
+        if self.is_over:
+            self._monitor.tell(self.context, is_last=True)
+
+    def result(self) -> EpisodeResult:
+        """How it ended; before its end, how it stands now."""
+        cell, context, records = self._cell, self.context, self._log.records
+        placements = cell.placements(context)
+        planner_context = cell.planner.GetMyContextFromRoot(context)
+        counts = cell.planner.GetOutputPort("counts").Eval(planner_context)
+        lost = self._failure is not None or self.timed_out
+        at_rest = cell.at_rest(context)
+        return EpisodeResult(
+            **self._names,  # type: ignore[arg-type]
+            objects=object_results(cell, self._task, context, records),
+            success_rate=0.0 if lost else total_reward(cell.scene.goals, placements),
+            strict_success_rate=0.0 if lost else strict_reward(cell.scene.goals, placements),
+            actions=int(counts[0]),
+            missed_grasps=int(counts[1]),
+            dropped_objects=int(counts[2]),
+            actions_taken=records,
+            sim_seconds=context.get_time(),
+            wall_seconds=self._wall_seconds,
+            point_contact_pairs=self._monitor.point_contact_pairs,
+            moving_at_end=[
+                item.name for item, rests in zip(cell.objects, at_rest, strict=True) if not rests
+            ],
+            failure=self._failure,
+            timed_out=self.timed_out,
+            interrupted=self.interrupted,
+        )
 
 
 def object_results(
@@ -196,10 +274,14 @@ def _object_result(
 
 
 class _Monitor:
-    """The simulator's monitor: puts objects to sleep, tells of events, knows the end."""
+    """The simulator's monitor: puts objects to sleep, tells of events, knows when to halt."""
 
-    def __init__(self, cell: Cell, observers: Sequence[EpisodeObserver]) -> None:
+    def __init__(
+        self, cell: Cell, observers: Sequence[EpisodeObserver], *, pauses: bool = False
+    ) -> None:
         self._cell = cell
+        self._pauses = pauses
+        self.is_paused = False
         self._observers = observers
         self._contact_results = cell.plant.get_contact_results_output_port()
         self._mode = Mode.OBSERVE
@@ -213,6 +295,11 @@ class _Monitor:
         self.point_contact_pairs = max(self.point_contact_pairs, results.num_point_pair_contacts())
         cell.apply_sleep(root_context)
         self.tell(root_context)
+        if self._pauses:
+            planner_context = cell.planner.GetMyContextFromRoot(root_context)
+            self.is_paused = cell.planner.asks_now(planner_context)
+            if self.is_paused:
+                return EventStatus.ReachedTermination(cell.diagram, "the planner asks")
         if self._mode != Mode.DONE:
             return EventStatus.DidNothing()
         now = root_context.get_time()

@@ -121,7 +121,9 @@ def build(args: argparse.Namespace, entries: list[ToolEntry]) -> None:
     with Progress(console=Console(stderr=True), transient=True, disable=args.quiet) as progress:
         task = progress.add_task("kits", total=None)
         manifest = build_dataset(
-            args.output, lambda done, total: progress.update(task, completed=done, total=total)
+            args.output,
+            lambda done, total: progress.update(task, completed=done, total=total),
+            mjcf=args.format == "mjcf",
         )
     if not args.quiet:
         counts = f"{len(manifest['tools'])} tools and {len(manifest['kits'])} kits"
@@ -229,6 +231,12 @@ def main() -> int:
             )
     builder = verbs.add_parser("build", help=build.__doc__)
     builder.add_argument("--output", type=Path, required=True, help="the folder to make")
+    builder.add_argument(
+        "--format",
+        choices=("sdf", "mjcf"),
+        default="sdf",
+        help="mjcf: also MuJoCo's models, beside the SDFormat ones",
+    )
     builder.add_argument("--quiet", action="store_true", help="print nothing")
     builder.set_defaults(function=build)
     annotator = verbs.add_parser("annotate", help=annotate.__doc__)

@@ -14,11 +14,14 @@ from kitting_drake.common.errors import UserError
 from kitting_drake.common.files import write_json
 from kitting_drake.hkd.kits.kit import Kit, make_kit
 from kitting_drake.hkd.kits.parameters import KitParameters
+from kitting_drake.hkd.mjcf import kit_mjcf, tool_mjcf
 from kitting_drake.hkd.tools.tool import Tool, load_tool
 from kitting_drake.hkd.tools.toolsets import SPLITS, TOOLSETS_SEED, tool_pools, toolsets
 
 
-def build_dataset(folder: Path, progress: Callable[[int, int], None]) -> dict[str, Any]:
+def build_dataset(
+    folder: Path, progress: Callable[[int, int], None], *, mjcf: bool = False
+) -> dict[str, Any]:
     """Writes tools and kits as SDFormat with their meshes, and `manifest.json`.
 
     The folder appears atomically. Tools are in `tools/NAME/`, kits in `kits/SPLIT_000/`;
@@ -27,6 +30,7 @@ def build_dataset(folder: Path, progress: Callable[[int, int], None]) -> dict[st
     Args:
         folder: where to; must not exist, or be empty.
         progress: called with how many kits are done and how many there are.
+        mjcf: whether to write MuJoCo's `NAME.xml` and `kit.xml` beside each SDFormat model.
 
     Returns:
         The manifest.
@@ -40,7 +44,7 @@ def build_dataset(folder: Path, progress: Callable[[int, int], None]) -> dict[st
         folder.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(dir=folder.parent, prefix=".building-") as scratch:
             root = Path(scratch) / "dataset"
-            manifest = _write_dataset(root, progress)
+            manifest = _write_dataset(root, progress, mjcf=mjcf)
             if folder.exists():
                 folder.rmdir()
             os.rename(root, folder)
@@ -49,7 +53,9 @@ def build_dataset(folder: Path, progress: Callable[[int, int], None]) -> dict[st
     return manifest
 
 
-def _write_dataset(root: Path, progress: Callable[[int, int], None]) -> dict[str, Any]:
+def _write_dataset(
+    root: Path, progress: Callable[[int, int], None], *, mjcf: bool
+) -> dict[str, Any]:
     parameters = KitParameters()
     tools: dict[str, Tool] = {}
     for split in SPLITS:
@@ -57,6 +63,8 @@ def _write_dataset(root: Path, progress: Callable[[int, int], None]) -> dict[str
             tools |= {name: load_tool(name) for name in pool}
     for name, tool in tools.items():
         shutil.copytree(tool.directory, root / "tools" / name)
+        if mjcf:
+            (root / "tools" / name / f"{name}.xml").write_text(tool_mjcf(tool.sdf))
     chosen = [
         (split, index, names) for split in SPLITS for index, names in enumerate(toolsets(split))
     ]
@@ -65,6 +73,8 @@ def _write_dataset(root: Path, progress: Callable[[int, int], None]) -> dict[str
         kit = make_kit([tools[name] for name in names], parameters)
         name = f"{split}_{index:03d}"
         shutil.copytree(kit.sdf.parent, root / "kits" / name)
+        if mjcf:
+            (root / "kits" / name / "kit.xml").write_text(kit_mjcf(kit.sdf))
         kits.append(_kit_entry(name, split, kit, root))
         progress(done + 1, len(chosen))
     manifest = {
@@ -91,7 +101,7 @@ def _tool_entry(tool: Tool, root: Path) -> dict[str, Any]:
         "height": tool.height,
         "mass": tool.mass,
         "grasp": asdict(tool.grasp),
-        "sdf": (folder / tool.sdf.name).relative_to(root).as_posix(),
+        **_models(folder / tool.sdf.name, root),
         "sha256": _checksums(folder, root),
     }
 
@@ -101,7 +111,7 @@ def _kit_entry(name: str, split: str, kit: Kit, root: Path) -> dict[str, Any]:
     return {
         "name": name,
         "split": split,
-        "sdf": (folder / kit.sdf.name).relative_to(root).as_posix(),
+        **_models(folder / kit.sdf.name, root),
         "size": list(kit.size),
         # The pose of each seated tool's frame in the kit's: yaw is about the kit's z.
         "tools": [
@@ -110,6 +120,12 @@ def _kit_entry(name: str, split: str, kit: Kit, root: Path) -> dict[str, Any]:
         ],
         "sha256": _checksums(folder, root),
     }
+
+
+def _models(sdf: Path, root: Path) -> dict[str, str]:
+    """The paths of a model in each format that there is."""
+    paths = {"sdf": sdf, "mjcf": sdf.with_suffix(".xml")}
+    return {key: path.relative_to(root).as_posix() for key, path in paths.items() if path.exists()}
 
 
 def _checksums(folder: Path, root: Path) -> dict[str, str]:

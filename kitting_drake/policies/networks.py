@@ -21,9 +21,9 @@ from kitting_drake.policies.correlation import Candidate, search
 from kitting_drake.policies.discretization import (
     discretization_matrix,
     discretize,
-    series_maximum,
 )
 from kitting_drake.policies.fibres import Irreps
+from kitting_drake.policies.fourier_series import series_maximum
 from kitting_drake.policies.images import Image, LabelledImage, crop
 from kitting_drake.policies.losses import (
     angle_loss,

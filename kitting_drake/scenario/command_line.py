@@ -99,15 +99,29 @@ def choose_scenario(arguments: argparse.Namespace) -> ChosenScenario:
     Raises:
         UserError: it cannot be used.
     """
-    path: Path = arguments.scenario
+    return find_scenario(
+        arguments.scenario,
+        arguments.scenario_name,
+        arguments.scenario_text,
+        arguments.perturb,
+    )
+
+
+def find_scenario(
+    path: Path, name: str | None = None, text: str | None = None, perturb: str | None = None
+) -> ChosenScenario:
+    """Loads a scenario as the command line does; the arguments are those of `load_scenario`.
+
+    Raises:
+        UserError: it cannot be used.
+    """
     by_name = path.parent in (Path(), Path(SCENARIOS.name))
     if by_name and not path.exists() and (SCENARIOS / path.name).is_file():
         # An installed wheel carries its scenarios; `scenarios/x.yaml` means them anywhere.
         path = SCENARIOS / path.name
-    name: str | None = arguments.scenario_name
-    scenario = load_scenario(path, name, arguments.scenario_text, arguments.perturb)
+    scenario = load_scenario(path, name, text, perturb)
     label = path.stem if name is None else f"{path.stem}:{name}"
-    return ChosenScenario(scenario, path, label, arguments.scenario_text, arguments.perturb)
+    return ChosenScenario(scenario, path, label, text, perturb)
 
 
 def output_folder(arguments: argparse.Namespace, name: str) -> Path:

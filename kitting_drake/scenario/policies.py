@@ -49,7 +49,11 @@ class PolicyConfig:
     """The interface of a policy; each variant of the scenario's `policy:` derives from it."""
 
     needs_observation: bool = True
-    """Whether the system has an input port `observation`; else one called `body_poses`."""
+    """Whether whoever decides sees by cameras, which are then needed. The system has an input port
+    `observation` or one called `body_poses`, or neither where it is told what to do."""
+
+    planner_observes: bool = True
+    """Whether the planner reads heights off o_t itself; else each action brings them."""
 
     @property
     def name(self) -> str:

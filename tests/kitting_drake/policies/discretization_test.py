@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 from kitting_drake.policies.discretization import (
     discretization_matrix,
     discretize,
-    series_maximum,
 )
+from kitting_drake.policies.fourier_series import series_maximum
 
 PAPER = tuple(range(7))
 QUOTIENT = (0, 2, 4, 6, 8, 10, 12)

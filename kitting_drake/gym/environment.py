@@ -1,0 +1,237 @@
+"""The Gymnasium environment: one step is one pick and place."""
+
+import dataclasses
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from kitting_drake.cell import Cell
+from kitting_drake.cell.cameras import render_picture
+from kitting_drake.common.errors import UserError
+from kitting_drake.episode import Episode, EpisodeResult
+from kitting_drake.episode.chosen import build_chosen
+from kitting_drake.gym.spaces import (
+    action_space,
+    as_action,
+    as_arrays,
+    observation_space,
+)
+from kitting_drake.scenario.command_line import find_scenario
+from kitting_drake.scenario.policies import PolicyConfig, PolicySite
+from kitting_drake.scenario.schema import Scenario
+from systems.given_action import GivenAction
+from systems.signals import Observation, PickPlaceAction
+from systems.surface_heights import read_surface_heights
+
+_SEEDS = 2**32
+_ALL = 1 - 1e-9
+"""A reward of this is that of every goal."""
+
+
+@dataclass
+class _Agent(PolicyConfig):
+    """Somebody outside the Diagram, who sees and says what to do.
+
+    The simulator halts before the plant's next step, and the planner decides after it: an o_t of
+    the planner's own would be another, rendered once more.
+    """
+
+    planner_observes = False
+
+    def make_system(self, site: PolicySite) -> GivenAction:
+        return GivenAction()
+
+
+class KittingEnvironment(gymnasium.Env[dict[str, Any], NDArray[Any]]):
+    """A scenario's cell, with an agent in the place of its policy.
+
+    - Observation and action: see `gym.spaces`. An observation is what a policy would see, taken as
+      the hand waits out of the cameras' sight for the next action.
+    - Reward: the increase of the task's reward; the rewards of an episode add up to the
+      `success_rate` of `results.json`. As there, an episode whose time is up, or whose simulation
+      fails, has none: its last step takes away what was earned.
+    - Terminated: the agent said stop, or every goal is filled. Truncated: the actions or the time
+      are spent, or the simulation failed, and `info["failure"]` says why.
+    - `info`: the keys of `results.json` as they stand, but for `wall_seconds`, which is never twice
+      the same; and `failed_picks`: where a grasp failed before, a tuple of (x, y, theta).
+    - `reset(seed=N)` makes the scene of seed N of `evaluate` and `run`; without a seed the next is
+      drawn. `info["seed"]` tells it.
+    """
+
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 1}  # noqa: RUF012  Gymnasium's own way.
+
+    def __init__(
+        self,
+        scenario: str | Path,
+        scenario_name: str | None = None,
+        scenario_text: str | None = None,
+        perturb: str | None = None,
+        *,
+        cameras: bool = False,
+        render_mode: str | None = None,
+    ) -> None:
+        """
+        Args:
+            scenario: its file, or the name of one of the project's; its policy means nothing here.
+            scenario_name: which of the file; the first when None.
+            scenario_text: YAML merged over it.
+            perturb: perturbations, as `--perturb` takes them.
+            cameras: whether observations hold the images of each camera too.
+            render_mode: `rgb_array` for `render`, or None.
+
+        Raises:
+            UserError: the scenario cannot be used.
+            ValueError: a render mode that there is not.
+        """
+        if render_mode not in (None, *self.metadata["render_modes"]):
+            raise ValueError(f"render_mode must be rgb_array or None, not {render_mode!r}")
+        found = find_scenario(Path(scenario), scenario_name, scenario_text, perturb)
+        if not found.scenario.cameras:
+            raise UserError(f"{found.path}: cameras is empty: an agent needs at least one")
+        agent: Any = _Agent()
+        self._chosen = dataclasses.replace(
+            found, scenario=dataclasses.replace(found.scenario, policy=agent)
+        )
+        self.render_mode = render_mode
+        self.grid = found.scenario.heightmap.grid()
+        """The pixel grid of the observations."""
+        self.observation_space = observation_space(found.scenario, cameras=cameras)
+        self.action_space = action_space(self.grid)
+        self._with_cameras = cameras
+        self._cell: Cell | None = None
+        self._episode: Episode | None = None
+        self._earned = 0.0
+
+    @property
+    def scenario(self) -> Scenario:
+        """The scenario, with the agent for its policy; its cameras tell where images are from."""
+        return self._chosen.scenario
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[dict[str, Any], dict[str, Any]]:
+        """A new scene: see Gymnasium and the class.
+
+        Raises:
+            ValueError: a seed that is none.
+            UserError: the scene cannot be made.
+        """
+        if seed is not None and not 0 <= seed < _SEEDS:
+            raise ValueError(f"a seed is a whole number from 0 to {_SEEDS - 1}, not {seed}")
+        super().reset(seed=seed)
+        chosen_seed = int(self.np_random.integers(_SEEDS)) if seed is None else int(seed)
+        self.close()
+        self._cell = build_chosen(
+            self._chosen, seed=chosen_seed, picture=self.render_mode is not None
+        )
+        self._episode = Episode(
+            self._cell,
+            task=self.scenario.task,
+            scenario=self._chosen.name,
+            policy="agent",
+            seed=chosen_seed,
+            time_limit=self.scenario.time_limit,
+            pauses=True,
+        )
+        self._earned = 0.0
+        self._advance(self._episode)
+        return self._observe(), self._info(self._episode.result())
+
+    def step(self, action: ArrayLike) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
+        """One pick and place, or the end: see Gymnasium and the class.
+
+        Args:
+            action: (7,): `gym.spaces.ACTION`. A position off the workspace is moved to its edge.
+
+        Raises:
+            ValueError: not seven finite numbers.
+            gymnasium.error.ResetNeeded: there is no episode, or it is over.
+        """
+        if self._cell is None or self._episode is None or self._episode.is_over:
+            raise gymnasium.error.ResetNeeded("call reset() first: there is no episode under way")
+        cell, episode = self._cell, self._episode
+        given = as_action(action, self.grid)
+        self._give(cell, episode, self._with_heights(given))
+        result = episode.result()
+        is_done = result.success_rate > _ALL
+        if is_done and not episode.is_over:
+            # As a policy would that sees that nothing is left to do.
+            self._give(cell, episode, PickPlaceAction(stop=True))
+            result = episode.result()
+            is_done = result.success_rate > _ALL
+        reward, self._earned = result.success_rate - self._earned, result.success_rate
+        was_cut = episode.timed_out or episode.failure is not None
+        terminated = episode.is_over and not was_cut and (given.stop or is_done)
+        truncated = episode.is_over and not terminated
+        return self._observe(), reward, terminated, truncated, self._info(result)
+
+    def render(self) -> NDArray[np.uint8] | None:
+        """(800, 1280, 3): the whole cell as it stands now; None without a render mode.
+
+        Raises:
+            gymnasium.error.ResetNeeded: there is no scene yet.
+        """
+        if self.render_mode is None:
+            return None
+        if self._cell is None or self._episode is None:
+            raise gymnasium.error.ResetNeeded("call reset() first: there is nothing to render")
+        scene_graph = self._cell.scene_graph
+        context = scene_graph.GetMyContextFromRoot(self._episode.context)
+        return render_picture(scene_graph, context)
+
+    def close(self) -> None:
+        """Lets go of the simulation."""
+        self._cell = self._episode = None
+
+    def _give(self, cell: Cell, episode: Episode, action: PickPlaceAction) -> None:
+        agent = cell.diagram.GetSubsystemByName("policy")
+        agent.set_action(agent.GetMyMutableContextFromRoot(episode.context), action)
+        self._advance(episode)
+
+    @staticmethod
+    def _advance(episode: Episode) -> None:
+        episode.advance()
+        if episode.interrupted:
+            raise KeyboardInterrupt
+
+    def _observation(self) -> Observation:
+        assert self._cell is not None and self._episode is not None
+        return self._cell.diagram.GetOutputPort("observation").Eval(self._episode.context)
+
+    def _with_heights(self, action: PickPlaceAction) -> PickPlaceAction:
+        """The action with the heights that it has to respect, off the o_t that the agent saw."""
+        heights = read_surface_heights(self._observation(), action.pick, action.place)
+        return dataclasses.replace(action, heights=heights)
+
+    def _observe(self) -> dict[str, Any]:
+        arrays: dict[str, Any] = dict(as_arrays(self._observation()))
+        if self._with_cameras:
+            arrays["cameras"] = {name: self._images(name) for name in self.scenario.cameras}
+        return arrays
+
+    def _images(self, camera: str) -> dict[str, NDArray[Any]]:
+        """What o_t was projected from: noise, where the scenario has some, included."""
+        assert self._cell is not None and self._episode is not None
+        diagram, name = self._cell.diagram, f"sensor_noise_{camera}"
+        if not diagram.HasSubsystemNamed(name):
+            name = f"camera_{camera}"
+        sensor = diagram.GetSubsystemByName(name)
+        context = sensor.GetMyContextFromRoot(self._episode.context)
+        colour = sensor.GetOutputPort("color_image").Eval(context).data
+        depth = sensor.GetOutputPort("depth_image_32f").Eval(context).data
+        return {"colour": np.array(colour[:, :, :3]), "depth": np.array(depth[:, :, 0])}
+
+    def _info(self, result: EpisodeResult) -> dict[str, Any]:
+        assert self._cell is not None and self._episode is not None
+        planner = self._cell.planner
+        failed = planner.GetOutputPort("failed_picks").Eval(
+            planner.GetMyContextFromRoot(self._episode.context)
+        )
+        picks = tuple((pick.x, pick.y, pick.theta) for pick in failed)
+        info = {**result.as_dict(), "failed_picks": picks}
+        del info["wall_seconds"]
+        return info

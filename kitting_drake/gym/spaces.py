@@ -1,0 +1,100 @@
+"""What an agent sees and says: Gymnasium's spaces, and the values that travel on the wires."""
+
+import math
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import ArrayLike, NDArray
+
+from kitting_drake.scenario.schema import Scenario
+from systems.signals import Observation, PickPlaceAction, PixelGrid, PlanarPose
+
+ACTION = ("pick_x", "pick_y", "pick_theta", "place_x", "place_y", "place_theta", "stop")
+"""The entries of an action: the gripper's poses in the world, in metres and radians, and whether to
+stop instead, which it is above 0.5."""
+_ANGLES = [2, 5]
+
+
+def action_space(grid: PixelGrid) -> spaces.Box:
+    """(7,) float64: `ACTION`; positions are within the workspace, angles within pi of zero."""
+    low, high = (grid.x_min, grid.y_min, -math.pi), (grid.x_max, grid.y_max, math.pi)
+    return spaces.Box(np.array([*low, *low, 0.0]), np.array([*high, *high, 1.0]), dtype=np.float64)
+
+
+def observation_space(scenario: Scenario, *, cameras: bool) -> spaces.Dict:
+    """`colour` (rows, cols, 3), `height` (rows, cols) in metres above `grid.z_min` and `valid`
+    (rows, cols), as in `Observation`; with cameras also `cameras`: `colour` (height, width, 3) and
+    `depth` (height, width) in metres, infinite where too far and 0 where too near, of each."""
+    grid = scenario.heightmap.grid()
+    depth_range = grid.z_max - grid.z_min
+    parts: dict[str, spaces.Space[Any]] = {
+        "colour": spaces.Box(0, 255, (*grid.shape, 3), np.uint8),
+        "height": spaces.Box(0.0, float(np.float32(depth_range)), grid.shape, np.float32),
+        "valid": spaces.MultiBinary(grid.shape),
+    }
+    if cameras:
+        images: dict[str, spaces.Space[Any]] = {
+            name: spaces.Dict(
+                {
+                    "colour": spaces.Box(0, 255, (item.height, item.width, 3), np.uint8),
+                    "depth": spaces.Box(0.0, math.inf, (item.height, item.width), np.float32),
+                }
+            )
+            for name, item in scenario.cameras.items()
+        }
+        parts["cameras"] = spaces.Dict(images)
+    return spaces.Dict(parts)
+
+
+def as_arrays(observation: Observation) -> dict[str, NDArray[Any]]:
+    """o_t as the environments tell it: colours are rounded to 8 bits."""
+    colour = np.rint(255 * np.moveaxis(observation.rgb, 0, -1)).astype(np.uint8)
+    return {
+        "colour": colour,
+        "height": observation.height.copy(),
+        "valid": observation.valid.astype(np.int8),
+    }
+
+
+def as_observation(arrays: dict[str, Any], grid: PixelGrid) -> Observation:
+    """o_t as policies take it: the inverse of `as_arrays`.
+
+    Args:
+        arrays: an environment's observation.
+        grid: the scenario's: `environment.unwrapped.grid`.
+    """
+    rgb = np.moveaxis(np.asarray(arrays["colour"], np.float32) / np.float32(255), -1, 0)
+    image = np.concatenate([rgb, np.asarray(arrays["height"], np.float32)[None]])
+    return Observation(image=image, grid=grid, valid=np.asarray(arrays["valid"], bool))
+
+
+def as_action(values: ArrayLike, grid: PixelGrid) -> PickPlaceAction:
+    """The action that an agent says; positions off the workspace are moved to its edge.
+
+    Raises:
+        ValueError: not seven numbers, or one that is not finite.
+    """
+    array = np.asarray(values, dtype=np.float64)
+    if array.shape != (len(ACTION),):
+        raise ValueError(f"an action is {len(ACTION)} numbers, not of the shape {array.shape}")
+    for name, value in zip(ACTION, array, strict=True):
+        if not math.isfinite(value):
+            raise ValueError(f"{name} of an action must be a finite number, not {value}")
+    space = action_space(grid)
+    held = np.clip(array, space.low, space.high)
+    # An angle has no edge: any is the same as one within pi of zero.
+    held[_ANGLES] = array[_ANGLES]
+    pick, place = PlanarPose(*held[:3].tolist()), PlanarPose(*held[3:6].tolist())
+    return PickPlaceAction(pick, place, stop=bool(array[6] > 0.5))
+
+
+def as_values(action: PickPlaceAction) -> NDArray[np.float64]:
+    """(7,) the action of a policy as an agent says it.
+
+    Raises:
+        ValueError: it presses, which environments have no word for.
+    """
+    if action.press:
+        raise ValueError("an environment's actions cannot press: use a policy that does not")
+    return np.array([*action.pick.as_array(), *action.place.as_array(), float(action.stop)])

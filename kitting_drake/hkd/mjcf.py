@@ -1,0 +1,180 @@
+"""MuJoCo's MJCF of tools and kits, from their SDFormat models.
+
+MuJoCo takes the convex hull of every mesh that collides. A tool's collision meshes are convex; a
+kit's block is cut into upright convex prisms, exactly but for the bevel around the rims, which is
+one step of half its width and all of its depth.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from pathlib import Path
+from xml.etree import ElementTree
+from xml.sax.saxutils import quoteattr
+
+import numpy as np
+import trimesh
+from manifold3d import CrossSection, Manifold, Mesh, triangulate
+from numpy.typing import NDArray
+
+from kitting_drake.common.errors import UserError
+
+_DRAKE = "{http://drake.mit.edu}"
+_TORSION, _ROLLING = 0.002, 0.0001
+"""MuJoCo's own friction of spinning and rolling, in m; Drake has none."""
+_LEVEL = 1e-5
+"""Heights of a block that differ by less are one, in m."""
+_TOLERANCE = 5e-5
+"""How far outlines may be simplified, in m."""
+_SLIVER = 1e-9
+"""What is smaller is no part of a block, in m^2."""
+
+
+def tool_mjcf(sdf: Path) -> str:
+    """A tool's model: one free body, named as the model, whose frame is the tool frame T.
+
+    Args:
+        sdf: its SDFormat model, of one link; the result names the same meshes, relatively where the
+            SDFormat does.
+
+    Raises:
+        UserError: it cannot be read.
+    """
+    try:
+        model = ElementTree.parse(sdf).getroot().find("model")
+        assert model is not None
+        link = model.find("link")
+        assert link is not None
+        return _tool(model.attrib["name"], link)
+    except (OSError, ElementTree.ParseError, AssertionError, KeyError, ValueError) as error:
+        raise UserError(f"{sdf} is no model of a tool: {error!r}") from error
+
+
+def _tool(name: str, link: ElementTree.Element) -> str:
+    centre = " ".join(_text(link, "inertial/pose").split()[:3])
+    keys = ("ixx", "iyy", "izz", "ixy", "ixz", "iyz")
+    inertia = " ".join(_text(link, f"inertial/inertia/{key}") for key in keys)
+    mass = _text(link, "inertial/mass")
+    assets, geoms = [], []
+    for kind in ("visual", "collision"):
+        for number, element in enumerate(link.findall(kind)):
+            mesh = f"{name}_{kind}_{number}"
+            scale = element.findtext("geometry/mesh/scale") or "1 1 1"
+            file = quoteattr(_text(element, "geometry/mesh/uri"))
+            assets.append(f'<mesh name="{mesh}" file={file} scale="{scale}"/>')
+            if kind == "visual":
+                colour = _text(element, "material/diffuse")
+                geoms.append(_geom(mesh, f'rgba="{colour}" contype="0" conaffinity="0" group="2"'))
+            else:
+                friction = _text(element, f"{_DRAKE}proximity_properties/{_DRAKE}mu_dynamic")
+                geoms.append(_geom(mesh, f'{_friction(float(friction))} group="3"'))
+    body = (
+        f'<body name="{name}">\n      <freejoint/>\n'
+        f'      <inertial pos="{centre}" mass="{mass}" fullinertia="{inertia}"/>\n      '
+        + "\n      ".join(geoms)
+        + "\n    </body>"
+    )
+    return _document(name, assets, body)
+
+
+def kit_mjcf(sdf: Path) -> str:
+    """A kit's model: one body `kit` that does not move, whose frame is the kit frame K.
+
+    Args:
+        sdf: its SDFormat model; `kit.obj` and the visual meshes are beside it.
+
+    Raises:
+        UserError: it, or its block, cannot be read.
+    """
+    try:
+        link = ElementTree.parse(sdf).getroot().find("model/link")
+        assert link is not None
+        mesh = trimesh.load_mesh(sdf.parent / "kit.obj")
+        friction = float(_text(link, f"collision/{_DRAKE}proximity_properties/{_DRAKE}mu_dynamic"))
+        assets, geoms = [], []
+        for element in link.findall("visual"):
+            name, colour = f"kit_{element.attrib['name']}", _text(element, "material/diffuse")
+            file = quoteattr(_text(element, "geometry/mesh/uri"))
+            assets.append(f'<mesh name="{name}" file={file}/>')
+            geoms.append(_geom(name, f'rgba="{colour}" contype="0" conaffinity="0" group="2"'))
+    except (OSError, ElementTree.ParseError, AssertionError, ValueError) as error:
+        raise UserError(f"{sdf} is no model of a kit: {error!r}") from error
+    for number, prism in enumerate(block_prisms(mesh.vertices, mesh.faces)):
+        points = " ".join(f"{value:.6g}" for value in prism.ravel())
+        assets.append(f'<mesh name="kit_part_{number}" vertex="{points}"/>')
+        geoms.append(_geom(f"kit_part_{number}", f'{_friction(friction)} group="3"'))
+    body = '<body name="kit">\n      ' + "\n      ".join(geoms) + "\n    </body>"
+    return _document("kit", assets, body)
+
+
+def block_prisms(
+    vertices: NDArray[np.float64], faces: NDArray[np.int64]
+) -> list[NDArray[np.float64]]:
+    """A block of upright walls as convex upright prisms, which may overlap.
+
+    Args:
+        vertices: (n, 3), in m.
+        faces: (m, 3), of a watertight mesh.
+
+    Returns:
+        (k, 3) the corners of each, in m.
+    """
+    solid = Manifold(Mesh(vertices.astype(np.float32), faces.astype(np.uint32)))
+    levels = [float(vertices[:, 2].min())]
+    for z in np.unique(vertices[:, 2]):
+        if z - levels[-1] > _LEVEL:
+            levels.append(float(z))
+    layers = [
+        solid.slice((low + high) / 2).simplify(_TOLERANCE)
+        for low, high in itertools.pairwise(levels)
+    ]
+    prisms: list[NDArray[np.float64]] = []
+    # From the top: what is new in a layer reaches from there to the bottom.
+    above = CrossSection()
+    for layer, top in zip(reversed(layers), reversed(levels[1:]), strict=True):
+        prisms += [_prism(part, levels[0], top) for part in _convex_parts(layer - above)]
+        above = above + layer
+    return prisms
+
+
+def _convex_parts(region: CrossSection) -> list[NDArray[np.float64]]:
+    """(3 or more, 2) the corners of convex polygons that make up a region."""
+    loops = [np.asarray(loop) for loop in region.to_polygons()]
+    if not loops:
+        return []
+    corners = np.concatenate(loops)
+    triangles = corners[np.asarray(triangulate(loops))]
+    edge_1, edge_2 = triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]
+    area = edge_1[:, 0] * edge_2[:, 1] - edge_1[:, 1] * edge_2[:, 0]
+    return list(triangles[np.abs(area) > 2 * _SLIVER])
+
+
+def _prism(polygon: NDArray[np.float64], bottom: float, top: float) -> NDArray[np.float64]:
+    return np.concatenate(
+        [np.column_stack([polygon, np.full(len(polygon), z)]) for z in (bottom, top)]
+    )
+
+
+def _text(element: ElementTree.Element, path: str) -> str:
+    text = element.findtext(path)
+    if not text:
+        raise ValueError(f"there is no {path}")
+    return text
+
+
+def _friction(sliding: float) -> str:
+    return f'condim="4" friction="{sliding:g} {_TORSION:g} {_ROLLING:g}"'
+
+
+def _geom(mesh: str, properties: str) -> str:
+    return f'<geom type="mesh" mesh="{mesh}" {properties}/>'
+
+
+def _document(name: str, assets: Sequence[str], body: str) -> str:
+    listed = "\n    ".join(assets)
+    return (
+        f'<mujoco model="{name}">\n  <compiler angle="radian"/>\n'
+        f"  <asset>\n    {listed}\n  </asset>\n"
+        f"  <worldbody>\n    {body}\n  </worldbody>\n</mujoco>\n"
+    )

@@ -1,0 +1,162 @@
+"""A policy that decides by onnxruntime and numpy, without torch: what `export_onnx` wrote.
+
+The reference for who runs the networks elsewhere: the same decisions as `LearnedPolicy` with the
+same settings. It takes from the project only what imports neither torch nor Drake.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kitting_drake.common.errors import UserError
+from kitting_drake.policies.fibres import fourier_basis
+from kitting_drake.policies.fourier_series import series_maximum
+from kitting_drake.policies.images import Image, crop, make_action, rotation_matrix
+from kitting_drake.policies.matching.policy import something_fits
+from kitting_drake.policies.matching.refinement import refine_grasp, refine_place
+from kitting_drake.policies.matching.segmentation import fill_unseen, segment
+from kitting_drake.policies.numpy_correlation import Array, search
+from systems.signals import Observation, PickPlaceAction, wrap_to_pi
+
+_GRAPHS = ("alpha", "beta", "phi", "psi")
+_NOTHING_LOGIT = math.log(160 * 320)
+"""See `losses.NOTHING_LOGIT`."""
+
+
+class OnnxPolicy:
+    """A function from an observation to an action, for `policy: !PythonPolicy` too."""
+
+    def __init__(
+        self,
+        folder: Path,
+        *,
+        orientations: int = 180,
+        continuous: bool = True,
+        fit_outlines: bool = False,
+    ) -> None:
+        """
+        Args:
+            folder: what `export_onnx` wrote.
+            orientations: N, even; that of the training for an Equivariant Transporter.
+            continuous: as for `LearnedPolicy`.
+            fit_outlines: as for `LearnedPolicy`.
+
+        Raises:
+            UserError: the folder cannot be read.
+            ImportError: onnxruntime is not installed.
+        """
+        import onnxruntime
+
+        try:
+            self.config: dict[str, Any] = json.loads((folder / "policy.json").read_text())
+            self._sessions = {
+                name: onnxruntime.InferenceSession(
+                    (folder / f"{name}.onnx").read_bytes(), providers=["CPUExecutionProvider"]
+                )
+                for name in _GRAPHS
+            }
+        except (OSError, ValueError) as error:
+            raise UserError(f"{folder} holds no policy as ONNX: {error}") from error
+        self._orientations = orientations
+        self._continuous = continuous
+        self._fit_outlines = fit_outlines
+
+    def __call__(self, observation: Observation) -> PickPlaceAction:
+        """The action; both gripper poses are in the world."""
+        resolution, orientations = observation.grid.resolution, self._orientations
+        image = self._input(observation)
+        rows, cols = image.shape[1:]
+        outlines = segment(observation) if self._fit_outlines else None
+        logits = self._run("alpha", image)[0, 0, :rows, :cols]
+        if self._stops(logits) and not (
+            outlines is not None and something_fits(outlines, resolution)
+        ):
+            return PickPlaceAction(stop=True)
+        row, col = divmod(int(logits.argmax()), cols)
+        pixel = np.array([row, col], float)
+        pick = pixel + _mean_offset(logits, (row, col)) if self._continuous else pixel
+        theta = self._angle(self._run("beta", crop(image, (row, col), self.config["pick_crop"]))[0])
+        if outlines is not None:
+            grasp = refine_grasp(outlines, pick, theta, resolution)
+            if grasp is not None:
+                pick, theta = grasp.pick, grasp.theta
+
+        encoding = self._run("psi", crop(image, (row, col), self.config["place_crop"]))[0]
+        window = search(self._run("phi", image)[0], encoding, orientations, (rows, cols))
+        found = window.best()
+        if self._continuous:
+            index = (found - window.origin).astype(int)
+            found = found + _mean_offset(window.scores, tuple(index))
+        rotation = wrap_to_pi(found[0] * math.tau / orientations)
+        # The crop is centred on a pixel. Its predicted motion applies to the refined pick too.
+        place = found[1:] + rotation_matrix(rotation) @ (pick - pixel)
+        if outlines is not None:
+            fitted = refine_place(outlines, pick, rotation, place, resolution)
+            if fitted is not None:
+                rotation, place = fitted.rotation, fitted.place
+        return make_action(observation, pick, theta, place, rotation)
+
+    def prepare(self, image: Image) -> Array:
+        """(1, channels, rows, cols): an input of the graphs from an observation or a crop of one.
+
+        Height alone where the networks see no colour; zeros below and on the right up to sides that
+        are one above a multiple of `stride`; all normalised.
+
+        Args:
+            image: (4, rows, cols), as `Observation.image`.
+        """
+        config = self.config
+        stride, channels = config["stride"], config["channels"]
+        ends = [(0, (1 - side) % stride) for side in image.shape[1:]]
+        seen = np.pad(image[-channels:], [(0, 0), *ends])
+        mean = np.array([config["colour_mean"]] * 3 + [config["height_mean"]], np.float32)
+        std = np.array([config["colour_std"]] * 3 + [config["height_std"]], np.float32)
+        shape = (channels, 1, 1)
+        return ((seen - mean[-channels:].reshape(shape)) / std[-channels:].reshape(shape))[None]
+
+    def _input(self, observation: Observation) -> Image:
+        if self.config["colour"]:
+            return observation.image
+        filled = fill_unseen(observation.height, observation.valid)
+        return np.concatenate([observation.rgb, filled[None]])
+
+    def _run(self, name: str, image: Image) -> Array:
+        (output,) = self._sessions[name].run(["output"], {"image": self.prepare(image)})
+        return output
+
+    def _stops(self, logits: Array) -> bool:
+        threshold = self.config["stop_threshold"]
+        if not self.config["stop"] or threshold is None:
+            return False
+        most = float(logits.max())
+        total = most + math.log(float(np.exp(logits.astype(np.float64) - most).sum()))
+        return total - _NOTHING_LOGIT < threshold
+
+    def _angle(self, output: Array) -> float:
+        """The gripper's angle, in radians, from beta's output: coefficients, or logits of bins."""
+        values, frequencies = output.astype(np.float64), self.config["angle_frequencies"]
+        step = math.tau / self._orientations
+        if self.config["method"] != "so2":
+            return int(values.argmax()) * step
+        if self._continuous:
+            return series_maximum(values, frequencies)
+        angles = step * np.arange(self._orientations // 2)
+        return int((fourier_basis(angles, frequencies) @ values).argmax()) * step
+
+
+def _mean_offset(logits: Array, index: tuple[int, ...]) -> NDArray[np.float64]:
+    """Sub-pixel and sub-bin refinement: the mean offset from an entry under the softmax over it and
+    its neighbours."""
+    starts = [max(i - 1, 0) for i in index]
+    part = logits[tuple(slice(start, i + 2) for start, i in zip(starts, index, strict=True))]
+    weights = np.exp(part.astype(np.float64) - part.max())
+    weights /= weights.sum()
+    offsets = np.stack(np.meshgrid(*(np.arange(n) for n in part.shape), indexing="ij"))
+    mean = (offsets * weights).reshape(len(index), -1).sum(axis=1)
+    return np.array(starts) + mean - np.array(index)

@@ -1,0 +1,96 @@
+"""MuJoCo's models of tools and kits: what the SDFormat says, in MuJoCo's words."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import trimesh
+from manifold3d import Manifold
+
+from kitting_drake.common.errors import UserError
+from kitting_drake.hkd import dataset
+from kitting_drake.hkd.kits.kit import Kit, make_kit
+from kitting_drake.hkd.kits.parameters import KitParameters
+from kitting_drake.hkd.mjcf import block_prisms, kit_mjcf, tool_mjcf
+from kitting_drake.hkd.tools.scaling import scaled_tool
+from kitting_drake.hkd.tools.tool import Tool, load_tool
+from kitting_drake.hkd.tools.toolsets import toolsets
+
+TOOLS = ("claw_hammer", "combination_wrench")
+
+
+@pytest.fixture(scope="module")
+def kit() -> Kit:
+    return make_kit([load_tool(name) for name in TOOLS], KitParameters())
+
+
+def compiled(text: str, folder: Path) -> Any:
+    mujoco = pytest.importorskip("mujoco")
+    spec = mujoco.MjSpec.from_string(text)
+    spec.meshdir = str(folder)
+    return spec.compile()
+
+
+@pytest.mark.parametrize("length", [None, 0.16])
+def test_a_tool_weighs_and_rubs_as_its_sdformat_says(length: float | None):
+    tool: Tool = load_tool("claw_hammer")
+    tool = tool if length is None else scaled_tool(tool, length)
+    model = compiled(tool_mjcf(tool.sdf), tool.directory)
+    assert model.body_mass[1] == pytest.approx(tool.mass, rel=1e-3)
+    assert model.nq == 7
+    collides = model.geom_contype > 0
+    assert 1 < collides.sum() < len(collides)
+    assert np.allclose(model.geom_friction[collides, 0], 0.5)
+
+
+def test_a_kits_prisms_are_its_block(kit: Kit):
+    mesh = trimesh.load_mesh(kit.sdf.parent / "kit.obj")
+    solid = Manifold()
+    for prism in block_prisms(mesh.vertices, mesh.faces):
+        solid += Manifold.hull_points(prism)
+    # But for the bevels, of which the step gives about as much as it takes.
+    assert solid.volume() == pytest.approx(mesh.volume, rel=1e-4)
+    model = compiled(kit_mjcf(kit.sdf), kit.sdf.parent)
+    assert model.nq == 0
+    assert np.allclose(model.geom_friction[model.geom_contype > 0, 0], 0.3)
+
+
+def test_a_seated_tool_stays_in_its_cavity(kit: Kit):
+    mujoco = pytest.importorskip("mujoco")
+    tool, goal = kit.tools[1], kit.goal(1)
+    world = mujoco.MjSpec()
+    for prefix, text, folder, place in (
+        ("kit_", kit_mjcf(kit.sdf), kit.sdf.parent, [0, 0, 0]),
+        ("tool_", tool_mjcf(tool.sdf), tool.directory, [goal.x, goal.y, goal.z + 0.001]),
+    ):
+        spec = mujoco.MjSpec.from_string(text)
+        spec.meshdir = str(folder)
+        world.attach(spec, prefix=prefix, frame=world.worldbody.add_frame(pos=place))
+    model = world.compile()
+    data = mujoco.MjData(model)
+    for _ in range(500):
+        mujoco.mj_step(model, data)
+    assert np.abs(data.qpos[:3] - [goal.x, goal.y, goal.z]).max() < 1e-3
+    assert np.abs(data.qvel).max() < 0.02
+
+
+def test_the_dataset_has_them_where_they_are_asked_for(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr(dataset, "toolsets", lambda split: toolsets(split)[:1])
+    manifest = dataset.build_dataset(tmp_path / "hkd", lambda done, total: None, mjcf=True)
+    for entry in (manifest["tools"][0], manifest["kits"][0]):
+        path = tmp_path / "hkd" / entry["mjcf"]
+        assert entry["mjcf"] in entry["sha256"]
+        compiled(path.read_text(), path.parent)
+
+
+def test_what_is_no_model_is_told(tmp_path: Path):
+    path = tmp_path / "broken.sdf"
+    for text in ("", "<sdf/>", "<sdf><model name='x'><link name='y'/></model></sdf>"):
+        path.write_text(text)
+        with pytest.raises(UserError, match="is no model of a tool"):
+            tool_mjcf(path)
+        with pytest.raises(UserError, match="is no model of a kit"):
+            kit_mjcf(path)
