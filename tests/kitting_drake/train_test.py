@@ -19,6 +19,7 @@ from kitting_drake import train as training
 from kitting_drake.common.errors import UserError
 from kitting_drake.common.files import alone_in
 from kitting_drake.policies import training as steps
+from kitting_drake.policies import training_run
 from kitting_drake.policies.demonstrations import (
     Demonstration,
     DemonstrationStep,
@@ -73,7 +74,7 @@ def words(demos: Path, folder: Path, *more: object) -> list[str]:
 def train(demos: Path, folder: Path, *more: object) -> None:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(sys, "argv", ["train", *words(demos, folder, *more)])
-        patch.setattr(training, "_CHECKPOINT_EVERY", 2)
+        patch.setattr(training_run, "_CHECKPOINT_EVERY", 2)
         # Some of few steps have a final observation.
         patch.setattr(steps, "_STOP_PROBABILITY", 0.5)
         assert training.main() == 0
