@@ -31,9 +31,11 @@ _TABLE_BAND = 0.008
 """Pixels within this of the table's height belong to it, however it is tilted, in metres."""
 _LEAST_TABLE, _FITS = 500, 3
 _LEVEL = 0.0003
-"""A tilt that brings less than this at the border is none, in metres."""
+"""A table that is nowhere off by more than this is level, in metres."""
+_MOST_OFF = 0.010
+"""One that is off by more is where it is, in metres."""
 _TILT_DOUBT, _MOST_DOUBT = 0.3, 0.0025
-"""Heights may be off by this share of what a tilt brought, and by at most this, in metres."""
+"""Heights may be off by this share of what the table was, and by at most this, in metres."""
 
 
 def read_surface_heights(
@@ -45,9 +47,9 @@ def read_surface_heights(
     an object in the middle of others is taken to stand on what they stand on.
 
     Tops are the highest of some pixels. Where o_t is noisy that would be the noise: then they are
-    medians and percentiles, corrected by what these are off in such noise. The table is level; a
-    tilt that o_t shows is one of the calibration, and is taken away. Neither is done where there is
-    nothing to correct.
+    medians and percentiles, corrected by what these are off in such noise. The table is level and
+    at the bottom of the grid: that it is tilted or higher in o_t is an error of calibration, and is
+    taken away. Neither is done where there is nothing to correct.
 
     Args:
         observation: o_t.
@@ -83,7 +85,7 @@ def read_surface_heights(
         near_place=grid.z_min
         + float(_around(height, at_place, reach["near_place"]).max(initial=0.0)),
         highest=grid.z_min + float(height.max(initial=0.0)),
-        table=grid.z_min + table,
+        table=grid.z_min + max(table, 0.0),
         doubt=doubt,
     )
 
@@ -93,35 +95,36 @@ def _percentile(values: NDArray[np.float32], share: float) -> float:
 
 
 def _level(height: NDArray[np.float32]) -> tuple[NDArray[np.float32], float, float]:
-    """Heights (rows, cols) without the tilt of the table, the standard deviation of their noise,
-    and what they may still be off; the same heights and zeros where there is neither."""
+    """Heights (rows, cols) above the table as it is, the standard deviation of their noise, and
+    what they may still be off; the same heights and zeros where there is nothing to correct."""
     away = np.abs(height - ndimage.uniform_filter(height, _SMOOTHED, mode="nearest"))
     noise = 1.4826 * float(np.median(away))
     if noise < _CLEAN:
         noise = 0.0
-    tilt = _tilt(height, noise)
-    largest = float(np.abs(tilt).max())
+    table = _table(height, noise)
+    largest = float(np.abs(table).max())
     if largest < _LEVEL:
         return height, noise, min(noise, _MOST_DOUBT)
     doubt = min(noise + _TILT_DOUBT * largest, _MOST_DOUBT)
-    return (height - tilt).astype(np.float32), noise, doubt
+    return (height - table).astype(np.float32), noise, doubt
 
 
-def _tilt(height: NDArray[np.float32], noise: float) -> NDArray[np.float64]:
-    """(rows, cols): by how much a plane through the table departs from its height in the middle."""
-    table = np.percentile(height, _TABLE_SHARE) + noise
+def _table(height: NDArray[np.float32], noise: float) -> NDArray[np.float64]:
+    """(rows, cols): the plane of the table, as o_t shows it; zero if it shows none near zero."""
+    start = np.percentile(height, _TABLE_SHARE) + noise
     rows, cols = (axis - axis.mean() for axis in np.indices(height.shape, np.float64))
-    near = np.abs(height - table) < _TABLE_BAND + 3 * noise
-    slope = np.zeros(2)
+    tilt = np.zeros(height.shape)
+    near = np.abs(height - start) < _TABLE_BAND + 3 * noise
     for _ in range(_FITS):
         if near.sum() < _LEAST_TABLE:
-            break
+            return np.zeros(height.shape)
         design = np.column_stack([rows[near], cols[near], np.ones(near.sum())])
         plane = np.linalg.lstsq(design, height[near], rcond=None)[0]
-        slope = plane[:2]
-        residual = height - (rows * slope[0] + cols * slope[1] + plane[2])
-        near = np.abs(residual) < _TABLE_BAND / 2 + 2 * noise
-    return rows * slope[0] + cols * slope[1]
+        tilt = rows * plane[0] + cols * plane[1]
+        near = np.abs(height - tilt - plane[2]) < _TABLE_BAND / 2 + 2 * noise
+    level = float(np.median((height - tilt)[near])) if near.any() else 0.0
+    # A grid that begins well below the table is no error of calibration.
+    return tilt + level if level < _MOST_OFF else tilt
 
 
 def _around(
