@@ -124,14 +124,14 @@ class _Handler(BaseHTTPRequestHandler):
     server: AnnotationServer
 
     def do_GET(self) -> None:
-        """Answers with the page, the steps, or an image."""
+        """Serves the page, the steps, or an image."""
         image = re.fullmatch(r"/steps/(\d+)/(color|height)\.png", self.path)
         if not self._is_local():
             self._fail(HTTPStatus.FORBIDDEN, "the page is for this machine only")
         elif self.path == "/":
-            self._answer("text/html; charset=utf-8", _PAGE.read_bytes())
+            self._send("text/html; charset=utf-8", _PAGE.read_bytes())
         elif self.path == "/steps":
-            self._answer_json(self.server.describe())
+            self._send_json(self.server.describe())
         elif image and int(image[1]) < len(self.server.steps):
             try:
                 observation = self.server.observation(int(image[1]))
@@ -139,7 +139,7 @@ class _Handler(BaseHTTPRequestHandler):
                 self._fail(HTTPStatus.BAD_REQUEST, str(error))
                 return
             draw = draw_color if image[2] == "color" else draw_height
-            self._answer("image/png", draw(observation))
+            self._send("image/png", draw(observation))
         else:
             self._fail(HTTPStatus.NOT_FOUND, f"there is no {self.path}")
 
@@ -158,7 +158,7 @@ class _Handler(BaseHTTPRequestHandler):
         except UserError as error:
             self._fail(HTTPStatus.BAD_REQUEST, str(error))
             return
-        self._answer_json(self.server.describe())
+        self._send_json(self.server.describe())
 
     def log_message(self, format: str, *args: Any) -> None:
         """Says nothing: the page itself tells what happens."""
@@ -178,15 +178,15 @@ class _Handler(BaseHTTPRequestHandler):
         except (ValueError, RecursionError) as error:
             raise UserError(f"the action is no JSON: {error}") from error
 
-    def _answer_json(self, value: Any, status: HTTPStatus = HTTPStatus.OK) -> None:
-        self._answer("application/json", json.dumps(value).encode(), status)
+    def _send_json(self, value: Any, status: HTTPStatus = HTTPStatus.OK) -> None:
+        self._send("application/json", json.dumps(value).encode(), status)
 
     def _fail(self, status: HTTPStatus, reason: str) -> None:
         # What was sent may not have been read: nothing more is read on this connection.
         self.close_connection = True
-        self._answer_json({"error": reason}, status)
+        self._send_json({"error": reason}, status)
 
-    def _answer(self, kind: str, content: bytes, status: HTTPStatus = HTTPStatus.OK) -> None:
+    def _send(self, kind: str, content: bytes, status: HTTPStatus = HTTPStatus.OK) -> None:
         self.send_response(status)
         self.send_header("Content-Type", kind)
         self.send_header("Content-Length", str(len(content)))

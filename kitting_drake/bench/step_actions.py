@@ -40,7 +40,10 @@ class StepAction:
             result["calibration"] = self.calibration
         if self.action.stop:
             return result
-        result |= {"object": self.object, "category": self.category}
+        if self.object != UNNAMED:
+            result["object"] = self.object
+        if self.category:
+            result["category"] = self.category
         for name, pose in (("pick", self.action.pick), ("place", self.action.place)):
             result[name] = {"x": pose.x, "y": pose.y, "yaw": wrap_to_pi(pose.theta)}
         return result

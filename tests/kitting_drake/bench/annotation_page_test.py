@@ -79,6 +79,9 @@ def test_a_person_annotates_a_demonstration_and_does_it_again(
     assert status == 200
     assert told["steps"][0]["action"]["object"] == "red"
     assert told["steps"][1]["action"]["stop"] is True
+    written = json.loads((folder / "demo" / "step1" / "action.json").read_text())
+    assert "category" not in written
+    assert set(written["pick"]) == {"x", "y", "yaw"}
     path = folder.parent / "mine.h5"
     convert(folder, BENCH, Learning(), path)
     (demonstration,) = read_demonstrations(path).demonstrations
@@ -131,7 +134,7 @@ def test_other_origins_are_refused(server: AnnotationServer, folder: Path):
     assert not list(folder.rglob("action.json"))
 
 
-def test_what_is_wrong_with_a_step_is_told_and_can_be_mended(
+def test_what_is_wrong_with_a_step_is_told_and_can_be_repaired(
     server: AnnotationServer, folder: Path
 ):
     step = folder / "demo" / "step1"
