@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
+import hashlib
+import json
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -135,12 +137,8 @@ def _read_grid(path: Path, node: Any, table_height: float) -> PixelGrid:
         raise UserError(f"{path}: workspace: {error}") from error
 
 
-def write_calibration(path: Path, calibration: Calibration) -> None:
-    """Writes a calibration in our own layout, to the last bit.
-
-    Raises:
-        UserError: the file cannot be written.
-    """
+def calibration_record(calibration: Calibration) -> dict[str, Any]:
+    """A calibration in our own layout, as YAML and JSON take it, to the last bit."""
     grid = calibration.grid
     content: dict[str, Any] = {
         "table_height": float(grid.z_min),
@@ -162,6 +160,22 @@ def write_calibration(path: Path, calibration: Calibration) -> None:
             "max_depth": camera.max_depth,
             "camera_to_base": np.asarray(camera.X_BC).tolist(),
         }
+    return content
+
+
+def calibration_digest(calibration: Calibration) -> str:
+    """Equal for calibrations that say the same, in whichever layout."""
+    text = json.dumps(calibration_record(calibration), sort_keys=True)
+    return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+
+def write_calibration(path: Path, calibration: Calibration) -> None:
+    """Writes a calibration in our own layout, to the last bit.
+
+    Raises:
+        UserError: the file cannot be written.
+    """
+    content = calibration_record(calibration)
     write_atomically(path, yaml.safe_dump(content, sort_keys=False, default_flow_style=None))
 
 

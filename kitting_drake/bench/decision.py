@@ -10,10 +10,9 @@ from typing import Any
 import numpy as np
 
 from kitting_drake.bench.calibration import Calibration
-from kitting_drake.bench.frames import Frame, check_frame
+from kitting_drake.bench.frames import Frame
 from kitting_drake.bench.policies import BenchPolicy, Choice
-from kitting_drake.bench.sight import make_views
-from systems.heightmap import project
+from kitting_drake.bench.sight import observe
 from systems.motion_heights import MotionHeights, motion_heights
 from systems.pick_place_parameters import PickPlaceParameters
 from systems.signals import Observation, PickPlaceAction, PlanarPose, SurfaceHeights, wrap_to_pi
@@ -109,12 +108,7 @@ def decide(
         UserError: frames, calibration and policy do not fit together; says what would do.
     """
     policy.check_grid(calibration.grid)
-    checked = {
-        camera.name: check_frame(frames[camera.name], camera)
-        for camera in calibration.cameras
-        if camera.name in frames
-    }
-    observation = project(make_views(checked, calibration), calibration.grid)
+    observation = observe(frames, calibration)
     choice = policy.choose(observation, failed_picks)
     parameters = PickPlaceParameters() if parameters is None else parameters
     surfaces = SurfaceHeights()

@@ -9,10 +9,10 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from kitting_drake.bench.calibration import BenchCamera, Calibration
-from kitting_drake.bench.frames import Frame
+from kitting_drake.bench.frames import Frame, check_frame
 from kitting_drake.common.errors import UserError
-from systems.heightmap import View
-from systems.signals import PixelGrid
+from systems.heightmap import View, project
+from systems.signals import Observation, PixelGrid
 
 Array = NDArray[np.float64]
 
@@ -30,6 +30,24 @@ _STEP = 4
 _OPTICAL = np.eye(4)
 _OPTICAL[:3, :3] = Rotation.from_euler("xyz", [-90, 0, -90], degrees=True).as_matrix()
 """The optical frame in a camera's body frame as ROS has it (x forward, y left, z up)."""
+
+
+def observe(frames: Mapping[str, Frame], calibration: Calibration) -> Observation:
+    """o_t, by the arithmetic of the simulated cell.
+
+    Args:
+        frames: of each camera by its name.
+        calibration: of the cameras.
+
+    Raises:
+        UserError: a frame is missing, has a wrong size or type, or does not fit the calibration.
+    """
+    checked = {
+        camera.name: check_frame(frames[camera.name], camera)
+        for camera in calibration.cameras
+        if camera.name in frames
+    }
+    return project(make_views(checked, calibration), calibration.grid)
 
 
 def make_views(frames: Mapping[str, Frame], calibration: Calibration) -> list[View]:

@@ -61,7 +61,7 @@ def number(value: Any, where: str) -> float:
     try:
         # YAML 1.1 takes 4e2 for a text.
         result = float(value) if not isinstance(value, bool) else math.nan
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         result = math.nan
     if not math.isfinite(result):
         raise UserError(f"{where} must be a finite number, not {value!r}")

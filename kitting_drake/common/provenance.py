@@ -1,5 +1,6 @@
 """The provenance of results beside the scenario: versions, and the commit."""
 
+import contextlib
 import importlib.metadata
 import platform
 import subprocess
@@ -11,13 +12,11 @@ import kitting_drake
 
 
 def versions() -> dict[str, str]:
-    """The versions of this package and of its foundations."""
-    return {
-        "kitting_drake": kitting_drake.__version__,
-        "drake": importlib.metadata.version("drake"),
-        "numpy": np.__version__,
-        "python": platform.python_version(),
-    }
+    """The versions of this package and of its foundations; Drake's only where it is installed."""
+    found = {"kitting_drake": kitting_drake.__version__}
+    with contextlib.suppress(importlib.metadata.PackageNotFoundError):
+        found["drake"] = importlib.metadata.version("drake")
+    return found | {"numpy": np.__version__, "python": platform.python_version()}
 
 
 def commit() -> str | None:
