@@ -32,7 +32,7 @@ _TABLE_BAND = 0.008
 _LEAST_TABLE, _FITS = 500, 3
 _LEVEL = 0.0003
 """A table that is nowhere off by more than this is level, in metres."""
-_MOST_OFF = 0.010
+_MOST_OFF = 0.008
 """One that is off by more is where it is, in metres."""
 _TILT_DOUBT, _MOST_DOUBT = 0.3, 0.0025
 """Heights may be off by this share of what the table was, and by at most this, in metres."""

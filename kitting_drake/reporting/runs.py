@@ -36,6 +36,8 @@ _ADDED = (
     "task.distractors",
     "task.tries",
     "task.pool",
+    "task.kit.always_nested",
+    "task.kit.fixed_size",
     "planner.press_force",
     "planner.press_depth",
     "planner.search.reach",

@@ -68,7 +68,8 @@ def test_the_graphs_agree_with_torch(exported: Path):
             expected = getattr(networks, name)(prepared).numpy()
         session = onnxruntime.InferenceSession(str(exported / f"{name}.onnx"))
         (found,) = session.run(None, {"image": prepared.numpy()})
-        assert np.abs(found - expected).max() < 1e-4
+        # Logits of beta reach forty: float32 has seven digits of them.
+        assert np.abs(found - expected).max() < 1e-4 * max(1.0, np.abs(expected).max() / 10)
         assert np.abs(OnnxPolicy(exported).prepare(part) - prepared.numpy()).max() < 1e-6
 
 
