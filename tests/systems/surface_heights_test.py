@@ -47,3 +47,43 @@ def test_poses_off_the_grid_have_the_lowest_heights():
     found = read_surface_heights(observation((PICK, 0.01, 0.03)), away, away)
     assert (found.pick_top, found.support, found.place_rim) == (GRID.z_min,) * 3
     assert found.highest == pytest.approx(0.03, abs=1e-6)
+
+
+def on_a_kit(grid: PixelGrid) -> np.ndarray:
+    """Heights (rows, cols): a tool of 20 mm, and a block of 50 mm with a cavity at the place."""
+    rows, cols = np.indices(grid.shape)
+    x, y = np.moveaxis(grid.to_world(np.stack([rows, cols], axis=-1)), -1, 0)
+    height = np.zeros(grid.shape)
+    height[(np.abs(x - PICK.x) < 0.06) & (np.abs(y - PICK.y) < 0.012)] = 0.02
+    height[(np.abs(x - PLACE.x) < 0.1) & (np.abs(y - PLACE.y) < 0.1)] = 0.05
+    height[(np.abs(x - PLACE.x) < 0.06) & (np.abs(y - PLACE.y) < 0.008)] = 0.02
+    return height
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.0015])
+@pytest.mark.parametrize("off", [0.0, 0.003])
+def test_errors_of_cameras_are_taken_away(noise: float, off: float):
+    """Noise, a tilt of 0.3 degrees and an error in height hardly change what is read."""
+    grid = PixelGrid()
+    true = on_a_kit(grid)
+    rng = np.random.default_rng(0)
+    errors = []
+    for _ in range(5):
+        tilt = np.tan(np.radians(0.3)) * np.arange(grid.cols) * grid.resolution
+        seen = true + noise * rng.standard_normal(grid.shape) + off + (tilt if off else 0)
+        image = np.zeros((4, *grid.shape), np.float32)
+        image[3] = np.maximum(seen, 0)
+        found = read_surface_heights(Observation(image, grid), PICK, PLACE)
+        errors.append([found.pick_top - 0.02, found.place_rim - 0.05])
+        # What is lowered stands on the rim by their difference.
+        errors[-1].append(found.support - (found.place_rim - 0.05))
+        assert (found.doubt > 0) == bool(noise or off)
+    assert np.abs(errors).max() < (0.002 if noise else 0.0005)
+
+
+def test_a_table_far_above_the_bottom_of_the_grid_is_where_it_is():
+    image = np.zeros((4, *GRID.shape), np.float32)
+    image[3] = 0.02
+    found = read_surface_heights(Observation(image, GRID), PICK, PLACE)
+    assert found.table == pytest.approx(GRID.z_min + 0.02, abs=1e-6)
+    assert found.doubt == 0
