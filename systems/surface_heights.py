@@ -49,7 +49,8 @@ def read_surface_heights(
     Tops are the highest of some pixels. Where o_t is noisy that would be the noise: then they are
     medians and percentiles, corrected by what these are off in such noise. The table is level and
     at the bottom of the grid: that it is tilted or higher in o_t is an error of calibration, and is
-    taken away. Neither is done where there is nothing to correct.
+    taken away. Neither is done where there is nothing to correct; many edges may pass for a little
+    noise.
 
     Args:
         observation: o_t.

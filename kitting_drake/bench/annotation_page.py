@@ -71,7 +71,7 @@ class AnnotationServer(ThreadingHTTPServer):
 
     @property
     def url(self) -> str:
-        """Of the page."""
+        """The address of the page."""
         return f"http://{_HOST}:{self.server_address[1]}/"
 
     def observation(self, index: int) -> Observation:
@@ -84,7 +84,7 @@ class AnnotationServer(ThreadingHTTPServer):
             return self._read(self.steps[index].path)
 
     def describe(self) -> dict[str, Any]:
-        """What the page needs to know, in metres and radians."""
+        """Describes grid and steps to the page, in metres and radians."""
         grid = self.calibration.grid
         return {
             "grid": {

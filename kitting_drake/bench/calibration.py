@@ -26,7 +26,7 @@ Array = NDArray[np.float64]
 _UNDISTORTED = 1e-4
 """A ray is found when its pixel is met to this, at depth 1."""
 _HEIGHT = PixelGrid().z_max - PixelGrid().z_min
-"""What rises above the table by more than this is left out, unless the calibration says more."""
+"""Points higher above the table than this are left out, unless the calibration says more."""
 
 
 @dataclass(frozen=True)

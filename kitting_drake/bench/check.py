@@ -1,4 +1,4 @@
-"""What is wrong with cameras, from a look at the empty table, or at a block of known size on it."""
+"""Finds errors of cameras from a look at the empty table, or at a block of known size on it."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ class TableCheck:
 
 @dataclass(frozen=True)
 class CameraCheck:
-    """What one camera sees."""
+    """The check of one camera."""
 
     table: TableCheck
     distance: float
@@ -63,13 +63,13 @@ class CameraCheck:
 
 @dataclass(frozen=True)
 class Check:
-    """What was found, and what to do about it."""
+    """The errors that were found, and the poses that correct them."""
 
     cameras: dict[str, CameraCheck]
     together: TableCheck
-    """Of o_t, in which the highest point of a pixel wins."""
+    """The check of o_t, in which the highest point of a pixel wins."""
     disagreements: dict[tuple[str, str], float]
-    """Of two cameras, by how much the first sees the table higher, in metres."""
+    """By how much the first of two cameras sees the table higher, in metres."""
     block_shifts: dict[tuple[str, str], Array]
     """Of two cameras, where the first sees the block, seen from the second: (2,) in metres."""
     block: Block | None

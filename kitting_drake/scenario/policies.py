@@ -158,8 +158,8 @@ class Learned(PolicyConfig):
     fit_outlines: bool = True
 
     # First mend what the last action left undone, as o_t shows it: press down what protrudes, take
-    # out what cannot be pressed down. It takes actions: see the task's `tries`. And pick only what
-    # fits into a recess; stop when nothing does.
+    # out what cannot be pressed down. It takes actions: see the task's `tries`. And pick what fits
+    # into a recess before anything else.
     recover: bool = False
 
     def make_system(self, site: PolicySite) -> LeafSystem:
