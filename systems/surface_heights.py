@@ -24,6 +24,8 @@ _CLEAN = 0.0003
 """A standard deviation of less is no noise, in metres."""
 _SMOOTHED = 9
 """Noise is what departs from the mean over so many pixels, along rows and columns."""
+_FLAT = 0.012
+"""Where the heights of these differ by more there are edges, which are no noise, in metres."""
 _NOISY_RIM_SHARE, _NOISY_RIM_BIAS = 90.0, 1.0
 """Of the pixels around a place some two thirds are its rim: the percentile of all that is so many
 standard deviations above the middle of these."""
@@ -49,8 +51,7 @@ def read_surface_heights(
     Tops are the highest of some pixels. Where o_t is noisy that would be the noise: then they are
     medians and percentiles, corrected by what these are off in such noise. The table is level and
     at the bottom of the grid: that it is tilted or higher in o_t is an error of calibration, and is
-    taken away. Neither is done where there is nothing to correct; many edges may pass for a little
-    noise.
+    taken away. Neither is done where there is nothing to correct.
 
     Args:
         observation: o_t.
@@ -98,16 +99,25 @@ def _percentile(values: NDArray[np.float32], share: float) -> float:
 def _level(height: NDArray[np.float32]) -> tuple[NDArray[np.float32], float, float]:
     """Heights (rows, cols) above the table as it is, the standard deviation of their noise, and
     what they may still be off; the same heights and zeros where there is nothing to correct."""
-    away = np.abs(height - ndimage.uniform_filter(height, _SMOOTHED, mode="nearest"))
-    noise = 1.4826 * float(np.median(away))
-    if noise < _CLEAN:
-        noise = 0.0
+    noise = _noise(height)
     table = _table(height, noise)
     largest = float(np.abs(table).max())
     if largest < _LEVEL:
         return height, noise, min(noise, _MOST_DOUBT)
     doubt = min(noise + _TILT_DOUBT * largest, _MOST_DOUBT)
     return (height - table).astype(np.float32), noise, doubt
+
+
+def _noise(height: NDArray[np.float32]) -> float:
+    """The standard deviation of the noise of heights (rows, cols); 0 where there is none."""
+    away = np.abs(height - ndimage.uniform_filter(height, _SMOOTHED, mode="nearest"))
+    highest = ndimage.maximum_filter(height, _SMOOTHED, mode="nearest")
+    flat = highest - ndimage.minimum_filter(height, _SMOOTHED, mode="nearest") < _FLAT
+    # Of flat places alone the calmest would be taken: they tell only whether there is noise.
+    if flat.sum() >= _LEAST_TABLE and 1.4826 * np.median(away[flat]) < _CLEAN:
+        return 0.0
+    noise = 1.4826 * float(np.median(away))
+    return noise if noise >= _CLEAN else 0.0
 
 
 def _table(height: NDArray[np.float32], noise: float) -> NDArray[np.float64]:

@@ -81,6 +81,16 @@ def test_errors_of_cameras_are_taken_away(noise: float, off: float):
     assert np.abs(errors).max() < (0.002 if noise else 0.0005)
 
 
+def test_edges_are_no_noise():
+    """A crowded table: half of all pixels are near an edge, and each pixel is exact."""
+    image = np.zeros((4, *GRID.shape), np.float32)
+    image[3, ::24] = image[3, 1::24] = 0.012
+    image[3, :, ::24] = 0.012
+    found = read_surface_heights(Observation(image, GRID), PICK, PLACE)
+    assert found.doubt == 0
+    assert found.highest == pytest.approx(GRID.z_min + 0.012, abs=1e-6)
+
+
 def test_a_table_far_above_the_bottom_of_the_grid_is_where_it_is():
     image = np.zeros((4, *GRID.shape), np.float32)
     image[3] = 0.02

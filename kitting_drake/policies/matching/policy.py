@@ -15,6 +15,7 @@ from kitting_drake.policies.matching.recovery import recovery_action
 from kitting_drake.policies.matching.registration import (
     Registration,
     coarse_cost,
+    mismatch,
     register,
     trace_outline,
 )
@@ -28,8 +29,6 @@ _WORST_COST = 0.0017
 metres."""
 _CERTAIN_COST = 0.0010
 """Those that differ by less certainly do."""
-_HEIGHT_WEIGHT = 0.1
-"""By how much a difference of an object's height and a recess's depth adds to the cost."""
 _PROMISING = 2.0
 """A recess is registered if its coarse cost is at most this many times the least of the object."""
 
@@ -134,8 +133,7 @@ def match(segmentation: Segmentation, resolution: float) -> list[tuple[int, Regi
     costs = np.full(coarse.shape, 10 * _WORST_COST)
     for i, j in np.argwhere(coarse <= _PROMISING * coarse.min(axis=1, keepdims=True)):
         fits[i, j] = register(outlines[i], recesses[j])
-        difference = abs(objects[i].height - regions[j].height)
-        costs[i, j] = fits[i, j].cost + _HEIGHT_WEIGHT * difference
+        costs[i, j] = mismatch(fits[i, j], objects[i], regions[j])
     chosen = _assign(costs)
     good = [(i, j) for i, j in chosen if costs[i, j] < _WORST_COST]
     return [(int(i), fits[i, j]) for i, j in sorted(good, key=lambda pair: costs[pair])]

@@ -16,7 +16,14 @@ from numpy.typing import NDArray
 
 from kitting_drake.policies.images import rotation_matrix
 from kitting_drake.policies.matching.jaw_clearance import JawGrasp, jaw_grasps
-from kitting_drake.policies.matching.registration import Registration, register, trace_outline
+from kitting_drake.policies.matching.registration import (
+    Outline,
+    Registration,
+    coarse_cost,
+    mismatch,
+    register,
+    trace_outline,
+)
 from kitting_drake.policies.matching.segmentation import Region, Segmentation
 from systems.signals import wrap_to_pi
 
@@ -26,6 +33,10 @@ _WORST_COST = 0.0016
 """Outlines that differ by more on average say nothing, in metres."""
 _HALF_TURN_GAIN = 0.95
 """The half turn is taken if its cost is at most this share of the other's."""
+_RIVAL_GAIN = 0.85
+"""Another recess is taken if its mismatch is at most this share of the predicted one's."""
+_PROMISING = 1.2
+"""Another recess is registered if its coarse cost is at most this many times the predicted one's."""
 _LARGEST_SHIFT = 0.010
 """A correction moves the object's middle by at most this, in metres, ..."""
 _LARGEST_ROTATION = math.radians(10)
@@ -85,7 +96,41 @@ def refine_place(
         best = reverse
     if best is None or best.cost > _WORST_COST:
         return None
+    others = [other for other in segmentation.recesses if other is not recess]
+    best = _better_elsewhere(taken, outline, recess, target, best, others, resolution)
     return RefinedPlace(wrap_to_pi(best.rotation), best.moved(pick))
+
+
+def _better_elsewhere(
+    taken: Region,
+    outline: Outline,
+    recess: Region,
+    target: Outline,
+    fit: Registration,
+    others: list[Region],
+    resolution: float,
+) -> Registration:
+    """The fit to another recess where that is clearly better than to the predicted one; else this.
+
+    Args:
+        taken: the object.
+        outline: its outline.
+        recess: the predicted one.
+        target: its outline.
+        fit: of the one to the other.
+        others: the other recesses.
+        resolution: of a pixel, in metres.
+    """
+    best, least = fit, _RIVAL_GAIN * mismatch(fit, taken, recess)
+    enough = _PROMISING * coarse_cost(outline, target)
+    for other in others:
+        rival = trace_outline(other.mask, resolution)
+        if coarse_cost(outline, rival) > enough:
+            continue
+        found = register(outline, rival)
+        if found.cost < _WORST_COST and mismatch(found, taken, other) < least:
+            best, least = found, mismatch(found, taken, other)
+    return best
 
 
 def _nearest(regions: tuple[Region, ...], pixel: Array) -> Region | None:

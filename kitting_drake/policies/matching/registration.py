@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from kitting_drake.policies.images import rotation_matrix
-from kitting_drake.policies.matching.segmentation import Mask
+from kitting_drake.policies.matching.segmentation import Mask, Region
 
 Array = NDArray[np.float64]
 
@@ -36,6 +36,8 @@ _ROBUST = 0.002
 """Differences beyond this count linearly, in metres."""
 _LARGEST_OFFSET = 0.004
 """The offset of the outlines is within plus or minus this, in metres."""
+_HEIGHT_WEIGHT = 0.1
+"""By how much a difference of an object's height and a recess's depth adds to a mismatch."""
 _POINTS, _COARSE_POINTS = 700, 160
 _ROTATIONS = 72
 _STARTS = 3
@@ -139,6 +141,11 @@ def register(
 def coarse_cost(outline: Outline, recess: Outline) -> float:
     """About the cost of `register`, in metres, quickly."""
     return float(_coarse(outline, recess)[0].min())
+
+
+def mismatch(fit: Registration, item: Region, recess: Region) -> float:
+    """How ill an object and a recess agree in outline and height, in metres."""
+    return fit.cost + _HEIGHT_WEIGHT * abs(item.height - recess.height)
 
 
 def _coarse(outline: Outline, recess: Outline) -> tuple[Array, Array]:

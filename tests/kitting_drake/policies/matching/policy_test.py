@@ -119,6 +119,30 @@ def test_a_place_that_is_nearly_right_or_reversed_is_put_right(seen, turn: float
         assert abs(math.remainder(found.rotation - rotation, math.tau)) < math.radians(2)
 
 
+def test_a_place_in_a_recess_that_fits_far_worse_than_another_moves_there():
+    """A precision screwdriver, thin enough to lie in a hammer's cavity, and placed there."""
+    scenario = load_scenario(SCENARIOS / "kitting_unseen.yaml", None, "{policy: !Oracle {}}")
+    cell = build_cell(scenario, seed=1216, base=SCENARIOS)
+    context = cell.diagram.CreateDefaultContext()
+    observation = cell.diagram.GetOutputPort("observation").Eval(context)
+    grid, segmentation = observation.grid, segment(observation)
+    names = [item.name for item in cell.scene.objects]
+    places = true_places(cell.scene)
+    lies, belongs = places[names.index("precision_screwdriver")]
+    pick, place = grid.to_pixel(lies[:2]), grid.to_pixel(belongs[:2])
+    rotation = belongs[2] - lies[2]
+    hammer = grid.to_pixel(places[names.index("cross_peen_hammer")][1][:2])
+    recess = min(
+        segmentation.recesses,
+        key=lambda item: np.linalg.norm(item.pixels - hammer, axis=1).min(),
+    )
+    wrong = recess.pixels.mean(axis=0)
+    found = refine_place(segmentation, pick, rotation, wrong, grid.resolution)
+    assert found is not None
+    assert np.linalg.norm(found.place - place) * grid.resolution < 0.003
+    assert abs(math.remainder(found.rotation - rotation, math.tau)) < math.radians(2)
+
+
 def test_a_grasp_with_no_room_for_the_jaws_moves_to_where_there_is(seen):
     observation, scene = seen
     grid = observation.grid
