@@ -36,7 +36,7 @@ _HALF_TURN_GAIN = 0.95
 _RIVAL_GAIN = 0.85
 """Another recess is taken if its mismatch is at most this share of the predicted one's."""
 _PROMISING = 1.2
-"""Another recess is registered if its coarse cost is at most this many times the predicted one's."""
+"""Another is registered if its coarse cost is at most this many times the predicted one's."""
 _LARGEST_SHIFT = 0.010
 """A correction moves the object's middle by at most this, in metres, ..."""
 _LARGEST_ROTATION = math.radians(10)
