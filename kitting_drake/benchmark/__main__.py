@@ -1,7 +1,8 @@
-"""`python -m kitting_drake.benchmark simulation | networks | kits | recovery | mujoco`."""
+"""`python -m kitting_drake.benchmark simulation | networks | kits | recovery | mujoco | paper`."""
 
 import argparse
 import os
+from fnmatch import fnmatch
 from pathlib import Path
 from typing import Any
 
@@ -9,6 +10,7 @@ from rich.console import Console
 from rich.table import Table
 
 from kitting_drake.common.command_line import count_type, run_command, seed_type
+from kitting_drake.common.errors import UserError
 from kitting_drake.common.files import require_folder, write_atomically, write_json
 from kitting_drake.scenario.command_line import add_scenario_flags, choose_scenario
 
@@ -24,6 +26,7 @@ def main() -> int:
         "kits": _kits,
         "recovery": _recovery,
         "mujoco": _mujoco,
+        "paper": _paper,
     }[arguments.benchmark]
     tables = measure(arguments, console, folder)
     for table in tables:
@@ -71,7 +74,23 @@ def _parser() -> argparse.ArgumentParser:
     opinion.add_argument(
         "--orientations", type=count_type, help="round the oracle's actions to so many (no)"
     )
-    for benchmark in (simulation, networks, kits, recovery, opinion):
+    paper = benchmarks.add_parser(
+        "paper", help="collect, train and evaluate the cells of the paper's tables; it takes days"
+    )
+    paper.add_argument(
+        "--cells", default="*", metavar="PATTERN", help="only those of such names (*: all)"
+    )
+    paper.add_argument(
+        "--results",
+        type=Path,
+        metavar="DIR",
+        default=Path("docs/results/paper"),
+        help="where the summaries of the cells go (docs/results/paper)",
+    )
+    paper.add_argument(
+        "--workers", type=count_type, default=1, help="episodes side by side, beside a training (1)"
+    )
+    for benchmark in (simulation, networks, kits, recovery, opinion, paper):
         benchmark.add_argument(
             "--output", type=Path, default=Path("output/benchmark"), help="where the files go"
         )
@@ -135,6 +154,17 @@ def _mujoco(arguments: argparse.Namespace, console: Console, folder: Path) -> li
     measured = ask_mujoco(arguments.placements, arguments.seed, arguments.orientations, console)
     write_json(folder / "mujoco.json", measured)
     return [opinion_table(measured)]
+
+
+def _paper(arguments: argparse.Namespace, console: Console, folder: Path) -> list[Table]:
+    from kitting_drake.benchmark.paper.cells import paper_cells
+    from kitting_drake.benchmark.paper.queue import run_paper
+
+    cells = [cell for cell in paper_cells() if fnmatch(cell.name, arguments.cells)]
+    if not cells:
+        raise UserError(f"--cells: there is no cell of the name '{arguments.cells}'")
+    table = run_paper(folder / "paper", arguments.results, cells, arguments.workers, console)
+    return [table]
 
 
 def _use_one_core() -> None:

@@ -31,6 +31,18 @@ DecisionObserver = Callable[[Observation, "Decision"], None]
 """Told of every decision of a learned policy."""
 
 
+_TOLD = (
+    "scenario",
+    "demonstrations",
+    "steps",
+    "learning_rate",
+    "decay",
+    "taken_only",
+    "rigid",
+)
+"""What of a network's training is told with its results."""
+
+
 @dataclass(frozen=True)
 class PolicySite:
     """The cell as far as it is built when the policy is made."""
@@ -209,7 +221,8 @@ class Learned(PolicyConfig):
             "recover": self.recover,
             "trained_orientations": file.config.orientations,
             "compute_type": str(preferred_type()).removeprefix("torch."),
-            **{key: file.card.get(key) for key in ("scenario", "demonstrations", "steps")},
+            **{key: file.card.get(key) for key in _TOLD},
+            "training_seed": file.card.get("seed"),
         }
 
     def digest(self, base: Path) -> str | None:

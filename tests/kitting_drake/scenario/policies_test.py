@@ -112,6 +112,11 @@ def test_results_say_what_a_policy_is(weights_file: Path):
         "scenario": "mine",
         "demonstrations": 3,
         "steps": 0,
+        "learning_rate": None,
+        "decay": None,
+        "taken_only": None,
+        "rigid": None,
+        "training_seed": None,
     }
     assert config.training_seeds(base) == {10_000, 10_001, 10_002}
     assert config.digest(base) == f"sha256 {hashlib.sha256(weights_file.read_bytes()).hexdigest()}"

@@ -1,0 +1,252 @@
+"""The queue of the paper's experiments: collects, trains and evaluates, cell by cell.
+
+Everything is done by the project's own commands, which take up what they left; so the queue itself
+may be stopped and begun again at any time, and does nothing twice.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import signal
+import subprocess
+import sys
+from collections.abc import Mapping, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.table import Table
+
+from kitting_drake.benchmark.paper.cells import (
+    LEARNING_RATES,
+    PRESET,
+    TASKS,
+    VALIDATE_EVERY,
+    Cell,
+    Task,
+    Training,
+    reference,
+)
+from kitting_drake.common.errors import UserError
+from kitting_drake.common.files import require_folder, write_atomically, write_json
+from kitting_drake.common.paths import SCENARIOS
+
+RATES = "learning_rates.json"
+"""The file, beside the results, of what each learning rate came to on validation scenes."""
+_FIRST_SEED, _FIRST_VALIDATION_SEED = 10000, 20000
+
+
+@dataclass
+class Failed(Exception):  # noqa: N818  It is no error of ours.
+    """One of the project's commands failed."""
+
+    why: str
+
+
+@dataclass
+class Queue:
+    """Where the work is done, and where its results go."""
+
+    folder: Path
+    results: Path
+    workers: int
+    """Episodes side by side, beside one training."""
+    console: Console
+    _running: list[subprocess.Popen[str]] = field(default_factory=list, init=False)
+
+    def run(self, cells: Sequence[Cell]) -> dict[str, str]:
+        """Fills cells, in their order as far as their networks are there.
+
+        Trainings are done one after another, in the order in which cells need them; evaluations
+        beside them.
+
+        Returns:
+            For each cell that could not be filled, by its name, why.
+        """
+        pending = [cell for cell in cells if not self.is_done(cell)]
+        self._say(f"{len(cells) - len(pending)} of {len(cells)} cells are done")
+        failures: dict[str, str] = {}
+        with ThreadPoolExecutor(max_workers=1) as trainer:
+            trained: dict[Training, Future[Path]] = {}
+            for cell in pending:
+                if isinstance(cell.policy, Training) and cell.policy not in trained:
+                    trained[cell.policy] = trainer.submit(self.train, cell.policy)
+            try:
+                while pending:
+                    cell = self._next(pending, trained)
+                    pending.remove(cell)
+                    try:
+                        weights = trained[cell.policy].result() if cell.policy in trained else None
+                        self._evaluate(cell, weights)
+                    except Failed as error:
+                        failures[cell.name] = error.why
+                        self._say(f"{cell.name}: {error.why}")
+            except BaseException:
+                # The trainer's own process would otherwise be waited for.
+                trainer.shutdown(wait=False, cancel_futures=True)
+                for process in self._running:
+                    process.send_signal(signal.SIGINT)
+                raise
+        return failures
+
+    def is_done(self, cell: Cell) -> bool:
+        """Whether there is a result of a cell.
+
+        Raises:
+            UserError: there is one that is not this cell's.
+        """
+        path = self.results / f"{cell.name}.json"
+        if not path.exists():
+            return False
+        try:
+            departure = cell.departure(json.loads(path.read_text()))
+        except (OSError, ValueError, KeyError) as error:
+            raise UserError(f"{path} is no summary of evaluate: delete it") from error
+        if departure is not None:
+            raise UserError(f"{path} is not that of its cell ({departure}): delete it")
+        return True
+
+    @staticmethod
+    def _next(pending: Sequence[Cell], trained: Mapping[Any, Future[Path]]) -> Cell:
+        """The first cell that need not wait; waits until there is one."""
+        while True:
+            for cell in pending:
+                if cell.policy not in trained or trained[cell.policy].done():
+                    return cell
+            wait([trained[cell.policy] for cell in pending], return_when=FIRST_COMPLETED)
+
+    def collect(self, task: Task, *, validation: bool) -> Path:
+        """The file of a task's demonstrations, or of those to validate by."""
+        folder = self.folder / "demonstrations" / f"{task.name}{'_validation' * validation}"
+        path = folder / "demonstrations.h5"
+        if not path.exists():
+            self._command(
+                "collect",
+                SCENARIOS / task.file,
+                *("--scenario_name", task.demonstrated),
+                *("--scenario_text", "{policy: !Oracle {}}"),
+                *("--demos", task.validation if validation else task.demonstrations),
+                *("--seed", _FIRST_VALIDATION_SEED if validation else _FIRST_SEED),
+                *("--workers", 1),
+                folder=folder,
+            )
+        return path
+
+    def train(self, training: Training) -> Path:
+        """The file of the weights of a training."""
+        if training.learning_rate is None:
+            ours = training.method == "so2"
+            rate = LEARNING_RATES[0] if ours else self._best_rate(training.method)
+            training = dataclasses.replace(training, learning_rate=rate)
+        task = TASKS[training.task]
+        folder = self.folder / "trainings" / f"{training.name}_lr{training.learning_rate:g}"
+        if not (folder / "summary.json").exists():
+            self._command(
+                "train",
+                *("--demos", self.collect(task, validation=False)),
+                *("--validation", self.collect(task, validation=True)),
+                *("--demonstrations", training.demonstrations),
+                *("--method", training.method),
+                *("--preset", PRESET),
+                *("--orientations", training.orientations),
+                *("--steps", task.steps),
+                *("--learning-rate", training.learning_rate),
+                "--decay",
+                *(("--taken-only",) if training.taken_only else ()),
+                *(("--rigid",) if training.rigid else ()),
+                *("--validate-every", VALIDATE_EVERY),
+                *("--seed", training.seed),
+                folder=folder,
+            )
+        return folder / "policy.safetensors"
+
+    def _best_rate(self, method: str) -> float:
+        """The learning rate at which a baseline does best on validation scenes; all are written."""
+        costs = {}
+        for rate in LEARNING_RATES:
+            weights = self.train(dataclasses.replace(reference(method), learning_rate=rate))
+            summary = json.loads(weights.with_name("summary.json").read_text())
+            costs[rate] = summary["best"]["cost_mm"]
+        path = self.results / RATES
+        known = json.loads(path.read_text()) if path.exists() else {}
+        found = known | {method: {f"{rate:g}": cost for rate, cost in costs.items()}}
+        if found != known:
+            write_json(path, dict(sorted(found.items())))
+        return min(costs, key=lambda rate: costs[rate])
+
+    def _evaluate(self, cell: Cell, weights: Path | None) -> None:
+        task = TASKS[cell.task]
+        folder = self.folder / "evaluations" / cell.name
+        self._command(
+            "evaluate",
+            SCENARIOS / task.file,
+            *("--scenario_name", task.tested),
+            *("--scenario_text", cell.scenario_text(str(weights.resolve()) if weights else "")),
+            *("--seed", cell.seeds[0]),
+            *("--episodes", len(cell.seeds)),
+            *("--workers", self.workers),
+            folder=folder,
+        )
+        text = (folder / "summary.json").read_text()
+        # The results say nothing of where they were made.
+        if weights is not None:
+            name = str(weights.resolve().relative_to(self.folder.resolve()))
+            text = text.replace(json.dumps(str(weights.resolve())), json.dumps(name))
+        summary = json.loads(text)
+        departure = cell.departure(summary)
+        if departure is not None:
+            raise Failed(f"what was evaluated is not the cell: {departure}")
+        write_atomically(self.results / f"{cell.name}.json", text)
+        rate = 100 * summary["strict_success_rate"]
+        self._say(f"{cell.name}: {rate:.1f} % strict, {100 * summary['success_rate']:.1f} %")
+
+    def _command(self, verb: str, *arguments: Any, folder: Path) -> None:
+        """Runs a command of the project with its output in a folder, and a log there.
+
+        Raises:
+            Failed: it failed.
+        """
+        command = [sys.executable, "-m", f"kitting_drake.{verb}", *map(str, arguments)]
+        with (require_folder(folder) / "log.txt").open("w") as log:
+            process = subprocess.Popen(
+                [*command, "--output", str(folder), "--quiet"],
+                stdout=log,
+                stderr=subprocess.STDOUT,
+                text=True,
+            )
+            self._running.append(process)
+            try:
+                code = process.wait()
+            finally:
+                if process.poll() is None:
+                    process.send_signal(signal.SIGINT)
+                    process.wait()
+                self._running.remove(process)
+        if code:
+            last = (folder / "log.txt").read_text().strip().splitlines()[-1:]
+            raise Failed(f"{verb} failed with exit code {code}: {' '.join(last)}")
+
+    def _say(self, text: str) -> None:
+        self.console.print(text, highlight=False, markup=False)
+
+
+def run_paper(
+    folder: Path, results: Path, cells: Sequence[Cell], workers: int, console: Console
+) -> Table:
+    """Fills cells; see `Queue.run`.
+
+    Returns:
+        What is done, and what failed.
+
+    Raises:
+        UserError: a result is not that of its cell, or a folder cannot be written to.
+    """
+    queue = Queue(require_folder(folder), require_folder(results), workers, console)
+    failures = queue.run(cells)
+    table = Table("cell", "state", title="the paper's experiments")
+    for cell in cells:
+        table.add_row(cell.name, failures.get(cell.name, "done"))
+    return table

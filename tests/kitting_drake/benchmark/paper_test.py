@@ -1,0 +1,172 @@
+"""The queue of the paper's experiments, with commands that only pretend."""
+
+import dataclasses
+import itertools
+import json
+from pathlib import Path
+
+import pytest
+from rich.console import Console
+
+from kitting_drake.benchmark.paper.cells import (
+    LEARNING_RATES,
+    PRESET,
+    TASKS,
+    Cell,
+    Training,
+    paper_cells,
+    reference,
+)
+from kitting_drake.benchmark.paper.queue import RATES, Failed, Queue, run_paper
+from kitting_drake.common.errors import UserError
+from kitting_drake.common.paths import SCENARIOS
+from kitting_drake.reporting.runs import described
+from kitting_drake.scenario.loader import load_scenario
+
+ORACLE = Cell("unseen", "!QuantizedOracle {orientations: 180}", 180, "quantized_oracle")
+OURS = Cell("unseen", Training("unseen", "so2", 180, 10), 36)
+THEIRS = Cell("unseen", Training("unseen", "transporter", 36, 10), 36)
+
+
+class Pretending(Queue):
+    """A queue whose commands leave the files that the real ones would."""
+
+    def __init__(self, *arguments) -> None:
+        super().__init__(*arguments)
+        self.calls: list[str] = []
+        self.broken: set[str] = set()
+
+    def _command(self, verb: str, *arguments, folder: Path) -> None:
+        self.calls.append(f"{verb} {folder.name}")
+        if folder.name in self.broken:
+            raise Failed("it broke")
+        folder.mkdir(parents=True, exist_ok=True)
+        words = list(map(str, arguments))
+        flags = dict(itertools.pairwise(words))
+        if verb == "collect":
+            (folder / "demonstrations.h5").touch()
+        elif verb == "train":
+            rate = float(flags["--learning-rate"])
+            summary = {"best": {"cost_mm": 1.0 if rate == LEARNING_RATES[1] else 2.0}}
+            (folder / "summary.json").write_text(json.dumps(summary))
+            (folder / "policy.safetensors").touch()
+        else:
+            (folder / "summary.json").write_text(json.dumps(self.summary(words, flags)))
+
+    def summary(self, words: list[str], flags: dict[str, str]) -> dict:
+        scenario = load_scenario(Path(words[0]), flags["--scenario_name"], flags["--scenario_text"])
+        policy = scenario.policy
+        first, count = int(flags["--seed"]), int(flags["--episodes"])
+        details = {"orientations": policy.orientations}
+        if hasattr(policy, "weights"):
+            folder = Path(policy.weights).parent.name
+            task, method, trained, demonstrations = folder.split("_")[:4]
+            details |= {
+                "method": method,
+                "preset": PRESET,
+                "trained_orientations": int(trained),
+                "demonstrations": int(demonstrations),
+                "training_seed": 0,
+                "steps": TASKS[task].steps,
+                "continuous": policy.continuous,
+                "fit_outlines": policy.fit_outlines,
+                "recover": policy.recover,
+                "taken_only": "ours" not in folder,
+                "rigid": "ours" not in folder,
+            }
+        return {
+            "resolved_scenario": described(scenario),
+            "seeds": list(range(first, first + count)),
+            "policy_details": details,
+            "strict_success_rate": 1.0,
+            "success_rate": 1.0,
+        }
+
+
+@pytest.fixture
+def queue(tmp_path: Path) -> Pretending:
+    (tmp_path / "results").mkdir()
+    return Pretending(tmp_path / "work", tmp_path / "results", 1, Console(quiet=True))
+
+
+def test_cells_have_names_of_their_own_and_scenarios_that_load():
+    cells = paper_cells()
+    assert len({cell.name for cell in cells}) == len(cells) > 100
+    for cell in cells:
+        task = TASKS[cell.task]
+        text = cell.scenario_text("w.safetensors")
+        scenario = load_scenario(SCENARIOS / task.file, task.tested, text)
+        assert (scenario.planner.search.steps > 0) == cell.search
+        load_scenario(SCENARIOS / task.file, task.demonstrated, "{policy: !Oracle {}}")
+
+
+def test_it_chooses_a_learning_rate_and_does_nothing_twice(queue: Pretending):
+    cells = [OURS, THEIRS, ORACLE]
+    assert queue.run(cells) == {}
+    first, best, _ = LEARNING_RATES
+    assert [call for call in queue.calls if call.startswith("train")] == [
+        f"train unseen_so2_180_10_seed0_lr{first:g}",
+        *(f"train {reference('transporter').name}_lr{rate:g}" for rate in LEARNING_RATES),
+        f"train unseen_transporter_36_10_seed0_lr{best:g}",
+    ]
+    assert [c for c in queue.calls if c.startswith("collect")] == [
+        "collect unseen",
+        "collect unseen_validation",
+    ]
+    rates = json.loads((queue.results / RATES).read_text())
+    costs = {f"{rate:g}": 1.0 if rate == best else 2.0 for rate in LEARNING_RATES}
+    assert rates == {"transporter": costs}
+    written = (queue.results / f"{OURS.name}.json").read_text()
+    assert str(queue.folder) not in written
+    assert "trainings/unseen_so2_180_10" in written
+
+    queue.calls.clear()
+    assert queue.run(cells) == {}
+    assert queue.calls == []
+
+
+def test_what_fails_keeps_nothing_else_up(queue: Pretending):
+    queue.broken = {f"{reference('transporter').name}_lr{LEARNING_RATES[2]:g}"}
+    assert queue.run([THEIRS, OURS, ORACLE]) == {THEIRS.name: "it broke"}
+    assert queue.is_done(ORACLE)
+    assert queue.is_done(OURS)
+    assert not queue.is_done(THEIRS)
+    queue.broken = set()
+    queue.calls.clear()
+    assert queue.run([THEIRS, OURS, ORACLE]) == {}
+    assert queue.calls[0].endswith(f"_lr{LEARNING_RATES[2]:g}")
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (lambda s: s["resolved_scenario"]["planner"]["search"].update(reach=0.004), "search.reach"),
+        (lambda s: s["resolved_scenario"]["plant"].update(time_step=0.5), "plant.time_step"),
+        (lambda s: s["policy_details"].update(steps=7), "steps is 7, not"),
+        (lambda s: s["policy_details"].update(continuous=True), "continuous is True"),
+        (lambda s: s["seeds"].pop(), "seeds are not 3000 to 3099"),
+    ],
+)
+def test_a_summary_of_something_else_is_refused(queue: Pretending, change, said: str):
+    queue.run([OURS])
+    path = queue.results / f"{OURS.name}.json"
+    summary = json.loads(path.read_text())
+    assert OURS.departure(summary) is None
+    change(summary)
+    path.write_text(json.dumps(summary))
+    with pytest.raises(UserError, match="delete it") as caught:
+        queue.is_done(OURS)
+    assert said in str(caught.value)
+
+
+def test_a_command_that_fails_is_told_by_its_last_line(tmp_path: Path):
+    """The real one: the scenario of this task does not exist."""
+    (tmp_path / "results").mkdir()
+    console = Console(quiet=True, record=True)
+    cell = dataclasses.replace(ORACLE, policy="!Nobody {}")
+    table = run_paper(tmp_path / "work", tmp_path / "results", [cell], 1, console)
+    console.quiet = False
+    console.print(table)
+    shown = console.export_text()
+    assert "evaluate failed with exit code 2: error: " in " ".join(shown.split())
+    assert "!Nobody" in shown
