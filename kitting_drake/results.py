@@ -1,18 +1,24 @@
 """`python -m kitting_drake.results`: docs/results.md, from the summaries in docs/results/, and the
 table of docs/robustness.md.
 
-Each file there is a copy of a `summary.json` of `evaluate`, under any name. Nothing in the tables
-comes from anywhere else, but the paper's own figures.
+Each file there is a copy of a `summary.json` of `evaluate`, under any name; in docs/results/paper/
+are those of `benchmark paper`, each under the name of its cell. Nothing in the tables comes from
+anywhere else, but the paper's own figures.
 """
 
 import argparse
+import json
 import os
+from collections.abc import Sequence
 from pathlib import Path
 
 from rich.console import Console
 
 from kitting_drake.common.command_line import run_command
 from kitting_drake.common.files import write_atomically
+from kitting_drake.paper.figure import draw_figure_6
+from kitting_drake.paper.page import Result, paper_sections, read_results
+from kitting_drake.paper.queue import RATES
 from kitting_drake.reporting.results_page import results_page
 from kitting_drake.reporting.robustness import robustness_table, with_figures
 from kitting_drake.reporting.runs import read_runs
@@ -41,15 +47,29 @@ def main() -> int:
     arguments = parser.parse_args()
     runs = read_runs(arguments.results)
     link = os.path.relpath(arguments.results, arguments.output.parent)
-    write_atomically(arguments.output, results_page(runs, link))
+    answers = read_results(arguments.results / "paper")
+    rates_file = arguments.results / "paper" / RATES
+    rates = json.loads(rates_file.read_text()) if rates_file.exists() else {}
+    page = results_page(runs, link, paper_sections(answers, rates, link))
+    write_atomically(arguments.output, page)
+    _draw(answers, arguments.output.parent)
     robustness = arguments.output.with_name("robustness.md")
     if robustness.exists():
         page = with_figures(robustness.read_text(), robustness_table(runs))
         write_atomically(robustness, page)
     Console(quiet=arguments.quiet).print(
-        f"{len(runs)} summaries: {arguments.output}", highlight=False, markup=False
+        f"{len(runs) + len(answers)} summaries: {arguments.output}", highlight=False, markup=False
     )
     return 0
+
+
+def _draw(answers: Sequence[Result], folder: Path) -> None:
+    """Draws figure 6 of the tasks that there are cells of."""
+    by_name = {answer.cell.name: answer for answer in answers}
+    for task in ("seen", "unseen"):
+        if any(answer.cell.task == task for answer in answers):
+            path = folder / f"results_{task}.png"
+            write_atomically(path, draw_figure_6(task, by_name))
 
 
 if __name__ == "__main__":

@@ -157,8 +157,8 @@ def _mujoco(arguments: argparse.Namespace, console: Console, folder: Path) -> li
 
 
 def _paper(arguments: argparse.Namespace, console: Console, folder: Path) -> list[Table]:
-    from kitting_drake.benchmark.paper.cells import paper_cells
-    from kitting_drake.benchmark.paper.queue import run_paper
+    from kitting_drake.paper.cells import paper_cells
+    from kitting_drake.paper.queue import run_paper
 
     cells = [cell for cell in paper_cells() if fnmatch(cell.name, arguments.cells)]
     if not cells:

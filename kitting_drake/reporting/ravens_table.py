@@ -10,7 +10,7 @@ from kitting_drake.tasks import RAVENS_TASKS
 TASKS = tuple(task.title for task in RAVENS_TASKS)
 """In the order of table I."""
 
-_PAPER: dict[tuple[str, int], tuple[tuple[float, float, float], ...]] = {
+PAPER: dict[tuple[str, int], tuple[tuple[float, float, float], ...]] = {
     ("SO(2)-equivariant (ours)", 36): (
         (100, 100, 100),
         (96.0, 100, 100),
@@ -67,7 +67,7 @@ def ravens_section(runs: Sequence[Run]) -> list[str]:
         name = METHODS.get(method, method)
         values = [found.get(task, "-") for task in TASKS]
         rows.append([name, str(orientations or ""), str(count or ""), *values])
-    for (method, orientations), by_task in _PAPER.items():
+    for (method, orientations), by_task in PAPER.items():
         for index, count in enumerate(_COUNTS):
             values = [f"{figures[index]:g}" for figures in by_task]
             rows.append([f"*paper*, {method}", str(orientations), str(count), *values])

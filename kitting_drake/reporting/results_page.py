@@ -14,8 +14,7 @@ from kitting_drake.reporting.terminal import number
 from kitting_drake.tasks import PAPER_TASKS
 
 _ORIENTATIONS = (36, 72, 120, 180)
-_DEMONSTRATIONS = (10, 100)
-"""The parameters that the paper varies (sections V-B.1 and V-C.1)."""
+"""N of the paper (section V-C.1)."""
 
 
 @dataclass(frozen=True)
@@ -40,7 +39,10 @@ _INTRODUCTION = """\
 Written by `python -m kitting_drake.results` from files alone, each the `summary.json` of one
 `evaluate`; they are listed at the end. Do not edit.
 
-A cell of the first tables is `strict / paper's, episodes`. The strict success rate in percent is
+Three parts: what the paper did, measured as the paper did it; what these policies do as the
+scenarios have them, with all that goes beyond the paper; and every other run.
+
+A cell of the second part is `strict / paper's, episodes`. The strict success rate in percent is
 what a person would sign: the share of the objects that are a success by the paper's measure, within
 2 mm of their height and within 20 degrees of their heading, modulo the symmetry that the object
 declares. The paper's measure (section IV-C) is ADD-S below 3.5 mm alone; it forgives a flat object
@@ -70,14 +72,15 @@ Runs of the first turn, which are not comparable with these, are in
 """
 
 
-def results_page(runs: Sequence[Run], link: str) -> str:
+def results_page(runs: Sequence[Run], link: str, paper: Sequence[str] = ()) -> str:
     """The whole page, in Markdown.
 
     Args:
         runs: from `read_runs`; there may be none of a task, or none at all.
         link: the folder of the files, from the page's own.
+        paper: the sections of `kitting_drake.paper.page`.
     """
-    sections = [_INTRODUCTION]
+    sections = [_INTRODUCTION, *paper]
     for task in PAPER_TASKS:
         sections += _task_sections(task, [run for run in runs if run.paper_task == task])
     sections += ravens_section(runs)
@@ -124,9 +127,7 @@ def _success_table(runs: list[Run], paper: _Paper) -> str:
     rows = []
     for method in LEARNED:
         mine = [(preset, count) for name, preset, count, _ in cells if name == method]
-        presets = sorted({preset for preset, _ in mine}, key=str) or [None]
-        counts = _with_others(_DEMONSTRATIONS, (count for _, count in mine))
-        rows += [row(method, preset, count) for preset in presets for count in counts]
+        rows += [row(method, *found) for found in sorted(set(mine), key=str)]
         if method == "so2":
             given = [f"- / {paper.ours:g}" if n == 180 else "" for n in orientations]
             rows.append(["*paper*, ours", "", "100", *given])

@@ -58,6 +58,9 @@ def summarise(
     objects, as if each were drawn anew. Where it is anything else (partial rewards, weights), it is
     Student's over the episodes; `ci95_method` says which.
 
+    `outcomes` has for each episode its seed, both rates, and for each object, by its name, 2: a
+    strict success, 1: a success, 0: none. Two runs of the same seeds are compared by them.
+
     Errors are those of all objects, and all actions, of the episodes that came to an end, missed
     ones included; an object that no goal was left for is in no statistic.
 
@@ -95,6 +98,10 @@ def summarise(
             )
             for name in categories
         },
+        "outcomes": [
+            _outcome(episode, objects)
+            for episode, objects in zip(episodes, objects_of, strict=True)
+        ],
         "missed_grasps": sum(episode["missed_grasps"] for episode in episodes),
         "dropped_objects": sum(episode["dropped_objects"] for episode in episodes),
         "moving_at_end": sum(len(episode["moving_at_end"]) for episode in episodes),
@@ -129,12 +136,22 @@ def counted_objects(episodes: Sequence[Episode]) -> list[list[Entry]]:
     ]
 
 
+def _outcome(episode: Episode, objects: list[Entry]) -> dict[str, Any]:
+    """One of the `outcomes`; an object whose name is lost with its process is in none."""
+    return {key: episode[key] for key in ("seed", "success_rate", "strict_success_rate")} | {
+        "objects": {
+            item["name"]: int(item["success"]) + int(item["strict_success"])
+            for item in objects
+            if "name" in item
+        }
+    }
+
+
 def _lost(objects: list[Entry], usual: list[str], cause: str) -> list[Entry]:
-    categories = [item["category"] for item in objects] or usual
+    known = [{key: item[key] for key in ("name", "category")} for item in objects]
     return [
-        {"category": name, "success": False, "strict_success": False, "cause": cause}
-        | dict.fromkeys(ERRORS)
-        for name in categories
+        {**item, "success": False, "strict_success": False, "cause": cause, **dict.fromkeys(ERRORS)}
+        for item in known or [{"category": name} for name in usual]
     ]
 
 

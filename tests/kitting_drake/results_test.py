@@ -98,8 +98,6 @@ def test_success_by_method_and_orientations_strict_first(folder: Path):
         *"---",
         "75.0 (59.8 to 85.8) / 100.0 (91.2 to 100.0), 10",
     ]
-    assert rows["SO(2)-equivariant (ours)", "small", "10"] == [*"----"]
-    assert rows["Equivariant Transporter", "", "100"] == [*"----"]
     assert rows["oracle, quantized", "", ""] == [
         "75.0 (53.1 to 88.8) / 75.0 (53.1 to 88.8), 5",
         *"---",

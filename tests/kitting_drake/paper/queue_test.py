@@ -8,7 +8,9 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
-from kitting_drake.benchmark.paper.cells import (
+from kitting_drake.common.errors import UserError
+from kitting_drake.common.paths import SCENARIOS
+from kitting_drake.paper.cells import (
     LEARNING_RATES,
     PRESET,
     TASKS,
@@ -17,9 +19,7 @@ from kitting_drake.benchmark.paper.cells import (
     paper_cells,
     reference,
 )
-from kitting_drake.benchmark.paper.queue import RATES, Failed, Queue, run_paper
-from kitting_drake.common.errors import UserError
-from kitting_drake.common.paths import SCENARIOS
+from kitting_drake.paper.queue import RATES, Failed, Queue, run_paper
 from kitting_drake.reporting.runs import described
 from kitting_drake.scenario.loader import load_scenario
 

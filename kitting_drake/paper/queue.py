@@ -20,7 +20,10 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
-from kitting_drake.benchmark.paper.cells import (
+from kitting_drake.common.errors import UserError
+from kitting_drake.common.files import require_folder, write_atomically, write_json
+from kitting_drake.common.paths import SCENARIOS
+from kitting_drake.paper.cells import (
     LEARNING_RATES,
     PRESET,
     TASKS,
@@ -30,9 +33,6 @@ from kitting_drake.benchmark.paper.cells import (
     Training,
     reference,
 )
-from kitting_drake.common.errors import UserError
-from kitting_drake.common.files import require_folder, write_atomically, write_json
-from kitting_drake.common.paths import SCENARIOS
 
 RATES = "learning_rates.json"
 """The file, beside the results, of what each learning rate came to on validation scenes."""

@@ -1,1 +1,0 @@
-"""The paper's experiments: the cells of its tables, and the queue that fills them."""

@@ -1,0 +1,259 @@
+"""The part of the page of results that answers the paper: figure 6 and table I, from the results of
+`benchmark paper` alone."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+from kitting_drake.common.errors import UserError
+from kitting_drake.paper.cells import (
+    DEMONSTRATIONS,
+    LEARNING_RATES,
+    PRESET,
+    TASKS,
+    Cell,
+    Training,
+    paper_cells,
+)
+from kitting_drake.paper.queue import RATES
+from kitting_drake.reporting.markdown import markdown_table
+from kitting_drake.reporting.paired import OWN, STRICT, Estimate, over_tools, paired_difference
+from kitting_drake.reporting.ravens_table import PAPER as TABLE_1
+from kitting_drake.reporting.runs import LEARNED, METHODS
+
+_COLUMNS = (36, 72, 120, 180)
+_HEADINGS = {"seen": "Seen toolset, figure 6(a)", "unseen": "Unseen toolsets, figure 6(b)"}
+_PAPER_OURS = {"seen": 96.5, "unseen": 87.25}
+"""Section V-D.1: 180 orientations and 100 demonstrations, in percent."""
+
+_INTRODUCTION = """\
+## As in the paper
+
+What the paper did, without what we added to it: actions quantized to pixels and N orientations, no
+search where an insertion is blocked, only the taken action as a label, scenes augmented by motions
+of the whole scene only. All methods of a task learn from the same demonstrations, of preset
+`{preset}`, for as many steps, and are tested on the same seeds, which nobody looked at before; the
+checkpoint is the one that does best on other scenes. Ours is trained once, at N = 180, and tested
+at every N. Written by `python -m kitting_drake.benchmark paper`, which runs these cells, and
+`python -m kitting_drake.results`; each file must be exactly what its cell says.
+
+{rates}
+A cell is the strict success rate in percent with its 95 % interval (Wilson's, over objects), and
+after the stroke the paper's measure. `-`: not run yet; `benchmark paper` goes on with it.
+"""
+
+
+@dataclass(frozen=True)
+class Result:
+    """A cell, and its summary."""
+
+    cell: Cell
+    summary: Mapping[str, Any]
+
+    @cached_property
+    def text(self) -> str:
+        """Both rates."""
+        strict = _rate(self.summary["strict_success_rate"], self.summary["strict_ci95"])
+        return f"{strict} / {100 * self.summary['success_rate']:.1f}"
+
+
+def read_results(folder: Path) -> list[Result]:
+    """The results of `benchmark paper`, in the order of the cells; there may be none.
+
+    Raises:
+        UserError: a file there is of no cell, or not what its cell says.
+    """
+    if not folder.is_dir():
+        return []
+    cells = {cell.name: cell for cell in paper_cells()}
+    found = {}
+    for path in sorted(folder.glob("*.json")):
+        if path.name == RATES:
+            continue
+        cell = cells.get(path.stem)
+        if cell is None:
+            raise UserError(f"{path} is of no cell of the paper's tables: delete it")
+        try:
+            summary = json.loads(path.read_text())
+            departure = cell.departure(summary)
+            _ = summary["outcomes"]
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            raise UserError(f"{path} is no summary of evaluate: {error!r}") from error
+        if departure is not None:
+            raise UserError(f"{path} is not that of its cell: {departure}")
+        found[cell.name] = Result(cell, summary)
+    return [found[name] for name in cells if name in found]
+
+
+def paper_sections(results: Sequence[Result], rates: Mapping[str, Any], link: str) -> list[str]:
+    """The sections of the page; none without results.
+
+    Args:
+        results: of `read_results`.
+        rates: what each learning rate of each baseline came to, in mm on validation scenes.
+        link: the folder of all results, from the page's own.
+    """
+    if not results:
+        return []
+    by_name = {result.cell.name: result for result in results}
+    sections = [_INTRODUCTION.format(preset=PRESET, rates=_rates_text(rates))]
+    for task, heading in _HEADINGS.items():
+        sections.append(f"### {heading}\n")
+        if any(result.cell.task == task for result in results):
+            sections.append(f"![Figure 6 of {task} tools](results_{task}.png)\n")
+        sections.append(_figure_table(task, by_name))
+    sections += _table_1(by_name)
+    sections += _differences(by_name)
+    sections += ["### Every cell\n", _every_cell(results, link)]
+    return sections
+
+
+def _rates_text(rates: Mapping[str, Any]) -> str:
+    if not rates:
+        return f"Ours learns at {LEARNING_RATES[0]:g}.\n"
+    parts = []
+    for method, costs in rates.items():
+        best = min(costs, key=lambda rate: costs[rate])
+        tried = ", ".join(f"{rate}: {cost:.1f} mm" for rate, cost in costs.items())
+        parts.append(f"the {METHODS[method]} at {best}, the best on validation scenes of {tried}")
+    return f"Ours learns at {LEARNING_RATES[0]:g}; {'; '.join(parts)}.\n"
+
+
+def _figure_table(task: str, results: Mapping[str, Result]) -> str:
+    def text(name: str) -> str:
+        return results[name].text if name in results else "-"
+
+    rows = []
+    for method in LEARNED:
+        for count in reversed(DEMONSTRATIONS):
+            given = [
+                # The paper has the Transporter at N = 36 only.
+                "" if method == "transporter" and n != 36 else text(f"{task}_{method}_{n}_{count}")
+                for n in _COLUMNS
+            ]
+            rows.append([METHODS[method], str(count), *given])
+        if method == "so2":
+            paper = [f"- / {_PAPER_OURS[task]:g}" if n == 180 else "" for n in _COLUMNS]
+            rows.append(["*paper*, ours", "100", *paper])
+    oracle = [text(f"{task}_quantized_oracle_{n}") for n in _COLUMNS]
+    rows.append([METHODS["quantized_oracle"], "", *oracle])
+    return markdown_table(["method", "demonstrations", *(f"N = {n}" for n in _COLUMNS)], rows)
+
+
+def _table_1(results: Mapping[str, Result]) -> list[str]:
+    tasks = [task.name for task in TASKS.values() if not task.is_kitting]
+    if not any(result.cell.task in tasks for result in results.values()):
+        return []
+    rows = []
+    for (name, n), figures in TABLE_1.items():
+        method = next(key for key, label in METHODS.items() if label == name)
+        for index, count in enumerate((1, 10, 100)):
+            found = [results.get(f"{task}_{method}_{n}_{count}") for task in tasks]
+            rows.append(
+                [name, str(n), str(count)]
+                + [
+                    "-" if r is None else _rate(r.summary["success_rate"], r.summary["ci95"])
+                    for r in found
+                ]
+            )
+            paper = [f"{task[index]:g}" for task in figures]
+            rows.append([f"*paper*, {name}", str(n), str(count), *paper])
+    return [
+        "### The five Ravens tasks, table I\n",
+        "The mean reward in percent and its 95 % interval.\n",
+        markdown_table(["method", "N", "demonstrations", *tasks], rows),
+    ]
+
+
+def _differences(results: Mapping[str, Result]) -> list[str]:
+    """What one method is better than another on the same seeds."""
+    rows = []
+    for name, result in results.items():
+        for label, other in _rivals(result.cell):
+            if other not in results:
+                continue
+            pair = (result.summary, results[other].summary)
+            found = [paired_difference(*pair, rate) for rate in (STRICT, OWN)]
+            if any(item is None for item in found):
+                continue
+            rows.append([name, label, *(_points(item) for item in found if item is not None)])
+    if not rows:
+        return []
+    return [
+        "### Differences on the same seeds\n",
+        "In points, with 95 % intervals by a bootstrap over episodes; above zero the first is "
+        "better.\n",
+        markdown_table(["cell", "minus", "strict", "paper's measure"], rows, left_columns=2),
+    ]
+
+
+def _rivals(cell: Cell) -> list[tuple[str, str]]:
+    """What a cell of ours is compared with: labels, and names of cells."""
+    training = cell.policy
+    if not isinstance(training, Training) or training.method != "so2":
+        return []
+    if cell.label.startswith("minus"):
+        return [("ours, whole", f"{cell.task}_so2_180_100_ours")]
+    if cell.label == "trained_at_36":
+        return [("trained at N = 180", f"{cell.task}_so2_36_100")]
+    if cell.label:
+        return [("ours, as in the paper", f"{cell.task}_so2_180_100")]
+    tail = f"{cell.orientations}_{training.demonstrations}"
+    tail += f"_seed{training.seed}" if training.seed else ""
+    return [
+        *((METHODS[other], f"{cell.task}_{other}_{tail}") for other in LEARNED[1:]),
+        (METHODS["quantized_oracle"], f"{cell.task}_quantized_oracle_{cell.orientations}"),
+    ]
+
+
+def _every_cell(results: Sequence[Result], link: str) -> str:
+    def detail(result: Result, key: str) -> str:
+        value = result.summary["policy_details"].get(key)
+        return "" if value is None else str(value)
+
+    rows = []
+    for result in results:
+        summary = result.summary
+        tools = over_tools(summary["outcomes"], STRICT)
+        rows.append(
+            [
+                f"[{result.cell.name}]({link}/paper/{result.cell.name}.json)",
+                *(
+                    detail(result, key)
+                    for key in ("trained_orientations", "steps", "learning_rate", "training_seed")
+                ),
+                str(summary["episodes"]),
+                f"{min(summary['seeds'])} to {max(summary['seeds'])}",
+                _rate(summary["strict_success_rate"], summary["strict_ci95"]),
+                "-" if tools is None else f"{100 * tools.low:.1f} to {100 * tools.high:.1f}",
+                _rate(summary["success_rate"], summary["ci95"]),
+                _causes(summary),
+                str(summary["commit"] or "")[:8],
+            ]
+        )
+    headings = ["cell", "trained at N", "steps", "learning rate", "training seed", "episodes"]
+    headings += ["seeds", "strict, %", "over tools", "paper's, %", "why not", "commit"]
+    return (
+        "`over tools`: the 95 % interval of the strict rate by a bootstrap that draws tools.\n\n"
+        + markdown_table(headings, rows)
+    )
+
+
+def _causes(summary: Mapping[str, Any]) -> str:
+    """Why objects were no success, or no strict one, and how many."""
+    counts = {**summary["causes"], **summary["ambiguous"]}
+    return ", ".join(f"{name} {count}" for name, count in counts.items() if count) or "-"
+
+
+def _rate(rate: float, interval: Sequence[float]) -> str:
+    low, high = interval
+    return f"{100 * rate:.1f} ({100 * low:.1f} to {100 * high:.1f})"
+
+
+def _points(found: Estimate) -> str:
+    return f"{100 * found.value:+.1f} ({100 * found.low:+.1f} to {100 * found.high:+.1f})"

@@ -1,0 +1,92 @@
+"""Two runs of the same seeds compared, and intervals of a rate for tools in general."""
+
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kitting_drake.reporting.intervals import proportion_interval
+
+_RESAMPLES = 10_000
+_TAILS = (2.5, 97.5)
+"""Percentiles of a 95 % interval."""
+
+STRICT, OWN = "strict_success_rate", "success_rate"
+"""The two rates of an episode: the strict one, and by the task's own measure."""
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A number and its 95 % interval."""
+
+    value: float
+    low: float
+    high: float
+
+
+def paired_difference(
+    first: Mapping[str, Any], second: Mapping[str, Any], rate: str
+) -> Estimate | None:
+    """How much better one run is than another, on the seeds that both ran.
+
+    The interval is a bootstrap's that draws episodes, each with both of its rates: what makes a
+    scene hard for both is in neither's favour. Where no episode differs, it is that of a share of
+    which no case was found, on either side.
+
+    Args:
+        first: a summary, with its `outcomes`.
+        second: another.
+        rate: `STRICT` or `OWN`.
+
+    Returns:
+        The mean over the seeds; None if there are none that both ran.
+    """
+    mine, theirs = (
+        {item["seed"]: item[rate] for item in run["outcomes"]} for run in (first, second)
+    )
+    seeds = sorted(mine.keys() & theirs.keys())
+    if not seeds:
+        return None
+    differences = np.array([mine[seed] - theirs[seed] for seed in seeds])
+    if not np.any(differences):
+        _, most = proportion_interval(0, len(seeds))
+        return Estimate(0.0, -most, most)
+    rng = np.random.default_rng(0)
+    drawn = rng.integers(len(seeds), size=(_RESAMPLES, len(seeds)))
+    low, high = np.percentile(differences[drawn].mean(axis=1), _TAILS)
+    return Estimate(float(differences.mean()), float(low), float(high))
+
+
+def over_tools(outcomes: Sequence[Mapping[str, Any]], rate: str) -> Estimate | None:
+    """The share of successes, with an interval by a bootstrap that draws tools.
+
+    It tells what to expect of other tools of the kind; intervals over objects tell it of these.
+    Where all tools, or none, always succeed, it is that of as many cases as there are tools.
+
+    Args:
+        outcomes: of a summary.
+        rate: `STRICT` or `OWN`.
+
+    Returns:
+        None if no objects are known.
+    """
+    needed = 2 if rate == STRICT else 1
+    counts: dict[str, list[bool]] = defaultdict(list)
+    for episode in outcomes:
+        for name, outcome in episode["objects"].items():
+            counts[name].append(outcome >= needed)
+    if not counts:
+        return None
+    good: NDArray[np.float64] = np.array([sum(found) for found in counts.values()], float)
+    all_of = np.array([len(found) for found in counts.values()], float)
+    share = float(good.sum() / all_of.sum())
+    if share in (0.0, 1.0):
+        low, high = proportion_interval(round(share) * len(good), len(good))
+        return Estimate(share, low, high)
+    drawn = np.random.default_rng(0).integers(len(good), size=(_RESAMPLES, len(good)))
+    shares = good[drawn].sum(axis=1) / all_of[drawn].sum(axis=1)
+    low, high = np.percentile(shares, _TAILS)
+    return Estimate(share, float(low), float(high))

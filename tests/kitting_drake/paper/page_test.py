@@ -1,0 +1,110 @@
+"""The paper's part of the page of results, of summaries made for it."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from kitting_drake.common.errors import UserError
+from kitting_drake.common.paths import SCENARIOS
+from kitting_drake.paper.cells import PRESET, TASKS, Cell, Training, paper_cells
+from kitting_drake.paper.figure import draw_figure_6
+from kitting_drake.paper.page import paper_sections, read_results
+from kitting_drake.reporting.runs import described
+from kitting_drake.reporting.summary import summarise
+from kitting_drake.scenario.loader import load_scenario
+from tests.kitting_drake.reporting.episodes import ADD_S, CHOSEN, make_episode
+
+CELLS = {cell.name: cell for cell in paper_cells()}
+
+
+def write(folder: Path, name: str, errors_mm: list[float]) -> None:
+    """The summary of a cell whose episodes are all alike."""
+    cell: Cell = CELLS[name]
+    task = TASKS[cell.task]
+    scenario = load_scenario(SCENARIOS / task.file, task.tested, cell.scenario_text("w"))
+    episodes = [make_episode(seed, errors_mm) for seed in cell.seeds]
+    summary = summarise(episodes, CHOSEN, ADD_S, wall_seconds_total=1.0)
+    details = {"orientations": cell.orientations}
+    if isinstance(cell.policy, Training):
+        details |= {
+            "method": cell.policy.method,
+            "preset": PRESET,
+            "trained_orientations": cell.policy.orientations,
+            "demonstrations": cell.policy.demonstrations,
+            "training_seed": 0,
+            "steps": task.steps,
+            "learning_rate": 0.001,
+            "continuous": cell.continuous,
+            "fit_outlines": cell.fit_outlines,
+            "recover": False,
+            "taken_only": cell.policy.taken_only,
+            "rigid": cell.policy.rigid,
+        }
+    summary |= {"resolved_scenario": described(scenario), "policy_details": details}
+    (folder / f"{name}.json").write_text(json.dumps(summary))
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    write(tmp_path, "unseen_so2_180_100", [1.0, 1.0, 1.0, 9.0])
+    write(tmp_path, "unseen_equivariant_transporter_180_100", [1.0, 1.0, 9.0, 9.0])
+    write(tmp_path, "unseen_quantized_oracle_180", [1.0, 1.0, 1.0, 1.0])
+    write(tmp_path, "stack_block_pyramid_so2_36_10", [1.0, 9.0])
+    return tmp_path
+
+
+def rows(text: str) -> dict[tuple[str, ...], list[str]]:
+    """The tables' lines, by their first two cells."""
+    lines = [line for line in text.splitlines() if line.startswith("| ")]
+    cells = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines]
+    return {tuple(row[:2]): row[2:] for row in cells}
+
+
+def test_the_tables_hold_the_cells_and_say_what_is_missing(folder: Path):
+    text = "\n".join(paper_sections(read_results(folder), {}, "results"))
+    found = rows(text)
+    assert found["SO(2)-equivariant (ours)", "100"] == ["-"] * 3 + ["75.0 (70.5 to 79.0) / 75.0"]
+    assert found["Transporter", "100"] == ["-", "", "", ""]
+    assert found["oracle, quantized", ""][-1].startswith("100.0")
+    assert found["unseen_so2_180_100", "Equivariant Transporter"] == ["+25.0 (+25.0 to +25.0)"] * 2
+    assert found["unseen_so2_180_100", "oracle, quantized"][0].startswith("-25.0")
+    assert "results/paper/unseen_so2_180_100.json" in text
+    assert "misplaced 100" in text
+    pyramid = [line for line in text.splitlines() if " 36 |" in line and " 10 |" in line]
+    assert any("50.0 (43.1 to 56.9)" in line for line in pyramid)
+    assert "*paper*, SO(2)-equivariant (ours)" in text
+
+
+def test_the_learning_rates_that_were_tried_are_told(folder: Path):
+    rates = {"transporter": {"0.001": 4.0, "0.0003": 2.5}}
+    text = "\n".join(paper_sections(read_results(folder), rates, "results"))
+    assert "the Transporter at 0.0003, the best on validation scenes of 0.001: 4.0 mm" in text
+
+
+def test_a_file_that_is_not_what_its_name_says_is_refused(folder: Path):
+    path = folder / "unseen_so2_180_100.json"
+    summary = json.loads(path.read_text())
+    summary["resolved_scenario"]["cameras"] = {}
+    path.write_text(json.dumps(summary))
+    with pytest.raises(UserError, match=r"unseen_so2_180_100\.json is not that of its cell: camer"):
+        read_results(folder)
+    path.rename(folder / "mine.json")
+    with pytest.raises(UserError, match=r"mine\.json is of no cell"):
+        read_results(folder)
+    (folder / "mine.json").unlink()
+    path.write_text("{}")
+    with pytest.raises(UserError, match="is no summary of evaluate"):
+        read_results(folder)
+
+
+def test_no_results_no_sections(tmp_path: Path):
+    assert read_results(tmp_path / "none") == []
+    assert paper_sections([], {}, "results") == []
+
+
+def test_the_figure_is_drawn_from_what_there_is(folder: Path):
+    results = {result.cell.name: result for result in read_results(folder)}
+    drawn = draw_figure_6("unseen", results)
+    assert drawn.startswith(b"\x89PNG")
+    assert drawn != draw_figure_6("seen", results)
