@@ -184,21 +184,22 @@ class Cell:
 
     def departure(self, summary: Mapping[str, Any]) -> str | None:
         """Why a summary is not this cell's; None if it is."""
-        wrong = scenario_differences(summary["resolved_scenario"], _expected(self))
+        expected = _expected(self)
+        wrong = scenario_differences(summary["resolved_scenario"], expected)
         if wrong:
             return wrong[0]
         if list(summary["seeds"]) != list(self.seeds):
             return f"its seeds are not {self.seeds[0]} to {self.seeds[-1]}"
+        if isinstance(self.policy, str):
+            same = summary["resolved_scenario"]["policy"] == expected["policy"]
+            return None if same else f"its policy is not {self.policy}"
         found = summary["policy_details"]
-        for key, wanted in self._details().items():
+        for key, wanted in self._details(self.policy).items():
             if found.get(key) != wanted:
                 return f"{key} is {found.get(key)}, not {wanted}"
         return None
 
-    def _details(self) -> dict[str, Any]:
-        if isinstance(self.policy, str):
-            return {"orientations": self.orientations} if self.orientations else {}
-        training = self.policy
+    def _details(self, training: Training) -> dict[str, Any]:
         wanted = {
             "method": training.method,
             "preset": PRESET,
@@ -220,7 +221,7 @@ class Cell:
 @cache
 def _expected(cell: Cell) -> dict[str, Any]:
     task = TASKS[cell.task]
-    text = None if cell.search else f"{{{_NO_SEARCH}}}"
+    text = cell.scenario_text("")
     return described(load_scenario(SCENARIOS / task.file, task.tested, text))
 
 

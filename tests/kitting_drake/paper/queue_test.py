@@ -159,6 +159,16 @@ def test_a_summary_of_something_else_is_refused(queue: Pretending, change, said:
     assert said in str(caught.value)
 
 
+def test_a_policy_of_its_own_is_checked_too(queue: Pretending):
+    queue.run([ORACLE])
+    path = queue.results / f"{ORACLE.name}.json"
+    path.write_text(path.read_text().replace('"orientations": 180', '"orientations": 72'))
+    with pytest.raises(
+        UserError, match=r"its policy is not !QuantizedOracle \{orientations: 180\}"
+    ):
+        queue.is_done(ORACLE)
+
+
 def test_a_command_that_fails_is_told_by_its_last_line(tmp_path: Path):
     """The real one: the scenario of this task does not exist."""
     (tmp_path / "results").mkdir()
