@@ -1,0 +1,56 @@
+"""The statistics of a LeRobotDataset, by which LeRobot normalises: see `lerobot_export`.
+
+They are those of `lerobot.datasets.compute_stats`, of every pixel and not of some.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+QUANTILES = {"q01": 0.01, "q10": 0.1, "q50": 0.5, "q90": 0.9, "q99": 0.99}
+
+
+def statistics_of(values: NDArray[Any], *, image: bool) -> dict[str, NDArray[Any]]:
+    """LeRobot's statistics of a feature in an episode: over frames, and over pixels of an image.
+
+    Args:
+        values: (frames,), (frames, entries) or (frames, rows, cols, channels).
+        image: whether it is an image: (channels, 1, 1) a statistic, and 8 bits are [0, 1].
+    """
+    flat = values.reshape(-1, values.shape[-1] if values.ndim > 1 else 1)
+    samples = flat.astype(np.float64) / (255 if image and values.dtype == np.uint8 else 1)
+    found = {
+        "min": samples.min(axis=0),
+        "max": samples.max(axis=0),
+        "mean": samples.mean(axis=0),
+        "std": samples.std(axis=0),
+        **dict(zip(QUANTILES, np.quantile(samples, [*QUANTILES.values()], axis=0), strict=True)),
+    }
+    if image:
+        found = {name: value[:, None, None] for name, value in found.items()}
+    return {**found, "count": np.array([len(values)])}
+
+
+def aggregate(episodes: Sequence[dict[str, NDArray[Any]]]) -> dict[str, Any]:
+    """Those of all episodes, as LeRobot's `aggregate_stats` has them: a quantile is the mean of
+    the episodes' quantiles."""
+    counts = np.array([item["count"][0] for item in episodes])
+    stacked = {name: np.stack([item[name] for item in episodes]) for name in episodes[0]}
+
+    def mean(value: NDArray[Any]) -> NDArray[Any]:
+        return np.average(value, axis=0, weights=counts)
+
+    variance = mean(stacked["std"] ** 2 + (stacked["mean"] - mean(stacked["mean"])) ** 2)
+    found = {
+        "min": stacked["min"].min(axis=0),
+        "max": stacked["max"].max(axis=0),
+        "mean": mean(stacked["mean"]),
+        "std": np.sqrt(variance),
+        "count": np.array([counts.sum()]),
+        **{name: mean(stacked[name]) for name in QUANTILES},
+    }
+    return {name: value.tolist() for name, value in found.items()}
