@@ -35,6 +35,7 @@ from kitting_drake.policies.demonstrations import (
     read_contents,
     write_demonstrations,
 )
+from kitting_drake.policies.lerobot_export import export_lerobot, require_export
 from kitting_drake.scenario.command_line import (
     ChosenScenario,
     choose_scenario,
@@ -66,6 +67,12 @@ def main() -> int:
         default=DEMONSTRATION_SEEDS.start,
         help=f"of the first ({DEMONSTRATION_SEEDS.start})",
     )
+    parser.add_argument(
+        "--export",
+        choices=("lerobot",),
+        help="also write them as a LeRobotDataset v3.0, to the folder lerobot in --output; those "
+        "collected before, without collecting",
+    )
     arguments = parser.parse_args()
     chosen = _by_oracle(choose_scenario(arguments))
     folder = require_folder(output_folder(arguments, f"{chosen.name}-demonstrations"))
@@ -79,18 +86,27 @@ def main() -> int:
         build_chosen(chosen, seed=arguments.seed)
         claim_folder(folder, "scenario.json", chosen.described, of="scenario")
         collection = Collection(folder, _origin(chosen, arguments.seed))
+        exported = folder / "lerobot" if arguments.export else None
         if collection.assembled >= arguments.demos:
-            console.print(f"nothing to do: {collection.summary()}", highlight=False, soft_wrap=True)
-            return 0
-        with open_workers(arguments, chosen) as (workers, sent):
-            collection.collect(
-                arguments.demos,
-                lambda seed: workers.run(_demonstrate, sent, seed),
-                workers=workers,
-                console=console,
-            )
-    seconds = time.perf_counter() - start
-    console.print(f"{collection.summary()}; {seconds:.0f} s", highlight=False, soft_wrap=True)
+            nothing = "nothing to collect" if exported else "nothing to do"
+            console.print(f"{nothing}: {collection.summary()}", highlight=False, soft_wrap=True)
+        else:
+            if exported:
+                require_export(exported)
+            with open_workers(arguments, chosen) as (workers, sent):
+                collection.collect(
+                    arguments.demos,
+                    lambda seed: workers.run(_demonstrate, sent, seed),
+                    workers=workers,
+                    console=console,
+                )
+            seconds = time.perf_counter() - start
+            told = f"{collection.summary()}; {seconds:.0f} s"
+            console.print(told, highlight=False, soft_wrap=True)
+        if exported:
+            with counting_bar(console, "exported") as progress:
+                export_lerobot(collection.path, exported, track=progress.track)
+            console.print(f"as a LeRobotDataset: {exported}/", highlight=False, soft_wrap=True)
     return 0
 
 

@@ -2,6 +2,7 @@ import dataclasses
 import json
 import os
 import random
+import shutil
 import signal
 import subprocess
 import sys
@@ -271,6 +272,41 @@ def test_what_is_finished_is_left_alone(
     monkeypatch.setattr(sys, "argv", [*arguments(tmp_path), "--scenario_text", "{time_limit: 2}"])
     with pytest.raises(UserError, match="another scenario"):
         collecting.main()
+
+
+def test_demonstrations_are_exported(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    pytest.importorskip("pyarrow", exc_type=ImportError)
+    monkeypatch.chdir(ROOT)
+    # That of the scenario.
+    monkeypatch.setattr(sys.modules[__name__], "GRID", PixelGrid())
+    monkeypatch.setattr(collecting, "require_rendering", lambda: None)
+    monkeypatch.setattr(collecting, "build_chosen", lambda *_, **__: None)
+    monkeypatch.setattr(LocalWorkers, "run", lambda _, __, ___, seed: Oracle()(seed))
+
+    def main(demos: int, *more: str) -> str:
+        monkeypatch.setattr(sys, "argv", arguments(tmp_path, "--demos", demos, "--seed", 10, *more))
+        assert collecting.main() == 0
+        return capsys.readouterr().out
+
+    main(1)
+    assert not (tmp_path / "lerobot").exists()
+    # Those that are there, without collecting; and again, which changes nothing.
+    told = main(1, "--export", "lerobot")
+    assert told.startswith("nothing to collect: ")
+    assert told.endswith(f"as a LeRobotDataset: {tmp_path / 'lerobot'}/\n")
+    before = (tmp_path / "lerobot").stat()
+    main(1, "--export", "lerobot")
+    assert (tmp_path / "lerobot").stat() == before
+    # An export of other demonstrations is in the way: told before any are collected.
+    with pytest.raises(UserError, match="lerobot exists, without the new demonstrations"):
+        main(2, "--export", "lerobot")
+    assert len(read_demonstrations(tmp_path / "demonstrations.h5").demonstrations) == 1
+    shutil.rmtree(tmp_path / "lerobot")
+    assert "holds 2 demonstrations" in main(2, "--export", "lerobot")
+    info = json.loads((tmp_path / "lerobot" / "meta" / "info.json").read_text())
+    assert (info["total_episodes"], info["total_frames"]) == (2, 2)
 
 
 ONE_TOOL = """
