@@ -68,6 +68,12 @@ class PickPlaceParameters:
     # How hard each pad presses on what it holds, in N.
     grasp_force: float = bounded(30.0, 1.0, 140.0)
 
+    # The same once the wrist has felt more than `heavy_load` of it, both in N: gripped beside its
+    # centre of mass, what is heavy would rotate between the pads. A Franka hand presses 70 N for as
+    # long as it likes.
+    firm_grasp_force: float = bounded(70.0, 1.0, 140.0)
+    heavy_load: float = bounded(5.0, 0.5, 100.0)
+
     # Less than this between the pressing pads is nothing at all, in m. They dent what is thin.
     minimum_width: float = bounded(0.0015, 0.0, 0.08)
 

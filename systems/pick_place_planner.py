@@ -105,6 +105,7 @@ class PickPlacePlanner(LeafSystem):
     the cavity (`SEARCH`) and lowers again once the resistance ends. A grasp is good if the pads
     stand further apart than `minimum_width` and both feel at least half of the grasp force; when it
     is not, or is lost on the way, the hand retreats and observes again, which counts as an action.
+    What turns out to be heavier than `heavy_load` is gripped more firmly as it is lifted.
     An action that says `press` ends with `DESCEND`, with closed jaws and as hard as `press_force`.
 
     All memory is discrete state: one vector, and the failed picks.
@@ -333,6 +334,8 @@ class PickPlacePlanner(LeafSystem):
             self._begin(state, Mode.RETREAT, time)
 
     def _hold(self, context, state, time, hand, contact) -> None:
+        if -contact[2] > self._parameters.heavy_load:
+            state.goal_force = max(state.goal_force, self._parameters.firm_grasp_force)
         if not self._is_held(hand, contact):
             state.dropped += 1
             self._begin(state, Mode.RETREAT, time)

@@ -38,6 +38,8 @@ _ADDED = (
     "task.pool",
     "task.kit.always_nested",
     "task.kit.fixed_size",
+    "planner.firm_grasp_force",
+    "planner.heavy_load",
     "planner.press_force",
     "planner.press_depth",
     "planner.search.reach",
@@ -48,7 +50,7 @@ _ADDED = (
     "appearance",
 )
 """Fields that older runs lack; their defaults change nothing in what those did, but that a search
-that was in vain goes on in a spiral."""
+that was in vain goes on in a spiral, and that what is heavy is gripped more firmly."""
 
 _FORMER = {"planner.minimum_width": 0.003}
 """Defaults of older runs that are not listed as departures: with this one what is thinner than 3 mm

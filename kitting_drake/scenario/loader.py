@@ -191,11 +191,13 @@ def _check_meaning(scenario: Scenario) -> None:
         raise ValueError(
             "planner.home[2] is below planner.floor_clearance: the hand would begin in the table"
         )
-    if planner.grasp_force > scenario.controller.finger_force_limit:
-        raise ValueError(
-            f"planner.grasp_force is {planner.grasp_force:g} N, more than the fingers can press "
-            f"(controller.finger_force_limit: {scenario.controller.finger_force_limit:g} N)"
-        )
+    for name in ("grasp_force", "firm_grasp_force"):
+        force = getattr(planner, name)
+        if force > scenario.controller.finger_force_limit:
+            raise ValueError(
+                f"planner.{name} is {force:g} N, more than the fingers can press "
+                f"(controller.finger_force_limit: {scenario.controller.finger_force_limit:g} N)"
+            )
     scenario.policy.validate()
     if scenario.policy.needs_observation and not scenario.cameras:
         raise ValueError("cameras is empty: this policy needs at least one to see by")

@@ -250,6 +250,20 @@ def test_where_the_hand_goes():
     )
 
 
+@pytest.mark.parametrize(("heavy_load", "firm"), [(WEIGHT - 0.5, True), (WEIGHT + 0.5, False)])
+def test_what_is_heavy_is_gripped_more_firmly_until_it_is_let_go(heavy_load: float, firm: bool):
+    parameters = dataclasses.replace(PARAMETERS, heavy_load=heavy_load)
+    run = Run(parameters=parameters).until(Mode.LIFT)
+    assert run.output("closing_force")[0] == parameters.grasp_force
+    run.until(Mode.LOWER)
+    force = parameters.firm_grasp_force if firm else parameters.grasp_force
+    assert run.output("closing_force")[0] == force
+    run.until(Mode.RETREAT)
+    assert run.output("closing_force")[0] == 0
+    run.finish()
+    assert run.sequence == [*PICK_AND_PLACE, Mode.OBSERVE, Mode.DONE]
+
+
 @pytest.mark.parametrize("height", [0.02, 0.045])
 def test_lowering_stops_where_something_is_touched(height: float):
     run = Run(World(touch_place=height)).until(Mode.RELEASE)

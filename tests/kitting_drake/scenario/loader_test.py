@@ -114,6 +114,10 @@ BAD = {
         "A: {controller: {finger_force_limit: 20.0}}",
         ["planner.grasp_force is 30 N", "controller.finger_force_limit: 20 N"],
     ),
+    "more force for what is heavy than there is": (
+        "A: {controller: {finger_force_limit: 50.0}}",
+        ["planner.firm_grasp_force is 70 N", "controller.finger_force_limit: 50 N"],
+    ),
     "unknown tag": ("A: {policy: !Orcle {}}", ["policy", "!Orcle", "!Oracle"]),
     "tag without a value": ("A: {policy: !Oracle }", ["mine.yaml"]),
     "empty value": ("A: {time_limit: }", ["time_limit", "empty"]),
