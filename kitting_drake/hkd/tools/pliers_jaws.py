@@ -17,8 +17,9 @@ Line = list[tuple[float, float]]
 class Jaws:
     """A pair of jaws. Lengths in mm of the full-size tool, the rivet at the origin."""
 
-    # One of OUTLINES.
+    # One of OUTLINES; and that of the lower jaw, where it is another.
     kind: str = "combination"
+    lower_kind: str = ""
     length_mm: float = 46.0
     # Width of both closed jaws at the tip, and how far they stand open there.
     tip_width_mm: float = 15.0
@@ -34,12 +35,13 @@ class Jaws:
     bend_deg: float = 0.0
 
 
-def upper_jaw(j: Jaws, start: float, half: float) -> np.ndarray:
+def upper_jaw(j: Jaws, start: float, half: float, kind: str = "") -> np.ndarray:
     """The outline (n, 2) of the upper jaw, counter-clockwise.
 
-    `start` is where the joint's flanks end along x, `half` half their distance.
+    `start` is where the joint's flanks end along x, `half` half their distance; `kind` is one of
+    OUTLINES, the jaws' own if empty.
     """
-    back, bite = OUTLINES[j.kind](j, start, half)
+    back, bite = OUTLINES[kind or j.kind](j, start, half)
     root = [(start - 6.0, 0.0), (start - 6.0, half - 0.3)]
     return np.array([*root, *back, *bite])[::-1].copy()
 
@@ -262,6 +264,43 @@ def _pump(j: Jaws, start: float, half: float) -> tuple[Line, Line]:
     return _rounded(back, [10.0, 18.0, 2.0], j), bite
 
 
+def _poll(j: Jaws, start: float, half: float) -> tuple[Line, Line]:
+    """The jaw of fencing pliers that is a hammer: a square poll stands out sideways at the tip."""
+    length, out = j.length_mm, j.tip_width_mm / 2
+    back = [
+        (start, half),
+        (0.46 * length, 0.70 * half),
+        (0.56 * length, out - 1.5),
+        (0.62 * length, out),
+        (length - 1.5, out),
+        (length, out - 1.5),
+    ]
+    return _rounded(back, [10.0, 8.0, 1.0, 1.0, 1.0], j), _staple_bite(j, start)
+
+
+def _pick(j: Jaws, start: float, half: float) -> tuple[Line, Line]:
+    """The jaw across from it: a curved point that draws staples stands out sideways."""
+    length, out = j.length_mm, j.tip_width_mm / 2
+    back = [
+        (start, half),
+        (0.40 * length, 0.72 * half),
+        (0.55 * length, 0.72 * half),
+        (0.58 * length, out),
+        (0.64 * length, out),
+        (0.80 * length, 0.84 * half),
+        (length, 0.55 * half),
+    ]
+    return _rounded(back, [10.0, 6.0, 1.0, 1.0, 14.0, 3.0], j), _staple_bite(j, start)
+
+
+def _staple_bite(j: Jaws, start: float) -> Line:
+    """Serrated at the tip, with a round hole for wire and a cutter behind it."""
+    length = j.length_mm
+    bite = _teeth(j, length - 1.0, 0.66 * length)
+    bite += _hollow(j, 0.62 * length, 0.46 * length, 2.4, False)
+    return [*bite, (0.42 * length, 0.35), (start, 0.3)]
+
+
 OUTLINES: dict[str, Callable[[Jaws, float, float], tuple[Line, Line]]] = {
     "combination": _combination,
     "linesman": _linesman,
@@ -274,4 +313,6 @@ OUTLINES: dict[str, Callable[[Jaws, float, float], tuple[Line, Line]]] = {
     "snips": _snips,
     "stripper": _stripper,
     "pump": _pump,
+    "poll": _poll,
+    "pick": _pick,
 }

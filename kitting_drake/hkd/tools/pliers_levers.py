@@ -139,7 +139,8 @@ def _lap_outline(v: Levers) -> np.ndarray:
 def _jaw_outlines(v: Levers, j: Jaws) -> tuple[np.ndarray, np.ndarray]:
     """The outlines of the upper and the lower jaw, rotated and bent as they are."""
     outline = upper_jaw(j, v.joint_front_mm, v.joint_width_mm / 2)
-    mirrored = (outline * np.array([1.0, -1.0]))[::-1]
+    other = upper_jaw(j, v.joint_front_mm, v.joint_width_mm / 2, j.lower_kind)
+    mirrored = (other * np.array([1.0, -1.0]))[::-1]
     upper, lower = (bent(j, o, v.joint_front_mm) for o in (outline, mirrored))
     return upper, lower
 

@@ -150,6 +150,16 @@ STYLES: dict[str, Style] = {
             Zone("metal", [S(0.92, 0.64), S(0.985, 0.56), S(1.0, 0.5)]),
         ],
     ),
+    # The cabinet maker's oval bulb, waisted toward a ferrule.
+    "cabinet": Style(
+        _oval,
+        [
+            Zone("grip", [S(0.0, 0.5), S(0.02, 0.7), S(0.08, 0.88), S(0.17, 0.97), S(0.25, 1.0)]),
+            Zone("grip", [S(0.25, 1.0), S(0.51, 1.0), S(0.59, 0.93), S(0.71, 0.68), S(0.80, 0.54)]),
+            Zone("grip", [S(0.80, 0.54), S(0.88, 0.5)]),
+            Zone("metal", [S(0.88, 0.47), S(0.98, 0.45), S(1.0, 0.4)]),
+        ],
+    ),
     # Wood through which the blade is forged, its end a steel cap to strike.
     "striking": Style(
         _octagon,
@@ -157,6 +167,18 @@ STYLES: dict[str, Style] = {
             Zone("metal", [S(0.0, 0.72), S(0.012, 0.8), S(0.075, 0.8), S(0.085, 0.72)]),
             Zone("grip", [S(0.085, 0.9), S(0.11, 1.0), S(0.86, 1.0), S(0.88, 0.9)]),
             Zone("metal", [S(0.88, 0.96), S(0.98, 0.96), S(1.0, 0.86)]),
+        ],
+    ),
+    # A body whose blade turns a little at every blow of a hammer: a cap to strike, and rings.
+    "impact": Style(
+        _octagon,
+        [
+            Zone("accent", [S(0.0, 0.84), S(0.015, 0.92), S(0.10, 0.92)]),
+            Zone("grip", [S(0.10, 0.98), S(0.115, 1.0), S(0.14, 1.0)]),
+            Zone("grip", [S(0.14 + 0.02 * i, 0.98 if i % 2 else 1.0) for i in range(13)], True),
+            Zone("grip", [S(0.38, 1.0), S(0.765, 1.0), S(0.78, 0.98)]),
+            Zone("accent", [S(0.78, 0.92), S(0.90, 0.92), S(0.91, 0.86)]),
+            Zone("metal", [S(0.91, 0.70), S(0.98, 0.70), S(1.0, 0.6)]),
         ],
     ),
     # Insulated: a guard at the front keeps the hand from what is live.

@@ -33,6 +33,7 @@ MATERIALS: dict[str, Material] = {
     "steel": Material(7850.0, (0.62, 0.64, 0.67, 1.0)),
     "dark_steel": Material(7850.0, (0.27, 0.28, 0.30, 1.0)),
     "hickory": Material(750.0, (0.82, 0.60, 0.34, 1.0)),
+    "dark_wood": Material(950.0, (0.45, 0.27, 0.14, 1.0)),
     "leather": Material(900.0, (0.55, 0.30, 0.14, 1.0)),
     "painted_wood": Material(750.0, (0.62, 0.13, 0.10, 1.0)),
     # Painted aluminium.

@@ -118,8 +118,8 @@ def _shank_cells(p: WrenchParameters) -> list[CrossSection]:
         return [_rectangle(-bend, bend), *_swung_ends(p, bend)]
     joints: list[float] = []
     for head, side in ((p.back, -1), (p.front, 1)):
-        if head.kind == "tail":
-            joints.append(side * (half + far))
+        if head.kind in ("tail", "spike"):
+            joints.append(side * (half + max(far, 2.0 * head.size_mm)))
             continue
         if not head.neck_mm:
             return []

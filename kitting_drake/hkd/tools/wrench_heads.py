@@ -22,12 +22,15 @@ class Head:
     """One end of a wrench. Lengths in mm."""
 
     # open, box, ratchet (a box with a geared ring), flare_nut (a box with a gap for the pipe),
-    # adjustable, pipe, hook (of a hook spanner) or tail (a round end with a hole to hang it by).
+    # adjustable, pipe, hook (of a hook spanner), tail (a round end with a hole to hang it by),
+    # spike (a taper to line up holes with) or bar (a handle, or a block to strike, across the end).
     kind: str = "open"
     # Size of the hexagon that it turns, across flats. For adjustable and pipe, how far the jaws
-    # stand open; for a tail, the diameter of the hole; for a hook, the length of its nose.
+    # stand open; for a tail, the diameter of the hole; for a hook, the length of its nose; for a
+    # spike, its length; for a bar, its depth along the shank.
     size_mm: float = 17.0
-    # Diameter of the head; for adjustable and pipe, the width across it.
+    # Diameter of the head; for adjustable and pipe, the width across it; for a spike, that of its
+    # foot; for a bar, its length.
     diameter_mm: float = 38.0
     thickness_mm: float = 8.8
     # Angle of the head's axis to the shank, in degrees.
@@ -368,6 +371,23 @@ def _hook(head: Head, x: float, turn_deg: float, bevel: float) -> HeadShape:
     return HeadShape(_put(arc + hook, x, turn_deg), CrossSection())
 
 
+# --- Ends without a mouth. ---
+
+
+def _spike(head: Head, x: float, turn_deg: float, bevel: float) -> HeadShape:
+    """A taper to a blunt point."""
+    foot, point = head.diameter_mm / 2, 0.2 * head.diameter_mm
+    rings = [circle(foot, segments=32), circle(point, (head.size_mm - point, 0.0), 32)]
+    return HeadShape(_put(CrossSection.hull_points(np.vstack(rings)), x, turn_deg), CrossSection())
+
+
+def _bar(head: Head, x: float, turn_deg: float, bevel: float) -> HeadShape:
+    """A bar with rounded ends across the shank."""
+    depth, length = head.size_mm, head.diameter_mm
+    outline = rounded_rectangle(depth, length, 0.2 * min(depth, length), 5)
+    return HeadShape(_put(CrossSection([outline]), x, turn_deg), CrossSection())
+
+
 _KINDS = {
     "open": _open,
     "box": _box,
@@ -377,4 +397,6 @@ _KINDS = {
     "adjustable": _adjustable,
     "pipe": _pipe,
     "hook": _hook,
+    "spike": _spike,
+    "bar": _bar,
 }
