@@ -115,7 +115,7 @@ def sheet(args: argparse.Namespace, entries: list[ToolEntry]) -> None:
 
 
 def build(args: argparse.Namespace, entries: list[ToolEntry]) -> None:
-    """Writes the whole dataset, tools and kits, to a folder that other simulators can load."""
+    """Writes the paper's dataset, tools and kits, to a folder that other simulators can load."""
     from kitting_drake.hkd.dataset import build_dataset
 
     with Progress(console=Console(stderr=True), transient=True, disable=args.quiet) as progress:

@@ -16,13 +16,13 @@ from kitting_drake.hkd.kits.kit import Kit, make_kit
 from kitting_drake.hkd.kits.parameters import KitParameters
 from kitting_drake.hkd.mjcf import kit_mjcf, tool_mjcf
 from kitting_drake.hkd.tools.tool import Tool, load_tool
-from kitting_drake.hkd.tools.toolsets import SPLITS, TOOLSETS_SEED, tool_pools, toolsets
+from kitting_drake.hkd.tools.toolsets import PAPER_SPLITS, TOOLSETS_SEED, tool_pools, toolsets
 
 
 def build_dataset(
     folder: Path, progress: Callable[[int, int], None], *, mjcf: bool = False
 ) -> dict[str, Any]:
-    """Writes tools and kits as SDFormat with their meshes, and `manifest.json`.
+    """Writes the paper's tools and kits as SDFormat with their meshes, and `manifest.json`.
 
     The folder appears atomically. Tools are in `tools/NAME/`, kits in `kits/SPLIT_000/`;
     meshes are named relatively, so that any part may be moved.
@@ -58,7 +58,7 @@ def _write_dataset(
 ) -> dict[str, Any]:
     parameters = KitParameters()
     tools: dict[str, Tool] = {}
-    for split in SPLITS:
+    for split in PAPER_SPLITS:
         for pool in tool_pools(split).values():
             tools |= {name: load_tool(name) for name in pool}
     for name, tool in tools.items():
@@ -66,7 +66,9 @@ def _write_dataset(
         if mjcf:
             (root / "tools" / name / f"{name}.xml").write_text(tool_mjcf(tool.sdf))
     chosen = [
-        (split, index, names) for split in SPLITS for index, names in enumerate(toolsets(split))
+        (split, index, names)
+        for split in PAPER_SPLITS
+        for index, names in enumerate(toolsets(split))
     ]
     kits = []
     for done, (split, index, names) in enumerate(chosen):

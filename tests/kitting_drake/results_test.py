@@ -127,6 +127,7 @@ DENSE = Scenario(task=ToolsetKitting(split="test"), heightmap=Heightmap(resoluti
         # Its task has the paper's title: not that alone makes it the paper's.
         (DENSE, None, "`heightmap.resolution: 0.002`"),
         (Scenario(task=ToolsetKitting(split="train")), None, '`task.split: "train"`'),
+        (Scenario(task=ToolsetKitting(split="fresh")), None, '`task.split: "fresh"`'),
         (Scenario(task=ArrangedKitting()), None, ""),
         (Scenario(task=ArrangedKitting(), time_limit=9.0), None, "`time_limit: 9.0`"),
     ],

@@ -13,7 +13,7 @@ from kitting_drake.hkd.kits.clearance import measure_clearance
 from kitting_drake.hkd.kits.layout import kit_cavities, layout_kit
 from kitting_drake.hkd.kits.parameters import KitParameters
 from kitting_drake.hkd.tools.tool import load_tool
-from kitting_drake.hkd.tools.toolsets import SPLITS, toolsets
+from kitting_drake.hkd.tools.toolsets import PAPER_SPLITS, toolsets
 
 
 def benchmark_kits(count: int | None, console: Console) -> dict[str, Any]:
@@ -24,7 +24,7 @@ def benchmark_kits(count: int | None, console: Console) -> dict[str, Any]:
         console: for progress.
     """
     build_times, triangles, medians, minima = [], [], [], []
-    chosen = [names for split in SPLITS for names in toolsets(split)[:count]]
+    chosen = [names for split in PAPER_SPLITS for names in toolsets(split)[:count]]
     for names in track(chosen, "kits", console=console, transient=True, disable=console.quiet):
         start = time.perf_counter()
         # From the meshes on disk to the block; nothing comes from the cache.

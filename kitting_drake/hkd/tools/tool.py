@@ -34,7 +34,8 @@ class Tool:
     category: str
     """One of `CATEGORIES`, or a name of one's own: small letters, digits and underscores."""
     split: str
-    """`train` or `test` (section IV-B.1 of the paper), or `user` for a tool of one's own."""
+    """`train` or `test` (section IV-B.1 of the paper), `fresh` (kept for a last test), or `user`
+    for a tool of one's own."""
     length: float
     """Extents of the bounding box along x, y and z of T, in metres."""
     width: float

@@ -5,9 +5,14 @@ import numpy as np
 from kitting_drake.common.errors import UserError
 from kitting_drake.hkd.tools.tool import CATEGORIES, load_tool, tool_names
 
-SPLITS = ("train", "test")
+PAPER_SPLITS = ("train", "test")
+"""The splits of the paper's dataset (section IV-B.1): forty tools to train with, twenty to test."""
+SPLITS = (*PAPER_SPLITS, "fresh")
+"""All splits; draws depend on their order, so a new one comes last. The ten `fresh` tools are no
+part of the paper's dataset: they are kept for a last test, and nothing is trained or tuned with
+them."""
 TOOLSET_COUNT = 100
-"""Toolsets, and so kits, of each split."""
+"""Toolsets, and so kits, of each split that has so many combinations."""
 TOOLSETS_SEED = 2024
 """The seed of the drawing."""
 

@@ -36,6 +36,9 @@ SEEN = "kitting-seen-toolset"
 UNSEEN = "kitting-unseen-toolsets"
 """The tasks of the paper (section V-B.1)."""
 
+_TITLES = {"train": "kitting-train-toolsets", "test": UNSEEN, "fresh": "kitting-fresh-toolsets"}
+"""The titles of the tasks that draw toolsets, by their split, where nothing else is changed."""
+
 
 @dataclass
 class _KittingTask(TaskConfig):
@@ -155,7 +158,7 @@ class Kitting(_DrawnKitting):
 class ToolsetKitting(_DrawnKitting):
     """Tools and kit drawn from the seed too, out of a pool: kitting-unseen-toolsets."""
 
-    # The pool: train or test (section IV-B.1 of the paper) ...
+    # The pool: train or test (section IV-B.1 of the paper), or fresh, which are neither ...
     split: str = "test"
 
     # ... or tools of one's own, names or paths of tool folders: of each of their categories one.
@@ -168,9 +171,8 @@ class ToolsetKitting(_DrawnKitting):
 
     @property
     def title(self) -> str:
-        if self == ToolsetKitting(split="test"):
-            return UNSEEN
-        return "kitting-train-toolsets" if self == ToolsetKitting(split="train") else "kitting"
+        unchanged = self == ToolsetKitting(split=self.split)
+        return _TITLES.get(self.split, "kitting") if unchanged else "kitting"
 
     def make_scene(self, *, grid: PixelGrid, seed: int, base: Path) -> Scene:
         choices = self._toolsets(base)

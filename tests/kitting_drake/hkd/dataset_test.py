@@ -9,7 +9,7 @@ from pydrake.systems.framework import DiagramBuilder
 
 from kitting_drake.common.errors import UserError
 from kitting_drake.hkd import dataset
-from kitting_drake.hkd.tools.toolsets import SPLITS, toolsets
+from kitting_drake.hkd.tools.toolsets import PAPER_SPLITS, toolsets
 
 
 @pytest.fixture
@@ -25,7 +25,9 @@ def test_what_is_built_is_what_the_manifest_says(tmp_path: Path):
     assert manifest == json.loads((folder / "manifest.json").read_text())
     assert steps == [(1, 4), (2, 4), (3, 4), (4, 4)]
     assert len(manifest["tools"]) == 60
-    assert [kit["split"] for kit in manifest["kits"]] == [split for split in SPLITS for _ in "12"]
+    assert [kit["split"] for kit in manifest["kits"]] == [
+        split for split in PAPER_SPLITS for _ in "12"
+    ]
     listed = {"manifest.json"}
     for entry in manifest["tools"] + manifest["kits"]:
         for path, checksum in entry["sha256"].items():

@@ -153,7 +153,10 @@ BAD = {
         "A: {task: !Kitting {tools: [a, a, a, a, a, a, a, a, a, a, a, a, a]}}",
         ["task.tools has 13 tools", "up to 12"],
     ),
-    "no such split": ("A: {task: !ToolsetKitting {split: dev}}", ["task.split", "train, test"]),
+    "no such split": (
+        "A: {task: !ToolsetKitting {split: dev}}",
+        ["task.split", "train, test, fresh"],
+    ),
     "lengths the wrong way round": (
         "A: {task: !ToolsetKitting {tool_length: [0.2, 0.15]}}",
         ["task.tool_length"],

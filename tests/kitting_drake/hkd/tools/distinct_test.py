@@ -11,6 +11,20 @@ def test_a_tool_is_no_distance_from_itself():
     assert mean_surface_distance(tool, tool) < 0.0005
 
 
+@pytest.mark.parametrize("name", [n for n in tool_names() if load_tool(n).split == "fresh"])
+def test_a_fresh_tool_is_like_none_of_its_category(name: str):
+    tool = load_tool(name)
+    others = [load_tool(other) for other in tool_names() if other != name]
+    distances = {
+        other.name: mean_surface_distance(tool, other, count=1000, dense=30_000)
+        for other in others
+        if other.category == tool.category
+    }
+    nearest = min(distances, key=distances.__getitem__)
+    # Points are sparser than below, and so a little further apart.
+    assert distances[nearest] > 0.0016, nearest
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("category", CATEGORIES)
 def test_no_two_tools_of_a_category_are_alike(category: str):

@@ -1,6 +1,11 @@
+import hashlib
+import json
+import math
+
 import pytest
 
 from kitting_drake.common.errors import UserError
+from kitting_drake.common.paths import SCENARIOS
 from kitting_drake.hkd.kits.block import build_block
 from kitting_drake.hkd.kits.clearance import measure_clearance
 from kitting_drake.hkd.kits.layout import kit_cavities
@@ -10,15 +15,17 @@ from kitting_drake.hkd.tools.tool import CATEGORIES, load_tool
 from kitting_drake.hkd.tools.toolsets import SPLITS, TOOLSET_COUNT, tool_pools, toolsets
 
 
-def test_ten_tools_of_each_category_to_train_with_and_five_to_test():
+def test_ten_tools_of_each_category_to_train_with_five_to_test_and_ten_fresh_ones():
     sizes = {split: [len(pool) for pool in tool_pools(split).values()] for split in SPLITS}
-    assert sizes == {"train": [10] * 4, "test": [5] * 4}
+    assert sizes == {"train": [10] * 4, "test": [5] * 4, "fresh": [3, 2, 3, 2]}
 
 
 @pytest.mark.parametrize("split", SPLITS)
 def test_toolsets_are_a_hundred_different_ones_of_their_own_split(split: str):
+    """Or all that there are."""
     drawn = toolsets(split)
-    assert len(set(drawn)) == len(drawn) == TOOLSET_COUNT
+    combinations = math.prod(len(pool) for pool in tool_pools(split).values())
+    assert len(set(drawn)) == len(drawn) == min(TOOLSET_COUNT, combinations)
     for names in drawn:
         tools = [load_tool(name) for name in names]
         assert tuple(tool.category for tool in tools) == CATEGORIES
@@ -27,6 +34,24 @@ def test_toolsets_are_a_hundred_different_ones_of_their_own_split(split: str):
     assert {name for names in drawn for name in names} == {
         name for pool in tool_pools(split).values() for name in pool
     }
+
+
+@pytest.mark.parametrize(
+    ("split", "digest"),
+    [
+        ("train", "1503670b669c29c4c9ccf241391387a10f3edcbfb54664db358da6b340807e0d"),
+        ("test", "3ac90885e97a9654d2a294cc3191c67c05f90d461d1d2434d8d1f3bb6f3c2320"),
+    ],
+)
+def test_toolsets_of_the_paper_never_change(split: str, digest: str):
+    """Demonstrations, weights and results are of these: a split that is added moves none."""
+    assert hashlib.sha256(json.dumps(toolsets(split)).encode()).hexdigest() == digest
+
+
+def test_fresh_tools_are_in_no_scenario_but_by_their_split():
+    fresh = [name for pool in tool_pools("fresh").values() for name in pool]
+    for path in SCENARIOS.glob("*.yaml"):
+        assert not [name for name in fresh if name in path.read_text()], path
 
 
 def test_a_split_that_lacks_a_category_is_told(monkeypatch: pytest.MonkeyPatch):

@@ -145,13 +145,14 @@ def test_arranged_stands_where_you_say():
         assert yaw_deg(X) == pytest.approx(pose.yaw_deg)
 
 
-def test_toolsets_are_drawn_from_their_split():
+@pytest.mark.parametrize("split", ["test", "fresh"])
+def test_toolsets_are_drawn_from_their_split(split: str):
     drawn = set()
     for seed in range(4):
-        scene = draw(seed, ToolsetKitting(split="test"))
+        scene = draw(seed, ToolsetKitting(split=split))
         drawn |= set(names(scene))
         assert sorted(item.category for item in scene.objects) == sorted(CATEGORIES)
-        assert {load_tool(name).split for name in names(scene)} == {"test"}
+        assert {load_tool(name).split for name in names(scene)} == {split}
         lengths = [float(np.ptp(item.p_BPoints[:, 0])) for item in scene.objects]
         assert all(0.145 < length < 0.201 for length in lengths)
     assert len(drawn) > 6
@@ -186,6 +187,8 @@ def test_only_what_is_unchanged_is_called_as_in_the_paper():
     assert Kitting(spacing=0.01).title == "kitting"
     assert ToolsetKitting().title == "kitting-unseen-toolsets"
     assert ToolsetKitting(split="train").title == "kitting-train-toolsets"
+    assert ToolsetKitting(split="fresh").title == "kitting-fresh-toolsets"
+    assert ToolsetKitting(split="fresh", distractors=1).title == "kitting"
     assert ToolsetKitting(random_lengths=False).title == "kitting"
     assert ArrangedKitting().title == "arranged"
 

@@ -9,7 +9,7 @@ import pytest
 from kitting_drake.cell.cameras import can_render
 from kitting_drake.common.errors import UserError
 from kitting_drake.common.paths import MODELS
-from kitting_drake.hkd.tools.generate import load_catalogue
+from kitting_drake.hkd.tools.generate import ToolEntry, load_catalogue
 from kitting_drake.hkd.tools.random_tools import draw_tool
 from kitting_drake.policies.static_scenes import (
     StaticSamples,
@@ -42,6 +42,21 @@ def test_random_tools_lie_on_the_table_and_differ():
     assert len({round(tool.footprint.area(), 9) for tool in tools}) == len(tools)
     again = draw_tool(ENTRIES, np.random.default_rng(2), "2")
     np.testing.assert_array_equal(again.triangles, tools[2].triangles)
+
+
+def test_random_tools_depart_from_tools_to_train_with_only(monkeypatch: pytest.MonkeyPatch):
+    given: list[ToolEntry] = []
+
+    def take_down(entries: list[ToolEntry], *_: object) -> None:
+        given.extend(entries)
+        raise UserError("seen enough")
+
+    monkeypatch.setattr(static_scenes, "require_rendering", lambda: None)
+    monkeypatch.setattr(static_scenes, "draw_tool", take_down)
+    with pytest.raises(UserError, match="seen enough"):
+        next(static_scenes.draw_batch(0))
+    assert len(given) == 40
+    assert {entry.split for entry in given} == {"train"}
 
 
 @pytest.fixture(scope="module")
