@@ -25,7 +25,7 @@ def write(folder: Path, name: str, errors_mm: list[float]) -> None:
     scenario = load_scenario(SCENARIOS / task.file, task.tested, cell.scenario_text("w"))
     episodes = [make_episode(seed, errors_mm) for seed in cell.seeds]
     summary = summarise(episodes, CHOSEN, ADD_S, wall_seconds_total=1.0)
-    details = {"orientations": cell.orientations}
+    details = {"orientations": cell.orientations, "method": "shape_matching"}
     if isinstance(cell.policy, Training):
         details |= {
             "method": cell.policy.method,
@@ -51,6 +51,7 @@ def folder(tmp_path: Path) -> Path:
     write(tmp_path, "unseen_equivariant_transporter_180_100", [1.0, 1.0, 9.0, 9.0])
     write(tmp_path, "unseen_quantized_oracle_180", [1.0, 1.0, 1.0, 1.0])
     write(tmp_path, "stack_block_pyramid_so2_36_10", [1.0, 9.0])
+    write(tmp_path, "fresh_shape_matching", [1.0, 1.0, 1.0, 1.0])
     return tmp_path
 
 
@@ -73,6 +74,8 @@ def test_the_tables_hold_the_cells_and_say_what_is_missing(folder: Path):
     assert "misplaced 100" in text
     pyramid = [line for line in text.splitlines() if " 36 |" in line and " 10 |" in line]
     assert any("50.0 (43.1 to 56.9)" in line for line in pyramid)
+    assert found["shape matching", "100.0 (99.0 to 100.0)"][1] == "100.0 (99.0 to 100.0)"
+    assert found["generalist", "-"] == ["-", "-"]
     assert "*paper*, SO(2)-equivariant (ours)" in text
 
 
