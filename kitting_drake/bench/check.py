@@ -228,7 +228,7 @@ def _aligned(
     poses: Mapping[str, Array], seen: Mapping[str, SeenBlock], block: Block
 ) -> dict[str, Array]:
     """The poses, shifted and rotated in the plane until the cameras see the block at one place."""
-    period = math.pi / 2 if math.isclose(block.size[0], block.size[1], rel_tol=0.05) else math.pi
+    period = block.period
     if block.pose is None:
         first = next(iter(seen.values())).yaw
         yaw = first + float(

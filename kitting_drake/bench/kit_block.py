@@ -31,6 +31,13 @@ class Block:
     pose: tuple[float, float, float] | None = None
     """x, y of its middle in the base frame, in metres, and the yaw of its length, in radians."""
 
+    @property
+    def period(self) -> float:
+        """The rotation after which it looks the same, in radians; a quarter where length and width
+        are too much alike to be told apart."""
+        length, width, _ = self.size
+        return math.pi / 2 if math.isclose(length, width, rel_tol=0.05) else math.pi
+
 
 @dataclass(frozen=True)
 class SeenBlock:
@@ -39,7 +46,7 @@ class SeenBlock:
     middle: Array
     """(2,) in the base frame, in metres."""
     yaw: float
-    """Of the longer side, in radians, modulo half a rotation."""
+    """Of the length, in radians, modulo `Block.period`."""
     size: tuple[float, float, float]
     """Length, width and height, in metres."""
     corner: float
@@ -121,13 +128,17 @@ def _filled(mask: NDArray[np.bool_], camera: BenchCamera) -> NDArray[np.bool_]:
 
 
 def _on_plane(camera: BenchCamera, X_BC: Array, height: float) -> tuple[Array, Array]:
-    """(height, width, 2) where each pixel's ray meets a horizontal plane, in metres, and the area
-    of it that the pixel covers, up to a factor."""
-    u, v = np.broadcast_arrays(camera.rays.u, camera.rays.v)
-    directions = np.stack([u, v, np.ones_like(u)], axis=-1).astype(float) @ X_BC[:3, :3].T
+    """(height, width, 2) where each pixel's ray meets a horizontal plane, in metres, and
+    (height, width) the area of it that the pixel covers, up to a factor."""
+    u, v = (item.astype(float) for item in np.broadcast_arrays(camera.rays.u, camera.rays.v))
+    directions = np.stack([u, v, np.ones_like(u)], axis=-1) @ X_BC[:3, :3].T
+    # What a pixel covers at depth 1: all alike, unless the lens distorts.
+    (u_row, u_col), (v_row, v_col) = np.gradient(u), np.gradient(v)
+    covered = np.abs(u_col * v_row - u_row * v_col)
     with np.errstate(divide="ignore", invalid="ignore"):
         depth = (height - X_BC[2, 3]) / directions[..., 2]
-        return X_BC[:2, 3] + depth[..., None] * directions[..., :2], np.abs(depth) ** 3
+        hit = X_BC[:2, 3] + depth[..., None] * directions[..., :2]
+        return hit, covered * np.abs(depth) ** 3
 
 
 def _rotation(angle: float) -> Array:

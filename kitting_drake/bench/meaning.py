@@ -177,11 +177,11 @@ def scales(seen: SeenBlock, block: Block) -> tuple[float, float, float]:
 
 def offset(seen: SeenBlock, block: Block) -> tuple[float, float, float] | None:
     """x, y in metres and yaw in radians by which a block looks displaced, if it is known where it
-    is; yaw modulo half a rotation."""
+    is; yaw modulo `Block.period`."""
     if block.pose is None:
         return None
     x, y = seen.middle - np.array(block.pose[:2])
-    return float(x), float(y), math.remainder(seen.yaw - block.pose[2], math.pi)
+    return float(x), float(y), math.remainder(seen.yaw - block.pose[2], block.period)
 
 
 def _verdict(error: float) -> str:

@@ -106,7 +106,29 @@ def test_a_block_tells_where_a_camera_is_beside_itself(size: tuple[float, float,
     arm = np.array(block.pose[:2]) - X_left[:2, 3]
     expected = Rotation.from_euler("z", 0.4, degrees=True).as_matrix()[:2, :2] @ arm - arm
     np.testing.assert_allclose((x, y), expected + (0.003, 0), atol=0.0006)
-    assert math.degrees(math.remainder(yaw, math.pi / 2)) == pytest.approx(0.4, abs=0.2)
+    assert math.degrees(yaw) == pytest.approx(0.4, abs=0.2)
+
+
+@pytest.mark.parametrize("yaw", [-0.5, 0.7, 1.2])
+def test_a_square_block_is_not_seen_rotated_by_a_quarter(yaw: float):
+    block = Block((0.16, 0.16, 0.05), (0.45, -0.2, yaw))
+    for camera in check_cameras(cast(TRUE, block), TRUE, block).cameras.values():
+        assert math.degrees(offset(camera.block, block)[2]) == pytest.approx(0, abs=0.3)
+
+
+@pytest.mark.parametrize("pose", [(0.45, -0.2, 1.1), (0.6, 0.2, 0.3)])
+def test_a_block_is_where_it_is_through_a_lens_that_distorts(pose: tuple[float, float, float]):
+    """A pixel near the border covers more of the block than one in the middle."""
+    block = Block((0.20, 0.15, 0.05), pose)
+    cameras = (
+        dataclasses.replace(
+            item, intrinsics=dataclasses.replace(item.intrinsics, distortion=(-0.3, 0.1, 0, 0))
+        )
+        for item in TRUE.cameras
+    )
+    bent = Calibration(tuple(cameras), TRUE.grid)
+    for camera in check_cameras(cast(bent, block), bent, block).cameras.values():
+        assert np.hypot(*offset(camera.block, block)[:2]) < 3e-4
 
 
 def test_the_scale_tells_depth_from_focal_length():
