@@ -16,6 +16,7 @@ import dataclasses
 import io
 import json
 import re
+import sys
 import threading
 from collections.abc import Sequence
 from functools import lru_cache
@@ -73,6 +74,11 @@ class AnnotationServer(ThreadingHTTPServer):
     def url(self) -> str:
         """The address of the page."""
         return f"http://{_HOST}:{self.server_address[1]}/"
+
+    def handle_error(self, request: Any, client_address: Any) -> None:
+        """Tells of what went wrong, but not of a browser that waits for an image no longer."""
+        if not isinstance(sys.exception(), ConnectionError):
+            super().handle_error(request, client_address)
 
     def observation(self, index: int) -> Observation:
         """o_t of a step.

@@ -3,7 +3,10 @@
 import http.client
 import io
 import json
+import socket
+import struct
 import threading
+import time
 import urllib.error
 import urllib.request
 from collections.abc import Iterator
@@ -132,6 +135,22 @@ def test_other_origins_are_refused(server: AnnotationServer, folder: Path):
     assert connection.getresponse().status == 403
     connection.close()
     assert not list(folder.rglob("action.json"))
+
+
+def test_a_browser_that_waits_no_longer_is_no_error(
+    server: AnnotationServer, capfd: pytest.CaptureFixture[str]
+):
+    """As when a person goes on to the next step before the images have come."""
+    get(server, "steps/0/color.png")
+    for _ in range(5):
+        connection = socket.create_connection(server.server_address)
+        connection.sendall(b"GET /steps/0/color.png HTTP/1.1\r\nHost: localhost:1\r\n\r\n")
+        # Closing resets the connection, whatever is still under way.
+        connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+        connection.close()
+    get(server, "steps")
+    time.sleep(0.5)
+    assert capfd.readouterr().err == ""
 
 
 def test_what_is_wrong_with_a_step_is_told_and_can_be_repaired(
