@@ -4,6 +4,7 @@ A real camera's frames become one pick and place in the robot's frame; no Drake.
 """
 
 import argparse
+import math
 import time
 from pathlib import Path
 
@@ -135,6 +136,8 @@ def _block(arguments: argparse.Namespace) -> Block | None:
         raise UserError("--kit_size_mm takes length, width and height between 0 and 1000 mm")
     length, width, height = (side / 1e3 for side in arguments.kit_size_mm)
     pose = None if arguments.kit_pose is None else tuple(arguments.kit_pose)
+    if pose is not None and not all(map(math.isfinite, pose)):
+        raise UserError("--kit_pose takes three finite numbers: x and y in m, and yaw in rad")
     return Block((length, width, height), pose)
 
 

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
+import difflib
 import hashlib
 import json
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -14,7 +16,14 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
-from kitting_drake.bench.layouts import Intrinsics, has_intrinsics, read_intrinsics, read_pose
+from kitting_drake.bench.layouts import (
+    OWN_INTRINSICS,
+    POSE_FIELDS,
+    Intrinsics,
+    has_intrinsics,
+    read_intrinsics,
+    read_pose,
+)
 from kitting_drake.bench.yaml_values import number, read_yaml, whole_number
 from kitting_drake.common.errors import UserError
 from kitting_drake.common.files import write_atomically
@@ -27,6 +36,9 @@ _UNDISTORTED = 1e-4
 """A ray is found when its pixel is met to this, at depth 1."""
 _HEIGHT = PixelGrid().z_max - PixelGrid().z_min
 """Points higher above the table than this are left out, unless the calibration says more."""
+_DEPTH_FIELDS = ("depth_scale", "min_depth", "max_depth")
+_BENCH_FIELDS = ("table_height", "workspace")
+_GRID_FIELDS = ("x_min", "y_min", "resolution", "rows", "cols", "max_height")
 
 
 @dataclass(frozen=True)
@@ -91,41 +103,58 @@ def read_calibration(path: Path, *, table_height: float | None = None) -> Calibr
     """
     content = read_yaml(path)
     if "cameras" in content:
+        _check_fields(content, ("cameras", *_BENCH_FIELDS), f"{path}")
         entries = content["cameras"]
         if not isinstance(entries, dict) or not entries:
             raise UserError(f"{path}: cameras must be a mapping from names to cameras")
     else:
         entries = {str(content.get("camera_name", "camera")): content}
     cameras = tuple(_read_camera(path, str(name), node) for name, node in entries.items())
-    if table_height is None:
-        table_height = number(content.get("table_height", 0.0), f"{path}: table_height")
-    return Calibration(cameras, _read_grid(path, content.get("workspace", {}), table_height))
+    told = content.get("table_height", 0.0) if table_height is None else table_height
+    height = number(told, f"{path}: table_height")
+    return Calibration(cameras, _read_grid(path, content.get("workspace", {}), height))
 
 
 def _read_camera(path: Path, name: str, node: Any) -> BenchCamera:
     where = f"{path}: camera {name}"
     if not isinstance(node, dict):
         raise UserError(f"{where} must be a mapping of fields")
-    lens = node
+    lens, known = node, (*POSE_FIELDS, *_DEPTH_FIELDS)
     if "camera_info" in node:
+        _check_fields(node, ("camera_info", *known), where)
         file = path.parent / str(node["camera_info"])
         lens = read_yaml(file)
         if not has_intrinsics(lens):
             raise UserError(f"{where}: {file} holds no camera_matrix and no k")
-    limits = {
-        key: number(node[key], f"{where}: {key}")
-        for key in ("depth_scale", "min_depth", "max_depth")
-        if key in node
-    }
+    limits = {key: number(node[key], f"{where}: {key}") for key in _DEPTH_FIELDS if key in node}
     if any(value <= 0 for value in limits.values()):
         raise UserError(f"{where}: depth_scale, min_depth and max_depth must be positive")
-    return BenchCamera(name, read_intrinsics(lens, where), read_pose(node, where), **limits)
+    intrinsics, X_BC = read_intrinsics(lens, where), read_pose(node, where)
+    if "fx" in node:
+        # A file of one camera has the bench's fields beside the camera's.
+        _check_fields(node, (*OWN_INTRINSICS, *known, *_BENCH_FIELDS, "camera_name"), where)
+    camera = BenchCamera(name, intrinsics, X_BC, **limits)
+    if camera.min_depth >= camera.max_depth:
+        raise UserError(
+            f"{where}: min_depth {camera.min_depth:g} must be less than max_depth "
+            f"{camera.max_depth:g}, both in metres"
+        )
+    return camera
+
+
+def _check_fields(node: dict[str, Any], known: Sequence[str], where: str) -> None:
+    """Raises UserError for a field that would be passed over, as if it were not there."""
+    for key in node:
+        if key not in known:
+            close = difflib.get_close_matches(str(key), known, n=1)
+            advice = f"did you mean '{close[0]}'?" if close else "it means nothing here"
+            raise UserError(f"{where} has the unknown field '{key}': {advice}")
 
 
 def _read_grid(path: Path, node: Any, table_height: float) -> PixelGrid:
-    known = ("x_min", "y_min", "resolution", "rows", "cols", "max_height")
-    if not isinstance(node, dict) or not set(node) <= set(known):
-        raise UserError(f"{path}: workspace has the fields {', '.join(known)}, and no others")
+    if not isinstance(node, dict) or not set(node) <= set(_GRID_FIELDS):
+        fields = ", ".join(_GRID_FIELDS)
+        raise UserError(f"{path}: workspace has the fields {fields}, and no others")
     values: dict[str, Any] = {}
     for key, value in node.items():
         read = whole_number if key in ("rows", "cols") else number

@@ -68,6 +68,10 @@ def check_frame(frame: Frame, camera: BenchCamera) -> Frame:
     """
     for what, image in (("colour", frame.color), ("depth", frame.depth)):
         _check_size(image.shape, camera, f"the {what} image of camera {camera.name}")
+    if frame.depth.ndim != 2:
+        raise UserError(
+            f"depth of camera {camera.name} must be (height, width), not {frame.depth.shape}"
+        )
     if frame.color.ndim != 3 or frame.color.shape[2] < 3 or frame.color.dtype != np.uint8:
         raise UserError(f"colour of camera {camera.name} must be (height, width, 3) of bytes")
     if not np.issubdtype(frame.depth.dtype, np.floating):
@@ -152,11 +156,13 @@ def _read_depth(path: Path, camera: BenchCamera) -> NDArray[np.float32]:
     else:
         with _open(path) as image:
             if image.mode not in _SIXTEEN_BIT:
-                raise UserError(f"{path} has 8 bits a pixel: a depth image has 16, one channel")
+                raise UserError(f"{path} is no depth image, which has one channel of 16 bits")
             try:
-                data = np.asarray(image).astype(np.uint16)
+                data = np.asarray(image)
             except OSError as error:
                 raise UserError(f"{path} is damaged: {error}") from error
+    if not isinstance(data, np.ndarray):
+        raise UserError(f"{path} is an archive of arrays (.npz): save the depth alone as .npy")
     if data.ndim == 3 and data.shape[2] == 1:
         data = data[:, :, 0]
     _check_size(data.shape, camera, str(path))

@@ -19,6 +19,18 @@ _ORTHOGONAL = 1e-3
 """By how much the entries of R^T R may differ from the identity's."""
 _MODELS = ("plumb_bob", "rational_polynomial", "radtan", "none", "")
 _COEFFICIENTS = (0, 4, 5, 8)
+_MATRICES = ("camera_matrix", "k", "K")
+_WIDTHS, _HEIGHTS = ("width", "image_width"), ("height", "image_height")
+_DISTORTIONS = ("distortion", "distortion_coefficients", "dist_coeffs", "d", "D")
+_POSES = ("camera_to_base", "pose", "transform", "base_to_camera")
+
+POSE_FIELDS = ("R_cam2base", "t_cam2base", *_POSES)
+"""The fields of a mapping that tell a pose."""
+OWN_INTRINSICS = (
+    *("fx", "fy", "cx", "cy", "image_size", *_WIDTHS, *_HEIGHTS),
+    *("distortion_model", *_DISTORTIONS),
+)
+"""The fields of intrinsics in our own layout; OpenCV and ROS write more, which mean nothing."""
 
 
 @dataclass(frozen=True)
@@ -37,7 +49,7 @@ class Intrinsics:
 
 def has_intrinsics(node: dict[str, Any]) -> bool:
     """Whether a mapping holds intrinsics in some layout."""
-    return any(key in node for key in ("fx", "camera_matrix", "k", "K"))
+    return any(key in node for key in ("fx", *_MATRICES))
 
 
 def read_intrinsics(node: dict[str, Any], where: str) -> Intrinsics:
@@ -51,7 +63,7 @@ def read_intrinsics(node: dict[str, Any], where: str) -> Intrinsics:
             number(_get(node, key, where), f"{where}: {key}") for key in ("fx", "fy", "cx", "cy")
         )
     else:
-        key = _first(node, "camera_matrix", "k", "K")
+        key = _first(node, *_MATRICES)
         if key is None:
             raise UserError(
                 f"{where} has no intrinsics: give fx, fy, cx, cy, or camera_matrix, or k"
@@ -61,7 +73,7 @@ def read_intrinsics(node: dict[str, Any], where: str) -> Intrinsics:
     if "image_size" in node:
         width, height = matrix(node["image_size"], 1, 2, f"{where}: image_size")[0].tolist()
     else:
-        across, down = _first(node, "width", "image_width"), _first(node, "height", "image_height")
+        across, down = _first(node, *_WIDTHS), _first(node, *_HEIGHTS)
         if across is None or down is None:
             raise UserError(f"{where} has no image size: give width and height, in pixels")
         width, height = node[across], node[down]
@@ -81,9 +93,9 @@ def _read_distortion(node: dict[str, Any], where: str) -> tuple[float, ...]:
     if model not in _MODELS:
         raise UserError(
             f"{where}: distortion_model {model} cannot be read: rectify the images, and give "
-            "distortion: []"
+            "distortion: [] and no distortion_model"
         )
-    key = _first(node, "distortion", "distortion_coefficients", "dist_coeffs", "d", "D")
+    key = _first(node, *_DISTORTIONS)
     if key is None:
         return ()
     values = tuple(numbers(node[key], f"{where}: {key}").tolist())
@@ -103,9 +115,10 @@ def read_pose(node: dict[str, Any], where: str) -> Array:
     if "R_cam2base" in node:
         X = np.eye(4)
         X[:3, :3] = matrix(node["R_cam2base"], 3, 3, f"{where}: R_cam2base")
-        X[:3, 3] = numbers(_get(node, "t_cam2base", where), f"{where}: t_cam2base")[:3]
+        t = matrix(_get(node, "t_cam2base", where), 3, 1, f"{where}: t_cam2base")
+        X[:3, 3] = t[:, 0]
         return _checked(X, f"{where}: R_cam2base")
-    key = _first(node, "camera_to_base", "pose", "transform", "base_to_camera")
+    key = _first(node, *_POSES)
     if key is None:
         raise UserError(
             f"{where} has no pose: give camera_to_base (4 x 4), or pose with position and "

@@ -42,26 +42,22 @@ def observe(frames: Mapping[str, Frame], calibration: Calibration) -> Observatio
     Raises:
         UserError: a frame is missing, has a wrong size or type, or does not fit the calibration.
     """
-    checked = {
-        camera.name: check_frame(frames[camera.name], camera)
-        for camera in calibration.cameras
-        if camera.name in frames
-    }
-    return project(make_views(checked, calibration), calibration.grid)
+    return project(make_views(frames, calibration), calibration.grid)
 
 
 def make_views(frames: Mapping[str, Frame], calibration: Calibration) -> list[View]:
     """The cameras' views, once it is plausible that they show the workspace.
 
     Raises:
-        UserError: a camera has no frame, sees nothing of the workspace, or has no depths or depths
-            in another unit.
+        UserError: a camera has no frame or one of a wrong size or type, sees nothing of the
+            workspace, or has no depths or depths in another unit.
     """
     views = []
     for camera in calibration.cameras:
         frame = frames.get(camera.name)
         if frame is None:
             raise UserError(f"there is no frame of camera {camera.name}")
+        frame = check_frame(frame, camera)
         _check_pose(camera, calibration.grid)
         _check_depth(frame, camera, calibration.grid)
         views.append(View(frame.color, frame.depth, camera.X_BC, camera.rays))
@@ -131,6 +127,11 @@ def _check_pose(camera: BenchCamera, grid: PixelGrid) -> None:
 def _check_depth(frame: Frame, camera: BenchCamera, grid: PixelGrid) -> None:
     expected = table_depth(camera, camera.X_BC, grid, _STEP)
     towards = np.isfinite(expected)
+    if not towards.any():
+        raise UserError(
+            f"the workspace is too small for camera {camera.name}, which has next to no pixel of "
+            "it: give it more rows and cols"
+        )
     depth = frame.depth[::_STEP, ::_STEP][towards]
     with np.errstate(invalid="ignore"):
         returned = np.isfinite(depth) & (depth > 0)
@@ -142,6 +143,7 @@ def _check_depth(frame: Frame, camera: BenchCamera, grid: PixelGrid) -> None:
     low, ratio, high = (float(value) for value in np.percentile(ratios, (25, 50, 75)))
     if _NEAREST <= ratio <= _FARTHEST:
         if high - low <= _WIDEST:
+            _check_limits(depth[returned], camera)
             return
         raise UserError(
             f"by its pose camera {camera.name} sees no table: half of its depths are from "
@@ -161,3 +163,13 @@ def _check_depth(frame: Frame, camera: BenchCamera, grid: PixelGrid) -> None:
         scale = camera.depth_scale / ratio
         hint = f"check the pose, table_height and depth_scale (of {scale:.2g} it would agree)"
     raise UserError(f"{told}: {hint}")
+
+
+def _check_limits(depth: NDArray[np.float32], camera: BenchCamera) -> None:
+    """Raises UserError where a camera's limits leave next to nothing of its depths (n), in m."""
+    low, high = camera.min_depth, camera.max_depth
+    if ((depth >= low) & (depth <= high)).mean() < _LEAST_DEPTH:
+        raise UserError(
+            f"depth of camera {camera.name} is {np.median(depth):.3g} m, the median, and by its "
+            f"min_depth {low:g} and max_depth {high:g} next to none is taken: these are in metres"
+        )

@@ -16,7 +16,18 @@ Array = NDArray[np.float64]
 
 
 class _Loader(yaml.SafeLoader):
-    """Plain YAML, and the matrices of `cv2.FileStorage`."""
+    """Plain YAML without repeated fields, and the matrices of `cv2.FileStorage`."""
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
+        """The mapping; of two fields of one name PyYAML would take the last and say nothing."""
+        pairs = node.value if isinstance(node, yaml.MappingNode) else []
+        fields = [key.value for key, _ in pairs if isinstance(key, yaml.ScalarNode)]
+        repeated = next((name for name in fields if fields.count(name) > 1), None)
+        if repeated is not None:
+            raise yaml.constructor.ConstructorError(
+                problem=f"'{repeated}' is there twice", problem_mark=node.start_mark
+            )
+        return super().construct_mapping(node, deep)
 
 
 def _opencv_matrix(loader: yaml.SafeLoader, node: yaml.Node) -> Any:
@@ -47,6 +58,9 @@ def read_yaml(path: Path) -> dict[str, Any]:
         where = f" line {mark.line + 1}:" if mark else ""
         problem = getattr(error, "problem", None) or "it is not YAML"
         raise UserError(f"{path}:{where} {problem}") from error
+    except ValueError as error:
+        # What looks like a date, and is none.
+        raise UserError(f"{path} is not YAML: {error}") from error
     if not isinstance(first, dict):
         raise UserError(f"{path} must hold a mapping of fields, such as 'cameras:'")
     return first

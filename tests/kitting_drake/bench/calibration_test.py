@@ -1,6 +1,7 @@
 """Calibrations as OpenCV, ROS and people write them."""
 
 import dataclasses
+import math
 import re
 from pathlib import Path
 
@@ -140,6 +141,11 @@ def test_what_is_written_is_read_again_to_the_last_bit(tmp_path: Path):
         (("table_height: 0.012", "table_height: high"), "table_height must be a finite number"),
         (("cameras:", "workspace: {cells: 3}\ncameras:"), "workspace has the fields x_min"),
         (("  eye:\n", "  eye: {\n"), "line "),
+        (("table_height:", "table_hieght:"), "unknown field 'table_hieght': did you mean 'table_h"),
+        (("distortion:", "distorsion:"), "camera eye has the unknown field 'distorsion'"),
+        (("fy: 51", "fy: 51\n    fy: 52"), "'fy' is there twice"),
+        (("fy: 51", "fy: 51\n    min_depth: 300"), "min_depth 300 must be less than max_depth 10"),
+        (("table_height: 0.012", "when: 2024-13-45"), "is not YAML: month must be"),
     ],
 )
 def test_one_sentence_says_what_is_wrong(tmp_path: Path, change: tuple[str, str], message: str):
@@ -156,11 +162,25 @@ def test_a_pose_that_is_no_rotation_is_refused(tmp_path: Path):
         read(tmp_path, text)
 
 
+def test_fields_beside_those_of_other_programs_are_not_passed_over(tmp_path: Path):
+    """What stands beside `camera_info` would not count: it has a distortion of its own."""
+    text = ROS.replace("camera_info:", "distortion: []\n    camera_info:")
+    with pytest.raises(UserError, match="camera eye has the unknown field 'distortion'"):
+        read(tmp_path, text, eye_info=CAMERA_INFO)
+    long = OPENCV.replace("1.0e-01, 9.0e-01 ]", "1.0e-01, 9.0e-01, 1. ]")
+    with pytest.raises(UserError, match=r"t_cam2base must hold 3 numbers \(3 x 1\), not 4"):
+        read(tmp_path, long)
+    read(tmp_path, OPENCV + "avg_reprojection_error: 0.2\n")
+
+
 def test_a_file_that_is_no_calibration_is_refused(tmp_path: Path):
     with pytest.raises(UserError, match=r"cannot read .*No such file"):
         read_calibration(tmp_path / "nothing.yaml")
     with pytest.raises(UserError, match="must hold a mapping"):
         read(tmp_path, "- 1\n")
+    read(tmp_path, OWN)
+    with pytest.raises(UserError, match="table_height must be a finite number, not nan"):
+        read_calibration(tmp_path / "calibration.yaml", table_height=math.nan)
 
 
 def test_the_documented_files_say_the_same(tmp_path: Path):

@@ -172,6 +172,9 @@ def test_the_command_checks_cameras_without_drake(bench: Path):
         assert camera["block"]["scale"] == pytest.approx([1, 1, 1], abs=0.01)
     assert "noise" in done.stdout
     read_calibration(bench / "out" / "corrected.yaml")
+    nowhere = command(bench, "--check", "--kit_size_mm", 200, 150, 50, "--kit_pose", 0.5, "nan", 0)
+    assert nowhere.returncode == 2
+    assert nowhere.stderr.startswith("error: --kit_pose takes three finite numbers")
 
 
 def test_input_that_cannot_be_used_ends_with_one_sentence(bench: Path):
@@ -207,6 +210,11 @@ def small_colour(folder: Path) -> None:
     Image.new("RGB", (320, 240)).save(folder / "front_color.png")
 
 
+def archive(folder: Path) -> None:
+    with (folder / "front_depth.npy").open("wb") as file:
+        np.savez(file, depth=np.ones((480, 640)))
+
+
 def broken(folder: Path) -> None:
     (folder / "front_depth.npy").write_bytes(b"not numbers")
 
@@ -223,6 +231,7 @@ def broken(folder: Path) -> None:
         (spoil(lambda depth: np.nan * depth), "depth of camera front is all zero or NaN"),
         (spoil(lambda depth: np.dstack([depth] * 3)), "must have one channel, not 3"),
         (broken, "no whole .npy file"),
+        (archive, r"is an archive of arrays \(.npz\)"),
     ],
 )
 def test_frames_that_cannot_be_are_refused(
@@ -232,6 +241,42 @@ def test_frames_that_cannot_be_are_refused(
     with pytest.raises(UserError, match=message) as raised:
         decide(read_frames([bench], TRUE), TRUE, ShapeMatching())
     assert "\n" not in str(raised.value)
+
+
+def test_a_frame_of_ones_own_has_the_shape_of_an_image():
+    """Drake and others have a last axis of one channel."""
+    frames = cast(TRUE)
+    frames["left"] = Frame(frames["left"].color, frames["left"].depth[..., None])
+    with pytest.raises(UserError, match=r"must be \(height, width\), not \(480, 640, 1\)"):
+        decide(frames, TRUE, ShapeMatching())
+
+
+def test_steps_of_more_than_16_bits_are_not_wrapped(tmp_path: Path):
+    front = Calibration((dataclasses.replace(TRUE.cameras[0], depth_scale=1e-5),), TRUE.grid)
+    frames = cast(front)
+    write_frames(tmp_path, frames)
+    (tmp_path / "front_depth.npy").unlink()
+    steps = np.rint(1e5 * frames["front"].depth).astype(np.int32)
+    assert steps.max() > 2**16
+    Image.fromarray(steps).save(tmp_path / "front_depth.png", "TIFF")
+    found = read_frames([tmp_path], front)["front"].depth
+    np.testing.assert_allclose(found, frames["front"].depth, atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("camera", "grid", "message"),
+    [
+        ({"max_depth": 0.3}, {}, "is 0.831 m, the median, and by its min_depth 0.01 and max_depth"),
+        ({}, {"rows": 1, "cols": 1}, "the workspace is too small for camera"),
+    ],
+)
+def test_what_leaves_nothing_to_see_is_told(
+    camera: dict[str, float], grid: dict[str, int], message: str
+):
+    cameras = (dataclasses.replace(TRUE.cameras[0], **camera), *TRUE.cameras[1:])
+    blind = Calibration(cameras, dataclasses.replace(TRUE.grid, **grid))
+    with pytest.raises(UserError, match=message):
+        decide(cast(TRUE), blind, ShapeMatching())
 
 
 def test_missing_depths_are_unseen_and_no_error():
