@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kitting_drake.common.errors import UserError
-from kitting_drake.policies.fibres import fourier_basis
+from kitting_drake.policies.discretization import discretization_matrix
 from kitting_drake.policies.fourier_series import series_maximum
 from kitting_drake.policies.images import Image, crop, make_action, rotation_matrix
 from kitting_drake.policies.matching.policy import something_fits
@@ -25,6 +25,12 @@ from kitting_drake.policies.numpy_correlation import Array, search
 from systems.signals import Observation, PickPlaceAction, wrap_to_pi
 
 _GRAPHS = ("alpha", "beta", "phi", "psi")
+_FIELDS = (
+    *("method", "orientations", "angle_frequencies", "stop", "stop_threshold", "stride"),
+    *("colour", "colour_mean", "colour_std", "height_mean", "height_std", "channels"),
+    *("pick_crop", "place_crop"),
+)
+"""What this reads of `policy.json`."""
 _NOTHING_LOGIT = math.log(160 * 320)
 """See `losses.NOTHING_LOGIT`."""
 
@@ -48,21 +54,25 @@ class OnnxPolicy:
             fit_outlines: as for `LearnedPolicy`.
 
         Raises:
-            UserError: the folder cannot be read.
+            UserError: the folder cannot be used.
+            ValueError: the networks cannot predict at N orientations.
             ImportError: onnxruntime is not installed.
         """
         import onnxruntime
 
         try:
             self.config: dict[str, Any] = json.loads((folder / "policy.json").read_text())
-            self._sessions = {
-                name: onnxruntime.InferenceSession(
-                    (folder / f"{name}.onnx").read_bytes(), providers=["CPUExecutionProvider"]
-                )
-                for name in _GRAPHS
-            }
+            missing = [key for key in _FIELDS if key not in self.config]
+            if missing:
+                raise ValueError(f"policy.json lacks '{missing[0]}'")
+            graphs = {name: (folder / f"{name}.onnx").read_bytes() for name in _GRAPHS}
         except (OSError, ValueError) as error:
             raise UserError(f"{folder} holds no policy as ONNX: {error}") from error
+        self._sessions = {
+            name: _session(onnxruntime, graph, folder / f"{name}.onnx")
+            for name, graph in graphs.items()
+        }
+        self._check_orientations(orientations)
         self._orientations = orientations
         self._continuous = continuous
         self._fit_outlines = fit_outlines
@@ -120,6 +130,16 @@ class OnnxPolicy:
         shape = (channels, 1, 1)
         return ((seen - mean[-channels:].reshape(shape)) / std[-channels:].reshape(shape))[None]
 
+    def _check_orientations(self, orientations: int) -> None:
+        """Raises ValueError as the networks' own `check_orientations`."""
+        if self.config["method"] == "so2":
+            discretization_matrix(orientations, self.config["angle_frequencies"], quotient=2)
+        elif orientations != self.config["orientations"]:
+            raise ValueError(
+                f"these networks predict at {self.config['orientations']} orientations, not at "
+                f"{orientations}"
+            )
+
     def _input(self, observation: Observation) -> Image:
         if self.config["colour"]:
             return observation.image
@@ -146,8 +166,17 @@ class OnnxPolicy:
             return int(values.argmax()) * step
         if self._continuous:
             return series_maximum(values, frequencies)
-        angles = step * np.arange(self._orientations // 2)
-        return int((fourier_basis(angles, frequencies) @ values).argmax()) * step
+        matrix = discretization_matrix(self._orientations, frequencies, quotient=2)
+        return int((matrix @ values).argmax()) * step
+
+
+def _session(onnxruntime: Any, graph: bytes, path: Path) -> Any:
+    """Raises UserError for a graph that cannot be run."""
+    try:
+        return onnxruntime.InferenceSession(graph, providers=["CPUExecutionProvider"])
+    except Exception as error:
+        # onnxruntime has an exception of its own for each way to fail, and no common one.
+        raise UserError(f"{path} is no network as ONNX") from error
 
 
 def _mean_offset(logits: Array, index: tuple[int, ...]) -> NDArray[np.float64]:

@@ -1,6 +1,7 @@
 """Networks as ONNX: the same outputs, and the same decisions, without torch."""
 
 import math
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -62,7 +63,8 @@ def test_the_graphs_agree_with_torch(exported: Path):
 
     networks = load_networks(GENERALIST)
     image = observations()[1].image
-    for name, part in {"alpha": image, "beta": image[:, 40:105, 100:165], "psi": image}.items():
+    parts = {"alpha": image, "beta": image[:, 40:105, 100:165], "phi": image, "psi": image}
+    for name, part in parts.items():
         prepared = networks.prepare(part)
         with torch.inference_mode():
             expected = getattr(networks, name)(prepared).numpy()
@@ -117,6 +119,34 @@ def test_what_cannot_be_exported_is_told(tmp_path: Path):
     pytest.importorskip("onnxruntime")
     with pytest.raises(UserError, match="holds no policy as ONNX"):
         OnnxPolicy(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("file", "content", "message"),
+    [
+        ("alpha.onnx", b"junk", "alpha.onnx is no network as ONNX"),
+        ("policy.json", b"{}", "policy.json lacks 'method'"),
+    ],
+)
+def test_a_damaged_policy_is_told(
+    exported: Path, tmp_path: Path, file: str, content: bytes, message: str
+):
+    damaged = tmp_path / "onnx"
+    shutil.copytree(exported, damaged)
+    (damaged / file).write_bytes(content)
+    with pytest.raises(UserError, match=message):
+        OnnxPolicy(damaged)
+
+
+def test_it_predicts_at_the_orientations_of_the_networks_only(exported: Path):
+    networks = load_networks(GENERALIST)
+    for orientations in (0, 16, 181):
+        for make in (
+            lambda n: LearnedPolicy(networks, orientations=n),
+            lambda n: OnnxPolicy(exported, orientations=n),
+        ):
+            with pytest.raises(ValueError, match=f"{orientations} orientations"):
+                make(orientations)
 
 
 def test_the_command_exports_what_was_trained(weights_file: Path, verb):
