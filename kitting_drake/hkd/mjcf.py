@@ -42,13 +42,10 @@ def tool_mjcf(sdf: Path) -> str:
         UserError: it cannot be read.
     """
     try:
-        model = ElementTree.parse(sdf).getroot().find("model")
-        assert model is not None
-        link = model.find("link")
-        assert link is not None
-        return _tool(model.attrib["name"], link)
-    except (OSError, ElementTree.ParseError, AssertionError, KeyError, ValueError) as error:
-        raise UserError(f"{sdf} is no model of a tool: {error!r}") from error
+        model = _child(ElementTree.parse(sdf).getroot(), "model")
+        return _tool(_name(model), _child(model, "link"))
+    except (OSError, ElementTree.ParseError, ValueError) as error:
+        raise UserError(f"{sdf} is no model of a tool: {error}") from error
 
 
 def _tool(name: str, link: ElementTree.Element) -> str:
@@ -88,18 +85,17 @@ def kit_mjcf(sdf: Path) -> str:
         UserError: it, or its block, cannot be read.
     """
     try:
-        link = ElementTree.parse(sdf).getroot().find("model/link")
-        assert link is not None
+        link = _child(ElementTree.parse(sdf).getroot(), "model/link")
         mesh = trimesh.load_mesh(sdf.parent / "kit.obj")
         friction = float(_text(link, f"collision/{_DRAKE}proximity_properties/{_DRAKE}mu_dynamic"))
         assets, geoms = [], []
         for element in link.findall("visual"):
-            name, colour = f"kit_{element.attrib['name']}", _text(element, "material/diffuse")
+            name, colour = f"kit_{_name(element)}", _text(element, "material/diffuse")
             file = quoteattr(_text(element, "geometry/mesh/uri"))
             assets.append(f'<mesh name="{name}" file={file}/>')
             geoms.append(_geom(name, f'rgba="{colour}" contype="0" conaffinity="0" group="2"'))
-    except (OSError, ElementTree.ParseError, AssertionError, ValueError) as error:
-        raise UserError(f"{sdf} is no model of a kit: {error!r}") from error
+    except (OSError, ElementTree.ParseError, ValueError) as error:
+        raise UserError(f"{sdf} is no model of a kit: {error}") from error
     for number, prism in enumerate(block_prisms(mesh.vertices, mesh.faces)):
         points = " ".join(f"{value:.6g}" for value in prism.ravel())
         assets.append(f'<mesh name="kit_part_{number}" vertex="{points}"/>')
@@ -154,6 +150,22 @@ def _prism(polygon: NDArray[np.float64], bottom: float, top: float) -> NDArray[n
     return np.concatenate(
         [np.column_stack([polygon, np.full(len(polygon), z)]) for z in (bottom, top)]
     )
+
+
+def _child(element: ElementTree.Element, path: str) -> ElementTree.Element:
+    """The element at a path; ValueError where there is none."""
+    child = element.find(path)
+    if child is None:
+        raise ValueError(f"there is no {path}")
+    return child
+
+
+def _name(element: ElementTree.Element) -> str:
+    """The attribute `name`; ValueError where there is none."""
+    name = element.get("name")
+    if not name:
+        raise ValueError(f"a {element.tag} has no name")
+    return name
 
 
 def _text(element: ElementTree.Element, path: str) -> str:

@@ -1,5 +1,6 @@
 """MuJoCo's models of tools and kits: what the SDFormat says, in MuJoCo's words."""
 
+import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 from typing import Any
 
@@ -7,6 +8,7 @@ import numpy as np
 import pytest
 import trimesh
 from manifold3d import Manifold
+from scipy.spatial.transform import Rotation
 
 from kitting_drake.common.errors import UserError
 from kitting_drake.hkd import dataset
@@ -38,6 +40,14 @@ def test_a_tool_weighs_and_rubs_as_its_sdformat_says(length: float | None):
     tool = tool if length is None else scaled_tool(tool, length)
     model = compiled(tool_mjcf(tool.sdf), tool.directory)
     assert model.body_mass[1] == pytest.approx(tool.mass, rel=1e-3)
+    link = ElementTree.parse(tool.sdf).getroot().find("model/link/inertial")
+    centre = [float(item) for item in link.findtext("pose").split()[:3]]
+    np.testing.assert_allclose(model.body_ipos[1], centre, atol=1e-9)
+    rows = (("ixx", "ixy", "ixz"), ("ixy", "iyy", "iyz"), ("ixz", "iyz", "izz"))
+    inertia = [[float(link.findtext(f"inertia/{key}")) for key in row] for row in rows]
+    axes = Rotation.from_quat(model.body_iquat[1], scalar_first=True).as_matrix()
+    found = axes @ np.diag(model.body_inertia[1]) @ axes.T
+    np.testing.assert_allclose(found, inertia, atol=1e-3 * np.max(inertia))
     assert model.nq == 7
     collides = model.geom_contype > 0
     assert 1 < collides.sum() < len(collides)
@@ -88,9 +98,14 @@ def test_the_dataset_has_them_where_they_are_asked_for(
 
 def test_what_is_no_model_is_told(tmp_path: Path):
     path = tmp_path / "broken.sdf"
-    for text in ("", "<sdf/>", "<sdf><model name='x'><link name='y'/></model></sdf>"):
+    for text, tools, kits in (
+        ("", "no element found", "no element found"),
+        ("<sdf/>", "there is no model", "there is no model/link"),
+        ("<sdf><model><link/></model></sdf>", "a model has no name", "kit.obj"),
+        ("<sdf><model name='x'><link name='y'/></model></sdf>", "there is no inertial", "kit.obj"),
+    ):
         path.write_text(text)
-        with pytest.raises(UserError, match="is no model of a tool"):
+        with pytest.raises(UserError, match=f"is no model of a tool: {tools}"):
             tool_mjcf(path)
-        with pytest.raises(UserError, match="is no model of a kit"):
+        with pytest.raises(UserError, match=f"is no model of a kit: .*{kits}"):
             kit_mjcf(path)
