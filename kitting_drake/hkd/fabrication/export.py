@@ -78,11 +78,9 @@ def export_kit(request: KitRequest) -> Design:
             made = Path(scratch) / "kit"
             made.mkdir()
             _write(made, design, parameters)
-            if folder.exists():
-                os.rename(folder, Path(scratch) / "replaced")
-            os.rename(made, folder)
+            _replace(folder, made, Path(scratch) / "replaced")
     except OSError as error:
-        raise UserError(f"cannot write {folder}: {error.strerror}") from error
+        raise UserError(f"cannot write {folder}: {error.strerror or error}") from error
     finally:
         for path in new_folders:
             if path.is_dir() and not any(path.iterdir()):
@@ -141,6 +139,19 @@ def _check_replaceable(folder: Path) -> None:
     if foreign or not present:
         what = foreign[0] if foreign else "an empty folder"
         raise UserError(f"{folder} holds {what}, which is no file of a kit: {advice}")
+
+
+def _replace(folder: Path, made: Path, aside: Path) -> None:
+    """Moves what was made into its place, and what was there aside; or changes nothing."""
+    there = folder.exists()
+    if there:
+        os.rename(folder, aside)
+    try:
+        os.rename(made, folder)
+    except BaseException:
+        if there:
+            os.rename(aside, folder)
+        raise
 
 
 def _write(folder: Path, design: Design, parameters: KitParameters) -> None:

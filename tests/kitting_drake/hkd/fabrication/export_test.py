@@ -1,5 +1,7 @@
+import errno
 import io
 import json
+import os
 import re
 import shutil
 import subprocess
@@ -294,6 +296,25 @@ def test_a_kit_replaces_a_kit_and_nothing_else(plain: Path, tmp_path: Path):
     with pytest.raises(UserError, match=r"notes\.txt, which is no file of a kit"):
         export_kit(KitRequest(("claw_hammer",), folder))
     assert (folder / "notes.txt").read_text() == "mine"
+
+
+def test_a_kit_that_cannot_be_moved_into_its_place_leaves_the_old_one(
+    plain: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    folder = tmp_path / "kit"
+    shutil.copytree(plain, folder)
+    rename = os.rename
+
+    def refuse(source: Path, target: Path) -> None:
+        if target == folder and Path(source).name == "kit":
+            raise OSError(errno.EBUSY, "Device or resource busy")
+        rename(source, target)
+
+    monkeypatch.setattr(os, "rename", refuse)
+    with pytest.raises(UserError, match=r"cannot write .*: Device or resource busy"):
+        export_kit(KitRequest(("claw_hammer",), folder))
+    assert len(record(folder)["tools"]) == 3
+    assert [path.name for path in tmp_path.iterdir()] == ["kit"]
 
 
 def test_the_command_says_what_is_wrong(
