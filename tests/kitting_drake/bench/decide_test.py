@@ -50,12 +50,10 @@ def check_against_cell(seed: int, folder: Path) -> None:
     np.testing.assert_array_equal(decision.observation.valid, found.observation.valid)
     assert decision.action == found.action
     assert 0 <= decision.choice.confidence <= 1
-    # In steps of a millimetre another tool may be the first.
+    # In steps of a millimetre the grasp may be another, but the same tool comes to the same place.
     stepped = read_frames([write_frames(folder / "png", found.frames, "png")], calibration)
     other = decide(stepped, calibration, policy).action
-    apart = difference(other, decision.action)
-    if apart[0] < 10:
-        assert (apart < (0.5, 0.7, 0.7, 0.7)).all()
+    assert (difference(other, decision.action) < (10.0, 1.0, 0.7)).all()
 
 
 @pytest.mark.usefixtures("rendering")

@@ -77,15 +77,18 @@ def write_frames(folder: Path, frames: dict[str, Frame], depth: str = "npy") -> 
 
 
 def difference(one: PickPlaceAction, other: PickPlaceAction) -> NDArray[np.float64]:
-    """(4,) between two actions: pick and place in mm, their angles in degrees. A grasp from the
-    other side is the same, if the object turns alike."""
-    turned = [item.place.theta - item.pick.theta for item in (one, other)]
+    """(3,) between two actions: the picks and where the picked point of the object comes to, in mm,
+    and the object's rotation in degrees. A grasp further along the object, or from its other side,
+    is as good, if the object moves alike."""
+    turned, other_turned = (item.place.theta - item.pick.theta for item in (one, other))
+    c, s = math.cos(turned), math.sin(turned)
+    x, y = other.pick.x - one.pick.x, other.pick.y - one.pick.y
+    moved = (one.place.x + c * x - s * y, one.place.y + s * x + c * y)
     return np.array(
         [
-            1e3 * math.dist((one.pick.x, one.pick.y), (other.pick.x, other.pick.y)),
-            math.degrees(abs(math.remainder(one.pick.theta - other.pick.theta, math.pi))),
-            1e3 * math.dist((one.place.x, one.place.y), (other.place.x, other.place.y)),
-            math.degrees(abs(math.remainder(turned[0] - turned[1], math.tau))),
+            1e3 * math.hypot(x, y),
+            1e3 * math.dist(moved, (other.place.x, other.place.y)),
+            math.degrees(abs(math.remainder(turned - other_turned, math.tau))),
         ]
     )
 
