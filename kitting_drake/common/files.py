@@ -53,6 +53,23 @@ def require_folder(path: Path) -> Path:
         raise UserError(f"cannot write into {path}: {error.strerror}") from error
 
 
+def replace_folder(folder: Path, made: Path, aside: Path) -> None:
+    """Moves a folder that was made beside its place there, and what was there aside; or neither.
+
+    Raises:
+        OSError: it cannot be moved.
+    """
+    there = folder.exists()
+    if there:
+        os.rename(folder, aside)
+    try:
+        os.rename(made, folder)
+    except BaseException:
+        if there:
+            os.rename(aside, folder)
+        raise
+
+
 def claim_folder(folder: Path, name: str, described: Any, *, of: str) -> None:
     """Marks a folder, by a JSON file in it, as that of one thing's files.
 

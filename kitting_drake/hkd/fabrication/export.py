@@ -2,7 +2,6 @@
 
 import dataclasses
 import json
-import os
 import shutil
 import tempfile
 from collections.abc import Sequence
@@ -16,7 +15,7 @@ import yaml
 
 import kitting_drake
 from kitting_drake.common.errors import UserError
-from kitting_drake.common.files import write_json
+from kitting_drake.common.files import replace_folder, write_json
 from kitting_drake.hkd.fabrication.design import Design, design_kit, solid
 from kitting_drake.hkd.fabrication.drawings import dxf_text, svg_text
 from kitting_drake.hkd.fabrication.picture import picture_png
@@ -78,7 +77,7 @@ def export_kit(request: KitRequest) -> Design:
             made = Path(scratch) / "kit"
             made.mkdir()
             _write(made, design, parameters)
-            _replace(folder, made, Path(scratch) / "replaced")
+            replace_folder(folder, made, Path(scratch) / "replaced")
     except OSError as error:
         raise UserError(f"cannot write {folder}: {error.strerror or error}") from error
     finally:
@@ -139,19 +138,6 @@ def _check_replaceable(folder: Path) -> None:
     if foreign or not present:
         what = foreign[0] if foreign else "an empty folder"
         raise UserError(f"{folder} holds {what}, which is no file of a kit: {advice}")
-
-
-def _replace(folder: Path, made: Path, aside: Path) -> None:
-    """Moves what was made into its place, and what was there aside; or changes nothing."""
-    there = folder.exists()
-    if there:
-        os.rename(folder, aside)
-    try:
-        os.rename(made, folder)
-    except BaseException:
-        if there:
-            os.rename(aside, folder)
-        raise
 
 
 def _write(folder: Path, design: Design, parameters: KitParameters) -> None:

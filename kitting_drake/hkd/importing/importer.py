@@ -24,6 +24,7 @@ import yaml
 from manifold3d import Manifold
 
 from kitting_drake.common.errors import UserError
+from kitting_drake.common.files import replace_folder
 from kitting_drake.hkd.importing.convex_decomposition import decompose
 from kitting_drake.hkd.importing.fit import (
     HIGHEST_MM,
@@ -121,9 +122,7 @@ def import_tool(request: ImportRequest, time_limit: float | None = TIME_LIMIT) -
                 if time_limit is None
                 else _prepare_aside(request, name, made, time_limit)
             )
-            if final.exists():
-                os.rename(final, Path(scratch) / "replaced")
-            os.rename(made, final)
+            replace_folder(final, made, Path(scratch) / "replaced")
             return ImportReport(final, *report)
     except OSError as error:
         raise UserError(f"cannot write {final}: {error.strerror}") from error
