@@ -16,13 +16,12 @@ from kitting_drake.common.errors import UserError
 from kitting_drake.common.files import require_folder, write_atomically, write_json
 from kitting_drake.policies import config as sizes
 from kitting_drake.policies.networks import FactoredNetworks
+from kitting_drake.policies.onnx_runner import GRAPHS
 from kitting_drake.policies.steerable import BlurPool
 from kitting_drake.policies.unet import STRIDE
 from kitting_drake.policies.weights import load_networks
 
 _OPSET = 17
-GRAPHS = ("alpha", "beta", "phi", "psi")
-"""The networks, a file each."""
 
 
 class _Blur(nn.Module):

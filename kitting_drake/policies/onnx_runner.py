@@ -24,7 +24,8 @@ from kitting_drake.policies.matching.segmentation import fill_unseen, segment
 from kitting_drake.policies.numpy_correlation import Array, search
 from systems.signals import Observation, PickPlaceAction, wrap_to_pi
 
-_GRAPHS = ("alpha", "beta", "phi", "psi")
+GRAPHS = ("alpha", "beta", "phi", "psi")
+"""The networks, a file each."""
 _FIELDS = (
     *("method", "orientations", "angle_frequencies", "stop", "stop_threshold", "stride"),
     *("colour", "colour_mean", "colour_std", "height_mean", "height_std", "channels"),
@@ -65,7 +66,7 @@ class OnnxPolicy:
             missing = [key for key in _FIELDS if key not in self.config]
             if missing:
                 raise ValueError(f"policy.json lacks '{missing[0]}'")
-            graphs = {name: (folder / f"{name}.onnx").read_bytes() for name in _GRAPHS}
+            graphs = {name: (folder / f"{name}.onnx").read_bytes() for name in GRAPHS}
         except (OSError, ValueError) as error:
             raise UserError(f"{folder} holds no policy as ONNX: {error}") from error
         self._sessions = {
