@@ -110,20 +110,23 @@ def read_pose(node: dict[str, Any], where: str) -> Array:
     """(4, 4) the pose of the camera's optical frame in the base frame, in any of the layouts.
 
     Raises:
-        UserError: there is none, or its rotation is none; names the field.
+        UserError: there is none, or more than one, or its rotation is none; names the field.
     """
+    given = [key for key in ("R_cam2base", *_POSES) if key in node]
+    if len(given) > 1:
+        raise UserError(f"{where} has {' and '.join(given)}: give one pose")
     if "R_cam2base" in node:
         X = np.eye(4)
         X[:3, :3] = matrix(node["R_cam2base"], 3, 3, f"{where}: R_cam2base")
         t = matrix(_get(node, "t_cam2base", where), 3, 1, f"{where}: t_cam2base")
         X[:3, 3] = t[:, 0]
         return _checked(X, f"{where}: R_cam2base")
-    key = _first(node, *_POSES)
-    if key is None:
+    if not given:
         raise UserError(
             f"{where} has no pose: give camera_to_base (4 x 4), or pose with position and "
             "quaternion_xyzw or rpy_deg"
         )
+    key = given[0]
     value, label = node[key], f"{where}: {key}"
     if isinstance(value, dict) and "data" not in value:
         X = _pose_of_parts(value, label)

@@ -138,6 +138,10 @@ def test_what_is_written_is_read_again_to_the_last_bit(tmp_path: Path):
         (("rpy_deg: [180, 0, -90]", "quaternion_xyzw: [1, 1, 0, 0]"), "must be a unit quaternion"),
         (("position: [0.5, 0.1, 0.9]", "position: [500, 100, 900]"), "positions are in metres"),
         (("    pose:", "    where:"), "camera eye has no pose"),
+        (
+            ("fy: 51", "fy: 51\n    camera_to_base: []"),
+            "camera eye has camera_to_base and pose: give one",
+        ),
         (("table_height: 0.012", "table_height: high"), "table_height must be a finite number"),
         (("cameras:", "workspace: {cells: 3}\ncameras:"), "workspace has the fields x_min"),
         (("  eye:\n", "  eye: {\n"), "line "),
