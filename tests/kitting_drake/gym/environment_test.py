@@ -232,22 +232,28 @@ def test_a_step_costs_what_an_action_costs_in_evaluate(monkeypatch: pytest.Monke
     """The same decisions through both; by CPU time, which no other work on the machine is in."""
     path = Path("kitting_unseen.yaml")
     environment = gymnasium.make("kitting_drake/KittingUnseen-v0")
-    ratios = []
     evaluated(path, Recorder(), 1, monkeypatch, "KittingUnseenToolsets")
     played(environment, Recorder(), 1)
-    for seed in (1, 2, 3):
+    here = there = 0.0
+    for seed in range(2, 10):
         start = time.process_time()
-        result = evaluated(path, Recorder(), seed, monkeypatch, "KittingUnseenToolsets")
-        middle = time.process_time()
-        total, info = played(environment, Recorder(), seed)
-        ratios.append((time.process_time() - middle) / (middle - start))
+        if seed % 2:
+            # Neither always finds the caches as the other left them.
+            total, info = played(environment, Recorder(), seed)
+            middle = time.process_time()
+            result = evaluated(path, Recorder(), seed, monkeypatch, "KittingUnseenToolsets")
+            here, there = here + middle - start, there + time.process_time() - middle
+        else:
+            result = evaluated(path, Recorder(), seed, monkeypatch, "KittingUnseenToolsets")
+            middle = time.process_time()
+            total, info = played(environment, Recorder(), seed)
+            here, there = here + time.process_time() - middle, there + middle - start
         assert total == result["success_rate"]
         for own, other in zip(info["objects"], result["objects"], strict=True):
             # To the bit only where nothing moved any more as o_t was taken, a step earlier.
             assert own["add_s_mm"] == pytest.approx(other["add_s_mm"], abs=0.01)
-    print(ratios)
-    # The least disturbed of them.
-    assert min(ratios) < 1.1
+    print(f"a step costs {here / there:.3f} of an action in evaluate")
+    assert here / there < 1.1
 
 
 @pytest.mark.slow
