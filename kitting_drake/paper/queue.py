@@ -245,7 +245,12 @@ def run_paper(
         UserError: a result is not that of its cell, or a folder cannot be written to.
     """
     queue = Queue(require_folder(folder), require_folder(results), workers, console)
-    failures = queue.run(cells)
+    # Whoever ends it, ends what it has begun too: that would keep the next queue out.
+    before = signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))
+    try:
+        failures = queue.run(cells)
+    finally:
+        signal.signal(signal.SIGTERM, before)
     table = Table("cell", "state", title="the paper's experiments")
     for cell in cells:
         table.add_row(cell.name, failures.get(cell.name, "done"))

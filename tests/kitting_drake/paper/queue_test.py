@@ -3,12 +3,16 @@
 import dataclasses
 import itertools
 import json
+import subprocess
+import sys
+import time
 from pathlib import Path
 
 import pytest
 from rich.console import Console
 
 from kitting_drake.common.errors import UserError
+from kitting_drake.common.files import alone_in
 from kitting_drake.common.paths import SCENARIOS
 from kitting_drake.paper.cells import (
     LEARNING_RATES,
@@ -180,3 +184,20 @@ def test_a_command_that_fails_is_told_by_its_last_line(tmp_path: Path):
     shown = console.export_text()
     assert "evaluate failed with exit code 2: error: " in " ".join(shown.split())
     assert "!Nobody" in shown
+
+
+def test_who_ends_it_ends_what_it_began(tmp_path: Path):
+    command = [sys.executable, "-m", "kitting_drake.benchmark", "paper", "--quiet"]
+    command += ["--cells", "unseen_quantized_oracle_180", "--results", str(tmp_path / "results")]
+    work = tmp_path / "work"
+    queue = subprocess.Popen([*command, "--output", str(work)], text=True)
+    folder = work / "paper" / "evaluations" / "unseen_quantized_oracle_180"
+    deadline = time.monotonic() + 120
+    while not (folder / ".lock").exists():
+        assert time.monotonic() < deadline
+        assert queue.poll() is None
+        time.sleep(0.2)
+    queue.terminate()
+    assert queue.wait(timeout=60) != 0
+    with alone_in(folder):
+        pass
