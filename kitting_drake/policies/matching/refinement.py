@@ -21,6 +21,7 @@ from kitting_drake.policies.matching.registration import (
     Registration,
     coarse_cost,
     mismatch,
+    preference,
     register,
     trace_outline,
 )
@@ -31,8 +32,8 @@ Array = NDArray[np.float64]
 
 _WORST_COST = 0.0016
 """Outlines that differ by more on average say nothing, in metres."""
-_HALF_TURN_GAIN = 0.95
-"""The half turn is taken if its cost is at most this share of the other's."""
+_HALF_TURN_GAIN = 0.00005
+"""The half turn is taken if it fits better by more than this where the two differ, in metres."""
 _RIVAL_GAIN = 0.85
 """Another recess is taken if its mismatch is at most this share of the predicted one's."""
 _PROMISING = 1.2
@@ -92,7 +93,9 @@ def refine_place(
         return found if away <= _LARGEST_SHIFT and turned <= _LARGEST_ROTATION else None
 
     best, reverse = fit(rotation, goal), fit(rotation + math.pi, target.middle)
-    if reverse is not None and (best is None or reverse.cost < _HALF_TURN_GAIN * best.cost):
+    if reverse is not None and (
+        best is None or preference(outline, target, reverse, best) > _HALF_TURN_GAIN
+    ):
         best = reverse
     if best is None or best.cost > _WORST_COST:
         return None

@@ -143,6 +143,31 @@ def coarse_cost(outline: Outline, recess: Outline) -> float:
     return float(_coarse(outline, recess)[0].min())
 
 
+def preference(
+    outline: Outline, recess: Outline, first: Registration, second: Registration
+) -> float:
+    """By how much a fit is better than another where the two differ, in metres.
+
+    The costs of two fits are means over the whole outline, most of which may tell nothing of them,
+    but for noise: as of an object and the same object a half turn away. Here each point counts by
+    how differently the two would have the recess there.
+    """
+    there, away = zip(*(_differences(outline, recess, fit) for fit in (first, second)), strict=True)
+    telling = np.abs(there[0] - there[1])
+    total = float(telling.sum())
+    return float((telling * (np.abs(away[1]) - np.abs(away[0]))).sum()) / total if total else 0.0
+
+
+def _differences(outline: Outline, recess: Outline, fit: Registration) -> tuple[Array, Array]:
+    """(p,) each: the recess's signed distances at the points of an object's outline, where a fit
+    brings them, without the offset; and by how much they differ from the object's own."""
+    positions = outline.points @ rotation_matrix(fit.rotation).T + fit.shift
+    there = recess.sample(recess.distance, positions, _FARTHEST)
+    difference = there - outline.values
+    offset = np.clip(np.median(difference), -_LARGEST_OFFSET, _LARGEST_OFFSET)
+    return there - offset, difference - offset
+
+
 def mismatch(fit: Registration, item: Region, recess: Region) -> float:
     """How ill an object and a recess agree in outline and height, in metres."""
     return fit.cost + _HEIGHT_WEIGHT * abs(item.height - recess.height)

@@ -6,6 +6,7 @@ import pytest
 from kitting_drake.policies.images import rotation_matrix
 from kitting_drake.policies.matching.registration import (
     coarse_cost,
+    preference,
     register,
     trace_outline,
 )
@@ -62,3 +63,27 @@ def test_a_recess_of_another_shape_costs_more():
     bar = trace_outline((np.abs(rows - 90) < 6) & (np.abs(cols - 220) < 26), RESOLUTION)
     assert coarse_cost(outline, bar) > 1.5 * coarse_cost(outline, own)
     assert register(outline, bar).cost > 2 * register(outline, own).cost
+
+
+def bar(middle: tuple[float, float], angle: float, grown: float = 0.0) -> np.ndarray:
+    """A bar whose ends differ by a step of a pixel, drawn at pixel centres; `grown` in pixels."""
+    rows, cols = np.indices(SHAPE)
+    u, v = np.moveaxis((np.stack([rows, cols], axis=-1) - middle) @ rotation_matrix(angle), -1, 0)
+    return (np.abs(u) < 28 + grown) & (np.abs(v) < np.where(u > 18, 4.5, 3.5) + grown)
+
+
+def test_a_fit_is_preferred_by_the_points_that_tell_the_two_apart():
+    random = np.random.default_rng(5)
+    for _ in range(8):
+        first, turn = random.uniform(-math.pi, math.pi, 2)
+        start, goal = random.uniform((50, 50), (110, 110)), random.uniform((50, 210), (110, 270))
+        outline = trace_outline(bar(start, first), RESOLUTION, close=True)
+        recess = trace_outline(bar(goal, first + turn, grown=0.64), RESOLUTION)
+        shift = recess.middle - rotation_matrix(turn) @ outline.middle
+        back = recess.middle - rotation_matrix(turn + math.pi) @ outline.middle
+        right = register(outline, recess, starts=((turn, shift),))
+        reverse = register(outline, recess, starts=((turn + math.pi, back),))
+        found = preference(outline, recess, right, reverse)
+        assert found > 0.0001
+        assert preference(outline, recess, reverse, right) == pytest.approx(-found)
+        assert preference(outline, recess, right, right) == 0
