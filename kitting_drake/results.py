@@ -17,7 +17,7 @@ from rich.console import Console
 from kitting_drake.common.command_line import run_command
 from kitting_drake.common.files import write_atomically
 from kitting_drake.paper.figure import draw_figure_6
-from kitting_drake.paper.page import Result, paper_sections, read_results
+from kitting_drake.paper.page import Result, has_figure, paper_sections, read_results
 from kitting_drake.paper.queue import RATES
 from kitting_drake.reporting.results_page import results_page
 from kitting_drake.reporting.robustness import robustness_table, with_figures
@@ -64,10 +64,10 @@ def main() -> int:
 
 
 def _draw(answers: Sequence[Result], folder: Path) -> None:
-    """Draws figure 6 of the tasks that there are cells of."""
+    """Draws figure 6 of the tasks that it compares methods on."""
     by_name = {answer.cell.name: answer for answer in answers}
     for task in ("seen", "unseen"):
-        if any(answer.cell.task == task for answer in answers):
+        if has_figure(task, answers):
             path = folder / f"results_{task}.png"
             write_atomically(path, draw_figure_6(task, by_name))
 

@@ -105,7 +105,7 @@ def paper_sections(results: Sequence[Result], rates: Mapping[str, Any], link: st
     sections = [_INTRODUCTION.format(preset=PRESET, rates=_rates_text(rates))]
     for task, heading in _HEADINGS.items():
         sections.append(f"### {heading}\n")
-        if any(result.cell.task == task for result in results):
+        if has_figure(task, results):
             sections.append(f"![Figure 6 of {task} tools](results_{task}.png)\n")
         sections.append(_figure_table(task, by_name))
     sections += _table_1(by_name)
@@ -113,6 +113,16 @@ def paper_sections(results: Sequence[Result], rates: Mapping[str, Any], link: st
     sections += _differences(by_name)
     sections += ["### Every cell\n", _every_cell(results, link)]
     return sections
+
+
+def has_figure(task: str, results: Sequence[Result]) -> bool:
+    """Whether there is something to draw: cells of both methods of a task's figure 6."""
+    methods = {
+        result.cell.policy.method
+        for result in results
+        if result.cell.task == task and isinstance(result.cell.policy, Training)
+    }
+    return set(LEARNED[:2]) <= methods
 
 
 def _rates_text(rates: Mapping[str, Any]) -> str:

@@ -99,7 +99,7 @@ def results_page(runs: Sequence[Run], link: str, paper: Sequence[str] = ()) -> s
 def _task_sections(task: str, runs: list[Run]) -> list[str]:
     paper = _PAPER[task]
     sections = [
-        f"## {paper.heading} (`{task}`)\n",
+        f"## {paper.heading}, with what goes beyond the paper (`{task}`)\n",
         _success_table(runs, paper),
         f"In the paper the Equivariant Transporter is {paper.transporter_gain} points better "
         "than the SO(2)-equivariant\nmethod, on average over N and demonstrations.\n",

@@ -9,7 +9,7 @@ from kitting_drake.common.errors import UserError
 from kitting_drake.common.paths import SCENARIOS
 from kitting_drake.paper.cells import PRESET, TASKS, Cell, Training, paper_cells
 from kitting_drake.paper.figure import draw_figure_6
-from kitting_drake.paper.page import paper_sections, read_results
+from kitting_drake.paper.page import has_figure, paper_sections, read_results
 from kitting_drake.reporting.runs import described
 from kitting_drake.reporting.summary import summarise
 from kitting_drake.scenario.loader import load_scenario
@@ -107,6 +107,10 @@ def test_no_results_no_sections(tmp_path: Path):
 
 
 def test_the_figure_is_drawn_from_what_there_is(folder: Path):
+    found = read_results(folder)
+    assert has_figure("unseen", found)
+    assert not has_figure("seen", found)
+    assert "results_unseen.png" in "\n".join(paper_sections(found, {}, "results"))
     results = {result.cell.name: result for result in read_results(folder)}
     drawn = draw_figure_6("unseen", results)
     assert drawn.startswith(b"\x89PNG")
