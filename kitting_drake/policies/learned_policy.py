@@ -44,6 +44,8 @@ class Decision:
     """(row, col)."""
     log_odds: float | None = None
     """That there is something to pick; None where the networks cannot tell."""
+    belongs: bool = False
+    """Whether the outlines say that the object belongs where it is to be placed."""
 
     @property
     def stop(self) -> bool:
@@ -74,8 +76,9 @@ class LearnedPolicy:
                 (`refine_place`), and the grasp by what room there is for the jaws
                 (`refine_grasp`); and do not stop while an object certainly fits
                 (`something_fits`). Not in the paper.
-            recover: first mend what is not seated (`recovery_action`), and pick what belongs into
-                a recess before anything else (`belonging`). Not in the paper.
+            recover: press down what protrudes, pick what belongs into a recess before anything
+                else (`belonging`), and at last take out what could not be pressed down
+                (`recovery_action`). Not in the paper.
             watch: called with each observation and decision.
 
         Raises:
@@ -99,11 +102,15 @@ class LearnedPolicy:
             failed_picks: where a grasp failed before: there it is not tried again.
         """
         segmentation = self._segment(observation)
+        mending = None
         if self._recover and segmentation is not None:
             mending = recovery_action(observation, segmentation, failed_picks)
-            if mending is not None:
-                return mending
+        if mending is not None and mending.press:
+            return mending
         decision = self._decide(observation, segmentation, failed_picks)
+        # What must be taken out waits: it may fail again, and actions are counted.
+        if mending is not None and not decision.belongs:
+            return mending
         if self._watch is not None:
             self._watch(observation, decision)
         return PickPlaceAction(stop=True) if decision.stop else decision.action
@@ -169,6 +176,7 @@ class LearnedPolicy:
             pick_pixel=choice.pick,
             place_pixel=choice.place,
             log_odds=odds,
+            belongs=belongs,
         )
 
     def _choose(

@@ -169,9 +169,9 @@ class Learned(PolicyConfig):
     # and do not stop while an object certainly fits into a recess (the paper does none of these).
     fit_outlines: bool = True
 
-    # First mend what the last action left undone, as o_t shows it: press down what protrudes, take
-    # out what cannot be pressed down. It takes actions: see the task's `tries`. And pick what fits
-    # into a recess before anything else.
+    # Mend what an action left undone, as o_t shows it: press down what protrudes; pick what fits
+    # into a recess before anything else; at last take out what could not be pressed down, and try
+    # again. It takes actions: see the task's `tries`.
     recover: bool = False
 
     def make_system(self, site: PolicySite) -> LeafSystem:
@@ -245,7 +245,7 @@ class Learned(PolicyConfig):
 class ShapeMatching(PolicyConfig):
     """Training-free: outlines of the loose objects, seen by height, fitted to those of recesses."""
 
-    # First mend what the last action left undone, as for !Learned.
+    # Mend what an action left undone, as for !Learned.
     recover: bool = False
 
     def make_system(self, site: PolicySite) -> LeafSystem:

@@ -55,7 +55,8 @@ class ShapeMatchingPolicy:
     def __init__(self, *, recover: bool = False) -> None:
         """
         Args:
-            recover: first mend what is not seated (`recovery_action`).
+            recover: press down what protrudes at once, and take out what could not be pressed
+                down where nothing else is left that fits (`recovery_action`).
         """
         self._recover = recover
 
@@ -73,10 +74,11 @@ class ShapeMatchingPolicy:
     def decide(self, observation: Observation, failed_picks: Sequence[PlanarPose] = ()) -> Matched:
         """The action, and how well the outlines behind it agree; see `__call__`."""
         segmentation = segment(observation)
+        mending = None
         if self._recover:
             mending = recovery_action(observation, segmentation, failed_picks)
-            if mending is not None:
-                return Matched(mending)
+        if mending is not None and mending.press:
+            return Matched(mending)
         places = np.array([(pick.x, pick.y) for pick in failed_picks]).reshape(-1, 2)
         failed = observation.grid.to_pixel(places)
         resolution = observation.grid.resolution
@@ -91,7 +93,8 @@ class ShapeMatchingPolicy:
                 place = fit.moved(best.pixel)
                 action = make_action(observation, best.pixel, best.theta, place, fit.rotation)
                 return Matched(action, min(max(1 - fit.cost / _WORST_COST, 0.0), 1.0))
-        return Matched(PickPlaceAction(stop=True))
+        # What must be taken out waits for all else: it may fail again, and actions are counted.
+        return Matched(mending or PickPlaceAction(stop=True))
 
 
 def _distance(positions: NDArray[np.float64], pixel: NDArray[np.float64]) -> float:

@@ -85,6 +85,31 @@ def test_where_a_grasp_failed_another_is_tried(seen):
         tried.append(action.pick)
 
 
+def test_what_must_be_taken_out_waits_for_all_that_fits(seen):
+    observation, _ = seen
+    segmentation = segment(observation)
+    policy = ShapeMatchingPolicy(recover=True)
+    # Something that stands 40 mm out of the fixture, where there is no recess.
+    top = float(np.median(observation.height[segmentation.fixture]))
+    rows, cols = np.nonzero(segmentation.fixture)
+    image = observation.image.copy()
+    image[3, rows.min() + 3 : rows.min() + 7, cols.min() + 4 : cols.min() + 30] = top + 0.04
+    blocked = dataclasses.replace(observation, image=image)
+    (standing,) = segment(blocked).protruding
+    action = policy(blocked)
+    assert not standing.mask[pixel_of(blocked, action)]
+    for region in segment(blocked).objects:
+        image[:, np.pad(region.mask, 2)[2:-2, 2:-2]] = image[:, :5, :5].mean(axis=(1, 2))[:, None]
+    action = policy(dataclasses.replace(blocked, image=image))
+    assert not action.stop
+    assert standing.mask[pixel_of(blocked, action)]
+
+
+def pixel_of(observation: Observation, action) -> tuple[int, int]:
+    row, col = np.rint(observation.grid.to_pixel((action.pick.x, action.pick.y))).astype(int)
+    return row, col
+
+
 def test_it_stops_where_nothing_is_left(seen):
     observation, _ = seen
     image = observation.image.copy()
