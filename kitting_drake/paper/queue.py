@@ -36,6 +36,8 @@ from kitting_drake.paper.cells import (
 
 RATES = "learning_rates.json"
 """The file, beside the results, of what each learning rate came to on validation scenes."""
+_PATIENCE = 10.0
+"""How long a command may take to end itself, in s."""
 _FIRST_SEED, _FIRST_VALIDATION_SEED = 10000, 20000
 
 
@@ -87,8 +89,8 @@ class Queue:
             except BaseException:
                 # The trainer's own process would otherwise be waited for.
                 trainer.shutdown(wait=False, cancel_futures=True)
-                for process in self._running:
-                    process.send_signal(signal.SIGINT)
+                for process in list(self._running):
+                    _end(process)
                 raise
         return failures
 
@@ -221,9 +223,7 @@ class Queue:
             try:
                 code = process.wait()
             finally:
-                if process.poll() is None:
-                    process.send_signal(signal.SIGINT)
-                    process.wait()
+                _end(process)
                 self._running.remove(process)
         if code:
             last = (folder / "log.txt").read_text().strip().splitlines()[-1:]
@@ -231,6 +231,17 @@ class Queue:
 
     def _say(self, text: str) -> None:
         self.console.print(text, highlight=False, markup=False)
+
+
+def _end(process: subprocess.Popen[str]) -> None:
+    """Ends a command as Ctrl-C does or, as it may be deaf to that in the background, for good."""
+    if process.poll() is None:
+        process.send_signal(signal.SIGINT)
+        try:
+            process.wait(_PATIENCE)
+        except subprocess.TimeoutExpired:
+            process.terminate()
+            process.wait()
 
 
 def run_paper(
