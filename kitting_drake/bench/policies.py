@@ -14,8 +14,6 @@ from numpy.typing import NDArray
 from kitting_drake.common.errors import UserError
 from kitting_drake.common.paths import GENERALIST
 from kitting_drake.policies.matching.policy import ShapeMatchingPolicy
-from kitting_drake.policies.matching.recovery import recovery_action
-from kitting_drake.policies.matching.segmentation import segment
 from systems.signals import Observation, PickPlaceAction, PixelGrid, PlanarPose
 
 if TYPE_CHECKING:
@@ -99,7 +97,6 @@ class _Networks:
     name: str
     resolution: float | None
     """Of the pixels that it learned from, in metres, if its file says."""
-    recover: bool
 
     def check_grid(self, grid: PixelGrid) -> None:
         learned, given = self.resolution, grid.resolution
@@ -110,13 +107,10 @@ class _Networks:
             )
 
     def choose(self, observation: Observation, failed_picks: Sequence[PlanarPose] = ()) -> Choice:
-        if self.recover:
-            mending = recovery_action(observation, segment(observation), failed_picks)
-            if mending is not None:
-                return Choice(mending, None, draw=lambda: _draw_action(observation, mending))
-        decision = self.policy.decide(observation, failed_picks)
+        action, decision = self.policy.act(observation, failed_picks)
+        if decision is None:
+            return Choice(action, None, draw=lambda: _draw_action(observation, action))
         parts = confidence_parts(decision, observation.grid.resolution)
-        action = PickPlaceAction(stop=True) if decision.stop else decision.action
 
         def draw() -> bytes:
             # Who draws nothing does not wait for matplotlib.
@@ -141,7 +135,7 @@ def load_policy(
         orientations: N.
         fit_outlines: refine places by outlines and grasps by the room for the jaws: for tasks in
             which objects are inserted.
-        recover: first mend what is not seated.
+        recover: mend what is not seated; see `LearnedPolicy`.
 
     Raises:
         UserError: the file cannot be used, or not at so many orientations.
@@ -164,7 +158,7 @@ def load_policy(
         )
     except ValueError as error:
         raise UserError(f"--orientations: {error}") from error
-    return _Networks(policy, path.stem, resolution, recover)
+    return _Networks(policy, path.stem, resolution)
 
 
 def confidence_parts(decision: Decision, resolution: float) -> dict[str, float]:

@@ -101,19 +101,28 @@ class LearnedPolicy:
             observation: o_t.
             failed_picks: where a grasp failed before: there it is not tried again.
         """
+        return self.act(observation, failed_picks)[0]
+
+    def act(
+        self, observation: Observation, failed_picks: Sequence[PlanarPose] = ()
+    ) -> tuple[PickPlaceAction, Decision | None]:
+        """The action, and the decision that it is; None where it mends something instead.
+
+        The arguments are those of `__call__`.
+        """
         segmentation = self._segment(observation)
         mending = None
         if self._recover and segmentation is not None:
             mending = recovery_action(observation, segmentation, failed_picks)
         if mending is not None and mending.press:
-            return mending
+            return mending, None
         decision = self._decide(observation, segmentation, failed_picks)
         # What must be taken out waits: it may fail again, and actions are counted.
         if mending is not None and not decision.belongs:
-            return mending
+            return mending, None
         if self._watch is not None:
             self._watch(observation, decision)
-        return PickPlaceAction(stop=True) if decision.stop else decision.action
+        return PickPlaceAction(stop=True) if decision.stop else decision.action, decision
 
     @torch.inference_mode()
     def log_odds(self, observation: Observation) -> float | None:
