@@ -89,7 +89,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--no_outlines", action="store_true", help="refine nothing: for tasks without cavities"
     )
-    parser.add_argument("--recover", action="store_true", help="first mend what is not seated")
+    parser.add_argument("--recover", action="store_true", help="mend what is not seated")
     parser.add_argument(
         "--table_height", type=float, metavar="Z", help="in the base frame, in m (the file's, or 0)"
     )

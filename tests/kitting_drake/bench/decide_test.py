@@ -17,6 +17,11 @@ from kitting_drake.bench.calibration import Calibration, read_calibration, write
 from kitting_drake.bench.kit_block import Block
 from kitting_drake.cell.cameras import camera_pose
 from kitting_drake.common.errors import UserError
+from kitting_drake.common.paths import GENERALIST
+from kitting_drake.policies.learned_policy import LearnedPolicy
+from kitting_drake.policies.matching.recovery import recovery_action
+from kitting_drake.policies.matching.segmentation import segment
+from kitting_drake.policies.weights import load_networks, preferred_type
 from kitting_drake.scenario import load_scenario
 from kitting_drake.scenario.schema import LookAt, Scenario
 from tests.kitting_drake.bench.frames import (
@@ -54,6 +59,28 @@ def check_against_cell(seed: int, folder: Path) -> None:
     stepped = read_frames([write_frames(folder / "png", found.frames, "png")], calibration)
     other = decide(stepped, calibration, policy).action
     assert (difference(other, decision.action) < (10.0, 1.0, 0.7)).all()
+
+
+@pytest.mark.usefixtures("rendering")
+@pytest.mark.parametrize("high", [0.008, 0.04])
+def test_what_stands_out_is_mended_when_the_cell_mends_it(high: float):
+    """A little: pressed down at once. By more: taken out when nothing else is left that fits."""
+    seen = rendered(1500, "!Oracle {}").observation
+    fixture = segment(seen).fixture
+    rows, cols = np.nonzero(fixture)
+    image = seen.image.copy()
+    top = float(np.median(seen.height[fixture]))
+    row, col = int(rows.mean()), cols.min() + 3
+    image[3, row : row + 4, col : col + 26] = top + high
+    seen = dataclasses.replace(seen, image=image)
+    assert recovery_action(seen, segment(seen)) is not None
+    cells = LearnedPolicy(
+        load_networks(GENERALIST, preferred_type()), fit_outlines=True, recover=True
+    )
+    chosen = load_policy(recover=True).choose(seen)
+    assert chosen.action == cells(seen)
+    assert chosen.action.press == (high < 0.01)
+    assert (chosen.confidence is None) == chosen.action.press
 
 
 @pytest.mark.usefixtures("rendering")
