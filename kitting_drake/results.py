@@ -16,9 +16,9 @@ from rich.console import Console
 
 from kitting_drake.common.command_line import run_command
 from kitting_drake.common.files import write_atomically
+from kitting_drake.paper.cells import RATES
 from kitting_drake.paper.figure import draw_figure_6
 from kitting_drake.paper.page import Result, has_figure, paper_sections, read_results
-from kitting_drake.paper.queue import RATES
 from kitting_drake.reporting.results_page import results_page
 from kitting_drake.reporting.robustness import robustness_table, with_figures
 from kitting_drake.reporting.runs import read_runs

@@ -20,6 +20,8 @@ RAVENS_DEMONSTRATIONS = (100, 10, 1)
 PRESET = "small"
 LEARNING_RATES = (1e-3, 3e-4, 3e-3)
 """Of these each baseline uses the one that is best on validation scenes; ours has the first."""
+RATES = "learning_rates.json"
+"""The file, beside the results, of what each learning rate came to on validation scenes."""
 VALIDATE_EVERY = 250
 _NO_SEARCH = "planner: {search: {amplitude: 0.0, reach: 0.0}}"
 

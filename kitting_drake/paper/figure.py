@@ -4,10 +4,9 @@ import io
 from collections.abc import Mapping
 
 from kitting_drake.paper.cells import DEMONSTRATIONS
-from kitting_drake.paper.page import Result
+from kitting_drake.paper.page import COLUMNS, Result
 from kitting_drake.reporting.runs import METHODS
 
-_N = (36, 72, 120, 180)
 _COLOURS = {10: "#009e73", 100: "#d55e00"}
 """Green and orange, as in the paper."""
 _WIDE, _SLIM = 0.34, 0.13
@@ -39,7 +38,7 @@ def draw_figure_6(task: str, results: Mapping[str, Result]) -> bytes:
         for method, (width, opacity) in _METHODS.items():
             for side, count in zip((-0.19, 0.19), reversed(DEMONSTRATIONS), strict=True):
                 label = f"{METHODS[method]}, {count} demonstrations"
-                for place, n in enumerate(_N):
+                for place, n in enumerate(COLUMNS):
                     result = results.get(f"{task}_{method}_{n}_{count}")
                     if result is None:
                         continue
@@ -57,13 +56,13 @@ def draw_figure_6(task: str, results: Mapping[str, Result]) -> bytes:
                     ends = (where - width / 2, where + width / 2)
                     axis.hlines(strict, *ends, color="white", linewidth=1.2, zorder=3)
                     label = ""
-        for place, n in enumerate(_N):
+        for place, n in enumerate(COLUMNS):
             oracle = results.get(f"{task}_quantized_oracle_{n}")
             if oracle is not None:
                 rate = 100 * oracle.summary["success_rate"]
                 axis.hlines(rate, place - 0.42, place + 0.42, color="black", linewidth=1.0)
-        axis.set_xticks(range(len(_N)), [f"N = {n}" for n in _N])
-        axis.set_xlim(-0.55, len(_N) - 0.45)
+        axis.set_xticks(range(len(COLUMNS)), [f"N = {n}" for n in COLUMNS])
+        axis.set_xlim(-0.55, len(COLUMNS) - 0.45)
         axis.set_ylim(0, 101)
         axis.set_ylabel("success, %")
         axis.grid(axis="y", color="0.9", zorder=0)

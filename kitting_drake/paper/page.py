@@ -14,23 +14,24 @@ from kitting_drake.common.errors import UserError
 from kitting_drake.paper.cells import (
     DEMONSTRATIONS,
     LEARNING_RATES,
+    ORIENTATIONS,
     PRESET,
+    RATES,
     SHIPPED,
     TASKS,
     Cell,
     Training,
     paper_cells,
 )
-from kitting_drake.paper.queue import RATES
-from kitting_drake.reporting.markdown import markdown_table
+from kitting_drake.reporting.markdown import markdown_table, rate_text
 from kitting_drake.reporting.paired import OWN, STRICT, Estimate, over_tools, paired_difference
 from kitting_drake.reporting.ravens_table import PAPER as TABLE_1
+from kitting_drake.reporting.results_page import PAPER
 from kitting_drake.reporting.runs import LEARNED, METHODS
 
-_COLUMNS = (36, 72, 120, 180)
+COLUMNS = tuple(sorted(ORIENTATIONS))
 _HEADINGS = {"seen": "Seen toolset, figure 6(a)", "unseen": "Unseen toolsets, figure 6(b)"}
-_PAPER_OURS = {"seen": 96.5, "unseen": 87.25}
-"""Section V-D.1: 180 orientations and 100 demonstrations, in percent."""
+_TITLES = {"seen": "kitting-seen-toolset", "unseen": "kitting-unseen-toolsets"}
 
 _INTRODUCTION = """\
 ## As in the paper
@@ -59,7 +60,7 @@ class Result:
     @cached_property
     def text(self) -> str:
         """Both rates."""
-        strict = _rate(self.summary["strict_success_rate"], self.summary["strict_ci95"])
+        strict = rate_text(self.summary["strict_success_rate"], self.summary["strict_ci95"])
         return f"{strict} / {100 * self.summary['success_rate']:.1f}"
 
 
@@ -146,15 +147,15 @@ def _figure_table(task: str, results: Mapping[str, Result]) -> str:
             given = [
                 # The paper has the Transporter at N = 36 only.
                 "" if method == "transporter" and n != 36 else text(f"{task}_{method}_{n}_{count}")
-                for n in _COLUMNS
+                for n in COLUMNS
             ]
             rows.append([METHODS[method], str(count), *given])
         if method == "so2":
-            paper = [f"- / {_PAPER_OURS[task]:g}" if n == 180 else "" for n in _COLUMNS]
+            paper = [f"- / {PAPER[_TITLES[task]].ours:g}" if n == 180 else "" for n in COLUMNS]
             rows.append(["*paper*, ours", "100", *paper])
-    oracle = [text(f"{task}_quantized_oracle_{n}") for n in _COLUMNS]
+    oracle = [text(f"{task}_quantized_oracle_{n}") for n in COLUMNS]
     rows.append([METHODS["quantized_oracle"], "", *oracle])
-    return markdown_table(["method", "demonstrations", *(f"N = {n}" for n in _COLUMNS)], rows)
+    return markdown_table(["method", "demonstrations", *(f"N = {n}" for n in COLUMNS)], rows)
 
 
 def _table_1(results: Mapping[str, Result]) -> list[str]:
@@ -169,7 +170,7 @@ def _table_1(results: Mapping[str, Result]) -> list[str]:
             rows.append(
                 [name, str(n), str(count)]
                 + [
-                    "-" if r is None else _rate(r.summary["success_rate"], r.summary["ci95"])
+                    "-" if r is None else rate_text(r.summary["success_rate"], r.summary["ci95"])
                     for r in found
                 ]
             )
@@ -204,9 +205,9 @@ def _both(result: Result) -> list[str]:
     summary = result.summary
     tools = over_tools(summary["outcomes"], STRICT)
     return [
-        _rate(summary["strict_success_rate"], summary["strict_ci95"]),
+        rate_text(summary["strict_success_rate"], summary["strict_ci95"]),
         "-" if tools is None else f"{100 * tools.low:.1f} to {100 * tools.high:.1f}",
-        _rate(summary["success_rate"], summary["ci95"]),
+        rate_text(summary["success_rate"], summary["ci95"]),
     ]
 
 
@@ -285,11 +286,6 @@ def _causes(summary: Mapping[str, Any]) -> str:
     """Why objects were no success, or no strict one, and how many."""
     counts = {**summary["causes"], **summary["ambiguous"]}
     return ", ".join(f"{name} {count}" for name, count in counts.items() if count) or "-"
-
-
-def _rate(rate: float, interval: Sequence[float]) -> str:
-    low, high = interval
-    return f"{100 * rate:.1f} ({100 * low:.1f} to {100 * high:.1f})"
 
 
 def _points(found: Estimate) -> str:

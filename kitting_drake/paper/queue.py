@@ -26,6 +26,7 @@ from kitting_drake.common.paths import SCENARIOS
 from kitting_drake.paper.cells import (
     LEARNING_RATES,
     PRESET,
+    RATES,
     TASKS,
     VALIDATE_EVERY,
     Cell,
@@ -34,8 +35,6 @@ from kitting_drake.paper.cells import (
     reference,
 )
 
-RATES = "learning_rates.json"
-"""The file, beside the results, of what each learning rate came to on validation scenes."""
 _PATIENCE = 10.0
 """How long a command may take to end itself, in s."""
 _FIRST_SEED, _FIRST_VALIDATION_SEED = 10000, 20000

@@ -3,6 +3,12 @@
 from collections.abc import Sequence
 
 
+def rate_text(rate: float, interval: Sequence[float]) -> str:
+    """A rate and its interval, shares of one, in percent."""
+    low, high = interval
+    return f"{100 * rate:.1f} ({100 * low:.1f} to {100 * high:.1f})"
+
+
 def markdown_table(
     headings: Sequence[str], rows: Sequence[Sequence[str]], left_columns: int = 1
 ) -> str:

@@ -5,7 +5,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from kitting_drake.reporting.markdown import markdown_table
+from kitting_drake.reporting.markdown import markdown_table, rate_text
 from kitting_drake.reporting.ravens_table import TASKS as RAVENS_TASKS
 from kitting_drake.reporting.ravens_table import ravens_section
 from kitting_drake.reporting.runs import LEARNED, METHODS, Run
@@ -28,7 +28,7 @@ class _Paper:
     """The advantage of the Equivariant Transporter on average, in points."""
 
 
-_PAPER = {
+PAPER = {
     "kitting-seen-toolset": _Paper("Seen toolset", 96.5, 0.63),
     "kitting-unseen-toolsets": _Paper("Unseen toolsets", 87.25, 2.16),
 }
@@ -99,7 +99,7 @@ def results_page(runs: Sequence[Run], link: str, paper: Sequence[str] = ()) -> s
 
 
 def _task_sections(task: str, runs: list[Run]) -> list[str]:
-    paper = _PAPER[task]
+    paper = PAPER[task]
     sections = [
         f"## {paper.heading}, with what goes beyond the paper (`{task}`)\n",
         _success_table(runs, paper),
@@ -164,16 +164,11 @@ def _marks(run: Run) -> str:
 
 
 def _strict(summary: dict[str, Any]) -> str:
-    return _rate(summary["strict_success_rate"], summary["strict_ci95"])
+    return rate_text(summary["strict_success_rate"], summary["strict_ci95"])
 
 
 def _own(summary: dict[str, Any]) -> str:
-    return _rate(summary["success_rate"], summary["ci95"])
-
-
-def _rate(rate: float, interval: Sequence[float]) -> str:
-    low, high = interval
-    return f"{100 * rate:.1f} ({100 * low:.1f} to {100 * high:.1f})"
+    return rate_text(summary["success_rate"], summary["ci95"])
 
 
 def _most_tested_run(runs: list[Run]) -> list[str]:

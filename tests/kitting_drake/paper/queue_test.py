@@ -17,13 +17,14 @@ from kitting_drake.common.paths import SCENARIOS
 from kitting_drake.paper.cells import (
     LEARNING_RATES,
     PRESET,
+    RATES,
     TASKS,
     Cell,
     Training,
     paper_cells,
     reference,
 )
-from kitting_drake.paper.queue import RATES, Failed, Queue, run_paper
+from kitting_drake.paper.queue import Failed, Queue, run_paper
 from kitting_drake.reporting.runs import described
 from kitting_drake.scenario.loader import load_scenario
 
