@@ -69,8 +69,8 @@ class PickPlaceParameters:
     grasp_force: float = bounded(30.0, 1.0, 140.0)
 
     # The same once the wrist has felt more than `heavy_load` of it, both in N: gripped beside its
-    # centre of mass, what is heavy would rotate between the pads. A Franka hand presses 70 N for as
-    # long as it likes.
+    # centre of mass, what is heavy would rotate between the pads. 70 N is the continuous grasping
+    # force of a Franka Hand.
     firm_grasp_force: float = bounded(70.0, 1.0, 140.0)
     heavy_load: float = bounded(5.0, 0.5, 100.0)
 

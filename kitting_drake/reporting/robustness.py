@@ -25,12 +25,13 @@ def robustness_table(runs: Sequence[Run]) -> str:
     """Strict success on unseen toolsets, with two tries a tool and policies that recover.
 
     Args:
-        runs: all; those that are none of these are left out.
+        runs: all; those that are none of these are left out. More than one of a cell are told one
+            below the other, in the order of their seeds.
     """
     expected = _expected()
-    cells: dict[str, dict[str, str]] = defaultdict(dict)
+    cells: dict[tuple[str, str], list[str]] = defaultdict(list)
     seeds: set[str] = set()
-    for run in runs:
+    for run in sorted(runs, key=lambda run: min(run.summary["seeds"])):
         if run.method not in _COLUMNS or not run.detail("recover"):
             continue
         found = run.summary["resolved_scenario"]
@@ -39,14 +40,15 @@ def robustness_table(runs: Sequence[Run]) -> str:
             continue
         low, high = (100 * value for value in run.summary["strict_ci95"])
         share = 100 * run.summary["strict_success_rate"]
-        cells[label][run.method] = f"{share:.1f} ({low:.0f} to {high:.0f})"
+        cells[label, run.method].append(f"{share:.1f} ({low:.0f} to {high:.0f})")
         seeds.add(f"{run.summary['episodes']} episodes from seed {min(run.summary['seeds'])}")
     if not cells:
         return "No runs yet.\n"
+    # Runs that differ in nothing but their seeds are all told: choosing would be flattering.
     rows = [
-        [label, *(cells[label].get(method, "-") for method in _COLUMNS)]
+        [label, *("<br>".join(cells[label, method]) or "-" for method in _COLUMNS)]
         for label in expected
-        if label in cells
+        if any((label, method) in cells for method in _COLUMNS)
     ]
     table = markdown_table(["perturbation", *_COLUMNS.values()], rows)
     return f"{table}\n{'; '.join(sorted(seeds))}.\n"

@@ -39,6 +39,13 @@ def test_each_run_goes_into_the_row_that_its_scenario_says():
     assert "2 episodes from seed 1." in table
 
 
+def test_runs_of_other_seeds_are_all_told():
+    later = run("all", 0.5)
+    later.summary["seeds"] = [7, 8]
+    table = robustness_table([later, run("all", 0.9)])
+    assert "| 90.0 (80 to 100)<br>50.0 (40 to 60) |" in table
+
+
 def test_what_is_something_else_is_left_out():
     others = [run("mass", 0.9, tries=1), run("mass", 0.9, recover=False)]
     others.append(run("mass,light", 0.9))
