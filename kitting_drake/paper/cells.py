@@ -7,6 +7,7 @@ import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
+from pathlib import Path
 from typing import Any
 
 from kitting_drake.common.paths import SCENARIOS
@@ -208,19 +209,21 @@ class Cell:
         return None
 
     def _details(self, training: Training) -> dict[str, Any]:
+        learned_at = TASKS[training.task]
         wanted = {
             "method": training.method,
+            "scenario": f"{Path(learned_at.file).stem}:{learned_at.demonstrated}",
             "preset": PRESET,
             "orientations": self.orientations,
             "trained_orientations": training.orientations,
             "demonstrations": training.demonstrations,
             "training_seed": training.seed,
-            "steps": TASKS[training.task].steps,
+            "steps": learned_at.steps,
             "continuous": self.continuous,
             "fit_outlines": self.fit_outlines,
             "recover": False,
         }
-        if TASKS[training.task].table == "6":
+        if learned_at.table == "6":
             # Elsewhere the task itself says what of these is possible.
             wanted |= {"taken_only": training.taken_only, "rigid": training.rigid}
         return wanted

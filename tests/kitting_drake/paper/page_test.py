@@ -29,6 +29,7 @@ def write(folder: Path, name: str, errors_mm: list[float]) -> None:
     if isinstance(cell.policy, Training):
         details |= {
             "method": cell.policy.method,
+            "scenario": f"{Path(task.file).stem}:{task.demonstrated}",
             "preset": PRESET,
             "trained_orientations": cell.policy.orientations,
             "demonstrations": cell.policy.demonstrations,

@@ -68,6 +68,7 @@ class Pretending(Queue):
             task, method, trained, demonstrations = folder.split("_")[:4]
             details |= {
                 "method": method,
+                "scenario": f"{Path(TASKS[task].file).stem}:{TASKS[task].demonstrated}",
                 "preset": PRESET,
                 "trained_orientations": int(trained),
                 "demonstrations": int(demonstrations),
@@ -148,6 +149,7 @@ def test_what_fails_keeps_nothing_else_up(queue: Pretending):
         (lambda s: s["resolved_scenario"]["planner"]["search"].update(reach=0.004), "search.reach"),
         (lambda s: s["resolved_scenario"]["plant"].update(time_step=0.5), "plant.time_step"),
         (lambda s: s["policy_details"].update(steps=7), "steps is 7, not"),
+        (lambda s: s["policy_details"].update(scenario="kitting_seen:Mine"), "scenario is kitting"),
         (lambda s: s["policy_details"].update(continuous=True), "continuous is True"),
         (lambda s: s["seeds"].pop(), "seeds are not 3000 to 3099"),
     ],
