@@ -71,7 +71,7 @@ class Check:
     disagreements: dict[tuple[str, str], float]
     """By how much the first of two cameras sees the table higher, in metres."""
     block_shifts: dict[tuple[str, str], Array]
-    """Of two cameras, where the first sees the block, seen from the second: (2,) in metres."""
+    """(2,) how far beside the second of two cameras the first one sees the block, in metres."""
     block: Block | None
     corrected: Calibration
     heights: dict[str, NDArray[np.float32]]

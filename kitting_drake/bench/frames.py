@@ -21,7 +21,7 @@ _SIXTEEN_BIT = ("I;16", "I;16B", "I")
 
 @dataclass(frozen=True)
 class Frame:
-    """What one camera saw, depth registered to colour."""
+    """The images that a camera took at one time, depth registered to colour."""
 
     color: NDArray[np.uint8]
     """(height, width, 3): red, green, blue."""

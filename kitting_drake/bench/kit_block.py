@@ -46,7 +46,7 @@ class SeenBlock:
     middle: Array
     """(2,) in the base frame, in metres."""
     yaw: float
-    """Of the length, in radians, modulo `Block.period`."""
+    """The direction of the length about z, in radians, modulo `Block.period`."""
     size: tuple[float, float, float]
     """Length, width and height, in metres."""
     corner: float

@@ -185,6 +185,6 @@ def offset(seen: SeenBlock, block: Block) -> tuple[float, float, float] | None:
 
 
 def _verdict(error: float) -> str:
-    """Of an error in metres, against the clearance."""
+    """The word for an error, in metres, by its share of the clearance."""
     share = abs(error) / CLEARANCE
     return GOOD if share < 0.25 else TIGHT if share < 0.75 else BAD

@@ -54,7 +54,7 @@ class StepFolder:
 
 @dataclass(frozen=True)
 class Summary:
-    """What was written."""
+    """The numbers of what was written."""
 
     demonstrations: int
     steps: int
@@ -220,6 +220,6 @@ def _update(digest: hashlib._Hash, frames: dict[str, Frame]) -> None:
 
 
 def _seed(digest: bytes) -> int:
-    """What stands for the frames of a demonstration in place of a seed, so that `train` sees when
-    the same one is learned from and validated by."""
+    """A number for the frames of a demonstration, which have no seed: by it `train` notices that
+    the same demonstration is learned from and validated by."""
     return _FIRST_SEED + int.from_bytes(digest[:8], "big") % (2**32 - _FIRST_SEED)

@@ -16,7 +16,7 @@ from systems.signals import PixelGrid
 Array = NDArray[np.float64]
 
 FARTHEST = 0.15
-"""What is farther above or below the table than this is not of it, in metres."""
+"""Points farther above or below the table than this are not part of it, in metres."""
 _TRIALS = 200
 _TRIED = 4000
 """So many of the points judge a trial."""

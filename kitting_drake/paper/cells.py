@@ -33,14 +33,14 @@ class Task:
 
     name: str
     file: str
-    """Of the scenarios."""
+    """The file of its scenarios."""
     tested: str
     """The name of the scenario that is evaluated."""
     demonstrated: str
     """The name of the scenario of the demonstrations."""
     first_seed: int
     table: str = "6"
-    """Where it stands: in figure 6, in table I, or with the fresh tools."""
+    """The table that it is in: `6` (figure 6), `I` (table I) or `fresh`."""
     episodes: int = 100
     steps: int = 1500
     demonstrations: int = 100
@@ -116,7 +116,7 @@ class Training:
 
     @property
     def name(self) -> str:
-        """Of its folder, without the learning rate."""
+        """The name of its folder, without the learning rate."""
         kind = "" if self.taken_only and self.rigid else "_ours"
         if kind and self.taken_only:
             kind += "_taken_only"
@@ -135,15 +135,15 @@ def reference(method: str) -> Training:
 
 @dataclass(frozen=True)
 class Cell:
-    """An evaluation, and what is wanted of it."""
+    """An evaluation of a policy on a task."""
 
     task: str
     policy: Training | str
-    """Networks that are trained for it; or a policy as a scenario has it."""
+    """The training of its networks, or a policy as YAML of a scenario."""
     orientations: int | None
     """N in use; None where the policy has none."""
     label: str = ""
-    """What tells it from the paper's own cell of the same task, policy and N."""
+    """Distinguishes it from the paper's own cell of the same task, policy and N."""
     continuous: bool = False
     """Refined between pixels and orientations; in the paper actions are quantized."""
     fit_outlines: bool = False
@@ -152,7 +152,7 @@ class Cell:
 
     @property
     def name(self) -> str:
-        """Of its file of results."""
+        """The name of its file of results."""
         if isinstance(self.policy, str):
             parts = [self.task, self.label, str(self.orientations or "")]
             return "_".join(part for part in parts if part)
@@ -169,12 +169,12 @@ class Cell:
 
     @property
     def seeds(self) -> range:
-        """Of its episodes; the same for all cells of a task."""
+        """The seeds of its episodes, which all cells of a task share."""
         task = TASKS[self.task]
         return range(task.first_seed, task.first_seed + task.episodes)
 
     def scenario_text(self, weights: str) -> str:
-        """What is merged over its scenario.
+        """The YAML that is merged over its scenario.
 
         Args:
             weights: the file of its networks, if it has any.

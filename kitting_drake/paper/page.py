@@ -59,7 +59,7 @@ class Result:
 
     @cached_property
     def text(self) -> str:
-        """Both rates."""
+        """The strict rate with its interval, and the rate by the paper's measure, in percent."""
         strict = rate_text(self.summary["strict_success_rate"], self.summary["strict_ci95"])
         return f"{strict} / {100 * self.summary['success_rate']:.1f}"
 
@@ -212,7 +212,7 @@ def _both(result: Result) -> list[str]:
 
 
 def _differences(results: Mapping[str, Result]) -> list[str]:
-    """What one method is better than another on the same seeds."""
+    """The section on how much better one method is than another on the same seeds."""
     rows = []
     for name, result in results.items():
         for label, other in _rivals(result.cell):

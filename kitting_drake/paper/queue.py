@@ -41,7 +41,7 @@ _FIRST_SEED, _FIRST_VALIDATION_SEED = 10000, 20000
 
 
 @dataclass
-class Failed(Exception):  # noqa: N818  It is no error of ours.
+class Failed(Exception):  # noqa: N818  A cell failed, not the queue.
     """One of the project's commands failed."""
 
     why: str
@@ -49,7 +49,7 @@ class Failed(Exception):  # noqa: N818  It is no error of ours.
 
 @dataclass
 class Queue:
-    """Where the work is done, and where its results go."""
+    """Collects, trains and evaluates in one folder, and puts results into another."""
 
     folder: Path
     results: Path
