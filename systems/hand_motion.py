@@ -12,8 +12,8 @@ from systems.signals import wrap_to_pi
 SMOOTHING = 1 / 16
 """Time in which an acceleration builds up or falls away, in s."""
 
-PARTS = (slice(0, 2), slice(2, 3), slice(3, 4))
-"""The parts of a motion that have a time course each: along (x, y), z and yaw."""
+PARTS = ([0, 1], [2], [3])
+"""The parts of a motion that have a time course each, as axes: (x, y), z and yaw."""
 
 
 @dataclass(frozen=True)
@@ -134,20 +134,23 @@ def motion_at(
     Returns:
         (12) position, velocity, acceleration.
     """
-    position, velocity, acceleration = start.copy(), np.zeros(4), np.zeros(4)
+    # Plain numbers: this runs at every step, and arrays of four cost more than they save.
+    position, velocity, acceleration = start.tolist(), [0.0] * 4, [0.0] * 4
     braking = braking_time(start_rate, limits)
     if braking > 0:
         s = min(max(elapsed / braking, 0.0), 1.0)
-        position += start_rate * braking * (s - s**3 + s**4 / 2)
-        velocity += start_rate * (1 - s**2 * (3 - 2 * s))
-        acceleration -= start_rate * 6 * s * (1 - s) / braking
+        for i, rate in enumerate(start_rate.tolist()):
+            position[i] += rate * braking * (s - s**3 + s**4 / 2)
+            velocity[i] += rate * (1 - s**2 * (3 - 2 * s))
+            acceleration[i] -= rate * 6 * s * (1 - s) / braking
     for part, delta, distance, limit, delay in _ways(start, goal, start_rate, limits, delays):
         if distance > 0:
             gone, rate, change = travel(distance, *limit, elapsed - delay)
-            position[part] += delta * (gone / distance)
-            velocity[part] += delta * (rate / distance)
-            acceleration[part] += delta * (change / distance)
-    return np.concatenate([position, velocity, acceleration])
+            for i, way in zip(part, delta, strict=True):
+                position[i] += way * (gone / distance)
+                velocity[i] += way * (rate / distance)
+                acceleration[i] += way * (change / distance)
+    return np.array([*position, *velocity, *acceleration])
 
 
 def motion_duration(
@@ -172,11 +175,12 @@ def _ways(
     start_rate: NDArray[np.float64],
     limits: MotionLimits,
     delays: NDArray[np.float64],
-) -> Iterator[tuple[slice, NDArray[np.float64], float, tuple[float, float], float]]:
-    """For each part: which, its way from where braking ends, how far that is, limits, delay."""
-    ways = goal - start - start_rate * braking_time(start_rate, limits) / 2
-    for part, limit, delay in zip(PARTS, limits.of_parts(), delays, strict=True):
-        yield part, ways[part], math.hypot(*ways[part]), limit, float(delay)
+) -> Iterator[tuple[list[int], list[float], float, tuple[float, float], float]]:
+    """For each part: its axes, the way from where braking ends, how far that is, limits, delay."""
+    ways = (goal - start - start_rate * braking_time(start_rate, limits) / 2).tolist()
+    for part, limit, delay in zip(PARTS, limits.of_parts(), delays.tolist(), strict=True):
+        way = [ways[i] for i in part]
+        yield part, way, math.hypot(*way), limit, delay
 
 
 def ramp(start: float, goal: float, rate: float, elapsed: float) -> tuple[float, float]:

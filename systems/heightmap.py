@@ -69,8 +69,8 @@ class DepthRays(NamedTuple):
 class View(NamedTuple):
     """What one camera saw, and from where."""
 
-    color: NDArray[np.uint8]
-    """(height, width, 3 or more): red, green, blue."""
+    color: NDArray[np.uint8] | None
+    """(height, width, 3 or more): red, green, blue. None: black."""
     depth: NDArray[np.float32]
     """(height, width) along the optical axis, in metres; 0, infinity and NaN are no depth."""
     X_WD: NDArray[np.float64]
@@ -131,11 +131,12 @@ def _see(view: View, grid: PixelGrid) -> NDArray[np.float32]:
     highest = np.full(grid.rows * grid.cols, -1, np.int64)
     np.maximum.at(highest, cell, key)
 
-    color = view.color.reshape(-1, view.color.shape[-1])
     seen_image = np.zeros((4, highest.size), np.float32)
     seen_image[3] = -1
     seen = np.flatnonzero(highest >= 0)
-    seen_image[:3, seen] = color[highest[seen] & 0xFFFFFFFF, :3].T / np.float32(255)
+    if view.color is not None:
+        color = view.color.reshape(-1, view.color.shape[-1])
+        seen_image[:3, seen] = color[highest[seen] & 0xFFFFFFFF, :3].T / np.float32(255)
     seen_image[3, seen] = (highest[seen] >> 32).astype(np.int32).view(np.float32)
     return seen_image.reshape(4, *grid.shape)
 

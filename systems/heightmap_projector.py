@@ -1,5 +1,6 @@
 """From the cameras' images to the orthographic heightmap that the policies look at."""
 
+import functools
 from collections.abc import Mapping
 from typing import Any
 
@@ -27,11 +28,13 @@ class HeightmapProjector(LeafSystem):
         - body_pose_in_world_<camera>
         output_ports:
         - observation
+        - heights
 
     There are three input ports for each camera. They take the outputs `color_image`,
-    `depth_image_32f` and `body_pose_in_world` (X_WB) of an RgbdSensor. The output port holds an
+    `depth_image_32f` and `body_pose_in_world` (X_WB) of an RgbdSensor. Each output port holds an
     Observation, computed when it is asked for and kept until an input changes; the passing of time
-    alone does not make it stale. Its image is read-only, as every reader shares it.
+    alone does not make it stale. Its image is read-only, as every reader shares it. That of
+    `heights` is the same in black: for who looks at heights alone, no colour image is rendered.
 
     The law, for a camera D with intrinsics (fx, fy, cx, cy) and fixed pose X_BD in the sensor body:
 
@@ -79,19 +82,28 @@ class HeightmapProjector(LeafSystem):
             self.DeclareAbstractInputPort(f"color_image_{name}", Value(ImageRgba8U()))
             self.DeclareAbstractInputPort(f"depth_image_{name}", Value(ImageDepth32F()))
             self.DeclareAbstractInputPort(f"body_pose_in_world_{name}", Value(RigidTransform()))
-        blank = np.zeros((4, *self._grid.shape), np.float32)
-        self.DeclareAbstractOutputPort(
-            "observation",
-            lambda: AbstractValue.Make(Observation(image=blank, grid=self._grid)),
-            self._CalcObservation,
-            prerequisites_of_calc={self.all_input_ports_ticket()},
-        )
+        shape_inputs = {
+            self.GetInputPort(f"{port}_{name}").ticket()
+            for port in ("depth_image", "body_pose_in_world")
+            for name in cameras
+        }
+        blank = Observation(np.zeros((4, *self._grid.shape), np.float32), self._grid)
+        for port, in_color, prerequisites in (
+            ("observation", True, {self.all_input_ports_ticket()}),
+            ("heights", False, shape_inputs),
+        ):
+            self.DeclareAbstractOutputPort(
+                port,
+                lambda: AbstractValue.Make(blank),
+                functools.partial(self._CalcObservation, in_color),
+                prerequisites_of_calc=prerequisites,
+            )
 
-    def _CalcObservation(self, context: Context, output: AbstractValue) -> None:
+    def _CalcObservation(self, in_color: bool, context: Context, output: AbstractValue) -> None:
         views = []
         for name, rays in self._rays.items():
             X_WB: Any = self.GetInputPort(f"body_pose_in_world_{name}").Eval(context)
-            color = self._EvalImage(context, f"color_image_{name}", rays)
+            color = self._EvalImage(context, f"color_image_{name}", rays) if in_color else None
             depth = self._EvalImage(context, f"depth_image_{name}", rays)
             X_WD = X_WB.multiply(self._X_BD[name]).GetAsMatrix4()
             views.append(View(color, depth[:, :, 0], X_WD, rays))

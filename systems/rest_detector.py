@@ -54,7 +54,7 @@ class _Boxes:
 
 
 def _gaps(
-    first: tuple[NDArray, NDArray, NDArray], second: tuple[NDArray, NDArray, NDArray]
+    first: Sequence[NDArray[np.float64]], second: Sequence[NDArray[np.float64]]
 ) -> NDArray[np.float64]:
     """(a, b) lower bounds of the distances of a boxes from b others, in metres.
 
@@ -146,8 +146,9 @@ class RestDetector(LeafSystem):
         anchors = discrete_state.get_mutable_value(self._anchors).reshape(n, 3, 4)
         still_for = discrete_state.get_mutable_value(self._still_for)
         moved = X[:n] - anchors
-        stayed = (np.linalg.norm(moved[:, :, 3], axis=1) <= self._position_tolerance) & (
-            np.linalg.norm(moved[:, :, :3], axis=(1, 2)) <= self._rotation_tolerance
+        squares = moved * moved
+        stayed = (squares[:, :, 3].sum(axis=1) <= self._position_tolerance**2) & (
+            squares[:, :, :3].sum(axis=(1, 2)) <= self._rotation_tolerance**2
         )
         anchors[~stayed] = X[:n][~stayed]
         still_for[:] = np.where(stayed, still_for + self._period, 0.0)
@@ -163,25 +164,26 @@ class RestDetector(LeafSystem):
             X: (bodies, 3, 4) X_WB of each.
             resting: (n,) written.
         """
-        n = self._count
-        rotations, centres, halves = self._wholes.posed(X)
-        near = (
-            _gaps((rotations[:n], centres[:n], halves[:n]), (rotations, centres, halves))
-            < self._wake_distance
-        )
+        if not resting.any():
+            return
+        rotations, centres, halves = boxes = self._wholes.posed(X)
+        reach = (np.abs(rotations) @ halves[:, :, None])[:, :, 0]
+        lower, upper = centres - reach, centres + reach + self._wake_distance
         # An awake object wakes its neighbours, and they theirs. That wholes are near is cheap to
-        # see; whether pieces are is looked at where it matters.
-        for _ in range(n):
-            awake = np.concatenate([~resting, np.ones(len(self._bodies) - n, bool)])
-            woken = False
-            for i, j in np.argwhere(near & resting[:, None] & awake):
-                if resting[i] and self._are_near(X, i, j):
-                    resting[i] = False
-                    woken = True
-                else:
-                    near[i, j] = False
-            if not woken:
+        # see, along the axes of the world cheapest; whether pieces are is looked at where it
+        # matters.
+        waking = np.append(~resting, np.ones(len(self._bodies) - self._count, bool))
+        while waking.any():
+            i, j = np.flatnonzero(resting), np.flatnonzero(waking)
+            near = (lower[i, None] < upper[j]) & (lower[j] < upper[i, None])
+            near = near.all(axis=2)
+            waking[:] = False
+            if not near.any():
                 break
+            near &= _gaps(*([part[k] for part in boxes] for k in (i, j))) < self._wake_distance
+            for a, b in np.argwhere(near):
+                if resting[i[a]] and self._are_near(X, i[a], j[b]):
+                    resting[i[a]], waking[i[a]] = False, True
 
     def _are_near(self, X: NDArray[np.float64], i: int, j: int) -> bool:
         """Whether pieces of two bodies are within the wake distance of each other."""

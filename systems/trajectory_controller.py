@@ -87,11 +87,13 @@ class TrajectoryController(LeafSystem):
                 raise ValueError(f"{name} must hold {HAND_AXES} numbers, not {np.shape(value)}")
         if np.any(np.asarray(force_limit) <= 0) or finger_force_limit <= 0:
             raise ValueError("force limits must be positive")
-        self._inertia = np.array(inertia)
-        self._gravity = np.array([0.0, 0.0, weight, 0.0])
-        self._stiffness = np.array(stiffness)
-        self._damping = np.array(damping)
-        self._force_limit = np.array(force_limit)
+        # Of each axis: inertia, weight, stiffness, damping and limit of the force.
+        self._axes = [
+            tuple(map(float, axis))
+            for axis in zip(
+                inertia, (0.0, 0.0, weight, 0.0), stiffness, damping, force_limit, strict=True
+            )
+        ]
         self._finger_stiffness = finger_stiffness
         self._finger_damping = finger_damping
         self._finger_force_limit = finger_force_limit
@@ -103,16 +105,19 @@ class TrajectoryController(LeafSystem):
         self.DeclareVectorOutputPort("actuation", HAND_AXES + FINGERS, self._calc_actuation)
 
     def _calc_actuation(self, context: Context, output: BasicVector) -> None:
-        state = self._hand_state.Eval(context)
-        # Sliced, not split: this runs at every step.
-        desired = self._desired_motion.Eval(context)
-        axes = (
-            self._inertia * desired[8:]
-            + self._gravity
-            + self._stiffness * (desired[:4] - state[:4])
-            + self._damping * (desired[4:8] - state[6:10])
-        )
-        opening, opening_rate = self._desired_opening.Eval(context)
+        # Plain numbers: this runs at every step, and arrays of four cost more than they save.
+        state = self._hand_state.Eval(context).tolist()
+        desired = self._desired_motion.Eval(context).tolist()
+        forces = []
+        for i, (inertia, weight, stiffness, damping, limit) in enumerate(self._axes):
+            force = (
+                inertia * desired[2 * HAND_AXES + i]
+                + weight
+                + stiffness * (desired[i] - state[i])
+                + damping * (desired[HAND_AXES + i] - state[HAND_AXES + FINGERS + i])
+            )
+            forces.append(min(max(force, -limit), limit))
+        opening, opening_rate = self._desired_opening.Eval(context).tolist()
         press = self._closing_force.Eval(context)[0] if self._closing_force.HasValue(context) else 0
         finger = (
             self._finger_stiffness * (opening - state[4] - state[5]) / 2
@@ -121,9 +126,4 @@ class TrajectoryController(LeafSystem):
         )
         limit = self._finger_force_limit
         finger = min(max(finger, -limit), limit)
-        output.SetFromVector(
-            [
-                *np.minimum(np.maximum(axes, -self._force_limit), self._force_limit).tolist(),
-                *[finger] * FINGERS,
-            ]
-        )
+        output.SetFromVector([*forces, *[finger] * FINGERS])

@@ -150,7 +150,7 @@ def _image_times(scenario: Scenario, seed: int) -> dict[str, float]:
                 sensor.GetOutputPort(port).Eval(sensor.GetMyContextFromRoot(context))
 
     def project() -> None:
-        projector.get_output_port().Eval(projector.GetMyContextFromRoot(context))
+        projector.GetOutputPort("observation").Eval(projector.GetMyContextFromRoot(context))
 
     render_times, project_times = [], []
     for second in range(6):

@@ -282,7 +282,9 @@ def _add_planner_and_controller(
     if policy.HasInputPort("failed_picks"):
         builder.Connect(planner.GetOutputPort("failed_picks"), policy.GetInputPort("failed_picks"))
     if projector is not None and scenario.policy.planner_observes:
-        builder.Connect(projector.GetOutputPort("observation"), planner.GetInputPort("observation"))
+        # Of the observation it reads the heights; colours are rendered only if the policy looks.
+        seen = "observation" if policy.HasInputPort("observation") else "heights"
+        builder.Connect(projector.GetOutputPort(seen), planner.GetInputPort("observation"))
     builder.Connect(hand_state, planner.GetInputPort("hand_state"))
     builder.Connect(
         plant.get_generalized_contact_forces_output_port(hand),

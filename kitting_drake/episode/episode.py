@@ -63,7 +63,7 @@ class EpisodeResult:
     sim_seconds: float
     wall_seconds: float
     point_contact_pairs: int
-    """The most pairs in point contact at any step."""
+    """The most pairs in point contact whenever the hand began something else."""
     moving_at_end: list[str]
     """The objects that had not come to rest when the episode ended."""
     failure: str | None
@@ -291,8 +291,6 @@ class _Monitor:
     def step(self, root_context: Context) -> EventStatus:
         """The callback that the simulator calls after every step."""
         cell = self._cell
-        results = self._contact_results.Eval(cell.plant.GetMyContextFromRoot(root_context))
-        self.point_contact_pairs = max(self.point_contact_pairs, results.num_point_pair_contacts())
         cell.apply_sleep(root_context)
         self.tell(root_context)
         if self._pauses:
@@ -311,9 +309,12 @@ class _Monitor:
 
     def tell(self, root_context: Context, *, is_last: bool = False) -> None:
         """Tells the observers, if the mode has changed or the episode is over."""
-        planner = self._cell.planner
+        plant, planner = self._cell.plant, self._cell.planner
         previous, self._mode = self._mode, planner.mode(planner.GetMyContextFromRoot(root_context))
         if is_last or self._mode != previous:
+            contact = self._contact_results.Eval(plant.GetMyContextFromRoot(root_context))
+            pairs = contact.num_point_pair_contacts()
+            self.point_contact_pairs = max(self.point_contact_pairs, pairs)
             event = ModeChange(
                 self._mode if is_last else previous, self._mode, root_context, is_last
             )

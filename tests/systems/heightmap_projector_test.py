@@ -194,10 +194,14 @@ def _small_camera():
 def _fix(projector, context, name, color, depth, X_WB):
     rgba = ImageRgba8U(color.shape[1], color.shape[0])
     rgba.mutable_data[:] = color
-    depth_32f = ImageDepth32F(depth.shape[1], depth.shape[0])
-    depth_32f.mutable_data[:, :, 0] = depth
-    for port, value in zip(INPUTS, (rgba, depth_32f, X_WB), strict=True):
+    for port, value in zip(INPUTS, (rgba, _depth(depth), X_WB), strict=True):
         projector.GetInputPort(f"{port}_{name}").FixValue(context, Value(value))
+
+
+def _depth(depth):
+    image = ImageDepth32F(depth.shape[1], depth.shape[0])
+    image.mutable_data[:, :, 0] = depth
+    return image
 
 
 def _small_projector(*names, grid=SMALL):
@@ -218,8 +222,8 @@ def test_ports():
     projector, _ = _small_projector("a", "b")
     names = [projector.get_input_port(i).get_name() for i in range(projector.num_input_ports())]
     assert names == [f"{name}_{camera}" for camera in "ab" for name in INPUTS]
-    assert projector.num_output_ports() == 1
-    assert projector.get_output_port().get_name() == "observation"
+    names = [projector.get_output_port(i).get_name() for i in range(projector.num_output_ports())]
+    assert names == ["observation", "heights"]
     with pytest.raises(ValueError, match="at least one camera"):
         HeightmapProjector(cameras={})
 
@@ -273,6 +277,20 @@ def test_only_cameras_that_see_the_top_give_it_color(lower, tints):
     image = _project((COLOR, depth), (2 * COLOR, depth + np.float32(lower)))
     share = 1.5 if tints else 1
     np.testing.assert_allclose(image[:, 1, 2], [*share * RGB[1, 2], 0.02], atol=1e-6)
+
+
+def test_heights_alone_need_no_color_image():
+    projector, context = _small_projector("a")
+    _fix(projector, context, "a", COLOR, 0.9 * FLAT, X_WB)
+    whole = projector.GetOutputPort("observation").Eval(context)
+    projector, context = _small_projector("a")
+    for port, value in (("depth_image_a", _depth(0.9 * FLAT)), ("body_pose_in_world_a", X_WB)):
+        projector.GetInputPort(port).FixValue(context, Value(value))
+    heights = projector.GetOutputPort("heights").Eval(context)
+    np.testing.assert_array_equal(heights.height, whole.height)
+    np.testing.assert_array_equal(heights.valid, whole.valid)
+    assert whole.rgb.any()
+    assert not heights.rgb.any()
 
 
 def test_unchanged_inputs_are_not_computed_again():

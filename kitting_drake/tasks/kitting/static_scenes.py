@@ -15,7 +15,6 @@ import numpy as np
 from manifold3d import CrossSection, Manifold
 from numpy.typing import NDArray
 from pydrake.common import MemoryFile
-from pydrake.common.value import Value
 from pydrake.geometry import (
     ColorRenderCamera,
     GeometryInstance,
@@ -27,8 +26,7 @@ from pydrake.geometry import (
 )
 from pydrake.math import RigidTransform, RollPitchYaw
 from pydrake.systems.framework import DiagramBuilder
-from pydrake.systems.primitives import ConstantValueSource
-from pydrake.systems.sensors import ImageRgba8U, RgbdSensor
+from pydrake.systems.sensors import RgbdSensor
 
 from kitting_drake.cell.cameras import (
     add_observation_renderer,
@@ -266,9 +264,6 @@ def render(
     cameras = {name: depth_camera(config, renderer) for name, config in configs.items()}
     projector = builder.AddSystem(HeightmapProjector(cameras=cameras, grid=grid))
     for number, (name, config) in enumerate(configs.items()):
-        black = builder.AddSystem(
-            ConstantValueSource(Value(ImageRgba8U(config.width, config.height)))
-        )
         sensor = builder.AddSystem(
             RgbdSensor(
                 parent_id=scene_graph.world_frame_id(),
@@ -281,20 +276,17 @@ def render(
             SensorNoise(parameters=noise, camera=cameras[name], seed=seed, number=number)
         )
         builder.Connect(scene_graph.get_query_output_port(), sensor.query_object_input_port())
-        builder.Connect(black.get_output_port(), imperfect.GetInputPort("color_image"))
-        for port in ("depth_image_32f", "body_pose_in_world"):
-            builder.Connect(sensor.GetOutputPort(port), imperfect.GetInputPort(port))
         for output, port in (
-            ("color_image", "color_image"),
             ("depth_image_32f", "depth_image"),
             ("body_pose_in_world", "body_pose_in_world"),
         ):
+            builder.Connect(sensor.GetOutputPort(output), imperfect.GetInputPort(output))
             builder.Connect(
                 imperfect.GetOutputPort(output), projector.GetInputPort(f"{port}_{name}")
             )
-    builder.ExportOutput(projector.GetOutputPort("observation"), "observation")
+    builder.ExportOutput(projector.GetOutputPort("heights"), "heights")
     diagram = builder.Build()
-    return diagram.GetOutputPort("observation").Eval(diagram.CreateDefaultContext())
+    return diagram.GetOutputPort("heights").Eval(diagram.CreateDefaultContext())
 
 
 def _box(box: DrawnBox) -> Manifold:
