@@ -37,14 +37,17 @@ class PickPlacePolicy(LeafSystem):
     what there is to remember comes in by a port.
     """
 
-    def __init__(self, *, policy: PolicyFunction) -> None:
+    def __init__(self, *, policy: PolicyFunction, heights_only: bool = False) -> None:
         """
         Args:
             policy: a function without memory. What it raises ends the evaluation of the port; an
                 answer that is no `PickPlaceAction` is a `TypeError`.
+            heights_only: whether the function looks at heights alone, so that observations may come
+                without colours.
         """
         super().__init__()
         self._policy = policy
+        self.heights_only = heights_only
         self._observation = self.DeclareAbstractInputPort("observation", Value(Observation()))
         tickets = {self._observation.ticket()}
         self._failed_picks = None

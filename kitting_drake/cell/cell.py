@@ -44,6 +44,7 @@ from kitting_drake.scenario.schema import Scenario
 from kitting_drake.tasks.task import Scene
 from systems.heightmap_projector import HeightmapProjector
 from systems.pick_place_planner import PickPlacePlanner
+from systems.pick_place_policy import PickPlacePolicy
 from systems.placement import PlacedObject, Placement
 from systems.placement_monitor import PlacementMonitor
 from systems.rest_detector import RestDetector
@@ -252,10 +253,18 @@ def _add_policy(
     policy = builder.AddNamedSystem("policy", scenario.policy.make_system(site))
     if policy.HasInputPort("observation"):
         assert projector is not None
-        builder.Connect(projector.GetOutputPort("observation"), policy.GetInputPort("observation"))
+        builder.Connect(projector.GetOutputPort(_sight(policy)), policy.GetInputPort("observation"))
     if policy.HasInputPort("body_poses"):
         builder.Connect(plant.get_body_poses_output_port(), policy.GetInputPort("body_poses"))
     return policy
+
+
+def _sight(policy: LeafSystem) -> str:
+    """The projector's port that policy and planner look at: in colour only if the policy sees it;
+    the planner reads heights."""
+    if isinstance(policy, PickPlacePolicy) and policy.heights_only:
+        return "heights"
+    return "observation" if policy.HasInputPort("observation") else "heights"
 
 
 def _add_planner_and_controller(
@@ -282,9 +291,8 @@ def _add_planner_and_controller(
     if policy.HasInputPort("failed_picks"):
         builder.Connect(planner.GetOutputPort("failed_picks"), policy.GetInputPort("failed_picks"))
     if projector is not None and scenario.policy.planner_observes:
-        # Of the observation it reads the heights; colours are rendered only if the policy looks.
-        seen = "observation" if policy.HasInputPort("observation") else "heights"
-        builder.Connect(projector.GetOutputPort(seen), planner.GetInputPort("observation"))
+        sight = projector.GetOutputPort(_sight(policy))
+        builder.Connect(sight, planner.GetInputPort("observation"))
     builder.Connect(hand_state, planner.GetInputPort("hand_state"))
     builder.Connect(
         plant.get_generalized_contact_forces_output_port(hand),

@@ -206,7 +206,9 @@ class Learned(PolicyConfig):
             )
         except ValueError as error:
             raise UserError(f"policy.orientations: {error}") from error
-        return PickPlacePolicy(policy=function)
+        # Who watches is shown colours, whatever the networks see.
+        heights_only = not networks.config.colour and site.observer is None
+        return PickPlacePolicy(policy=function, heights_only=heights_only)
 
     def details(self, base: Path) -> dict[str, Any]:
         from kitting_drake.policies.weights import preferred_type, read_weights_file
@@ -251,7 +253,8 @@ class ShapeMatching(PolicyConfig):
     def make_system(self, site: PolicySite) -> LeafSystem:
         from kitting_drake.policies.matching.policy import ShapeMatchingPolicy
 
-        return PickPlacePolicy(policy=ShapeMatchingPolicy(recover=self.recover))
+        function = ShapeMatchingPolicy(recover=self.recover)
+        return PickPlacePolicy(policy=function, heights_only=True)
 
     def details(self, base: Path) -> dict[str, Any]:
         return {"method": "shape_matching", "recover": self.recover}

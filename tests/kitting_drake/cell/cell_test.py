@@ -16,11 +16,19 @@ from kitting_drake.common.paths import MODELS
 from kitting_drake.policies.learned_policy import LearnedPolicy
 from kitting_drake.policies.weights import load_networks, preferred_type
 from kitting_drake.scenario import Scenario, load_scenario
-from kitting_drake.scenario.policies import Learned, PythonPolicy, QuantizedOracle
+from kitting_drake.scenario.policies import (
+    Learned,
+    Oracle,
+    PolicyConfig,
+    PythonPolicy,
+    QuantizedOracle,
+    ShapeMatching,
+)
 from kitting_drake.scenario.schema import Pinhole, Sleep
 from kitting_drake.tasks import Kitting
 from kitting_drake.tasks.ravens.palletizing_boxes import PalletizingBoxes
 from kitting_drake.tasks.task import TABLE
+from systems.heightmap_projector import HeightmapProjector
 from systems.placement import Placement
 from systems.signals import Observation, PickPlaceAction
 
@@ -266,6 +274,29 @@ def test_a_learned_policy_acts_upon_what_is_seen(weights_file: Path):
     # Nothing has changed: it is not asked again.
     assert port(cell, "action", context) == found
     assert len(told) == 1
+
+
+@pytest.mark.parametrize(
+    ("policy", "sight"),
+    [
+        (Oracle(), "heights"),
+        (ShapeMatching(), "heights"),
+        (Learned(), "heights"),
+        (PythonPolicy(function="systems.signals:PickPlaceAction"), "observation"),
+    ],
+)
+@pytest.mark.usefixtures("rendering")
+def test_colours_are_rendered_only_for_who_sees_them(policy: PolicyConfig, sight: str):
+    cell = build(Scenario(policy=policy, cameras=SMALL))
+    (projector,) = (
+        system for system in cell.diagram.GetSystems() if isinstance(system, HeightmapProjector)
+    )
+    lookers = [cell.planner.GetInputPort("observation")]
+    looks = cell.diagram.GetSubsystemByName("policy")
+    if looks.HasInputPort("observation"):
+        lookers.append(looks.GetInputPort("observation"))
+    for looker in lookers:
+        assert cell.diagram.AreConnected(projector.GetOutputPort(sight), looker)
 
 
 def test_a_policy_that_looks_needs_cameras_and_rendering(monkeypatch: pytest.MonkeyPatch):
