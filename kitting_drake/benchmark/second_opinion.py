@@ -30,6 +30,9 @@ _CONTACT_TIME = 0.004
 _FRICTION = 0.375
 """What Drake makes of a tool's 0.5 and a kit's 0.3: their harmonic mean. MuJoCo would take 0.5."""
 
+_MOST_FRUITLESS = 5
+"""So many episodes in a row in which nothing is let go of mean that the policy cannot do it."""
+
 
 @dataclass(frozen=True)
 class Release:
@@ -58,17 +61,23 @@ def ask_mujoco(
         What `benchmark mujoco` writes: the share of equal verdicts, and each placement.
 
     Raises:
-        UserError: the package mujoco is not installed.
+        UserError: the package mujoco is not installed; or the oracle lets go of nothing.
     """
     try:
         import mujoco
     except ImportError as error:
         raise UserError('MuJoCo is missing: pip install "kitting_drake[mujoco]"') from error
     rows: list[dict[str, Any]] = []
+    fruitless = 0
     with counting_bar(console, "placements") as progress:
         bar = progress.add_task("", total=placements)
         while len(rows) < placements:
             witness = _episode(seed, orientations)
+            fruitless = 0 if witness.releases else fruitless + 1
+            if fruitless == _MOST_FRUITLESS:
+                raise UserError(
+                    f"nothing was let go of in {fruitless} episodes: raise --orientations"
+                )
             for release in witness.releases.values():
                 rows.append(_row(seed, witness, release, _fall(mujoco, release)))
                 progress.update(bar, completed=len(rows))
