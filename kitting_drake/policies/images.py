@@ -9,6 +9,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from dataclasses import dataclass, field
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,6 +28,14 @@ _ROTATION_STD = math.radians(60)
 """Standard deviation of augmentation's rotations, in radians (as in the authors' code)."""
 _SHIFT_STD = 1 / 6
 """Standard deviation of augmentation's shifts, in sides of the image (as in the authors' code)."""
+
+
+class Pictured(Protocol):
+    """What has an image, made when it is asked for."""
+
+    @property
+    def image(self) -> Image:
+        """(4, rows, cols)."""
 
 
 @dataclass(frozen=True)

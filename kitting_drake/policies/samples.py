@@ -12,16 +12,43 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kitting_drake.policies.config import NetworkConfig
-from kitting_drake.policies.demonstrations import Demonstration, FinalObservation, Recorded
-from kitting_drake.policies.images import LabelledImage
+from kitting_drake.policies.demonstrations import Demonstration, FinalObservation
+from kitting_drake.policies.images import Image, LabelledImage, Pictured
+from kitting_drake.policies.matching.segmentation import fill_unseen
 from systems.signals import Observation, PickPlaceAction, PixelGrid
+
+
+@dataclass(frozen=True)
+class HeightsOnly:
+    """A recorded observation as networks that see heights alone are shown it."""
+
+    recorded: Pictured
+
+    @property
+    def image(self) -> Image:
+        """(4, rows, cols): black, and what no camera saw filled in; made anew each time."""
+        image = self.recorded.image
+        image[3] = fill_unseen(image[3], image.any(axis=0))
+        image[:3] = 0
+        return image
+
+
+def observed(image: Image, grid: PixelGrid) -> Observation:
+    """The observation of a recorded image.
+
+    Args:
+        image: (4, rows, cols). Where it is black, what was unseen has been filled in.
+        grid: its pixels.
+    """
+    valid = None if image[:3].any() else np.ones(image.shape[1:], bool)
+    return Observation(image, grid, valid)  # type: ignore[arg-type]
 
 
 @dataclass(frozen=True)
 class Scene:
     """One observation, and the actions that an expert may take next."""
 
-    recorded: Recorded
+    recorded: Pictured
     actions: tuple[PickPlaceAction, ...]
     """First the one that the expert took."""
     grid: PixelGrid
@@ -29,7 +56,7 @@ class Scene:
     @property
     def observation(self) -> Observation:
         """The observation; made anew each time."""
-        return Observation(self.recorded.image, self.grid)
+        return observed(self.recorded.image, self.grid)
 
     @property
     def targets(self) -> tuple[LabelledImage, ...]:

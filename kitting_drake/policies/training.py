@@ -11,8 +11,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from kitting_drake.policies.demonstrations import FinalObservation
-from kitting_drake.policies.images import Image, LabelledImage, Motion, augment
+from kitting_drake.policies.images import Image, LabelledImage, Motion, Pictured, augment
 from kitting_drake.policies.networks import Networks
 
 BETAS = (0.9, 0.999)
@@ -40,10 +39,10 @@ class _Prepared:
 
     step: int
     samples: Sequence[LabelledImage]
-    finals: Sequence[FinalObservation]
+    finals: Sequence[Pictured]
     draw: Future[_Draw]
 
-    def of(self, samples: Sequence[LabelledImage], finals: Sequence[FinalObservation]) -> bool:
+    def of(self, samples: Sequence[LabelledImage], finals: Sequence[Pictured]) -> bool:
         """Whether it is drawn from these very samples and final observations."""
         return self.samples is samples and self.finals is finals
 
@@ -107,7 +106,7 @@ class Trainer:
         return self.learning_rate * rise * 0.5 * (1 + math.cos(math.pi * share))
 
     def step(
-        self, samples: Sequence[LabelledImage], finals: Sequence[FinalObservation] = ()
+        self, samples: Sequence[LabelledImage], finals: Sequence[Pictured] = ()
     ) -> dict[str, float]:
         """One step on a sample that is drawn at random and augmented.
 
@@ -140,7 +139,7 @@ class Trainer:
         self.step_count += 1
         return values
 
-    def _take(self, samples: Sequence[LabelledImage], finals: Sequence[FinalObservation]) -> _Draw:
+    def _take(self, samples: Sequence[LabelledImage], finals: Sequence[Pictured]) -> _Draw:
         """What this step learns from; the preparation of what the next one does begins."""
         prepared = self._prepared
         if prepared and prepared.step == self.step_count and prepared.of(samples, finals):
@@ -153,7 +152,7 @@ class Trainer:
         return draw
 
     def _draw(
-        self, step: int, samples: Sequence[LabelledImage], finals: Sequence[FinalObservation]
+        self, step: int, samples: Sequence[LabelledImage], finals: Sequence[Pictured]
     ) -> _Draw:
         """What a step learns from: a sample at random, augmented, and perhaps what ends it all."""
         random = np.random.default_rng([self.seed, step])
@@ -167,9 +166,7 @@ class Trainer:
         stop_random = np.random.default_rng([self.seed, step, 1])
         return _Draw(sample, random, self._draw_final(finals, stop_random), stop_random)
 
-    def _draw_final(
-        self, finals: Sequence[FinalObservation], random: np.random.Generator
-    ) -> Image | None:
+    def _draw_final(self, finals: Sequence[Pictured], random: np.random.Generator) -> Image | None:
         """A final observation after a random motion, if this step has one."""
         if not (self.networks.config.stop and finals) or random.random() >= _STOP_PROBABILITY:
             return None

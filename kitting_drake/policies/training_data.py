@@ -18,9 +18,10 @@ from kitting_drake.policies.demonstrations import (
     Recorded,
     read_demonstrations,
 )
-from kitting_drake.policies.images import LabelledImage
+from kitting_drake.policies.images import LabelledImage, Pictured
 from kitting_drake.policies.learning import Learning
 from kitting_drake.policies.samples import (
+    HeightsOnly,
     Scene,
     final_observations,
     labelled_images,
@@ -89,18 +90,31 @@ class TrainingData:
             result.append(Scene(_recorded(Recorded, scene.image), actions, self.grid))
         return result
 
-    def finals(self, most: int | None = None) -> list[FinalObservation]:
-        """The observations in which there is nothing left to pick; `most` as for `scenes`."""
+    def finals(self, most: int | None = None, *, colour: bool = True) -> Sequence[Pictured]:
+        """The observations in which there is nothing left to pick; `most` as for `scenes`, `colour`
+        as for `samples`."""
         if not isinstance(self.items, StaticScenes):
-            return evenly_chosen(final_observations(self.items), most)
+            found = evenly_chosen(final_observations(self.items), most)
+            return found if colour else [HeightsOnly(final) for final in found]
         seated = [scene for scene in self.items.scenes if not len(scene.actions)]
         return [_recorded(FinalObservation, item.image) for item in evenly_chosen(seated, most)]
 
-    def samples(self, *, taken_only: bool) -> Sequence[LabelledImage]:
-        """What to learn from, of the observations in which there is something to pick."""
+    def samples(self, *, taken_only: bool, colour: bool = True) -> Sequence[LabelledImage]:
+        """What to learn from, of the observations in which there is something to pick.
+
+        Args:
+            taken_only: see `labelled_images`.
+            colour: whether the networks see colours. If not, they learn from what they will be
+                shown: what no camera saw is filled in.
+        """
         if isinstance(self.items, StaticScenes):
             return StaticSamples(self.items)
-        return labelled_images(self.scenes(), taken_only=taken_only)
+        found = self.scenes()
+        if not colour:
+            found = [
+                dataclasses.replace(scene, recorded=HeightsOnly(scene.recorded)) for scene in found
+            ]
+        return labelled_images(found, taken_only=taken_only)
 
     def shares_scenes(self, other: TrainingData) -> int | None:
         """A seed of which both hold the same scene; None if there is none."""

@@ -136,8 +136,8 @@ class TrainingRun:
         self.settings, self.folder, self.console = settings, folder, console
         self._log = folder / "log.jsonl"
         self.grid = learned.grid
-        self.samples = learned.samples(taken_only=settings.taken_only)
-        self.finals = learned.finals()
+        self.samples = learned.samples(taken_only=settings.taken_only, colour=settings.colour)
+        self.finals = learned.finals(colour=settings.colour)
         self.validation_scenes = held_out.scenes(_MOST_VALIDATED)
         self.validation_finals = held_out.finals(_MOST_VALIDATED)
         networks = _fresh(settings, learned) if start is None else load_trainable(start)

@@ -8,11 +8,9 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from kitting_drake.policies.demonstrations import FinalObservation
-from kitting_drake.policies.images import LabelledImage
+from kitting_drake.policies.images import LabelledImage, Pictured
 from kitting_drake.policies.learned_policy import Decision, LearnedPolicy
-from kitting_drake.policies.samples import Scene
-from systems.signals import Observation
+from kitting_drake.policies.samples import Scene, observed
 
 ERRORS = ("pick_mm", "pick_deg", "place_mm", "rotation_deg", "displacement_mm")
 """The names of what `prediction_errors` returns."""
@@ -88,7 +86,7 @@ def choose_stop_threshold(present: ArrayLike, absent: ArrayLike) -> float | None
 
 
 def validate(
-    policy: LearnedPolicy, scenes: Sequence[Scene], finals: Sequence[FinalObservation] = ()
+    policy: LearnedPolicy, scenes: Sequence[Scene], finals: Sequence[Pictured] = ()
 ) -> dict[str, float]:
     """Validates a policy on scenes with something to pick, and on final observations.
 
@@ -110,7 +108,7 @@ def validate(
     errors, present = [], []
     for scene in scenes:
         targets = scene.targets
-        decision = policy.decide(Observation(targets[0].image, scene.grid))
+        decision = policy.decide(observed(targets[0].image, scene.grid))
         errors.append(prediction_errors(decision, targets, 1e3 * scene.grid.resolution))
         present.append(decision.log_odds)
     table = np.array(errors)
@@ -121,7 +119,7 @@ def validate(
         report[f"p95_{name}"] = float(np.percentile(column, 95))
     report["cost_mm"] = report["displacement_mm"]
     grid = scenes[0].grid
-    absent = [policy.log_odds(Observation(final.image, grid)) for final in finals]
+    absent = [policy.log_odds(observed(final.image, grid)) for final in finals]
     # Where the networks cannot tell, there are no odds.
     if absent and None not in (*present, *absent):
         report |= _stop_report(np.array(present, float), np.array(absent, float), displacements)

@@ -3,6 +3,7 @@ import math
 import numpy as np
 import pytest
 
+from kitting_drake.policies import samples
 from kitting_drake.policies.demonstrations import (
     Demonstration,
     DemonstrationStep,
@@ -10,6 +11,7 @@ from kitting_drake.policies.demonstrations import (
     record,
 )
 from kitting_drake.policies.samples import (
+    HeightsOnly,
     Scene,
     final_observations,
     labelled_images,
@@ -106,3 +108,36 @@ def test_constant_inputs_are_not_divided_by_zero():
     assert (found["colour_mean"], found["height_mean"]) == (0, 0)
     assert math.isfinite(1 / found["colour_std"])
     assert math.isfinite(1 / found["height_std"])
+
+
+def with_a_hole() -> np.ndarray:
+    """A coloured plate of 20 mm on a coloured table, and in the plate a pixel that nobody saw."""
+    image = np.full((4, *GRID.shape), 0.5, np.float32)
+    image[3] = 0.0
+    image[3, 5:12, 5:12] = 0.02
+    image[:, 8, 8] = 0.0
+    return image
+
+
+def test_networks_without_colours_learn_from_what_they_will_be_shown():
+    whole = with_a_hole()
+    recorded = FinalObservation.of(Observation(whole, GRID))
+    shown = HeightsOnly(recorded).image
+    expected = whole[3].copy()
+    expected[8, 8] = 0.02
+    np.testing.assert_array_equal(shown[3], expected)
+    assert not shown[:3].any()
+    action = PickPlaceAction(PlanarPose(*GRID.to_world((6, 6)), 0.0), PlanarPose())
+    (sample,) = labelled_images([Scene(HeightsOnly(recorded), (action,), GRID)], taken_only=True)
+    np.testing.assert_array_equal(sample.image, shown)
+
+
+def test_in_a_black_image_nothing_is_unseen():
+    """The table is at height zero, and is not to be filled in with what stands beside it."""
+    assert not samples.observed(with_a_hole(), GRID).valid[8, 8]
+    black = with_a_hole()
+    black[:3] = 0.0
+    assert samples.observed(black, GRID).valid.all()
+    assert Scene(
+        HeightsOnly(FinalObservation.of(Observation(black, GRID))), (), GRID
+    ).observation.valid.all()
