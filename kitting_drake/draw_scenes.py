@@ -1,6 +1,7 @@
 """`python -m kitting_drake.draw_scenes`: static scenes of random tools, to train a generalist."""
 
 import argparse
+import itertools
 import os
 from pathlib import Path
 
@@ -69,18 +70,21 @@ class _Parts:
         begun = set(self._counts)
 
         def next_batch() -> int | None:
-            if sum(self._counts.values()) >= count:
+            if self._gapless() >= count:
                 return None
             batch = next(i for i in range(_MOST_BATCHES) if i not in begun)
+            # With what is at work there may be enough before this one already.
+            if sum(self._counts.values()) >= count and batch > max(self._counts):
+                return None
             begun.add(batch)
             return batch
 
         def draw(batch: int) -> tuple[int, int | ProcessCrashed]:
-            return batch, workers.run(_draw_part, self.path(batch), self._seed + batch)
+            seed = _MOST_BATCHES * self._seed + batch
+            return batch, workers.run(_draw_part, self.path(batch), seed)
 
         with counting_bar(console, "scenes") as progress:
-            drawn = min(count, sum(self._counts.values()))
-            task = progress.add_task("", total=count, completed=drawn)
+            task = progress.add_task("", total=count, completed=min(count, self._gapless()))
             for batch, outcome in side_by_side(draw, next_batch, workers=workers):
                 if isinstance(outcome, ProcessCrashed):
                     raise UserError(
@@ -88,7 +92,12 @@ class _Parts:
                         f"(exit code {outcome.exit_code}): the same command goes on there"
                     )
                 self._counts[batch] = outcome
-                progress.update(task, completed=min(count, sum(self._counts.values())))
+                progress.update(task, completed=min(count, self._gapless()))
+
+    def _gapless(self) -> int:
+        """How many scenes the batches without a gap before them hold."""
+        batches = itertools.takewhile(self._counts.__contains__, itertools.count())
+        return sum(self._counts[batch] for batch in batches)
 
     def assemble(self, count: int, path: Path) -> list:
         """Writes the one file of the first so many scenes; returns them."""

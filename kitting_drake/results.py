@@ -15,6 +15,7 @@ from pathlib import Path
 from rich.console import Console
 
 from kitting_drake.common.command_line import run_command
+from kitting_drake.common.errors import UserError
 from kitting_drake.common.files import write_atomically
 from kitting_drake.paper.cells import RATES
 from kitting_drake.paper.figure import draw_figure_6
@@ -49,7 +50,10 @@ def main() -> int:
     link = os.path.relpath(arguments.results, arguments.output.parent)
     answers = read_results(arguments.results / "paper")
     rates_file = arguments.results / "paper" / RATES
-    rates = json.loads(rates_file.read_text()) if rates_file.exists() else {}
+    try:
+        rates = json.loads(rates_file.read_text()) if rates_file.exists() else {}
+    except (OSError, ValueError) as error:
+        raise UserError(f"{rates_file} is damaged: delete it") from error
     page = results_page(runs, link, paper_sections(answers, rates, link))
     write_atomically(arguments.output, page)
     _draw(answers, arguments.output.parent)

@@ -33,6 +33,12 @@ def main() -> int:
         return 0
     learned, held_out = _split(arguments.demos, arguments.demonstrations, arguments.validation)
     settings = _settings(arguments, learned, held_out)
+    _check_validation(settings, held_out, arguments.validation or arguments.demos)
+    if arguments.export:
+        # Not after hours.
+        from kitting_drake.policies.onnx_export import require_onnx
+
+        require_onnx()
     folder = require_folder(
         arguments.output or Path("output") / f"{learned.scenario}-training".replace(" ", "_")
     )
@@ -100,6 +106,17 @@ def _checked_start(arguments: argparse.Namespace, learned: TrainingData) -> Netw
     if config.colour and not learned.colour:
         raise UserError(f"{arguments.start} looks at colours, and {arguments.demos} has none")
     return config
+
+
+def _check_validation(settings: Settings, held_out: TrainingData, path: Path) -> None:
+    """Raises UserError where no checkpoint, or no threshold for stopping, can be chosen by it."""
+    if settings.colour and not held_out.colour:
+        raise UserError(f"{path} has no colours, and the networks look at them: validate by others")
+    if settings.stop and not held_out.finals(1):
+        raise UserError(
+            f"of the demonstrations in {path} to validate by, none ends with nothing left to pick: "
+            "the policy would never stop: give others by --validation"
+        )
 
 
 def _digest(path: Path) -> str:
@@ -178,6 +195,8 @@ def _parse() -> argparse.Namespace:
         parser.error("--demos says what to learn from")
     if arguments.demos is None and not (arguments.weights or arguments.output):
         parser.error("--export needs --demos to train first, or --output or --weights to export")
+    if arguments.demos and arguments.export and arguments.method == "transporter":
+        parser.error("--export onnx: a transporter cannot be exported")
     if arguments.weights and (arguments.demos or not arguments.export):
         parser.error("--weights is for --export without --demos")
     return arguments

@@ -23,3 +23,5 @@ FINGERTIP_DISTANCE = 0.1121
 """Distance of the fingertip ends from the hand's flange, along G's z."""
 FINGER_BASE_DISTANCE = 0.0584
 """Distance of the origin of the finger meshes from the hand's flange, along G's z."""
+JOINT_LIMITS = {"x": (-1.0, 1.5), "y": (-1.5, 1.5), "z": (-0.05, 1.2), "yaw": (-3.5, 3.5)}
+"""Lowest and highest position of the joints that move G, in metres and rad."""

@@ -23,7 +23,8 @@ class InsertionSearch:
     ends."""
 
     # How far the hand rotates to and fro, in rad: a tool that the closing jaws rotated a little
-    # slips into its cavity then. At zero there is no search: it is let go where it is.
+    # slips into its cavity then. At zero it does not; with `reach` zero too there is no search: it
+    # is let go where it is.
     amplitude: float = bounded(0.12, 0.0, 0.5)
 
     # How far from the place it strays, in m: about what calibration may be off. At zero it rotates

@@ -448,7 +448,7 @@ class PickPlacePlanner(LeafSystem):
         elif mode == Mode.SEARCH:
             x, y, yaw = parameters.search.offset(int(state.search_step))
             state.goal_x, state.goal_y = state.place_x + x, state.place_y + y
-            state.goal_yaw = state.place_yaw + yaw
+            state.goal_yaw = min(max(state.place_yaw + yaw, -_YAW_LIMIT), _YAW_LIMIT)
             state.goal_z = state.touch_z - parameters.search.press
         elif mode == Mode.RELEASE:
             state.goal_opening = min(

@@ -6,14 +6,16 @@ import inspect
 from collections.abc import Callable
 from typing import Any
 
+import numpy as np
 from pydrake.common.value import AbstractValue, Value
 from pydrake.systems.framework import Context, LeafSystem
 
 from systems.signals import Observation, PickPlaceAction
 
 PolicyFunction = Callable[..., PickPlaceAction]
-"""Called with an `Observation`; and, if it takes a second argument, with a tuple of the
-`PlanarPose`s at which a grasp failed before, the latest last; without it where none is known."""
+"""Called with an `Observation`; and, if it takes a second argument `failed_picks`, with a tuple of
+the `PlanarPose`s at which a grasp failed before, the latest last; without it where none is known.
+A second argument of any other name is taken for it too, unless it has a default."""
 
 
 class PickPlacePolicy(LeafSystem):
@@ -41,7 +43,8 @@ class PickPlacePolicy(LeafSystem):
         """
         Args:
             policy: a function without memory. What it raises ends the evaluation of the port; an
-                answer that is no `PickPlaceAction` is a `TypeError`.
+                answer that is no `PickPlaceAction` is a `TypeError`, one whose poses are no finite
+                numbers a `ValueError`.
             heights_only: whether the function looks at heights alone, so that observations may come
                 without colours.
         """
@@ -68,15 +71,21 @@ class PickPlacePolicy(LeafSystem):
                 f"the policy {self._policy!r} answered with {type(action).__name__}, "
                 "not a PickPlaceAction"
             )
+        poses = np.concatenate([action.pick.as_array(), action.place.as_array()])
+        if not (action.stop or np.isfinite(poses).all()):
+            raise ValueError(
+                f"the policy {self._policy!r} answered with no finite numbers: {action}"
+            )
         output.set_value(action)
 
 
 def _takes_two(policy: Callable[..., Any]) -> bool:
-    """Whether a function takes a second argument by its place."""
+    """Whether a function takes a second argument, by its place, that is for failed picks."""
     try:
         parameters = list(inspect.signature(policy).parameters.values())
     except (TypeError, ValueError):
         # Some built-in functions do not tell.
         return False
     placed = (inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD)
-    return sum(item.kind in placed for item in parameters) >= 2
+    second = [item for item in parameters if item.kind in placed][1:2]
+    return any(item.name == "failed_picks" or item.default is item.empty for item in second)

@@ -152,7 +152,7 @@ class RestDetector(LeafSystem):
         )
         anchors[~stayed] = X[:n][~stayed]
         still_for[:] = np.where(stayed, still_for + self._period, 0.0)
-        resting = still_for >= self._time_to_sleep - self._period / 2
+        resting = stayed & (still_for >= self._time_to_sleep - self._period / 2)
         self._wake(X, resting)
         discrete_state.get_mutable_value(self._at_rest)[:] = resting
         return EventStatus.Succeeded()

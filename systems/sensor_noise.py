@@ -88,7 +88,7 @@ class SensorNoise(LeafSystem):
 
         name: SensorNoise
         input_ports:
-        - color_image
+        - color_image (optional)
         - depth_image_32f
         - label_image (optional)
         - body_pose_in_world

@@ -9,7 +9,7 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
-from kitting_drake.common.command_line import count_type, run_command, seed_type
+from kitting_drake.common.command_line import FAILED, count_type, run_command, seed_type
 from kitting_drake.common.errors import UserError
 from kitting_drake.common.files import require_folder, write_atomically, write_json
 from kitting_drake.scenario.command_line import add_scenario_flags, choose_scenario
@@ -20,16 +20,16 @@ def main() -> int:
     arguments = _parser().parse_args()
     console = Console(quiet=arguments.quiet)
     folder = require_folder(arguments.output)
+    if arguments.benchmark == "paper":
+        return _paper(arguments, console, folder)
     measure = {
         "simulation": _simulation,
         "networks": _networks,
         "kits": _kits,
         "recovery": _recovery,
         "mujoco": _mujoco,
-        "paper": _paper,
     }[arguments.benchmark]
-    tables = measure(arguments, console, folder)
-    for table in tables:
+    for table in measure(arguments, console, folder):
         console.print(table)
     console.print(f"files: {folder}/", highlight=False, markup=False)
     return 0
@@ -156,15 +156,20 @@ def _mujoco(arguments: argparse.Namespace, console: Console, folder: Path) -> li
     return [opinion_table(measured)]
 
 
-def _paper(arguments: argparse.Namespace, console: Console, folder: Path) -> list[Table]:
+def _paper(arguments: argparse.Namespace, console: Console, folder: Path) -> int:
+    """Fills the paper's cells; returns the exit code."""
     from kitting_drake.paper.cells import paper_cells
     from kitting_drake.paper.queue import run_paper
 
     cells = [cell for cell in paper_cells() if fnmatch(cell.name, arguments.cells)]
     if not cells:
         raise UserError(f"--cells: there is no cell of the name '{arguments.cells}'")
-    table = run_paper(folder / "paper", arguments.results, cells, arguments.workers, console)
-    return [table]
+    failures = run_paper(folder / "paper", arguments.results, cells, arguments.workers, console)
+    table = Table("cell", "state", title="the paper's experiments")
+    for cell in cells:
+        table.add_row(cell.name, failures.get(cell.name, "done"))
+    console.print(table)
+    return FAILED if failures else 0
 
 
 def _use_one_core() -> None:

@@ -12,6 +12,7 @@ from rich.table import Table
 
 from kitting_drake.cell import Cell, build_cell
 from kitting_drake.common.errors import UserError
+from kitting_drake.common.extras import import_extra
 from kitting_drake.common.processes import counting_bar
 from kitting_drake.episode import ModeChange, run_episode
 from kitting_drake.episode.action_log import nearest_object
@@ -63,10 +64,7 @@ def ask_mujoco(
     Raises:
         UserError: the package mujoco is not installed; or the oracle lets go of nothing.
     """
-    try:
-        import mujoco
-    except ImportError as error:
-        raise UserError('MuJoCo is missing: pip install "kitting_drake[mujoco]"') from error
+    mujoco = import_extra("mujoco", purpose="benchmark mujoco", extra="mujoco")
     rows: list[dict[str, Any]] = []
     fruitless = 0
     with counting_bar(console, "placements") as progress:

@@ -393,7 +393,8 @@ def _add_cameras(
 def _add_video(builder: DiagramBuilder, scene_graph: SceneGraph, path: Path) -> VideoWriter:
     core = picture_camera(add_film_renderer(scene_graph), width=640, height=400)
     sensor = builder.AddNamedSystem(
-        "camera_video",
+        # No camera of a scenario can be called so.
+        "film_camera",
         RgbdSensor(
             parent_id=scene_graph.world_frame_id(),
             X_PB=camera_pose(OVERVIEW),

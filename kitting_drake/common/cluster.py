@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any, Self, TypeVar
 
 from kitting_drake.common.errors import UserError
+from kitting_drake.common.extras import import_extra
 from kitting_drake.common.processes import ProcessCrashed, run_in_subprocess
 from kitting_drake.common.provenance import versions
 
@@ -67,12 +68,7 @@ class RayWorkers:
         """
         # When a node dies, Ray prints why; without this, pages of that node's log, too.
         os.environ.setdefault("RAY_DEDUP_LOGS_SKIP_REGEX", "Raylet is terminated")
-        try:
-            self._ray = importlib.import_module("ray")
-        except ImportError as error:
-            raise UserError(
-                "--ray needs Ray, which is not installed: pip install 'kitting_drake[cluster]'"
-            ) from error
+        self._ray = import_extra("ray", purpose="--ray", extra="cluster")
         address = _find_cluster(self._address)
         try:
             self._ray.init(

@@ -4,5 +4,5 @@
 class UserError(ValueError):
     """Input that cannot be used. Its text is one sentence: what is wrong, where, what would do.
 
-    Verbs print it and leave with exit code 2.
+    Commands print it and leave with exit code 2.
     """

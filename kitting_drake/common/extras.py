@@ -5,6 +5,16 @@ from types import ModuleType
 
 from kitting_drake.common.errors import UserError
 
+EXTRAS = {
+    "cluster": ("ray[client]>=2.50",),
+    "fabrication": ("ezdxf>=1.4", "svgelements>=1.9.6"),
+    "gym": ("gymnasium>=1.0",),
+    "lerobot": ("pyarrow>=21,<26",),
+    "mujoco": ("mujoco>=3.2,<4",),
+    "onnx": ("ml_dtypes<0.6", "onnx>=1.17", "onnxruntime>=1.20"),
+}
+"""What each extra brings, as pyproject.toml has it."""
+
 
 def import_extra(package: str, *modules: str, purpose: str, extra: str) -> ModuleType:
     """A package that may be missing, with some of its modules imported.
@@ -16,14 +26,13 @@ def import_extra(package: str, *modules: str, purpose: str, extra: str) -> Modul
         extra: the project's extra that brings it.
 
     Raises:
-        UserError: it is not installed.
+        UserError: it is not installed; says by what command it would be.
     """
     try:
         found = importlib.import_module(package)
         for module in modules:
             importlib.import_module(f"{package}.{module}")
     except ImportError as error:
-        raise UserError(
-            f"{purpose} needs the package {package}: pip install 'kitting_drake[{extra}]'"
-        ) from error
+        packages = " ".join(f"'{requirement}'" for requirement in EXTRAS[extra])
+        raise UserError(f"{purpose} needs the package {package}: pip install {packages}") from error
     return found

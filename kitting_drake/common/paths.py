@@ -1,4 +1,4 @@
-"""Where the project's files are, in a checkout in an installed wheel, and its cache."""
+"""Where the project's files are, in a checkout or in an installed wheel, and its cache."""
 
 import os
 from pathlib import Path

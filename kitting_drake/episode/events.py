@@ -12,8 +12,8 @@ from systems.pick_place_parameters import Mode
 class ModeChange:
     """The planner has gone from one mode to another; or, at its end, the episode is over.
 
-    The plant steps first, then the planner decides upon the outcome: when this is told, what it
-    decided upon is still there, and the ports say the same again.
+    The planner decides, then the plant steps once more before this is told. Things have hardly
+    moved since; but ports that depend on time, such as the noise of cameras, are evaluated anew.
     """
 
     previous: Mode

@@ -6,6 +6,8 @@ looks for no entry points of installed packages any more, from its version 1.0 o
 
 import gymnasium
 
+from kitting_drake.common import paths
+
 SCENARIOS = {
     "KittingSeen": ("kitting_seen.yaml", "KittingSeenToolset"),
     "KittingUnseen": ("kitting_unseen.yaml", "KittingUnseenToolsets"),
@@ -26,7 +28,10 @@ def _register_environments() -> None:
             f"kitting_drake/{name}-v0",
             # Drake is slow to load: it is, once an environment is made.
             entry_point="kitting_drake.gym.environment:KittingEnvironment",
-            kwargs={} if file is None else {"scenario": file, "scenario_name": scenario},
+            # By its path: a file of that name in the working directory is another.
+            kwargs={}
+            if file is None
+            else {"scenario": str(paths.SCENARIOS / file), "scenario_name": scenario},
         )
 
 

@@ -18,7 +18,6 @@ from pathlib import Path
 from typing import Any
 
 from rich.console import Console
-from rich.table import Table
 
 from kitting_drake.common.errors import UserError
 from kitting_drake.common.files import require_folder, write_atomically, write_json
@@ -172,7 +171,10 @@ class Queue:
             summary = json.loads(weights.with_name("summary.json").read_text())
             costs[rate] = summary["best"]["cost_mm"]
         path = self.results / RATES
-        known = json.loads(path.read_text()) if path.exists() else {}
+        try:
+            known = json.loads(path.read_text()) if path.exists() else {}
+        except (OSError, ValueError) as error:
+            raise UserError(f"{path} is damaged: delete it") from error
         found = known | {method: {f"{rate:g}": cost for rate, cost in costs.items()}}
         if found != known:
             write_json(path, dict(sorted(found.items())))
@@ -245,11 +247,11 @@ def _end(process: subprocess.Popen[str]) -> None:
 
 def run_paper(
     folder: Path, results: Path, cells: Sequence[Cell], workers: int, console: Console
-) -> Table:
+) -> dict[str, str]:
     """Fills cells; see `Queue.run`.
 
     Returns:
-        What is done, and what failed.
+        For each cell that could not be filled, by its name, why.
 
     Raises:
         UserError: a result is not that of its cell, or a folder cannot be written to.
@@ -258,10 +260,6 @@ def run_paper(
     # Whoever ends it, ends what it has begun too: that would keep the next queue out.
     before = signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))
     try:
-        failures = queue.run(cells)
+        return queue.run(cells)
     finally:
         signal.signal(signal.SIGTERM, before)
-    table = Table("cell", "state", title="the paper's experiments")
-    for cell in cells:
-        table.add_row(cell.name, failures.get(cell.name, "done"))
-    return table

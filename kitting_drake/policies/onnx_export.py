@@ -7,12 +7,14 @@ import dataclasses
 import tempfile
 import warnings
 from pathlib import Path
+from types import ModuleType
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
 from kitting_drake.common.errors import UserError
+from kitting_drake.common.extras import import_extra
 from kitting_drake.common.files import require_folder, write_atomically, write_json
 from kitting_drake.policies import config as sizes
 from kitting_drake.policies.networks import FactoredNetworks
@@ -40,6 +42,15 @@ class _Blur(nn.Module):
         return halved.reshape(features.shape[0], -1, halved.shape[2], halved.shape[3])
 
 
+def require_onnx() -> ModuleType:
+    """The package onnx.
+
+    Raises:
+        UserError: it is not installed.
+    """
+    return import_extra("onnx", purpose="--export onnx", extra="onnx")
+
+
 def export_onnx(weights: Path, folder: Path) -> list[Path]:
     """Writes the networks of a weights file as ONNX, in float32, and `policy.json`.
 
@@ -61,10 +72,7 @@ def export_onnx(weights: Path, folder: Path) -> list[Path]:
     networks = load_networks(weights)
     if not isinstance(networks, FactoredNetworks):
         raise UserError(f"{weights}: a {networks.config.method} cannot be exported as ONNX")
-    try:
-        import onnx
-    except ImportError as error:
-        raise UserError('--export onnx needs onnx: pip install "kitting_drake[onnx]"') from error
+    onnx = require_onnx()
     require_folder(folder)
     config = networks.config
     written = []

@@ -2,6 +2,7 @@
 
 import dataclasses as dc
 import typing
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,7 @@ from kitting_drake.scenario.schema import LookAt, Scenario
 from kitting_drake.scenario.yaml_check import check_yaml
 from kitting_drake.tasks import Task
 from systems.bounds import check_bounds
+from systems.hand_geometry import JOINT_LIMITS
 
 
 def load_scenario(
@@ -95,14 +97,12 @@ def _onto(raw: dict, defaults: Scenario) -> tuple[dict, Scenario]:
     task = tagged.get("task")
     if isinstance(task, dict):
         defaults = dc.replace(defaults, task=_without_mappings(task, defaults.task))
-    cameras = raw.get("cameras")
-    if isinstance(cameras, dict):
-        tagged["cameras"] = {
-            name: _of_variant(camera, defaults.cameras[name])
-            if name in defaults.cameras
-            else camera
-            for name, camera in cameras.items()
-        }
+    if "cameras" in raw:
+        tagged["cameras"] = _of_variants(raw["cameras"], defaults.cameras)
+    appearance = raw.get("appearance")
+    if isinstance(appearance, dict) and "paints" in appearance:
+        paints = _of_variants(appearance["paints"], defaults.appearance.paints)
+        tagged["appearance"] = {**appearance, "paints": paints}
     return tagged, defaults
 
 
@@ -124,6 +124,16 @@ def _without_mappings(given: dict, current: Task) -> Task:
 def _of_variant(given: object, current: object) -> object:
     """A mapping with the tag of a variant, if it has none of its own."""
     return {"_tag": f"!{type(current).__name__}", **given} if isinstance(given, dict) else given
+
+
+def _of_variants(given: object, current: Mapping[str, object]) -> object:
+    """The same for each of a mapping's values that there is already."""
+    if not isinstance(given, dict):
+        return given
+    return {
+        name: _of_variant(value, current[name]) if name in current else value
+        for name, value in given.items()
+    }
 
 
 def _check_names(node: yaml.Node | None) -> None:
@@ -191,6 +201,14 @@ def _check_meaning(scenario: Scenario) -> None:
         raise ValueError(
             "planner.home[2] is below planner.floor_clearance: the hand would begin in the table"
         )
+    for index, (axis, (low, high)) in enumerate(JOINT_LIMITS.items()):
+        if not low <= planner.home[index] <= high:
+            raise ValueError(
+                f"planner.home[{index}] is {planner.home[index]:g}, beyond the hand's {axis}, "
+                f"{low:g} to {high:g}"
+            )
+    if planner.grasp_depth > planner.max_grasp_depth:
+        raise ValueError("planner.grasp_depth is more than planner.max_grasp_depth")
     for name in ("grasp_force", "firm_grasp_force"):
         force = getattr(planner, name)
         if force > scenario.controller.finger_force_limit:

@@ -40,6 +40,9 @@ def check_yaml(schema: Any, value: Any, where: str) -> None:
         for key, item in value.items():
             check_yaml(typing.get_args(schema)[1], item, _join(where, key))
     elif dataclasses.is_dataclass(schema):
+        if isinstance(value, dict) and "_tag" in value:
+            tag = str(value["_tag"]).lstrip("!")
+            raise ValueError(f"{where or 'the scenario'} has the tag !{tag}, and takes none")
         _check_dataclass(schema, value, where)
     else:
         _check_scalar(schema, value, where)
@@ -58,7 +61,7 @@ def _check_union(schema: Any, value: Any, where: str) -> None:
     tag = str(value.get("_tag", options[0].__name__)).lstrip("!")
     for option in options:
         if option.__name__ == tag:
-            check_yaml(option, value, where)
+            _check_dataclass(option, value, where)
             return
     known = ", ".join(f"!{option.__name__}" for option in options)
     raise ValueError(f"{where} has the unknown tag !{tag}: use one of {known}")

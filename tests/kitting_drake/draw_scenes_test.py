@@ -1,11 +1,21 @@
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
+from rich.console import Console
 
 from kitting_drake import draw_scenes
 from kitting_drake.cell.cameras import can_render
-from kitting_drake.policies.static_scenes import read_static_scenes
+from kitting_drake.policies.static_scenes import (
+    StaticScene,
+    StaticScenes,
+    read_static_scenes,
+    write_static_scenes,
+)
+from systems.signals import PixelGrid
+
+GRID = PixelGrid()
 
 pytestmark = pytest.mark.skipif(not can_render(), reason="images cannot be rendered here")
 
@@ -13,6 +23,37 @@ pytestmark = pytest.mark.skipif(not can_render(), reason="images cannot be rende
 def run(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> int:
     monkeypatch.setattr(sys, "argv", ["draw_scenes", *arguments])
     return draw_scenes.main()
+
+
+class AtOnce:
+    """A worker that writes twenty scenes of its seed at once."""
+
+    def capacity(self) -> int:
+        return 1
+
+    def run(self, _, path: Path, seed: int) -> int:
+        rng = np.random.default_rng(seed)
+        scene = StaticScene(rng.integers(9, size=GRID.shape, dtype=np.uint16), np.zeros((0, 8)))
+        write_static_scenes(path, StaticScenes(GRID, (scene,) * 20, seed))
+        return 20
+
+    def stop(self) -> None: ...
+
+
+def test_a_batch_that_is_missing_is_drawn_again_and_seeds_share_nothing(tmp_path: Path):
+    console = Console(quiet=True)
+    parts = draw_scenes._Parts(tmp_path, seed=0)
+    parts.draw(40, AtOnce(), console)
+    parts.path(0).unlink()
+    again = draw_scenes._Parts(tmp_path, seed=0)
+    again.draw(20, AtOnce(), console)
+    assert parts.path(0).exists()
+    other = tmp_path / "other"
+    other.mkdir()
+    draw_scenes._Parts(other, seed=1).draw(20, AtOnce(), console)
+    (one,) = read_static_scenes(other / "batch_000000.h5").scenes[:1]
+    (two,) = read_static_scenes(parts.path(1)).scenes[:1]
+    assert (one.height != two.height).any()
 
 
 @pytest.mark.slow

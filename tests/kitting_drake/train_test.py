@@ -28,6 +28,7 @@ from kitting_drake.policies.demonstrations import (
     Origin,
     write_demonstrations,
 )
+from kitting_drake.policies.static_scenes import StaticScene, StaticScenes, write_static_scenes
 from kitting_drake.policies.training import Trainer
 from kitting_drake.policies.weights import load_networks, read_weights_file
 from systems.signals import Observation, PickPlaceAction, PixelGrid, PlanarPose
@@ -373,6 +374,34 @@ def test_unsuitable_validation_demonstrations_are_refused(
     seeds, origin, sentence = VALIDATIONS[case]
     path = write(tmp_path / "validation.h5", seeds, origin)
     assert sentence in refused(demos, tmp_path / "run", "--validation", path)
+
+
+def test_a_policy_that_would_never_stop_is_not_trained(
+    demos: Path, tmp_path: Path, refused: Callable[..., str]
+):
+    path = tmp_path / "validation.h5"
+    write_demonstrations(path, ORIGIN, [demonstration(20, final=False)])
+    told = refused(demos, tmp_path / "run", "--validation", path)
+    assert "none ends with nothing left to pick: the policy would never stop" in told
+
+
+def test_networks_that_see_colours_are_not_validated_without(
+    demos: Path, tmp_path: Path, refused: Callable[..., str]
+):
+    path = tmp_path / "scenes.h5"
+    scene = StaticScene(np.zeros(GRID.shape, np.uint16), np.zeros((1, 8)))
+    write_static_scenes(path, StaticScenes(GRID, (scene,)))
+    assert "scenes.h5 has no colours" in refused(demos, tmp_path / "run", "--validation", path)
+
+
+def test_what_cannot_be_exported_is_not_trained_first(
+    demos: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys
+):
+    flags = words(demos, tmp_path, "--export", "onnx", "--method", "transporter")
+    monkeypatch.setattr(sys, "argv", ["train", *flags])
+    with pytest.raises(SystemExit):
+        training.main()
+    assert "a transporter cannot be exported" in capsys.readouterr().err
 
 
 def test_a_file_without_demonstrations_is_refused(tmp_path: Path, refused: Callable[..., str]):

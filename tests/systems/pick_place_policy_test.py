@@ -5,7 +5,7 @@ from pydrake.common.value import Value
 from systems.pick_place_policy import PickPlacePolicy
 from systems.signals import Observation, PickPlaceAction, PlanarPose
 
-ACTION = PickPlaceAction(PlanarPose(0.4, 0.1, 0.2), PlanarPose(0.5, -0.1, 1.0), 0.02)
+ACTION = PickPlaceAction(PlanarPose(0.4, 0.1, 0.2), PlanarPose(0.5, -0.1, 1.0))
 
 
 def observation(value: float) -> Observation:
@@ -73,3 +73,28 @@ def test_a_function_of_two_arguments_is_told_where_grasps_failed():
         policy.GetInputPort("failed_picks").FixValue(context, Value(failed))
         assert policy.GetOutputPort("action").Eval(context) == ACTION
     assert told == [(), (PlanarPose(0.4, 0.1, 0.2),)]
+
+
+def test_an_option_of_a_function_is_its_own():
+    thresholds = []
+
+    def answer(_: Observation, threshold: float = 0.5) -> PickPlaceAction:
+        thresholds.append(threshold)
+        return ACTION
+
+    policy = PickPlacePolicy(policy=answer)
+    assert policy.num_input_ports() == 1
+    context = policy.CreateDefaultContext()
+    policy.GetInputPort("observation").FixValue(context, Value(Observation()))
+    policy.GetOutputPort("action").Eval(context)
+    assert thresholds == [0.5]
+
+
+@pytest.mark.parametrize("number", [np.nan, np.inf])
+def test_an_action_that_is_no_number_is_refused(number: float):
+    action = PickPlaceAction(PlanarPose(0.4, 0.1, number), PlanarPose())
+    policy = PickPlacePolicy(policy=lambda _: action)
+    context = policy.CreateDefaultContext()
+    policy.GetInputPort("observation").FixValue(context, Value(Observation()))
+    with pytest.raises(ValueError, match="answered with no finite numbers"):
+        policy.GetOutputPort("action").Eval(context)

@@ -4,6 +4,7 @@ from pydrake.common.value import Value
 from pydrake.math import RigidTransform, RollPitchYaw
 from pydrake.multibody.tree import BodyIndex
 from pydrake.systems.analysis import Simulator
+from pydrake.systems.framework import Context
 
 from systems.rest_detector import BoundedBody, Box, RestDetector
 
@@ -16,26 +17,31 @@ AWAY, BESIDE = 1.0, 0.004
 class Table:
     """Two bars 20 cm long and 2 cm wide, 20 cm apart, and a hand; their poses set by hand."""
 
-    def __init__(self) -> None:
+    def __init__(self, time_to_sleep: float = PATIENCE) -> None:
         bar = Box(RigidTransform(), np.array([0.1, 0.01, 0.01]))
         self.detector = RestDetector(
             objects=[BoundedBody(BodyIndex(i), [bar]) for i in (LEFT, RIGHT)],
             movers=[BoundedBody(BodyIndex(HAND), [Box(RigidTransform(), np.full(3, 0.02))])],
             position_tolerance=POSITION,
             angle_tolerance=ANGLE,
-            time_to_sleep=PATIENCE,
+            time_to_sleep=time_to_sleep,
             wake_distance=0.006,
         )
         self.simulator = Simulator(self.detector)
         self.poses = {LEFT: RigidTransform([0, 0.1, 0]), RIGHT: RigidTransform([0, -0.1, 0])}
         self.poses[HAND] = RigidTransform([0, 0, AWAY])
 
-    def at_rest_after(self, seconds: float) -> list[bool]:
-        """Whether left and right are at rest, some time later."""
+    def advance(self, seconds: float) -> Context:
+        """All but the update at the end of that time."""
         context = self.simulator.get_mutable_context()
         poses = [RigidTransform(), *(self.poses[i] for i in (LEFT, RIGHT, HAND))]
         self.detector.GetInputPort("body_poses").FixValue(context, Value(poses))
         self.simulator.AdvanceTo(context.get_time() + seconds)
+        return context
+
+    def at_rest_after(self, seconds: float) -> list[bool]:
+        """Whether left and right are at rest, some time later."""
+        context = self.advance(seconds)
         self.simulator.AdvancePendingEvents()
         assert self.detector.GetOutputPort("at_rest").Eval(context).tolist() == [
             float(value) for value in self.detector.at_rest(context)
@@ -164,3 +170,12 @@ def test_what_is_between_pieces_is_not_near():
     assert rests([0.1, 0.1, 0.0])
     assert not rests([0.1, 0.01 + 0.02 + BESIDE, 0.0])
     assert not rests([0.01 + 0.02 + BESIDE, 0.1, 0.0])
+
+
+def test_what_moves_does_not_rest_however_soon_it_may():
+    table = Table(time_to_sleep=0.0)
+    for _ in range(4):
+        table.move_by(LEFT, 2 * POSITION)
+        context = table.advance(1 / 64)
+    assert table.detector.at_rest(context).tolist() == [False, True]
+    assert table.at_rest_after(1 / 64) == [True, True]

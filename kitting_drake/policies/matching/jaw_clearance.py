@@ -89,7 +89,8 @@ def jaw_grasps(
 
 
 def _tip_height(top: Array, support: float) -> Array:
-    """Where the fingertips go, above the table: as the planner has it, but not below a support."""
+    """Where the fingertips go, above the table: as the planner has it by default, but not below a
+    support."""
     depth = np.clip(
         _PRIMITIVE.grasp_depth_share * (top - support),
         _PRIMITIVE.grasp_depth,

@@ -2,6 +2,7 @@
 
 import dataclasses
 import itertools
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -73,7 +74,7 @@ class _KittingTask(TaskConfig):
         try:
             return make_kit(tools, self.kit)
         except UserError as error:
-            raise UserError(f"{field}: {error}") from error
+            raise UserError(f"task.kit: {error}") from error
 
 
 @dataclass
@@ -312,7 +313,8 @@ def _unique_names(tools: Sequence[Tool]) -> list[str]:
     names: list[str] = []
     for tool in tools:
         name, number = tool.name, 2
-        while name in names:
+        # As the kit, and what else is on the table, is called.
+        while name in names or re.fullmatch(r"kit|distractor_\d+", name):
             name, number = f"{tool.name}_{number}", number + 1
         names.append(name)
     return names

@@ -93,7 +93,10 @@ def draw_batch(seed: int) -> Iterator[StaticScene]:
             kit = _draw_kit(chosen, rng)
             others = [tool for tool in tools if all(tool.name != own.name for own in chosen)]
             for scene in range(_SCENES_A_TOOLSET):
-                yield _draw_scene(kit, chosen, others, rng, noise_seed=100 * number + scene)
+                # Of its own, so that noise and scene have nothing to do with each other.
+                own = np.random.SeedSequence([seed, 1, number, scene])
+                noise_seed = int(own.generate_state(1)[0])
+                yield _draw_scene(kit, chosen, others, rng, noise_seed)
         except UserError:
             # There is no room for so many such tools.
             continue

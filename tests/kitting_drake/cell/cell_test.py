@@ -282,6 +282,7 @@ def test_a_learned_policy_acts_upon_what_is_seen(weights_file: Path):
         (Oracle(), "heights"),
         (ShapeMatching(), "heights"),
         (Learned(), "heights"),
+        (Learned(weights=str(MODELS / "policies" / "kitting_seen.safetensors")), "observation"),
         (PythonPolicy(function="systems.signals:PickPlaceAction"), "observation"),
     ],
 )
@@ -297,6 +298,19 @@ def test_colours_are_rendered_only_for_who_sees_them(policy: PolicyConfig, sight
         lookers.append(looks.GetInputPort("observation"))
     for looker in lookers:
         assert cell.diagram.AreConnected(projector.GetOutputPort(sight), looker)
+
+
+@pytest.mark.usefixtures("rendering")
+def test_who_watches_is_shown_colours():
+    told: list[Observation] = []
+    cell = build_cell(
+        Scenario(policy=Learned(), cameras=SMALL),
+        seed=0,
+        base=BASE,
+        observer=lambda observation, _: told.append(observation),
+    )
+    port(cell, "action")
+    assert told[0].rgb.any()
 
 
 def test_a_policy_that_looks_needs_cameras_and_rendering(monkeypatch: pytest.MonkeyPatch):

@@ -162,7 +162,7 @@ def test_a_function_of_the_main_module_has_the_name_of_its_file(monkeypatch: pyt
 
 def test_without_ray_one_sentence(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setitem(sys.modules, "ray", None)
-    with pytest.raises(UserError, match=r"not installed: pip install 'kitting_drake\[cluster\]'"):
+    with pytest.raises(UserError, match=r"--ray needs the package ray: pip install 'ray"):
         workers().__enter__()
 
 

@@ -62,6 +62,14 @@ def test_all_are_registered():
         gymnasium.make(f"kitting_drake/{name}-v0").close()
 
 
+def test_a_file_beside_ones_script_replaces_no_environment(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    (tmp_path / "kitting_unseen.yaml").write_text("Mine: {}")
+    monkeypatch.chdir(tmp_path)
+    gymnasium.make("kitting_drake/KittingUnseen-v0").close()
+
+
 def test_gymnasiums_own_checks_pass(small: Path):
     # Rendering is checked below: theirs makes many pictures.
     check_env(make(small, cameras=True).unwrapped, skip_render_check=True)

@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
+from kitting_drake.benchmark import __main__ as benchmark
 from kitting_drake.common.errors import UserError
 from kitting_drake.common.files import alone_in
 from kitting_drake.common.paths import SCENARIOS
@@ -179,14 +180,23 @@ def test_a_policy_of_its_own_is_checked_too(queue: Pretending):
 def test_a_command_that_fails_is_told_by_its_last_line(tmp_path: Path):
     """The real one: the scenario of this task does not exist."""
     (tmp_path / "results").mkdir()
-    console = Console(quiet=True, record=True)
     cell = dataclasses.replace(ORACLE, policy="!Nobody {}")
-    table = run_paper(tmp_path / "work", tmp_path / "results", [cell], 1, console)
-    console.quiet = False
-    console.print(table)
-    shown = console.export_text()
-    assert "evaluate failed with exit code 2: error: " in " ".join(shown.split())
-    assert "!Nobody" in shown
+    console = Console(quiet=True)
+    failures = run_paper(tmp_path / "work", tmp_path / "results", [cell], 1, console)
+    assert list(failures) == [cell.name]
+    assert failures[cell.name].startswith("evaluate failed with exit code 2: error: ")
+    assert "!Nobody" in failures[cell.name]
+
+
+@pytest.mark.parametrize(("failures", "code"), [({}, 0), ({ORACLE.name: "it broke"}, 1)])
+def test_what_failed_is_told_by_the_exit_code(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys, failures: dict, code: int
+):
+    monkeypatch.setattr("kitting_drake.paper.queue.run_paper", lambda *_: failures)
+    arguments = ["benchmark", "paper", "--cells", ORACLE.name, "--output", str(tmp_path)]
+    monkeypatch.setattr(sys, "argv", arguments)
+    assert benchmark.main() == code
+    assert ("it broke" in capsys.readouterr().out) == bool(code)
 
 
 def test_who_ends_it_ends_what_it_began(tmp_path: Path):

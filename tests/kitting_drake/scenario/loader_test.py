@@ -62,6 +62,8 @@ def test_text_without_a_tag_keeps_the_variant(tmp_path: Path):
     )
     text = "{task: {spacing: 0.02}, policy: {orientations: 36}, cameras: {top: {height: 77}}}"
     merged = load_scenario(path, text=text)
+    drawn = load_scenario(path, text="appearance: {paints: {'*': {spread: 0.1}}}", perturb="colour")
+    assert drawn.appearance.paints["*"].spread == 0.1
     assert merged.task == ToolsetKitting(split="train", spacing=0.02)
     assert merged.policy == Learned(weights="w", orientations=36)
     assert merged.cameras == {"top": LookAt(width=99, height=77)}
@@ -110,6 +112,13 @@ BAD = {
         ["policy.needs_observation is an unknown field"],
     ),
     "hand in the table": ("A: {planner: {home: [0.3, 0, -1, 0]}}", ["planner.home[2]", "table"]),
+    "hand beyond its joints": ("A: {planner: {home: [2, 0, 0.4, 0]}}", ["planner.home[0]", "1.5"]),
+    "deeper than the deepest": (
+        "A: {planner: {grasp_depth: 0.03}}",
+        ["planner.grasp_depth is more than planner.max_grasp_depth"],
+    ),
+    "a tag where there are no variants": ("A: {planner: !Foo {}}", ["A: planner has the tag !Foo"]),
+    "a tag of a scenario": ("A: !Foo {}", ["the scenario has the tag !Foo"]),
     "more force than there is": (
         "A: {controller: {finger_force_limit: 20.0}}",
         ["planner.grasp_force is 30 N", "controller.finger_force_limit: 20 N"],

@@ -1,3 +1,4 @@
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -7,6 +8,7 @@ from pydrake.multibody.tree import BodyIndex
 
 from kitting_drake.common.errors import UserError
 from kitting_drake.common.paths import MODELS
+from kitting_drake.hkd.kits.parameters import KitParameters
 from kitting_drake.hkd.tools.tool import CATEGORIES, load_tool, tool_names
 from kitting_drake.policies.learning import Learning
 from kitting_drake.tasks import ArrangedKitting, Kitting, ToolsetKitting
@@ -215,3 +217,20 @@ def test_the_files_that_scenes_depend_on():
 def test_tools_that_cannot_be_had_are_told_by_their_field():
     with pytest.raises(UserError, match=r"task\.tools: there is no tool 'spoon'"):
         draw(0, Kitting(tools=["spoon"]))
+
+
+def test_a_tool_may_be_called_as_something_else_on_the_table(tmp_path: Path, monkeypatch):
+    for name in ("kit", "distractor_1"):
+        shutil.copytree(load_tool("flat_screwdriver", BASE).directory, tmp_path / name)
+        (tmp_path / name / "flat_screwdriver.sdf").rename(tmp_path / name / f"{name}.sdf")
+        card = tmp_path / name / "tool.yaml"
+        card.write_text(card.read_text().replace("flat_screwdriver", name, 1))
+    monkeypatch.setenv("KITTING_DRAKE_TOOLS", str(tmp_path))
+    scene = draw(0, Kitting(tools=["kit", "distractor_1"], distractors=1))
+    assert {"kit_2", "distractor_1_2"} <= set(names(scene))
+
+
+def test_a_kit_that_is_too_small_is_told_by_its_field():
+    small = KitParameters(fixed_size=True, length=0.1, width=0.1)
+    with pytest.raises(UserError, match=r"^task\.kit: there is no room"):
+        draw(0, Kitting(kit=small))
