@@ -189,7 +189,7 @@ def _digest(paths: Iterable[Path]) -> str:
 
 
 def run_in_worker(workers: Workers, chosen: ChosenScenario, seed: int) -> Episode:
-    """Runs one episode in a process of its own and waits for it.
+    """Runs one episode in another process and waits for it.
 
     A process that dies leaves a failed episode with its reason; one that something else killed is
     given a second chance.

@@ -21,6 +21,8 @@ _Result = TypeVar("_Result")
 
 _THREADS = "OMP_NUM_THREADS"
 
+_MOST_CALLS = 10
+"""A process is ended after so many calls: each episode leaves some fifty megabytes behind."""
 _MOST_AT_WORK = 1000
 """Each occupies a thread here, wherever it is at work."""
 
@@ -45,42 +47,70 @@ class ProcessCrashed:
         )
 
 
+class Subprocess:
+    """A process that answers calls, one after another.
+
+    Ctrl-C is not for it, and it ends when this process does.
+    """
+
+    def __init__(self) -> None:
+        context = multiprocessing.get_context("spawn")
+        self._connection, theirs = context.Pipe()
+        self._process = context.Process(target=_serve, args=(theirs,), daemon=True)
+        self._process.start()
+        theirs.close()
+        self.calls = 0
+        """How many it has been given."""
+
+    def call(
+        self, function: Callable[..., _Result], *arguments: object
+    ) -> _Result | ProcessCrashed:
+        """Calls a function there, and waits for it.
+
+        Args:
+            function: importable by name, as its arguments and its result travel pickled. What it
+                raises ends the process.
+            arguments: its arguments.
+
+        Returns:
+            What the function returned, or how the process ended if it did not.
+        """
+        self.calls += 1
+        try:
+            self._connection.send((function, arguments))
+            return self._connection.recv()
+        except (EOFError, OSError):
+            # OSError: it died in the middle of its answer.
+            self._process.join()
+            return ProcessCrashed(self._process.exitcode)
+
+    def end(self) -> None:
+        """Ends it, once it has answered."""
+        self._connection.close()
+        self._process.join()
+
+
 def run_in_subprocess(
     function: Callable[..., _Result], *arguments: object
 ) -> _Result | ProcessCrashed:
-    """Calls a function in a fresh process, and waits for it.
-
-    Args:
-        function: importable by name, as its arguments and its result travel pickled. Ctrl-C is not
-            for it, and it ends when this process does.
-        arguments: its arguments.
-
-    Returns:
-        What the function returned, or how its process ended if it did not.
-    """
-    context = multiprocessing.get_context("spawn")
-    receiver, sender = context.Pipe(duplex=False)
-    process = context.Process(target=_serve, args=(function, arguments, sender), daemon=True)
-    process.start()
-    sender.close()
+    """Calls a function in a fresh process, and waits for it; see `Subprocess.call`."""
+    process = Subprocess()
     try:
-        return receiver.recv()
-    except (EOFError, OSError):
-        # OSError: it died in the middle of its answer.
-        process.join()
-        return ProcessCrashed(process.exitcode)
+        return process.call(function, *arguments)
     finally:
-        process.join()
+        process.end()
 
 
 class Workers(Protocol):
-    """A place where functions run in fresh processes: this machine, or a cluster."""
+    """A place where functions run in other processes: this machine, or a cluster."""
 
     def capacity(self) -> int:
         """How many processes it has room for now; at least 1."""
 
     def run(self, function: Callable[..., _Result], *arguments: object) -> _Result | ProcessCrashed:
-        """Calls a function as `run_in_subprocess` does; may be called in many threads at once.
+        """Calls a function as `Subprocess.call` does; may be called in many threads at once.
+
+        What ran in the process before must not matter to the function.
 
         Raises:
             UserError: the place is not fit for it.
@@ -94,18 +124,28 @@ class Workers(Protocol):
 
 
 class LocalWorkers:
-    """This machine, as `Workers`. Inside its `with`, several processes use one thread each."""
+    """This machine, as `Workers`.
 
-    def __init__(self, count: int) -> None:
+    Inside its `with`, several processes use one thread each, and a process answers several calls,
+    as to start one and import everything takes seconds.
+    """
+
+    def __init__(self, count: int, *, reuse: bool = True) -> None:
         """
         Args:
             count: how many processes at a time.
+            reuse: whether a process answers several calls; else each has a fresh one.
         """
         self._count = count
+        self._reuse = reuse
         self._stopped = False
         self._threads_before: str | None = None
+        self._most_calls = 1
+        self._idle: list[Subprocess] = []
 
     def __enter__(self) -> Self:
+        if self._reuse:
+            self._most_calls = _MOST_CALLS
         self._threads_before = os.environ.get(_THREADS)
         if self._count > 1:
             # For the processes to come: this one has long read the variable.
@@ -113,6 +153,9 @@ class LocalWorkers:
         return self
 
     def __exit__(self, *_: object) -> None:
+        self._most_calls = 1
+        while self._idle:
+            self._idle.pop().end()
         if self._threads_before is not None:
             os.environ[_THREADS] = self._threads_before
         else:
@@ -124,7 +167,16 @@ class LocalWorkers:
     def run(self, function: Callable[..., _Result], *arguments: object) -> _Result | ProcessCrashed:
         if self._stopped:
             return ProcessCrashed(-signal.SIGKILL)
-        return run_in_subprocess(function, *arguments)
+        try:
+            process = self._idle.pop()
+        except IndexError:
+            process = Subprocess()
+        outcome = process.call(function, *arguments)
+        if isinstance(outcome, ProcessCrashed) or process.calls >= self._most_calls:
+            process.end()
+        else:
+            self._idle.append(process)
+        return outcome
 
     def stop(self) -> None:
         self._stopped = True
@@ -176,11 +228,16 @@ def counting_bar(console: Console, label: str) -> Progress:
     )
 
 
-def _serve(function: Callable[..., object], arguments: tuple, sender: Connection) -> None:
+def _serve(connection: Connection) -> None:
     # Ctrl-C is the parent's to handle.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_end_with_parent, daemon=True).start()
-    sender.send(function(*arguments))
+    while True:
+        try:
+            function, arguments = connection.recv()
+        except EOFError:
+            return
+        connection.send(function(*arguments))
 
 
 def _end_with_parent() -> None:

@@ -41,7 +41,9 @@ def open_workers(
         UserError: there is no such cluster, or it cannot take the work.
     """
     if arguments.ray is None:
-        with LocalWorkers(arguments.workers or os.cpu_count() or 1) as local:
+        # What a person's own function remembers must not travel from episode to episode.
+        reuse = not chosen.scenario.policy.modules()
+        with LocalWorkers(arguments.workers or os.cpu_count() or 1, reuse=reuse) as local:
             yield local, chosen
         return
     with tempfile.TemporaryDirectory() as folder:

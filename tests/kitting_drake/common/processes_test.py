@@ -44,6 +44,19 @@ def test_a_process_that_dies_takes_nothing_with_it():
     assert run_in_subprocess(leave) == ProcessCrashed(3)
 
 
+def test_processes_answer_again_but_not_for_ever_nor_after_a_crash():
+    with LocalWorkers(1) as workers:
+        found = [workers.run(os.getpid) for _ in range(12)]
+        assert len(set(found[:10])) == 1
+        assert len({*found[9:11]}) == 2
+        assert workers.run(kill_itself) == ProcessCrashed(-signal.SIGKILL)
+        last = workers.run(os.getpid)
+        assert last not in found
+    assert command(last) == ""
+    # Nobody would end it.
+    assert len({workers.run(os.getpid) for _ in range(2)}) == 2
+
+
 @pytest.mark.parametrize(("count", "threads"), [(2, "1"), (1, "7")])
 def test_side_by_side_processes_compute_in_one_thread(
     count: int, threads: str, monkeypatch: pytest.MonkeyPatch

@@ -1,10 +1,13 @@
 import argparse
+import dataclasses
+import os
 from pathlib import Path
 
 import pytest
 
 from kitting_drake.common.processes import LocalWorkers
 from kitting_drake.scenario.command_line import ChosenScenario
+from kitting_drake.scenario.policies import Oracle, PythonPolicy
 from kitting_drake.scenario.schema import Scenario
 from kitting_drake.scenario.workers import add_workers_flags, open_workers
 
@@ -25,6 +28,16 @@ def test_processes_of_this_machine(
         assert isinstance(workers, LocalWorkers)
         assert workers.capacity() == count
         assert sent is chosen
+
+
+@pytest.mark.parametrize(
+    ("policy", "processes"), [(Oracle(), 1), (PythonPolicy(function="mine:policy"), 2)]
+)
+def test_what_ones_own_function_remembers_stays_in_its_episode(policy, processes: int):
+    scenario = dataclasses.replace(Scenario(), policy=policy)
+    chosen = ChosenScenario(scenario, Path("mine.yaml"), "mine", None)
+    with open_workers(parse("--workers", "1"), chosen) as (workers, _):
+        assert len({workers.run(os.getpid) for _ in range(2)}) == processes
 
 
 @pytest.mark.parametrize("count", range(1, 5))
