@@ -236,6 +236,9 @@ def _differences(results: Mapping[str, Result]) -> list[str]:
 def _rivals(cell: Cell) -> list[tuple[str, str]]:
     """What a cell of ours is compared with: labels, and names of cells."""
     training = cell.policy
+    if cell.label == "generalist":
+        others = [label for label in SHIPPED if label != cell.label]
+        return [(label.replace("_", " "), f"{cell.task}_{label}") for label in others]
     if not isinstance(training, Training) or training.method != "so2":
         return []
     if cell.label.startswith("minus"):
