@@ -87,7 +87,7 @@ def _parser() -> argparse.ArgumentParser:
         "--orientations", type=count_type, default=180, metavar="N", help="of the networks (180)"
     )
     parser.add_argument(
-        "--no_outlines", action="store_true", help="networks: refine nothing, for tasks without cavities"
+        "--no_outlines", action="store_true", help="networks: refine nothing (no cavities)"
     )
     parser.add_argument("--recover", action="store_true", help="mend what is not seated")
     parser.add_argument(
