@@ -194,8 +194,8 @@ def _fresh_tools(results: Mapping[str, Result]) -> list[str]:
     return [
         "### Ten tools that nobody had looked at\n",
         "The policies as they come, with all that goes beyond the paper, on the toolsets of split "
-        "`fresh`:\nmade for this, kept out of every training, and seen by no policy before this "
-        "run.\n",
+        "`fresh`:\nmade for this, kept out of every training, and looked at by nobody before "
+        "these runs.\n",
         markdown_table(["policy", "strict, %", "over tools", "paper's, %"], rows),
     ]
 

@@ -28,6 +28,7 @@ from kitting_drake.scenario.schema import Pinhole, Sleep
 from kitting_drake.tasks import Kitting
 from kitting_drake.tasks.ravens.palletizing_boxes import PalletizingBoxes
 from kitting_drake.tasks.task import TABLE
+from systems.hand_geometry import JOINT_LIMITS
 from systems.heightmap_projector import HeightmapProjector
 from systems.placement import Placement
 from systems.signals import Observation, PickPlaceAction
@@ -88,6 +89,13 @@ def test_default_context_is_the_scene(cell: Cell):
     np.testing.assert_allclose(
         cell.plant.GetPositionsAndVelocities(context, hand), [*home, 0.04, 0.04, *np.zeros(6)]
     )
+
+
+def test_the_hand_reaches_as_far_as_scenarios_are_told(cell: Cell):
+    for name, limits in JOINT_LIMITS.items():
+        joint = cell.plant.GetJointByName(name)
+        found = (*joint.position_lower_limits(), *joint.position_upper_limits())
+        assert found == pytest.approx(limits)
 
 
 def test_the_table_is_where_tasks_have_it(cell: Cell):
