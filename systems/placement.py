@@ -25,6 +25,8 @@ STRICT_HEIGHT = 0.002
 """A strict success stands at most this far above or below its goal, in metres."""
 STRICT_ANGLE = math.radians(20.0)
 """Its heading differs by at most this, modulo the object's symmetry, in radians."""
+ALL = 1 - 1e-9
+"""A share or a reward above this is all of it."""
 
 _FAR = 0.5
 """Beyond this an object is no nearer to one goal than to another, in metres."""
@@ -108,7 +110,7 @@ class Placement:
     @property
     def success(self) -> bool:
         """Whether the object fills its goal by the task's own measure."""
-        return self.share > 1 - 1e-9
+        return self.share > ALL
 
     @property
     def strict_success(self) -> bool:

@@ -273,6 +273,7 @@ def _run(
         policy=scenario.policy.name,
         seed=seed,
         time_limit=scenario.time_limit,
+        end_at_success=scenario.end_at_success,
         observers=[adversary.observe, strip.observe],
     )
     strict = {item.name for item in result.objects if item.strict_success}

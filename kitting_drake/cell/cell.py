@@ -187,7 +187,14 @@ def build_cell(
     if scenario.policy.needs_observation or (scenario.cameras and can_render()):
         projector = _add_cameras(builder, scenario, scene_graph, grid, seed)
         builder.ExportOutput(projector.GetOutputPort("observation"), "observation")
-    site = PolicySite(scene=scene, objects=objects, grid=grid, base=base, observer=observer)
+    site = PolicySite(
+        scene=scene,
+        objects=objects,
+        grid=grid,
+        base=base,
+        observer=observer,
+        may_stop=not scenario.end_at_success,
+    )
     policy = _add_policy(builder, scenario, site, plant, projector)
     planner = _add_planner_and_controller(builder, scenario, scene, plant, policy, projector)
 

@@ -57,6 +57,7 @@ def run_chosen(
         policy=chosen.policy,
         seed=seed,
         time_limit=chosen.scenario.time_limit,
+        end_at_success=chosen.scenario.end_at_success,
         realtime_rate=realtime_rate,
         observers=observers,
     )

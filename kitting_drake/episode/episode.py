@@ -15,7 +15,7 @@ from kitting_drake.episode.action_log import ActionLog
 from kitting_drake.episode.events import EpisodeObserver, ModeChange
 from kitting_drake.tasks.task import ActionRecord, TaskConfig
 from systems.pick_place_parameters import Mode
-from systems.placement import Placement, strict_reward, total_reward
+from systems.placement import ALL, Placement, strict_reward, total_reward
 
 _LAST_WAIT = 2.0
 """How long the objects may take to come to rest after the last action, in s."""
@@ -86,6 +86,7 @@ def run_episode(
     policy: str,
     seed: int,
     time_limit: float,
+    end_at_success: bool = False,
     realtime_rate: float = 0.0,
     observers: Sequence[EpisodeObserver] = (),
 ) -> EpisodeResult:
@@ -101,6 +102,7 @@ def run_episode(
         policy: its name, for the result.
         seed: for the result; it has done its work in `build_cell`.
         time_limit: simulated time at which the episode ends at the latest, in s.
+        end_at_success: end as soon as every goal is met, instead of asking for an action more.
         realtime_rate: 1 for real time, 0 for as fast as possible.
         observers: told of every event.
     """
@@ -111,6 +113,7 @@ def run_episode(
         policy=policy,
         seed=seed,
         time_limit=time_limit,
+        end_at_success=end_at_success,
         realtime_rate=realtime_rate,
         observers=observers,
     )
@@ -130,6 +133,7 @@ class Episode:
         policy: str,
         seed: int,
         time_limit: float,
+        end_at_success: bool = False,
         realtime_rate: float = 0.0,
         observers: Sequence[EpisodeObserver] = (),
         pauses: bool = False,
@@ -142,6 +146,7 @@ class Episode:
             policy: see there.
             seed: see there.
             time_limit: see there.
+            end_at_success: see there.
             realtime_rate: see there.
             observers: see there.
             pauses: whether `advance` returns each time the planner asks for an action.
@@ -151,7 +156,12 @@ class Episode:
         self._simulator = Simulator(cell.diagram)
         self._simulator.set_target_realtime_rate(realtime_rate)
         self._log = ActionLog(cell)
-        self._monitor = _Monitor(cell, [self._log.observe, *observers], pauses=pauses)
+        self._monitor = _Monitor(
+            cell,
+            [self._log.observe, *observers],
+            pauses=pauses,
+            end_at_success=end_at_success,
+        )
         self._simulator.set_monitor(self._monitor.step)
         self._failure: str | None = None
         self._wall_seconds = 0.0
@@ -277,10 +287,16 @@ class _Monitor:
     """The simulator's monitor: puts objects to sleep, tells of events, knows when to halt."""
 
     def __init__(
-        self, cell: Cell, observers: Sequence[EpisodeObserver], *, pauses: bool = False
+        self,
+        cell: Cell,
+        observers: Sequence[EpisodeObserver],
+        *,
+        pauses: bool,
+        end_at_success: bool,
     ) -> None:
         self._cell = cell
         self._pauses = pauses
+        self._end_at_success = end_at_success
         self.is_paused = False
         self._observers = observers
         self._contact_results = cell.plant.get_contact_results_output_port()
@@ -293,9 +309,13 @@ class _Monitor:
         cell = self._cell
         cell.apply_sleep(root_context)
         self.tell(root_context)
-        if self._pauses:
+        if self._pauses or self._end_at_success:
             planner_context = cell.planner.GetMyContextFromRoot(root_context)
-            self.is_paused = cell.planner.asks_now(planner_context)
+            asks = cell.planner.asks_now(planner_context)
+            if asks and self._end_at_success and self._is_fulfilled(root_context):
+                self.done_since = root_context.get_time()
+                return EventStatus.ReachedTermination(cell.diagram, "every goal is met")
+            self.is_paused = asks and self._pauses
             if self.is_paused:
                 return EventStatus.ReachedTermination(cell.diagram, "the planner asks")
         if self._mode != Mode.DONE:
@@ -306,6 +326,10 @@ class _Monitor:
         if cell.at_rest(root_context).all() or now - self.done_since > _LAST_WAIT:
             return EventStatus.ReachedTermination(cell.diagram, "the episode is over")
         return EventStatus.DidNothing()
+
+    def _is_fulfilled(self, root_context: Context) -> bool:
+        reward = total_reward(self._cell.scene.goals, self._cell.placements(root_context))
+        return reward > ALL
 
     def tell(self, root_context: Context, *, is_last: bool = False) -> None:
         """Tells the observers, if the mode has changed or the episode is over."""

@@ -24,12 +24,11 @@ from kitting_drake.scenario.command_line import find_scenario
 from kitting_drake.scenario.policies import PolicyConfig, PolicySite
 from kitting_drake.scenario.schema import Scenario
 from systems.given_action import GivenAction
+from systems.placement import ALL
 from systems.signals import Observation, PickPlaceAction
 from systems.surface_heights import read_surface_heights
 
 _SEEDS = 2**32
-_ALL = 1 - 1e-9
-"""A reward of this is that of every goal."""
 
 
 @dataclass
@@ -157,12 +156,12 @@ class KittingEnvironment(gymnasium.Env[dict[str, Any], NDArray[Any]]):
         given = as_action(action, self.grid)
         self._give(cell, episode, self._with_heights(given))
         result = episode.result()
-        is_done = result.success_rate > _ALL
+        is_done = result.success_rate > ALL
         if is_done and not episode.is_over:
             # As a policy would that sees that nothing is left to do.
             self._give(cell, episode, PickPlaceAction(stop=True))
             result = episode.result()
-            is_done = result.success_rate > _ALL
+            is_done = result.success_rate > ALL
         reward, self._earned = result.success_rate - self._earned, result.success_rate
         was_cut = episode.timed_out or episode.failure is not None
         terminated = episode.is_over and not was_cut and (given.stop or is_done)

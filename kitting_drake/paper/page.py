@@ -38,10 +38,12 @@ _INTRODUCTION = """\
 
 What the paper did, without what we added to it: actions quantized to pixels and N orientations, no
 search where an insertion is blocked, only the taken action as a label, scenes augmented by motions
-of the whole scene only. All methods of a task learn from the same demonstrations, of preset
-`{preset}`, for as many steps, and are tested on the same seeds, which nobody looked at before; the
-checkpoint is the one that does best on other scenes. Ours is trained once, at N = 180, and tested
-at every N. Written by `python -m kitting_drake.benchmark paper`, which runs these cells, and
+of the whole scene only; and no policy says when it is done, but an episode ends when every goal is
+met or its actions are spent (`end_at_success`), as in the Ravens benchmark. All methods of a task
+learn from the same demonstrations, of preset `{preset}`, for as many steps, and are tested on the
+same seeds, which nobody looked at before; the checkpoint is the one that does best on other scenes.
+Ours is trained once, at N = 180, and tested at every N. Written by
+`python -m kitting_drake.benchmark paper`, which runs these cells, and
 `python -m kitting_drake.results`; each file must be exactly what its cell says.
 
 {rates}

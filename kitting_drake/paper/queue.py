@@ -70,10 +70,12 @@ class Queue:
         self._say(f"{len(cells) - len(pending)} of {len(cells)} cells are done")
         failures: dict[str, str] = {}
         with ThreadPoolExecutor(max_workers=1) as trainer:
-            trained: dict[Training, Future[Path]] = {}
-            for cell in pending:
-                if isinstance(cell.policy, Training) and cell.policy not in trained:
-                    trained[cell.policy] = trainer.submit(self.train, cell.policy)
+            needed = dict.fromkeys(c.policy for c in pending if isinstance(c.policy, Training))
+            # What is trained already need not wait behind what is not.
+            trained: dict[Any, Future[Path]] = {
+                training: trainer.submit(self.train, training)
+                for training in sorted(needed, key=lambda training: not self._is_trained(training))
+            }
             try:
                 while pending:
                     cell = self._next(pending, trained)
@@ -135,14 +137,21 @@ class Queue:
             )
         return path
 
+    def _is_trained(self, training: Training) -> bool:
+        rates = LEARNING_RATES[:1] if training.method == "so2" else LEARNING_RATES
+        return any((self._folder(training, rate) / "summary.json").exists() for rate in rates)
+
+    def _folder(self, training: Training, rate: float) -> Path:
+        return self.folder / "trainings" / f"{training.name}_lr{rate:g}"
+
     def train(self, training: Training) -> Path:
         """The file of the weights of a training."""
-        if training.learning_rate is None:
+        rate = training.learning_rate
+        if rate is None:
             ours = training.method == "so2"
             rate = LEARNING_RATES[0] if ours else self._best_rate(training.method)
-            training = dataclasses.replace(training, learning_rate=rate)
         task = TASKS[training.task]
-        folder = self.folder / "trainings" / f"{training.name}_lr{training.learning_rate:g}"
+        folder = self._folder(training, rate)
         if not (folder / "summary.json").exists():
             self._command(
                 "train",
@@ -153,7 +162,7 @@ class Queue:
                 *("--preset", PRESET),
                 *("--orientations", training.orientations),
                 *("--steps", task.steps),
-                *("--learning-rate", training.learning_rate),
+                *("--learning-rate", rate),
                 "--decay",
                 *(("--taken-only",) if training.taken_only else ()),
                 *(("--rigid",) if training.rigid else ()),

@@ -64,6 +64,7 @@ class LearnedPolicy:
         continuous: bool = True,
         fit_outlines: bool = False,
         recover: bool = False,
+        may_stop: bool = True,
         watch: Callable[[Observation, Decision], None] | None = None,
     ) -> None:
         """
@@ -79,6 +80,7 @@ class LearnedPolicy:
             recover: press down what protrudes, pick what belongs into a recess before anything
                 else (`belonging`), and at last take out what could not be pressed down
                 (`recovery_action`). Not in the paper.
+            may_stop: whether to stop where there is nothing left to pick. Not in the paper.
             watch: called with each observation and decision.
 
         Raises:
@@ -90,6 +92,7 @@ class LearnedPolicy:
         self._continuous = continuous
         self._fit_outlines = fit_outlines
         self._recover = recover
+        self._may_stop = may_stop
         self._watch = watch
 
     def __call__(
@@ -171,7 +174,7 @@ class LearnedPolicy:
                 logits = _without(logits, ~wanted)
                 choice = self._choose(image, picking, logits, outlines, resolution, refine_pick)
         odds, threshold = picking.log_odds, self._networks.stop_threshold
-        stop = odds is not None and threshold is not None and odds < threshold
+        stop = self._may_stop and odds is not None and threshold is not None and odds < threshold
         if stop and self._recover:
             stop = not belongs
         elif stop and outlines is not None:

@@ -55,6 +55,8 @@ class PolicySite:
     base: Path
     """Where relative paths in the scenario start."""
     observer: DecisionObserver | None = None
+    may_stop: bool = True
+    """False where the episode ends by itself once all is done."""
 
 
 class PolicyConfig:
@@ -202,6 +204,7 @@ class Learned(PolicyConfig):
                 continuous=self.continuous,
                 fit_outlines=insertion and self.continuous and self.fit_outlines,
                 recover=insertion and self.recover,
+                may_stop=site.may_stop,
                 watch=site.observer,
             )
         except ValueError as error:

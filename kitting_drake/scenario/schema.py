@@ -130,6 +130,10 @@ class Scenario:
     # The episode ends after this much simulated time whatever happens, in s.
     time_limit: float = bounded(180.0, 0.1, 1e6)
 
+    # It ends as soon as every goal is met, and learned policies are not asked whether they stop, as
+    # in the Ravens benchmark and the paper. Otherwise whoever decides must see that all is done.
+    end_at_success: bool = False
+
     # Live viewing: 1 is real time, 0 as fast as the machine allows.
     target_realtime_rate: float = bounded(0.0, 0.0, 100.0)
 

@@ -169,6 +169,28 @@ def test_what_is_there_already_counts_only_if_the_episode_ends_well():
     assert (early.timed_out, early.success_rate, early.strict_success_rate) == (True, 0.0, 0.0)
 
 
+def test_an_episode_that_ends_at_success_asks_for_no_action_more():
+    """With two tries a tool the planner would ask again."""
+    scenario = dataclasses.replace(BLIND, task=dataclasses.replace(ONE_TOOL, tries=2))
+    told: dict[bool, list[Mode]] = {}
+    for ends in (False, True):
+        cell = build(scenario)
+        modes = told.setdefault(ends, [])
+        result = run_episode(
+            cell,
+            task=scenario.task,
+            scenario="test",
+            policy="test",
+            seed=0,
+            time_limit=30.0,
+            end_at_success=ends,
+            observers=[lambda event, modes=modes: modes.append(event.mode)],
+        )
+        assert (result.strict_success_rate, result.actions, result.timed_out) == (1.0, 1, False)
+    assert Mode.DONE in told[False]
+    assert Mode.DONE not in told[True]
+
+
 def raise_at(mode: Mode, error: BaseException) -> EpisodeObserver:
     def observe(event: ModeChange) -> None:
         if event.mode == mode and not event.is_last:

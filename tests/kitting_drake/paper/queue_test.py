@@ -5,6 +5,7 @@ import itertools
 import json
 import subprocess
 import sys
+import threading
 import time
 from pathlib import Path
 
@@ -30,7 +31,7 @@ from kitting_drake.reporting.runs import described
 from kitting_drake.scenario.loader import load_scenario
 
 ORACLE = Cell("unseen", "!QuantizedOracle {orientations: 180}", 180, "quantized_oracle")
-OURS = Cell("unseen", Training("unseen", "so2", 180, 10), 36)
+OURS = Cell("unseen", Training("unseen", "so2", 180, 10), 36, end_at_success=True)
 THEIRS = Cell("unseen", Training("unseen", "transporter", 36, 10), 36)
 
 
@@ -41,11 +42,15 @@ class Pretending(Queue):
         super().__init__(*arguments)
         self.calls: list[str] = []
         self.broken: set[str] = set()
+        self.slow = ""
+        self._has_evaluated = threading.Event()
 
     def _command(self, verb: str, *arguments, folder: Path) -> None:
         self.calls.append(f"{verb} {folder.name}")
         if folder.name in self.broken:
             raise Failed("it broke")
+        if folder.name == self.slow:
+            self._has_evaluated.wait(10.0)
         folder.mkdir(parents=True, exist_ok=True)
         words = list(map(str, arguments))
         flags = dict(itertools.pairwise(words))
@@ -57,6 +62,7 @@ class Pretending(Queue):
             (folder / "summary.json").write_text(json.dumps(summary))
             (folder / "policy.safetensors").touch()
         else:
+            self._has_evaluated.set()
             (folder / "summary.json").write_text(json.dumps(self.summary(words, flags)))
 
     def summary(self, words: list[str], flags: dict[str, str]) -> dict:
@@ -104,6 +110,7 @@ def test_cells_have_names_of_their_own_and_scenarios_that_load():
         text = cell.scenario_text("w.safetensors")
         scenario = load_scenario(SCENARIOS / task.file, task.tested, text)
         assert (scenario.planner.search.steps > 0) == cell.search
+        assert scenario.end_at_success == cell.end_at_success
         load_scenario(SCENARIOS / task.file, task.demonstrated, "{policy: !Oracle {}}")
 
 
@@ -132,6 +139,17 @@ def test_it_chooses_a_learning_rate_and_does_nothing_twice(queue: Pretending):
     assert queue.calls == []
 
 
+def test_what_is_trained_does_not_wait_behind_what_is_not(queue: Pretending):
+    queue.train(OURS.policy)
+    other = dataclasses.replace(OURS, policy=Training("unseen", "so2", 180, 100))
+    queue.slow = f"{other.policy.name}_lr{LEARNING_RATES[0]:g}"
+    assert queue.run([other, OURS]) == {}
+    assert [call for call in queue.calls if call.startswith("evaluate")] == [
+        f"evaluate {OURS.name}",
+        f"evaluate {other.name}",
+    ]
+
+
 def test_what_fails_keeps_nothing_else_up(queue: Pretending):
     queue.broken = {f"{reference('transporter').name}_lr{LEARNING_RATES[2]:g}"}
     assert queue.run([THEIRS, OURS, ORACLE]) == {THEIRS.name: "it broke"}
@@ -149,6 +167,7 @@ def test_what_fails_keeps_nothing_else_up(queue: Pretending):
     [
         (lambda s: s["resolved_scenario"]["planner"]["search"].update(reach=0.004), "search.reach"),
         (lambda s: s["resolved_scenario"]["plant"].update(time_step=0.5), "plant.time_step"),
+        (lambda s: s["resolved_scenario"].pop("end_at_success"), "end_at_success: false"),
         (lambda s: s["policy_details"].update(steps=7), "steps is 7, not"),
         (lambda s: s["policy_details"].update(scenario="kitting_seen:Mine"), "scenario is kitting"),
         (lambda s: s["policy_details"].update(continuous=True), "continuous is True"),

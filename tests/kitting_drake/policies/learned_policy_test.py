@@ -177,6 +177,9 @@ def test_stops_where_the_odds_that_there_is_something_to_pick_are_below_the_thre
     action = policy(observation())
     assert action == (PickPlaceAction(stop=True) if stop else found.action)
     assert action.heights is None
+    # Where the episode ends by itself it is not asked.
+    unasked = LearnedPolicy(networks, orientations=N, may_stop=False)
+    assert unasked(observation()) == dataclasses.replace(found.action, stop=False)
 
 
 @pytest.mark.parametrize(
