@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Sequence
+from collections.abc import Sequence, Set
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Protocol
@@ -348,11 +348,36 @@ def _measure(
     return dataclasses.replace(measured, share=success.share(measured, X_WB))
 
 
-def total_reward(goals: Sequence[Goal], placements: Sequence[Placement]) -> float:
-    """The episode's score, 0 to 1."""
-    return math.fsum(
-        goals[item.goal].reward * item.share for item in placements if item.goal is not None
-    )
+def complete_stages(
+    goals: Sequence[Goal], placements: Sequence[Placement], kept: Set[int] = frozenset()
+) -> frozenset[int]:
+    """The goals that others come `after`, once all of those have been filled together.
+
+    As in the Ravens benchmark they are filled for good: the reward is not lost when the objects are
+    moved later.
+
+    Args:
+        goals: of the task.
+        placements: as things stand.
+        kept: those that were complete before.
+    """
+    filled = kept | {item.goal for item in placements if item.success}
+    return frozenset(kept).union(*(goal.after for goal in goals if filled >= {*goal.after}))
+
+
+def total_reward(
+    goals: Sequence[Goal], placements: Sequence[Placement], kept: Set[int] = frozenset()
+) -> float:
+    """The episode's score, 0 to 1.
+
+    Args:
+        goals: of the task.
+        placements: as things stand.
+        kept: goals that count as filled however things stand (`complete_stages`).
+    """
+    shares = {item.goal: item.share for item in placements if item.goal is not None}
+    shares |= dict.fromkeys(kept, 1.0)
+    return math.fsum(goals[goal].reward * share for goal, share in shares.items())
 
 
 def strict_reward(goals: Sequence[Goal], placements: Sequence[Placement]) -> float:

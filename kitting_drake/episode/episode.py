@@ -15,7 +15,7 @@ from kitting_drake.episode.action_log import ActionLog
 from kitting_drake.episode.events import EpisodeObserver, ModeChange
 from kitting_drake.tasks.task import ActionRecord, TaskConfig
 from systems.pick_place_parameters import Mode
-from systems.placement import ALL, Placement, strict_reward, total_reward
+from systems.placement import ALL, Placement, complete_stages, strict_reward, total_reward
 
 _LAST_WAIT = 2.0
 """How long the objects may take to come to rest after the last action, in s."""
@@ -223,7 +223,7 @@ class Episode:
         return EpisodeResult(
             **self._names,  # type: ignore[arg-type]
             objects=object_results(cell, self._task, context, records),
-            success_rate=0.0 if lost else total_reward(cell.scene.goals, placements),
+            success_rate=0.0 if lost else self._monitor.reward(context),
             strict_success_rate=0.0 if lost else strict_reward(cell.scene.goals, placements),
             actions=int(counts[0]),
             missed_grasps=int(counts[1]),
@@ -303,6 +303,12 @@ class _Monitor:
         self._mode = Mode.OBSERVE
         self.point_contact_pairs = 0
         self.done_since: float | None = None
+        self._complete: frozenset[int] = frozenset()
+
+    def reward(self, root_context: Context) -> float:
+        """The task's reward, counting stages that were complete at some time."""
+        placements = self._cell.placements(root_context)
+        return total_reward(self._cell.scene.goals, placements, self._complete)
 
     def step(self, root_context: Context) -> EventStatus:
         """The callback that the simulator calls after every step."""
@@ -312,7 +318,7 @@ class _Monitor:
         if self._pauses or self._end_at_success:
             planner_context = cell.planner.GetMyContextFromRoot(root_context)
             asks = cell.planner.asks_now(planner_context)
-            if asks and self._end_at_success and self._is_fulfilled(root_context):
+            if asks and self._end_at_success and self.reward(root_context) > ALL:
                 self.done_since = root_context.get_time()
                 return EventStatus.ReachedTermination(cell.diagram, "every goal is met")
             self.is_paused = asks and self._pauses
@@ -327,10 +333,6 @@ class _Monitor:
             return EventStatus.ReachedTermination(cell.diagram, "the episode is over")
         return EventStatus.DidNothing()
 
-    def _is_fulfilled(self, root_context: Context) -> bool:
-        reward = total_reward(self._cell.scene.goals, self._cell.placements(root_context))
-        return reward > ALL
-
     def tell(self, root_context: Context, *, is_last: bool = False) -> None:
         """Tells the observers, if the mode has changed or the episode is over."""
         plant, planner = self._cell.plant, self._cell.planner
@@ -339,6 +341,9 @@ class _Monitor:
             contact = self._contact_results.Eval(plant.GetMyContextFromRoot(root_context))
             pairs = contact.num_point_pair_contacts()
             self.point_contact_pairs = max(self.point_contact_pairs, pairs)
+            if is_last or previous == Mode.OBSERVE:
+                placements = self._cell.placements(root_context)
+                self._complete = complete_stages(self._cell.scene.goals, placements, self._complete)
             event = ModeChange(
                 self._mode if is_last else previous, self._mode, root_context, is_last
             )

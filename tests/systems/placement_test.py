@@ -14,6 +14,7 @@ from systems.placement import (
     Placement,
     PoseWithin,
     add_s,
+    complete_stages,
     evaluate_placements,
     strict_reward,
     total_reward,
@@ -177,6 +178,32 @@ def test_goals_count_only_after_those_that_come_before():
     assert away[1].add_s == pytest.approx(0.0, abs=1e-12)
     first = evaluate_placements(objects, goals, AddS(), [poses[0], planar(1, 0)])
     assert total_reward(goals, first) == 0.75
+
+
+def test_a_stage_that_was_complete_keeps_its_reward():
+    row = [planar(0, 0), planar(0.1, 0)]
+    top = planar(0.05, 0, 0, 0.01)
+    goals = [
+        *(goal(0, 1, pose=pose, reward=0.25) for pose in row),
+        goal(2, pose=top, reward=0.5, after=(0, 1)),
+    ]
+    objects = [bar(0), bar(1), bar(2)]
+
+    def at(*poses: RigidTransform) -> list[Placement]:
+        return evaluate_placements(objects, goals, AddS(), poses)
+
+    away = planar(1, 0)
+    half, whole, fallen = at(row[0], away, away), at(*row, away), at(row[0], away, away)
+    assert complete_stages(goals, half) == frozenset()
+    kept = complete_stages(goals, whole)
+    assert kept == {0, 1}
+    # It is kept from then on, and nothing is counted twice.
+    assert complete_stages(goals, fallen, kept) == kept
+    assert (total_reward(goals, fallen), total_reward(goals, fallen, kept)) == (0.25, 0.5)
+    assert total_reward(goals, at(*row, top), kept) == 1.0
+    # The last stage, which nothing comes after, counts as it stands.
+    assert complete_stages(goals, at(*row, top)) == kept
+    assert strict_reward(goals, fallen) == 0.25
 
 
 def test_an_object_without_a_goal_has_no_errors():
