@@ -24,7 +24,7 @@ from kitting_drake.paper.cells import (
     paper_cells,
 )
 from kitting_drake.reporting.markdown import markdown_table, rate_text
-from kitting_drake.reporting.paired import OWN, STRICT, Estimate, over_tools, paired_difference
+from kitting_drake.reporting.paired import OWN, STRICT, over_tools, paired_difference, points_text
 from kitting_drake.reporting.ravens_table import PAPER as TABLE_1
 from kitting_drake.reporting.results_page import PAPER
 from kitting_drake.reporting.runs import LEARNED, METHODS
@@ -224,7 +224,7 @@ def _differences(results: Mapping[str, Result]) -> list[str]:
             found = [paired_difference(*pair, rate) for rate in (STRICT, OWN)]
             if any(item is None for item in found):
                 continue
-            rows.append([name, label, *(_points(item) for item in found if item is not None)])
+            rows.append([name, label, *(points_text(item) for item in found if item is not None)])
     if not rows:
         return []
     return [
@@ -291,7 +291,3 @@ def _causes(summary: Mapping[str, Any]) -> str:
     """Why objects were no success, or no strict one, and how many."""
     counts = {**summary["causes"], **summary["ambiguous"]}
     return ", ".join(f"{name} {count}" for name, count in counts.items() if count) or "-"
-
-
-def _points(found: Estimate) -> str:
-    return f"{100 * found.value:+.1f} ({100 * found.low:+.1f} to {100 * found.high:+.1f})"

@@ -60,6 +60,11 @@ def paired_difference(
     return Estimate(float(differences.mean()), float(low), float(high))
 
 
+def points_text(found: Estimate) -> str:
+    """A difference of rates in points, with its interval."""
+    return f"{100 * found.value:+.1f} ({100 * found.low:+.1f} to {100 * found.high:+.1f})"
+
+
 def over_tools(outcomes: Sequence[Mapping[str, Any]], rate: str) -> Estimate | None:
     """The share of successes, with an interval by a bootstrap that draws tools.
 

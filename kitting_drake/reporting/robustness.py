@@ -7,6 +7,7 @@ from typing import Any
 from kitting_drake.common.errors import UserError
 from kitting_drake.common.paths import SCENARIOS
 from kitting_drake.reporting.markdown import markdown_table
+from kitting_drake.reporting.paired import STRICT, paired_difference, points_text
 from kitting_drake.reporting.runs import Run, described, scenario_differences
 from kitting_drake.scenario.loader import load_scenario
 from kitting_drake.scenario.perturbations import LEVELS, NAMES
@@ -18,6 +19,8 @@ _COLUMNS = {
     "generalist": "generalist",
     "shape_matching": "shape matching",
 }
+_COMPARED = ("generalist, minus as it is", "generalist, minus shape matching")
+"""In points, on the seeds that both ran."""
 _TRIES = 2
 
 
@@ -30,6 +33,7 @@ def robustness_table(runs: Sequence[Run]) -> str:
     """
     expected = _expected()
     cells: dict[tuple[str, str], list[str]] = defaultdict(list)
+    outcomes: dict[tuple[str, str], list[Any]] = defaultdict(list)
     seeds: set[str] = set()
     for run in sorted(runs, key=lambda run: min(run.summary["seeds"])):
         if run.method not in _COLUMNS or not run.detail("recover"):
@@ -41,16 +45,32 @@ def robustness_table(runs: Sequence[Run]) -> str:
         low, high = (100 * value for value in run.summary["strict_ci95"])
         share = 100 * run.summary["strict_success_rate"]
         cells[label, run.method].append(f"{share:.1f} ({low:.0f} to {high:.0f})")
+        # Older summaries tell of no episode.
+        outcomes[label, run.method] += run.summary.get("outcomes", ())
         seeds.add(f"{run.summary['episodes']} episodes from seed {min(run.summary['seeds'])}")
     if not cells:
         return "No runs yet.\n"
+
+    def difference(first: tuple[str, str], second: tuple[str, str]) -> str:
+        if first == second:
+            return "-"
+        found = paired_difference(
+            {"outcomes": outcomes[first]}, {"outcomes": outcomes[second]}, STRICT
+        )
+        return "-" if found is None else points_text(found)
+
     # Runs that differ in nothing but their seeds are all told: choosing would be flattering.
     rows = [
-        [label, *("<br>".join(cells[label, method]) or "-" for method in _COLUMNS)]
+        [
+            label,
+            *("<br>".join(cells[label, method]) or "-" for method in _COLUMNS),
+            difference((label, "generalist"), (_AS_IT_IS, "generalist")),
+            difference((label, "generalist"), (label, "shape_matching")),
+        ]
         for label in expected
         if any((label, method) in cells for method in _COLUMNS)
     ]
-    table = markdown_table(["perturbation", *_COLUMNS.values()], rows)
+    table = markdown_table(["perturbation", *_COLUMNS.values(), *_COMPARED], rows)
     return f"{table}\n{'; '.join(sorted(seeds))}.\n"
 
 

@@ -25,6 +25,7 @@ def run(perturb: str | None, share: float, tries: int = 2, **details: Any) -> Ru
             "strict_ci95": [share - 0.1, min(1.0, share + 0.1)],
             "seeds": [1, 2],
             "episodes": 2,
+            "outcomes": [{"seed": seed, "strict_success_rate": share} for seed in (1, 2)],
         },
     )
 
@@ -44,6 +45,20 @@ def test_runs_of_other_seeds_are_all_told():
     later.summary["seeds"] = [7, 8]
     table = robustness_table([later, run("all", 0.9)])
     assert "| 90.0 (80 to 100)<br>50.0 (40 to 60) |" in table
+
+
+def test_the_generalist_is_compared_on_the_seeds_that_both_ran():
+    learned = {"method": "generalist"}
+    better, worse = run("all", 0.9, **learned), run("all", 0.5)
+    elsewhere = run("all", 0.1)
+    elsewhere.summary["outcomes"] = [{"seed": 7, "strict_success_rate": 0.1}]
+    table = robustness_table([run(None, 1.0, **learned), better, worse, elsewhere])
+    rows = {line.split("|")[1].strip(): line for line in table.splitlines() if "|" in line}
+    *_, lost, ahead, _ = map(str.strip, rows["`all:moderate`"].split("|"))
+    assert lost.startswith("-10.0 (")
+    assert ahead.startswith("+40.0 (")
+    *_, lost, ahead, _ = map(str.strip, rows["as it is"].split("|"))
+    assert (lost, ahead) == ("-", "-")
 
 
 def test_what_is_something_else_is_left_out():
