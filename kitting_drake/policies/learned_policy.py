@@ -15,7 +15,7 @@ from torch import Tensor
 
 from kitting_drake.policies.correlation import Candidate
 from kitting_drake.policies.images import Image, make_action, rotation_matrix
-from kitting_drake.policies.matching.policy import RETRY_DISTANCE, belonging, something_fits
+from kitting_drake.policies.matching.policy import RETRY_DISTANCE, belonging, certain_fits
 from kitting_drake.policies.matching.recovery import recovery_action
 from kitting_drake.policies.matching.refinement import refine_grasp, refine_place
 from kitting_drake.policies.matching.segmentation import Segmentation, fill_unseen, segment
@@ -75,8 +75,8 @@ class LearnedPolicy:
                 refinement, not in the paper) instead of quantizing it.
             fit_outlines: refine the place by the outlines of object and recess, where they agree
                 (`refine_place`), and the grasp by what room there is for the jaws
-                (`refine_grasp`); and do not stop while an object certainly fits
-                (`something_fits`). Not in the paper.
+                (`refine_grasp`); and where the networks would stop while an object certainly fits
+                (`certain_fits`), pick that one. Not in the paper.
             recover: press down what protrudes, pick what belongs into a recess before anything
                 else (`belonging`), and at last take out what could not be pressed down
                 (`recovery_action`). Not in the paper.
@@ -168,17 +168,22 @@ class LearnedPolicy:
         belongs = choice.fits
         if self._recover and segmentation is not None and not belongs:
             # The network's favourite may have no business here: what does, goes first.
-            wanted = belonging(segmentation, resolution)
-            belongs = wanted is not None and bool(wanted.any())
-            if wanted is not None and belongs:
-                logits = _without(logits, ~wanted)
+            left = _within(logits, belonging(segmentation, resolution))
+            belongs = left is not None
+            if left is not None:
+                logits = left
                 choice = self._choose(image, picking, logits, outlines, resolution, refine_pick)
         odds, threshold = picking.log_odds, self._networks.stop_threshold
         stop = self._may_stop and odds is not None and threshold is not None and odds < threshold
         if stop and self._recover:
             stop = not belongs
         elif stop and outlines is not None:
-            stop = not something_fits(outlines, resolution)
+            # To the networks nothing looks like an object; an outline says that something is one.
+            left = _within(logits, certain_fits(outlines, resolution))
+            stop = left is None
+            if left is not None:
+                logits = left
+                choice = self._choose(image, picking, logits, outlines, resolution, refine_pick)
         action = make_action(observation, choice.pick, choice.theta, choice.place, choice.rotation)
         return Decision(
             action=dataclasses.replace(action, stop=stop),
@@ -262,6 +267,14 @@ class _Choice:
 def _without(logits: Tensor, mask: NDArray[np.bool_]) -> Tensor:
     """Logits by which no pixel of a mask is chosen."""
     return logits.masked_fill(torch.from_numpy(mask).to(logits.device), _NEVER)
+
+
+def _within(logits: Tensor, mask: NDArray[np.bool_] | None) -> Tensor | None:
+    """Logits by which only pixels of a mask are chosen; None if it leaves none."""
+    if mask is None:
+        return None
+    left = _without(logits, ~mask)
+    return left if bool((left > _NEVER).any()) else None
 
 
 def near_failed(grid: PixelGrid, failed_picks: Sequence[PlanarPose]) -> NDArray[np.bool_]:

@@ -18,7 +18,7 @@ from kitting_drake.common.errors import UserError
 from kitting_drake.policies.discretization import discretization_matrix
 from kitting_drake.policies.fourier_series import series_maximum
 from kitting_drake.policies.images import Image, crop, make_action, rotation_matrix
-from kitting_drake.policies.matching.policy import something_fits
+from kitting_drake.policies.matching.policy import certain_fits
 from kitting_drake.policies.matching.refinement import refine_grasp, refine_place
 from kitting_drake.policies.matching.segmentation import fill_unseen, segment
 from kitting_drake.policies.numpy_correlation import Array, search
@@ -85,10 +85,11 @@ class OnnxPolicy:
         rows, cols = image.shape[1:]
         outlines = segment(observation) if self._fit_outlines else None
         logits = self._run("alpha", image)[0, 0, :rows, :cols]
-        if self._stops(logits) and not (
-            outlines is not None and something_fits(outlines, resolution)
-        ):
-            return PickPlaceAction(stop=True)
+        if self._stops(logits):
+            certain = None if outlines is None else certain_fits(outlines, resolution)
+            if certain is None or not certain.any():
+                return PickPlaceAction(stop=True)
+            logits = np.where(certain, logits, -np.inf)
         row, col = divmod(int(logits.argmax()), cols)
         pixel = np.array([row, col], float)
         pick = pixel + _mean_offset(logits, (row, col)) if self._continuous else pixel

@@ -102,9 +102,13 @@ def _distance(positions: NDArray[np.float64], pixel: NDArray[np.float64]) -> flo
     return float(np.linalg.norm(positions - pixel, axis=1).min(initial=np.inf))
 
 
-def something_fits(segmentation: Segmentation, resolution: float) -> bool:
-    """Whether a loose object certainly belongs into a recess that is free; see `match`."""
-    return any(fit.cost < _CERTAIN_COST for _, fit in match(segmentation, resolution))
+def certain_fits(segmentation: Segmentation, resolution: float) -> NDArray[np.bool_]:
+    """(rows, cols): the loose objects that certainly belong into a free recess; see `match`."""
+    mask = np.zeros(segmentation.fixture.shape, bool)
+    for index, fit in match(segmentation, resolution):
+        if fit.cost < _CERTAIN_COST:
+            mask |= segmentation.objects[index].mask
+    return mask
 
 
 def belonging(segmentation: Segmentation, resolution: float) -> NDArray[np.bool_] | None:

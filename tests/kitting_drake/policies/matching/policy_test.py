@@ -11,13 +11,15 @@ from pydrake.math import RollPitchYaw
 
 from kitting_drake.cell import build_cell
 from kitting_drake.cell.cameras import can_render
-from kitting_drake.common.paths import SCENARIOS
+from kitting_drake.common.paths import GENERALIST, SCENARIOS
 from kitting_drake.policies.images import rotation_matrix
-from kitting_drake.policies.matching.policy import ShapeMatchingPolicy
+from kitting_drake.policies.learned_policy import LearnedPolicy
+from kitting_drake.policies.matching.policy import ShapeMatchingPolicy, certain_fits
 from kitting_drake.policies.matching.refinement import refine_grasp, refine_place
 from kitting_drake.policies.matching.segmentation import fill_unseen, segment
+from kitting_drake.policies.weights import load_networks
 from kitting_drake.scenario.loader import load_scenario
-from systems.signals import Observation, PixelGrid
+from systems.signals import Observation, PixelGrid, PlanarPose
 
 pytestmark = pytest.mark.skipif(not can_render(), reason="images cannot be rendered here")
 
@@ -118,6 +120,35 @@ def test_it_stops_where_nothing_is_left(seen):
     cleared = dataclasses.replace(observation, image=image)
     assert ShapeMatchingPolicy()(cleared).stop
     assert ShapeMatchingPolicy()(Observation()).stop
+
+
+@pytest.mark.parametrize("seen", [None], indirect=True)
+def test_what_certainly_fits_is_picked_though_the_networks_see_nothing(seen):
+    observation, _ = seen
+    networks = load_networks(GENERALIST)
+    predict = networks.predict_pick
+
+    def blind(*arguments):
+        found = predict(*arguments)
+        position = found.position.clone()
+        position[0, 0] = 1e3
+        return dataclasses.replace(found, position=position, log_odds=-99.0)
+
+    networks.predict_pick = blind
+    action = LearnedPolicy(networks, fit_outlines=True)(observation)
+    assert not action.stop
+    assert certain_fits(segment(observation), observation.grid.resolution)[
+        pixel_of(observation, action)
+    ]
+    assert LearnedPolicy(networks)(observation).stop
+    # Where a grasp of each of them failed everywhere, nothing is left.
+    grid = observation.grid
+    everywhere = [
+        PlanarPose(*grid.to_world(pixel), 0.0)
+        for region in segment(observation).objects
+        for pixel in np.argwhere(region.mask)[::3]
+    ]
+    assert LearnedPolicy(networks, fit_outlines=True)(observation, everywhere).stop
 
 
 @pytest.mark.parametrize("turn", [0.0, math.pi])
