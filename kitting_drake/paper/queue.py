@@ -161,7 +161,7 @@ class Queue:
                 *("--method", training.method),
                 *("--preset", PRESET),
                 *("--orientations", training.orientations),
-                *("--steps", task.steps),
+                *("--steps", training.steps),
                 *("--learning-rate", rate),
                 "--decay",
                 *(("--taken-only",) if training.taken_only else ()),

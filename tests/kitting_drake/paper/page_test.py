@@ -34,7 +34,7 @@ def write(folder: Path, name: str, errors_mm: list[float]) -> None:
             "trained_orientations": cell.policy.orientations,
             "demonstrations": cell.policy.demonstrations,
             "training_seed": 0,
-            "steps": task.steps,
+            "steps": cell.policy.steps,
             "learning_rate": 0.001,
             "continuous": cell.continuous,
             "fit_outlines": cell.fit_outlines,
