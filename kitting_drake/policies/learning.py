@@ -21,3 +21,7 @@ class Learning:
     reflection: bool = False
     """Mirror images of scenes are scenes of the task as well, and their objects are handled alike.
     True for hand tools of many shapes."""
+    many_answers: bool = False
+    """What the expert does is one of several things that are as right: objects are symmetric, or
+    places may be exchanged. Errors against it then say little, and a checkpoint is chosen by the
+    losses. True for blocks, false for hand tools."""

@@ -5,6 +5,7 @@ import io
 import json
 import pickle
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -24,13 +25,14 @@ from kitting_drake.common.files import (
     write_json,
 )
 from kitting_drake.policies.config import NetworkConfig
+from kitting_drake.policies.images import LabelledImage
 from kitting_drake.policies.learned_policy import LearnedPolicy
 from kitting_drake.policies.methods import make_networks
 from kitting_drake.policies.networks import Networks
 from kitting_drake.policies.samples import normalisation
 from kitting_drake.policies.training import Trainer
-from kitting_drake.policies.training_data import TrainingData
-from kitting_drake.policies.validation import validate
+from kitting_drake.policies.training_data import TrainingData, evenly_chosen
+from kitting_drake.policies.validation import mean_loss, validate
 from kitting_drake.policies.weights import (
     load_trainable,
     preferred_type,
@@ -140,6 +142,11 @@ class TrainingRun:
         self.finals = learned.finals(colour=settings.colour)
         self.validation_scenes = held_out.scenes(_MOST_VALIDATED)
         self.validation_finals = held_out.finals(_MOST_VALIDATED)
+        self._judged: Sequence[LabelledImage] = ()
+        if held_out.learning.many_answers:
+            samples = held_out.samples(taken_only=True, colour=settings.colour)
+            chosen = evenly_chosen(list(range(len(samples))), _MOST_VALIDATED)
+            self._judged = [samples[index] for index in chosen]
         networks = _fresh(settings, learned) if start is None else load_trainable(start)
         networks.to(settings.device)
         networks.compute_type = preferred_type()
@@ -247,8 +254,11 @@ class TrainingRun:
         networks, step = self.trainer.networks.eval(), self.trainer.step_count
         policy = LearnedPolicy(networks, orientations=self.settings.orientations)
         report = validate(policy, self.validation_scenes, self.validation_finals)
+        if self._judged:
+            report["loss"] = mean_loss(networks, self._judged)
         chosen = {"step": step, **report}
-        if self.best is None or report["cost_mm"] < self.best["cost_mm"]:
+        criterion = "loss" if self._judged else "cost_mm"
+        if self.best is None or report[criterion] < self.best[criterion]:
             self.best = chosen
             threshold = report.get("stop_threshold")
             card = {**self.card, "validation": chosen, "stop_threshold": threshold}
@@ -290,9 +300,10 @@ def _report_line(step: int, report: dict[str, float]) -> str:
     stops = ""
     if "stop_threshold" in report:
         stops = f"; {report['false_stops']:.0f} false and {report['missed_stops']:.0f} missed stops"
+    loss = f"; loss {report['loss']:.2f}" if "loss" in report else ""
     return (
         f"step {step}: median errors of the pick {report['median_pick_mm']:.1f} mm, "
         f"{report['median_pick_deg']:.2f} deg, of the place {report['median_place_mm']:.1f} mm, "
         f"{report['median_rotation_deg']:.2f} deg; "
-        f"mean displacement {report['displacement_mm']:.2f} mm{stops}"
+        f"mean displacement {report['displacement_mm']:.2f} mm{stops}{loss}"
     )

@@ -6,10 +6,12 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
+import torch
 from numpy.typing import ArrayLike, NDArray
 
 from kitting_drake.policies.images import LabelledImage, Pictured
 from kitting_drake.policies.learned_policy import Decision, LearnedPolicy
+from kitting_drake.policies.networks import Networks
 from kitting_drake.policies.samples import Scene, observed
 
 ERRORS = ("pick_mm", "pick_deg", "place_mm", "rotation_deg", "displacement_mm")
@@ -101,7 +103,8 @@ def validate(
         observations, also the `stop_threshold` chosen for them, by how many nats the two kinds
         are separated, as `stop_margin` (negative: they overlap), and how many scenes are judged
         wrongly: `false_stops`, in which there is something to pick, and `missed_stops`.
-        And `cost_mm`, by which a checkpoint is chosen: the mean displacement over all scenes and
+        And `cost_mm`, by which a checkpoint is chosen where the expert's action is the only right
+        one: the mean displacement over all scenes and
         final observations, where what is judged wrongly counts as lost (20 mm) and a final
         observation that is judged rightly as 0.
     """
@@ -124,6 +127,22 @@ def validate(
     if absent and None not in (*present, *absent):
         report |= _stop_report(np.array(present, float), np.array(absent, float), displacements)
     return report
+
+
+@torch.no_grad()
+def mean_loss(networks: Networks, samples: Sequence[LabelledImage]) -> float:
+    """The mean over samples of the sum of all losses, in nats: of the action that was taken, how
+    improbable it is to the networks.
+
+    Args:
+        networks: of any method, for inference.
+        samples: at least one, as networks of their kind learn from.
+    """
+    values = [
+        sum(float(loss()) for _, loss in networks.losses(sample, np.random.default_rng(index)))
+        for index, sample in enumerate(samples)
+    ]
+    return float(np.mean(values))
 
 
 def _stop_report(

@@ -6,7 +6,7 @@ import shutil
 import signal
 import subprocess
 import sys
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +28,8 @@ from kitting_drake.policies.demonstrations import (
     Origin,
     write_demonstrations,
 )
+from kitting_drake.policies.images import LabelledImage
+from kitting_drake.policies.networks import Networks
 from kitting_drake.policies.static_scenes import StaticScene, StaticScenes, write_static_scenes
 from kitting_drake.policies.training import Trainer
 from kitting_drake.policies.weights import load_networks, read_weights_file
@@ -182,6 +184,25 @@ def test_the_task_says_what_training_may_assume(
     assert not file.config.stop
     assert file.card["stop_threshold"] is None
     assert "false_stops" not in file.card["validation"]
+
+
+@pytest.mark.parametrize(("losses", "best"), [((1.0, 2.0), 3), ((2.0, 1.0), 4)])
+def test_where_many_answers_are_right_the_losses_choose(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, losses: tuple[float, float], best: int
+):
+    origin = dataclasses.replace(ORIGIN, learning=Learning(many_answers=True))
+    demos = write(tmp_path / "demonstrations.h5", range(10, 14), origin)
+    told: list[int] = []
+
+    def mean_loss(networks: Networks, samples: Sequence[LabelledImage]) -> float:
+        assert len(samples) == 2
+        told.append(len(told))
+        return losses[told[-1]]
+
+    monkeypatch.setattr(training_run, "mean_loss", mean_loss)
+    train(demos, tmp_path / "run")
+    card = read_weights_file(tmp_path / "run" / "policy.safetensors").card
+    assert (card["validation"]["step"], card["validation"]["loss"]) == (best, min(losses))
 
 
 def test_the_curves(trained: Path):

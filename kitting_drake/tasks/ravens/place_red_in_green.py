@@ -36,7 +36,7 @@ class PlaceRedInGreen(RavensTask):
 
     @property
     def learning(self) -> Learning:
-        return Learning(later_picks_possible=True, curvature=False)
+        return Learning(later_picks_possible=True, many_answers=True)
 
     def make_scene(self, *, grid: PixelGrid, seed: int, base: Path) -> Scene:
         rng = np.random.default_rng([seed, 1])

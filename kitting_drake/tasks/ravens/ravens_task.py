@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 from pydrake.math import RigidTransform
 
+from kitting_drake.policies.learning import Learning
 from kitting_drake.tasks.task import MISPLACED, ActionRecord, Scene, TaskConfig
 from systems.bounds import bounded
 from systems.placement import Placement, PoseWithin
@@ -23,6 +24,10 @@ class RavensTask(TaskConfig):
     """A task of Ravens: its name, and why its objects fail."""
 
     causes = (*TaskConfig.causes[:-1], TOPPLED, PREREQUISITE_MISSING, TaskConfig.causes[-1])
+
+    @property
+    def learning(self) -> Learning:
+        return Learning(many_answers=True)
 
     @property
     def title(self) -> str:

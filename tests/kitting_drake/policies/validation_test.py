@@ -1,15 +1,19 @@
+import dataclasses
 import math
 
 import numpy as np
 import pytest
 
+from kitting_drake.policies.config import NetworkConfig
 from kitting_drake.policies.demonstrations import FinalObservation, record
 from kitting_drake.policies.images import Image, make_action, rotation_matrix
 from kitting_drake.policies.learned_policy import Decision
+from kitting_drake.policies.methods import make_networks
 from kitting_drake.policies.samples import Scene
 from kitting_drake.policies.validation import (
     ERRORS,
     choose_stop_threshold,
+    mean_loss,
     prediction_errors,
     validate,
 )
@@ -127,3 +131,17 @@ def test_the_threshold_for_stopping(
     present: tuple[float, ...], absent: tuple[float, ...], threshold: float | None
 ):
     assert choose_stop_threshold(present, absent) == threshold
+
+
+def test_the_mean_loss_is_that_of_the_action_that_was_taken():
+    networks = make_networks(NetworkConfig(preset="tiny")).eval()
+    seen = np.random.default_rng(0).random((4, *GRID.shape)).astype(np.float32)
+    sample = dataclasses.replace(SCENE.targets[0], image=seen)
+    found = mean_loss(networks, [sample, sample])
+    assert found == mean_loss(networks, [sample, sample])
+    parts = {
+        name: float(loss().detach())
+        for name, loss in networks.losses(sample, np.random.default_rng(0))
+    }
+    assert mean_loss(networks, [sample]) == pytest.approx(sum(parts.values()), rel=1e-4)
+    assert parts.keys() == {"pick_position", "pick_angle", "place"}
