@@ -49,6 +49,7 @@ def write(folder: Path, name: str, errors_mm: list[float]) -> None:
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
     write(tmp_path, "unseen_so2_180_100", [1.0, 1.0, 1.0, 9.0])
+    write(tmp_path, "unseen_so2_180_100_ours", [1.0, 1.0, 1.0, 1.0])
     write(tmp_path, "unseen_equivariant_transporter_180_100", [1.0, 1.0, 9.0, 9.0])
     write(tmp_path, "unseen_quantized_oracle_180", [1.0, 1.0, 1.0, 1.0])
     write(tmp_path, "stack_block_pyramid_so2_36_10", [1.0, 9.0])
@@ -71,6 +72,9 @@ def test_the_tables_hold_the_cells_and_say_what_is_missing(folder: Path):
     assert found["oracle, quantized", ""][-1].startswith("100.0")
     assert found["unseen_so2_180_100", "Equivariant Transporter"] == ["+25.0 (+25.0 to +25.0)"] * 2
     assert found["unseen_so2_180_100", "oracle, quantized"][0].startswith("-25.0")
+    assert found["as in the paper", "75.0 (70.5 to 79.0) / 75.0"] == ["-"]
+    assert found["with all that goes beyond it", "100.0 (99.0 to 100.0) / 100.0"] == ["-"]
+    assert found["without outlines", "-"] == [""]
     assert "results/paper/unseen_so2_180_100.json" in text
     assert "misplaced 100" in text
     pyramid = [line for line in text.splitlines() if " 36 |" in line and " 10 |" in line]
