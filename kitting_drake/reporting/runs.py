@@ -47,6 +47,7 @@ _ADDED = (
     "plant.friction_variation",
     "plant.mass_variation",
     "sensor_noise",
+    "sensor_noise.frames",
     "appearance",
 )
 """Fields that older runs lack; their defaults change nothing in what those did, but that a search

@@ -7,7 +7,13 @@ from pydrake.geometry import ClippingRange, DepthRange, DepthRenderCamera, Rende
 from pydrake.math import RigidTransform, RollPitchYaw
 from pydrake.systems.sensors import CameraInfo, ImageDepth32F, ImageLabel16I, ImageRgba8U
 
-from systems.sensor_noise import SHEEN_LABELS, SensorNoise, SensorNoiseParameters, noisy_depth
+from systems.sensor_noise import (
+    SHEEN_LABELS,
+    SensorNoise,
+    SensorNoiseParameters,
+    median_depth,
+    noisy_depth,
+)
 
 WIDTH, HEIGHT, FOCAL = 160, 120, 112.0
 POSE = RigidTransform(RollPitchYaw(0.8, 3.0, -1.5), [1.0, 0.1, 0.75])
@@ -121,6 +127,29 @@ def test_pixels_fly_only_beside_edges():
     assert changed.sum() == changed[:, WIDTH // 2 - 1 : WIDTH // 2 + 1].sum()
     assert (seen >= 0.9 - 1e-6).all()
     assert (seen <= 1.0 + 1e-6).all()
+
+
+def test_the_median_of_frames_is_less_noisy_and_has_fewer_holes():
+    depth = np.full((HEIGHT, WIDTH), 1.2, np.float32)
+    one, five = (
+        depth_of(noise, context_of(noise, depth))
+        for noise in (
+            system(depth_std=0.002, hole_share=0.1, frames=frames, correlation=1.0)
+            for frames in (1, 5)
+        )
+    )
+    errors = [float(np.std(image[image > 0] - 1.2)) for image in (one, five)]
+    # The median of five normal values has a standard deviation of 0.536 of one's.
+    assert errors[0] == pytest.approx(0.002 * 1.2**2, rel=0.1)
+    assert 0.5 < errors[1] / errors[0] < 0.62
+    assert (one == 0).mean() > 0.05
+    assert not (five == 0).any()
+
+
+def test_a_median_is_of_what_has_a_depth():
+    frames = np.array([[3, 0, np.inf, 1], [1, 2, np.inf, 0], [2, 4, np.inf, 0]], np.float32)
+    found = median_depth([frame[None] for frame in frames])
+    np.testing.assert_array_equal(found, np.array([[2, 3, np.inf, 1]], np.float32))
 
 
 def test_calibration_is_off_by_what_was_asked():
