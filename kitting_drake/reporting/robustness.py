@@ -96,7 +96,6 @@ def _expected() -> dict[str, dict[str, Any]]:
     rows: dict[str, tuple[str, str | None]] = {_AS_IT_IS: (one, None)}
     for level in LEVELS:
         rows |= {f"`{name}:{level}`": (one, f"{name}:{level}") for name in NAMES}
-    # Last: older runs do not say that they took one image, and belong to the rows above.
     for name in ("depth_noise", "all"):
         rows[f"`{name}:moderate`, {_FRAMES} frames"] = (more, f"{name}:moderate")
     return {
