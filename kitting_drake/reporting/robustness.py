@@ -56,9 +56,9 @@ def robustness_table(runs: Sequence[Run]) -> str:
     same = {
         key: chosen
         for key, every in found.items()
-        if (chosen := [run for run in every if list(run.summary["seeds"]) == list(_SEEDS)])
+        if (chosen := [run for run in every if _same(run)])
     }
-    further = {label for (label, _), every in found.items() if len(every) > 1}
+    further = {label for (label, _), every in found.items() for run in every if not _same(run)}
     parts = []
     if same:
         parts.append(
@@ -67,7 +67,7 @@ def robustness_table(runs: Sequence[Run]) -> str:
         )
     if further:
         parts.append(
-            "All seeds together, where there were more, with the number of objects (most of them "
+            "All seeds together, where there are more, with the number of objects (most of them "
             "by earlier code):\n\n"
             + _table(found, [label for label in expected if label in further], counted=True)
         )
@@ -114,6 +114,11 @@ def _table(found: Mapping[Key, Sequence[Run]], labels: Sequence[str], counted: b
         if any((label, method) in found for method in _COLUMNS)
     ]
     return markdown_table(["perturbation", *_COLUMNS.values(), *_COMPARED], rows)
+
+
+def _same(run: Run) -> bool:
+    """Whether its seeds are those that all are run on."""
+    return list(run.summary["seeds"]) == list(_SEEDS)
 
 
 def _strict(run: Run) -> tuple[int, int]:
