@@ -18,12 +18,17 @@ from kitting_drake.policies.images import Image, make_action, rotation_matrix
 from kitting_drake.policies.matching.policy import RETRY_DISTANCE, belonging, certain_fits
 from kitting_drake.policies.matching.recovery import recovery_action
 from kitting_drake.policies.matching.refinement import refine_grasp, refine_place
+from kitting_drake.policies.matching.release_clearance import blocked_at_place
 from kitting_drake.policies.matching.segmentation import Segmentation, fill_unseen, segment
 from kitting_drake.policies.networks import Networks, PickPrediction
 from systems.signals import Observation, PickPlaceAction, PixelGrid, PlanarPose, wrap_to_pi
 
 _NEVER = -math.inf
 """The logit of a pixel that must not be chosen."""
+_AS_GOOD = 2.0
+"""A rotation whose score is less by at most this is as good, in nats, ..."""
+_SAME_PLACE = 4.0
+"""... where the places are at most this far apart, in pixels."""
 
 
 @dataclass(frozen=True)
@@ -64,6 +69,7 @@ class LearnedPolicy:
         continuous: bool = True,
         fit_outlines: bool = False,
         recover: bool = False,
+        clear_jaws: bool = False,
         may_stop: bool = True,
         watch: Callable[[Observation, Decision], None] | None = None,
     ) -> None:
@@ -80,6 +86,9 @@ class LearnedPolicy:
             recover: press down what protrudes, pick what belongs into a recess before anything
                 else (`belonging`), and at last take out what could not be pressed down
                 (`recovery_action`). Not in the paper.
+            clear_jaws: of rotations that the networks hold for as good, as a cube has four, take
+                the one where the fingers have most room when they let go (`blocked_at_place`). Not
+                in the paper.
             may_stop: whether to stop where there is nothing left to pick. Not in the paper.
             watch: called with each observation and decision.
 
@@ -92,6 +101,7 @@ class LearnedPolicy:
         self._continuous = continuous
         self._fit_outlines = fit_outlines
         self._recover = recover
+        self._clear_jaws = clear_jaws
         self._may_stop = may_stop
         self._watch = watch
 
@@ -230,9 +240,7 @@ class LearnedPolicy:
 
         # The crop is centred on a pixel. Its predicted motion applies to the refined pick too.
         placing = self._networks.predict_place(image, (row, col), self._orientations)
-        rotation, place = best_placement(
-            placing.candidates[0], self._orientations, self._continuous
-        )
+        rotation, place = self._placement(placing.candidates, image[3], resolution, pixel, theta)
         place = place + rotation_matrix(rotation) @ (pick - pixel)
         fits = False
         if outlines is not None:
@@ -247,6 +255,43 @@ class LearnedPolicy:
             fits=fits,
             angle_curve=F.softmax(angles, 0).float().cpu().numpy(),
             place_map=(placing.score_map - placing.score_map.max()).float().cpu().numpy(),
+        )
+
+    def _placement(
+        self,
+        candidates: Sequence[Candidate],
+        height: NDArray[np.float32],
+        resolution: float,
+        pixel: NDArray[np.float64],
+        theta: float,
+    ) -> tuple[float, NDArray[np.float64]]:
+        """The rotation in radians and the position (row, col) of the best candidate, or of one as
+        good that leaves the fingers more room.
+
+        Args:
+            candidates: the best first.
+            height: (rows, cols) of o_t, in metres.
+            resolution: of a pixel, in metres.
+            pixel: (row, col) of the pick.
+            theta: of the gripper there, in radians.
+        """
+
+        def placement(candidate: Candidate) -> tuple[float, NDArray[np.float64]]:
+            return best_placement(candidate, self._orientations, self._continuous)
+
+        first = placement(candidates[0])
+        if not self._clear_jaws:
+            return first
+        score = candidates[0].best()[0]
+        as_good = [
+            found
+            for candidate in candidates
+            if candidate.best()[0] >= score - _AS_GOOD
+            and np.linalg.norm((found := placement(candidate))[1] - first[1]) <= _SAME_PLACE
+        ]
+        # Of equals the first: it has the best score.
+        return min(
+            as_good, key=lambda item: blocked_at_place(height, resolution, pixel, theta, *item)
         )
 
 

@@ -166,9 +166,11 @@ class Learned(PolicyConfig):
     # among pixel centres and the N orientations.
     continuous: bool = True
 
-    # With `continuous`: refine the place by fitting the outline of the object, as o_t shows it, to
-    # that of the recess, where the two agree, and the grasp by the room that there is for the jaws;
-    # and do not stop while an object certainly fits into a recess (the paper does none of these).
+    # With `continuous`, by the geometry of o_t (the paper does none of these): refine the place by
+    # fitting the outline of the object to that of the recess, where the two agree, and the grasp by
+    # the room that there is for the jaws; and do not stop while an object certainly fits into a
+    # recess. Where nothing is inserted: of rotations that the networks hold for as good, take the
+    # one where the fingers have room when they let go.
     fit_outlines: bool = True
 
     # Mend what an action left undone, as o_t shows it: press down what protrudes; pick what fits
@@ -204,6 +206,7 @@ class Learned(PolicyConfig):
                 continuous=self.continuous,
                 fit_outlines=insertion and self.continuous and self.fit_outlines,
                 recover=insertion and self.recover,
+                clear_jaws=not insertion and self.continuous and self.fit_outlines,
                 may_stop=site.may_stop,
                 watch=site.observer,
             )

@@ -1,0 +1,96 @@
+"""Whether the fingers have room where an object is put down, as o_t shows it.
+
+Where a place is as good in several rotations, as that of a cube is, a network cannot know which:
+its encodings of object and place do not tell how the jaws hold the object. Between neighbours it
+matters. Geometry alone, by height: not in the paper.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from kitting_drake.policies.images import rotation_matrix
+from systems.hand_geometry import FINGER_LENGTH, FINGERTIP_DEPTH, MAX_OPENING
+from systems.pick_place_parameters import PickPlaceParameters
+
+Array = NDArray[np.float64]
+
+_PRIMITIVE = PickPlaceParameters()
+_STEP = 0.001
+"""Between samples along the jaws' way, in metres."""
+_LINES = 7
+"""Lines of samples along the fingers' length."""
+_SUPPORT_REACH, _SUPPORT_SHARE = 0.06, 10.0
+"""What an object stands on is the percentile of the heights this near to it, in metres."""
+_UNDER = 0.009
+"""What it is put on is the highest within this of the place, in metres."""
+_LEAST = 0.004
+"""What rises above the fingertips by less than this is in nobody's way, in metres."""
+
+
+def blocked_at_place(
+    height: NDArray[np.float32],
+    resolution: float,
+    pick: Array,
+    theta: float,
+    rotation: float,
+    place: Array,
+) -> float:
+    """The share of what the fingers need at a place that something stands in.
+
+    Args:
+        height: (rows, cols) of o_t, in metres.
+        resolution: of a pixel, in metres.
+        pick: (row, col) where the object is gripped.
+        theta: of the gripper there, in radians.
+        rotation: of the object on its way, in radians.
+        place: (row, col) where the gripper is to let go of it.
+    """
+    top = _highest(height, pick, resolution, resolution)
+    around = _window(height, pick, _SUPPORT_REACH / resolution)
+    support = float(np.percentile(around, _SUPPORT_SHARE))
+    depth = np.clip(
+        _PRIMITIVE.grasp_depth_share * (top - support),
+        _PRIMITIVE.grasp_depth,
+        _PRIMITIVE.max_grasp_depth,
+    )
+    tip = max(top - float(depth), support + _LEAST)
+    across = np.array([-math.sin(theta), math.cos(theta)])
+    ways = np.arange(0.0, MAX_OPENING / 2, _STEP)
+    reach = FINGERTIP_DEPTH + _PRIMITIVE.release_clearance
+    along = np.array([math.cos(theta), math.sin(theta)])
+    lines = np.linspace(-FINGER_LENGTH / 2, FINGER_LENGTH / 2, _LINES)
+    bottom = _highest(height, place, resolution, _UNDER)
+    turn = rotation_matrix(rotation)
+    taken = []
+    for side in (1.0, -1.0):
+        held = _sample(height, pick + side * ways[:, None] * across / resolution) > tip
+        face = ways[int(held.argmin())] if not held.all() else ways[-1]
+        out = face + np.arange(_STEP, reach, _STEP)
+        offsets = side * out[:, None, None] * across + lines[None, :, None] * along
+        there = place + offsets.reshape(-1, 2) @ turn.T / resolution
+        taken.append(_sample(height, there) > bottom + (tip - support) + _LEAST)
+    return float(np.concatenate(taken).mean())
+
+
+def _sample(height: NDArray[np.float32], positions: Array) -> Array:
+    """(n,) the heights at positions (n, 2) in pixels; zero outside."""
+    return ndimage.map_coordinates(height, positions.T, order=1, mode="constant", cval=0.0)
+
+
+def _window(height: NDArray[np.float32], pixel: Array, reach: float) -> NDArray[np.float32]:
+    """The heights within so many rows and cols of a pixel, which is brought into the image."""
+    size = np.array(height.shape)
+    middle = np.clip(np.rint(pixel), 0, size - 1)
+    (top, left), (bottom, right) = (
+        np.clip(middle + sign * math.ceil(reach), 0, size - 1).astype(int) for sign in (-1, 1)
+    )
+    return height[top : bottom + 1, left : right + 1]
+
+
+def _highest(height: NDArray[np.float32], pixel: Array, resolution: float, reach: float) -> float:
+    return float(_window(height, pixel, reach / resolution).max())
