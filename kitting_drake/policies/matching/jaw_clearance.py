@@ -88,7 +88,7 @@ def jaw_grasps(
     return sorted([*refined, *found], key=lambda item: item.cost)
 
 
-def _tip_height(top: Array, support: float) -> Array:
+def tip_height(top: Array, support: float) -> Array:
     """Where the fingertips go, above the table: as the planner has it by default, but not below a
     support."""
     depth = np.clip(
@@ -110,7 +110,7 @@ def _grip(
     """The grasps among places (n, 2) and angles (n,) that the jaws can take."""
     raised = ndimage.maximum_filter(relief, 3)
     top = raised[tuple(np.rint(places).astype(int).T)].astype(float)
-    tip = _tip_height(top, support)
+    tip = tip_height(top, support)
 
     along = np.column_stack([np.cos(thetas), np.sin(thetas)])
     across = np.column_stack([-np.sin(thetas), np.cos(thetas)])

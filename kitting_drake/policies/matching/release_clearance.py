@@ -14,12 +14,12 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from kitting_drake.policies.images import rotation_matrix
+from kitting_drake.policies.matching.jaw_clearance import tip_height
 from systems.hand_geometry import FINGER_LENGTH, FINGERTIP_DEPTH, MAX_OPENING
 from systems.pick_place_parameters import PickPlaceParameters
 
 Array = NDArray[np.float64]
 
-_PRIMITIVE = PickPlaceParameters()
 _STEP = 0.001
 """Between samples along the jaws' way, in metres."""
 _LINES = 7
@@ -53,15 +53,10 @@ def blocked_at_place(
     top = _highest(height, pick, resolution, resolution)
     around = _window(height, pick, _SUPPORT_REACH / resolution)
     support = float(np.percentile(around, _SUPPORT_SHARE))
-    depth = np.clip(
-        _PRIMITIVE.grasp_depth_share * (top - support),
-        _PRIMITIVE.grasp_depth,
-        _PRIMITIVE.max_grasp_depth,
-    )
-    tip = max(top - float(depth), support + _LEAST)
+    tip = float(tip_height(np.array(top), support))
     across = np.array([-math.sin(theta), math.cos(theta)])
     ways = np.arange(0.0, MAX_OPENING / 2, _STEP)
-    reach = FINGERTIP_DEPTH + _PRIMITIVE.release_clearance
+    reach = FINGERTIP_DEPTH + PickPlaceParameters().release_clearance
     along = np.array([math.cos(theta), math.sin(theta)])
     lines = np.linspace(-FINGER_LENGTH / 2, FINGER_LENGTH / 2, _LINES)
     bottom = _highest(height, place, resolution, _UNDER)
