@@ -15,13 +15,10 @@ from kitting_drake.common.files import (
     require_folder,
 )
 from kitting_drake.policies.config import METHODS, PRESETS, NetworkConfig
+from kitting_drake.policies.device import preferred_device, preferred_type
 from kitting_drake.policies.training_data import TrainingData, read_training_data
 from kitting_drake.policies.training_run import WEIGHTS, Settings, TrainingRun
-from kitting_drake.policies.weights import (
-    preferred_device,
-    preferred_type,
-    read_weights_file,
-)
+from kitting_drake.policies.weights import read_weights_file
 
 
 def main() -> int:

@@ -141,13 +141,9 @@ def load_policy(
         UserError: the file cannot be used, or not at so many orientations.
     """
     # Only who uses a network waits for torch.
+    from kitting_drake.policies.device import preferred_device, preferred_type
     from kitting_drake.policies.learned_policy import LearnedPolicy
-    from kitting_drake.policies.weights import (
-        load_networks,
-        preferred_device,
-        preferred_type,
-        read_weights_file,
-    )
+    from kitting_drake.policies.weights import load_networks, read_weights_file
 
     path = GENERALIST if weights is None else weights
     resolution = read_weights_file(path).card.get("resolution")

@@ -25,6 +25,7 @@ from kitting_drake.common.files import (
     write_json,
 )
 from kitting_drake.policies.config import NetworkConfig
+from kitting_drake.policies.device import preferred_type
 from kitting_drake.policies.images import LabelledImage
 from kitting_drake.policies.learned_policy import LearnedPolicy
 from kitting_drake.policies.methods import make_networks
@@ -33,11 +34,7 @@ from kitting_drake.policies.samples import normalisation
 from kitting_drake.policies.training import Trainer
 from kitting_drake.policies.training_data import TrainingData, evenly_chosen
 from kitting_drake.policies.validation import mean_loss, validate
-from kitting_drake.policies.weights import (
-    load_trainable,
-    preferred_type,
-    save_weights,
-)
+from kitting_drake.policies.weights import load_trainable, save_weights
 
 WEIGHTS = "policy.safetensors"
 """The best weights, in the folder of a training run."""

@@ -210,21 +210,6 @@ def _plain_state(
     return state
 
 
-def preferred_device() -> torch.device:
-    """The device to train and infer on: an accelerator where there is one, else the CPU."""
-    return torch.device("cuda" if torch.cuda.is_available() else "cpu")
-
-
-def preferred_type() -> torch.dtype:
-    """The type to compute in: bfloat16 where the preferred device is fast in it, else float32."""
-    if preferred_device().type == "cuda":
-        return torch.bfloat16 if torch.cuda.is_bf16_supported() else torch.float32
-    fast = torch.backends.cpu.get_cpu_capability() in ("AVX512", "AMX") and (
-        torch.cpu._is_avx512_bf16_supported() or torch.cpu._is_amx_tile_supported()
-    )
-    return torch.bfloat16 if fast else torch.float32
-
-
 def _read(path: Path, *, tensors: bool) -> tuple[dict[str, str], dict[str, Tensor]]:
     try:
         with safe_open(path, framework="pt") as file:

@@ -180,13 +180,9 @@ class Learned(PolicyConfig):
 
     def make_system(self, site: PolicySite) -> LeafSystem:
         # Only who uses a network waits for torch.
+        from kitting_drake.policies.device import preferred_device, preferred_type
         from kitting_drake.policies.learned_policy import LearnedPolicy
-        from kitting_drake.policies.weights import (
-            load_networks,
-            preferred_device,
-            preferred_type,
-            read_weights_file,
-        )
+        from kitting_drake.policies.weights import load_networks, read_weights_file
 
         path = self._path(site.base)
         networks = load_networks(path, preferred_type()).to(preferred_device())
@@ -217,7 +213,8 @@ class Learned(PolicyConfig):
         return PickPlacePolicy(policy=function, heights_only=heights_only)
 
     def details(self, base: Path) -> dict[str, Any]:
-        from kitting_drake.policies.weights import preferred_type, read_weights_file
+        from kitting_drake.policies.device import preferred_type
+        from kitting_drake.policies.weights import read_weights_file
 
         file = read_weights_file(self._path(base))
         return {

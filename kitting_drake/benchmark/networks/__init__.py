@@ -23,7 +23,7 @@ from kitting_drake.benchmark.networks.orientations import (
 )
 from kitting_drake.benchmark.networks.speed import measure_folding, measure_levels, measure_shares
 from kitting_drake.benchmark.networks.timing import describe_machine, measure_peak
-from kitting_drake.policies.weights import preferred_device, preferred_type
+from kitting_drake.policies.device import preferred_device, preferred_type
 
 
 def benchmark_networks(plan: Plan, console: Console) -> dict[str, Any]:

@@ -11,13 +11,13 @@ from torch import nn
 from kitting_drake.benchmark.networks.bench import Bench, Plan, times_of
 from kitting_drake.benchmark.networks.timing import Timing, count_operations, read_clock
 from kitting_drake.policies.config import METHODS, PICK_CROP, NetworkConfig
+from kitting_drake.policies.device import preferred_type
 from kitting_drake.policies.images import crop
 from kitting_drake.policies.learned_policy import LearnedPolicy
 from kitting_drake.policies.methods import make_networks
 from kitting_drake.policies.networks import FactoredNetworks, Networks
 from kitting_drake.policies.steerable import PlainConv2d
 from kitting_drake.policies.transporter import TransporterNetworks, encodings_per_decision
-from kitting_drake.policies.weights import preferred_type
 
 PARTS = {
     "pick_position": ("alpha", "f_pick"),

@@ -14,6 +14,7 @@ from kitting_drake.benchmark.networks.bench import Bench, times_of, type_name
 from kitting_drake.benchmark.networks.convolutions import Convolutions
 from kitting_drake.benchmark.networks.timing import Timing, count_operations, read_clock
 from kitting_drake.policies.config import NetworkConfig
+from kitting_drake.policies.device import preferred_type
 from kitting_drake.policies.escnn_reference import as_escnn
 from kitting_drake.policies.learned_policy import LearnedPolicy
 from kitting_drake.policies.methods import make_networks
@@ -22,7 +23,6 @@ from kitting_drake.policies.samples import Scene, labelled_images
 from kitting_drake.policies.steerable import PlainConv2d
 from kitting_drake.policies.training import Trainer
 from kitting_drake.policies.unet import UNet
-from kitting_drake.policies.weights import preferred_type
 
 MEASURES = ("training_step", "alpha_training_step", "decision", "alpha_inference")
 """What is timed for each way to run the same networks."""

@@ -18,10 +18,11 @@ from kitting_drake.bench.kit_block import Block
 from kitting_drake.cell.cameras import camera_pose
 from kitting_drake.common.errors import UserError
 from kitting_drake.common.paths import GENERALIST
+from kitting_drake.policies.device import preferred_type
 from kitting_drake.policies.learned_policy import LearnedPolicy
 from kitting_drake.policies.matching.recovery import recovery_action
 from kitting_drake.policies.matching.segmentation import segment
-from kitting_drake.policies.weights import load_networks, preferred_type
+from kitting_drake.policies.weights import load_networks
 from kitting_drake.scenario import load_scenario
 from kitting_drake.scenario.schema import LookAt, Scenario
 from tests.kitting_drake.bench.frames import (

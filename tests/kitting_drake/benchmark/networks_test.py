@@ -24,7 +24,7 @@ from kitting_drake.policies.demonstrations import (
     Origin,
     write_demonstrations,
 )
-from kitting_drake.policies.weights import preferred_type
+from kitting_drake.policies.device import preferred_type
 from systems.signals import Observation, PickPlaceAction, PixelGrid, PlanarPose
 
 GRID = PixelGrid(rows=32, cols=48)

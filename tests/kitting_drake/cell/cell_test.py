@@ -13,8 +13,9 @@ from pydrake.systems.framework import Context, EventStatus
 from kitting_drake.cell import Cell, build_cell
 from kitting_drake.common.errors import UserError
 from kitting_drake.common.paths import MODELS
+from kitting_drake.policies.device import preferred_type
 from kitting_drake.policies.learned_policy import LearnedPolicy
-from kitting_drake.policies.weights import load_networks, preferred_type
+from kitting_drake.policies.weights import load_networks
 from kitting_drake.scenario import Scenario, load_scenario
 from kitting_drake.scenario.policies import (
     Learned,
