@@ -7,7 +7,6 @@ anywhere else, but the paper's own figures.
 """
 
 import argparse
-import json
 import os
 from collections.abc import Sequence
 from pathlib import Path
@@ -15,11 +14,10 @@ from pathlib import Path
 from rich.console import Console
 
 from kitting_drake.common.command_line import run_command
-from kitting_drake.common.errors import UserError
 from kitting_drake.common.files import write_atomically
-from kitting_drake.paper.cells import RATES
 from kitting_drake.paper.figure import draw_figure_6
 from kitting_drake.paper.page import Result, has_figure, paper_sections, read_results
+from kitting_drake.paper.rates import read_rates
 from kitting_drake.reporting.results_page import results_page
 from kitting_drake.reporting.robustness import robustness_table, with_figures
 from kitting_drake.reporting.runs import read_runs
@@ -49,11 +47,7 @@ def main() -> int:
     runs = read_runs(arguments.results)
     link = os.path.relpath(arguments.results, arguments.output.parent)
     answers = read_results(arguments.results / "paper")
-    rates_file = arguments.results / "paper" / RATES
-    try:
-        rates = json.loads(rates_file.read_text()) if rates_file.exists() else {}
-    except (OSError, ValueError) as error:
-        raise UserError(f"{rates_file} is damaged: delete it") from error
+    rates = read_rates(arguments.results / "paper")
     page = results_page(runs, link, paper_sections(answers, rates, link))
     write_atomically(arguments.output, page)
     _draw(answers, arguments.output.parent)

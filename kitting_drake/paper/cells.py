@@ -11,8 +11,10 @@ from pathlib import Path
 from typing import Any
 
 from kitting_drake.common.paths import SCENARIOS
+from kitting_drake.paper.rates import Rates, best_rate
 from kitting_drake.reporting.runs import LEARNED, described, scenario_differences
 from kitting_drake.scenario.loader import load_scenario
+from kitting_drake.scenario.schema import Scenario
 
 ORIENTATIONS = (180, 36, 72, 120)
 """N of figure 6, the most telling first."""
@@ -21,8 +23,6 @@ RAVENS_DEMONSTRATIONS = (100, 10, 1)
 PRESET = "small"
 LEARNING_RATES = (1e-3, 3e-4, 3e-3)
 """Of these each baseline uses the one that is best on validation scenes; ours has the first."""
-RATES = "learning_rates.json"
-"""The file, beside the results, of what each learning rate came to on validation scenes."""
 VALIDATE_EVERY = 250
 _NO_SEARCH = "planner: {search: {amplitude: 0.0, reach: 0.0}}"
 
@@ -216,8 +216,13 @@ class Cell:
             parts.append("task: {tries: 2}")
         return f"{{{', '.join(parts)}}}"
 
-    def departure(self, summary: Mapping[str, Any]) -> str | None:
-        """Why a summary is not this cell's; None if it is."""
+    def departure(self, summary: Mapping[str, Any], rates: Rates | None = None) -> str | None:
+        """Why a summary is not this cell's; None if it is.
+
+        Args:
+            summary: of `evaluate`.
+            rates: what each learning rate of each baseline came to, if that is known.
+        """
         expected = _expected(self)
         wrong = scenario_differences(summary["resolved_scenario"], expected)
         if wrong:
@@ -225,17 +230,22 @@ class Cell:
         if list(summary["seeds"]) != list(self.seeds):
             return f"its seeds are not {self.seeds[0]} to {self.seeds[-1]}"
         if isinstance(self.policy, str):
-            same = summary["resolved_scenario"]["policy"] == expected["policy"]
-            return None if same else f"its policy is not {self.policy}"
+            if summary["resolved_scenario"]["policy"] != expected["policy"]:
+                return f"its policy is not {self.policy}"
+            same = summary["policy_digest"] == _loaded(self).policy.digest(SCENARIOS)
+            return None if same else "its weights are not those that come with the package"
         found = summary["policy_details"]
-        for key, wanted in self._details(self.policy).items():
+        details = self._details(self.policy)
+        if rates and self.policy.method in rates:
+            details["learning_rate"] = float(best_rate(rates[self.policy.method]))
+        for key, wanted in details.items():
             if found.get(key) != wanted:
                 return f"{key} is {found.get(key)}, not {wanted}"
         return None
 
     def _details(self, training: Training) -> dict[str, Any]:
         learned_at = TASKS[training.task]
-        wanted = {
+        wanted: dict[str, Any] = {
             "method": training.method,
             "scenario": f"{Path(learned_at.file).stem}:{learned_at.demonstrated}",
             "preset": PRESET,
@@ -244,10 +254,13 @@ class Cell:
             "demonstrations": training.demonstrations,
             "training_seed": training.seed,
             "steps": training.steps,
+            "decay": True,
             "continuous": self.continuous,
             "fit_outlines": self.fit_outlines,
             "recover": self.recover,
         }
+        if training.method == "so2":
+            wanted["learning_rate"] = LEARNING_RATES[0]
         if learned_at.table == "6":
             # Elsewhere the task itself says what of these is possible.
             wanted |= {"taken_only": training.taken_only, "rigid": training.rigid}
@@ -256,9 +269,12 @@ class Cell:
 
 @cache
 def _expected(cell: Cell) -> dict[str, Any]:
+    return described(_loaded(cell))
+
+
+def _loaded(cell: Cell) -> Scenario:
     task = TASKS[cell.task]
-    text = cell.scenario_text("")
-    return described(load_scenario(SCENARIOS / task.file, task.tested, text))
+    return load_scenario(SCENARIOS / task.file, task.tested, cell.scenario_text(""))
 
 
 def _paper_cell(task: str, method: str, n: int, demonstrations: int, seed: int = 0) -> Cell:

@@ -17,7 +17,6 @@ from kitting_drake.paper.cells import (
     LEARNING_RATES,
     ORIENTATIONS,
     PRESET,
-    RATES,
     RAVENS_DEMONSTRATIONS,
     SHIPPED,
     TASKS,
@@ -25,6 +24,7 @@ from kitting_drake.paper.cells import (
     Training,
     paper_cells,
 )
+from kitting_drake.paper.rates import RATES, Rates, best_rate, read_rates
 from kitting_drake.reporting.markdown import markdown_table, rate_text
 from kitting_drake.reporting.paired import OWN, STRICT, over_tools, paired_difference, points_text
 from kitting_drake.reporting.ravens_table import PAPER as TABLE_1
@@ -110,6 +110,7 @@ def read_results(folder: Path) -> list[Result]:
     if not folder.is_dir():
         return []
     cells = {cell.name: cell for cell in paper_cells()}
+    rates = read_rates(folder)
     found = {}
     for path in sorted(folder.glob("*.json")):
         if path.name == RATES:
@@ -119,7 +120,7 @@ def read_results(folder: Path) -> list[Result]:
             raise UserError(f"{path} is of no cell of the paper's tables: delete it")
         try:
             summary = json.loads(path.read_text())
-            departure = cell.departure(summary)
+            departure = cell.departure(summary, rates)
             _ = summary["outcomes"]
         except (OSError, ValueError, KeyError, TypeError) as error:
             raise UserError(f"{path} is no summary of evaluate: {error!r}") from error
@@ -129,7 +130,7 @@ def read_results(folder: Path) -> list[Result]:
     return [found[name] for name in cells if name in found]
 
 
-def paper_sections(results: Sequence[Result], rates: Mapping[str, Any], link: str) -> list[str]:
+def paper_sections(results: Sequence[Result], rates: Rates, link: str) -> list[str]:
     """The sections of the page; none without results.
 
     Args:
@@ -171,12 +172,12 @@ def has_figure(task: str, results: Sequence[Result]) -> bool:
     return set(LEARNED[:2]) <= methods
 
 
-def _rates_text(rates: Mapping[str, Any]) -> str:
+def _rates_text(rates: Rates) -> str:
     if not rates:
         return f"Ours learns at {LEARNING_RATES[0]:g}.\n"
     parts = []
     for method, costs in rates.items():
-        best = min(costs, key=lambda rate: costs[rate])
+        best = best_rate(costs)
         tried = ", ".join(f"{rate}: {cost:.1f} mm" for rate, cost in costs.items())
         parts.append(f"the {METHODS[method]} at {best}, the best on validation scenes of {tried}")
     return f"Ours learns at {LEARNING_RATES[0]:g}; {'; '.join(parts)}.\n"

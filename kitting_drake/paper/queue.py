@@ -25,7 +25,6 @@ from kitting_drake.common.paths import SCENARIOS
 from kitting_drake.paper.cells import (
     LEARNING_RATES,
     PRESET,
-    RATES,
     TASKS,
     VALIDATE_EVERY,
     Cell,
@@ -33,6 +32,7 @@ from kitting_drake.paper.cells import (
     Training,
     reference,
 )
+from kitting_drake.paper.rates import RATES, best_rate, read_rates
 
 _PATIENCE = 10.0
 """How long a command may take to end itself, in s."""
@@ -104,8 +104,8 @@ class Queue:
         if not path.exists():
             return False
         try:
-            departure = cell.departure(json.loads(path.read_text()))
-        except (OSError, ValueError, KeyError) as error:
+            departure = cell.departure(json.loads(path.read_text()), read_rates(self.results))
+        except (OSError, ValueError, KeyError, TypeError) as error:
             raise UserError(f"{path} is no summary of evaluate: delete it") from error
         if departure is not None:
             raise UserError(f"{path} is not that of its cell ({departure}): delete it")
@@ -170,7 +170,23 @@ class Queue:
                 *("--seed", training.seed),
                 folder=folder,
             )
+        self._check_training(training, folder)
         return folder / "policy.safetensors"
+
+    @staticmethod
+    def _check_training(training: Training, folder: Path) -> None:
+        """Raises Failed if what was trained in a folder, by an earlier version, is another."""
+        summary = json.loads((folder / "summary.json").read_text())
+        for key, wanted in (
+            ("method", training.method),
+            ("preset", PRESET),
+            ("orientations", training.orientations),
+            ("demonstrations", training.demonstrations),
+            ("steps", training.steps),
+            ("seed", training.seed),
+        ):
+            if summary[key] != wanted:
+                raise Failed(f"{folder}: its {key} is {summary[key]}, not {wanted}: delete it")
 
     def _best_rate(self, method: str) -> float:
         """The learning rate at which a baseline does best on validation scenes; all are written."""
@@ -179,15 +195,11 @@ class Queue:
             weights = self.train(dataclasses.replace(reference(method), learning_rate=rate))
             summary = json.loads(weights.with_name("summary.json").read_text())
             costs[rate] = summary["best"]["cost_mm"]
-        path = self.results / RATES
-        try:
-            known = json.loads(path.read_text()) if path.exists() else {}
-        except (OSError, ValueError) as error:
-            raise UserError(f"{path} is damaged: delete it") from error
+        known = read_rates(self.results)
         found = known | {method: {f"{rate:g}": cost for rate, cost in costs.items()}}
         if found != known:
-            write_json(path, dict(sorted(found.items())))
-        return min(costs, key=lambda rate: costs[rate])
+            write_json(self.results / RATES, dict(sorted(found.items())))
+        return float(best_rate(found[method]))
 
     def _evaluate(self, cell: Cell, weights: Path | None) -> None:
         task = TASKS[cell.task]
@@ -208,7 +220,7 @@ class Queue:
             name = str(weights.resolve().relative_to(self.folder.resolve()))
             text = text.replace(json.dumps(str(weights.resolve())), json.dumps(name))
         summary = json.loads(text)
-        departure = cell.departure(summary)
+        departure = cell.departure(summary, read_rates(self.results))
         if departure is not None:
             raise Failed(f"what was evaluated is not the cell: {departure}")
         write_atomically(self.results / f"{cell.name}.json", text)

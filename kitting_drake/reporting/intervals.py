@@ -7,6 +7,8 @@ import numpy as np
 from scipy import stats
 
 _CONFIDENCE = 0.95
+_ALIKE = 0.9
+"""Where this share of scores is one and the same, the others do not tell how much scores vary."""
 
 
 def proportion_interval(successes: int, trials: int) -> list[float]:
@@ -18,11 +20,12 @@ def proportion_interval(successes: int, trials: int) -> list[float]:
 def mean_interval(scores: Sequence[float]) -> list[float]:
     """Student's interval of the mean of scores between 0 and 1, as [low, high].
 
-    Scores that are all alike do not tell how much they vary. Their interval is Wilson's, as if each
-    were a number of successes in one trial: no scores of that mean vary more.
+    Scores nearly all of which are alike do not tell how much they vary. Their interval is Wilson's,
+    as if each were a number of successes in one trial: no scores of that mean vary more.
     """
     count, mean = len(scores), float(np.mean(scores))
-    if np.ptp(scores) < 1e-9:
+    _, counts = np.unique(np.round(scores, 9), return_counts=True)
+    if counts.max() >= _ALIKE * count:
         total = round(mean * count, 6)
         low, _ = proportion_interval(math.floor(total), count)
         _, high = proportion_interval(math.ceil(total), count)

@@ -1,4 +1,8 @@
-"""Two runs of the same seeds compared, and intervals of a rate for tools in general."""
+"""Two runs of the same seeds compared, and intervals of a rate for tools in general.
+
+Both intervals are a bootstrap's, which knows of nothing that it has not seen: where few episodes
+differ, or few tools fail, they are too narrow.
+"""
 
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
@@ -8,11 +12,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from kitting_drake.reporting.intervals import proportion_interval
-
 _RESAMPLES = 10_000
 _TAILS = (2.5, 97.5)
 """Percentiles of a 95 % interval."""
+_FEWEST_TOOLS = 3
+"""With fewer tools that ever fail, drawing tools tells nothing of others."""
 
 STRICT, OWN = "strict_success_rate", "success_rate"
 """The two rates of an episode: the strict one, and by the task's own measure."""
@@ -33,8 +37,8 @@ def paired_difference(
     """How much better one run is than another, on the seeds that both ran.
 
     The interval is a bootstrap's that draws episodes, each with both of its rates: what makes a
-    scene hard for both is in neither's favour. Where no episode differs, it is that of a share of
-    which no case was found, on either side.
+    scene hard for both is in neither's favour. How much one training differs from another of the
+    same method is not in it.
 
     Args:
         first: a summary, with its `outcomes`.
@@ -51,9 +55,6 @@ def paired_difference(
     if not seeds:
         return None
     differences = np.array([mine[seed] - theirs[seed] for seed in seeds])
-    if not np.any(differences):
-        _, most = proportion_interval(0, len(seeds))
-        return Estimate(0.0, -most, most)
     rng = np.random.default_rng(0)
     drawn = rng.integers(len(seeds), size=(_RESAMPLES, len(seeds)))
     low, high = np.percentile(differences[drawn].mean(axis=1), _TAILS)
@@ -61,7 +62,9 @@ def paired_difference(
 
 
 def points_text(found: Estimate) -> str:
-    """A difference of rates in points, with its interval."""
+    """A difference of rates in points, with its interval where any episode differs."""
+    if found.low == found.high == 0:
+        return "+0.0 (none differs)"
     return f"{100 * found.value:+.1f} ({100 * found.low:+.1f} to {100 * found.high:+.1f})"
 
 
@@ -69,28 +72,24 @@ def over_tools(outcomes: Sequence[Mapping[str, Any]], rate: str) -> Estimate | N
     """The share of successes, with an interval by a bootstrap that draws tools.
 
     It tells what to expect of other tools of the kind; intervals over objects tell it of these.
-    Where all tools, or none, always succeed, it is that of as many cases as there are tools.
 
     Args:
         outcomes: of a summary.
         rate: `STRICT` or `OWN`.
 
     Returns:
-        None if no objects are known.
+        None if fewer than three tools ever fail, or ever succeed.
     """
     needed = 2 if rate == STRICT else 1
     counts: dict[str, list[bool]] = defaultdict(list)
     for episode in outcomes:
         for name, outcome in episode["objects"].items():
             counts[name].append(outcome >= needed)
-    if not counts:
-        return None
     good: NDArray[np.float64] = np.array([sum(found) for found in counts.values()], float)
     all_of = np.array([len(found) for found in counts.values()], float)
+    if min(np.sum(good < all_of), np.sum(good > 0)) < _FEWEST_TOOLS:
+        return None
     share = float(good.sum() / all_of.sum())
-    if share in (0.0, 1.0):
-        low, high = proportion_interval(round(share) * len(good), len(good))
-        return Estimate(share, low, high)
     drawn = np.random.default_rng(0).integers(len(good), size=(_RESAMPLES, len(good)))
     shares = good[drawn].sum(axis=1) / all_of[drawn].sum(axis=1)
     low, high = np.percentile(shares, _TAILS)

@@ -4,7 +4,7 @@ from collections import defaultdict
 from collections.abc import Sequence
 
 from kitting_drake.reporting.markdown import markdown_table
-from kitting_drake.reporting.runs import METHODS, Run
+from kitting_drake.reporting.runs import LEARNED, METHODS, Run
 from kitting_drake.tasks import RAVENS_TASKS
 
 TASKS = tuple(task.title for task in RAVENS_TASKS)
@@ -47,15 +47,20 @@ def ravens_section(runs: Sequence[Run]) -> list[str]:
     """The section of the five tasks; nothing without a run of them.
 
     Args:
-        runs: all; those of other tasks, or that depart from these tasks, are left out.
+        runs: all; those of other tasks, that depart from these tasks, or whose actions are
+            quantized, are left out.
     """
-    cells: dict[tuple[str, int | None, int | None], dict[str, str]] = defaultdict(dict)
+    cells: dict[tuple[str, int | None, int | None], dict[str, list[str]]] = defaultdict(
+        lambda: defaultdict(list)
+    )
     for run in runs:
         if run.summary["task"] not in TASKS or run.departures:
             continue
+        if run.method in LEARNED and not run.detail("continuous"):
+            continue
         low, high = (100 * value for value in run.summary["ci95"])
         key = (run.method, run.detail("orientations"), run.detail("demonstrations"))
-        cells[key][run.summary["task"]] = (
+        cells[key][run.summary["task"]].append(
             f"{100 * run.summary['success_rate']:.1f} ({low:.1f} to {high:.1f}), "
             f"{run.summary['episodes']}"
         )
@@ -64,7 +69,8 @@ def ravens_section(runs: Sequence[Run]) -> list[str]:
     rows = []
     for (method, orientations, count), found in sorted(cells.items(), key=str):
         name = METHODS.get(method, method)
-        values = [found.get(task, "-") for task in TASKS]
+        # All are told: to choose would be flattering.
+        values = ["<br>".join(found[task]) if task in found else "-" for task in TASKS]
         rows.append([name, str(orientations or ""), str(count or ""), *values])
     headings = ["method", "N", "demonstrations", *TASKS]
     return [

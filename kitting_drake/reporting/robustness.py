@@ -1,6 +1,6 @@
 """The table of what each perturbation costs each policy: a part of `docs/robustness.md`."""
 
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -14,7 +14,9 @@ from kitting_drake.reporting.paired import STRICT, paired_difference, points_tex
 from kitting_drake.reporting.runs import Run, described, scenario_differences
 from kitting_drake.scenario.loader import load_scenario
 from kitting_drake.scenario.perturbations import LEVELS, NAMES
+from kitting_drake.scenario.policies import Learned
 
+_UNSEEN = SCENARIOS / "kitting_unseen.yaml"
 _BEGIN, _END = "<!-- figures -->\n", "<!-- end of figures -->\n"
 _AS_IT_IS = "as it is"
 _COLUMNS = {
@@ -41,18 +43,25 @@ def robustness_table(runs: Sequence[Run]) -> str:
     seeds too, takes all of them together: choosing among them would be flattering.
 
     Args:
-        runs: all; those that are none of these are left out.
+        runs: all; those that are none of these, or of other weights than the shipped ones, are left
+            out.
+
+    Raises:
+        UserError: of two runs of one cell some seeds are the same.
     """
-    expected = _expected()
+    expected, shipped = _expected(), _shipped()
     found: dict[Key, list[Run]] = defaultdict(list)
     for run in runs:
         if run.method not in _COLUMNS or not run.detail("recover"):
+            continue
+        if run.method in shipped and run.summary.get("policy_digest") != shipped[run.method]:
             continue
         scenario = run.summary["resolved_scenario"]
         for label, wanted in expected.items():
             if not scenario_differences(scenario, wanted):
                 found[label, run.method].append(run)
                 break
+    _check_seeds(found)
     same = {
         key: chosen
         for key, every in found.items()
@@ -67,8 +76,7 @@ def robustness_table(runs: Sequence[Run]) -> str:
         )
     if further:
         parts.append(
-            "All seeds together, where there are more, with the number of objects (most of them "
-            "by earlier code):\n\n"
+            "All seeds together, where there are more, with the number of objects:\n\n"
             + _table(found, [label for label in expected if label in further], counted=True)
         )
     return "\n".join(parts) or "No runs yet.\n"
@@ -116,6 +124,17 @@ def _table(found: Mapping[Key, Sequence[Run]], labels: Sequence[str], counted: b
     return markdown_table(["perturbation", *_COLUMNS.values(), *_COMPARED], rows)
 
 
+def _check_seeds(found: Mapping[Key, Sequence[Run]]) -> None:
+    for (label, method), runs in found.items():
+        counts = Counter(seed for run in runs for seed in run.summary["seeds"])
+        twice = min((seed for seed, count in counts.items() if count > 1), default=None)
+        if twice is not None:
+            files = " and ".join(run.file for run in runs if twice in run.summary["seeds"])
+            raise UserError(
+                f"{files} are both of {_COLUMNS[method]}, {label}, seed {twice}: delete one"
+            )
+
+
 def _same(run: Run) -> bool:
     """Whether its seeds are those that all are run on."""
     return list(run.summary["seeds"]) == list(_SEEDS)
@@ -140,9 +159,15 @@ def with_figures(page: str, figures: str) -> str:
     return f"{head}{begin}{figures}{end}{tail}"
 
 
+def _shipped() -> dict[str, str | None]:
+    """The digests of the weights that come with the package, by method."""
+    policies = {"generalist": Learned(weights=""), "so2": load_scenario(_UNSEEN).policy}
+    return {method: policy.digest(SCENARIOS) for method, policy in policies.items()}
+
+
 def _expected() -> dict[str, dict[str, Any]]:
     """The scenario of each row, as JSON holds it."""
-    path, task = SCENARIOS / "kitting_unseen.yaml", f"task: {{tries: {_TRIES}}}"
+    path, task = _UNSEEN, f"task: {{tries: {_TRIES}}}"
     one, more = f"{{{task}}}", f"{{{task}, sensor_noise: {{frames: {_FRAMES}}}}}"
     rows: dict[str, tuple[str, str | None]] = {_AS_IT_IS: (one, None)}
     for level in LEVELS:

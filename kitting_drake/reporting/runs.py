@@ -4,7 +4,7 @@ paper's tasks."""
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cache, cached_property
 from pathlib import Path
 from typing import Any
 
@@ -32,30 +32,33 @@ LEARNED = ("so2", "equivariant_transporter", "transporter")
 _NOT_THE_TASK = ("policy", "random_seed", "target_realtime_rate")
 """The fields of a scenario in which runs of one task may differ."""
 
-_ADDED = (
-    "task.distractors",
-    "task.tries",
-    "task.pool",
-    "task.kit.always_nested",
-    "task.kit.fixed_size",
+_ADDED: dict[str, Any] = {
+    "task.distractors": 0,
+    "task.tries": 1,
+    "task.pool": [],
+    "task.kit.always_nested": False,
+    "task.kit.fixed_size": False,
+    "plant.friction_variation": 0.0,
+    "plant.mass_variation": 0.0,
+    "sensor_noise.frames": 1,
+    "end_at_success": False,
+}
+"""Fields that older runs lack, with what those did."""
+
+_ADDED_WHOLE = ("sensor_noise", "appearance")
+"""The same, where it is what a scenario does by default."""
+
+_HAND = (
     "planner.firm_grasp_force",
     "planner.heavy_load",
     "planner.press_force",
     "planner.press_depth",
     "planner.search.reach",
     "planner.search.speed",
-    "plant.friction_variation",
-    "plant.mass_variation",
-    "sensor_noise",
-    "appearance",
 )
-"""Fields that older runs lack; their defaults change nothing in what those did, but that a search
-that was in vain goes on in a spiral, and that what is heavy is gripped more firmly."""
-
-_FORMER = {"planner.minimum_width": 0.003}
-"""Defaults of older runs that are not listed as departures: with this one what is thinner than 3 mm
-counted as not gripped, and no tool of the paper's tasks and no box is gripped where it is that
-thin."""
+_EARLIER_HAND = "an earlier hand"
+"""How it is told that these fields are lacking: it did not grip what is heavy more firmly, nor
+press, nor search in a spiral, and took what is thinner than 3 mm for not gripped."""
 
 _MOST_SHOWN = 4
 """So many differences of one run are listed; more are counted."""
@@ -167,11 +170,13 @@ def scenario_differences(found: dict[str, Any], expected: dict[str, Any]) -> lis
 
 
 def _without(scenario: dict[str, Any], *more: str) -> dict[str, Any]:
-    # What older runs, which lack these fields, did.
-    whole = {"end_at_success": False} | scenario
-    if "sensor_noise" in whole:
-        whole["sensor_noise"] = {"frames": 1} | whole["sensor_noise"]
-    return {key: value for key, value in whole.items() if key not in (*_NOT_THE_TASK, *more)}
+    return {key: value for key, value in scenario.items() if key not in (*_NOT_THE_TASK, *more)}
+
+
+@cache
+def _added() -> dict[str, Any]:
+    defaults = described(Scenario())
+    return _ADDED | {key: defaults[key] for key in _ADDED_WHOLE}
 
 
 def _differences(found: Any, expected: Any, path: str = "") -> list[str]:
@@ -185,17 +190,16 @@ def _differences(found: Any, expected: Any, path: str = "") -> list[str]:
     differences = []
     for key in dict.fromkeys((*expected, *found)):
         here = f"{path}.{key}" if path else key
-        if key not in found and here in _ADDED:
-            continue
-        if here in _FORMER and found.get(key) == _FORMER[here]:
-            continue
-        if key not in found:
+        if key not in found and here in _HAND:
+            differences.append(_EARLIER_HAND)
+        elif key not in found and here not in _added():
             differences.append(f"{here}: not there")
         elif key not in expected:
             differences.append(f"{here}: {json.dumps(found[key])}")
         else:
-            differences += _differences(found[key], expected[key], here)
-    return differences
+            was = found[key] if key in found else _added()[here]
+            differences += _differences(was, expected[key], here)
+    return list(dict.fromkeys(differences))
 
 
 def read_runs(folder: Path) -> list[Run]:

@@ -198,7 +198,7 @@ def _rates(episodes: Sequence[Episode], objects_of: list[list[Entry]]) -> dict[s
         "ci95": interval(scores, counts),
         "strict_success_rate": float(np.mean(strict_scores)),
         "strict_ci95": interval(strict_scores, strict_counts),
-        "ci95_method": "Wilson, over objects" if are_shares else "Student, over episodes",
+        "ci95_method": "Wilson, over objects" if are_shares else "Student or Wilson, over episodes",
     }
 
 

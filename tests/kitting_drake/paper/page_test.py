@@ -36,6 +36,7 @@ def write(folder: Path, name: str, errors_mm: list[float]) -> None:
             "training_seed": 0,
             "steps": cell.policy.steps,
             "learning_rate": 0.001,
+            "decay": True,
             "continuous": cell.continuous,
             "fit_outlines": cell.fit_outlines,
             "recover": False,
@@ -43,6 +44,8 @@ def write(folder: Path, name: str, errors_mm: list[float]) -> None:
             "rigid": cell.policy.rigid,
         }
     summary |= {"resolved_scenario": described(scenario), "policy_details": details}
+    if isinstance(cell.policy, str):
+        summary["policy_digest"] = scenario.policy.digest(SCENARIOS)
     (folder / f"{name}.json").write_text(json.dumps(summary))
 
 
@@ -100,6 +103,14 @@ def test_a_file_that_is_not_what_its_name_says_is_refused(folder: Path):
     with pytest.raises(UserError, match=r"mine\.json is of no cell"):
         read_results(folder)
     (folder / "mine.json").unlink()
+    (folder / "learning_rates.json").write_text("[]")
+    with pytest.raises(UserError, match=r"learning_rates\.json is damaged"):
+        read_results(folder)
+    rates = {"equivariant_transporter": {"0.001": 4.0, "0.0003": 2.5}}
+    (folder / "learning_rates.json").write_text(json.dumps(rates))
+    with pytest.raises(UserError, match=r"learning_rate is 0\.001, not 0\.0003"):
+        read_results(folder)
+    (folder / "learning_rates.json").unlink()
     path.write_text("{}")
     with pytest.raises(UserError, match="is no summary of evaluate"):
         read_results(folder)

@@ -19,7 +19,6 @@ from kitting_drake.common.paths import SCENARIOS
 from kitting_drake.paper.cells import (
     LEARNING_RATES,
     PRESET,
-    RATES,
     TASKS,
     Cell,
     Training,
@@ -27,12 +26,17 @@ from kitting_drake.paper.cells import (
     reference,
 )
 from kitting_drake.paper.queue import Failed, Queue, run_paper
+from kitting_drake.paper.rates import RATES
 from kitting_drake.reporting.runs import described
 from kitting_drake.scenario.loader import load_scenario
 
+PAPER_RESULTS = SCENARIOS.parent / "docs" / "results" / "paper"
 ORACLE = Cell("unseen", "!QuantizedOracle {orientations: 180}", 180, "quantized_oracle")
 OURS = Cell("unseen", Training("unseen", "so2", 180, 10), 36, end_at_success=True)
 THEIRS = Cell("unseen", Training("unseen", "transporter", 36, 10), 36)
+
+
+COUNTED = ("orientations", "demonstrations", "steps", "seed")
 
 
 class Pretending(Queue):
@@ -59,6 +63,8 @@ class Pretending(Queue):
         elif verb == "train":
             rate = float(flags["--learning-rate"])
             summary = {"best": {"cost_mm": 1.0 if rate == LEARNING_RATES[1] else 2.0}}
+            summary |= {key: int(flags[f"--{key}"]) for key in COUNTED}
+            summary |= {"method": flags["--method"], "preset": flags["--preset"]}
             (folder / "summary.json").write_text(json.dumps(summary))
             (folder / "policy.safetensors").touch()
         else:
@@ -81,6 +87,8 @@ class Pretending(Queue):
                 "demonstrations": int(demonstrations),
                 "training_seed": 0,
                 "steps": TASKS[task].steps,
+                "learning_rate": float(folder.rpartition("_lr")[2]),
+                "decay": True,
                 "continuous": policy.continuous,
                 "fit_outlines": policy.fit_outlines,
                 "recover": policy.recover,
@@ -91,6 +99,7 @@ class Pretending(Queue):
             "resolved_scenario": described(scenario),
             "seeds": list(range(first, first + count)),
             "policy_details": details,
+            "policy_digest": None,
             "strict_success_rate": 1.0,
             "success_rate": 1.0,
         }
@@ -169,6 +178,9 @@ def test_what_fails_keeps_nothing_else_up(queue: Pretending):
         (lambda s: s["resolved_scenario"]["plant"].update(time_step=0.5), "plant.time_step"),
         (lambda s: s["resolved_scenario"].pop("end_at_success"), "end_at_success: false"),
         (lambda s: s["policy_details"].update(steps=7), "steps is 7, not"),
+        (lambda s: s["policy_details"].update(learning_rate=0.1), "learning_rate is 0.1, not"),
+        (lambda s: s["policy_details"].update(decay=False), "decay is False, not"),
+        (lambda s: s["resolved_scenario"]["planner"].pop("heavy_load"), "an earlier hand"),
         (lambda s: s["policy_details"].update(scenario="kitting_seen:Mine"), "scenario is kitting"),
         (lambda s: s["policy_details"].update(continuous=True), "continuous is True"),
         (lambda s: s["seeds"].pop(), "seeds are not 3000 to 3099"),
@@ -194,6 +206,25 @@ def test_a_policy_of_its_own_is_checked_too(queue: Pretending):
         UserError, match=r"its policy is not !QuantizedOracle \{orientations: 180\}"
     ):
         queue.is_done(ORACLE)
+    path.write_text("[]")
+    with pytest.raises(UserError, match="is no summary of evaluate"):
+        queue.is_done(ORACLE)
+
+
+def test_shipped_policies_must_have_the_weights_that_come_with_the_package():
+    cell = next(cell for cell in paper_cells() if cell.name == "fresh_generalist")
+    path = PAPER_RESULTS / "fresh_generalist.json"
+    summary = json.loads(path.read_text())
+    assert cell.departure(summary) is None
+    summary["policy_digest"] = "sha256 of others"
+    assert cell.departure(summary) == "its weights are not those that come with the package"
+
+
+def test_what_an_earlier_version_trained_is_not_taken_for_what_is_asked(queue: Pretending):
+    path = queue.train(OURS.policy).with_name("summary.json")
+    path.write_text(path.read_text().replace(f'"steps": {OURS.policy.steps}', '"steps": 7'))
+    (failure,) = queue.run([OURS]).values()
+    assert failure == f"{path.parent}: its steps is 7, not {OURS.policy.steps}: delete it"
 
 
 def test_a_command_that_fails_is_told_by_its_last_line(tmp_path: Path):

@@ -1,3 +1,5 @@
+import itertools
+
 import pytest
 
 from kitting_drake.reporting.intervals import mean_interval, proportion_interval
@@ -26,3 +28,10 @@ def test_equal_scores_do_not_make_certain(score: float, count: int):
     low, high = mean_interval([score] * count)
     assert low <= score <= high
     assert high - low > 1 / (count + 4)
+
+
+def test_a_failure_more_never_lifts_the_lower_end():
+    ends = [mean_interval([1.0] * (100 - failures) + [2 / 3] * failures) for failures in range(30)]
+    lows = [low for low, _ in ends]
+    assert lows[0] == pytest.approx(proportion_interval(100, 100)[0])
+    assert all(after <= before + 1e-9 for before, after in itertools.pairwise(lows[:10]))

@@ -9,6 +9,7 @@ from kitting_drake.common.paths import SCENARIOS
 from kitting_drake.reporting.robustness import robustness_table, with_figures
 from kitting_drake.reporting.runs import Run, described
 from kitting_drake.scenario.loader import load_scenario
+from kitting_drake.scenario.policies import Learned
 
 UNSEEN = SCENARIOS / "kitting_unseen.yaml"
 
@@ -18,13 +19,19 @@ SAME = range(2870, 2895)
 
 
 def run(
-    perturb: str | None, share: float, tries: int = 2, seeds: range = SAME, **details: Any
+    perturb: str | None,
+    share: float,
+    tries: int = 2,
+    seeds: range = SAME,
+    digest: str | None = None,
+    **details: Any,
 ) -> Run:
     scenario = load_scenario(UNSEEN, text=f"{{task: {{tries: {tries}}}}}", perturb=perturb)
     return Run(
         "some.json",
         {
             "policy": "shape_matching",
+            "policy_digest": digest,
             "policy_details": {"method": "shape_matching", "recover": True} | details,
             "resolved_scenario": described(scenario),
             "strict_success_rate": share,
@@ -65,7 +72,7 @@ def test_runs_of_other_seeds_are_pooled_in_a_table_of_their_own():
 
 
 def test_the_generalist_is_compared_on_the_seeds_that_both_ran():
-    learned = {"method": "generalist"}
+    learned = {"method": "generalist", "digest": Learned(weights="").digest(SCENARIOS)}
     better, worse = run("all", 0.9, **learned), run("all", 0.5)
     table = robustness_table(
         [run(None, 1.0, **learned), better, worse, run("all", 0.1, seeds=range(7, 32))]
@@ -80,7 +87,13 @@ def test_the_generalist_is_compared_on_the_seeds_that_both_ran():
 def test_what_is_something_else_is_left_out():
     others = [run("mass", 0.9, tries=1), run("mass", 0.9, recover=False)]
     others.append(run("mass,light", 0.9))
+    others.append(run("mass", 0.9, method="generalist", digest="sha256 of earlier weights"))
     assert robustness_table(others) == "No runs yet.\n"
+
+
+def test_no_episode_counts_twice():
+    with pytest.raises(UserError, match="shape matching, `all:moderate`, seed 2880: delete one"):
+        robustness_table([run("all", 0.9), run("all", 0.9, seeds=range(2880, 2881))])
 
 
 def test_the_figures_are_put_between_their_marks():

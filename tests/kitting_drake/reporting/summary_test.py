@@ -141,7 +141,7 @@ def test_partial_rewards_vary_by_episode():
     summary = summarise(episodes, CHOSEN, PoseWithin(), wall_seconds_total=1.0)
     assert summary["success_rate"] == pytest.approx(0.8)
     assert summary["ci95"] == pytest.approx(mean_interval([0.8, 0.9, 0.7]))
-    assert summary["ci95_method"] == "Student, over episodes"
+    assert summary["ci95_method"] == "Student or Wilson, over episodes"
     assert summary["categories"]["cup"]["success_rate"] == 0.0
     assert summary["success_threshold_mm"] is None
 
