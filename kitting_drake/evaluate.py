@@ -26,7 +26,7 @@ from kitting_drake.common.processes import (
     counting_bar,
     side_by_side,
 )
-from kitting_drake.common.provenance import versions
+from kitting_drake.common.provenance import commit, versions
 from kitting_drake.episode import EpisodeResult
 from kitting_drake.episode.chosen import build_chosen, run_chosen
 from kitting_drake.reporting.summary import Episode, summarise
@@ -112,7 +112,8 @@ def evaluate(
 ) -> Evaluation:
     """Runs an episode for each seed.
 
-    Episodes already in `folder/episodes.jsonl` are not run again; one is written there as it ends.
+    Episodes already in `folder/episodes.jsonl` are not run again; one is written there as it ends,
+    with the commit of the code that ran it.
 
     Args:
         chosen: the scenario.
@@ -133,9 +134,11 @@ def evaluate(
     done = {episode["seed"]: episode for episode in read_lines(path)}
     pending = [seed for seed in seeds if seed not in done]
     queue = iter(pending)
+    now = commit()
     with counting_bar(console, "episodes") as progress:
         task = progress.add_task("", total=len(seeds), completed=len(seeds) - len(pending))
         for episode in side_by_side(run, lambda: next(queue, None), workers=workers):
+            episode["commit"] = now
             done[episode["seed"]] = episode
             append_line(path, episode)
             clock.save()

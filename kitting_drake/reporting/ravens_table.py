@@ -43,20 +43,24 @@ PAPER: dict[tuple[str, int], tuple[tuple[float, float, float], ...]] = {
 """Success rates in percent after 1, 10 and 100 demonstrations, by method and N."""
 
 
+def in_ravens_table(run: Run) -> bool:
+    """Whether a run is of one of the tasks as it is by default, and its actions are refined."""
+    if run.summary["task"] not in TASKS or run.departures:
+        return False
+    return run.method not in LEARNED or bool(run.detail("continuous"))
+
+
 def ravens_section(runs: Sequence[Run]) -> list[str]:
     """The section of the five tasks; nothing without a run of them.
 
     Args:
-        runs: all; those of other tasks, that depart from these tasks, or whose actions are
-            quantized, are left out.
+        runs: all; those of which `in_ravens_table` says no are left out.
     """
     cells: dict[tuple[str, int | None, int | None], dict[str, list[str]]] = defaultdict(
         lambda: defaultdict(list)
     )
     for run in runs:
-        if run.summary["task"] not in TASKS or run.departures:
-            continue
-        if run.method in LEARNED and not run.detail("continuous"):
+        if not in_ravens_table(run):
             continue
         low, high = (100 * value for value in run.summary["ci95"])
         key = (run.method, run.detail("orientations"), run.detail("demonstrations"))

@@ -56,7 +56,7 @@ def summarise(
     Rates are means of the episodes' rewards; an episode that failed or timed out counts 0. Where
     reward is the share of the objects that are successes, the interval is Wilson's over the
     objects, as if each were drawn anew. Where it is anything else (partial rewards, weights), it is
-    Student's over the episodes; `ci95_method` says which.
+    one over the episodes (see `mean_interval`); `ci95_method` says which.
 
     `outcomes` has for each episode its seed, both rates, and for each object, by its name, 2: a
     strict success, 1: a success, 0: none. Two runs of the same seeds are compared by them.
@@ -110,9 +110,16 @@ def summarise(
         "wall_seconds": sum(episode["wall_seconds"] for episode in episodes),
         "wall_seconds_total": wall_seconds_total,
         "versions": versions(),
-        "commit": commit(),
+        "commit": _commits(episodes),
         "resolved_scenario": chosen.described,
     }
+
+
+def _commits(episodes: Sequence[Episode]) -> str | None:
+    """The commit of the code that ran the episodes; several if an evaluation was taken up by
+    other code. Older episodes do not tell."""
+    found = dict.fromkeys(str(episode["commit"]) for episode in episodes if episode.get("commit"))
+    return ", ".join(found) or commit()
 
 
 def counted_objects(episodes: Sequence[Episode]) -> list[list[Entry]]:

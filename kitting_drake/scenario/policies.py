@@ -237,9 +237,13 @@ class Learned(PolicyConfig):
         return [self._path(base)] if self.weights else []
 
     def training_seeds(self, base: Path) -> set[int]:
+        from kitting_drake.policies.static_scenes import STATIC
         from kitting_drake.policies.weights import read_weights_file
 
         card = read_weights_file(self._path(base)).card
+        if card.get("scenario") == STATIC:
+            # Its seeds are of scenes, which no episode has.
+            return set()
         return {*card.get("demonstration_seeds", ()), *card.get("validation_seeds", ())}
 
     def _path(self, base: Path) -> Path:

@@ -20,7 +20,7 @@ from kitting_drake.common.files import alone_in
 from kitting_drake.common.paths import MODELS
 from kitting_drake.common.processes import LocalWorkers, ProcessCrashed, Workers
 from kitting_drake.episode import EpisodeResult
-from kitting_drake.reporting.summary import Episode
+from kitting_drake.reporting.summary import Episode, summarise
 from kitting_drake.scenario.command_line import ChosenScenario
 from kitting_drake.scenario.policies import Learned, PythonPolicy
 from kitting_drake.scenario.schema import Heightmap, Scenario
@@ -57,6 +57,13 @@ def test_goes_on_where_it_was_stopped(tmp_path: Path):
     assert ran == [0, 1, 2, 3]
     assert [item["seed"] for item in done.episodes] == [0, 1, 2, 3]
     assert [json.loads(line)["seed"] for line in path.read_text().splitlines()] == [0, 1, 2, 3]
+
+
+def test_episodes_of_two_commits_are_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    for commit, seeds in (("first", [0]), ("second", [0, 1]), ("second", [0, 1])):
+        monkeypatch.setattr(evaluation, "commit", lambda commit=commit: commit)
+        episodes = evaluate(CHOSEN, seeds, tmp_path).episodes
+    assert summarise(episodes, CHOSEN, AddS(), wall_seconds_total=1.0)["commit"] == "first, second"
 
 
 def test_the_time_of_all_calls_adds_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

@@ -120,6 +120,8 @@ def test_results_say_what_a_policy_is(weights_file: Path):
         "training_seed": None,
     }
     assert config.training_seeds(base) == {10_000, 10_001, 10_002}
+    # Seeds of static scenes are none of episodes.
+    assert Learned(weights="").training_seeds(base) == set()
     assert config.digest(base) == f"sha256 {hashlib.sha256(weights_file.read_bytes()).hexdigest()}"
     with pytest.raises(UserError, match=r"gone\.safetensors"):
         Learned("gone.safetensors").digest(base)
