@@ -9,7 +9,7 @@ only, at any N. The cost of the search hardly grows with N.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -235,6 +235,34 @@ class Candidate:
         score = float(self.scores[rotation, row, col])
         return score, self.first_bin + rotation, self.corner[0] + row, self.corner[1] + col
 
+    def known_neighbours(self) -> int:
+        """How many scores there are of the largest's own cell and those next to it, of 27."""
+        at = _argmax(self.scores)
+        return math.prod(
+            min(i + 2, n) - max(i - 1, 0) for i, n in zip(at, self.scores.shape, strict=True)
+        )
+
+
+def ranked(candidates: Iterable[Candidate], orientations: int) -> list[Candidate]:
+    """The candidates, best first, each of another cell.
+
+    Windows overlap, and the largest score of one may be that of the next, where it lies at the
+    edge. Of those with the same cell the one is kept that knows most of its neighbours, which
+    sub-pixel refinement needs; which is largest by rounding says nothing.
+
+    Args:
+        candidates: those of the coarse volume's peaks.
+        orientations: N.
+    """
+    of_cell: dict[tuple[int, int, int], Candidate] = {}
+    for candidate in candidates:
+        _, rotation, row, col = candidate.best()
+        cell = rotation % orientations, row, col
+        if cell in of_cell and of_cell[cell].known_neighbours() >= candidate.known_neighbours():
+            continue
+        of_cell[cell] = candidate
+    return sorted(of_cell.values(), key=lambda item: -item.best()[0])
+
 
 def _argmax(volume: Tensor) -> tuple[int, int, int]:
     rotation, row, col = np.unravel_index(int(volume.argmax()), volume.shape)
@@ -316,4 +344,4 @@ def search(
         bins = torch.arange(first, last + 1, dtype=scene.dtype, device=scene.device)
         angles = bins * (math.tau / orientations)
         found.append(Candidate(window(scene, encoding, angles, corner, size), first, corner))
-    return sorted(found, key=lambda item: -item.best()[0]), volume
+    return ranked(found, orientations), volume

@@ -35,6 +35,14 @@ class Window:
         """(rotation in bins, row, col) of the largest score, of which the first."""
         return self.origin + np.array(np.unravel_index(self.scores.argmax(), self.scores.shape))
 
+    def known_neighbours(self) -> int:
+        """How many scores there are of the largest's own cell and those next to it, of 27."""
+        at = np.unravel_index(self.scores.argmax(), self.scores.shape)
+        return math.prod(
+            min(int(i) + 2, n) - max(int(i) - 1, 0)
+            for i, n in zip(at, self.scores.shape, strict=True)
+        )
+
     @property
     def origin(self) -> NDArray[np.float64]:
         """(rotation in bins, row, col) of the first score."""
@@ -54,7 +62,7 @@ def search(scene: Array, encoding: Array, orientations: int, shape: tuple[int, i
     angles = np.arange(COARSE_ROTATIONS) * (math.tau / COARSE_ROTATIONS)
     kernels = lift(_halve(encoding), angles, KERNEL // 2 + 1)
     volume = _correlate(_halve(scene), kernels)[:, : rows // 2 + 1, : cols // 2 + 1]
-    found = []
+    of_cell: dict[tuple[int, ...], Window] = {}
     for rotation, row, col in _peaks(volume):
         first = math.floor((rotation - 1) * orientations / COARSE_ROTATIONS)
         last = math.ceil((rotation + 1) * orientations / COARSE_ROTATIONS)
@@ -64,8 +72,14 @@ def search(scene: Array, encoding: Array, orientations: int, shape: tuple[int, i
         scores = _window(
             scene, lift(encoding, fine, KERNEL), (top, left), (bottom - top, right - left)
         )
-        found.append(Window(scores, first, (top, left)))
-    return max(found, key=lambda item: float(item.scores.max()))
+        found = Window(scores, first, (top, left))
+        best = found.best().astype(int)
+        cell = (int(best[0]) % orientations, *best[1:].tolist())
+        # Of those that share their largest score, the one that knows most of its neighbours.
+        kept = of_cell.setdefault(cell, found)
+        if found.known_neighbours() > kept.known_neighbours():
+            of_cell[cell] = found
+    return max(of_cell.values(), key=lambda item: float(item.scores.max()))
 
 
 def lift(encoding: Array, angles: NDArray[np.float64], size: int) -> Array:

@@ -26,6 +26,7 @@ from kitting_drake.policies.correlation import (
     finer_bins,
     kernel_window,
     peaks,
+    ranked,
     window_around,
 )
 from kitting_drake.policies.images import Image, LabelledImage
@@ -189,7 +190,7 @@ class TransporterNetworks(Networks):
                 finer = self.encode_crops(image, pixel, angles)
                 scores = kernel_window(scene, finer, corner, size)
             candidates.append(Candidate(scores, first, corner))
-        return PlacePrediction(sorted(candidates, key=lambda item: -item.best()[0]), volume.amax(0))
+        return PlacePrediction(ranked(candidates, orientations), volume.amax(0))
 
     def place_loss(self, sample: LabelledImage, pixel: tuple[int, int], seed: int) -> Tensor:
         """Cross-entropy over all pixels and a sample of the rotations: the label's own, some near

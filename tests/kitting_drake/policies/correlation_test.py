@@ -1,3 +1,4 @@
+import itertools
 import math
 
 import numpy as np
@@ -7,10 +8,12 @@ from torch import Tensor
 
 from kitting_drake.policies.correlation import (
     KERNEL,
+    Candidate,
     coarse_volume,
     cross_correlation,
     cross_correlation_fft,
     lift,
+    ranked,
     rotation_angles,
     search,
     window,
@@ -163,6 +166,18 @@ def test_the_search_finds_the_crop_itself(pixel: tuple[int, int], rotation: int)
     # At an edge, where half of the crop is not seen, the rotation may be off by a bin.
     assert (row, col) == pixel
     assert (found - rotation + 36) % 72 - 36 in (-1, 0, 1)
+
+
+def test_of_windows_with_the_same_maximum_the_one_counts_that_has_it_inside():
+    """Else rounding decides between them, and sub-pixel refinement lacks neighbours."""
+    volume = torch.zeros(72, 20, 20)
+    volume[70, 9, 9], volume[30, 2, 2] = 3.0, 5.0
+    cut = Candidate(torch.cat([volume[66:], volume[:3]])[:, 1:10, 3:12], 66, (1, 3))
+    # The same, but for rounding: by another turn of the bins, and whole.
+    whole = Candidate(volume[66:72, 5:14, 5:14] * (1 - 1e-6), 66 - 72, (5, 5))
+    other = Candidate(volume[28:33, 0:7, 0:7], 28, (0, 0))
+    for given in itertools.permutations([cut, whole, other]):
+        assert list(map(id, ranked(given, 72))) == [id(other), id(whole)]
 
 
 def test_the_search_stays_within_the_given_shape():
