@@ -56,7 +56,7 @@ def test_each_run_goes_into_the_row_that_its_scenario_says():
     table = robustness_table([run(None, 1.0), run("mass:mild", 0.9), run("all", 0.5)])
     found = rows(table)
     assert found["as it is"][2] == "100.0 (96 to 100)"
-    assert found["`mass:mild`"][2] == "90.0 (83 to 94)"
+    assert found["`mass:mild`"][2] == "90.0 (83 to 94), 100"
     assert found["`all:moderate`"][2] == "50.0 (40 to 60)"
     assert "`mass:moderate`" not in found
     assert "25 episodes from seed 2870" in table
@@ -69,6 +69,17 @@ def test_runs_of_other_seeds_are_pooled_in_a_table_of_their_own():
     assert rows(first)["`all:moderate`"][2] == "90.0 (83 to 94)"
     assert rows(second)["`all:moderate`"][2] == "70.0 (63 to 76), 200"
     assert "as it is" not in rows(second)
+
+
+def test_other_levels_are_of_the_first_seeds_and_tell_how_many():
+    first = run("mass:severe", 0.5, seeds=SAME[:12])
+    table = robustness_table([run(None, 1.0), first, run("mass:mild", 1.0, seeds=SAME[:5])])
+    _, levels = table.split("The other levels")
+    levels, pooled = levels.split("All seeds together")
+    assert rows(levels)["`mass:severe`"][2] == "50.0 (36 to 64), 48"
+    assert "`mass:mild`" not in levels
+    assert "`mass:mild`" in pooled
+    assert "severe" not in pooled
 
 
 def test_the_generalist_is_compared_on_the_seeds_that_both_ran():
