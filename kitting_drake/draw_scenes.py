@@ -37,7 +37,8 @@ def main() -> int:
     require_rendering()
     folder = require_folder(arguments.output)
     with alone_in(folder):
-        claim_folder(folder, "settings.json", {"seed": arguments.seed}, of="set of scenes")
+        identity = {"seed": arguments.seed, **versions()}
+        claim_folder(folder, "settings.json", identity, of="set of scenes")
         path = folder / "scenes.h5"
         parts = _Parts(folder / "parts", arguments.seed)
         with LocalWorkers(arguments.workers or os.cpu_count() or 1) as workers:

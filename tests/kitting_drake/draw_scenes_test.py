@@ -1,3 +1,4 @@
+import json
 import sys
 from pathlib import Path
 
@@ -7,6 +8,8 @@ from rich.console import Console
 
 from kitting_drake import draw_scenes
 from kitting_drake.cell.cameras import can_render
+from kitting_drake.common.errors import UserError
+from kitting_drake.common.provenance import versions
 from kitting_drake.policies.static_scenes import (
     StaticScene,
     StaticScenes,
@@ -54,6 +57,16 @@ def test_a_batch_that_is_missing_is_drawn_again_and_seeds_share_nothing(tmp_path
     (one,) = read_static_scenes(other / "batch_000000.h5").scenes[:1]
     (two,) = read_static_scenes(parts.path(1)).scenes[:1]
     assert (one.height != two.height).any()
+
+
+def test_scenes_of_another_seed_or_version_are_not_mixed(tmp_path: Path, monkeypatch):
+    settings = tmp_path / "settings.json"
+    claimed = {"seed": 0, **versions()}
+    for other, message in [({"seed": 7}, "seed is 0, there 7"), ({"drake": "1.2"}, "there 1.2")]:
+        settings.write_text(json.dumps(claimed | other))
+        with pytest.raises(UserError, match=message):
+            run(monkeypatch, "--scenes", "1", "--quiet", "--output", str(tmp_path))
+        assert json.loads(settings.read_text()) == claimed | other
 
 
 @pytest.mark.slow
