@@ -4,6 +4,10 @@ The gripper frame G: the origin midway between the fingertip ends, z up, the jaw
 Lengths in metres.
 """
 
+import numpy as np
+
+from systems.signals import PickPlaceAction
+
 PAD_LENGTH = 0.0176
 """Length of the pads' gripping faces along G's x."""
 FINGER_LENGTH = 0.0208
@@ -25,3 +29,21 @@ FINGER_BASE_DISTANCE = 0.0584
 """Distance of the origin of the finger meshes from the hand's flange, along G's z."""
 JOINT_LIMITS = {"x": (-1.0, 1.5), "y": (-1.5, 1.5), "z": (-0.05, 1.2), "yaw": (-3.5, 3.5)}
 """Lowest and highest position of the joints that move G, in metres and rad."""
+
+
+def check_reach(action: PickPlaceAction) -> None:
+    """Checks that the hand can go to an action's pick, and unless it presses to its place.
+
+    Raises:
+        RuntimeError: it cannot; says which, and why.
+    """
+    for name, pose in action.poses.items():
+        if not np.isfinite(pose.as_array()).all():
+            raise RuntimeError(f"the action's {name} has no finite numbers: {pose}")
+        for axis in ("x", "y"):
+            value, (low, high) = getattr(pose, axis), JOINT_LIMITS[axis]
+            if not low <= value <= high:
+                raise RuntimeError(
+                    f"the action's {name} is out of the hand's reach: {axis} is {value:g}, not "
+                    f"between {low:g} and {high:g} m in the world"
+                )

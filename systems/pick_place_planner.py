@@ -1,5 +1,6 @@
 """The pick-and-place motion primitive: a state machine that makes smooth, limited motions."""
 
+import dataclasses
 import math
 from typing import Any, TypeAlias
 
@@ -15,6 +16,7 @@ from pydrake.systems.framework import (
     LeafSystem,
 )
 
+from systems.hand_geometry import check_reach
 from systems.hand_motion import (
     PARTS,
     braking_time,
@@ -35,7 +37,7 @@ _FIELDS = (
     + [f"goal_{axis}" for axis in ("x", "y", "z", "yaw")]
     + [f"start_rate_{axis}" for axis in ("x", "y", "z", "yaw")]
     + ["delay_xy", "delay_z", "delay_yaw"]
-    + ["start_opening", "goal_opening", "start_force", "goal_force"]
+    + ["start_opening", "goal_opening", "start_force", "goal_force", "force_start_time"]
     + ["pick_x", "pick_y", "pick_yaw", "place_x", "place_y", "place_yaw", "grasp_z"]
     + ["travel_z", "clear_z", "pick_top_z"]
     + ["pick_hover_z", "place_hover_z", "table_z", "support_z", "rim_z"]
@@ -136,6 +138,7 @@ class PickPlacePlanner(LeafSystem):
         state = _PlannerState(model)
         state[_START] = state[_GOAL] = parameters.home
         state.start_opening = state.goal_opening = parameters.open_width
+        state.force_start_time = -parameters.force_ramp
         self._state_index = self.DeclareDiscreteState(model)
         self._period = period
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
@@ -203,14 +206,7 @@ class PickPlacePlanner(LeafSystem):
         )
 
     def _calc_force(self, context: Context, output: BasicVector) -> None:
-        state = self._state(context)
-        fraction = 1.0
-        if self._parameters.force_ramp > 0:
-            elapsed = context.get_time() - state.start_time
-            fraction = min(max(elapsed / self._parameters.force_ramp, 0.0), 1.0)
-        output.SetFromVector(
-            [state.start_force + fraction * (state.goal_force - state.start_force)]
-        )
+        output.SetFromVector([self._force_at(self._state(context), context.get_time())])
 
     def _calc_mode(self, context: Context, output: BasicVector) -> None:
         output.SetFromVector([self._state(context).mode])
@@ -264,6 +260,9 @@ class PickPlacePlanner(LeafSystem):
         if action.stop:
             self._begin(state, Mode.DONE, time)
             return
+        check_reach(action)
+        if action.press:
+            action = dataclasses.replace(action, place=action.pick)
         pick_yaw, place_yaw = shortest_yaws(
             action.pick.theta, action.place.theta, float(state.goal_yaw), _YAW_LIMIT
         )
@@ -328,6 +327,10 @@ class PickPlacePlanner(LeafSystem):
             return
         if self._is_held(hand, contact):
             state.hold_z = hand[2]
+            # Gripped higher than it was to be, the object reaches farther below the hand.
+            higher = max(hand[2] - state.grasp_z, 0.0)
+            state.travel_z += higher
+            state.place_hover_z += higher
             self._begin(state, Mode.LIFT, time)
         else:
             state.missed += 1
@@ -335,7 +338,8 @@ class PickPlacePlanner(LeafSystem):
 
     def _hold(self, context, state, time, hand, contact) -> None:
         if -contact[2] > self._parameters.heavy_load:
-            state.goal_force = max(state.goal_force, self._parameters.firm_grasp_force)
+            firm = max(state.goal_force, self._parameters.firm_grasp_force)
+            self._set_force(state, time, firm)
         if not self._is_held(hand, contact):
             state.dropped += 1
             self._begin(state, Mode.RETREAT, time)
@@ -419,7 +423,6 @@ class PickPlacePlanner(LeafSystem):
             rate = np.zeros(4)
         if opening is not None:
             now_opening = opening
-        state.start_force = state.goal_force
         state.mode = mode
         state.start_time = time
         state[_START] = now
@@ -438,7 +441,7 @@ class PickPlacePlanner(LeafSystem):
         elif mode == Mode.CLOSE:
             state.goal_opening = 0.0
         elif mode == Mode.CHECK:
-            state.goal_force = parameters.grasp_force
+            self._set_force(state, time, parameters.grasp_force)
         elif mode == Mode.LIFT:
             state.goal_z = state.travel_z + _OVERSHOOT
         elif mode == Mode.CARRY:
@@ -458,7 +461,7 @@ class PickPlacePlanner(LeafSystem):
             state.goal_x, _, home_z, _ = parameters.home
             state.goal_z = max(home_z, state.travel_z)
         if mode in (Mode.RELEASE, Mode.RETREAT):
-            state.goal_force = 0.0
+            self._set_force(state, time, 0.0)
         self._set_times(state)
 
     def _set_times(self, state: _State) -> None:
@@ -490,13 +493,27 @@ class PickPlacePlanner(LeafSystem):
             np.asarray(state[_START]), np.asarray(state[_GOAL]), rate, limits, delays
         )
 
+    def _set_force(self, state: _State, time: float, force: float) -> None:
+        """Lets the closing force go to another value, from what it is now."""
+        if force != state.goal_force:
+            state.start_force = self._force_at(state, time)
+            state.goal_force, state.force_start_time = force, time
+
+    def _force_at(self, state: _State, time: float) -> float:
+        """The closing force, in N."""
+        fraction = 1.0
+        if self._parameters.force_ramp > 0:
+            elapsed = time - state.force_start_time
+            fraction = min(max(elapsed / self._parameters.force_ramp, 0.0), 1.0)
+        return float(state.start_force + fraction * (state.goal_force - state.start_force))
+
     def _arrival(self, state: _State) -> float:
         """When the motion, the jaws and the force of the present mode have arrived, in s."""
         opening_time = abs(state.goal_opening - state.start_opening) / (
             2 * self._parameters.finger_speed
         )
-        force_time = self._parameters.force_ramp * (state.goal_force != state.start_force)
-        return float(state.start_time + max(state.duration, opening_time, force_time))
+        moved = state.start_time + max(state.duration, opening_time)
+        return float(max(moved, state.force_start_time + self._parameters.force_ramp))
 
     def _motion_at(self, state: _State, time: float) -> NDArray[np.float64]:
         """q_d, v_d, a_d (12) of the present mode's motion."""

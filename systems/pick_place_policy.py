@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import inspect
 from collections.abc import Callable
 from typing import Any
@@ -10,12 +11,12 @@ import numpy as np
 from pydrake.common.value import AbstractValue, Value
 from pydrake.systems.framework import Context, LeafSystem
 
-from systems.signals import Observation, PickPlaceAction
+from systems.signals import Observation, PickPlaceAction, PlanarPose
 
 PolicyFunction = Callable[..., PickPlaceAction]
-"""Called with an `Observation`; and, if it takes a second argument `failed_picks`, with a tuple of
-the `PlanarPose`s at which a grasp failed before, the latest last; without it where none is known.
-A second argument of any other name is taken for it too, unless it has a default."""
+"""Called with an `Observation`; and, if it has an argument `failed_picks`, with a tuple of the
+`PlanarPose`s at which a grasp failed before, the latest last; without it where none is known. A
+second argument of any other name is taken for it too, unless it has a default."""
 
 
 class PickPlacePolicy(LeafSystem):
@@ -54,7 +55,8 @@ class PickPlacePolicy(LeafSystem):
         self._observation = self.DeclareAbstractInputPort("observation", Value(Observation()))
         tickets = {self._observation.ticket()}
         self._failed_picks = None
-        if _takes_two(policy):
+        self._by_name, by_place = _takes_failed_picks(policy)
+        if self._by_name or by_place:
             self._failed_picks = self.DeclareAbstractInputPort("failed_picks", Value(()))
             tickets.add(self._failed_picks.ticket())
         self.DeclareAbstractOutputPort(
@@ -62,30 +64,59 @@ class PickPlacePolicy(LeafSystem):
         )
 
     def _calc_action(self, context: Context, output: AbstractValue) -> None:
-        arguments = [self._observation.Eval(context)]
+        arguments, named = [self._observation.Eval(context)], {}
         if self._failed_picks is not None and self._failed_picks.HasValue(context):
-            arguments.append(self._failed_picks.Eval(context))
-        action = self._policy(*arguments)
+            failed_picks = self._failed_picks.Eval(context)
+            if self._by_name:
+                named["failed_picks"] = failed_picks
+            else:
+                arguments.append(failed_picks)
+        action = self._policy(*arguments, **named)
         if not isinstance(action, PickPlaceAction):
             raise TypeError(
                 f"the policy {self._policy!r} answered with {type(action).__name__}, "
                 "not a PickPlaceAction"
             )
-        poses = np.concatenate([action.pick.as_array(), action.place.as_array()])
-        if not (action.stop or np.isfinite(poses).all()):
-            raise ValueError(
-                f"the policy {self._policy!r} answered with no finite numbers: {action}"
-            )
-        output.set_value(action)
+        output.set_value(self._checked(action))
+
+    def _checked(self, action: PickPlaceAction) -> PickPlaceAction:
+        """An action whose poses are numbers, as far as they mean anything.
+
+        Raises:
+            TypeError: they are none.
+            ValueError: they are not finite.
+        """
+        numbers: dict[str, Any] = {}
+        for name, pose in action.poses.items():
+            if not isinstance(pose, PlanarPose):
+                raise TypeError(
+                    f"the policy {self._policy!r} answered with a {name} that is no PlanarPose: "
+                    f"{pose!r}"
+                )
+            values = (pose.x, pose.y, pose.theta)
+            if any(isinstance(value, str) for value in values):
+                raise TypeError(
+                    f"the policy {self._policy!r} answered with a {name} of text: {pose!r}"
+                )
+            numbers[name] = PlanarPose(*map(float, values))
+            if not np.isfinite(numbers[name].as_array()).all():
+                raise ValueError(
+                    f"the policy {self._policy!r} answered with no finite numbers: {action}"
+                )
+        return dataclasses.replace(action, **numbers)
 
 
-def _takes_two(policy: Callable[..., Any]) -> bool:
-    """Whether a function takes a second argument, by its place, that is for failed picks."""
+def _takes_failed_picks(policy: Callable[..., Any]) -> tuple[bool, bool]:
+    """Whether a function takes failed picks by their name, and whether as its second argument."""
     try:
         parameters = list(inspect.signature(policy).parameters.values())
     except (TypeError, ValueError):
         # Some built-in functions do not tell.
-        return False
+        return False, False
+    named = (inspect.Parameter.POSITIONAL_OR_KEYWORD, inspect.Parameter.KEYWORD_ONLY)
+    by_name = any(item.name == "failed_picks" and item.kind in named for item in parameters)
     placed = (inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD)
     second = [item for item in parameters if item.kind in placed][1:2]
-    return any(item.name == "failed_picks" or item.default is item.empty for item in second)
+    return by_name, any(
+        item.default is item.empty or item.name == "failed_picks" for item in second
+    )

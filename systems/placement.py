@@ -238,6 +238,7 @@ def evaluate_placements(
     goals: Sequence[Goal],
     success: SuccessPredicate,
     poses: Sequence[RigidTransform],
+    kept: Set[int] = frozenset(),
 ) -> list[Placement]:
     """Assigns objects to the goals that they may fill, and measures how far from them they are.
 
@@ -249,6 +250,8 @@ def evaluate_placements(
         goals: what is to be brought about.
         success: when a goal is filled.
         poses: n, X_WB of each object.
+        kept: goals that those after them need not wait for, however things stand
+            (`complete_stages`).
 
     Returns:
         One for each object, in their order. An object without a goal has no errors.
@@ -262,7 +265,9 @@ def evaluate_placements(
     filled = {item.goal for item in placements if item.success}
 
     def counts(goal: int) -> bool:
-        return all(other in filled and counts(other) for other in goals[goal].after)
+        return all(
+            other in kept or (other in filled and counts(other)) for other in goals[goal].after
+        )
 
     return [
         item if item.goal is None or counts(item.goal) else dataclasses.replace(item, share=0.0)
@@ -358,7 +363,7 @@ def complete_stages(
 
     Args:
         goals: of the task.
-        placements: as things stand.
+        placements: as things stand, evaluated with `kept`.
         kept: those that were complete before.
     """
     filled = kept | {item.goal for item in placements if item.success}
@@ -372,7 +377,7 @@ def total_reward(
 
     Args:
         goals: of the task.
-        placements: as things stand.
+        placements: as things stand, evaluated with `kept`.
         kept: goals that count as filled however things stand (`complete_stages`).
     """
     shares = {item.goal: item.share for item in placements if item.goal is not None}

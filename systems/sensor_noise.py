@@ -11,7 +11,7 @@ from pydrake.common.value import AbstractValue, Value
 from pydrake.geometry import DepthRenderCamera
 from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.systems.framework import Context, LeafSystem
-from pydrake.systems.sensors import ImageDepth32F, ImageLabel16I, ImageRgba8U
+from pydrake.systems.sensors import CameraInfo, ImageDepth32F, ImageLabel16I, ImageRgba8U
 from scipy import ndimage
 from scipy.special import ndtri
 
@@ -109,8 +109,9 @@ class SensorNoise(LeafSystem):
     - Beside an edge (a step of more than 15 mm within a pixel) a share `flying_share` of the pixels
       gets a depth anywhere between the two sides.
     - Holes, with depth 0 (Drake's too close): blobs over `hole_share` of the image; what is seen at
-      more than `steepest_deg` from its normal; and, where `label_image` is connected, blobs over a
-      share of the surfaces with sheen: of a label of SHEEN_LABELS + p, p percent.
+      more than `steepest_deg` from its normal, outlines too, where depth jumps; and, where
+      `label_image` is connected, blobs over a share of the surfaces with sheen: of a label of
+      SHEEN_LABELS + p, p percent.
     - Of `frames` such images, each with draws of its own, the median of the depths is kept.
     - Each colour channel is multiplied by a gain, normally distributed about one.
     - `body_pose_in_world` is the pose that calibration *believes*: `X_Rig X_WB X_Camera`, with
@@ -144,7 +145,7 @@ class SensorNoise(LeafSystem):
         self._parameters = parameters
         self._seed, self._number = seed, number
         info = camera.core().intrinsics()
-        self._focal = (info.focal_x(), info.focal_y())
+        self._camera = info
         self._shape = (info.height(), info.width())
         middle = RigidTransform([*workspace_middle, 0.0])
         rig = _pose_error(
@@ -217,7 +218,7 @@ class SensorNoise(LeafSystem):
                 0.0,
             ).astype(np.float32)
         frames = [
-            noisy_depth(data[:, :, 0], self._parameters, self._focal, random, sheen)
+            noisy_depth(data[:, :, 0], self._parameters, self._camera, random, sheen)
             for _ in range(self._parameters.frames)
         ]
         image.mutable_data[:, :, 0] = frames[0] if len(frames) == 1 else median_depth(frames)
@@ -227,7 +228,7 @@ class SensorNoise(LeafSystem):
 def noisy_depth(
     depth: NDArray[np.float32],
     parameters: SensorNoiseParameters,
-    focal: tuple[float, float],
+    camera: CameraInfo,
     random: np.random.Generator,
     sheen: NDArray[np.float32] | None = None,
 ) -> NDArray[np.float32]:
@@ -236,7 +237,7 @@ def noisy_depth(
     Args:
         depth: (height, width), in metres; 0 and infinity are no depth.
         parameters: of the noise.
-        focal: focal lengths along x and y, in pixels.
+        camera: its intrinsics.
         random: for all draws.
         sheen: (height, width), the share of holes on each surface, if there is any sheen.
     """
@@ -244,13 +245,17 @@ def noisy_depth(
     z = np.where(seen, depth, 1.0).astype(np.float32)
     hole = np.zeros(depth.shape, bool)
     if parameters.steepest_deg < 90:
-        by_row, by_col = np.gradient(z)
-        # The tangent of the angle of incidence, nearly, for a ray along the optical axis.
-        tangent = np.hypot(by_row * focal[1], by_col * focal[0]) / z
-        hole |= tangent > math.tan(math.radians(parameters.steepest_deg))
+        hole |= _incidence(z, seen, camera) < math.cos(math.radians(parameters.steepest_deg))
     noisy = z
     if parameters.flying_share:
-        low, high = ndimage.minimum_filter(z, 3), ndimage.maximum_filter(z, 3)
+        # Where there is no depth there is no other side for a pixel to fly to.
+        low, high = (
+            np.where(seen, extreme(np.where(seen, z, none), 3), z)
+            for extreme, none in (
+                (ndimage.minimum_filter, np.float32(np.inf)),
+                (ndimage.maximum_filter, np.float32(-np.inf)),
+            )
+        )
         flying = (high - low > _EDGE) & (random.random(z.shape) < parameters.flying_share)
         mixed = low + (high - low) * random.random(z.shape, dtype=np.float32)
         noisy = np.where(flying, mixed, noisy)
@@ -270,6 +275,27 @@ def noisy_depth(
             share = np.maximum(share, sheen)
         hole |= field > _upper_quantile(share)
     return np.where(hole | ~seen, np.where(seen, 0.0, depth), noisy).astype(np.float32)
+
+
+def _incidence(
+    z: NDArray[np.float32], seen: NDArray[np.bool_], camera: CameraInfo
+) -> NDArray[np.float32]:
+    """(height, width): the cosine of the angle between each pixel's ray and the surface's normal;
+    not a number beside pixels without depth.
+
+    Args:
+        z: (height, width), depths in metres.
+        seen: (height, width), where there is one.
+        camera: its intrinsics.
+    """
+    x = ((np.arange(z.shape[1]) - camera.center_x()) / camera.focal_x()).astype(np.float32)
+    y = ((np.arange(z.shape[0]) - camera.center_y()) / camera.focal_y()).astype(np.float32)[:, None]
+    by_row, by_col = np.gradient(np.where(seen, z, np.float32(np.nan)))
+    along_x, along_y = by_col * np.float32(camera.focal_x()), by_row * np.float32(camera.focal_y())
+    # Of the surface z (x, y, 1) the normal is (-dz/dx, -dz/dy, z + x dz/dx + y dz/dy), and its
+    # product with the ray (x, y, 1) is z.
+    normal = np.sqrt(along_x**2 + along_y**2 + (z + x * along_x + y * along_y) ** 2)
+    return z / (normal * np.sqrt(x**2 + y**2 + 1))
 
 
 def median_depth(frames: Sequence[NDArray[np.float32]]) -> NDArray[np.float32]:

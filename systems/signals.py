@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy import ndimage
 
 
 @dataclass(frozen=True)
@@ -104,6 +105,29 @@ class Observation:
         return self.image[3]
 
 
+def fill_unseen(height: NDArray[np.float32], valid: NDArray[np.bool_]) -> NDArray[np.float32]:
+    """Heights with the pixels that no camera saw filled in from around them.
+
+    What is hidden is hidden by something higher: a hole takes the lowest of its neighbours, from
+    its border inwards.
+
+    Args:
+        height: (rows, cols).
+        valid: (rows, cols), where it was seen.
+    """
+    if valid.all() or not valid.any():
+        return height
+    filled = np.where(valid, height, np.inf).astype(np.float32)
+    missing = ~valid
+    for _ in range(max(height.shape)):
+        lowest = ndimage.minimum_filter(filled, size=3, mode="nearest")
+        filled = np.where(missing, lowest, filled)
+        missing = ~np.isfinite(filled)
+        if not missing.any():
+            break
+    return filled
+
+
 @dataclass(frozen=True)
 class PlanarPose:
     """A pose of the gripper in SE(2), pointing straight down.
@@ -164,6 +188,13 @@ class PickPlaceAction:
     """True: push down at the pick with closed jaws, and nothing else; the place means nothing."""
     heights: SurfaceHeights | None = None
     """Given by the oracle, which knows them; used only where there is no observation."""
+
+    @property
+    def poses(self) -> dict[str, PlanarPose]:
+        """Those that mean something, by their names."""
+        if self.stop:
+            return {}
+        return {"pick": self.pick} if self.press else {"pick": self.pick, "place": self.place}
 
 
 def wrap_to_pi(angle: float) -> float:

@@ -1,10 +1,12 @@
 """Reads off o_t the heights that a motion between pick and place must respect: the only place."""
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from systems.signals import Observation, PlanarPose, SurfaceHeights
+from systems.signals import Observation, PlanarPose, SurfaceHeights, fill_unseen
 
 _PICK_REACH = 1
 """How far around the pick pixel its top is looked for, in pixels."""
@@ -45,6 +47,8 @@ def read_surface_heights(
 ) -> SurfaceHeights:
     """The heights around a pick and a place, from o_t alone.
 
+    What no camera sees is taken to be as high as what is around it (`fill_unseen`).
+
     The support of an object is the height that a tenth of the pixels around it do not exceed; so
     an object in the middle of others is taken to stand on what they stand on.
 
@@ -68,10 +72,12 @@ def read_surface_heights(
             ("near_place", _PLACE_CLEARANCE_REACH),
         )
     }
-    height, noise, doubt = _level(observation.height)
+    height, noise, doubt = _level(fill_unseen(observation.height, observation.valid))
     at_pick, at_place = (grid.to_pixel((pose.x, pose.y)) for pose in (pick, place))
     around_pick = _around(height, at_pick, reach["support"])
     top, rim = _around(height, at_pick, _PICK_REACH), _around(height, at_place, reach["rim"])
+    seen = _around(observation.valid, at_pick, _PICK_REACH)
+    top = top[seen] if seen.any() else top
     support = _percentile(around_pick, _SUPPORT_SHARE)
     table = _percentile(height, _TABLE_SHARE)
     if noise:
@@ -138,11 +144,9 @@ def _table(height: NDArray[np.float32], noise: float) -> NDArray[np.float64]:
     return tilt + level if level < _MOST_OFF else tilt
 
 
-def _around(
-    height: NDArray[np.float32], pixel: NDArray[np.float64], reach: int
-) -> NDArray[np.float32]:
-    """The heights within `reach` pixels, along rows and columns, of a position (row, col)."""
+def _around(values: NDArray[Any], pixel: NDArray[np.float64], reach: int) -> NDArray[Any]:
+    """The values (rows, cols) within `reach` pixels, along both, of a position (row, col)."""
     row, col = np.rint(pixel).astype(int)
     rows = slice(max(row - reach, 0), max(row + reach + 1, 0))
     cols = slice(max(col - reach, 0), max(col + reach + 1, 0))
-    return height[rows, cols]
+    return values[rows, cols]

@@ -1,7 +1,7 @@
 """From a scenario to the Diagram of the kitting cell: the only place where systems are wired."""
 
 import functools
-from collections.abc import Sequence
+from collections.abc import Sequence, Set
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -45,7 +45,7 @@ from kitting_drake.tasks.task import Scene
 from systems.heightmap_projector import HeightmapProjector
 from systems.pick_place_planner import PickPlacePlanner
 from systems.pick_place_policy import PickPlacePolicy
-from systems.placement import PlacedObject, Placement
+from systems.placement import PlacedObject, Placement, evaluate_placements
 from systems.placement_monitor import PlacementMonitor
 from systems.rest_detector import RestDetector
 from systems.sensor_noise import SensorNoise
@@ -85,9 +85,17 @@ class Cell:
         context = self.plant.GetMyContextFromRoot(root_context)
         return [self.plant.get_body(item.body).EvalPoseInWorld(context) for item in self.objects]
 
-    def placements(self, root_context: Context) -> list[Placement]:
-        """Where each of the scene's objects is relative to its goal."""
-        return self.monitor.placements(self.monitor.GetMyContextFromRoot(root_context))
+    def placements(self, root_context: Context, kept: Set[int] = frozenset()) -> list[Placement]:
+        """Where each of the scene's objects is relative to its goal.
+
+        Args:
+            root_context: of the diagram.
+            kept: goals that were filled for good before (`complete_stages`).
+        """
+        if not kept:
+            return self.monitor.placements(self.monitor.GetMyContextFromRoot(root_context))
+        scene, poses = self.scene, self.object_poses(root_context)
+        return evaluate_placements(self.objects, scene.goals, scene.success, poses, kept)
 
     def at_rest(self, root_context: Context) -> NDArray[np.bool_]:
         """(n,) which of the scene's objects are at rest."""

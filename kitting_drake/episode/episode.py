@@ -215,14 +215,14 @@ class Episode:
     def result(self) -> EpisodeResult:
         """How it ended; before its end, how it stands now."""
         cell, context, records = self._cell, self.context, self._log.records
-        placements = cell.placements(context)
+        placements = self._monitor.placements(context)
         planner_context = cell.planner.GetMyContextFromRoot(context)
         counts = cell.planner.GetOutputPort("counts").Eval(planner_context)
         lost = self._failure is not None or self.timed_out
         at_rest = cell.at_rest(context)
         return EpisodeResult(
             **self._names,  # type: ignore[arg-type]
-            objects=object_results(cell, self._task, context, records),
+            objects=object_results(cell, self._task, context, placements, records),
             success_rate=0.0 if lost else self._monitor.reward(context),
             strict_success_rate=0.0 if lost else strict_reward(cell.scene.goals, placements),
             actions=int(counts[0]),
@@ -242,7 +242,11 @@ class Episode:
 
 
 def object_results(
-    cell: Cell, task: TaskConfig, root_context: Context, records: Sequence[ActionRecord] = ()
+    cell: Cell,
+    task: TaskConfig,
+    root_context: Context,
+    placements: Sequence[Placement],
+    records: Sequence[ActionRecord] = (),
 ) -> list[ObjectResult]:
     """How every object that a goal takes stands now, in the scene's order.
 
@@ -250,10 +254,10 @@ def object_results(
         cell: the episode's.
         task: which knows why objects fail.
         root_context: of the cell's diagram.
+        placements: of the scene's objects, in its order.
         records: the actions so far.
     """
     poses = cell.object_poses(root_context)
-    placements = cell.placements(root_context)
     results = []
     for index in cell.scene.goal_objects:
         item, placement = cell.scene.objects[index], placements[index]
@@ -305,9 +309,13 @@ class _Monitor:
         self.done_since: float | None = None
         self._complete: frozenset[int] = frozenset()
 
+    def placements(self, root_context: Context) -> list[Placement]:
+        """Where objects are; what comes after a stage that was complete once need not wait."""
+        return self._cell.placements(root_context, self._complete)
+
     def reward(self, root_context: Context) -> float:
         """The task's reward, counting stages that were complete at some time."""
-        placements = self._cell.placements(root_context)
+        placements = self.placements(root_context)
         return total_reward(self._cell.scene.goals, placements, self._complete)
 
     def step(self, root_context: Context) -> EventStatus:
@@ -342,7 +350,7 @@ class _Monitor:
             pairs = contact.num_point_pair_contacts()
             self.point_contact_pairs = max(self.point_contact_pairs, pairs)
             if is_last or previous == Mode.OBSERVE:
-                placements = self._cell.placements(root_context)
+                placements = self.placements(root_context)
                 self._complete = complete_stages(self._cell.scene.goals, placements, self._complete)
             event = ModeChange(
                 self._mode if is_last else previous, self._mode, root_context, is_last

@@ -110,7 +110,7 @@ class NetworkConfig:
     """The frequencies of beta's output."""
     colour: bool = True
     """Whether the networks see colours; if not, what no camera saw is filled in for them (see
-    `matching.segmentation.fill_unseen`)."""
+    `systems.signals.fill_unseen`)."""
     stop: bool = False
     """Whether the picking module has a class "nothing to pick" (see `losses.log_odds`)."""
 

@@ -19,9 +19,16 @@ from kitting_drake.policies.matching.policy import RETRY_DISTANCE, belonging, ce
 from kitting_drake.policies.matching.recovery import recovery_action
 from kitting_drake.policies.matching.refinement import refine_grasp, refine_place
 from kitting_drake.policies.matching.release_clearance import blocked_at_place
-from kitting_drake.policies.matching.segmentation import Segmentation, fill_unseen, segment
+from kitting_drake.policies.matching.segmentation import Segmentation, segment
 from kitting_drake.policies.networks import Networks, PickPrediction
-from systems.signals import Observation, PickPlaceAction, PixelGrid, PlanarPose, wrap_to_pi
+from systems.signals import (
+    Observation,
+    PickPlaceAction,
+    PixelGrid,
+    PlanarPose,
+    fill_unseen,
+    wrap_to_pi,
+)
 
 _NEVER = -math.inf
 """The logit of a pixel that must not be chosen."""

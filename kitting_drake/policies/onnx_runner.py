@@ -20,9 +20,9 @@ from kitting_drake.policies.fourier_series import series_maximum
 from kitting_drake.policies.images import Image, crop, make_action, rotation_matrix
 from kitting_drake.policies.matching.policy import certain_fits
 from kitting_drake.policies.matching.refinement import refine_grasp, refine_place
-from kitting_drake.policies.matching.segmentation import fill_unseen, segment
+from kitting_drake.policies.matching.segmentation import segment
 from kitting_drake.policies.numpy_correlation import Array, search
-from systems.signals import Observation, PickPlaceAction, wrap_to_pi
+from systems.signals import Observation, PickPlaceAction, fill_unseen, wrap_to_pi
 
 GRAPHS = ("alpha", "beta", "phi", "psi")
 """The networks, a file each."""

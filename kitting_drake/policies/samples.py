@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 from kitting_drake.policies.config import NetworkConfig
 from kitting_drake.policies.demonstrations import Demonstration, FinalObservation
 from kitting_drake.policies.images import Image, LabelledImage, Pictured
-from kitting_drake.policies.matching.segmentation import fill_unseen
-from systems.signals import Observation, PickPlaceAction, PixelGrid
+from systems.signals import Observation, PickPlaceAction, PixelGrid, fill_unseen
 
 
 @dataclass(frozen=True)

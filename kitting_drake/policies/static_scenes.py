@@ -25,8 +25,7 @@ from numpy.typing import NDArray
 
 from kitting_drake.common.errors import UserError
 from kitting_drake.policies.images import LabelledImage
-from kitting_drake.policies.matching.segmentation import fill_unseen
-from systems.signals import Observation, PixelGrid
+from systems.signals import Observation, PixelGrid, fill_unseen
 
 STATIC = "static scenes"
 """What the card of weights that learned from them has for a scenario's name."""

@@ -64,7 +64,11 @@ def load_scenario(
 def _parse(content: str, where: str) -> dict:
     try:
         # A Python mapping swallows a field that is given twice.
-        _check_names(yaml.compose(content, Loader=yaml.SafeLoader))
+        node = yaml.compose(content, Loader=yaml.SafeLoader)
+        _check_names(node)
+        # It would be dropped without a word.
+        if isinstance(node, yaml.MappingNode) and node.tag != "tag:yaml.org,2002:map":
+            raise ValueError(f"the tag {node.tag} at the beginning means nothing there")
         # Drake takes an empty text for no text at all.
         root = yaml_load(data=content) if content.strip() else None
     except yaml.YAMLError as error:
@@ -197,16 +201,18 @@ def _check_meaning(scenario: Scenario) -> None:
                 f"cameras.{key} looks straight down, where upright means nothing: use !Pinhole"
             )
     planner = scenario.planner
-    if planner.home[2] < planner.floor_clearance:
-        raise ValueError(
-            "planner.home[2] is below planner.floor_clearance: the hand would begin in the table"
-        )
     for index, (axis, (low, high)) in enumerate(JOINT_LIMITS.items()):
         if not low <= planner.home[index] <= high:
             raise ValueError(
                 f"planner.home[{index}] is {planner.home[index]:g}, beyond the hand's {axis}, "
                 f"{low:g} to {high:g}"
             )
+    lowest = scenario.heightmap.z_max + planner.travel_clearance
+    if planner.home[2] < lowest:
+        raise ValueError(
+            f"planner.home[2] is {planner.home[2]:g}: the hand would sweep across the table below "
+            f"what may stand there (heightmap.z_max + planner.travel_clearance: {lowest:g})"
+        )
     if planner.grasp_depth > planner.max_grasp_depth:
         raise ValueError("planner.grasp_depth is more than planner.max_grasp_depth")
     for name in ("grasp_force", "firm_grasp_force"):

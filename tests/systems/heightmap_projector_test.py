@@ -307,6 +307,17 @@ def test_unchanged_inputs_are_not_computed_again():
     assert first.height.max() == pytest.approx(0, abs=1e-6)
 
 
+@pytest.mark.parametrize("name", ["observation", "heights"])
+def test_outputs_follow_the_pose_of_a_camera(name):
+    projector, context = _small_projector("a")
+    _fix(projector, context, "a", COLOR, FLAT, X_WB)
+    port = projector.GetOutputPort(name)
+    assert port.Eval(context).height.max() == pytest.approx(0, abs=1e-6)
+    raised = RigidTransform([0, 0, 0.1]) @ X_WB
+    projector.GetInputPort("body_pose_in_world_a").FixValue(context, Value(raised))
+    assert port.Eval(context).height.max() == pytest.approx(0.1)
+
+
 @pytest.mark.parametrize("wrong", ["color", "depth"])
 def test_an_image_of_another_size_is_refused(wrong):
     images = {"color": COLOR, "depth": FLAT}

@@ -107,15 +107,14 @@ class StubPolicy(LeafSystem):
 
     def __init__(self, actions: int, answer: PickPlaceAction) -> None:
         super().__init__()
-        self._answer = answer
+        self.answers = [answer] * actions
         self.asked: list[float] = []
-        self._actions = actions
         self.DeclareAbstractOutputPort("action", lambda: Value(PickPlaceAction()), self._calc)
 
     def _calc(self, context, output) -> None:
         self.asked.append(context.get_time())
-        stop = len(self.asked) > self._actions
-        output.set_value(PickPlaceAction(stop=True) if stop else self._answer)
+        stop = len(self.asked) > len(self.answers)
+        output.set_value(PickPlaceAction(stop=True) if stop else self.answers[len(self.asked) - 1])
 
 
 class Run:
@@ -363,7 +362,7 @@ def test_the_rim_is_told_from_what_the_object_stood_on():
 def seen(**heights: float) -> Observation:
     """A table, a tall block in a corner, and something at the pick and at the place."""
     grid = PixelGrid()
-    image = np.zeros((4, *grid.shape), np.float32)
+    image = np.full((4, *grid.shape), 0.5, np.float32)
     image[3] = heights.get("table", 0.0)
     image[3, :10, :10] = heights.get("tallest", 0.0)
     for pose, height in ((PICK, heights.get("pick", 0.0)), (PLACE, heights.get("place", 0.0))):
@@ -409,6 +408,31 @@ def test_what_crosses_the_table_clears_the_highest_surface(tallest: float):
     )
     assert at_pick == pytest.approx(0.06 + hover, abs=1e-4)
     assert at_place == pytest.approx(0.03 + hanging + hover, abs=1e-4)
+
+
+@pytest.mark.parametrize("higher", [0.0, 0.006, 0.012])
+def test_what_is_gripped_higher_than_planned_clears_the_rim_as_well(higher: float):
+    """Something is touched early: more of the object is below the hand than o_t had told."""
+    world = World(touch_pick=GRASP_Z + higher if higher else NO_TOUCH)
+    seen_heights = dataclasses.replace(HEIGHTS, near_place=0.05, place_rim=0.05)
+    run = Run(world, answer=dataclasses.replace(ACTION, heights=seen_heights)).until(Mode.LIFT)
+    hanging = run.output("desired_motion")[2]
+    run.until(Mode.LOWER)
+    bottom = run.output("desired_motion")[2] - hanging
+    assert bottom >= 0.05 + PARAMETERS.hover_clearance - 5e-4
+
+
+@pytest.mark.parametrize("ramp", [0.05, 0.4])
+def test_the_force_builds_up_and_goes_on_to_a_firm_grip_without_a_step(ramp: float):
+    parameters = dataclasses.replace(PARAMETERS, force_ramp=ramp, heavy_load=WEIGHT - 0.5)
+    run = Run(parameters=parameters).until(Mode.CHECK)
+    forces, step = [run.output("closing_force")[0]], ramp / 16
+    while run.sequence[-1] != Mode.RELEASE:
+        run.simulator.AdvanceTo(run.simulator.get_context().get_time() + step)
+        forces.append(run.output("closing_force")[0])
+    assert max(forces) == parameters.firm_grasp_force
+    steepest = parameters.firm_grasp_force / ramp * step
+    assert np.abs(np.diff(forces[:-1])).max() <= steepest + 1e-6
 
 
 def test_the_hand_rises_before_it_leaves_the_place():
@@ -458,10 +482,33 @@ def test_a_missed_grasp_is_counted_and_tried_again():
 
 
 def test_the_latest_failed_picks_are_remembered():
+    """As many as there is room for, in their order."""
     world = World(width=lambda attempt, mode: 0.0)
     run = Run(world, actions=20, parameters=dataclasses.replace(PARAMETERS, max_actions=20))
+    picks = [dataclasses.replace(PICK, x=0.3 + 0.01 * number) for number in range(20)]
+    run.policy.answers = [dataclasses.replace(ACTION, pick=pick) for pick in picks]
     assert run.finish().counts == [20, 20, 0]
-    assert run.output("failed_picks") == (PICK,) * 16
+    assert run.output("failed_picks") == tuple(picks[-16:])
+
+
+@pytest.mark.parametrize(
+    ("name", "x", "message"),
+    [
+        ("pick", np.nan, "pick has no finite"),
+        ("place", 50.0, "place is out .* x is 50, not between"),
+    ],
+)
+def test_an_action_out_of_reach_is_refused(name: str, x: float, message: str):
+    pose = dataclasses.replace(PLACE, x=x)
+    run = Run(answer=dataclasses.replace(ACTION, **{name: pose}))
+    with pytest.raises(RuntimeError, match=message):
+        run.simulator.AdvanceTo(2.0)
+
+
+def test_what_is_pressed_has_no_place():
+    nowhere = PlanarPose(np.nan, np.nan, np.nan)
+    answer = dataclasses.replace(ACTION, press=True, place=nowhere)
+    assert Run(answer=answer).finish().counts == [1, 0, 0]
 
 
 def test_an_object_dropped_while_searching_is_counted():

@@ -47,6 +47,34 @@ def test_an_answer_of_another_type_is_refused():
         policy.GetOutputPort("action").Eval(context)
 
 
+@pytest.mark.parametrize(
+    ("answer", "error", "message"),
+    [
+        (PickPlaceAction(pick=(0.3, 0, 0)), TypeError, "a pick that is no PlanarPose: .0.3, 0, 0."),
+        (PickPlaceAction(place=PlanarPose("0.3")), TypeError, "a place of text"),
+        (PickPlaceAction(place=PlanarPose(np.nan)), ValueError, "no finite numbers"),
+    ],
+)
+def test_poses_that_are_no_numbers_are_refused(answer, error: type, message: str):
+    policy = PickPlacePolicy(policy=lambda _: answer)
+    context = policy.CreateDefaultContext()
+    policy.GetInputPort("observation").FixValue(context, Value(Observation()))
+    with pytest.raises(error, match=message):
+        policy.GetOutputPort("action").Eval(context)
+
+
+def test_what_means_nothing_is_not_looked_at():
+    nowhere = PlanarPose(np.nan, 0, 0)
+    for answer in (
+        PickPlaceAction(nowhere, nowhere, stop=True),
+        PickPlaceAction(PlanarPose(np.float32(0.5), 0, 0), nowhere, press=True),
+    ):
+        policy = PickPlacePolicy(policy=lambda _, answer=answer: answer)
+        context = policy.CreateDefaultContext()
+        policy.GetInputPort("observation").FixValue(context, Value(Observation()))
+        assert policy.GetOutputPort("action").Eval(context).press == answer.press
+
+
 def test_what_the_policy_raises_comes_through():
     def fail(_: Observation) -> PickPlaceAction:
         raise KeyError("no such weight")
@@ -73,6 +101,25 @@ def test_a_function_of_two_arguments_is_told_where_grasps_failed():
         policy.GetInputPort("failed_picks").FixValue(context, Value(failed))
         assert policy.GetOutputPort("action").Eval(context) == ACTION
     assert told == [(), (PlanarPose(0.4, 0.1, 0.2),)]
+
+
+def test_failed_picks_are_found_by_their_name():
+    told = []
+
+    def last(_: Observation, threshold: float = 0.5, *, failed_picks=()) -> PickPlaceAction:
+        told.append((threshold, failed_picks))
+        return ACTION
+
+    def third(_: Observation, threshold: float = 0.5, failed_picks=()) -> PickPlaceAction:
+        return last(_, threshold, failed_picks=failed_picks)
+
+    for function in (last, third):
+        policy = PickPlacePolicy(policy=function)
+        context = policy.CreateDefaultContext()
+        policy.GetInputPort("observation").FixValue(context, Value(Observation()))
+        policy.GetInputPort("failed_picks").FixValue(context, Value((ACTION.pick,)))
+        assert policy.GetOutputPort("action").Eval(context) == ACTION
+    assert told == [(0.5, (ACTION.pick,))] * 2
 
 
 def test_an_option_of_a_function_is_its_own():

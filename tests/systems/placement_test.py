@@ -201,6 +201,11 @@ def test_a_stage_that_was_complete_keeps_its_reward():
     assert complete_stages(goals, fallen, kept) == kept
     assert (total_reward(goals, fallen), total_reward(goals, fallen, kept)) == (0.25, 0.5)
     assert total_reward(goals, at(*row, top), kept) == 1.0
+    # What comes after it counts on its own, as in Ravens: the row was popped from its goals.
+    moved = evaluate_placements(objects, goals, AddS(), [row[0], away, top], kept)
+    assert (moved[1].success, moved[2].success) == (False, True)
+    assert total_reward(goals, moved, kept) == 1.0
+    assert total_reward(goals, at(row[0], away, top)) == 0.25
     # The last stage, which nothing comes after, counts as it stands.
     assert complete_stages(goals, at(*row, top)) == kept
     assert strict_reward(goals, fallen) == 0.25

@@ -16,12 +16,12 @@ from systems.sensor_noise import (
 )
 
 WIDTH, HEIGHT, FOCAL = 160, 120, 112.0
+INFO = CameraInfo(WIDTH, HEIGHT, FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2)
 POSE = RigidTransform(RollPitchYaw(0.8, 3.0, -1.5), [1.0, 0.1, 0.75])
 
 
 def camera() -> DepthRenderCamera:
-    info = CameraInfo(WIDTH, HEIGHT, FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2)
-    core = RenderCameraCore("none", info, ClippingRange(0.01, 10.0), RigidTransform())
+    core = RenderCameraCore("none", INFO, ClippingRange(0.01, 10.0), RigidTransform())
     return DepthRenderCamera(core, DepthRange(0.01, 10.0))
 
 
@@ -91,20 +91,14 @@ def test_it_repeats_itself_and_differs_by_time_seed_and_camera():
         assert (other != seen()).mean() > 0.9
 
 
-def test_holes_have_their_share_and_steep_and_shiny_surfaces_more():
+def test_holes_have_their_share_and_shiny_surfaces_more():
     flat = np.full((HEIGHT, WIDTH), 1.0, np.float32)
     random = np.random.default_rng(0)
     shares = [
-        (noisy_depth(flat, SensorNoiseParameters(hole_share=0.05), (FOCAL, FOCAL), random) == 0)
+        (noisy_depth(flat, SensorNoiseParameters(hole_share=0.05), INFO, random) == 0)
         for _ in range(20)
     ]
     assert np.mean(shares) == pytest.approx(0.05, rel=0.15)
-    # A plane that recedes by 60 degrees more than a fronto-parallel one.
-    steep = np.tile(1 + np.arange(WIDTH) / FOCAL * math.tan(math.radians(75)), (HEIGHT, 1))
-    seen = noisy_depth(
-        steep.astype(np.float32), SensorNoiseParameters(steepest_deg=60.0), (FOCAL, FOCAL), random
-    )
-    assert (seen[:, : WIDTH // 8] == 0).all()
     noise = system(use_labels=True)
     context = context_of(noise, flat)
     labels = ImageLabel16I(WIDTH, HEIGHT)
@@ -114,13 +108,74 @@ def test_holes_have_their_share_and_steep_and_shiny_surfaces_more():
     holes = depth_of(noise, context) == 0
     assert not holes[:, : WIDTH // 2].any()
     assert 0.45 < holes[:, WIDTH // 2 :].mean() < 0.75
+    # What the labels say now, not what they said.
+    labels.mutable_data[:] = 7
+    noise.GetInputPort("label_image").FixValue(context, Value(labels))
+    assert (depth_of(noise, context) != 0).all()
+
+
+@pytest.mark.parametrize("normal", [(0.0, 0.0, 1.0), (0.7, 0.1, 0.7), (-0.3, 0.8, 0.5)])
+def test_what_is_seen_at_a_grazing_angle_is_a_hole(normal: tuple[float, float, float]):
+    """Of a plane the angle between each ray and the normal is known."""
+    x, y = np.meshgrid(
+        (np.arange(WIDTH) - INFO.center_x()) / FOCAL, (np.arange(HEIGHT) - INFO.center_y()) / FOCAL
+    )
+    rays = np.stack([x, y, np.ones(x.shape)], axis=-1)
+    facing = rays @ (np.array(normal) / np.linalg.norm(normal))
+    angle = np.degrees(np.arccos(facing / np.linalg.norm(rays, axis=-1)))
+    plane = np.where(facing > 0.05, 0.7 / np.maximum(facing, 0.05), np.inf).astype(np.float32)
+    limit = float(np.median(angle))
+    noise = SensorNoiseParameters(steepest_deg=limit)
+    seen = noisy_depth(plane, noise, INFO, np.random.default_rng(0))
+    clear = np.isfinite(plane) & (np.abs(angle - limit) > 1.0)
+    assert 0.2 < (angle[clear] > limit).mean() < 0.8
+    assert ((seen == 0) == (angle > limit))[clear].mean() > 0.99
+
+
+def test_what_has_no_depth_is_no_surface():
+    depth = np.full((HEIGHT, WIDTH), 0.7, np.float32)
+    depth[:, WIDTH // 3 :] = np.inf
+    depth[:, 2 * WIDTH // 3 :] = 0.0
+    noise = SensorNoiseParameters(flying_share=1.0, steepest_deg=60.0)
+    seen = noisy_depth(depth, noise, INFO, np.random.default_rng(0))
+    np.testing.assert_array_equal(seen, depth)
+
+
+def test_depths_come_in_steps_that_grow_with_the_square_of_depth():
+    for distance in (0.5, 1.5):
+        depth = np.full((HEIGHT, WIDTH), distance, np.float32)
+        noise = SensorNoiseParameters(depth_std=0.002, depth_step=0.004)
+        seen = noisy_depth(depth, noise, INFO, np.random.default_rng(0))
+        steps = seen / (0.004 * distance**2)
+        np.testing.assert_allclose(steps, np.rint(steps), atol=0.01)
+        assert 2 < len(np.unique(np.rint(steps))) < 8
+
+
+def test_outputs_follow_their_inputs():
+    noise = system(depth_std=0.001, white_balance_std=0.1, camera_position_error=0.001)
+    context = context_of(noise, np.full((HEIGHT, WIDTH), 0.9))
+    ports = ("color_image", "depth_image_32f", "body_pose_in_world")
+
+    def values() -> list[np.ndarray]:
+        color, depth, pose = (noise.GetOutputPort(name).Eval(context) for name in ports)
+        return [np.array(color.data), np.array(depth.data), pose.GetAsMatrix34()]
+
+    before = values()
+    image, colours = ImageDepth32F(WIDTH, HEIGHT), ImageRgba8U(WIDTH, HEIGHT)
+    image.mutable_data[:], colours.mutable_data[:] = 1.4, 40
+    noise.GetInputPort("depth_image_32f").FixValue(context, Value(image))
+    noise.GetInputPort("color_image").FixValue(context, Value(colours))
+    moved = RigidTransform(POSE.rotation(), POSE.translation() + [0, 0, 0.5])
+    noise.GetInputPort("body_pose_in_world").FixValue(context, Value(moved))
+    for old, new in zip(before, values(), strict=True):
+        assert (old != new).any()
 
 
 def test_pixels_fly_only_beside_edges():
     step = np.full((HEIGHT, WIDTH), 1.0, np.float32)
     step[:, WIDTH // 2 :] = 0.9
     seen = noisy_depth(
-        step, SensorNoiseParameters(flying_share=0.5), (FOCAL, FOCAL), np.random.default_rng(1)
+        step, SensorNoiseParameters(flying_share=0.5), INFO, np.random.default_rng(1)
     )
     changed = seen != step
     assert changed[:, WIDTH // 2 - 1 : WIDTH // 2 + 1].mean() == pytest.approx(0.5, abs=0.12)

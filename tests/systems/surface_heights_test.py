@@ -10,7 +10,7 @@ PICK, PLACE = PlanarPose(0.40, 0.20), PlanarPose(0.60, -0.20)
 
 def observation(*boxes: tuple[PlanarPose, float, float]) -> Observation:
     """Boxes by their middle, half their side and their height above the world's origin."""
-    image = np.zeros((4, *GRID.shape), np.float32)
+    image = np.full((4, *GRID.shape), 0.5, np.float32)
     image[3] = -GRID.z_min
     for middle, half, height in boxes:
         rows, cols = (
@@ -71,7 +71,7 @@ def test_errors_of_cameras_are_taken_away(noise: float, off: float):
     for _ in range(5):
         tilt = np.tan(np.radians(0.3)) * np.arange(grid.cols) * grid.resolution
         seen = true + noise * rng.standard_normal(grid.shape) + off + (tilt if off else 0)
-        image = np.zeros((4, *grid.shape), np.float32)
+        image = np.full((4, *grid.shape), 0.5, np.float32)
         image[3] = np.maximum(seen, 0)
         found = read_surface_heights(Observation(image, grid), PICK, PLACE)
         errors.append([found.pick_top - 0.02, found.place_rim - 0.05])
@@ -81,9 +81,29 @@ def test_errors_of_cameras_are_taken_away(noise: float, off: float):
     assert np.abs(errors).max() < (0.002 if noise else 0.0005)
 
 
+@pytest.mark.parametrize("noise", [0.0, 0.0015])
+def test_what_no_camera_sees_is_not_the_table(noise: float):
+    """A hole over most of the pick, and the shadow that a tool on a block casts beside itself."""
+    grid = PixelGrid()
+    row, col = np.rint(grid.to_pixel((PLACE.x, PLACE.y))).astype(int)
+    height = noise * np.random.default_rng(0).standard_normal(grid.shape)
+    height[row - 32 : row + 33, col - 32 : col + 33] += 0.05
+    height[row - 10 : row + 11, col - 3 : col + 4] += 0.02
+    valid = np.ones(grid.shape, bool)
+    valid[row - 1 : row + 2, col - 1 : col + 1] = False
+    valid[row - 12 : row + 13, col + 4 : col + 14] = False
+    image = np.full((4, *grid.shape), 0.5, np.float32)
+    image[3] = np.maximum(height, 0)
+    image[:, ~valid] = 0.0
+    found = read_surface_heights(Observation(image, grid, valid), PLACE, PICK)
+    assert found.pick_top == pytest.approx(0.07, abs=1e-6 + noise)
+    assert found.support == pytest.approx(0.05, abs=1e-6 + 2 * noise)
+
+
 def test_edges_are_no_noise():
     """A crowded table: half of all pixels are near an edge, and each pixel is exact."""
-    image = np.zeros((4, *GRID.shape), np.float32)
+    image = np.full((4, *GRID.shape), 0.5, np.float32)
+    image[3] = 0.0
     image[3, ::24] = image[3, 1::24] = 0.012
     image[3, :, ::24] = 0.012
     found = read_surface_heights(Observation(image, GRID), PICK, PLACE)
@@ -92,7 +112,7 @@ def test_edges_are_no_noise():
 
 
 def test_a_table_far_above_the_bottom_of_the_grid_is_where_it_is():
-    image = np.zeros((4, *GRID.shape), np.float32)
+    image = np.full((4, *GRID.shape), 0.5, np.float32)
     image[3] = 0.02
     found = read_surface_heights(Observation(image, GRID), PICK, PLACE)
     assert found.table == pytest.approx(GRID.z_min + 0.02, abs=1e-6)

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 from scipy.spatial import ConvexHull, QhullError
 
-from systems.signals import Observation
+from systems.signals import Observation, fill_unseen
 
 Mask = NDArray[np.bool_]
 Plane = NDArray[np.float64]
@@ -127,29 +127,6 @@ def segment(observation: Observation) -> Segmentation:
         ),
         relief=relief,
     )
-
-
-def fill_unseen(height: NDArray[np.float32], valid: Mask) -> NDArray[np.float32]:
-    """Heights with the pixels that no camera saw filled in from around them.
-
-    What is hidden is hidden by something higher: a hole takes the lowest of its neighbours, from
-    its border inwards.
-
-    Args:
-        height: (rows, cols).
-        valid: (rows, cols), where it was seen.
-    """
-    if valid.all() or not valid.any():
-        return height
-    filled = np.where(valid, height, np.inf).astype(np.float32)
-    missing = ~valid
-    for _ in range(max(height.shape)):
-        lowest = ndimage.minimum_filter(filled, footprint=_NEIGHBOURS, mode="nearest")
-        filled = np.where(missing, lowest, filled)
-        missing = ~np.isfinite(filled)
-        if not missing.any():
-            break
-    return filled
 
 
 def _noise(relief: NDArray[np.floating]) -> float:

@@ -5,6 +5,7 @@ import math
 
 import numpy as np
 import pytest
+from pydrake.systems.sensors import CameraInfo
 from scipy.spatial.transform import Rotation
 
 from kitting_drake.bench.calibration import Calibration, with_poses
@@ -37,7 +38,9 @@ def noisy(
     random = np.random.default_rng(0)
     result = {}
     for name, frame in frames.items():
-        drawn = [noisy_depth(frame.depth, noise, (450.0, 450.0), random) for _ in range(takes)]
+        height, width = frame.depth.shape
+        camera = CameraInfo(width, height, 450.0, 450.0, width / 2, height / 2)
+        drawn = [noisy_depth(frame.depth, noise, camera, random) for _ in range(takes)]
         depth = np.median(drawn, axis=0).astype(np.float32)
         result[name] = Frame(frame.color, depth + np.float32(longer))
     return result

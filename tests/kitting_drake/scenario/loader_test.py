@@ -111,7 +111,7 @@ BAD = {
         "A: {policy: !Oracle {needs_observation: true}}",
         ["policy.needs_observation is an unknown field"],
     ),
-    "hand in the table": ("A: {planner: {home: [0.3, 0, -1, 0]}}", ["planner.home[2]", "table"]),
+    "hand sweeping": ("A: {planner: {home: [0.3, 0, 0.2, 0]}}", ["planner.home[2]", "0.295"]),
     "hand beyond its joints": ("A: {planner: {home: [2, 0, 0.4, 0]}}", ["planner.home[0]", "1.5"]),
     "deeper than the deepest": (
         "A: {planner: {grasp_depth: 0.03}}",
@@ -234,6 +234,8 @@ def test_bad_text_is_told_apart_from_a_bad_file():
         load_scenario(TEST_SCENARIOS, text="{planner: {hom: 1}}")
     with pytest.raises(UserError, match=r"^--scenario_text.* is not YAML"):
         load_scenario(TEST_SCENARIOS, text="{planner: ")
+    with pytest.raises(UserError, match=r"^--scenario_text: the tag !Oracle at the beginning"):
+        load_scenario(TEST_SCENARIOS, text="!Oracle {time_limit: 3.0}")
     with pytest.raises(UserError, match=r"^--scenario_text must be a mapping"):
         load_scenario(TEST_SCENARIOS, text="faster")
 

@@ -16,10 +16,10 @@ from kitting_drake.policies.images import rotation_matrix
 from kitting_drake.policies.learned_policy import LearnedPolicy
 from kitting_drake.policies.matching.policy import ShapeMatchingPolicy, certain_fits
 from kitting_drake.policies.matching.refinement import refine_grasp, refine_place
-from kitting_drake.policies.matching.segmentation import fill_unseen, segment
+from kitting_drake.policies.matching.segmentation import segment
 from kitting_drake.policies.weights import load_networks
 from kitting_drake.scenario.loader import load_scenario
-from systems.signals import Observation, PixelGrid, PlanarPose
+from systems.signals import Observation, PixelGrid, PlanarPose, fill_unseen
 
 pytestmark = pytest.mark.skipif(not can_render(), reason="images cannot be rendered here")
 
