@@ -5,7 +5,7 @@ import dataclasses
 import itertools
 import json
 import time
-from collections.abc import Callable, Container, Iterable, Sized
+from collections.abc import Callable, Container, Iterable, Mapping, Sized
 from pathlib import Path
 
 from rich.console import Console
@@ -35,7 +35,7 @@ from kitting_drake.policies.demonstrations import (
     read_contents,
     write_demonstrations,
 )
-from kitting_drake.policies.lerobot_export import export_lerobot, require_export
+from kitting_drake.policies.lerobot_export import export_lerobot, require_export, require_pyarrow
 from kitting_drake.scenario.command_line import (
     ChosenScenario,
     choose_scenario,
@@ -84,9 +84,12 @@ def main() -> int:
             raise UserError(f"{chosen.path}: cameras is empty: demonstrations need at least one")
         require_rendering()
         build_chosen(chosen, seed=arguments.seed)
-        claim_folder(folder, "scenario.json", chosen.described, of="scenario")
-        collection = Collection(folder, _origin(chosen, arguments.seed))
         exported = folder / "lerobot" if arguments.export else None
+        if exported:
+            require_pyarrow()
+        identity = {**chosen.described, "versions": versions()}
+        claim_folder(folder, "scenario.json", identity, of="scenario or version")
+        collection = Collection(folder, _origin(chosen, arguments.seed))
         if collection.assembled >= arguments.demos:
             nothing = "nothing to collect" if exported else "nothing to do"
             console.print(f"{nothing}: {collection.summary()}", highlight=False, soft_wrap=True)
@@ -155,6 +158,11 @@ class Collection:
         if found.scenario != self._origin.scenario:
             raise UserError(
                 f"{self.path} is of another scenario: give another --output, or delete it"
+            )
+        if found.versions != self._origin.versions:
+            raise UserError(
+                f"{self.path} is by other versions ({_listed(found.versions)}), these are "
+                f"{_listed(self._origin.versions)}: give another --output, or delete it"
             )
         if found.first_seed != self._origin.first_seed:
             raise UserError(
@@ -242,6 +250,10 @@ class Collection:
             f"{self.path} ({megabytes:.1f} MB) holds {_number(contents.seeds, 'demonstration')}, "
             f"{_number(contents.rejected, 'seed')} rejected"
         )
+
+
+def _listed(versions_: Mapping[str, str]) -> str:
+    return ", ".join(f"{name} {version}" for name, version in versions_.items())
 
 
 def _number(things: Sized, name: str) -> str:

@@ -17,7 +17,7 @@ from kitting_drake.common.processes import (
     counting_bar,
     side_by_side,
 )
-from kitting_drake.common.provenance import versions
+from kitting_drake.common.provenance import source_digest, versions
 from kitting_drake.policies.static_scenes import (
     StaticScenes,
     read_static_scenes,
@@ -26,6 +26,8 @@ from kitting_drake.policies.static_scenes import (
 from kitting_drake.tasks.kitting.static_scenes import draw_batch
 from systems.signals import PixelGrid
 
+_DRAWN_BY = ("kitting_drake.hkd", "kitting_drake.tasks", "kitting_drake.cell", "systems")
+"""The packages that decide what a scene looks like."""
 _MOST_BATCHES = 10_000
 """No batch has so few scenes that more than this would be needed."""
 
@@ -37,10 +39,11 @@ def main() -> int:
     require_rendering()
     folder = require_folder(arguments.output)
     with alone_in(folder):
-        identity = {"seed": arguments.seed, **versions()}
+        drawn_by = {**versions(), "code": source_digest(*_DRAWN_BY)}
+        identity = {"seed": arguments.seed, **drawn_by}
         claim_folder(folder, "settings.json", identity, of="set of scenes")
         path = folder / "scenes.h5"
-        parts = _Parts(folder / "parts", arguments.seed)
+        parts = _Parts(folder / "parts", arguments.seed, drawn_by)
         with LocalWorkers(arguments.workers or os.cpu_count() or 1) as workers:
             parts.draw(arguments.scenes, workers, console)
         scenes = parts.assemble(arguments.scenes, path)
@@ -55,13 +58,40 @@ def main() -> int:
 class _Parts:
     """A file for each batch of scenes; they stay, so that more can be asked for later."""
 
-    def __init__(self, folder: Path, seed: int) -> None:
-        self._folder, self._seed = folder, seed
-        folder.mkdir(exist_ok=True)
-        self._counts = {
-            int(path.stem.removeprefix("batch_")): len(read_static_scenes(path).scenes)
-            for path in folder.glob("batch_*.h5")
-        }
+    def __init__(self, folder: Path, seed: int, drawn_by: dict[str, str]) -> None:
+        """Finds what is there.
+
+        Args:
+            folder: of the files.
+            seed: of all draws.
+            drawn_by: the versions that draw.
+
+        Raises:
+            UserError: what is there is of another seed or version, or damaged.
+        """
+        self._folder, self._seed, self._drawn_by = require_folder(folder), seed, drawn_by
+        self._counts = {}
+        for path in folder.glob("batch_*.h5"):
+            number = path.stem.removeprefix("batch_")
+            if not number.isdecimal() or path != self.path(int(number)):
+                raise UserError(f"{path} makes no sense here: delete it")
+            self._counts[int(number)] = len(self._read(int(number)).scenes)
+
+    def _read(self, batch: int) -> StaticScenes:
+        path = self.path(batch)
+        try:
+            found = read_static_scenes(path)
+        except UserError as error:
+            raise UserError(f"{error}: delete it, and it is drawn again") from error
+        mine = (self._seed_of(batch), self._drawn_by, PixelGrid())
+        if (found.first_seed, found.versions, found.grid) != mine:
+            raise UserError(
+                f"{path} is of another seed or version: delete it, and it is drawn again"
+            )
+        return found
+
+    def _seed_of(self, batch: int) -> int:
+        return _MOST_BATCHES * self._seed + batch
 
     def path(self, batch: int) -> Path:
         return self._folder / f"batch_{batch:06d}.h5"
@@ -81,8 +111,8 @@ class _Parts:
             return batch
 
         def draw(batch: int) -> tuple[int, int | ProcessCrashed]:
-            seed = _MOST_BATCHES * self._seed + batch
-            return batch, workers.run(_draw_part, self.path(batch), seed)
+            seed = self._seed_of(batch)
+            return batch, workers.run(_draw_part, self.path(batch), seed, self._drawn_by)
 
         with counting_bar(console, "scenes") as progress:
             task = progress.add_task("", total=count, completed=min(count, self._gapless()))
@@ -102,19 +132,17 @@ class _Parts:
 
     def assemble(self, count: int, path: Path) -> list:
         """Writes the one file of the first so many scenes; returns them."""
-        scenes = [
-            scene
-            for batch in sorted(self._counts)
-            for scene in read_static_scenes(self.path(batch)).scenes
-        ][:count]
-        content = StaticScenes(PixelGrid(), tuple(scenes), self._seed, versions())
+        scenes = [scene for batch in sorted(self._counts) for scene in self._read(batch).scenes][
+            :count
+        ]
+        content = StaticScenes(PixelGrid(), tuple(scenes), self._seed, self._drawn_by)
         _write(path, content)
         return scenes
 
 
-def _draw_part(path: Path, seed: int) -> int:
+def _draw_part(path: Path, seed: int, drawn_by: dict[str, str]) -> int:
     scenes = tuple(draw_batch(seed))
-    _write(path, StaticScenes(PixelGrid(), scenes, seed, versions()))
+    _write(path, StaticScenes(PixelGrid(), scenes, seed, drawn_by))
     return len(scenes)
 
 

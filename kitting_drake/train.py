@@ -43,7 +43,8 @@ def main() -> int:
     with alone_in(folder):
         # Scenarios of one name may differ, and with them what the same seeds give.
         origins = [item.origin for item in (learned, held_out)]
-        described = {**dataclasses.asdict(settings), "origins": origins}
+        made_by = [item.made_by for item in (learned, held_out)]
+        described = {**dataclasses.asdict(settings), "origins": origins, "made_by": made_by}
         claim_folder(folder, "settings.json", described, of="training run")
         run.train()
     if arguments.export:
@@ -111,8 +112,9 @@ def _check_validation(settings: Settings, held_out: TrainingData, path: Path) ->
         raise UserError(f"{path} has no colours, and the networks look at them: validate by others")
     if settings.stop and not held_out.finals(1):
         raise UserError(
-            f"of the demonstrations in {path} to validate by, none ends with nothing left to pick: "
-            "the policy would never stop: give others by --validation"
+            f"of the {held_out.count} {held_out.kind} in {path} to validate by, none ends with "
+            f"nothing left to pick: the policy would never stop: {held_out.made} more, or give "
+            "others by --validation"
         )
 
 
@@ -218,14 +220,16 @@ def _split(
     if count is None:
         count = total if validation else total - max(1, total // 11)
     if total < count:
-        raise UserError(f"{path} holds {total} demonstrations, not {count}: collect more")
+        raise UserError(
+            f"{path} holds {total} {everything.kind}, not {count}: {everything.made} more"
+        )
     learned = everything.part(0, count)
     if validation is None:
         kept = everything.part(count, count + max(1, count // 10))
         if not kept.count or not count:
             raise UserError(
                 f"of {total} in {path}, {count} to learn from leave none to validate by: "
-                "collect more, or give --validation"
+                f"{everything.made} more, or give --validation"
             )
         return learned, kept
     held_out = read_training_data(validation)

@@ -84,8 +84,10 @@ def claim_folder(folder: Path, name: str, described: Any, *, of: str) -> None:
     """
     path = folder / name
     described = json.loads(json.dumps(described, default=str))
-    if not path.exists() and (folder / "summary.json").exists():
-        raise UserError(f"{folder} holds the summary.json of something else: give another --output")
+    if not path.exists():
+        others = sorted(item.name for item in folder.iterdir() if not item.name.startswith("."))
+        if others:
+            raise UserError(f"{folder} holds {others[0]} of something else: give another --output")
     if path.exists():
         try:
             found = json.loads(path.read_text())

@@ -1,7 +1,9 @@
 """The provenance of results beside the scenario: versions, and the commit."""
 
 import contextlib
+import hashlib
 import importlib.metadata
+import importlib.util
 import platform
 import subprocess
 from pathlib import Path
@@ -31,6 +33,24 @@ def commit() -> str | None:
     except (OSError, subprocess.CalledProcessError):
         return None
     return head + ("+" if changed else "")
+
+
+def source_digest(*packages: str) -> str:
+    """A digest of the Python sources of some packages: another one may do something else.
+
+    Args:
+        packages: their names.
+    """
+    digest = hashlib.sha256()
+    for package in packages:
+        spec = importlib.util.find_spec(package)
+        if spec is None or not spec.submodule_search_locations:
+            raise ImportError(f"there is no package {package}")
+        root = Path(spec.submodule_search_locations[0])
+        for path in sorted(root.rglob("*.py")):
+            digest.update(path.relative_to(root).as_posix().encode())
+            digest.update(hashlib.sha256(path.read_bytes()).digest())
+    return digest.hexdigest()[:16]
 
 
 def _git(root: Path, *arguments: str) -> str:

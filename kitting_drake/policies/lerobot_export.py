@@ -68,7 +68,7 @@ def require_export(folder: Path) -> None:
     Raises:
         UserError: pyarrow is not installed, or the folder exists.
     """
-    _pyarrow()
+    require_pyarrow()
     if folder.exists():
         raise UserError(f"{folder} exists, without the new demonstrations: delete it")
 
@@ -90,7 +90,7 @@ def export_lerobot(
         UserError: the demonstrations cannot be used, the folder is something else or cannot be
             written to, or pyarrow is not installed.
     """
-    pyarrow = _pyarrow()
+    pyarrow = require_pyarrow()
     read = read_demonstrations(source)
     if not read.demonstrations:
         raise UserError(f"{source} holds no demonstrations: collect some")
@@ -138,7 +138,7 @@ def features(grid: PixelGrid) -> dict[str, dict[str, Any]]:
     }
 
 
-def _pyarrow() -> ModuleType:
+def require_pyarrow() -> ModuleType:
     return import_extra("pyarrow", "parquet", purpose="--export lerobot", extra="lerobot")
 
 

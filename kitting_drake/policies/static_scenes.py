@@ -13,6 +13,7 @@ and `versions`, and these datasets for n scenes with m actions in all:
 from __future__ import annotations
 
 import dataclasses
+import hashlib
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -86,6 +87,14 @@ class StaticScenes:
     scenes: tuple[StaticScene, ...]
     first_seed: int = 0
     versions: dict[str, Any] = dataclasses.field(default_factory=dict)
+
+    def digest(self) -> str:
+        """A digest of all heights and actions."""
+        found = hashlib.sha256()
+        for scene in self.scenes:
+            found.update(np.ascontiguousarray(scene.height).tobytes())
+            found.update(np.ascontiguousarray(scene.actions, np.float64).tobytes())
+        return found.hexdigest()
 
 
 def write_static_scenes(path: Path, content: StaticScenes) -> None:

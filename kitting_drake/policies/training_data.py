@@ -56,11 +56,24 @@ class TrainingData:
     seeds: tuple[int, ...]
     """Of the demonstrations, or the first seed of static scenes."""
     items: tuple[Demonstration, ...] | StaticScenes
+    made_by: dict[str, str]
+    """What tells data of the same seeds apart: the versions that made them, and of static scenes
+    a digest of the content."""
 
     @property
     def count(self) -> int:
         """How many demonstrations, or static scenes."""
         return len(self.items.scenes if isinstance(self.items, StaticScenes) else self.items)
+
+    @property
+    def kind(self) -> str:
+        """Its items' name, for people."""
+        return "scenes" if isinstance(self.items, StaticScenes) else "demonstrations"
+
+    @property
+    def made(self) -> str:
+        """What one does to get some, for people."""
+        return "draw" if isinstance(self.items, StaticScenes) else "collect"
 
     def part(self, first: int, last: int) -> TrainingData:
         """Some of them."""
@@ -149,6 +162,7 @@ def read_training_data(path: Path) -> TrainingData:
             colour=False,
             seeds=(content.first_seed,),
             items=content,
+            made_by={**content.versions, "content": content.digest()},
         )
     else:
         demonstrations: Demonstrations = read_demonstrations(path)
@@ -161,7 +175,8 @@ def read_training_data(path: Path) -> TrainingData:
             colour=True,
             seeds=tuple(item.seed for item in demonstrations.demonstrations),
             items=demonstrations.demonstrations,
+            made_by=origin.versions,
         )
     if not data.count:
-        raise UserError(f"{path} holds no demonstrations: collect some")
+        raise UserError(f"{path} holds no {data.kind}: {data.made} some")
     return data

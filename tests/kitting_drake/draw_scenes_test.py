@@ -9,7 +9,7 @@ from rich.console import Console
 from kitting_drake import draw_scenes
 from kitting_drake.cell.cameras import can_render
 from kitting_drake.common.errors import UserError
-from kitting_drake.common.provenance import versions
+from kitting_drake.common.provenance import source_digest, versions
 from kitting_drake.policies.static_scenes import (
     StaticScene,
     StaticScenes,
@@ -19,6 +19,7 @@ from kitting_drake.policies.static_scenes import (
 from systems.signals import PixelGrid
 
 GRID = PixelGrid()
+OURS = {"kitting_drake": "0.1"}
 
 pytestmark = pytest.mark.skipif(not can_render(), reason="images cannot be rendered here")
 
@@ -34,10 +35,10 @@ class AtOnce:
     def capacity(self) -> int:
         return 1
 
-    def run(self, _, path: Path, seed: int) -> int:
+    def run(self, _, path: Path, seed: int, drawn_by: dict[str, str]) -> int:
         rng = np.random.default_rng(seed)
         scene = StaticScene(rng.integers(9, size=GRID.shape, dtype=np.uint16), np.zeros((0, 8)))
-        write_static_scenes(path, StaticScenes(GRID, (scene,) * 20, seed))
+        write_static_scenes(path, StaticScenes(GRID, (scene,) * 20, seed, drawn_by))
         return 20
 
     def stop(self) -> None: ...
@@ -45,24 +46,42 @@ class AtOnce:
 
 def test_a_batch_that_is_missing_is_drawn_again_and_seeds_share_nothing(tmp_path: Path):
     console = Console(quiet=True)
-    parts = draw_scenes._Parts(tmp_path, seed=0)
+    parts = draw_scenes._Parts(tmp_path, 0, OURS)
     parts.draw(40, AtOnce(), console)
     parts.path(0).unlink()
-    again = draw_scenes._Parts(tmp_path, seed=0)
+    again = draw_scenes._Parts(tmp_path, 0, OURS)
     again.draw(20, AtOnce(), console)
     assert parts.path(0).exists()
     other = tmp_path / "other"
     other.mkdir()
-    draw_scenes._Parts(other, seed=1).draw(20, AtOnce(), console)
+    draw_scenes._Parts(other, 1, OURS).draw(20, AtOnce(), console)
     (one,) = read_static_scenes(other / "batch_000000.h5").scenes[:1]
     (two,) = read_static_scenes(parts.path(1)).scenes[:1]
     assert (one.height != two.height).any()
 
 
-def test_scenes_of_another_seed_or_version_are_not_mixed(tmp_path: Path, monkeypatch):
+def test_batches_of_another_seed_or_version_are_not_mixed(tmp_path: Path):
+    draw_scenes._Parts(tmp_path, 0, OURS).draw(20, AtOnce(), Console(quiet=True))
+    for seed, drawn_by in [(1, OURS), (0, {"kitting_drake": "0.2"})]:
+        with pytest.raises(UserError, match=r"batch_000000\.h5 is of another seed or version"):
+            draw_scenes._Parts(tmp_path, seed, drawn_by)
+    path = tmp_path / "batch_000000.h5"
+    path.write_bytes(path.read_bytes()[:1000])
+    with pytest.raises(UserError, match=r"cannot read .*: delete it, and it is drawn again"):
+        draw_scenes._Parts(tmp_path, 0, OURS)
+    path.rename(tmp_path / "batch_000000 (1).h5")
+    with pytest.raises(UserError, match="makes no sense here: delete it"):
+        draw_scenes._Parts(tmp_path, 0, OURS)
+
+
+def test_a_folder_of_another_seed_or_version_is_refused(tmp_path: Path, monkeypatch):
     settings = tmp_path / "settings.json"
-    claimed = {"seed": 0, **versions()}
-    for other, message in [({"seed": 7}, "seed is 0, there 7"), ({"drake": "1.2"}, "there 1.2")]:
+    code = source_digest(*draw_scenes._DRAWN_BY)
+    claimed = {"seed": 0, **versions(), "code": code}
+    for other, message in [
+        ({"seed": 7}, "seed is 0, there 7"),
+        ({"code": "1"}, f"{code}, there 1"),
+    ]:
         settings.write_text(json.dumps(claimed | other))
         with pytest.raises(UserError, match=message):
             run(monkeypatch, "--scenes", "1", "--quiet", "--output", str(tmp_path))

@@ -75,8 +75,7 @@ def test_a_folder_is_that_of_one_thing(tmp_path: Path):
     claim_folder(tmp_path, "settings.json", {"steps": 3, "type": "float32"}, of="run")
     with pytest.raises(UserError, match=r"another run \(type is bfloat16, there float32\)"):
         claim_folder(tmp_path, "settings.json", {"steps": 3, "type": "bfloat16"}, of="run")
-    (tmp_path / "summary.json").write_text("{}")
-    with pytest.raises(UserError, match=r"holds the summary\.json of something else"):
+    with pytest.raises(UserError, match=r"holds settings\.json of something else"):
         claim_folder(tmp_path, "scenario.json", {}, of="scenario")
     (tmp_path / "settings.json").write_text('{"steps": ')
     with pytest.raises(UserError, match=r"settings\.json is damaged"):
