@@ -126,6 +126,8 @@ def _read_camera(path: Path, name: str, node: Any) -> BenchCamera:
         lens = read_yaml(file)
         if not has_intrinsics(lens):
             raise UserError(f"{where}: {file} holds no camera_matrix and no k")
+    elif not has_intrinsics(node):
+        _check_misspelt(node, (*known, *_BENCH_FIELDS, "camera_name"), where)
     limits = {key: number(node[key], f"{where}: {key}") for key in _DEPTH_FIELDS if key in node}
     if any(value <= 0 for value in limits.values()):
         raise UserError(f"{where}: depth_scale, min_depth and max_depth must be positive")
@@ -149,6 +151,16 @@ def _check_fields(node: dict[str, Any], known: Sequence[str], where: str) -> Non
             close = difflib.get_close_matches(str(key), known, n=1)
             advice = f"did you mean '{close[0]}'?" if close else "it means nothing here"
             raise UserError(f"{where} has the unknown field '{key}': {advice}")
+
+
+def _check_misspelt(node: dict[str, Any], known: Sequence[str], where: str) -> None:
+    """Raises UserError for a field that seems to be where a camera's intrinsics are, misspelt."""
+    for key in node:
+        close = difflib.get_close_matches(
+            str(key), ("cameras", "camera_info", "camera_matrix", "fx")
+        )
+        if close and key not in known:
+            raise UserError(f"{where} has the unknown field '{key}': did you mean '{close[0]}'?")
 
 
 def _read_grid(path: Path, node: Any, table_height: float) -> PixelGrid:

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import yaml
 from rich.console import Console
+from rich.measure import Measurement
 from rich.progress import Progress, track
 from rich.table import Table
 
@@ -77,7 +78,11 @@ def list_tools(args: argparse.Namespace, entries: list[ToolEntry]) -> None:
             grasp,
         )
         table.add_row(*row, *([str(d.get("symmetry", 1))] if symmetric else []))
-    Console().print(table)
+    console = Console()
+    # Names are what the other commands take: they are never cut.
+    wide = console.options.update(width=1000)
+    console.width = max(console.width, Measurement.get(console, wide, table).maximum)
+    console.print(table)
 
 
 def generate(args: argparse.Namespace, entries: list[ToolEntry]) -> None:

@@ -32,6 +32,7 @@ from kitting_drake.policies.images import LabelledImage
 from kitting_drake.policies.networks import Networks
 from kitting_drake.policies.static_scenes import StaticScene, StaticScenes, write_static_scenes
 from kitting_drake.policies.training import Trainer
+from kitting_drake.policies.training_data import read_training_data
 from kitting_drake.policies.weights import load_networks, read_weights_file
 from systems.signals import Observation, PickPlaceAction, PixelGrid, PlanarPose
 
@@ -439,10 +440,13 @@ def test_a_folder_of_another_run_is_refused(
     assert (folder / "settings.json").read_bytes() == before
 
 
-def test_the_same_seeds_of_another_scenario_are_another_run(
-    folder: Path, tmp_path: Path, refused: Callable[..., str]
+@pytest.mark.parametrize(
+    "other", [{"scenario": {"time_limit": 2.0}}, {"versions": {"kitting_drake": "0.0.1"}}]
+)
+def test_the_same_seeds_of_another_scenario_or_version_are_another_run(
+    folder: Path, tmp_path: Path, refused: Callable[..., str], other: dict[str, Any]
 ):
-    origin = dataclasses.replace(ORIGIN, scenario={"time_limit": 2.0})
+    origin = dataclasses.replace(ORIGIN, **other)
     others = write(tmp_path / "others.h5", range(10, 14), origin)
     assert f"{folder} holds the files of another training run" in refused(others, folder)
 
@@ -508,3 +512,13 @@ def test_a_run_that_is_killed_again_and_again_ends_as_if_it_had_not_been(
     assert_same_outcome(killed, whole)
     # The best checkpoint is not simply the first one.
     assert json.loads((whole / "summary.json").read_text())["best"]["step"] > 20
+
+
+def test_static_scenes_of_one_seed_are_told_apart_by_what_they_show(tmp_path: Path):
+    found = []
+    for height in (0, 0, 7):
+        scene = StaticScene(np.full(GRID.shape, height, np.uint16), np.zeros((1, 8)))
+        path = tmp_path / f"{len(found)}.h5"
+        write_static_scenes(path, StaticScenes(GRID, (scene,), 3, {"drake": "1"}))
+        found.append(read_training_data(path).made_by)
+    assert found[0] == found[1] != found[2]

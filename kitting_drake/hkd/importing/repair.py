@@ -13,6 +13,7 @@ import trimesh
 from manifold3d import Error, Manifold, Mesh64, OpType
 from numpy.typing import NDArray
 from scipy import ndimage
+from scipy.spatial import cKDTree
 
 from kitting_drake.common.errors import UserError
 
@@ -30,6 +31,9 @@ _GAP_MM, _DIRT = 1.5, 0.02
 _LOST = 0.03
 # Projections are compared in pixels of this size.
 _PIXEL_MM = 0.5
+# What is added to close a surface is told if it is more than this share of the result's: points
+# that are so far from the surface that was there, in mm, of so many.
+_TELLING, _AWAY_MM, _PROBES = 0.03, 1.5, 20_000
 _MOST_COMPONENTS = 3000
 _VOXEL_MM = 0.75
 # Less than this share of a box is no solid but a skin.
@@ -75,7 +79,7 @@ def read_mesh(path: Path) -> tuple[Array, Faces]:
         # Readers fail on broken files in as many ways as there are.
         raise UserError(f"{path} cannot be read as {path.suffix[1:].upper()}") from error
     if len(faces) == 0 or vertices.ndim != 2 or faces.ndim != 2 or faces.shape[1] != 3:
-        raise UserError(f"{path} holds no triangles")
+        raise UserError(f"{path} holds no triangles: is the file whole?")
     if len(faces) > MOST_TRIANGLES:
         raise UserError(
             f"{path} has {len(faces)} triangles, and {MOST_TRIANGLES} is the most that is taken: "
@@ -124,6 +128,12 @@ def make_solid(vertices: Array, faces: Faces) -> tuple[Manifold, list[str]]:
         if _loses(triangles, solid):
             solid = _wrapped(triangles)
             notes = ["wrapped a surface with large gaps"]
+        added = _added(triangles, solid)
+        if added > _TELLING:
+            notes.append(
+                f"{100 * added:.0f} % of its surface was not there: see by `hkd sheet` whether the "
+                "file is whole"
+            )
     if solid.is_empty() or solid.volume() < _HOLLOW * _box_volume(solid):
         raise UserError("the mesh encloses no volume")
     return _one_thing(solid, notes), notes
@@ -218,6 +228,22 @@ def _loses(triangles: Array, solid: Manifold) -> bool:
         if lost > _LOST * seen.sum() or gained > 5 * _LOST * seen.sum():
             return True
     return False
+
+
+def _added(triangles: Array, solid: Manifold) -> float:
+    """The share of a solid's surface that is away from all triangles that it was made of."""
+    if solid.is_empty():
+        return 0.0
+    mesh = solid.to_mesh64()
+    surface = trimesh.Trimesh(
+        np.asarray(mesh.vert_properties)[:, :3],
+        np.asarray(mesh.tri_verts).astype(int),
+        process=False,
+    )
+    points, _ = trimesh.sample.sample_surface(surface, _PROBES, seed=0)
+    there = cKDTree(_sampled(triangles, _AWAY_MM))
+    distances, _ = there.query(points, distance_upper_bound=2 * _AWAY_MM)
+    return float((distances > _AWAY_MM).mean())
 
 
 def _sampled(triangles: Array, step: float) -> Array:

@@ -102,9 +102,9 @@ def layout_kit(tools: Sequence[Tool], parameters: KitParameters) -> KitLayout:
     for tool in tools:
         if parameters.height - tool.height < parameters.minimum_wall:
             raise UserError(
-                f"'{tool.name}' is {1e3 * tool.height:.1f} mm high and leaves less than "
-                f"kit.minimum_wall, {1e3 * parameters.minimum_wall:.1f} mm, below it in a block of "
-                f"{1e3 * parameters.height:.1f} mm"
+                f"'{tool.name}' is {1e3 * tool.height:.1f} mm high and leaves less than a wall of "
+                f"{1e3 * parameters.minimum_wall:.1f} mm (kit.minimum_wall) below it in a block of "
+                f"{1e3 * parameters.height:.1f} mm: a higher block would do"
             )
     categories = [tool.category for tool in tools]
     unlike = len(set(categories)) == len(categories) and set(categories) <= set(SLOTS)

@@ -145,6 +145,8 @@ def test_what_is_written_is_read_again_to_the_last_bit(tmp_path: Path):
         (("table_height: 0.012", "table_height: high"), "table_height must be a finite number"),
         (("cameras:", "workspace: {cells: 3}\ncameras:"), "workspace has the fields x_min"),
         (("  eye:\n", "  eye: {\n"), "line "),
+        (("cameras:", "camera:"), "unknown field 'camera': did you mean 'cameras'?"),
+        (("fx:", "fxx:"), "unknown field 'fxx': did you mean 'fx'?"),
         (("table_height:", "table_hieght:"), "unknown field 'table_hieght': did you mean 'table_h"),
         (("distortion:", "distorsion:"), "camera eye has the unknown field 'distorsion'"),
         (("fy: 51", "fy: 51\n    fy: 52"), "'fy' is there twice"),

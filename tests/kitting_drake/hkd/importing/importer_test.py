@@ -166,6 +166,16 @@ def test_a_long_tool_is_scaled_and_a_holed_one_repaired(tmp_path: Path):
     assert any("repaired" in note for note in report.notes)
 
 
+def test_what_closing_a_hole_added_is_told(tmp_path: Path):
+    """Half of a file is a mesh with a large hole, which closes to another shape."""
+    box = trimesh.creation.box((0.18, 0.02, 0.012)).subdivide().subdivide()
+    whole = bring(exported(box, tmp_path / "whole.stl"), tmp_path / "tools")
+    assert not any("was not there" in note for note in whole.notes)
+    box.update_faces(box.triangles_center[:, 2] < 0.0055)
+    report = bring(exported(box, tmp_path / "lidless.stl"), tmp_path / "tools")
+    assert any("% of its surface was not there" in note for note in report.notes)
+
+
 def test_a_broad_tool_keeps_its_length(tmp_path: Path):
     # Broader than the slot of a hammer: no tool beside it in the template would have room.
     handle = Manifold.cube((180, 20, 14), True)
