@@ -39,7 +39,12 @@ _FIXTURE_MARGIN = 0.006
 """Closer to the fixture's outline than this is neither table nor recess, in metres."""
 _CLEAN = 0.0005
 """Heights with less noise than this are taken as they are, in metres."""
+_CLEARLY = 2.0
+"""What rises or is deeper by more than this many standard deviations of the noise is no noise: few
+enough pixels are, and apart. More would cut off flat ends, by which a tool is told from the same
+tool a half turn away."""
 _NEIGHBOURS = np.ones((3, 3), bool)
+_CROSS = ndimage.generate_binary_structure(2, 1)
 
 
 @dataclass(frozen=True)
@@ -90,17 +95,16 @@ def segment(observation: Observation) -> Segmentation:
     table = _fit_table(height)
     relief = (height - _plane_heights(table, height.shape)).astype(np.float32)
     fixture, top = _find_fixture(height, relief, resolution)
-    # Of the table and, as what lies lower than the grid reads as flat, of the fixture's top too.
-    rises = (height - _plane_heights(top, height.shape))[fixture]
-    noise = max(_noise(relief), _noise(rises))
+    noise = _noise_of(height, relief, fixture, top)
     if noise > _CLEAN:
-        # A median would erase what is one pixel wide: only where it must be.
-        height = ndimage.median_filter(height, 3, mode="nearest")
-        relief = ndimage.median_filter(relief, 3, mode="nearest")
+        # A median erases what is one pixel wide: only where it must be.
+        height = ndimage.median_filter(height, footprint=_CROSS, mode="nearest")
+        relief = ndimage.median_filter(relief, footprint=_CROSS, mode="nearest")
         fixture, top = _find_fixture(height, relief, resolution)
+        noise = _noise_of(height, relief, fixture, top)
     margin = _FIXTURE_MARGIN / resolution
     outside = ndimage.distance_transform_edt(~fixture) if fixture.any() else None
-    least = max(_OBJECT_HEIGHT, 3 * noise)
+    least = max(_OBJECT_HEIGHT, _CLEARLY * noise)
     loose = relief > least
     if outside is not None:
         loose &= outside > margin
@@ -114,7 +118,7 @@ def segment(observation: Observation) -> Segmentation:
         # What no camera sees into is the bottom of a recess, where it is part of one.
         hidden = inside & ~observation.valid
         rise[fixture] = -depth[fixture]
-    deep = depth > max(_RECESS_DEPTH, 3 * noise)
+    deep = depth > max(_RECESS_DEPTH, _CLEARLY * noise)
     return Segmentation(
         fixture=fixture,
         objects=_regions(loose, relief, resolution),
@@ -127,6 +131,14 @@ def segment(observation: Observation) -> Segmentation:
         ),
         relief=relief,
     )
+
+
+def _noise_of(
+    height: NDArray[np.float32], relief: NDArray[np.float32], fixture: Mask, top: Plane
+) -> float:
+    """The standard deviation of the noise of the table and, as what lies lower than the grid reads
+    as flat, of the fixture's top too."""
+    return max(_noise(relief), _noise((height - _plane_heights(top, height.shape))[fixture]))
 
 
 def _noise(relief: NDArray[np.floating]) -> float:
