@@ -1,0 +1,35 @@
+"""What is an object, and what is noise."""
+
+import numpy as np
+import pytest
+from scipy import ndimage
+
+from kitting_drake.policies.matching.segmentation import segment
+from systems.signals import Observation, PixelGrid
+
+GRID = PixelGrid()
+FLAT = (slice(40, 44), slice(30, 80))
+"""A flat object on the table, ..."""
+CAVITY = (slice(70, 74), slice(210, 260))
+"""... and its cavity."""
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.001, 0.002])
+@pytest.mark.parametrize("height", [0.008, 0.02])
+def test_flat_objects_and_cavities_are_whole_in_noise(noise: float, height: float):
+    """Their ends tell which way round an object goes."""
+    true = np.zeros(GRID.shape)
+    true[50:130, 190:280] = 0.05
+    true[FLAT], true[CAVITY] = height, 0.05 - height
+    for seed in range(5):
+        field = ndimage.gaussian_filter(np.random.default_rng(seed).normal(size=GRID.shape), 0.7)
+        image = np.full((4, *GRID.shape), 0.5, np.float32)
+        image[3] = np.maximum(true + noise * field / field.std(), 0)
+        found = segment(Observation(image, GRID))
+        for regions, region in ((found.objects, FLAT), (found.recesses, CAVITY)):
+            whole = np.zeros(GRID.shape, bool)
+            whole[region] = True
+            assert len(regions) == 1
+            share = (regions[0].mask & whole).sum() / (regions[0].mask | whole).sum()
+            assert share > (0.8 if noise else 0.99)
+        assert not found.protruding
