@@ -310,6 +310,16 @@ def test_what_stands_on_the_rim_is_turned_into_its_cavity(offset: float):
     assert run.finish().counts == [1, 0, 0]
 
 
+@pytest.mark.parametrize(("doubt", "follows"), [(0.0, Mode.RELEASE), (0.002, Mode.SEARCH)])
+def test_a_rim_may_be_off_by_what_o_t_leaves_in_doubt(doubt: float, follows: Mode):
+    """What comes to stand a little below where the rim was read may stand on it."""
+    heights = dataclasses.replace(OVER_A_CAVITY.heights, doubt=doubt)
+    world = World(touch_place=ON_THE_RIM - 0.0015)
+    answer = dataclasses.replace(OVER_A_CAVITY, heights=heights)
+    run = Run(world, answer=answer, insertion=True).until(follows)
+    assert run.sequence[-2:] == [Mode.LOWER, follows]
+
+
 def test_a_search_in_vain_ends_where_it_began():
     run = Run(World(touch_place=ON_THE_RIM), answer=OVER_A_CAVITY, insertion=True).until(
         Mode.RELEASE
@@ -455,7 +465,10 @@ def test_descent_stops_where_something_is_touched():
     run = Run(World(touch_pick=touched)).until(Mode.CLOSE)
     z = run.output("desired_motion")[2]
     late = PARAMETERS.descend_speed / 64
-    assert touched - late < z - PARAMETERS.floor_clearance <= touched
+    assert touched - late < z <= touched
+    # Pressed fingertips would not close: it backs off.
+    backed_off = run.until(Mode.CHECK).output("desired_motion")[2]
+    assert backed_off == pytest.approx(z + PARAMETERS.floor_clearance, abs=2e-4)
 
 
 @pytest.mark.parametrize(("height", "depth"), [(0.02, 0.010), (0.04, 0.016), (0.09, 0.018)])
