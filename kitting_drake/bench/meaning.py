@@ -22,9 +22,12 @@ _HALF_WORKSPACE = 0.5
 """In metres."""
 _LEVEL = math.radians(0.02)
 """A table that looks tilted by less than this looks level."""
-_CLEAN, _NOISY = 0.0005, 0.001
+_CLEAN, _NOISY = 0.0005, 0.0016
 """Heights with less noise than the first are taken as they are; with more than the second, what is
 3 mm high or deep is lost (`policies/matching/segmentation.py`). In metres."""
+_LOST = 1.8
+"""What is lower than this many times the noise is lost: two standard deviations of what smoothing
+leaves of it, nine tenths where neighbouring pixels err alike."""
 _FEW_HOLES, _MANY_HOLES = 0.02, 0.10
 
 
@@ -110,7 +113,7 @@ def _of_table(who: str, table: TableCheck, distance: float | None) -> list[Findi
     if table.noise <= _CLEAN:
         noise, blurred = "heights are taken as they are", GOOD
     else:
-        least = max(3.0, 3e3 * table.noise)
+        least = max(3.0, 1e3 * _LOST * table.noise)
         noise = f"heights are smoothed, and what is less than {least:.1f} mm high or deep is lost"
         blurred = TIGHT if table.noise <= _NOISY else BAD
     holes = GOOD if table.holes < _FEW_HOLES else TIGHT if table.holes < _MANY_HOLES else BAD
