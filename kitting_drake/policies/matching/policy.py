@@ -24,7 +24,7 @@ from systems.signals import Observation, PickPlaceAction, PlanarPose
 
 RETRY_DISTANCE = 0.010
 """A grasp is not tried again this near to where one failed, in metres."""
-_WORST_COST = 0.0017
+_WORST_COST = 0.0019
 """An outline and a recess that differ by more than this on average do not belong together, in
 metres."""
 _CERTAIN_COST = 0.0010
