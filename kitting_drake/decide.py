@@ -31,6 +31,11 @@ def main() -> int:
     arguments = _parser().parse_args()
     console = Console(quiet=arguments.quiet)
     folder = require_folder(arguments.output)
+    action, picture = folder / "action.json", folder / "decision.png"
+    if not arguments.check:
+        # Should this fail, nobody must take the answer to an earlier frame for that to this one.
+        action.unlink(missing_ok=True)
+        picture.unlink(missing_ok=True)
     calibration = read_calibration(arguments.camera, table_height=arguments.table_height)
     block = _block(arguments)
     frames = read_frames(arguments.frames, calibration)
@@ -51,8 +56,8 @@ def main() -> int:
         "seconds": round(seconds, 3),
         **decision.as_dict(),
     }
-    write_json(folder / "action.json", record)
-    write_atomically(folder / "decision.png", decision.draw())
+    write_atomically(picture, decision.draw())
+    write_json(action, record)
     print_decision(console, record)
     console.print(f"files: {folder}/", highlight=False)
     return 0

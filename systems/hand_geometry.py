@@ -21,8 +21,6 @@ MAX_OPENING = 0.080
 """Between the pads of the open jaws."""
 PALM_SIZE = (0.064, 0.209)
 """Extents of the palm along G's x and y."""
-PALM_HEIGHT = 0.046
-"""Height of the underside of the palm above the fingertips."""
 FINGERTIP_DISTANCE = 0.1121
 """Distance of the fingertip ends from the hand's flange, along G's z."""
 FINGER_BASE_DISTANCE = 0.0584

@@ -20,6 +20,9 @@ from systems.bounds import bounded
 SHEEN_LABELS = 20000
 """A render label of this plus a percentage is that of a surface of so much sheen."""
 
+_RIG_STREAM, _CAMERA_STREAM, _DEPTH_STREAM = 14, 15, 16
+"""Random streams of a seed; those below are of scenes and of what else a cell draws. None is zero,
+for numpy takes [seed, 2, 0] for [seed, 2]."""
 _TIME_RESOLUTION = 1e-6
 """Images that are farther apart than this, in seconds, have noise of their own."""
 _HOLE_RADIUS = 3.0
@@ -149,12 +152,12 @@ class SensorNoise(LeafSystem):
         self._shape = (info.height(), info.width())
         middle = RigidTransform([*workspace_middle, 0.0])
         rig = _pose_error(
-            np.random.default_rng([seed, 1]),
+            np.random.default_rng([seed, _RIG_STREAM]),
             parameters.rig_position_error,
             parameters.rig_angle_error_deg,
         )
         self._X_rig = middle @ rig @ middle.inverse()
-        own = np.random.default_rng([seed, 2, number])
+        own = np.random.default_rng([seed, _CAMERA_STREAM, number])
         self._X_camera = _pose_error(
             own, parameters.camera_position_error, parameters.camera_angle_error_deg
         )
@@ -208,7 +211,7 @@ class SensorNoise(LeafSystem):
         data = np.asarray(self._depth.Eval(context).data)
         image = ImageDepth32F(data.shape[1], data.shape[0])
         frame = round(context.get_time() / _TIME_RESOLUTION)
-        random = np.random.default_rng([self._seed, 3, self._number, frame])
+        random = np.random.default_rng([self._seed, _DEPTH_STREAM, self._number, frame])
         sheen = None
         if self._label is not None:
             labels = np.asarray(self._label.Eval(context).data)[:, :, 0].astype(np.int32)

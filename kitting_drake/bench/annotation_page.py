@@ -172,7 +172,7 @@ class _Handler(BaseHTTPRequestHandler):
     def _is_local(self) -> bool:
         """Whether the page was asked for by a name of this machine, and not by one that somebody
         else let point here."""
-        name = self.headers.get("Host", "").rpartition(":")[0]
+        name = self.headers.get("Host", "").split(":")[0]
         return name in (_HOST, "localhost")
 
     def _body(self) -> Any:

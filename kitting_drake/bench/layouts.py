@@ -23,6 +23,10 @@ _MATRICES = ("camera_matrix", "k", "K")
 _WIDTHS, _HEIGHTS = ("width", "image_width"), ("height", "image_height")
 _DISTORTIONS = ("distortion", "distortion_coefficients", "dist_coeffs", "d", "D")
 _POSES = ("camera_to_base", "pose", "transform", "base_to_camera")
+_POSITIONS = ("position", "translation")
+_ROTATIONS = ("orientation", "quaternion_xyzw", "rotation", "rpy_deg", "rvec")
+_ENVELOPE = ("header", "child_frame_id", "covariance")
+"""What ROS writes around a pose."""
 
 POSE_FIELDS = ("R_cam2base", "t_cam2base", *_POSES)
 """The fields of a mapping that tell a pose."""
@@ -69,8 +73,14 @@ def read_intrinsics(node: dict[str, Any], where: str) -> Intrinsics:
                 f"{where} has no intrinsics: give fx, fy, cx, cy, or camera_matrix, or k"
             )
         K = matrix(node[key], 3, 3, f"{where}: {key}")
+        if K[1, 0] != 0 or not np.allclose(K[2], [0, 0, 1]):
+            raise UserError(
+                f"{where}: {key} must be fx 0 cx, 0 fy cy, 0 0 1: is it transposed, as MATLAB "
+                "writes it?"
+            )
         fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
     if "image_size" in node:
+        _refuse_two(node, ("image_size", *_WIDTHS, *_HEIGHTS), where)
         width, height = matrix(node["image_size"], 1, 2, f"{where}: image_size")[0].tolist()
     else:
         across, down = _first(node, *_WIDTHS), _first(node, *_HEIGHTS)
@@ -113,11 +123,14 @@ def read_pose(node: dict[str, Any], where: str) -> Array:
         UserError: there is none, or more than one, or its rotation is none; names the field.
     """
     given = [key for key in ("R_cam2base", *_POSES) if key in node]
+    if "t_cam2base" in node and "R_cam2base" not in node:
+        given.insert(0, "t_cam2base")
     if len(given) > 1:
         raise UserError(f"{where} has {' and '.join(given)}: give one pose")
-    if "R_cam2base" in node:
+    if "R_cam2base" in node or "t_cam2base" in node:
         X = np.eye(4)
-        X[:3, :3] = matrix(node["R_cam2base"], 3, 3, f"{where}: R_cam2base")
+        R = _get(node, "R_cam2base", where)
+        X[:3, :3] = matrix(R, 3, 3, f"{where}: R_cam2base")
         t = matrix(_get(node, "t_cam2base", where), 3, 1, f"{where}: t_cam2base")
         X[:3, 3] = t[:, 0]
         return _checked(X, f"{where}: R_cam2base")
@@ -137,17 +150,19 @@ def read_pose(node: dict[str, Any], where: str) -> Array:
 
 
 def _pose_of_parts(value: dict[str, Any], where: str) -> Array:
-    if isinstance(value.get("pose"), dict):
-        # geometry_msgs/PoseStamped, and PoseWithCovariance.
-        value = value["pose"]
-    if isinstance(value.get("transform"), dict):
-        value = value["transform"]
-    at = _first(value, "position", "translation")
+    # geometry_msgs wraps a Pose into PoseStamped and PoseWithCovariance, and one into the other.
+    while inner := _first(value, "pose", "transform"):
+        _refuse_unknown(value, (inner, *_ENVELOPE), where)
+        if not isinstance(value[inner], dict):
+            raise UserError(f"{where}.{inner} must be a mapping")
+        value = value[inner]
+    _refuse_unknown(value, (*_POSITIONS, *_ROTATIONS), where)
+    at = _refuse_two(value, _POSITIONS, where)
     if at is None:
         raise UserError(f"{where} has no position: three numbers in metres")
     X = np.eye(4)
     X[:3, 3] = matrix(value[at], 1, 3, f"{where}.{at}")[0]
-    key = _first(value, "orientation", "quaternion_xyzw", "rotation", "rpy_deg", "rvec")
+    key = _refuse_two(value, _ROTATIONS, where)
     if key is None:
         raise UserError(f"{where} has no rotation: give quaternion_xyzw, rpy_deg, rotation or rvec")
     turn = numbers(value[key], f"{where}.{key}")
@@ -191,3 +206,18 @@ def _get(node: dict[str, Any], key: str, where: str) -> Any:
 
 def _first(node: dict[str, Any], *keys: str) -> str | None:
     return next((key for key in keys if key in node), None)
+
+
+def _refuse_two(node: dict[str, Any], keys: tuple[str, ...], where: str) -> str | None:
+    """The one of some fields that is there, if any; raises UserError where there are more."""
+    given = [key for key in keys if key in node]
+    if len(given) > 1:
+        raise UserError(f"{where} has {' and '.join(given)}: give one of them")
+    return given[0] if given else None
+
+
+def _refuse_unknown(node: dict[str, Any], keys: tuple[str, ...], where: str) -> None:
+    """Raises UserError for a field that is none of some."""
+    for key in node:
+        if key not in keys:
+            raise UserError(f"{where} has '{key}', which means nothing there")

@@ -36,8 +36,8 @@ def varied_model(path: Path, *, friction: float, mass: float) -> str:
         raise UserError(f"task: {path} cannot be read: {error}") from error
     for uri in root.iter("uri"):
         if uri.text and "://" not in uri.text:
-            # A text has no folder of its own.
-            uri.text = (path.resolve().parent / uri.text).as_uri()
+            # A text has no folder of its own; Drake takes what follows the scheme as it stands.
+            uri.text = f"file://{path.resolve().parent / uri.text}"
     return ElementTree.tostring(root, encoding="unicode")
 
 

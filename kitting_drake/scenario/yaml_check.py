@@ -57,6 +57,8 @@ def _check_union(schema: Any, value: Any, where: str) -> None:
     if len(options) == 1 or not isinstance(value, dict):
         check_yaml(options[0], value, where)
         return
+    if not isinstance(value.get("_tag", ""), str):
+        raise ValueError(f"{where} has a tag that is no name: {_shown(value['_tag'])}")
     # An untagged mapping takes the first option, as in Drake.
     tag = str(value.get("_tag", options[0].__name__)).lstrip("!")
     for option in options:

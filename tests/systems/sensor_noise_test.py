@@ -207,6 +207,19 @@ def test_a_median_is_of_what_has_a_depth():
     np.testing.assert_array_equal(found, np.array([[2, 3, np.inf, 1]], np.float32))
 
 
+def test_errors_have_streams_of_their_own():
+    """Scenes are drawn from [seed] and [seed, k] with a k of a few; numpy pads with zeros."""
+    noise = system(seed=7, camera_position_error=0.01)
+    context = context_of(noise, np.full((HEIGHT, WIDTH), 0.8))
+    seen = noise.GetOutputPort("body_pose_in_world").Eval(context)
+    away = POSE.inverse() @ seen.translation()
+    for stream in range(14):
+        rng = np.random.default_rng([7, stream])
+        direction = rng.standard_normal(3)
+        cosine = away @ direction / np.linalg.norm(away) / np.linalg.norm(direction)
+        assert abs(cosine) < 0.999
+
+
 def test_calibration_is_off_by_what_was_asked():
     def believed(number: int, **errors: float) -> RigidTransform:
         noise = system(number=number, **errors)

@@ -1,9 +1,12 @@
 """Outlines of tools, drawn in SVG or DXF: read in true millimetres, and extruded to solids."""
 
+import io
 import math
+import re
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from manifold3d import CrossSection, FillRule, Manifold
@@ -26,6 +29,10 @@ _STEP_MM = 0.25
 _MOST_STEPS = 400
 _MOST_BYTES = 20_000_000
 _LEAST_AREA_MM2 = 1.0
+_NUMBER_UNIT = re.compile(r"([0-9.eE+-]+)\s*([a-z]*)")
+_NOT_DRAWN = ("symbol", "mask", "marker", "clipPath", "pattern")
+_NOTES = ("DIMENSION", "ARC_DIMENSION", "LARGE_RADIAL_DIMENSION", "LEADER", "MULTILEADER")
+"""Entities of DXF that tell of a drawing, and whose lines are no outline."""
 
 Curve = NDArray[np.float64]
 """The points (n, 2) of a curve, in mm, y up."""
@@ -95,10 +102,12 @@ def _svg_curves(path: Path) -> list[Curve]:
         root = ElementTree.parse(path).getroot()
         if root.tag.rsplit("}", 1)[-1] != "svg":
             raise ValueError("the root is no svg element")
-        # Without a width of its own an SVG is as large as its viewBox says, in pixels.
-        box = root.get("viewBox", "0 0 1000 1000").replace(",", " ").split()
-        drawing = svgelements.SVG.parse(str(path), width=float(box[2]), height=float(box[3]))
+        width, height = _settle_size(root)
+        _keep_from_drawing(root)
+        text = io.StringIO(ElementTree.tostring(root, encoding="unicode"))
+        drawing = svgelements.SVG.parse(text, width=width, height=height)
         shapes = [e for e in drawing.elements() if isinstance(e, svgelements.Shape)]
+        shapes = [e for e in shapes if e.values.get("visibility") not in ("hidden", "collapse")]
         curves = [
             _MM_PER_PIXEL * np.array(points) * (1, -1)
             for shape in shapes
@@ -111,6 +120,44 @@ def _svg_curves(path: Path) -> list[Curve]:
         # Readers fail on broken files in as many ways as there are.
         raise UserError(f"{path} cannot be read as SVG") from error
     return curves
+
+
+def _settle_size(root: ElementTree.Element) -> tuple[float, float]:
+    """The size of a drawing whose root does not say it, in pixels: that of its viewBox.
+
+    Where the root says one side alone, it gets the other one, in proportion to its viewBox.
+    """
+    box = root.get("viewBox", "0 0 1000 1000").replace(",", " ").split()
+    sides = {"width": float(box[2]), "height": float(box[3])}
+    for name in sides:
+        value = root.get(name, "").strip()
+        if value == "auto" or value.endswith("%"):
+            del root.attrib[name]
+    given = [name for name in sides if name in root.attrib]
+    if len(given) == 1 and "viewBox" in root.attrib:
+        (known,) = given
+        (other,) = sides.keys() - {known}
+        match = _NUMBER_UNIT.fullmatch(root.attrib[known].strip())
+        if match is None:
+            raise ValueError(f"{known} is no length")
+        number, unit = match.groups()
+        root.set(known, number + unit)
+        root.set(other, f"{float(number) * sides[other] / sides[known]!r}{unit}")
+    return sides["width"], sides["height"]
+
+
+def _keep_from_drawing(root: ElementTree.Element) -> None:
+    """Moves what is drawn only where it is referred to among the definitions."""
+    space = root.tag.rpartition("svg")[0]
+    definitions = ElementTree.Element(f"{space}defs")
+    for parent in list(root.iter()):
+        if parent.tag == f"{space}defs":
+            continue
+        for child in list(parent):
+            if child.tag in [f"{space}{name}" for name in _NOT_DRAWN]:
+                parent.remove(child)
+                definitions.append(child)
+    root.insert(0, definitions)
 
 
 def _sampled(path: Iterable, mm: float) -> list[tuple[float, float]]:
@@ -140,12 +187,24 @@ def _dxf_curves(path: Path) -> list[Curve]:
         mm = 1.0
         if units != ezdxf.units.InsertUnits.Unitless:
             mm = ezdxf.units.conversion_factor(units, ezdxf.units.InsertUnits.Millimeters)
+        hidden = {
+            layer.dxf.name.lower()
+            for layer in document.layers
+            if layer.is_off() or layer.is_frozen()
+        }
+
+        def is_drawn(entity: Any) -> bool:
+            layer = entity.dxf.get("layer", "0").lower()
+            seen = layer not in hidden and not entity.dxf.get("invisible", 0)
+            return seen and entity.dxftype() not in _NOTES
+
+        whole = filter(is_drawn, document.modelspace())
         curves = []
-        for entity in ezdxf.disassemble.recursive_decompose(document.modelspace()):
+        for entity in filter(is_drawn, ezdxf.disassemble.recursive_decompose(whole)):
             try:
                 curve = ezdxf.path.make_path(entity)
             except TypeError:
-                # Text, dimensions and the like are no curves.
+                # Text and the like are no curves.
                 continue
             for part in curve.sub_paths():
                 points = [(mm * p.x, mm * p.y) for p in part.flattening(_FLAT_MM / mm)]

@@ -14,9 +14,6 @@ from kitting_drake.common.paths import cache_directory
 from kitting_drake.hkd.cache import cached_folder
 from kitting_drake.hkd.tools.tool import Tool
 
-LENGTH_RANGE = (0.150, 0.200)
-"""The lengths to which the paper scales tools, in metres."""
-
 _FORMAT_VERSION = "1"
 """Part of the cache key: changed whenever the same input makes another file."""
 _SAME_LENGTH = 1e-9

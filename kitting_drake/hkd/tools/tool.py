@@ -117,6 +117,8 @@ def load_tool(name: str, base: Path | None = None) -> Tool:
     Raises:
         UserError: no such tool, or a record or a mesh that is missing or broken.
     """
+    if "\0" in name:
+        raise UserError(f"there is no tool {name!r}")
     directory = ((base or Path.cwd()) / name).resolve()
     if Path(name).name == name:
         for folder in (user_tools(), MODELS / "tools"):

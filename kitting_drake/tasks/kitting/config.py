@@ -27,6 +27,7 @@ from kitting_drake.tasks.kitting.sampling import (
 )
 from kitting_drake.tasks.task import ActionRecord, Fixture, Scene, SceneObject, TaskConfig
 from systems.bounds import bounded
+from systems.hand_geometry import MAX_OPENING
 from systems.placement import AddS, Goal, Placement
 from systems.signals import PixelGrid
 
@@ -189,6 +190,7 @@ class ToolsetKitting(_DrawnKitting):
                 scaled_tool(tool, float(length))
                 for tool, length in zip(tools, lengths, strict=True)
             ]
+            _check_grasps(tools)
         return self._draw_scene(tools, grid, seed)
 
     def _toolsets(self, base: Path) -> list[tuple[str, ...]]:
@@ -318,6 +320,17 @@ def _unique_names(tools: Sequence[Tool]) -> list[str]:
             name, number = f"{tool.name}_{number}", number + 1
         names.append(name)
     return names
+
+
+def _check_grasps(tools: Sequence[Tool]) -> None:
+    """Raises UserError for a tool that is wider at its grasp than the jaws open."""
+    for tool in tools:
+        if tool.grasp.width >= MAX_OPENING:
+            raise UserError(
+                f"task: at a length of {1e3 * tool.length:.0f} mm the tool '{tool.name}' is "
+                f"{1e3 * tool.grasp.width:.0f} mm wide where it is held, and the jaws open to "
+                f"{1e3 * MAX_OPENING:.0f} mm: set random_lengths: false, or another tool_length"
+            )
 
 
 def _load_tools(

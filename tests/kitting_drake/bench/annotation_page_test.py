@@ -133,6 +133,10 @@ def test_other_origins_are_refused(server: AnnotationServer, folder: Path):
     connection = http.client.HTTPConnection(*server.server_address)
     connection.request("GET", "/steps", headers={"Host": "elsewhere.example:80"})
     assert connection.getresponse().status == 403
+    # A browser leaves out port 80.
+    connection = http.client.HTTPConnection(*server.server_address)
+    connection.request("GET", "/steps", headers={"Host": "localhost"})
+    assert connection.getresponse().status == 200
     connection.close()
     assert not list(folder.rglob("action.json"))
 

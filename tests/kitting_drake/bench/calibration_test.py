@@ -134,7 +134,15 @@ def test_what_is_written_is_read_again_to_the_last_bit(tmp_path: Path):
         (("cx: 31.5", "cx: 310"), "intrinsics those of another resolution"),
         (("0.001, -0.002, 0.01]", "0.001]"), "distortion must hold 0, 4, 5 or 8 numbers, not 3"),
         (("[0.1, -0.05,", "[-9.0, -0.05,"), "its distortion cannot be undone"),
-        (("rpy_deg: [180, 0, -90]", "yaw: 3"), "camera eye: pose has no rotation"),
+        ((", rpy_deg: [180, 0, -90]", ""), "camera eye: pose has no rotation"),
+        (("rpy_deg: [180, 0, -90]", "yaw: 3"), "camera eye: pose has 'yaw', which means nothing"),
+        (
+            ("rpy_deg: [180, 0, -90]", "rpy_deg: [0, 0, 0], quaternion_xyzw: [1, 0, 0, 0]"),
+            "pose has quaternion_xyzw and rpy_deg: give one of them",
+        ),
+        (("{position:", "{translation: [9, 9, 9], position:"), "has position and translation"),
+        (("fy: 51", "fy: 51\n    image_size: [48, 64]"), "has image_size and width and height"),
+        (("fy: 51", "fy: 51\n    t_cam2base: [0, 0, 1]"), "has t_cam2base and pose: give one"),
         (("rpy_deg: [180, 0, -90]", "quaternion_xyzw: [1, 1, 0, 0]"), "must be a unit quaternion"),
         (("position: [0.5, 0.1, 0.9]", "position: [500, 100, 900]"), "positions are in metres"),
         (("    pose:", "    where:"), "camera eye has no pose"),
@@ -166,6 +174,24 @@ def test_a_pose_that_is_no_rotation_is_refused(tmp_path: Path):
     text = OWN.replace("pose: {position: [0.5, 0.1, 0.9], rpy_deg: [180, 0, -90]}", "pose: " + rows)
     with pytest.raises(UserError, match="its rotation is not orthonormal"):
         read(tmp_path, text)
+
+
+def test_a_transposed_camera_matrix_is_refused(tmp_path: Path):
+    transposed = "[50.0, 0.0, 0.0, 0.0, 51.0, 0.0, 31.5, 23.25, 1.0]"
+    info = CAMERA_INFO.replace("[50.0, 0.0, 31.5, 0.0, 51.0, 23.25, 0.0, 0.0, 1.0]", transposed)
+    with pytest.raises(UserError, match="k must be fx 0 cx, 0 fy cy, 0 0 1: is it transposed"):
+        read(tmp_path, ROS, eye_info=info)
+
+
+def test_poses_may_be_wrapped_as_ros_does(tmp_path: Path):
+    """As PoseWithCovarianceStamped has them."""
+    pose = "{position: {x: 0.5, y: 0.1, z: 0.9}, orientation: {x: 0.7071068, y: -0.7071068}}"
+    pose = pose.replace("-0.7071068}", "-0.7071068, z: 0.0, w: 0.0}")
+    wrapped = f"{{header: {{frame_id: base}}, pose: {{pose: {pose}, covariance: [0.0]}}}}"
+    text = OWN.replace("{position: [0.5, 0.1, 0.9], rpy_deg: [180, 0, -90]}", wrapped)
+    np.testing.assert_allclose(
+        read(tmp_path, text).cameras[0].X_BC, read(tmp_path, OWN).cameras[0].X_BC, atol=1e-6
+    )
 
 
 def test_fields_beside_those_of_other_programs_are_not_passed_over(tmp_path: Path):

@@ -205,7 +205,11 @@ def test_the_command_checks_cameras_without_drake(bench: Path):
 
 def test_input_that_cannot_be_used_ends_with_one_sentence(bench: Path):
     (bench / "left_depth.npy").unlink()
+    (bench / "out").mkdir()
+    (bench / "out" / "action.json").write_text("{}")
     done = command(bench, "--shape_matching")
+    # What an earlier frame was answered is no answer to this one.
+    assert not list((bench / "out").iterdir())
     assert done.returncode == 2
     assert done.stderr.startswith("error: camera left: ")
     assert "neither left_depth.npy nor" in done.stderr

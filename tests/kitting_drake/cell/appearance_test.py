@@ -1,7 +1,11 @@
+import shutil
 from pathlib import Path
 
 import numpy as np
 import pytest
+from pydrake.multibody.parsing import Parser
+from pydrake.multibody.plant import AddMultibodyPlantSceneGraph
+from pydrake.systems.framework import DiagramBuilder
 
 from kitting_drake.cell import build_cell
 from kitting_drake.cell.appearance import lights_of
@@ -100,7 +104,13 @@ def test_a_models_friction_is_scaled_and_its_meshes_are_found(tmp_path: Path):
     )
     assert "<mass>0.1805997838</mass>" in tool
     assert "mu_static>0.25<" in tool
-    assert (MODELS / "tools" / "claw_hammer" / "steel.obj").as_uri() in tool
+    assert f"file://{MODELS / 'tools' / 'claw_hammer' / 'steel.obj'}" in tool
+    # Where homes have such names; Drake decodes nothing.
+    folder = tmp_path / "ä b#c%20d"
+    shutil.copytree(MODELS / "tools" / "claw_hammer", folder)
+    plant, _ = AddMultibodyPlantSceneGraph(DiagramBuilder(), time_step=0.01)
+    moved = varied_model(folder / "claw_hammer.sdf", friction=0.5, mass=2.0)
+    assert Parser(plant).AddModelsFromString(moved, "sdf")
     broken = tmp_path / "broken.sdf"
     broken.write_text("<sdf")
     with pytest.raises(UserError, match=r"broken\.sdf cannot be read"):

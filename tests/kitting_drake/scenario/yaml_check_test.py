@@ -47,6 +47,7 @@ def test_accepts(value: Any):
     [
         ({"bottoms": [{}, {"side": 1.0}]}, r"^bottoms\[1\]\.side is an unknown field"),
         ({"lid": {"_tag": "!Sqare"}}, "^lid has the unknown tag !Sqare: use one of !Round, !Squa"),
+        ({"lid": {"_tag": 3}}, "^lid has a tag that is no name: '3'$"),
         ({"lid": {"_tag": "!Square", "radius": 1.0}}, r"^lid\.radius is an unknown field"),
         ({"lid": None}, "^lid is empty"),
         ({"by_name": {"a": {"sid": 1.0}}}, r"^by_name\.a\.sid .* did you mean 'side'"),

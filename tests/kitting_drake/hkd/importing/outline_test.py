@@ -49,10 +49,32 @@ def size(path: Path) -> tuple[float, float]:
         ('width="200" height="80"', 25.4 / 96),
         ("", 25.4 / 96),
         ('width="100%" height="100%"', 25.4 / 96),
+        ('width="200mm"', 1.0),
+        ('height="80 mm"', 1.0),
+        ('width="10cm" height="auto"', 0.5),
     ],
 )
 def test_an_svg_is_measured_by_its_width(measures: str, mm: float, tmp_path: Path):
     assert size(drawing(tmp_path, BAR, measures)) == pytest.approx((160 * mm, 20 * mm), rel=1e-4)
+
+
+@pytest.mark.parametrize(
+    "unseen",
+    [
+        '<rect width="190" height="70" visibility="hidden"/>',
+        '<rect width="190" height="70" style="visibility:hidden"/>',
+        '<symbol id="s"><rect width="190" height="70"/></symbol>',
+        '<g><mask id="m"><rect width="190" height="70"/></mask></g>',
+        '<marker id="a"><path d="M0 0 L10 5"/></marker>',
+    ],
+)
+def test_what_an_svg_does_not_draw_is_no_outline(unseen: str, tmp_path: Path):
+    assert size(drawing(tmp_path, unseen + BAR)) == pytest.approx((160, 20), rel=1e-4)
+
+
+def test_a_symbol_counts_where_it_is_used(tmp_path: Path):
+    used = f'<symbol id="s">{BAR}</symbol><use href="#s"/>'
+    assert size(drawing(tmp_path, used)) == pytest.approx((160, 20), rel=1e-4)
 
 
 def test_y_points_up_and_transforms_count(tmp_path: Path):
@@ -68,6 +90,22 @@ def test_a_dxf_is_measured_by_its_units_and_its_pieces_are_joined(
     outline = read_outline(stadium(tmp_path, units, scale))
     x_min, y_min, x_max, y_max = outline.bounds()
     assert (x_max - x_min, y_max - y_min) == pytest.approx((160, 20), abs=0.02)
+    assert outline.area() == pytest.approx(140 * 20 + np.pi * (10**2 - 4**2), rel=1e-3)
+
+
+def test_layers_that_are_off_and_dimensions_are_no_outline(tmp_path: Path):
+    path = stadium(tmp_path, 4, 1.0)
+    document = ezdxf.readfile(path)
+    document.layers.add("frame").freeze()
+    document.layers.add("axes").off()
+    space = document.modelspace()
+    space.add_lwpolyline(
+        [(-50, -50), (250, -50), (250, 90), (-50, 90)], close=True, dxfattribs={"layer": "FRAME"}
+    )
+    space.add_line((-50, 10), (250, 10), dxfattribs={"layer": "axes"})
+    space.add_linear_dim(base=(0, -30), p1=(-10, 10), p2=(150, 10)).render()
+    document.saveas(path)
+    outline = read_outline(path)
     assert outline.area() == pytest.approx(140 * 20 + np.pi * (10**2 - 4**2), rel=1e-3)
 
 

@@ -3,6 +3,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
 from pydrake.math import RigidTransform, RollPitchYaw
 from pydrake.multibody.tree import BodyIndex
 
@@ -168,6 +169,21 @@ def test_toolsets_are_drawn_from_a_pool():
     assert any(path.name == "club_hammer.sdf" for path in task.input_files(BASE))
     with pytest.raises(UserError, match=r"task\.pool.*no_such_tool"):
         draw(0, ToolsetKitting(pool=["no_such_tool"]))
+    with pytest.raises(UserError, match=r"no tool 'a\\x00b'"):
+        draw(0, ToolsetKitting(pool=["a\0b"]))
+
+
+def test_tools_that_are_scaled_beyond_what_the_jaws_take_are_refused(tmp_path: Path):
+    folder = tmp_path / "wide"
+    shutil.copytree(MODELS / "tools" / "stubby_screwdriver", folder)
+    tool = load_tool(str(folder))
+    record = yaml.safe_load((folder / "tool.yaml").read_text())
+    # As wide as the jaws open, at a length of 0.2 m.
+    record["grasp"]["width"] = 0.08 * tool.length / 0.2
+    (folder / "tool.yaml").write_text(yaml.safe_dump(record))
+    draw(0, ToolsetKitting(pool=[str(folder)], tool_length=[0.15, 0.19]))
+    with pytest.raises(UserError, match=r"'stubby_screwdriver' is 8\d mm wide where it is held"):
+        draw(0, ToolsetKitting(pool=[str(folder)], tool_length=[0.201, 0.21]))
 
 
 def test_lengths_are_drawn_only_if_asked_for():
