@@ -234,7 +234,9 @@ class Queue:
             Failed: it failed.
         """
         command = [sys.executable, "-m", f"kitting_drake.{verb}", *map(str, arguments)]
-        with (require_folder(folder) / "log.txt").open("w") as log:
+        # Beside the folder: the command takes none that holds anything else.
+        log_file = require_folder(folder.parent) / f"{folder.name}.log"
+        with log_file.open("w") as log:
             process = subprocess.Popen(
                 [*command, "--output", str(folder), "--quiet"],
                 stdout=log,
@@ -248,7 +250,7 @@ class Queue:
                 _end(process)
                 self._running.remove(process)
         if code:
-            last = (folder / "log.txt").read_text().strip().splitlines()[-1:]
+            last = log_file.read_text().strip().splitlines()[-1:]
             raise Failed(f"{verb} failed with exit code {code}: {' '.join(last)}")
 
     def _say(self, text: str) -> None:

@@ -227,6 +227,16 @@ def test_what_an_earlier_version_trained_is_not_taken_for_what_is_asked(queue: P
     assert failure == f"{path.parent}: its steps is 7, not {OURS.policy.steps}: delete it"
 
 
+def test_commands_take_the_folders_that_they_are_given(tmp_path: Path):
+    """They refuse one that holds anything of something else."""
+    queue = Queue(tmp_path / "out", tmp_path / "results", 1, Console(quiet=True))
+    folder = tmp_path / "out" / "evaluations" / "short"
+    text = "{policy: !Oracle {}, time_limit: 0.1}"
+    arguments = (SCENARIOS / "kitting_oracle.yaml", "--scenario_text", text, "--episodes", 1)
+    queue._command("evaluate", *arguments, "--workers", 1, folder=folder)
+    assert (folder / "summary.json").exists()
+
+
 def test_a_command_that_fails_is_told_by_its_last_line(tmp_path: Path):
     """The real one: the scenario of this task does not exist."""
     (tmp_path / "results").mkdir()
