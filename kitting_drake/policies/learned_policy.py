@@ -36,6 +36,9 @@ _AS_GOOD = 2.0
 """A rotation whose score is less by at most this is as good, in nats, ..."""
 _SAME_PLACE = 4.0
 """... where the places are at most this far apart, in pixels."""
+_SOMETHING_FITS, _NOTHING_FITS = -1.0, 2.0
+"""By how much the threshold for stopping moves with what the outlines say, in nats. With everything
+kitted and other things about, networks and outlines each err at times, and seldom both."""
 
 
 @dataclass(frozen=True)
@@ -91,8 +94,8 @@ class LearnedPolicy:
                 (`refine_grasp`); and where the networks would stop while an object certainly fits
                 (`certain_fits`), pick that one. Not in the paper.
             recover: press down what protrudes, pick what belongs into a recess before anything
-                else (`belonging`), and at last take out what could not be pressed down
-                (`recovery_action`). Not in the paper.
+                else (`belonging`), let that have a say in when to stop, and at last take out what
+                could not be pressed down (`recovery_action`). Not in the paper.
             clear_jaws: of rotations that the networks hold for as good, as a cube has four, take
                 the one where the fingers have most room when they let go (`blocked_at_place`). Not
                 in the paper.
@@ -191,10 +194,13 @@ class LearnedPolicy:
                 logits = left
                 choice = self._choose(image, picking, logits, outlines, resolution, refine_pick)
         odds, threshold = picking.log_odds, self._networks.stop_threshold
-        stop = self._may_stop and odds is not None and threshold is not None and odds < threshold
-        if stop and self._recover:
-            stop = not belongs
-        elif stop and outlines is not None:
+        say = 0.0
+        if self._recover and segmentation is not None and segmentation.fixture.any():
+            say = _SOMETHING_FITS if belongs else _NOTHING_FITS
+        stop = False
+        if self._may_stop and odds is not None and threshold is not None:
+            stop = odds < threshold + say
+        if stop and not self._recover and outlines is not None:
             # To the networks nothing looks like an object; an outline says that something is one.
             left = _within(logits, certain_fits(outlines, resolution))
             stop = left is None

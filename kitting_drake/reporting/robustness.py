@@ -83,6 +83,12 @@ def robustness_table(runs: Sequence[Run]) -> str:
             "objects:\n\n"
             + _table(common, [label for label in expected if _is_other_level(label)], counted=True)
         )
+    needless = _needless_table(common, list(expected))
+    if needless:
+        parts.append(
+            "Of these runs, the actions on boxes and whatever else has no cavity, and of how many. "
+            "No rate of success\ntells of them:\n\n" + needless
+        )
     if further:
         parts.append(
             "All seeds together, where there are more, with the number of objects:\n\n"
@@ -131,6 +137,28 @@ def _table(found: Mapping[Key, Sequence[Run]], labels: Sequence[str], counted: b
         if any((label, method) in found for method in _COLUMNS)
     ]
     return markdown_table(["perturbation", *_COLUMNS.values(), *_COMPARED], rows)
+
+
+def _needless_table(found: Mapping[Key, Sequence[Run]], labels: Sequence[str]) -> str:
+    """One row for each perturbation that lays other things on the table; empty without runs."""
+
+    def share(key: Key) -> str:
+        summaries = [run.summary for run in found.get(key, ())]
+        # Older ones do not tell.
+        if not summaries or not all("needless_actions" in item for item in summaries):
+            return "-"
+        needless, every = (
+            sum(item[field] for item in summaries) for field in ("needless_actions", "actions")
+        )
+        return f"{needless} of {every}"
+
+    rows = [
+        [label, *cells]
+        for label in labels
+        if any(name in label for name in ("distractors", "all"))
+        and set(cells := [share((label, method)) for method in _COLUMNS]) != {"-"}
+    ]
+    return markdown_table(["perturbation", *_COLUMNS.values()], rows) if rows else ""
 
 
 def _check_seeds(found: Mapping[Key, Sequence[Run]]) -> None:

@@ -102,6 +102,8 @@ def summarise(
             _outcome(episode, objects)
             for episode, objects in zip(episodes, objects_of, strict=True)
         ],
+        "actions": sum(episode["actions"] for episode in episodes),
+        "needless_actions": sum(needless_actions(episode) for episode in episodes),
         "missed_grasps": sum(episode["missed_grasps"] for episode in episodes),
         "dropped_objects": sum(episode["dropped_objects"] for episode in episodes),
         "moving_at_end": sum(len(episode["moving_at_end"]) for episode in episodes),
@@ -120,6 +122,16 @@ def _commits(episodes: Sequence[Episode]) -> str | None:
     other code. Older episodes do not tell."""
     found = dict.fromkeys(str(episode["commit"]) for episode in episodes if episode.get("commit"))
     return ", ".join(found) or commit()
+
+
+def needless_actions(episode: Episode) -> int:
+    """The actions on objects that no goal was left for: no success rate tells of them, and they may
+    do harm."""
+    useful = {item["name"] for item in episode["objects"] if item["add_s_mm"] is not None}
+    if not useful:
+        # It failed, and does not tell.
+        return 0
+    return sum(action["object"] not in useful for action in episode["actions_taken"])
 
 
 def counted_objects(episodes: Sequence[Episode]) -> list[list[Entry]]:

@@ -141,6 +141,11 @@ def summary_notes(summary: dict[str, Any]) -> str:
         f"actions, median error: pick {pick_position} mm {pick_angle} deg, "
         f"place {place_position} mm {place_angle} deg",
     ]
+    if summary["needless_actions"]:
+        lines.append(
+            f"actions on objects that have no goal: {summary['needless_actions']} of "
+            f"{summary['actions']}"
+        )
     if summary["moving_at_end"]:
         lines.append(f"still moving at the end: {summary['moving_at_end']} objects")
     return "\n".join(lines)

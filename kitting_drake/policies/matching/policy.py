@@ -15,6 +15,7 @@ from kitting_drake.policies.matching.recovery import recovery_action
 from kitting_drake.policies.matching.registration import (
     Registration,
     coarse_cost,
+    is_covered,
     mismatch,
     register,
     trace_outline,
@@ -140,7 +141,8 @@ def match(segmentation: Segmentation, resolution: float) -> list[tuple[int, Regi
     costs = np.full(coarse.shape, 10 * _WORST_COST)
     for i, j in np.argwhere(coarse <= _PROMISING * coarse.min(axis=1, keepdims=True)):
         fits[i, j] = register(outlines[i], recesses[j])
-        costs[i, j] = mismatch(fits[i, j], objects[i], regions[j])
+        if is_covered(outlines[i], recesses[j], fits[i, j]):
+            costs[i, j] = mismatch(fits[i, j], objects[i], regions[j])
     chosen = _assign(costs)
     good = [(i, j) for i, j in chosen if costs[i, j] < _WORST_COST]
     return [(int(i), fits[i, j]) for i, j in sorted(good, key=lambda pair: costs[pair])]

@@ -20,6 +20,7 @@ from kitting_drake.policies.matching.registration import (
     Outline,
     Registration,
     coarse_cost,
+    is_covered,
     mismatch,
     preference,
     register,
@@ -100,7 +101,11 @@ def refine_place(
     if best is None or best.cost > _WORST_COST:
         return None
     others = [other for other in segmentation.recesses if other is not recess]
-    best = _better_elsewhere(taken, outline, recess, target, best, others, resolution)
+    elsewhere = _better_elsewhere(taken, outline, recess, target, best, others, resolution)
+    if elsewhere is not None:
+        best = elsewhere
+    elif not is_covered(outline, target, best):
+        return None
     return RefinedPlace(wrap_to_pi(best.rotation), best.moved(pick))
 
 
@@ -112,8 +117,8 @@ def _better_elsewhere(
     fit: Registration,
     others: list[Region],
     resolution: float,
-) -> Registration:
-    """The fit to another recess where that is clearly better than to the predicted one; else this.
+) -> Registration | None:
+    """The fit to another recess where that is clearly better than to the predicted one; else None.
 
     Args:
         taken: the object.
@@ -124,14 +129,15 @@ def _better_elsewhere(
         others: the other recesses.
         resolution: of a pixel, in metres.
     """
-    best, least = fit, _RIVAL_GAIN * mismatch(fit, taken, recess)
+    best, least = None, _RIVAL_GAIN * mismatch(fit, taken, recess)
     enough = _PROMISING * coarse_cost(outline, target)
     for other in others:
         rival = trace_outline(other.mask, resolution)
         if coarse_cost(outline, rival) > enough:
             continue
         found = register(outline, rival)
-        if found.cost < _WORST_COST and mismatch(found, taken, other) < least:
+        fits = found.cost < _WORST_COST and is_covered(outline, rival, found)
+        if fits and mismatch(found, taken, other) < least:
             best, least = found, mismatch(found, taken, other)
     return best
 

@@ -33,7 +33,11 @@ _BAND = 0.006
 _FARTHEST = 0.012
 """Distances are clipped to this, in metres."""
 _ROBUST = 0.002
-"""Differences beyond this count linearly, in metres."""
+"""Differences beyond this count as no more, in metres: what is hidden, or touches a neighbour, may
+be anywhere."""
+_WORST_REVERSE = 0.0025
+"""A recess whose outline is farther than this from an object's, on average, is another's, in
+metres."""
 _LARGEST_OFFSET = 0.004
 """The offset of the outlines is within plus or minus this, in metres."""
 _HEIGHT_WEIGHT = 0.1
@@ -152,20 +156,40 @@ def preference(
     but for noise: as of an object and the same object a half turn away. Here each point counts by
     how differently the two would have the recess there.
     """
-    there, away = zip(*(_differences(outline, recess, fit) for fit in (first, second)), strict=True)
+    there, away = zip(*(_compared(outline, recess, fit) for fit in (first, second)), strict=True)
     telling = np.abs(there[0] - there[1])
     total = float(telling.sum())
     return float((telling * (np.abs(away[1]) - np.abs(away[0]))).sum()) / total if total else 0.0
 
 
-def _differences(outline: Outline, recess: Outline, fit: Registration) -> tuple[Array, Array]:
+def _compared(outline: Outline, recess: Outline, fit: Registration) -> tuple[Array, Array]:
     """(p,) each: the recess's signed distances at the points of an object's outline, where a fit
     brings them, without the offset; and by how much they differ from the object's own."""
+    there, offset = _brought(outline, recess, fit)
+    return there - offset, there - offset - outline.values
+
+
+def _brought(outline: Outline, recess: Outline, fit: Registration) -> tuple[Array, float]:
+    """(p,) the recess's signed distances at the points of an object's outline, where a fit brings
+    them; and the offset of the outlines."""
     positions = outline.points @ rotation_matrix(fit.rotation).T + fit.shift
     there = recess.sample(recess.distance, positions, _FARTHEST)
-    difference = there - outline.values
-    offset = np.clip(np.median(difference), -_LARGEST_OFFSET, _LARGEST_OFFSET)
-    return there - offset, difference - offset
+    offset = float(np.median(there - outline.values))
+    return there, float(np.clip(offset, -_LARGEST_OFFSET, _LARGEST_OFFSET))
+
+
+def is_covered(outline: Outline, recess: Outline, fit: Registration) -> bool:
+    """Whether a fit brings the object's outline to all of the recess's.
+
+    `register` asks for each point of the object how far from its own the recess's outline is, and
+    all that is far is alike: so a box lies well enough along a cavity that is longer or, with most
+    of it beside, on what a seated object leaves to be seen of its own. Asked of the recess's
+    points, that costs as much as it is wrong.
+    """
+    back = (recess.points - fit.shift) @ rotation_matrix(fit.rotation)
+    _, offset = _brought(outline, recess, fit)
+    reverse = outline.sample(outline.distance, back, _FARTHEST) - recess.values + offset
+    return float(np.abs(reverse).mean()) < _WORST_REVERSE
 
 
 def mismatch(fit: Registration, item: Region, recess: Region) -> float:

@@ -107,6 +107,16 @@ def test_no_episode_counts_twice():
         robustness_table([run("all", 0.9), run("all", 0.9, seeds=range(2880, 2881))])
 
 
+def test_needless_actions_are_told_where_other_things_lie_about():
+    runs = [run("all", 0.9), run("mass", 1.0)]
+    assert "no cavity" not in robustness_table(runs)
+    for item in runs:
+        item.summary.update(needless_actions=3, actions=120)
+    _, table = robustness_table(runs).split("no cavity")
+    assert rows(table)["`all:moderate`"] == ["-", "-", "3 of 120"]
+    assert "`mass:moderate`" not in rows(table)
+
+
 def test_the_figures_are_put_between_their_marks():
     page = "before\n<!-- figures -->\nold\n<!-- end of figures -->\nafter\n"
     new = with_figures(page, "new\n")

@@ -75,6 +75,16 @@ def test_episodes_that_came_to_nothing_count_zero_and_are_never_dropped():
     assert summary["moving_at_end"] == 1
 
 
+def test_actions_on_what_has_no_goal_are_counted():
+    """As on a box, which is among no objects, or on one of these that no goal is left for."""
+    episodes = [make_episode(0, [1.0, 9.0]), make_episode(1, [1.0, 1.0])]
+    assert summarised(episodes)["needless_actions"] == 0
+    episodes[0]["actions_taken"][0]["object"] = "distractor_1"
+    episodes[1]["objects"][1]["add_s_mm"] = None
+    summary = summarised(episodes)
+    assert (summary["needless_actions"], summary["actions"]) == (2, 4)
+
+
 def test_what_it_takes_to_run_it_again():
     summary = summarised([make_episode(0, [1.0])])
     assert summary["task"] == "kitting-seen-toolset"

@@ -14,7 +14,7 @@ from kitting_drake.cell.cameras import can_render
 from kitting_drake.common.paths import GENERALIST, SCENARIOS
 from kitting_drake.policies.images import rotation_matrix
 from kitting_drake.policies.learned_policy import LearnedPolicy
-from kitting_drake.policies.matching.policy import ShapeMatchingPolicy, certain_fits
+from kitting_drake.policies.matching.policy import ShapeMatchingPolicy, certain_fits, match
 from kitting_drake.policies.matching.refinement import refine_grasp, refine_place
 from kitting_drake.policies.matching.segmentation import segment
 from kitting_drake.policies.weights import load_networks
@@ -247,3 +247,44 @@ def test_it_needs_no_torch():
     out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert out.stdout.strip() == "False"
     assert PixelGrid() == Observation().grid
+
+
+@pytest.fixture(scope="module", params=[7402, 7417])
+def kitted(request) -> Observation:
+    """A kit with all of its tools, and four boxes on the table."""
+    scenario = load_scenario(
+        SCENARIOS / "kitting_unseen.yaml",
+        "KittingUnseenToolsetsTraining",
+        "{policy: !Oracle {}}",
+        "distractors",
+    )
+    cell = build_cell(scenario, seed=request.param, base=SCENARIOS)
+    context = cell.diagram.CreateDefaultContext()
+    plant_context = cell.plant.GetMyMutableContextFromRoot(context)
+    for goal in cell.scene.goals:
+        body = cell.plant.get_body(cell.objects[goal.objects[0]].body)
+        cell.plant.SetFreeBodyPose(plant_context, body, goal.poses[0])
+    return cell.diagram.GetOutputPort("observation").Eval(context)
+
+
+def test_boxes_fit_nothing_that_tools_leave_of_their_cavities(kitted: Observation):
+    """What is left to be seen of a filled cavity is narrow, and lies well along a box's side."""
+    segmentation = segment(kitted)
+    assert segmentation.recesses
+    assert len(segmentation.objects) == 4
+    policy = LearnedPolicy(load_networks(GENERALIST), fit_outlines=True, recover=True)
+    assert policy(kitted).stop
+
+
+def test_a_box_is_no_tool_and_a_tool_is(seen):
+    observation, _ = seen
+    segmentation = segment(observation)
+    resolution = observation.grid.resolution
+    assert len(match(segmentation, resolution)) == 4
+    # A square among the tools: the largest that a cavity would hold.
+    box = np.zeros(segmentation.fixture.shape, bool)
+    box[4:18, 4:18] = True
+    recesses = dataclasses.replace(
+        segmentation, objects=(dataclasses.replace(segmentation.objects[0], mask=box),)
+    )
+    assert match(recesses, resolution) == []
