@@ -21,7 +21,7 @@ from kitting_drake.common.processes import (
     counting_bar,
     side_by_side,
 )
-from kitting_drake.common.provenance import versions
+from kitting_drake.common.provenance import commit, versions
 from kitting_drake.common.seeds import DEMONSTRATION_SEEDS, seeds_from
 from kitting_drake.episode import EpisodeResult, ModeChange
 from kitting_drake.episode.chosen import build_chosen, run_chosen
@@ -229,7 +229,8 @@ class Collection:
             self._rejected[outcome.seed] = outcome
 
     def _assemble(self, seeds: list[int]) -> None:
-        rejected = [item for seed, item in sorted(self._rejected.items()) if seed < seeds[-1]]
+        tried = range(self._origin.first_seed, seeds[-1])
+        rejected = [item for seed, item in sorted(self._rejected.items()) if seed in tried]
         sources = [(self._accepted[seed], seed) for seed in seeds]
         merge_demonstrations(self.path, sources, self._origin, rejected)
         self._find_assembled()
@@ -246,9 +247,12 @@ class Collection:
         """The contents of the one file, for people."""
         contents = read_contents(self.path)
         megabytes = self.path.stat().st_size / 1e6
+        several = ""
+        if len(contents.commits) > 1:
+            several = f"; they are of several commits: {', '.join(c[:8] for c in contents.commits)}"
         return (
             f"{self.path} ({megabytes:.1f} MB) holds {_number(contents.seeds, 'demonstration')}, "
-            f"{_number(contents.rejected, 'seed')} rejected"
+            f"{_number(contents.rejected, 'seed')} rejected{several}"
         )
 
 
@@ -378,7 +382,7 @@ class DemonstrationRecorder:
         if not steps:
             return Rejection(result.seed, result.success_rate, "there was nothing to do")
         # All goals are filled: whether the expert was asked again or not, nothing is left to do.
-        return Demonstration(result.seed, result.success_rate, steps, self._final)
+        return Demonstration(result.seed, result.success_rate, steps, self._final, commit())
 
 
 if __name__ == "__main__":

@@ -18,7 +18,7 @@ from kitting_drake.policies.config import METHODS, PRESETS, NetworkConfig
 from kitting_drake.policies.device import preferred_device, preferred_type
 from kitting_drake.policies.training_data import TrainingData, read_training_data
 from kitting_drake.policies.training_run import WEIGHTS, Settings, TrainingRun
-from kitting_drake.policies.weights import read_weights_file
+from kitting_drake.policies.weights import card_seeds, read_weights_file
 
 
 def main() -> int:
@@ -29,6 +29,11 @@ def main() -> int:
         _export(arguments, arguments.weights or arguments.output / WEIGHTS, console)
         return 0
     learned, held_out = _split(arguments.demos, arguments.demonstrations, arguments.validation)
+    if not learned.scenes(1):
+        raise UserError(
+            f"of the {learned.count} {learned.kind} in {arguments.demos} to learn from, none has "
+            f"anything to pick: {learned.made} more"
+        )
     settings = _settings(arguments, learned, held_out)
     _check_validation(settings, held_out, arguments.validation or arguments.demos)
     if arguments.export:
@@ -68,7 +73,15 @@ def _settings(
     arguments: argparse.Namespace, learned: TrainingData, held_out: TrainingData
 ) -> Settings:
     assumed = learned.learning
-    begun = None if arguments.start is None else _checked_start(arguments, learned)
+    if arguments.taken_only and not learned.has_taken:
+        raise UserError(
+            f"--taken-only is for demonstrations: the scenes in {arguments.demos} tell what could "
+            "be picked, not what was"
+        )
+    begun: NetworkConfig | None = None
+    seeds: tuple[int, ...] = ()
+    if arguments.start is not None:
+        begun, seeds = _checked_start(arguments, learned, held_out)
     return Settings(
         scenario=learned.scenario,
         demonstrations=learned.count,
@@ -89,27 +102,43 @@ def _settings(
         validate_every=arguments.validate_every,
         seed=arguments.seed,
         start=None if begun is None else _digest(arguments.start),
+        start_seeds=seeds,
         device=preferred_device().type,
         compute_type=str(preferred_type()).removeprefix("torch."),
     )
 
 
-def _checked_start(arguments: argparse.Namespace, learned: TrainingData) -> NetworkConfig:
-    """The config of the weights to begin with, which must be those that the flags ask for."""
-    config = read_weights_file(arguments.start).config
+def _checked_start(
+    arguments: argparse.Namespace, learned: TrainingData, held_out: TrainingData
+) -> tuple[NetworkConfig, tuple[int, ...]]:
+    """The config of the weights to begin with, which must be those that the flags ask for, and the
+    seeds of the demonstrations that they were made with; to validate by, they learned from none."""
+    file = read_weights_file(arguments.start)
+    config = file.config
+    shared = set(file.card.get("demonstration_seeds", ())) & set(held_out.seeds)
+    if shared and file.card.get("scenario") == held_out.scenario:
+        raise UserError(
+            f"{arguments.start} learned from the seed {min(shared)}, which is one to validate by: "
+            "give others by --validation"
+        )
     for flag in ("method", "preset", "orientations"):
         given, found = getattr(arguments, flag), getattr(config, flag)
         if given != found:
             raise UserError(f"{arguments.start} has {flag} {found}: give --{flag} {found}")
     if config.colour and not learned.colour:
         raise UserError(f"{arguments.start} looks at colours, and {arguments.demos} has none")
-    return config
+    return config, tuple(sorted(card_seeds(file.card)))
 
 
 def _check_validation(settings: Settings, held_out: TrainingData, path: Path) -> None:
     """Raises UserError where no checkpoint, or no threshold for stopping, can be chosen by it."""
     if settings.colour and not held_out.colour:
         raise UserError(f"{path} has no colours, and the networks look at them: validate by others")
+    if not held_out.scenes(1):
+        raise UserError(
+            f"of the {held_out.count} {held_out.kind} in {path} to validate by, none has anything "
+            f"to pick: {held_out.made} more, or give others by --validation"
+        )
     if settings.stop and not held_out.finals(1):
         raise UserError(
             f"of the {held_out.count} {held_out.kind} in {path} to validate by, none ends with "

@@ -7,14 +7,17 @@ a group, `seed_00010000`, with the attributes `seed` and `score` and the dataset
 - `rgb` (T, 3, rows, cols), 8 bits, and `height` (T, rows, cols), metres: the observations,
 - `pick` and `place` (T, 3), x and y in metres and theta in radians: the actions,
 - `object` and `category` (T,): what was picked,
-- `final_rgb` (3, rows, cols) and `final_height` (rows, cols): what was seen when the expert said
-  that nothing is left to do. They are absent where the number of actions ended the episode.
+- `final_rgb` (3, rows, cols) and `final_height` (rows, cols): what was seen when nothing was left
+  to do. They are absent where the episode ended before the hand was ready for another action.
+
+A group tells the `commit` of the code that made it too, if that was a checkout.
 """
 
 from __future__ import annotations
 
 import contextlib
 import dataclasses
+import hashlib
 import json
 import os
 from collections.abc import Iterable, Iterator
@@ -134,7 +137,11 @@ class Demonstration:
     """Share of the objects that it placed."""
     steps: tuple[DemonstrationStep, ...]
     final: FinalObservation | None = None
-    """None: the episode was ended by its number of actions, before the expert said stop."""
+    """None: the episode ended before the hand was ready for another action."""
+    commit: str | None = None
+    """Of the code that ran it; None where that was no checkout, or is not known."""
+    digest: str | None = None
+    """Of all that its group in a file holds; None where it comes from none."""
 
 
 @dataclass(frozen=True)
@@ -179,6 +186,8 @@ class Contents:
     origin: Origin
     rejected: tuple[Rejection, ...]
     seeds: tuple[int, ...]
+    commits: tuple[str, ...] = ()
+    """Of the code that made them, as far as they tell."""
 
 
 def read_demonstrations(path: Path, first: int | None = None) -> Demonstrations:
@@ -243,7 +252,15 @@ def merge_demonstrations(
     with _created(path, origin, rejected) as file:
         for source, seed in sources:
             with _opened(source) as part:
-                part.copy(_group_name(seed), file)
+                _copy(part, _group_name(seed), file, path)
+
+
+def _copy(part: h5py.File, name: str, file: h5py.File, path: Path) -> None:
+    """Copies a group; where that fails, nobody knows whether it was read or written."""
+    try:
+        part.copy(name, file)
+    except (OSError, RuntimeError) as error:
+        raise UserError(f"cannot copy {name} of {part.filename} to {path}: {error}") from error
 
 
 def _group_name(seed: int) -> str:
@@ -268,8 +285,10 @@ def _created(path: Path, origin: Origin, rejected: Iterable[Rejection]) -> Itera
             file.attrs["rejected"] = json.dumps([dataclasses.asdict(item) for item in rejected])
             yield file
         os.replace(scratch, path)
-    except OSError as error:
-        raise UserError(f"cannot write {path}: {error.strerror or error}") from error
+    except (OSError, RuntimeError) as error:
+        # HDF5 has the second for a disk that is full when it closes the file.
+        reason = getattr(error, "strerror", None) or error
+        raise UserError(f"cannot write {path}: {reason}") from error
     finally:
         scratch.unlink(missing_ok=True)
 
@@ -279,6 +298,8 @@ def _write_group(file: h5py.File, demonstration: Demonstration) -> None:
     group = file.create_group(_group_name(demonstration.seed))
     group.attrs["seed"] = demonstration.seed
     group.attrs["score"] = demonstration.score
+    if demonstration.commit is not None:
+        group.attrs["commit"] = demonstration.commit
     for name in ("rgb", "height"):
         images = np.stack([getattr(step, name) for step in steps])
         _write_images(group, name, images, chunks=(1, *images.shape[1:]))
@@ -348,7 +369,8 @@ def _contents(file: h5py.File) -> Contents:
     )
     rejected = tuple(Rejection(**item) for item in json.loads(attributes["rejected"]))
     seeds = sorted(int(group.attrs["seed"]) for group in file.values())
-    return Contents(origin, rejected, tuple(seeds))
+    commits = {str(group.attrs["commit"]) for group in file.values() if "commit" in group.attrs}
+    return Contents(origin, rejected, tuple(seeds), tuple(sorted(commits)))
 
 
 def _read_group(group: h5py.Group, grid: PixelGrid) -> Demonstration:
@@ -356,14 +378,18 @@ def _read_group(group: h5py.Group, grid: PixelGrid) -> Demonstration:
     steps = len(texts[0])
     if not steps:
         raise ValueError(f"{group.name} holds no step")
-    rgb = _checked(group, "rgb", (steps, 3, *grid.shape))
-    height = _checked(group, "height", (steps, *grid.shape))
-    actions = [_checked(group, name, (steps, 3))[()] for name in ("pick", "place")]
+    digest = hashlib.sha256(repr([list(text) for text in texts]).encode())
+
+    def checked(name: str, *shape: int) -> h5py.Dataset:
+        return _checked(group, name, shape, digest)
+
+    rgb, height = checked("rgb", steps, 3, *grid.shape), checked("height", steps, *grid.shape)
+    actions = [checked(name, steps, 3)[()] for name in ("pick", "place")]
     final = None
     if "final_rgb" in group:
         final = FinalObservation(
-            rgb=Stored.of(_checked(group, "final_rgb", (3, *grid.shape))),
-            height=Stored.of(_checked(group, "final_height", grid.shape)),
+            rgb=Stored.of(checked("final_rgb", 3, *grid.shape)),
+            height=Stored.of(checked("final_height", *grid.shape)),
         )
     return Demonstration(
         seed=int(group.attrs["seed"]),
@@ -380,15 +406,23 @@ def _read_group(group: h5py.Group, grid: PixelGrid) -> Demonstration:
             for row, (pick, place, name, category) in enumerate(zip(*actions, *texts, strict=True))
         ),
         final=final,
+        commit=group.attrs.get("commit"),
+        digest=digest.hexdigest(),
     )
 
 
-def _checked(group: h5py.Group, name: str, shape: tuple[int, ...]) -> h5py.Dataset:
-    """A dataset of some shape, all of whose entries are finite."""
+def _checked(group: h5py.Group, name: str, shape: tuple[int, ...], digest: Any) -> h5py.Dataset:
+    """A dataset of some shape, all of whose entries are finite; it is added to a digest."""
     dataset = group[name]
     values = dataset[()]
     if values.shape != shape:
         raise ValueError(f"{group.name}/{name} is of the shape {values.shape}")
     if not np.isfinite(values).all():
         raise ValueError(f"{group.name}/{name} holds what is no number")
+    digest.update(np.ascontiguousarray(values).data)
     return dataset
+
+
+def content_digest(demonstrations: Iterable[Demonstration]) -> str:
+    """A digest of all that is learned from demonstrations that were read from a file."""
+    return hashlib.sha256(repr([(d.seed, d.digest) for d in demonstrations]).encode()).hexdigest()

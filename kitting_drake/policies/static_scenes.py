@@ -135,16 +135,31 @@ def read_static_scenes(path: Path) -> StaticScenes:
                 raise UserError(f"{path} holds no static scenes")
             if file.attrs["format_version"] != FORMAT_VERSION:
                 raise UserError(f"{path} is of another version: draw the scenes again")
+            grid = PixelGrid(**json.loads(file.attrs["grid"]))
             heights, actions, first = (file[key][()] for key in ("height", "actions", "first"))
+            _check(heights, actions, first, grid)
             scenes = tuple(
                 StaticScene(height, actions[first[i] : first[i + 1]])
                 for i, height in enumerate(heights)
             )
-            grid = PixelGrid(**json.loads(file.attrs["grid"]))
             seed, versions = int(file.attrs["first_seed"]), json.loads(file.attrs["versions"])
-    except (OSError, KeyError, ValueError, TypeError, IndexError) as error:
-        raise UserError(f"cannot read {path}: {error}") from error
+    except (OSError, LookupError, ValueError, TypeError, AttributeError, RuntimeError) as error:
+        # h5py has all of these for bytes that make no sense.
+        raise UserError(
+            f"{path} is truncated or damaged: delete it and draw the scenes again ({error})"
+        ) from error
     return StaticScenes(grid, scenes, seed, versions)
+
+
+def _check(heights: NDArray, actions: NDArray, first: NDArray, grid: PixelGrid) -> None:
+    """Raises ValueError for what cannot be the content of a file."""
+    if heights.shape[1:] != grid.shape or heights.dtype != np.uint16:
+        raise ValueError(f"its heights are {heights.dtype} of the shape {heights.shape}")
+    if actions.ndim != 2 or actions.shape[1] != 8 or not np.isfinite(actions).all():
+        raise ValueError(f"its actions, of the shape {actions.shape}, are not 8 numbers each")
+    bounds = first.shape == (len(heights) + 1,) and first.dtype.kind in "iu"
+    if not bounds or first[0] != 0 or first[-1] != len(actions) or (np.diff(first) < 0).any():
+        raise ValueError("it does not tell which actions are whose")
 
 
 class StaticSamples(Sequence[LabelledImage]):

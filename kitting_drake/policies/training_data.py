@@ -16,6 +16,7 @@ from kitting_drake.policies.demonstrations import (
     Demonstrations,
     FinalObservation,
     Recorded,
+    content_digest,
     read_demonstrations,
 )
 from kitting_drake.policies.images import LabelledImage, Pictured
@@ -57,8 +58,8 @@ class TrainingData:
     """Of the demonstrations, or the first seed of static scenes."""
     items: tuple[Demonstration, ...] | StaticScenes
     made_by: dict[str, str]
-    """What tells data of the same seeds apart: the versions that made them, and of static scenes
-    a digest of the content."""
+    """What tells data of the same seeds apart: the versions that made them, and a digest of the
+    content."""
 
     @property
     def count(self) -> int:
@@ -71,6 +72,11 @@ class TrainingData:
         return "scenes" if isinstance(self.items, StaticScenes) else "demonstrations"
 
     @property
+    def has_taken(self) -> bool:
+        """Whether it is told what was picked, not only what could be."""
+        return not isinstance(self.items, StaticScenes)
+
+    @property
     def made(self) -> str:
         """What one does to get some, for people."""
         return "draw" if isinstance(self.items, StaticScenes) else "collect"
@@ -81,7 +87,12 @@ class TrainingData:
             chosen = dataclasses.replace(self.items, scenes=self.items.scenes[first:last])
             return dataclasses.replace(self, items=chosen)
         items = self.items[first:last]
-        return dataclasses.replace(self, items=items, seeds=tuple(item.seed for item in items))
+        return dataclasses.replace(
+            self,
+            items=items,
+            seeds=tuple(item.seed for item in items),
+            made_by={**self.made_by, "content": content_digest(items)},
+        )
 
     def scenes(self, most: int | None = None) -> list[Scene]:
         """The observations in which there is something to pick.
@@ -175,7 +186,10 @@ def read_training_data(path: Path) -> TrainingData:
             colour=True,
             seeds=tuple(item.seed for item in demonstrations.demonstrations),
             items=demonstrations.demonstrations,
-            made_by=origin.versions,
+            made_by={
+                **origin.versions,
+                "content": content_digest(demonstrations.demonstrations),
+            },
         )
     if not data.count:
         raise UserError(f"{path} holds no {data.kind}: {data.made} some")

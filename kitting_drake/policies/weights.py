@@ -11,6 +11,7 @@ import dataclasses
 import json
 import math
 import textwrap
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -25,6 +26,7 @@ from kitting_drake.common.files import write_atomically
 from kitting_drake.policies.config import NetworkConfig
 from kitting_drake.policies.methods import make_networks
 from kitting_drake.policies.networks import Networks
+from kitting_drake.policies.static_scenes import STATIC
 from kitting_drake.policies.steerable import (
     ExpandedConv2d,
     PlainConv2d,
@@ -49,6 +51,16 @@ class WeightsFile:
     card: dict[str, Any]
     """Where the weights come from: data, seeds, steps, validation. Its `stop_threshold`, if there
     is one, is `Networks.stop_threshold`."""
+
+
+def card_seeds(card: Mapping[str, Any]) -> set[int]:
+    """The seeds of the demonstrations that weights were made with, learned from or validated by,
+    with those of the weights that training began with."""
+    seeds = set(card.get("start_seeds", ()))
+    # Those of static scenes are of scenes, which no episode has.
+    if card.get("scenario") != STATIC:
+        seeds |= {*card.get("demonstration_seeds", ()), *card.get("validation_seeds", ())}
+    return seeds
 
 
 def save_weights(path: Path, networks: Networks, card: dict[str, Any]) -> None:

@@ -237,14 +237,9 @@ class Learned(PolicyConfig):
         return [self._path(base)] if self.weights else []
 
     def training_seeds(self, base: Path) -> set[int]:
-        from kitting_drake.policies.static_scenes import STATIC
-        from kitting_drake.policies.weights import read_weights_file
+        from kitting_drake.policies.weights import card_seeds, read_weights_file
 
-        card = read_weights_file(self._path(base)).card
-        if card.get("scenario") == STATIC:
-            # Its seeds are of scenes, which no episode has.
-            return set()
-        return {*card.get("demonstration_seeds", ()), *card.get("validation_seeds", ())}
+        return card_seeds(read_weights_file(self._path(base)).card)
 
     def _path(self, base: Path) -> Path:
         return base / self.weights if self.weights else GENERALIST

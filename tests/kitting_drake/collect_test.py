@@ -25,6 +25,7 @@ from kitting_drake.policies.demonstrations import (
     DemonstrationStep,
     Origin,
     Rejection,
+    read_contents,
     read_demonstrations,
 )
 from systems.signals import Observation, PickPlaceAction, PixelGrid, PlanarPose
@@ -176,6 +177,15 @@ def test_fewer_after_a_stop_lose_nothing(tmp_path: Path):
     assert collect(tmp_path / "stopped", 2).asked == []
     assert content(tmp_path / "stopped") == content(tmp_path / "whole")
     assert collect(tmp_path / "stopped", 4).asked == [16]
+
+
+def test_rejections_of_another_stretch_of_seeds_are_not_told(tmp_path: Path):
+    """A run was stopped, and another begun in its folder further on."""
+    (tmp_path / "parts").mkdir()
+    rejected = {"seed": 3, "score": 0.0, "reason": "of another run"}
+    (tmp_path / "parts" / "seed_00000003.json").write_text(json.dumps(rejected))
+    collect(tmp_path, 2)
+    assert 3 not in [item.seed for item in read_contents(tmp_path / "demonstrations.h5").rejected]
 
 
 def test_a_file_of_another_origin_is_refused(tmp_path: Path):

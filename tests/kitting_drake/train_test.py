@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
+import h5py
 import numpy as np
 import pytest
 import torch
@@ -33,7 +34,7 @@ from kitting_drake.policies.networks import Networks
 from kitting_drake.policies.static_scenes import StaticScene, StaticScenes, write_static_scenes
 from kitting_drake.policies.training import Trainer
 from kitting_drake.policies.training_data import read_training_data
-from kitting_drake.policies.weights import load_networks, read_weights_file
+from kitting_drake.policies.weights import card_seeds, load_networks, read_weights_file
 from systems.signals import Observation, PickPlaceAction, PixelGrid, PlanarPose
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -149,6 +150,9 @@ def test_begins_with_the_weights_of_a_file(
         torch.testing.assert_close(new[name], values, atol=1e-4, rtol=1e-3)
     card = read_weights_file(tmp_path / "on" / start.name).card
     assert len(card["start"]) == 64
+    assert card_seeds(card) == {10, 11, 12, 13}
+    fewer = refused(demos, tmp_path / "no", "--from", start, "--demonstrations", 2)
+    assert "learned from the seed 12, which is one to validate by" in fewer
     assert "give --orientations 180" in refused(
         demos, tmp_path / "no", "--from", start, "--orientations", 36
     )
@@ -407,6 +411,50 @@ def test_a_policy_that_would_never_stop_is_not_trained(
     assert "none ends with nothing left to pick: the policy would never stop" in told
 
 
+def static_scenes(path: Path, *counts: int) -> Path:
+    """A file of scenes with so many actions each."""
+    scenes = [StaticScene(np.zeros(GRID.shape, np.uint16), np.zeros((n, 8))) for n in counts]
+    write_static_scenes(path, StaticScenes(GRID, tuple(scenes)))
+    return path
+
+
+def test_where_there_is_nothing_to_pick_nothing_is_learned(
+    tmp_path: Path, refused: Callable[..., str]
+):
+    path = static_scenes(tmp_path / "scenes.h5", 1, 1, 0)
+    told = refused(path, tmp_path / "run", "--demonstrations", 2)
+    assert "to validate by, none has anything to pick: draw more" in told
+    path = static_scenes(tmp_path / "none.h5", 0, 0, 1)
+    told = refused(path, tmp_path / "run", "--demonstrations", 2)
+    assert "to learn from, none has anything to pick: draw more" in told
+
+
+def test_static_scenes_do_not_tell_what_was_picked(tmp_path: Path, refused: Callable[..., str]):
+    path = static_scenes(tmp_path / "scenes.h5", *[1, 0] * 11)
+    assert "--taken-only is for demonstrations" in refused(path, tmp_path / "run", "--taken-only")
+
+
+@pytest.mark.parametrize(
+    ("name", "values"),
+    [
+        ("height", np.zeros((3, 5, 5), np.uint16)),
+        ("actions", np.full((2, 8), np.nan)),
+        ("actions", np.zeros((2, 5))),
+        ("actions", np.zeros((1, 8))),
+        ("first", np.array([0, 2, 1, 2])),
+    ],
+)
+def test_static_scenes_that_make_no_sense_are_refused(
+    tmp_path: Path, refused: Callable[..., str], name: str, values: np.ndarray
+):
+    path = static_scenes(tmp_path / "scenes.h5", 1, 1, 0)
+    with h5py.File(path, "a") as file:
+        del file[name]
+        file[name] = values
+    told = refused(path, tmp_path / "run")
+    assert f"{path} is truncated or damaged: delete it and draw the scenes again" in told
+
+
 def test_networks_that_see_colours_are_not_validated_without(
     demos: Path, tmp_path: Path, refused: Callable[..., str]
 ):
@@ -451,6 +499,18 @@ def test_the_same_seeds_of_another_scenario_or_version_are_another_run(
     assert f"{folder} holds the files of another training run" in refused(others, folder)
 
 
+def test_the_same_seeds_with_other_images_are_another_run(
+    folder: Path, tmp_path: Path, refused: Callable[..., str]
+):
+    """As those that were collected again by other code."""
+    path = tmp_path / "others.h5"
+    changed = demonstration(10)
+    brighter = dataclasses.replace(changed.steps[0], height=changed.steps[0].height + 0.001)
+    changed = dataclasses.replace(changed, steps=(brighter, *changed.steps[1:]))
+    write_demonstrations(path, ORIGIN, [changed, *map(demonstration, range(11, 14))])
+    assert f"{folder} holds the files of another training run" in refused(path, folder)
+
+
 def test_two_do_not_train_in_one_folder(demos: Path, folder: Path, refused: Callable[..., str]):
     with alone_in(folder):
         assert f"another process is at work in {folder}" in refused(demos, folder)
@@ -487,8 +547,9 @@ def test_a_loss_that_is_no_number_ends_the_run(
 # Checkpoints are a second apart, and no displacement is so large that others are equal to it.
 KILLABLE = """
 from kitting_drake import train
-from kitting_drake.policies import validation
-train._CHECKPOINT_EVERY = 3
+from kitting_drake.policies import training_run, validation
+assert training_run._CHECKPOINT_EVERY
+training_run._CHECKPOINT_EVERY = 3
 validation._LOST = 1e9
 train.run_command(train.main)
 """
@@ -506,8 +567,11 @@ def test_a_run_that_is_killed_again_and_again_ends_as_if_it_had_not_been(
 
     assert start(whole).wait() == 0
     rng = random.Random(0)
+    taken_up = 0
     for _ in range(20):
+        taken_up += (killed / "checkpoint.pt").exists()
         kill_at_random(start(killed), killed / "log.jsonl", rng, changes=rng.randrange(4))
+    assert taken_up > 10
     assert start(killed).wait() == 0
     assert_same_outcome(killed, whole)
     # The best checkpoint is not simply the first one.

@@ -1,3 +1,4 @@
+import dataclasses
 import subprocess
 import sys
 from pathlib import Path
@@ -149,6 +150,33 @@ def test_what_was_there_stays_whole_when_writing_fails(tmp_path: Path):
         merge_demonstrations(path, [(path, 10), (tmp_path / "gone.h5", 13)], ORIGIN, [])
     assert path.read_bytes() == before
     assert list(tmp_path.iterdir()) == [path]
+
+
+def test_a_disk_that_is_full_blames_no_demonstration(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    path = written(tmp_path)
+
+    def full(*_):
+        raise RuntimeError("Unable to synchronously copy object (No space left on device)")
+
+    monkeypatch.setattr(h5py.File, "copy", full)
+    with pytest.raises(UserError, match=r"cannot copy seed_00000010 of .* to .*No space left") as e:
+        merge_demonstrations(path, [(path, 10)], ORIGIN, [])
+    assert "delete" not in str(e.value)
+
+
+def test_the_commits_are_told_that_made_them(tmp_path: Path):
+    path = tmp_path / "demonstrations.h5"
+    made = [dataclasses.replace(demonstration(seed), commit=f"c{seed % 2}") for seed in (1, 2, 3)]
+    write_demonstrations(path, ORIGIN, [*made, demonstration(4)])
+    assert read_contents(path).commits == ("c0", "c1")
+    assert [item.commit for item in read_demonstrations(path).demonstrations] == [
+        "c1",
+        "c0",
+        "c1",
+        None,
+    ]
 
 
 def test_thousands_of_rejected_seeds_fit(tmp_path: Path):
