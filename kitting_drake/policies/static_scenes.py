@@ -145,9 +145,7 @@ def read_static_scenes(path: Path) -> StaticScenes:
             seed, versions = int(file.attrs["first_seed"]), json.loads(file.attrs["versions"])
     except (OSError, LookupError, ValueError, TypeError, AttributeError, RuntimeError) as error:
         # h5py has all of these for bytes that make no sense.
-        raise UserError(
-            f"{path} is truncated or damaged: delete it and draw the scenes again ({error})"
-        ) from error
+        raise UserError(f"cannot read {path}: {error}") from error
     return StaticScenes(grid, scenes, seed, versions)
 
 
