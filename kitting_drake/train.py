@@ -29,11 +29,7 @@ def main() -> int:
         _export(arguments, arguments.weights or arguments.output / WEIGHTS, console)
         return 0
     learned, held_out = _split(arguments.demos, arguments.demonstrations, arguments.validation)
-    if not learned.scenes(1):
-        raise UserError(
-            f"of the {learned.count} {learned.kind} in {arguments.demos} to learn from, none has "
-            f"anything to pick: {learned.made} more"
-        )
+    _require_picks(learned, arguments.demos, "to learn from")
     settings = _settings(arguments, learned, held_out)
     _check_validation(settings, held_out, arguments.validation or arguments.demos)
     if arguments.export:
@@ -134,16 +130,21 @@ def _check_validation(settings: Settings, held_out: TrainingData, path: Path) ->
     """Raises UserError where no checkpoint, or no threshold for stopping, can be chosen by it."""
     if settings.colour and not held_out.colour:
         raise UserError(f"{path} has no colours, and the networks look at them: validate by others")
-    if not held_out.scenes(1):
-        raise UserError(
-            f"of the {held_out.count} {held_out.kind} in {path} to validate by, none has anything "
-            f"to pick: {held_out.made} more, or give others by --validation"
-        )
+    _require_picks(held_out, path, "to validate by")
     if settings.stop and not held_out.finals(1):
         raise UserError(
             f"of the {held_out.count} {held_out.kind} in {path} to validate by, none ends with "
             f"nothing left to pick: the policy would never stop: {held_out.made} more, or give "
             "others by --validation"
+        )
+
+
+def _require_picks(data: TrainingData, path: Path, purpose: str) -> None:
+    """Raises UserError where there is nothing to pick in any observation."""
+    if not data.scenes(1):
+        raise UserError(
+            f"of the {data.count} {data.kind} in {path} {purpose}, none has anything to pick: "
+            f"{data.made} more"
         )
 
 

@@ -155,7 +155,7 @@ def _needless_table(found: Mapping[Key, Sequence[Run]], labels: Sequence[str]) -
     rows = [
         [label, *cells]
         for label in labels
-        if any(name in label for name in ("distractors", "all"))
+        if label.startswith(("`distractors", "`all"))
         and set(cells := [share((label, method)) for method in _COLUMNS]) != {"-"}
     ]
     return markdown_table(["perturbation", *_COLUMNS.values()], rows) if rows else ""
