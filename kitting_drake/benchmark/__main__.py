@@ -78,7 +78,11 @@ def _parser() -> argparse.ArgumentParser:
         "paper", help="collect, train and evaluate the cells of the paper's tables; it takes days"
     )
     paper.add_argument(
-        "--cells", default="*", metavar="PATTERN", help="only those of such names (*: all)"
+        "--cells",
+        nargs="+",
+        default=["*"],
+        metavar="PATTERN",
+        help="only those of such names, in this order (*: all, the most telling first)",
     )
     paper.add_argument(
         "--results",
@@ -88,8 +92,9 @@ def _parser() -> argparse.ArgumentParser:
         help="where the summaries of the cells go (docs/results/paper)",
     )
     paper.add_argument(
-        "--workers", type=count_type, default=1, help="episodes side by side, beside a training (1)"
+        "--workers", type=count_type, default=1, help="episodes side by side, beside trainings (1)"
     )
+    paper.add_argument("--trainings", type=count_type, default=1, help="trainings side by side (1)")
     for benchmark in (simulation, networks, kits, recovery, opinion, paper):
         benchmark.add_argument(
             "--output", type=Path, default=Path("output/benchmark"), help="where the files go"
@@ -158,13 +163,24 @@ def _mujoco(arguments: argparse.Namespace, console: Console, folder: Path) -> li
 
 def _paper(arguments: argparse.Namespace, console: Console, folder: Path) -> int:
     """Fills the paper's cells; returns the exit code."""
-    from kitting_drake.paper.cells import paper_cells
-    from kitting_drake.paper.queue import run_paper
+    from kitting_drake.paper.cells import Cell, paper_cells
+    from kitting_drake.paper.queue import Queue, run_paper
 
-    cells = [cell for cell in paper_cells() if fnmatch(cell.name, arguments.cells)]
-    if not cells:
-        raise UserError(f"--cells: there is no cell of the name '{arguments.cells}'")
-    failures = run_paper(folder / "paper", arguments.results, cells, arguments.workers, console)
+    chosen: dict[str, Cell] = {}
+    for pattern in arguments.cells:
+        matching = {cell.name: cell for cell in paper_cells() if fnmatch(cell.name, pattern)}
+        if not matching:
+            raise UserError(f"--cells: there is no cell of the name '{pattern}'")
+        chosen |= matching
+    cells = list(chosen.values())
+    queue = Queue(
+        require_folder(folder / "paper"),
+        require_folder(arguments.results),
+        console,
+        workers=arguments.workers,
+        trainings=arguments.trainings,
+    )
+    failures = run_paper(queue, cells)
     table = Table("cell", "state", title="the paper's experiments")
     for cell in cells:
         table.add_row(cell.name, failures.get(cell.name, "done"))

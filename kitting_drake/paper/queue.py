@@ -8,9 +8,11 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import os
 import signal
 import subprocess
 import sys
+import threading
 from collections.abc import Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass, field
@@ -34,6 +36,7 @@ from kitting_drake.paper.cells import (
 )
 from kitting_drake.paper.rates import RATES, best_rate, read_rates
 
+_THREADS = "OMP_NUM_THREADS"
 _PATIENCE = 10.0
 """How long a command may take to end itself, in s."""
 _FIRST_SEED, _FIRST_VALIDATION_SEED = 10000, 20000
@@ -52,16 +55,23 @@ class Queue:
 
     folder: Path
     results: Path
-    workers: int
-    """Episodes side by side, beside one training."""
     console: Console
+    workers: int = 1
+    """Episodes side by side, beside the trainings."""
+    trainings: int = 1
+    """Trainings side by side."""
     _running: list[subprocess.Popen[str]] = field(default_factory=list, init=False)
+    _locks: dict[Path, threading.Lock] = field(default_factory=dict, init=False)
+    """Of what several trainings need, and only one of them is to make."""
+    _has_ended: bool = field(default=False, init=False)
+    _guard: threading.Lock = field(default_factory=threading.Lock, init=False)
+    """Of all of these."""
 
     def run(self, cells: Sequence[Cell]) -> dict[str, str]:
         """Fills cells, in their order as far as their networks are there.
 
-        Trainings are done one after another, in the order in which cells need them; evaluations
-        beside them.
+        Trainings are begun in the order in which cells need them; evaluations are done one after
+        another, beside them.
 
         Returns:
             For each cell that could not be filled, by its name, why.
@@ -69,7 +79,7 @@ class Queue:
         pending = [cell for cell in cells if not self.is_done(cell)]
         self._say(f"{len(cells) - len(pending)} of {len(cells)} cells are done")
         failures: dict[str, str] = {}
-        with ThreadPoolExecutor(max_workers=1) as trainer:
+        with ThreadPoolExecutor(max_workers=self.trainings) as trainer:
             needed = dict.fromkeys(c.policy for c in pending if isinstance(c.policy, Training))
             # What is trained already need not wait behind what is not.
             trained: dict[Any, Future[Path]] = {
@@ -87,9 +97,12 @@ class Queue:
                         failures[cell.name] = error.why
                         self._say(f"{cell.name}: {error.why}")
             except BaseException:
-                # The trainer's own process would otherwise be waited for.
+                # The trainings' own processes would otherwise be waited for.
                 trainer.shutdown(wait=False, cancel_futures=True)
-                for process in list(self._running):
+                with self._guard:
+                    self._has_ended = True
+                    running = list(self._running)
+                for process in running:
                     _end(process)
                 raise
         return failures
@@ -124,18 +137,23 @@ class Queue:
         """The file of a task's demonstrations, or of those to validate by."""
         folder = self.folder / "demonstrations" / f"{task.name}{'_validation' * validation}"
         path = folder / "demonstrations.h5"
-        if not path.exists():
-            self._command(
-                "collect",
-                SCENARIOS / task.file,
-                *("--scenario_name", task.demonstrated),
-                *("--scenario_text", "{policy: !Oracle {}}"),
-                *("--demos", task.validation if validation else task.demonstrations),
-                *("--seed", _FIRST_VALIDATION_SEED if validation else _FIRST_SEED),
-                *("--workers", 1),
-                folder=folder,
-            )
+        with self._only_one_makes(folder):
+            if not path.exists():
+                self._command(
+                    "collect",
+                    SCENARIOS / task.file,
+                    *("--scenario_name", task.demonstrated),
+                    *("--scenario_text", "{policy: !Oracle {}}"),
+                    *("--demos", task.validation if validation else task.demonstrations),
+                    *("--seed", _FIRST_VALIDATION_SEED if validation else _FIRST_SEED),
+                    *("--workers", 1),
+                    folder=folder,
+                )
         return path
+
+    def _only_one_makes(self, path: Path) -> threading.Lock:
+        with self._guard:
+            return self._locks.setdefault(path, threading.Lock())
 
     def _is_trained(self, training: Training) -> bool:
         rates = LEARNING_RATES[:1] if training.method == "so2" else LEARNING_RATES
@@ -150,28 +168,32 @@ class Queue:
         if rate is None:
             ours = training.method == "so2"
             rate = LEARNING_RATES[0] if ours else self._best_rate(training.method)
-        task = TASKS[training.task]
         folder = self._folder(training, rate)
-        if not (folder / "summary.json").exists():
-            self._command(
-                "train",
-                *("--demos", self.collect(task, validation=False)),
-                *("--validation", self.collect(task, validation=True)),
-                *("--demonstrations", training.demonstrations),
-                *("--method", training.method),
-                *("--preset", PRESET),
-                *("--orientations", training.orientations),
-                *("--steps", training.steps),
-                *("--learning-rate", rate),
-                "--decay",
-                *(("--taken-only",) if training.taken_only else ()),
-                *(("--rigid",) if training.rigid else ()),
-                *("--validate-every", VALIDATE_EVERY),
-                *("--seed", training.seed),
-                folder=folder,
-            )
+        with self._only_one_makes(folder):
+            if not (folder / "summary.json").exists():
+                self._train(training, rate, folder)
         self._check_training(training, folder)
         return folder / "policy.safetensors"
+
+    def _train(self, training: Training, rate: float, folder: Path) -> None:
+        task = TASKS[training.task]
+        self._command(
+            "train",
+            *("--demos", self.collect(task, validation=False)),
+            *("--validation", self.collect(task, validation=True)),
+            *("--demonstrations", training.demonstrations),
+            *("--method", training.method),
+            *("--preset", PRESET),
+            *("--orientations", training.orientations),
+            *("--steps", training.steps),
+            *("--learning-rate", rate),
+            "--decay",
+            *(("--taken-only",) if training.taken_only else ()),
+            *(("--rigid",) if training.rigid else ()),
+            *("--validate-every", VALIDATE_EVERY),
+            *("--seed", training.seed),
+            folder=folder,
+        )
 
     @staticmethod
     def _check_training(training: Training, folder: Path) -> None:
@@ -195,10 +217,12 @@ class Queue:
             weights = self.train(dataclasses.replace(reference(method), learning_rate=rate))
             summary = json.loads(weights.with_name("summary.json").read_text())
             costs[rate] = summary["best"]["cost_mm"]
-        known = read_rates(self.results)
-        found = known | {method: {f"{rate:g}": cost for rate, cost in costs.items()}}
-        if found != known:
-            write_json(self.results / RATES, dict(sorted(found.items())))
+        file = self.results / RATES
+        with self._only_one_makes(file):
+            known = read_rates(self.results)
+            found = known | {method: {f"{rate:g}": cost for rate, cost in costs.items()}}
+            if found != known:
+                write_json(file, dict(sorted(found.items())))
         return float(best_rate(found[method]))
 
     def _evaluate(self, cell: Cell, weights: Path | None) -> None:
@@ -237,13 +261,17 @@ class Queue:
         # Beside the folder: the command takes none that holds anything else.
         log_file = require_folder(folder.parent) / f"{folder.name}.log"
         with log_file.open("w") as log:
-            process = subprocess.Popen(
-                [*command, "--output", str(folder), "--quiet"],
-                stdout=log,
-                stderr=subprocess.STDOUT,
-                text=True,
-            )
-            self._running.append(process)
+            with self._guard:
+                if self._has_ended:
+                    raise Failed("the queue was ended")
+                process = subprocess.Popen(
+                    [*command, "--output", str(folder), "--quiet"],
+                    stdout=log,
+                    stderr=subprocess.STDOUT,
+                    text=True,
+                    env={_THREADS: str(self._threads()), **os.environ},
+                )
+                self._running.append(process)
             try:
                 code = process.wait()
             finally:
@@ -252,6 +280,10 @@ class Queue:
         if code:
             last = log_file.read_text().strip().splitlines()[-1:]
             raise Failed(f"{verb} failed with exit code {code}: {' '.join(last)}")
+
+    def _threads(self) -> int:
+        """Of each command: its share of the cores, as all that are at work at once make them."""
+        return max(1, len(os.sched_getaffinity(0)) // (self.trainings + self.workers))
 
     def _say(self, text: str) -> None:
         self.console.print(text, highlight=False, markup=False)
@@ -268,19 +300,9 @@ def _end(process: subprocess.Popen[str]) -> None:
             process.wait()
 
 
-def run_paper(
-    folder: Path, results: Path, cells: Sequence[Cell], workers: int, console: Console
-) -> dict[str, str]:
-    """Fills cells; see `Queue.run`.
-
-    Returns:
-        For each cell that could not be filled, by its name, why.
-
-    Raises:
-        UserError: a result is not that of its cell, or a folder cannot be written to.
-    """
-    queue = Queue(require_folder(folder), require_folder(results), workers, console)
-    # Whoever ends it, ends what it has begun too: that would keep the next queue out.
+def run_paper(queue: Queue, cells: Sequence[Cell]) -> dict[str, str]:
+    """Fills cells, as `Queue.run` does, and ends what it began when it is ended itself."""
+    # What goes on would keep the next queue out.
     before = signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))
     try:
         return queue.run(cells)

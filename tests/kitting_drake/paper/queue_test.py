@@ -42,11 +42,13 @@ COUNTED = ("orientations", "demonstrations", "steps", "seed")
 class Pretending(Queue):
     """A queue whose commands leave the files that the real ones would."""
 
-    def __init__(self, *arguments) -> None:
-        super().__init__(*arguments)
+    def __init__(self, *arguments, **options) -> None:
+        super().__init__(*arguments, **options)
         self.calls: list[str] = []
         self.broken: set[str] = set()
         self.slow = ""
+        self.together: threading.Barrier | None = None
+        """Where trainings wait for each other."""
         self._has_evaluated = threading.Event()
 
     def _command(self, verb: str, *arguments, folder: Path) -> None:
@@ -61,6 +63,8 @@ class Pretending(Queue):
         if verb == "collect":
             (folder / "demonstrations.h5").touch()
         elif verb == "train":
+            if self.together:
+                self.together.wait(10.0)
             rate = float(flags["--learning-rate"])
             summary = {"best": {"cost_mm": 1.0 if rate == LEARNING_RATES[1] else 2.0}}
             summary |= {key: int(flags[f"--{key}"]) for key in COUNTED}
@@ -108,7 +112,7 @@ class Pretending(Queue):
 @pytest.fixture
 def queue(tmp_path: Path) -> Pretending:
     (tmp_path / "results").mkdir()
-    return Pretending(tmp_path / "work", tmp_path / "results", 1, Console(quiet=True))
+    return Pretending(tmp_path / "work", tmp_path / "results", Console(quiet=True))
 
 
 def test_cells_have_names_of_their_own_and_scenarios_that_load():
@@ -156,6 +160,18 @@ def test_what_is_trained_does_not_wait_behind_what_is_not(queue: Pretending):
     assert [call for call in queue.calls if call.startswith("evaluate")] == [
         f"evaluate {OURS.name}",
         f"evaluate {other.name}",
+    ]
+
+
+def test_trainings_side_by_side_collect_once(tmp_path: Path):
+    (tmp_path / "results").mkdir()
+    queue = Pretending(tmp_path, tmp_path / "results", Console(quiet=True), trainings=2)
+    queue.together = threading.Barrier(2)
+    other = dataclasses.replace(OURS, policy=Training("unseen", "so2", 180, 100))
+    assert queue.run([OURS, other]) == {}
+    assert [call for call in queue.calls if call.startswith("collect")] == [
+        "collect unseen",
+        "collect unseen_validation",
     ]
 
 
@@ -229,7 +245,7 @@ def test_what_an_earlier_version_trained_is_not_taken_for_what_is_asked(queue: P
 
 def test_commands_take_the_folders_that_they_are_given(tmp_path: Path):
     """They refuse one that holds anything of something else."""
-    queue = Queue(tmp_path / "out", tmp_path / "results", 1, Console(quiet=True))
+    queue = Queue(tmp_path / "out", tmp_path / "results", Console(quiet=True))
     folder = tmp_path / "out" / "evaluations" / "short"
     text = "{policy: !Oracle {}, time_limit: 0.1}"
     arguments = (SCENARIOS / "kitting_oracle.yaml", "--scenario_text", text, "--episodes", 1)
@@ -241,11 +257,30 @@ def test_a_command_that_fails_is_told_by_its_last_line(tmp_path: Path):
     """The real one: the scenario of this task does not exist."""
     (tmp_path / "results").mkdir()
     cell = dataclasses.replace(ORACLE, policy="!Nobody {}")
-    console = Console(quiet=True)
-    failures = run_paper(tmp_path / "work", tmp_path / "results", [cell], 1, console)
+    queue = Queue(tmp_path / "work", tmp_path / "results", Console(quiet=True))
+    failures = run_paper(queue, [cell])
     assert list(failures) == [cell.name]
     assert failures[cell.name].startswith("evaluate failed with exit code 2: error: ")
     assert "!Nobody" in failures[cell.name]
+
+
+def test_cells_are_chosen_by_patterns_in_their_order(tmp_path: Path, monkeypatch, capsys):
+    chosen: list[str] = []
+
+    def fill(_: Queue, cells: list[Cell]) -> dict[str, str]:
+        chosen.extend(cell.name for cell in cells)
+        return {}
+
+    monkeypatch.setattr("kitting_drake.paper.queue.run_paper", fill)
+    patterns = ["seen_quantized_oracle_36", "*_quantized_oracle_36"]
+    arguments = ["benchmark", "paper", "--output", str(tmp_path), "--cells", *patterns]
+    arguments += ["--results", str(tmp_path / "results")]
+    monkeypatch.setattr(sys, "argv", arguments)
+    assert benchmark.main() == 0
+    assert chosen == ["seen_quantized_oracle_36", "unseen_quantized_oracle_36"]
+    monkeypatch.setattr(sys, "argv", [*arguments, "--cells", "seen_*", "nothing_*"])
+    with pytest.raises(UserError, match="no cell of the name 'nothing_\\*'"):
+        benchmark.main()
 
 
 @pytest.mark.parametrize(("failures", "code"), [({}, 0), ({ORACLE.name: "it broke"}, 1)])
@@ -254,6 +289,7 @@ def test_what_failed_is_told_by_the_exit_code(
 ):
     monkeypatch.setattr("kitting_drake.paper.queue.run_paper", lambda *_: failures)
     arguments = ["benchmark", "paper", "--cells", ORACLE.name, "--output", str(tmp_path)]
+    arguments += ["--results", str(tmp_path / "results")]
     monkeypatch.setattr(sys, "argv", arguments)
     assert benchmark.main() == code
     assert ("it broke" in capsys.readouterr().out) == bool(code)
