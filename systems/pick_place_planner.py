@@ -2,11 +2,9 @@
 
 import dataclasses
 import math
-from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
-from pydrake.common.containers import namedview
 from pydrake.common.value import AbstractValue, Value
 from pydrake.systems.framework import (
     BasicVector,
@@ -17,47 +15,15 @@ from pydrake.systems.framework import (
 )
 
 from systems.hand_geometry import check_reach
-from systems.hand_motion import (
-    PARTS,
-    braking_time,
-    motion_at,
-    motion_duration,
-    ramp,
-    shortest_yaws,
-    time_to_reach,
-)
+from systems.hand_motion import shortest_yaws
 from systems.motion_heights import motion_heights
+from systems.pick_place_motion import YAW_LIMIT, PickPlaceMotion, PlannerState, State
 from systems.pick_place_parameters import Mode, PickPlaceParameters
 from systems.signals import Observation, PickPlaceAction, PlanarPose, SurfaceHeights
 from systems.surface_heights import read_surface_heights
 
-_FIELDS = (
-    ["mode", "start_time", "duration"]
-    + [f"start_{axis}" for axis in ("x", "y", "z", "yaw")]
-    + [f"goal_{axis}" for axis in ("x", "y", "z", "yaw")]
-    + [f"start_rate_{axis}" for axis in ("x", "y", "z", "yaw")]
-    + ["delay_xy", "delay_z", "delay_yaw"]
-    + ["start_opening", "goal_opening", "start_force", "goal_force", "force_start_time"]
-    + ["pick_x", "pick_y", "pick_yaw", "place_x", "place_y", "place_yaw", "grasp_z"]
-    + ["travel_z", "clear_z", "pick_top_z"]
-    + ["pick_hover_z", "place_hover_z", "table_z", "support_z", "rim_z"]
-    + ["hold_z", "touch_z", "search_step"]
-    + ["payload", "actions", "missed", "dropped", "press"]
-)
-_PlannerState = namedview("PlannerState", _FIELDS)
-_State: TypeAlias = Any
-"""A `_PlannerState`, which is made at run time and is no type to a type checker."""
-
-_START, _GOAL, _START_RATE, _DELAYS = slice(3, 7), slice(7, 11), slice(11, 15), slice(15, 18)
-
-_YAW_LIMIT = 3.4
-"""How far the wrist may rotate either way, in rad: just short of its joint limit."""
 _MOST_FAILED = 16
 """So many failed picks are remembered."""
-_NEARLY_THERE = 0.02
-"""So near to where it goes, in m, the hand may sink below what the rest of the way has to clear."""
-_OVERSHOOT = 0.05
-"""How far above the travel height a lift aims, in m, as the hand crosses that without a stop."""
 
 
 class PickPlacePlanner(LeafSystem):
@@ -133,13 +99,8 @@ class PickPlacePlanner(LeafSystem):
         given = parameters.max_actions
         self._max_actions = max_actions if given is None else given
         self._search_steps = parameters.search.steps if insertion else 0
-        self._motions = parameters.motion_limits()
-        model = np.zeros(len(_FIELDS))
-        state = _PlannerState(model)
-        state[_START] = state[_GOAL] = parameters.home
-        state.start_opening = state.goal_opening = parameters.open_width
-        state.force_start_time = -parameters.force_ramp
-        self._state_index = self.DeclareDiscreteState(model)
+        self._motion = PickPlaceMotion(parameters)
+        self._state_index = self.DeclareDiscreteState(self._motion.initial_state())
         self._period = period
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
 
@@ -185,28 +146,21 @@ class PickPlacePlanner(LeafSystem):
             and math.remainder(time, self._period) == 0.0
         )
 
-    def _state(self, context: Context) -> _State:
-        return _PlannerState(context.get_discrete_state(self._state_index).get_value())
+    def _state(self, context: Context) -> State:
+        return PlannerState(context.get_discrete_state(self._state_index).get_value())
 
     # Outputs.
 
     def _calc_motion(self, context: Context, output: BasicVector) -> None:
         state = self._state(context)
-        output.SetFromVector(self._motion_at(state, context.get_time()))
+        output.SetFromVector(self._motion.motion_at(state, context.get_time()))
 
     def _calc_opening(self, context: Context, output: BasicVector) -> None:
         state = self._state(context)
-        output.SetFromVector(
-            ramp(
-                state.start_opening,
-                state.goal_opening,
-                2 * self._parameters.finger_speed,
-                context.get_time() - state.start_time,
-            )
-        )
+        output.SetFromVector(self._motion.opening_at(state, context.get_time()))
 
     def _calc_force(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector([self._force_at(self._state(context), context.get_time())])
+        output.SetFromVector([self._motion.force_at(self._state(context), context.get_time())])
 
     def _calc_mode(self, context: Context, output: BasicVector) -> None:
         output.SetFromVector([self._state(context).mode])
@@ -223,7 +177,7 @@ class PickPlacePlanner(LeafSystem):
     # The state machine.
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> EventStatus:
-        state = _PlannerState(discrete_state.get_mutable_value(self._state_index))
+        state = PlannerState(discrete_state.get_mutable_value(self._state_index))
         time = context.get_time()
         hand = self._hand_state.Eval(context)
         contact = self._contact_force.Eval(context)
@@ -243,39 +197,42 @@ class PickPlacePlanner(LeafSystem):
             step(context, state, time, hand, contact)
             has_pressed = mode == Mode.DESCEND and state.mode == Mode.RETREAT
             if has_pressed or state.missed + state.dropped > failed:
-                rows = discrete_state.get_mutable_value(self._failed_index).reshape(-1, 3)
-                known = np.flatnonzero(np.isnan(rows[:, 0]))
-                if not len(known):
-                    rows[:-1] = rows[1:].copy()
-                rows[known[0] if len(known) else -1] = state.pick_x, state.pick_y, state.pick_yaw
+                self._remember_failed(state, discrete_state)
         return EventStatus.Succeeded()
+
+    def _remember_failed(self, state: State, discrete_state: DiscreteValues) -> None:
+        rows = discrete_state.get_mutable_value(self._failed_index).reshape(-1, 3)
+        free = np.flatnonzero(np.isnan(rows[:, 0]))
+        if not len(free):
+            rows[:-1] = rows[1:].copy()
+        rows[free[0] if len(free) else -1] = state.pick_x, state.pick_y, state.pick_yaw
 
     def _observe(self, context, state, time, hand, contact) -> None:
         if not self._has_settled(state, time):
             return
         if state.actions >= self._max_actions:
-            self._begin(state, Mode.DONE, time)
+            self._motion.begin(state, Mode.DONE, time)
             return
         action: PickPlaceAction = self._action.Eval(context)
         if action.stop:
-            self._begin(state, Mode.DONE, time)
+            self._motion.begin(state, Mode.DONE, time)
             return
         check_reach(action)
         if action.press:
             action = dataclasses.replace(action, place=action.pick)
         pick_yaw, place_yaw = shortest_yaws(
-            action.pick.theta, action.place.theta, float(state.goal_yaw), _YAW_LIMIT
+            action.pick.theta, action.place.theta, float(state.goal_yaw), YAW_LIMIT
         )
         state.pick_x, state.pick_y, state.pick_yaw = action.pick.x, action.pick.y, pick_yaw
         state.place_x, state.place_y, state.place_yaw = action.place.x, action.place.y, place_yaw
         self._set_heights(state, self._heights(context, action))
         state.search_step, state.press = 0, action.press
         state.actions += 1
-        self._begin(state, Mode.APPROACH, time)
+        self._motion.begin(state, Mode.APPROACH, time)
 
-    def _has_settled(self, state: _State, time: float) -> bool:
+    def _has_settled(self, state: State, time: float) -> bool:
         """Whether the hand has been at rest out of sight for long enough to observe."""
-        return time >= self._arrival(state) + self._parameters.observe_settle
+        return time >= self._motion.arrival(state) + self._parameters.observe_settle
 
     def _heights(self, context: Context, action: PickPlaceAction) -> SurfaceHeights:
         if self._observation.HasValue(context):
@@ -287,7 +244,7 @@ class PickPlacePlanner(LeafSystem):
             )
         return action.heights
 
-    def _set_heights(self, state: _State, heights: SurfaceHeights) -> None:
+    def _set_heights(self, state: State, heights: SurfaceHeights) -> None:
         motion = motion_heights(heights, self._parameters)
         state.grasp_z, state.pick_top_z = motion.grasp, heights.pick_top
         state.table_z, state.support_z = heights.table, heights.support
@@ -297,21 +254,21 @@ class PickPlacePlanner(LeafSystem):
         state.pick_hover_z, state.place_hover_z = motion.pick_hover, motion.place_hover
 
     def _follow(self, context, state, time, hand, contact) -> None:
-        if time >= self._arrival(state):
+        if time >= self._motion.arrival(state):
             following = Mode.OBSERVE if state.mode == Mode.RETREAT else Mode(int(state.mode) + 1)
-            self._begin(state, following, time)
+            self._motion.begin(state, following, time)
 
     def _descend(self, context, state, time, hand, contact) -> None:
         if state.press:
-            if contact[2] > self._parameters.press_force or time >= self._arrival(state):
-                self._begin(state, Mode.RETREAT, time)
+            if contact[2] > self._parameters.press_force or time >= self._motion.arrival(state):
+                self._motion.begin(state, Mode.RETREAT, time)
         elif contact[2] > self._parameters.contact_threshold:
-            self._begin(state, Mode.CLOSE, time, z=hand[2])
+            self._motion.begin(state, Mode.CLOSE, time, z=hand[2])
             # Back off a little: pressed fingertips would not close.
             state.goal_z += self._parameters.floor_clearance
-            self._set_times(state)
-        elif time >= self._arrival(state):
-            self._begin(state, Mode.CLOSE, time)
+            self._motion.set_times(state)
+        elif time >= self._motion.arrival(state):
+            self._motion.begin(state, Mode.CLOSE, time)
 
     def _close(self, context, state, time, hand, contact) -> None:
         opening, rate = hand[4] + hand[5], hand[10] + hand[11]
@@ -320,10 +277,10 @@ class PickPlacePlanner(LeafSystem):
         commanded, _ = self.get_output_port(1).Eval(context)
         stalled = moving_for > 0.1 and abs(rate) < 2e-3 and commanded < opening - 1e-3
         if stalled or commanded <= 0.0:
-            self._begin(state, Mode.CHECK, time, opening=opening)
+            self._motion.begin(state, Mode.CHECK, time, opening=opening)
 
     def _check(self, context, state, time, hand, contact) -> None:
-        if time < self._arrival(state) + self._parameters.tare_settle:
+        if time < self._motion.arrival(state) + self._parameters.tare_settle:
             return
         if self._is_held(hand, contact):
             state.hold_z = hand[2]
@@ -331,199 +288,59 @@ class PickPlacePlanner(LeafSystem):
             higher = max(hand[2] - state.grasp_z, 0.0)
             state.travel_z += higher
             state.place_hover_z += higher
-            self._begin(state, Mode.LIFT, time)
+            self._motion.begin(state, Mode.LIFT, time)
         else:
             state.missed += 1
-            self._begin(state, Mode.RETREAT, time)
+            self._motion.begin(state, Mode.RETREAT, time)
 
     def _hold(self, context, state, time, hand, contact) -> None:
         if -contact[2] > self._parameters.heavy_load:
             firm = max(state.goal_force, self._parameters.firm_grasp_force)
-            self._set_force(state, time, firm)
+            self._motion.set_force(state, time, firm)
         if not self._is_held(hand, contact):
             state.dropped += 1
-            self._begin(state, Mode.RETREAT, time)
+            self._motion.begin(state, Mode.RETREAT, time)
         elif state.mode == Mode.LIFT:
-            if self._brakes_above(state, time, state.travel_z):
-                self._begin(state, Mode.CARRY, time)
-        elif time >= self._arrival(state) + self._parameters.tare_settle:
+            if self._motion.brakes_above(state, time, state.travel_z):
+                self._motion.begin(state, Mode.CARRY, time)
+        elif time >= self._motion.arrival(state) + self._parameters.tare_settle:
             state.payload = contact[2]
-            self._begin(state, Mode.LOWER, time)
+            self._motion.begin(state, Mode.LOWER, time)
 
     def _lower(self, context, state, time, hand, contact) -> None:
         if not self._is_held(hand, contact):
             state.dropped += 1
-            self._begin(state, Mode.RETREAT, time)
+            self._motion.begin(state, Mode.RETREAT, time)
         elif contact[2] - state.payload > self._parameters.contact_threshold:
             if self._is_blocked(state, hand):
                 state.touch_z = hand[2]
-                self._begin(state, Mode.SEARCH, time, z=hand[2])
+                self._motion.begin(state, Mode.SEARCH, time, z=hand[2])
             else:
-                self._begin(state, Mode.RELEASE, time, z=hand[2])
-        elif time >= self._arrival(state):
-            self._begin(state, Mode.RELEASE, time)
+                self._motion.begin(state, Mode.RELEASE, time, z=hand[2])
+        elif time >= self._motion.arrival(state):
+            self._motion.begin(state, Mode.RELEASE, time)
 
     def _search(self, context, state, time, hand, contact) -> None:
         free = contact[2] - state.payload < self._parameters.contact_threshold / 2
         if not self._is_held(hand, contact):
             state.dropped += 1
-            self._begin(state, Mode.RETREAT, time)
+            self._motion.begin(state, Mode.RETREAT, time)
         elif free and self._parameters.search.has_slipped_in(hand[2], state.touch_z):
             # Given a height, it stops dead: here the object fits.
-            self._begin(state, Mode.LOWER, time, z=hand[2])
-        elif time >= self._arrival(state):
+            self._motion.begin(state, Mode.LOWER, time, z=hand[2])
+        elif time >= self._motion.arrival(state):
             state.search_step += 1
             if state.search_step < self._search_steps:
-                self._begin(state, Mode.SEARCH, time)
+                self._motion.begin(state, Mode.SEARCH, time)
             else:
-                self._begin(state, Mode.RELEASE, time, z=hand[2])
+                self._motion.begin(state, Mode.RELEASE, time, z=hand[2])
 
-    def _is_blocked(self, state: _State, hand: NDArray[np.float64]) -> bool:
+    def _is_blocked(self, state: State, hand: NDArray[np.float64]) -> bool:
         bottom = hand[2] - state.hold_z + state.support_z
         left = state.search_step < self._search_steps
         return left and self._parameters.search.is_on_rim(float(bottom), float(state.rim_z))
-
-    def _brakes_above(self, state: _State, time: float, height: float) -> bool:
-        """Whether the hand, braking from now on, would come to rest above a height."""
-        now, rate, _ = np.split(self._motion_at(state, time), 3)
-        return bool(now[2] + rate[2] * braking_time(rate, self._motions[Mode.LIFT]) / 2 >= height)
 
     def _is_held(self, hand: NDArray[np.float64], contact: NDArray[np.float64]) -> bool:
         # Contact pushes the fingers apart: along their positive axes.
         pressed = contact[4:6].min() > self._parameters.grasp_force / 2
         return bool(pressed and hand[4] + hand[5] > self._parameters.minimum_width)
-
-    def _begin(
-        self,
-        state: _State,
-        mode: Mode,
-        time: float,
-        z: float | None = None,
-        opening: float | None = None,
-    ) -> None:
-        """Starts a mode from where the commands now stand.
-
-        Args:
-            state: the planner's state, written.
-            mode: the mode to begin.
-            time: now, in s.
-            z: hold the fingertips at this height from now on, in m.
-            opening: hold the jaws at this opening from now on, in m.
-        """
-        parameters = self._parameters
-        now, rate, _ = np.split(self._motion_at(state, time), 3)
-        now_opening, _ = ramp(
-            state.start_opening,
-            state.goal_opening,
-            2 * parameters.finger_speed,
-            time - state.start_time,
-        )
-        if z is not None:
-            now[2] = z
-            rate = np.zeros(4)
-        if opening is not None:
-            now_opening = opening
-        state.mode = mode
-        state.start_time = time
-        state[_START] = now
-        state[_START_RATE] = rate
-        # Unless the mode says otherwise: come to rest.
-        state[_GOAL] = now + rate * braking_time(rate, self._motions[mode]) / 2
-        state.start_opening = state.goal_opening = now_opening
-
-        if mode == Mode.APPROACH:
-            state[_GOAL] = (state.pick_x, state.pick_y, state.pick_hover_z, state.pick_yaw)
-            state.goal_opening = 0.0 if state.press else parameters.open_width
-        elif mode == Mode.DESCEND:
-            state.goal_z = state.grasp_z
-            if state.press:
-                state.goal_z = state.pick_top_z - parameters.press_depth
-        elif mode == Mode.CLOSE:
-            state.goal_opening = 0.0
-        elif mode == Mode.CHECK:
-            self._set_force(state, time, parameters.grasp_force)
-        elif mode == Mode.LIFT:
-            state.goal_z = state.travel_z + _OVERSHOOT
-        elif mode == Mode.CARRY:
-            state[_GOAL] = (state.place_x, state.place_y, state.place_hover_z, state.place_yaw)
-        elif mode == Mode.LOWER:
-            state.goal_z = state.table_z + parameters.floor_clearance
-        elif mode == Mode.SEARCH:
-            x, y, yaw = parameters.search.offset(int(state.search_step))
-            state.goal_x, state.goal_y = state.place_x + x, state.place_y + y
-            state.goal_yaw = min(max(state.place_yaw + yaw, -_YAW_LIMIT), _YAW_LIMIT)
-            state.goal_z = state.touch_z - parameters.search.press
-        elif mode == Mode.RELEASE:
-            state.goal_opening = min(
-                now_opening + 2 * parameters.release_clearance, parameters.open_width
-            )
-        elif mode == Mode.RETREAT:
-            state.goal_x, _, home_z, _ = parameters.home
-            state.goal_z = max(home_z, state.travel_z)
-        if mode in (Mode.RELEASE, Mode.RETREAT):
-            self._set_force(state, time, 0.0)
-        self._set_times(state)
-
-    def _set_times(self, state: _State) -> None:
-        """Sets when each part of the present mode's motion begins, and how long all of it takes."""
-        mode = Mode(int(state.mode))
-        limits = self._motions[mode]
-        rate = np.asarray(state[_START_RATE])
-        braking = braking_time(rate, limits)
-        # What moves comes to rest first.
-        delays = np.array([braking * bool(rate[part].any()) for part in PARTS])
-        ways = np.abs(state[_GOAL] - state[_START] - rate * braking / 2)
-        across, height = float(np.linalg.norm(ways[:2])), float(ways[2])
-        of_plane, of_height, _ = limits.of_parts()
-        if mode == Mode.CARRY:
-            # The lift that it goes on from is all but done by half of the braking.
-            delays = np.maximum(delays, braking / 2)
-        if mode in (Mode.APPROACH, Mode.CARRY):
-            # Sink when it is nearly there.
-            clear = state.clear_z if mode == Mode.APPROACH else state.travel_z
-            nearly_there = delays[0] + time_to_reach(across - _NEARLY_THERE, across, *of_plane)
-            sinks = height - (clear - state.goal_z)
-            delays[1] = max(delays[1], nearly_there - time_to_reach(sinks, height, *of_height))
-        elif mode == Mode.RETREAT:
-            # Rise first.
-            rises = height - (state.goal_z - state.travel_z)
-            delays[0] = max(delays[0], delays[1] + time_to_reach(rises, height, *of_height))
-        state[_DELAYS] = delays
-        state.duration = motion_duration(
-            np.asarray(state[_START]), np.asarray(state[_GOAL]), rate, limits, delays
-        )
-
-    def _set_force(self, state: _State, time: float, force: float) -> None:
-        """Lets the closing force go to another value, from what it is now."""
-        if force != state.goal_force:
-            state.start_force = self._force_at(state, time)
-            state.goal_force, state.force_start_time = force, time
-
-    def _force_at(self, state: _State, time: float) -> float:
-        """The closing force, in N."""
-        fraction = 1.0
-        if self._parameters.force_ramp > 0:
-            elapsed = time - state.force_start_time
-            fraction = min(max(elapsed / self._parameters.force_ramp, 0.0), 1.0)
-        return float(state.start_force + fraction * (state.goal_force - state.start_force))
-
-    def _arrival(self, state: _State) -> float:
-        """When the motion, the jaws and the force of the present mode have arrived, in s."""
-        opening_time = abs(state.goal_opening - state.start_opening) / (
-            2 * self._parameters.finger_speed
-        )
-        moved = state.start_time + max(state.duration, opening_time)
-        return float(max(moved, state.force_start_time + self._parameters.force_ramp))
-
-    def _motion_at(self, state: _State, time: float) -> NDArray[np.float64]:
-        """q_d, v_d, a_d (12) of the present mode's motion."""
-        if time >= state.start_time + state.duration:
-            return np.concatenate([state[_GOAL], np.zeros(8)])
-        return motion_at(
-            state[_START],
-            state[_GOAL],
-            state[_START_RATE],
-            self._motions[Mode(int(state.mode))],
-            state[_DELAYS],
-            time - state.start_time,
-        )
