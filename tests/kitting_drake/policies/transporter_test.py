@@ -18,10 +18,9 @@ from kitting_drake.policies.losses import (
     presence_loss,
 )
 from kitting_drake.policies.methods import make_networks
+from kitting_drake.policies.resnet import PlainLayer, ResNet
 from kitting_drake.policies.training import Trainer
 from kitting_drake.policies.transporter import (
-    PlainLayer,
-    ResNet,
     TransporterNetworks,
     canvas_shape,
     draw_bins,
