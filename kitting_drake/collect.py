@@ -27,8 +27,6 @@ from kitting_drake.episode import EpisodeResult, ModeChange
 from kitting_drake.episode.chosen import build_chosen, run_chosen
 from kitting_drake.policies.demonstrations import (
     Demonstration,
-    DemonstrationStep,
-    FinalObservation,
     Origin,
     Rejection,
     merge_demonstrations,
@@ -36,6 +34,7 @@ from kitting_drake.policies.demonstrations import (
     write_demonstrations,
 )
 from kitting_drake.policies.lerobot_export import export_lerobot, require_export, require_pyarrow
+from kitting_drake.policies.recorded import DemonstrationStep, FinalObservation
 from kitting_drake.scenario.command_line import (
     ChosenScenario,
     choose_scenario,

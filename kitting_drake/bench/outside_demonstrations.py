@@ -22,14 +22,9 @@ from kitting_drake.bench.step_actions import StepAction, read_action
 from kitting_drake.common.errors import UserError
 from kitting_drake.common.provenance import versions
 from kitting_drake.common.seeds import VALIDATION_SEEDS
-from kitting_drake.policies.demonstrations import (
-    Demonstration,
-    DemonstrationStep,
-    FinalObservation,
-    Origin,
-    write_demonstrations,
-)
+from kitting_drake.policies.demonstrations import Demonstration, Origin, write_demonstrations
 from kitting_drake.policies.learning import Learning
+from kitting_drake.policies.recorded import DemonstrationStep, FinalObservation
 from systems.signals import Observation
 
 TASK = "bench"

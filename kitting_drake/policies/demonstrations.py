@@ -31,101 +31,11 @@ from numpy.typing import NDArray
 
 from kitting_drake.common.errors import UserError
 from kitting_drake.policies.learning import Learning
-from systems.signals import Observation, PickPlaceAction, PixelGrid, PlanarPose
+from kitting_drake.policies.recorded import DemonstrationStep, FinalObservation, Stored
+from systems.signals import PixelGrid, PlanarPose
 
 FORMAT = "kitting_drake demonstrations"
 FORMAT_VERSION = 2
-
-
-@dataclass(frozen=True)
-class Stored:
-    """An array that stays in its file and is read whenever NumPy asks for it.
-
-    The file stays open meanwhile, so that nothing changes when another one takes its place.
-    """
-
-    file: h5py.File
-    dataset: str
-    """The name of a dataset. An open dataset would keep what was read of it in memory."""
-    shape: tuple[int, ...]
-    """The array's shape."""
-    dtype: np.dtype[Any]
-    """The type of its entries."""
-    row: int | None = None
-    """The row of the dataset that is meant; None: the whole dataset."""
-
-    @classmethod
-    def of(cls, dataset: h5py.Dataset, row: int | None = None) -> Stored:
-        """A dataset, or a row of it."""
-        shape = dataset.shape if row is None else dataset.shape[1:]
-        return cls(dataset.file, dataset.name, shape, dataset.dtype, row)
-
-    def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray[Any]:
-        """The array, read from the file.
-
-        Raises:
-            UserError: the file cannot be read any more.
-        """
-        try:
-            values = self.file[self.dataset][() if self.row is None else self.row]
-        except (OSError, LookupError, RuntimeError) as error:
-            raise UserError(f"cannot read {self.dataset} again: {error}") from error
-        return np.asarray(values, dtype)
-
-
-@dataclass(frozen=True)
-class Recorded:
-    """An observation as the file holds it, with colours in 8 bits: in memory, or in the file."""
-
-    rgb: NDArray[np.uint8] | Stored
-    """(3, rows, cols)."""
-    height: NDArray[np.float32] | Stored
-    """(rows, cols), metres above `grid.z_min`."""
-
-    @property
-    def image(self) -> NDArray[np.float32]:
-        """(4, rows, cols), as `Observation.image`: colours in [0, 1], height in metres; made, and
-        read where it is stored, each time."""
-        image = np.empty((4, *self.height.shape), np.float32)
-        np.divide(np.asarray(self.rgb), 255, out=image[:3], dtype=np.float32)
-        image[3] = np.asarray(self.height)
-        return image
-
-
-@dataclass(frozen=True)
-class DemonstrationStep(Recorded):
-    """One observation, and what the expert did."""
-
-    pick: PlanarPose
-    place: PlanarPose
-    object: str
-    """The name of what is picked."""
-    category: str = ""
-    """Its category, where the task has categories."""
-
-    @staticmethod
-    def of(
-        observation: Observation, action: PickPlaceAction, *, name: str, category: str = ""
-    ) -> DemonstrationStep:
-        """A step as it happened; colours are rounded to 8 bits."""
-        seen = record(observation)
-        return DemonstrationStep(seen.rgb, seen.height, action.pick, action.place, name, category)
-
-
-@dataclass(frozen=True)
-class FinalObservation(Recorded):
-    """What was seen when the expert said that nothing is left to do (`PickPlaceAction.stop`)."""
-
-    @staticmethod
-    def of(observation: Observation) -> FinalObservation:
-        """The observation; colours are rounded to 8 bits."""
-        seen = record(observation)
-        return FinalObservation(seen.rgb, seen.height)
-
-
-def record(observation: Observation) -> Recorded:
-    """An observation with its colours rounded to 8 bits."""
-    return Recorded(np.rint(observation.rgb * 255).astype(np.uint8), observation.height.copy())
 
 
 @dataclass(frozen=True)

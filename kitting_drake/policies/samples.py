@@ -12,8 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kitting_drake.policies.config import NetworkConfig
-from kitting_drake.policies.demonstrations import Demonstration, FinalObservation
+from kitting_drake.policies.demonstrations import Demonstration
 from kitting_drake.policies.images import Image, LabelledImage, Pictured
+from kitting_drake.policies.recorded import FinalObservation
 from systems.signals import Observation, PickPlaceAction, PixelGrid, fill_unseen
 
 

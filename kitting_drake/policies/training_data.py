@@ -14,13 +14,12 @@ from kitting_drake.common.errors import UserError
 from kitting_drake.policies.demonstrations import (
     Demonstration,
     Demonstrations,
-    FinalObservation,
-    Recorded,
     content_digest,
     read_demonstrations,
 )
 from kitting_drake.policies.images import LabelledImage, Pictured
 from kitting_drake.policies.learning import Learning
+from kitting_drake.policies.recorded import FinalObservation, Recorded
 from kitting_drake.policies.samples import (
     HeightsOnly,
     Scene,

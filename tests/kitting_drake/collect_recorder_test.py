@@ -13,7 +13,8 @@ from pydrake.systems.framework import Context
 from kitting_drake.cell import Cell, build_cell
 from kitting_drake.collect import DemonstrationRecorder
 from kitting_drake.episode import EpisodeObserver, EpisodeResult, ModeChange, run_episode
-from kitting_drake.policies.demonstrations import Demonstration, DemonstrationStep, Rejection
+from kitting_drake.policies.demonstrations import Demonstration, Rejection
+from kitting_drake.policies.recorded import DemonstrationStep
 from kitting_drake.scenario import Scenario
 from kitting_drake.scenario.policies import PythonPolicy
 from kitting_drake.scenario.schema import Pinhole

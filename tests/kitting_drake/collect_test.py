@@ -22,12 +22,12 @@ from kitting_drake.common.processes import LocalWorkers, ProcessCrashed
 from kitting_drake.common.seeds import DEMONSTRATION_SEEDS, TEST_SEEDS, VALIDATION_SEEDS, seeds_from
 from kitting_drake.policies.demonstrations import (
     Demonstration,
-    DemonstrationStep,
     Origin,
     Rejection,
     read_contents,
     read_demonstrations,
 )
+from kitting_drake.policies.recorded import DemonstrationStep
 from systems.signals import Observation, PickPlaceAction, PixelGrid, PlanarPose
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -23,14 +23,13 @@ from kitting_drake.policies import training as steps
 from kitting_drake.policies import training_run
 from kitting_drake.policies.demonstrations import (
     Demonstration,
-    DemonstrationStep,
-    FinalObservation,
     Learning,
     Origin,
     write_demonstrations,
 )
 from kitting_drake.policies.images import LabelledImage
 from kitting_drake.policies.networks import Networks
+from kitting_drake.policies.recorded import DemonstrationStep, FinalObservation
 from kitting_drake.policies.static_scenes import StaticScene, StaticScenes, write_static_scenes
 from kitting_drake.policies.training import Trainer
 from kitting_drake.policies.training_data import read_training_data

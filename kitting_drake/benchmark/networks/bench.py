@@ -17,10 +17,11 @@ from kitting_drake.benchmark.networks.timing import Timing, memory_bytes, time_e
 from kitting_drake.common.errors import UserError
 from kitting_drake.policies import config as sizes
 from kitting_drake.policies.config import PRESETS
-from kitting_drake.policies.demonstrations import read_demonstrations, record
+from kitting_drake.policies.demonstrations import read_demonstrations
 from kitting_drake.policies.device import preferred_type
 from kitting_drake.policies.images import Image, crop, rotation_matrix
 from kitting_drake.policies.networks import Networks
+from kitting_drake.policies.recorded import record
 from kitting_drake.policies.samples import Scene, scenes
 from kitting_drake.policies.weights import load_networks, save_weights
 from systems.signals import Observation, PickPlaceAction, PixelGrid, PlanarPose

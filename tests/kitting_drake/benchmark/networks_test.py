@@ -18,13 +18,9 @@ from kitting_drake.benchmark.networks.convolutions import Convolutions
 from kitting_drake.benchmark.networks.figure import draw_networks
 from kitting_drake.benchmark.networks.tables import count_text, network_tables, seconds_text
 from kitting_drake.benchmark.networks.timing import count_operations, time_each
-from kitting_drake.policies.demonstrations import (
-    Demonstration,
-    DemonstrationStep,
-    Origin,
-    write_demonstrations,
-)
+from kitting_drake.policies.demonstrations import Demonstration, Origin, write_demonstrations
 from kitting_drake.policies.device import preferred_type
+from kitting_drake.policies.recorded import DemonstrationStep
 from systems.signals import Observation, PickPlaceAction, PixelGrid, PlanarPose
 
 GRID = PixelGrid(rows=32, cols=48)

@@ -10,17 +10,15 @@ import pytest
 from kitting_drake.common.errors import UserError
 from kitting_drake.policies.demonstrations import (
     Demonstration,
-    DemonstrationStep,
-    FinalObservation,
     Learning,
     Origin,
     Rejection,
-    Stored,
     merge_demonstrations,
     read_contents,
     read_demonstrations,
     write_demonstrations,
 )
+from kitting_drake.policies.recorded import DemonstrationStep, FinalObservation, Stored
 from systems.signals import Observation, PickPlaceAction, PixelGrid, PlanarPose
 
 GRID = PixelGrid(rows=5, cols=7, z_max=0.3)

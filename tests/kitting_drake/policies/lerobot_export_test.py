@@ -21,13 +21,7 @@ from PIL import Image
 
 from kitting_drake.common.errors import UserError
 from kitting_drake.policies import lerobot_export
-from kitting_drake.policies.demonstrations import (
-    Demonstration,
-    DemonstrationStep,
-    FinalObservation,
-    Origin,
-    write_demonstrations,
-)
+from kitting_drake.policies.demonstrations import Demonstration, Origin, write_demonstrations
 from kitting_drake.policies.lerobot_export import (
     ACTION,
     COLOUR,
@@ -35,6 +29,7 @@ from kitting_drake.policies.lerobot_export import (
     export_lerobot,
     require_export,
 )
+from kitting_drake.policies.recorded import DemonstrationStep, FinalObservation
 from systems.signals import Observation, PickPlaceAction, PixelGrid, PlanarPose
 
 GRID = PixelGrid(rows=5, cols=7)

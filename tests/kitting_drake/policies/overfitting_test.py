@@ -8,11 +8,11 @@ import torch
 from numpy.typing import NDArray
 
 from kitting_drake.policies import training
-from kitting_drake.policies.demonstrations import FinalObservation
 from kitting_drake.policies.images import LabelledImage, move
 from kitting_drake.policies.learned_policy import LearnedPolicy
 from kitting_drake.policies.methods import make_networks
 from kitting_drake.policies.networks import Networks
+from kitting_drake.policies.recorded import FinalObservation
 from systems.signals import Observation, PixelGrid
 from tests.kitting_drake.policies.scenes import (
     ORIENTATIONS,

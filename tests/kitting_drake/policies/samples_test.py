@@ -4,12 +4,8 @@ import numpy as np
 import pytest
 
 from kitting_drake.policies import samples
-from kitting_drake.policies.demonstrations import (
-    Demonstration,
-    DemonstrationStep,
-    FinalObservation,
-    record,
-)
+from kitting_drake.policies.demonstrations import Demonstration
+from kitting_drake.policies.recorded import DemonstrationStep, FinalObservation, record
 from kitting_drake.policies.samples import (
     HeightsOnly,
     Scene,

@@ -10,10 +10,10 @@ import torch
 from kitting_drake.common.paths import GENERALIST, MODELS
 from kitting_drake.common.seeds import TEST_SEEDS
 from kitting_drake.policies.config import PICK_CROP, NetworkConfig
-from kitting_drake.policies.demonstrations import Recorded
 from kitting_drake.policies.learned_policy import LearnedPolicy
 from kitting_drake.policies.methods import make_networks
 from kitting_drake.policies.networks import SO2Networks
+from kitting_drake.policies.recorded import Recorded
 from kitting_drake.policies.weights import load_networks, read_weights_file
 from systems.signals import Observation, PixelGrid
 from tests.kitting_drake.policies.equivariance import relative_error, rotate_image, smooth_image

@@ -7,8 +7,8 @@ import torch
 
 from kitting_drake.policies import training
 from kitting_drake.policies.config import METHODS
-from kitting_drake.policies.demonstrations import FinalObservation
 from kitting_drake.policies.methods import make_networks
+from kitting_drake.policies.recorded import FinalObservation
 from kitting_drake.policies.training import Trainer
 from systems.signals import Observation
 from tests.kitting_drake.policies.scenes import config, final_scene, scene

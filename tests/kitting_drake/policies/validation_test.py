@@ -5,10 +5,10 @@ import numpy as np
 import pytest
 
 from kitting_drake.policies.config import NetworkConfig
-from kitting_drake.policies.demonstrations import FinalObservation, record
 from kitting_drake.policies.images import Image, make_action, rotation_matrix
 from kitting_drake.policies.learned_policy import Decision
 from kitting_drake.policies.methods import make_networks
+from kitting_drake.policies.recorded import FinalObservation, record
 from kitting_drake.policies.samples import Scene
 from kitting_drake.policies.validation import (
     ERRORS,
