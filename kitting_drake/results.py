@@ -15,8 +15,14 @@ from rich.console import Console
 
 from kitting_drake.common.command_line import run_command
 from kitting_drake.common.files import write_atomically
-from kitting_drake.paper.figure import draw_figure_6
-from kitting_drake.paper.page import Result, has_figure, paper_sections, read_results
+from kitting_drake.paper.figure import draw_figure_6, draw_table_1
+from kitting_drake.paper.page import (
+    Result,
+    has_figure,
+    has_table_1,
+    paper_sections,
+    read_results,
+)
 from kitting_drake.paper.rates import read_rates
 from kitting_drake.reporting.results_page import results_page
 from kitting_drake.reporting.robustness import robustness_table, with_figures
@@ -62,12 +68,14 @@ def main() -> int:
 
 
 def _draw(answers: Sequence[Result], folder: Path) -> None:
-    """Draws figure 6 of the tasks that it compares methods on."""
+    """Draws figure 6 of the tasks that it compares methods on, and table I."""
     by_name = {answer.cell.name: answer for answer in answers}
     for task in ("seen", "unseen"):
         if has_figure(task, answers):
             path = folder / f"results_{task}.png"
             write_atomically(path, draw_figure_6(task, by_name))
+    if has_table_1(answers):
+        write_atomically(folder / "results_ravens.png", draw_table_1(by_name))
 
 
 if __name__ == "__main__":

@@ -1,4 +1,5 @@
-"""Figures 6(a) and 6(b) of the paper, from the results of `benchmark paper`."""
+"""Figures 6(a) and 6(b) of the paper, and its table I as a figure, from the results of
+`benchmark paper`."""
 
 from __future__ import annotations
 
@@ -6,8 +7,9 @@ import io
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
-from kitting_drake.paper.cells import DEMONSTRATIONS
+from kitting_drake.paper.cells import DEMONSTRATIONS, RAVENS_DEMONSTRATIONS, TASKS
 from kitting_drake.paper.page import COLUMNS, Result
+from kitting_drake.reporting.ravens_table import PAPER as TABLE_1
 from kitting_drake.reporting.runs import METHODS
 
 if TYPE_CHECKING:
@@ -18,6 +20,16 @@ _COLOURS = {10: "#009e73", 100: "#d55e00"}
 _MARKERS = {"so2": "o", "equivariant_transporter": "s", "transporter": "^"}
 _STEP = 0.12
 """Between the markers of one N."""
+_ROWS = {
+    ("so2", 36): "#d55e00",
+    ("so2", 180): "#a01a3a",
+    ("equivariant_transporter", 36): "#0072b2",
+    ("transporter", 36): "#666666",
+}
+"""The rows of table I, method and N, and their colours."""
+_ROW_STEP = 0.19
+"""Between the markers of one number of demonstrations."""
+_STYLE = {"font.size": 10, "axes.spines.top": False, "axes.spines.right": False}
 
 
 def draw_figure_6(task: str, results: Mapping[str, Result]) -> bytes:
@@ -39,8 +51,7 @@ def draw_figure_6(task: str, results: Mapping[str, Result]) -> bytes:
 
     series = [(method, count) for count in sorted(DEMONSTRATIONS) for method in _MARKERS]
     image = io.BytesIO()
-    style = {"font.size": 10, "axes.spines.top": False, "axes.spines.right": False}
-    with plt.rc_context(style):
+    with plt.rc_context(_STYLE):
         figure, axis = plt.subplots(figsize=(7.0, 3.8), layout="constrained")
         for index, (method, count) in enumerate(series):
             for place, n in enumerate(COLUMNS):
@@ -95,3 +106,86 @@ def _draw_marker(
         **look,
     )
     axis.plot(where, 100 * summary["success_rate"], markerfacecolor="white", zorder=2, **look)
+
+
+def draw_table_1(results: Mapping[str, Result]) -> bytes:
+    """A PNG: the mean reward of each Ravens task over the number of demonstrations.
+
+    A filled marker is measured, with its 95 % interval; a diamond is with what goes beyond the
+    paper; a hollow one is what the paper gives for the same cell. What was not run is not there,
+    nor is the paper's beside it.
+
+    Args:
+        results: by the names of their cells.
+    """
+    # Imported here: the other commands should not wait for it.
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    tasks = [task.name for task in TASKS.values() if task.table == "I"]
+    counts = sorted(RAVENS_DEMONSTRATIONS)
+    image = io.BytesIO()
+    with plt.rc_context(_STYLE):
+        figure, axes = plt.subplots(
+            1, len(tasks), figsize=(9.6, 3.4), sharey=True, layout="constrained"
+        )
+        for column, (task, axis) in enumerate(zip(tasks, axes, strict=True)):
+            _draw_task(axis, task, column, results)
+            axis.set_title(task.replace("_", " "), fontsize=10)
+            axis.set_xticks(range(len(counts)), [str(count) for count in counts])
+            axis.set_xlim(-0.5, len(counts) - 0.5)
+            axis.grid(axis="y", color="0.9", zorder=0)
+            axis.set_axisbelow(True)
+        axes[0].set_ylim(top=102)
+        axes[0].set_ylabel("mean reward, %")
+        axes[len(tasks) // 2].set_xlabel("demonstrations")
+        axes[0].plot([], [], "o", color="0.4", label="filled: measured here")
+        hollow = {"color": "0.4", "markerfacecolor": "white"}
+        axes[0].plot([], [], "o", label="hollow: the paper's", **hollow)
+        pairs = [axis.get_legend_handles_labels() for axis in axes]
+        once = {label: handle for pair in pairs for handle, label in zip(*pair, strict=True)}
+        figure.legend(
+            once.values(),
+            once.keys(),
+            loc="outside lower center",
+            ncols=2,
+            frameon=False,
+            fontsize=9,
+        )
+        figure.savefig(image, format="png", dpi=130)
+        plt.close(figure)
+    return image.getvalue()
+
+
+def _draw_task(axis: Axes, task: str, column: int, results: Mapping[str, Result]) -> None:
+    """The panel of a task: its cells, and the paper's beside those as in the paper."""
+    for index, ((method, n), colour) in enumerate(_ROWS.items()):
+        for place, count in enumerate(sorted(RAVENS_DEMONSTRATIONS)):
+            where = place + _ROW_STEP * (index - (len(_ROWS) - 1) / 2)
+            name, row = f"{task}_{method}_{n}_{count}", f"{METHODS[method]}, N = {n}"
+            if name in results:
+                look = {"color": colour, "marker": _MARKERS[method], "linestyle": ""}
+                paper = TABLE_1[METHODS[method], n][column][place]
+                axis.plot(where, paper, markerfacecolor="white", zorder=2, **look)
+                _draw_reward(axis, where, results[name].summary, row, look)
+            if f"{name}_ours" in results:
+                look = {"color": colour, "marker": "d", "linestyle": ""}
+                summary = results[f"{name}_ours"].summary
+                _draw_reward(axis, where, summary, f"{row}, with what goes beyond the paper", look)
+
+
+def _draw_reward(
+    axis: Axes, where: float, summary: Mapping[str, Any], label: str, look: Mapping[str, str]
+) -> None:
+    rate, (low, high) = summary["success_rate"], summary["ci95"]
+    axis.errorbar(
+        where,
+        100 * rate,
+        yerr=[[100 * (rate - low)], [100 * (high - rate)]],
+        elinewidth=1.2,
+        label=label,
+        zorder=3,
+        **look,
+    )

@@ -8,8 +8,8 @@ import pytest
 from kitting_drake.common.errors import UserError
 from kitting_drake.common.paths import SCENARIOS
 from kitting_drake.paper.cells import PRESET, TASKS, Cell, Training, paper_cells
-from kitting_drake.paper.figure import draw_figure_6
-from kitting_drake.paper.page import has_figure, paper_sections, read_results
+from kitting_drake.paper.figure import draw_figure_6, draw_table_1
+from kitting_drake.paper.page import has_figure, has_table_1, paper_sections, read_results
 from kitting_drake.reporting.runs import described
 from kitting_drake.reporting.summary import summarise
 from kitting_drake.scenario.loader import load_scenario
@@ -130,3 +130,16 @@ def test_the_figure_is_drawn_from_what_there_is(folder: Path):
     drawn = draw_figure_6("unseen", results)
     assert drawn.startswith(b"\x89PNG")
     assert drawn != draw_figure_6("seen", results)
+
+
+def test_table_1_is_drawn_from_what_there_is(folder: Path):
+    found = read_results(folder)
+    assert has_table_1(found)
+    assert "results_ravens.png" in "\n".join(paper_sections(found, {}, "results"))
+    results = {result.cell.name: result for result in found}
+    drawn = draw_table_1(results)
+    assert drawn.startswith(b"\x89PNG")
+    del results["stack_block_pyramid_so2_36_10"]
+    assert drawn != draw_table_1(results)
+    assert not has_table_1(results.values())
+    assert "results_ravens.png" not in "\n".join(paper_sections(list(results.values()), {}, "r"))
