@@ -18,13 +18,16 @@ def proportion_interval(successes: int, trials: int) -> list[float]:
 
 
 def mean_interval(scores: Sequence[float]) -> list[float]:
-    """Student's interval of the mean of scores between 0 and 1, as [low, high].
+    """An interval of the mean of scores between 0 and 1, as [low, high].
 
-    Scores nearly all of which are alike do not tell how much they vary. Their interval is Wilson's,
-    as if each were a number of successes in one trial: no scores of that mean vary more.
+    It is Student's; of scores that are all 0 or 1 it is Wilson's. Scores nearly all of which are
+    alike do not tell how much they vary. Their interval is Wilson's too, as if each were a number
+    of successes in one trial: no scores of that mean vary more.
     """
     count, mean = len(scores), float(np.mean(scores))
-    _, counts = np.unique(np.round(scores, 9), return_counts=True)
+    values, counts = np.unique(np.round(scores, 9), return_counts=True)
+    if set(values) <= {0.0, 1.0}:
+        return proportion_interval(round(sum(scores)), count)
     if counts.max() >= _ALIKE * count:
         total = round(mean * count, 6)
         low, _ = proportion_interval(math.floor(total), count)

@@ -54,9 +54,10 @@ def summarise(
     """The content of `summary.json`.
 
     Rates are means of the episodes' rewards; an episode that failed or timed out counts 0. Where
-    reward is the share of the objects that are successes, the interval is Wilson's over the
-    objects, as if each were drawn anew. Where it is anything else (partial rewards, weights), it is
-    one over the episodes (see `mean_interval`); `ci95_method` says which.
+    reward is the share of the objects that are successes, and the task says that each is one by
+    itself, the interval is Wilson's over the objects, as if each were drawn anew. Where it is
+    anything else (partial rewards, weights, cubes that stand on one another), it is one over the
+    episodes (see `mean_interval`); `ci95_method` says which.
 
     `outcomes` has for each episode its seed, both rates, and for each object, by its name, 2: a
     strict success, 1: a success, 0: none. Two runs of the same seeds are compared by them.
@@ -88,7 +89,7 @@ def summarise(
         "episodes": len(episodes),
         "failed_episodes": sum(bool(episode["failure"]) for episode in episodes),
         "timed_out_episodes": sum(episode["timed_out"] for episode in episodes),
-        **_rates(episodes, objects_of),
+        **_rates(episodes, objects_of, chosen.scenario.task.objects_are_independent),
         **_statistics(objects, actions, causes),
         "categories": {
             name: _summarise_category(
@@ -190,7 +191,9 @@ def counted_actions(episodes: Sequence[Episode]) -> list[Entry]:
     ]
 
 
-def _rates(episodes: Sequence[Episode], objects_of: list[list[Entry]]) -> dict[str, Any]:
+def _rates(
+    episodes: Sequence[Episode], objects_of: list[list[Entry]], are_independent: bool
+) -> dict[str, Any]:
     """Both rates and their intervals."""
     scores, strict_scores = (
         [float(episode[key]) for episode in episodes]
@@ -201,23 +204,25 @@ def _rates(episodes: Sequence[Episode], objects_of: list[list[Entry]]) -> dict[s
         for key in ("success", "strict_success")
     )
     sizes = [len(objects) for objects in objects_of]
-    are_shares = (
-        len(set(sizes)) == 1
+    over_objects = (
+        are_independent
+        and len(set(sizes)) == 1
         and sizes[0] > 0
         and np.allclose([scores, strict_scores], np.array([counts, strict_counts]) / sizes[0])
     )
 
     def interval(scores: list[float], counts: list[int]) -> list[float]:
-        if are_shares:
+        if over_objects:
             return proportion_interval(sum(counts), sum(sizes))
         return mean_interval(scores)
 
+    method = "Wilson, over objects" if over_objects else "Student or Wilson, over episodes"
     return {
         "success_rate": float(np.mean(scores)),
         "ci95": interval(scores, counts),
         "strict_success_rate": float(np.mean(strict_scores)),
         "strict_ci95": interval(strict_scores, strict_counts),
-        "ci95_method": "Wilson, over objects" if are_shares else "Student or Wilson, over episodes",
+        "ci95_method": method,
     }
 
 

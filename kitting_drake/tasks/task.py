@@ -114,6 +114,9 @@ class TaskConfig:
 
     causes: tuple[str, ...] = (MISSED_GRASP, SLIPPED, MISPLACED, NEVER_PICKED)
     """The answers of `find_cause`, in the order of tables."""
+    objects_are_independent: bool = False
+    """Whether no object of a scene stands on another, or in its way, once it is placed: intervals
+    of rates are then over objects, else over episodes."""
 
     def make_scene(self, *, grid: PixelGrid, seed: int, base: Path) -> Scene:
         """The scene of a seed; the same seed gives the same scene.

@@ -56,6 +56,7 @@ class _KittingTask(TaskConfig):
     success_threshold: float = bounded(0.0035, 1e-6, 1.0)
 
     causes = diagnosis.CAUSES
+    objects_are_independent = True
 
     @property
     def learning(self) -> Learning:

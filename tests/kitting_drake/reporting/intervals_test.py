@@ -30,6 +30,10 @@ def test_equal_scores_do_not_make_certain(score: float, count: int):
     assert high - low > 1 / (count + 4)
 
 
+def test_of_successes_and_failures_it_is_wilsons():
+    assert mean_interval([1.0] * 13 + [0.0] * 7) == proportion_interval(13, 20)
+
+
 def test_a_failure_more_never_lifts_the_lower_end():
     ends = [mean_interval([1.0] * (100 - failures) + [2 / 3] * failures) for failures in range(30)]
     lows = [low for low, _ in ends]

@@ -1,3 +1,4 @@
+import dataclasses
 import json
 
 import pytest
@@ -5,6 +6,7 @@ import pytest
 from kitting_drake.reporting.intervals import mean_interval, proportion_interval
 from kitting_drake.reporting.summary import summarise
 from kitting_drake.scenario.schema import Scenario
+from kitting_drake.tasks import StackBlockPyramid
 from systems.placement import PoseWithin
 from tests.kitting_drake.reporting.episodes import (
     ADD_S,
@@ -154,6 +156,18 @@ def test_partial_rewards_vary_by_episode():
     assert summary["ci95_method"] == "Student or Wilson, over episodes"
     assert summary["categories"]["cup"]["success_rate"] == 0.0
     assert summary["success_threshold_mm"] is None
+
+
+def test_objects_that_stand_on_each_other_vary_by_episode():
+    """However their rewards come out: here as the share of the objects."""
+    chosen = dataclasses.replace(CHOSEN, scenario=Scenario(task=StackBlockPyramid()))
+    episodes = [make_episode(seed, [1.0, 9.0 if seed % 2 else 1.0]) for seed in range(6)]
+    summary = summarise(episodes, chosen, PoseWithin(), wall_seconds_total=1.0)
+    assert summary["ci95"] == pytest.approx(mean_interval([1.0, 0.5] * 3))
+    assert summary["ci95_method"] == "Student or Wilson, over episodes"
+    summary = summarised(episodes)
+    assert summary["ci95"] == pytest.approx(proportion_interval(9, 12))
+    assert summary["ci95_method"] == "Wilson, over objects"
 
 
 def test_nothing_but_failures_has_a_summary():
