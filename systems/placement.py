@@ -254,7 +254,8 @@ def evaluate_placements(
             (`complete_stages`).
 
     Returns:
-        One for each object, in their order. An object without a goal has no errors.
+        One for each object, in their order. An object without a goal has no errors, nor has one
+        whose pose is no number, as after a simulation that diverged.
     """
     placements = [Placement() for _ in objects]
     for index, goal_index, pose_index in _assign(objects, goals, poses):
@@ -282,8 +283,11 @@ def _assign(
     # Pairs that are not allowed cost more than all that are.
     cost = np.full((len(objects), len(goals)), 10.0 * _FAR * max(len(objects), 1))
     nearest = np.zeros(cost.shape, int)
+    known = [np.isfinite(pose.GetAsMatrix34()).all() for pose in poses]
     for column, goal in enumerate(goals):
         for row in goal.objects:
+            if not known[row]:
+                continue
             distances = [
                 displacement(objects[row], X_WGoal, poses[row], any_heading=goal.any_heading)
                 for X_WGoal in goal.poses
@@ -293,7 +297,7 @@ def _assign(
     return [
         (int(row), int(column), int(nearest[row, column]))
         for row, column in zip(*linear_sum_assignment(cost), strict=True)
-        if row in goals[column].objects
+        if row in goals[column].objects and known[row]
     ]
 
 

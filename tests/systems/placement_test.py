@@ -157,6 +157,15 @@ def test_interchangeable_objects_fill_each_others_goals():
     assert not any(item.success for item in evaluate_placements(objects, fixed, AddS(), order))
 
 
+def test_an_object_whose_pose_is_no_number_fills_no_goal():
+    objects, left = [bar(0), bar(1)], planar(0, 0)
+    goals = [goal(0, 1, pose=left, reward=1.0)]
+    nowhere = RigidTransform([np.nan, 0, 0])
+    lost, placed = evaluate_placements(objects, goals, AddS(), [nowhere, left])
+    assert (lost.goal, lost.success, placed.success) == (None, False, True)
+    assert not np.isfinite(lost.add_s)
+
+
 def test_any_pose_of_a_goal_will_do():
     corners = tuple(GOAL @ planar(0, 0, k * math.pi / 2) for k in range(4))
     placement = place(bar(), goal(0, poses=corners), corners[2] @ planar(0.002, 0, 0.01))

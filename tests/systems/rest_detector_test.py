@@ -118,6 +118,16 @@ def test_wakes_at_once():
     assert table.at_rest_after(1 / 64) == [False, True]
 
 
+@pytest.mark.parametrize("metres", [20.0, np.nan])
+def test_what_has_left_the_cell_rests_however_it_flies(metres: float):
+    table = Table()
+    table.poses[RIGHT] = RigidTransform([0, -0.1, metres])
+    assert table.at_rest_after(1 / 64) == [False, True]
+    table.move_by(RIGHT, metres=5.0, radians=1.0)
+    assert table.at_rest_after(1 / 64) == [False, True]
+    assert table.at_rest_after(PATIENCE) == [True, True]
+
+
 def test_an_awake_neighbour_wakes_a_sleeper():
     table = Table()
     table.poses[RIGHT] = RigidTransform([0, 0.1 - 0.02 - BESIDE, 0])

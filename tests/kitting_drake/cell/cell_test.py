@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from pydrake.multibody.math import SpatialVelocity
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import Context, EventStatus
 
@@ -222,6 +223,27 @@ def test_a_sleeping_stack_costs_nothing_and_wakes_together():
     assert locked(cell, root) == [True] * top + [False]
     Simulator(cell.diagram, root).AdvanceTo(root.get_time() + 0.01)
     assert contacts(root) == 1
+
+
+def test_what_is_flung_out_of_the_cell_comes_to_rest(cell: Cell):
+    """A free body that spins on and on overflows its quaternion in two seconds."""
+    simulator = Simulator(cell.diagram)
+    root = simulator.get_mutable_context()
+    context = cell.plant.GetMyMutableContextFromRoot(root)
+    # The oracle is busy with another meanwhile.
+    flung = cell.plant.get_body(cell.objects[-1].body)
+    velocity = SpatialVelocity([0, 0, 4000.0], [300.0, 200.0, 300.0])
+    cell.plant.SetFreeBodySpatialVelocity(context, flung, velocity)
+
+    def monitor(root: Context) -> EventStatus:
+        cell.apply_sleep(root)
+        return EventStatus.DidNothing()
+
+    simulator.set_monitor(monitor)
+    simulator.AdvanceTo(2.5)
+    assert np.isfinite(cell.plant.GetPositions(context)).all()
+    assert locked(cell, root)[-1]
+    assert not port(cell, "placements", root)[-1].success
 
 
 def test_sleep_can_be_switched_off():
