@@ -153,6 +153,20 @@ def _digest(path: Path) -> str:
 
 
 def _parse() -> argparse.Namespace:
+    parser = _parser()
+    arguments = parser.parse_args()
+    if arguments.demos is None and not arguments.export:
+        parser.error("--demos says what to learn from")
+    if arguments.demos is None and not (arguments.weights or arguments.output):
+        parser.error("--export needs --demos to train first, or --output or --weights to export")
+    if arguments.demos and arguments.export and arguments.method == "transporter":
+        parser.error("--export onnx: a transporter cannot be exported")
+    if arguments.weights and (arguments.demos or not arguments.export):
+        parser.error("--weights is for --export without --demos")
+    return arguments
+
+
+def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="python -m kitting_drake.train",
         description="Train a policy's networks from demonstrations. Run again, it resumes.",
@@ -219,16 +233,7 @@ def _parse() -> argparse.Namespace:
         "--weights", type=Path, metavar="FILE", help="what to export, without --demos"
     )
     parser.add_argument("--quiet", action="store_true", help="print nothing but errors")
-    arguments = parser.parse_args()
-    if arguments.demos is None and not arguments.export:
-        parser.error("--demos says what to learn from")
-    if arguments.demos is None and not (arguments.weights or arguments.output):
-        parser.error("--export needs --demos to train first, or --output or --weights to export")
-    if arguments.demos and arguments.export and arguments.method == "transporter":
-        parser.error("--export onnx: a transporter cannot be exported")
-    if arguments.weights and (arguments.demos or not arguments.export):
-        parser.error("--weights is for --export without --demos")
-    return arguments
+    return parser
 
 
 def _rate_type(text: str) -> float:

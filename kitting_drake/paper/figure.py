@@ -14,6 +14,7 @@ from kitting_drake.reporting.runs import METHODS
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 _COLOURS = {10: "#009e73", 100: "#d55e00"}
 """Green and orange, as in the paper."""
@@ -50,7 +51,6 @@ def draw_figure_6(task: str, results: Mapping[str, Result]) -> bytes:
     import matplotlib.pyplot as plt
 
     series = [(method, count) for count in sorted(DEMONSTRATIONS) for method in _MARKERS]
-    image = io.BytesIO()
     with plt.rc_context(_STYLE):
         figure, axis = plt.subplots(figsize=(7.0, 3.8), layout="constrained")
         for index, (method, count) in enumerate(series):
@@ -72,22 +72,8 @@ def draw_figure_6(task: str, results: Mapping[str, Result]) -> bytes:
         axis.set_ylabel("success, %")
         axis.grid(axis="y", color="0.9", zorder=0)
         axis.set_axisbelow(True)
-        axis.plot([], [], "o", color="0.4", label="filled: strict success")
-        hollow = {"color": "0.4", "markerfacecolor": "white"}
-        axis.plot([], [], "o", label="hollow: by the paper's measure", **hollow)
-        handles, labels = axis.get_legend_handles_labels()
-        once = dict(zip(labels, handles, strict=True))
-        figure.legend(
-            once.values(),
-            once.keys(),
-            loc="outside lower center",
-            ncols=2,
-            frameon=False,
-            fontsize=9,
-        )
-        figure.savefig(image, format="png", dpi=130)
-        plt.close(figure)
-    return image.getvalue()
+        _explain(axis, "strict success", "by the paper's measure")
+        return _finish(figure)
 
 
 def _draw_marker(
@@ -126,7 +112,6 @@ def draw_table_1(results: Mapping[str, Result]) -> bytes:
 
     tasks = [task.name for task in TASKS.values() if task.table == "I"]
     counts = sorted(RAVENS_DEMONSTRATIONS)
-    image = io.BytesIO()
     with plt.rc_context(_STYLE):
         figure, axes = plt.subplots(
             1, len(tasks), figsize=(9.6, 3.4), sharey=True, layout="constrained"
@@ -141,22 +126,8 @@ def draw_table_1(results: Mapping[str, Result]) -> bytes:
         axes[0].set_ylim(top=102)
         axes[0].set_ylabel("mean reward, %")
         axes[len(tasks) // 2].set_xlabel("demonstrations")
-        axes[0].plot([], [], "o", color="0.4", label="filled: measured here")
-        hollow = {"color": "0.4", "markerfacecolor": "white"}
-        axes[0].plot([], [], "o", label="hollow: the paper's", **hollow)
-        pairs = [axis.get_legend_handles_labels() for axis in axes]
-        once = {label: handle for pair in pairs for handle, label in zip(*pair, strict=True)}
-        figure.legend(
-            once.values(),
-            once.keys(),
-            loc="outside lower center",
-            ncols=2,
-            frameon=False,
-            fontsize=9,
-        )
-        figure.savefig(image, format="png", dpi=130)
-        plt.close(figure)
-    return image.getvalue()
+        _explain(axes[0], "measured here", "the paper's")
+        return _finish(figure)
 
 
 def _draw_task(axis: Axes, task: str, column: int, results: Mapping[str, Result]) -> None:
@@ -189,3 +160,29 @@ def _draw_reward(
         zorder=3,
         **look,
     )
+
+
+def _explain(axis: Axes, filled: str, hollow: str) -> None:
+    """Adds to the legend what filled and hollow markers are."""
+    axis.plot([], [], "o", color="0.4", label=f"filled: {filled}")
+    axis.plot([], [], "o", color="0.4", markerfacecolor="white", label=f"hollow: {hollow}")
+
+
+def _finish(figure: Figure) -> bytes:
+    """A PNG of a figure with its legend, in which each label stands once; closes the figure."""
+    import matplotlib.pyplot as plt
+
+    pairs = [axis.get_legend_handles_labels() for axis in figure.axes]
+    once = {label: handle for pair in pairs for handle, label in zip(*pair, strict=True)}
+    figure.legend(
+        once.values(),
+        once.keys(),
+        loc="outside lower center",
+        ncols=2,
+        frameon=False,
+        fontsize=9,
+    )
+    image = io.BytesIO()
+    figure.savefig(image, format="png", dpi=130)
+    plt.close(figure)
+    return image.getvalue()

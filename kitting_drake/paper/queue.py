@@ -301,7 +301,14 @@ def _end(process: subprocess.Popen[str]) -> None:
 
 
 def run_paper(queue: Queue, cells: Sequence[Cell]) -> dict[str, str]:
-    """Fills cells, as `Queue.run` does, and ends what it began when it is ended itself."""
+    """Fills cells, as `Queue.run` does, and ends what it began when it is ended itself.
+
+    Returns:
+        For each cell that could not be filled, by its name, why.
+
+    Raises:
+        UserError: a result is not that of its cell.
+    """
     # What goes on would keep the next queue out.
     before = signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))
     try:
