@@ -97,6 +97,7 @@ def _settings(
         stop=bool(learned.finals(1)) if begun is None else begun.stop,
         validate_every=arguments.validate_every,
         seed=arguments.seed,
+        angle_only=arguments.angle_only,
         start=None if begun is None else _digest(arguments.start),
         start_seeds=seeds,
         device=preferred_device().type,
@@ -117,7 +118,9 @@ def _checked_start(
             f"{arguments.start} learned from the seed {min(shared)}, which is one to validate by: "
             "give others by --validation"
         )
-    for flag in ("method", "preset", "orientations"):
+    # The angle network alone depends on N, and is then a fresh one.
+    fixed = ("method", "preset") if arguments.angle_only else ("method", "preset", "orientations")
+    for flag in fixed:
         given, found = getattr(arguments, flag), getattr(config, flag)
         if given != found:
             raise UserError(f"{arguments.start} has {flag} {found}: give --{flag} {found}")
@@ -161,6 +164,10 @@ def _parse() -> argparse.Namespace:
         parser.error("--export needs --demos to train first, or --output or --weights to export")
     if arguments.demos and arguments.export and arguments.method == "transporter":
         parser.error("--export onnx: a transporter cannot be exported")
+    if arguments.angle_only and not arguments.start:
+        parser.error("--angle-only needs --from: the weights of all other networks")
+    if arguments.angle_only and arguments.method == "transporter":
+        parser.error("--angle-only: a transporter has no network for angles alone")
     if arguments.weights and (arguments.demos or not arguments.export):
         parser.error("--weights is for --export without --demos")
     return arguments
@@ -197,6 +204,12 @@ def _parser() -> argparse.ArgumentParser:
         metavar="FILE.safetensors",
         help="weights to begin with, such as models/policies/generalist.safetensors (default: "
         "fresh ones)",
+    )
+    parser.add_argument(
+        "--angle-only",
+        action="store_true",
+        help="train the pick-angle network alone, from fresh weights; all else is that of --from, "
+        "which may have been trained at another N",
     )
     parser.add_argument("--method", choices=METHODS, default="so2")
     parser.add_argument("--preset", choices=PRESETS, default="small", help="size of the networks")

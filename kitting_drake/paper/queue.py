@@ -177,6 +177,8 @@ class Queue:
 
     def _train(self, training: Training, rate: float, folder: Path) -> None:
         task = TASKS[training.task]
+        base = training.base
+        start = () if base is None else ("--angle-only", "--from", self.train(base))
         self._command(
             "train",
             *("--demos", self.collect(task, validation=False)),
@@ -191,6 +193,7 @@ class Queue:
             *(("--taken-only",) if training.taken_only else ()),
             *(("--rigid",) if training.rigid else ()),
             *("--validate-every", VALIDATE_EVERY),
+            *start,
             *("--seed", training.seed),
             folder=folder,
         )
@@ -206,12 +209,20 @@ class Queue:
             ("demonstrations", training.demonstrations),
             ("steps", training.steps),
             ("seed", training.seed),
+            ("angle_only", training.angle_only),
         ):
-            if summary[key] != wanted:
-                raise Failed(f"{folder}: its {key} is {summary[key]}, not {wanted}: delete it")
+            found = summary.get(key, False)
+            if found != wanted:
+                raise Failed(f"{folder}: its {key} is {found}, not {wanted}: delete it")
 
     def _best_rate(self, method: str) -> float:
-        """The learning rate at which a baseline does best on validation scenes; all are written."""
+        """The learning rate at which a baseline does best on validation scenes; all are written.
+
+        Where it is known what each came to, none is tried again.
+        """
+        told = read_rates(self.results).get(method, {})
+        if {f"{rate:g}" for rate in LEARNING_RATES} <= set(told):
+            return float(best_rate(told))
         costs = {}
         for rate in LEARNING_RATES:
             weights = self.train(dataclasses.replace(reference(method), learning_rate=rate))

@@ -65,6 +65,7 @@ class Trainer:
         decay: bool = False,
         curvature: bool = False,
         reflection: bool = False,
+        only: str | None = None,
     ) -> None:
         """
         Args:
@@ -76,6 +77,8 @@ class Trainer:
                 over the first hundred) instead of keeping it constant.
             curvature: see `augment`.
             reflection: see `augment`.
+            only: the loss whose modules are trained, in the very steps that they take when all
+                are; the others keep their weights. None: all losses.
         """
         self.networks = networks
         self.seed = seed
@@ -95,6 +98,7 @@ class Trainer:
                 fused=True,
             )
             for name, modules in networks.modules_by_loss().items()
+            if only in (None, name)
         }
 
     def rate(self, step: int) -> float:
@@ -124,7 +128,9 @@ class Trainer:
         self.networks.train()
         values = {}
         for name, loss_of in self.networks.losses(draw.sample, draw.random):
-            optimiser = self.optimisers[name]
+            optimiser = self.optimisers.get(name)
+            if optimiser is None:
+                continue
             for group in optimiser.param_groups:
                 group["lr"] = self.rate(self.step_count)
             optimiser.zero_grad(set_to_none=True)

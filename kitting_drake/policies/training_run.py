@@ -83,6 +83,8 @@ class Settings:
     """Whether the networks learn from final observations that there is nothing left to pick."""
     validate_every: int
     seed: int
+    angle_only: bool
+    """Whether only the pick-angle network is trained, afresh, beside those that it begins with."""
     start: str | None
     """A digest of the weights that training begins with; None: fresh ones."""
     start_seeds: tuple[int, ...]
@@ -91,9 +93,12 @@ class Settings:
     compute_type: str
 
 
-def _fresh(settings: Settings, learned: TrainingData) -> Networks:
-    """Networks with fresh weights."""
+def _begun(settings: Settings, learned: TrainingData, start: Path | None) -> Networks:
+    """The networks before the first step: fresh ones, or those of a file."""
+    torch.manual_seed(settings.seed)
     try:
+        if start is not None:
+            return load_trainable(start, settings.orientations if settings.angle_only else None)
         config = NetworkConfig(
             method=settings.method,
             preset=settings.preset,
@@ -102,7 +107,6 @@ def _fresh(settings: Settings, learned: TrainingData) -> Networks:
             stop=settings.stop,
             **normalisation(learned.scenes(_MOST_NORMALISED)),  # type: ignore[arg-type]
         )
-        torch.manual_seed(settings.seed)
         networks = make_networks(config)
         networks.check_orientations(settings.orientations)
     except ValueError as error:
@@ -146,7 +150,7 @@ class TrainingRun:
             samples = held_out.samples(taken_only=True, colour=settings.colour)
             chosen = evenly_chosen(list(range(len(samples))), _MOST_VALIDATED)
             self._judged = [samples[index] for index in chosen]
-        networks = _fresh(settings, learned) if start is None else load_trainable(start)
+        networks = _begun(settings, learned, start)
         networks.to(settings.device)
         networks.compute_type = preferred_type()
         self.trainer = Trainer(
@@ -157,6 +161,7 @@ class TrainingRun:
             decay=settings.decay,
             curvature=not settings.rigid,
             reflection=settings.reflection,
+            only="pick_angle" if settings.angle_only else None,
         )
         self.best: dict[str, Any] | None = None
         self.seconds = 0.0

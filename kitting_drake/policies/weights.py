@@ -157,23 +157,35 @@ def load_networks(path: Path, compute_type: torch.dtype = torch.float32) -> Netw
     return networks
 
 
-def load_trainable(path: Path) -> Networks:
+def load_trainable(path: Path, fresh_angle_at: int | None = None) -> Networks:
     """Networks as they are trained, to go on from a file's weights.
 
     The optimisers' state is not in a file: training begins anew, from these weights.
 
     Args:
         path: a file that `save_weights` wrote.
+        fresh_angle_at: N of the result, whose pick-angle network then has fresh weights: of the
+            `FactoredNetworks` it is the only one in whose architecture N may be. None: the file's
+            N, and all its weights.
 
     Raises:
         UserError: as `load_networks`.
+        ValueError: there are no such networks at that N.
     """
     plain = load_networks(path)
-    networks = make_networks(plain.config)
+    config = plain.config
+    if fresh_angle_at is not None:
+        config = dataclasses.replace(config, orientations=fresh_angle_at)
+    networks = make_networks(config)
+    networks.check_orientations(config.orientations)
     stored = dict(plain.named_modules())
+
+    def is_fresh(name: str) -> bool:
+        return fresh_angle_at is not None and name.split(".")[0] == "beta"
+
     with torch.no_grad():
         for name, module in networks.named_modules():
-            if isinstance(module, ExpandedConv2d):
+            if isinstance(module, ExpandedConv2d) and not is_fresh(name):
                 layer = stored[name]
                 _fit_weights(module, layer.weight)
                 if module.bias is not None:
@@ -181,7 +193,7 @@ def load_trainable(path: Path) -> Networks:
         rest = dict(plain.named_parameters())
         expanded = {n for n, m in networks.named_modules() if isinstance(m, ExpandedConv2d)}
         for name, parameter in networks.named_parameters():
-            if name.rpartition(".")[0] not in expanded:
+            if name.rpartition(".")[0] not in expanded and not is_fresh(name):
                 parameter.copy_(rest[name])
     return networks
 

@@ -228,6 +228,7 @@ class Learned(PolicyConfig):
             "compute_type": str(preferred_type()).removeprefix("torch."),
             **{key: file.card.get(key) for key in _TOLD},
             "training_seed": file.card.get("seed"),
+            "angle_only": file.card.get("angle_only", False),
         }
 
     def digest(self, base: Path) -> str | None:

@@ -157,6 +157,46 @@ def test_begins_with_the_weights_of_a_file(
     )
 
 
+@pytest.mark.parametrize("method", ["so2", "equivariant_transporter"])
+def test_the_angle_network_alone_is_trained_at_another_n(demos: Path, tmp_path: Path, method: str):
+    both = ("--method", method, "--steps", 1)
+    train(demos, tmp_path / "first", *both, "--orientations", 36)
+    first = tmp_path / "first" / "policy.safetensors"
+    train(demos, tmp_path / "angle", *both, "--orientations", 48, "--angle-only", "--from", first)
+    path = tmp_path / "angle" / first.name
+    old, new = (load_networks(file).state_dict() for file in (first, path))
+    shared = {name for name in old if not name.startswith("beta.")}
+    for name in shared:
+        torch.testing.assert_close(new[name], old[name], atol=1e-5, rtol=1e-4)
+    others = old.keys() - shared
+    assert others == new.keys() - shared
+    # N is part of the baseline's angle network.
+    alike = all(old[name].shape == new[name].shape for name in others)
+    assert alike == (method == "so2")
+    file = read_weights_file(path)
+    assert file.config.orientations == 48
+    assert file.card["angle_only"]
+    assert not read_weights_file(first).card["angle_only"]
+    assert set(log(path.parent)[-1]) == {"step", "pick_angle"}
+
+
+@pytest.mark.parametrize(
+    ("flags", "sentence"),
+    [
+        ((), "--angle-only needs --from"),
+        (("--method", "transporter", "--from", "x"), "a transporter has no network for angles"),
+    ],
+)
+def test_the_angle_network_alone_needs_the_others(
+    demos: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], flags: tuple, sentence: str
+):
+    with pytest.MonkeyPatch.context() as patch, pytest.raises(SystemExit) as left:
+        patch.setattr(sys, "argv", ["train", *words(demos, tmp_path, "--angle-only", *flags)])
+        training.main()
+    assert left.value.code == 2
+    assert sentence in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(
     ("learning", "flags", "taken_only", "rigid", "reflection"),
     [

@@ -69,6 +69,7 @@ class Pretending(Queue):
             summary = {"best": {"cost_mm": 1.0 if rate == LEARNING_RATES[1] else 2.0}}
             summary |= {key: int(flags[f"--{key}"]) for key in COUNTED}
             summary |= {"method": flags["--method"], "preset": flags["--preset"]}
+            summary["angle_only"] = "--angle-only" in words
             (folder / "summary.json").write_text(json.dumps(summary))
             (folder / "policy.safetensors").touch()
         else:
@@ -152,6 +153,34 @@ def test_it_chooses_a_learning_rate_and_does_nothing_twice(queue: Pretending):
     assert queue.calls == []
 
 
+def test_learning_rates_that_are_known_are_not_tried_again(queue: Pretending):
+    costs = {f"{rate:g}": 1.0 + (rate != LEARNING_RATES[1]) for rate in LEARNING_RATES}
+    (queue.results / RATES).write_text(json.dumps({"transporter": costs}))
+    queue.run([THEIRS])
+    assert [call for call in queue.calls if call.startswith("train")] == [
+        f"train unseen_transporter_36_10_seed0_lr{LEARNING_RATES[1]:g}"
+    ]
+
+
+def test_what_has_no_n_is_trained_once(queue: Pretending):
+    """Of the Equivariant Transporter everything but the angle network."""
+    costs = {f"{rate:g}": rate for rate in LEARNING_RATES}
+    (queue.results / RATES).write_text(json.dumps({"equivariant_transporter": costs}))
+    cells = {cell.name: cell for cell in paper_cells()}
+    for n in (36, 72):
+        queue.train(cells[f"seen_equivariant_transporter_{n}_100"].policy)
+    rate = min(LEARNING_RATES)
+    assert [call for call in queue.calls if call.startswith("train")] == [
+        f"train seen_equivariant_transporter_180_100_seed0_lr{rate:g}",
+        f"train seen_equivariant_transporter_36_100_angle_only_seed0_lr{rate:g}",
+        f"train seen_equivariant_transporter_72_100_angle_only_seed0_lr{rate:g}",
+    ]
+    whole = cells["seen_equivariant_transporter_180_100"].policy
+    assert whole.base is None
+    assert cells["seen_equivariant_transporter_36_100"].policy.base == whole
+    assert cells["block_insertion_equivariant_transporter_36_100"].policy.base is None
+
+
 def test_what_is_trained_does_not_wait_behind_what_is_not(queue: Pretending):
     queue.train(OURS.policy)
     other = dataclasses.replace(OURS, policy=Training("unseen", "so2", 180, 100))
@@ -199,6 +228,7 @@ def test_what_fails_keeps_nothing_else_up(queue: Pretending):
         (lambda s: s["resolved_scenario"]["planner"].pop("heavy_load"), "an earlier hand"),
         (lambda s: s["policy_details"].update(scenario="kitting_seen:Mine"), "scenario is kitting"),
         (lambda s: s["policy_details"].update(continuous=True), "continuous is True"),
+        (lambda s: s["policy_details"].update(angle_only=True), "angle_only is True"),
         (lambda s: s["seeds"].pop(), "seeds are not 3000 to 3099"),
     ],
 )

@@ -73,6 +73,19 @@ def test_a_final_observation_trains_where_to_pick_and_changes_nothing_else(
     assert changed == {"alpha"}
 
 
+def test_one_loss_alone_is_trained_as_beside_the_others():
+    whole, alone = trainer(learning_rate=1e-3), trainer(learning_rate=1e-3, only="pick_angle")
+    before = copy.deepcopy(alone.networks.state_dict())
+    for _ in range(2):
+        losses = whole.step([scene(0)]), alone.step([scene(0)])
+        assert losses[1] == {"pick_angle": losses[0]["pick_angle"]}
+    expected, found = (item.networks.state_dict() for item in (whole, alone))
+    for name, values in found.items():
+        trained = name.startswith("beta.")
+        assert torch.equal(values, (expected if trained else before)[name]), name
+    assert not torch.equal(expected["alpha.lift.weights"], before["alpha.lift.weights"])
+
+
 def test_what_is_prepared_is_only_for_the_step_and_the_samples_that_it_was_drawn_for():
     samples, others = [scene(0), scene(1)], [scene(2)]
     one, other = trainer(), trainer()
