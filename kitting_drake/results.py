@@ -10,11 +10,13 @@ import argparse
 import os
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 from rich.console import Console
 
 from kitting_drake.common.command_line import run_command
 from kitting_drake.common.files import write_atomically
+from kitting_drake.paper.efficiency import read_efficiency
 from kitting_drake.paper.figure import draw_figure_6, draw_table_1
 from kitting_drake.paper.page import (
     Result,
@@ -54,9 +56,10 @@ def main() -> int:
     link = os.path.relpath(arguments.results, arguments.output.parent)
     answers = read_results(arguments.results / "paper")
     rates = read_rates(arguments.results / "paper")
-    page = results_page(runs, link, paper_sections(answers, rates, link))
+    efficiency = read_efficiency(arguments.results / "paper")
+    page = results_page(runs, link, paper_sections(answers, rates, link, efficiency))
     write_atomically(arguments.output, page)
-    _draw(answers, arguments.output.parent)
+    _draw(answers, efficiency, arguments.output.parent)
     robustness = arguments.output.with_name("robustness.md")
     if robustness.exists():
         page = with_figures(robustness.read_text(), robustness_table(runs))
@@ -67,13 +70,18 @@ def main() -> int:
     return 0
 
 
-def _draw(answers: Sequence[Result], folder: Path) -> None:
-    """Draws figure 6 of the tasks that it compares methods on, and table I."""
+def _draw(answers: Sequence[Result], efficiency: dict[str, Any] | None, folder: Path) -> None:
+    """Draws figure 6 of the tasks that it compares methods on, what networks cost, and table I."""
     by_name = {answer.cell.name: answer for answer in answers}
     for task in ("seen", "unseen"):
         if has_figure(task, answers):
             path = folder / f"results_{task}.png"
             write_atomically(path, draw_figure_6(task, by_name))
+    if answers and efficiency is not None:
+        # Only who has something to draw waits for torch.
+        from kitting_drake.benchmark.networks.figure import draw_networks
+
+        draw_networks(efficiency, folder / "networks.png")
     if has_table_1(answers):
         write_atomically(folder / "results_ravens.png", draw_table_1(by_name))
 

@@ -24,6 +24,7 @@ from kitting_drake.paper.cells import (
     Training,
     paper_cells,
 )
+from kitting_drake.paper.efficiency import EFFICIENCY, efficiency_section
 from kitting_drake.paper.rates import RATES, Rates, best_rate, read_rates
 from kitting_drake.reporting.markdown import markdown_table, rate_text
 from kitting_drake.reporting.paired import OWN, STRICT, over_tools, paired_difference, points_text
@@ -125,7 +126,7 @@ def read_results(folder: Path) -> list[Result]:
     rates = read_rates(folder)
     found = {}
     for path in sorted(folder.glob("*.json")):
-        if path.name == RATES:
+        if path.name in (RATES, EFFICIENCY):
             continue
         cell = cells.get(path.stem)
         if cell is None:
@@ -142,13 +143,19 @@ def read_results(folder: Path) -> list[Result]:
     return [found[name] for name in cells if name in found]
 
 
-def paper_sections(results: Sequence[Result], rates: Rates, link: str) -> list[str]:
+def paper_sections(
+    results: Sequence[Result],
+    rates: Rates,
+    link: str,
+    efficiency: Mapping[str, Any] | None = None,
+) -> list[str]:
     """The sections of the page; none without results.
 
     Args:
         results: of `read_results`.
         rates: what each learning rate of each baseline came to, in mm on validation scenes.
         link: the folder of all results, from the page's own.
+        efficiency: what `benchmark networks` measured, if it was.
     """
     if not results:
         return []
@@ -166,6 +173,8 @@ def paper_sections(results: Sequence[Result], rates: Rates, link: str) -> list[s
         if has_figure(task, results):
             sections.append(f"![Figure 6 of {task} tools](results_{task}.png)\n")
         sections.append(_figure_table(task, by_name))
+    if efficiency is not None:
+        sections.append(efficiency_section(efficiency))
     sections += _beyond_the_paper(by_name)
     sections += _table_1(by_name)
     sections += _fresh_tools(by_name)

@@ -10,10 +10,9 @@ from kitting_drake.benchmark.networks.tables import (
     MEASURE_NAMES,
     METHOD_NAMES,
     RUNG_NAMES,
-    count_text,
-    seconds_text,
 )
 from kitting_drake.common.files import write_atomically
+from kitting_drake.reporting.quantities import count_text, seconds_text
 
 _METHODS = {"so2": "#009e73", "equivariant_transporter": "#e69f00", "transporter": "#56646f"}
 """Colours for the colour-blind too; the first two are the paper's green and orange."""

@@ -6,6 +6,8 @@ from typing import Any
 
 from rich.table import Table
 
+from kitting_drake.reporting.quantities import count_text, seconds_text
+
 METHOD_NAMES = {
     "so2": "SO(2)",
     "equivariant_transporter": "Equiv. Transporter",
@@ -39,23 +41,6 @@ def network_tables(measured: dict[str, Any]) -> list[Table]:
         _share_table(measured),
         _level_table(measured),
     ]
-
-
-def seconds_text(seconds: float | None) -> str:
-    """A time with three digits, in s or ms."""
-    if seconds is None:
-        return "-"
-    if seconds >= 100:
-        return f"{seconds:.0f} s"
-    return f"{seconds:.3g} s" if seconds >= 1 else f"{1e3 * seconds:.3g} ms"
-
-
-def count_text(count: float) -> str:
-    """A count with three digits and a prefix: k, M, G or T."""
-    for power, letter in ((1e12, "T"), (1e9, "G"), (1e6, "M"), (1e3, "k")):
-        if count >= power:
-            return f"{count / power:.3g} {letter}"
-    return f"{count:.3g}"
 
 
 def _table(title: str, *headings: str) -> Table:

@@ -16,11 +16,15 @@ from kitting_drake.benchmark.networks import benchmark_networks
 from kitting_drake.benchmark.networks.bench import Plan, synthetic_scene
 from kitting_drake.benchmark.networks.convolutions import Convolutions
 from kitting_drake.benchmark.networks.figure import draw_networks
-from kitting_drake.benchmark.networks.tables import count_text, network_tables, seconds_text
+from kitting_drake.benchmark.networks.tables import network_tables
 from kitting_drake.benchmark.networks.timing import count_operations, time_each
+from kitting_drake.common.errors import UserError
+from kitting_drake.paper.efficiency import EFFICIENCY, efficiency_section, read_efficiency
 from kitting_drake.policies.demonstrations import Demonstration, Origin, write_demonstrations
 from kitting_drake.policies.device import preferred_type
 from kitting_drake.policies.recorded import DemonstrationStep
+from kitting_drake.reporting.quantities import count_text, seconds_text
+from kitting_drake.reporting.runs import METHODS as NAMES
 from systems.signals import Observation, PickPlaceAction, PixelGrid, PlanarPose
 
 GRID = PixelGrid(rows=32, cols=48)
@@ -174,6 +178,26 @@ def test_draws_and_prints_what_was_measured(measured: dict[str, Any], tmp_path: 
     for table in network_tables(measured):
         console.print(table)
     assert console.export_text().count("not run: ~99 s") == 4
+
+
+def test_the_page_of_results_tells_what_the_angle_costs(measured: dict[str, Any], tmp_path: Path):
+    assert read_efficiency(tmp_path) is None
+    path = tmp_path / EFFICIENCY
+    path.write_text(json.dumps(measured))
+    text = efficiency_section(read_efficiency(tmp_path))
+    lines = [line.split("|")[1:-1] for line in text.splitlines() if line.startswith("| ")]
+    table = {line[0].strip(): [cell.strip() for cell in line[1:]] for line in lines}
+    assert table["method"] == ["preset", "N = 26", "N = 30", "growth"]
+    rows = {row["method"]: row for row in measured["pick_angle_growth"]}
+    for method in METHODS[:2]:
+        cells = table[NAMES[method]]
+        assert cells[0] == "tiny"
+        assert all(cell.endswith(" ms") for cell in cells[1:3])
+        assert cells[3].startswith(f"{rows[method]['parameters']:.2f}, ")
+    assert NAMES["transporter"] not in table
+    path.write_text('{"machine": 7}')
+    with pytest.raises(UserError, match="is no file of benchmark networks: delete it"):
+        read_efficiency(tmp_path)
 
 
 def test_the_synthetic_scene_has_its_picks_on_tools():
