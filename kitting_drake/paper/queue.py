@@ -216,25 +216,23 @@ class Queue:
                 raise Failed(f"{folder}: its {key} is {found}, not {wanted}: delete it")
 
     def _best_rate(self, method: str) -> float:
-        """The learning rate at which a baseline does best on validation scenes; all are written.
+        """The learning rate at which a baseline does best on validation scenes.
 
-        Where it is known what each came to, none is tried again.
+        What each comes to is written as soon as it is known, and not tried again.
         """
-        told = read_rates(self.results).get(method, {})
-        if {f"{rate:g}" for rate in LEARNING_RATES} <= set(told):
-            return float(best_rate(told))
-        costs = {}
         for rate in LEARNING_RATES:
-            weights = self.train(dataclasses.replace(reference(method), learning_rate=rate))
-            summary = json.loads(weights.with_name("summary.json").read_text())
-            costs[rate] = summary["best"]["cost_mm"]
+            if f"{rate:g}" not in read_rates(self.results).get(method, {}):
+                weights = self.train(dataclasses.replace(reference(method), learning_rate=rate))
+                summary = json.loads(weights.with_name("summary.json").read_text())
+                self._keep_rate(method, rate, summary["best"]["cost_mm"])
+        return float(best_rate(read_rates(self.results)[method]))
+
+    def _keep_rate(self, method: str, rate: float, cost_mm: float) -> None:
         file = self.results / RATES
         with self._only_one_makes(file):
             known = read_rates(self.results)
-            found = known | {method: {f"{rate:g}": cost for rate, cost in costs.items()}}
-            if found != known:
-                write_json(file, dict(sorted(found.items())))
-        return float(best_rate(found[method]))
+            costs = known.get(method, {}) | {f"{rate:g}": cost_mm}
+            write_json(file, dict(sorted((known | {method: costs}).items())))
 
     def _evaluate(self, cell: Cell, weights: Path | None) -> None:
         task = TASKS[cell.task]
