@@ -19,13 +19,12 @@ from kitting_drake.common.files import write_atomically
 from kitting_drake.paper.efficiency import read_efficiency
 from kitting_drake.paper.figure import draw_figure_6, draw_table_1
 from kitting_drake.paper.page import (
-    Result,
     has_figure,
     has_table_1,
     paper_sections,
-    read_results,
 )
 from kitting_drake.paper.rates import read_rates
+from kitting_drake.paper.result import Result, read_results
 from kitting_drake.reporting.results_page import results_page
 from kitting_drake.reporting.robustness import robustness_table, with_figures
 from kitting_drake.reporting.runs import read_runs

@@ -50,7 +50,8 @@ class Task:
     validation: int = 24
 
 
-_KITTING = ("unseen", "seen")
+FIGURE_6 = ("unseen", "seen")
+"""The tasks of figure 6."""
 TASKS = {
     task.name: task
     for task in (
@@ -305,10 +306,10 @@ def _figure_6() -> list[Cell]:
     cells = []
     for n in ORIENTATIONS:
         for count in DEMONSTRATIONS:
-            for task in _KITTING:
+            for task in FIGURE_6:
                 for method in LEARNED if n == 36 else LEARNED[:2]:
                     cells.append(_paper_cell(task, method, n, count))
-        for task in _KITTING:
+        for task in FIGURE_6:
             text = f"!QuantizedOracle {{orientations: {n}}}"
             cells.append(Cell(task, text, n, "quantized_oracle"))
     return cells
@@ -317,7 +318,7 @@ def _figure_6() -> list[Cell]:
 def _checks() -> list[Cell]:
     """All networks trained at the N that they are tested at."""
     trainings = [
-        *(Training(task, "so2", 36, 100) for task in _KITTING),
+        *(Training(task, "so2", 36, 100) for task in FIGURE_6),
         Training("unseen", "equivariant_transporter", 36, 100),
     ]
     return [
@@ -330,7 +331,7 @@ def _headline_seeds() -> list[Cell]:
     return [
         _paper_cell(task, method, 180, 100, seed)
         for seed in (1, 2)
-        for task in _KITTING
+        for task in FIGURE_6
         for method in LEARNED[:2]
     ]
 
@@ -347,8 +348,8 @@ def _ablation() -> list[Cell]:
         return dataclasses.replace(whole, **changes)
 
     return [
-        *(ours(task, "ours") for task in _KITTING),
-        *(ours(task, "ours_recovering", recover=True) for task in _KITTING),
+        *(ours(task, "ours") for task in FIGURE_6),
+        *(ours(task, "ours_recovering", recover=True) for task in FIGURE_6),
         ours("unseen", "minus_search", search=False),
         ours("unseen", "minus_outlines", fit_outlines=False),
         ours("unseen", "minus_refinement", continuous=False, fit_outlines=False),

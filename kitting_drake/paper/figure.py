@@ -8,7 +8,8 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 from kitting_drake.paper.cells import DEMONSTRATIONS, RAVENS_DEMONSTRATIONS, TASKS
-from kitting_drake.paper.page import COLUMNS, Result
+from kitting_drake.paper.page import COLUMNS
+from kitting_drake.paper.result import Result
 from kitting_drake.reporting.ravens_table import PAPER as TABLE_1
 from kitting_drake.reporting.runs import METHODS
 

@@ -3,14 +3,9 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
-from functools import cached_property
-from pathlib import Path
 from typing import Any
 
-from kitting_drake.common.errors import UserError
 from kitting_drake.paper.cells import (
     CROWDED,
     DEMONSTRATIONS,
@@ -20,14 +15,18 @@ from kitting_drake.paper.cells import (
     RAVENS_DEMONSTRATIONS,
     SHIPPED,
     TASKS,
-    Cell,
     Training,
     paper_cells,
 )
-from kitting_drake.paper.efficiency import EFFICIENCY, efficiency_section
-from kitting_drake.paper.rates import RATES, Rates, best_rate, read_rates
+from kitting_drake.paper.differences import differences
+from kitting_drake.paper.efficiency import efficiency_section
+from kitting_drake.paper.rates import Rates, best_rate
+from kitting_drake.paper.result import Result
 from kitting_drake.reporting.markdown import markdown_table, rate_text
-from kitting_drake.reporting.paired import OWN, STRICT, over_tools, paired_difference, points_text
+from kitting_drake.reporting.paired import (
+    STRICT,
+    over_tools,
+)
 from kitting_drake.reporting.ravens_table import PAPER as TABLE_1
 from kitting_drake.reporting.results_page import PAPER
 from kitting_drake.reporting.runs import LEARNED, METHODS
@@ -77,7 +76,8 @@ by refined actions.
 
 What does not depend on N is trained once, at N = 180, and tested at every N: all networks of ours,
 and of the Equivariant Transporter all but the one for pick angles, which is trained at each N
-beside the others. Written by
+beside the others. Where a machine was given up between two cells, it was trained again from the
+same seed: `weights`, in the last table, tells which cells share theirs. Written by
 `python -m kitting_drake.benchmark paper`, which runs these cells, and
 `python -m kitting_drake.results`; each file must be exactly what its cell says.
 
@@ -98,49 +98,6 @@ too; the rule was tried on the seeds 100 to 119, and not changed after. Of what 
 after 100 demonstrations, five episodes were looked at: two lost a cube that was put down 15 degrees
 off, three one that was pushed or toppled after it had been put down within a millimetre:
 """
-
-
-@dataclass(frozen=True)
-class Result:
-    """A cell, and its summary."""
-
-    cell: Cell
-    summary: Mapping[str, Any]
-
-    @cached_property
-    def text(self) -> str:
-        """The strict rate with its interval, and the rate by the paper's measure, in percent."""
-        strict = rate_text(self.summary["strict_success_rate"], self.summary["strict_ci95"])
-        return f"{strict} / {100 * self.summary['success_rate']:.1f}"
-
-
-def read_results(folder: Path) -> list[Result]:
-    """The results of `benchmark paper`, in the order of the cells; there may be none.
-
-    Raises:
-        UserError: a file there is of no cell, or not what its cell says.
-    """
-    if not folder.is_dir():
-        return []
-    cells = {cell.name: cell for cell in paper_cells()}
-    rates = read_rates(folder)
-    found = {}
-    for path in sorted(folder.glob("*.json")):
-        if path.name in (RATES, EFFICIENCY):
-            continue
-        cell = cells.get(path.stem)
-        if cell is None:
-            raise UserError(f"{path} is of no cell of the paper's tables: delete it")
-        try:
-            summary = json.loads(path.read_text())
-            departure = cell.departure(summary, rates)
-            _ = summary["outcomes"]
-        except (OSError, ValueError, KeyError, TypeError) as error:
-            raise UserError(f"{path} is no summary of evaluate: {error!r}") from error
-        if departure is not None:
-            raise UserError(f"{path} is not that of its cell: {departure}")
-        found[cell.name] = Result(cell, summary)
-    return [found[name] for name in cells if name in found]
 
 
 def paper_sections(
@@ -178,7 +135,7 @@ def paper_sections(
     sections += _beyond_the_paper(by_name)
     sections += _table_1(by_name)
     sections += _fresh_tools(by_name)
-    sections += _differences(by_name)
+    sections += differences(by_name)
     sections += ["### Every cell\n", _every_cell(results, link)]
     return sections
 
@@ -321,53 +278,6 @@ def _both(result: Result) -> list[str]:
     ]
 
 
-def _differences(results: Mapping[str, Result]) -> list[str]:
-    """The section on how much better one method is than another on the same seeds."""
-    rows = []
-    for name, result in results.items():
-        for label, other in _rivals(result.cell):
-            if other not in results:
-                continue
-            pair = (result.summary, results[other].summary)
-            found = [paired_difference(*pair, rate) for rate in (STRICT, OWN)]
-            if any(item is None for item in found):
-                continue
-            rows.append([name, label, *(points_text(item) for item in found if item is not None)])
-    if not rows:
-        return []
-    return [
-        "### Differences on the same seeds\n",
-        "In points, with 95 % intervals by a bootstrap over episodes; above zero the first is "
-        "better. They\nare of these very trainings: how much one differs from another is not in "
-        "them. `none differs`: no\nepisode does.\n",
-        markdown_table(["cell", "minus", "strict", "paper's measure"], rows, left_columns=2),
-    ]
-
-
-def _rivals(cell: Cell) -> list[tuple[str, str]]:
-    """What a cell of ours is compared with: labels, and names of cells."""
-    training = cell.policy
-    if cell.label == "trained_at_36" and isinstance(training, Training):
-        return [("trained at N = 180", f"{cell.task}_{training.method}_36_100")]
-    if cell.label == "generalist":
-        others = [label for label in SHIPPED if label != cell.label]
-        return [(label.replace("_", " "), f"{cell.task}_{label}") for label in others]
-    if not isinstance(training, Training) or training.method != "so2":
-        return []
-    if cell.label.startswith("minus"):
-        return [("ours, whole", f"{cell.task}_so2_180_100_ours")]
-    if cell.label == "ours_recovering":
-        return [("in one try a tool", f"{cell.task}_so2_180_100_ours")]
-    tail = f"{cell.orientations}_{training.demonstrations}"
-    if cell.label:
-        return [("ours, as in the paper", f"{cell.task}_so2_{tail}")]
-    tail += f"_seed{training.seed}" if training.seed else ""
-    return [
-        *((METHODS[other], f"{cell.task}_{other}_{tail}") for other in LEARNED[1:]),
-        (METHODS["quantized_oracle"], f"{cell.task}_quantized_oracle_{cell.orientations}"),
-    ]
-
-
 def _every_cell(results: Sequence[Result], link: str) -> str:
     def detail(result: Result, key: str) -> str:
         value = result.summary["policy_details"].get(key)
@@ -387,16 +297,17 @@ def _every_cell(results: Sequence[Result], link: str) -> str:
                 f"{min(summary['seeds'])} to {max(summary['seeds'])}",
                 *_both(result),
                 _causes(summary),
+                (summary["policy_digest"] or "-").removeprefix("sha256 ")[:8],
                 ", ".join(item[:8] for item in (summary["commit"] or "").split(", ")),
             ]
         )
     headings = ["cell", "trained at N", "steps", "learning rate", "training seed", "episodes"]
-    headings += ["seeds", "strict, %", "over tools", "paper's, %", "why not", "commit"]
+    headings += ["seeds", "strict, %", "over tools", "paper's, %", "why not", "weights", "commit"]
     return (
         "`over tools`: the 95 % interval of the strict rate by a bootstrap that draws tools; `-` "
         "where fewer\nthan three fail, which tells nothing of others, and where no tools are "
-        "drawn. With ten or twenty\ntools it is on the narrow side.\n\n"
-        + markdown_table(headings, rows)
+        "drawn. With ten or twenty\ntools it is on the narrow side. `weights`: the first digits of "
+        "their digest.\n\n" + markdown_table(headings, rows)
     )
 
 

@@ -48,13 +48,33 @@ def paired_difference(
     Returns:
         The mean over the seeds; None if there are none that both ran.
     """
-    mine, theirs = (
-        {item["seed"]: item[rate] for item in run["outcomes"]} for run in (first, second)
-    )
-    seeds = sorted(mine.keys() & theirs.keys())
+    return mean_paired_difference([(first, second)], rate)
+
+
+def mean_paired_difference(
+    pairs: Sequence[tuple[Mapping[str, Any], Mapping[str, Any]]], rate: str
+) -> Estimate | None:
+    """The mean over several pairs of runs of how much better the first of each is.
+
+    Episodes are resampled jointly: one that is drawn brings its rates in all runs, as its scene is
+    the same in all of them.
+
+    Args:
+        pairs: of summaries, as `paired_difference` takes them.
+        rate: `STRICT` or `OWN`.
+
+    Returns:
+        The mean over the seeds; None if there are none that all ran.
+    """
+    runs = [
+        [{item["seed"]: item[rate] for item in run["outcomes"]} for run in pair] for pair in pairs
+    ]
+    seeds = sorted(set.intersection(*(set(run) for pair in runs for run in pair)))
     if not seeds:
         return None
-    differences = np.array([mine[seed] - theirs[seed] for seed in seeds])
+    differences = np.mean(
+        [[mine[seed] - theirs[seed] for seed in seeds] for mine, theirs in runs], axis=0
+    )
     rng = np.random.default_rng(0)
     drawn = rng.integers(len(seeds), size=(_RESAMPLES, len(seeds)))
     low, high = np.percentile(differences[drawn].mean(axis=1), _TAILS)

@@ -9,7 +9,8 @@ from kitting_drake.common.errors import UserError
 from kitting_drake.common.paths import SCENARIOS
 from kitting_drake.paper.cells import PRESET, TASKS, Cell, Training, paper_cells
 from kitting_drake.paper.figure import draw_figure_6, draw_table_1
-from kitting_drake.paper.page import has_figure, has_table_1, paper_sections, read_results
+from kitting_drake.paper.page import has_figure, has_table_1, paper_sections
+from kitting_drake.paper.result import read_results
 from kitting_drake.reporting.runs import described
 from kitting_drake.reporting.summary import summarise
 from kitting_drake.scenario.loader import load_scenario
@@ -32,6 +33,7 @@ def write(folder: Path, name: str, errors_mm: list[float]) -> None:
             "scenario": f"{Path(task.file).stem}:{task.demonstrated}",
             "preset": PRESET,
             "trained_orientations": cell.policy.orientations,
+            "angle_only": cell.policy.angle_only,
             "demonstrations": cell.policy.demonstrations,
             "training_seed": 0,
             "steps": cell.policy.steps,
@@ -84,6 +86,17 @@ def test_the_tables_hold_the_cells_and_say_what_is_missing(folder: Path):
     assert any("50.0 (43.1 to 56.9) / 84.5 |" in line for line in pyramid)
     assert found["shape matching", "100.0 (99.0 to 100.0)"][1] == "100.0 (99.0 to 100.0)"
     assert found["generalist", "-"] == ["-", "-"]
+
+
+def test_the_mean_over_n_is_compared_once_all_of_it_is_there(folder: Path):
+    for n in (36, 72, 120):
+        write(folder, f"unseen_so2_{n}_100", [1.0, 1.0, 9.0, 9.0])
+        label = ("unseen, 100 demonstrations, mean over N", "Equivariant Transporter")
+        assert label not in rows("\n".join(paper_sections(read_results(folder), {}, "results")))
+        write(folder, f"unseen_equivariant_transporter_{n}_100", [1.0, 1.0, 1.0, 1.0])
+    found = rows("\n".join(paper_sections(read_results(folder), {}, "results")))
+    # -50 three times and +25 once.
+    assert found[label] == ["-31.2 (-31.2 to -31.2)"] * 2
 
 
 def test_the_learning_rates_that_were_tried_are_told(folder: Path):

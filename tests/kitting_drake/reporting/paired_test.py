@@ -1,7 +1,14 @@
 import numpy as np
 import pytest
 
-from kitting_drake.reporting.paired import OWN, STRICT, over_tools, paired_difference, points_text
+from kitting_drake.reporting.paired import (
+    OWN,
+    STRICT,
+    mean_paired_difference,
+    over_tools,
+    paired_difference,
+    points_text,
+)
 
 
 def run(rates: dict[int, float]) -> dict:
@@ -18,6 +25,17 @@ def test_a_difference_is_of_the_seeds_that_both_ran():
     assert found.value == pytest.approx(0.125)
     assert 0 <= found.low <= found.value <= found.high <= 0.25
     assert paired_difference(run({1: 1.0}), run({2: 1.0}), STRICT) is None
+
+
+def test_an_episode_is_drawn_with_its_rates_in_all_runs():
+    zeros = run(dict.fromkeys(range(50), 0.0))
+    halves = ({i: float(i % 2 == k) for i in range(50)} for k in (0, 1))
+    pairs = [(run(rates), zeros) for rates in halves]
+    found = mean_paired_difference(pairs, STRICT)
+    # What one pair gains in an episode the other does not.
+    assert (found.low, found.value, found.high) == (0.5, 0.5, 0.5)
+    assert paired_difference(*pairs[0], STRICT).low < 0.45
+    assert mean_paired_difference([*pairs, (run({99: 1.0}), zeros)], STRICT) is None
 
 
 def test_what_is_hard_for_both_does_not_widen_the_interval_of_the_difference():
