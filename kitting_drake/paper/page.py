@@ -77,7 +77,9 @@ by refined actions.
 What does not depend on N is trained once, at N = 180, and tested at every N: all networks of ours,
 and of the Equivariant Transporter all but the one for pick angles, which is trained at each N
 beside the others. Where a machine was given up between two cells, it was trained again from the
-same seed: `weights`, in the last table, tells which cells share theirs. Written by
+same seed: `weights`, in the last table, tells which cells share theirs. Whether it costs anything
+is asked at N = 36, by cells whose networks were all trained there (`trained_at_36`, among the
+differences); what these differ by is also what one training differs from another by. Written by
 `python -m kitting_drake.benchmark paper`, which runs these cells, and
 `python -m kitting_drake.results`; each file must be exactly what its cell says.
 
