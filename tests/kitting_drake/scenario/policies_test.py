@@ -118,6 +118,7 @@ def test_results_say_what_a_policy_is(weights_file: Path):
         "taken_only": None,
         "rigid": None,
         "training_seed": None,
+        "angle_only": False,
     }
     assert config.training_seeds(base) == {10_000, 10_001, 10_002}
     # Seeds of static scenes are none of episodes.
