@@ -2,8 +2,9 @@
 table of docs/robustness.md.
 
 Each file there is a copy of a `summary.json` of `evaluate`, under any name; in docs/results/paper/
-are those of `benchmark paper`, each under the name of its cell. Nothing in the tables comes from
-anywhere else, but the paper's own figures.
+are those of `benchmark paper`, each under the name of its cell, and `networks.json`, a copy of the
+file of `benchmark networks`. Nothing in the tables comes from anywhere else, but the paper's own
+figures.
 """
 
 import argparse
@@ -18,11 +19,7 @@ from kitting_drake.common.command_line import run_command
 from kitting_drake.common.files import write_atomically
 from kitting_drake.paper.efficiency import read_efficiency
 from kitting_drake.paper.figure import draw_figure_6, draw_table_1
-from kitting_drake.paper.page import (
-    has_figure,
-    has_table_1,
-    paper_sections,
-)
+from kitting_drake.paper.page import has_figure, has_table_1, paper_sections
 from kitting_drake.paper.rates import read_rates
 from kitting_drake.paper.result import Result, read_results
 from kitting_drake.reporting.results_page import results_page

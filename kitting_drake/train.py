@@ -205,6 +205,23 @@ def _parser() -> argparse.ArgumentParser:
         help="weights to begin with, such as models/policies/generalist.safetensors (default: "
         "fresh ones)",
     )
+    _add_settings(parser)
+    parser.add_argument("--output", type=Path, metavar="DIR", help="where all files go")
+    parser.add_argument(
+        "--export",
+        choices=("onnx",),
+        help="also write the networks for other programs, to the folder onnx in --output; without "
+        "--demos those trained in --output before, or of --weights, without training",
+    )
+    parser.add_argument(
+        "--weights", type=Path, metavar="FILE", help="what to export, without --demos"
+    )
+    parser.add_argument("--quiet", action="store_true", help="print nothing but errors")
+    return parser
+
+
+def _add_settings(parser: argparse.ArgumentParser) -> None:
+    """Adds the flags of what is trained, and how."""
     parser.add_argument(
         "--angle-only",
         action="store_true",
@@ -235,18 +252,6 @@ def _parser() -> argparse.ArgumentParser:
         "--validate-every", type=count_type, default=500, metavar="STEPS", help="(500)"
     )
     parser.add_argument("--seed", type=seed_type, default=0, help="of weights and draws (0)")
-    parser.add_argument("--output", type=Path, metavar="DIR", help="where all files go")
-    parser.add_argument(
-        "--export",
-        choices=("onnx",),
-        help="also write the networks for other programs, to the folder onnx in --output; without "
-        "--demos those trained in --output before, or of --weights, without training",
-    )
-    parser.add_argument(
-        "--weights", type=Path, metavar="FILE", help="what to export, without --demos"
-    )
-    parser.add_argument("--quiet", action="store_true", help="print nothing but errors")
-    return parser
 
 
 def _rate_type(text: str) -> float:

@@ -44,9 +44,9 @@ def differences(results: Mapping[str, Result]) -> list[str]:
         "### Differences on the same seeds\n",
         "In points, with 95 % intervals by a bootstrap over episodes; above zero the first is "
         "better. They\nare of these very trainings: how much one differs from another is not in "
-        "them. `none differs`: no\nepisode does. Over all N and both numbers of demonstrations, "
-        "the paper has ours 0.63 (seen) and 2.16\n(unseen) points behind the Equivariant "
-        "Transporter.\n",
+        "them. `none differs`: no\nepisode does. A mean over N is of as many trainings as its cells "
+        "have different `weights`; over all N and\nboth numbers of demonstrations, the paper has ours "
+        "0.63 (seen) and 2.16 (unseen) points behind the\nEquivariant Transporter.\n",
         markdown_table(["cell", "minus", "strict", "paper's measure"], rows, left_columns=2),
     ]
 
@@ -70,7 +70,7 @@ def _over_n(results: Mapping[str, Result]) -> list[list[str]]:
 
 
 def _rivals(cell: Cell) -> list[tuple[str, str]]:
-    """What a cell of ours is compared with: labels, and names of cells."""
+    """The cells that a cell is compared with: labels, and names."""
     training = cell.policy
     if cell.label == "trained_at_36" and isinstance(training, Training):
         return [("trained at N = 180", f"{cell.task}_{training.method}_36_100")]

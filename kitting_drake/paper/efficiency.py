@@ -41,7 +41,7 @@ def read_efficiency(folder: Path) -> dict[str, Any] | None:
     try:
         measured: dict[str, Any] = json.loads(path.read_text())
         efficiency_section(measured)
-    except (OSError, ValueError, KeyError, TypeError) as error:
+    except (OSError, ValueError, LookupError, TypeError) as error:
         raise UserError(f"{path} is no file of benchmark networks: delete it") from error
     return measured
 
@@ -55,14 +55,15 @@ def efficiency_section(measured: Mapping[str, Any]) -> str:
     machine = measured["machine"]
     place = machine["cpu"] if machine["device"] == "cpu" else machine["device"]
     growths = {(row["method"], row["preset"]): row for row in measured["pick_angle_growth"]}
-    ends = next(iter(growths.values()))
+    presets = list(dict.fromkeys(row["preset"] for row in measured["pick_angle"]))
+    ends = growths[LEARNED[0], presets[0]]
     counts = [
         n
         for n in sorted({row["orientations"] for row in measured["pick_angle"]})
         if ends["from"] <= n <= ends["to"]
     ]
     rows = []
-    for preset in dict.fromkeys(row["preset"] for row in measured["pick_angle"]):
+    for preset in presets:
         for method in LEARNED[:2]:
             by_n = {
                 row["orientations"]: row

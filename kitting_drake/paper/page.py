@@ -23,10 +23,7 @@ from kitting_drake.paper.efficiency import efficiency_section
 from kitting_drake.paper.rates import Rates, best_rate
 from kitting_drake.paper.result import Result
 from kitting_drake.reporting.markdown import markdown_table, rate_text
-from kitting_drake.reporting.paired import (
-    STRICT,
-    over_tools,
-)
+from kitting_drake.reporting.paired import STRICT, over_tools
 from kitting_drake.reporting.ravens_table import PAPER as TABLE_1
 from kitting_drake.reporting.results_page import PAPER
 from kitting_drake.reporting.runs import LEARNED, METHODS

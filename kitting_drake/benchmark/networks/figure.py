@@ -6,11 +6,7 @@ import io
 from pathlib import Path
 from typing import Any
 
-from kitting_drake.benchmark.networks.tables import (
-    MEASURE_NAMES,
-    METHOD_NAMES,
-    RUNG_NAMES,
-)
+from kitting_drake.benchmark.networks.tables import MEASURE_NAMES, METHOD_NAMES, RUNG_NAMES
 from kitting_drake.common.files import write_atomically
 from kitting_drake.reporting.quantities import count_text, seconds_text
 

@@ -195,9 +195,10 @@ def test_the_page_of_results_tells_what_the_angle_costs(measured: dict[str, Any]
         assert all(cell.endswith(" ms") for cell in cells[1:3])
         assert cells[3].startswith(f"{rows[method]['parameters']:.2f}, ")
     assert NAMES["transporter"] not in table
-    path.write_text('{"machine": 7}')
-    with pytest.raises(UserError, match="is no file of benchmark networks: delete it"):
-        read_efficiency(tmp_path)
+    for damaged in ({"machine": 7}, measured | {"pick_angle": []}, []):
+        path.write_text(json.dumps(damaged))
+        with pytest.raises(UserError, match="is no file of benchmark networks: delete it"):
+            read_efficiency(tmp_path)
 
 
 def test_the_synthetic_scene_has_its_picks_on_tools():
