@@ -24,7 +24,6 @@ from kitting_drake.reporting.paired import (
 )
 from kitting_drake.reporting.runs import LEARNED, METHODS
 
-
 _INTRODUCTION = """\
 In points, with 95 % intervals by a bootstrap over episodes; above zero the first is better. They
 are of these very trainings: how much one differs from another is not in them. `none differs`: no
