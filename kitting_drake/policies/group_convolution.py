@@ -75,6 +75,17 @@ class GroupConv2d(ExpandedConv2d):
         channels = self.weights.shape[0] * self.out_fibre.channels
         return kernel.to(dtype).reshape(channels, size, size, -1).permute(0, 3, 1, 2)
 
+    @torch.no_grad()
+    def fit(self, kernel: Tensor) -> None:
+        # Of each output field the first channel, which is not rotated, has all weights; all of them
+        # together would take 20 GB at N = 180.
+        first = kernel[:: self.out_fibre.channels].unflatten(1, (self.weights.shape[1], -1))
+        if isinstance(self.out_fibre, Scalar):
+            first = first[:, :, :1]
+        patterns = self.basis[0].flatten(1).double()
+        found = torch.linalg.lstsq(patterns.T, first.flatten(3).flatten(0, 2).double().T).solution
+        self.weights.copy_(found.T.reshape(self.weights.shape))
+
 
 @functools.lru_cache(maxsize=16)
 def rotated_patterns(fibre: Regular, size: int) -> Tensor:

@@ -59,6 +59,26 @@ class ExpandedConv2d(nn.Module):
         takes."""
         raise NotImplementedError
 
+    @torch.no_grad()
+    def fit(self, kernel: Tensor) -> None:
+        """Sets the weights to those of a plain kernel that came from such a layer.
+
+        Args:
+            kernel: as `kernel` returns it.
+        """
+        out_fields, in_fields = self.weights.shape[:2]
+        out_channels, in_channels = self.out_fibre.channels, self.in_fibre.channels
+        shape = self.weights.shape[2:]
+        rows = []
+        for unit in torch.eye(shape.numel()):
+            # All blocks of fields are alike then: the first is what this weight brings.
+            self.weights.copy_(unit.view(shape).expand_as(self.weights))
+            rows.append(self.kernel()[:out_channels, :in_channels].flatten())
+        blocks = kernel.reshape(out_fields, out_channels, in_fields, in_channels, *kernel.shape[2:])
+        targets = blocks.transpose(1, 2).flatten(2).flatten(0, 1)
+        found = torch.linalg.lstsq(torch.stack(rows).double().T, targets.double().T).solution
+        self.weights.copy_(found.T.reshape(self.weights.shape))
+
     def channel_bias(self) -> Tensor | None:
         """(out channels,), if there is a bias."""
         return None if self.bias is None else self.bias.repeat_interleave(self.out_fibre.channels)

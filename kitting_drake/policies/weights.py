@@ -187,7 +187,7 @@ def load_trainable(path: Path, fresh_angle_at: int | None = None) -> Networks:
         for name, module in networks.named_modules():
             if isinstance(module, ExpandedConv2d) and not is_fresh(name):
                 layer = stored[name]
-                _fit_weights(module, layer.weight)
+                module.fit(layer.weight)
                 if module.bias is not None:
                     module.bias.copy_(layer.bias[:: module.out_fibre.channels])
         rest = dict(plain.named_parameters())
@@ -196,22 +196,6 @@ def load_trainable(path: Path, fresh_angle_at: int | None = None) -> Networks:
             if name.rpartition(".")[0] not in expanded and not is_fresh(name):
                 parameter.copy_(rest[name])
     return networks
-
-
-def _fit_weights(layer: ExpandedConv2d, kernel: Tensor) -> None:
-    """Sets a layer's weights to those of a plain kernel that came from it."""
-    out_fields, in_fields = layer.weights.shape[:2]
-    out_channels, in_channels = layer.out_fibre.channels, layer.in_fibre.channels
-    shape = layer.weights.shape[2:]
-    rows = []
-    for unit in torch.eye(shape.numel()):
-        # All blocks of fields are alike then: the first is what this weight brings.
-        layer.weights.copy_(unit.view(shape).expand_as(layer.weights))
-        rows.append(layer.kernel()[:out_channels, :in_channels].flatten())
-    blocks = kernel.reshape(out_fields, out_channels, in_fields, in_channels, *kernel.shape[2:])
-    targets = blocks.transpose(1, 2).flatten(2).flatten(0, 1)
-    found = torch.linalg.lstsq(torch.stack(rows).double().T, targets.double().T).solution
-    layer.weights.copy_(found.T.reshape(layer.weights.shape))
 
 
 def _plain_state(
