@@ -261,7 +261,8 @@ class TrainingRun:
         if self._judged:
             report["loss"] = mean_loss(networks, self._judged)
         chosen = {"step": step, **report}
-        if self._is_as_good_as_any(report):
+        criterion = "loss" if self._judged else "cost_mm"
+        if self.best is None or report[criterion] < self.best[criterion]:
             self.best = chosen
             threshold = report.get("stop_threshold")
             card = {**self.card, "validation": chosen, "stop_threshold": threshold}
@@ -270,24 +271,6 @@ class TrainingRun:
         for name, value in report.items():
             writer.add_scalar(f"validation/{name}", value, step)
         return report
-
-    def _is_as_good_as_any(self, report: dict[str, float]) -> bool:
-        """Whether a checkpoint is to be kept rather than those before it.
-
-        A mean over few scenes of which some are lost tells checkpoints apart only so far. Of those
-        within one standard error of the lowest the latest is kept, as it has learned the longest
-        (after the one-standard-error rule of Breiman et al., Classification and Regression Trees,
-        1984, section 3.4.3). The losses of a Ravens task are compared as they are.
-        """
-        criterion = "loss" if self._judged else "cost_mm"
-        before = [line for line in read_lines(self._log) if criterion in line]
-        if not before:
-            return True
-        lowest = min(before, key=lambda line: line[criterion])
-        if self._judged:
-            return report[criterion] < lowest[criterion]
-        # Lines of an earlier version have no error.
-        return report[criterion] <= lowest[criterion] + lowest.get("cost_error_mm", 0.0)
 
     def _resume(self) -> None:
         path = self.folder / "checkpoint.pt"

@@ -104,7 +104,7 @@ def validate(
         are separated, as `stop_margin` (negative: they overlap), and how many scenes are judged
         wrongly: `false_stops`, in which there is something to pick, and `missed_stops`.
         And `cost_mm`, by which a checkpoint is chosen where the expert's action is the only right
-        one, with its standard error `cost_error_mm`: the mean displacement over all scenes and
+        one: the mean displacement over all scenes and
         final observations, where what is judged wrongly counts as lost (20 mm) and a final
         observation that is judged rightly as 0.
     """
@@ -120,15 +120,12 @@ def validate(
     for name, column in zip(ERRORS, table.T, strict=True):
         report[f"median_{name}"] = float(np.median(column))
         report[f"p95_{name}"] = float(np.percentile(column, 95))
-    costs = displacements
+    report["cost_mm"] = report["displacement_mm"]
     grid = scenes[0].grid
     absent = [policy.log_odds(observed(final.image, grid)) for final in finals]
     # Where the networks cannot tell, there are no odds.
     if absent and None not in (*present, *absent):
-        stops, costs = _judge_stops(np.array(present, float), np.array(absent, float), costs)
-        report |= stops
-    report["cost_mm"] = float(costs.mean())
-    report["cost_error_mm"] = float(costs.std() / math.sqrt(len(costs)))
+        report |= _stop_report(np.array(present, float), np.array(absent, float), displacements)
     return report
 
 
@@ -148,10 +145,10 @@ def mean_loss(networks: Networks, samples: Sequence[LabelledImage]) -> float:
     return float(np.mean(values))
 
 
-def _judge_stops(
+def _stop_report(
     present: NDArray[np.float64], absent: NDArray[np.float64], displacements: NDArray[np.float64]
-) -> tuple[dict[str, float], NDArray[np.float64]]:
-    """The part of `validate`'s report that is about stopping, and what each observation costs.
+) -> dict[str, float]:
+    """The part of `validate`'s report that is about stopping.
 
     Args:
         present: the log-odds of scenes in which there is something to pick.
@@ -160,12 +157,12 @@ def _judge_stops(
     """
     threshold = choose_stop_threshold(present, absent)
     assert threshold is not None
-    stopped, missed = present < threshold, absent >= threshold
-    costs = np.concatenate([np.where(stopped, _LOST, displacements), _LOST * missed])
-    report = {
+    stopped, missed = present < threshold, int((absent >= threshold).sum())
+    costs = np.where(stopped, _LOST, displacements).sum() + _LOST * missed
+    return {
+        "cost_mm": float(costs / (len(present) + len(absent))),
         "stop_threshold": threshold,
         "stop_margin": float(present.min() - absent.max()),
         "false_stops": int(stopped.sum()),
-        "missed_stops": int(missed.sum()),
+        "missed_stops": missed,
     }
-    return report, costs

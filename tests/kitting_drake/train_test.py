@@ -33,7 +33,6 @@ from kitting_drake.policies.recorded import DemonstrationStep, FinalObservation
 from kitting_drake.policies.static_scenes import StaticScene, StaticScenes, write_static_scenes
 from kitting_drake.policies.training import Trainer
 from kitting_drake.policies.training_data import read_training_data
-from kitting_drake.policies.validation import ERRORS
 from kitting_drake.policies.weights import card_seeds, load_networks, read_weights_file
 from systems.signals import Observation, PickPlaceAction, PixelGrid, PlanarPose
 
@@ -248,41 +247,6 @@ def test_where_many_answers_are_right_the_losses_choose(
     train(demos, tmp_path / "run")
     card = read_weights_file(tmp_path / "run" / "policy.safetensors").card
     assert (card["validation"]["step"], card["validation"]["loss"]) == (best, min(losses))
-
-
-@pytest.mark.parametrize(
-    ("costs", "chosen"),
-    [
-        ((3.0, 2.0, 2.4), 3),
-        # Each is compared with the best, not with the one before it.
-        ((2.0, 2.4, 2.8), 2),
-        ((2.0, 5.0, 1.9), 3),
-    ],
-)
-def test_the_latest_checkpoint_within_a_standard_error_is_kept(
-    demos: Path,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    costs: tuple[float, ...],
-    chosen: int,
-):
-    coming = iter(costs)
-
-    def report(*_: object) -> dict[str, float]:
-        names = (f"median_{name}" for name in ERRORS)
-        cost = next(coming)
-        return dict.fromkeys(names, 0.0) | {
-            "displacement_mm": cost,
-            "cost_mm": cost,
-            "cost_error_mm": 0.5,
-        }
-
-    monkeypatch.setattr(training_run, "validate", report)
-    run = tmp_path / "run"
-    train(demos, run, "--steps", 3, "--validate-every", 1)
-    best = json.loads((run / "summary.json").read_text())["best"]
-    assert (best["step"], best["cost_mm"]) == (chosen, costs[chosen - 1])
-    assert read_weights_file(run / "policy.safetensors").card["validation"] == best
 
 
 def test_the_curves(trained: Path):
