@@ -87,17 +87,17 @@ cells are done, whose episodes alone took {hours:.0f} hours of a core. `benchmar
 """
 
 _TEN = """\
-After ten demonstrations much is chance. Networks of ours that learned from the same seeds, where
-demonstrations and episodes were run by Drake 1.51 and by Drake 1.58, came to 82.2 % (an earlier
-file, under "Other runs") and to 68.5 % strict at N = 180; which of these made the difference was
-not told apart. It was looked into on scenes that are no test, 120 of the ninety demonstrations that
-were not learned from, by scripts that are not kept. Of the second training the validation scenes
-have the checkpoint of step 500, which was kept, at 1.9 mm and the last, of step 1500, at 2.1 mm; on
-those 120 they are at 4.1 and 3.0 mm (the last better by 1.0, with a standard error of 0.5). To keep
-the latest checkpoint within one standard error of the best would have kept the last here, and was
-tried: of the Equivariant Transporter it takes the last instead of that of step 1250, which is worse
-by 0.6 mm, with a standard error of 0.3. It is no better a rule, and all methods keep the one that
-displaces objects least.
+After ten demonstrations much is chance. Networks of ours that learned from the same seeds on two
+machines, whose episodes were run by Drake 1.51 and by Drake 1.58, came to 82.2 % (an earlier file,
+under "Other runs") and to 68.5 % strict at N = 180; how much of the difference is training and how
+much physics was not told apart. The training was looked into on scenes that are no test, 120 of the
+ninety demonstrations that were not learned from, by scripts that are not kept. Of the second
+training the validation scenes have the checkpoint of step 500, which was kept, at 1.9 mm and the
+last, of step 1500, at 2.1 mm; on those 120 they are at 4.1 and 3.0 mm (the last better by 1.0, with
+a standard error of 0.5). To keep the latest checkpoint within one standard error of the best would
+have kept the last here, and was tried: of the Equivariant Transporter it takes the last instead of
+that of step 1250, which is worse by 0.6 mm, with a standard error of 0.3. It is no better a rule,
+and all methods keep the one that displaces objects least.
 """
 
 _FINGERS = """\
