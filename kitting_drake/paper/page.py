@@ -313,16 +313,19 @@ def _every_cell(results: Sequence[Result], link: str) -> str:
                 *_both(result),
                 _causes(summary),
                 (summary["policy_digest"] or "-").removeprefix("sha256 ")[:8],
+                summary["versions"]["drake"],
                 ", ".join(item[:8] for item in (summary["commit"] or "").split(", ")),
             ]
         )
     headings = ["cell", "trained at N", "steps", "learning rate", "training seed", "episodes"]
-    headings += ["seeds", "strict, %", "over tools", "paper's, %", "why not", "weights", "commit"]
+    headings += ["seeds", "strict, %", "over tools", "paper's, %", "why not"]
+    headings += ["weights", "Drake", "commit"]
     return (
         "`over tools`: the 95 % interval of the strict rate by a bootstrap that draws tools; `-` "
         "where fewer\nthan three fail, which tells nothing of others, and where no tools are "
         "drawn. With ten or twenty\ntools it is on the narrow side. `weights`: the first digits of "
-        "their digest.\n\n" + markdown_table(headings, rows)
+        "their digest. `Drake`: by\nwhich its episodes were run.\n\n"
+        + markdown_table(headings, rows)
     )
 
 

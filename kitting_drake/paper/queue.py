@@ -13,7 +13,7 @@ import signal
 import subprocess
 import sys
 import threading
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -80,7 +80,12 @@ class Queue:
         self._say(f"{len(cells) - len(pending)} of {len(cells)} cells are done")
         failures: dict[str, str] = {}
         with ThreadPoolExecutor(max_workers=self.trainings) as trainer:
-            needed = dict.fromkeys(c.policy for c in pending if isinstance(c.policy, Training))
+            needed = dict.fromkeys(
+                training
+                for cell in pending
+                if isinstance(cell.policy, Training)
+                for training in (*self._before(cell.policy), cell.policy)
+            )
             # What is trained already need not wait behind what is not.
             trained: dict[Any, Future[Path]] = {
                 training: trainer.submit(self.train, training)
@@ -155,8 +160,21 @@ class Queue:
         with self._guard:
             return self._locks.setdefault(path, threading.Lock())
 
+    def _before(self, training: Training) -> Iterator[Training]:
+        """What is to be trained before a training: what it goes on from, and every learning rate.
+
+        Each is begun by itself, as a training that waits for several would train them in turn.
+        """
+        if training.base is not None:
+            yield from (*self._before(training.base), training.base)
+        elif training.method != "so2" and training.learning_rate is None:
+            for rate in self._untried(training.method):
+                yield dataclasses.replace(reference(training.method), learning_rate=rate)
+
     def _is_trained(self, training: Training) -> bool:
-        rates = LEARNING_RATES[:1] if training.method == "so2" else LEARNING_RATES
+        rates: Sequence[float] = LEARNING_RATES[:1] if training.method == "so2" else LEARNING_RATES
+        if training.learning_rate is not None:
+            rates = (training.learning_rate,)
         return any((self._folder(training, rate) / "summary.json").exists() for rate in rates)
 
     def _folder(self, training: Training, rate: float) -> Path:
@@ -220,12 +238,16 @@ class Queue:
 
         What each comes to is written as soon as it is known, and not tried again.
         """
-        for rate in LEARNING_RATES:
-            if f"{rate:g}" not in read_rates(self.results).get(method, {}):
-                weights = self.train(dataclasses.replace(reference(method), learning_rate=rate))
-                summary = json.loads(weights.with_name("summary.json").read_text())
-                self._keep_rate(method, rate, summary["best"]["cost_mm"])
+        for rate in self._untried(method):
+            weights = self.train(dataclasses.replace(reference(method), learning_rate=rate))
+            summary = json.loads(weights.with_name("summary.json").read_text())
+            self._keep_rate(method, rate, summary["best"]["cost_mm"])
         return float(best_rate(read_rates(self.results)[method]))
+
+    def _untried(self, method: str) -> list[float]:
+        """The learning rates of which it is not known what a baseline comes to."""
+        tried = read_rates(self.results).get(method, {})
+        return [rate for rate in LEARNING_RATES if f"{rate:g}" not in tried]
 
     def _keep_rate(self, method: str, rate: float, cost_mm: float) -> None:
         file = self.results / RATES

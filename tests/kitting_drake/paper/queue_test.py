@@ -204,6 +204,15 @@ def test_trainings_side_by_side_collect_once(tmp_path: Path):
     ]
 
 
+def test_learning_rates_are_tried_side_by_side(tmp_path: Path):
+    (tmp_path / "results").mkdir()
+    queue = Pretending(tmp_path, tmp_path / "results", Console(quiet=True), trainings=3)
+    queue.together = threading.Barrier(3, action=lambda: setattr(queue, "together", None))
+    assert queue.run([THEIRS]) == {}
+    tried = {f"train {reference('transporter').name}_lr{rate:g}" for rate in LEARNING_RATES}
+    assert set(queue.calls[2:5]) == tried
+
+
 def test_what_fails_keeps_nothing_else_up(queue: Pretending):
     queue.broken = {f"{reference('transporter').name}_lr{LEARNING_RATES[2]:g}"}
     assert queue.run([THEIRS, OURS, ORACLE]) == {THEIRS.name: "it broke"}
