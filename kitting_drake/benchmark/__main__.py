@@ -163,8 +163,9 @@ def _mujoco(arguments: argparse.Namespace, console: Console, folder: Path) -> li
 
 def _paper(arguments: argparse.Namespace, console: Console, folder: Path) -> int:
     """Fills the paper's cells; returns the exit code."""
-    from kitting_drake.paper.cells import Cell, paper_cells
+    from kitting_drake.paper.cells import Cell
     from kitting_drake.paper.queue import Queue, run_paper
+    from kitting_drake.paper.tables import paper_cells
 
     chosen: dict[str, Cell] = {}
     for pattern in arguments.cells:

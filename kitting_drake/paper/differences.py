@@ -5,15 +5,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from kitting_drake.paper.cells import (
-    DEMONSTRATIONS,
-    FIGURE_6,
-    ORIENTATIONS,
-    SHIPPED,
-    Cell,
-    Training,
-)
+from kitting_drake.paper.cells import ORIENTATIONS, Cell, Training
 from kitting_drake.paper.result import Result
+from kitting_drake.paper.tables import DEMONSTRATIONS, FIGURE_6, SHIPPED
 from kitting_drake.reporting.markdown import markdown_table
 from kitting_drake.reporting.paired import (
     OWN,

@@ -7,9 +7,10 @@ import io
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
-from kitting_drake.paper.cells import DEMONSTRATIONS, RAVENS_DEMONSTRATIONS, TASKS
+from kitting_drake.paper.cells import TASKS
 from kitting_drake.paper.page import COLUMNS
 from kitting_drake.paper.result import Result
+from kitting_drake.paper.tables import DEMONSTRATIONS, RAVENS_DEMONSTRATIONS
 from kitting_drake.reporting.ravens_table import PAPER as TABLE_1
 from kitting_drake.reporting.runs import METHODS
 

@@ -6,22 +6,18 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
-from kitting_drake.paper.cells import (
-    CROWDED,
-    DEMONSTRATIONS,
-    LEARNING_RATES,
-    ORIENTATIONS,
-    PRESET,
-    RAVENS_DEMONSTRATIONS,
-    SHIPPED,
-    TASKS,
-    Training,
-    paper_cells,
-)
+from kitting_drake.paper.cells import LEARNING_RATES, ORIENTATIONS, PRESET, TASKS, Training
 from kitting_drake.paper.differences import differences
 from kitting_drake.paper.efficiency import efficiency_section
 from kitting_drake.paper.rates import Rates, best_rate
 from kitting_drake.paper.result import Result
+from kitting_drake.paper.tables import (
+    CROWDED,
+    DEMONSTRATIONS,
+    RAVENS_DEMONSTRATIONS,
+    SHIPPED,
+    paper_cells,
+)
 from kitting_drake.reporting.markdown import markdown_table, rate_text
 from kitting_drake.reporting.paired import STRICT, over_tools
 from kitting_drake.reporting.ravens_table import PAPER as TABLE_1

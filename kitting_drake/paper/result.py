@@ -10,9 +10,10 @@ from pathlib import Path
 from typing import Any
 
 from kitting_drake.common.errors import UserError
-from kitting_drake.paper.cells import Cell, paper_cells
+from kitting_drake.paper.cells import Cell
 from kitting_drake.paper.efficiency import EFFICIENCY
 from kitting_drake.paper.rates import RATES, read_rates
+from kitting_drake.paper.tables import paper_cells
 from kitting_drake.reporting.markdown import rate_text
 
 

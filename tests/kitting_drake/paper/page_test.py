@@ -7,10 +7,11 @@ import pytest
 
 from kitting_drake.common.errors import UserError
 from kitting_drake.common.paths import SCENARIOS
-from kitting_drake.paper.cells import PRESET, TASKS, Cell, Training, paper_cells
+from kitting_drake.paper.cells import PRESET, TASKS, Cell, Training
 from kitting_drake.paper.figure import draw_figure_6, draw_table_1
 from kitting_drake.paper.page import has_figure, has_table_1, paper_sections
 from kitting_drake.paper.result import read_results
+from kitting_drake.paper.tables import paper_cells
 from kitting_drake.reporting.runs import described
 from kitting_drake.reporting.summary import summarise
 from kitting_drake.scenario.loader import load_scenario

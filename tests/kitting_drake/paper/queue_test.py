@@ -16,17 +16,10 @@ from kitting_drake.benchmark import __main__ as benchmark
 from kitting_drake.common.errors import UserError
 from kitting_drake.common.files import alone_in
 from kitting_drake.common.paths import SCENARIOS
-from kitting_drake.paper.cells import (
-    LEARNING_RATES,
-    PRESET,
-    TASKS,
-    Cell,
-    Training,
-    paper_cells,
-    reference,
-)
+from kitting_drake.paper.cells import LEARNING_RATES, PRESET, TASKS, Cell, Training, reference
 from kitting_drake.paper.queue import Failed, Queue, run_paper
 from kitting_drake.paper.rates import RATES
+from kitting_drake.paper.tables import paper_cells
 from kitting_drake.reporting.runs import described
 from kitting_drake.scenario.loader import load_scenario
 
