@@ -109,10 +109,11 @@ chosen.
 """
 
 _PALLETIZING = """\
-Palletizing is learned in 3000 steps, by every method, the four others in 1000. After 1000 steps of
-ours the first episodes of this test were losing boxes; why, was looked at on the seeds 100, 101,
-103 and 104: boxes were put onto others of their own layer, or across it, after ten demonstrations
-and after a hundred.
+Palletizing is learned in 3000 steps, by every method, the four others in 1000: chosen after some of
+this test had been seen. After 1000 steps ours, of ten demonstrations, lost boxes in episodes of the
+seeds 3200 to 3233 of it (their rewards and causes were looked at), and of a hundred on 100 to 104;
+why, was looked at on 100, 101 and 103: boxes were put onto others of their own layer, or across it.
+The seeds 3234 to 3249 had been run by nobody before.
 """
 
 _FINGERS = """\
