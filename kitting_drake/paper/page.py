@@ -12,7 +12,7 @@ from kitting_drake.paper.efficiency import efficiency_section
 from kitting_drake.paper.rates import Rates, best_rate
 from kitting_drake.paper.result import Result
 from kitting_drake.paper.tables import (
-    CROWDED,
+    BEYOND_OF_TABLE_1,
     DEMONSTRATIONS,
     RAVENS_DEMONSTRATIONS,
     SHIPPED,
@@ -117,15 +117,17 @@ The seeds 3234 to 3249 had been run by nobody before.
 """
 
 _FINGERS = """\
-The fingers are 15 mm deep, and between the cubes of the pyramid are 10 mm: along their row a hand
-that puts one down pushes the others away. Which way it holds a cube, and in which of four rotations
-it puts it down, are drawn apart: neither the crop about a pick nor the scene tells. With what goes
-beyond the paper (actions refined between pixels and orientations; and of rotations that the
-networks hold for as good, the one where the fingers have room as they let go), the same networks.
-The cause was found in the episodes 3200 to 3236 of a cell of the pyramid, which are of this test
-too; the rule was tried on the seeds 100 to 119, and not changed after. Of what it loses at N = 180
-after 100 demonstrations, five episodes were looked at: two lost a cube that was put down 15 degrees
-off, three one that was pushed or toppled after it had been put down within a millimetre:
+After ten and a hundred demonstrations only the pyramid comes out below the paper, and it alone was
+also run with what goes beyond it. The fingers are 15 mm deep, and between its cubes are 10 mm:
+along their row a hand that puts one down pushes the others away. Which way it holds a cube, and in
+which of four rotations it puts it down, are drawn apart: neither the crop about a pick nor the
+scene tells. With what goes beyond the paper (actions refined between pixels and orientations; and
+of rotations that the networks hold for as good, the one where the fingers have room as they let
+go), the same networks. The cause was found in the episodes 3200 to 3236 of a cell of the pyramid,
+which are of this test too; the rule was tried on the seeds 100 to 119, and not changed after. Of
+what it loses at N = 180 after 100 demonstrations, five episodes were looked at: two lost a cube
+that was put down 15 degrees off, three one that was pushed or toppled after it had been put down
+within a millimetre:
 """
 
 
@@ -249,12 +251,9 @@ def _table_1(results: Mapping[str, Result]) -> list[str]:
 
     def text(name: str, paper: float) -> str:
         found = results.get(name)
-        ours = (
-            "-"
-            if found is None
-            else rate_text(found.summary["success_rate"], found.summary["ci95"])
-        )
-        return f"{ours} / {paper:g}"
+        if found is None:
+            return f"- / {paper:g}"
+        return f"{rate_text(found.summary['success_rate'], found.summary['ci95'])} / {paper:g}"
 
     rows, beyond = [], []
     for (name, n), by_task in TABLE_1.items():
@@ -265,8 +264,8 @@ def _table_1(results: Mapping[str, Result]) -> list[str]:
             paper = {task: papers[task][index] for task in tasks}
             rows.append([name, str(n), str(count), *(text(cells[t], paper[t]) for t in tasks)])
             if method == "so2":
-                crowded = [text(f"{cells[t]}_ours", paper[t]) for t in CROWDED]
-                beyond.append([name, str(n), str(count), *crowded])
+                ours = [text(f"{cells[t]}_ours", paper[t]) for t in BEYOND_OF_TABLE_1]
+                beyond.append([name, str(n), str(count), *ours])
     headings = ["method", "N", "demonstrations"]
     sections = [
         "### The five Ravens tasks, table I\n",
@@ -277,9 +276,11 @@ def _table_1(results: Mapping[str, Result]) -> list[str]:
         _PALLETIZING,
     ]
     if any(
-        f"{task}_so2" in name and name.endswith("_ours") for name in results for task in CROWDED
+        f"{task}_so2" in name and name.endswith("_ours")
+        for name in results
+        for task in BEYOND_OF_TABLE_1
     ):
-        sections += [_FINGERS, markdown_table([*headings, *CROWDED], beyond)]
+        sections += [_FINGERS, markdown_table([*headings, *BEYOND_OF_TABLE_1], beyond)]
     return sections
 
 

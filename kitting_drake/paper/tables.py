@@ -12,8 +12,9 @@ DEMONSTRATIONS = (100, 10)
 RAVENS_DEMONSTRATIONS = (100, 10, 1)
 FIGURE_6 = ("unseen", "seen")
 """The tasks of figure 6."""
-CROWDED = ("palletizing_boxes", "stack_block_pyramid")
-"""The tasks in which an object is put down between others."""
+BEYOND_OF_TABLE_1 = ("stack_block_pyramid",)
+"""The tasks of table I that are also run with what goes beyond the paper: those where, as published
+and after ten or a hundred demonstrations, ours comes out below the paper."""
 
 
 def _paper_cell(task: str, method: str, n: int, demonstrations: int, seed: int = 0) -> Cell:
@@ -99,7 +100,7 @@ def _table_1() -> list[Cell]:
     ours = [
         dataclasses.replace(cell, label="ours", continuous=True, fit_outlines=True)
         for cell in as_published
-        if cell.task in CROWDED
+        if cell.task in BEYOND_OF_TABLE_1
         and isinstance(cell.policy, Training)
         and cell.policy.method == "so2"
     ]
