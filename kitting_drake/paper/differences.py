@@ -3,11 +3,11 @@ seeds."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 from kitting_drake.paper.cells import ORIENTATIONS, Cell, Training
 from kitting_drake.paper.result import Result
-from kitting_drake.paper.tables import DEMONSTRATIONS, FIGURE_6, SHIPPED
+from kitting_drake.paper.tables import DEMONSTRATIONS, FIGURE_6, SHIPPED, headline
 from kitting_drake.reporting.markdown import markdown_table
 from kitting_drake.reporting.paired import (
     OWN,
@@ -39,7 +39,7 @@ def differences(results: Mapping[str, Result]) -> list[str]:
             if any(item is None for item in found):
                 continue
             rows.append([name, label, *(points_text(item) for item in found if item is not None)])
-    rows += _over_n(results)
+    rows += _means(results)
     if not rows:
         return []
     return [
@@ -49,22 +49,36 @@ def differences(results: Mapping[str, Result]) -> list[str]:
     ]
 
 
-def _over_n(results: Mapping[str, Result]) -> list[list[str]]:
-    """Rows of how ours differs from the Equivariant Transporter on the mean over the N of figure 6,
-    where all of its cells are there."""
+def _means(results: Mapping[str, Result]) -> list[list[str]]:
+    """Rows of how ours differs from the Equivariant Transporter on a mean: over the N of figure 6,
+    where all of its cells are there, and over the trainings that are there of both."""
     rows = []
     ours, theirs = LEARNED[:2]
     for task in FIGURE_6:
         for count in DEMONSTRATIONS:
             names = [[f"{task}_{m}_{n}_{count}" for m in (ours, theirs)] for n in ORIENTATIONS]
-            if not all(name in results for pair in names for name in pair):
-                continue
-            pairs = [(results[one].summary, results[two].summary) for one, two in names]
-            found = [mean_paired_difference(pairs, rate) for rate in (STRICT, OWN)]
-            label = f"{task}, {count} demonstrations, mean over N"
-            texts = [points_text(item) for item in found if item is not None]
-            rows.append([label, METHODS[theirs], *texts])
+            if all(name in results for pair in names for name in pair):
+                label = f"{task}, {count} demonstrations, mean over N"
+                rows.append(_mean_row(results, label, names))
+        trained = [
+            [cell.name for cell in pair]
+            for pair in zip(headline(task, ours), headline(task, theirs), strict=True)
+            if all(cell.name in results for cell in pair)
+        ]
+        if len(trained) > 1:
+            label = f"{task}, N = 180, mean over {len(trained)} trainings"
+            rows.append(_mean_row(results, label, trained))
     return rows
+
+
+def _mean_row(
+    results: Mapping[str, Result], label: str, names: Sequence[Sequence[str]]
+) -> list[str]:
+    """A row: `label`, and the mean over pairs of cells of what the first has more."""
+    pairs = [(results[one].summary, results[two].summary) for one, two in names]
+    found = [mean_paired_difference(pairs, rate) for rate in (STRICT, OWN)]
+    texts = [points_text(item) for item in found if item is not None]
+    return [label, METHODS[LEARNED[1]], *texts]
 
 
 def _rivals(cell: Cell) -> list[tuple[str, str]]:

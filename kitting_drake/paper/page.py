@@ -18,6 +18,7 @@ from kitting_drake.paper.tables import (
     SHIPPED,
     paper_cells,
 )
+from kitting_drake.paper.trainings import trainings
 from kitting_drake.reporting.markdown import markdown_table, rate_text
 from kitting_drake.reporting.paired import STRICT, over_tools
 from kitting_drake.reporting.ravens_table import PAPER as TABLE_1
@@ -165,6 +166,7 @@ def paper_sections(
             sections.append(_TEN)
         if task == "unseen" and "unseen_transporter_36_100" in by_name:
             sections.append(_TRANSPORTER)
+    sections += trainings(by_name)
     if efficiency is not None:
         sections.append(efficiency_section(efficiency))
     sections += _beyond_the_paper(by_name)

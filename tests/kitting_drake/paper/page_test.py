@@ -36,7 +36,7 @@ def write(folder: Path, name: str, errors_mm: list[float]) -> None:
             "trained_orientations": cell.policy.orientations,
             "angle_only": cell.policy.angle_only,
             "demonstrations": cell.policy.demonstrations,
-            "training_seed": 0,
+            "training_seed": cell.policy.seed,
             "steps": cell.policy.steps,
             "learning_rate": 0.001,
             "decay": True,
@@ -98,6 +98,22 @@ def test_the_mean_over_n_is_compared_once_all_of_it_is_there(folder: Path):
     found = rows("\n".join(paper_sections(read_results(folder), {}, "results")))
     # -50 three times and +25 once.
     assert found[label] == ["-31.2 (-31.2 to -31.2)"] * 2
+
+
+def test_trainings_are_compared_once_there_are_two(folder: Path):
+    assert "One training and another" not in "\n".join(
+        paper_sections(read_results(folder), {}, "results")
+    )
+    write(folder, "unseen_so2_180_100_seed2", [1.0, 1.0, 1.0, 1.0])
+    found = rows("\n".join(paper_sections(read_results(folder), {}, "results")))
+    ours = found["SO(2)-equivariant (ours)", "unseen"]
+    # 75 and 100.
+    assert ours == ["75.0 / 75.0", "-", "100.0 / 100.0", "87.5 ± 17.7 / 87.5 ± 17.7"]
+    assert ("Equivariant Transporter", "unseen") not in found
+    write(folder, "unseen_equivariant_transporter_180_100_seed2", [1.0, 1.0, 1.0, 9.0])
+    found = rows("\n".join(paper_sections(read_results(folder), {}, "results")))
+    label = ("unseen, N = 180, mean over 2 trainings", "Equivariant Transporter")
+    assert found[label] == ["+25.0 (+25.0 to +25.0)"] * 2
 
 
 def test_the_learning_rates_that_were_tried_are_told(folder: Path):

@@ -1,0 +1,49 @@
+"""The section of the page of results on how much one training differs from another."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from statistics import mean, stdev
+
+from kitting_drake.paper.result import Result
+from kitting_drake.paper.tables import FIGURE_6, HEADLINE_SEEDS, headline
+from kitting_drake.reporting.markdown import markdown_table
+from kitting_drake.reporting.paired import OWN, STRICT
+from kitting_drake.reporting.runs import LEARNED, METHODS
+
+_INTRODUCTION = """\
+At N = 180 and after 100 demonstrations, each method is trained from three seeds. The seed sets the
+first weights, and the order and motions of the scenes that are learned from; demonstrations,
+validation scenes and test episodes are the same. In percent, strict and after the stroke by the
+paper's measure; last, the mean of the trainings that are there, and their standard deviation.
+"""
+
+
+def trainings(results: Mapping[str, Result]) -> list[str]:
+    """The section; empty where nothing has been trained from a second seed."""
+    rows = []
+    for task in FIGURE_6:
+        for method in LEARNED[:2]:
+            found = [results.get(cell.name) for cell in headline(task, method)]
+            there = [result for result in found if result is not None]
+            if len(there) > 1:
+                cells = ["-" if result is None else _rates([result]) for result in found]
+                rows.append([METHODS[method], task, *cells, _rates(there)])
+    if not rows:
+        return []
+    headings = ["method", "toolsets", *(f"seed {seed}" for seed in HEADLINE_SEEDS), "mean"]
+    return [
+        "### One training and another\n",
+        _INTRODUCTION,
+        markdown_table(headings, rows, left_columns=2),
+    ]
+
+
+def _rates(results: Sequence[Result]) -> str:
+    """The mean of both rates, and its standard deviation where there are several."""
+    texts = []
+    for rate in (STRICT, OWN):
+        percents = [100 * result.summary[rate] for result in results]
+        spread = f" ± {stdev(percents):.1f}" if len(percents) > 1 else ""
+        texts.append(f"{mean(percents):.1f}{spread}")
+    return " / ".join(texts)
