@@ -11,7 +11,7 @@ from kitting_drake.reporting.runs import LEARNED
 DEMONSTRATIONS = (100, 10)
 RAVENS_DEMONSTRATIONS = (100, 10, 1)
 HEADLINE_SEEDS = (0, 1, 2)
-"""From which each method is trained at N = 180 on 100 demonstrations."""
+"""From which each method of figure 6 is trained at N = 180 on 100 demonstrations."""
 FIGURE_6 = ("unseen", "seen")
 """The tasks of figure 6."""
 BEYOND_OF_TABLE_1 = ("stack_block_pyramid",)
@@ -55,16 +55,16 @@ def _checks() -> list[Cell]:
     ]
 
 
-def headline(task: str, method: str) -> list[Cell]:
-    """The cells at N = 180 after 100 demonstrations, one for each of `HEADLINE_SEEDS`."""
-    return [_paper_cell(task, method, 180, 100, seed) for seed in HEADLINE_SEEDS]
+def headline(task: str, method: str, seed: int) -> Cell:
+    """A method's cell at N = 180 after 100 demonstrations, of one of `HEADLINE_SEEDS`."""
+    return _paper_cell(task, method, 180, 100, seed)
 
 
 def _headline_seeds() -> list[Cell]:
     """Those of all seeds but the first, whose cells are in figure 6."""
     return [
-        headline(task, method)[index]
-        for index in range(1, len(HEADLINE_SEEDS))
+        headline(task, method, seed)
+        for seed in HEADLINE_SEEDS[1:]
         for task in FIGURE_6
         for method in LEARNED[:2]
     ]

@@ -12,8 +12,8 @@ from kitting_drake.reporting.paired import OWN, STRICT
 from kitting_drake.reporting.runs import LEARNED, METHODS
 
 _INTRODUCTION = """\
-At N = 180 and after 100 demonstrations, each method is trained from three seeds. The seed sets the
-first weights, and the order and motions of the scenes that are learned from; demonstrations,
+Trainings of each method from three seeds, at N = 180 and after 100 demonstrations. The seed sets
+the first weights, and the order and motions of the scenes that are learned from; demonstrations,
 validation scenes and test episodes are the same. In percent, strict and after the stroke by the
 paper's measure; last, the mean of the trainings that are there, and their standard deviation.
 """
@@ -24,7 +24,7 @@ def trainings(results: Mapping[str, Result]) -> list[str]:
     rows = []
     for task in FIGURE_6:
         for method in LEARNED[:2]:
-            found = [results.get(cell.name) for cell in headline(task, method)]
+            found = [results.get(headline(task, method, seed).name) for seed in HEADLINE_SEEDS]
             there = [result for result in found if result is not None]
             if len(there) > 1:
                 cells = ["-" if result is None else _rates([result]) for result in found]
