@@ -118,6 +118,8 @@ class Training:
     """As in the paper: augmented by motions of the whole scene only."""
     angle_only: bool = False
     """Whether only the pick-angle network is trained; all else is that of `base`."""
+    times: int = 1
+    """How many times the steps that every method gets as in the paper."""
 
     @property
     def base(self) -> Training | None:
@@ -130,7 +132,8 @@ class Training:
     def steps(self) -> int:
         """Those of all methods as in the paper; more where more is learned from."""
         task = TASKS[self.task]
-        return task.steps if self.taken_only and self.rigid else task.steps + task.more_steps
+        more = 0 if self.taken_only and self.rigid else task.more_steps
+        return self.times * (task.steps + more)
 
     @property
     def name(self) -> str:
@@ -142,6 +145,8 @@ class Training:
             kind += "_rigid"
         if self.angle_only:
             kind += "_angle_only"
+        if self.times > 1:
+            kind += f"_{self.times}_times_the_steps"
         return (
             f"{self.task}_{self.method}_{self.orientations}_{self.demonstrations}{kind}"
             f"_seed{self.seed}"

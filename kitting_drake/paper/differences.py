@@ -7,7 +7,14 @@ from collections.abc import Mapping, Sequence
 
 from kitting_drake.paper.cells import ORIENTATIONS, Cell, Training
 from kitting_drake.paper.result import Result
-from kitting_drake.paper.tables import DEMONSTRATIONS, FIGURE_6, HEADLINE_SEEDS, SHIPPED, headline
+from kitting_drake.paper.tables import (
+    DEMONSTRATIONS,
+    FIGURE_6,
+    HEADLINE_SEEDS,
+    PATIENT,
+    SHIPPED,
+    headline,
+)
 from kitting_drake.reporting.markdown import markdown_table
 from kitting_drake.reporting.paired import (
     OWN,
@@ -85,6 +92,8 @@ def _rivals(cell: Cell) -> list[tuple[str, str]]:
     training = cell.policy
     if cell.label == "trained_at_36" and isinstance(training, Training):
         return [("trained at N = 180", f"{cell.task}_{training.method}_36_100")]
+    if cell.label == PATIENT and isinstance(training, Training):
+        return [("in as many steps as the others", f"{cell.task}_{training.method}_36_100")]
     if cell.label == "generalist":
         others = [label for label in SHIPPED if label != cell.label]
         return [(label.replace("_", " "), f"{cell.task}_{label}") for label in others]

@@ -75,7 +75,8 @@ class Pretending(Queue):
         first, count = int(flags["--seed"]), int(flags["--episodes"])
         details = {"orientations": policy.orientations}
         if hasattr(policy, "weights"):
-            folder = Path(policy.weights).parent.name
+            trained_by = Path(policy.weights).with_name("summary.json")
+            folder = trained_by.parent.name
             task, method, trained, demonstrations = folder.split("_")[:4]
             details |= {
                 "method": method,
@@ -84,7 +85,7 @@ class Pretending(Queue):
                 "trained_orientations": int(trained),
                 "demonstrations": int(demonstrations),
                 "training_seed": 0,
-                "steps": TASKS[task].steps,
+                "steps": json.loads(trained_by.read_text())["steps"],
                 "learning_rate": float(folder.rpartition("_lr")[2]),
                 "decay": True,
                 "continuous": policy.continuous,
@@ -172,6 +173,21 @@ def test_what_has_no_n_is_trained_once(queue: Pretending):
     assert whole.base is None
     assert cells["seen_equivariant_transporter_36_100"].policy.base == whole
     assert cells["block_insertion_equivariant_transporter_36_100"].policy.base is None
+
+
+def test_more_patience_is_another_training(queue: Pretending):
+    patient = Cell(
+        "unseen",
+        dataclasses.replace(THEIRS.policy, times=3, learning_rate=LEARNING_RATES[0]),
+        36,
+        "3_times_the_steps",
+    )
+    assert patient.policy.steps == 3 * THEIRS.policy.steps
+    assert queue.run([patient]) == {}
+    summary = json.loads((queue.results / f"{patient.name}.json").read_text())
+    assert patient.departure(summary) is None
+    at_once = dataclasses.replace(patient, policy=dataclasses.replace(patient.policy, times=1))
+    assert at_once.departure(summary).startswith("steps is")
 
 
 def test_what_is_trained_does_not_wait_behind_what_is_not(queue: Pretending):
