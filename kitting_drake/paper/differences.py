@@ -26,11 +26,11 @@ from kitting_drake.reporting.paired import (
 from kitting_drake.reporting.runs import LEARNED, METHODS
 
 _INTRODUCTION = """\
-In points, with 95 % intervals by a bootstrap over episodes; above zero the first is better. They
-are of these very trainings: how much one differs from another is not in them. `none differs`: no
-episode does. A mean over N is of as many trainings as its cells have different `weights`; over all
-N and both numbers of demonstrations, the paper has ours 0.63 (seen) and 2.16 (unseen) points behind
-the Equivariant Transporter.
+The first cell minus the second on the same seeds, in points, with 95 % intervals by a bootstrap
+over episodes. They hold for these trainings; the variation between trainings is not in them.
+`none differs`: both came to the same in every episode. A mean over N is over as many trainings as
+its cells have different `weights`. On average over all N and both numbers of demonstrations, the
+paper has ours 0.63 (seen) and 2.16 (unseen) points behind the Equivariant Transporter.
 """
 
 
@@ -50,7 +50,7 @@ def differences(results: Mapping[str, Result]) -> list[str]:
     if not rows:
         return []
     return [
-        "### Differences on the same seeds\n",
+        "### Paired differences\n",
         _INTRODUCTION,
         markdown_table(["cell", "minus", "strict", "paper's measure"], rows, left_columns=2),
     ]
@@ -93,14 +93,14 @@ def _rivals(cell: Cell) -> list[tuple[str, str]]:
     if cell.label == "trained_at_36" and isinstance(training, Training):
         return [("trained at N = 180", f"{cell.task}_{training.method}_36_100")]
     if cell.label == PATIENT and isinstance(training, Training):
-        return [("in as many steps as the others", f"{cell.task}_{training.method}_36_100")]
+        return [("in the usual number of steps", f"{cell.task}_{training.method}_36_100")]
     if cell.label == "generalist":
         others = [label for label in SHIPPED if label != cell.label]
         return [(label.replace("_", " "), f"{cell.task}_{label}") for label in others]
     if not isinstance(training, Training) or training.method != "so2":
         return []
     if cell.label.startswith("minus"):
-        return [("ours, whole", f"{cell.task}_so2_180_100_ours")]
+        return [("ours, with all extensions", f"{cell.task}_so2_180_100_ours")]
     if cell.label == "ours_recovering":
         return [("in one try a tool", f"{cell.task}_so2_180_100_ours")]
     tail = f"{cell.orientations}_{training.demonstrations}"

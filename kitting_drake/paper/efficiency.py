@@ -19,10 +19,10 @@ EFFICIENCY = "networks.json"
 _INTRODUCTION = """\
 ### Efficiency, figure 6(c)
 
-The models of the pick angle, of the size that the paper gives (preset `paper`) and of the size that
-all else on this page has (`small`): their parameters, and the time of an inference. {machine}, in
-{type}, the median of {repeats}. The last column is N = {most} over N = {fewest}. The Transporter
-has no such model and is left out: its one picking network takes the scene at N / 2 angles.
+Parameters and inference time of the pick-angle networks, of the size that the paper gives (preset
+`paper`) and of the size used elsewhere on this page (`small`). {machine}, in {type}, the median
+of {repeats}. The last column is the growth from N = {fewest} to N = {most}, of parameters and of
+time. The Transporter has no such network: its one picking network sees the scene at N / 2 angles.
 
 ![Parameters and time of the networks](networks.png)
 

@@ -6,6 +6,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
+from kitting_drake.paper import texts
 from kitting_drake.paper.cells import LEARNING_RATES, ORIENTATIONS, PRESET, TASKS, Training
 from kitting_drake.paper.differences import differences
 from kitting_drake.paper.efficiency import efficiency_section
@@ -31,107 +32,15 @@ _TITLES = {"seen": "kitting-seen-toolset", "unseen": "kitting-unseen-toolsets"}
 
 _VARIANTS = {
     "as in the paper": "",
-    "with all that goes beyond it": "_ours",
-    "and mended, in two tries a tool": "_ours_recovering",
-    "without the hand's search": "_minus_search",
-    "without outlines": "_minus_outlines",
+    "with all extensions": "_ours",
+    "with recovery, in two tries a tool": "_ours_recovering",
+    "without the search by the hand": "_minus_search",
+    "without outline fitting": "_minus_outlines",
     "without any refinement": "_minus_refinement",
     "without labels of later picks": "_minus_all_targets",
     "without curvature and reflection": "_minus_curvature",
 }
 """Endings of the names of cells, by what their rows are called."""
-
-_BEYOND = """\
-Beyond the paper go: actions refined between pixels and orientations, and fitted to the outlines of
-tool and cavity; a hand that feels its way where an insertion is blocked; every tool of a scene as a
-label, not the one that was taken next; tools bent and mirrored to learn from. On the unseen
-toolsets networks learn from these samples in {more} steps, not {steps}. The policy itself says when
-it is done. One row more closes the loop: what an action left undone is mended (`recover`), for
-which each tool allows two actions, where the paper has one. When these rows were run, it was known
-what ours loses of these seeds. Colours are augmented in none of them: there is no such row to take
-away. All rows of the unseen toolsets but the first, and those of other labels or samples, share
-their networks. These were trained again for the ablation, from the same seed, as those before were
-not kept, and the rows run again; before, they came to 98.8 % strict in one try a tool, with the
-hand's search and without, and to 99.0 in two (`trained_before`, under "Other runs").
-"""
-
-_INTRODUCTION = """\
-## As in the paper
-
-Acting and augmenting as in the paper: actions quantized to pixels and N orientations, no search
-where an insertion is blocked, only the taken action as a label, scenes augmented by motions of the
-whole scene only; and no policy says when it is done, but an episode ends when every goal is met or
-its actions are spent (`end_at_success`), as in the Ravens benchmark. All methods of a task learn
-from the same demonstrations, of preset `{preset}`, for as many steps, and are tested on the same
-seeds, which nobody looked at before; the checkpoint is the one that does best on other scenes.
-
-How they learn is ours in this: a label between pixels and orientations is shared by those next to
-it (in the paper it is one-hot); the correlation at half the resolution, where the search for a
-place begins, has a loss of its own; alpha learns a class "nothing to pick"; learning rates rise
-and fall, over 1000 to 3000 steps (in the paper 0.0001, over 10,000); and checkpoints are compared
-by refined actions, or by their loss where many actions are right.
-
-What does not depend on N is trained once, at N = 180, and tested at every N: all networks of ours,
-and of the Equivariant Transporter all but the one for pick angles, which is trained at each N
-beside the others. Where a machine was given up between two cells, it was trained again from the
-same seed: `weights`, in the last table, tells which cells share theirs. Whether it costs anything
-is asked at N = 36, by cells whose networks were all trained there (`trained_at_36`, among the
-differences); what these differ by is also what one training differs from another by. Written by
-`python -m kitting_drake.benchmark paper`, which runs these cells, and
-`python -m kitting_drake.results`; each file must be exactly what its cell says.
-
-{rates}
-A cell is the strict success rate in percent with its 95 % interval (Wilson's, over objects), and
-after the stroke the paper's measure. `-`: not run yet, for want of machine time: {done} of {all}
-cells are done, whose episodes alone took {hours:.0f} hours of a core. `benchmark paper` goes on.
-"""
-
-_TEN = """\
-After ten demonstrations much is chance. Networks of ours that learned from the same seeds on two
-machines came to 82.2 % (an earlier file, under "Other runs") and to 68.5 % strict at N = 180. The
-episodes of the first were run by Drake 1.51 and of the second by 1.58; that is hardly why: see
-"Every cell". The training was looked into on scenes that are no test, 120 of the ninety
-demonstrations that were not learned from, by scripts that are not kept. Of the second training the
-validation scenes have the checkpoint of step 500, which was kept, at 1.9 mm and the last, of step
-1500, at 2.1 mm; on those 120 they are at 4.1 and 3.0 mm (the last better by 1.0, with a standard
-error of 0.5). To keep the latest checkpoint within one standard error of the best would have kept
-the last here, and was tried: of the Equivariant Transporter it takes the last instead of that of
-step 1250, which is worse by 0.6 mm, with a standard error of 0.3. It is no better a rule, and all
-methods keep the one that displaces objects least.
-"""
-
-_TRANSPORTER = """\
-What the Transporter loses is most often put into the cavity of another tool (`why not`, in "Every
-cell"). After 100 demonstrations, on both toolsets, it did best on the validation scenes at its last
-step, as the others do: more steps may help it. On the seen toolset it comes further from ten
-demonstrations than from a hundred, on the validation scenes too: in as many steps it meets each of
-the ten ten times as often. In the tables it has as many steps as they; what three times as many
-make of it is asked by cells of their own (`3_times_the_steps`, among the differences once they are
-run), of both toolsets and of align box corner, where it misplaces most. Else only its learning rate
-was chosen.
-"""
-
-_PALLETIZING = """\
-Palletizing is learned in 3000 steps, by every method, the four others in 1000: chosen after some of
-this test had been seen. After 1000 steps ours, of ten demonstrations, lost boxes in episodes of the
-seeds 3200 to 3233 of it (their rewards and causes were looked at), and of a hundred on 100 to 104;
-why, was looked at on 100, 101 and 103: boxes were put onto others of their own layer, or across it.
-The seeds 3234 to 3249 had been run by nobody before.
-"""
-
-_FINGERS = """\
-After ten and a hundred demonstrations only the pyramid comes out below the paper, and it alone was
-also run with what goes beyond it. The fingers are 15 mm deep, and between its cubes are 10 mm:
-along their row a hand that puts one down pushes the others away. Which way it holds a cube, and in
-which of four rotations it puts it down, are drawn apart: neither the crop about a pick nor the
-scene tells. With what goes beyond the paper (actions refined between pixels and orientations; and
-of rotations that the networks hold for as good, the one where the fingers have room as they let
-go), the same networks. The cause was found in the episodes 3200 to 3236 of a cell of the pyramid,
-which are of this test too; the rule was tried on the seeds 100 to 119, and not changed after. Of
-what it loses at N = 180 after 100 demonstrations, five episodes were looked at: two lost a cube
-that was put down 15 degrees off, three one that was pushed or toppled after it had been put down
-within a millimetre:
-"""
 
 
 def paper_sections(
@@ -151,23 +60,20 @@ def paper_sections(
     if not results:
         return []
     by_name = {result.cell.name: result for result in results}
-    introduction = _INTRODUCTION.format(
-        preset=PRESET,
-        rates=_rates_text(rates),
-        done=len(results),
-        all=len(paper_cells()),
-        hours=sum(result.summary["wall_seconds"] for result in results) / 3600,
-    )
-    sections = [introduction]
+    sections = [
+        texts.INTRODUCTION.format(
+            preset=PRESET, rates=_rates_text(rates), state=_state_text(results)
+        )
+    ]
     for task, heading in _HEADINGS.items():
         sections.append(f"### {heading}\n")
         if has_figure(task, results):
             sections.append(f"![Figure 6 of {task} tools](results_{task}.png)\n")
         sections.append(_figure_table(task, by_name))
         if task == "unseen" and "unseen_so2_180_10" in by_name:
-            sections.append(_TEN)
+            sections.append(texts.TEN)
         if task == "unseen" and "unseen_transporter_36_100" in by_name:
-            sections.append(_TRANSPORTER)
+            sections.append(texts.TRANSPORTER)
     sections += trainings(by_name)
     if efficiency is not None:
         sections.append(efficiency_section(efficiency))
@@ -194,15 +100,26 @@ def has_table_1(results: Iterable[Result]) -> bool:
     return any(TASKS[result.cell.task].table == "I" for result in results)
 
 
+def _state_text(results: Sequence[Result]) -> str:
+    """How many of the cells have been run, and what that took."""
+    count = len(paper_cells())
+    hours = sum(result.summary["wall_seconds"] for result in results) / 3600
+    text = texts.ALL if len(results) == count else texts.NOT_ALL
+    return text.format(done=len(results), all=count, hours=hours)
+
+
 def _rates_text(rates: Rates) -> str:
     if not rates:
-        return f"Ours learns at {LEARNING_RATES[0]:g}.\n"
+        return f"The learning rate of ours is {LEARNING_RATES[0]:g}.\n"
     parts = []
     for method, costs in rates.items():
         best = best_rate(costs)
         tried = ", ".join(f"{rate}: {cost:.1f} mm" for rate, cost in costs.items())
-        parts.append(f"the {METHODS[method]} at {best}, the best on validation scenes of {tried}")
-    return f"Ours learns at {LEARNING_RATES[0]:g}; {'; '.join(parts)}.\n"
+        parts.append(f"- the {METHODS[method]}: {best}, of {tried}\n")
+    return (
+        f"The learning rate of ours is {LEARNING_RATES[0]:g}. For each baseline it is the best of "
+        "three, by the displacement\non validation scenes:\n\n" + "".join(parts)
+    )
 
 
 def _figure_table(task: str, results: Mapping[str, Result]) -> str:
@@ -242,8 +159,8 @@ def _beyond_the_paper(results: Mapping[str, Result]) -> list[str]:
         for label, name in names.items()
     ]
     return [
-        "### With what goes beyond the paper, and without one thing at a time\n",
-        _BEYOND.format(steps=steps, more=steps + TASKS["unseen"].more_steps),
+        "### Beyond the paper, and an ablation\n",
+        texts.BEYOND.format(steps=steps, more=steps + TASKS["unseen"].more_steps),
         markdown_table(["ours, N = 180, 100 demonstrations", "unseen", "seen"], rows),
     ]
 
@@ -273,18 +190,20 @@ def _table_1(results: Mapping[str, Result]) -> list[str]:
     headings = ["method", "N", "demonstrations"]
     sections = [
         "### The five Ravens tasks, table I\n",
-        "The mean reward in percent with its 95 % interval, over episodes, and after the stroke "
-        "what the\npaper gives: of the checkpoint that is best on the test runs.\n",
+        "The mean reward in percent with its 95 % interval over episodes, and after the stroke the "
+        "figure\nof the paper, whose checkpoints are the best on the test runs.\n",
         "![Table I as a figure](results_ravens.png)\n",
         markdown_table([*headings, *tasks], rows),
-        _PALLETIZING,
     ]
+    if any(name.startswith("palletizing_boxes") for name in results):
+        sections.append(texts.PALLETIZING)
     if any(
         f"{task}_so2" in name and name.endswith("_ours")
         for name in results
         for task in BEYOND_OF_TABLE_1
     ):
-        sections += [_FINGERS, markdown_table([*headings, *BEYOND_OF_TABLE_1], beyond)]
+        table = markdown_table([*headings, *BEYOND_OF_TABLE_1], beyond)
+        sections += [texts.PYRAMID, table, texts.PYRAMID_SEEN]
     return sections
 
 
@@ -297,10 +216,8 @@ def _fresh_tools(results: Mapping[str, Result]) -> list[str]:
         for label, result in found.items()
     ]
     return [
-        "### Ten tools that nobody had looked at\n",
-        "The policies as they come, with all that goes beyond the paper, on the toolsets of split "
-        "`fresh`:\nmade for this, kept out of every training, and looked at by nobody before "
-        "these runs.\n",
+        "### Ten fresh tools\n",
+        texts.FRESH,
         markdown_table(["policy", "strict, %", "over tools", "paper's, %"], rows),
     ]
 
@@ -342,18 +259,9 @@ def _every_cell(results: Sequence[Result], link: str) -> str:
             ]
         )
     headings = ["cell", "trained at N", "steps", "learning rate", "training seed", "episodes"]
-    headings += ["seeds", "strict, %", "over tools", "paper's, %", "why not"]
+    headings += ["seeds", "strict, %", "over tools", "paper's, %", "causes"]
     headings += ["weights", "Drake", "commit"]
-    return (
-        "`over tools`: the 95 % interval of the strict rate by a bootstrap that draws tools; `-` "
-        "where fewer\nthan three fail, which tells nothing of others, and where no tools are "
-        "drawn. With ten or twenty\ntools it is on the narrow side. `weights`: the first digits of "
-        "their digest. `Drake`: by\nwhich its episodes were run. It makes little of a "
-        "difference: the quantized oracle of N = 36,\nwhich sees no pictures, came to 93.8 % "
-        "strict and the same causes by 1.51 and, run again, by 1.58\n"
-        "(`unseen_quantized_oracle_36_drake_1.58.json`); two of its 100 episodes differ, one each "
-        "way.\n\n" + markdown_table(headings, rows)
-    )
+    return f"{texts.EVERY_CELL}\n{markdown_table(headings, rows)}"
 
 
 def _causes(summary: Mapping[str, Any]) -> str:

@@ -12,10 +12,10 @@ from kitting_drake.reporting.paired import OWN, STRICT
 from kitting_drake.reporting.runs import LEARNED, METHODS
 
 _INTRODUCTION = """\
-Trainings of each method from three seeds, at N = 180 and after 100 demonstrations. The seed sets
-the first weights, and the order and motions of the scenes that are learned from; demonstrations,
-validation scenes and test episodes are the same. In percent, strict and after the stroke by the
-paper's measure; last, the mean of the trainings that are there, and their standard deviation.
+Three trainings of each method at N = 180 after 100 demonstrations. The seed of a training sets
+its initial weights, and the order and augmentation of its samples; demonstrations, validation
+scenes and test episodes are the same. Success rates in percent, strict and by the paper's
+measure; the mean is given with the standard deviation over trainings.
 """
 
 
@@ -33,7 +33,7 @@ def trainings(results: Mapping[str, Result]) -> list[str]:
         return []
     headings = ["method", "toolsets", *(f"seed {seed}" for seed in HEADLINE_SEEDS), "mean"]
     return [
-        "### One training and another\n",
+        "### Variation between trainings\n",
         _INTRODUCTION,
         markdown_table(headings, rows, left_columns=2),
     ]

@@ -78,8 +78,8 @@ def ravens_section(runs: Sequence[Run]) -> list[str]:
         rows.append([name, str(orientations or ""), str(count or ""), *values])
     headings = ["method", "N", "demonstrations", *TASKS]
     return [
-        "## The five Ravens tasks, by default\n",
-        "With what goes beyond the paper: actions refined between pixels and orientations. The "
-        "mean reward\nin percent, its 95 % interval and the number of episodes.\n",
+        "### The five Ravens tasks\n",
+        "With sub-pixel and sub-bin refinement. The mean reward in percent, its 95 % interval and "
+        "the\nnumber of episodes.\n",
         markdown_table(headings, rows),
     ]

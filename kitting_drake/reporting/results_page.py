@@ -35,44 +35,48 @@ PAPER = {
 _INTRODUCTION = """\
 # Results
 
-Written by `python -m kitting_drake.results` from files alone, each the `summary.json` of one
-`evaluate`; they are listed at the end. Do not edit.
+Written by `python -m kitting_drake.results` from the `summary.json` of many runs of `evaluate`,
+listed at the end: do not edit. First come the paper's experiments, measured as in the paper; then
+the policies on the scenarios as they are by default, with all extensions; then every other run.
 
-Three parts: what the paper did, measured as the paper did it; what these policies do as the
-scenarios have them, with all that goes beyond the paper; and every other run.
+## How to read the tables
 
-A cell of the second part is `strict / paper's, episodes`. The strict success rate in percent is
-what a person would sign: the share of the objects that are a success by the paper's measure, within
-2 mm of their height and within 20 degrees of their heading, modulo the symmetry that the object
-declares. The paper's measure (section IV-C) is ADD-S below 3.5 mm alone; it forgives a flat object
-that protrudes, or lies the wrong way round. Episodes that failed or timed out count 0. In brackets
-are 95 % intervals (Wilson's, as if every object of every episode were drawn anew: for *these*
-objects; of objects in general the twenty tools of the test set tell less). `-`: not run. A star:
-actions are refined to sub-pixel and sub-bin accuracy, which the paper does not do; without it they
-are quantized. Two stars: places are also refined by the outlines of object and recess. A dagger:
-run at another N than it was trained at.
+- *Strict success* is an object that is a success by the paper's measure, within 2 mm of its height
+  and within 20 degrees of its heading, modulo the symmetry that the object declares.
+- *The paper's measure* (section IV-C) is ADD-S below 3.5 mm alone. It accepts a flat object that
+  protrudes, or that is reversed.
+- Episodes that failed or timed out count 0.
+- In brackets are 95 % intervals (Wilson's), as if every object of every episode were drawn anew.
+  They hold for *these* objects; of objects in general, the twenty tools of the test split tell
+  less.
+- The oracle knows the true poses. Quantized, it acts in pixels and N orientations, and no policy at
+  that N can be expected to do better. Exact, it has no N, and its figure stands in every column.
+- The paper gives two cells of figure 6 as numbers, over 100 episodes each and with the best of its
+  checkpoints (section V-C.2). The others are bars, and are left out.
 
-A run is in a task's tables only if nothing but the policy differs from that task of the paper as
-the scenarios have it by default. Any other run is listed under "Other runs", with what differs;
-`an earlier hand` did not grip what is heavy more firmly, press, or search in a spiral.
+## Which seeds were looked at
 
-These policies and the hand were improved while looking at episodes of the seeds 0 to 99, 300 to
-314, 600 to 607, 640 to 689 and 700 to 728, with the tools of the test split, and of the seed 112
-of stack-block-pyramid; those that fit outlines also at 800 to 849 and 960 to 974, and those that
-recover at 900 to 912, 940 to 951 and 1000 to 1006; after they had been run, also at what failed of
+The policies and the hand were improved while looking at episodes of the seeds 0 to 99, 300 to 314,
+600 to 607, 640 to 689 and 700 to 728, with the tools of the test split, and of the seed 112 of
+stack-block-pyramid; those that fit outlines also at 800 to 849 and 960 to 974, and those that
+recover also at 900 to 912, 940 to 951 and 1000 to 1006. Failures were looked at, after the run, of
 1200 to 1224, 1300 to 1366, 1900 to 1924, 2000 to 2024, 2100 to 2124, 2200 to 2224, 2400 to 2424,
-2820 to 2844, 2870 to 2894, 2900 to 2924 and 3000 to 3099, and 3200 to 3236, 3252 and 3299 of
-stack-block-pyramid.
-No others were looked at before they were run.
-
-The oracle knows the truth. Quantized, it acts in pixels and N orientations: no policy of that N can
-be expected to do better. Exact, it has no N, and its one figure stands in every column.
-
-The paper gives two of these cells as numbers, over 100 episodes each and with the best of its
-checkpoints (section V-C.2). The others are bars of its figure 6, and left out.
+2820 to 2844, 2870 to 2894, 2900 to 2924 and 3000 to 3099, and of 3200 to 3236, 3252 and 3299 of
+stack-block-pyramid. No others were looked at before they were run.
 
 Runs of the first turn, which are not comparable with these, are in
 [results_first_turn.md](results_first_turn.md).
+"""
+
+_DEFAULTS = """\
+## The policies by default, with all extensions
+
+A run is in these tables only if nothing but its policy differs from the paper's task as the
+scenarios have it by default; any other is under "Other runs", with what differs. A cell is
+`strict / paper's, episodes`, and `-` was not run. A star: actions are refined to sub-pixel and
+sub-bin accuracy, which the paper does not do. Two stars: places are also fitted to the outlines of
+object and recess. A dagger: run at another N than it was trained at. `an earlier hand` did not grip
+heavy objects more firmly, press, or search in a spiral.
 """
 
 
@@ -85,8 +89,11 @@ def results_page(runs: Sequence[Run], link: str, paper: Sequence[str] = ()) -> s
         paper: the sections of `kitting_drake.paper.page`.
     """
     sections = [_INTRODUCTION, *paper]
+    if runs:
+        sections.append(_DEFAULTS)
     for task in PAPER_TASKS:
-        sections += _task_sections(task, [run for run in runs if run.paper_task == task])
+        if of_task := [run for run in runs if run.paper_task == task]:
+            sections += _task_sections(task, of_task)
     sections += ravens_section(runs)
     others = [run for run in runs if run.paper_task is None and not in_ravens_table(run)]
     if others:
@@ -98,15 +105,14 @@ def results_page(runs: Sequence[Run], link: str, paper: Sequence[str] = ()) -> s
 
 def _task_sections(task: str, runs: list[Run]) -> list[str]:
     paper = PAPER[task]
-    sections = [
-        f"## {paper.heading}, with what goes beyond the paper (`{task}`)\n",
+    return [
+        f"### {paper.heading} (`{task}`)\n",
         _success_table(runs, paper),
         f"In the paper the Equivariant Transporter is {paper.transporter_gain} points better "
         "than the SO(2)-equivariant\nmethod, on average over N and demonstrations.\n",
+        *_most_tested_run(runs),
+        *_causes(runs),
     ]
-    if runs:
-        sections += [*_most_tested_run(runs), *_causes(runs)]
-    return sections
 
 
 def _success_table(runs: list[Run], paper: _Paper) -> str:
@@ -186,8 +192,8 @@ def _most_tested_run(runs: list[Run]) -> list[str]:
         [name, *(errors(row["action_errors"][key]) for key in ACTION_ERRORS)] for name, row in rows
     ]
     return [
-        f"### By category: {most.label}\n",
-        "How far from their goals the objects ended: median and 95th percentile.\n",
+        f"#### By category: {most.label}\n",
+        "Errors of the objects at the end of an episode: median and 95th percentile.\n",
         markdown_table(
             [
                 "category",
@@ -200,7 +206,7 @@ def _most_tested_run(runs: list[Run]) -> list[str]:
             ],
             placed,
         ),
-        "How far the policy's actions were from the annotated grasp, and from the goal.\n",
+        "Errors of the policy's actions, against the annotated grasp and the goal.\n",
         markdown_table(["category", "pick, mm", "pick, deg", "place, mm", "place, deg"], acted),
     ]
 
@@ -219,7 +225,7 @@ def _causes(runs: list[Run]) -> list[str]:
         )
     ambiguous = [f"success, but {name}" for name in AMBIGUITIES]
     return [
-        "### Why objects were no success, or no strict one\n",
+        "#### Causes of failure\n",
         markdown_table(["run", "seeds", "objects", *causes, *ambiguous], rows, left_columns=2),
     ]
 

@@ -104,7 +104,7 @@ def test_success_by_method_and_orientations_strict_first(folder: Path):
     ]
     assert rows["oracle, exact", "", ""] == [*"----"]
     assert rows["*paper*, ours", "", "100"] == ["", "", "", "- / 96.5"]
-    assert successes(page(folder), UNSEEN)["*paper*, ours", "", "100"][-1] == "- / 87.25"
+    assert UNSEEN not in page(folder)
 
 
 def test_a_policy_of_ones_own_has_one_figure_for_all(folder: Path):
@@ -143,8 +143,7 @@ def test_a_run_is_the_papers_only_if_nothing_but_the_policy_differs(
         (others,) = tables(text)["Other runs"]
         assert [row[0] for row in others[1:]] == ["run.json"]
         assert others[1][3] == departures
-        for title in PAPER_TASKS:
-            assert successes(text, title)["oracle, exact", "", ""] == [*"----"]
+        assert not any(title in heading for title in PAPER_TASKS for heading in tables(text))
     else:
         assert "Other runs" not in tables(text)
         assert "-" not in successes(text, task)["oracle, exact", "", ""]
@@ -168,7 +167,7 @@ def test_the_most_tested_network_and_all_causes(folder: Path):
     assert [row[0] for row in placed[1:]] == ["block", "bolt", "cup", "ring", "all"]
     assert placed[1][1:4] == ["0.0 (0.0 to 27.8)", "100.0 (72.2 to 100.0)", "2.00, 2.00"]
     assert acted[1][1:] == ["1.00, 1.00", "2.00, 2.00", "4.00, 4.00", "6.00, 6.00"]
-    (causes,) = found["Why objects were no success, or no strict one"]
+    (causes,) = found["Causes of failure"]
     columns = [0, 1, 2, causes[0].index("misplaced"), causes[0].index("success, but protruding")]
     assert [[row[column] for column in columns] for row in causes[1:]] == [
         [
@@ -213,7 +212,7 @@ def test_tables_are_aligned(folder: Path):
 
 def test_without_files_there_is_a_page(tmp_path: Path):
     text = page(tmp_path)
-    assert successes(text, SEEN)["*paper*, ours", "", "100"][-1] == "- / 96.5"
+    assert tables(text) == {}
     assert text.endswith("There are none yet.\n")
     with pytest.raises(UserError, match=r"there is no folder .*none"):
         read_runs(tmp_path / "none")
