@@ -1,4 +1,4 @@
-"""From a scenario to the Diagram of the kitting cell: the only place where systems are wired."""
+"""From a scenario to the Diagram of the kitting cell: here its systems are wired together."""
 
 import functools
 from collections.abc import Sequence, Set
@@ -9,9 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 from pydrake.geometry import (
     CollisionFilterDeclaration,
-    ColorRenderCamera,
-    DepthRange,
-    DepthRenderCamera,
     GeometrySet,
     Meshcat,
     MeshcatVisualizer,
@@ -23,22 +20,12 @@ from pydrake.math import RigidTransform
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import BodyIndex, RigidBody
 from pydrake.systems.framework import Context, Diagram, DiagramBuilder, LeafSystem
-from pydrake.systems.sensors import RgbdSensor
 from pydrake.visualization import VideoWriter
 
-from kitting_drake.cell.appearance import lights_of, paint_surfaces
-from kitting_drake.cell.cameras import (
-    OVERVIEW,
-    add_film_renderer,
-    add_observation_renderer,
-    add_picture_renderer,
-    camera_pose,
-    can_render,
-    depth_camera,
-    picture_camera,
-)
+from kitting_drake.cell.appearance import paint_surfaces
+from kitting_drake.cell.cameras import add_picture_renderer, can_render
 from kitting_drake.cell.plant import add_models, add_plant, bounded_body, set_initial_poses
-from kitting_drake.common.errors import UserError
+from kitting_drake.cell.sensing import add_cameras, add_video
 from kitting_drake.scenario.policies import DecisionObserver, PolicySite
 from kitting_drake.scenario.schema import Scenario
 from kitting_drake.tasks.task import Scene
@@ -48,17 +35,9 @@ from systems.pick_place_policy import PickPlacePolicy
 from systems.placement import PlacedObject, Placement, evaluate_placements
 from systems.placement_monitor import PlacementMonitor
 from systems.rest_detector import RestDetector
-from systems.sensor_noise import SensorNoise
-from systems.signals import PixelGrid
 from systems.trajectory_controller import TrajectoryController
 
 MESHCAT_PERIOD = 1 / 32
-_IMAGES = {
-    "color_image": "color_image",
-    "depth_image_32f": "depth_image",
-    "body_pose_in_world": "body_pose_in_world",
-}
-"""A camera's output ports, and the projector's input ports but for the camera's name."""
 
 
 @dataclass(frozen=True)
@@ -193,7 +172,7 @@ def build_cell(
     # Cameras, policy, planner and controller.
     projector = None
     if scenario.policy.needs_observation or (scenario.cameras and can_render()):
-        projector = _add_cameras(builder, scenario, scene_graph, grid, seed)
+        projector = add_cameras(builder, scenario, scene_graph, grid, seed)
         builder.ExportOutput(projector.GetOutputPort("observation"), "observation")
     site = PolicySite(
         scene=scene,
@@ -206,16 +185,9 @@ def build_cell(
     policy = _add_policy(builder, scenario, site, plant, projector)
     planner = _add_planner_and_controller(builder, scenario, scene, plant, policy, projector)
 
-    # Score and rest.
-    monitor = builder.AddNamedSystem(
-        "monitor", PlacementMonitor(objects=objects, goals=scene.goals, success=scene.success)
+    monitor, rest_detector = _add_score_and_rest(
+        builder, scenario, scene, plant, scene_graph, objects
     )
-    builder.Connect(plant.get_body_poses_output_port(), monitor.GetInputPort("body_poses"))
-    rest_detector = builder.AddNamedSystem(
-        "rest_detector", _make_rest_detector(scenario, plant, scene_graph, objects)
-    )
-    builder.Connect(plant.get_body_poses_output_port(), rest_detector.GetInputPort("body_poses"))
-
     for system, ports in (
         (policy, ["action"]),
         (monitor, [monitor.get_output_port(i).get_name() for i in range(7)]),
@@ -223,13 +195,15 @@ def build_cell(
     ):
         for port in ports:
             builder.ExportOutput(system.GetOutputPort(port), port)
+
+    # What shows it.
     if meshcat is not None:
         parameters = MeshcatVisualizerParams(role=Role.kIllustration)
         parameters.publish_period = MESHCAT_PERIOD
         MeshcatVisualizer.AddToBuilder(builder, scene_graph, meshcat, parameters)
     if picture:
         add_picture_renderer(scene_graph)
-    video_writer = None if video is None else _add_video(builder, scene_graph, video)
+    video_writer = None if video is None else add_video(builder, scene_graph, video)
     diagram = builder.Build()
     diagram.set_name("cell")
     return Cell(
@@ -341,6 +315,26 @@ def _make_controller(scenario: Scenario, plant: MultibodyPlant) -> TrajectoryCon
     )
 
 
+def _add_score_and_rest(
+    builder: DiagramBuilder,
+    scenario: Scenario,
+    scene: Scene,
+    plant: MultibodyPlant,
+    scene_graph: SceneGraph,
+    objects: tuple[PlacedObject, ...],
+) -> tuple[PlacementMonitor, RestDetector]:
+    """Adds both, which watch the bodies."""
+    monitor = builder.AddNamedSystem(
+        "monitor", PlacementMonitor(objects=objects, goals=scene.goals, success=scene.success)
+    )
+    rest_detector = builder.AddNamedSystem(
+        "rest_detector", _make_rest_detector(scenario, plant, scene_graph, objects)
+    )
+    for system in (monitor, rest_detector):
+        builder.Connect(plant.get_body_poses_output_port(), system.GetInputPort("body_poses"))
+    return monitor, rest_detector
+
+
 def _make_rest_detector(
     scenario: Scenario,
     plant: MultibodyPlant,
@@ -356,68 +350,3 @@ def _make_rest_detector(
         time_to_sleep=scenario.sleep.time_to_sleep,
         wake_distance=scenario.sleep.wake_distance,
     )
-
-
-def _add_cameras(
-    builder: DiagramBuilder,
-    scenario: Scenario,
-    scene_graph: SceneGraph,
-    grid: PixelGrid,
-    seed: int,
-) -> HeightmapProjector:
-    if not scenario.cameras:
-        raise UserError("cameras is empty: the heightmap needs at least one")
-    lights = lights_of(scenario.appearance, seed)
-    renderer = add_observation_renderer(scene_graph, lights)
-    cameras = {name: depth_camera(config, renderer) for name, config in scenario.cameras.items()}
-    projector = builder.AddNamedSystem(
-        "heightmap_projector", HeightmapProjector(cameras=cameras, grid=grid)
-    )
-    for number, (name, config) in enumerate(scenario.cameras.items()):
-        sensor = builder.AddNamedSystem(
-            f"camera_{name}",
-            RgbdSensor(
-                parent_id=scene_graph.world_frame_id(),
-                X_PB=camera_pose(config),
-                color_camera=ColorRenderCamera(cameras[name].core()),
-                depth_camera=cameras[name],
-            ),
-        )
-        builder.Connect(scene_graph.get_query_output_port(), sensor.query_object_input_port())
-        source: LeafSystem = sensor
-        use_labels = bool(scenario.appearance.sheen)
-        if use_labels or not scenario.sensor_noise.is_none:
-            source = builder.AddNamedSystem(
-                f"sensor_noise_{name}",
-                SensorNoise(
-                    parameters=scenario.sensor_noise,
-                    camera=cameras[name],
-                    seed=seed,
-                    number=number,
-                    workspace_middle=((grid.x_min + grid.x_max) / 2, (grid.y_min + grid.y_max) / 2),
-                    use_labels=use_labels,
-                ),
-            )
-            for port in (*_IMAGES, *(["label_image"] if use_labels else [])):
-                builder.Connect(sensor.GetOutputPort(port), source.GetInputPort(port))
-        for output, port in _IMAGES.items():
-            builder.Connect(source.GetOutputPort(output), projector.GetInputPort(f"{port}_{name}"))
-    return projector
-
-
-def _add_video(builder: DiagramBuilder, scene_graph: SceneGraph, path: Path) -> VideoWriter:
-    core = picture_camera(add_film_renderer(scene_graph), width=640, height=400)
-    sensor = builder.AddNamedSystem(
-        # No camera of a scenario can be called so.
-        "film_camera",
-        RgbdSensor(
-            parent_id=scene_graph.world_frame_id(),
-            X_PB=camera_pose(OVERVIEW),
-            color_camera=ColorRenderCamera(core),
-            depth_camera=DepthRenderCamera(core, DepthRange(0.05, 10.0)),
-        ),
-    )
-    builder.Connect(scene_graph.get_query_output_port(), sensor.query_object_input_port())
-    writer = builder.AddNamedSystem("video_writer", VideoWriter(filename=str(path), fps=16.0))
-    writer.ConnectRgbdSensor(builder=builder, sensor=sensor)
-    return writer
