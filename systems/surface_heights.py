@@ -29,7 +29,7 @@ _SMOOTHED = 9
 _FLAT = 0.012
 """Where the heights of these differ by more there are edges, which are no noise, in metres."""
 _NOISY_RIM_SHARE, _NOISY_RIM_BIAS = 90.0, 1.0
-"""Of the pixels around a place some two thirds are its rim: the percentile of all that is so many
+"""Some two thirds of the pixels around a place are its rim: the percentile of all that is so many
 standard deviations above the middle of these."""
 _TABLE_BAND = 0.008
 """Pixels within this of the table's height belong to it, however it is tilted, in metres."""

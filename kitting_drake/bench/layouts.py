@@ -26,7 +26,7 @@ _POSES = ("camera_to_base", "pose", "transform", "base_to_camera")
 _POSITIONS = ("position", "translation")
 _ROTATIONS = ("orientation", "quaternion_xyzw", "rotation", "rpy_deg", "rvec")
 _ENVELOPE = ("header", "child_frame_id", "covariance")
-"""What ROS writes around a pose."""
+"""The keys that ROS writes around a pose."""
 
 POSE_FIELDS = ("R_cam2base", "t_cam2base", *_POSES)
 """The fields of a mapping that tell a pose."""

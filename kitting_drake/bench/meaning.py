@@ -1,4 +1,4 @@
-"""What a check of cameras found, for a person: numbers, and what each means for the clearance."""
+"""The report of a check of cameras: numbers, and their meaning for the clearance."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _CLEAN, _NOISY = 0.0005, 0.0016
 """Heights with less noise than the first are taken as they are; with more than the second, what is
 3 mm high or deep is lost (`policies/matching/segmentation.py`). In metres."""
 _LOST = 1.8
-"""What is lower than this many times the noise is lost: two standard deviations of what smoothing
+"""Anything lower than this many times the noise is lost: two standard deviations of what smoothing
 leaves of it, nine tenths where neighbouring pixels err alike."""
 _FEW_HOLES, _MANY_HOLES = 0.02, 0.10
 

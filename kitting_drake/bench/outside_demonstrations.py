@@ -132,7 +132,7 @@ def check_action(step: StepFolder, action: StepAction, calibration: Calibration)
 
 
 def convert(folder: Path, calibration: Calibration, learning: Learning, path: Path) -> Summary:
-    """Writes a folder's demonstrations to a file, whole or not at all.
+    """Writes a folder's demonstrations to a file, atomically.
 
     Args:
         folder: see `find_demonstrations`.

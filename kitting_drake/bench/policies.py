@@ -29,19 +29,19 @@ _SAME_ANGLE = math.radians(10)
 
 @dataclass(frozen=True)
 class Choice:
-    """What a policy chose."""
+    """The choice of a policy."""
 
     action: PickPlaceAction
     confidence: float | None
     """0 to 1; None where a rule of geometry decided, which weighs nothing."""
     parts: dict[str, float] = field(default_factory=dict)
-    """What the confidence is the product of."""
+    """The factors of the confidence."""
     draw: Callable[[], bytes] = bytes
     """Draws the decision: a PNG."""
 
 
 class BenchPolicy(Protocol):
-    """What decides."""
+    """A policy that decides on a frame."""
 
     @property
     def name(self) -> str:
@@ -96,7 +96,7 @@ class _Networks:
     policy: LearnedPolicy
     name: str
     resolution: float | None
-    """Of the pixels that it learned from, in metres, if its file says."""
+    """The size of the pixels that it learned from, in metres, if its file tells."""
 
     def check_grid(self, grid: PixelGrid) -> None:
         learned, given = self.resolution, grid.resolution

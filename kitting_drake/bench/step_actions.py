@@ -1,4 +1,4 @@
-"""What a person or a robot did after a frame: the `action.json` beside it, read and written."""
+"""The action of a person or a robot after a frame: `action.json` beside it, read and written."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from systems.signals import PickPlaceAction, PixelGrid, PlanarPose, wrap_to_pi
 
 NAME = "action.json"
 UNNAMED = "object"
-"""What an object is called that has no name in the file."""
+"""The name of an object that has none in the file."""
 
 
 @dataclass(frozen=True)

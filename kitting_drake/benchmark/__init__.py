@@ -1,1 +1,1 @@
-"""What things cost on this machine: the command `benchmark`."""
+"""The command `benchmark`: measurements on this machine."""

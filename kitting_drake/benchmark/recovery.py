@@ -47,7 +47,7 @@ _DRAWS = 200
 
 
 class Disturbance(enum.Enum):
-    """What goes wrong with the first action of an episode."""
+    """The fault of the first action of an episode."""
 
     NONE = "nothing"
     MOVED = "object moved"
@@ -292,7 +292,7 @@ def _run(
 
 
 def recovery_table(measured: dict[str, Any]) -> Table:
-    """What was measured, for a person."""
+    """The measurements, for a person."""
     table = Table(title=f"{measured['policy']['name']}: {measured['episodes']} episodes each")
     for column in ("the first action", "recovered", "kitted in all", "disturbed again", "actions"):
         table.add_column(column, justify="left" if column == "the first action" else "right")

@@ -29,7 +29,7 @@ _REST = 2.0
 _CONTACT_TIME = 0.004
 """MuJoCo's time constant of contact, in s: twice the step at least, and stiff."""
 _FRICTION = 0.375
-"""What Drake makes of a tool's 0.5 and a kit's 0.3: their harmonic mean. MuJoCo would take 0.5."""
+"""Drake combines a tool's 0.5 and a kit's 0.3 to their harmonic mean; MuJoCo would take 0.5."""
 
 _MOST_FRUITLESS = 5
 """So many episodes in a row in which nothing is let go of mean that the policy cannot do it."""
@@ -41,7 +41,7 @@ class Release:
 
     cell: Cell
     index: int
-    """Of the object."""
+    """The index of the object."""
     X_WB: RigidTransform
 
 

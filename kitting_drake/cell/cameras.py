@@ -162,7 +162,7 @@ def render_picture(
 
 
 def save_png(pixels: NDArray[np.uint8], path: Path) -> None:
-    """Writes an image (height, width, 3) to a PNG file, whole or not at all.
+    """Writes an image (height, width, 3) to a PNG file, atomically.
 
     Raises:
         UserError: the file cannot be written.

@@ -117,7 +117,7 @@ class Cell:
 
     @functools.cached_property
     def _bodies(self) -> list[RigidBody]:
-        """Of the scene's objects."""
+        """The bodies of the scene's objects."""
         return [self.plant.get_body(item.body) for item in self.objects]
 
     def _geometry(self, bodies: Sequence[RigidBody]) -> GeometrySet:

@@ -161,13 +161,13 @@ def _name(function: Callable[..., object]) -> tuple[str, str]:
 
 
 def _serve(versions_wanted: dict[str, str], call: bytes) -> bytes | ProcessCrashed:
-    """What a worker of a node does. It reads neither the call nor the result: so it imports nothing
-    that is not needed to pass them on."""
+    """Runs a call in a worker of a node. It reads neither the call nor the result, and so imports
+    nothing that is not needed to pass them on."""
     return run_in_subprocess(_answer, versions_wanted, call)
 
 
 def _answer(versions_wanted: dict[str, str], call: bytes) -> bytes:
-    """What the fresh process of a node does: a pickled result, or `_Unfit`."""
+    """Runs a call in the fresh process of a node: a pickled result, or `_Unfit`."""
     node = platform.node()
     try:
         found = versions()

@@ -13,7 +13,7 @@ EXTRAS = {
     "mujoco": ("mujoco>=3.2,<4",),
     "onnx": ("ml_dtypes<0.6", "onnx>=1.17", "onnxruntime>=1.20"),
 }
-"""What each extra brings, as pyproject.toml has it."""
+"""The packages of each extra, as in pyproject.toml."""
 
 
 def import_extra(package: str, *modules: str, purpose: str, extra: str) -> ModuleType:

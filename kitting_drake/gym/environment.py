@@ -213,7 +213,7 @@ class KittingEnvironment(gymnasium.Env[dict[str, Any], NDArray[Any]]):
         return arrays
 
     def _images(self, camera: str) -> dict[str, NDArray[Any]]:
-        """What o_t was projected from: noise, where the scenario has some, included."""
+        """The images that o_t was projected from, with the scenario's noise."""
         assert self._cell is not None and self._episode is not None
         diagram, name = self._cell.diagram, f"sensor_noise_{camera}"
         if not diagram.HasSubsystemNamed(name):

@@ -1,4 +1,4 @@
-"""What an agent sees and says: Gymnasium's spaces, and the values that travel on the wires."""
+"""Observations and actions of an agent: Gymnasium's spaces, to and from the systems' signals."""
 
 import math
 from typing import Any

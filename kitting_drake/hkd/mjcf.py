@@ -28,7 +28,7 @@ _LEVEL = 1e-5
 _TOLERANCE = 5e-5
 """How far outlines may be simplified, in m."""
 _SLIVER = 1e-9
-"""What is smaller is no part of a block, in m^2."""
+"""Smaller areas are no part of a block, in m^2."""
 
 
 def tool_mjcf(sdf: Path) -> str:

@@ -20,7 +20,7 @@ ORIENTATIONS = (180, 36, 72, 120)
 """N of figure 6, the most telling first."""
 PRESET = "small"
 LEARNING_RATES = (1e-3, 3e-4, 3e-3)
-"""Of these each baseline uses the one that is best on validation scenes; ours has the first."""
+"""The candidates: each baseline uses the best on validation scenes, and ours the first."""
 VALIDATE_EVERY = 250
 _NO_SEARCH = "planner: {search: {amplitude: 0.0, reach: 0.0}}"
 

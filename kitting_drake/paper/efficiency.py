@@ -30,7 +30,7 @@ time. The Transporter has no such network: its one picking network sees the scen
 
 
 def read_efficiency(folder: Path) -> dict[str, Any] | None:
-    """What `benchmark networks` measured; None where there is no file.
+    """The measurements of `benchmark networks`; None where there is no file.
 
     Raises:
         UserError: the file is damaged.

@@ -62,10 +62,10 @@ class Queue:
     """Trainings side by side."""
     _running: list[subprocess.Popen[str]] = field(default_factory=list, init=False)
     _locks: dict[Path, threading.Lock] = field(default_factory=dict, init=False)
-    """Of what several trainings need, and only one of them is to make."""
+    """A lock for each folder that several trainings need and only one of them is to make."""
     _has_ended: bool = field(default=False, init=False)
     _guard: threading.Lock = field(default_factory=threading.Lock, init=False)
-    """Of all of these."""
+    """Guards the three fields above."""
 
     def run(self, cells: Sequence[Cell]) -> dict[str, str]:
         """Fills cells, in their order as far as their networks are there.
@@ -161,7 +161,7 @@ class Queue:
             return self._locks.setdefault(path, threading.Lock())
 
     def _before(self, training: Training) -> Iterator[Training]:
-        """What is to be trained before a training: what it goes on from, and every learning rate.
+        """The trainings before a training: its base, and those of every learning rate.
 
         Each is begun by itself, as a training that waits for several would train them in turn.
         """
@@ -313,7 +313,7 @@ class Queue:
             raise Failed(f"{verb} failed with exit code {code}: {' '.join(last)}")
 
     def _threads(self) -> int:
-        """Of each command: its share of the cores, as all that are at work at once make them."""
+        """The threads of each command: its share of the cores."""
         return max(1, len(os.sched_getaffinity(0)) // (self.trainings + self.workers))
 
     def _say(self, text: str) -> None:

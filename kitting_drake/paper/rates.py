@@ -14,7 +14,7 @@ Rates = Mapping[str, Mapping[str, float]]
 
 
 def read_rates(folder: Path) -> dict[str, dict[str, float]]:
-    """What is known of the learning rates; nothing where there is no file.
+    """The learning rates that have been tried; none where there is no file.
 
     Raises:
         UserError: the file is damaged.

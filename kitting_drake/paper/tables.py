@@ -88,7 +88,7 @@ def _headline_seeds() -> list[Cell]:
 
 
 def _ablation() -> list[Cell]:
-    """What goes beyond the paper, and the same without one thing at a time."""
+    """All extensions beyond the paper, and the same without one of them at a time."""
 
     def ours(task: str, label: str, **changes: Any) -> Cell:
         training = {key: changes.pop(key) for key in ("taken_only", "rigid") if key in changes}

@@ -1,1 +1,1 @@
-"""What decides by looking: demonstrations to learn from, networks, losses. No pydrake here."""
+"""Policies: their demonstrations, networks and losses. There is no pydrake here."""

@@ -77,7 +77,7 @@ PRESETS = {
 BAND = 3
 """The cutoff frequency j_c of alpha, phi and psi (section V-A.1)."""
 ANGLE_FREQUENCIES = (0, 2, 4, 6, 8, 10, 12)
-"""Of beta's output, on SO(2)/C_2: j = 0 to 6 with a period of pi (section V-A.2)."""
+"""The frequencies of beta's output on SO(2)/C_2: j = 0 to 6, period pi (section V-A.2)."""
 FEATURES = 3
 """The number of channels of phi's and psi's encodings."""
 PICK_CROP = 65
@@ -131,7 +131,7 @@ class NetworkConfig:
 
     @property
     def channels(self) -> int:
-        """Of the networks' inputs: red, green, blue and height, or height alone."""
+        """The number of input channels: red, green, blue and height, or height alone."""
         return 4 if self.colour else 1
 
     def as_dict(self) -> dict[str, Any]:

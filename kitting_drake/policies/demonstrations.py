@@ -49,9 +49,9 @@ class Demonstration:
     final: FinalObservation | None = None
     """None: the episode ended before the hand was ready for another action."""
     commit: str | None = None
-    """Of the code that ran it; None where that was no checkout, or is not known."""
+    """The commit of the code that ran it; None where there was no checkout, or it is not known."""
     digest: str | None = None
-    """Of all that its group in a file holds; None where it comes from none."""
+    """The digest of all that its group in a file holds; None where it comes from no file."""
 
 
 @dataclass(frozen=True)
@@ -74,14 +74,14 @@ class Origin:
     first_seed: int
     """Demonstrations are of the first seeds from here on that were not rejected."""
     versions: dict[str, str]
-    """Of what the last of them were made with."""
+    """The versions that the last of them were made with."""
     learning: Learning = field(default_factory=Learning)
-    """What the task lets training assume."""
+    """The assumptions that the task allows in training."""
 
 
 @dataclass(frozen=True)
 class Demonstrations:
-    """What a file holds."""
+    """The contents of a file."""
 
     origin: Origin
     rejected: tuple[Rejection, ...]
@@ -91,13 +91,13 @@ class Demonstrations:
 
 @dataclass(frozen=True)
 class Contents:
-    """What a file holds, without the demonstrations themselves."""
+    """The contents of a file, without the demonstrations themselves."""
 
     origin: Origin
     rejected: tuple[Rejection, ...]
     seeds: tuple[int, ...]
     commits: tuple[str, ...] = ()
-    """Of the code that made them, as far as they tell."""
+    """The commits of the code that made them, as far as they are recorded."""
 
 
 def read_demonstrations(path: Path, first: int | None = None) -> Demonstrations:
@@ -135,7 +135,7 @@ def write_demonstrations(
     demonstrations: Iterable[Demonstration],
     rejected: Iterable[Rejection] = (),
 ) -> None:
-    """Writes a file of demonstrations, whole or not at all, over what was there.
+    """Writes a file of demonstrations atomically, over any that was there.
 
     Raises:
         UserError: the file cannot be written.
@@ -148,7 +148,7 @@ def write_demonstrations(
 def merge_demonstrations(
     path: Path, sources: Iterable[tuple[Path, int]], origin: Origin, rejected: Iterable[Rejection]
 ) -> None:
-    """Writes, whole or not at all, a file of demonstrations taken as they are from other files.
+    """Writes atomically a file of demonstrations taken as they are from other files.
 
     Args:
         path: the file; may be one of the others.

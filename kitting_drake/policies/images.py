@@ -31,7 +31,7 @@ _SHIFT_STD = 1 / 6
 
 
 class Pictured(Protocol):
-    """What has an image, made when it is asked for."""
+    """An object with an image, which is made when it is asked for."""
 
     @property
     def image(self) -> Image:

@@ -154,7 +154,7 @@ class LearnedPolicy:
         return self._networks.predict_pick(image, self._orientations).log_odds
 
     def _input(self, observation: Observation) -> Image:
-        """What the networks see of an observation."""
+        """The input of the networks: without colours where they see heights alone."""
         if self._networks.config.colour:
             return observation.image
         filled = fill_unseen(observation.height, observation.valid)

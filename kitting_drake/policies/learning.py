@@ -1,4 +1,4 @@
-"""What a task says about how its demonstrations may be learned from; no Drake and no torch here."""
+"""The assumptions that a task allows in training; no Drake and no torch here."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ class Learning:
     """
 
     later_picks_possible: bool = False
-    """What the expert picked later in an episode could have been picked at once, from where it lay:
+    """Objects that the expert picked later could have been picked at once, from where they lay:
     every later pick is then a label of an observation too. True for kitting, false for stacking."""
     curvature: bool = False
     """Objects may be bent in the image to augment pick angles: objects of the task come in slightly
@@ -22,6 +22,6 @@ class Learning:
     """Mirror images of scenes are scenes of the task as well, and their objects are handled alike.
     True for hand tools of many shapes."""
     many_answers: bool = False
-    """What the expert does is one of several things that are as right: objects are symmetric, or
+    """The expert's action is one of several that are equally right: objects are symmetric, or
     places may be exchanged. Errors against it then say little, and a checkpoint is chosen by the
     losses. True for blocks, false for hand tools."""

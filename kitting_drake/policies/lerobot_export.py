@@ -76,7 +76,7 @@ def require_export(folder: Path) -> None:
 def export_lerobot(
     source: Path, folder: Path, task: str | None = None, *, track: Track = iter
 ) -> None:
-    """Writes demonstrations as a LeRobotDataset, episode by episode, whole or not at all.
+    """Writes demonstrations as a LeRobotDataset, episode by episode, atomically.
 
     A folder that holds this very export is left alone.
 

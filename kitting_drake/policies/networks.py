@@ -73,7 +73,7 @@ class PlacePrediction:
 
 
 class Networks(nn.Module):
-    """What the networks of every method share: their inputs, and the placing module.
+    """The base of the networks of every method: their inputs, and the placing module.
 
     Subclasses define `phi` and `psi` (scalar encodings of the scene and of a crop) and the picking
     module. Nothing is remembered between calls.

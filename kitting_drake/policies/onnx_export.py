@@ -27,7 +27,7 @@ _OPSET = 17
 
 
 class _Blur(nn.Module):
-    """What `BlurPool` computes, in operators that ONNX has for images of any size."""
+    """`BlurPool` in operators that ONNX has for images of any size."""
 
     kernel: Tensor
 

@@ -31,7 +31,7 @@ _FIELDS = (
     *("colour", "colour_mean", "colour_std", "height_mean", "height_std", "channels"),
     *("pick_crop", "place_crop"),
 )
-"""What this reads of `policy.json`."""
+"""The fields of `policy.json` that are read."""
 _NOTHING_LOGIT = math.log(160 * 320)
 """See `losses.NOTHING_LOGIT`."""
 

@@ -1,4 +1,4 @@
-"""What is recorded of an episode: what was seen, and what was done. Images may stay in a file."""
+"""Recorded episodes: their observations, whose images may stay in a file, and actions."""
 
 from __future__ import annotations
 
@@ -90,7 +90,7 @@ class DemonstrationStep(Recorded):
 
 @dataclass(frozen=True)
 class FinalObservation(Recorded):
-    """What was seen when the expert said that nothing is left to do (`PickPlaceAction.stop`)."""
+    """The observation at which the expert had nothing left to do (`PickPlaceAction.stop`)."""
 
     @staticmethod
     def of(observation: Observation) -> FinalObservation:

@@ -29,13 +29,13 @@ from kitting_drake.policies.images import LabelledImage
 from systems.signals import Observation, PixelGrid, fill_unseen
 
 STATIC = "static scenes"
-"""What the card of weights that learned from them has for a scenario's name."""
+"""The name of the scenario in the card of weights that learned from static scenes."""
 
 FORMAT = "kitting_drake static scenes"
 FORMAT_VERSION = 1
 
 _STEP = 1e-4
-"""Of the stored heights, in metres."""
+"""The step of the stored heights, in metres."""
 _TEMPERATURE = 0.6
 """A grasp is drawn with a probability proportional to exp(-cost / temperature)."""
 _HEIGHT_SHIFT = 0.002

@@ -162,7 +162,7 @@ def expand_kernel(weights: Tensor, basis: Tensor, dtype: torch.dtype = torch.flo
 
 
 class PlainConv2d(nn.Conv2d):
-    """What an `ExpandedConv2d` becomes for inference: an ordinary convolution.
+    """An `ExpandedConv2d` as it is exported for inference: an ordinary convolution.
 
     It computes in the type of its input. If its weights are of another type, they are cast at every
     call; `MixedPrecision.cast` casts them once.
@@ -313,7 +313,7 @@ class InvariantPart(nn.Module):
 
 
 def _of_several_fields(matrix: NDArray[np.float64], fields: int) -> Tensor:
-    """What a matrix does to each of a few fields, as one matrix for their channels together.
+    """A matrix that acts on each of a few fields, as one matrix for their channels together.
 
     With its zeros, a product with about 64 channels takes half as long as one with eight.
     """

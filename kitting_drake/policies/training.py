@@ -22,7 +22,7 @@ _STOP_PROBABILITY = 1 / 8
 
 @dataclass(frozen=True)
 class _Draw:
-    """What a step learns from."""
+    """The sample, and perhaps the final observation, of a step."""
 
     sample: LabelledImage
     random: np.random.Generator
@@ -35,7 +35,7 @@ class _Draw:
 
 @dataclass(frozen=True)
 class _Prepared:
-    """What is being prepared for a later step."""
+    """The draw that is being prepared for a later step."""
 
     step: int
     samples: Sequence[LabelledImage]
@@ -146,7 +146,7 @@ class Trainer:
         return values
 
     def _take(self, samples: Sequence[LabelledImage], finals: Sequence[Pictured]) -> _Draw:
-        """What this step learns from; the preparation of what the next one does begins."""
+        """The draw of this step; the preparation of the next one's begins."""
         prepared = self._prepared
         if prepared and prepared.step == self.step_count and prepared.of(samples, finals):
             draw = prepared.draw.result()
@@ -160,7 +160,7 @@ class Trainer:
     def _draw(
         self, step: int, samples: Sequence[LabelledImage], finals: Sequence[Pictured]
     ) -> _Draw:
-        """What a step learns from: a sample at random, augmented, and perhaps what ends it all."""
+        """The draw of a step: a random sample, augmented, and perhaps a final observation."""
         random = np.random.default_rng([self.seed, step])
         sample = augment(
             samples[random.integers(len(samples))],

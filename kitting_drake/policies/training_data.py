@@ -1,4 +1,4 @@
-"""What a training run learns from and validates by: demonstrations, or static scenes."""
+"""The data of a training run, or of its validation: demonstrations, or static scenes."""
 
 from __future__ import annotations
 
@@ -54,11 +54,11 @@ class TrainingData:
     colour: bool
     """Whether there are colours to learn from."""
     seeds: tuple[int, ...]
-    """Of the demonstrations, or the first seed of static scenes."""
+    """The seeds of the demonstrations, or the first seed of static scenes."""
     items: tuple[Demonstration, ...] | StaticScenes
     made_by: dict[str, str]
-    """What tells data of the same seeds apart: the versions that made them, and a digest of the
-    content."""
+    """The versions that made them and a digest of the content, which distinguish data of the same
+    seeds."""
 
     @property
     def count(self) -> int:
@@ -77,7 +77,7 @@ class TrainingData:
 
     @property
     def made(self) -> str:
-        """What one does to get some, for people."""
+        """The command by which one gets some, for people."""
         return "draw" if isinstance(self.items, StaticScenes) else "collect"
 
     def part(self, first: int, last: int) -> TrainingData:
@@ -123,7 +123,7 @@ class TrainingData:
         return [_recorded(FinalObservation, item.image) for item in evenly_chosen(seated, most)]
 
     def samples(self, *, taken_only: bool, colour: bool = True) -> Sequence[LabelledImage]:
-        """What to learn from, of the observations in which there is something to pick.
+        """The samples to learn from, of the observations in which there is something to pick.
 
         Args:
             taken_only: see `labelled_images`.

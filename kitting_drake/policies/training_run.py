@@ -88,7 +88,7 @@ class Settings:
     start: str | None
     """A digest of the weights that training begins with; None: fresh ones."""
     start_seeds: tuple[int, ...]
-    """Of the demonstrations that those weights were made with."""
+    """The seeds of the demonstrations that those weights were made with."""
     device: str
     compute_type: str
 

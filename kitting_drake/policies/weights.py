@@ -45,7 +45,7 @@ _ADDED = ("colour", "stop")
 
 @dataclass(frozen=True)
 class WeightsFile:
-    """What a file says beside the weights."""
+    """The metadata of a file of weights."""
 
     config: NetworkConfig
     card: dict[str, Any]

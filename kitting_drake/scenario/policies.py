@@ -40,7 +40,7 @@ _TOLD = (
     "taken_only",
     "rigid",
 )
-"""What of a network's training is told with its results."""
+"""The fields of a network's training that are reported with its results."""
 
 
 @dataclass(frozen=True)

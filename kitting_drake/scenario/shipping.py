@@ -23,7 +23,7 @@ _FILES = Path("files")
 
 @dataclasses.dataclass(frozen=True)
 class Shipment:
-    """What `pack` made."""
+    """The result of `pack`."""
 
     chosen: ChosenScenario
     """The scenario for a process that runs in the folder where the archive was unpacked."""

@@ -170,7 +170,7 @@ def box_symmetry(size: tuple[float, float, float]) -> int:
 
 
 def box_footprint(size: tuple[float, float, float]) -> Footprint:
-    """What a box, and the open hand that grasps it, covers on the table."""
+    """The footprint of a box, and of the open hand that grasps it."""
     return Footprint((rectangle(size[0], size[1]),), box_grasps(size))
 
 

@@ -56,7 +56,7 @@ def separation(a: Polygon, b: Polygon) -> float:
 
 @dataclass(frozen=True)
 class Footprint:
-    """What something covers on the table, in its own frame, in metres."""
+    """The area that something covers on the table, in its own frame, in metres."""
 
     body: tuple[Polygon, ...]
     """Convex pieces of its outline."""
@@ -68,12 +68,12 @@ class Footprint:
 
     @cached_property
     def fingers(self) -> tuple[Polygon, ...]:
-        """What the open fingers, and the room between them, cover at each of the grasps."""
+        """The areas of the open fingers and of the room between them, at each of the grasps."""
         return self._at_grasps((FINGER_LENGTH, MAX_OPENING + 2 * FINGER_DEPTH))
 
     @cached_property
     def palm(self) -> tuple[Polygon, ...]:
-        """What the palm covers at each of the grasps."""
+        """The area of the palm at each of the grasps."""
         return self._at_grasps(PALM_SIZE)
 
     def moved(self, x: float, y: float, yaw: float) -> Placed:

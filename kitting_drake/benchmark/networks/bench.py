@@ -1,4 +1,4 @@
-"""What the measurements of a benchmark share: the plan, the machine and the observation."""
+"""The common part of a benchmark's measurements: the plan, the machine and the observation."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ _EXPECTED_SHARE = 0.3
 
 @dataclass(frozen=True)
 class Plan:
-    """What to measure, and how often."""
+    """The measurements to make, and how often."""
 
     preset: str = "small"
     compared_preset: str | None = "paper"
@@ -58,7 +58,7 @@ class Plan:
 
 @dataclass
 class Bench:
-    """What all measurements share."""
+    """The plan, the machine and the observation of all measurements."""
 
     plan: Plan
     device: torch.device
@@ -66,7 +66,7 @@ class Bench:
     """The folder for the weights of exported networks."""
     scene: Scene
     peak: dict[torch.dtype, dict[str, float]] = field(default_factory=dict)
-    """What `measure_peak` returns, by type."""
+    """The results of `measure_peak`, by type."""
 
     def __post_init__(self) -> None:
         self.image: Image = self.scene.recorded.image
@@ -78,7 +78,7 @@ class Bench:
         return int(row), int(col)
 
     def observe(self) -> Observation:
-        """What is decided upon."""
+        """The observation of the decisions that are timed."""
         return Observation(self.image, self.scene.grid)
 
     def time_each(

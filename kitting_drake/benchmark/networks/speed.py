@@ -25,7 +25,7 @@ from kitting_drake.policies.training import Trainer
 from kitting_drake.policies.unet import UNet
 
 MEASURES = ("training_step", "alpha_training_step", "decision", "alpha_inference")
-"""What is timed for each way to run the same networks."""
+"""The operations that are timed for each way to run the same networks."""
 
 
 def measure_folding(bench: Bench) -> dict[str, Any]:

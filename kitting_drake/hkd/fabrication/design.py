@@ -1,4 +1,4 @@
-"""What is cut out of a kit's block where it is to be printed or milled: more than is simulated.
+"""The cuts of a kit's block that is to be printed or milled: more than is simulated.
 
 To the cavities, which are those of the simulated kit, come finger notches and engraved labels.
 """
@@ -35,7 +35,7 @@ class Design:
     recesses: tuple[Recess, ...]
     """All that is cut from above: the cavities first, in the tools' order."""
     notes: tuple[str, ...]
-    """What had no room, a sentence each."""
+    """A sentence on each notch or label that had no room."""
 
     @property
     def size_mm(self) -> tuple[float, float, float]:

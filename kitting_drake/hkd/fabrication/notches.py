@@ -18,7 +18,7 @@ DEEPEST = 0.020
 """A notch is as deep as its cavity, but no deeper than a finger reaches, in metres."""
 
 _WALL = 0.003
-"""What is to stand between a notch and all else, in metres; less where the kit's walls are less."""
+"""The least wall between a notch and all else, in metres; less where the kit's walls are less."""
 _SLIDES = tuple(sign * step for step in np.arange(0.0, 0.041, 0.004) for sign in (1, -1))
 """How far along the tool from its grasp a notch may be, in metres."""
 _SHARES = (0.85, 1.15)

@@ -33,7 +33,7 @@ from kitting_drake.hkd.tools.tool import Tool
 Array = NDArray[np.float64]
 
 _LENGTHS = (0.11, 0.23)
-"""Of the tools, in metres."""
+"""The range of the tools' lengths, in metres."""
 _HIGHEST = 0.046
 """Higher tools do not fit into a kit's block, in metres."""
 _COMPOSED = 0.25
@@ -163,7 +163,7 @@ class _Warp:
     """A map of points (n, 3) in mm: stretched and splayed across the tool's axis, then bent."""
 
     low: float
-    """Of the tool along its axis, x."""
+    """The lower end of the tool along its axis, x."""
     length: float
     stretch: Array
     """(2,): along y and z."""

@@ -34,7 +34,7 @@ _WIDEST = MAX_OPENING - 0.010
 _NARROWEST = 0.003
 """The least width that is worth a grasp, in metres."""
 _LOWEST = 0.003
-"""What rises by less than this above its support is in nobody's way, in metres."""
+"""Anything that rises by less than this above its support is no obstacle, in metres."""
 _FINGER_MARGIN = 0.003
 """Space left beyond the fingers of the open jaws, in metres."""
 _STRAIGHT = 0.003
@@ -48,7 +48,7 @@ class JawGrasp:
     pixel: Array
     """(row, col), midway between the faces."""
     theta: float
-    """Of the gripper, in radians; adding pi gives the same grasp."""
+    """The angle of the gripper, in radians; adding pi gives the same grasp."""
     cost: float
     """How far from the middle it is and how crooked its faces are; without a unit, 0 is best."""
 

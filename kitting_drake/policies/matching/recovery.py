@@ -1,4 +1,4 @@
-"""What became of the last action, as the next o_t tells it, and what to do about it.
+"""The outcome of the last action, as the next o_t shows it, and how to recover from it.
 
 An object that stands out of the fixture is not seated. Where it stands out by little, it is pressed
 down once; where it stands out by more, or pressing did not help, it is taken out and laid on the
@@ -23,7 +23,7 @@ from systems.signals import Observation, PickPlaceAction, PlanarPose
 Array = NDArray[np.float64]
 
 _PRESSED = 0.012
-"""What stands out by more than this is taken out instead of being pressed down, in metres."""
+"""An object that protrudes by more than this is taken out, not pressed down, in metres."""
 _TRIED = 0.020
 """A press or a grasp this near to a tried one is the same, in metres."""
 _ROOM = 0.045
@@ -33,7 +33,7 @@ _ROOM = 0.045
 def recovery_action(
     observation: Observation, segmentation: Segmentation, tried: Sequence[PlanarPose] = ()
 ) -> PickPlaceAction | None:
-    """What mends the worst of what is not seated; None if nothing is wrong or can be mended.
+    """The recovery of the object that is seated worst; None if there is none, or no recovery.
 
     Args:
         observation: o_t.

@@ -25,11 +25,11 @@ _STEP = 0.001
 _LINES = 7
 """Lines of samples along the fingers' length."""
 _SUPPORT_REACH, _SUPPORT_SHARE = 0.06, 10.0
-"""What an object stands on is the percentile of the heights this near to it, in metres."""
+"""The support of an object is this percentile of the heights this near to it, in metres."""
 _UNDER = 0.009
-"""What it is put on is the highest within this of the place, in metres."""
+"""The support at the place is the highest within this of it, in metres."""
 _LEAST = 0.004
-"""What rises above the fingertips by less than this is in nobody's way, in metres."""
+"""Anything that rises above the fingertips by less than this is no obstacle, in metres."""
 
 
 def blocked_at_place(

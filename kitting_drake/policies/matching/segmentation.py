@@ -26,11 +26,11 @@ _LEAST_FIXTURE_HEIGHT = 0.015
 _LEAST_FIXTURE_AREA = 0.003
 """The same for its area, in square metres."""
 _OBJECT_HEIGHT = 0.003
-"""What rises by more than this above the table is an object, in metres."""
+"""Anything that rises by more than this above the table is an object, in metres."""
 _RECESS_DEPTH = 0.003
-"""What is deeper than this below the top of the fixture is a recess, in metres."""
+"""Anything deeper than this below the top of the fixture is a recess, in metres."""
 _PROTRUSION = 0.002
-"""What rises by more than this above the top of the fixture is not seated, in metres."""
+"""Anything that rises by more than this above the fixture is not seated, in metres."""
 _LEAST_AREA = 0.0004
 """Smaller regions are noise, in square metres."""
 _LEAST_PROTRUDING = 0.00012
@@ -40,8 +40,8 @@ _FIXTURE_MARGIN = 0.006
 _CLEAN = 0.0005
 """Heights with less noise than this are taken as they are, in metres."""
 _CLEARLY = 2.0
-"""What rises or is deeper by more than this many standard deviations of the noise is no noise: few
-enough pixels are, and apart. More would cut off flat ends, by which a tool is told from the same
+"""A height that differs by more standard deviations of the noise than this is no noise: few pixels
+of it do, and apart. More would cut off flat ends, by which a tool is told from the same
 tool a half turn away."""
 _NEIGHBOURS = np.ones((3, 3), bool)
 _CROSS = ndimage.generate_binary_structure(2, 1)
@@ -65,7 +65,7 @@ class Region:
 
 @dataclass(frozen=True)
 class Segmentation:
-    """What stands where in an observation."""
+    """The regions of an observation: fixture, recesses, objects."""
 
     fixture: Mask
     """(rows, cols) the fixture; nowhere if there is none."""
@@ -75,8 +75,8 @@ class Segmentation:
     """Regions below the top of the fixture. One that a seated object fills leaves fragments, which
     are among them."""
     protruding: tuple[Region, ...]
-    """What stands out of the fixture, the highest first: objects that are not seated. Their height
-    is that above its top."""
+    """The objects that protrude from the fixture, the highest first. Their height is that above
+    its top."""
     relief: NDArray[np.float32]
     """(rows, cols) height above the table plane, in metres, with what was not seen filled in."""
 

@@ -59,7 +59,7 @@ _SCENES_A_TOOLSET = 4
 _COUNTS = np.array([2, 4, 8, 24, 8, 6, 4, 2, 2, 1, 1, 1], float)
 """How often kits of 1, 2, ... 12 tools are drawn: mostly of four."""
 _MOST_LOOSE = 8
-"""Of more tools than this the others are seated: the workspace has no room for all."""
+"""The most loose tools; any others are seated, as the workspace has no room for all."""
 _CLUTTERED = 0.5
 """The share of scenes with things that have no cavity, ..."""
 _MOST_STRANGERS, _MOST_BOXES = 2, 6

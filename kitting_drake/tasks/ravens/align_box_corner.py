@@ -18,7 +18,7 @@ from systems.placement import Goal
 from systems.signals import PixelGrid
 
 _ARM_LENGTH, _ARM_WIDTH = 0.055, 0.005
-"""Of the marker, in metres."""
+"""The size of each arm of the marker, in metres."""
 
 
 @dataclass

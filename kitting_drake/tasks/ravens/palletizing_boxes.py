@@ -38,7 +38,7 @@ _DISARRAY_ANGLE = math.radians(2.0)
 """The boxes to be moved are off their places in the stack by at most so much."""
 
 _POINT_SPACING = 0.02
-"""Of the points by which the reward measures how much of a box is in the zone."""
+"""The spacing of the points by which the reward measures the share of a box in the zone, in m."""
 
 
 @dataclass

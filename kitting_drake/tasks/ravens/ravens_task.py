@@ -1,4 +1,4 @@
-"""What the tasks of Ravens share."""
+"""The base of the five Ravens tasks."""
 
 import math
 import re
