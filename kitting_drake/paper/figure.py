@@ -146,7 +146,7 @@ def _draw_task(axis: Axes, task: str, column: int, results: Mapping[str, Result]
             if f"{name}_ours" in results:
                 look = {"color": colour, "marker": "d", "linestyle": ""}
                 summary = results[f"{name}_ours"].summary
-                _draw_reward(axis, where, summary, f"{row}, with what goes beyond the paper", look)
+                _draw_reward(axis, where, summary, f"{row}, with extensions", look)
 
 
 def _draw_reward(

@@ -18,7 +18,7 @@ PATIENCE = 3
 PATIENT = f"{PATIENCE}_times_the_steps"
 """The label of the cells whose networks were trained for `PATIENCE` times the steps."""
 BEYOND_OF_TABLE_1 = ("stack_block_pyramid",)
-"""The tasks of table I that are also run with what goes beyond the paper: those where, as published
+"""The tasks of table I that are also run with the extensions: those where, as published
 and after ten or a hundred demonstrations, ours comes out below the paper."""
 
 
@@ -138,7 +138,7 @@ SHIPPED = {
     "shape_matching": "!ShapeMatching {}",
     "oracle": "!Oracle {}",
 }
-"""The policies as they come, with all that goes beyond the paper; the second is the scenario's."""
+"""The policies as they come, with all extensions; the second is the scenario's."""
 
 
 def _fresh_tools() -> list[Cell]:
