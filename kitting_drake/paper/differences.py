@@ -93,7 +93,8 @@ def _rivals(cell: Cell) -> list[tuple[str, str]]:
     if cell.label == "trained_at_36" and isinstance(training, Training):
         return [("trained at N = 180", f"{cell.task}_{training.method}_36_100")]
     if cell.label == PATIENT and isinstance(training, Training):
-        return [("in the usual number of steps", f"{cell.task}_{training.method}_36_100")]
+        tail = f"{training.method}_{cell.orientations}_{training.demonstrations}"
+        return [("in the usual number of steps", f"{cell.task}_{tail}")]
     if cell.label == "generalist":
         others = [label for label in SHIPPED if label != cell.label]
         return [(label.replace("_", " "), f"{cell.task}_{label}") for label in others]

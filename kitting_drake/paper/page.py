@@ -197,6 +197,8 @@ def _table_1(results: Mapping[str, Result]) -> list[str]:
     ]
     if any(name.startswith("palletizing_boxes") for name in results):
         sections.append(texts.PALLETIZING)
+    if "stack_block_pyramid_equivariant_transporter_36_100" in results:
+        sections.append(texts.PYRAMID_STEPS)
     if any(
         f"{task}_so2" in name and name.endswith("_ours")
         for name in results

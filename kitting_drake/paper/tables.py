@@ -59,17 +59,20 @@ def _checks() -> list[Cell]:
 
 
 def _patient() -> list[Cell]:
-    """The Transporter in more steps than the others get, as it is far from done by then."""
-    return [
-        Cell(
-            task,
-            Training(task, "transporter", 36, 100, times=PATIENCE),
-            36,
-            PATIENT,
-            end_at_success=True,
-        )
-        for task in (*FIGURE_6, "align_box_corner")
+    """Cells in more steps than the others get, of what is far from done by then: the Transporter,
+    and every method on the pyramid."""
+    pyramid = "stack_block_pyramid"
+    wanted = [
+        *((task, "transporter", 36) for task in (*FIGURE_6, "align_box_corner")),
+        *((pyramid, "so2", n) for n in (180, 36)),
+        *((pyramid, method, 36) for method in LEARNED[1:]),
     ]
+    cells = []
+    for task, method, n in wanted:
+        trained_at = ORIENTATIONS[0] if method == "so2" else n
+        training = Training(task, method, trained_at, 100, times=PATIENCE)
+        cells.append(Cell(task, training, n, PATIENT, end_at_success=True))
+    return cells
 
 
 def headline(task: str, method: str, seed: int) -> Cell:
