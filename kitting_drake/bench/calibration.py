@@ -205,9 +205,22 @@ def calibration_record(calibration: Calibration) -> dict[str, Any]:
 
 
 def calibration_digest(calibration: Calibration) -> str:
-    """Equal for calibrations that say the same, in whichever layout."""
-    text = json.dumps(calibration_record(calibration), sort_keys=True)
+    """Equal for calibrations that say the same, in whichever layout.
+
+    Numbers count to nine decimals: a rotation that was read as a quaternion differs from the same
+    as a matrix in the last bit.
+    """
+    text = json.dumps(_rounded(calibration_record(calibration)), sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+
+def _rounded(value: Any) -> Any:
+    """A record with its numbers rounded, and without negative zeros."""
+    if isinstance(value, dict):
+        return {key: _rounded(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_rounded(item) for item in value]
+    return round(value, 9) + 0.0 if isinstance(value, float) else value
 
 
 def write_calibration(path: Path, calibration: Calibration) -> None:

@@ -1,4 +1,4 @@
-"""The dataset: tools and kits, `python -m kitting_drake.hkd VERB`."""
+"""The dataset: tools and kits, `python -m kitting_drake.hkd COMMAND`."""
 
 import argparse
 from pathlib import Path

@@ -64,7 +64,7 @@ recover also at 900 to 912, 940 to 951 and 1000 to 1006. Failures were looked at
 2820 to 2844, 2870 to 2894, 2900 to 2924 and 3000 to 3099, and of 3200 to 3236, 3252 and 3299 of
 stack-block-pyramid. No others were looked at before they were run.
 
-Runs of the first turn, which are not comparable with these, are in
+Runs of the first version of the code, which are not comparable with these, are in
 [results_first_turn.md](results_first_turn.md).
 """
 

@@ -17,6 +17,7 @@ from kitting_drake.bench.calibration import (
     Calibration,
     calibration_digest,
     read_calibration,
+    with_poses,
     write_calibration,
 )
 from kitting_drake.bench.kit_block import Block
@@ -242,5 +243,10 @@ def test_folders_without_demonstrations_are_refused(tmp_path: Path):
 def test_calibrations_are_told_apart_by_what_they_say(tmp_path: Path):
     write_calibration(tmp_path / "same.yaml", BENCH)
     assert calibration_digest(read_calibration(tmp_path / "same.yaml")) == calibration_digest(BENCH)
+    # As the same rotation in another layout comes out.
+    other = with_poses(BENCH, {camera.name: camera.X_BC - 1e-15 for camera in BENCH.cameras})
+    assert calibration_digest(other) == calibration_digest(BENCH)
+    moved = with_poses(BENCH, {camera.name: camera.X_BC + 1e-5 for camera in BENCH.cameras})
+    assert calibration_digest(moved) != calibration_digest(BENCH)
     lifted = Calibration(BENCH.cameras, dataclasses.replace(BENCH.grid, z_min=0.001))
     assert calibration_digest(lifted) != calibration_digest(BENCH)
