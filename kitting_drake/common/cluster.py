@@ -172,11 +172,14 @@ def _answer(versions_wanted: dict[str, str], call: bytes) -> bytes:
     try:
         found = versions()
         if found != versions_wanted:
-            name = next(key for key in versions_wanted if found[key] != versions_wanted[key])
+            # What is not installed has no version.
+            names = (*versions_wanted, *found)
+            name = next(key for key in names if found.get(key) != versions_wanted.get(key))
+            there, here = (which.get(name, "none") for which in (found, versions_wanted))
             return pickle.dumps(
                 _Unfit(
-                    f"the node {node} has {name} {found[name]}, this machine "
-                    f"{versions_wanted[name]}: install the same there"
+                    f"the node {node} has {name} {there}, this machine {here}: install the same "
+                    "there"
                 )
             )
         module, function, arguments = pickle.loads(call)

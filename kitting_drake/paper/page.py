@@ -227,7 +227,7 @@ def _fresh_tools(results: Mapping[str, Result]) -> list[str]:
 def _both(result: Result) -> list[str]:
     """Both rates, and between them the strict one's interval over tools."""
     summary = result.summary
-    drawn = TASKS[result.cell.task].table != "I"
+    drawn = summary["resolved_scenario"]["task"]["_tag"] == "!ToolsetKitting"
     tools = over_tools(summary["outcomes"], STRICT) if drawn else None
     return [
         rate_text(summary["strict_success_rate"], summary["strict_ci95"]),

@@ -139,6 +139,13 @@ def test_a_node_with_other_versions_is_named(monkeypatch: pytest.MonkeyPatch):
     assert outcome.reason.startswith(f"the node second has drake {versions()['drake']}, this ")
 
 
+def test_a_node_without_a_package_says_so():
+    """Not a failure of the episode, which would be kept as its result."""
+    wanted = {**versions(), "absent": "1.2"}
+    outcome = pickle.loads(cluster._answer(wanted, pickle.dumps(("os", "getpid", ()))))
+    assert "has absent none, this machine 1.2" in outcome.reason
+
+
 def test_a_node_without_a_package_is_named(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr("platform.node", lambda: "second")
     call = pickle.dumps(("no_such_module", "work", ()))

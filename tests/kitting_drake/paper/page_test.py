@@ -116,6 +116,20 @@ def test_trainings_are_compared_once_there_are_two(folder: Path):
     assert found[label] == ["+25.0 (+25.0 to +25.0)"] * 2
 
 
+def test_an_interval_over_tools_is_given_only_where_tools_are_drawn(folder: Path):
+    for name in ("seen_so2_180_100", "unseen_so2_180_100"):
+        write(folder, name, [1.0, 1.0, 1.0, 1.0])
+        path = folder / f"{name}.json"
+        summary = json.loads(path.read_text())
+        # Every tool fails once, and so tells something of others.
+        summary["outcomes"][0]["objects"] = dict.fromkeys(summary["outcomes"][0]["objects"], 0)
+        path.write_text(json.dumps(summary))
+    text = "\n".join(paper_sections(read_results(folder), {}, "results"))
+    cells = {row.split("]")[0]: row.split(" | ") for row in text.splitlines() if "/paper/" in row}
+    assert cells["| [seen_so2_180_100"][8].strip() == "-"
+    assert " to " in cells["| [unseen_so2_180_100"][8]
+
+
 def test_the_learning_rates_that_were_tried_are_told(folder: Path):
     rates = {"transporter": {"0.001": 4.0, "0.0003": 2.5}}
     text = "\n".join(paper_sections(read_results(folder), rates, "results"))
