@@ -42,6 +42,9 @@ _VARIANTS = {
 }
 """Endings of the names of cells, by what their rows are called."""
 
+_TOLD = ("trained_orientations", "steps", "learning_rate", "training_seed", "compute_type")
+"""The details of a policy that are columns of "Every cell"."""
+
 
 def paper_sections(
     results: Sequence[Result],
@@ -247,10 +250,7 @@ def _every_cell(results: Sequence[Result], link: str) -> str:
         rows.append(
             [
                 f"[{result.cell.name}]({link}/paper/{result.cell.name}.json)",
-                *(
-                    detail(result, key)
-                    for key in ("trained_orientations", "steps", "learning_rate", "training_seed")
-                ),
+                *(detail(result, key) for key in _TOLD),
                 str(summary["episodes"]),
                 f"{min(summary['seeds'])} to {max(summary['seeds'])}",
                 *_both(result),
@@ -260,7 +260,15 @@ def _every_cell(results: Sequence[Result], link: str) -> str:
                 ", ".join(item[:8] for item in (summary["commit"] or "").split(", ")),
             ]
         )
-    headings = ["cell", "trained at N", "steps", "learning rate", "training seed", "episodes"]
+    headings = [
+        "cell",
+        "trained at N",
+        "steps",
+        "learning rate",
+        "training seed",
+        "type",
+        "episodes",
+    ]
     headings += ["seeds", "strict, %", "over tools", "paper's, %", "causes"]
     headings += ["weights", "Drake", "commit"]
     return f"{texts.EVERY_CELL}\n{markdown_table(headings, rows)}"

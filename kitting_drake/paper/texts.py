@@ -121,11 +121,12 @@ kept out of every training, and not looked at before these runs.
 """
 
 EVERY_CELL = """\
-`over tools`: the 95 % interval of the strict rate by a bootstrap over tools, which with ten or
-twenty of them is on the narrow side; `-` where fewer than three tools fail, which tells nothing
-of others, and where no tools are drawn. `causes`: of failures, and of successes that are not
-strict. `weights`: the first digits of their digest. `Drake`: the version that ran the episodes.
-It matters little: the quantized oracle at N = 36, which sees no images, came to 93.8 % strict
-with the same causes by 1.51 and by 1.58 (`unseen_quantized_oracle_36_drake_1.58.json`); two of
-its 100 episodes differ, one each way.
+`type`: the number type of the networks, the faster one on the machine of the cell. `over tools`:
+the 95 % interval of the strict rate by a bootstrap over tools, which with ten or twenty of them
+is on the narrow side; `-` where fewer than three tools fail, which tells nothing of others, and
+where no tools are drawn. `causes`: of failures, and of successes that are not strict. `weights`:
+the first digits of their digest. `Drake`: the version that ran the episodes. It matters little:
+the quantized oracle at N = 36, which sees no images, came to 93.8 % strict with the same causes
+by 1.51 and by 1.58 (`unseen_quantized_oracle_36_drake_1.58.json`); two of its 100 episodes
+differ, one each way.
 """
