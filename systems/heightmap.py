@@ -67,7 +67,7 @@ class DepthRays(NamedTuple):
 
 
 class View(NamedTuple):
-    """What one camera saw, and from where."""
+    """The image of one camera, and the pose that it was taken from."""
 
     color: NDArray[np.uint8] | None
     """(height, width, 3 or more): red, green, blue. None: black."""

@@ -17,7 +17,7 @@ class MotionHeights:
     clear: float
     """Empty jaws clear everything from here on."""
     travel: float
-    """What is held clears everything when the fingertips are here or higher."""
+    """The held object clears everything when the fingertips are here or higher."""
     pick_hover: float
     """Down to here the hand may come fast over the pick."""
     place_hover: float

@@ -71,7 +71,7 @@ def _gaps(
 
 
 _GONE = 10.0
-"""What is this far from the world's origin, in m, has left the cell for good."""
+"""An object this far from the world's origin, in m, has left the cell for good."""
 
 
 class RestDetector(LeafSystem):

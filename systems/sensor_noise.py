@@ -1,4 +1,4 @@
-"""What a real RGB-D camera adds to an ideal one: noise, holes, and a calibration that is off."""
+"""The errors of a real RGB-D camera: noise, holes, and a calibration that is off."""
 
 import dataclasses as dc
 import math
@@ -331,7 +331,7 @@ def _unit_field(
 
 
 def _upper_quantile(share: NDArray[np.float32]) -> NDArray[np.float32]:
-    """What a share of normally distributed values exceeds."""
+    """The value that a share of normally distributed values exceeds."""
     return ndtri(1 - np.clip(share, 1e-9, 1 - 1e-9)).astype(np.float32)
 
 

@@ -113,9 +113,9 @@ class Training:
     learning_rate: float | None = None
     """None: the method's; see `LEARNING_RATES`."""
     taken_only: bool = True
-    """As in the paper: only the taken action is a label."""
+    """Whether only the taken action is a label, as in the paper."""
     rigid: bool = True
-    """As in the paper: augmented by motions of the whole scene only."""
+    """Whether the only augmentation is a motion of the whole scene, as in the paper."""
     angle_only: bool = False
     """Whether only the pick-angle network is trained; all else is that of `base`."""
     times: int = 1

@@ -139,7 +139,7 @@ def test_a_node_with_other_versions_is_named(monkeypatch: pytest.MonkeyPatch):
     assert outcome.reason.startswith(f"the node second has drake {versions()['drake']}, this ")
 
 
-def test_a_node_without_a_package_says_so():
+def test_a_package_without_a_version_on_a_node_is_named():
     """Not a failure of the episode, which would be kept as its result."""
     wanted = {**versions(), "absent": "1.2"}
     outcome = pickle.loads(cluster._answer(wanted, pickle.dumps(("os", "getpid", ()))))
