@@ -160,6 +160,8 @@ class SurfaceHeights:
     """The top of what that stands on."""
     place_rim: float = 0.0
     """The highest surface around the place: the rim of a cavity, if there is one."""
+    place_floor: float = 0.0
+    """The lowest surface at the place: on it an object there will stand."""
     near_pick: float = 0.0
     """The highest surface that open jaws over the pick are above."""
     near_place: float = 0.0

@@ -12,6 +12,8 @@ _PICK_REACH = 1
 """How far around the pick pixel its top is looked for, in pixels."""
 _RIM_REACH = 0.025
 """How far around the place its rim is looked for, in metres."""
+_FLOOR_REACH = 2
+"""How far around the place pixel its floor is looked for, in pixels."""
 _PICK_CLEARANCE_REACH = 0.07
 """How far around the pick the open jaws must clear what is there, in metres."""
 _PLACE_CLEARANCE_REACH = 0.125
@@ -31,6 +33,9 @@ _FLAT = 0.012
 _NOISY_RIM_SHARE, _NOISY_RIM_BIAS = 90.0, 1.0
 """Some two thirds of the pixels around a place are its rim: the percentile of all that is so many
 standard deviations above the middle of these."""
+_NOISY_FLOOR_SHARE, _NOISY_FLOOR_BIAS = 25.0, -0.67
+"""The percentile of the heights at a place that is taken for its floor's, and how many standard
+deviations it is above their middle."""
 _TABLE_BAND = 0.008
 """Pixels within this of the table's height belong to it, however it is tilted, in metres."""
 _LEAST_TABLE, _FITS = 500, 3
@@ -52,10 +57,11 @@ def read_surface_heights(
     The support of an object is the height that a tenth of the pixels around it do not exceed; so
     an object in the middle of others is taken to stand on what they stand on.
 
-    Tops are the highest of some pixels. Where o_t is noisy that would be the noise: then they are
-    medians and percentiles, corrected by what these are off in such noise. The table is level and
-    at the bottom of the grid: that it is tilted or higher in o_t is an error of calibration, and is
-    taken away. Neither is done where there is nothing to correct.
+    Tops are the highest of some pixels, and the floor of a place is the lowest of those that are
+    seen. Where o_t is noisy that would be the noise: then they are medians and percentiles,
+    corrected by what these are off in such noise. The table is level and at the bottom of the grid:
+    that it is tilted or higher in o_t is an error of calibration, and is taken away. Neither is
+    done where there is nothing to correct.
 
     Args:
         observation: o_t.
@@ -80,15 +86,21 @@ def read_surface_heights(
     top = top[seen] if seen.any() else top
     support = _percentile(around_pick, _SUPPORT_SHARE)
     table = _percentile(height, _TABLE_SHARE)
+    # Where nothing is seen of it, the floor is the table's.
+    seen = _around(observation.valid, at_place, _FLOOR_REACH)
+    floor = _around(height, at_place, _FLOOR_REACH)[seen] if seen.any() else np.zeros(1, np.float32)
     if noise:
         pick_top = _percentile(top, 50.0)
         place_rim = _percentile(rim, _NOISY_RIM_SHARE) - _NOISY_RIM_BIAS * noise
+        place_floor = _percentile(floor, _NOISY_FLOOR_SHARE) - _NOISY_FLOOR_BIAS * noise
     else:
         pick_top, place_rim = float(top.max(initial=0.0)), float(rim.max(initial=0.0))
+        place_floor = float(floor.min())
     return SurfaceHeights(
         pick_top=grid.z_min + pick_top,
         support=grid.z_min + support,
         place_rim=grid.z_min + place_rim,
+        place_floor=grid.z_min + place_floor,
         near_pick=grid.z_min + float(_around(height, at_pick, reach["near_pick"]).max(initial=0.0)),
         near_place=grid.z_min
         + float(_around(height, at_place, reach["near_place"]).max(initial=0.0)),

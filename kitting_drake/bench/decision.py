@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
-
-import numpy as np
 
 from kitting_drake.bench.calibration import Calibration
 from kitting_drake.bench.frames import Frame
@@ -17,9 +14,6 @@ from systems.motion_heights import MotionHeights, motion_heights
 from systems.pick_place_parameters import PickPlaceParameters
 from systems.signals import Observation, PickPlaceAction, PlanarPose, SurfaceHeights, wrap_to_pi
 from systems.surface_heights import read_surface_heights
-
-_FLOOR_REACH = 2
-"""How far around the place its floor is looked for, in pixels."""
 
 
 @dataclass(frozen=True)
@@ -44,7 +38,7 @@ class BenchDecision:
         """Where the fingertips will be when the object stands at its place, in metres: as high
         above the floor there, as o_t shows it, as they were above its support at the pick."""
         hanging = max(self.heights.grasp - self.surfaces.support, 0.0)
-        return max(_floor(self.observation, self.action.place) + hanging, self._lowest)
+        return max(self.surfaces.place_floor + hanging, self._lowest)
 
     @property
     def _lowest(self) -> float:
@@ -116,15 +110,3 @@ def decide(
         surfaces = read_surface_heights(observation, choice.action.pick, choice.action.place)
     heights = motion_heights(surfaces, parameters)
     return BenchDecision(observation, choice, surfaces, heights, parameters)
-
-
-def _floor(observation: Observation, place: PlanarPose) -> float:
-    """The height on which an object will stand at its place: the lowest that is seen about it; the
-    table's where nothing is seen. In metres."""
-    grid = observation.grid
-    row, col = np.rint(grid.to_pixel((place.x, place.y))).astype(int)
-    rows = slice(max(row - _FLOOR_REACH, 0), max(row + _FLOOR_REACH + 1, 0))
-    cols = slice(max(col - _FLOOR_REACH, 0), max(col + _FLOOR_REACH + 1, 0))
-    seen = observation.height[rows, cols][observation.valid[rows, cols]]
-    floor = float(seen.min(initial=math.inf))
-    return grid.z_min + (floor if math.isfinite(floor) else 0.0)

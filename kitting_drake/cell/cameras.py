@@ -1,6 +1,8 @@
 """Cameras and render engines: from their descriptions in a scenario to Drake's."""
 
+import contextlib
 import ctypes
+import importlib.util
 import io
 from collections.abc import Sequence
 from pathlib import Path
@@ -42,7 +44,7 @@ def can_render() -> bool:
 
 
 def require_rendering() -> None:
-    """Makes sure that images can be rendered here.
+    """Makes sure that images can be rendered here; to be called before an engine is made.
 
     Raises:
         UserError: the system library is missing; names the package.
@@ -52,6 +54,21 @@ def require_rendering() -> None:
             "rendering needs the system library libEGL: install it "
             "(Debian and Ubuntu: apt-get install libegl1 libgl1-mesa-dri)"
         )
+    _load_triton()
+
+
+def _load_triton() -> None:
+    """Loads Triton, which PyTorch imports with its first optimizer where it is built for CUDA.
+
+    It brings an LLVM of its own. Where Mesa's was loaded before, as by rendering without a graphics
+    card, that import ends in a segmentation fault; in this order both work.
+    """
+    package = importlib.util.find_spec("triton")
+    for folder in (package and package.submodule_search_locations) or ():
+        for library in Path(folder, "_C").glob("libtriton*.so"):
+            # One that does not load cannot be imported later either.
+            with contextlib.suppress(OSError):
+                ctypes.CDLL(str(library))
 
 
 def add_observation_renderer(scene_graph: SceneGraph, lights: Sequence[LightParameter] = ()) -> str:

@@ -46,6 +46,7 @@ def test_poses_off_the_grid_have_the_lowest_heights():
     away = PlanarPose(3.0, 0.0)
     found = read_surface_heights(observation((PICK, 0.01, 0.03)), away, away)
     assert (found.pick_top, found.support, found.place_rim) == (GRID.z_min,) * 3
+    assert found.place_floor == GRID.z_min
     assert found.highest == pytest.approx(0.03, abs=1e-6)
 
 
@@ -74,7 +75,7 @@ def test_errors_of_cameras_are_taken_away(noise: float, off: float):
         image = np.full((4, *grid.shape), 0.5, np.float32)
         image[3] = np.maximum(seen, 0)
         found = read_surface_heights(Observation(image, grid), PICK, PLACE)
-        errors.append([found.pick_top - 0.02, found.place_rim - 0.05])
+        errors.append([found.pick_top - 0.02, found.place_rim - 0.05, found.place_floor - 0.02])
         # What is lowered stands on the rim by their difference.
         errors[-1].append(found.support - (found.place_rim - 0.05))
         assert (found.doubt > 0) == bool(noise or off)
