@@ -13,7 +13,7 @@ from rich.console import Console
 from kitting_drake.cell import Cell
 from kitting_drake.cell.cameras import require_rendering
 from kitting_drake.common.command_line import count_type, run_command, seed_type
-from kitting_drake.common.errors import UserError
+from kitting_drake.common.errors import MachineError, UserError
 from kitting_drake.common.files import alone_in, claim_folder, require_folder, write_json
 from kitting_drake.common.processes import (
     ProcessCrashed,
@@ -335,8 +335,12 @@ def _reject_dead(seed: int, dead: ProcessCrashed) -> Rejection:
 
 
 def _demonstrate(chosen: ChosenScenario, seed: int) -> Demonstration | Rejection:
+    # A cell whose expert does not look is built without cameras where nothing can be rendered.
+    require_rendering()
     try:
         cell = build_chosen(chosen, seed=seed)
+    except MachineError:
+        raise
     except UserError as error:
         return Rejection(seed, 0.0, str(error))
     recorder = DemonstrationRecorder(cell)

@@ -11,7 +11,7 @@ from typing import Any
 from rich.console import Console
 
 from kitting_drake.common.command_line import FAILED, count_type, run_command, seed_type
-from kitting_drake.common.errors import UserError
+from kitting_drake.common.errors import MachineError, UserError
 from kitting_drake.common.files import (
     alone_in,
     append_line,
@@ -219,9 +219,11 @@ def run_in_worker(workers: Workers, chosen: ChosenScenario, seed: int) -> Episod
 
 
 def _work(chosen: ChosenScenario, seed: int) -> Episode | str:
-    """An episode, or why there is none."""
+    """An episode, or why there is none of this seed."""
     try:
         cell = build_chosen(chosen, seed=seed)
+    except MachineError:
+        raise
     except UserError as error:
         return str(error)
     return run_chosen(chosen, cell, seed=seed).as_dict()

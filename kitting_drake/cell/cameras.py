@@ -26,7 +26,7 @@ from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 from pydrake.systems.framework import Context
 from pydrake.systems.sensors import CameraInfo
 
-from kitting_drake.common.errors import UserError
+from kitting_drake.common.errors import MachineError
 from kitting_drake.common.files import write_atomically
 from kitting_drake.scenario.schema import LookAt, Pinhole
 
@@ -47,10 +47,10 @@ def require_rendering() -> None:
     """Makes sure that images can be rendered here; to be called before an engine is made.
 
     Raises:
-        UserError: the system library is missing; names the package.
+        MachineError: the system library is missing; names the package.
     """
     if not can_render():
-        raise UserError(
+        raise MachineError(
             "rendering needs the system library libEGL: install it "
             "(Debian and Ubuntu: apt-get install libegl1 libgl1-mesa-dri)"
         )
@@ -79,7 +79,7 @@ def add_observation_renderer(scene_graph: SceneGraph, lights: Sequence[LightPara
         lights: none: one at each camera.
 
     Raises:
-        UserError: images cannot be rendered here.
+        MachineError: images cannot be rendered here.
     """
     require_rendering()
     parameters = RenderEngineVtkParams(lights=list(lights))
@@ -94,7 +94,7 @@ def add_picture_renderer(scene_graph: SceneGraph) -> str:
     before a context is made: one that comes later is not told where things are.
 
     Raises:
-        UserError: images cannot be rendered here.
+        MachineError: images cannot be rendered here.
     """
     return _add_studio(scene_graph, "picture", SsaoParameter(radius=0.08))
 
@@ -103,7 +103,7 @@ def add_film_renderer(scene_graph: SceneGraph) -> str:
     """Adds the engine that films are made with, lit as pictures are, but quick; returns its name.
 
     Raises:
-        UserError: images cannot be rendered here.
+        MachineError: images cannot be rendered here.
     """
     return _add_studio(scene_graph, "film", None)
 

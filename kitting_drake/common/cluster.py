@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Self, TypeVar
 
-from kitting_drake.common.errors import UserError
+from kitting_drake.common.errors import MachineError, UserError
 from kitting_drake.common.extras import import_extra
 from kitting_drake.common.processes import ProcessCrashed, run_in_subprocess
 from kitting_drake.common.provenance import versions
@@ -184,8 +184,11 @@ def _answer(versions_wanted: dict[str, str], call: bytes) -> bytes:
             )
         module, function, arguments = pickle.loads(call)
         chosen = operator.attrgetter(function)(importlib.import_module(module))
+        answer = chosen(*arguments)
+    except MachineError as error:
+        return pickle.dumps(_Unfit(f"the node {node} cannot work: {error}"))
     except ImportError as error:
         return pickle.dumps(
             _Unfit(f"the node {node} cannot import what it needs: {error}: install it there")
         )
-    return pickle.dumps(chosen(*arguments))
+    return pickle.dumps(answer)

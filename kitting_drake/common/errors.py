@@ -6,3 +6,8 @@ class UserError(ValueError):
 
     Commands print it and leave with exit code 2.
     """
+
+
+class MachineError(UserError):
+    """The same where it is this machine that lacks something, such as a library or room on its
+    disk: the input may be fine elsewhere."""

@@ -3,7 +3,7 @@
 import importlib
 from types import ModuleType
 
-from kitting_drake.common.errors import UserError
+from kitting_drake.common.errors import MachineError
 
 EXTRAS = {
     "cluster": ("ray[client]>=2.50",),
@@ -26,7 +26,7 @@ def import_extra(package: str, *modules: str, purpose: str, extra: str) -> Modul
         extra: the project's extra that brings it.
 
     Raises:
-        UserError: it is not installed; says by what command it would be.
+        MachineError: it is not installed; says by what command it would be.
     """
     try:
         found = importlib.import_module(package)
@@ -34,5 +34,7 @@ def import_extra(package: str, *modules: str, purpose: str, extra: str) -> Modul
             importlib.import_module(f"{package}.{module}")
     except ImportError as error:
         packages = " ".join(f"'{requirement}'" for requirement in EXTRAS[extra])
-        raise UserError(f"{purpose} needs the package {package}: pip install {packages}") from error
+        raise MachineError(
+            f"{purpose} needs the package {package}: pip install {packages}"
+        ) from error
     return found

@@ -9,14 +9,14 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from kitting_drake.common.errors import UserError
+from kitting_drake.common.errors import MachineError, UserError
 
 
 def write_atomically(path: Path, content: str | bytes) -> None:
     """Writes a file beside its place and moves it there, making its folder if need be.
 
     Raises:
-        UserError: the place cannot be written to.
+        MachineError: the place cannot be written to.
     """
     data = content.encode() if isinstance(content, str) else content
     try:
@@ -31,7 +31,7 @@ def write_atomically(path: Path, content: str | bytes) -> None:
             os.unlink(scratch)
             raise
     except OSError as error:
-        raise UserError(f"cannot write {path}: {error.strerror}") from error
+        raise MachineError(f"cannot write {path}: {error.strerror}") from error
 
 
 def write_json(path: Path, value: Any) -> None:
@@ -43,14 +43,14 @@ def require_folder(path: Path) -> Path:
     """Makes a folder for a run's files, before the run.
 
     Raises:
-        UserError: it cannot be made, or written to.
+        MachineError: it cannot be made, or written to.
     """
     try:
         path.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=path):
             return path
     except OSError as error:
-        raise UserError(f"cannot write into {path}: {error.strerror}") from error
+        raise MachineError(f"cannot write into {path}: {error.strerror}") from error
 
 
 def replace_folder(folder: Path, made: Path, aside: Path) -> None:

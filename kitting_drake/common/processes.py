@@ -14,7 +14,7 @@ from typing import Protocol, Self, TypeVar
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from kitting_drake.common.errors import UserError
+from kitting_drake.common.errors import MachineError, UserError
 
 _Item = TypeVar("_Item")
 _Result = TypeVar("_Result")
@@ -69,20 +69,26 @@ class Subprocess:
 
         Args:
             function: importable by name, as its arguments and its result travel pickled. What it
-                raises ends the process.
+                raises ends the process, but for a `MachineError`.
             arguments: its arguments.
 
         Returns:
             What the function returned, or how the process ended if it did not.
+
+        Raises:
+            MachineError: the function raised it.
         """
         self.calls += 1
         try:
             self._connection.send((function, arguments))
-            return self._connection.recv()
+            answer = self._connection.recv()
         except (EOFError, OSError):
             # OSError: it died in the middle of its answer.
             self._process.join()
             return ProcessCrashed(self._process.exitcode)
+        if isinstance(answer, MachineError):
+            raise answer
+        return answer
 
     def end(self) -> None:
         """Ends it, once it has answered."""
@@ -93,7 +99,7 @@ class Subprocess:
 def run_in_subprocess(
     function: Callable[..., _Result], *arguments: object
 ) -> _Result | ProcessCrashed:
-    """Calls a function in a fresh process, and waits for it; see `Subprocess.call`."""
+    """Calls a function in a fresh process, and waits for it; as `Subprocess.call` does."""
     process = Subprocess()
     try:
         return process.call(function, *arguments)
@@ -113,7 +119,7 @@ class Workers(Protocol):
         What ran in the process before must not matter to the function.
 
         Raises:
-            UserError: the place is not fit for it.
+            UserError: the place is not fit for it, or the function raised a `MachineError`.
         """
 
     def stop(self) -> None:
@@ -171,7 +177,11 @@ class LocalWorkers:
             process = self._idle.pop()
         except IndexError:
             process = Subprocess()
-        outcome = process.call(function, *arguments)
+        try:
+            outcome = process.call(function, *arguments)
+        except MachineError:
+            process.end()
+            raise
         if isinstance(outcome, ProcessCrashed) or process.calls >= self._most_calls:
             process.end()
         else:
@@ -237,7 +247,11 @@ def _serve(connection: Connection) -> None:
             function, arguments = connection.recv()
         except EOFError:
             return
-        connection.send(function(*arguments))
+        try:
+            answer = function(*arguments)
+        except MachineError as error:
+            answer = error
+        connection.send(answer)
 
 
 def _end_with_parent() -> None:

@@ -38,7 +38,7 @@ def build_chosen(
             observer=observer,
         )
     except UserError as error:
-        raise UserError(f"{chosen.path}: {error}") from error
+        raise type(error)(f"{chosen.path}: {error}") from error
 
 
 def run_chosen(

@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from kitting_drake.common.errors import UserError
+from kitting_drake.common.errors import MachineError
 
 KEPT_ENTRIES = 1000
 """The number of folders that `prune` leaves."""
@@ -31,7 +31,7 @@ def cached_folder(final: Path, files: Sequence[str], write: Callable[[Path], obj
         write: writes them into an empty folder.
 
     Raises:
-        UserError: the cache cannot be written.
+        MachineError: the cache cannot be written.
     """
     # Renewed before it is looked at, so that it is not removed in between.
     with contextlib.suppress(OSError):
@@ -51,7 +51,7 @@ def cached_folder(final: Path, files: Sequence[str], write: Callable[[Path], obj
     except OSError as error:
         # Another process may have been quicker: its folder is the same.
         if not _is_complete(final, files):
-            raise UserError(f"cannot write to {final.parent}: {error.strerror}") from error
+            raise MachineError(f"cannot write to {final.parent}: {error.strerror}") from error
     prune(final.parent)
     return final
 

@@ -10,10 +10,12 @@ import sys
 import types
 from collections.abc import Callable, Iterable
 from pathlib import Path
+from typing import Any
 
 import pytest
 from rich.console import Console
 
+import kitting_drake.cell.cameras as cameras
 import kitting_drake.evaluate as evaluation
 from kitting_drake.common.errors import UserError
 from kitting_drake.common.files import alone_in
@@ -171,6 +173,20 @@ def test_a_scene_that_cannot_be_set_is_a_failed_episode():
     chosen = dataclasses.replace(CHOSEN, scenario=scenario)
     lost = evaluation.run_in_worker(LocalWorkers(1), chosen, 7)
     assert "there is no free space in the workspace" in lost["failure"]
+
+
+def without_rendering(chosen: ChosenScenario, seed: int) -> Any:
+    cameras.can_render = lambda: False
+    return evaluation._work(chosen, seed)
+
+
+def test_what_a_machine_lacks_is_no_failed_episode(monkeypatch: pytest.MonkeyPatch):
+    """It would be kept as the result of the seed."""
+    monkeypatch.setattr(evaluation, "_work", without_rendering)
+    looks = PythonPolicy(function="systems.signals:PickPlaceAction")
+    chosen = dataclasses.replace(CHOSEN, scenario=Scenario(policy=looks))
+    with pytest.raises(UserError, match="rendering needs the system library"):
+        evaluation.run_in_worker(LocalWorkers(1), chosen, 7)
 
 
 @pytest.mark.parametrize(("failures", "code"), [([None, "no"], 0), (["no", "no"], 1)])

@@ -76,7 +76,7 @@ class _KittingTask(TaskConfig):
         try:
             return make_kit(tools, self.kit)
         except UserError as error:
-            raise UserError(f"task.kit: {error}") from error
+            raise type(error)(f"task.kit: {error}") from error
 
 
 @dataclass
@@ -345,7 +345,7 @@ def _load_tool(name: str, base: Path, field: str) -> Tool:
     try:
         return load_tool(name, base)
     except UserError as error:
-        raise UserError(f"{field}: {error}") from error
+        raise type(error)(f"{field}: {error}") from error
 
 
 def _tool_files(names: Sequence[str] | dict[str, TablePose], base: Path) -> list[Path]:

@@ -156,6 +156,14 @@ def test_a_node_without_a_package_is_named(monkeypatch: pytest.MonkeyPatch):
     )
 
 
+def test_a_node_that_lacks_something_is_named(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
+    monkeypatch.setattr("platform.node", lambda: "second")
+    (tmp_path / "file").touch()
+    call = ("kitting_drake.common.files", "require_folder", (tmp_path / "file" / "folder",))
+    outcome = pickle.loads(cluster._answer(versions(), pickle.dumps(call)))
+    assert outcome.reason.startswith("the node second cannot work: cannot write into ")
+
+
 def test_a_function_of_the_main_module_has_the_name_of_its_file(monkeypatch: pytest.MonkeyPatch):
     main = types.ModuleType("__main__")
     main.__spec__ = types.SimpleNamespace(name="kitting_drake.collect")  # type: ignore[assignment]

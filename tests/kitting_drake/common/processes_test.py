@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from kitting_drake.common.errors import MachineError
 from kitting_drake.common.processes import (
     LocalWorkers,
     ProcessCrashed,
@@ -31,6 +32,17 @@ def kill_itself() -> None:
 
 def leave() -> None:
     sys.exit(3)
+
+
+def lack_room() -> None:
+    raise MachineError("cannot write: No space left on device")
+
+
+def test_what_a_machine_lacks_is_raised_here():
+    with LocalWorkers(1) as workers:
+        with pytest.raises(MachineError, match="No space left"):
+            workers.run(lack_room)
+        assert workers.run(add, 2, 3) == 5
 
 
 def test_the_result_comes_back_from_another_process():
