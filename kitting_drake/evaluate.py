@@ -1,5 +1,6 @@
 """`python -m kitting_drake.evaluate SCENARIO.yaml`: many seeds side by side, and their summary."""
 
+import functools
 import hashlib
 import json
 import time
@@ -138,7 +139,8 @@ def evaluate(
     with counting_bar(console, "episodes") as progress:
         task = progress.add_task("", total=len(seeds), completed=len(seeds) - len(pending))
         for episode in side_by_side(run, lambda: next(queue, None), workers=workers):
-            episode["commit"] = now
+            # A worker tells that of its own code, where it has a checkout.
+            episode["commit"] = episode.get("commit") or now
             done[episode["seed"]] = episode
             append_line(path, episode)
             clock.save()
@@ -178,6 +180,7 @@ def _identity(chosen: ChosenScenario) -> dict[str, Any]:
         **chosen.described,
         "versions": versions(),
         "policy_digest": scenario.policy.digest(chosen.base),
+        "policy_details": scenario.policy.details(chosen.base),
         "task_digest": _digest(scenario.task.input_files(chosen.base)),
     }
 
@@ -226,7 +229,13 @@ def _work(chosen: ChosenScenario, seed: int) -> Episode | str:
         raise
     except UserError as error:
         return str(error)
-    return run_chosen(chosen, cell, seed=seed).as_dict()
+    return run_chosen(chosen, cell, seed=seed).as_dict() | {"commit": _commit_of_process()}
+
+
+@functools.cache
+def _commit_of_process() -> str | None:
+    """The commit of the code that this process runs: as of its first episode."""
+    return commit()
 
 
 def _lost_episode(chosen: ChosenScenario, seed: int, failure: str, seconds: float) -> Episode:

@@ -18,7 +18,7 @@ from kitting_drake.policies.config import METHODS, PRESETS, NetworkConfig
 from kitting_drake.policies.device import preferred_device, preferred_type
 from kitting_drake.policies.training_data import TrainingData, read_training_data
 from kitting_drake.policies.training_run import WEIGHTS, Settings, TrainingRun
-from kitting_drake.policies.weights import card_seeds, read_weights_file
+from kitting_drake.policies.weights import card_seeds, learned_seeds, read_weights_file
 
 
 def main() -> int:
@@ -76,8 +76,9 @@ def _settings(
         )
     begun: NetworkConfig | None = None
     seeds: tuple[int, ...] = ()
+    before: dict[str, list[int]] = {}
     if arguments.start is not None:
-        begun, seeds = _checked_start(arguments, learned, held_out)
+        begun, seeds, before = _checked_start(arguments, learned, held_out)
     return Settings(
         scenario=learned.scenario,
         demonstrations=learned.count,
@@ -100,6 +101,7 @@ def _settings(
         angle_only=arguments.angle_only,
         start=None if begun is None else _digest(arguments.start),
         start_seeds=seeds,
+        start_learned=before,
         device=preferred_device().type,
         compute_type=str(preferred_type()).removeprefix("torch."),
     )
@@ -107,13 +109,14 @@ def _settings(
 
 def _checked_start(
     arguments: argparse.Namespace, learned: TrainingData, held_out: TrainingData
-) -> tuple[NetworkConfig, tuple[int, ...]]:
-    """The config of the weights to begin with, which must be those that the flags ask for, and the
-    seeds of the demonstrations that they were made with; to validate by, they learned from none."""
+) -> tuple[NetworkConfig, tuple[int, ...], dict[str, list[int]]]:
+    """The config of the weights to begin with, which must be those that the flags ask for, with
+    `card_seeds` and `learned_seeds`; they learned from none of those to validate by."""
     file = read_weights_file(arguments.start)
     config = file.config
-    shared = set(file.card.get("demonstration_seeds", ())) & set(held_out.seeds)
-    if shared and file.card.get("scenario") == held_out.scenario:
+    before = learned_seeds(file.card)
+    shared = set(before.get(held_out.scenario, ())) & set(held_out.seeds)
+    if shared:
         raise UserError(
             f"{arguments.start} learned from the seed {min(shared)}, which is one to validate by: "
             "give others by --validation"
@@ -126,7 +129,7 @@ def _checked_start(
             raise UserError(f"{arguments.start} has {flag} {found}: give --{flag} {found}")
     if config.colour and not learned.colour:
         raise UserError(f"{arguments.start} looks at colours, and {arguments.demos} has none")
-    return config, tuple(sorted(card_seeds(file.card)))
+    return config, tuple(sorted(card_seeds(file.card))), before
 
 
 def _check_validation(settings: Settings, held_out: TrainingData, path: Path) -> None:

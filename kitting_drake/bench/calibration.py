@@ -107,6 +107,13 @@ def read_calibration(path: Path, *, table_height: float | None = None) -> Calibr
         entries = content["cameras"]
         if not isinstance(entries, dict) or not entries:
             raise UserError(f"{path}: cameras must be a mapping from names to cameras")
+        for name, node in entries.items():
+            for key in _BENCH_FIELDS:
+                if isinstance(node, dict) and key in node:
+                    raise UserError(
+                        f"{path}: camera {name} has the field '{key}', which all cameras share: "
+                        "put it beside 'cameras'"
+                    )
     else:
         entries = {str(content.get("camera_name", "camera")): content}
     cameras = tuple(_read_camera(path, str(name), node) for name, node in entries.items())

@@ -1,5 +1,8 @@
 """Errors that are the user's to mend."""
 
+DIVERGED = "a loss is no longer a number"
+"""The words of the error with which a training ends that diverges."""
+
 
 class UserError(ValueError):
     """Input that cannot be used. Its text is one sentence: what is wrong, where, what would do.

@@ -110,6 +110,8 @@ def _first_difference(found: Any, described: Any) -> str:
     for key in (*described, *found):
         old, new = found.get(key), described.get(key)
         if old != new:
+            if isinstance(old, dict) and isinstance(new, dict):
+                return _first_difference(old, new)
             simple = all(isinstance(value, str | float | int | None) for value in (old, new))
             return f" ({key} is {new}, there {old})" if simple else f" ({key} differs)"
     return ""

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
@@ -117,7 +118,10 @@ def _rates_text(rates: Rates) -> str:
     parts = []
     for method, costs in rates.items():
         best = best_rate(costs)
-        tried = ", ".join(f"{rate}: {cost:.1f} mm" for rate, cost in costs.items())
+        tried = ", ".join(
+            f"{rate}: {f'{cost:.1f} mm' if math.isfinite(cost) else 'diverged'}"
+            for rate, cost in costs.items()
+        )
         parts.append(f"- the {METHODS[method]}: {best}, of {tried}\n")
     return (
         f"The learning rate of ours is {LEARNING_RATES[0]:g}. For each baseline it is the best of "

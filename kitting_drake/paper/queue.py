@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import math
 import os
 import signal
 import subprocess
@@ -21,8 +22,8 @@ from typing import Any
 
 from rich.console import Console
 
-from kitting_drake.common.errors import UserError
-from kitting_drake.common.files import require_folder, write_atomically, write_json
+from kitting_drake.common.errors import DIVERGED, UserError
+from kitting_drake.common.files import require_folder, write_atomically
 from kitting_drake.common.paths import SCENARIOS
 from kitting_drake.paper.cells import (
     LEARNING_RATES,
@@ -34,10 +35,10 @@ from kitting_drake.paper.cells import (
     Training,
     reference,
 )
-from kitting_drake.paper.rates import RATES, best_rate, read_rates
+from kitting_drake.paper.rates import RATES, best_rate, read_rates, write_rates
 
 _THREADS = "OMP_NUM_THREADS"
-_PATIENCE = 10.0
+_PATIENCE = 60.0
 """How long a command may take to end itself, in s."""
 _FIRST_SEED, _FIRST_VALIDATION_SEED = 10000, 20000
 
@@ -61,11 +62,13 @@ class Queue:
     trainings: int = 1
     """Trainings side by side."""
     _running: list[subprocess.Popen[str]] = field(default_factory=list, init=False)
+    _collected: set[Path] = field(default_factory=set, init=False)
+    """The folders of demonstrations that were looked at."""
     _locks: dict[Path, threading.Lock] = field(default_factory=dict, init=False)
     """A lock for each folder that several trainings need and only one of them is to make."""
     _has_ended: bool = field(default=False, init=False)
     _guard: threading.Lock = field(default_factory=threading.Lock, init=False)
-    """Guards the three fields above."""
+    """Guards the fields above."""
 
     def run(self, cells: Sequence[Cell]) -> dict[str, str]:
         """Fills cells, in their order as far as their networks are there.
@@ -141,9 +144,9 @@ class Queue:
     def collect(self, task: Task, *, validation: bool) -> Path:
         """The file of a task's demonstrations, or of those to validate by."""
         folder = self.folder / "demonstrations" / f"{task.name}{'_validation' * validation}"
-        path = folder / "demonstrations.h5"
         with self._only_one_makes(folder):
-            if not path.exists():
+            if folder not in self._collected:
+                # Where all are there, it checks whether they are those of this task.
                 self._command(
                     "collect",
                     SCENARIOS / task.file,
@@ -154,7 +157,8 @@ class Queue:
                     *("--workers", 1),
                     folder=folder,
                 )
-        return path
+                self._collected.add(folder)
+        return folder / "demonstrations.h5"
 
     def _only_one_makes(self, path: Path) -> threading.Lock:
         with self._guard:
@@ -239,7 +243,13 @@ class Queue:
         What each comes to is written as soon as it is known, and not tried again.
         """
         for rate in self._untried(method):
-            weights = self.train(dataclasses.replace(reference(method), learning_rate=rate))
+            try:
+                weights = self.train(dataclasses.replace(reference(method), learning_rate=rate))
+            except Failed as error:
+                if DIVERGED not in error.why:
+                    raise
+                self._keep_rate(method, rate, math.inf)
+                continue
             summary = json.loads(weights.with_name("summary.json").read_text())
             self._keep_rate(method, rate, summary["best"]["cost_mm"])
         return float(best_rate(read_rates(self.results)[method]))
@@ -254,7 +264,7 @@ class Queue:
         with self._only_one_makes(file):
             known = read_rates(self.results)
             costs = known.get(method, {}) | {f"{rate:g}": cost_mm}
-            write_json(file, dict(sorted((known | {method: costs}).items())))
+            write_rates(self.results, known | {method: costs})
 
     def _evaluate(self, cell: Cell, weights: Path | None) -> None:
         task = TASKS[cell.task]
@@ -301,6 +311,8 @@ class Queue:
                     stderr=subprocess.STDOUT,
                     text=True,
                     env={_THREADS: str(self._threads()), **os.environ},
+                    # Ctrl-C would reach it twice: it is passed on by `_end`.
+                    start_new_session=True,
                 )
                 self._running.append(process)
             try:
@@ -341,8 +353,10 @@ def run_paper(queue: Queue, cells: Sequence[Cell]) -> dict[str, str]:
         UserError: a result is not that of its cell.
     """
     # What goes on would keep the next queue out.
-    before = signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))
+    ended_by = (signal.SIGTERM, signal.SIGHUP)
+    before = [signal.signal(number, lambda came, _: sys.exit(128 + came)) for number in ended_by]
     try:
         return queue.run(cells)
     finally:
-        signal.signal(signal.SIGTERM, before)
+        for number, handler in zip(ended_by, before, strict=True):
+            signal.signal(number, handler)

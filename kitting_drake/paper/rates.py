@@ -1,16 +1,19 @@
 """The learning rates of the baselines: the file of what each came to on validation scenes."""
 
 import json
+import math
 from collections.abc import Mapping
 from pathlib import Path
 
 from kitting_drake.common.errors import UserError
+from kitting_drake.common.files import write_json
 
 RATES = "learning_rates.json"
 """The file, beside the results."""
 
 Rates = Mapping[str, Mapping[str, float]]
-"""For each method and learning rate, the displacement on validation scenes in mm."""
+"""For each method and learning rate, the displacement on validation scenes in mm; infinite where
+the training diverged, which the file has as null."""
 
 
 def read_rates(folder: Path) -> dict[str, dict[str, float]]:
@@ -23,11 +26,26 @@ def read_rates(folder: Path) -> dict[str, dict[str, float]]:
     try:
         found = json.loads(path.read_text()) if path.exists() else {}
         return {
-            method: {str(rate): float(cost) for rate, cost in costs.items()}
+            method: {
+                str(rate): math.inf if cost is None else float(cost) for rate, cost in costs.items()
+            }
             for method, costs in found.items()
         }
     except (OSError, ValueError, TypeError, AttributeError) as error:
         raise UserError(f"{path} is damaged: delete it") from error
+
+
+def write_rates(folder: Path, rates: Rates) -> None:
+    """Writes what `read_rates` reads.
+
+    Raises:
+        UserError: the file cannot be written.
+    """
+    content = {
+        method: {rate: cost if math.isfinite(cost) else None for rate, cost in costs.items()}
+        for method, costs in sorted(rates.items())
+    }
+    write_json(folder / RATES, content)
 
 
 def best_rate(costs: Mapping[str, float]) -> str:

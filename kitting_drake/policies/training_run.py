@@ -17,7 +17,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from torch.utils.tensorboard import SummaryWriter
 
 from kitting_drake.common.command_line import interrupts_wait
-from kitting_drake.common.errors import UserError
+from kitting_drake.common.errors import DIVERGED, UserError
 from kitting_drake.common.files import (
     append_line,
     read_lines,
@@ -89,6 +89,8 @@ class Settings:
     """A digest of the weights that training begins with; None: fresh ones."""
     start_seeds: tuple[int, ...]
     """The seeds of the demonstrations that those weights were made with."""
+    start_learned: dict[str, list[int]]
+    """Those of them that were learned from, by scenario."""
     device: str
     compute_type: str
 
@@ -232,10 +234,7 @@ class TrainingRun:
         losses = self.trainer.step(self.samples, self.finals)
         self.recent.append(losses)
         if not all(np.isfinite(list(losses.values()))):
-            raise UserError(
-                f"a loss is no longer a number at step {self.trainer.step_count}: "
-                "lower --learning-rate"
-            )
+            raise UserError(f"{DIVERGED} at step {self.trainer.step_count}: lower --learning-rate")
 
     def _log_losses(self, writer: SummaryWriter) -> None:
         """The mean of each loss since the last point of the curves, over the steps that have it."""

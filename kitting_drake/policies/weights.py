@@ -63,6 +63,16 @@ def card_seeds(card: Mapping[str, Any]) -> set[int]:
     return seeds
 
 
+def learned_seeds(card: Mapping[str, Any]) -> dict[str, list[int]]:
+    """The seeds of the demonstrations that weights learned from, by scenario, with those of all
+    the weights that training began with, one after another."""
+    learned = {scenario: set(seeds) for scenario, seeds in card.get("start_learned", {}).items()}
+    own = set(card.get("demonstration_seeds", ()))
+    scenario = str(card.get("scenario"))
+    learned[scenario] = learned.get(scenario, set()) | own
+    return {scenario: sorted(seeds) for scenario, seeds in learned.items()}
+
+
 def save_weights(path: Path, networks: Networks, card: dict[str, Any]) -> None:
     """Writes networks, as they are trained, to a file.
 

@@ -13,10 +13,12 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import torch
 from rich.console import Console
 
 import kitting_drake.cell.cameras as cameras
 import kitting_drake.evaluate as evaluation
+import kitting_drake.policies.device as device
 from kitting_drake.common.errors import UserError
 from kitting_drake.common.files import alone_in
 from kitting_drake.common.paths import MODELS
@@ -101,16 +103,22 @@ def test_a_folder_of_another_scenario_is_refused(tmp_path: Path):
         evaluate(other, [0], tmp_path)
 
 
-def test_a_folder_of_other_weights_is_refused(tmp_path: Path):
+def test_a_folder_of_other_weights_or_another_number_type_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
     weights = tmp_path / "policy.safetensors"
     scenario = Scenario(policy=Learned(weights=weights.name))
     chosen = ChosenScenario(scenario, tmp_path / "mine.yaml", "mine", None)
     folder = tmp_path / "out"
     folder.mkdir()
-    weights.write_bytes(b"trained")
+    shutil.copy(MODELS / "policies" / "kitting_seen.safetensors", weights)
     for seeds in ([0], [0, 1]):
         evaluate(chosen, seeds, folder)
-    weights.write_bytes(b"trained anew")
+    with monkeypatch.context() as elsewhere:
+        elsewhere.setattr(device, "preferred_type", lambda: torch.float16)
+        with pytest.raises(UserError, match=r"another scenario.*compute_type"):
+            evaluate(chosen, [0, 1, 2], folder)
+    shutil.copy(MODELS / "policies" / "generalist.safetensors", weights)
     with pytest.raises(UserError, match="another scenario"):
         evaluate(chosen, [0, 1, 2], folder)
 

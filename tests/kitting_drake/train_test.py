@@ -150,6 +150,7 @@ def test_begins_with_the_weights_of_a_file(
     card = read_weights_file(tmp_path / "on" / start.name).card
     assert len(card["start"]) == 64
     assert card_seeds(card) == {10, 11, 12, 13}
+    assert list(card["start_learned"].values()) == [[10, 11, 12]]
     fewer = refused(demos, tmp_path / "no", "--from", start, "--demonstrations", 2)
     assert "learned from the seed 12, which is one to validate by" in fewer
     assert "give --orientations 180" in refused(

@@ -159,6 +159,7 @@ def test_what_is_written_is_read_again_to_the_last_bit(tmp_path: Path):
         (("distortion:", "distorsion:"), "camera eye has the unknown field 'distorsion'"),
         (("fy: 51", "fy: 51\n    fy: 52"), "'fy' is there twice"),
         (("fy: 51", "fy: 51\n    min_depth: 300"), "min_depth 300 must be less than max_depth 10"),
+        (("fy: 51", "fy: 51\n    table_height: 1"), "which all cameras share: put it beside 'cam"),
         (("table_height: 0.012", "when: 2024-13-45"), "is not YAML: month must be"),
     ],
 )

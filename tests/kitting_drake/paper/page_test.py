@@ -1,6 +1,7 @@
 """The paper's part of the page of results, of summaries made for it."""
 
 import json
+import math
 from pathlib import Path
 
 import pytest
@@ -131,9 +132,9 @@ def test_an_interval_over_tools_is_given_only_where_tools_are_drawn(folder: Path
 
 
 def test_the_learning_rates_that_were_tried_are_told(folder: Path):
-    rates = {"transporter": {"0.001": 4.0, "0.0003": 2.5}}
+    rates = {"transporter": {"0.001": 4.0, "0.0003": 2.5, "0.01": math.inf}}
     text = "\n".join(paper_sections(read_results(folder), rates, "results"))
-    assert "- the Transporter: 0.0003, of 0.001: 4.0 mm, 0.0003: 2.5 mm" in text
+    assert "- the Transporter: 0.0003, of 0.001: 4.0 mm, 0.0003: 2.5 mm, 0.01: diverged" in text
 
 
 def test_a_file_that_is_not_what_its_name_says_is_refused(folder: Path):

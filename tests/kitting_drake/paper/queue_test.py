@@ -13,7 +13,7 @@ import pytest
 from rich.console import Console
 
 from kitting_drake.benchmark import __main__ as benchmark
-from kitting_drake.common.errors import UserError
+from kitting_drake.common.errors import DIVERGED, UserError
 from kitting_drake.common.files import alone_in
 from kitting_drake.common.paths import SCENARIOS
 from kitting_drake.paper.cells import LEARNING_RATES, PRESET, TASKS, Cell, Training, reference
@@ -39,6 +39,7 @@ class Pretending(Queue):
         super().__init__(*arguments, **options)
         self.calls: list[str] = []
         self.broken: set[str] = set()
+        self.why = "it broke"
         self.slow = ""
         self.together: threading.Barrier | None = None
         """Where trainings wait for each other."""
@@ -47,7 +48,7 @@ class Pretending(Queue):
     def _command(self, verb: str, *arguments, folder: Path) -> None:
         self.calls.append(f"{verb} {folder.name}")
         if folder.name in self.broken:
-            raise Failed("it broke")
+            raise Failed(self.why)
         if folder.name == self.slow:
             self._has_evaluated.wait(10.0)
         folder.mkdir(parents=True, exist_ok=True)
@@ -232,6 +233,28 @@ def test_what_fails_keeps_nothing_else_up(queue: Pretending):
     queue.calls.clear()
     assert queue.run([THEIRS, OURS, ORACLE]) == {}
     assert queue.calls[0].endswith(f"_lr{LEARNING_RATES[2]:g}")
+
+
+def test_a_learning_rate_that_diverges_is_the_worst(queue: Pretending):
+    queue.broken = {f"{reference('transporter').name}_lr{LEARNING_RATES[1]:g}"}
+    queue.why = f"train failed with exit code 2: error: {DIVERGED} at step 3"
+    assert queue.run([THEIRS]) == {}
+    assert json.loads((queue.results / RATES).read_text())["transporter"] == {
+        f"{rate:g}": None if rate == LEARNING_RATES[1] else 2.0 for rate in LEARNING_RATES
+    }
+    assert queue.calls[-1] == f"evaluate {THEIRS.name}"
+    queue.calls.clear()
+    assert queue.run([THEIRS]) == {}
+    assert queue.calls == []
+
+
+def test_demonstrations_that_are_there_are_looked_at_once(queue: Pretending):
+    """`collect` refuses those of another scenario."""
+    queue.collect(TASKS["unseen"], validation=False)
+    again = Pretending(queue.folder, queue.results, Console(quiet=True))
+    for _ in range(2):
+        again.collect(TASKS["unseen"], validation=False)
+    assert again.calls == ["collect unseen"]
 
 
 @pytest.mark.parametrize(

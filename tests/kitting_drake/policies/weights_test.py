@@ -21,6 +21,7 @@ from kitting_drake.policies.learned_policy import LearnedPolicy
 from kitting_drake.policies.methods import make_networks
 from kitting_drake.policies.networks import Networks
 from kitting_drake.policies.weights import (
+    learned_seeds,
     load_networks,
     load_trainable,
     read_weights_file,
@@ -252,6 +253,17 @@ def test_a_truncated_file_is_refused(file: Path, length: int):
 def test_another_kind_of_file_is_refused(file: Path, text: bytes):
     file.write_bytes(text)
     assert "it is not a whole safetensors file" in refusal(file)
+
+
+def test_seeds_that_ancestors_learned_from_are_known():
+    mother = {"scenario": "a", "demonstration_seeds": [1, 2]}
+    daughter = {
+        "scenario": "b",
+        "demonstration_seeds": [1, 7],
+        "start_learned": learned_seeds(mother),
+    }
+    again = {"scenario": "a", "demonstration_seeds": [3], "start_learned": learned_seeds(daughter)}
+    assert learned_seeds(again) == {"a": [1, 2, 3], "b": [1, 7]}
 
 
 @pytest.mark.parametrize("metadata", [None, {"format": "pt"}])
