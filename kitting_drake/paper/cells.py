@@ -46,6 +46,8 @@ class Task:
     demonstrations: int = 100
     """How many are collected, from seed 10000; those to validate by from seed 20000."""
     validation: int = 24
+    rates_from: str = "unseen"
+    """The task on which the learning rates of the baselines are chosen."""
 
 
 TASKS = {
@@ -86,15 +88,18 @@ TASKS = {
                 episodes=episodes,
                 steps=steps,
                 validation=validation,
+                rates_from=rates_from,
             )
             # Of eighteen decisions each, few episodes are enough to validate by; and each of many
             # places is as good as the next, which takes longer to learn.
-            for name, scenario, episodes, steps, validation in (
-                ("block_insertion", "BlockInsertion", 100, 1000, 24),
-                ("place_red_in_green", "PlaceRedInGreen", 100, 1000, 24),
-                ("palletizing_boxes", "PalletizingBoxes", 50, 3000, 6),
-                ("align_box_corner", "AlignBoxCorner", 100, 1000, 24),
-                ("stack_block_pyramid", "StackBlockPyramid", 100, 1000, 24),
+            # And where the rate of figure 6 leaves a baseline short of 100 % after ten or a hundred
+            # demonstrations, it is chosen anew.
+            for name, scenario, episodes, steps, validation, rates_from in (
+                ("block_insertion", "BlockInsertion", 100, 1000, 24, "unseen"),
+                ("place_red_in_green", "PlaceRedInGreen", 100, 1000, 24, "unseen"),
+                ("palletizing_boxes", "PalletizingBoxes", 50, 3000, 6, "stack_block_pyramid"),
+                ("align_box_corner", "AlignBoxCorner", 100, 1000, 24, "stack_block_pyramid"),
+                ("stack_block_pyramid", "StackBlockPyramid", 100, 1000, 24, "stack_block_pyramid"),
             )
         ),
     )
@@ -111,7 +116,8 @@ class Training:
     demonstrations: int
     seed: int = 0
     learning_rate: float | None = None
-    """None: the method's; see `LEARNING_RATES`."""
+    """None: for ours the first of `LEARNING_RATES`, for a baseline the one that is best for
+    `reference`."""
     taken_only: bool = True
     """Whether only the taken action is a label, as in the paper."""
     rigid: bool = True
@@ -153,9 +159,14 @@ class Training:
         )
 
 
-def reference(method: str) -> Training:
-    """The training by which a baseline's learning rate is chosen, with none yet."""
-    return Training("unseen", method, 36, 100)
+def reference(training: Training) -> Training:
+    """The training by which the learning rate of a baseline's training is chosen; has none yet."""
+    return Training(TASKS[training.task].rates_from, training.method, 36, 100)
+
+
+def rates_key(chosen_by: Training) -> str:
+    """The key in `Rates` of what the learning rates come to in a training of `reference`."""
+    return f"{chosen_by.task}_{chosen_by.method}"
 
 
 @dataclass(frozen=True)
@@ -249,8 +260,9 @@ class Cell:
         # Those of an earlier version have no such thing.
         found = {"angle_only": False, **summary["policy_details"]}
         details = self._details(self.policy)
-        if rates and self.policy.method in rates:
-            details["learning_rate"] = float(best_rate(rates[self.policy.method]))
+        key = rates_key(reference(self.policy))
+        if rates and self.policy.method != "so2" and key in rates:
+            details["learning_rate"] = float(best_rate(rates[key]))
         for key, wanted in details.items():
             if found.get(key) != wanted:
                 return f"{key} is {found.get(key)}, not {wanted}"

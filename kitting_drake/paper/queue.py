@@ -33,6 +33,7 @@ from kitting_drake.paper.cells import (
     Cell,
     Task,
     Training,
+    rates_key,
     reference,
 )
 from kitting_drake.paper.rates import RATES, best_rate, read_rates, write_rates
@@ -172,8 +173,9 @@ class Queue:
         if training.base is not None:
             yield from (*self._before(training.base), training.base)
         elif training.method != "so2" and training.learning_rate is None:
-            for rate in self._untried(training.method):
-                yield dataclasses.replace(reference(training.method), learning_rate=rate)
+            chosen_by = reference(training)
+            for rate in self._untried(chosen_by):
+                yield dataclasses.replace(chosen_by, learning_rate=rate)
 
     def _is_trained(self, training: Training) -> bool:
         rates: Sequence[float] = LEARNING_RATES[:1] if training.method == "so2" else LEARNING_RATES
@@ -189,7 +191,7 @@ class Queue:
         rate = training.learning_rate
         if rate is None:
             ours = training.method == "so2"
-            rate = LEARNING_RATES[0] if ours else self._best_rate(training.method)
+            rate = LEARNING_RATES[0] if ours else self._best_rate(reference(training))
         folder = self._folder(training, rate)
         with self._only_one_makes(folder):
             if not (folder / "summary.json").exists():
@@ -237,34 +239,36 @@ class Queue:
             if found != wanted:
                 raise Failed(f"{folder}: its {key} is {found}, not {wanted}: delete it")
 
-    def _best_rate(self, method: str) -> float:
-        """The learning rate at which a baseline does best on validation scenes.
+    def _best_rate(self, chosen_by: Training) -> float:
+        """The learning rate at which a training of `reference` does best on validation scenes.
 
         What each comes to is written as soon as it is known, and not tried again.
         """
-        for rate in self._untried(method):
+        for rate in self._untried(chosen_by):
             try:
-                weights = self.train(dataclasses.replace(reference(method), learning_rate=rate))
+                weights = self.train(dataclasses.replace(chosen_by, learning_rate=rate))
             except Failed as error:
                 if DIVERGED not in error.why:
                     raise
-                self._keep_rate(method, rate, math.inf)
+                self._keep_rate(chosen_by, rate, math.inf)
                 continue
             summary = json.loads(weights.with_name("summary.json").read_text())
-            self._keep_rate(method, rate, summary["best"]["cost_mm"])
-        return float(best_rate(read_rates(self.results)[method]))
+            best = summary["best"]
+            # The one of the two by which the checkpoint was chosen.
+            self._keep_rate(chosen_by, rate, best.get("loss", best["cost_mm"]))
+        return float(best_rate(read_rates(self.results)[rates_key(chosen_by)]))
 
-    def _untried(self, method: str) -> list[float]:
-        """The learning rates of which it is not known what a baseline comes to."""
-        tried = read_rates(self.results).get(method, {})
+    def _untried(self, chosen_by: Training) -> list[float]:
+        """The learning rates of which it is not known what a training of `reference` comes to."""
+        tried = read_rates(self.results).get(rates_key(chosen_by), {})
         return [rate for rate in LEARNING_RATES if f"{rate:g}" not in tried]
 
-    def _keep_rate(self, method: str, rate: float, cost_mm: float) -> None:
+    def _keep_rate(self, chosen_by: Training, rate: float, cost: float) -> None:
         file = self.results / RATES
         with self._only_one_makes(file):
             known = read_rates(self.results)
-            costs = known.get(method, {}) | {f"{rate:g}": cost_mm}
-            write_rates(self.results, known | {method: costs})
+            key = rates_key(chosen_by)
+            write_rates(self.results, known | {key: known.get(key, {}) | {f"{rate:g}": cost}})
 
     def _evaluate(self, cell: Cell, weights: Path | None) -> None:
         task = TASKS[cell.task]

@@ -12,8 +12,9 @@ RATES = "learning_rates.json"
 """The file, beside the results."""
 
 Rates = Mapping[str, Mapping[str, float]]
-"""For each method and learning rate, the displacement on validation scenes in mm; infinite where
-the training diverged, which the file has as null."""
+"""For each task and method (`rates_key`) and for each learning rate, the criterion of a checkpoint
+on validation scenes: the cost in mm, on a Ravens task the loss in nats. It is infinite where
+training diverged, which the file has as null."""
 
 
 def read_rates(folder: Path) -> dict[str, dict[str, float]]:
@@ -26,10 +27,10 @@ def read_rates(folder: Path) -> dict[str, dict[str, float]]:
     try:
         found = json.loads(path.read_text()) if path.exists() else {}
         return {
-            method: {
+            key: {
                 str(rate): math.inf if cost is None else float(cost) for rate, cost in costs.items()
             }
-            for method, costs in found.items()
+            for key, costs in found.items()
         }
     except (OSError, ValueError, TypeError, AttributeError) as error:
         raise UserError(f"{path} is damaged: delete it") from error
@@ -42,8 +43,8 @@ def write_rates(folder: Path, rates: Rates) -> None:
         UserError: the file cannot be written.
     """
     content = {
-        method: {rate: cost if math.isfinite(cost) else None for rate, cost in costs.items()}
-        for method, costs in sorted(rates.items())
+        key: {rate: cost if math.isfinite(cost) else None for rate, cost in costs.items()}
+        for key, costs in sorted(rates.items())
     }
     write_json(folder / RATES, content)
 

@@ -132,9 +132,19 @@ def test_an_interval_over_tools_is_given_only_where_tools_are_drawn(folder: Path
 
 
 def test_the_learning_rates_that_were_tried_are_told(folder: Path):
-    rates = {"transporter": {"0.001": 4.0, "0.0003": 2.5, "0.01": math.inf}}
+    rates = {
+        "unseen_transporter": {"0.001": 4.0, "0.0003": 2.5, "0.01": math.inf},
+        "stack_block_pyramid_transporter": {"0.001": 9.25, "0.0003": 12.0},
+    }
     text = "\n".join(paper_sections(read_results(folder), rates, "results"))
-    assert "- the Transporter: 0.0003, of 0.001: 4.0 mm, 0.0003: 2.5 mm, 0.01: diverged" in text
+    assert (
+        "- the Transporter, unseen: 0.0003 of 0.001 (4.00 mm), 0.0003 (2.50 mm), 0.01 (diverged)"
+        in text
+    )
+    assert (
+        "- the Transporter, stack_block_pyramid: 0.001 of 0.001 (9.25 nats), 0.0003 (12.00 nats)"
+        in text
+    )
 
 
 def test_a_file_that_is_not_what_its_name_says_is_refused(folder: Path):
@@ -151,7 +161,7 @@ def test_a_file_that_is_not_what_its_name_says_is_refused(folder: Path):
     (folder / "learning_rates.json").write_text("[]")
     with pytest.raises(UserError, match=r"learning_rates\.json is damaged"):
         read_results(folder)
-    rates = {"equivariant_transporter": {"0.001": 4.0, "0.0003": 2.5}}
+    rates = {"unseen_equivariant_transporter": {"0.001": 4.0, "0.0003": 2.5}}
     (folder / "learning_rates.json").write_text(json.dumps(rates))
     with pytest.raises(UserError, match=r"learning_rate is 0\.001, not 0\.0003"):
         read_results(folder)
