@@ -6,6 +6,7 @@ from pydrake.common.value import AbstractValue, Value
 from pydrake.systems.framework import AbstractParameterIndex, Context, LeafSystem
 
 from systems.signals import PickPlaceAction
+from systems.weak_calc import weak_calc
 
 
 class GivenAction(LeafSystem):
@@ -32,7 +33,7 @@ class GivenAction(LeafSystem):
         self.DeclareAbstractOutputPort(
             "action",
             lambda: Value(PickPlaceAction()),
-            self._calc_action,
+            weak_calc(self._calc_action),
             {self.abstract_parameter_ticket(self._index)},
         )
 

@@ -1,6 +1,5 @@
 """From the cameras' images to the orthographic heightmap that the policies look at."""
 
-import functools
 from collections.abc import Mapping
 from typing import Any
 
@@ -14,6 +13,7 @@ from pydrake.systems.sensors import ImageDepth32F, ImageRgba8U
 
 from systems.heightmap import DepthRays, View, project
 from systems.signals import Observation, PixelGrid
+from systems.weak_calc import weak_calc
 
 
 class HeightmapProjector(LeafSystem):
@@ -95,7 +95,7 @@ class HeightmapProjector(LeafSystem):
             self.DeclareAbstractOutputPort(
                 port,
                 lambda: AbstractValue.Make(blank),
-                functools.partial(self._CalcObservation, in_color),
+                weak_calc(self._CalcObservation, in_color),
                 prerequisites_of_calc=prerequisites,
             )
 

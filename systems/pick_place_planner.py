@@ -21,6 +21,7 @@ from systems.pick_place_motion import YAW_LIMIT, PickPlaceMotion, PlannerState, 
 from systems.pick_place_parameters import Mode, PickPlaceParameters
 from systems.signals import Observation, PickPlaceAction, PlanarPose, SurfaceHeights
 from systems.surface_heights import read_surface_heights
+from systems.weak_calc import weak_calc
 
 _MOST_FAILED = 16
 """So many failed picks are remembered."""
@@ -120,7 +121,7 @@ class PickPlacePlanner(LeafSystem):
         self.DeclareAbstractOutputPort(
             "failed_picks",
             lambda: Value(()),
-            self._calc_failed_picks,
+            weak_calc(self._calc_failed_picks),
             {self.discrete_state_ticket(self._failed_index)},
         )
 

@@ -12,6 +12,7 @@ from pydrake.common.value import AbstractValue, Value
 from pydrake.systems.framework import Context, LeafSystem
 
 from systems.signals import Observation, PickPlaceAction, PlanarPose
+from systems.weak_calc import weak_calc
 
 PolicyFunction = Callable[..., PickPlaceAction]
 """Called with an `Observation`; and, if it has an argument `failed_picks`, with a tuple of the
@@ -60,7 +61,7 @@ class PickPlacePolicy(LeafSystem):
             self._failed_picks = self.DeclareAbstractInputPort("failed_picks", Value(()))
             tickets.add(self._failed_picks.ticket())
         self.DeclareAbstractOutputPort(
-            "action", lambda: Value(PickPlaceAction()), self._calc_action, tickets
+            "action", lambda: Value(PickPlaceAction()), weak_calc(self._calc_action), tickets
         )
 
     def _calc_action(self, context: Context, output: AbstractValue) -> None:

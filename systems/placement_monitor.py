@@ -16,6 +16,7 @@ from systems.placement import (
     evaluate_placements,
     total_reward,
 )
+from systems.weak_calc import weak_calc
 
 
 class PlacementMonitor(LeafSystem):
@@ -76,7 +77,7 @@ class PlacementMonitor(LeafSystem):
         self._placements = self.DeclareAbstractOutputPort(
             "placements",
             lambda: Value([Placement()]),
-            self._calc_placements,
+            weak_calc(self._calc_placements),
             {self._body_poses.ticket()},
         )
         tickets = {self._body_poses.ticket()}

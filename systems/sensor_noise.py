@@ -16,6 +16,7 @@ from scipy import ndimage
 from scipy.special import ndtri
 
 from systems.bounds import bounded
+from systems.weak_calc import weak_calc
 
 SHEEN_LABELS = 20000
 """A render label of this plus a percentage is that of a surface of so much sheen."""
@@ -174,7 +175,7 @@ class SensorNoise(LeafSystem):
         self.DeclareAbstractOutputPort(
             "color_image",
             lambda: Value(ImageRgba8U(width, height)),
-            self._calc_color,
+            weak_calc(self._calc_color),
             {self._color.ticket()},
         )
         depends = {self._depth.ticket(), self.time_ticket()}
@@ -183,13 +184,13 @@ class SensorNoise(LeafSystem):
         self.DeclareAbstractOutputPort(
             "depth_image_32f",
             lambda: Value(ImageDepth32F(width, height)),
-            self._calc_depth,
+            weak_calc(self._calc_depth),
             depends,
         )
         self.DeclareAbstractOutputPort(
             "body_pose_in_world",
             lambda: Value(RigidTransform()),
-            self._calc_pose,
+            weak_calc(self._calc_pose),
             {self._pose.ticket()},
         )
 

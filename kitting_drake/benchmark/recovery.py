@@ -32,6 +32,7 @@ from kitting_drake.scenario.policies import Policy, PolicyConfig, PolicySite
 from kitting_drake.scenario.schema import Scenario
 from systems.pick_place_parameters import Mode
 from systems.signals import PickPlaceAction, PlanarPose
+from systems.weak_calc import weak_calc
 
 _MOVED = (0.03, 0.06)
 """How far an object is moved, in metres, ..."""
@@ -78,7 +79,9 @@ class ActionOffset(LeafSystem):
         super().__init__()
         self._action = self.DeclareAbstractInputPort("action", Value(PickPlaceAction()))
         self._offset = self.DeclareNumericParameter(BasicVector(offset))
-        self.DeclareAbstractOutputPort("action", lambda: Value(PickPlaceAction()), self._calc)
+        self.DeclareAbstractOutputPort(
+            "action", lambda: Value(PickPlaceAction()), weak_calc(self._calc)
+        )
 
     def stop(self, context: Context) -> None:
         """From now on nothing is shifted."""

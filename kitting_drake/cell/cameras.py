@@ -4,6 +4,7 @@ import contextlib
 import ctypes
 import importlib.util
 import io
+import os
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -30,6 +31,9 @@ from kitting_drake.common.errors import MachineError
 from kitting_drake.common.files import write_atomically
 from kitting_drake.scenario.schema import LookAt, Pinhole
 
+_rendering_process: int | None = None
+"""The process in which engines were made; a fork inherits it."""
+
 OVERVIEW = LookAt(position=[1.62, -0.95, 1.13], target=[0.48, -0.02, 0.06])
 """From where pictures and films show the whole cell."""
 
@@ -47,13 +51,21 @@ def require_rendering() -> None:
     """Makes sure that images can be rendered here; to be called before an engine is made.
 
     Raises:
-        MachineError: the system library is missing; names the package.
+        MachineError: the system library is missing, or the process was forked from one that has
+            rendered; says what would do.
     """
+    global _rendering_process
     if not can_render():
         raise MachineError(
             "rendering needs the system library libEGL: install it "
             "(Debian and Ubuntu: apt-get install libegl1 libgl1-mesa-dri)"
         )
+    if _rendering_process not in (None, os.getpid()):
+        raise MachineError(
+            "this process was forked from one that has rendered, which OpenGL does not survive: "
+            "start it by spawn, as in multiprocessing.get_context('spawn')"
+        )
+    _rendering_process = os.getpid()
     _load_triton()
 
 

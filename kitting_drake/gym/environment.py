@@ -1,6 +1,7 @@
 """The Gymnasium environment: one step is one pick and place."""
 
 import dataclasses
+import gc
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -185,6 +186,8 @@ class KittingEnvironment(gymnasium.Env[dict[str, Any], NDArray[Any]]):
     def close(self) -> None:
         """Lets go of the simulation."""
         self._cell = self._episode = None
+        # A Diagram and its systems refer to each other: without this they stay for a while.
+        gc.collect()
 
     def _give(self, cell: Cell, episode: Episode, action: PickPlaceAction) -> None:
         agent = cell.diagram.GetSubsystemByName("policy")

@@ -1,5 +1,7 @@
 import dataclasses
+import gc
 import shutil
+import weakref
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -33,6 +35,7 @@ from kitting_drake.tasks.task import TABLE
 from systems.hand_geometry import JOINT_LIMITS
 from systems.heightmap_projector import HeightmapProjector
 from systems.placement import Placement
+from systems.sensor_noise import SensorNoiseParameters
 from systems.signals import Observation, PickPlaceAction
 
 BASE = Path(__file__).parent
@@ -405,3 +408,19 @@ def test_a_mesh_that_is_none_is_the_users_to_repair(own_tool: Path):
         (own_tool / name).write_text("not a mesh\n")
     with pytest.raises(UserError, match="obj"):
         build(with_tool(own_tool))
+
+
+@pytest.mark.parametrize(
+    "policy", [Oracle(), PythonPolicy(function="systems.signals:PickPlaceAction")]
+)
+@pytest.mark.usefixtures("rendering", "freed_diagrams")
+def test_a_cell_that_nobody_uses_leaves_the_memory(policy: PolicyConfig):
+    """A loop that builds cell after cell does not grow."""
+    scenario = Scenario(policy=policy, sensor_noise=SensorNoiseParameters(depth_std=0.001))
+    cell = build(scenario)
+    simulator = Simulator(cell.diagram)
+    simulator.AdvanceTo(0.01)
+    diagram = weakref.ref(cell.diagram)
+    del cell, simulator
+    gc.collect()
+    assert diagram() is None

@@ -5,6 +5,7 @@ import subprocess
 import sys
 import time
 import types
+import weakref
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -155,6 +156,20 @@ def test_an_observation_is_rendered_once_an_action_and_once_at_the_end(
     assert len(count) == 3
 
 
+@pytest.mark.usefixtures("freed_diagrams")
+def test_scene_after_scene_leaves_the_memory(small: Path):
+    environment = make(small, render_mode="rgb_array")
+    environment.reset(seed=0)
+    environment.step(NOWHERE)
+    environment.render()
+    first = weakref.ref(environment.unwrapped._cell.diagram)
+    environment.reset(seed=1)
+    assert first() is None
+    second = weakref.ref(environment.unwrapped._cell.diagram)
+    environment.close()
+    assert second() is None
+
+
 def test_what_ends_an_episode(small: Path):
     environment = make(small)
     environment.reset(seed=0)
@@ -211,8 +226,14 @@ def test_a_seed_is_drawn_where_none_is_given(small: Path):
 
 
 def test_many_at_once(small: Path):
+    make(small).reset(seed=0)
     environments = gymnasium.make_vec(
-        "kitting_drake/Scenario-v0", num_envs=2, vectorization_mode="async", scenario=small
+        "kitting_drake/Scenario-v0",
+        num_envs=2,
+        vectorization_mode="async",
+        # A fork of this process, which has rendered, would wait for threads that it does not have.
+        vector_kwargs={"context": "spawn"},
+        scenario=small,
     )
     try:
         arrays, info = environments.reset(seed=[1, 2])
