@@ -66,7 +66,7 @@ def _patient() -> list[Cell]:
     """Cells in more steps than the others get: the Transporter, which is far from done by then, and
     ours on the pyramid."""
     wanted = [
-        *((task, "transporter", 36) for task in FIGURE_6),
+        *((task, "transporter", 36) for task in (*FIGURE_6, "align_box_corner")),
         *(("stack_block_pyramid", "so2", n) for n in (180, 36)),
     ]
     return [_paper_cell(task, method, n, 100, times=PATIENCE) for task, method, n in wanted]

@@ -42,7 +42,7 @@ def tell_refusal(connection: Connection) -> None:
 
 @pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")
 @pytest.mark.parametrize(
-    ("start", "refusal"), [("fork", "OpenGL does not survive"), ("spawn", "n")]
+    ("start", "refusal"), [("fork", "this process was forked from"), ("spawn", "nothing")]
 )
 def test_a_fork_of_a_process_that_rendered_is_told_so(start: str, refusal: str):
     """It would wait for ever for threads that only its parent has."""
@@ -51,5 +51,5 @@ def test_a_fork_of_a_process_that_rendered_is_told_so(start: str, refusal: str):
     here, there = context.Pipe()
     process = context.Process(target=tell_refusal, args=(there,))
     process.start()
-    assert refusal in here.recv()
+    assert here.recv().startswith(refusal)
     process.join()
