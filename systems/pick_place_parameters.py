@@ -40,7 +40,9 @@ class PickPlaceParameters:
     """Heights, speeds and thresholds of the motion primitive."""
 
     # Where the hand waits while the cameras look: x, y, height of the fingertips (m), yaw (rad).
-    # There it begins; later it returns to this x and height, and keeps its y and yaw.
+    # There it begins; later it returns to this x and height, and keeps its y and yaw. It has to be
+    # out of the cameras' sight: the default is for the three default cameras. Below a camera that
+    # looks straight down choose another, such as [-0.4, 0, 0.4, 0], or o_t lacks what it hides.
     home: list[float] = bounded([0.5, 0.0, 0.4, 0.0], -2.0, 2.0)
 
     # What crosses the table, fingertips or what hangs below them, stays this far above the highest

@@ -114,19 +114,22 @@ def read_calibration(path: Path, *, table_height: float | None = None) -> Calibr
                         f"{path}: camera {name} has the field '{key}', which all cameras share: "
                         "put it beside 'cameras'"
                     )
+        beside: tuple[str, ...] = ()
     else:
         entries = {str(content.get("camera_name", "camera")): content}
-    cameras = tuple(_read_camera(path, str(name), node) for name, node in entries.items())
+        # A file of one camera has the bench's fields beside the camera's.
+        beside = (*_BENCH_FIELDS, "camera_name")
+    cameras = tuple(_read_camera(path, str(name), node, beside) for name, node in entries.items())
     told = content.get("table_height", 0.0) if table_height is None else table_height
     height = number(told, f"{path}: table_height")
     return Calibration(cameras, _read_grid(path, content.get("workspace", {}), height))
 
 
-def _read_camera(path: Path, name: str, node: Any) -> BenchCamera:
+def _read_camera(path: Path, name: str, node: Any, beside: Sequence[str]) -> BenchCamera:
     where = f"{path}: camera {name}"
     if not isinstance(node, dict):
         raise UserError(f"{where} must be a mapping of fields")
-    lens, known = node, (*POSE_FIELDS, *_DEPTH_FIELDS)
+    lens, known = node, (*POSE_FIELDS, *_DEPTH_FIELDS, *beside)
     if "camera_info" in node:
         _check_fields(node, ("camera_info", *known), where)
         file = path.parent / str(node["camera_info"])
@@ -134,14 +137,13 @@ def _read_camera(path: Path, name: str, node: Any) -> BenchCamera:
         if not has_intrinsics(lens):
             raise UserError(f"{where}: {file} holds no camera_matrix and no k")
     elif not has_intrinsics(node):
-        _check_misspelt(node, (*known, *_BENCH_FIELDS, "camera_name"), where)
+        _check_misspelt(node, (*known, "camera_name"), where)
     limits = {key: number(node[key], f"{where}: {key}") for key in _DEPTH_FIELDS if key in node}
     if any(value <= 0 for value in limits.values()):
         raise UserError(f"{where}: depth_scale, min_depth and max_depth must be positive")
     intrinsics, X_BC = read_intrinsics(lens, where), read_pose(node, where)
     if "fx" in node:
-        # A file of one camera has the bench's fields beside the camera's.
-        _check_fields(node, (*OWN_INTRINSICS, *known, *_BENCH_FIELDS, "camera_name"), where)
+        _check_fields(node, (*OWN_INTRINSICS, *known, "camera_name"), where)
     camera = BenchCamera(name, intrinsics, X_BC, **limits)
     if camera.min_depth >= camera.max_depth:
         raise UserError(

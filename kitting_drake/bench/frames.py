@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from tokenize import TokenError
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +18,8 @@ _COLOUR_NAMES = ("color", "colour", "rgb")
 _COLOUR_ENDINGS = (".png", ".jpg", ".jpeg")
 _DEPTH_ENDINGS = (".npy", ".png")
 _SIXTEEN_BIT = ("I;16", "I;16B", "I")
+_DAMAGED = (OSError, SyntaxError)
+"""Raised by Pillow for a file that is not whole: the second for a PNG with a broken chunk."""
 
 
 @dataclass(frozen=True)
@@ -141,7 +144,7 @@ def _read_color(path: Path, camera: BenchCamera) -> NDArray[np.uint8]:
             raise UserError(f"{path} has 16 bits a pixel: colour has 8, is this the depth?")
         try:
             data = np.asarray(image.convert("RGB"))
-        except OSError as error:
+        except _DAMAGED as error:
             raise UserError(f"{path} is damaged: {error}") from error
     _check_size(data.shape, camera, str(path))
     return data
@@ -151,7 +154,7 @@ def _read_depth(path: Path, camera: BenchCamera) -> NDArray[np.float32]:
     if path.suffix == ".npy":
         try:
             data = np.load(path, allow_pickle=False)
-        except (OSError, ValueError, EOFError) as error:
+        except (OSError, ValueError, EOFError, SyntaxError, TokenError) as error:
             raise UserError(f"cannot read {path}: it is no whole .npy file of numbers") from error
     else:
         with _open(path) as image:
@@ -159,7 +162,7 @@ def _read_depth(path: Path, camera: BenchCamera) -> NDArray[np.float32]:
                 raise UserError(f"{path} is no depth image, which has one channel of 16 bits")
             try:
                 data = np.asarray(image)
-            except OSError as error:
+            except _DAMAGED as error:
                 raise UserError(f"{path} is damaged: {error}") from error
     if not isinstance(data, np.ndarray):
         raise UserError(f"{path} is an archive of arrays (.npz): save the depth alone as .npy")

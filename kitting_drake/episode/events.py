@@ -12,8 +12,9 @@ from systems.pick_place_parameters import Mode
 class ModeChange:
     """The planner has gone from one mode to another; or, at its end, the episode is over.
 
-    The planner decides, then the plant steps once more before this is told. Things have hardly
-    moved since; but ports that depend on time, such as the noise of cameras, are evaluated anew.
+    The plant has stepped, the planner has decided on that, and this is told one step of time later:
+    nothing has moved since, but ports that depend on time, such as the noise of cameras, are
+    evaluated anew.
     """
 
     previous: Mode

@@ -83,14 +83,20 @@ def _sources(modules: list[str]) -> Iterator[tuple[Path, Path]]:
         folders.append(MODELS)
     for name in {module.partition(".")[0] for module in modules} - set(_PACKAGES):
         spec = importlib.util.find_spec(name)
-        origin = Path(spec.origin) if spec is not None and spec.origin is not None else None
-        if origin is None or origin.is_relative_to(sysconfig.get_path("purelib")):
-            # Installed: it has to be there, too.
+        if spec is None:
             continue
-        if origin.name == "__init__.py":
-            folders.append(origin.parent)
-        else:
-            yield origin, Path(origin.name)
+        # A package without an `__init__.py` has folders and no origin.
+        places = [Path(place) for place in spec.submodule_search_locations or ()]
+        if spec.origin is not None:
+            places = places or [Path(spec.origin)]
+        for place in places:
+            if place.is_relative_to(sysconfig.get_path("purelib")):
+                # Installed: it has to be there, too.
+                continue
+            if place.is_dir():
+                folders.append(place)
+            else:
+                yield place, Path(place.name)
     for folder in folders:
         for path in sorted(folder.rglob("*")):
             if path.is_file() and "__pycache__" not in path.parts:

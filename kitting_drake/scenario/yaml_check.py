@@ -6,6 +6,7 @@ field, which is what a person needs to mend it.
 
 import dataclasses
 import difflib
+import math
 import types
 import typing
 from pathlib import Path
@@ -91,7 +92,18 @@ def _check_scalar(schema: Any, value: Any, where: str) -> None:
         raise ValueError(f"{where} is empty: give a value or leave the field out")
     accepted: tuple[type, ...] = {float: (float, int), Path: (str,)}.get(schema, (schema,))
     if not isinstance(value, accepted) or (isinstance(value, bool) and schema is not bool):
-        raise ValueError(f"{where} must be {_NAMES.get(schema, 'a path')}, not {_shown(value)}")
+        advice = _float_advice(value) if schema is float else ""
+        wanted = _NAMES.get(schema, "a path")
+        raise ValueError(f"{where} must be {wanted}, not {_shown(value)}{advice}")
+
+
+def _float_advice(value: Any) -> str:
+    """What would do instead of a number in a notation that YAML takes for a text, such as 1e-3."""
+    try:
+        number = float(value) if isinstance(value, str) else math.nan
+    except ValueError:
+        number = math.nan
+    return f": write {number!r}" if math.isfinite(number) else ""
 
 
 def _join(where: str, key: object) -> str:

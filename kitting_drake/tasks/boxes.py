@@ -11,11 +11,13 @@ import numpy as np
 from numpy.typing import NDArray
 from pydrake.math import RigidTransform
 
-from kitting_drake.common.files import write_atomically
 from kitting_drake.common.paths import MODELS, cache_directory
+from kitting_drake.hkd.cache import cached_folder
 from kitting_drake.tasks.sampling import Footprint, rectangle
 from kitting_drake.tasks.task import SceneObject
 from systems.grasp import Grasp
+
+_FILE = "model.sdf"
 
 Colour = tuple[float, float, float]
 """Diffuse red, green and blue, in [0, 1]."""
@@ -194,7 +196,9 @@ def _rgb(colour: Colour) -> str:
 
 def _cached(text: str) -> Path:
     digest = hashlib.sha256(text.encode()).hexdigest()
-    path = cache_directory() / "models" / "ravens" / f"{digest[:24]}.sdf"
-    if not path.exists() or path.read_text() != text:
-        write_atomically(path, text)
-    return path
+    folder = cached_folder(
+        cache_directory() / "boxes" / digest[:24],
+        [_FILE],
+        lambda scratch: (scratch / _FILE).write_text(text),
+    )
+    return folder / _FILE

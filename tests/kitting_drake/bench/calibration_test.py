@@ -97,6 +97,19 @@ def test_three_layouts_tell_the_same_camera(tmp_path: Path):
     assert own.table_height == 0.012
 
 
+def test_a_file_of_one_camera_says_where_the_table_is(tmp_path: Path):
+    one = """
+camera_name: eye
+table_height: 0.012
+camera_info: eye_info.yaml
+transform:
+  translation: {x: 0.5, y: 0.1, z: 0.9}
+  rotation: {x: 0.7071067811865476, y: -0.7071067811865476, z: 0.0, w: 0.0}
+"""
+    found = read(tmp_path, one, eye_info=CAMERA_INFO)
+    assert (found.cameras[0].name, found.table_height) == ("eye", 0.012)
+
+
 def test_rays_are_where_the_lens_bends_them_from(tmp_path: Path):
     """Bent by the lens, as OpenCV's manual states it, a ray comes back to its pixel."""
     camera = read(tmp_path, OWN).cameras[0]

@@ -249,9 +249,27 @@ def broken(folder: Path) -> None:
     (folder / "front_depth.npy").write_bytes(b"not numbers")
 
 
+def broken_header(folder: Path) -> None:
+    path = folder / "front_depth.npy"
+    path.write_bytes(path.read_bytes().replace(b"{'descr'", b"{('descr'", 1))
+
+
+def broken_chunk(folder: Path) -> None:
+    """Of the kind that a faulty disk makes: what follows the first data is no chunk."""
+    path = folder / "front_color.png"
+    image = np.random.default_rng(0).integers(0, 255, (480, 640, 3), np.uint8)
+    Image.fromarray(image).save(path)
+    content = bytearray(path.read_bytes())
+    second = content.index(b"IDAT", content.index(b"IDAT") + 4)
+    content[second : second + 4] = b"\x00\x01\x02\x03"
+    path.write_bytes(bytes(content))
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [
+        (broken_header, "no whole .npy file"),
+        (broken_chunk, "front_color.png is damaged: broken PNG file"),
         (spoil(lambda depth: 1000 * depth), "these are millimetres"),
         (as_png(1.0), "these are metres"),
         (as_png(4000.0), r"depth_scale \(of 0.00025 it would agree\)"),

@@ -18,7 +18,7 @@ from kitting_drake.tasks.kitting.config import TablePose
 WRENCH = MODELS / "tools" / "combination_wrench"
 
 _ON_THE_NODE = """
-import pickle, sys
+import importlib, pickle, sys
 from pathlib import Path
 import kitting_drake, systems
 from kitting_drake.common.paths import MODELS
@@ -33,7 +33,7 @@ for path in (*chosen.scenario.policy.input_files(chosen.base),
     assert path.resolve().is_relative_to(here), path
     assert path.is_file(), path
 for module in chosen.scenario.policy.modules():
-    assert Path(__import__(module).__file__).is_relative_to(here), module
+    assert Path(importlib.import_module(module).__file__).is_relative_to(here), module
 print(chosen.name, chosen.path)
 """
 
@@ -97,15 +97,22 @@ def test_absolute_paths_are_made_relative(tmp_path: Path):
     assert second == "claw_hammer"
 
 
-@pytest.mark.parametrize("name", ["policy_of_mine.py", "policy_of_mine/__init__.py"])
+@pytest.mark.parametrize(
+    ("name", "module"),
+    [
+        ("policy_of_mine.py", "policy_of_mine"),
+        ("policy_of_mine/__init__.py", "policy_of_mine"),
+        ("policies_of_mine/policy.py", "policies_of_mine.policy"),
+    ],
+)
 def test_a_policy_of_ones_own_travels_along(
-    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    name: str, module: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     source = tmp_path / "where_i_run" / name
     source.parent.mkdir(parents=True)
     source.write_text("def act(observation): ...\n")
     monkeypatch.syspath_prepend(tmp_path / "where_i_run")
-    scenario = Scenario(policy=PythonPolicy("policy_of_mine:act"))
+    scenario = Scenario(policy=PythonPolicy(f"{module}:act"))
     chosen = ChosenScenario(scenario, tmp_path / "mine.yaml", "mine", None)
     shipment = pack(chosen, tmp_path / "a.zip")
     unpacked(shipment, tmp_path / "a.zip", tmp_path / "node")

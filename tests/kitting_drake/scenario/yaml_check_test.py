@@ -50,6 +50,8 @@ def test_accepts(value: Any):
         ({"lid": {"_tag": 3}}, "^lid has a tag that is no name: '3'$"),
         ({"lid": {"_tag": "!Square", "radius": 1.0}}, r"^lid\.radius is an unknown field"),
         ({"lid": None}, "^lid is empty"),
+        ({"by_name": {"a": {"side": "2e-3"}}}, "a number, not '2e-3': write 0.002$"),
+        ({"by_name": {"a": {"side": "wide"}}}, "a number, not 'wide'$"),
         ({"by_name": {"a": {"sid": 1.0}}}, r"^by_name\.a\.sid .* did you mean 'side'"),
         ({"by_name": [1]}, "^by_name must be a mapping of names, not a list"),
         ({"note": "here"}, "^note must be a mapping, not 'here'"),
