@@ -40,16 +40,11 @@ def count_type(text: str) -> int:
 
 @contextlib.contextmanager
 def interrupts_wait() -> Iterator[Callable[[], bool]]:
-    """Lets Ctrl-C wait for a good moment; a second one does not wait.
+    """Lets Ctrl-C, and being told to end (SIGTERM), wait for a good moment; a second does not wait.
 
     Yields:
         Whether there was one: who asks goes on to raise KeyboardInterrupt.
     """
-    before = signal.getsignal(signal.SIGINT)
-    if before == signal.SIG_IGN:
-        # As of jobs that a shell starts in the background.
-        yield lambda: False
-        return
     came = False
 
     def note(number: int, frame: object) -> None:
@@ -58,11 +53,16 @@ def interrupts_wait() -> Iterator[Callable[[], bool]]:
             raise KeyboardInterrupt
         came = True
 
-    signal.signal(signal.SIGINT, note)
+    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    for number, handler in before.items():
+        # Ctrl-C is ignored in jobs that a shell starts in the background.
+        if handler != signal.SIG_IGN:
+            signal.signal(number, note)
     try:
         yield lambda: came
     finally:
-        signal.signal(signal.SIGINT, before)
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 def run_command(main: Callable[[], int]) -> None:

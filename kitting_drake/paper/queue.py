@@ -315,7 +315,7 @@ class Queue:
                     stderr=subprocess.STDOUT,
                     text=True,
                     env={_THREADS: str(self._threads()), **os.environ},
-                    # Ctrl-C would reach it twice: it is passed on by `_end`.
+                    # Ctrl-C is for the queue, which ends it.
                     start_new_session=True,
                 )
                 self._running.append(process)
@@ -337,13 +337,13 @@ class Queue:
 
 
 def _end(process: subprocess.Popen[str]) -> None:
-    """Ends a command as Ctrl-C does or, as it may be deaf to that in the background, for good."""
+    """Ends a command: a training saves what it has before."""
     if process.poll() is None:
-        process.send_signal(signal.SIGINT)
+        process.terminate()
         try:
             process.wait(_PATIENCE)
         except subprocess.TimeoutExpired:
-            process.terminate()
+            process.kill()
             process.wait()
 
 

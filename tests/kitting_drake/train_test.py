@@ -299,7 +299,9 @@ def assert_same_outcome(folder: Path, other: Path) -> None:
     assert one | {"wall_seconds": 0} == two | {"wall_seconds": 0}
 
 
-def test_ctrl_c_loses_no_step(
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_whoever_ends_it_loses_no_step(
+    number: signal.Signals,
     demos: Path,
     trained: Path,
     tmp_path: Path,
@@ -311,7 +313,7 @@ def test_ctrl_c_loses_no_step(
     def step_and_interrupt(self: Trainer, *arguments: Any) -> dict[str, float]:
         if self.step_count == 2:
             # In the middle of a step, and between two checkpoints.
-            os.kill(os.getpid(), signal.SIGINT)
+            os.kill(os.getpid(), number)
         return step(self, *arguments)
 
     # A shell that starts the tests in the background has them ignore Ctrl-C.
