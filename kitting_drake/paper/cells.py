@@ -286,7 +286,7 @@ class Cell:
             "recover": self.recover,
         }
         if training.method == "so2":
-            wanted["learning_rate"] = LEARNING_RATES[0]
+            wanted["learning_rate"] = training.learning_rate or LEARNING_RATES[0]
         if learned_at.table == "6":
             # Elsewhere the task itself says what of these is possible.
             wanted |= {"taken_only": training.taken_only, "rigid": training.rigid}

@@ -8,6 +8,7 @@ from collections.abc import Mapping, Sequence
 from kitting_drake.paper.cells import ORIENTATIONS, Cell, Training
 from kitting_drake.paper.result import Result
 from kitting_drake.paper.tables import (
+    AT_FASTER,
     DEMONSTRATIONS,
     FIGURE_6,
     HEADLINE_SEEDS,
@@ -95,6 +96,12 @@ def _rivals(cell: Cell) -> list[tuple[str, str]]:
     if cell.label == PATIENT and isinstance(training, Training):
         tail = f"{training.method}_{cell.orientations}_{training.demonstrations}"
         return [("in the usual number of steps", f"{cell.task}_{tail}")]
+    if cell.label == AT_FASTER and isinstance(training, Training):
+        tail = f"{cell.orientations}_{training.demonstrations}"
+        return [
+            ("at its own learning rate", f"{cell.task}_so2_{tail}"),
+            *((METHODS[other], f"{cell.task}_{other}_{tail}") for other in LEARNED[1:]),
+        ]
     if cell.label == "generalist":
         others = [label for label in SHIPPED if label != cell.label]
         return [(label.replace("_", " "), f"{cell.task}_{label}") for label in others]
