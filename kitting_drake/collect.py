@@ -12,6 +12,7 @@ from rich.console import Console
 
 from kitting_drake.cell import Cell
 from kitting_drake.cell.cameras import require_rendering
+from kitting_drake.cell.sight import hidden_table_note
 from kitting_drake.common.command_line import count_type, run_command, seed_type
 from kitting_drake.common.errors import MachineError, UserError
 from kitting_drake.common.files import alone_in, claim_folder, require_folder, write_json
@@ -76,6 +77,8 @@ def main() -> int:
     chosen = _by_oracle(choose_scenario(arguments))
     folder = require_folder(output_folder(arguments, f"{chosen.name}-demonstrations"))
     console = Console(quiet=arguments.quiet)
+    if note := hidden_table_note(chosen.scenario):
+        console.print(f"note: {note}", highlight=False, markup=False)
     start = time.perf_counter()
     with alone_in(folder):
         # What cannot be built at all is told at once, and claims no folder.

@@ -11,6 +11,7 @@ from typing import Any
 
 from rich.console import Console
 
+from kitting_drake.cell.sight import hidden_table_note
 from kitting_drake.common.command_line import FAILED, count_type, run_command, seed_type
 from kitting_drake.common.errors import MachineError, UserError
 from kitting_drake.common.files import (
@@ -57,6 +58,8 @@ def main() -> int:
     seeds = range(first, first + arguments.episodes)
     folder = require_folder(output_folder(arguments, f"{chosen.name}-evaluation"))
     console = Console(quiet=arguments.quiet)
+    if note := hidden_table_note(chosen.scenario):
+        console.print(f"note: {note}", highlight=False, markup=False)
 
     known = chosen.scenario.policy.training_seeds(chosen.base).intersection(seeds)
     if known:

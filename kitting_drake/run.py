@@ -12,6 +12,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 from kitting_drake.cell import Cell
 from kitting_drake.cell.cameras import render_picture, save_png
+from kitting_drake.cell.sight import hidden_table_note
 from kitting_drake.common.command_line import FAILED, INTERRUPTED, run_command, seed_type
 from kitting_drake.common.errors import UserError
 from kitting_drake.common.files import require_folder, write_atomically, write_json
@@ -50,6 +51,8 @@ def main() -> int:
     scenario = chosen.scenario
     seed = scenario.random_seed if arguments.seed is None else arguments.seed
     console = Console(quiet=arguments.quiet)
+    if note := hidden_table_note(chosen.scenario):
+        console.print(f"note: {note}", highlight=False, markup=False)
     folder = require_folder(output_folder(arguments, chosen.name))
     _check_endings(arguments.picture, arguments.video)
 
