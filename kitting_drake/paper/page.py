@@ -65,7 +65,7 @@ def paper_sections(
 
     Args:
         results: of `read_results`.
-        rates: what each learning rate of each baseline came to, in mm on validation scenes.
+        rates: what each learning rate of each baseline came to on validation scenes.
         link: the folder of all results, from the page's own.
         efficiency: what `benchmark networks` measured, if it was.
     """
@@ -126,16 +126,18 @@ def _rates_text(rates: Rates) -> str:
     parts = []
     for training in map(reference, _baselines()):
         costs = rates.get(rates_key(training))
+        who = f"the {METHODS[training.method]}, {training.task}"
         if costs is None:
+            parts.append(
+                f'- {who}: not chosen yet; `learning rate` of "Every cell" says what was used\n'
+            )
             continue
         unit = "mm" if TASKS[training.task].table == "6" else "nats"
         tried = ", ".join(
             f"{rate} ({f'{cost:.2f} {unit}' if math.isfinite(cost) else 'diverged'})"
             for rate, cost in costs.items()
         )
-        parts.append(
-            f"- the {METHODS[training.method]}, {training.task}: {best_rate(costs)} of {tried}\n"
-        )
+        parts.append(f"- {who}: {best_rate(costs)} of {tried}\n")
     return texts.RATES.format(ours=f"{LEARNING_RATES[0]:g}") + "\n" + "".join(parts)
 
 
