@@ -22,8 +22,8 @@ _Result = TypeVar("_Result")
 _THREADS = "OMP_NUM_THREADS"
 
 _MOST_CALLS = 10
-"""A process is ended after so many calls: by Drake 1.51, which keeps every
-Diagram, each episode leaves some fifty megabytes behind."""
+"""A process is ended after so many calls: Drake 1.51 keeps every Diagram, so that each episode
+leaves some fifty megabytes behind."""
 _MOST_AT_WORK = 1000
 """Each occupies a thread here, wherever it is at work."""
 

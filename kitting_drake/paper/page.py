@@ -15,7 +15,6 @@ from kitting_drake.paper.cells import (
     TASKS,
     Training,
     rates_key,
-    reference,
 )
 from kitting_drake.paper.differences import differences
 from kitting_drake.paper.efficiency import efficiency_section
@@ -124,7 +123,7 @@ def _rates_text(rates: Rates) -> str:
     if not rates:
         return f"The learning rate of ours is {LEARNING_RATES[0]:g}.\n"
     parts = []
-    for training in map(reference, _baselines()):
+    for training in _baselines():
         costs = rates.get(rates_key(training))
         who = f"the {METHODS[training.method]}, {training.task}"
         if costs is None:
@@ -142,7 +141,7 @@ def _rates_text(rates: Rates) -> str:
 
 
 def _baselines() -> list[Training]:
-    """One training of each baseline for each task on which its learning rate is chosen."""
+    """The trainings of `reference`: of each baseline on each task that chooses its rate."""
     tasks = dict.fromkeys(task.rates_from for task in TASKS.values())
     return [Training(task, method, 36, 100) for method in LEARNED[1:] for task in tasks]
 

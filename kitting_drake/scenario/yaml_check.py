@@ -98,7 +98,7 @@ def _check_scalar(schema: Any, value: Any, where: str) -> None:
 
 
 def _float_advice(value: Any) -> str:
-    """What would do instead of a number in a notation that YAML takes for a text, such as 1e-3."""
+    """Says how to write a number that YAML takes for a text, such as 1e-3."""
     try:
         number = float(value) if isinstance(value, str) else math.nan
     except ValueError:
