@@ -93,9 +93,9 @@ def _rivals(cell: Cell) -> list[tuple[str, str]]:
     training = cell.policy
     if cell.label == "trained_at_36" and isinstance(training, Training):
         return [("trained at N = 180", f"{cell.task}_{training.method}_36_100")]
-    if cell.label == PATIENT and isinstance(training, Training):
+    if cell.label.startswith(PATIENT) and isinstance(training, Training):
         tail = f"{training.method}_{cell.orientations}_{training.demonstrations}"
-        return [("in the usual number of steps", f"{cell.task}_{tail}")]
+        return [("in the usual number of steps", f"{cell.task}_{tail}{cell.label[len(PATIENT) :]}")]
     if cell.label == AT_FASTER and isinstance(training, Training):
         tail = f"{cell.orientations}_{training.demonstrations}"
         return [

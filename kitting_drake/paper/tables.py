@@ -139,8 +139,10 @@ def _table_1() -> list[Cell]:
         for task in tasks
     ]
     ours = [
-        dataclasses.replace(cell, label="ours", continuous=True, fit_outlines=True)
-        for cell in as_published
+        dataclasses.replace(
+            cell, label=f"{cell.label}_ours".strip("_"), continuous=True, fit_outlines=True
+        )
+        for cell in (*as_published, *_patient())
         if cell.task in BEYOND_OF_TABLE_1
         and isinstance(cell.policy, Training)
         and cell.policy.method == "so2"

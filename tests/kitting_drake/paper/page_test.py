@@ -117,6 +117,17 @@ def test_trainings_are_compared_once_there_are_two(folder: Path):
     assert found[label] == ["+25.0 (+25.0 to +25.0)"] * 2
 
 
+def test_a_longer_training_is_compared_with_the_same_cell_in_the_usual_steps(tmp_path: Path):
+    ours = "stack_block_pyramid_so2_36_100"
+    write(tmp_path, ours, [9.0, 9.0])
+    write(tmp_path, f"{ours}_ours", [1.0, 9.0])
+    write(tmp_path, f"{ours}_3_times_the_steps_ours", [1.0, 1.0])
+    text = "\n".join(paper_sections(read_results(tmp_path), {}, "results"))
+    name = f"{ours}_3_times_the_steps_ours", "in the usual number of steps"
+    assert rows(text)[name][0] == "+50.0 (+50.0 to +50.0)"
+    assert "| 100, 3 times the steps | 100.0" in text
+
+
 def test_an_interval_over_tools_is_given_only_where_tools_are_drawn(folder: Path):
     for name in ("seen_so2_180_100", "unseen_so2_180_100"):
         write(folder, name, [1.0, 1.0, 1.0, 1.0])
