@@ -226,6 +226,8 @@ def _table_1(results: Mapping[str, Result]) -> list[str]:
     ]
     if any(name.startswith("palletizing_boxes") for name in results):
         sections.append(texts.PALLETIZING)
+    if "place_red_in_green_so2_180_1" in results:
+        sections.append(texts.RED)
     if any(
         f"{task}_so2" in name and name.endswith("_ours")
         for name in results

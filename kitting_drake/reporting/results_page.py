@@ -61,8 +61,9 @@ The policies and the hand were improved while looking at episodes of the seeds 0
 stack-block-pyramid; those that fit outlines also at 800 to 849 and 960 to 974, and those that
 recover also at 900 to 912, 940 to 951 and 1000 to 1006. Failures were looked at, after the run, of
 1200 to 1224, 1300 to 1366, 1900 to 1924, 2000 to 2024, 2100 to 2124, 2200 to 2224, 2400 to 2424,
-2820 to 2844, 2870 to 2894, 2900 to 2924 and 3000 to 3099, and of 3200 to 3236, 3252 and 3299 of
-stack-block-pyramid. No others were looked at before they were run.
+2820 to 2844, 2870 to 2894, 2900 to 2924 and 3000 to 3099, of 3200 to 3236, 3252 and 3299 of
+stack-block-pyramid, and of 3200 to 3299 of place-red-in-green. No others were looked at before they
+were run.
 
 Runs of the first version of the code, which are not comparable with these, are in
 [results_first_turn.md](results_first_turn.md).
