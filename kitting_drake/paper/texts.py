@@ -122,7 +122,7 @@ four equivalent rotations it places it are drawn independently, and neither the 
 pick nor the scene tells the place network which of them leaves room. The extensions are sub-pixel
 and sub-bin refinement and, among rotations that the networks consider equally good, the choice of
 the one in which the fingers have room to
-release. With the same networks:
+release. With the same networks, and with those of the longer trainings:
 """
 
 PYRAMID_SEEN = """\
