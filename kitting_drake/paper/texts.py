@@ -41,8 +41,8 @@ The learning rate of ours is {ours}. That of each baseline is the best of three 
 scenes after 100 demonstrations at N = 36: on the unseen toolsets by the cost, for figure 6, block
 insertion and place red in green; on the pyramid by the loss, for the pyramid, align box corner and
 palletizing. On the first two the rate of figure 6 left the baselines short (44 % of the Equivariant
-Transporter on the pyramid, a file under "Other runs"; 7 % of the Transporter there and 61 % on
-align box corner), which was seen on the seeds of this test; palletizing had not been run.
+Transporter on the pyramid, 7 % of the Transporter there and 61 % on align box corner: files under
+"Other runs"), which was seen on the seeds of this test; palletizing had not been run.
 """
 
 NOT_ALL = """\
@@ -70,8 +70,8 @@ kept.)
 
 TRANSPORTER = """\
 The Transporter most often fails by putting a tool into the cavity of another (`causes`, in "Every
-cell"). After 100 demonstrations, on both toolsets, its best checkpoint is its last: it may not
-have converged. On the seen toolset it does better after ten demonstrations than after a hundred,
+cell"). After 100 demonstrations, on both toolsets and on the pyramid, its best checkpoint is its
+last: it may not have converged. On the seen toolset it does better after ten demonstrations than after a hundred,
 on validation scenes too: in the same number of steps it sees each of them ten times as often. In
 these tables it is trained for as many steps as the other methods, and only its learning rate was
 tuned. The cells `3_times_the_steps` train it for longer, on both toolsets and on align box
