@@ -178,10 +178,19 @@ class Queue:
                 yield dataclasses.replace(chosen_by, learning_rate=rate)
 
     def _is_trained(self, training: Training) -> bool:
-        rates: Sequence[float] = LEARNING_RATES[:1] if training.method == "so2" else LEARNING_RATES
-        if training.learning_rate is not None:
-            rates = (training.learning_rate,)
-        return any((self._folder(training, rate) / "summary.json").exists() for rate in rates)
+        """Whether there are its networks, at its own learning rate."""
+        rate = training.learning_rate
+        if rate is None:
+            if training.method != "so2" and self._untried(reference(training)):
+                return False
+            rate = self._rate(training)
+        return (self._folder(training, rate) / "summary.json").exists()
+
+    def _rate(self, training: Training) -> float:
+        """The learning rate of a training that has none of its own; of a baseline, chosen first."""
+        if training.method == "so2":
+            return LEARNING_RATES[0]
+        return self._best_rate(reference(training))
 
     def _folder(self, training: Training, rate: float) -> Path:
         return self.folder / "trainings" / f"{training.name}_lr{rate:g}"
@@ -190,8 +199,7 @@ class Queue:
         """The file of the weights of a training."""
         rate = training.learning_rate
         if rate is None:
-            ours = training.method == "so2"
-            rate = LEARNING_RATES[0] if ours else self._best_rate(reference(training))
+            rate = self._rate(training)
         folder = self._folder(training, rate)
         with self._only_one_makes(folder):
             if not (folder / "summary.json").exists():

@@ -71,12 +71,12 @@ kept.)
 TRANSPORTER = """\
 The Transporter most often fails by putting a tool into the cavity of another (`causes`, in "Every
 cell"). After 100 demonstrations, on both toolsets and on the pyramid, its best checkpoint is its
-last: it may not have converged. On the seen toolset it does better after ten demonstrations than after a hundred,
-on validation scenes too: in the same number of steps it sees each of them ten times as often. In
-these tables it is trained for as many steps as the other methods, and only its learning rate was
-tuned. The cells `3_times_the_steps` train it for longer, on both toolsets and on align box
-corner; as far as they have been run, they are among the paired differences. They were chosen when
-the figures of this test were known.
+last: it may not have converged. On the seen toolset it does better after ten demonstrations than
+after a hundred, on validation scenes too: in the same number of steps it sees each of them ten
+times as often. In these tables it is trained for as many steps as the other methods, and only its
+learning rate was tuned. The cells `3_times_the_steps` train it for longer, on both toolsets and on
+align box corner; as far as they have been run, they are among the paired differences. They were
+chosen when the figures of this test were known.
 """
 
 BEYOND = """\

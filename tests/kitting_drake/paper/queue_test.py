@@ -224,6 +224,19 @@ def test_what_is_trained_does_not_wait_behind_what_is_not(queue: Pretending):
     ]
 
 
+def test_networks_at_another_learning_rate_do_not_count_as_trained(queue: Pretending):
+    many, few = (Training("seen", "transporter", 36, count) for count in (100, 10))
+    for rate in LEARNING_RATES:
+        queue.train(dataclasses.replace(reference(many), learning_rate=rate))
+    other, _, chosen = sorted(LEARNING_RATES, reverse=True)
+    queue.train(dataclasses.replace(few, learning_rate=other))
+    queue.calls.clear()
+    assert queue.run([Cell("seen", many, 36), Cell("seen", few, 36)]) == {}
+    assert [call for call in queue.calls if call.startswith("train")] == [
+        f"train {training.name}_lr{chosen:g}" for training in (many, few)
+    ]
+
+
 def test_trainings_side_by_side_collect_once(tmp_path: Path):
     (tmp_path / "results").mkdir()
     queue = Pretending(tmp_path, tmp_path / "results", Console(quiet=True), trainings=2)
