@@ -105,11 +105,11 @@ across it. The seeds 3234 to 3249 had not been run before.
 """
 
 RED = """\
-After one demonstration of place red in green, every method that has been run comes below the
-paper. That demonstration, of seed 10000, is of two actions, and of the ten colours of cubes it
-lacks four. Of the 46 episodes in which ours fails at N = 180, 28 begin with a cube of another
-colour than red, 15 of these with one of those four; of the 50 of the Equivariant Transporter it is
-24 and 17. Of the others more than half put the first red cube right and fail at a later one.
+After one demonstration of place red in green, every method comes below the paper. That
+demonstration, of seed 10000, is of two actions, and of the ten colours of cubes it lacks four. Of
+the 46 episodes in which ours fails at N = 180, 28 begin with a cube of another colour than red, 15
+of these with one of those four; of the 50 of the Equivariant Transporter it is 24 and 17. Of the
+others more than half put the first red cube right and fail at a later one.
 """
 
 PYRAMID = """\
