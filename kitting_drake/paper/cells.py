@@ -92,9 +92,9 @@ TASKS = {
             )
             # Of eighteen decisions each, few episodes are enough to validate by; and each of many
             # places is as good as the next, which takes longer to learn.
-            # On the pyramid and align box corner the rate of figure 6 left the baselines short, and
-            # on align box corner that of the pyramid did: each chooses its own. Palletizing, which
-            # had not been run, takes that of the pyramid.
+            # On the pyramid and align box corner the rate of figure 6 left a baseline short, and on
+            # align box corner that of the pyramid left the Transporter short: each has its own.
+            # Palletizing, which had not been run, takes that of the pyramid.
             for name, scenario, episodes, steps, validation, rates_from in (
                 ("block_insertion", "BlockInsertion", 100, 1000, 24, "unseen"),
                 ("place_red_in_green", "PlaceRedInGreen", 100, 1000, 24, "unseen"),

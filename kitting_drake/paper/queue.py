@@ -179,27 +179,26 @@ class Queue:
 
     def _is_trained(self, training: Training) -> bool:
         """Whether there are its networks, at its own learning rate."""
-        rate = training.learning_rate
-        if rate is None:
-            if training.method != "so2" and self._untried(reference(training)):
-                return False
-            rate = self._rate(training)
-        return (self._folder(training, rate) / "summary.json").exists()
+        if self._is_rate_chosen(training) and self._untried(reference(training)):
+            return False
+        return (self._folder(training, self._rate(training)) / "summary.json").exists()
 
     def _rate(self, training: Training) -> float:
-        """The learning rate of a training that has none of its own; of a baseline, chosen first."""
-        if training.method == "so2":
-            return LEARNING_RATES[0]
-        return self._best_rate(reference(training))
+        """The learning rate of a training, which for a baseline may have to be found first."""
+        if self._is_rate_chosen(training):
+            return self._best_rate(reference(training))
+        return training.learning_rate or LEARNING_RATES[0]
+
+    def _is_rate_chosen(self, training: Training) -> bool:
+        """Whether its learning rate is the best one of `reference`."""
+        return training.learning_rate is None and training.method != "so2"
 
     def _folder(self, training: Training, rate: float) -> Path:
         return self.folder / "trainings" / f"{training.name}_lr{rate:g}"
 
     def train(self, training: Training) -> Path:
         """The file of the weights of a training."""
-        rate = training.learning_rate
-        if rate is None:
-            rate = self._rate(training)
+        rate = self._rate(training)
         folder = self._folder(training, rate)
         with self._only_one_makes(folder):
             if not (folder / "summary.json").exists():

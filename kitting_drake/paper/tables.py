@@ -66,8 +66,8 @@ def _checks() -> list[Cell]:
 
 
 def _patient() -> list[Cell]:
-    """Cells in more steps than the others get: the Transporter, which is far from done by then, and
-    ours on the pyramid."""
+    """Cells in more steps than the others get: the Transporter, which may not have converged by
+    then, and ours on the pyramid."""
     wanted = [
         *((task, "transporter", 36) for task in (*FIGURE_6, "align_box_corner")),
         *(("stack_block_pyramid", "so2", n) for n in (180, 36)),

@@ -109,7 +109,8 @@ After one demonstration of place red in green, every method comes below the pape
 demonstration, of seed 10000, is of two actions, and of the ten colours of cubes it lacks four. Of
 the 46 episodes in which ours fails at N = 180, 28 begin with a cube of another colour than red, 15
 of these with one of those four; of the 50 of the Equivariant Transporter it is 24 and 17. Of the
-others more than half put the first red cube right and fail at a later one.
+others more than half put the first red cube right and fail at a later one. (Counted in the
+`episodes.jsonl` of these runs, which are not kept.)
 """
 
 PYRAMID = """\
@@ -122,8 +123,8 @@ pushes the neighbouring cubes away as it releases. How the hand holds a cube and
 four equivalent rotations it places it are drawn independently, and neither the crop around the
 pick nor the scene tells the place network which of them leaves room. The extensions are sub-pixel
 and sub-bin refinement and, among rotations that the networks consider equally good, the choice of
-the one in which the fingers have room to
-release. With the same networks, and with those of the longer trainings:
+the one in which the fingers have room to release. With the same networks, and with those of the
+longer trainings:
 """
 
 PYRAMID_SEEN = """\
