@@ -34,10 +34,20 @@ from kitting_drake.hkd.importing.fit import (
     material_of,
 )
 from kitting_drake.hkd.importing.materials import bodies_of
-from kitting_drake.hkd.importing.outline import extruded, is_outline, read_outline
+from kitting_drake.hkd.importing.outline import (
+    extruded,
+    is_outline,
+    laid_along_x,
+    read_outline,
+)
 from kitting_drake.hkd.importing.repair import NOMINAL_MM, make_solid, read_mesh
 from kitting_drake.hkd.importing.resting_pose import resting_tilt
-from kitting_drake.hkd.importing.stable_pose import size, to_tool_frame
+from kitting_drake.hkd.importing.stable_pose import (
+    facing_forward,
+    size,
+    tipping_deg,
+    to_tool_frame,
+)
 from kitting_drake.hkd.tools import meshes
 from kitting_drake.hkd.tools.mass import mass_properties
 from kitting_drake.hkd.tools.sdf import tool_sdf
@@ -49,6 +59,8 @@ TIME_LIMIT = 55.0
 _MOST_MEMORY = 12 * 2**30
 # A tool is laid anew where it comes to rest by more than this, in degrees, at most so often.
 _SAME_POSE_DEG, _LAYINGS = 2.0, 3
+# A tool that falls over when its table tilts by this, in degrees, falls over at a touch.
+_TIPS_DEG = 10.0
 # Collision hulls that are further off the outline than this are worth a note.
 _TRUE_OUTLINE_MM = 0.35
 _FRONTS = {"hammer": "its head", "screwdriver": "its blade"}
@@ -107,10 +119,7 @@ def import_tool(request: ImportRequest, time_limit: float | None = TIME_LIMIT) -
     _check_height(request)
     folder = request.output or user_tools()
     final = folder / name
-    if final.exists() and not _is_import(final):
-        raise UserError(f"{final} exists and is no imported tool: give another --name")
-    if final.exists() and yaml.safe_load((final / "tool.yaml").read_text()).get("annotated"):
-        raise UserError(f"{final} has a grasp that you saved: give another --name, or delete it")
+    replaced = _check_replaceable(final, request) if final.exists() else None
     new_folders = [p for p in (folder, *folder.parents) if not p.exists()]
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -123,7 +132,10 @@ def import_tool(request: ImportRequest, time_limit: float | None = TIME_LIMIT) -
                 else _prepare_aside(request, name, made, time_limit)
             )
             replace_folder(final, made, Path(scratch) / "replaced")
-            return ImportReport(final, *report)
+            record, notes, hulls = report
+            if replaced is not None:
+                notes = [*notes, replaced]
+            return ImportReport(final, record, notes, hulls)
     except OSError as error:
         raise UserError(f"cannot write {final}: {error.strerror}") from error
     finally:
@@ -141,7 +153,9 @@ def _check_height(request: ImportRequest) -> None:
 
 def _checked_name(request: ImportRequest) -> str:
     if request.name is None:
-        name = re.sub(r"[^a-z0-9]+", "_", request.mesh.stem.lower()).strip("_")[:60] or "tool"
+        name = re.sub(r"[^a-z0-9]+", "_", request.mesh.stem.lower()).strip("_")[:60]
+        if not name:
+            raise UserError(f"{request.mesh} has no small letter or digit in its name: give --name")
     else:
         name = request.name
     if not re.fullmatch(r"[a-z0-9][a-z0-9_]{0,63}", name):
@@ -151,11 +165,29 @@ def _checked_name(request: ImportRequest) -> str:
     return name
 
 
-def _is_import(folder: Path) -> bool:
+def _check_replaceable(folder: Path, request: ImportRequest) -> str | None:
+    """Checks that what a folder holds may be replaced; returns a note if it is of other content.
+
+    Raises:
+        UserError: it is no imported tool, or of a file of another name, or it has a person's work.
+    """
     try:
-        return bool(yaml.safe_load((folder / "tool.yaml").read_text())["split"] == "user")
-    except (OSError, yaml.YAMLError, KeyError, TypeError, UnicodeDecodeError):
-        return False
+        record = yaml.safe_load((folder / "tool.yaml").read_text())
+        file, digest = record["imported"]["file"], record["imported"]["sha256"]
+        annotated = record.get("annotated")
+    except (OSError, yaml.YAMLError, KeyError, TypeError, UnicodeDecodeError) as error:
+        raise UserError(f"{folder} exists and is no imported tool: give another --name") from error
+    if annotated:
+        raise UserError(f"{folder} has a grasp that you saved: give another --name, or delete it")
+    if file != request.mesh.name:
+        raise UserError(f"{folder} is the tool of {file}: give another --name, or delete it")
+    if request.mesh.is_file() and digest != _digest(request.mesh):
+        return f"replaces the tool of another {file}"
+    return None
+
+
+def _digest(path: Path) -> str:
+    return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
 Prepared = tuple[dict[str, Any], list[str], int]
@@ -220,6 +252,8 @@ def prepare_tool(request: ImportRequest, name: str, directory: Path) -> Prepared
         raise UserError(text if path in text else f"{path}: {text}") from error
     except MemoryError as error:
         raise UserError(f"{request.mesh} needs more memory than there is") from error
+    except OSError as error:
+        raise UserError(f"cannot write {name}: {error.strerror}") from error
     except Exception as error:
         # Whatever geometry fails on: a broken mesh is the user's to repair, not a fault to trace.
         raise UserError(
@@ -235,9 +269,15 @@ def _prepare(request: ImportRequest, name: str, directory: Path) -> Prepared:
         raise UserError("all of the mesh is one point")
     nominal = NOMINAL_MM / longest
     solid, notes = make_solid((vertices - (low + high) / 2) * nominal, faces)
-    solid = to_tool_frame(solid, request.category)
+    drawn = is_outline(request.mesh)
+    # What is drawn is a tool as it lies, seen from above.
+    solid = (facing_forward if drawn else to_tool_frame)(solid, request.category)
     length = size(solid)[0] / nominal
-    if is_outline(request.mesh):
+    if drawn:
+        if tipping_deg(solid) < _TIPS_DEG:
+            raise UserError(
+                f"{request.height_mm:g} mm high, it falls over: draw it as it lies, from above"
+            )
         lengths = [length]
         assumed = f"an outline, {length:.0f} mm long and made {request.height_mm:g} mm high"
     else:
@@ -253,7 +293,7 @@ def _prepare(request: ImportRequest, name: str, directory: Path) -> Prepared:
         if angle <= _SAME_POSE_DEG:
             return prepared
         solid = fitted.transform(np.column_stack([tilt, np.zeros(3)]))
-        lengths = [size(solid)[0]]
+        lengths = [request.length_mm or size(solid)[0]]
         laid = [f"laid as it comes to rest, which is {angle:.0f} degrees tilted"]
     # It rolls wherever it is laid: then it is laid as low as it can be.
     _empty(directory)
@@ -266,7 +306,8 @@ def _surface(request: ImportRequest) -> tuple[np.ndarray, np.ndarray]:
     if not is_outline(request.mesh):
         return read_mesh(request.mesh)
     assert request.height_mm is not None
-    return extruded(read_outline(request.mesh, request.length_mm), request.height_mm)
+    outline = laid_along_x(read_outline(request.mesh), request.length_mm, str(request.mesh))
+    return extruded(outline, request.height_mm)
 
 
 def _empty(directory: Path) -> None:
@@ -329,7 +370,7 @@ def _write(
         "visual_meshes": [path.name for path in tool.visual_meshes],
         "imported": {
             "file": request.mesh.name,
-            "sha256": hashlib.sha256(request.mesh.read_bytes()).hexdigest(),
+            "sha256": _digest(request.mesh),
             "density": round(float(mass / (1e-9 * solid.volume())), 1),
             "outline_deviation": round(1e-3 * collision.outline_deviation_mm, 6),
             "notes": notes,

@@ -14,6 +14,8 @@ from numpy.typing import NDArray
 
 from kitting_drake.common.errors import UserError
 from kitting_drake.common.extras import import_extra
+from kitting_drake.hkd.importing.repair import NOMINAL_MM
+from kitting_drake.hkd.importing.stable_pose import long_direction_deg
 
 OUTLINE_FORMATS = (".svg", ".dxf")
 LENGTHS_MM = (20.0, 250.0)
@@ -43,7 +45,7 @@ def is_outline(path: Path) -> bool:
     return path.suffix.lower() in OUTLINE_FORMATS
 
 
-def read_outline(path: Path, length_mm: float | None = None) -> CrossSection:
+def read_outline(path: Path) -> CrossSection:
     """The area that a drawing's closed curves enclose, in mm: the largest, less those inside it.
 
     An SVG is measured by its width, height and viewBox, a DXF by its $INSUNITS: without those, in
@@ -52,7 +54,6 @@ def read_outline(path: Path, length_mm: float | None = None) -> CrossSection:
 
     Args:
         path: of the drawing.
-        length_mm: to scale the longer side of the outline's bounding box to; its own if None.
 
     Raises:
         UserError: no such file, not a drawing, an open curve, or not the outline of one tool.
@@ -67,7 +68,36 @@ def read_outline(path: Path, length_mm: float | None = None) -> CrossSection:
     curves = [curve for curve in read(path) if len(curve) > 1 and np.isfinite(curve).all()]
     if not curves:
         raise UserError(f"{path} holds no curves: text and pictures have to be made paths first")
-    return _scaled(_enclosed(_joined(curves, path), path), length_mm, path)
+    return _enclosed(_joined(curves, path), path)
+
+
+def laid_along_x(
+    outline: CrossSection, length_mm: float | None = None, name: str = "the outline"
+) -> CrossSection:
+    """An outline turned so that its length is along x.
+
+    Args:
+        outline: in mm.
+        length_mm: to scale its extent along x to; its own if None.
+        name: what to call it.
+
+    Raises:
+        UserError: no length was given, and by its units it is no hand tool's.
+    """
+    x_min, y_min, x_max, y_max = outline.bounds()
+    nominal = NOMINAL_MM / max(x_max - x_min, y_max - y_min)
+    outline = outline.rotate(-long_direction_deg(outline.scale((nominal, nominal))))
+    x_min, _, x_max, _ = outline.bounds()
+    length = x_max - x_min
+    if length_mm is not None:
+        return outline.scale((length_mm / length, length_mm / length))
+    low, high = LENGTHS_MM
+    if not low <= length <= high:
+        raise UserError(
+            f"{name} is {length:.4g} mm long by its own units, and {low:g} to {high:g} mm are "
+            "taken: give --length_mm, or set the drawing's units"
+        )
+    return outline
 
 
 def extruded(outline: CrossSection, height_mm: float) -> tuple[NDArray, NDArray]:
@@ -75,25 +105,6 @@ def extruded(outline: CrossSection, height_mm: float) -> tuple[NDArray, NDArray]
     mesh = Manifold.extrude(outline, height_mm).to_mesh64()
     vertices = np.asarray(mesh.vert_properties, dtype=float)[:, :3]
     return vertices, np.asarray(mesh.tri_verts, dtype=np.int64)
-
-
-def _scaled(outline: CrossSection, length_mm: float | None, path: Path) -> CrossSection:
-    """An outline at the length asked for.
-
-    Raises:
-        UserError: none was asked for, and by its units it is no hand tool's.
-    """
-    x_min, y_min, x_max, y_max = outline.bounds()
-    longest = max(x_max - x_min, y_max - y_min)
-    if length_mm is not None:
-        return outline.scale((length_mm / longest, length_mm / longest))
-    low, high = LENGTHS_MM
-    if not low <= longest <= high:
-        raise UserError(
-            f"{path} is {longest:.4g} mm long by its own units, and {low:g} to {high:g} mm are "
-            "taken: give --length_mm, or set the drawing's units"
-        )
-    return outline
 
 
 def _svg_curves(path: Path) -> list[Curve]:
@@ -111,7 +122,8 @@ def _svg_curves(path: Path) -> list[Curve]:
         curves = [
             _MM_PER_PIXEL * np.array(points) * (1, -1)
             for shape in shapes
-            for part in svgelements.Path(shape).as_subpaths()
+            # Else a rectangle or ellipse would lose a transform that turns, skews or mirrors it.
+            for part in abs(svgelements.Path(shape)).as_subpaths()
             if (points := _sampled(svgelements.Path(part), _MM_PER_PIXEL))
         ]
     except MemoryError:

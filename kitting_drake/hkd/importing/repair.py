@@ -1,8 +1,9 @@
 """Anyone's mesh, read and made one solid: what `hkd import` begins with.
 
 A mesh that is sound is taken as it is. One that is not is split into connected components, each
-repaired alone (winding, then holes, then pymeshfix) and all united; where that loses any of the
-shape that can be seen, the surface is wrapped instead: filled as voxels, and traced.
+repaired alone (winding, then holes, then pymeshfix) and all united, less sealed hollows; where that
+loses any of the shape that can be seen, the surface is wrapped instead: filled as voxels, and
+traced.
 """
 
 from pathlib import Path
@@ -36,6 +37,8 @@ _PIXEL_MM = 0.5
 _TELLING, _AWAY_MM, _PROBES = 0.03, 1.5, 20_000
 _MOST_COMPONENTS = 3000
 _VOXEL_MM = 0.75
+# A hollow has less than this share outside the body that it is in.
+_OUTSIDE = 0.01
 # Less than this share of a box is no solid but a skin.
 _HOLLOW = 0.002
 
@@ -109,15 +112,20 @@ def make_solid(vertices: Array, faces: Faces) -> tuple[Manifold, list[str]]:
     components = trimesh.graph.connected_components(
         trimesh.graph.face_adjacency(faces), nodes=np.arange(len(faces)), min_len=1
     )
-    solids, repaired = [], 0
+    outward, inward, repaired = [], [], 0
     if len(components) <= _MOST_COMPONENTS:
         for component in sorted(components, key=len, reverse=True):
             sound = _as_manifold(vertices, faces[component])
             if sound is None:
                 repaired += 1
                 sound = _repaired(vertices, faces[component])
-            if sound is not None:
-                solids.append(sound)
+                if sound is not None:
+                    outward.append(sound)
+            elif _volume(vertices[faces[component]]) > 0:
+                outward.append(sound)
+            else:
+                inward.append(sound)
+    solids, hollows = _told_apart(outward, inward)
     solid = Manifold.batch_boolean(solids, OpType.Add) if solids else Manifold()
     if repaired:
         notes.append(f"repaired {repaired} of {len(components)} surfaces")
@@ -126,7 +134,7 @@ def make_solid(vertices: Array, faces: Faces) -> tuple[Manifold, list[str]]:
     if repaired or not solids:
         triangles = vertices[faces]
         if _loses(triangles, solid):
-            solid = _wrapped(triangles)
+            solid, hollows = _wrapped(triangles), []
             notes = ["wrapped a surface with large gaps"]
         added = _added(triangles, solid)
         if added > _TELLING:
@@ -136,7 +144,40 @@ def make_solid(vertices: Array, faces: Faces) -> tuple[Manifold, list[str]]:
             )
     if solid.is_empty() or solid.volume() < _HOLLOW * _box_volume(solid):
         raise UserError("the mesh encloses no volume")
-    return _one_thing(solid, notes), notes
+    solid = _one_thing(solid, notes)
+    if hollows:
+        notes.append(f"kept {len(hollows)} sealed {'hollow' if len(hollows) == 1 else 'hollows'}")
+    for hollow in hollows:
+        inside = [body for body in solids if body.volume() < hollow.volume()]
+        solid -= Manifold.batch_boolean([hollow, *inside], OpType.Subtract)
+    return solid, notes
+
+
+def _told_apart(
+    outward: list[Manifold], inward: list[Manifold]
+) -> tuple[list[Manifold], list[Manifold]]:
+    """The bodies, and the sealed hollows inside them, of what surfaces bound.
+
+    A hollow's surface is wound the other way than that of the body which it is in. A surface that
+    is not inside another bounds a body, however it is wound.
+
+    Args:
+        outward: what is inside surfaces whose normals point out of it.
+        inward: what is inside those whose normals point into it.
+    """
+    if inward and max((s.volume() for s in outward), default=0.0) < max(s.volume() for s in inward):
+        outward, inward = inward, outward
+    if not inward:
+        return outward, []
+    whole = Manifold.batch_boolean(outward, OpType.Add)
+    hollows = [s for s in inward if (s - whole).volume() < _OUTSIDE * s.volume()]
+    return [*outward, *(s for s in inward if s not in hollows)], hollows
+
+
+def _volume(triangles: Array) -> float:
+    """What triangles (n, 3, 3) enclose, negative where their normals point into it."""
+    a, b, c = np.moveaxis(triangles - triangles.mean(axis=(0, 1)), 1, 0)
+    return float((a * np.cross(b, c)).sum() / 6)
 
 
 def _merged(vertices: Array, faces: Faces) -> tuple[Array, Faces]:

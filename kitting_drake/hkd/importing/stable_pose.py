@@ -36,10 +36,26 @@ def to_tool_frame(solid: Manifold, category: str) -> Manifold:
     pose = _lowest_pose(vertices, com)
     R_TB = pose.rotation(forward=np.eye(3)[np.abs(pose.normal).argmin()])
     solid = solid.transform(np.column_stack([R_TB, np.zeros(3)]))
-    solid = solid.rotate((0.0, 0.0, -_long_direction_deg(solid.project())))
+    return facing_forward(solid.rotate((0.0, 0.0, -long_direction_deg(solid.project()))), category)
+
+
+def facing_forward(solid: Manifold, category: str) -> Manifold:
+    """A solid (mm) that lies along x in its pose at rest, moved into the frame T: turned by half a
+    turn about z where its working end (see `to_tool_frame`) is not at +x."""
     if not _works_at_plus_x(solid, category):
         solid = solid.rotate((0.0, 0.0, 180.0))
     return centred(solid)
+
+
+def tipping_deg(solid: Manifold) -> float:
+    """By how many degrees the table has to tilt until a solid (mm), as it lies, falls over.
+
+    It is 0 where it does not stay as it lies at all.
+    """
+    vertices, faces = meshes.vertices_and_faces(solid)
+    com = trimesh.triangles.mass_properties(vertices[faces])["center_mass"]
+    kept = [pose for pose in stable_poses(vertices, com) if pose.normal[2] < -0.999]
+    return max((np.degrees(np.arctan2(p.margin, p.height)) for p in kept), default=0.0)
 
 
 def centred(solid: Manifold) -> Manifold:
@@ -76,10 +92,16 @@ def _lowest_pose(vertices: Array, com: Array) -> StablePose:
     )
 
 
-def _long_direction_deg(outline: CrossSection) -> float:
+def long_direction_deg(outline: CrossSection) -> float:
     """The direction along which most of an outline's edge runs, of those near its long axis.
 
     A handle's two edges decide it, not how far a head or a jaw stands out to one side.
+
+    Args:
+        outline: some 180 mm long.
+
+    Returns:
+        Counter-clockwise from x, in degrees.
     """
     loops = outline.simplify(0.2).to_polygons()
     points = np.vstack([0.5 * (loop + np.roll(loop, -1, axis=0)) for loop in loops])

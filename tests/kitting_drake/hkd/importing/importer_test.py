@@ -211,6 +211,22 @@ def test_one_body_is_made_of_several_and_of_a_soup(tmp_path: Path):
         assert report.record[key] == pytest.approx(united[key], abs=1.2e-3)
 
 
+@pytest.mark.parametrize("inverted", [False, True])
+def test_a_sealed_hollow_weighs_nothing(inverted: bool, tmp_path: Path):
+    outer, hollow = trimesh.creation.box((170, 30, 20)), trimesh.creation.box((160, 26, 16))
+    hollow.invert()
+    # A rod that is in the hollow, without touching its wall.
+    rod = trimesh.creation.box((20, 10, 8))
+    mesh = trimesh.util.concatenate([outer, hollow, rod])
+    if inverted:
+        mesh.invert()
+    path = exported(mesh, tmp_path / "pipe.stl")
+    report = bring(path, tmp_path / "tools", category="wrench", density=7850.0)
+    volume = 1e-9 * (170 * 30 * 20 - 160 * 26 * 16 + 20 * 10 * 8)
+    assert report.record["mass"] == pytest.approx(7850 * volume, rel=1e-3)
+    assert "kept 1 sealed hollow" in report.notes
+
+
 def test_a_mesh_of_many_triangles_is_decimated(tmp_path: Path):
     mesh = mallet().subdivide_to_size(0.8)
     assert len(mesh.faces) > 50_000
@@ -299,6 +315,16 @@ def test_names(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     # An import may be done again; what is none is not overwritten.
     again = bring(path, tmp_path / "own", name="mine", length_mm=160.0)
     assert load_tool("mine").length == pytest.approx(0.160) == again.record["length"]
+    # Another file of that name may be a newer one.
+    newer = exported(mallet().apply_scale(1.05), path)
+    assert (
+        "replaces the tool of another Claw Hammer.stl"
+        in bring(newer, tmp_path / "own", name="mine").notes
+    )
+    with pytest.raises(UserError, match=r"mine is the tool of Claw Hammer\.stl: give another"):
+        bring(exported(mallet(), tmp_path / "hammer.stl"), tmp_path / "own", name="mine")
+    with pytest.raises(UserError, match="no small letter or digit in its name: give --name"):
+        bring(exported(mallet(), tmp_path / "\u6273\u624b.stl"), tmp_path / "own")
     # A person's work is not undone by it.
     grasp = dataclasses.replace(load_tool("mine").grasp, x=0.011)
     save_grasp(load_tool("mine"), grasp)

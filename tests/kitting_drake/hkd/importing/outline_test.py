@@ -83,6 +83,15 @@ def test_y_points_up_and_transforms_count(tmp_path: Path):
     assert read_outline(path).bounds() == pytest.approx((10, -70, 160, -20), abs=1e-3)
 
 
+@pytest.mark.parametrize(
+    "transform", ["rotate(90 85 20)", "matrix(0 1 1 0 0 0)", "scale(-1 1) translate(-300)"]
+)
+def test_rectangles_and_ellipses_are_turned_and_mirrored(transform: str, tmp_path: Path):
+    hole = '<ellipse cx="150" cy="20" rx="6" ry="3"/>'
+    outline = read_outline(drawing(tmp_path, f'<g transform="{transform}">{BAR}{hole}</g>'))
+    assert outline.area() == pytest.approx(160 * 20 - 18 * np.pi, rel=1e-3)
+
+
 @pytest.mark.parametrize(("units", "scale"), [(4, 1.0), (1, 1 / 25.4), (5, 0.1), (0, 1.0)])
 def test_a_dxf_is_measured_by_its_units_and_its_pieces_are_joined(
     units: int, scale: float, tmp_path: Path
@@ -129,7 +138,6 @@ def test_splines_and_blocks_are_read(tmp_path: Path):
         ('<path d="M0 0 L160 40 V0 L0 40 z"/>', "crosses itself"),
         ('<path d="M0 0 H160 z"/>', "encloses"),
         ("<g>", "cannot be read as SVG"),
-        ('<rect width="9" height="5"/>', "9 mm long by its own units"),
     ],
 )
 def test_what_is_no_outline_is_told_in_a_sentence(content: str, sentence: str, tmp_path: Path):
@@ -158,6 +166,26 @@ def test_an_outline_becomes_a_tool_of_its_size(tmp_path: Path):
     assert tool.footprint.area() == pytest.approx(1e-6 * (110 * 14 - 9 * np.pi), rel=1e-2)
     longer = load_tool(str(bring(path, height_mm=12.0, length_mm=165.0).directory))
     assert (longer.length, longer.height) == pytest.approx((0.165, 0.012), abs=2e-5)
+
+
+def test_an_outline_lies_as_it_is_drawn(tmp_path: Path):
+    path = drawing(tmp_path, '<rect width="150" height="10"/>')
+    tool = load_tool(str(bring(path, height_mm=20.0).directory))
+    assert (tool.length, tool.width, tool.height) == pytest.approx((0.150, 0.010, 0.020), abs=2e-5)
+    path = drawing(tmp_path, '<rect width="150" height="4"/>')
+    with pytest.raises(UserError, match="40 mm high, it falls over: draw"):
+        bring(path, height_mm=40.0)
+
+
+def test_the_length_is_the_tools_however_the_drawing_is_turned(tmp_path: Path):
+    # Its bounding box is 123 mm wide.
+    path = drawing(tmp_path, '<rect transform="rotate(45)" width="160" height="14"/>')
+    for length_mm in (None, 100.0):
+        tool = load_tool(str(bring(path, height_mm=12.0, length_mm=length_mm).directory))
+        expected = (1e-3 * (length_mm or 160.0), 1e-3 * 14 * (length_mm or 160.0) / 160, 0.012)
+        assert (tool.length, tool.width, tool.height) == pytest.approx(expected, abs=5e-5)
+    with pytest.raises(UserError, match="9 mm long by its own units"):
+        bring(drawing(tmp_path, '<rect width="9" height="5"/>'), height_mm=12.0)
 
 
 def test_only_outlines_have_and_need_a_height(tmp_path: Path):
