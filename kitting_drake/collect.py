@@ -107,11 +107,13 @@ def main() -> int:
                 )
             seconds = time.perf_counter() - start
             told = f"{collection.summary()}; {seconds:.0f} s"
-            console.print(told, highlight=False, soft_wrap=True)
+            console.print(told, highlight=False, markup=False, soft_wrap=True)
         if exported:
             with counting_bar(console, "exported") as progress:
                 export_lerobot(collection.path, exported, track=progress.track)
-            console.print(f"as a LeRobotDataset: {exported}/", highlight=False, soft_wrap=True)
+            console.print(
+                f"as a LeRobotDataset: {exported}/", highlight=False, markup=False, soft_wrap=True
+            )
     return 0
 
 

@@ -20,9 +20,9 @@ from kitting_drake.bench import (
 )
 from kitting_drake.bench.check import check_cameras
 from kitting_drake.bench.kit_block import Block
-from kitting_drake.bench.report import print_check, print_decision, save_check
+from kitting_drake.bench.report import CHECK_FILES, print_check, print_decision, save_check
 from kitting_drake.common.command_line import count_type, run_command
-from kitting_drake.common.errors import UserError
+from kitting_drake.common.errors import MachineError, UserError
 from kitting_drake.common.files import require_folder, write_atomically, write_json
 
 
@@ -32,10 +32,11 @@ def main() -> int:
     console = Console(quiet=arguments.quiet)
     folder = require_folder(arguments.output)
     action, picture = folder / "action.json", folder / "decision.png"
-    if not arguments.check:
-        # Should this fail, nobody must take the answer to an earlier frame for that to this one.
-        action.unlink(missing_ok=True)
-        picture.unlink(missing_ok=True)
+    # Should this fail, nobody must take the answer to an earlier frame for that to this one.
+    earlier = [folder / name for name in CHECK_FILES] if arguments.check else [action, picture]
+    for path in earlier:
+        if path.resolve() != arguments.camera.resolve():
+            _remove(path)
     calibration = read_calibration(arguments.camera, table_height=arguments.table_height)
     block = _block(arguments)
     frames = read_frames(arguments.frames, calibration)
@@ -43,7 +44,7 @@ def main() -> int:
         checked = check_cameras(frames, calibration, block)
         save_check(folder, checked)
         print_check(console, checked)
-        console.print(f"files: {folder}/", highlight=False)
+        console.print(f"files: {folder}/", highlight=False, markup=False)
         return 0
 
     policy = _policy(arguments)
@@ -59,8 +60,15 @@ def main() -> int:
     write_atomically(picture, decision.draw())
     write_json(action, record)
     print_decision(console, record)
-    console.print(f"files: {folder}/", highlight=False)
+    console.print(f"files: {folder}/", highlight=False, markup=False)
     return 0
+
+
+def _remove(path: Path) -> None:
+    try:
+        path.unlink(missing_ok=True)
+    except OSError as error:
+        raise MachineError(f"cannot remove {path}: {error.strerror}") from error
 
 
 def _parser() -> argparse.ArgumentParser:

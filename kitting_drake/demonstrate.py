@@ -12,7 +12,11 @@ from rich.console import Console
 
 from kitting_drake.bench.annotation_page import AnnotationServer
 from kitting_drake.bench.calibration import Calibration, read_calibration
-from kitting_drake.bench.outside_demonstrations import convert, find_demonstrations
+from kitting_drake.bench.outside_demonstrations import (
+    check_replaceable,
+    convert,
+    find_demonstrations,
+)
 from kitting_drake.common.command_line import run_command
 from kitting_drake.common.files import require_folder
 from kitting_drake.policies.learning import Learning
@@ -29,6 +33,7 @@ def main() -> int:
     path = arguments.output or Path("output") / f"{arguments.folder.resolve().name}-demonstrations"
     if path.suffix != ".h5":
         path = path / "demonstrations.h5"
+    check_replaceable(path, arguments.folder)
     require_folder(path.parent)
     learning = Learning(
         later_picks_possible=not arguments.no_later_picks,
@@ -41,6 +46,7 @@ def main() -> int:
         f"{path} holds {found.demonstrations} demonstrations of {found.steps} steps in all; "
         f"{found.finals} of them show in the end that nothing is left to do",
         highlight=False,
+        markup=False,
         soft_wrap=True,
     )
     return 0

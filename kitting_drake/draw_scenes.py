@@ -51,6 +51,7 @@ def main() -> int:
     console.print(
         f"{path} holds {len(scenes)} scenes, in {finals} of them nothing is left to do",
         highlight=False,
+        markup=False,
     )
     return 0
 
@@ -136,21 +137,14 @@ class _Parts:
             :count
         ]
         content = StaticScenes(PixelGrid(), tuple(scenes), self._seed, self._drawn_by)
-        _write(path, content)
+        write_static_scenes(path, content)
         return scenes
 
 
 def _draw_part(path: Path, seed: int, drawn_by: dict[str, str]) -> int:
     scenes = tuple(draw_batch(seed))
-    _write(path, StaticScenes(PixelGrid(), scenes, seed, drawn_by))
+    write_static_scenes(path, StaticScenes(PixelGrid(), scenes, seed, drawn_by))
     return len(scenes)
-
-
-def _write(path: Path, content: StaticScenes) -> None:
-    """Writes a file atomically."""
-    scratch = path.with_name(f".{path.name}")
-    write_static_scenes(scratch, content)
-    scratch.replace(path)
 
 
 def _parse() -> argparse.Namespace:

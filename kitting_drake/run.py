@@ -93,7 +93,7 @@ def main() -> int:
     if cell.video_writer is not None:
         cell.video_writer.Save()
     print_episode(console, result)
-    console.print(f"files: {folder}/", highlight=False)
+    console.print(f"files: {folder}/", highlight=False, markup=False)
     if result.failure:
         return FAILED
     return INTERRUPTED if result.interrupted else 0

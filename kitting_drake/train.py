@@ -50,7 +50,7 @@ def main() -> int:
         run.train()
     if arguments.export:
         _export(arguments, folder / WEIGHTS, console)
-    console.print(f"files: {folder}/", highlight=False)
+    console.print(f"files: {folder}/", highlight=False, markup=False)
     return 0
 
 
@@ -62,7 +62,7 @@ def _export(arguments: argparse.Namespace, weights: Path, console: Console) -> N
     folder = (arguments.output or weights.parent) / "onnx"
     with console.status(f"exporting {weights.name}"):
         export_onnx(weights, folder)
-    console.print(f"networks as ONNX: {folder}/", highlight=False)
+    console.print(f"networks as ONNX: {folder}/", highlight=False, markup=False)
 
 
 def _settings(

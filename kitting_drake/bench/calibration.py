@@ -36,6 +36,8 @@ _UNDISTORTED = 1e-4
 """A ray is found when its pixel is met to this, at depth 1."""
 _HEIGHT = PixelGrid().z_max - PixelGrid().z_min
 """Points higher above the table than this are left out, unless the calibration says more."""
+_MOST_PIXELS = 10_000_000
+"""Of the workspace."""
 _DEPTH_FIELDS = ("depth_scale", "min_depth", "max_depth")
 _BENCH_FIELDS = ("table_height", "workspace")
 _GRID_FIELDS = ("x_min", "y_min", "resolution", "rows", "cols", "max_height")
@@ -120,8 +122,10 @@ def read_calibration(path: Path, *, table_height: float | None = None) -> Calibr
         # A file of one camera has the bench's fields beside the camera's.
         beside = (*_BENCH_FIELDS, "camera_name")
     cameras = tuple(_read_camera(path, str(name), node, beside) for name, node in entries.items())
-    told = content.get("table_height", 0.0) if table_height is None else table_height
-    height = number(told, f"{path}: table_height")
+    if table_height is None:
+        height = number(content.get("table_height", 0.0), f"{path}: table_height")
+    else:
+        height = number(table_height, "table_height")
     return Calibration(cameras, _read_grid(path, content.get("workspace", {}), height))
 
 
@@ -137,12 +141,17 @@ def _read_camera(path: Path, name: str, node: Any, beside: Sequence[str]) -> Ben
         if not has_intrinsics(lens):
             raise UserError(f"{where}: {file} holds no camera_matrix and no k")
     elif not has_intrinsics(node):
-        _check_misspelt(node, (*known, "camera_name"), where)
+        # Where a camera's intrinsics are, or seem to be.
+        lenses = ("cameras", "camera_info", "camera_matrix", "fx")
+        _check_misspelt(node, lenses, (*known, "camera_name"), where, likeness=0.6)
     limits = {key: number(node[key], f"{where}: {key}") for key in _DEPTH_FIELDS if key in node}
     if any(value <= 0 for value in limits.values()):
         raise UserError(f"{where}: depth_scale, min_depth and max_depth must be positive")
     intrinsics, X_BC = read_intrinsics(lens, where), read_pose(node, where)
-    if "fx" in node:
+    if "fx" not in node:
+        # OpenCV and ROS write fields that mean nothing here, such as image_height.
+        _check_misspelt(node, (*known, *_BENCH_FIELDS), known, where, likeness=0.85)
+    else:
         _check_fields(node, (*OWN_INTRINSICS, *known, "camera_name"), where)
     camera = BenchCamera(name, intrinsics, X_BC, **limits)
     if camera.min_depth >= camera.max_depth:
@@ -162,12 +171,12 @@ def _check_fields(node: dict[str, Any], known: Sequence[str], where: str) -> Non
             raise UserError(f"{where} has the unknown field '{key}': {advice}")
 
 
-def _check_misspelt(node: dict[str, Any], known: Sequence[str], where: str) -> None:
-    """Raises UserError for a field that seems to be where a camera's intrinsics are, misspelt."""
+def _check_misspelt(
+    node: dict[str, Any], meant: Sequence[str], known: Sequence[str], where: str, likeness: float
+) -> None:
+    """Raises UserError for an unknown field that is like one that may be meant, from 0 to 1."""
     for key in node:
-        close = difflib.get_close_matches(
-            str(key), ("cameras", "camera_info", "camera_matrix", "fx")
-        )
+        close = difflib.get_close_matches(str(key), meant, cutoff=likeness)
         if close and key not in known:
             raise UserError(f"{where} has the unknown field '{key}': did you mean '{close[0]}'?")
 
@@ -180,6 +189,11 @@ def _read_grid(path: Path, node: Any, table_height: float) -> PixelGrid:
     for key, value in node.items():
         read = whole_number if key in ("rows", "cols") else number
         values[key] = read(value, f"{path}: workspace.{key}")
+    if values.get("rows", 1) * values.get("cols", 1) > _MOST_PIXELS:
+        raise UserError(
+            f"{path}: workspace has {values['rows']} x {values['cols']} pixels, and "
+            f"{_MOST_PIXELS:.0e} is the most: resolution is in metres"
+        )
     top = table_height + values.pop("max_height", _HEIGHT)
     try:
         return PixelGrid(**values, z_min=table_height, z_max=top)

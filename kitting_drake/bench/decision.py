@@ -9,11 +9,15 @@ from typing import Any
 from kitting_drake.bench.calibration import Calibration
 from kitting_drake.bench.frames import Frame
 from kitting_drake.bench.policies import BenchPolicy, Choice
-from kitting_drake.bench.sight import observe
+from kitting_drake.bench.sight import observe, seen_share
+from kitting_drake.common.errors import UserError
 from systems.motion_heights import MotionHeights, motion_heights
 from systems.pick_place_parameters import PickPlaceParameters
 from systems.signals import Observation, PickPlaceAction, PlanarPose, SurfaceHeights, wrap_to_pi
 from systems.surface_heights import read_surface_heights
+
+_SEEN_TO_STOP = 0.7
+"""An object may lie in what is not seen: with less than this share there is no stop."""
 
 
 @dataclass(frozen=True)
@@ -22,6 +26,8 @@ class BenchDecision:
 
     observation: Observation
     """o_t."""
+    seen: float
+    """The share of its pixels in view of the cameras that they see, from 0 to 1."""
     choice: Choice
     surfaces: SurfaceHeights
     heights: MotionHeights
@@ -51,6 +57,7 @@ class BenchDecision:
             "stop": action.stop,
             "confidence": self.choice.confidence,
             "confidence_parts": self.choice.parts,
+            "seen": round(self.seen, 3),
         }
         if action.stop:
             return result
@@ -99,14 +106,21 @@ def decide(
         parameters: of the motion, for its heights; None: the cell's.
 
     Raises:
-        UserError: frames, calibration and policy do not fit together; says what would do.
+        UserError: frames, calibration and policy do not fit together; says what would do. Or the
+            policy would stop, and too little is seen to say that nothing is left.
     """
     policy.check_grid(calibration.grid)
     observation = observe(frames, calibration)
     choice = policy.choose(observation, failed_picks)
+    seen = seen_share(observation, calibration)
+    if choice.action.stop and seen < _SEEN_TO_STOP:
+        raise UserError(
+            f"only {100 * seen:.0f} % of what is in view is seen, too little to say that nothing "
+            "is left to do: see by --check what is wrong"
+        )
     parameters = PickPlaceParameters() if parameters is None else parameters
     surfaces = SurfaceHeights()
     if not choice.action.stop:
         surfaces = read_surface_heights(observation, choice.action.pick, choice.action.place)
     heights = motion_heights(surfaces, parameters)
-    return BenchDecision(observation, choice, surfaces, heights, parameters)
+    return BenchDecision(observation, seen, choice, surfaces, heights, parameters)

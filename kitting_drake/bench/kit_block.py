@@ -82,7 +82,9 @@ def see_block(
     if near.sum() < _LEAST_PIXELS:
         raise UserError(f"camera {camera.name} sees no block {1e3 * block.size[2]:g} mm high")
     values = z[near]
-    counts, edges = np.histogram(values, bins=max(4, math.ceil(np.ptp(values) / 0.001)))
+    # A millimetre each, also where all heights are the same.
+    low, high = values.min() - 0.002, values.max() + 0.002
+    counts, edges = np.histogram(values, math.ceil((high - low) / 0.001), (low, high))
     mode = edges[counts.argmax()] + (edges[1] - edges[0]) / 2
     band = max(_LEAST_BAND, 3 * noise)
     top = float(np.median(values[np.abs(values - mode) < max(2 * band, 0.002)]))

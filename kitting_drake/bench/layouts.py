@@ -25,6 +25,7 @@ _DISTORTIONS = ("distortion", "distortion_coefficients", "dist_coeffs", "d", "D"
 _POSES = ("camera_to_base", "pose", "transform", "base_to_camera")
 _POSITIONS = ("position", "translation")
 _ROTATIONS = ("orientation", "quaternion_xyzw", "rotation", "rpy_deg", "rvec")
+_MOST_ENVELOPES = 4
 _ENVELOPE = ("header", "child_frame_id", "covariance")
 """The keys that ROS writes around a pose."""
 
@@ -151,7 +152,10 @@ def read_pose(node: dict[str, Any], where: str) -> Array:
 
 def _pose_of_parts(value: dict[str, Any], where: str) -> Array:
     # geometry_msgs wraps a Pose into PoseStamped and PoseWithCovariance, and one into the other.
-    while inner := _first(value, "pose", "transform"):
+    for _ in range(_MOST_ENVELOPES):
+        inner = _first(value, "pose", "transform")
+        if inner is None:
+            break
         _refuse_unknown(value, (inner, *_ENVELOPE), where)
         if not isinstance(value[inner], dict):
             raise UserError(f"{where}.{inner} must be a mapping")

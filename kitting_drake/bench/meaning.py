@@ -108,8 +108,10 @@ def _of_table(who: str, table: TableCheck, distance: float | None) -> list[Findi
         )
     high = "high" if table.bias > 0 else "low"
     bias = f"grasps and rims look {1e3 * abs(table.bias):.1f} mm too {high}"
-    if table.bias < -floor:
-        bias += f"; fingertips are to stop {1e3 * floor:.1f} mm above the table, and would touch it"
+    if table.bias > floor:
+        # The hand stops that much above `table_height`, wherever the depths are.
+        into = f"{1e3 * (table.bias - floor):.1f} mm"
+        bias += f"; if it is table_height that is too low, fingertips may go {into} into the table"
     if table.noise <= _CLEAN:
         noise, blurred = "heights are taken as they are", GOOD
     else:
@@ -133,18 +135,19 @@ def _of_table(who: str, table: TableCheck, distance: float | None) -> list[Findi
 
 def _of_block(who: str, seen: SeenBlock, block: Block) -> list[Finding]:
     length, width, height = scales(seen, block)
-    sideways = (length + width) / 2
-    wrong = (sideways - 1) * _HALF_KIT
+    # Opposite errors of length and width do not make up for one another.
+    worst = max(length, width, key=lambda share: abs(share - 1))
+    wrong = (worst - 1) * _HALF_KIT
     reason = ""
-    if abs(sideways - 1) > _OUT_OF_SCALE:
-        alike = abs(height - sideways) < 0.4 * abs(sideways - 1)
+    if abs(worst - 1) > _OUT_OF_SCALE:
+        alike = max(abs(s - worst) for s in (length, width, height)) < 0.4 * abs(worst - 1)
         reason = "; depth_scale may be wrong" if alike else "; the focal length may be wrong"
     skew = (seen.corner - math.pi / 2) * _HALF_KIT
     lines = [
         Finding(
             who,
             "scale",
-            f"{sideways:.4f}",
+            f"{worst:.4f}",
             _verdict(wrong),
             f"length {length:.4f}, width {width:.4f}, height {height:.4f}: 10 cm look "
             f"{1e3 * abs(wrong):.2f} mm too {'long' if wrong > 0 else 'short'}{reason}",
@@ -165,8 +168,8 @@ def _of_block(who: str, seen: SeenBlock, block: Block) -> list[Finding]:
                 who,
                 "offset",
                 f"({1e3 * x:+.2f}, {1e3 * y:+.2f}) mm, {math.degrees(yaw):+.2f} deg",
-                _verdict(math.hypot(x, y)),
-                "picks and places go as far beside",
+                _verdict(math.hypot(x, y) + _HALF_KIT * abs(yaw)),
+                "picks and places go as far beside, and by the angle farther away from the block",
             )
         )
     return lines

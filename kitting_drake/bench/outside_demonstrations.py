@@ -22,7 +22,12 @@ from kitting_drake.bench.step_actions import StepAction, read_action
 from kitting_drake.common.errors import UserError
 from kitting_drake.common.provenance import versions
 from kitting_drake.common.seeds import VALIDATION_SEEDS
-from kitting_drake.policies.demonstrations import Demonstration, Origin, write_demonstrations
+from kitting_drake.policies.demonstrations import (
+    Demonstration,
+    Origin,
+    read_demonstrations,
+    write_demonstrations,
+)
 from kitting_drake.policies.learning import Learning
 from kitting_drake.policies.recorded import DemonstrationStep, FinalObservation
 from systems.signals import Observation
@@ -129,6 +134,22 @@ def check_action(step: StepFolder, action: StepAction, calibration: Calibration)
             f"{step.name} was clicked by another calibration: give that by --camera, or click it "
             "again"
         )
+
+
+def check_replaceable(path: Path, folder: Path) -> None:
+    """Checks that a file, if there is one, holds earlier demonstrations of a folder of that name.
+
+    Raises:
+        UserError: it holds something else.
+    """
+    if not path.exists():
+        return
+    try:
+        origin = read_demonstrations(path).origin
+    except UserError as error:
+        raise UserError(f"{path} exists, and is no file of demonstrations: delete it") from error
+    if (origin.scenario_name, origin.scenario.get("task")) != (folder.resolve().name, TASK):
+        raise UserError(f"{path} holds demonstrations of {origin.scenario_name}: delete it")
 
 
 def convert(folder: Path, calibration: Calibration, learning: Learning, path: Path) -> Summary:

@@ -134,7 +134,8 @@ def load_policy(
         weights: a file that `train` wrote; None: the generalist's.
         orientations: N.
         fit_outlines: refine places by outlines and grasps by the room for the jaws: for tasks in
-            which objects are inserted.
+            which objects are inserted; False: of equivalent rotations of a place, take one in which
+            the jaws have room to let go.
         recover: mend what is not seated; see `LearnedPolicy`.
 
     Raises:
@@ -150,7 +151,11 @@ def load_policy(
     networks = load_networks(path, preferred_type()).to(preferred_device())
     try:
         policy = LearnedPolicy(
-            networks, orientations=orientations, fit_outlines=fit_outlines, recover=recover
+            networks,
+            orientations=orientations,
+            fit_outlines=fit_outlines,
+            clear_jaws=not fit_outlines,
+            recover=recover,
         )
     except ValueError as error:
         raise UserError(f"--orientations: {error}") from error

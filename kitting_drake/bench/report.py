@@ -14,6 +14,11 @@ from kitting_drake.bench.check import Check, TableCheck
 from kitting_drake.bench.meaning import BAD, GOOD, findings, offset, scales
 from kitting_drake.common.files import write_atomically, write_json
 
+CHECK_FILES = ("check.json", "corrected.yaml", "check.png")
+"""What `save_check` writes."""
+_WELL_SEEN = 0.9
+"""Of what is in view: less is told."""
+
 
 def print_decision(console: Console, record: dict[str, Any]) -> None:
     """Prints the content of an `action.json`."""
@@ -21,6 +26,12 @@ def print_decision(console: Console, record: dict[str, Any]) -> None:
     sure = "" if confidence is None else f", confidence {confidence:.2f}"
     said = "stop" if record["stop"] else "press" if record["press"] else "pick and place"
     console.print(f"{said}{sure} ({record['policy']}, {record['seconds']:.2f} s)", highlight=False)
+    if record["seen"] < _WELL_SEEN:
+        console.print(
+            f"  only {100 * record['seen']:.0f} % of what is in view is seen; the rest is filled "
+            "in from around it",
+            highlight=False,
+        )
     for name in ("pick", "place"):
         pose = record.get(name)
         if pose is not None:
@@ -32,7 +43,7 @@ def print_decision(console: Console, record: dict[str, Any]) -> None:
 
 
 def save_check(folder: Path, check: Check) -> None:
-    """Writes `check.json`, `check.png` and the corrected calibration, `corrected.yaml`.
+    """Writes `check.json`, the corrected calibration `corrected.yaml`, and `check.png`.
 
     Raises:
         UserError: a file cannot be written.
@@ -40,9 +51,10 @@ def save_check(folder: Path, check: Check) -> None:
     # Who draws nothing does not wait for matplotlib.
     from kitting_drake.reporting.check_figure import draw_heights
 
-    write_json(folder / "check.json", check_record(check))
-    write_calibration(folder / "corrected.yaml", check.corrected)
-    write_atomically(folder / "check.png", draw_heights(check.heights, check.corrected.grid))
+    record, calibration, picture = (folder / name for name in CHECK_FILES)
+    write_json(record, check_record(check))
+    write_calibration(calibration, check.corrected)
+    write_atomically(picture, draw_heights(check.heights, check.corrected.grid))
 
 
 def check_record(check: Check) -> dict[str, Any]:

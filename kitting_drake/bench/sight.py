@@ -23,6 +23,8 @@ _LEAST_DEPTH = 0.01
 _NEAREST, _FARTHEST = 0.8, 1.25
 """Depths, as shares of that of the table, that may be something on the table, or a pose that is
 off: beyond these the unit is wrong, or the pose."""
+_TALL = 0.1
+"""What stands on the table may be so high, in metres, wherever a camera looks."""
 _WIDEST = 0.15
 """Half of these shares lie within a range as narrow as this, or what is seen is no table."""
 _STEP = 4
@@ -79,22 +81,34 @@ def table_depth(
     return np.where(seen, depth, np.nan)
 
 
-def _share_seen(camera: BenchCamera, X_BC: Array, grid: PixelGrid) -> float:
-    """The share of the workspace's pixels, at the table's height, that are in the image."""
-    rows, cols = np.meshgrid(np.arange(0, grid.rows, 4), np.arange(0, grid.cols, 4), indexing="ij")
+def seen_share(observation: Observation, calibration: Calibration) -> float:
+    """The share of o_t's pixels in view of any camera that one sees, from 0 to 1."""
+    grid = observation.grid
+    views = [_in_view(camera, camera.X_BC, grid, 1) for camera in calibration.cameras]
+    return float(observation.valid.ravel()[np.any(views, axis=0)].mean())
+
+
+def _in_view(
+    camera: BenchCamera, X_BC: Array, grid: PixelGrid, step: int = _STEP
+) -> NDArray[np.bool_]:
+    """(n,) of every `step`th of the workspace's pixels along rows and columns, whether it is in the
+    image, at the table's height."""
+    rows, cols = np.meshgrid(
+        np.arange(0, grid.rows, step), np.arange(0, grid.cols, step), indexing="ij"
+    )
     xy = grid.to_world(np.stack([rows.ravel(), cols.ravel()], axis=-1))
     p_C = (np.column_stack([xy, np.full(len(xy), grid.z_min)]) - X_BC[:3, 3]) @ X_BC[:3, :3]
-    lens, before = camera.intrinsics, p_C[:, 2] > 0
-    x, y = (p_C[before, :2] / p_C[before, 2:]).T * np.array(lens.focal)[:, None]
-    inside = (np.abs(x + lens.centre[0] - lens.size[0] / 2) <= lens.size[0] / 2) & (
+    lens, inside = camera.intrinsics, p_C[:, 2] > 0
+    x, y = (p_C[inside, :2] / p_C[inside, 2:]).T * np.array(lens.focal)[:, None]
+    inside[inside] = (np.abs(x + lens.centre[0] - lens.size[0] / 2) <= lens.size[0] / 2) & (
         np.abs(y + lens.centre[1] - lens.size[1] / 2) <= lens.size[1] / 2
     )
-    return float(inside.sum() / len(xy))
+    return inside
 
 
 def _check_pose(camera: BenchCamera, grid: PixelGrid) -> None:
     X_BC = camera.X_BC
-    if _share_seen(camera, X_BC, grid) >= _LEAST_SEEN and X_BC[2, 3] > grid.z_min:
+    if _in_view(camera, X_BC, grid).mean() >= _LEAST_SEEN and X_BC[2, 3] > grid.z_min:
         return
     others = {
         "its inverse would: is it the pose of the base in the camera?": np.linalg.inv(X_BC),
@@ -107,7 +121,7 @@ def _check_pose(camera: BenchCamera, grid: PixelGrid) -> None:
     hints = [
         text
         for text, X in others.items()
-        if X[2, 3] > grid.z_min and _share_seen(camera, X, grid) >= 0.1
+        if X[2, 3] > grid.z_min and _in_view(camera, X, grid).mean() >= 0.1
     ]
     if hints:
         hint = hints[0]
@@ -140,6 +154,9 @@ def _check_depth(frame: Frame, camera: BenchCamera, grid: PixelGrid) -> None:
             f"depth of camera {camera.name} is all zero or NaN where it looks at the workspace"
         )
     ratios = depth[returned] / expected[towards][returned]
+    # Along a ray, the share that is left is that of the camera's height.
+    on_table = (ratios < 1) & (ratios > 1 - _TALL / (camera.X_BC[2, 3] - grid.z_min))
+    ratios[on_table] = 1
     low, ratio, high = (float(value) for value in np.percentile(ratios, (25, 50, 75)))
     if _NEAREST <= ratio <= _FARTHEST:
         if high - low <= _WIDEST:

@@ -69,6 +69,8 @@ def parse_action(record: Any, grid: PixelGrid, where: str) -> StepAction:
     for key, text in texts.items():
         if text is not None and not isinstance(text, str):
             raise UserError(f"{where}: {key} must be a text, not {text!r}")
+        if text and not text.isprintable():
+            raise UserError(f"{where}: {key} must be of printable characters, not {text!r}")
     known = {key: text for key, text in texts.items() if text}
     if record.get("stop", False):
         return StepAction(PickPlaceAction(stop=True), **known)

@@ -59,9 +59,11 @@ def read_yaml(path: Path) -> dict[str, Any]:
         where = f" line {mark.line + 1}:" if mark else ""
         problem = getattr(error, "problem", None) or "it is not YAML"
         raise UserError(f"{path}:{where} {problem}") from error
-    except ValueError as error:
-        # What looks like a date, and is none.
+    except (ValueError, KeyError, AttributeError) as error:
+        # What looks like a date, and is none; what is tagged as of a type that it is not of.
         raise UserError(f"{path} is not YAML: {error}") from error
+    except RecursionError as error:
+        raise UserError(f"{path} is nested too deeply") from error
     if not isinstance(first, dict):
         raise UserError(f"{path} must hold a mapping of fields, such as 'cameras:'")
     return first

@@ -1,10 +1,12 @@
 """The dataset: tools and kits, `python -m kitting_drake.hkd COMMAND`."""
 
 import argparse
+import shlex
 from pathlib import Path
 
 import yaml
 from rich.console import Console
+from rich.markup import escape
 from rich.measure import Measurement
 from rich.progress import Progress, track
 from rich.table import Table
@@ -59,8 +61,13 @@ def list_tools(args: argparse.Namespace, entries: list[ToolEntry]) -> None:
         table.add_column(heading, justify="right", no_wrap=True)
     chosen, own = _with_own(entries, args.names)
     descriptions = [_description(args.models, entry.name) for entry in chosen]
+    console, broken = Console(markup=False), []
     for name in own:
-        load_tool(str(user_tools() / name))
+        try:
+            load_tool(str(user_tools() / name))
+        except UserError as error:
+            broken.append(f"not listed: {error}")
+            continue
         descriptions.append(yaml.safe_load((user_tools() / name / "tool.yaml").read_text()))
     # Most tools have none, and a terminal is narrow.
     symmetric = any(d.get("symmetry", 1) != 1 for d in descriptions)
@@ -78,11 +85,12 @@ def list_tools(args: argparse.Namespace, entries: list[ToolEntry]) -> None:
             grasp,
         )
         table.add_row(*row, *([str(d.get("symmetry", 1))] if symmetric else []))
-    console = Console()
     # Names are what the other commands take: they are never cut.
     wide = console.options.update(width=1000)
     console.width = max(console.width, Measurement.get(console, wide, table).maximum)
     console.print(table)
+    for line in broken:
+        console.print(line, highlight=False, soft_wrap=True)
 
 
 def generate(args: argparse.Namespace, entries: list[ToolEntry]) -> None:
@@ -132,7 +140,7 @@ def build(args: argparse.Namespace, entries: list[ToolEntry]) -> None:
         )
     if not args.quiet:
         counts = f"{len(manifest['tools'])} tools and {len(manifest['kits'])} kits"
-        Console().print(f"{counts}: {args.output}/manifest.json", highlight=False)
+        Console(markup=False).print(f"{counts}: {args.output}/manifest.json", highlight=False)
 
 
 def annotate(args: argparse.Namespace, entries: list[ToolEntry]) -> None:
@@ -146,7 +154,7 @@ def import_mesh(args: argparse.Namespace, entries: list[ToolEntry]) -> None:
     """Makes a tool of a mesh (STL, OBJ, PLY, GLB) or of an outline (SVG, DXF)."""
     from kitting_drake.hkd.importing.importer import ImportRequest, import_tool
 
-    console = Console(quiet=args.quiet, highlight=False)
+    console = Console(quiet=args.quiet, highlight=False, markup=False)
     request = ImportRequest(
         mesh=args.mesh,
         category=args.category,
@@ -156,14 +164,14 @@ def import_mesh(args: argparse.Namespace, entries: list[ToolEntry]) -> None:
         output=args.output,
         height_mm=args.height_mm,
     )
-    with Console(stderr=True, quiet=args.quiet).status(f"importing {args.mesh}"):
+    with Console(stderr=True, quiet=args.quiet).status(f"importing {escape(str(args.mesh))}"):
         report = import_tool(request)
     d = report.record
     size = " x ".join(f"{1e3 * d[key]:.0f}" for key in ("length", "width", "height"))
     held = f"held by {1e3 * d['grasp']['width']:.1f} mm"
     console.print(f"{d['name']}: {size} mm, {1e3 * d['mass']:.0f} g, {held}")
     for note in report.notes:
-        console.print(f"  {note}", markup=False)
+        console.print(f"  {note}")
     named = d["name"] if args.output is None else report.directory.resolve()
     console.print(f"files: {report.directory}/; name it '{named}' in a scenario", soft_wrap=True)
 
@@ -185,12 +193,12 @@ def kit(args: argparse.Namespace, entries: list[ToolEntry]) -> None:
         design = export_kit(request)
     if args.quiet:
         return
-    console = Console(highlight=False)
+    console = Console(highlight=False, markup=False)
     size = " x ".join(f"{side:g}" for side in design.size_mm)
     files = "kit.stl, kit.3mf, cavities.dxf, cavities.svg, kit.png"
     console.print(f"a block of {size} mm in {args.output}/: {files}", soft_wrap=True)
     for note in design.notes:
-        console.print(f"  {note}", markup=False, soft_wrap=True)
+        console.print(f"  {note}", soft_wrap=True)
     _check_scenario(args.output / "scenario.yaml", console)
 
 
@@ -210,7 +218,9 @@ def _check_scenario(path: Path, console: Console) -> None:
             soft_wrap=True,
         )
     else:
-        console.print(f"try it: python -m kitting_drake.run {path}", soft_wrap=True)
+        console.print(
+            f"try it: python -m kitting_drake.run {shlex.quote(str(path))}", soft_wrap=True
+        )
 
 
 def main() -> int:

@@ -37,6 +37,7 @@ from kitting_drake.policies.demonstrations import (
     Demonstration,
     Demonstrations,
     Origin,
+    content_digest,
     read_demonstrations,
 )
 from kitting_drake.policies.lerobot_statistics import aggregate, statistics_of
@@ -151,8 +152,13 @@ def _task(origin: Origin) -> str:
 
 def _record(read: Demonstrations, task: str) -> dict[str, Any]:
     origin = dataclasses.asdict(read.origin)
-    seeds = [item.seed for item in read.demonstrations]
-    return json.loads(json.dumps({"task": task, "episode_seeds": seeds, **origin}, default=str))
+    described = {
+        "task": task,
+        "episode_seeds": [item.seed for item in read.demonstrations],
+        "content": content_digest(read.demonstrations),
+        **origin,
+    }
+    return json.loads(json.dumps(described, default=str))
 
 
 def _found(path: Path) -> Any:

@@ -76,6 +76,9 @@ def export_onnx(weights: Path, folder: Path) -> list[Path]:
     require_folder(folder)
     config = networks.config
     written = []
+    # It is written last: a folder without it is none, should this not come to its end.
+    described_in = folder / "policy.json"
+    described_in.unlink(missing_ok=True)
     for name in GRAPHS:
         side = sizes.PICK_CROP if name == "beta" else 4 * STRIDE + 1
         example = torch.zeros(1, config.channels, side, side)
@@ -94,8 +97,8 @@ def export_onnx(weights: Path, folder: Path) -> list[Path]:
         "stride": STRIDE,
         "weights": weights.name,
     }
-    write_json(folder / "policy.json", described)
-    return [*written, folder / "policy.json"]
+    write_json(described_in, described)
+    return [*written, described_in]
 
 
 def _graph(network: nn.Module, example: Tensor, *, any_size: bool) -> bytes:

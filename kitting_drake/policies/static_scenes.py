@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
+import io
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -25,6 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kitting_drake.common.errors import UserError
+from kitting_drake.common.files import write_atomically
 from kitting_drake.policies.images import LabelledImage
 from systems.signals import Observation, PixelGrid, fill_unseen
 
@@ -98,9 +100,15 @@ class StaticScenes:
 
 
 def write_static_scenes(path: Path, content: StaticScenes) -> None:
-    """Writes a file, replacing what is there; the caller sees to it that this is atomic."""
+    """Writes a file atomically.
+
+    Raises:
+        MachineError: it cannot be written.
+    """
     counts = [len(scene.actions) for scene in content.scenes]
-    with h5py.File(path, "w") as file:
+    # In memory: HDF5 crashes where a disk is full.
+    data = io.BytesIO()
+    with h5py.File(data, "w") as file:
         file.attrs["format"], file.attrs["format_version"] = FORMAT, FORMAT_VERSION
         file.attrs["first_seed"] = content.first_seed
         file.attrs["grid"] = json.dumps(dataclasses.asdict(content.grid))
@@ -112,6 +120,7 @@ def write_static_scenes(path: Path, content: StaticScenes) -> None:
         )
         file["actions"] = np.concatenate([np.zeros((0, 8)), *(s.actions for s in content.scenes)])
         file["first"] = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
+    write_atomically(path, data.getvalue())
 
 
 def is_static_scenes(path: Path) -> bool:

@@ -20,6 +20,7 @@ from kitting_drake.hkd.grasps.grip import find_grip, jaw_axes
 from kitting_drake.hkd.grasps.proposals import (
     FLOOR_CLEARANCE,
     GRASP_DEPTH,
+    WIDEST,
     GraspProposal,
     propose_grasps,
 )
@@ -69,8 +70,14 @@ def save_grasp(tool: Tool, grasp: Grasp, models: Path = MODELS) -> None:
         models: the folder with the catalogue in `tools/`.
 
     Raises:
-        UserError: the catalogue cannot have it; then nothing has changed.
+        UserError: the jaws do not open so far, or the catalogue cannot have it; then nothing has
+            changed.
     """
+    if grasp.width > WIDEST:
+        raise UserError(
+            f"the tool is {1e3 * grasp.width:.0f} mm wide there, and the jaws take "
+            f"{1e3 * WIDEST:.0f} mm"
+        )
     if tool.directory.parent != models / "tools":
         record_path = tool.directory / "tool.yaml"
         record = yaml.safe_load(record_path.read_text())
@@ -257,8 +264,11 @@ def annotate(name: str, console: Console) -> None:
         UserError: no such tool, or no port for the page.
     """
     tool = load_tool(name)
-    record = yaml.safe_load((tool.directory / "tool.yaml").read_text())
-    proposals = propose_grasps(tool.triangles, np.array(record["center_of_mass"]))
+    path = tool.directory / "tool.yaml"
+    com = yaml.safe_load(path.read_text()).get("center_of_mass")
+    if not isinstance(com, list) or len(com) != 3:
+        raise UserError(f"{path} has no center_of_mass, three numbers: import the tool again")
+    proposals = propose_grasps(tool.triangles, np.array(com, dtype=float))
     console.print(proposal_table(tool, proposals))
     try:
         meshcat = Meshcat(MeshcatParams(host="localhost", show_stats_plot=False))

@@ -12,8 +12,10 @@ import math
 import multiprocessing
 import os
 import re
+import shutil
 import signal
 import tempfile
+import time
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from pathlib import Path
@@ -56,6 +58,8 @@ from kitting_drake.hkd.tools.tool import check_category, load_tool, tool_names, 
 
 TIME_LIMIT = 55.0
 """Seconds after which the geometry is given up."""
+_MAKING = ".making-"
+"""What the names of folders begin with in which tools are made."""
 _MOST_MEMORY = 12 * 2**30
 # A tool is laid anew where it comes to rest by more than this, in degrees, at most so often.
 _SAME_POSE_DEG, _LAYINGS = 2.0, 3
@@ -123,7 +127,8 @@ def import_tool(request: ImportRequest, time_limit: float | None = TIME_LIMIT) -
     new_folders = [p for p in (folder, *folder.parents) if not p.exists()]
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(dir=folder, prefix=".making-") as scratch:
+        _remove_abandoned(folder)
+        with tempfile.TemporaryDirectory(dir=folder, prefix=_MAKING) as scratch:
             made = Path(scratch) / name
             made.mkdir()
             report = (
@@ -142,6 +147,13 @@ def import_tool(request: ImportRequest, time_limit: float | None = TIME_LIMIT) -
         for path in new_folders:
             if path.is_dir() and not any(path.iterdir()):
                 path.rmdir()
+
+
+def _remove_abandoned(folder: Path) -> None:
+    """Removes what imports that were killed have left."""
+    for path in folder.glob(f"{_MAKING}*"):
+        if time.time() - path.stat().st_mtime > 10 * TIME_LIMIT:
+            shutil.rmtree(path, ignore_errors=True)
 
 
 def _check_height(request: ImportRequest) -> None:

@@ -144,7 +144,11 @@ def load_tool(name: str, base: Path | None = None) -> Tool:
             visual_meshes=tuple(directory / str(path) for path in record["visual_meshes"]),
             symmetry=int(record.get("symmetry", 1)),
         )
-    except (yaml.YAMLError, KeyError, TypeError, ValueError, AttributeError) as error:
+    except yaml.YAMLError as error:
+        mark = getattr(error, "problem_mark", None)
+        where = f" from line {mark.line + 1} on" if mark else ""
+        raise UserError(f"{record_path} is not a tool record: it is not YAML{where}") from error
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise UserError(f"{record_path} is not a tool record: {error!r}") from error
     for path in (tool.sdf, *tool.visual_meshes):
         if not path.is_file():

@@ -33,6 +33,7 @@ from systems.signals import PixelGrid
 
 _SURFACE_POINTS = 2000
 _MOST_TOOLS = 12
+_ANNOTATE = "save another grasp by `hkd annotate`"
 
 SEEN = "kitting-seen-toolset"
 UNSEEN = "kitting-unseen-toolsets"
@@ -148,7 +149,9 @@ class Kitting(_DrawnKitting):
         return SEEN if self == Kitting() else "kitting"
 
     def make_scene(self, *, grid: PixelGrid, seed: int, base: Path) -> Scene:
-        return self._draw_scene(_load_tools(self.tools, base), grid, seed)
+        tools = _load_tools(self.tools, base)
+        _check_grasps(tools, _ANNOTATE)
+        return self._draw_scene(tools, grid, seed)
 
     def input_files(self, base: Path) -> list[Path]:
         return _tool_files(self.tools, base)
@@ -191,7 +194,10 @@ class ToolsetKitting(_DrawnKitting):
                 scaled_tool(tool, float(length))
                 for tool, length in zip(tools, lengths, strict=True)
             ]
-            _check_grasps(tools)
+            advice = "set random_lengths: false, or another tool_length"
+        else:
+            advice = _ANNOTATE
+        _check_grasps(tools, advice)
         return self._draw_scene(tools, grid, seed)
 
     def _toolsets(self, base: Path) -> list[tuple[str, ...]]:
@@ -230,6 +236,7 @@ class ArrangedKitting(_KittingTask):
 
     def make_scene(self, *, grid: PixelGrid, seed: int, base: Path) -> Scene:
         tools = _load_tools(self.tools, base)
+        _check_grasps(tools, _ANNOTATE)
         kit = self._kit_of(tools)
         poses = list(self.tools.values())
         check_arrangement(
@@ -323,14 +330,14 @@ def _unique_names(tools: Sequence[Tool]) -> list[str]:
     return names
 
 
-def _check_grasps(tools: Sequence[Tool]) -> None:
-    """Raises UserError for a tool that is wider at its grasp than the jaws open."""
+def _check_grasps(tools: Sequence[Tool], advice: str) -> None:
+    """Raises UserError, with advice, for a tool that is wider at its grasp than the jaws open."""
     for tool in tools:
         if tool.grasp.width >= MAX_OPENING:
             raise UserError(
                 f"task: at a length of {1e3 * tool.length:.0f} mm the tool '{tool.name}' is "
                 f"{1e3 * tool.grasp.width:.0f} mm wide where it is held, and the jaws open to "
-                f"{1e3 * MAX_OPENING:.0f} mm: set random_lengths: false, or another tool_length"
+                f"{1e3 * MAX_OPENING:.0f} mm: {advice}"
             )
 
 

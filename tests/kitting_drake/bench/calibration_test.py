@@ -174,6 +174,13 @@ def test_what_is_written_is_read_again_to_the_last_bit(tmp_path: Path):
         (("fy: 51", "fy: 51\n    min_depth: 300"), "min_depth 300 must be less than max_depth 10"),
         (("fy: 51", "fy: 51\n    table_height: 1"), "which all cameras share: put it beside 'cam"),
         (("table_height: 0.012", "when: 2024-13-45"), "is not YAML: month must be"),
+        (("table_height: 0.012", "when: !!bool 5"), "is not YAML"),
+        (("table_height: 0.012", "deep: " + 3000 * "["), "is nested too deeply"),
+        (
+            ("pose: {position: [0.5, 0.1, 0.9], rpy_deg: [180, 0, -90]}", "pose: &p {pose: *p}"),
+            "pose has 'pose', which means nothing",
+        ),
+        (("cameras:", "workspace: {rows: 1000000, cols: 1000000}\ncameras:"), "is the most: res"),
     ],
 )
 def test_one_sentence_says_what_is_wrong(tmp_path: Path, change: tuple[str, str], message: str):
@@ -216,7 +223,9 @@ def test_fields_beside_those_of_other_programs_are_not_passed_over(tmp_path: Pat
     long = OPENCV.replace("1.0e-01, 9.0e-01 ]", "1.0e-01, 9.0e-01, 1. ]")
     with pytest.raises(UserError, match=r"t_cam2base must hold 3 numbers \(3 x 1\), not 4"):
         read(tmp_path, long)
-    read(tmp_path, OPENCV + "avg_reprojection_error: 0.2\n")
+    read(tmp_path, OPENCV + "avg_reprojection_error: 0.2\nimage_height_mm: 3\n")
+    with pytest.raises(UserError, match="field 'table_hieght': did you mean 'table_height'"):
+        read(tmp_path, OPENCV + "table_hieght: 0.012\n")
 
 
 def test_a_file_that_is_no_calibration_is_refused(tmp_path: Path):

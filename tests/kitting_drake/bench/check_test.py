@@ -12,7 +12,7 @@ from kitting_drake.bench.calibration import Calibration, with_poses
 from kitting_drake.bench.check import Check, check_cameras
 from kitting_drake.bench.frames import Frame
 from kitting_drake.bench.kit_block import Block
-from kitting_drake.bench.meaning import explains_depth, findings, offset, scales
+from kitting_drake.bench.meaning import BAD, Finding, explains_depth, findings, offset, scales
 from kitting_drake.common.errors import UserError
 from kitting_drake.scenario.schema import Scenario
 from systems.sensor_noise import SensorNoiseParameters, noisy_depth
@@ -85,6 +85,10 @@ def test_a_tilt_is_found_and_about_which_axis(
 
 def test_a_camera_that_is_too_high_is_found(table: dict[str, Frame]):
     check = check_cameras(noisy(table), moved("front", shift=(0, 0, 0.003)))
+    # The hand stops 1.5 mm above where the table is believed to be.
+    assert "may go 1.5 mm into the table" in _meaning(check, "height bias")
+    low = check_cameras(table, moved("front", shift=(0, 0, -0.003)))
+    assert "into the table" not in _meaning(low, "height bias")
     assert check.cameras["front"].table.bias == pytest.approx(0.003, rel=0.2)
     assert abs(check.cameras["left"].table.bias) < 0.0003
     assert check.disagreements["front", "left"] == pytest.approx(0.003, rel=0.2)
@@ -150,8 +154,44 @@ def test_the_scale_tells_depth_from_focal_length():
     assert abs(height - 1) < 0.02
 
 
+def test_opposite_errors_of_two_focal_lengths_do_not_cancel():
+    lens = dataclasses.replace(TRUE.cameras[0].intrinsics, focal=(459.0, 441.0))
+    cameras = (dataclasses.replace(TRUE.cameras[0], intrinsics=lens), *TRUE.cameras[1:])
+    block = dataclasses.replace(BLOCK, pose=(0.45, -0.2, 0.0))
+    check = check_cameras(cast(TRUE, block), dataclasses.replace(TRUE, cameras=cameras), block)
+    assert _line(check, "scale").verdict == BAD
+
+
+def test_a_rotation_about_the_block_is_an_offset_beside_it():
+    x, y, _ = BLOCK.pose
+    R = Rotation.from_euler("z", 1.5, degrees=True).as_matrix()
+    X = TRUE.cameras[0].X_BC.copy()
+    X[:3, :3] = R @ X[:3, :3]
+    X[:3, 3] = R @ (X[:3, 3] - (x, y, 0)) + (x, y, 0)
+    check = check_cameras(cast(TRUE, BLOCK), with_poses(TRUE, {"front": X}), BLOCK)
+    assert np.hypot(*offset(check.cameras["front"].block, BLOCK)[:2]) < 5e-4
+    # 2.6 mm at 10 cm from the block.
+    assert _line(check, "offset").verdict == BAD
+
+
+@pytest.mark.parametrize("high", [0.3, 0.6])
+def test_a_camera_that_looks_straight_down_sees_all_heights_alike(high: float):
+    down = dataclasses.replace(
+        TRUE.cameras[0],
+        X_BC=np.array([[0.0, -1, 0, 0.5], [-1, 0, 0, 0], [0, 0, -1, high], [0, 0, 0, 1]]),
+    )
+    block = Block((0.20, 0.15, 0.05), (0.5, 0.0, 0.0))
+    alone = Calibration((down,), TRUE.grid)
+    check = check_cameras(cast(alone, block), alone, block)
+    assert np.hypot(*offset(check.cameras["front"].block, block)[:2]) < 5e-4
+
+
+def _line(check: Check, what: str) -> Finding:
+    return next(line for line in findings(check) if line.what == what)
+
+
 def _meaning(check: Check, what: str) -> str:
-    return next(line.meaning for line in findings(check) if line.what == what)
+    return _line(check, what).meaning
 
 
 def test_corrected_poses_are_those_of_the_cameras():

@@ -207,6 +207,9 @@ def test_input_that_cannot_be_used_ends_with_one_sentence(bench: Path):
     (bench / "left_depth.npy").unlink()
     (bench / "out").mkdir()
     (bench / "out" / "action.json").write_text("{}")
+    (bench / "out" / "check.json").write_text("{}")
+    assert command(bench, "--check").returncode == 2
+    assert [path.name for path in (bench / "out").iterdir()] == ["action.json"]
     done = command(bench, "--shape_matching")
     # What an earlier frame was answered is no answer to this one.
     assert not list((bench / "out").iterdir())
@@ -336,6 +339,26 @@ def test_missing_depths_are_unseen_and_no_error():
     seen = decide({"front": Frame(frames["front"].color, depth)}, front, ShapeMatching())
     whole = decide(frames, front, ShapeMatching())
     assert 500 < (whole.observation.valid & ~seen.observation.valid).sum() < 12000
+
+
+def test_nobody_stops_where_little_is_seen():
+    front = Calibration(TRUE.cameras[:1], TRUE.grid)
+    color, depth = (getattr(cast(front)["front"], name).copy() for name in ("color", "depth"))
+    assert decide({"front": Frame(color, depth)}, front, ShapeMatching()).action.stop
+    depth[:, 200:] = 0
+    with pytest.raises(UserError, match=r"only \d+ % of what is in view is seen, too"):
+        decide({"front": Frame(color, depth)}, front, ShapeMatching())
+
+
+def test_a_near_camera_may_see_little_but_a_kit():
+    down = dataclasses.replace(
+        TRUE.cameras[0],
+        X_BC=np.array([[0.0, -1, 0, 0.5], [-1, 0, 0, 0], [0, 0, -1, 0.3], [0, 0, 0, 1]]),
+    )
+    near = Calibration((down,), TRUE.grid)
+    frames = cast(near, Block((0.24, 0.22, 0.05), (0.5, 0.0, 0.0)))
+    # The kit hides some of the table.
+    assert decide(frames, near, ShapeMatching()).seen > 0.8
 
 
 def turned(camera: str, X: np.ndarray) -> Calibration:

@@ -21,7 +21,11 @@ from kitting_drake.bench.calibration import (
     write_calibration,
 )
 from kitting_drake.bench.kit_block import Block
-from kitting_drake.bench.outside_demonstrations import convert, find_demonstrations
+from kitting_drake.bench.outside_demonstrations import (
+    check_replaceable,
+    convert,
+    find_demonstrations,
+)
 from kitting_drake.common.errors import UserError
 from kitting_drake.policies.demonstrations import Demonstrations, read_demonstrations
 from kitting_drake.policies.learning import Learning
@@ -109,6 +113,20 @@ def test_the_file_holds_what_decide_sees_and_what_was_done(
             assert (step.pick, step.place) == (pose(POSES["pick"]), pose(POSES["place"]))
     assert [step.object for step in items["demo1"].steps] == ["red", "object"]
     assert [step.category for step in items["demo1"].steps] == ["wrench", ""]
+
+
+def test_only_demonstrations_of_the_same_bench_are_replaced(
+    folder: Path, command: Callable[..., int]
+):
+    path = folder.parent / "mine.h5"
+    path.write_text("before")
+    with pytest.raises(UserError, match=r"mine\.h5 exists, and is no file of demonstrations"):
+        command("--output", path)
+    assert path.read_text() == "before"
+    path.unlink()
+    assert command("--output", path) == command("--output", path) == 0
+    with pytest.raises(UserError, match="holds demonstrations of my bench: delete it"):
+        check_replaceable(path, folder.parent / "another bench")
 
 
 def test_train_takes_the_file(folder: Path, command, monkeypatch: pytest.MonkeyPatch):
@@ -210,6 +228,7 @@ def only_stop(folder: Path) -> None:
         (action("demo1/step9", {"stop": "yes"}), "stop must be true or false, not 'yes'"),
         (action("demo1/step9", {**POSES, "press": True}), "presses down"),
         (action("demo1/step9", {**POSES, "object": 3}), "object must be a text, not 3"),
+        (action("demo1/step9", {**POSES, "object": "a\0b"}), "must be of printable characters"),
         (action("demo1/step9", {"stop": True}), "demo1/step9 says that nothing is left to do, but"),
         (action("demo1/step9", {**POSES, "calibration": "0"}), "clicked by another calibration"),
         (small, "demo2/step1: .* but camera front was calibrated at 640x480"),

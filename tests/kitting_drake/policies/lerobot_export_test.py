@@ -226,9 +226,14 @@ def test_what_is_exported_is_left_alone_and_nothing_else_written_over(
     before = folder.stat()
     export_lerobot(source, folder, "stack them")
     assert folder.stat() == before
-    write_demonstrations(source, ORIGIN, EPISODES[:2])
-    with pytest.raises(UserError, match=r"lerobot exists, and is not of .*demonstrations\.h5"):
-        export_lerobot(source, folder, "stack them")
+    # Fewer demonstrations, and as many that tell of other actions.
+    step = EPISODES[-1].steps[0]
+    other = dataclasses.replace(step, pick=dataclasses.replace(step.pick, x=step.pick.x + 0.001))
+    changed = dataclasses.replace(EPISODES[-1], steps=[other, *EPISODES[-1].steps[1:]])
+    for episodes in (EPISODES[:2], [*EPISODES[:-1], changed]):
+        write_demonstrations(source, ORIGIN, episodes)
+        with pytest.raises(UserError, match=r"lerobot exists, and is not of .*demonstrations\.h5"):
+            export_lerobot(source, folder, "stack them")
     with pytest.raises(UserError, match="lerobot exists, without the new demonstrations"):
         require_export(folder)
     require_export(tmp_path / "other")

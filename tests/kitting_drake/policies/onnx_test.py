@@ -12,6 +12,7 @@ import torch
 
 from kitting_drake.common.errors import UserError
 from kitting_drake.common.paths import MODELS
+from kitting_drake.policies import onnx_export
 from kitting_drake.policies.config import NetworkConfig
 from kitting_drake.policies.correlation import search as torch_search
 from kitting_drake.policies.learned_policy import LearnedPolicy
@@ -94,6 +95,22 @@ def test_the_search_in_numpy_is_that_in_torch():
     assert window.corner == candidates[0].corner
     assert window.first_bin == candidates[0].first_bin
     np.testing.assert_allclose(window.scores, candidates[0].scores.numpy(), atol=2e-3)
+
+
+def test_an_export_that_is_stopped_is_no_policy(
+    exported: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    folder = tmp_path / "onnx"
+    shutil.copytree(exported, folder)
+
+    def stop(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(onnx_export, "_graph", stop)
+    with pytest.raises(KeyboardInterrupt):
+        export_onnx(GENERALIST, folder)
+    with pytest.raises(UserError):
+        OnnxPolicy(folder)
 
 
 def test_it_runs_without_torch_and_drake(exported: Path):

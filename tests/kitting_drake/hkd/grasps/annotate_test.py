@@ -9,7 +9,9 @@ from kitting_drake.common.errors import UserError
 from kitting_drake.common.paths import MODELS
 from kitting_drake.hkd.grasps.annotate import measure_grasp, save_grasp, with_grasp
 from kitting_drake.hkd.tools.tool import Tool, load_tool
+from kitting_drake.tasks.kitting.config import Kitting
 from systems.grasp import Grasp
+from systems.signals import PixelGrid
 
 CATALOGUE = (MODELS / "tools" / "catalogue.yaml").read_text()
 GRASP = Grasp(x=-0.0205, y=0.0, theta=math.radians(0.5), width=0.02, surface_height=0.02)
@@ -87,3 +89,20 @@ def test_saving_a_tool_of_ones_own_changes_its_record(models: Path, tmp_path: Pa
     save_grasp(tool, GRASP)
     assert load_tool(str(own)).grasp.x == pytest.approx(GRASP.x)
     assert load_tool(str(own)).mass == tool.mass
+
+
+def test_what_the_jaws_cannot_hold_is_not_saved(models: Path, tmp_path: Path):
+    own = tmp_path / "flat_screwdriver"
+    shutil.copytree(models / "tools" / "flat_screwdriver", own)
+    tool = load_tool(str(own))
+    along = measure_grasp(tool, 0.0, 0.0, math.pi / 2)
+    assert along is not None
+    with pytest.raises(UserError, match="mm wide there, and the jaws take 65 mm"):
+        save_grasp(tool, along)
+    assert load_tool(str(own)).grasp == tool.grasp
+    # Where the record was changed by hand, the scene is refused.
+    record = yaml.safe_load((own / "tool.yaml").read_text())
+    record["grasp"]["width"] = along.width
+    (own / "tool.yaml").write_text(yaml.safe_dump(record))
+    with pytest.raises(UserError, match=r"wide where it is held, .* save another grasp by"):
+        Kitting(tools=[str(own)]).make_scene(grid=PixelGrid(), seed=0, base=tmp_path)
