@@ -112,7 +112,7 @@ def make_solid(vertices: Array, faces: Faces) -> tuple[Manifold, list[str]]:
     components = trimesh.graph.connected_components(
         trimesh.graph.face_adjacency(faces), nodes=np.arange(len(faces)), min_len=1
     )
-    outward, inward, repaired = [], [], 0
+    outward, inward, mended, repaired = [], [], [], 0
     if len(components) <= _MOST_COMPONENTS:
         for component in sorted(components, key=len, reverse=True):
             sound = _as_manifold(vertices, faces[component])
@@ -120,12 +120,13 @@ def make_solid(vertices: Array, faces: Faces) -> tuple[Manifold, list[str]]:
                 repaired += 1
                 sound = _repaired(vertices, faces[component])
                 if sound is not None:
-                    outward.append(sound)
+                    mended.append(sound)
             elif _volume(vertices[faces[component]]) > 0:
                 outward.append(sound)
             else:
                 inward.append(sound)
     solids, hollows = _told_apart(outward, inward)
+    solids += mended
     solid = Manifold.batch_boolean(solids, OpType.Add) if solids else Manifold()
     if repaired:
         notes.append(f"repaired {repaired} of {len(components)} surfaces")
