@@ -30,6 +30,8 @@ ALL = 1 - 1e-9
 
 _FAR = 0.5
 """Beyond this an object is no nearer to one goal than to another, in metres."""
+_NEAR = 0.05
+"""Beyond this an object is not asked whether it fills a goal, when objects are assigned, in metres."""
 _FREE_ANGLES = 24
 """In how many headings an object of any heading is compared with its goal."""
 
@@ -242,8 +244,10 @@ def evaluate_placements(
 ) -> list[Placement]:
     """Assigns objects to the goals that they may fill, and measures how far from them they are.
 
-    The assignment is the one of least displacement in all (Hungarian method), the displacement of
-    an object being the mean distance of the corners of its bounding box from where they belong.
+    The assignment is the one that fills most goals, and of those the one of least displacement in
+    all (Hungarian method), the displacement of an object being the mean distance of the corners of
+    its bounding box from where they belong. By displacement alone a row of objects in place would
+    be assigned anew, each to its neighbour's goal, where one more lies along the row.
 
     Args:
         objects: n of them.
@@ -258,7 +262,7 @@ def evaluate_placements(
         whose pose is no number, as after a simulation that diverged.
     """
     placements = [Placement() for _ in objects]
-    for index, goal_index, pose_index in _assign(objects, goals, poses):
+    for index, goal_index, pose_index in _assign(objects, goals, success, poses):
         goal = goals[goal_index]
         placements[index] = _measure(
             objects[index], goal, goal_index, pose_index, poses[index], success
@@ -277,7 +281,10 @@ def evaluate_placements(
 
 
 def _assign(
-    objects: Sequence[PlacedObject], goals: Sequence[Goal], poses: Sequence[RigidTransform]
+    objects: Sequence[PlacedObject],
+    goals: Sequence[Goal],
+    success: SuccessPredicate,
+    poses: Sequence[RigidTransform],
 ) -> list[tuple[int, int, int]]:
     """(object, goal, pose) of each pair."""
     # Pairs that are not allowed cost more than all that are.
@@ -292,8 +299,13 @@ def _assign(
                 displacement(objects[row], X_WGoal, poses[row], any_heading=goal.any_heading)
                 for X_WGoal in goal.poses
             ]
-            nearest[row, column] = int(np.argmin(distances))
-            cost[row, column] = min(distances[nearest[row, column]], _FAR)
+            pose_index = int(np.argmin(distances))
+            nearest[row, column] = pose_index
+            cost[row, column] = min(distances[pose_index], _FAR)
+            if len(goal.objects) > 1 and distances[pose_index] < _NEAR:
+                measured = _measure(objects[row], goal, column, pose_index, poses[row], success)
+                # A goal that is filled outweighs all displacements.
+                cost[row, column] -= _FAR * len(objects) * measured.share
     return [
         (int(row), int(column), int(nearest[row, column]))
         for row, column in zip(*linear_sum_assignment(cost), strict=True)
