@@ -31,7 +31,7 @@ ALL = 1 - 1e-9
 _FAR = 0.5
 """Beyond this an object is no nearer to one goal than to another, in metres."""
 _NEAR = 0.05
-"""Beyond this an object is not asked whether it fills a goal, when objects are assigned, in metres."""
+"""Objects beyond this do not fill a goal when they are assigned, in metres."""
 _FREE_ANGLES = 24
 """In how many headings an object of any heading is compared with its goal."""
 
