@@ -135,7 +135,10 @@ def evaluate(
     path = folder / "episodes.jsonl"
     claim_folder(folder, "scenario.json", _identity(chosen), of="scenario, policy or version")
     clock = _WallClock(folder / "wall_seconds.json")
-    done = {episode["seed"]: episode for episode in read_lines(path)}
+    earlier = read_lines(path)
+    if not all(isinstance(item, dict) and {"seed", "objects"} <= item.keys() for item in earlier):
+        raise UserError(f"{path} is damaged: it has a line that is no episode")
+    done = {episode["seed"]: episode for episode in earlier}
     pending = [seed for seed in seeds if seed not in done]
     queue = iter(pending)
     now = commit()

@@ -3,6 +3,7 @@
 import argparse
 import dataclasses
 import hashlib
+import re
 from pathlib import Path
 
 from rich.console import Console
@@ -38,7 +39,7 @@ def main() -> int:
 
         require_onnx()
     folder = require_folder(
-        arguments.output or Path("output") / f"{learned.scenario}-training".replace(" ", "_")
+        arguments.output or Path("output") / re.sub(r"[ /]", "_", f"{learned.scenario}-training")
     )
     run = TrainingRun(settings, learned, held_out, folder, console, arguments.start)
     with alone_in(folder):

@@ -154,7 +154,10 @@ def read_lines(path: Path) -> list[Any]:
     """
     if not path.exists():
         return []
-    content = path.read_text()
+    try:
+        content = path.read_text()
+    except ValueError as error:
+        raise UserError(f"{path} is damaged: it is not text") from error
     whole = content[: content.rfind("\n") + 1]
     if whole != content:
         write_atomically(path, whole)

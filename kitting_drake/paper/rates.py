@@ -26,12 +26,15 @@ def read_rates(folder: Path) -> dict[str, dict[str, float]]:
     path = folder / RATES
     try:
         found = json.loads(path.read_text()) if path.exists() else {}
-        return {
+        rates = {
             key: {
                 str(rate): math.inf if cost is None else float(cost) for rate, cost in costs.items()
             }
             for key, costs in found.items()
         }
+        if not all(rates.values()):
+            raise ValueError("a method without any rate")
+        return rates
     except (OSError, ValueError, TypeError, AttributeError) as error:
         raise UserError(f"{path} is damaged: delete it") from error
 

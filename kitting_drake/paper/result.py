@@ -15,6 +15,7 @@ from kitting_drake.paper.efficiency import EFFICIENCY
 from kitting_drake.paper.rates import RATES, read_rates
 from kitting_drake.paper.tables import paper_cells
 from kitting_drake.reporting.markdown import rate_text
+from kitting_drake.reporting.runs import check_summary
 
 
 @dataclass(frozen=True)
@@ -50,9 +51,12 @@ def read_results(folder: Path) -> list[Result]:
             raise UserError(f"{path} is of no cell of the paper's tables: delete it")
         try:
             summary = json.loads(path.read_text())
+            check_summary(summary, path)
             departure = cell.departure(summary, rates)
-            _ = summary["outcomes"]
-        except (OSError, ValueError, KeyError, TypeError) as error:
+            kinds = (type(summary["outcomes"]), type(summary["versions"]))
+            if kinds != (list, dict):
+                raise TypeError("outcomes must be a list, and versions a mapping")
+        except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
             raise UserError(f"{path} is no summary of evaluate: {error!r}") from error
         if departure is not None:
             raise UserError(f"{path} is not that of its cell: {departure}")

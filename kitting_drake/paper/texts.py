@@ -4,7 +4,8 @@ INTRODUCTION = """\
 ## As in the paper
 
 Every method of a task learns from the same demonstrations, with networks of preset `{preset}`,
-for the same number of steps, and is tested on the same seeds, which nobody had looked at before.
+for the same number of steps, and is tested on the same seeds. Nobody had looked at them before,
+but for what is told below of the learning rates of the baselines and of the steps of palletizing.
 As in the paper,
 
 - actions are quantized to pixels and N orientations, and a blocked insertion is not searched;

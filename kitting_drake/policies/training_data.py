@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
@@ -40,6 +40,11 @@ Item = TypeVar("Item")
 
 _TABLE = ("task", "heightmap")
 """The fields of a scenario that determine, with the seed, what stands where."""
+_NO_SCENE = (
+    *("tries", "random_order"),
+    *("success_threshold", "position_threshold", "angle_threshold_deg"),
+)
+"""Fields of a task that change nothing about that."""
 
 
 @dataclass(frozen=True)
@@ -142,8 +147,16 @@ class TrainingData:
     def shares_scenes(self, other: TrainingData) -> int | None:
         """A seed of which both hold the same scene; None if there is none."""
         shared = set(self.seeds) & set(other.seeds)
-        same = all(self.origin.get(key) == other.origin.get(key) for key in _TABLE)
+        same = all(_alike(self.origin.get(key), other.origin.get(key)) for key in _TABLE)
         return min(shared) if shared and same else None
+
+
+def _alike(one: Any, other: Any) -> bool:
+    """Whether scenes may be the same by these fields; older files lack some, which says nothing."""
+    if not isinstance(one, Mapping) or not isinstance(other, Mapping):
+        return bool(one == other)
+    both = (one.keys() & other.keys()) - {*_NO_SCENE}
+    return all(one[key] == other[key] for key in both)
 
 
 def evenly_chosen(items: list[Item], most: int | None) -> list[Item]:

@@ -63,25 +63,16 @@ press, nor search in a spiral, and took what is thinner than 3 mm for not grippe
 _MOST_SHOWN = 4
 """So many differences of one run are listed; more are counted."""
 
-_KEYS = (
-    "task",
-    "policy",
-    "policy_details",
-    "resolved_scenario",
-    "success_description",
-    "seeds",
-    "episodes",
-    "success_rate",
-    "ci95",
-    "strict_success_rate",
-    "strict_ci95",
-    *ERRORS,
-    "action_errors",
-    "causes",
-    "ambiguous",
-    "categories",
-    "wall_seconds",
-)
+_TYPES: dict[str, type | tuple[type, ...]] = {
+    **dict.fromkeys(("task", "policy", "success_description"), str),
+    **dict.fromkeys(("policy_details", "resolved_scenario", *ERRORS, "action_errors"), dict),
+    **dict.fromkeys(("causes", "ambiguous", "categories"), dict),
+    **dict.fromkeys(("seeds", "ci95", "strict_ci95"), list),
+    "episodes": int,
+    "wall_seconds": (int, float),
+}
+"""What the fields of a summary hold."""
+_SHARES = ("success_rate", "strict_success_rate")
 
 
 @dataclass(frozen=True)
@@ -218,15 +209,39 @@ def _read_summary(path: Path) -> dict[str, Any]:
         summary = json.loads(path.read_text())
     except (OSError, ValueError) as error:
         raise UserError(f"{path} cannot be read: {error}") from error
-    for key in _KEYS:
-        if not isinstance(summary, dict) or key not in summary:
-            raise UserError(f"{path} lacks '{key}': it must be a summary.json of evaluate")
-    if not summary["seeds"]:
-        raise UserError(f"{path} has no seeds: it must be a summary.json of evaluate")
-    if not isinstance(summary["resolved_scenario"].get("task"), dict):
-        raise UserError(f"{path}: resolved_scenario has no task")
+    check_summary(summary, path)
     _check_details(summary["policy_details"], f"{path}: policy_details")
     return summary
+
+
+def check_summary(summary: Any, path: Path) -> None:
+    """Checks that a file's content has the fields of `evaluate`, and that each is of its kind.
+
+    Raises:
+        UserError: it has not; names the file and the field.
+    """
+    must = "it must be a summary.json of evaluate"
+    for key in (*_TYPES, *_SHARES):
+        if not isinstance(summary, dict) or key not in summary:
+            raise UserError(f"{path} lacks '{key}': {must}")
+    wrong = [key for key, kind in _TYPES.items() if not isinstance(summary[key], kind)]
+    if not wrong:
+        wrong = [key for key in _SHARES if not _are_shares([summary[key]], 1)]
+        wrong += [key for key in ("ci95", "strict_ci95") if not _are_shares(summary[key], 2)]
+    if wrong:
+        raise UserError(f"{path}: '{wrong[0]}' is {summary[wrong[0]]!r}: {must}")
+    seeds = summary["seeds"]
+    if not seeds or not all(isinstance(seed, int) for seed in seeds):
+        raise UserError(f"{path} has no seeds, or some that are no whole numbers: {must}")
+    task = summary["resolved_scenario"].get("task")
+    if not isinstance(task, dict) or not isinstance(task.get("_tag"), str):
+        raise UserError(f"{path}: resolved_scenario has no task")
+
+
+def _are_shares(values: list[Any], count: int) -> bool:
+    return len(values) == count and all(
+        isinstance(value, int | float) and 0 <= value <= 1 for value in values
+    )
 
 
 def _check_details(details: Any, where: str) -> None:

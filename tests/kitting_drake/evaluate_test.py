@@ -63,6 +63,15 @@ def test_goes_on_where_it_was_stopped(tmp_path: Path):
     assert [json.loads(line)["seed"] for line in path.read_text().splitlines()] == [0, 1, 2, 3]
 
 
+@pytest.mark.parametrize("line", [b"{}", b"[1]", b'{"seed": 5}', b"\xff\xfe", b"{"])
+def test_a_damaged_record_is_told_in_a_sentence(line: bytes, tmp_path: Path):
+    evaluate(CHOSEN, [0], tmp_path)
+    path = tmp_path / "episodes.jsonl"
+    path.write_bytes(path.read_bytes() + line + b"\n")
+    with pytest.raises(UserError, match=r"episodes\.jsonl is damaged"):
+        evaluate(CHOSEN, [0, 1], tmp_path)
+
+
 def test_episodes_of_two_commits_are_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     for commit, seeds in (("first", [0]), ("second", [0, 1]), ("second", [0, 1])):
         monkeypatch.setattr(evaluation, "commit", lambda commit=commit: commit)

@@ -1,5 +1,6 @@
 import itertools
 import json
+import math
 import subprocess
 from collections.abc import Callable
 from dataclasses import replace
@@ -221,12 +222,29 @@ def test_without_files_there_is_a_page(tmp_path: Path):
 def test_files_that_cannot_be_used_are_named(folder: Path):
     ours = folder / "ours.json"
     for details, words in (
-        ("so2", "policy_details must be a mapping"),
+        ("so2", "'policy_details' is 'so2': it must be"),
         ({"method": "so2", "orientations": 36}, "policy_details.demonstrations must be a whole"),
     ):
         spoil(ours, policy_details=details)
         with pytest.raises(UserError, match=rf"ours\.json: {words}"):
             read_runs(folder)
+    spoil(ours, policy_details={"method": "oracle"})
+    for field, value in (
+        ("resolved_scenario", None),
+        ("resolved_scenario", {"task": {}}),
+        ("seeds", 3),
+        ("seeds", ["a"]),
+        ("ci95", None),
+        ("success_rate", math.nan),
+        ("success_rate", "all"),
+        ("causes", None),
+        ("categories", []),
+    ):
+        before = ours.read_text()
+        spoil(ours, **{field: value})
+        with pytest.raises(UserError, match=rf"ours\.json.*({field}|seeds|must be a summary)"):
+            read_runs(folder)
+        ours.write_text(before)
     ours.write_text("{}")
     with pytest.raises(UserError, match=r"ours\.json lacks 'task': it must be a summary\.json"):
         read_runs(folder)

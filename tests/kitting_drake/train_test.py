@@ -39,7 +39,9 @@ from systems.signals import Observation, PickPlaceAction, PixelGrid, PlanarPose
 ROOT = Path(__file__).resolve().parents[2]
 GRID = PixelGrid(rows=33, cols=49)
 LEARNING = Learning(later_picks_possible=True, curvature=True)
-ORIGIN = Origin("mine", {"time_limit": 1.0}, GRID, 10, {}, LEARNING)
+ORIGIN = Origin(
+    "mine", {"time_limit": 1.0, "task": {"_tag": "!Kitting", "tries": 1}}, GRID, 10, {}, LEARNING
+)
 ONE_THREAD = os.environ | {"OMP_NUM_THREADS": "1"}
 LOSSES = {"pick_position", "pick_angle", "place"}
 
@@ -355,7 +357,7 @@ def test_a_stopped_run_resumes_as_if_it_had_not_been_stopped(
 
 
 def test_demonstrations_of_another_task_may_have_the_same_seeds(demos: Path, tmp_path: Path):
-    origin = dataclasses.replace(ORIGIN, scenario={"task": {"spacing": 0.02}})
+    origin = dataclasses.replace(ORIGIN, scenario={"task": {"_tag": "!StackBlockPyramid"}})
     validation = write(tmp_path / "validation.h5", range(10, 12), origin)
     train(demos, tmp_path / "run", "--validation", validation, "--steps", 1)
     card = read_weights_file(tmp_path / "run" / "policy.safetensors").card
@@ -420,10 +422,14 @@ def test_refuses(
 
 VALIDATIONS = {
     "overlapping": (range(13, 15), ORIGIN, "share the seed 13: validation needs other ones"),
-    # A time limit does not change what stands where.
+    # Neither a time limit nor the number of tries changes what stands where, nor does a field that
+    # an older file lacks.
     "the same tables": (
         range(13, 15),
-        dataclasses.replace(ORIGIN, scenario={"time_limit": 2.0}),
+        dataclasses.replace(
+            ORIGIN,
+            scenario={"time_limit": 2.0, "task": {"_tag": "!Kitting", "tries": 2, "new": 0}},
+        ),
         "share the seed 13: validation needs other ones",
     ),
     "another grid": (

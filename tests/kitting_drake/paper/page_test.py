@@ -160,6 +160,7 @@ def test_the_learning_rates_that_were_tried_are_told(folder: Path):
 
 def test_a_file_that_is_not_what_its_name_says_is_refused(folder: Path):
     path = folder / "unseen_so2_180_100.json"
+    good = json.loads(path.read_text())
     summary = json.loads(path.read_text())
     summary["resolved_scenario"]["cameras"] = {}
     path.write_text(json.dumps(summary))
@@ -169,16 +170,21 @@ def test_a_file_that_is_not_what_its_name_says_is_refused(folder: Path):
     with pytest.raises(UserError, match=r"mine\.json is of no cell"):
         read_results(folder)
     (folder / "mine.json").unlink()
-    (folder / "learning_rates.json").write_text("[]")
-    with pytest.raises(UserError, match=r"learning_rates\.json is damaged"):
-        read_results(folder)
+    for content in ("[]", '{"unseen_equivariant_transporter": {}}'):
+        (folder / "learning_rates.json").write_text(content)
+        with pytest.raises(UserError, match=r"learning_rates\.json is damaged"):
+            read_results(folder)
     rates = {"unseen_equivariant_transporter": {"0.001": 4.0, "0.0003": 2.5}}
     (folder / "learning_rates.json").write_text(json.dumps(rates))
     with pytest.raises(UserError, match=r"learning_rate is 0\.001, not 0\.0003"):
         read_results(folder)
     (folder / "learning_rates.json").unlink()
+    for field in ("outcomes", "versions"):
+        path.write_text(json.dumps({**good, field: 3}))
+        with pytest.raises(UserError, match=r"is no summary of evaluate: .*must be"):
+            read_results(folder)
     path.write_text("{}")
-    with pytest.raises(UserError, match="is no summary of evaluate"):
+    with pytest.raises(UserError, match="lacks 'task': it must be a summary"):
         read_results(folder)
 
 
