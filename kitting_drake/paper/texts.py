@@ -134,7 +134,7 @@ this test; the rule was developed on the seeds 100 to 119 and not changed afterw
 failures at N = 180 after 100 demonstrations, five were looked at: in two a cube was placed 15
 degrees off; in three a cube was pushed or toppled after it had been placed within a millimetre.
 
-Before commit 63a72873, cubes were assigned to goals by least displacement alone, and now and then
+Before commit c8787967, cubes were assigned to goals by least displacement alone, and now and then
 one that was in place was taken for its neighbour's. Now as many goals are filled as can be. Where
 the episodes were at hand, those that this could concern, by the errors that they record, were run
 again: the cells that have this commit, under "Every cell". They gained at most a point: one
