@@ -31,7 +31,7 @@ ALL = 1 - 1e-9
 _FAR = 0.5
 """Beyond this an object is no nearer to one goal than to another, in metres."""
 _NEAR = 0.05
-"""Objects beyond this do not fill a goal when they are assigned, in metres."""
+"""When objects are assigned, one that is farther from a goal is not held to fill it, in metres."""
 _FREE_ANGLES = 24
 """In how many headings an object of any heading is compared with its goal."""
 
@@ -244,10 +244,10 @@ def evaluate_placements(
 ) -> list[Placement]:
     """Assigns objects to the goals that they may fill, and measures how far from them they are.
 
-    The assignment is the one that fills most goals, and of those the one of least displacement in
-    all (Hungarian method), the displacement of an object being the mean distance of the corners of
-    its bounding box from where they belong. By displacement alone a row of objects in place would
-    be assigned anew, each to its neighbour's goal, where one more lies along the row.
+    The assignment is the one that fills most goals, by objects within 5 cm of them, and of those
+    the one of least displacement in all (Hungarian method): the mean distance of the corners of an
+    object's bounding box from where they belong. By displacement alone each object of a row in
+    place may be assigned to its neighbour's goal, where one more lies along the row.
 
     Args:
         objects: n of them.

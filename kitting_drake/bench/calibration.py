@@ -37,7 +37,7 @@ _UNDISTORTED = 1e-4
 _HEIGHT = PixelGrid().z_max - PixelGrid().z_min
 """Points higher above the table than this are left out, unless the calibration says more."""
 _MOST_PIXELS = 10_000_000
-"""Of the workspace."""
+"""A workspace that has more is a mistake in the unit of its resolution."""
 _DEPTH_FIELDS = ("depth_scale", "min_depth", "max_depth")
 _BENCH_FIELDS = ("table_height", "workspace")
 _GRID_FIELDS = ("x_min", "y_min", "resolution", "rows", "cols", "max_height")

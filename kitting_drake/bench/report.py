@@ -15,9 +15,9 @@ from kitting_drake.bench.meaning import BAD, GOOD, findings, offset, scales
 from kitting_drake.common.files import write_atomically, write_json
 
 CHECK_FILES = ("check.json", "corrected.yaml", "check.png")
-"""What `save_check` writes."""
+"""The files that `save_check` writes."""
 _WELL_SEEN = 0.9
-"""Of what is in view: less is told."""
+"""Where less than this share of what is in view is seen, it is told."""
 
 
 def print_decision(console: Console, record: dict[str, Any]) -> None:

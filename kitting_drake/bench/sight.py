@@ -24,7 +24,7 @@ _NEAREST, _FARTHEST = 0.8, 1.25
 """Depths, as shares of that of the table, that may be something on the table, or a pose that is
 off: beyond these the unit is wrong, or the pose."""
 _TALL = 0.1
-"""What stands on the table may be so high, in metres, wherever a camera looks."""
+"""Depths may be those of what stands on the table, up to this height in metres."""
 _WIDEST = 0.15
 """Half of these shares lie within a range as narrow as this, or what is seen is no table."""
 _STEP = 4

@@ -137,9 +137,9 @@ degrees off; in three a cube was pushed or toppled after it had been placed with
 Before commit c8787967, cubes were assigned to goals by least displacement alone, and now and then
 one that was in place was taken for its neighbour's. Now as many goals are filled as can be. Where
 the episodes were at hand, those that this could concern, by the errors that they record, were run
-again: the cells that have this commit, under "Every cell". They gained at most a point: one
-demonstration of the Equivariant Transporter had come to 61.7. The other cells of the pyramid are
-scored as before, and may be as much too low.
+again (the script that chose them is not kept): the cells that have this commit, under "Every cell".
+They gained at most a point: the Equivariant Transporter had come to 61.7 after one demonstration.
+The other cells of the pyramid are scored as before, and may be too low by about as much.
 """
 
 FRESH = """\

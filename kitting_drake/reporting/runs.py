@@ -71,8 +71,9 @@ _TYPES: dict[str, type | tuple[type, ...]] = {
     "episodes": int,
     "wall_seconds": (int, float),
 }
-"""What the fields of a summary hold."""
+"""The types of a summary's fields."""
 _SHARES = ("success_rate", "strict_success_rate")
+"""The fields that are numbers from 0 to 1."""
 
 
 @dataclass(frozen=True)

@@ -7,6 +7,7 @@ convex decomposition for collision (`convex_decomposition`), and laid as it come
 the tool's folder appears atomically. Solids are handled in mm and written in metres.
 """
 
+import contextlib
 import hashlib
 import math
 import multiprocessing
@@ -59,7 +60,7 @@ from kitting_drake.hkd.tools.tool import check_category, load_tool, tool_names, 
 TIME_LIMIT = 55.0
 """Seconds after which the geometry is given up."""
 _MAKING = ".making-"
-"""What the names of folders begin with in which tools are made."""
+"""The names of the folders in which tools are made begin with this."""
 _MOST_MEMORY = 12 * 2**30
 # A tool is laid anew where it comes to rest by more than this, in degrees, at most so often.
 _SAME_POSE_DEG, _LAYINGS = 2.0, 3
@@ -152,8 +153,10 @@ def import_tool(request: ImportRequest, time_limit: float | None = TIME_LIMIT) -
 def _remove_abandoned(folder: Path) -> None:
     """Removes what imports that were killed have left."""
     for path in folder.glob(f"{_MAKING}*"):
-        if time.time() - path.stat().st_mtime > 10 * TIME_LIMIT:
-            shutil.rmtree(path, ignore_errors=True)
+        # Another import may have removed it by now.
+        with contextlib.suppress(FileNotFoundError):
+            if time.time() - path.stat().st_mtime > 10 * TIME_LIMIT:
+                shutil.rmtree(path, ignore_errors=True)
 
 
 def _check_height(request: ImportRequest) -> None:

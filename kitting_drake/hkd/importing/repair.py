@@ -176,7 +176,7 @@ def _told_apart(
 
 
 def _volume(triangles: Array) -> float:
-    """What triangles (n, 3, 3) enclose, negative where their normals point into it."""
+    """The volume inside triangles (n, 3, 3), negative where their normals point inward."""
     a, b, c = np.moveaxis(triangles - triangles.mean(axis=(0, 1)), 1, 0)
     return float((a * np.cross(b, c)).sum() / 6)
 
