@@ -44,7 +44,7 @@ class Task:
     more_steps: int = 0
     """Steps beyond these where more is learned from than the taken actions, moved rigidly."""
     demonstrations: int = 100
-    """How many are collected, from seed 10000; those to validate by from seed 20000."""
+    """The most that are learned from, from seed 10000; those to validate by begin with 20000."""
     validation: int = 24
     rates_from: str = "unseen"
     """The task on which the learning rates of the baselines are chosen."""
@@ -262,7 +262,7 @@ class Cell:
         found = {"angle_only": False, **summary["policy_details"]}
         details = self._details(self.policy)
         key = rates_key(reference(self.policy))
-        if rates and self.policy.method != "so2" and key in rates:
+        if rates and "learning_rate" not in details and key in rates:
             details["learning_rate"] = float(best_rate(rates[key]))
         for key, wanted in details.items():
             if found.get(key) != wanted:
@@ -286,8 +286,10 @@ class Cell:
             "fit_outlines": self.fit_outlines,
             "recover": self.recover,
         }
-        if training.method == "so2":
-            wanted["learning_rate"] = training.learning_rate or LEARNING_RATES[0]
+        if training.learning_rate is not None:
+            wanted["learning_rate"] = training.learning_rate
+        elif training.method == "so2":
+            wanted["learning_rate"] = LEARNING_RATES[0]
         if learned_at.table == "6":
             # Elsewhere the task itself says what of these is possible.
             wanted |= {"taken_only": training.taken_only, "rigid": training.rigid}

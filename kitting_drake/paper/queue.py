@@ -63,6 +63,8 @@ class Queue:
     trainings: int = 1
     """Trainings side by side."""
     _running: list[subprocess.Popen[str]] = field(default_factory=list, init=False)
+    _wanted: dict[str, int] = field(default_factory=dict, init=False)
+    """The most demonstrations of each task that a training of this run learns from."""
     _collected: set[Path] = field(default_factory=set, init=False)
     """The folders of demonstrations that were looked at."""
     _locks: dict[Path, threading.Lock] = field(default_factory=dict, init=False)
@@ -90,6 +92,9 @@ class Queue:
                 if isinstance(cell.policy, Training)
                 for training in (*self._before(cell.policy), cell.policy)
             )
+            for training in needed:
+                most = max(training.demonstrations, self._wanted.get(training.task, 0))
+                self._wanted[training.task] = most
             # What is trained already need not wait behind what is not.
             trained: dict[Any, Future[Path]] = {
                 training: trainer.submit(self.train, training)
@@ -143,7 +148,9 @@ class Queue:
             wait([trained[cell.policy] for cell in pending], return_when=FIRST_COMPLETED)
 
     def collect(self, task: Task, *, validation: bool) -> Path:
-        """The file of a task's demonstrations, or of those to validate by."""
+        """The file of a task's demonstrations, as many as this run needs, or of those to validate
+        by."""
+        count = task.validation if validation else self._wanted.get(task.name, task.demonstrations)
         folder = self.folder / "demonstrations" / f"{task.name}{'_validation' * validation}"
         with self._only_one_makes(folder):
             if folder not in self._collected:
@@ -153,7 +160,7 @@ class Queue:
                     SCENARIOS / task.file,
                     *("--scenario_name", task.demonstrated),
                     *("--scenario_text", "{policy: !Oracle {}}"),
-                    *("--demos", task.validation if validation else task.demonstrations),
+                    *("--demos", count),
                     *("--seed", _FIRST_VALIDATION_SEED if validation else _FIRST_SEED),
                     *("--workers", 1),
                     folder=folder,

@@ -40,6 +40,8 @@ class Pretending(Queue):
         self.calls: list[str] = []
         self.broken: set[str] = set()
         self.why = "it broke"
+        self.collected: dict[str, int] = {}
+        """How many demonstrations were asked for, by folder."""
         self.slow = ""
         self.together: threading.Barrier | None = None
         """Where trainings wait for each other."""
@@ -55,6 +57,7 @@ class Pretending(Queue):
         words = list(map(str, arguments))
         flags = dict(itertools.pairwise(words))
         if verb == "collect":
+            self.collected[folder.name] = int(flags["--demos"])
             (folder / "demonstrations.h5").touch()
         elif verb == "train":
             if self.together:
@@ -179,6 +182,18 @@ def test_tasks_that_the_first_rate_leaves_short_have_one_of_their_own(queue: Pre
     }
 
 
+def test_a_baseline_may_have_a_rate_of_its_own(queue: Pretending):
+    rates = {"unseen_transporter": {f"{rate:g}": rate for rate in LEARNING_RATES}}
+    (queue.results / RATES).write_text(json.dumps(rates))
+    steadier = dataclasses.replace(THEIRS.policy, learning_rate=LEARNING_RATES[0])
+    cell = dataclasses.replace(THEIRS, policy=steadier)
+    assert queue.run([cell]) == {}
+    assert f"train {steadier.name}_lr{LEARNING_RATES[0]:g}" in queue.calls
+    summary = json.loads((queue.results / f"{cell.name}.json").read_text())
+    assert cell.departure(summary, rates) is None
+    assert THEIRS.departure(summary, rates).startswith("learning_rate is 0.001, not 0.0003")
+
+
 def test_what_has_no_n_is_trained_once(queue: Pretending):
     """Of the Equivariant Transporter everything but the angle network."""
     costs = {f"{rate:g}": rate for rate in LEARNING_RATES}
@@ -256,6 +271,15 @@ def test_learning_rates_are_tried_side_by_side(tmp_path: Path):
     assert queue.run([THEIRS]) == {}
     tried = {f"train {reference(THEIRS.policy).name}_lr{rate:g}" for rate in LEARNING_RATES}
     assert set(queue.calls[2:5]) == tried
+
+
+def test_a_run_collects_as_many_demonstrations_as_its_cells_need(queue: Pretending):
+    assert queue.run([OURS]) == {}
+    assert queue.collected == {"unseen": 10, "unseen_validation": TASKS["unseen"].validation}
+    more = dataclasses.replace(OURS, policy=Training("unseen", "so2", 180, 100))
+    again = Pretending(queue.folder, queue.results, Console(quiet=True))
+    assert again.run([OURS, more]) == {}
+    assert again.collected["unseen"] == 100
 
 
 def test_what_fails_keeps_nothing_else_up(queue: Pretending):
