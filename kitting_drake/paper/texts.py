@@ -13,8 +13,14 @@ As in the paper,
   a rigid motion of the whole scene;
 - an episode ends when every goal is met or its actions are spent (`end_at_success`).
 
+The first cells, ours at N = 180, were run again when episodes came to end at success: after 100
+demonstrations the unseen toolsets had come to 88.5 % strict before, instead of 89.2, and the seen
+toolset to the same.
+
 Training departs from the paper in this:
 
+- the networks are smaller (preset `{preset}`): the pick-angle network has 0.10 M parameters, at the
+  paper's size 0.84 M (figure 6(c), below);
 - a label between pixels or orientations is shared among its neighbours (one-hot in the paper);
 - the correlation at half the resolution, where the search for a place begins, has a loss of its
   own;
@@ -28,9 +34,10 @@ Training departs from the paper in this:
 
 Networks that do not depend on N are trained once, at N = 180, and tested at every N: all of ours,
 and all of the Equivariant Transporter but its pick-angle network, which is trained at each N. The
-cells `trained_at_36`, under "Paired differences", test whether this costs anything; what they
-differ by includes the variation between two trainings. Where the weights of an earlier cell had
-not been kept, they were trained again from the same seed: the column `weights` of "Every cell"
+cells `trained_at_36`, under "Paired differences", test whether this costs anything, and find no
+cost: ours comes to the same, and the Equivariant Transporter does better with shared networks, by
+5.2 points, which include the variation between two trainings. Where the weights of an earlier cell
+had not been kept, they were trained again from the same seed: the column `weights` of "Every cell"
 tells which cells share theirs.
 
 {rates}
@@ -44,11 +51,15 @@ insertion and place red in green; on the pyramid by the loss, for the pyramid an
 align box corner by the loss, for that task alone. What led to this was seen on the seeds of this
 test: the rate of figure 6 left the baselines short on the pyramid (44 % of the Equivariant
 Transporter, 7 % of the Transporter) and that of the pyramid left the Transporter short on align box
-corner (36 %; files under "Other runs"). Palletizing had not been run. There the Equivariant
-Transporter after ten demonstrations lost its pick-angle network at 0.003: the loss, a mean over a
-hundred steps, rose from 0.7 to 65 nats between steps 600 and 700, and then stayed at that of a
-network that has learned nothing, 2.9. After ten demonstrations and after one it therefore learns at
-0.001, the second best; this was decided on the losses alone.
+corner (36 %; files under "Other runs"). On align box corner the Equivariant Transporter had come to
+69, 100 and 100 % at the rate of figure 6, which is not the one that is best there.
+
+No baseline had been run on palletizing when it was given the rate of the pyramid. Later, at 0.003,
+the Equivariant Transporter lost its pick-angle network in training on ten demonstrations of
+palletizing: between steps 600 and 700 the loss of that network rose from 0.7 to 65 nats, and then
+it stayed at 2.9, as of a network that has learned nothing (the log is not kept). After ten
+demonstrations and after one it therefore learns at 0.001, the second best on the pyramid. This was
+decided on the losses of the training, before any episode was run.
 """
 
 NOT_ALL = """\
@@ -63,26 +74,30 @@ episodes alone took {hours:.0f} hours of a core.
 TEN = """\
 With ten demonstrations, trainings vary widely. Two trainings of ours from the same seed, on two
 machines, came to 82.2 % (an earlier file, under "Other runs") and to 68.5 % strict at N = 180.
-Their episodes were run by Drake 1.51 and 1.58, which explains little of it (see "Every cell"). In
-the second training the validation scenes prefer the checkpoint of step 500, at
-1.9 mm, to the last, of step 1500, at 2.1 mm. On 120 further scenes, from the
-ninety demonstrations that were not learned from, they come to 4.1 and 3.0 mm: the last is better
-by 1.0, with a standard error of 0.5. To keep the latest checkpoint within one standard error of
-the best would have kept it; for the Equivariant Transporter the same rule replaces step 1250 by
-the last, which is worse by 0.6 mm, with a standard error of 0.3. As neither rule is better, all
-methods keep the checkpoint of the least cost. (The scripts of this comparison are not
-kept.)
+Their episodes were run by Drake 1.51 and 1.58, whose physics agree (see "Every cell"); whether
+their images do was not tested. Against the Equivariant Transporter at that N the earlier training
+is level (+2.8, -3.2 to +9.0), and the later one behind (under "Paired differences"). In the second
+training the validation scenes prefer the checkpoint of step 500, at 1.9 mm, to the last, of step
+1500, at 2.1 mm. On 120 further scenes, from the ninety demonstrations that were not learned from,
+they come to 4.1 and 3.0 mm: the last is better by 1.0, with a standard error of 0.5. To keep the
+latest checkpoint within one standard error of the best would have kept it; for the Equivariant
+Transporter the same rule replaces step 1250 by the last, which is worse by 0.6 mm, with a standard
+error of 0.3. As neither rule is better, all methods keep the checkpoint of the least cost. (The
+scripts of this comparison are not kept.)
 """
 
 TRANSPORTER = """\
 The Transporter most often fails by putting a tool into the cavity of another (`causes`, in "Every
-cell"). After 100 demonstrations, on both toolsets and on the pyramid, its best checkpoint is its
-last: it may not have converged. On the seen toolset it does better after ten demonstrations than
-after a hundred, on validation scenes too: in the same number of steps it sees each of them ten
-times as often. In these tables it is trained for as many steps as the other methods, and only its
-learning rate was tuned. The cells `3_times_the_steps` train it for longer, on both toolsets and on
-align box corner; as far as they have been run, they are among the paired differences. They were
-chosen when the figures of this test were known.
+cell"). After 100 demonstrations, on both toolsets and on the pyramid, its best checkpoint was its
+last, by the cards of its weights, which are not kept: it may not have converged. On the seen
+toolset it does better after ten demonstrations than after a hundred, on validation scenes too: in
+the same number of steps it sees each of them ten times as often. In these tables it is trained for
+as many steps as the other methods, and only its learning rate was tuned.
+"""
+LONGER = """\
+To train the Transporter for three times as long, on both toolsets and on align box corner (the
+cells `3_times_the_steps`), was decided when the figures of this test were known. Of these {all}
+cells {done} {has} been run.
 """
 
 BEYOND = """\
@@ -92,8 +107,8 @@ labels from every tool of a scene instead of the one that was taken next; and cu
 reflection augmentation of the tools. On the unseen toolsets networks learn from these samples in
 {more} steps instead of {steps}. The policy itself says when it is done. One more row closes the
 loop: it corrects what an action left undone (`recover`), in at most two actions a tool, where the
-paper has one. There is no colour augmentation in any row, and so no row without it. When these
-cells were run, the failures of ours on these seeds were known.
+paper has one. No row uses colour augmentation, so that it is not ablated. When these cells were
+run, the failures of ours on these seeds were known.
 
 The rows of the unseen toolsets share their networks, but for the first and the last two. They
 were trained again for the ablation, from the same seed, as those before had not been kept; those
@@ -115,21 +130,23 @@ demonstration, of seed 10000, is of two actions, and of the ten colours of cubes
 the 46 episodes in which ours fails at N = 180, 28 begin with a cube of another colour than red, 15
 of these with one of those four; of the 50 of the Equivariant Transporter it is 24 and 17. Of the
 others more than half put the first red cube right and fail at a later one. (Counted in the
-`episodes.jsonl` of these runs, which are not kept.)
+`episodes.jsonl` of these runs, which are not kept.) The two N of ours have different trainings
+here: that at N = 36, of an earlier day, fails in 33 episodes.
 """
 
 PYRAMID = """\
-After ten and a hundred demonstrations, ours comes out below the paper on the pyramid alone. Want
-of training is a small part of it: in three times the steps, or at three times the learning rate,
-it gains six to ten points (`3_times_the_steps` and `learning_rate_0.003`, under "Paired
-differences"; chosen when the figures of this test were known). The cause of most of it is the
-hand. The fingers are 15 mm deep and the gaps between the cubes 10 mm, so along the row the hand
-pushes the neighbouring cubes away as it releases. How the hand holds a cube and in which of the
-four equivalent rotations it places it are drawn independently, and neither the crop around the
-pick nor the scene tells the place network which of them leaves room. The extensions are sub-pixel
-and sub-bin refinement and, among rotations that the networks consider equally good, the choice of
-the one in which the fingers have room to release. With the same networks, and with those of the
-longer trainings:
+After ten and a hundred demonstrations, ours comes out below the paper on the pyramid alone. Want of
+training is a small part of it: in three times the steps, or at three times the learning rate, it
+comes to six to ten points more, of which one difference in four is beyond its interval
+(`3_times_the_steps` and `learning_rate_0.003`, under "Paired differences"; chosen when the figures
+of this test were known). Most of the gap is closed by the extensions of the next table, and the
+likely cause is the hand. The fingers are 15 mm deep and the gaps between the cubes 10 mm, so along
+the row the hand pushes the neighbouring cubes away as it releases. How the hand holds a cube and in
+which of the four equivalent rotations it places it are drawn independently, and neither the crop
+around the pick nor the scene tells the place network which of them leaves room. The extensions are
+sub-pixel and sub-bin refinement and, among rotations that the networks consider equally good, the
+choice of the one in which the fingers have room to release; no cell has one of them alone. With the
+same networks, and with those of the longer trainings:
 """
 
 PYRAMID_SEEN = """\
@@ -138,12 +155,13 @@ this test; the rule was developed on the seeds 100 to 119 and not changed afterw
 failures at N = 180 after 100 demonstrations, five were looked at: in two a cube was placed 15
 degrees off; in three a cube was pushed or toppled after it had been placed within a millimetre.
 
-Before commit c8787967, cubes were assigned to goals by least displacement alone, and now and then
+Before commit f9bb6de, cubes were assigned to goals by least displacement alone, and now and then
 one that was in place was taken for its neighbour's. Now as many goals are filled as can be. Where
 the episodes were at hand, those that this could concern, by the errors that they record, were run
-again (the script that chose them is not kept): the cells that have this commit, under "Every cell".
-They gained at most a point: the Equivariant Transporter had come to 61.7 after one demonstration.
-The other cells of the pyramid are scored as before, and may be too low by about as much.
+again (the script that chose them is not kept): the cells of the pyramid that have commit c8787967,
+which has the new assignment, under "Every cell". They gained at most a point: the Equivariant
+Transporter had come to 61.7 after one demonstration. The other cells of the pyramid are scored as
+before, and may be too low by about as much.
 """
 
 FRESH = """\

@@ -30,7 +30,8 @@ _TRIES = 2
 _FRAMES = 5
 """So many images are averaged in further rows."""
 _SEEDS = range(2870, 2895)
-"""Those on which every policy meets every perturbation; nobody had looked at them before."""
+"""Those on which every policy meets every perturbation; nobody had looked at them before
+their first run."""
 _FEWEST = 12
 """At other levels than moderate at least so many of them, the first ones."""
 
