@@ -15,7 +15,13 @@ from kitting_drake.cell.cameras import require_rendering
 from kitting_drake.cell.sight import hidden_table_note
 from kitting_drake.common.command_line import count_type, run_command, seed_type
 from kitting_drake.common.errors import MachineError, UserError
-from kitting_drake.common.files import alone_in, claim_folder, require_folder, write_json
+from kitting_drake.common.files import (
+    alone_in,
+    claim_folder,
+    files_digest,
+    require_folder,
+    write_json,
+)
 from kitting_drake.common.processes import (
     ProcessCrashed,
     Workers,
@@ -25,7 +31,7 @@ from kitting_drake.common.processes import (
 from kitting_drake.common.provenance import commit, versions
 from kitting_drake.common.seeds import DEMONSTRATION_SEEDS, seeds_from
 from kitting_drake.episode import EpisodeResult, ModeChange
-from kitting_drake.episode.chosen import build_chosen, run_chosen
+from kitting_drake.episode.chosen import build_any_chosen, build_chosen, run_chosen
 from kitting_drake.policies.demonstrations import (
     Demonstration,
     Origin,
@@ -85,12 +91,17 @@ def main() -> int:
         if not chosen.scenario.cameras:
             raise UserError(f"{chosen.path}: cameras is empty: demonstrations need at least one")
         require_rendering()
-        build_chosen(chosen, seed=arguments.seed)
+        build_any_chosen(chosen, seeds_from(arguments.seed))
         exported = folder / "lerobot" if arguments.export else None
         if exported:
             require_pyarrow()
-        identity = {**chosen.described, "versions": versions()}
-        claim_folder(folder, "scenario.json", identity, of="scenario or version")
+        identity = {
+            **chosen.described,
+            "versions": versions(),
+            # Tools of a person's own may have been imported or annotated anew.
+            "task_digest": files_digest(chosen.scenario.task.input_files(chosen.base)),
+        }
+        claim_folder(folder, "scenario.json", identity, of="scenario, tools or version")
         collection = Collection(folder, _origin(chosen, arguments.seed))
         if collection.assembled >= arguments.demos:
             nothing = "nothing to collect" if exported else "nothing to do"
@@ -159,7 +170,7 @@ class Collection:
     def _find_assembled(self) -> None:
         contents = read_contents(self.path)
         found = contents.origin
-        if found.scenario != self._origin.scenario:
+        if json.dumps(found.scenario) != json.dumps(self._origin.scenario):
             raise UserError(
                 f"{self.path} is of another scenario: give another --output, or delete it"
             )

@@ -1,7 +1,6 @@
 """`python -m kitting_drake.evaluate SCENARIO.yaml`: many seeds side by side, and their summary."""
 
 import functools
-import hashlib
 import json
 import time
 from collections.abc import Callable, Iterable
@@ -18,6 +17,7 @@ from kitting_drake.common.files import (
     alone_in,
     append_line,
     claim_folder,
+    files_digest,
     read_lines,
     require_folder,
     write_json,
@@ -30,7 +30,7 @@ from kitting_drake.common.processes import (
 )
 from kitting_drake.common.provenance import commit, versions
 from kitting_drake.episode import EpisodeResult
-from kitting_drake.episode.chosen import build_chosen, run_chosen
+from kitting_drake.episode.chosen import build_any_chosen, build_chosen, run_chosen
 from kitting_drake.reporting.summary import Episode, summarise
 from kitting_drake.reporting.summary_figure import draw_summary
 from kitting_drake.reporting.terminal import summary_notes, summary_table
@@ -65,7 +65,7 @@ def main() -> int:
     if known:
         console.print(f"note: the policy has learned from seeds {min(known)} to {max(known)}")
     # What cannot be built at all is told at once, not once for each seed.
-    success = build_chosen(chosen, seed=seeds[0]).scene.success
+    success = build_any_chosen(chosen, seeds).scene.success
     with alone_in(folder):
         with open_workers(arguments, chosen) as (workers, sent):
             evaluation = evaluate(
@@ -187,17 +187,8 @@ def _identity(chosen: ChosenScenario) -> dict[str, Any]:
         "versions": versions(),
         "policy_digest": scenario.policy.digest(chosen.base),
         "policy_details": scenario.policy.details(chosen.base),
-        "task_digest": _digest(scenario.task.input_files(chosen.base)),
+        "task_digest": files_digest(scenario.task.input_files(chosen.base)),
     }
-
-
-def _digest(paths: Iterable[Path]) -> str:
-    """A digest of the content of files, in their order."""
-    digest = hashlib.sha256()
-    for path in paths:
-        # Of fixed length each, so that no two sequences of files have the same.
-        digest.update(hashlib.sha256(path.read_bytes()).digest())
-    return f"sha256 {digest.hexdigest()}"
 
 
 def run_in_worker(workers: Workers, chosen: ChosenScenario, seed: int) -> Episode:

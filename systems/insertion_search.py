@@ -13,6 +13,8 @@ _SPIRAL = tuple(
     for n in range(1, 17)
 )
 """Then the positions, evenly spread over a disc from its middle outward, in parts of its radius."""
+_LEAST_RIM = 0.004
+"""The rim of a cavity is at least this high above the table, in m; noise is less."""
 _BACK = (0.0, 0.0)
 """At last it is where it began."""
 
@@ -60,9 +62,16 @@ class InsertionSearch:
         x, y = (*_SPIRAL, _BACK)[step]
         return self.reach * x, self.reach * y, 0.0
 
-    def is_on_rim(self, bottom: float, rim: float) -> bool:
-        """Whether an object with its bottom at a height stands on the rim, in metres."""
-        return bottom > rim - self.rim_margin
+    def is_on_rim(self, bottom: float, rim: float, table: float) -> bool:
+        """Whether an object with its bottom at a height stands on the rim of a cavity.
+
+        Args:
+            bottom: of the object, in metres.
+            rim: the highest around its place, in metres. What is no higher than the table has no
+                cavity: an object that is laid there has arrived.
+            table: of the table's top, in metres.
+        """
+        return rim > table + _LEAST_RIM and bottom > rim - self.rim_margin
 
     def has_slipped_in(self, z: float, touched_at: float) -> bool:
         """Whether the hand at a height has gone down from where it was stopped, in metres."""

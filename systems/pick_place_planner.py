@@ -339,7 +339,8 @@ class PickPlacePlanner(LeafSystem):
     def _is_blocked(self, state: State, hand: NDArray[np.float64]) -> bool:
         bottom = hand[2] - state.hold_z + state.support_z
         left = state.search_step < self._search_steps
-        return left and self._parameters.search.is_on_rim(float(bottom), float(state.rim_z))
+        search, rim, table = self._parameters.search, float(state.rim_z), float(state.table_z)
+        return left and search.is_on_rim(float(bottom), rim, table)
 
     def _is_held(self, hand: NDArray[np.float64], contact: NDArray[np.float64]) -> bool:
         # Contact pushes the fingers apart: along their positive axes.

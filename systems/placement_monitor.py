@@ -39,7 +39,9 @@ class PlacementMonitor(LeafSystem):
     - `body_poses` (abstract, list of RigidTransform by body index): the plant's port of that name.
     - `placements` (abstract, list of n `Placement`): one for each object, by the law of
       `evaluate_placements`: each object is assigned to the goal that it is nearest to filling.
-    - `reward` (1): the sum of the goals' rewards, each by the share of it that is earned.
+    - `reward` (1): the sum of the goals' rewards, each by the share of it that is earned as things
+      stand now. An episode's result also keeps what a stage earned that was complete at some time
+      (`complete_stages`), which is no matter of where things are.
     - `success` (n): 1 for an object that fills a goal.
     - `add_s` (n): equation 9, metres; infinite for an object that no goal is left for.
     - `position_error`, `angle_error`, `height_error` (n): see `Placement`; metres, radians.

@@ -2,10 +2,11 @@
 
 import contextlib
 import fcntl
+import hashlib
 import json
 import os
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -70,6 +71,15 @@ def replace_folder(folder: Path, made: Path, aside: Path) -> None:
         raise
 
 
+def files_digest(paths: Iterable[Path]) -> str:
+    """A digest of the content of files, in their order."""
+    digest = hashlib.sha256()
+    for path in paths:
+        # Of fixed length each, so that no two sequences of files have the same.
+        digest.update(hashlib.sha256(path.read_bytes()).digest())
+    return f"sha256 {digest.hexdigest()}"
+
+
 def claim_folder(folder: Path, name: str, described: Any, *, of: str) -> None:
     """Marks a folder, by a JSON file in it, as that of one thing's files.
 
@@ -95,7 +105,8 @@ def claim_folder(folder: Path, name: str, described: Any, *, of: str) -> None:
             raise UserError(f"{path} is damaged: give another --output, or delete {folder}") from (
                 error
             )
-        if found != described:
+        # Of tools or paints the order counts too.
+        if json.dumps(found) != json.dumps(described):
             raise UserError(
                 f"{folder} holds the files of another {of}"
                 f"{_first_difference(found, described)}: give another --output, or delete it"
@@ -114,7 +125,10 @@ def _first_difference(found: Any, described: Any) -> str:
                 return _first_difference(old, new)
             simple = all(isinstance(value, str | float | int | None) for value in (old, new))
             return f" ({key} is {new}, there {old})" if simple else f" ({key} differs)"
-    return ""
+    for key, new in described.items():
+        if json.dumps(found[key]) != json.dumps(new):
+            return _first_difference(found[key], new) or f" ({key} differs)"
+    return f" ({', '.join(described)} were in the order {', '.join(found)})"
 
 
 @contextlib.contextmanager

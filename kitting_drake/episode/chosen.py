@@ -1,16 +1,20 @@
 """The cell and the episode of a scenario that a command line names."""
 
-from collections.abc import Sequence
+import itertools
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 from pydrake.geometry import Meshcat
 
 from kitting_drake.cell import Cell, build_cell
-from kitting_drake.common.errors import UserError
+from kitting_drake.common.errors import MachineError, UserError
 from kitting_drake.episode.episode import EpisodeResult, run_episode
 from kitting_drake.episode.events import EpisodeObserver
 from kitting_drake.scenario.command_line import ChosenScenario
 from kitting_drake.scenario.policies import DecisionObserver
+
+_TRIED = 5
+"""How many seeds tell whether a scenario can be built at all."""
 
 
 def build_chosen(
@@ -39,6 +43,25 @@ def build_chosen(
         )
     except UserError as error:
         raise type(error)(f"{chosen.path}: {error}") from error
+
+
+def build_any_chosen(chosen: ChosenScenario, seeds: Iterable[int]) -> Cell:
+    """The cell of the first of a few seeds with which it can be built: what a scene draws may not
+    fit with some of them, and is then that seed's own failure.
+
+    Raises:
+        MachineError: it cannot be built on this machine.
+        UserError: it can be built with none of the first seeds; that of the first of all.
+    """
+    errors = []
+    for seed in itertools.islice(seeds, _TRIED):
+        try:
+            return build_chosen(chosen, seed=seed)
+        except MachineError:
+            raise
+        except UserError as error:
+            errors.append(error)
+    raise errors[0]
 
 
 def run_chosen(

@@ -4,12 +4,15 @@ import dataclasses
 import logging
 import math
 import time
+import traceback
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import Context, EventStatus
 
+import systems
 from kitting_drake.cell import Cell
 from kitting_drake.episode.action_log import ActionLog
 from kitting_drake.episode.events import EpisodeObserver, ModeChange
@@ -17,6 +20,8 @@ from kitting_drake.tasks.task import ActionRecord, TaskConfig
 from systems.pick_place_parameters import Mode
 from systems.placement import ALL, Placement, complete_stages, strict_reward, total_reward
 
+_OWN = (Path(__file__).resolve().parent, Path(systems.__file__).resolve().parent)
+"""Where the innermost Python code is when Drake fails."""
 _LAST_WAIT = 2.0
 """How long the objects may take to come to rest after the last action, in s."""
 
@@ -201,11 +206,10 @@ class Episode:
         except KeyboardInterrupt:
             self.is_over = self.interrupted = True
         except (Exception, SystemExit) as error:
-            # Drake's own errors are RuntimeErrors; what a policy raises may be anything, and its
-            # author wants to know where.
             self._failure = " ".join(f"{type(error).__name__}: {error}".split())
             self.is_over = True
-            if not isinstance(error, RuntimeError):
+            if not _is_of_simulation(error):
+                # What a policy raises may be anything, and its author wants to know where.
                 seed = self._names["seed"]
                 logging.getLogger(__name__).exception("the episode of seed %d failed", seed)
         self._wall_seconds += time.perf_counter() - start
@@ -239,6 +243,15 @@ class Episode:
             timed_out=self.timed_out,
             interrupted=self.interrupted,
         )
+
+
+def _is_of_simulation(error: BaseException) -> bool:
+    """Whether Drake raised an error, or one of our systems did in a sentence of its own; torch and
+    people's own policies raise RuntimeErrors too."""
+    frames = traceback.extract_tb(error.__traceback__)
+    raised_in = Path(frames[-1].filename).resolve() if frames else None
+    ours = raised_in is None or any(raised_in.is_relative_to(folder) for folder in _OWN)
+    return isinstance(error, RuntimeError) and ours
 
 
 def object_results(

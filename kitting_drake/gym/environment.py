@@ -118,7 +118,7 @@ class KittingEnvironment(gymnasium.Env[dict[str, Any], NDArray[Any]]):
 
         Raises:
             ValueError: a seed that is none.
-            UserError: the scene cannot be made.
+            UserError: the scene cannot be made, or the episode ends before its first action.
         """
         if seed is not None and not 0 <= seed < _SEEDS:
             raise ValueError(f"a seed is a whole number from 0 to {_SEEDS - 1}, not {seed}")
@@ -139,6 +139,12 @@ class KittingEnvironment(gymnasium.Env[dict[str, Any], NDArray[Any]]):
         )
         self._earned = 0.0
         self._advance(self._episode)
+        if self._episode.is_over:
+            limit = f"the time limit of {self.scenario.time_limit:g} s came first"
+            raise UserError(
+                f"{self._chosen.path}: with seed {chosen_seed} the episode was over before the "
+                f"first action: {self._episode.failure or limit}"
+            )
         return self._observe(), self._info(self._episode.result())
 
     def step(self, action: ArrayLike) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
@@ -184,7 +190,8 @@ class KittingEnvironment(gymnasium.Env[dict[str, Any], NDArray[Any]]):
         return render_picture(scene_graph, context)
 
     def close(self) -> None:
-        """Lets go of the simulation."""
+        """Lets go of the simulation. Drake 1.51, of Python 3.11, keeps some 30 MB of it all the
+        same."""
         self._cell = self._episode = None
         # A Diagram and its systems refer to each other: without this they stay for a while.
         gc.collect()

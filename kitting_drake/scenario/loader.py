@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import yaml
-from pydrake.common.yaml import yaml_dump, yaml_load, yaml_load_typed
+from pydrake.common.yaml import yaml_load, yaml_load_typed
 
 from kitting_drake.common.errors import UserError
 from kitting_drake.scenario.perturbations import perturbation
@@ -54,11 +54,29 @@ def load_scenario(
     scenario = _load(root[name], content, name, Scenario(), f"{path}: {name}")
     if perturb is not None:
         raw, defaults = _onto(perturbation(perturb, scenario), scenario)
-        scenario = _load(raw, yaml_dump(raw), None, defaults, "--perturb")
+        scenario = _load(raw, _dumped(raw), None, defaults, "--perturb")
     if text is not None:
         raw, defaults = _onto(_parse(text, "--scenario_text"), scenario)
-        scenario = _load(raw, yaml_dump(raw), None, defaults, "--scenario_text")
+        scenario = _load(raw, _dumped(raw), None, defaults, "--scenario_text")
     return scenario
+
+
+class _Dumper(yaml.SafeDumper):
+    """Writes what Drake's `yaml_load` reads: the tag of a mapping is under `_tag`."""
+
+
+def _represent_tagged(dumper: yaml.SafeDumper, data: dict[str, Any]) -> yaml.Node:
+    tag = data.get("_tag", "tag:yaml.org,2002:map")
+    return dumper.represent_mapping(tag, {k: v for k, v in data.items() if k != "_tag"})
+
+
+_Dumper.add_representer(dict, _represent_tagged)
+
+
+def _dumped(raw: dict) -> str:
+    """The YAML of a mapping. Drake's `yaml_dump` would sort it: but of paints the later one wins,
+    and tools are taken in their order."""
+    return yaml.dump(raw, Dumper=_Dumper, sort_keys=False)
 
 
 def _parse(content: str, where: str) -> dict:
@@ -190,6 +208,11 @@ def _check_meaning(scenario: Scenario) -> None:
         raise ValueError(
             "plant.time_step must divide 1/64 s, the planner's period, "
             f"not be {scenario.plant.time_step:g}"
+        )
+    if scenario.heightmap.z_min > 0:
+        raise ValueError(
+            f"heightmap.z_min is {scenario.heightmap.z_min:g}: the table, at 0, must be seen, as "
+            "the hand goes by its height"
         )
     if scenario.heightmap.z_max <= scenario.heightmap.z_min:
         raise ValueError("heightmap.z_max must be above heightmap.z_min")

@@ -63,12 +63,12 @@ def perturbation(text: str, scenario: Scenario) -> dict[str, Any]:
 
     Args:
         text: `NAME[:LEVEL]`, several separated by commas; without a level it is `moderate`. `all`
-            is all that the scenario has fields for.
+            is all that applies to the scenario's task.
         scenario: what it will be laid over.
 
     Raises:
-        UserError: there is no such name or level, one is given twice, or the scenario's task has
-            no such field.
+        UserError: there is no such name or level, one is given twice, or it does not apply to the
+            scenario's task.
     """
     levels: dict[str, str] = {}
     for item in text.split(","):
@@ -89,12 +89,19 @@ def perturbation(text: str, scenario: Scenario) -> dict[str, Any]:
     for name, level in levels.items():
         if not _applies(name, scenario):
             task = type(scenario.task).__name__
-            raise UserError(f"--perturb: the task !{task} has no {name}")
+            raise UserError(f"--perturb: {name} does not apply to the task !{task}")
         _merge(overlay, _OVERLAYS[name][LEVELS.index(level)])
+    if "task" in overlay:
+        # The world does not become more perfect than the scenario has it.
+        found = scenario.task.distractors  # type: ignore[union-attr]
+        overlay["task"]["distractors"] = max(overlay["task"]["distractors"], found)
     return overlay
 
 
 def _applies(name: str, scenario: Scenario) -> bool:
+    """Whether the task has what a perturbation changes, and stays the same task with it."""
+    if name in scenario.task.not_perturbed:
+        return False
     fields = {item.name for item in dc.fields(scenario.task)}
     return "task" not in _OVERLAYS[name][0] or name in fields
 

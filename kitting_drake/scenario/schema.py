@@ -62,7 +62,8 @@ class Heightmap:
     rows: int = bounded(160, 1, 4096)
     cols: int = bounded(320, 1, 4096)
 
-    # Heights outside this range are not seen, in m.
+    # Heights are counted from z_min, at or below the table's 0, in m: what is below reads as z_min,
+    # and what is above z_max is not seen.
     z_min: float = bounded(0.0, -1.0, 10.0)
     z_max: float = bounded(0.28, -1.0, 10.0)
 

@@ -114,6 +114,8 @@ class TaskConfig:
 
     causes: tuple[str, ...] = (MISSED_GRASP, SLIPPED, MISPLACED, NEVER_PICKED)
     """The answers of `find_cause`, in the order of tables."""
+    not_perturbed: tuple[str, ...] = ()
+    """Names of `--perturb` that would change what the task asks for, and do not apply to it."""
     objects_are_independent: bool = False
     """Whether no object of a scene stands on another, or in its way, once it is placed: intervals
     of rates are then over objects, else over episodes."""

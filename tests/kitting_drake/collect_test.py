@@ -268,7 +268,7 @@ def test_what_is_finished_is_left_alone(
 ):
     monkeypatch.chdir(ROOT)
     monkeypatch.setattr(collecting, "require_rendering", lambda: None)
-    monkeypatch.setattr(collecting, "build_chosen", lambda *_, **__: None)
+    monkeypatch.setattr(collecting, "build_any_chosen", lambda *_, **__: None)
     monkeypatch.setattr(LocalWorkers, "run", lambda _, __, ___, seed: Oracle()(seed))
     monkeypatch.setattr(sys, "argv", arguments(tmp_path, "--demos", 3, "--seed", 10))
     assert collecting.main() == 0
@@ -282,6 +282,12 @@ def test_what_is_finished_is_left_alone(
     monkeypatch.setattr(sys, "argv", [*arguments(tmp_path), "--scenario_text", "{time_limit: 2}"])
     with pytest.raises(UserError, match="another scenario"):
         collecting.main()
+    monkeypatch.setattr(collecting, "files_digest", lambda _: "of a tool annotated anew")
+    monkeypatch.setattr(sys, "argv", arguments(tmp_path, "--demos", 3, "--seed", 10))
+    with pytest.raises(
+        UserError, match=r"another scenario, tools or version \(task_digest is of a"
+    ):
+        collecting.main()
 
 
 def test_demonstrations_are_exported(
@@ -292,7 +298,7 @@ def test_demonstrations_are_exported(
     # That of the scenario.
     monkeypatch.setattr(sys.modules[__name__], "GRID", PixelGrid())
     monkeypatch.setattr(collecting, "require_rendering", lambda: None)
-    monkeypatch.setattr(collecting, "build_chosen", lambda *_, **__: None)
+    monkeypatch.setattr(collecting, "build_any_chosen", lambda *_, **__: None)
     monkeypatch.setattr(LocalWorkers, "run", lambda _, __, ___, seed: Oracle()(seed))
 
     def main(demos: int, *more: str) -> str:

@@ -17,6 +17,7 @@ import torch
 from rich.console import Console
 
 import kitting_drake.cell.cameras as cameras
+import kitting_drake.episode.chosen as chosen_module
 import kitting_drake.evaluate as evaluation
 import kitting_drake.policies.device as device
 from kitting_drake.common.errors import UserError
@@ -192,6 +193,18 @@ def test_a_scene_that_cannot_be_set_is_a_failed_episode():
     assert "there is no free space in the workspace" in lost["failure"]
 
 
+def test_one_seed_without_a_scene_keeps_no_other_up(monkeypatch: pytest.MonkeyPatch):
+    def build(_: ChosenScenario, *, seed: int) -> int:
+        if seed < 2:
+            raise UserError(f"no room with {seed}")
+        return seed
+
+    monkeypatch.setattr(chosen_module, "build_chosen", build)
+    assert chosen_module.build_any_chosen(CHOSEN, range(9)) == 2
+    with pytest.raises(UserError, match="no room with 0"):
+        chosen_module.build_any_chosen(CHOSEN, range(2))
+
+
 def without_rendering(chosen: ChosenScenario, seed: int) -> Any:
     cameras.can_render = lambda: False
     return evaluation._work(chosen, seed)
@@ -238,7 +251,7 @@ def test_seeds_that_the_policy_has_learned_from_are_told(
     monkeypatch.setattr(evaluation, "run_in_worker", lambda _, __, seed: fake_run(seed))
     # Nobody waits for networks that decide nothing.
     scene = types.SimpleNamespace(scene=types.SimpleNamespace(success=AddS()))
-    monkeypatch.setattr(evaluation, "build_chosen", lambda *_, **__: scene)
+    monkeypatch.setattr(evaluation, "build_any_chosen", lambda *_: scene)
     flags = ["--seed", "10001", "--episodes", "3", "--workers", "1"]
     monkeypatch.setattr(
         sys, "argv", ["evaluate", str(scenario), *flags, "--output", str(tmp_path / "out")]

@@ -359,6 +359,12 @@ def test_nothing_is_searched_for(touched: float, insertion: bool, amplitude: flo
     assert run.sequence == [*PICK_AND_PLACE, Mode.OBSERVE, Mode.DONE]
 
 
+def test_what_is_laid_on_the_table_has_arrived():
+    """Where insertions are searched for too: the table has no cavity."""
+    run = Run(World(touch_place=GRASP_Z), insertion=True).finish()
+    assert run.sequence == [*PICK_AND_PLACE, Mode.OBSERVE, Mode.DONE]
+
+
 def test_the_rim_is_told_from_what_the_object_stood_on():
     """Picked off something 20 mm high, its bottom is 20 mm nearer to the fingertips."""
     on_a_box = dataclasses.replace(HEIGHTS, support=0.02, place_rim=RIM)

@@ -251,7 +251,22 @@ class ArrangedKitting(_KittingTask):
             np.arange(len(tools)),
             self.success_threshold,
         )
+        self._check_workspace(scene, grid)
         return dataclasses.replace(scene, max_actions=self.tries * len(tools))
+
+    @staticmethod
+    def _check_workspace(scene: Scene, grid: PixelGrid) -> None:
+        """Raises UserError where the hand would have to go beside o_t, whose heights it goes by."""
+        things = {f"task.tools.{item.name}": item.X_WB for item in scene.objects}
+        for goal in scene.goals:
+            name = scene.objects[goal.objects[0]].name
+            things[f"task.kit_pose: the cavity of {name}"] = goal.poses[0]
+        for name, X_WThing in things.items():
+            if not grid.contains(X_WThing.translation()[:2]):
+                raise UserError(
+                    f"{name} is not in the workspace (heightmap), x from {grid.x_min:g} to "
+                    f"{grid.x_max:g} m and y from {grid.y_min:g} to {grid.y_max:g} m"
+                )
 
     def input_files(self, base: Path) -> list[Path]:
         return _tool_files(self.tools, base)

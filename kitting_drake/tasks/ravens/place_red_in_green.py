@@ -25,6 +25,9 @@ _BOWL_FLOOR = 0.004
 class PlaceRedInGreen(RavensTask):
     """Red cubes are put into green bowls."""
 
+    # Colours say what is to be done, and what else lies there has them too.
+    not_perturbed = ("colour", "distractors")
+
     # The most green bowls; there are one to so many, and no more red cubes than bowls.
     bowls: int = bounded(3, 1, 6)
 

@@ -33,6 +33,9 @@ _BASE = Footprint(
 class StackBlockPyramid(PoseTask):
     """Six cubes are stacked to a pyramid."""
 
+    # The colour of a cube says where it belongs.
+    not_perturbed = ("colour",)
+
     def make_scene(self, *, grid: PixelGrid, seed: int, base: Path) -> Scene:
         names = [name for row in _ROWS for name in row]
         X_WBase, *X_WCubes = draw_poses(

@@ -75,6 +75,8 @@ def test_a_folder_is_that_of_one_thing(tmp_path: Path):
     claim_folder(tmp_path, "settings.json", {"steps": 3, "type": "float32"}, of="run")
     with pytest.raises(UserError, match=r"another run \(type is bfloat16, there float32\)"):
         claim_folder(tmp_path, "settings.json", {"steps": 3, "type": "bfloat16"}, of="run")
+    with pytest.raises(UserError, match=r"another run \(type, steps were in the order steps, type"):
+        claim_folder(tmp_path, "settings.json", {"type": "float32", "steps": 3}, of="run")
     with pytest.raises(UserError, match=r"holds settings\.json of something else"):
         claim_folder(tmp_path, "scenario.json", {}, of="scenario")
     (tmp_path / "settings.json").write_text('{"steps": ')

@@ -286,14 +286,15 @@ def test_a_policy_is_asked_only_when_the_planner_has_observed(monkeypatch: pytes
 
 
 @pytest.mark.usefixtures("rendering")
+@pytest.mark.parametrize("kind", [ValueError, RuntimeError])
 def test_a_policy_that_fails_ends_the_episode_with_its_reason(
-    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+    kind: type[Exception], monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ):
     def fail(_: Observation) -> PickPlaceAction:
-        raise ValueError("weights of the wrong shape")
+        raise kind("weights of the wrong shape")
 
     scenario = install(fail, monkeypatch)
     result = run(build(scenario), 1.0, scenario=scenario)
-    assert result.failure == "ValueError: weights of the wrong shape"
+    assert result.failure == f"{kind.__name__}: weights of the wrong shape"
     # Its author is told where.
     assert "in fail" in caplog.text

@@ -202,6 +202,9 @@ def test_bad_input_is_told(small: Path, tmp_path: Path):
     assert environment.unwrapped.step(far)[4]["failure"] is None
     with pytest.raises(ValueError, match="a seed is a whole number"):
         environment.unwrapped.reset(seed=-1)
+    short = make(small, scenario_text="{time_limit: 0.1}")
+    with pytest.raises(UserError, match=r"seed 3 the episode was over before.*limit of 0\.1 s"):
+        short.reset(seed=3)
     with pytest.raises(UserError, match="cannot read the scenario"):
         make(tmp_path / "nowhere.yaml")
     with pytest.raises(UserError, match="cameras is empty"):

@@ -54,6 +54,20 @@ planner: {home: [0.4, 0.0, 0.5, 0.0], search: {amplitude: 0.0}}
     assert merged.time_limit == 9.0
 
 
+def test_text_keeps_the_order_that_it_is_written_in(tmp_path: Path):
+    """The oracle takes tools in their order, and of paints the later one wins."""
+    path = write(tmp_path, "A: {}")
+    text = """
+task: !ArrangedKitting {tools: {slip_joint_pliers: {x: 0.3, y: 0.3}, claw_hammer: {x: 0.6, y: 0.3}}}
+appearance: {paints: {'table/*': !Fixed {rgb: [1, 0, 0]}, '*': !Drawn {}}}
+cameras: {zed: !LookAt {}, alpha: !LookAt {}}
+"""
+    merged = load_scenario(path, text=text)
+    assert [*merged.task.tools] == ["slip_joint_pliers", "claw_hammer"]
+    assert [*merged.appearance.paints] == ["table/*", "*"]
+    assert [*merged.cameras][-2:] == ["zed", "alpha"]
+
+
 def test_text_without_a_tag_keeps_the_variant(tmp_path: Path):
     path = write(
         tmp_path,
@@ -242,6 +256,10 @@ def test_bad_text_is_told_apart_from_a_bad_file():
 
 def test_a_range_holds_for_file_and_text_together(tmp_path: Path):
     """Each is right by itself: it is the sum that cannot be."""
-    path = write(tmp_path, "A: {heightmap: {z_max: 0.1}}")
+    path = write(tmp_path, "A: {heightmap: {z_min: -0.1}}")
     with pytest.raises(UserError, match=r"--scenario_text: heightmap\.z_max must be above"):
-        load_scenario(path, text="{heightmap: {z_min: 0.2}}")
+        load_scenario(path, text="{heightmap: {z_max: -0.2}}")
+    with pytest.raises(
+        UserError, match=r"heightmap\.z_min is 0\.02: the table, at 0, must be seen"
+    ):
+        load_scenario(path, text="{heightmap: {z_min: 0.02}}")

@@ -6,7 +6,7 @@ from kitting_drake.common.errors import UserError
 from kitting_drake.common.paths import SCENARIOS
 from kitting_drake.scenario.appearance import Drawn
 from kitting_drake.scenario.loader import load_scenario
-from kitting_drake.scenario.perturbations import LEVELS, NAMES
+from kitting_drake.scenario.perturbations import LEVELS, NAMES, perturbation
 from kitting_drake.scenario.schema import Scenario
 from kitting_drake.tasks import Kitting
 
@@ -53,10 +53,27 @@ def test_a_mistake_is_told(text: str, message: str):
 
 def test_a_task_without_distractors(tmp_path: Path):
     ravens = SCENARIOS / "ravens.yaml"
-    with pytest.raises(UserError, match="the task !BlockInsertion has no distractors"):
+    with pytest.raises(UserError, match="distractors does not apply to the task !BlockInsertion"):
         load_scenario(ravens, "BlockInsertion", perturb="distractors")
     # All that there is.
     assert load_scenario(ravens, "BlockInsertion", perturb="all").plant.mass_variation == 0.3
+
+
+def test_what_a_task_asks_for_is_not_perturbed():
+    """Red cubes go into green bowls, and each cube of the pyramid has its place by its colour."""
+    ravens = SCENARIOS / "ravens.yaml"
+    for name in ("PlaceRedInGreen", "StackBlockPyramid"):
+        perturbed = load_scenario(ravens, name, perturb="all:severe")
+        assert perturbed.appearance.paints == load_scenario(ravens, name).appearance.paints
+        assert perturbed.plant.mass_variation == 0.5
+        with pytest.raises(UserError, match=f"colour does not apply to the task !{name}"):
+            load_scenario(ravens, name, perturb="colour")
+    assert load_scenario(ravens, "PlaceRedInGreen", perturb="all").task.distractors == 10
+
+
+def test_nothing_becomes_more_perfect():
+    crowded = load_scenario(KITTING, None, None, "distractors:severe")
+    assert perturbation("distractors:mild", crowded) == {"task": {"distractors": 8}}
 
 
 def test_by_default_nothing_is_perturbed():

@@ -33,7 +33,7 @@ GRID = PixelGrid(rows=33, cols=49)
 @pytest.fixture(scope="module")
 def site() -> PolicySite:
     """A cell in which no policy has a body to look at."""
-    scene = ArrangedKitting().make_scene(grid=GRID, seed=0, base=Path())
+    scene = ArrangedKitting().make_scene(grid=PixelGrid(), seed=0, base=Path())
     return PolicySite(scene=scene, objects=(), grid=GRID, base=Path())
 
 
@@ -142,10 +142,10 @@ def act(observation):
 
 
 def test_a_function_of_ones_own(site: PolicySite, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    path = tmp_path / "policy_of_mine.py"
+    path = tmp_path / "a_policy_of_mine.py"
     path.write_text(STOP)
     monkeypatch.syspath_prepend(tmp_path)
-    config = PythonPolicy("policy_of_mine:act")
+    config = PythonPolicy("a_policy_of_mine:act")
     assert action(config, site, observation()) == PickPlaceAction(stop=True)
     # Results tell one version of it from another.
     assert config.digest(tmp_path) == f"sha256 {hashlib.sha256(STOP.encode()).hexdigest()}"

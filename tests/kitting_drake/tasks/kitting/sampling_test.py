@@ -108,6 +108,16 @@ def test_no_free_space_is_told_with_the_fields_to_change():
         (0.9, {"claw_hammer": TablePose(x=0.3, y=0.4)}, "task.kit_pose is not whole on the table"),
         (0.6, {"claw_hammer": TablePose(x=0.3, y=0.8)}, "task.tools.claw_hammer is not whole"),
         (
+            0.2,
+            {"claw_hammer": TablePose(x=0.6, y=0.4)},
+            "task.kit_pose: the cavity of claw_hammer is not in the workspace",
+        ),
+        (
+            0.6,
+            {"claw_hammer": TablePose(x=0.2, y=0.3)},
+            "task.tools.claw_hammer is not in the workspace",
+        ),
+        (
             0.6,
             {"claw_hammer": TablePose(x=0.6, y=0.1)},
             "task.kit_pose and task.tools.claw_hammer are within",
@@ -115,8 +125,8 @@ def test_no_free_space_is_told_with_the_fields_to_change():
         (
             0.6,
             {
-                "claw_hammer": TablePose(x=0.3, y=0.3),
-                "flat_screwdriver": TablePose(x=0.3, y=0.31),
+                "claw_hammer": TablePose(x=0.5, y=0.3),
+                "flat_screwdriver": TablePose(x=0.5, y=0.31),
             },
             "task.tools.claw_hammer and task.tools.flat_screwdriver are within each other",
         ),
