@@ -29,6 +29,7 @@ from kitting_drake.common.processes import (
     side_by_side,
 )
 from kitting_drake.common.provenance import commit, versions
+from kitting_drake.common.seeds import ALL_SEEDS
 from kitting_drake.episode import EpisodeResult
 from kitting_drake.episode.chosen import build_any_chosen, build_chosen, run_chosen
 from kitting_drake.reporting.summary import Episode, summarise
@@ -56,6 +57,10 @@ def main() -> int:
     chosen = choose_scenario(arguments)
     first = chosen.scenario.random_seed if arguments.seed is None else arguments.seed
     seeds = range(first, first + arguments.episodes)
+    if seeds[-1] not in ALL_SEEDS:
+        raise UserError(
+            f"the seeds end at {ALL_SEEDS[-1]}: ask for fewer --episodes, or another --seed"
+        )
     folder = require_folder(output_folder(arguments, f"{chosen.name}-evaluation"))
     console = Console(quiet=arguments.quiet)
     if note := hidden_table_note(chosen.scenario):

@@ -8,6 +8,7 @@ import sys
 from collections.abc import Callable, Iterator
 
 from kitting_drake.common.errors import UserError
+from kitting_drake.common.seeds import ALL_SEEDS
 
 FAILED = 1
 """Exit code when a simulation or a policy failed, and nothing else can be blamed."""
@@ -22,8 +23,9 @@ def seed_type(text: str) -> int:
         seed = int(text)
     except ValueError:
         seed = -1
-    if not 0 <= seed < 2**32:
-        raise argparse.ArgumentTypeError(f"'{text}' is not a whole number from 0 to {2**32 - 1}")
+    if seed not in ALL_SEEDS:
+        last = ALL_SEEDS[-1]
+        raise argparse.ArgumentTypeError(f"'{text}' is not a whole number from 0 to {last}")
     return seed
 
 

@@ -1,5 +1,8 @@
 """Which seeds are for what: what a policy has learned from is not what it is tested on."""
 
+ALL_SEEDS = range(2**32)
+"""What can be a seed."""
+
 TEST_SEEDS = range(10_000)
 """Seeds of test episodes."""
 
@@ -15,4 +18,4 @@ def seeds_from(first: int) -> range:
     for seeds in (TEST_SEEDS, DEMONSTRATION_SEEDS, VALIDATION_SEEDS):
         if first in seeds:
             return range(first, seeds.stop)
-    return range(first, 2**32)
+    return range(first, ALL_SEEDS.stop)

@@ -193,6 +193,16 @@ def test_a_scene_that_cannot_be_set_is_a_failed_episode():
     assert "there is no free space in the workspace" in lost["failure"]
 
 
+def test_seeds_come_to_an_end(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    scenario = tmp_path / "mine.yaml"
+    scenario.write_text("Mine: {}\n")
+    flags = ["--seed", str(2**32 - 1), "--episodes", "2", "--output", str(tmp_path / "out")]
+    monkeypatch.setattr(sys, "argv", ["evaluate", str(scenario), *flags])
+    with pytest.raises(UserError, match="the seeds end at 4294967295"):
+        evaluation.main()
+    assert not (tmp_path / "out").exists()
+
+
 def test_one_seed_without_a_scene_keeps_no_other_up(monkeypatch: pytest.MonkeyPatch):
     def build(_: ChosenScenario, *, seed: int) -> int:
         if seed < 2:
