@@ -73,19 +73,23 @@ class OraclePolicy(LeafSystem):
         name: OraclePolicy
         input_ports:
         - body_poses
+        - kept_goals
         output_ports:
         - action
 
     - `body_poses` (abstract, list of RigidTransform by body index): the plant's port of that name.
+    - `kept_goals` (one for each goal): the `PlacementMonitor`'s port of that name. Where it is not
+      connected, none is kept.
     - `action` (abstract, `PickPlaceAction`): an object and a goal that it may fill; `stop` when
       every goal is filled.
 
     The law. The next goal is the first, in the order given, that is not filled and whose
-    prerequisites are; goals whose object is already there, though not as it should be, come last.
-    Of the objects that may fill it and fill no other, the highest is taken, as nothing lies on it;
-    of several as high, the one assigned to the goal by `evaluate_placements`. Of the goal's poses
-    it takes the free one that rotates the object least, and of the object's grasps the first at
-    which the fingers are clear of other objects at the pick and at the place.
+    prerequisites are, where those that are kept count as filled; goals whose object is already
+    there, though not as it should be, come last. Of the objects that may fill it and fill no other,
+    the highest is taken, as nothing lies on it; of several as high, the one assigned to the goal by
+    `evaluate_placements`. Of the goal's poses it takes the free one that rotates the object least,
+    and of the object's grasps the first at which the fingers are clear of other objects at the pick
+    and at the place.
 
     With a quantizer it answers the best action that a policy of the paper can choose: the pick is
     the annotated grasp, rounded; the place is where the gripper, *holding the object as the rounded
@@ -126,23 +130,29 @@ class OraclePolicy(LeafSystem):
         self._grasps = tuple(tuple(choices) for choices in grasps)
         self._quantizer = quantizer
         self._body_poses = self.DeclareAbstractInputPort("body_poses", Value([RigidTransform()]))
+        self._kept_goals = self.DeclareVectorInputPort("kept_goals", len(goals))
         self.DeclareAbstractOutputPort(
             "action",
             lambda: Value(PickPlaceAction()),
             weak_calc(self._calc_action),
-            {self._body_poses.ticket()},
+            {self._body_poses.ticket(), self._kept_goals.ticket()},
         )
 
     def _calc_action(self, context: Context, output: AbstractValue) -> None:
         bodies = self._body_poses.Eval(context)
         poses = [bodies[int(item.body)] for item in self._objects]
-        placements = evaluate_placements(self._objects, self._goals, self._success, poses)
-        plan = self._plan(poses, placements)
+        kept: frozenset[int] = frozenset()
+        if self._kept_goals.HasValue(context):
+            kept = frozenset(np.flatnonzero(self._kept_goals.Eval(context)).tolist())
+        placements = evaluate_placements(self._objects, self._goals, self._success, poses, kept)
+        plan = self._plan(poses, placements, kept)
         output.set_value(PickPlaceAction(stop=True) if plan is None else self._action(plan, poses))
 
-    def _plan(self, poses: list[RigidTransform], placements: list[Placement]) -> _Plan | None:
+    def _plan(
+        self, poses: list[RigidTransform], placements: list[Placement], kept: frozenset[int]
+    ) -> _Plan | None:
         """The next thing to do; None when every goal is filled, or none can be."""
-        filled = {item.goal for item in placements if item.success}
+        filled = kept | {item.goal for item in placements if item.success}
         failed_there = {
             item.goal
             for index, item in enumerate(placements)

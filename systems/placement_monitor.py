@@ -4,15 +4,24 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 
+import numpy as np
 from pydrake.common.value import AbstractValue, Value
 from pydrake.math import RigidTransform
-from pydrake.systems.framework import BasicVector, Context, LeafSystem
+from pydrake.systems.framework import (
+    BasicVector,
+    Context,
+    DiscreteValues,
+    EventStatus,
+    LeafSystem,
+)
 
+from systems.pick_place_parameters import Mode
 from systems.placement import (
     Goal,
     PlacedObject,
     Placement,
     SuccessPredicate,
+    complete_stages,
     evaluate_placements,
     total_reward,
 )
@@ -27,6 +36,7 @@ class PlacementMonitor(LeafSystem):
         name: PlacementMonitor
         input_ports:
         - body_poses
+        - mode
         output_ports:
         - placements
         - reward
@@ -35,18 +45,21 @@ class PlacementMonitor(LeafSystem):
         - position_error
         - angle_error
         - height_error
+        - kept_goals
 
     - `body_poses` (abstract, list of RigidTransform by body index): the plant's port of that name.
+    - `mode` (1): the planner's port of that name. Where it is not connected, no goal is kept.
     - `placements` (abstract, list of n `Placement`): one for each object, by the law of
       `evaluate_placements`: each object is assigned to the goal that it is nearest to filling.
-    - `reward` (1): the sum of the goals' rewards, each by the share of it that is earned as things
-      stand now. An episode's result also keeps what a stage earned that was complete at some time
-      (`complete_stages`), which is no matter of where things are.
+    - `reward` (1): the sum of the goals' rewards, each by the share of it that is earned.
     - `success` (n): 1 for an object that fills a goal.
     - `add_s` (n): equation 9, metres; infinite for an object that no goal is left for.
     - `position_error`, `angle_error`, `height_error` (n): see `Placement`; metres, radians.
+    - `kept_goals` (one for each goal): 1 for those of a stage that was complete when an action was
+      begun. They count as filled for good (`complete_stages`).
 
-    Stateless, pulled.
+    The goals that are kept, and the mode that was seen last, are discrete state. Everything else is
+    pulled.
     """
 
     def __init__(
@@ -55,12 +68,14 @@ class PlacementMonitor(LeafSystem):
         objects: Sequence[PlacedObject],
         goals: Sequence[Goal],
         success: SuccessPredicate,
+        period: float = 1 / 64,
     ) -> None:
         """
         Args:
             objects: n of them.
             goals: at least one.
             success: when a goal is filled.
+            period: how often it looks at the mode, in s: the planner's.
 
         Raises:
             ValueError: no goals, a goal of no object or pose, or an object without points.
@@ -76,16 +91,22 @@ class PlacementMonitor(LeafSystem):
                 raise ValueError(f"the points of {item.name} must be (m, 3) with m > 0")
         self._objects, self._goals, self._success = tuple(objects), tuple(goals), success
         self._body_poses = self.DeclareAbstractInputPort("body_poses", Value([RigidTransform()]))
+        self._mode = self.DeclareVectorInputPort("mode", 1)
+        self._kept_index = self.DeclareDiscreteState(np.zeros(len(goals)))
+        self._mode_index = self.DeclareDiscreteState([float(Mode.OBSERVE)])
+        self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
+        kept = self.discrete_state_ticket(self._kept_index)
         self._placements = self.DeclareAbstractOutputPort(
             "placements",
             lambda: Value([Placement()]),
             weak_calc(self._calc_placements),
-            {self._body_poses.ticket()},
+            {self._body_poses.ticket(), kept},
         )
-        tickets = {self._body_poses.ticket()}
+        tickets = {self._body_poses.ticket(), kept}
         self.DeclareVectorOutputPort("reward", 1, self._calc_reward, tickets)
         for name in ("success", "add_s", "position_error", "angle_error", "height_error"):
             self.DeclareVectorOutputPort(name, len(objects), self._copy(name), tickets)
+        self.DeclareVectorOutputPort("kept_goals", len(goals), self._calc_kept, {kept})
 
     @property
     def objects(self) -> tuple[PlacedObject, ...]:
@@ -101,13 +122,41 @@ class PlacementMonitor(LeafSystem):
         """The port `placements` in the given context (its own)."""
         return self._placements.Eval(context)
 
+    def reward(self, context: Context) -> float:
+        """The port `reward` in the given context (its own)."""
+        return total_reward(self._goals, self.placements(context), self._kept(context))
+
+    def _kept(self, context: Context) -> frozenset[int]:
+        flags = context.get_discrete_state(self._kept_index).get_value()
+        return frozenset(np.flatnonzero(flags).tolist())
+
+    def _update(self, context: Context, discrete_state: DiscreteValues) -> EventStatus:
+        if not self._mode.HasValue(context):
+            return EventStatus.DidNothing()
+        mode = self._mode.Eval(context)[0]
+        last = context.get_discrete_state(self._mode_index).get_value()[0]
+        if mode == last:
+            return EventStatus.DidNothing()
+        discrete_state.get_mutable_value(self._mode_index)[0] = mode
+        if last == Mode.OBSERVE:
+            kept = complete_stages(self._goals, self.placements(context), self._kept(context))
+            discrete_state.get_mutable_value(self._kept_index)[sorted(kept)] = 1.0
+        return EventStatus.Succeeded()
+
     def _calc_placements(self, context: Context, output: AbstractValue) -> None:
         poses = self._body_poses.Eval(context)
         actual = [poses[int(item.body)] for item in self._objects]
-        output.set_value(evaluate_placements(self._objects, self._goals, self._success, actual))
+        output.set_value(
+            evaluate_placements(
+                self._objects, self._goals, self._success, actual, self._kept(context)
+            )
+        )
 
     def _calc_reward(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector([total_reward(self._goals, self.placements(context))])
+        output.SetFromVector([self.reward(context)])
+
+    def _calc_kept(self, context: Context, output: BasicVector) -> None:
+        output.SetFromVector(context.get_discrete_state(self._kept_index).get_value())
 
     def _copy(self, name: str) -> Callable[[Context, BasicVector], None]:
         def calc(context: Context, output: BasicVector) -> None:

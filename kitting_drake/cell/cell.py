@@ -1,7 +1,7 @@
 """From a scenario to the Diagram of the kitting cell: here its systems are wired together."""
 
 import functools
-from collections.abc import Sequence, Set
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -32,7 +32,7 @@ from kitting_drake.tasks.task import Scene
 from systems.heightmap_projector import HeightmapProjector
 from systems.pick_place_planner import PickPlacePlanner
 from systems.pick_place_policy import PickPlacePolicy
-from systems.placement import PlacedObject, Placement, evaluate_placements
+from systems.placement import PlacedObject, Placement
 from systems.placement_monitor import PlacementMonitor
 from systems.rest_detector import RestDetector
 from systems.trajectory_controller import TrajectoryController
@@ -64,17 +64,13 @@ class Cell:
         context = self.plant.GetMyContextFromRoot(root_context)
         return [self.plant.get_body(item.body).EvalPoseInWorld(context) for item in self.objects]
 
-    def placements(self, root_context: Context, kept: Set[int] = frozenset()) -> list[Placement]:
-        """Where each of the scene's objects is relative to its goal.
+    def placements(self, root_context: Context) -> list[Placement]:
+        """Where each of the scene's objects is relative to its goal."""
+        return self.monitor.placements(self.monitor.GetMyContextFromRoot(root_context))
 
-        Args:
-            root_context: of the diagram.
-            kept: goals that were filled for good before (`complete_stages`).
-        """
-        if not kept:
-            return self.monitor.placements(self.monitor.GetMyContextFromRoot(root_context))
-        scene, poses = self.scene, self.object_poses(root_context)
-        return evaluate_placements(self.objects, scene.goals, scene.success, poses, kept)
+    def reward(self, root_context: Context) -> float:
+        """The task's reward, 0 to 1, as things stand."""
+        return self.monitor.reward(self.monitor.GetMyContextFromRoot(root_context))
 
     def at_rest(self, root_context: Context) -> NDArray[np.bool_]:
         """(n,) which of the scene's objects are at rest."""
@@ -188,6 +184,9 @@ def build_cell(
     monitor, rest_detector = _add_score_and_rest(
         builder, scenario, scene, plant, scene_graph, objects
     )
+    builder.Connect(planner.GetOutputPort("mode"), monitor.GetInputPort("mode"))
+    if policy.HasInputPort("kept_goals"):
+        builder.Connect(monitor.GetOutputPort("kept_goals"), policy.GetInputPort("kept_goals"))
     for system, ports in (
         (policy, ["action"]),
         (monitor, [monitor.get_output_port(i).get_name() for i in range(7)]),

@@ -18,7 +18,7 @@ from kitting_drake.episode.action_log import ActionLog
 from kitting_drake.episode.events import EpisodeObserver, ModeChange
 from kitting_drake.tasks.task import ActionRecord, TaskConfig
 from systems.pick_place_parameters import Mode
-from systems.placement import ALL, Placement, complete_stages, strict_reward, total_reward
+from systems.placement import ALL, Placement, strict_reward
 
 _OWN = (Path(__file__).resolve().parent, Path(systems.__file__).resolve().parent)
 """Where the innermost Python code is when Drake fails."""
@@ -219,7 +219,7 @@ class Episode:
     def result(self) -> EpisodeResult:
         """How it ended; before its end, how it stands now."""
         cell, context, records = self._cell, self.context, self._log.records
-        placements = self._monitor.placements(context)
+        placements = cell.placements(context)
         planner_context = cell.planner.GetMyContextFromRoot(context)
         counts = cell.planner.GetOutputPort("counts").Eval(planner_context)
         lost = self._failure is not None or self.timed_out
@@ -227,7 +227,7 @@ class Episode:
         return EpisodeResult(
             **self._names,  # type: ignore[arg-type]
             objects=object_results(cell, self._task, context, placements, records),
-            success_rate=0.0 if lost else self._monitor.reward(context),
+            success_rate=0.0 if lost else cell.reward(context),
             strict_success_rate=0.0 if lost else strict_reward(cell.scene.goals, placements),
             actions=int(counts[0]),
             missed_grasps=int(counts[1]),
@@ -320,16 +320,6 @@ class _Monitor:
         self._mode = Mode.OBSERVE
         self.point_contact_pairs = 0
         self.done_since: float | None = None
-        self._complete: frozenset[int] = frozenset()
-
-    def placements(self, root_context: Context) -> list[Placement]:
-        """Where objects are; what comes after a stage that was complete once need not wait."""
-        return self._cell.placements(root_context, self._complete)
-
-    def reward(self, root_context: Context) -> float:
-        """The task's reward, counting stages that were complete at some time."""
-        placements = self.placements(root_context)
-        return total_reward(self._cell.scene.goals, placements, self._complete)
 
     def step(self, root_context: Context) -> EventStatus:
         """The callback that the simulator calls after every step."""
@@ -339,7 +329,7 @@ class _Monitor:
         if self._pauses or self._end_at_success:
             planner_context = cell.planner.GetMyContextFromRoot(root_context)
             asks = cell.planner.asks_now(planner_context)
-            if asks and self._end_at_success and self.reward(root_context) > ALL:
+            if asks and self._end_at_success and cell.reward(root_context) > ALL:
                 self.done_since = root_context.get_time()
                 return EventStatus.ReachedTermination(cell.diagram, "every goal is met")
             self.is_paused = asks and self._pauses
@@ -362,9 +352,6 @@ class _Monitor:
             contact = self._contact_results.Eval(plant.GetMyContextFromRoot(root_context))
             pairs = contact.num_point_pair_contacts()
             self.point_contact_pairs = max(self.point_contact_pairs, pairs)
-            if is_last or previous == Mode.OBSERVE:
-                placements = self.placements(root_context)
-                self._complete = complete_stages(self._cell.scene.goals, placements, self._complete)
             event = ModeChange(
                 self._mode if is_last else previous, self._mode, root_context, is_last
             )

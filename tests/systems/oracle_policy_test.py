@@ -1,3 +1,4 @@
+import dataclasses
 import math
 
 import numpy as np
@@ -37,6 +38,7 @@ def ask(
     grasps: list[tuple[Grasp, ...]] | None = None,
     success: SuccessPredicate | None = None,
     quantizer: ActionQuantizer | None = None,
+    kept: list[float] | None = None,
 ) -> PickPlaceAction:
     """The action for these poses of the objects."""
     oracle = OraclePolicy(
@@ -48,6 +50,8 @@ def ask(
     )
     context = oracle.CreateDefaultContext()
     oracle.GetInputPort("body_poses").FixValue(context, Value([RigidTransform(), *poses]))
+    if kept is not None:
+        oracle.GetInputPort("kept_goals").FixValue(context, kept)
     return oracle.GetOutputPort("action").Eval(context)
 
 
@@ -62,9 +66,25 @@ def test_ports():
     oracle = OraclePolicy(
         objects=[HAMMER], grasps=[(HAMMER_GRASP,)], goals=[HAMMER_GOAL], success=AddS()
     )
-    assert oracle.num_input_ports() == oracle.num_output_ports() == 1
+    assert (oracle.num_input_ports(), oracle.num_output_ports()) == (2, 1)
+    assert oracle.GetInputPort("kept_goals").size() == 1
     assert oracle.GetInputPort("body_poses").Allocate().get_value() is not None
     assert oracle.GetOutputPort("action").Allocate().get_value() == PickPlaceAction()
+
+
+def test_what_is_kept_is_not_done_again():
+    """What lies on a row that was complete holds it down, though it has been nudged since."""
+    nudged = [HAMMER_GOAL.poses[0] @ planar(0.02, 0), planar(0.3, 0.0)]
+    goals = [HAMMER_GOAL, dataclasses.replace(PLIERS_GOAL, after=(0,))]
+    hammer = gripper_pose(nudged[0], HAMMER_GRASP)
+    pliers = gripper_pose(nudged[1], PLIERS_GRASP)
+    action = ask(nudged, goals)
+    np.testing.assert_allclose((action.pick.x, action.pick.y), (hammer.x, hammer.y), atol=1e-12)
+    action = ask(nudged, goals, kept=[1.0, 0.0])
+    np.testing.assert_allclose((action.pick.x, action.pick.y), (pliers.x, pliers.y), atol=1e-12)
+    done = [nudged[0], PLIERS_GOAL.poses[0]]
+    assert ask(done, goals, kept=[1.0, 0.0]).stop
+    assert not ask(done, goals).stop
 
 
 def test_takes_the_first_goal_in_order_that_is_not_filled():

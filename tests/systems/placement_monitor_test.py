@@ -1,9 +1,13 @@
+import dataclasses
+
 import numpy as np
 import pytest
 from pydrake.common.value import Value
 from pydrake.math import RigidTransform
 from pydrake.multibody.tree import BodyIndex
+from pydrake.systems.analysis import Simulator
 
+from systems.pick_place_parameters import Mode
 from systems.placement import AddS, Goal, PlacedObject, evaluate_placements
 from systems.placement_monitor import PlacementMonitor
 
@@ -22,10 +26,12 @@ def monitor(objects=OBJECTS, goals=GOALS) -> PlacementMonitor:
 
 def test_ports():
     system = monitor()
-    assert system.num_input_ports() == 1
+    assert system.num_input_ports() == 2
     assert system.GetInputPort("body_poses").get_index() == 0
+    assert system.GetInputPort("mode").size() == 1
     names = [system.get_output_port(i).get_name() for i in range(system.num_output_ports())]
-    assert names == ["placements", "reward", *VECTORS]
+    assert names == ["placements", "reward", *VECTORS, "kept_goals"]
+    assert system.GetOutputPort("kept_goals").size() == 2
     assert system.GetOutputPort("reward").size() == 1
     assert all(system.GetOutputPort(name).size() == 3 for name in VECTORS)
 
@@ -43,6 +49,37 @@ def test_outputs_are_the_law_at_the_bodies_poses():
         np.testing.assert_array_equal(system.GetOutputPort(name).Eval(context), values)
     # An object that no goal is left for.
     assert system.GetOutputPort("add_s").Eval(context)[2] == np.inf
+
+
+def test_a_stage_that_was_complete_when_an_action_began_is_kept():
+    staged = [GOALS[0], dataclasses.replace(GOALS[1], after=(0,))]
+    system = monitor(goals=staged)
+    simulator = Simulator(system)
+    context = simulator.get_mutable_context()
+    away, (first, second) = RigidTransform(), (goal.poses[0] for goal in staged)
+
+    def advance(mode: Mode, *poses: RigidTransform) -> list[float]:
+        bodies = [RigidTransform(), *poses, away]
+        system.GetInputPort("body_poses").FixValue(context, Value(bodies))
+        system.GetInputPort("mode").FixValue(context, [float(mode)])
+        simulator.AdvanceTo(context.get_time() + 1 / 32)
+        return system.GetOutputPort("kept_goals").Eval(context).tolist()
+
+    assert advance(Mode.OBSERVE, first, away) == [0.0, 0.0]
+    # In between it may be complete for a moment.
+    assert advance(Mode.APPROACH, away, away) == [0.0, 0.0]
+    assert advance(Mode.CARRY, first, away) == [0.0, 0.0]
+    assert advance(Mode.OBSERVE, first, away) == [0.0, 0.0]
+    assert advance(Mode.APPROACH, first, away) == [1.0, 0.0]
+    assert system.reward(context) == 0.75
+    # It counts as filled from then on, and what comes after it need not wait.
+    assert advance(Mode.RETREAT, away, second) == [1.0, 0.0]
+    assert system.GetOutputPort("reward").Eval(context).tolist() == [1.0]
+    # All of that is in the context.
+    clone = context.Clone()
+    assert system.reward(clone) == 1.0
+    system.SetDefaultContext(context)
+    assert system.GetOutputPort("kept_goals").Eval(context).tolist() == [0.0, 0.0]
 
 
 def test_what_cannot_be_scored_is_refused():
