@@ -240,6 +240,8 @@ def _table_1(results: Mapping[str, Result]) -> list[str]:
     ]
     if any(name.startswith("palletizing_boxes") for name in results):
         sections.append(texts.PALLETIZING)
+    if "palletizing_boxes_so2_180_1" in results:
+        sections.append(texts.PALLETIZING_ONCE)
     if "place_red_in_green_so2_180_1" in results:
         sections.append(texts.RED)
     if any(
