@@ -103,7 +103,7 @@ class PlacementMonitor(LeafSystem):
             {self._body_poses.ticket(), kept},
         )
         tickets = {self._body_poses.ticket(), kept}
-        self.DeclareVectorOutputPort("reward", 1, self._calc_reward, tickets)
+        self._reward = self.DeclareVectorOutputPort("reward", 1, self._calc_reward, tickets)
         for name in ("success", "add_s", "position_error", "angle_error", "height_error"):
             self.DeclareVectorOutputPort(name, len(objects), self._copy(name), tickets)
         self.DeclareVectorOutputPort("kept_goals", len(goals), self._calc_kept, {kept})
@@ -124,7 +124,7 @@ class PlacementMonitor(LeafSystem):
 
     def reward(self, context: Context) -> float:
         """The port `reward` in the given context (its own)."""
-        return total_reward(self._goals, self.placements(context), self._kept(context))
+        return float(self._reward.Eval(context)[0])
 
     def _kept(self, context: Context) -> frozenset[int]:
         flags = context.get_discrete_state(self._kept_index).get_value()
@@ -153,7 +153,8 @@ class PlacementMonitor(LeafSystem):
         )
 
     def _calc_reward(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector([self.reward(context)])
+        reward = total_reward(self._goals, self.placements(context), self._kept(context))
+        output.SetFromVector([reward])
 
     def _calc_kept(self, context: Context, output: BasicVector) -> None:
         output.SetFromVector(context.get_discrete_state(self._kept_index).get_value())

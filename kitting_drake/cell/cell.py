@@ -69,7 +69,7 @@ class Cell:
         return self.monitor.placements(self.monitor.GetMyContextFromRoot(root_context))
 
     def reward(self, root_context: Context) -> float:
-        """The task's reward, 0 to 1, as things stand."""
+        """The task's reward so far, 0 to 1: see `PlacementMonitor`."""
         return self.monitor.reward(self.monitor.GetMyContextFromRoot(root_context))
 
     def at_rest(self, root_context: Context) -> NDArray[np.bool_]:

@@ -1,7 +1,7 @@
 """Which seeds are for what: what a policy has learned from is not what it is tested on."""
 
 ALL_SEEDS = range(2**32)
-"""What can be a seed."""
+"""All seeds that there are."""
 
 TEST_SEEDS = range(10_000)
 """Seeds of test episodes."""
