@@ -5,6 +5,7 @@ import dataclasses
 import itertools
 import json
 import time
+from collections import Counter
 from collections.abc import Callable, Container, Iterable, Mapping, Sized
 from pathlib import Path
 
@@ -359,7 +360,8 @@ def _demonstrate(chosen: ChosenScenario, seed: int) -> Demonstration | Rejection
         raise
     except UserError as error:
         return Rejection(seed, 0.0, str(error))
-    recorder = DemonstrationRecorder(cell)
+    learning = chosen.scenario.task.learning
+    recorder = DemonstrationRecorder(cell, later_picks_possible=learning.later_picks_possible)
     result = run_chosen(chosen, cell, seed=seed, observers=[recorder.observe])
     return recorder.demonstration(result)
 
@@ -367,12 +369,15 @@ def _demonstrate(chosen: ChosenScenario, seed: int) -> Demonstration | Rejection
 class DemonstrationRecorder:
     """Takes down what the expert saw and did: an `EpisodeObserver`."""
 
-    def __init__(self, cell: Cell) -> None:
+    def __init__(self, cell: Cell, *, later_picks_possible: bool = False) -> None:
         """
         Args:
             cell: with the oracle and an `observation`.
+            later_picks_possible: see `Learning`. What took two actions, as it may where there are
+                several tries, did not lie yet where it was picked later, and spoils those labels.
         """
         self._cell = cell
+        self._later_picks_possible = later_picks_possible
         self._actions: list[tuple[Observation, PickPlaceAction]] = []
         self._final: FinalObservation | None = None
 
@@ -389,10 +394,14 @@ class DemonstrationRecorder:
             self._actions.append((observation, action))
 
     def demonstration(self, result: EpisodeResult) -> Demonstration | Rejection:
-        """The demonstration of the episode, now that it is over; steps that failed are left out."""
+        """The demonstration of the episode, now that it is over, without actions that failed."""
         if result.failure or result.success_rate < LEAST_SCORE:
             reason = result.failure or f"the reward was {result.success_rate:.0%}"
             return Rejection(result.seed, result.success_rate, reason)
+        taken = Counter(item.object for item in result.actions_taken)
+        again = next((name for name, times in taken.items() if times > 1), None)
+        if self._later_picks_possible and again is not None:
+            return Rejection(result.seed, result.success_rate, f"{again} took a second action")
         steps = tuple(
             DemonstrationStep.of(observation, action, name=item.object, category=item.category)
             for (observation, action), item in zip(self._actions, result.actions_taken, strict=True)

@@ -19,6 +19,7 @@ from kitting_drake.common.processes import (
 )
 from kitting_drake.common.provenance import source_digest, versions
 from kitting_drake.policies.static_scenes import (
+    StaticScene,
     StaticScenes,
     read_static_scenes,
     write_static_scenes,
@@ -131,14 +132,16 @@ class _Parts:
         batches = itertools.takewhile(self._counts.__contains__, itertools.count())
         return sum(self._counts[batch] for batch in batches)
 
-    def assemble(self, count: int, path: Path) -> list:
+    def assemble(self, count: int, path: Path) -> tuple[StaticScene, ...]:
         """Writes the one file of the first so many scenes; returns them."""
-        scenes = [scene for batch in sorted(self._counts) for scene in self._read(batch).scenes][
-            :count
-        ]
-        content = StaticScenes(PixelGrid(), tuple(scenes), self._seed, self._drawn_by)
+        batches = [self._read(batch).scenes for batch in sorted(self._counts)]
+        # In a batch there may be room for no toolset.
+        ends = sorted({*itertools.accumulate(len(scenes) for scenes in batches)} - {0})
+        everything = tuple(itertools.chain.from_iterable(batches))
+        content = StaticScenes(PixelGrid(), everything, self._seed, self._drawn_by, tuple(ends))
+        content = content.part(0, count)
         write_static_scenes(path, content)
-        return scenes
+        return content.scenes
 
 
 def _draw_part(path: Path, seed: int, drawn_by: dict[str, str]) -> int:

@@ -3,6 +3,7 @@
 import argparse
 import dataclasses
 import hashlib
+import math
 import re
 from pathlib import Path
 
@@ -130,6 +131,12 @@ def _checked_start(
             raise UserError(f"{arguments.start} has {flag} {found}: give --{flag} {found}")
     if config.colour and not learned.colour:
         raise UserError(f"{arguments.start} looks at colours, and {arguments.demos} has none")
+    resolution, found = learned.grid.resolution, file.card.get("resolution")
+    if found is not None and not math.isclose(found, resolution, rel_tol=1e-6):
+        raise UserError(
+            f"{arguments.start} learned from pixels of {found:g} m, and {arguments.demos} has "
+            f"pixels of {resolution:g} m"
+        )
     return config, tuple(sorted(card_seeds(file.card))), before
 
 
@@ -174,6 +181,13 @@ def _parse() -> argparse.Namespace:
         parser.error("--angle-only: a transporter has no network for angles alone")
     if arguments.weights and (arguments.demos or not arguments.export):
         parser.error("--weights is for --export without --demos")
+    for flag, given in (
+        ("--from", arguments.start),
+        ("--validation", arguments.validation),
+        ("--demonstrations", arguments.demonstrations),
+    ):
+        if arguments.demos is None and given is not None:
+            parser.error(f"{flag} needs --demos: without it nothing is trained")
     return arguments
 
 
@@ -274,18 +288,23 @@ def _split(
     """The data to learn from, and those to validate by."""
     everything = read_training_data(path)
     total = everything.count
+    # By default all are used.
+    most_kept = total if count is None else max(1, count // 10)
     if count is None:
-        count = total if validation else total - max(1, total // 11)
+        count = total if validation else _most_unrelated(everything, total - max(1, total // 11))
     if total < count:
         raise UserError(
             f"{path} holds {total} {everything.kind}, not {count}: {everything.made} more"
         )
     learned = everything.part(0, count)
     if validation is None:
-        kept = everything.part(count, count + max(1, count // 10))
+        first = min(end for end in everything.unrelated if end >= count)
+        kept = everything.part(first, first + most_kept)
         if not kept.count or not count:
             raise UserError(
-                f"of {total} in {path}, {count} to learn from leave none to validate by: "
+                f"of {total} in {path}, {count} {everything.kind} to learn from leave none to "
+                "validate by"
+                f"{'' if everything.has_taken else ' that show other tools'}: "
                 f"{everything.made} more, or give --validation"
             )
         return learned, kept
@@ -298,6 +317,12 @@ def _split(
     if held_out.grid != everything.grid:
         raise UserError(f"{validation} and {path} have different pixel grids")
     return learned, held_out
+
+
+def _most_unrelated(data: TrainingData, wanted: int) -> int:
+    """The most of them, up to what is wanted, that show nothing of what those after them show; all
+    that are wanted if there are none."""
+    return max((end for end in data.unrelated if end <= wanted), default=wanted)
 
 
 if __name__ == "__main__":

@@ -24,6 +24,8 @@ Training departs from the paper in this:
 - a label between pixels or orientations is shared among its neighbours (one-hot in the paper);
 - the correlation at half the resolution, where the search for a place begins, has a loss of its
   own;
+- a scene is shifted with a standard deviation of a sixth of the image along each side (in Ravens,
+  of a sixth of the shorter side along both);
 - alpha has an additional class, "nothing to pick";
 - the learning rate rises and falls over 1000 to 3000 steps (0.0001 over 10,000 in the paper);
 - the checkpoint is the best on separate validation scenes (on the test runs in the paper), by the

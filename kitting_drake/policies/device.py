@@ -30,7 +30,9 @@ def preferred_type() -> torch.dtype:
     there one is timed, once a process.
     """
     if preferred_device().type == "cuda":
-        return torch.bfloat16 if torch.cuda.is_bf16_supported() else torch.float32
+        # Before compute capability 8 it is emulated, and slower.
+        native = torch.cuda.is_bf16_supported(including_emulation=False)
+        return torch.bfloat16 if native else torch.float32
     if torch.backends.cpu.get_cpu_capability() not in ("AVX512", "AMX"):
         return torch.float32
     if torch.cpu._is_amx_tile_supported():

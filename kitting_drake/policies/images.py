@@ -27,7 +27,8 @@ the crop's corners."""
 _ROTATION_STD = math.radians(60)
 """Standard deviation of augmentation's rotations, in radians (as in the authors' code)."""
 _SHIFT_STD = 1 / 6
-"""Standard deviation of augmentation's shifts, in sides of the image (as in the authors' code)."""
+"""Standard deviation of augmentation's shifts, in sides of the image. In Ravens it is in shorter
+sides along both axes: here what is shifted along the longer one goes twice as far."""
 
 
 class Pictured(Protocol):

@@ -21,7 +21,7 @@ from kitting_drake.policies.networks import FactoredNetworks
 from kitting_drake.policies.onnx_runner import GRAPHS
 from kitting_drake.policies.steerable import BlurPool
 from kitting_drake.policies.unet import STRIDE
-from kitting_drake.policies.weights import load_networks
+from kitting_drake.policies.weights import load_networks, read_weights_file
 
 _OPSET = 17
 
@@ -70,6 +70,7 @@ def export_onnx(weights: Path, folder: Path) -> list[Path]:
             images between its networks, or the package onnx is not installed.
     """
     networks = load_networks(weights)
+    card = read_weights_file(weights).card
     if not isinstance(networks, FactoredNetworks):
         raise UserError(f"{weights}: a {networks.config.method} cannot be exported as ONNX")
     onnx = require_onnx()
@@ -95,6 +96,7 @@ def export_onnx(weights: Path, folder: Path) -> list[Path]:
         "pick_crop": sizes.PICK_CROP,
         "place_crop": sizes.PLACE_CROP,
         "stride": STRIDE,
+        "resolution": card.get("resolution"),
         "weights": weights.name,
     }
     write_json(described_in, described)

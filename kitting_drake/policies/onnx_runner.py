@@ -79,8 +79,19 @@ class OnnxPolicy:
         self._fit_outlines = fit_outlines
 
     def __call__(self, observation: Observation) -> PickPlaceAction:
-        """The action; both gripper poses are in the world."""
+        """The action; both gripper poses are in the world.
+
+        Raises:
+            UserError: the pixels are of another size than those that the networks learned from.
+        """
         resolution, orientations = observation.grid.resolution, self._orientations
+        # Exports of earlier versions do not tell.
+        learned_at = self.config.get("resolution")
+        if learned_at is not None and not math.isclose(learned_at, resolution, rel_tol=1e-6):
+            raise UserError(
+                f"the pixels are of {resolution:g} m, and the policy of {self.config['weights']} "
+                f"learned from pixels of {learned_at:g} m"
+            )
         image = self._input(observation)
         rows, cols = image.shape[1:]
         outlines = segment(observation) if self._fit_outlines else None

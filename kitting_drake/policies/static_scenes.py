@@ -7,7 +7,9 @@ and `versions`, and these datasets for n scenes with m actions in all:
   filled in (`fill_unseen`);
 - `actions` (m, 8): number of the object, cost of the grasp, pick x, y, theta, place x, y, theta, in
   metres and radians;
-- `first` (n + 1,): scene i has the actions `first[i]` to `first[i + 1]`; one without any is final.
+- `first` (n + 1,): scene i has the actions `first[i]` to `first[i + 1]`; one without any is final;
+- `batch_ends` (b,): how many scenes there are up to the end of each batch. The scenes of a batch
+  share their tools, and those of different batches nothing. Older files lack it.
 """
 
 from __future__ import annotations
@@ -89,6 +91,17 @@ class StaticScenes:
     scenes: tuple[StaticScene, ...]
     first_seed: int = 0
     versions: dict[str, Any] = dataclasses.field(default_factory=dict)
+    batch_ends: tuple[int, ...] = ()
+    """As in the file; if empty, the scenes are one batch."""
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "batch_ends", self.batch_ends or (len(self.scenes),))
+
+    def part(self, first: int, last: int) -> StaticScenes:
+        """Some of the scenes."""
+        scenes = self.scenes[first:last]
+        inside = (end - first for end in self.batch_ends if first < end < first + len(scenes))
+        return dataclasses.replace(self, scenes=scenes, batch_ends=(*inside, len(scenes)))
 
     def digest(self) -> str:
         """A digest of all heights and actions."""
@@ -120,6 +133,7 @@ def write_static_scenes(path: Path, content: StaticScenes) -> None:
         )
         file["actions"] = np.concatenate([np.zeros((0, 8)), *(s.actions for s in content.scenes)])
         file["first"] = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
+        file["batch_ends"] = np.array(content.batch_ends, np.int64)
     write_atomically(path, data.getvalue())
 
 
@@ -152,10 +166,12 @@ def read_static_scenes(path: Path) -> StaticScenes:
                 for i, height in enumerate(heights)
             )
             seed, versions = int(file.attrs["first_seed"]), json.loads(file.attrs["versions"])
+            ends = file["batch_ends"][()] if "batch_ends" in file else np.array([len(scenes)])
+            _check_batches(ends, len(scenes))
     except (OSError, LookupError, ValueError, TypeError, AttributeError, RuntimeError) as error:
         # h5py has all of these for bytes that make no sense.
         raise UserError(f"cannot read {path}: {error}") from error
-    return StaticScenes(grid, scenes, seed, versions)
+    return StaticScenes(grid, scenes, seed, versions, tuple(ends.tolist()))
 
 
 def _check(heights: NDArray, actions: NDArray, first: NDArray, grid: PixelGrid) -> None:
@@ -167,6 +183,13 @@ def _check(heights: NDArray, actions: NDArray, first: NDArray, grid: PixelGrid) 
     bounds = first.shape == (len(heights) + 1,) and first.dtype.kind in "iu"
     if not bounds or first[0] != 0 or first[-1] != len(actions) or (np.diff(first) < 0).any():
         raise ValueError("it does not tell which actions are whose")
+
+
+def _check_batches(ends: NDArray, count: int) -> None:
+    """Raises ValueError for what cannot be the ends of the batches of so many scenes."""
+    whole = ends.ndim == 1 and ends.dtype.kind in "iu" and len(ends) > 0
+    if not whole or ends[-1] != count or (np.diff(ends) <= 0).any():
+        raise ValueError("it does not tell which scenes are of one batch")
 
 
 class StaticSamples(Sequence[LabelledImage]):

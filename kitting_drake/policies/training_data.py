@@ -41,10 +41,10 @@ Item = TypeVar("Item")
 _TABLE = ("task", "heightmap")
 """The fields of a scenario that determine, with the seed, what stands where."""
 _NO_SCENE = (
-    *("tries", "random_order"),
+    *("tries", "random_order", "distractors"),
     *("success_threshold", "position_threshold", "angle_threshold_deg"),
 )
-"""Fields of a task that change nothing about that."""
+"""Fields of a task that change nothing about that, or nothing but what lies about beside it."""
 
 
 @dataclass(frozen=True)
@@ -85,11 +85,18 @@ class TrainingData:
         """The command by which one gets some, for people."""
         return "draw" if isinstance(self.items, StaticScenes) else "collect"
 
+    @property
+    def unrelated(self) -> tuple[int, ...]:
+        """After how many of them they may be cut in two, so that neither side shows what the other
+        one does: static scenes of one batch share their tools, demonstrations nothing."""
+        if isinstance(self.items, StaticScenes):
+            return self.items.batch_ends
+        return tuple(range(1, self.count + 1))
+
     def part(self, first: int, last: int) -> TrainingData:
         """Some of them."""
         if isinstance(self.items, StaticScenes):
-            chosen = dataclasses.replace(self.items, scenes=self.items.scenes[first:last])
-            return dataclasses.replace(self, items=chosen)
+            return dataclasses.replace(self, items=self.items.part(first, last))
         items = self.items[first:last]
         return dataclasses.replace(
             self,
@@ -190,6 +197,13 @@ def read_training_data(path: Path) -> TrainingData:
     else:
         demonstrations: Demonstrations = read_demonstrations(path)
         origin = demonstrations.origin
+        # On a bench the grid begins at the table, wherever that is.
+        z_min = (origin.scenario.get("heightmap") or {}).get("z_min", 0.0)
+        if z_min != 0:
+            raise UserError(
+                f"{path} was collected with heightmap.z_min {z_min:g}, and networks learn from "
+                "heights above the table: collect with 0"
+            )
         data = TrainingData(
             scenario=origin.scenario_name,
             origin=origin.scenario,

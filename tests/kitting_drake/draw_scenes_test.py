@@ -60,6 +60,13 @@ def test_a_batch_that_is_missing_is_drawn_again_and_seeds_share_nothing(tmp_path
     assert (one.height != two.height).any()
 
 
+def test_the_one_file_tells_which_scenes_share_their_tools(tmp_path: Path):
+    parts = draw_scenes._Parts(tmp_path / "parts", 0, OURS)
+    parts.draw(50, AtOnce(), Console(quiet=True))
+    parts.assemble(50, tmp_path / "scenes.h5")
+    assert read_static_scenes(tmp_path / "scenes.h5").batch_ends == (20, 40, 50)
+
+
 def test_batches_of_another_seed_or_version_are_not_mixed(tmp_path: Path):
     draw_scenes._Parts(tmp_path, 0, OURS).draw(20, AtOnce(), Console(quiet=True))
     for seed, drawn_by in [(1, OURS), (0, {"kitting_drake": "0.2"})]:

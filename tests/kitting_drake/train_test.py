@@ -40,7 +40,12 @@ ROOT = Path(__file__).resolve().parents[2]
 GRID = PixelGrid(rows=33, cols=49)
 LEARNING = Learning(later_picks_possible=True, curvature=True)
 ORIGIN = Origin(
-    "mine", {"time_limit": 1.0, "task": {"_tag": "!Kitting", "tries": 1}}, GRID, 10, {}, LEARNING
+    "mine",
+    {"time_limit": 1.0, "task": {"_tag": "!Kitting", "tries": 1, "distractors": 0}},
+    GRID,
+    10,
+    {},
+    LEARNING,
 )
 ONE_THREAD = os.environ | {"OMP_NUM_THREADS": "1"}
 LOSSES = {"pick_position", "pick_angle", "place"}
@@ -158,6 +163,12 @@ def test_begins_with_the_weights_of_a_file(
     assert "give --orientations 180" in refused(
         demos, tmp_path / "no", "--from", start, "--orientations", 36
     )
+    finer = dataclasses.replace(ORIGIN, grid=dataclasses.replace(GRID, resolution=0.002))
+    told = refused(
+        write(tmp_path / "finer.h5", range(20, 24), finer), tmp_path / "no", "--from", start
+    )
+    assert "learned from pixels of 0.003125 m" in told
+    assert "finer.h5 has pixels of 0.002 m" in told
 
 
 @pytest.mark.parametrize("method", ["so2", "equivariant_transporter"])
@@ -356,6 +367,18 @@ def test_a_stopped_run_resumes_as_if_it_had_not_been_stopped(
     assert_same_outcome(tmp_path, trained)
 
 
+@pytest.mark.parametrize("flag", ["--from", "--validation", "--demonstrations"])
+def test_what_is_for_training_is_not_ignored_in_an_export(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], flag: str
+):
+    arguments = ["train", "--export", "onnx", "--output", str(tmp_path), flag, "3"]
+    with pytest.MonkeyPatch.context() as patch, pytest.raises(SystemExit) as left:
+        patch.setattr(sys, "argv", arguments)
+        training.main()
+    assert left.value.code == 2
+    assert f"{flag} needs --demos" in capsys.readouterr().err
+
+
 def test_demonstrations_of_another_task_may_have_the_same_seeds(demos: Path, tmp_path: Path):
     origin = dataclasses.replace(ORIGIN, scenario={"task": {"_tag": "!StackBlockPyramid"}})
     validation = write(tmp_path / "validation.h5", range(10, 12), origin)
@@ -406,7 +429,7 @@ def refused(
     ("flags", "sentence"),
     [
         (("--demonstrations", 5), "demonstrations.h5 holds 4 demonstrations, not 5: collect more"),
-        (("--demonstrations", 4), "4 to learn from leave none to validate by: collect more, or"),
+        (("--demonstrations", 4), "4 demonstrations to learn from leave none to validate by: "),
         (("--orientations", 24), "--orientations 24: 24 orientations alias"),
         (("--orientations", 37), "--orientations 37: orientations must be an even number, not 37"),
         (("--validation", "gone.h5"), "there is no file gone.h5"),
@@ -430,6 +453,12 @@ VALIDATIONS = {
             ORIGIN,
             scenario={"time_limit": 2.0, "task": {"_tag": "!Kitting", "tries": 2, "new": 0}},
         ),
+        "share the seed 13: validation needs other ones",
+    ),
+    # Nor do the boxes that --perturb lays beside them.
+    "the same tables with boxes": (
+        range(13, 15),
+        dataclasses.replace(ORIGIN, scenario={"task": {"_tag": "!Kitting", "distractors": 4}}),
         "share the seed 13: validation needs other ones",
     ),
     "another grid": (
@@ -459,11 +488,42 @@ def test_a_policy_that_would_never_stop_is_not_trained(
     assert "none ends with nothing left to pick: the policy would never stop" in told
 
 
-def static_scenes(path: Path, *counts: int) -> Path:
-    """A file of scenes with so many actions each."""
+def static_scenes(path: Path, *counts: int, batch: int = 1) -> Path:
+    """A file of scenes with so many actions each, in batches of so many."""
     scenes = [StaticScene(np.zeros(GRID.shape, np.uint16), np.zeros((n, 8))) for n in counts]
-    write_static_scenes(path, StaticScenes(GRID, tuple(scenes)))
+    ends = (*range(batch, len(scenes), batch), len(scenes))
+    write_static_scenes(path, StaticScenes(GRID, tuple(scenes), batch_ends=ends))
     return path
+
+
+@pytest.mark.parametrize(
+    ("batch", "count", "expected"),
+    [
+        # Neither side has scenes of a batch that the other has.
+        (8, None, (16, 4)),
+        (8, 9, (9, 1)),
+        (1, None, (19, 1)),
+        # Of the scenes after the batch of the last that is learned from, a tenth as many.
+        (5, 13, (13, 1)),
+    ],
+)
+def test_static_scenes_are_validated_by_other_tools(
+    tmp_path: Path, batch: int, count: int | None, expected: tuple[int, int]
+):
+    path = static_scenes(tmp_path / "scenes.h5", *range(1, 21), batch=batch)
+    learned, kept = training._split(path, count, None)
+    assert (learned.count, kept.count) == expected
+    # The scenes are known by how many actions they have.
+    last, first = (len(data.items.scenes[i].actions) - 1 for data, i in ((learned, -1), (kept, 0)))
+    assert last // batch < first // batch
+
+
+def test_static_scenes_of_one_batch_are_not_validated_by_themselves(
+    tmp_path: Path, refused: Callable[..., str]
+):
+    path = static_scenes(tmp_path / "scenes.h5", *range(1, 21), batch=20)
+    told = refused(path, tmp_path / "run")
+    assert "19 scenes to learn from leave none to validate by that show other tools" in told
 
 
 def test_where_there_is_nothing_to_pick_nothing_is_learned(

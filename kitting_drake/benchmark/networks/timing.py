@@ -73,10 +73,9 @@ def time_each(
             function()
             elapsed = read_clock(device) - start
             spent[name] += elapsed
-            if repeat == 0 or repeat >= warm_ups:
-                times[name].append(elapsed)
-    # The first run counts only where there was no time for another one.
-    return {name: Timing.of(runs[1:] or runs) for name, runs in times.items()}
+            times[name].append(elapsed)
+    # Warming up counts only where there was no time for more, and of that the warmest run.
+    return {name: Timing.of(runs[warm_ups:] or runs[-1:]) for name, runs in times.items()}
 
 
 def count_operations(function: Callable[[], object]) -> int:

@@ -12,7 +12,7 @@ import torch
 from PIL import Image
 from rich.console import Console
 
-from kitting_drake.benchmark.networks import benchmark_networks
+from kitting_drake.benchmark.networks import benchmark_networks, timing
 from kitting_drake.benchmark.networks.bench import Plan, synthetic_scene
 from kitting_drake.benchmark.networks.convolutions import Convolutions
 from kitting_drake.benchmark.networks.figure import draw_networks
@@ -253,6 +253,15 @@ def test_stops_when_the_budget_is_spent():
     )
     assert ran == ["a", "b"]
     assert timings["a"].runs == 1
+
+
+def test_where_the_budget_is_spent_in_warming_up_the_warmest_run_counts(
+    monkeypatch: pytest.MonkeyPatch,
+):
+    clock = iter([0.0, 3.0, 10.0, 11.0])  # Of 3 s and of 1 s.
+    monkeypatch.setattr(timing, "read_clock", lambda _: next(clock))
+    timings = time_each({"a": lambda: None}, torch.device("cpu"), repeats=5, budget=3.5)
+    assert timings["a"] == timing.Timing.of([1.0])
 
 
 @pytest.mark.parametrize(

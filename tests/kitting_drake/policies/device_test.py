@@ -34,6 +34,19 @@ def test_with_avx512_alone_the_faster_type_is_chosen(
     assert torch.get_num_threads() == threads
 
 
+@pytest.mark.parametrize(("native", "chosen"), [(True, torch.bfloat16), (False, torch.float32)])
+def test_an_accelerator_that_emulates_bfloat16_computes_in_float32(
+    monkeypatch: pytest.MonkeyPatch, native: bool, chosen: torch.dtype
+) -> None:
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+
+    def supported(including_emulation: bool = True) -> bool:
+        return native or including_emulation
+
+    monkeypatch.setattr(torch.cuda, "is_bf16_supported", supported)
+    assert device.preferred_type() == chosen
+
+
 def test_what_is_timed_takes_time() -> None:
     times = [device._seconds(dtype) for dtype in (torch.float32, torch.bfloat16)]
     assert all(1e-5 < seconds < 10 for seconds in times)
