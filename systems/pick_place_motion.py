@@ -9,6 +9,7 @@ from pydrake.common.containers import namedview
 
 from systems.hand_motion import (
     PARTS,
+    MotionLimits,
     braking_time,
     motion_at,
     motion_duration,
@@ -95,7 +96,7 @@ class PickPlaceMotion:
         state[_START] = now
         state[_START_RATE] = rate
         # Unless the mode says otherwise: come to rest.
-        state[_GOAL] = now + rate * braking_time(rate, self._limits[mode]) / 2
+        state[_GOAL] = now + rate * braking_time(rate, self._limits_of(state)) / 2
         state.start_opening = state.goal_opening = now_opening
         self._set_goals(state, mode)
         if mode == Mode.CHECK:
@@ -138,7 +139,7 @@ class PickPlaceMotion:
     def set_times(self, state: State) -> None:
         """Sets when each part of the present mode's motion begins, and how long all of it takes."""
         mode = Mode(int(state.mode))
-        limits = self._limits[mode]
+        limits = self._limits_of(state)
         rate = np.asarray(state[_START_RATE])
         braking = braking_time(rate, limits)
         # What moves comes to rest first.
@@ -164,6 +165,12 @@ class PickPlaceMotion:
             np.asarray(state[_START]), np.asarray(state[_GOAL]), rate, limits, delays
         )
 
+    def _limits_of(self, state: State) -> MotionLimits:
+        """The limits of the present mode's motion."""
+        mode = Mode(int(state.mode))
+        # In a period of a faster one the force would rise by more than is asked for.
+        return self._limits[Mode.LOWER if state.press and mode == Mode.DESCEND else mode]
+
     def set_force(self, state: State, time: float, force: float) -> None:
         """Lets the closing force go to another value, from what it is now."""
         if force != state.goal_force:
@@ -178,7 +185,7 @@ class PickPlaceMotion:
             state[_START],
             state[_GOAL],
             state[_START_RATE],
-            self._limits[Mode(int(state.mode))],
+            self._limits_of(state),
             state[_DELAYS],
             time - state.start_time,
         )

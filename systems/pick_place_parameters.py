@@ -80,7 +80,8 @@ class PickPlaceParameters:
     minimum_width: float = bounded(0.0015, 0.0, 0.08)
 
     # How hard the closed jaws press an object down that is not seated, in N, and how far below its
-    # top they may go, in m.
+    # top they may go, in m. They come down at `lower_speed`, at which merely to touch it means some
+    # 25 N, and go beyond what is asked for by some 5 N.
     press_force: float = bounded(30.0, 1.0, 140.0)
     press_depth: float = bounded(0.020, 0.001, 0.05)
 

@@ -64,18 +64,20 @@ class PickPlacePlanner(LeafSystem):
       object pressed down, the latest last, at most 16 of them: for a policy that is to try another.
 
     Every motion is as short as the limits on speed and acceleration allow, and smooth (see
-    `systems.hand_motion`): in the plane along a straight line, while height and yaw have time
-    courses of their own. What goes up clears the highest surface of o_t before it travels, and what
-    travels sinks when it is nearly there, to just above what o_t shows around its goal
-    (`APPROACH`, `CARRY`). From there two guarded motions, `DESCEND` and `LOWER`, stop dead where
-    the vertical contact force rises `contact_threshold` above the payload's weight, and hold the
-    height reached: no known height of table, kit or cavity tells them where to stop. Where places
-    are insertions, and the object comes to stand on the rim around its place, the hand feels for
-    the cavity (`SEARCH`) and lowers again once the resistance ends. A grasp is good if the pads
+    `systems.hand_motion`); where `CARRY` goes on from a `LIFT` that still accelerates, velocity is
+    continuous and acceleration is not. It is in the plane along a straight line, while height and
+    yaw have time courses of their own. What goes up clears the highest surface of o_t before it
+    travels, and what travels sinks when it is nearly there, to just above what o_t shows around its
+    goal (`APPROACH`, `CARRY`). From there two guarded motions, `DESCEND` and `LOWER`, stop dead
+    where the vertical contact force rises `contact_threshold` above the payload's weight, and hold
+    the height reached: no known height of table, kit or cavity tells them where to stop. Where
+    places are insertions, and the object comes to stand on the rim around its place, the hand feels
+    for the cavity (`SEARCH`) and lowers again once the resistance ends. A grasp is good if the pads
     stand further apart than `minimum_width` and both feel at least half of the grasp force; when it
     is not, or is lost on the way, the hand retreats and observes again, which counts as an action.
-    What turns out to be heavier than `heavy_load` is gripped more firmly as it is lifted.
-    An action that says `press` ends with `DESCEND`, with closed jaws and as hard as `press_force`.
+    What turns out to be heavier than `heavy_load` is gripped more firmly as it is lifted. An action
+    that says `press` ends with `DESCEND`, with closed jaws, as slowly as `LOWER` and until
+    `press_force` is reached.
 
     All memory is discrete state: one vector, and the failed picks.
     """
@@ -261,7 +263,10 @@ class PickPlacePlanner(LeafSystem):
 
     def _descend(self, context, state, time, hand, contact) -> None:
         if state.press:
-            if contact[2] > self._parameters.press_force or time >= self._motion.arrival(state):
+            if contact[2] > self._parameters.press_force:
+                # Braking would press harder still.
+                self._motion.begin(state, Mode.RETREAT, time, z=hand[2])
+            elif time >= self._motion.arrival(state):
                 self._motion.begin(state, Mode.RETREAT, time)
         elif contact[2] > self._parameters.contact_threshold:
             self._motion.begin(state, Mode.CLOSE, time, z=hand[2])

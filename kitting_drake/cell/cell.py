@@ -26,6 +26,7 @@ from kitting_drake.cell.appearance import paint_surfaces
 from kitting_drake.cell.cameras import add_picture_renderer, can_render
 from kitting_drake.cell.plant import add_models, add_plant, bounded_body, set_initial_poses
 from kitting_drake.cell.sensing import add_cameras, add_video
+from kitting_drake.common.errors import UserError
 from kitting_drake.scenario.policies import DecisionObserver, PolicySite
 from kitting_drake.scenario.schema import Scenario
 from kitting_drake.tasks.task import Scene
@@ -155,6 +156,7 @@ def build_cell(
     """
     grid = scenario.heightmap.grid()
     scene = scenario.task.make_scene(grid=grid, seed=seed, base=base)
+    _check_scene(scenario, scene)
     builder = DiagramBuilder()
 
     # The plant: table, fixtures, objects, hand.
@@ -218,6 +220,26 @@ def build_cell(
         sleep=scenario.sleep.enabled,
         video_writer=video_writer,
     )
+
+
+def _check_scene(scenario: Scenario, scene: Scene) -> None:
+    """Raises UserError where the hand would collide with what it cannot see or cannot span."""
+    tops = {item.name: float((item.X_WB @ item.p_BPoints.T)[2].max()) for item in scene.objects}
+    tops |= {goal.name: goal.rim_height for goal in scene.goals if goal.rim_height is not None}
+    name, top = max(tops.items(), key=lambda pair: pair[1])
+    if top > scenario.heightmap.z_max:
+        raise UserError(
+            f"heightmap.z_max is {scenario.heightmap.z_max:g}, and the hand would not see how high "
+            f"{name} is: at least {top:.3f} is needed"
+        )
+    for index in scene.goal_objects:
+        item = scene.objects[index]
+        narrowest = min((grasp.width for grasp in item.grasps), default=0.0)
+        if narrowest >= scenario.planner.open_width:
+            raise UserError(
+                f"planner.open_width is {scenario.planner.open_width:g}, and {item.name} is "
+                f"{narrowest:.3f} m wide where it is gripped"
+            )
 
 
 def _surface_groups(

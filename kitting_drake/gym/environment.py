@@ -139,10 +139,12 @@ class KittingEnvironment(gymnasium.Env[dict[str, Any], NDArray[Any]]):
         self._earned = 0.0
         self._advance(self._episode)
         if self._episode.is_over:
-            limit = f"the time limit of {self.scenario.time_limit:g} s came first"
+            why = self._episode.failure or "planner.max_actions allows none"
+            if self._episode.timed_out:
+                why = f"the time limit of {self.scenario.time_limit:g} s came first"
             raise UserError(
                 f"{self._chosen.path}: with seed {chosen_seed} the episode was over before the "
-                f"first action: {self._episode.failure or limit}"
+                f"first action: {why}"
             )
         return self._observe(), self._info(self._episode.result())
 

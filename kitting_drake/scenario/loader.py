@@ -17,6 +17,10 @@ from kitting_drake.tasks import Task
 from systems.bounds import check_bounds
 from systems.hand_geometry import JOINT_LIMITS
 
+_PLAINLY_BELOW = 0.02
+"""A grid that begins so far below the table, in m, is not taken for one that is off (see
+`systems.surface_heights`)."""
+
 
 def load_scenario(
     path: Path, name: str | None = None, text: str | None = None, perturb: str | None = None
@@ -53,7 +57,15 @@ def load_scenario(
         raise UserError(f"{path} has no scenario '{name}': use one of {', '.join(names)}")
     scenario = _load(root[name], content, name, Scenario(), f"{path}: {name}")
     if perturb is not None:
-        raw, defaults = _onto(perturbation(perturb, scenario), scenario)
+        overlay = perturbation(perturb, scenario)
+        # Of paints the later one wins, and a name that is given again would keep its place.
+        kept = {
+            name: paint
+            for name, paint in scenario.appearance.paints.items()
+            if name not in overlay.get("appearance", {}).get("paints", {})
+        }
+        scenario = dc.replace(scenario, appearance=dc.replace(scenario.appearance, paints=kept))
+        raw, defaults = _onto(overlay, scenario)
         scenario = _load(raw, _dumped(raw), None, defaults, "--perturb")
     if text is not None:
         raw, defaults = _onto(_parse(text, "--scenario_text"), scenario)
@@ -165,6 +177,8 @@ def _check_names(node: yaml.Node | None) -> None:
             line = key.start_mark.line + 1
             if key.tag != "tag:yaml.org,2002:str":
                 raise ValueError(f"the name on line {line} must be a text")
+            if key.value == "_tag":
+                raise ValueError(f"'_tag' on line {line} is no field: write !Name before the value")
             if key.value in seen:
                 raise ValueError(f"'{key.value}' is given twice (again on line {line})")
             seen.add(key.value)
@@ -213,6 +227,11 @@ def _check_meaning(scenario: Scenario) -> None:
         raise ValueError(
             f"heightmap.z_min is {scenario.heightmap.z_min:g}: the table, at 0, must be seen, as "
             "the hand goes by its height"
+        )
+    if -_PLAINLY_BELOW < scenario.heightmap.z_min < 0:
+        raise ValueError(
+            f"heightmap.z_min is {scenario.heightmap.z_min:g}: so little below the table it would "
+            f"pass for an error of calibration: use 0, or -{_PLAINLY_BELOW:g} and less"
         )
     if scenario.heightmap.z_max <= scenario.heightmap.z_min:
         raise ValueError("heightmap.z_max must be above heightmap.z_min")

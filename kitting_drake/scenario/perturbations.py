@@ -54,6 +54,8 @@ _OVERLAYS: dict[str, tuple[dict[str, Any], ...]] = {
     "mass": tuple({"plant": {"mass_variation": share}} for share in (0.15, 0.3, 0.5)),
     "distractors": tuple({"task": {"distractors": count}} for count in (2, 4, 8)),
 }
+_WORSE_IF_LESS = ("steepest_deg",)
+"""Of all other numbers the greater one is worse."""
 
 NAMES = (*_OVERLAYS, "all")
 
@@ -91,10 +93,7 @@ def perturbation(text: str, scenario: Scenario) -> dict[str, Any]:
             task = type(scenario.task).__name__
             raise UserError(f"--perturb: {name} does not apply to the task !{task}")
         _merge(overlay, _OVERLAYS[name][LEVELS.index(level)])
-    if "task" in overlay:
-        # The world does not become more perfect than the scenario has it.
-        found = scenario.task.distractors  # type: ignore[union-attr]
-        overlay["task"]["distractors"] = max(overlay["task"]["distractors"], found)
+    _keep_worse(overlay, scenario)
     return overlay
 
 
@@ -104,6 +103,16 @@ def _applies(name: str, scenario: Scenario) -> bool:
         return False
     fields = {item.name for item in dc.fields(scenario.task)}
     return "task" not in _OVERLAYS[name][0] or name in fields
+
+
+def _keep_worse(overlay: dict[str, Any], found: object) -> None:
+    """Lets the world become no more perfect than it is: of two numbers the worse one stays."""
+    for name, value in overlay.items():
+        given = getattr(found, name)
+        if isinstance(value, dict) and dc.is_dataclass(given):
+            _keep_worse(value, given)
+        elif isinstance(value, int | float) and given is not None:
+            overlay[name] = min(value, given) if name in _WORSE_IF_LESS else max(value, given)
 
 
 def _merge(into: dict[str, Any], given: dict[str, Any]) -> None:

@@ -193,15 +193,22 @@ class Learned(PolicyConfig):
                 f"heightmap.resolution is {resolution:g} m, and the policy of {path.name} "
                 f"learned from pixels of {learned_at:g} m"
             )
+        if site.grid.z_min != 0:
+            raise UserError(
+                f"heightmap.z_min is {site.grid.z_min:g}, and the policy of {path.name} learned "
+                "from heights above the table: use 0"
+            )
         # Outlines and recesses mean something only where objects are inserted.
         insertion = any(goal.rim_height is not None for goal in site.scene.goals)
+        if self.recover and not insertion:
+            raise UserError("policy.recover mends insertions, and in this task nothing is inserted")
         try:
             function = LearnedPolicy(
                 networks,
                 orientations=self.orientations,
                 continuous=self.continuous,
                 fit_outlines=insertion and self.continuous and self.fit_outlines,
-                recover=insertion and self.recover,
+                recover=self.recover,
                 clear_jaws=not insertion and self.continuous and self.fit_outlines,
                 may_stop=site.may_stop,
                 watch=site.observer,

@@ -62,8 +62,8 @@ class Heightmap:
     rows: int = bounded(160, 1, 4096)
     cols: int = bounded(320, 1, 4096)
 
-    # Heights are counted from z_min, at or below the table's 0, in m: what is below reads as z_min,
-    # and what is above z_max is not seen.
+    # Heights are counted from z_min, in m: what is below reads as z_min, and what is above z_max is
+    # not seen. Learned policies need 0, the table's; where something is lower, take -0.02 or less.
     z_min: float = bounded(0.0, -1.0, 10.0)
     z_max: float = bounded(0.28, -1.0, 10.0)
 

@@ -15,7 +15,7 @@ from pydrake.systems.framework import Context, EventStatus
 
 from kitting_drake.cell import Cell, build_cell
 from kitting_drake.common.errors import UserError
-from kitting_drake.common.paths import MODELS
+from kitting_drake.common.paths import MODELS, SCENARIOS
 from kitting_drake.policies.device import preferred_type
 from kitting_drake.policies.learned_policy import LearnedPolicy
 from kitting_drake.policies.weights import load_networks
@@ -368,6 +368,28 @@ def test_one_of_everything_builds_and_steps(name: str):
     observation = port(cell, "observation", root)
     assert observation.grid == scenario.heightmap.grid()
     assert observation.height.any()
+
+
+@pytest.mark.parametrize(
+    ("text", "sentence"),
+    [
+        ("{heightmap: {z_max: 0.03}}", r"z_max is 0\.03, and the hand would not see how high"),
+        ("{planner: {open_width: 0.01}}", r"open_width is 0\.01, and .* wide where it is gripped"),
+        (
+            "{heightmap: {z_min: -0.03}, policy: !Learned {weights: ''}}",
+            r"z_min is -0\.03, and the policy of generalist\.safetensors learned from heights",
+        ),
+        (
+            "{task: !StackBlockPyramid {}, policy: !Learned {weights: '', recover: true}}",
+            r"policy\.recover mends insertions",
+        ),
+    ],
+)
+@pytest.mark.usefixtures("rendering")
+def test_what_would_go_wrong_is_not_built(text: str, sentence: str):
+    scenario = load_scenario(SCENARIOS / "kitting_seen.yaml", text=text)
+    with pytest.raises(UserError, match=sentence):
+        build(scenario)
 
 
 # Models that cannot be used.

@@ -252,6 +252,8 @@ def test_bad_text_is_told_apart_from_a_bad_file():
         load_scenario(TEST_SCENARIOS, text="!Oracle {time_limit: 3.0}")
     with pytest.raises(UserError, match=r"^--scenario_text must be a mapping"):
         load_scenario(TEST_SCENARIOS, text="faster")
+    with pytest.raises(UserError, match=r"^--scenario_text: '_tag' on line 1 is no field"):
+        load_scenario(TEST_SCENARIOS, text="{task: {_tag: 5}}")
 
 
 def test_a_range_holds_for_file_and_text_together(tmp_path: Path):
@@ -263,3 +265,5 @@ def test_a_range_holds_for_file_and_text_together(tmp_path: Path):
         UserError, match=r"heightmap\.z_min is 0\.02: the table, at 0, must be seen"
     ):
         load_scenario(path, text="{heightmap: {z_min: 0.02}}")
+    with pytest.raises(UserError, match=r"z_min is -0\.005: so little below the table it would"):
+        load_scenario(path, text="{heightmap: {z_min: -0.005}}")

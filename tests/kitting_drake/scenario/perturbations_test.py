@@ -4,7 +4,7 @@ import pytest
 
 from kitting_drake.common.errors import UserError
 from kitting_drake.common.paths import SCENARIOS
-from kitting_drake.scenario.appearance import Drawn
+from kitting_drake.scenario.appearance import Drawn, Fixed
 from kitting_drake.scenario.loader import load_scenario
 from kitting_drake.scenario.perturbations import LEVELS, NAMES, perturbation
 from kitting_drake.scenario.schema import Scenario
@@ -71,9 +71,36 @@ def test_what_a_task_asks_for_is_not_perturbed():
     assert load_scenario(ravens, "PlaceRedInGreen", perturb="all").task.distractors == 10
 
 
-def test_nothing_becomes_more_perfect():
+def test_nothing_becomes_more_perfect(tmp_path: Path):
     crowded = load_scenario(KITTING, None, None, "distractors:severe")
     assert perturbation("distractors:mild", crowded) == {"task": {"distractors": 8}}
+    path = tmp_path / "measured.yaml"
+    path.write_text(
+        "Mine:\n"
+        "  sensor_noise: {depth_std: 0.003, steepest_deg: 75.0}\n"
+        "  plant: {mass_variation: 0.2}\n"
+        "  appearance: {drawn_lights: 0.5}\n"
+    )
+    for level, expected in (("mild", (0.003, 75, 0.2, 0.5)), ("severe", (0.004, 70, 0.5, 0.9))):
+        scenario = load_scenario(path, None, None, f"all:{level}")
+        noise, appearance = scenario.sensor_noise, scenario.appearance
+        found = (noise.depth_std, noise.steepest_deg, scenario.plant.mass_variation)
+        assert (*found, appearance.drawn_lights) == expected
+
+
+@pytest.mark.parametrize("level", LEVELS)
+def test_colours_are_drawn_over_a_scenarios_own_paints(tmp_path: Path, level: str):
+    path = tmp_path / "mine.yaml"
+    path.write_text(
+        "Mine: {appearance: {paints: {'*': !Fixed {rgb: [1, 0, 0]}, 'fixtures/*': !Fixed {}, "
+        "'objects/*': !Fixed {rgb: [0, 1, 0]}}}}"
+    )
+    paints = load_scenario(path, None, None, f"colour:{level}").appearance.paints
+    drawn = [name for name, paint in paints.items() if isinstance(paint, Drawn)]
+    # They come last, so that they win; what was painted before is what a spread is about.
+    assert list(paints)[-len(drawn) :] == drawn
+    assert drawn == (["*", "fixtures/*"] if level == "severe" else ["*"])
+    assert paints["objects/*"] == Fixed(rgb=[0, 1, 0])
 
 
 def test_by_default_nothing_is_perturbed():
