@@ -4,6 +4,7 @@ A real camera's frames become one pick and place in the robot's frame; no Drake.
 """
 
 import argparse
+import json
 import math
 import time
 from pathlib import Path
@@ -24,6 +25,7 @@ from kitting_drake.bench.report import CHECK_FILES, print_check, print_decision,
 from kitting_drake.common.command_line import count_type, run_command
 from kitting_drake.common.errors import MachineError, UserError
 from kitting_drake.common.files import require_folder, write_atomically, write_json
+from systems.signals import PixelGrid
 
 
 def main() -> int:
@@ -34,11 +36,13 @@ def main() -> int:
     action, picture = folder / "action.json", folder / "decision.png"
     # Should this fail, nobody must take the answer to an earlier frame for that to this one.
     earlier = [folder / name for name in CHECK_FILES] if arguments.check else [action, picture]
+    if not arguments.check:
+        _check_decided(action)
     for path in earlier:
         if path.resolve() != arguments.camera.resolve():
             _remove(path)
     calibration = read_calibration(arguments.camera, table_height=arguments.table_height)
-    block = _block(arguments)
+    block = _block(arguments, calibration.grid)
     frames = read_frames(arguments.frames, calibration)
     if arguments.check:
         checked = check_cameras(frames, calibration, block)
@@ -62,6 +66,18 @@ def main() -> int:
     print_decision(console, record)
     console.print(f"files: {folder}/", highlight=False, markup=False)
     return 0
+
+
+def _check_decided(action: Path) -> None:
+    """Raises UserError for an `action.json` that was not decided here: it is a demonstration's."""
+    try:
+        record = json.loads(action.read_text())
+    except FileNotFoundError:
+        return
+    except (OSError, ValueError):
+        record = None
+    if not isinstance(record, dict) or not {"policy", "seconds"} <= set(record):
+        raise UserError(f"{action} was not decided here: give another --output")
 
 
 def _remove(path: Path) -> None:
@@ -97,7 +113,7 @@ def _parser() -> argparse.ArgumentParser:
     policy.add_argument("--weights", type=Path, metavar="FILE", help="networks (the generalist's)")
     policy.add_argument("--shape_matching", action="store_true", help="decide by outlines alone")
     parser.add_argument(
-        "--orientations", type=count_type, default=180, metavar="N", help="of the networks (180)"
+        "--orientations", type=count_type, metavar="N", help="of the networks (180)"
     )
     parser.add_argument(
         "--no_outlines", action="store_true", help="networks: refine nothing (no cavities)"
@@ -129,16 +145,22 @@ def _parser() -> argparse.ArgumentParser:
 
 def _policy(arguments: argparse.Namespace) -> BenchPolicy:
     if arguments.shape_matching:
+        for flag, given in (
+            ("--orientations", arguments.orientations is not None),
+            ("--no_outlines", arguments.no_outlines),
+        ):
+            if given:
+                raise UserError(f"{flag} is for networks, and --shape_matching has none")
         return ShapeMatching(recover=arguments.recover)
     return load_policy(
         arguments.weights,
-        orientations=arguments.orientations,
+        orientations=arguments.orientations or 180,
         fit_outlines=not arguments.no_outlines,
         recover=arguments.recover,
     )
 
 
-def _block(arguments: argparse.Namespace) -> Block | None:
+def _block(arguments: argparse.Namespace, grid: PixelGrid) -> Block | None:
     if arguments.kit_size_mm is None:
         if arguments.kit_pose is not None:
             raise UserError("--kit_pose needs --kit_size_mm")
@@ -151,6 +173,13 @@ def _block(arguments: argparse.Namespace) -> Block | None:
     pose = None if arguments.kit_pose is None else tuple(arguments.kit_pose)
     if pose is not None and not all(map(math.isfinite, pose)):
         raise UserError("--kit_pose takes three finite numbers: x and y in m, and yaw in rad")
+    if pose is not None and not grid.contains(pose[:2]):
+        raise UserError(
+            f"--kit_pose: ({pose[0]:g}, {pose[1]:g}) m is outside the workspace: it takes x and y "
+            "of the block's middle in m"
+        )
+    if pose is not None and abs(pose[2]) > math.tau:
+        raise UserError(f"--kit_pose: the yaw {pose[2]:g} is more than a rotation: it is in rad")
     return Block((length, width, height), pose)
 
 

@@ -140,6 +140,7 @@ def _read_camera(path: Path, name: str, node: Any, beside: Sequence[str]) -> Ben
         lens = read_yaml(file)
         if not has_intrinsics(lens):
             raise UserError(f"{where}: {file} holds no camera_matrix and no k")
+        _check_distortion(lens, f"{where}: {file}")
     elif not has_intrinsics(node):
         # Where a camera's intrinsics are, or seem to be.
         lenses = ("cameras", "camera_info", "camera_matrix", "fx")
@@ -150,6 +151,7 @@ def _read_camera(path: Path, name: str, node: Any, beside: Sequence[str]) -> Ben
     intrinsics, X_BC = read_intrinsics(lens, where), read_pose(node, where)
     if "fx" not in node:
         # OpenCV and ROS write fields that mean nothing here, such as image_height.
+        _check_distortion(node, where)
         _check_misspelt(node, (*known, *_BENCH_FIELDS), known, where, likeness=0.85)
     else:
         _check_fields(node, (*OWN_INTRINSICS, *known, "camera_name"), where)
@@ -160,6 +162,17 @@ def _read_camera(path: Path, name: str, node: Any, beside: Sequence[str]) -> Ben
             f"{camera.max_depth:g}, both in metres"
         )
     return camera
+
+
+def _check_distortion(node: dict[str, Any], where: str) -> None:
+    """Raises UserError for coefficients that would be passed over. OpenCV and ROS write other
+    fields that we do not know, and none whose name begins so."""
+    for key in node:
+        if str(key).lower().startswith("dist") and key not in OWN_INTRINSICS:
+            raise UserError(
+                f"{where} has the unknown field '{key}': the lens's coefficients are called "
+                "distortion_coefficients, and in ROS d"
+            )
 
 
 def _check_fields(node: dict[str, Any], known: Sequence[str], where: str) -> None:

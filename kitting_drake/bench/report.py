@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 
 from kitting_drake.bench.calibration import write_calibration
@@ -25,7 +26,8 @@ def print_decision(console: Console, record: dict[str, Any]) -> None:
     confidence = record["confidence"]
     sure = "" if confidence is None else f", confidence {confidence:.2f}"
     said = "stop" if record["stop"] else "press" if record["press"] else "pick and place"
-    console.print(f"{said}{sure} ({record['policy']}, {record['seconds']:.2f} s)", highlight=False)
+    by = f"({record['policy']}, {record['seconds']:.2f} s)"
+    console.print(f"{said}{sure} {by}", highlight=False, markup=False)
     if record["seen"] < _WELL_SEEN:
         console.print(
             f"  only {100 * record['seen']:.0f} % of what is in view is seen; the rest is filled "
@@ -98,7 +100,7 @@ def print_check(console: Console, check: Check) -> None:
     for line in findings(check):
         colour = {GOOD: "green", BAD: "red"}.get(line.verdict, "yellow")
         table.add_row(
-            line.who if line.who != last else "",
+            escape(line.who) if line.who != last else "",
             line.what,
             line.value,
             f"[{colour}]{line.verdict}[/]",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -89,6 +90,8 @@ def _pose(node: Any, grid: PixelGrid, where: str) -> PlanarPose:
             f"{where} at ({x:g}, {y:g}) m is outside the workspace "
             f"({grid.x_min:g} to {grid.x_max:g}, {grid.y_min:g} to {grid.y_max:g} m)"
         )
+    if abs(yaw) > math.tau:
+        raise UserError(f"{where}.yaw is {yaw:g}, more than a rotation: it is in radians")
     return PlanarPose(x, y, yaw)
 
 

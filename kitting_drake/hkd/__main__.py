@@ -117,6 +117,8 @@ def sheet(args: argparse.Namespace, entries: list[ToolEntry]) -> None:
     from kitting_drake.hkd.sheet import kit_subject, tool_subject, write_sheet
 
     if args.kits:
+        if args.names:
+            raise UserError(f"--kits draws kits, not '{args.names[0]}': leave one of the two out")
         chosen = toolsets(args.split)[: args.kits]
         kits = [make_kit([load_tool(name) for name in names], KitParameters()) for names in chosen]
         subjects = [kit_subject(f"{args.split} {i:03d}", kit) for i, kit in enumerate(kits)]
@@ -226,9 +228,6 @@ def _check_scenario(path: Path, console: Console) -> None:
 def main() -> int:
     """Runs one verb; returns the exit status."""
     parser = argparse.ArgumentParser(prog="python -m kitting_drake.hkd", description=__doc__)
-    parser.add_argument(
-        "--models", type=Path, default=MODELS, help="the directory with package.xml and tools/"
-    )
     verbs = parser.add_subparsers(dest="verb", required=True)
     for name, function in (("list", list_tools), ("generate", generate), ("sheet", sheet)):
         verb = verbs.add_parser(name, help=function.__doc__)
@@ -236,6 +235,10 @@ def main() -> int:
             "names", nargs="*", metavar="NAME", help="tools; all of them if none is named"
         )
         verb.set_defaults(function=function)
+        if name != "sheet":
+            verb.add_argument(
+                "--models", type=Path, default=MODELS, help="the folder with package.xml and tools/"
+            )
         if name == "generate":
             verb.add_argument("--quiet", action="store_true", help="print nothing")
         if name == "sheet":
@@ -260,7 +263,8 @@ def main() -> int:
     _describe_import(verbs.add_parser("import", help=import_mesh.__doc__))
     _describe_kit(verbs.add_parser("kit", help=kit.__doc__))
     args = parser.parse_args()
-    args.function(args, load_catalogue(args.models / "tools" / "catalogue.yaml"))
+    models = getattr(args, "models", MODELS)
+    args.function(args, load_catalogue(models / "tools" / "catalogue.yaml"))
     return 0
 
 

@@ -80,7 +80,9 @@ class Subject:
 def tool_subject(tool: Tool) -> Subject:
     """A tool at rest on the table."""
     title = tool.name.replace("_", " ")
-    return Subject(title, [(tool.sdf, RigidTransform())], (0.0, 0.0, 0.006), 0.208)
+    # A larger tool than those of the dataset is seen from further away.
+    size = 0.208 * max(1.0, tool.length / 0.2, tool.width / 0.13)
+    return Subject(title, [(tool.sdf, RigidTransform())], (0.0, 0.0, 0.006), size)
 
 
 def kit_subject(title: str, kit: Kit) -> Subject:

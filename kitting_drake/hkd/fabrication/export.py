@@ -102,6 +102,9 @@ def _parameters(request: KitRequest) -> KitParameters:
             raise UserError(f"{flag} {value:g} is out of range: give {low:g} to {high:g}")
     if request.clearance_mm is not None:
         parameters.clearance = round(1e-3 * request.clearance_mm, 7)
+        # Straight edges that stray inward would take a small clearance away.
+        finest = max(parameters.clearance / 20, 1e-6)
+        parameters.tolerance = min(parameters.tolerance, finest)
     if request.wall_mm is not None:
         parameters.nested_wall = round(1e-3 * request.wall_mm, 7)
     if request.block_mm is not None:

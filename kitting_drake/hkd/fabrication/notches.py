@@ -78,10 +78,15 @@ def _best_pair(
                 outline = _notch(cavity, disc, radius, wall)
                 if outline is not None:
                     outlines.append(outline)
-        if len(outlines) == 2:
+        if len(outlines) == 2 and _is_wall_between(outlines[0], outlines[1], cavity, wall):
             return outlines
-        single = single or outlines
+        single = single or outlines[:1]
     return single
+
+
+def _is_wall_between(one: CrossSection, other: CrossSection, cavity: Cavity, wall: float) -> bool:
+    """Whether what stands between two notches of a cavity is no thinner than a wall."""
+    return ((_grown(one, wall) ^ other) - cavity.outline).area() < 1e-9
 
 
 def _beside(

@@ -58,7 +58,9 @@ from kitting_drake.hkd.tools.symmetry import symmetry_order
 from kitting_drake.hkd.tools.tool import check_category, load_tool, tool_names, user_tools
 
 TIME_LIMIT = 55.0
-"""Seconds after which the geometry is given up."""
+"""Seconds of processor time after which the geometry is given up."""
+_MOST_WAITING = 10.0
+"""It is given up too after so many times that limit by the clock: the machine may be busy."""
 _MAKING = ".making-"
 """The names of the folders in which tools are made begin with this."""
 _MOST_MEMORY = 12 * 2**30
@@ -107,7 +109,8 @@ def import_tool(request: ImportRequest, time_limit: float | None = TIME_LIMIT) -
 
     Args:
         request: what to import.
-        time_limit: in seconds, for the process that does it; None does it in this process.
+        time_limit: in seconds of processor time, for the process that does it; None does it in this
+            process.
 
     Raises:
         UserError: it cannot be saved, and nothing was written.
@@ -155,7 +158,7 @@ def _remove_abandoned(folder: Path) -> None:
     for path in folder.glob(f"{_MAKING}*"):
         # Another import may have removed it by now.
         with contextlib.suppress(FileNotFoundError):
-            if time.time() - path.stat().st_mtime > 10 * TIME_LIMIT:
+            if time.time() - path.stat().st_mtime > 2 * _MOST_WAITING * TIME_LIMIT:
                 shutil.rmtree(path, ignore_errors=True)
 
 
@@ -209,19 +212,24 @@ Prepared = tuple[dict[str, Any], list[str], int]
 
 
 def _prepare_aside(request: ImportRequest, name: str, made: Path, time_limit: float) -> Prepared:
-    """`prepare_tool` in a process that is ended after `time_limit`."""
+    """`prepare_tool` in a process that is ended after `time_limit` of processor time."""
+    too_long = UserError(
+        f"{request.mesh} was not worked out in {time_limit:.0f} s: decimate the mesh first"
+    )
     context = multiprocessing.get_context("spawn")
     ours, theirs = context.Pipe(duplex=False)
-    process = context.Process(target=_child, args=(theirs, request, name, made), daemon=True)
+    arguments = (theirs, request, name, made, time_limit)
+    process = context.Process(target=_child, args=arguments, daemon=True)
     process.start()
     theirs.close()
     try:
-        if not ours.poll(time_limit):
-            raise UserError(
-                f"{request.mesh} was not worked out in {time_limit:.0f} s: decimate the mesh first"
-            )
+        if not ours.poll(_MOST_WAITING * time_limit):
+            raise too_long
         error, result = ours.recv()
     except EOFError as end:
+        process.join()
+        if process.exitcode == -signal.SIGXCPU:
+            raise too_long from end
         raise UserError(f"{request.mesh} is too broken a mesh to be worked out") from end
     finally:
         process.kill()
@@ -232,7 +240,9 @@ def _prepare_aside(request: ImportRequest, name: str, made: Path, time_limit: fl
     return result
 
 
-def _child(pipe: Connection, request: ImportRequest, name: str, made: Path) -> None:
+def _child(
+    pipe: Connection, request: ImportRequest, name: str, made: Path, time_limit: float
+) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     # Libraries talk: what there is to say goes through the pipe.
     nowhere = os.open(os.devnull, os.O_WRONLY)
@@ -242,6 +252,8 @@ def _child(pipe: Connection, request: ImportRequest, name: str, made: Path) -> N
         import resource
 
         resource.setrlimit(resource.RLIMIT_AS, (_MOST_MEMORY, _MOST_MEMORY))
+        most = math.ceil(time.process_time() + time_limit)
+        resource.setrlimit(resource.RLIMIT_CPU, (most, resource.getrlimit(resource.RLIMIT_CPU)[1]))
     except (ImportError, ValueError, OSError):
         pass
     try:

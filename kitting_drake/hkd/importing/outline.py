@@ -32,6 +32,7 @@ _MOST_STEPS = 400
 _MOST_BYTES = 20_000_000
 _LEAST_AREA_MM2 = 1.0
 _NUMBER_UNIT = re.compile(r"([0-9.eE+-]+)\s*([a-z]*)")
+_UNITS = ("", "mm", "cm", "in", "pt", "pc", "px")
 _NOT_DRAWN = ("symbol", "mask", "marker", "clipPath", "pattern")
 _NOTES = ("DIMENSION", "ARC_DIMENSION", "LARGE_RADIAL_DIMENSION", "LEADER", "MULTILEADER")
 """Entities of DXF that tell of a drawing, and whose lines are no outline."""
@@ -126,7 +127,7 @@ def _svg_curves(path: Path) -> list[Curve]:
             for part in abs(svgelements.Path(shape)).as_subpaths()
             if (points := _sampled(svgelements.Path(part), _MM_PER_PIXEL))
         ]
-    except MemoryError:
+    except (MemoryError, UserError):
         raise
     except Exception as error:
         # Readers fail on broken files in as many ways as there are.
@@ -146,16 +147,28 @@ def _settle_size(root: ElementTree.Element) -> tuple[float, float]:
         if value == "auto" or value.endswith("%"):
             del root.attrib[name]
     given = [name for name in sides if name in root.attrib]
+    for name in given:
+        # svgelements takes what it cannot read for pixels: `200 mm`, for one.
+        root.set(name, "".join(_length(root.attrib[name], name)))
     if len(given) == 1 and "viewBox" in root.attrib:
         (known,) = given
         (other,) = sides.keys() - {known}
-        match = _NUMBER_UNIT.fullmatch(root.attrib[known].strip())
-        if match is None:
-            raise ValueError(f"{known} is no length")
-        number, unit = match.groups()
-        root.set(known, number + unit)
+        number, unit = _length(root.attrib[known], known)
         root.set(other, f"{float(number) * sides[other] / sides[known]!r}{unit}")
     return sides["width"], sides["height"]
+
+
+def _length(text: str, name: str) -> tuple[str, str]:
+    """The number and the unit of a length, which may be none.
+
+    Raises:
+        UserError: it is no length in a unit that we know.
+    """
+    match = _NUMBER_UNIT.fullmatch(text.strip().lower())
+    if match is None or match[2] not in _UNITS:
+        units = ", ".join(unit for unit in _UNITS if unit)
+        raise UserError(f"its {name} is '{text}': give a number and one of {units}")
+    return match[1], match[2]
 
 
 def _keep_from_drawing(root: ElementTree.Element) -> None:

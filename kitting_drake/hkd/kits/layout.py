@@ -100,7 +100,7 @@ def layout_kit(tools: Sequence[Tool], parameters: KitParameters) -> KitLayout:
     if not 1 <= len(tools) <= MOST_TOOLS:
         raise UserError(f"a kit holds 1 to {MOST_TOOLS} tools, not {len(tools)}")
     for tool in tools:
-        if parameters.height - tool.height < parameters.minimum_wall:
+        if parameters.height - tool.height < parameters.minimum_wall - 1e-9:
             raise UserError(
                 f"'{tool.name}' is {1e3 * tool.height:.1f} mm high and leaves less than a wall of "
                 f"{1e3 * parameters.minimum_wall:.1f} mm (kit.minimum_wall) below it in a block of "

@@ -6,7 +6,7 @@ Solids are handled in mm and written in metres.
 """
 
 import dataclasses
-import shutil
+import tempfile
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -17,7 +17,8 @@ import yaml
 from manifold3d import CrossSection, JoinType, Manifold, OpType
 from scipy.spatial import ConvexHull, QhullError
 
-from kitting_drake.common.errors import UserError
+from kitting_drake.common.errors import MachineError, UserError
+from kitting_drake.common.files import replace_folder
 from kitting_drake.hkd.grasps.grip import Grip, find_grip, jaw_axes
 from kitting_drake.hkd.tools import hammer, meshes, pliers, screwdriver, wrench
 from kitting_drake.hkd.tools.collision import (
@@ -184,8 +185,23 @@ def generate_tool(entry: ToolEntry, directory: Path) -> Report:
     """Writes the model of one tool to `directory`, replacing what is there.
 
     Raises:
-        CatalogueError: the entry makes no tool that can be used; then nothing is written.
+        CatalogueError: the entry makes no tool that can be used.
+        MachineError: it cannot be written. In both cases what is there remains.
     """
+    try:
+        directory.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(dir=directory.parent, prefix=".making-") as scratch:
+            made = Path(scratch) / entry.name
+            made.mkdir()
+            report = _write_tool(entry, made)
+            replace_folder(directory, made, Path(scratch) / "replaced")
+            return report
+    except OSError as error:
+        raise MachineError(f"cannot write {directory}: {error.strerror}") from error
+
+
+def _write_tool(entry: ToolEntry, directory: Path) -> Report:
+    """Writes the model of one tool into an empty folder; see `generate_tool`."""
     parts = build_parts(entry)
     mass, center, inertia = mass_properties(homogeneous(parts))
     # Hulls are merged in the stable pose: outline and heights are those of that pose.
@@ -195,9 +211,6 @@ def generate_tool(entry: ToolEntry, directory: Path) -> Report:
     box = np.array(whole.bounding_box()).reshape(2, 3)
     grip = _measure_grasp(entry.grasp, whole)
 
-    if directory.exists():
-        shutil.rmtree(directory)
-    directory.mkdir(parents=True)
     center = R_TD @ center + 1e-3 * p_T
     inertia = R_TD @ inertia @ R_TD.T
     visuals, triangles = _write_visuals(parts, R_TD, p_T, directory)

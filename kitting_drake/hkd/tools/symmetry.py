@@ -1,7 +1,7 @@
-"""Which tools are reversible: whether a half turn about z leaves a tool as it was.
+"""Which rotations about z leave a tool as it was.
 
-A tool is reversible only if nobody could tell it from its half-turn copy, neither by its surface
-nor by the fit in its cavity. Then the half turn in its cavity is the same placement.
+A tool is symmetric only if nobody could tell it from its rotated copy, neither by its surface nor
+by the fit in its cavity. Then the rotation in its cavity is the same placement.
 """
 
 from collections.abc import Callable
@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import trimesh
+from manifold3d import CrossSection
 from numpy.typing import NDArray
 from scipy.optimize import minimize
 from scipy.spatial import cKDTree
@@ -17,10 +18,13 @@ from kitting_drake.hkd.tools.collision import furthest
 from kitting_drake.hkd.tools.tool import footprint
 
 MOST_SURFACE_DISTANCE_MM = 0.5
-"""The mean distance of a reversible tool from its half-turn copy is less than this."""
+"""The mean distance of a symmetric tool from its rotated copy is less than this."""
 
 MOST_OUTLINE_DEVIATION_MM = 2.0
 """The largest distance of their outlines is less than this: the clearance of a cavity."""
+
+ORDERS = (24, 12, 8, 6, 5, 4, 3, 2)
+"""The orders that are tried. The first one stands for what is round."""
 
 _SAMPLES, _DENSE_SAMPLES = 4000, 400_000
 
@@ -28,8 +32,8 @@ Shift = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class Reversal:
-    """How a tool differs from its half-turn copy about the best centre."""
+class Difference:
+    """How a tool differs from its rotated copy about the best centre."""
 
     outline_deviation_mm: float
     """The largest distance of a point of one outline from the other, 5 mm at most."""
@@ -46,16 +50,32 @@ class Reversal:
 
 
 def symmetry_order(triangles: NDArray[np.float64]) -> int:
-    """The order of a tool's rotational symmetry about z: 2 for a reversible tool, else 1.
+    """The order of a tool's rotational symmetry about z, the largest of `ORDERS`; 1 for none.
 
     Args:
         triangles: (n, 3, 3) of the surface in frame T, in metres.
     """
-    return 2 if measure_reversal(triangles).is_symmetric else 1
+    outline = footprint(triangles).scale((1e3, 1e3))
+    size = _size(outline)
+    for order in ORDERS:
+        # Wherever the copy is moved: what has another size deviates by half of the difference.
+        differs = np.abs(_size(outline.rotate(360.0 / order)) - size).max()
+        alike = differs < 2 * MOST_OUTLINE_DEVIATION_MM
+        if alike and measure_rotation(triangles, order).is_symmetric:
+            return order
+    return 1
 
 
-def measure_reversal(triangles: NDArray[np.float64], *, complete: bool = False) -> Reversal:
-    """Compares a tool with its half-turn copy.
+def _size(outline: CrossSection) -> NDArray[np.float64]:
+    """(2): along x and y."""
+    bounds = np.array(outline.bounds())
+    return bounds[2:] - bounds[:2]
+
+
+def measure_rotation(
+    triangles: NDArray[np.float64], order: int = 2, *, complete: bool = False
+) -> Difference:
+    """Compares a tool with its copy, rotated by 2 pi / order.
 
     The copy is moved along x and y to where the area that only one of the outlines covers is least;
     from there, once to where the outlines' deviation is least, and once to where the surfaces'
@@ -63,10 +83,11 @@ def measure_reversal(triangles: NDArray[np.float64], *, complete: bool = False) 
 
     Args:
         triangles: (n, 3, 3) of the surface in frame T, in metres.
+        order: of the symmetry; 2 is a half turn.
         complete: whether the surfaces are compared where the outlines already differ too much.
     """
     outline = footprint(triangles).scale((1e3, 1e3))
-    copy = outline.rotate(180.0)
+    copy = outline.rotate(360.0 / order)
 
     def uncommon_area(shift: Shift) -> float:
         moved = copy.translate(tuple(shift))
@@ -82,22 +103,27 @@ def measure_reversal(triangles: NDArray[np.float64], *, complete: bool = False) 
     if complete or outline_deviation < 2 * MOST_OUTLINE_DEVIATION_MM:
         outline_deviation = _minimum(deviation, shift, 0.5)[1]
     if not complete and outline_deviation >= MOST_OUTLINE_DEVIATION_MM:
-        return Reversal(outline_deviation, np.inf)
-    return Reversal(outline_deviation, _surface_distance(1e3 * triangles, shift))
+        return Difference(outline_deviation, np.inf)
+    return Difference(outline_deviation, _surface_distance(1e3 * triangles, order, shift))
 
 
-def _surface_distance(triangles: NDArray[np.float64], start: Shift) -> float:
-    """The mean distance of a surface and its half-turn copy, moved from `start` to the best."""
+def _surface_distance(triangles: NDArray[np.float64], order: int, start: Shift) -> float:
+    """The mean distance of a surface and its rotated copy, moved from `start` to the best."""
     faces = np.arange(3 * len(triangles)).reshape(-1, 3)
     mesh = trimesh.Trimesh(triangles.reshape(-1, 3), faces, process=False)
     points, _ = trimesh.sample.sample_surface(mesh, _SAMPLES, seed=0)
     dense, _ = trimesh.sample.sample_surface(mesh, _DENSE_SAMPLES, seed=1)
     tree = cKDTree(dense)
 
-    # A half turn undoes itself, so the distances from the copy to the original are those back.
+    c, s = np.cos(2 * np.pi / order), np.sin(2 * np.pi / order)
+    R = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+
+    # From the copy to the original and back; a half turn undoes itself.
     def mean_distance(shift: Shift) -> float:
-        copies = points * (-1.0, -1.0, 1.0) + np.append(shift, 0.0)
-        return float(tree.query(copies)[0].mean())
+        offset = np.append(shift, 0.0)
+        there = tree.query(points @ R.T + offset)[0].mean()
+        back = there if order == 2 else tree.query((points - offset) @ R)[0].mean()
+        return float(there + back) / 2
 
     return _minimum(mean_distance, start, 0.5)[1]
 

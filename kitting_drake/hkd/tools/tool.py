@@ -1,6 +1,8 @@
 """A tool as a scenario uses it: a folder with its SDFormat model, its meshes and its record."""
 
+import dataclasses
 import difflib
+import math
 import os
 import re
 from dataclasses import dataclass
@@ -157,6 +159,15 @@ def load_tool(name: str, base: Path | None = None) -> Tool:
         check_category(tool.category)
     except UserError as error:
         raise UserError(f"{record_path}: {error}") from error
+    sizes = {
+        **{name: getattr(tool, name) for name in ("length", "width", "height", "mass")},
+        "grasp.width": tool.grasp.width,
+    }
+    for name, value in sizes.items():
+        if not 0 < value < math.inf:
+            raise UserError(f"{record_path}: {name} is {value:g}, and has to be positive")
+    if not all(map(math.isfinite, dataclasses.astuple(tool.grasp))):
+        raise UserError(f"{record_path}: grasp has to be of finite numbers")
     if tool.symmetry < 1:
         raise UserError(f"{record_path}: symmetry is {tool.symmetry}, and has to be 1 or more")
     return tool

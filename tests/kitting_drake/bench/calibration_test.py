@@ -226,6 +226,12 @@ def test_fields_beside_those_of_other_programs_are_not_passed_over(tmp_path: Pat
     read(tmp_path, OPENCV + "avg_reprojection_error: 0.2\nimage_height_mm: 3\n")
     with pytest.raises(UserError, match="field 'table_hieght': did you mean 'table_height'"):
         read(tmp_path, OPENCV + "table_hieght: 0.012\n")
+    assert "distortion_coefficients:" in OPENCV
+    for name in ("dist_coeff", "distCoeffs", "distortion_coefs"):
+        with pytest.raises(UserError, match=f"unknown field '{name}': the lens's coefficients"):
+            read(tmp_path, OPENCV.replace("distortion_coefficients", name))
+    with pytest.raises(UserError, match="unknown field 'distortion_coeffs': the lens's"):
+        read(tmp_path, ROS, eye_info=CAMERA_INFO.replace("\nd: ", "\ndistortion_coeffs: "))
 
 
 def test_a_file_that_is_no_calibration_is_refused(tmp_path: Path):

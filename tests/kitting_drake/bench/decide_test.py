@@ -201,12 +201,16 @@ def test_the_command_checks_cameras_without_drake(bench: Path):
     nowhere = command(bench, "--check", "--kit_size_mm", 200, 150, 50, "--kit_pose", 0.5, "nan", 0)
     assert nowhere.returncode == 2
     assert nowhere.stderr.startswith("error: --kit_pose takes three finite numbers")
+    in_mm = command(bench, "--check", "--kit_size_mm", 200, 150, 50, "--kit_pose", 500, 0, 0)
+    assert in_mm.stderr.startswith("error: --kit_pose: (500, 0) m is outside the workspace")
+    in_deg = command(bench, "--check", "--kit_size_mm", 200, 150, 50, "--kit_pose", 0.5, 0, 90)
+    assert in_deg.stderr.startswith("error: --kit_pose: the yaw 90 is more than a rotation")
 
 
 def test_input_that_cannot_be_used_ends_with_one_sentence(bench: Path):
     (bench / "left_depth.npy").unlink()
     (bench / "out").mkdir()
-    (bench / "out" / "action.json").write_text("{}")
+    (bench / "out" / "action.json").write_text('{"policy": "generalist", "seconds": 0.3}')
     (bench / "out" / "check.json").write_text("{}")
     assert command(bench, "--check").returncode == 2
     assert [path.name for path in (bench / "out").iterdir()] == ["action.json"]
@@ -217,6 +221,24 @@ def test_input_that_cannot_be_used_ends_with_one_sentence(bench: Path):
     assert done.stderr.startswith("error: camera left: ")
     assert "neither left_depth.npy nor" in done.stderr
     assert "Traceback" not in done.stderr
+
+
+def test_the_action_of_a_demonstration_is_not_lost(bench: Path):
+    (bench / "out").mkdir()
+    kept = bench / "out" / "action.json"
+    for text in ('{"pick": {}, "place": {}, "object": "hammer"}', "{", "[]"):
+        kept.write_text(text)
+        done = command(bench, "--shape_matching")
+        assert done.returncode == 2
+        assert "action.json was not decided here: give another --output" in done.stderr
+        assert kept.read_text() == text
+
+
+@pytest.mark.parametrize("flags", [("--orientations", 36), ("--no_outlines",)])
+def test_flags_of_networks_are_not_ignored(bench: Path, flags: tuple):
+    done = command(bench, "--shape_matching", *flags)
+    assert done.returncode == 2
+    assert f"{flags[0]} is for networks, and --shape_matching has none" in done.stderr
 
 
 # What may be wrong with frames.

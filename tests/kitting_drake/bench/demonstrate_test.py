@@ -225,6 +225,10 @@ def only_stop(folder: Path) -> None:
         (action("demo1/step9", "{"), "step9/action.json is no JSON"),
         (action("demo1/step9", [1]), "must be an object with pick and place"),
         (action("demo1/step9", {"pick": POSES["pick"]}), "place must have x, y and yaw"),
+        (
+            action("demo1/step9", {**POSES, "pick": {**POSES["pick"], "yaw": 17}}),
+            "pick.yaw is 17, more than a rotation: it is in radians",
+        ),
         (action("demo1/step9", {"stop": "yes"}), "stop must be true or false, not 'yes'"),
         (action("demo1/step9", {**POSES, "press": True}), "presses down"),
         (action("demo1/step9", {**POSES, "object": 3}), "object must be a text, not 3"),

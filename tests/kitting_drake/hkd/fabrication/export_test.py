@@ -1,6 +1,7 @@
 import errno
 import io
 import json
+import math
 import os
 import re
 import shutil
@@ -22,7 +23,9 @@ from scipy.spatial import cKDTree
 from kitting_drake.common.errors import UserError
 from kitting_drake.hkd.fabrication.design import design_kit
 from kitting_drake.hkd.fabrication.export import KitRequest, export_kit
+from kitting_drake.hkd.fabrication.notches import _is_wall_between
 from kitting_drake.hkd.importing.importer import ImportRequest, import_tool
+from kitting_drake.hkd.kits.block import Cavity
 from kitting_drake.hkd.kits.kit import make_kit
 from kitting_drake.hkd.kits.parameters import KitParameters
 from kitting_drake.hkd.tools.tool import load_tool, tool_names
@@ -237,6 +240,17 @@ def test_notches_leave_walls_standing():
         assert max(-y_min, y_max) < width / 2 - 0.0029
 
 
+@pytest.mark.parametrize("apart", [0.001, 0.004])
+@pytest.mark.parametrize("inside", [False, True])
+def test_a_wall_stands_between_the_notches_of_one_tool(apart: float, inside: bool):
+    """Around a corner of a tool they may come near; within its cavity there is nothing between."""
+    one = CrossSection.square((0.02, 0.02))
+    other = one.translate((0.02 + apart, 0.0))
+    side = 0.1 if inside else 0.01
+    cavity = Cavity(CrossSection.square((side, side)), floor=0.03, top=0.05, lead_in=0.001)
+    assert _is_wall_between(one, other, cavity, 0.003) == (inside or apart > 0.003)
+
+
 def test_a_notch_without_room_is_told_and_a_label_goes_to_the_floor(bar: Path, tmp_path: Path):
     request = KitRequest((str(bar),), tmp_path, wall_mm=2.0, notches=True, labels=True)
     design = export_kit(request)
@@ -268,6 +282,21 @@ def test_a_block_of_a_given_size(tmp_path: Path):
     scenario = load_scenario(tmp_path / "kit" / "scenario.yaml")
     scene = scenario.task.make_scene(grid=PixelGrid(), seed=0, base=tmp_path / "kit")
     assert scene.goals[0].rim_height == pytest.approx(0.030)
+
+
+@pytest.mark.parametrize("clearance", [0.1, 0.2])
+def test_a_small_clearance_is_kept(clearance: float, tmp_path: Path):
+    design = export_kit(KitRequest(("claw_hammer",), tmp_path / "kit", clearance_mm=clearance))
+    kit = design.kit
+    pose = kit.layout.poses[0]
+    outline = kit.tools[0].footprint.rotate(math.degrees(pose.yaw)).translate((pose.x, pose.y))
+    grown = outline.offset(0.8e-3 * clearance, JoinType.Round)
+    assert (grown - design.cavities[0].outline).area() < 1e-10
+
+
+def test_what_is_left_below_a_tool_may_be_just_a_wall(bar: Path, tmp_path: Path):
+    height = 1e3 * load_tool(str(bar)).height
+    export_kit(KitRequest((str(bar),), tmp_path, block_mm=(300.0, 300.0, height + 2.0)))
 
 
 @pytest.mark.parametrize(

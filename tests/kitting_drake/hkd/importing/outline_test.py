@@ -51,11 +51,18 @@ def size(path: Path) -> tuple[float, float]:
         ('width="100%" height="100%"', 25.4 / 96),
         ('width="200mm"', 1.0),
         ('height="80 mm"', 1.0),
+        ('width="200 mm" height="80 mm"', 1.0),
+        ('width="200MM" height="80MM"', 1.0),
         ('width="10cm" height="auto"', 0.5),
     ],
 )
 def test_an_svg_is_measured_by_its_width(measures: str, mm: float, tmp_path: Path):
     assert size(drawing(tmp_path, BAR, measures)) == pytest.approx((160 * mm, 20 * mm), rel=1e-4)
+
+
+def test_a_unit_that_is_none_is_told(tmp_path: Path):
+    with pytest.raises(UserError, match="its width is '200um': give a number and one of mm, cm"):
+        read_outline(drawing(tmp_path, BAR, 'width="200um" height="80um"'))
 
 
 @pytest.mark.parametrize(

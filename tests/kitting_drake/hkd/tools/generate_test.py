@@ -1,9 +1,12 @@
+import errno
 import re
 from pathlib import Path
 
 import pytest
 
+from kitting_drake.common.errors import MachineError
 from kitting_drake.common.paths import MODELS
+from kitting_drake.hkd.tools import generate
 from kitting_drake.hkd.tools.generate import CatalogueError, generate_tool, load_catalogue
 from kitting_drake.hkd.tools.tool import tool_names
 
@@ -28,6 +31,23 @@ def without_noise(sdf: bytes) -> str:
     return re.sub(r"-?\d+(\.\d+)?e-\d+", clean, sdf.decode())
 
 
+def without_order(obj: bytes) -> list[tuple[str, ...]]:
+    """The corners of all faces, with their normals, in an order that is the same on any machine:
+    of faces that are alike, rounding decides which comes first, and with which corner."""
+    lines = obj.decode().splitlines()
+    points, normals = ([line for line in lines if line.startswith(kind)] for kind in ("v ", "vn "))
+    faces = []
+    for line in lines:
+        if line.startswith("f "):
+            # Hulls have no normals.
+            pairs = [corner.partition("//")[::2] for corner in line.split()[1:]]
+            corners = [points[int(v) - 1] + (normals[int(n) - 1] if n else "") for v, n in pairs]
+            first = corners.index(min(corners))
+            faces.append((*corners[first:], *corners[:first]))
+    assert faces
+    return sorted(faces)
+
+
 @pytest.mark.parametrize(
     "entry",
     [
@@ -43,12 +63,32 @@ def test_generating_gives_the_committed_files(entry, tmp_path: Path):
     for name in kept:
         if name.endswith(".sdf"):
             assert without_noise(made[name]) == without_noise(kept[name]), name
+        elif name.endswith(".obj"):
+            assert without_order(made[name]) == without_order(kept[name]), name
         else:
             assert made[name] == kept[name], name
     # What can be touched is what is seen, to a fraction of the clearance.
     assert max(report.outside_mm, report.inside_mm) < 0.35
     assert abs(report.bottom_error_mm) < 0.1
     assert abs(report.grip_error_mm) < 0.2
+
+
+def test_a_tool_that_cannot_be_written_leaves_the_old_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    folder = tmp_path / "claw_hammer"
+    folder.mkdir()
+    (folder / "old").write_text("")
+
+    def full(*_: object) -> int:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(generate.meshes, "write_convex_obj", full)
+    entry = next(entry for entry in ENTRIES if entry.name == "claw_hammer")
+    with pytest.raises(MachineError, match="claw_hammer: No space left on device"):
+        generate_tool(entry, folder)
+    assert [path.name for path in tmp_path.iterdir()] == ["claw_hammer"]
+    assert [path.name for path in folder.iterdir()] == ["old"]
 
 
 @pytest.mark.parametrize(

@@ -4,7 +4,7 @@ from manifold3d import Manifold
 from numpy.typing import NDArray
 
 from kitting_drake.hkd.tools.meshes import vertices_and_faces
-from kitting_drake.hkd.tools.symmetry import measure_reversal, symmetry_order
+from kitting_drake.hkd.tools.symmetry import measure_rotation, symmetry_order
 from kitting_drake.hkd.tools.tool import load_tool
 
 
@@ -14,6 +14,10 @@ def bar() -> Manifold:
 
 def block(length: float, width: float, height: float) -> Manifold:
     return Manifold.cube((length, width, height), True).translate((0, 0, height / 2))
+
+
+def prism(sides: int, size: float) -> Manifold:
+    return Manifold.cylinder(20, size / 2, circular_segments=sides)
 
 
 def triangles(solid: Manifold) -> NDArray[np.float64]:
@@ -43,6 +47,10 @@ def triangles(solid: Manifold) -> NDArray[np.float64]:
         # Nobody sees a notch of half a millimetre; of five, everybody does.
         (bar() - block(1, 4, 30).translate((90, 0, 0)), 2),
         (bar() - block(10, 4, 30).translate((90, 0, 0)), 1),
+        (prism(6, 60), 6),
+        (prism(4, 60), 4),
+        (prism(3, 60), 3),
+        (prism(128, 60), 24),
         # The same outline, but a hollow at one end.
         (bar() - block(70, 18, 10).translate((50, 0, 5)), 1),
     ],
@@ -53,7 +61,7 @@ def test_the_order_of_shapes(solid: Manifold, order: int):
 
 def test_what_is_measured():
     longer = bar() + block(10, 20, 10).translate((85, 5, 0))
-    reversal = measure_reversal(triangles(longer), complete=True)
+    reversal = measure_rotation(triangles(longer), complete=True)
     # The step of 5 mm is shared between the two ends.
     assert reversal.outline_deviation_mm == pytest.approx(2.5, abs=0.1)
     assert 0.1 < reversal.surface_distance_mm < 0.5

@@ -83,6 +83,8 @@ def test_a_path_is_not_a_name(copy: Path, tmp_path: Path):
     [
         ({"category": "A spoon"}, r"tool\.yaml: category 'A spoon' has to be a name"),
         ({"symmetry": 0}, r"tool\.yaml: symmetry is 0, and has to be 1 or more"),
+        ({"width": float("nan")}, r"tool\.yaml: width is nan, and has to be positive"),
+        ({"mass": -3.0}, r"tool\.yaml: mass is -3, and has to be positive"),
         ({"mass": "heavy"}, r"tool\.yaml is not a tool record"),
         ({"grasp": {"x": 0.0}}, r"tool\.yaml is not a tool record"),
         ({"grasp": None}, r"tool\.yaml is not a tool record"),
