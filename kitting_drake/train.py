@@ -213,7 +213,7 @@ def _parser() -> argparse.ArgumentParser:
         type=Path,
         metavar="FILE.h5",
         help="demonstrations to choose a checkpoint by (default: those of --demos that come after "
-        "the ones learned from, a tenth as many)",
+        "the ones learned from, a tenth as many; of static scenes, those of other tools)",
     )
     parser.add_argument(
         "--from",
