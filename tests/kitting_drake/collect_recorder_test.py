@@ -162,10 +162,9 @@ def test_only_what_was_placed_is_a_step():
     failed = dataclasses.replace(result, success_rate=0.0, failure="the solver", actions_taken=[])
     assert recorder.demonstration(failed) == Rejection(3, 0.0, "the solver")
     # What was picked again lay elsewhere before, which matters where later picks are labels.
-    first, *_, last = result.actions_taken
-    again = dataclasses.replace(
-        result, actions_taken=[first, dataclasses.replace(last, object=first.object)]
-    )
+    first, *others, last = result.actions_taken
+    twice = [first, *others, dataclasses.replace(last, object=first.object)]
+    again = dataclasses.replace(result, actions_taken=twice)
     assert isinstance(recorder.demonstration(again), Demonstration)
     labelling = DemonstrationRecorder(cell, later_picks_possible=True)
     assert labelling.demonstration(again) == Rejection(3, 1.0, "object_0 took a second action")
