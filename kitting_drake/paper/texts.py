@@ -109,8 +109,9 @@ labels from every tool of a scene instead of the one that was taken next; and cu
 reflection augmentation of the tools. On the unseen toolsets networks learn from these samples in
 {more} steps instead of {steps}. The policy itself says when it is done. One more row closes the
 loop: it corrects what an action left undone (`recover`), in at most two actions a tool, where the
-paper has one. No row uses colour augmentation, so that it is not ablated. When these cells were
-run, the failures of ours on these seeds were known.
+paper has one. The hand pressed with twice the force that it presses with now. No row uses colour
+augmentation, so that it is not ablated. When these cells were run, the failures of ours on these
+seeds were known.
 
 The rows of the unseen toolsets share their networks, but for the first and the last two. They
 were trained again for the ablation, from the same seed, as those before had not been kept; those

@@ -92,7 +92,7 @@ class StaticScenes:
     first_seed: int = 0
     versions: dict[str, Any] = dataclasses.field(default_factory=dict)
     batch_ends: tuple[int, ...] = ()
-    """As in the file; if empty, the scenes are one batch."""
+    """They are as in the file; where none is given, the scenes are one batch."""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "batch_ends", self.batch_ends or (len(self.scenes),))

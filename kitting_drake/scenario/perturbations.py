@@ -55,7 +55,7 @@ _OVERLAYS: dict[str, tuple[dict[str, Any], ...]] = {
     "distractors": tuple({"task": {"distractors": count}} for count in (2, 4, 8)),
 }
 _WORSE_IF_LESS = ("steepest_deg",)
-"""Of all other numbers the greater one is worse."""
+"""These numbers are worse where they are less; all others are worse where they are greater."""
 
 NAMES = (*_OVERLAYS, "all")
 
