@@ -236,6 +236,8 @@ class Learned(PolicyConfig):
             **{key: file.card.get(key) for key in _TOLD},
             "training_seed": file.card.get("seed"),
             "angle_only": file.card.get("angle_only", False),
+            # The step of the checkpoint that was kept, of `steps`.
+            "checkpoint_step": (file.card.get("validation") or {}).get("step"),
         }
 
     def digest(self, base: Path) -> str | None:

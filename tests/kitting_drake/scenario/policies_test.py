@@ -119,7 +119,9 @@ def test_results_say_what_a_policy_is(weights_file: Path):
         "rigid": None,
         "training_seed": None,
         "angle_only": False,
+        "checkpoint_step": None,
     }
+    assert Learned(weights="").details(base)["checkpoint_step"] == 4800
     assert config.training_seeds(base) == {10_000, 10_001, 10_002}
     # Seeds of static scenes are none of episodes.
     assert Learned(weights="").training_seeds(base) == set()
