@@ -1,6 +1,7 @@
 """`python -m kitting_drake.draw_scenes`: static scenes of random tools, to train a generalist."""
 
 import argparse
+import hashlib
 import itertools
 import os
 from pathlib import Path
@@ -11,6 +12,7 @@ from kitting_drake.cell.cameras import require_rendering
 from kitting_drake.common.command_line import count_type, run_command, seed_type
 from kitting_drake.common.errors import UserError
 from kitting_drake.common.files import alone_in, claim_folder, require_folder
+from kitting_drake.common.paths import MODELS
 from kitting_drake.common.processes import (
     LocalWorkers,
     ProcessCrashed,
@@ -27,8 +29,17 @@ from kitting_drake.policies.static_scenes import (
 from kitting_drake.tasks.kitting.static_scenes import draw_batch
 from systems.signals import PixelGrid
 
-_DRAWN_BY = ("kitting_drake.hkd", "kitting_drake.tasks", "kitting_drake.cell", "systems")
-"""The packages that decide what a scene looks like."""
+_DRAWN_BY = (
+    "kitting_drake.hkd",
+    "kitting_drake.tasks",
+    "kitting_drake.cell",
+    "kitting_drake.scenario",
+    "kitting_drake.policies.static_scenes",
+    "systems",
+)
+"""The packages and modules that decide what a scene looks like, ..."""
+_CATALOGUE = MODELS / "tools" / "catalogue.yaml"
+"""... and the designs that its tools begin with."""
 _MOST_BATCHES = 10_000
 """No batch has so few scenes that more than this would be needed."""
 
@@ -40,7 +51,7 @@ def main() -> int:
     require_rendering()
     folder = require_folder(arguments.output)
     with alone_in(folder):
-        drawn_by = {**versions(), "code": source_digest(*_DRAWN_BY)}
+        drawn_by = _drawn_by()
         identity = {"seed": arguments.seed, **drawn_by}
         claim_folder(folder, "settings.json", identity, of="set of scenes")
         path = folder / "scenes.h5"
@@ -55,6 +66,12 @@ def main() -> int:
         markup=False,
     )
     return 0
+
+
+def _drawn_by() -> dict[str, str]:
+    """What decides what a scene of a seed looks like."""
+    catalogue = hashlib.sha256(_CATALOGUE.read_bytes()).hexdigest()[:16]
+    return {**versions(), "code": source_digest(*_DRAWN_BY), "catalogue": catalogue}
 
 
 class _Parts:

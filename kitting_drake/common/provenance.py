@@ -35,19 +35,21 @@ def commit() -> str | None:
     return head + ("+" if changed else "")
 
 
-def source_digest(*packages: str) -> str:
-    """A digest of the Python sources of some packages: another one may do something else.
+def source_digest(*names: str) -> str:
+    """A digest of the Python sources of some packages or modules: another one may do something
+    else.
 
     Args:
-        packages: their names.
+        names: of packages, with all that they hold, and of modules.
     """
     digest = hashlib.sha256()
-    for package in packages:
-        spec = importlib.util.find_spec(package)
-        if spec is None or not spec.submodule_search_locations:
-            raise ImportError(f"there is no package {package}")
-        root = Path(spec.submodule_search_locations[0])
-        for path in sorted(root.rglob("*.py")):
+    for name in names:
+        spec = importlib.util.find_spec(name)
+        if spec is None or spec.origin is None:
+            raise ImportError(f"there is no package and no module {name}")
+        root = Path(spec.origin).parent
+        is_package = spec.submodule_search_locations is not None
+        for path in sorted(root.rglob("*.py")) if is_package else [Path(spec.origin)]:
             digest.update(path.relative_to(root).as_posix().encode())
             digest.update(hashlib.sha256(path.read_bytes()).digest())
     return digest.hexdigest()[:16]

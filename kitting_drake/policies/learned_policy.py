@@ -15,7 +15,8 @@ from torch import Tensor
 
 from kitting_drake.policies.correlation import Candidate
 from kitting_drake.policies.images import Image, make_action, rotation_matrix
-from kitting_drake.policies.matching.policy import RETRY_DISTANCE, belonging, certain_fits
+from kitting_drake.policies.matching.jaw_clearance import RETRY_DISTANCE
+from kitting_drake.policies.matching.policy import belonging, certain_fits
 from kitting_drake.policies.matching.recovery import recovery_action
 from kitting_drake.policies.matching.refinement import refine_grasp, refine_place
 from kitting_drake.policies.matching.release_clearance import blocked_at_place
@@ -92,7 +93,7 @@ class LearnedPolicy:
             fit_outlines: refine the place by the outlines of object and recess, where they agree
                 (`refine_place`), and the grasp by what room there is for the jaws
                 (`refine_grasp`); and where the networks would stop while an object certainly fits
-                (`certain_fits`), pick that one. Not in the paper.
+                (`certain_fits`), pick that one, unless `recover`. Not in the paper.
             recover: press down what protrudes, pick what belongs into a recess before anything
                 else (`belonging`), let that have a say in when to stop, and at last take out what
                 could not be pressed down (`recovery_action`). Not in the paper.
@@ -141,7 +142,7 @@ class LearnedPolicy:
             return mending, None
         decision = self._decide(observation, segmentation, failed_picks)
         # What must be taken out waits: it may fail again, and actions are counted.
-        if mending is not None and not decision.belongs:
+        if mending is not None and (decision.stop or not decision.belongs):
             return mending, None
         if self._watch is not None:
             self._watch(observation, decision)
@@ -183,8 +184,9 @@ class LearnedPolicy:
             logits = _without(logits, near_failed(observation.grid, failed_picks))
         outlines = segmentation if self._fit_outlines else None
         resolution = observation.grid.resolution
-        refine_pick = not failed_picks
-        choice = self._choose(image, picking, logits, outlines, resolution, refine_pick)
+        places = np.array([(pick.x, pick.y) for pick in failed_picks]).reshape(-1, 2)
+        failed = observation.grid.to_pixel(places)
+        choice = self._choose(image, picking, logits, outlines, resolution, failed)
         belongs = choice.fits
         if self._recover and segmentation is not None and not belongs:
             # The network's favourite may have no business here: what does, goes first.
@@ -192,7 +194,7 @@ class LearnedPolicy:
             belongs = left is not None
             if left is not None:
                 logits = left
-                choice = self._choose(image, picking, logits, outlines, resolution, refine_pick)
+                choice = self._choose(image, picking, logits, outlines, resolution, failed)
         odds, threshold = picking.log_odds, self._networks.stop_threshold
         say = 0.0
         if self._recover and segmentation is not None and segmentation.fixture.any():
@@ -206,7 +208,7 @@ class LearnedPolicy:
             stop = left is None
             if left is not None:
                 logits = left
-                choice = self._choose(image, picking, logits, outlines, resolution, refine_pick)
+                choice = self._choose(image, picking, logits, outlines, resolution, failed)
         action = make_action(observation, choice.pick, choice.theta, choice.place, choice.rotation)
         return Decision(
             action=dataclasses.replace(action, stop=stop),
@@ -226,7 +228,7 @@ class LearnedPolicy:
         logits: Tensor,
         outlines: Segmentation | None,
         resolution: float,
-        refine_pick: bool,
+        failed: NDArray[np.float64],
     ) -> _Choice:
         """The best action among the pixels that logits leave.
 
@@ -236,7 +238,7 @@ class LearnedPolicy:
             logits: (rows, cols), of the pick.
             outlines: to refine by; None: not refined by outlines.
             resolution: of a pixel, in metres.
-            refine_pick: whether a grasp moves to where the jaws have room.
+            failed: (n, 2), the (row, col) of where grasps failed.
         """
         row, col = divmod(int(logits.argmax()), logits.shape[1])
         pixel = np.array([row, col], float)
@@ -246,8 +248,8 @@ class LearnedPolicy:
         if self._continuous:
             theta = theta if refined is None else refined
             pick = expected_position(logits, (row, col))
-        if outlines is not None and refine_pick:
-            grasp = refine_grasp(outlines, pick, theta, resolution)
+        if outlines is not None:
+            grasp = refine_grasp(outlines, pick, theta, resolution, failed)
             if grasp is not None:
                 pick, theta = grasp.pick, grasp.theta
 

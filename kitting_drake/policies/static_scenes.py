@@ -126,11 +126,11 @@ def write_static_scenes(path: Path, content: StaticScenes) -> None:
         file.attrs["first_seed"] = content.first_seed
         file.attrs["grid"] = json.dumps(dataclasses.asdict(content.grid))
         file.attrs["versions"] = json.dumps(content.versions)
-        heights = np.array([scene.height for scene in content.scenes])
+        heights = np.array([scene.height for scene in content.scenes], np.uint16)
         heights = heights.reshape(-1, *content.grid.shape)
-        file.create_dataset(
-            "height", data=heights, chunks=(1, *content.grid.shape), compression="gzip"
-        )
+        # Of no scenes there are no chunks.
+        packed: dict[str, Any] = {"chunks": (1, *content.grid.shape), "compression": "gzip"}
+        file.create_dataset("height", data=heights, **(packed if len(heights) else {}))
         file["actions"] = np.concatenate([np.zeros((0, 8)), *(s.actions for s in content.scenes)])
         file["first"] = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
         file["batch_ends"] = np.array(content.batch_ends, np.int64)
@@ -215,6 +215,7 @@ class StaticSamples(Sequence[LabelledImage]):
     def __getitem__(self, index: int | slice) -> LabelledImage | Sequence[LabelledImage]:
         if isinstance(index, slice):
             return [self[i] for i in range(*index.indices(len(self)))]
+        index = range(len(self))[index]
         scene = self._scenes[index % len(self._scenes)]
         random = np.random.default_rng(index)
         image = scene.image

@@ -168,8 +168,8 @@ class Learned(PolicyConfig):
 
     # With `continuous`, by the geometry of o_t (the paper does none of these): refine the place by
     # fitting the outline of the object to that of the recess, where the two agree, and the grasp by
-    # the room that there is for the jaws; and do not stop while an object certainly fits into a
-    # recess. Where nothing is inserted: of rotations that the networks hold for as good, take the
+    # the room that there is for the jaws; and, unless `recover`, do not stop while an object
+    # certainly fits into a recess. Where nothing is inserted: of rotations that the networks hold for as good, take the
     # one where the fingers have room when they let go.
     fit_outlines: bool = True
 

@@ -9,7 +9,7 @@ from rich.console import Console
 from kitting_drake import draw_scenes
 from kitting_drake.cell.cameras import can_render
 from kitting_drake.common.errors import UserError
-from kitting_drake.common.provenance import source_digest, versions
+from kitting_drake.common.provenance import source_digest
 from kitting_drake.policies.static_scenes import (
     StaticScene,
     StaticScenes,
@@ -83,16 +83,37 @@ def test_batches_of_another_seed_or_version_are_not_mixed(tmp_path: Path):
 
 def test_a_folder_of_another_seed_or_version_is_refused(tmp_path: Path, monkeypatch):
     settings = tmp_path / "settings.json"
-    code = source_digest(*draw_scenes._DRAWN_BY)
-    claimed = {"seed": 0, **versions(), "code": code}
+    ours = draw_scenes._drawn_by()
+    claimed = {"seed": 0, **ours}
     for other, message in [
         ({"seed": 7}, "seed is 0, there 7"),
-        ({"code": "1"}, f"{code}, there 1"),
+        ({"code": "1"}, f"{ours['code']}, there 1"),
+        ({"catalogue": "2"}, f"{ours['catalogue']}, there 2"),
     ]:
         settings.write_text(json.dumps(claimed | other))
         with pytest.raises(UserError, match=message):
             run(monkeypatch, "--scenes", "1", "--quiet", "--output", str(tmp_path))
         assert json.loads(settings.read_text()) == claimed | other
+
+
+def test_what_is_drawn_by_includes_cameras_encoding_and_designs(tmp_path: Path, monkeypatch):
+    before = draw_scenes._drawn_by()
+    catalogue = tmp_path / "catalogue.yaml"
+    catalogue.write_text("tools: {}\n")
+    monkeypatch.setattr(draw_scenes, "_CATALOGUE", catalogue)
+    assert draw_scenes._drawn_by()["catalogue"] != before["catalogue"]
+    for name in ("kitting_drake.scenario", "kitting_drake.policies.static_scenes"):
+        others = [item for item in draw_scenes._DRAWN_BY if item != name]
+        assert source_digest(*others) != before["code"]
+
+
+def test_a_batch_in_which_no_toolset_has_room_is_kept(tmp_path: Path):
+    parts = draw_scenes._Parts(tmp_path, 0, OURS)
+    write_static_scenes(parts.path(0), StaticScenes(GRID, (), 0, OURS))
+    assert read_static_scenes(parts.path(0)).scenes == ()
+    again = draw_scenes._Parts(tmp_path, 0, OURS)
+    again.draw(20, AtOnce(), Console(quiet=True))
+    assert len(again.assemble(20, tmp_path / "scenes.h5")) == 20
 
 
 @pytest.mark.slow

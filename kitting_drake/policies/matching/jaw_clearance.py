@@ -8,6 +8,7 @@ faces, as closing jaws would centre it.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -20,6 +21,8 @@ from systems.pick_place_parameters import PickPlaceParameters
 
 Array = NDArray[np.float64]
 
+RETRY_DISTANCE = 0.010
+"""A grasp is not tried again this near to where one failed, in metres."""
 _PRIMITIVE = PickPlaceParameters()
 _ANGLES = 36
 _MOST_PLACES = 80
@@ -51,6 +54,22 @@ class JawGrasp:
     """The angle of the gripper, in radians; adding pi gives the same grasp."""
     cost: float
     """How far from the middle it is and how crooked its faces are; without a unit, 0 is best."""
+
+
+def untried(grasps: Sequence[JawGrasp], failed: Array, resolution: float) -> list[JawGrasp]:
+    """The grasps that are not where one failed before.
+
+    Args:
+        grasps: some.
+        failed: (n, 2), the (row, col) of where grasps failed.
+        resolution: of a pixel, in metres.
+    """
+    return [
+        grasp
+        for grasp in grasps
+        if np.linalg.norm(failed - grasp.pixel, axis=1).min(initial=np.inf) * resolution
+        > RETRY_DISTANCE
+    ]
 
 
 def jaw_grasps(

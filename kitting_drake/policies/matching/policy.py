@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
 from kitting_drake.policies.images import make_action
-from kitting_drake.policies.matching.jaw_clearance import jaw_grasps
+from kitting_drake.policies.matching.jaw_clearance import jaw_grasps, untried
 from kitting_drake.policies.matching.recovery import recovery_action
 from kitting_drake.policies.matching.registration import (
     Registration,
@@ -23,8 +23,6 @@ from kitting_drake.policies.matching.registration import (
 from kitting_drake.policies.matching.segmentation import Segmentation, segment
 from systems.signals import Observation, PickPlaceAction, PlanarPose
 
-RETRY_DISTANCE = 0.010
-"""A grasp is not tried again this near to where one failed, in metres."""
 _WORST_COST = 0.0019
 """An outline and a recess that differ by more than this on average do not belong together, in
 metres."""
@@ -84,11 +82,11 @@ class ShapeMatchingPolicy:
         failed = observation.grid.to_pixel(places)
         resolution = observation.grid.resolution
         for index, fit in match(segmentation, resolution):
-            grasps = [
-                grasp
-                for grasp in jaw_grasps(segmentation, segmentation.objects[index], resolution)
-                if _distance(failed, grasp.pixel) * resolution > RETRY_DISTANCE
-            ]
+            grasps = untried(
+                jaw_grasps(segmentation, segmentation.objects[index], resolution),
+                failed,
+                resolution,
+            )
             if grasps:
                 best = grasps[0]
                 place = fit.moved(best.pixel)
@@ -96,11 +94,6 @@ class ShapeMatchingPolicy:
                 return Matched(action, min(max(1 - fit.cost / _WORST_COST, 0.0), 1.0))
         # What must be taken out waits for all else: it may fail again, and actions are counted.
         return Matched(mending or PickPlaceAction(stop=True))
-
-
-def _distance(positions: NDArray[np.float64], pixel: NDArray[np.float64]) -> float:
-    """From the nearest of positions (n, 2), of which there may be none."""
-    return float(np.linalg.norm(positions - pixel, axis=1).min(initial=np.inf))
 
 
 def certain_fits(segmentation: Segmentation, resolution: float) -> NDArray[np.bool_]:

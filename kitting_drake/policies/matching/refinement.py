@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kitting_drake.policies.images import rotation_matrix
-from kitting_drake.policies.matching.jaw_clearance import JawGrasp, jaw_grasps
+from kitting_drake.policies.matching.jaw_clearance import JawGrasp, jaw_grasps, untried
 from kitting_drake.policies.matching.registration import (
     Outline,
     Registration,
@@ -163,7 +163,11 @@ class RefinedGrasp:
 
 
 def refine_grasp(
-    segmentation: Segmentation, pick: Array, theta: float, resolution: float
+    segmentation: Segmentation,
+    pick: Array,
+    theta: float,
+    resolution: float,
+    failed: Array | None = None,
 ) -> RefinedGrasp | None:
     """A grasp near a predicted one for which o_t leaves the jaws no room; None if it does leave it,
     or there is none.
@@ -173,6 +177,7 @@ def refine_grasp(
         pick: (row, col) predicted.
         theta: of the gripper, predicted, in radians.
         resolution: of a pixel, in metres.
+        failed: (n, 2), the (row, col) of where grasps failed: none is taken there.
     """
     taken = _nearest(segmentation.objects, pick)
     if taken is None:
@@ -194,5 +199,9 @@ def refine_grasp(
     # A network knows more of a grasp than that the jaws have room: where they have, it stays.
     if not grasps or any(is_same(*away(grasp)) for grasp in grasps):
         return None
-    best = min(grasps, key=departure)
+    if failed is not None:
+        grasps = untried(grasps, failed, resolution)
+    best = min(grasps, key=departure, default=None)
+    if best is None:
+        return None
     return RefinedGrasp(best.pixel, best.theta)

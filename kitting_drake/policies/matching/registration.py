@@ -218,6 +218,9 @@ def _coarse_starts(outline: Outline, recess: Outline) -> list[tuple[float, Array
     costs, angles = _coarse(outline, recess)
     lowest = (costs <= np.roll(costs, 1)) & (costs < np.roll(costs, -1))
     candidates = np.flatnonzero(lowest)
+    if not len(candidates):
+        # The middle of an L may be so far from all of it that a small object reaches it nowhere.
+        candidates = costs.argmin(keepdims=True)
     best = candidates[np.argsort(costs[candidates])][:_STARTS]
     return [
         (float(angle), recess.middle - rotation_matrix(float(angle)) @ outline.middle)

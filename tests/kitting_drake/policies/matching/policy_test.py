@@ -213,6 +213,19 @@ def test_a_grasp_with_no_room_for_the_jaws_moves_to_where_there_is(seen):
         along = refine_grasp(segment(observation), pick, theta + math.pi / 2, grid.resolution)
         assert along is not None
         assert abs(math.remainder(along.theta - theta, math.pi)) < math.radians(40)
+        # Not where a grasp failed before; and where all failed, nowhere.
+        other = refine_grasp(
+            segment(observation), pick, theta + math.pi / 2, grid.resolution, along.pick[None]
+        )
+        if other is not None:
+            assert np.linalg.norm(other.pick - along.pick) * grid.resolution > 0.0099
+        everywhere = np.argwhere(np.ones(grid.shape))[::2]
+        assert (
+            refine_grasp(
+                segment(observation), pick, theta + math.pi / 2, grid.resolution, everywhere
+            )
+            is None
+        )
     assert (
         refine_grasp(segment(Observation()), np.array([80.0, 160.0]), 0.0, grid.resolution) is None
     )

@@ -87,3 +87,11 @@ def test_a_fit_is_preferred_by_the_points_that_tell_the_two_apart():
         assert found > 0.0001
         assert preference(outline, recess, reverse, right) == pytest.approx(-found)
         assert preference(outline, recess, right, right) == 0
+
+
+def test_a_small_object_is_registered_to_a_recess_that_is_far_from_its_own_middle():
+    rows, cols = np.indices(SHAPE)
+    box = trace_outline((abs(rows - 30) < 4) & (abs(cols - 30) < 4), RESOLUTION, close=True)
+    ell = (abs(rows - 80) < 55) & (abs(cols - 160) < 55) & ~((rows > 36) & (cols < 204))
+    recess = trace_outline(ell, RESOLUTION)
+    assert np.isfinite(register(box, recess).cost)

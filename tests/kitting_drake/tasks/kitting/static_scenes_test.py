@@ -139,6 +139,10 @@ def test_samples_have_a_grasp_of_each_loose_tool():
     scene = StaticScene.of(Observation(), actions)
     final = StaticScene.of(Observation(), np.zeros((0, 8)))
     samples = StaticSamples(StaticScenes(GRID, (final, scene)))
+    # As of any sequence, the last follows from its end, and there is an end.
+    assert (samples[-1].pick == samples[len(samples) - 1].pick).all()
+    with pytest.raises(IndexError):
+        samples[len(samples)]
     rows = GRID.to_pixel(actions[:, 2:4])[:, 0]
     seen = set()
     for index in range(len(samples)):
