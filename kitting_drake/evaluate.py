@@ -191,7 +191,8 @@ def _identity(chosen: ChosenScenario) -> dict[str, Any]:
         **chosen.described,
         "versions": versions(),
         "policy_digest": scenario.policy.digest(chosen.base),
-        "policy_details": scenario.policy.details(chosen.base),
+        # Networks compute in what is faster on the machine: not the same to the last bit.
+        "compute_type": scenario.policy.details(chosen.base).get("compute_type"),
         "task_digest": files_digest(scenario.task.input_files(chosen.base)),
     }
 

@@ -26,6 +26,9 @@ from systems.signals import Observation
 if TYPE_CHECKING:
     from kitting_drake.policies.learned_policy import Decision
 
+REPLAY = "replay.html"
+"""The file of an episode's recording, in the folder of its files."""
+
 
 def main() -> int:
     """Parses the command line and runs the episode; returns the exit code."""
@@ -54,7 +57,7 @@ def main() -> int:
     if note := hidden_table_note(chosen.scenario):
         console.print(f"note: {note}", highlight=False, markup=False)
     folder = require_folder(output_folder(arguments, chosen.name))
-    _check_endings(arguments.picture, arguments.video)
+    _check_files(arguments.picture, arguments.video, folder / REPLAY)
 
     decisions: list[tuple[Observation, Decision]] = []
     meshcat = None if arguments.no_meshcat else _start_meshcat(console)
@@ -79,14 +82,14 @@ def main() -> int:
             realtime_rate=scenario.target_realtime_rate,
             observers=[progress.observe],
         )
-    # What an earlier run left is not of this one.
-    (folder / "replay.html").unlink(missing_ok=True)
     write_json(folder / "results.json", result.as_dict())
+    # What an earlier run left is not of this one.
+    (folder / REPLAY).unlink(missing_ok=True)
     _save_decisions(folder / "decisions", decisions)
     if meshcat is not None:
         meshcat.StopRecording()
         meshcat.PublishRecording()
-        write_atomically(folder / "replay.html", meshcat.StaticHtml())
+        write_atomically(folder / REPLAY, meshcat.StaticHtml())
     if arguments.picture and progress.last_context is not None:
         context = cell.scene_graph.GetMyMutableContextFromRoot(progress.last_context)
         save_png(render_picture(cell.scene_graph, context), arguments.picture)
@@ -112,13 +115,14 @@ def _save_decisions(folder: Path, decisions: "list[tuple[Observation, Decision]]
             write_atomically(folder / f"decision_{number:02}.png", picture)
 
 
-def _check_endings(picture: Path | None, video: Path | None) -> None:
+def _check_files(picture: Path | None, video: Path | None, replay: Path) -> None:
+    """Raises UserError for a file that cannot be written after the episode."""
     if picture is not None and picture.suffix != ".png":
         raise UserError(f"--picture writes .png files, not '{picture}'")
     if video is not None and video.suffix not in (".gif", ".webp"):
         raise UserError(f"--video writes .gif and .webp files, not '{video}'")
     # Told before the episode, not after it.
-    for path in (picture, video):
+    for path in (picture, video, replay):
         if path is not None and path.is_dir():
             raise UserError(f"{path} is a folder")
         if path is not None:
@@ -146,7 +150,8 @@ def draw_diagram(diagram: Diagram, path: Path) -> None:
     """Draws a Diagram with Graphviz.
 
     Raises:
-        UserError: an ending other than .svg, .png, .pdf and .dot, or Graphviz is not there.
+        UserError: an ending other than .svg, .png, .pdf and .dot, or Graphviz is not there or
+            cannot write it.
     """
     source = diagram.GetGraphvizString(max_depth=1)
     if path.suffix == ".dot":
@@ -160,8 +165,11 @@ def draw_diagram(diagram: Diagram, path: Path) -> None:
             "graphviz), or write the source to a .dot file"
         )
     drawn = subprocess.run(
-        ["dot", f"-T{path.suffix[1:]}"], input=source.encode(), capture_output=True, check=True
+        ["dot", f"-T{path.suffix[1:]}"], input=source.encode(), capture_output=True
     )
+    if drawn.returncode:
+        reason = drawn.stderr.decode(errors="replace").strip().splitlines()[-1:]
+        raise UserError(f"--graphviz: dot cannot write {path}: {' '.join(reason)}")
     write_atomically(path, drawn.stdout)
 
 

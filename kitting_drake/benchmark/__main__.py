@@ -22,11 +22,12 @@ def main() -> int:
     folder = require_folder(arguments.output)
     if arguments.benchmark == "paper":
         return _paper(arguments, console, folder)
+    if arguments.benchmark == "recovery":
+        return _recovery(arguments, console, folder)
     measure = {
         "simulation": _simulation,
         "networks": _networks,
         "kits": _kits,
-        "recovery": _recovery,
         "mujoco": _mujoco,
     }[arguments.benchmark]
     for table in measure(arguments, console, folder):
@@ -139,18 +140,20 @@ def _networks(arguments: argparse.Namespace, console: Console, folder: Path) -> 
     return network_tables(measured)
 
 
-def _recovery(arguments: argparse.Namespace, console: Console, folder: Path) -> list[Table]:
+def _recovery(arguments: argparse.Namespace, console: Console, folder: Path) -> int:
+    """Measures recovery; returns the exit code."""
     from kitting_drake.benchmark.recovery import benchmark_recovery, recovery_table
 
     chosen = choose_scenario(arguments)
-    measured, strips = benchmark_recovery(
-        chosen.scenario, chosen.base, arguments.episodes, arguments.seed, console
-    )
+    measured, strips = benchmark_recovery(chosen, arguments.episodes, arguments.seed, console)
     measured |= {"scenario": chosen.name, "perturbed": chosen.perturbed, "text": chosen.text}
     write_json(folder / "recovery.json", measured)
     if strips:
         write_atomically(folder / "recovery.png", strips)
-    return [recovery_table(measured)]
+    console.print(recovery_table(measured))
+    console.print(f"files: {folder}/", highlight=False, markup=False)
+    counts = measured["disturbances"].values()
+    return FAILED if all(count["failed"] == arguments.episodes for count in counts) else 0
 
 
 def _mujoco(arguments: argparse.Namespace, console: Console, folder: Path) -> list[Table]:

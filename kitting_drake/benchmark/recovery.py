@@ -10,7 +10,6 @@ import enum
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
@@ -23,15 +22,17 @@ from rich.progress import track
 from rich.table import Table
 from scipy.spatial import cKDTree
 
-from kitting_drake.cell import Cell, build_cell
-from kitting_drake.episode import ModeChange, run_episode
+from kitting_drake.cell import Cell
+from kitting_drake.common.errors import UserError
+from kitting_drake.episode import ModeChange
 from kitting_drake.episode.action_log import nearest_object
+from kitting_drake.episode.chosen import build_chosen, run_chosen
 from kitting_drake.reporting.action_strip import ActionStrip, Frame, draw_strips
 from kitting_drake.reporting.intervals import proportion_interval
+from kitting_drake.scenario.command_line import ChosenScenario
 from kitting_drake.scenario.policies import Policy, PolicyConfig, PolicySite
-from kitting_drake.scenario.schema import Scenario
 from systems.pick_place_parameters import Mode
-from systems.signals import PickPlaceAction, PlanarPose
+from systems.signals import PickPlaceAction, PixelGrid, PlanarPose
 from systems.weak_calc import weak_calc
 
 _MOVED = (0.03, 0.06)
@@ -44,6 +45,8 @@ _BLOCKED = 0.003
 """By how much a place is off, in metres."""
 _ROOM = 0.012
 """An object is moved to where it is at least this far from all others, in metres."""
+_INSIDE = 0.02
+"""An object is moved to where all of it is at least this far within o_t, in metres."""
 _DRAWS = 200
 
 
@@ -132,9 +135,15 @@ class _Adversary:
     """An `EpisodeObserver` that brings a disturbance about, and counts what is touched again."""
 
     def __init__(
-        self, cell: Cell, kind: Disturbance, offset: NDArray[np.float64], rng: np.random.Generator
+        self,
+        cell: Cell,
+        kind: Disturbance,
+        offset: NDArray[np.float64],
+        rng: np.random.Generator,
+        grid: PixelGrid,
     ) -> None:
         self._cell, self._kind, self._offset, self._rng = cell, kind, offset, rng
+        self._grid = grid
         self._actions = 0
         self.victim: int | None = None
         """The object whose action went wrong; None if nothing could be done to it."""
@@ -187,14 +196,15 @@ class _Adversary:
         ]
         others = cKDTree(np.concatenate(clouds))
         middle = own.mean(axis=0)
-        low, high = own.min(axis=0), own.max(axis=0)
+        grid = self._grid
+        low = np.array([grid.x_min, grid.y_min]) + _INSIDE
+        high = low + grid.resolution * np.array(grid.shape) - 2 * _INSIDE
         for _ in range(_DRAWS):
             way, turn = rng.uniform(0, math.tau), rng.uniform(-_MOVED_YAW, _MOVED_YAW)
             shift = rng.uniform(*_MOVED) * np.array([math.cos(way), math.sin(way)])
             R = RollPitchYaw(0, 0, turn).ToRotationMatrix()
             there = (own - middle) @ R.matrix()[:2, :2].T + middle + shift
-            # Where it was on the table, an object is on it a little beside too.
-            outside = np.any(there < low - 0.02) or np.any(there > high + 0.02)
+            outside = np.any(there < low) or np.any(there > high)
             if outside or others.query(there)[0].min() < _ROOM:
                 continue
             about = np.append(middle, 0.0)
@@ -218,10 +228,14 @@ class _Count:
     touched: int = 0
     seated: int = 0
     actions: int = 0
+    failed: int = 0
+    """Episodes that failed: none of their objects counts as kitted."""
+    timed_out: int = 0
+    """Episodes that timed out: none of their objects counts as kitted either."""
 
 
 def benchmark_recovery(
-    scenario: Scenario, base: Path, episodes: int, seed: int, console: Console
+    chosen: ChosenScenario, episodes: int, seed: int, console: Console
 ) -> tuple[dict[str, Any], bytes]:
     """Runs episodes with each disturbance.
 
@@ -229,31 +243,36 @@ def benchmark_recovery(
     the most actions, but recovered.
 
     Args:
-        scenario: with the policy that is to recover.
-        base: where relative paths in it start.
+        chosen: the scenario, with the policy that is to recover.
         episodes: with each disturbance.
         seed: of the first; the others follow.
         console: for progress.
+
+    Raises:
+        UserError: there are no cameras, by whose images episodes are drawn, or the scene of a seed
+            cannot be built.
     """
+    if not chosen.scenario.cameras:
+        raise UserError(
+            f"{chosen.path}: cameras is empty: the strips of episodes need at least one"
+        )
     counts = {kind: _Count() for kind in Disturbance}
     strips: dict[Disturbance, _Strip] = {}
     runs = [(kind, seed + number) for kind in Disturbance for number in range(episodes)]
     for kind, number in track(runs, "episodes", console=console, disable=console.quiet):
-        strip = _run(scenario, base, kind, number, counts[kind])
+        strip = _run(chosen, kind, number, counts[kind])
         if strip is not None and len(strip[1]) > len(strips.get(kind, ("", (), ()))[1]):
             strips[kind] = strip
     measured = {
         "episodes": episodes,
         "seed": seed,
-        "policy": {"name": scenario.policy.name, **scenario.policy.details(base)},
+        "policy": {"name": chosen.policy, **chosen.scenario.policy.details(chosen.base)},
         "disturbances": {kind.value: dataclasses.asdict(count) for kind, count in counts.items()},
     }
     return measured, draw_strips(list(strips.values())) if strips else b""
 
 
-def _run(
-    scenario: Scenario, base: Path, kind: Disturbance, seed: int, count: _Count
-) -> _Strip | None:
+def _run(chosen: ChosenScenario, kind: Disturbance, seed: int, count: _Count) -> _Strip | None:
     """Runs an episode and counts; returns it as a strip if everything was kitted."""
     rng = np.random.default_rng([seed, list(Disturbance).index(kind)])
     way = rng.uniform(0, math.tau)
@@ -263,31 +282,28 @@ def _run(
         offset[:2] = _MISSED * direction
     elif kind == Disturbance.BLOCKED:
         offset[2:] = _BLOCKED * direction
+    policy = cast(Policy, _Disturbed(chosen.scenario.policy, offset))
     disturbed = dataclasses.replace(
-        scenario, policy=cast(Policy, _Disturbed(scenario.policy, offset))
+        chosen, scenario=dataclasses.replace(chosen.scenario, policy=policy)
     )
-    cell = build_cell(disturbed, seed=seed, base=base)
-    adversary = _Adversary(cell, kind, offset, rng)
+    cell = build_chosen(disturbed, seed=seed)
+    adversary = _Adversary(cell, kind, offset, rng, chosen.scenario.heightmap.grid())
     strip = ActionStrip(cell)
-    result = run_episode(
-        cell,
-        task=scenario.task,
-        scenario="recovery",
-        policy=scenario.policy.name,
-        seed=seed,
-        time_limit=scenario.time_limit,
-        end_at_success=scenario.end_at_success,
-        observers=[adversary.observe, strip.observe],
-    )
-    strict = {item.name for item in result.objects if item.strict_success}
+    observers = [adversary.observe, strip.observe]
+    result = run_chosen(disturbed, cell, seed=seed, observers=observers)
+    count.failed += bool(result.failure)
+    count.timed_out += result.timed_out
+    lost = bool(result.failure) or result.timed_out
+    strict = {item.name for item in result.objects if item.strict_success and not lost}
     if adversary.victim is not None and kind != Disturbance.NONE:
         count.disturbed += 1
         count.recovered += cell.scene.objects[adversary.victim].name in strict
     ended = {i for i in cell.scene.goal_objects if cell.scene.objects[i].name in strict}
     count.kitted += len(strict)
     count.objects += len(result.objects)
-    count.seated += len(adversary.seated)
-    count.touched += len(adversary.touched | (adversary.seated - ended))
+    if not lost:
+        count.seated += len(adversary.seated)
+        count.touched += len(adversary.touched | (adversary.seated - ended))
     count.actions += result.actions
     if len(strict) < len(result.objects):
         return None
@@ -297,8 +313,10 @@ def _run(
 def recovery_table(measured: dict[str, Any]) -> Table:
     """The measurements, for a person."""
     table = Table(title=f"{measured['policy']['name']}: {measured['episodes']} episodes each")
-    for column in ("the first action", "recovered", "kitted in all", "disturbed again", "actions"):
-        table.add_column(column, justify="left" if column == "the first action" else "right")
+    columns = ("recovered", "kitted in all", "disturbed again", "actions", "failed, timed out")
+    table.add_column("the first action")
+    for column in columns:
+        table.add_column(column, justify="right")
     for name, count in measured["disturbances"].items():
         table.add_row(
             name,
@@ -306,6 +324,7 @@ def recovery_table(measured: dict[str, Any]) -> Table:
             _share(count["kitted"], count["objects"]),
             _share(count["touched"], count["seated"]),
             str(count["actions"]),
+            f"{count['failed']}, {count['timed_out']}",
         )
     return table
 

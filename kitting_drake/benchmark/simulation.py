@@ -17,9 +17,10 @@ from rich.table import Table
 
 from kitting_drake.cell import Cell, build_cell
 from kitting_drake.cell.cameras import require_rendering
+from kitting_drake.common.errors import UserError
 from kitting_drake.common.paths import SCENARIOS
 from kitting_drake.common.provenance import versions
-from kitting_drake.episode import ModeChange, run_episode
+from kitting_drake.episode import EpisodeResult, ModeChange, run_episode
 from kitting_drake.scenario.loader import load_scenario
 from kitting_drake.scenario.schema import Scenario
 
@@ -80,6 +81,7 @@ def _whole_episodes(
             time_limit=scenario.time_limit,
             observers=[stopwatch.observe],
         )
+        _require_whole(result)
         simulated += result.sim_seconds
         wall += result.wall_seconds
         kitted += sum(item.strict_success for item in result.objects)
@@ -89,6 +91,15 @@ def _whole_episodes(
         "real_time_rate": simulated / wall,
         "objects_per_simulated_hour": 3600 * kitted / simulated,
     }
+
+
+def _require_whole(result: EpisodeResult) -> None:
+    """Raises UserError for an episode that failed or timed out, which is no measurement."""
+    if result.failure or result.timed_out:
+        reason = result.failure or "timed out"
+        raise UserError(
+            f"{result.scenario}, seed {result.seed}: the episode cannot count: {reason}"
+        )
 
 
 def _build(scenario: Scenario, seed: int) -> Cell:

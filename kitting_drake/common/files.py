@@ -119,7 +119,11 @@ def _first_difference(found: Any, described: Any) -> str:
     if not isinstance(found, dict) or not isinstance(described, dict):
         return ""
     for key in (*described, *found):
-        old, new = found.get(key), described.get(key)
+        if key not in found:
+            return f" (there is no {key} there)"
+        if key not in described:
+            return f" (there is a {key} there)"
+        old, new = found[key], described[key]
         if old != new:
             if isinstance(old, dict) and isinstance(new, dict):
                 return _first_difference(old, new)
@@ -136,9 +140,15 @@ def alone_in(folder: Path) -> Iterator[None]:
     """Keeps a second process out of a folder while one is at work there.
 
     Raises:
+        MachineError: the folder cannot be written to.
         UserError: there is one already.
     """
-    with (folder / ".lock").open("w") as file:
+    path = folder / ".lock"
+    try:
+        lock = path.open("w")
+    except OSError as error:
+        raise MachineError(f"cannot write {path}: {error.strerror}") from error
+    with lock as file:
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError as error:
@@ -151,11 +161,18 @@ def alone_in(folder: Path) -> Iterator[None]:
 
 
 def append_line(path: Path, item: Any) -> None:
-    """Adds an object to a file of JSON lines, and sees to it that it is on the disk."""
-    with path.open("a") as file:
-        file.write(json.dumps(item) + "\n")
-        file.flush()
-        os.fsync(file.fileno())
+    """Adds an object to a file of JSON lines, and sees to it that it is on the disk.
+
+    Raises:
+        MachineError: it cannot be written; `read_lines` cuts off what was.
+    """
+    try:
+        with path.open("a") as file:
+            file.write(json.dumps(item) + "\n")
+            file.flush()
+            os.fsync(file.fileno())
+    except OSError as error:
+        raise MachineError(f"cannot write {path}: {error.strerror}") from error
 
 
 def read_lines(path: Path) -> list[Any]:

@@ -20,8 +20,8 @@ toolset to the same.
 The cell departs from the paper in this, so that methods here are compared with one another, and
 only roughly with the figures of the paper:
 
-- physics, tools and cameras are of this project; there is no arm: the hand moves in x, y, z and yaw,
-  within the limits of the Franka;
+- physics, tools and cameras are of this project; there is no arm: the hand moves in x, y, z and
+  yaw, within the limits of the Franka;
 - cavities have a lead-in bevel of 1 mm, and kits a friction of 0.3;
 - scenes are drawn so that the open hand is free at every annotated grasp;
 - tools drawn for a toolset are scaled to 15 to 20 cm, as in the paper; the seen toolset always has

@@ -16,6 +16,7 @@ from pydrake.systems.framework import LeafSystem
 
 from kitting_drake.common.errors import UserError
 from kitting_drake.common.paths import GENERALIST
+from kitting_drake.common.provenance import source_digest
 from kitting_drake.tasks.task import Scene
 from systems.action_quantizer import ActionQuantizer
 from systems.bounds import bounded
@@ -169,8 +170,8 @@ class Learned(PolicyConfig):
     # With `continuous`, by the geometry of o_t (the paper does none of these): refine the place by
     # fitting the outline of the object to that of the recess, where the two agree, and the grasp by
     # the room that there is for the jaws; and, unless `recover`, do not stop while an object
-    # certainly fits into a recess. Where nothing is inserted: of rotations that the networks hold for as good, take the
-    # one where the fingers have room when they let go.
+    # certainly fits into a recess. Where nothing is inserted: of rotations that the networks hold
+    # for as good, take the one where the fingers have room when they let go.
     fit_outlines: bool = True
 
     # Mend what an action left undone, as o_t shows it: press down what protrudes; pick what fits
@@ -274,7 +275,12 @@ class ShapeMatching(PolicyConfig):
 
 @dataclass
 class PythonPolicy(PolicyConfig):
-    """Your own function from `Observation` to `PickPlaceAction` (see systems/signals.py)."""
+    """Your own function from `Observation` to `PickPlaceAction` (see systems/signals.py).
+
+    Results tell policies apart by the sources of the function's package, or of its module if that
+    is in none. What else it reads (weights, other modules) is not told: give another --output when
+    that has changed.
+    """
 
     # `module:function`, importable from where you run; called with one Observation.
     function: str = ""
@@ -299,7 +305,11 @@ class PythonPolicy(PolicyConfig):
             raise UserError(f"policy.function: cannot import {self.function}: {error}") from error
         if spec is None or spec.origin is None:
             raise UserError(f"policy.function: there is no file of the module {module}")
-        return _digest(Path(spec.origin))
+        # What the function imports from its own package makes it another policy too.
+        package = module.partition(".")[0]
+        top = importlib.util.find_spec(package)
+        whole = package if top is not None and top.origin is not None else module
+        return f"sha256 {source_digest(whole)}"
 
     def modules(self) -> list[str]:
         return [self.function.partition(":")[0]]

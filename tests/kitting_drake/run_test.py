@@ -12,10 +12,13 @@ from typing import Any
 import pytest
 import torch
 import yaml
+from pydrake.systems.framework import DiagramBuilder
+from pydrake.systems.primitives import ConstantVectorSource
 from safetensors.torch import save_file
 
 from kitting_drake import run as running
 from kitting_drake.common.command_line import run_command
+from kitting_drake.common.errors import UserError
 from kitting_drake.common.paths import SCENARIOS
 from kitting_drake.scenario import load_scenario
 from kitting_drake.scenario.policies import Learned
@@ -168,6 +171,24 @@ def test_flags_that_cannot_be_used(verb: Verb, tmp_path: Path, flags: list[str],
     assert words in done.stderr
     assert "Traceback" not in done.stderr
     assert not list(tmp_path.iterdir())
+
+
+def test_a_folder_in_the_replay_s_place_is_told_before_the_episode(verb: Verb, tmp_path: Path):
+    (tmp_path / "replay.html").mkdir()
+    done = verb("run", "scenarios/kitting_oracle.yaml", "--no-meshcat", "--output", tmp_path)
+    assert (done.returncode, done.stdout) == (2, "")
+    assert "replay.html is a folder" in done.stderr
+
+
+def test_a_diagram_that_graphviz_cannot_write_is_told(tmp_path: Path, monkeypatch):
+    broken = tmp_path / "dot"
+    broken.write_text("#!/bin/sh\necho 'Format: pdf not recognized' >&2\nexit 1\n")
+    broken.chmod(0o755)
+    monkeypatch.setenv("PATH", str(tmp_path), prepend=":")
+    builder = DiagramBuilder()
+    builder.AddSystem(ConstantVectorSource([0.0]))
+    with pytest.raises(UserError, match=r"dot cannot write cell\.pdf: Format: pdf not recognized"):
+        running.draw_diagram(builder.Build(), Path("cell.pdf"))
 
 
 def test_a_scenario_is_found_by_its_name_and_not_by_another_path(verb: Verb, tmp_path: Path):

@@ -3,7 +3,7 @@ from pathlib import Path
 
 import pytest
 
-from kitting_drake.common.errors import UserError
+from kitting_drake.common.errors import MachineError, UserError
 from kitting_drake.common.files import (
     alone_in,
     append_line,
@@ -54,6 +54,15 @@ def test_only_another_process_in_the_folder_is_told_of(tmp_path: Path):
         raise BlockingIOError
     with alone_in(tmp_path):
         pass
+    (tmp_path / ".lock").unlink()
+    (tmp_path / ".lock").mkdir()
+    with pytest.raises(MachineError, match=r"cannot write .*\.lock"), alone_in(tmp_path):
+        pass
+
+
+def test_a_line_for_which_there_is_no_room_is_told():
+    with pytest.raises(MachineError, match="cannot write /dev/full: No space left"):
+        append_line(Path("/dev/full"), {"seed": 1})
 
 
 def test_a_line_that_was_being_written_is_cut_off(tmp_path: Path):
@@ -77,6 +86,12 @@ def test_a_folder_is_that_of_one_thing(tmp_path: Path):
         claim_folder(tmp_path, "settings.json", {"steps": 3, "type": "bfloat16"}, of="run")
     with pytest.raises(UserError, match=r"another run \(type, steps were in the order steps, type"):
         claim_folder(tmp_path, "settings.json", {"type": "float32", "steps": 3}, of="run")
+    # As of a field that there was not yet, or is no more.
+    known = {"steps": 3, "type": "float32"}
+    with pytest.raises(UserError, match=r"another run \(there is no seed there\)"):
+        claim_folder(tmp_path, "settings.json", {**known, "seed": None}, of="run")
+    with pytest.raises(UserError, match=r"another run \(there is a type there\)"):
+        claim_folder(tmp_path, "settings.json", {"steps": 3}, of="run")
     with pytest.raises(UserError, match=r"holds settings\.json of something else"):
         claim_folder(tmp_path, "scenario.json", {}, of="scenario")
     (tmp_path / "settings.json").write_text('{"steps": ')

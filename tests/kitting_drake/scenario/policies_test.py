@@ -150,9 +150,21 @@ def test_a_function_of_ones_own(site: PolicySite, tmp_path: Path, monkeypatch: p
     config = PythonPolicy("a_policy_of_mine:act")
     assert action(config, site, observation()) == PickPlaceAction(stop=True)
     # Results tell one version of it from another.
-    assert config.digest(tmp_path) == f"sha256 {hashlib.sha256(STOP.encode()).hexdigest()}"
+    first = config.digest(tmp_path)
     path.write_text(STOP + "\n# better\n")
-    assert config.digest(tmp_path) != f"sha256 {hashlib.sha256(STOP.encode()).hexdigest()}"
+    assert config.digest(tmp_path) != first
+    path.write_text(STOP)
+    assert config.digest(tmp_path) == first
+    # What its package holds beside it makes it another one, too.
+    package = tmp_path / "policies_of_mine"
+    package.mkdir()
+    (package / "__init__.py").touch()
+    (package / "stop.py").write_text(STOP)
+    (package / "helper.py").write_text("WIDTH = 1\n")
+    config = PythonPolicy("policies_of_mine.stop:act")
+    first = config.digest(tmp_path)
+    (package / "helper.py").write_text("WIDTH = 2\n")
+    assert config.digest(tmp_path) != first
 
 
 @pytest.mark.parametrize(
