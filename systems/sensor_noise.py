@@ -292,8 +292,10 @@ def _incidence(
         seen: (height, width), where there is one.
         camera: its intrinsics.
     """
-    x = ((np.arange(z.shape[1]) - camera.center_x()) / camera.focal_x()).astype(np.float32)
-    y = ((np.arange(z.shape[0]) - camera.center_y()) / camera.focal_y()).astype(np.float32)[:, None]
+    # A pixel's middle is half a pixel from where it begins, as in `heightmap.py`.
+    columns, rows = np.arange(z.shape[1]) + 0.5, np.arange(z.shape[0]) + 0.5
+    x = ((columns - camera.center_x()) / camera.focal_x()).astype(np.float32)
+    y = ((rows - camera.center_y()) / camera.focal_y()).astype(np.float32)[:, None]
     by_row, by_col = np.gradient(np.where(seen, z, np.float32(np.nan)))
     along_x, along_y = by_col * np.float32(camera.focal_x()), by_row * np.float32(camera.focal_y())
     # Of the surface z (x, y, 1) the normal is (-dz/dx, -dz/dy, z + x dz/dx + y dz/dy), and its

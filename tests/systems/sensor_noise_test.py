@@ -118,7 +118,8 @@ def test_holes_have_their_share_and_shiny_surfaces_more():
 def test_what_is_seen_at_a_grazing_angle_is_a_hole(normal: tuple[float, float, float]):
     """Of a plane the angle between each ray and the normal is known."""
     x, y = np.meshgrid(
-        (np.arange(WIDTH) - INFO.center_x()) / FOCAL, (np.arange(HEIGHT) - INFO.center_y()) / FOCAL
+        (np.arange(WIDTH) + 0.5 - INFO.center_x()) / FOCAL,
+        (np.arange(HEIGHT) + 0.5 - INFO.center_y()) / FOCAL,
     )
     rays = np.stack([x, y, np.ones(x.shape)], axis=-1)
     facing = rays @ (np.array(normal) / np.linalg.norm(normal))
@@ -130,6 +131,16 @@ def test_what_is_seen_at_a_grazing_angle_is_a_hole(normal: tuple[float, float, f
     clear = np.isfinite(plane) & (np.abs(angle - limit) > 1.0)
     assert 0.2 < (angle[clear] > limit).mean() < 0.8
     assert ((seen == 0) == (angle > limit))[clear].mean() > 0.99
+
+
+def test_a_wall_that_is_faced_squarely_has_the_same_holes_on_all_sides():
+    depth = np.full((HEIGHT, WIDTH), 0.7, np.float32)
+    # Of this angle some pixels near a corner are, and their neighbours are not.
+    noise = SensorNoiseParameters(steepest_deg=36.0)
+    holes = noisy_depth(depth, noise, INFO, np.random.default_rng(0)) == 0
+    assert 0 < holes.mean() < 0.5
+    np.testing.assert_array_equal(holes, holes[::-1])
+    np.testing.assert_array_equal(holes, holes[:, ::-1])
 
 
 def test_what_has_no_depth_is_no_surface():
