@@ -86,7 +86,7 @@ def paper_sections(
         if task == "unseen" and "unseen_so2_180_10" in by_name:
             sections.append(texts.TEN)
         if task == "unseen" and "unseen_transporter_36_100" in by_name:
-            sections += [texts.TRANSPORTER, _longer_text(by_name)]
+            sections.append(texts.TRANSPORTER)
     sections += trainings(by_name)
     if efficiency is not None:
         sections.append(efficiency_section(efficiency))
@@ -119,20 +119,6 @@ def _state_text(results: Sequence[Result]) -> str:
     hours = sum(result.summary["wall_seconds"] for result in results) / 3600
     text = texts.ALL if len(results) == count else texts.NOT_ALL
     return text.format(done=len(results), all=count, hours=hours)
-
-
-def _longer_text(results: Mapping[str, Result]) -> str:
-    """Which of the Transporter's longer trainings have been run."""
-    longer = [
-        cell
-        for cell in paper_cells()
-        if isinstance(cell.policy, Training)
-        and (cell.policy.method, cell.policy.times) == ("transporter", PATIENCE)
-    ]
-    done = [cell for cell in longer if cell.name in results]
-    return texts.LONGER.format(
-        done=len(done) or "none", all=len(longer), has="has" if len(done) == 1 else "have"
-    )
 
 
 def _rates_text(rates: Rates) -> str:
@@ -242,6 +228,8 @@ def _table_1(results: Mapping[str, Result]) -> list[str]:
         sections.append(texts.PALLETIZING)
     if "palletizing_boxes_so2_180_1" in results:
         sections.append(texts.PALLETIZING_ONCE)
+    if "palletizing_boxes_transporter_36_100" in results:
+        sections.append(texts.PALLETIZING_TRANSPORTER)
     if "place_red_in_green_so2_180_1" in results:
         sections.append(texts.RED)
     if any(
