@@ -156,12 +156,12 @@ def test_a_function_of_ones_own(site: PolicySite, tmp_path: Path, monkeypatch: p
     path.write_text(STOP)
     assert config.digest(tmp_path) == first
     # What its package holds beside it makes it another one, too.
-    package = tmp_path / "policies_of_mine"
+    package = tmp_path / "a_package_of_mine"
     package.mkdir()
     (package / "__init__.py").touch()
     (package / "stop.py").write_text(STOP)
     (package / "helper.py").write_text("WIDTH = 1\n")
-    config = PythonPolicy("policies_of_mine.stop:act")
+    config = PythonPolicy("a_package_of_mine.stop:act")
     first = config.digest(tmp_path)
     (package / "helper.py").write_text("WIDTH = 2\n")
     assert config.digest(tmp_path) != first
