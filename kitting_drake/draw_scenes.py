@@ -69,7 +69,7 @@ def main() -> int:
 
 
 def _drawn_by() -> dict[str, str]:
-    """What decides what a scene of a seed looks like."""
+    """The versions, sources and designs that decide how the scene of a seed looks."""
     catalogue = hashlib.sha256(_CATALOGUE.read_bytes()).hexdigest()[:16]
     return {**versions(), "code": source_digest(*_DRAWN_BY), "catalogue": catalogue}
 

@@ -303,13 +303,17 @@ class PythonPolicy(PolicyConfig):
             spec = importlib.util.find_spec(module)
         except (ImportError, ValueError) as error:
             raise UserError(f"policy.function: cannot import {self.function}: {error}") from error
-        if spec is None or spec.origin is None:
+        if spec is None or not spec.has_location:
             raise UserError(f"policy.function: there is no file of the module {module}")
         # What the function imports from its own package makes it another policy too.
         package = module.partition(".")[0]
         top = importlib.util.find_spec(package)
-        whole = package if top is not None and top.origin is not None else module
-        return f"sha256 {source_digest(whole)}"
+        whole = package if top is not None and top.has_location else module
+        try:
+            return f"sha256 {source_digest(whole)}"
+        except OSError as error:
+            reason = f"{error.filename}: {error.strerror}"
+            raise UserError(f"policy.function: cannot read {reason}") from error
 
     def modules(self) -> list[str]:
         return [self.function.partition(":")[0]]

@@ -155,6 +155,8 @@ def test_a_function_of_ones_own(site: PolicySite, tmp_path: Path, monkeypatch: p
     assert config.digest(tmp_path) != first
     path.write_text(STOP)
     assert config.digest(tmp_path) == first
+    with pytest.raises(UserError, match="there is no file of the module time"):
+        PythonPolicy("time:sleep").digest(tmp_path)
     # What its package holds beside it makes it another one, too.
     package = tmp_path / "a_package_of_mine"
     package.mkdir()
