@@ -147,10 +147,10 @@ On palletizing the Transporter does better after one demonstration than after te
 more scenes it learns more slowly, and all have the same number of steps. The training loss of its
 place network, which is 14.4 nats for a guess among all pixels and rotations, is still 11.4 after
 1300 steps on one demonstration and 11.6 after 1900 on a hundred: that leaves about a twentieth of
-all pixels and rotations. At the last step it is 9.0 and 10.9 nats. On the validation scenes of other
-stacks the loss is least at step 1750 after one demonstration (16.4 nats), and falls to the last
-step after a hundred (17.6 at step 250, 13.6 at the end): it has not converged in the steps that all
-methods get. (The logs are not kept.)
+all pixels and rotations. At the last step it is 9.0 and 10.9 nats. On the validation scenes of
+other stacks the loss is least at step 1750 after one demonstration (16.4 nats), and falls to the
+last step after a hundred (17.6 at step 250, 13.6 at the end): it has not converged in the steps
+that all methods get. (The logs are not kept.)
 """
 
 RED = """\
