@@ -11,9 +11,6 @@ from pathlib import Path
 
 from rich.console import Console
 
-from kitting_drake.cell import Cell
-from kitting_drake.cell.cameras import require_rendering
-from kitting_drake.cell.sight import hidden_table_note
 from kitting_drake.common.command_line import count_type, run_command, seed_type
 from kitting_drake.common.errors import MachineError, UserError
 from kitting_drake.common.files import (
@@ -30,10 +27,11 @@ from kitting_drake.common.processes import (
     side_by_side,
 )
 from kitting_drake.common.provenance import commit, versions
+from kitting_drake.common.rendering import require_rendering
 from kitting_drake.common.seeds import DEMONSTRATION_SEEDS, seeds_from
 from kitting_drake.episode import EpisodeResult, ModeChange
 from kitting_drake.episode.chosen import build_any_chosen, build_chosen, run_chosen
-from kitting_drake.policies.demonstrations import (
+from kitting_drake.policies.data.demonstrations import (
     Demonstration,
     Origin,
     Rejection,
@@ -41,9 +39,13 @@ from kitting_drake.policies.demonstrations import (
     read_contents,
     write_demonstrations,
 )
-from kitting_drake.policies.lerobot_export import export_lerobot, require_export, require_pyarrow
-from kitting_drake.policies.recorded import DemonstrationStep, FinalObservation
-from kitting_drake.scenario.command_line import (
+from kitting_drake.policies.data.lerobot_export import (
+    export_lerobot,
+    require_export,
+    require_pyarrow,
+)
+from kitting_drake.policies.data.recorded import DemonstrationStep, FinalObservation
+from kitting_drake.scenario.choosing import (
     ChosenScenario,
     choose_scenario,
     output_folder,
@@ -51,6 +53,8 @@ from kitting_drake.scenario.command_line import (
 )
 from kitting_drake.scenario.policies import Oracle
 from kitting_drake.scenario.workers import add_workers_flags, open_workers
+from kitting_drake.station import Cell
+from kitting_drake.station.hidden_table import hidden_table_note
 from systems.signals import Observation, PickPlaceAction
 
 LEAST_SCORE = 0.99

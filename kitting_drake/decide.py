@@ -11,7 +11,10 @@ from pathlib import Path
 
 from rich.console import Console
 
-from kitting_drake.bench import (
+from kitting_drake.common.command_line import count_type, run_command
+from kitting_drake.common.errors import MachineError, UserError
+from kitting_drake.common.files import require_folder, write_atomically, write_json
+from kitting_drake.real_camera import (
     BenchPolicy,
     ShapeMatching,
     decide,
@@ -19,12 +22,9 @@ from kitting_drake.bench import (
     read_calibration,
     read_frames,
 )
-from kitting_drake.bench.check import check_cameras
-from kitting_drake.bench.kit_block import Block
-from kitting_drake.bench.report import CHECK_FILES, print_check, print_decision, save_check
-from kitting_drake.common.command_line import count_type, run_command
-from kitting_drake.common.errors import MachineError, UserError
-from kitting_drake.common.files import require_folder, write_atomically, write_json
+from kitting_drake.real_camera.checking.check import check_cameras
+from kitting_drake.real_camera.checking.kit_block import Block
+from kitting_drake.real_camera.report import CHECK_FILES, print_check, print_decision, save_check
 from systems.signals import PixelGrid
 
 

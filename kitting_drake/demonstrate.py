@@ -10,16 +10,16 @@ from pathlib import Path
 
 from rich.console import Console
 
-from kitting_drake.bench.annotation_page import AnnotationServer
-from kitting_drake.bench.calibration import Calibration, read_calibration
-from kitting_drake.bench.outside_demonstrations import (
+from kitting_drake.common.command_line import run_command
+from kitting_drake.common.files import require_folder
+from kitting_drake.policies.data.learning import Learning
+from kitting_drake.real_camera.annotation_page import AnnotationServer
+from kitting_drake.real_camera.calibrations.calibration import Calibration, read_calibration
+from kitting_drake.real_camera.outside_demonstrations import (
     check_replaceable,
     convert,
     find_demonstrations,
 )
-from kitting_drake.common.command_line import run_command
-from kitting_drake.common.files import require_folder
-from kitting_drake.policies.learning import Learning
 
 
 def main() -> int:

@@ -8,7 +8,6 @@ from pathlib import Path
 
 from rich.console import Console
 
-from kitting_drake.cell.cameras import require_rendering
 from kitting_drake.common.command_line import count_type, run_command, seed_type
 from kitting_drake.common.errors import UserError
 from kitting_drake.common.files import alone_in, claim_folder, require_folder
@@ -20,21 +19,22 @@ from kitting_drake.common.processes import (
     side_by_side,
 )
 from kitting_drake.common.provenance import source_digest, versions
-from kitting_drake.policies.static_scenes import (
+from kitting_drake.common.rendering import require_rendering
+from kitting_drake.policies.data.static_scenes import (
     StaticScene,
     StaticScenes,
     read_static_scenes,
     write_static_scenes,
 )
-from kitting_drake.tasks.kitting.static_scenes import draw_batch
+from kitting_drake.static_scenes.drawing import draw_batch
 from systems.signals import PixelGrid
 
 _DRAWN_BY = (
     "kitting_drake.hkd",
     "kitting_drake.tasks",
-    "kitting_drake.cell",
+    "kitting_drake.station",
     "kitting_drake.scenario",
-    "kitting_drake.policies.static_scenes",
+    "kitting_drake.policies.data.static_scenes",
     "systems",
 )
 """The packages and modules that decide what a scene looks like, ..."""

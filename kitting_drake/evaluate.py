@@ -10,7 +10,6 @@ from typing import Any
 
 from rich.console import Console
 
-from kitting_drake.cell.sight import hidden_table_note
 from kitting_drake.common.command_line import FAILED, count_type, run_command, seed_type
 from kitting_drake.common.errors import MachineError, UserError
 from kitting_drake.common.files import (
@@ -32,16 +31,17 @@ from kitting_drake.common.provenance import commit, versions
 from kitting_drake.common.seeds import ALL_SEEDS
 from kitting_drake.episode import EpisodeResult
 from kitting_drake.episode.chosen import build_any_chosen, build_chosen, run_chosen
-from kitting_drake.reporting.summary import Episode, summarise
-from kitting_drake.reporting.summary_figure import draw_summary
-from kitting_drake.reporting.terminal import summary_notes, summary_table
-from kitting_drake.scenario.command_line import (
+from kitting_drake.evaluation.summary import Episode, summarise
+from kitting_drake.evaluation.summary_figure import draw_summary
+from kitting_drake.evaluation.terminal import summary_notes, summary_table
+from kitting_drake.scenario.choosing import (
     ChosenScenario,
     choose_scenario,
     output_folder,
     scenario_parser,
 )
 from kitting_drake.scenario.workers import add_workers_flags, open_workers
+from kitting_drake.station.hidden_table import hidden_table_note
 
 Run = Callable[[int], Episode]
 """Runs the episode of a seed; called in a thread."""

@@ -17,14 +17,14 @@ from rich.console import Console
 
 from kitting_drake.common.command_line import run_command
 from kitting_drake.common.files import write_atomically
-from kitting_drake.paper.efficiency import read_efficiency
-from kitting_drake.paper.figure import draw_figure_6, draw_table_1
-from kitting_drake.paper.page import has_figure, has_table_1, paper_sections
-from kitting_drake.paper.rates import read_rates
-from kitting_drake.paper.result import Result, read_results
-from kitting_drake.reporting.results_page import results_page
-from kitting_drake.reporting.robustness import robustness_table, with_figures
-from kitting_drake.reporting.runs import read_runs
+from kitting_drake.reproduction.page.results_page import results_page
+from kitting_drake.reproduction.page.robustness import robustness_table, with_figures
+from kitting_drake.reproduction.page.runs import read_runs
+from kitting_drake.reproduction.paper.cell_results import Result, read_results
+from kitting_drake.reproduction.paper.efficiency import read_efficiency
+from kitting_drake.reproduction.paper.learning_rates import read_rates
+from kitting_drake.reproduction.paper.paper_figures import draw_figure_6, draw_table_1
+from kitting_drake.reproduction.paper.paper_sections import has_figure, has_table_1, paper_sections
 
 
 def main() -> int:
@@ -75,7 +75,7 @@ def _draw(answers: Sequence[Result], efficiency: dict[str, Any] | None, folder: 
             write_atomically(path, draw_figure_6(task, by_name))
     if answers and efficiency is not None:
         # Only who has something to draw waits for torch.
-        from kitting_drake.benchmark.networks.figure import draw_networks
+        from kitting_drake.reproduction.network_speed.speed_figure import draw_networks
 
         draw_networks(efficiency, folder / "networks.png")
     if has_table_1(answers):

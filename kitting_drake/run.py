@@ -10,16 +10,16 @@ from pydrake.systems.framework import Context, Diagram
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
-from kitting_drake.cell import Cell
-from kitting_drake.cell.cameras import render_picture, save_png
-from kitting_drake.cell.sight import hidden_table_note
 from kitting_drake.common.command_line import FAILED, INTERRUPTED, run_command, seed_type
 from kitting_drake.common.errors import UserError
 from kitting_drake.common.files import require_folder, write_atomically, write_json
+from kitting_drake.common.rendering import render_picture, save_png
 from kitting_drake.episode import ModeChange
 from kitting_drake.episode.chosen import build_chosen, run_chosen
-from kitting_drake.reporting.terminal import print_episode
-from kitting_drake.scenario.command_line import choose_scenario, output_folder, scenario_parser
+from kitting_drake.evaluation.terminal import print_episode
+from kitting_drake.scenario.choosing import choose_scenario, output_folder, scenario_parser
+from kitting_drake.station import Cell
+from kitting_drake.station.hidden_table import hidden_table_note
 from systems.pick_place_parameters import Mode
 from systems.signals import Observation
 
@@ -108,7 +108,7 @@ def _save_decisions(folder: Path, decisions: "list[tuple[Observation, Decision]]
         path.unlink()
     if decisions:
         # Who draws nothing does not wait for matplotlib.
-        from kitting_drake.reporting.decision_figure import draw_decision
+        from kitting_drake.evaluation.decision_figure import draw_decision
 
         for number, (observation, decision) in enumerate(decisions, start=1):
             picture = draw_decision(observation, decision)

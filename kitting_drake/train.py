@@ -16,11 +16,11 @@ from kitting_drake.common.files import (
     claim_folder,
     require_folder,
 )
-from kitting_drake.policies.config import METHODS, PRESETS, NetworkConfig
-from kitting_drake.policies.device import preferred_device, preferred_type
-from kitting_drake.policies.training_data import TrainingData, read_training_data
-from kitting_drake.policies.training_run import WEIGHTS, Settings, TrainingRun
-from kitting_drake.policies.weights import card_seeds, learned_seeds, read_weights_file
+from kitting_drake.policies.data.training_data import TrainingData, read_training_data
+from kitting_drake.policies.networks.architecture import METHODS, PRESETS, NetworkConfig
+from kitting_drake.policies.networks.device import preferred_device, preferred_type
+from kitting_drake.policies.networks.weights import card_seeds, learned_seeds, read_weights_file
+from kitting_drake.policies.training.training_run import WEIGHTS, Settings, TrainingRun
 
 
 def main() -> int:
@@ -36,7 +36,7 @@ def main() -> int:
     _check_validation(settings, held_out, arguments.validation or arguments.demos)
     if arguments.export:
         # Not after hours.
-        from kitting_drake.policies.onnx_export import require_onnx
+        from kitting_drake.policies.training.onnx_export import require_onnx
 
         require_onnx()
     folder = require_folder(
@@ -59,7 +59,7 @@ def main() -> int:
 def _export(arguments: argparse.Namespace, weights: Path, console: Console) -> None:
     """Writes weights in another format, to the folder `onnx` beside them, or in --output."""
     # Who exports nothing does not wait for it.
-    from kitting_drake.policies.onnx_export import export_onnx
+    from kitting_drake.policies.training.onnx_export import export_onnx
 
     folder = (arguments.output or weights.parent) / "onnx"
     with console.status(f"exporting {weights.name}"):

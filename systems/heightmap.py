@@ -1,7 +1,7 @@
 """The arithmetic of o_t: from the images of RGB-D cameras to the orthographic heightmap.
 
-No pydrake here: `HeightmapProjector` computes it in the cell, `kitting_drake.bench` on a robot's
-own frames, and both get the same bits from the same images, intrinsics and poses.
+No pydrake here: `HeightmapProjector` computes it in simulation, `kitting_drake.real_camera` on a
+robot's own frames, and both get the same bits from the same images, intrinsics and poses.
 """
 
 from __future__ import annotations

@@ -23,7 +23,7 @@ def cache_home(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
 
 @pytest.fixture(scope="session")
 def rendering() -> None:
-    """Skips where images cannot be rendered; see `kitting_drake.cell.cameras.require_rendering`."""
+    """Skips where images cannot be rendered."""
     try:
         ctypes.CDLL("libEGL.so.1")
     except OSError:

@@ -9,8 +9,8 @@ import math
 import numpy as np
 from pydrake.math import RigidTransform, RollPitchYaw
 
-from kitting_drake.cell import Cell
 from kitting_drake.episode.events import ModeChange
+from kitting_drake.station import Cell
 from kitting_drake.tasks.task import ActionRecord
 from systems.oracle_policy import gripper_pose
 from systems.pick_place_parameters import Mode

@@ -6,12 +6,12 @@ from pathlib import Path
 
 from pydrake.geometry import Meshcat
 
-from kitting_drake.cell import Cell, build_cell
 from kitting_drake.common.errors import MachineError, UserError
 from kitting_drake.episode.episode import EpisodeResult, run_episode
 from kitting_drake.episode.events import EpisodeObserver
-from kitting_drake.scenario.command_line import ChosenScenario
+from kitting_drake.scenario.choosing import ChosenScenario
 from kitting_drake.scenario.policies import DecisionObserver
+from kitting_drake.station import Cell, build_cell
 
 _TRIED = 5
 """How many seeds tell whether a scenario can be built at all."""

@@ -13,9 +13,9 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import Context, EventStatus
 
 import systems
-from kitting_drake.cell import Cell
 from kitting_drake.episode.action_log import ActionLog
 from kitting_drake.episode.events import EpisodeObserver, ModeChange
+from kitting_drake.station import Cell
 from kitting_drake.tasks.task import ActionRecord, TaskConfig
 from systems.pick_place_parameters import Mode
 from systems.placement import ALL, Placement, strict_reward

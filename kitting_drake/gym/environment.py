@@ -10,9 +10,8 @@ import gymnasium
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from kitting_drake.cell import Cell
-from kitting_drake.cell.cameras import render_picture
 from kitting_drake.common.errors import UserError
+from kitting_drake.common.rendering import render_picture
 from kitting_drake.common.seeds import ALL_SEEDS
 from kitting_drake.episode import Episode, EpisodeResult
 from kitting_drake.episode.chosen import build_chosen
@@ -22,9 +21,10 @@ from kitting_drake.gym.spaces import (
     as_arrays,
     observation_space,
 )
-from kitting_drake.scenario.command_line import find_scenario
+from kitting_drake.scenario.choosing import find_scenario
 from kitting_drake.scenario.policies import PolicyConfig, PolicySite
 from kitting_drake.scenario.schema import Scenario
+from kitting_drake.station import Cell
 from systems.given_action import GivenAction
 from systems.placement import ALL
 from systems.signals import Observation, PickPlaceAction

@@ -25,8 +25,8 @@ from pydrake.multibody.plant import AddMultibodyPlantSceneGraph
 from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.sensors import CameraInfo
 
-from kitting_drake.cell.cameras import require_rendering
 from kitting_drake.common.files import write_atomically
+from kitting_drake.common.rendering import require_rendering
 from kitting_drake.hkd.kits.kit import Kit
 from kitting_drake.hkd.kits.parameters import KitParameters
 from kitting_drake.hkd.tools.tool import Tool

@@ -13,15 +13,15 @@ import torch.nn.functional as F
 from numpy.typing import NDArray
 from torch import Tensor
 
-from kitting_drake.policies.correlation import Candidate
-from kitting_drake.policies.images import Image, make_action, rotation_matrix
+from kitting_drake.policies.data.images import Image, make_action, rotation_matrix
 from kitting_drake.policies.matching.jaw_clearance import RETRY_DISTANCE
-from kitting_drake.policies.matching.policy import belonging, certain_fits
 from kitting_drake.policies.matching.recovery import recovery_action
 from kitting_drake.policies.matching.refinement import refine_grasp, refine_place
 from kitting_drake.policies.matching.release_clearance import blocked_at_place
 from kitting_drake.policies.matching.segmentation import Segmentation, segment
-from kitting_drake.policies.networks import Networks, PickPrediction
+from kitting_drake.policies.matching.shape_matching import belonging, certain_fits
+from kitting_drake.policies.networks.factored import Networks, PickPrediction
+from kitting_drake.policies.networks.layers.correlation import Candidate
 from systems.signals import (
     Observation,
     PickPlaceAction,

@@ -1,4 +1,4 @@
-"""`policies.correlation` in numpy, for inference where there is no torch: see `onnx_runner`.
+"""`correlation` in numpy, for inference where there is no torch: see `onnx_runner`.
 
 The same search with the same constants; `tests/kitting_drake/policies/onnx_test.py` compares them.
 """

@@ -181,9 +181,9 @@ class Learned(PolicyConfig):
 
     def make_system(self, site: PolicySite) -> LeafSystem:
         # Only who uses a network waits for torch.
-        from kitting_drake.policies.device import preferred_device, preferred_type
         from kitting_drake.policies.learned_policy import LearnedPolicy
-        from kitting_drake.policies.weights import load_networks, read_weights_file
+        from kitting_drake.policies.networks.device import preferred_device, preferred_type
+        from kitting_drake.policies.networks.weights import load_networks, read_weights_file
 
         path = self._path(site.base)
         networks = load_networks(path, preferred_type()).to(preferred_device())
@@ -221,8 +221,8 @@ class Learned(PolicyConfig):
         return PickPlacePolicy(policy=function, heights_only=heights_only)
 
     def details(self, base: Path) -> dict[str, Any]:
-        from kitting_drake.policies.device import preferred_type
-        from kitting_drake.policies.weights import read_weights_file
+        from kitting_drake.policies.networks.device import preferred_type
+        from kitting_drake.policies.networks.weights import read_weights_file
 
         file = read_weights_file(self._path(base))
         return {
@@ -248,7 +248,7 @@ class Learned(PolicyConfig):
         return [self._path(base)] if self.weights else []
 
     def training_seeds(self, base: Path) -> set[int]:
-        from kitting_drake.policies.weights import card_seeds, read_weights_file
+        from kitting_drake.policies.networks.weights import card_seeds, read_weights_file
 
         return card_seeds(read_weights_file(self._path(base)).card)
 
@@ -264,7 +264,7 @@ class ShapeMatching(PolicyConfig):
     recover: bool = False
 
     def make_system(self, site: PolicySite) -> LeafSystem:
-        from kitting_drake.policies.matching.policy import ShapeMatchingPolicy
+        from kitting_drake.policies.matching.shape_matching import ShapeMatchingPolicy
 
         function = ShapeMatchingPolicy(recover=self.recover)
         return PickPlacePolicy(policy=function, heights_only=True)

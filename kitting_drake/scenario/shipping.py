@@ -13,7 +13,7 @@ import kitting_drake
 from kitting_drake.common.errors import UserError
 from kitting_drake.common.paths import MODELS
 from kitting_drake.hkd.tools.tool import user_tools
-from kitting_drake.scenario.command_line import ChosenScenario
+from kitting_drake.scenario.choosing import ChosenScenario
 
 _PACKAGES = ("kitting_drake", "systems")
 

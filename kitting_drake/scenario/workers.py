@@ -10,7 +10,7 @@ from pathlib import Path
 from kitting_drake.common.cluster import RayWorkers
 from kitting_drake.common.command_line import count_type
 from kitting_drake.common.processes import LocalWorkers, Workers
-from kitting_drake.scenario.command_line import ChosenScenario
+from kitting_drake.scenario.choosing import ChosenScenario
 from kitting_drake.scenario.shipping import pack
 
 

@@ -1,6 +1,6 @@
 """Tasks: what stands on the table, what is to be brought about, and when it is success."""
 
-from kitting_drake.tasks.kitting.config import ArrangedKitting, Kitting, ToolsetKitting
+from kitting_drake.tasks.kitting.kitting import ArrangedKitting, Kitting, ToolsetKitting
 from kitting_drake.tasks.ravens.align_box_corner import AlignBoxCorner
 from kitting_drake.tasks.ravens.block_insertion import BlockInsertion
 from kitting_drake.tasks.ravens.palletizing_boxes import PalletizingBoxes

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydrake.math import RigidTransform
 
-from kitting_drake.policies.learning import Learning
+from kitting_drake.policies.data.learning import Learning
 from systems.grasp import Grasp
 from systems.placement import Goal, Placement, SuccessPredicate
 from systems.signals import PixelGrid, PlanarPose

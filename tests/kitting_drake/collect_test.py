@@ -20,14 +20,14 @@ from kitting_drake.common.errors import UserError
 from kitting_drake.common.files import alone_in
 from kitting_drake.common.processes import LocalWorkers, ProcessCrashed
 from kitting_drake.common.seeds import DEMONSTRATION_SEEDS, TEST_SEEDS, VALIDATION_SEEDS, seeds_from
-from kitting_drake.policies.demonstrations import (
+from kitting_drake.policies.data.demonstrations import (
     Demonstration,
     Origin,
     Rejection,
     read_contents,
     read_demonstrations,
 )
-from kitting_drake.policies.recorded import DemonstrationStep
+from kitting_drake.policies.data.recorded import DemonstrationStep
 from systems.signals import Observation, PickPlaceAction, PixelGrid, PlanarPose
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -236,7 +236,7 @@ def test_without_rendering_one_sentence(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
     monkeypatch.chdir(ROOT)
-    monkeypatch.setattr("kitting_drake.cell.cameras.can_render", lambda: False)
+    monkeypatch.setattr("kitting_drake.common.rendering.can_render", lambda: False)
     monkeypatch.setattr(sys, "argv", arguments(tmp_path))
     with pytest.raises(SystemExit) as left:
         collecting.run_command(collecting.main)

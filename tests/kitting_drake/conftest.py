@@ -38,9 +38,9 @@ def weights_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
     # Who tests no network does not wait for torch.
     import torch
 
-    from kitting_drake.policies.config import NetworkConfig
-    from kitting_drake.policies.methods import make_networks
-    from kitting_drake.policies.weights import save_weights
+    from kitting_drake.policies.networks.architecture import NetworkConfig
+    from kitting_drake.policies.networks.methods import make_networks
+    from kitting_drake.policies.networks.weights import save_weights
 
     torch.set_num_threads(1)
     torch.manual_seed(0)

@@ -7,10 +7,10 @@ import pytest
 from rich.console import Console
 
 from kitting_drake import draw_scenes
-from kitting_drake.cell.cameras import can_render
 from kitting_drake.common.errors import UserError
 from kitting_drake.common.provenance import source_digest
-from kitting_drake.policies.static_scenes import (
+from kitting_drake.common.rendering import can_render
+from kitting_drake.policies.data.static_scenes import (
     StaticScene,
     StaticScenes,
     read_static_scenes,
@@ -102,7 +102,7 @@ def test_what_is_drawn_by_includes_cameras_encoding_and_designs(tmp_path: Path, 
     catalogue.write_text("tools: {}\n")
     monkeypatch.setattr(draw_scenes, "_CATALOGUE", catalogue)
     assert draw_scenes._drawn_by()["catalogue"] != before["catalogue"]
-    for name in ("kitting_drake.scenario", "kitting_drake.policies.static_scenes"):
+    for name in ("kitting_drake.scenario", "kitting_drake.policies.data.static_scenes"):
         others = [item for item in draw_scenes._DRAWN_BY if item != name]
         assert source_digest(*others) != before["code"]
 

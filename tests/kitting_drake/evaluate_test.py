@@ -16,17 +16,17 @@ import pytest
 import torch
 from rich.console import Console
 
-import kitting_drake.cell.cameras as cameras
+import kitting_drake.common.rendering as cameras
 import kitting_drake.episode.chosen as chosen_module
 import kitting_drake.evaluate as evaluation
-import kitting_drake.policies.device as device
+import kitting_drake.policies.networks.device as device
 from kitting_drake.common.errors import UserError
 from kitting_drake.common.files import alone_in
 from kitting_drake.common.paths import MODELS
 from kitting_drake.common.processes import LocalWorkers, ProcessCrashed, Workers
 from kitting_drake.episode import EpisodeResult
-from kitting_drake.reporting.summary import Episode, summarise
-from kitting_drake.scenario.command_line import ChosenScenario
+from kitting_drake.evaluation.summary import Episode, summarise
+from kitting_drake.scenario.choosing import ChosenScenario
 from kitting_drake.scenario.policies import Learned, PythonPolicy
 from kitting_drake.scenario.schema import Heightmap, Scenario
 from kitting_drake.tasks import Kitting

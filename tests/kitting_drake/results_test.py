@@ -10,13 +10,13 @@ from typing import Any
 import pytest
 
 from kitting_drake.common.errors import UserError
-from kitting_drake.reporting.results_page import results_page
-from kitting_drake.reporting.runs import read_runs
-from kitting_drake.reporting.summary import summarise
+from kitting_drake.evaluation.summary import summarise
+from kitting_drake.reproduction.page.results_page import results_page
+from kitting_drake.reproduction.page.runs import read_runs
 from kitting_drake.scenario.policies import PythonPolicy, QuantizedOracle
 from kitting_drake.scenario.schema import Heightmap, Scenario
 from kitting_drake.tasks import PAPER_TASKS, ArrangedKitting, Kitting, ToolsetKitting
-from tests.kitting_drake.reporting.episodes import (
+from tests.kitting_drake.evaluation.episodes import (
     ADD_S,
     CHOSEN,
     make_episode,

@@ -19,21 +19,21 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from kitting_drake import train as training
 from kitting_drake.common.errors import UserError
 from kitting_drake.common.files import alone_in
-from kitting_drake.policies import training as steps
-from kitting_drake.policies import training_run
-from kitting_drake.policies.demonstrations import (
+from kitting_drake.policies.data.demonstrations import (
     Demonstration,
     Learning,
     Origin,
     write_demonstrations,
 )
-from kitting_drake.policies.images import LabelledImage
-from kitting_drake.policies.networks import Networks
-from kitting_drake.policies.recorded import DemonstrationStep, FinalObservation
-from kitting_drake.policies.static_scenes import StaticScene, StaticScenes, write_static_scenes
-from kitting_drake.policies.training import Trainer
-from kitting_drake.policies.training_data import read_training_data
-from kitting_drake.policies.weights import card_seeds, load_networks, read_weights_file
+from kitting_drake.policies.data.images import LabelledImage
+from kitting_drake.policies.data.recorded import DemonstrationStep, FinalObservation
+from kitting_drake.policies.data.static_scenes import StaticScene, StaticScenes, write_static_scenes
+from kitting_drake.policies.data.training_data import read_training_data
+from kitting_drake.policies.networks.factored import Networks
+from kitting_drake.policies.networks.weights import card_seeds, load_networks, read_weights_file
+from kitting_drake.policies.training import training_run
+from kitting_drake.policies.training import training_step as steps
+from kitting_drake.policies.training.training_step import Trainer
 from systems.signals import Observation, PickPlaceAction, PixelGrid, PlanarPose
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -655,7 +655,7 @@ def test_a_loss_that_is_no_number_ends_the_run(
 # Checkpoints are a second apart, and no displacement is so large that others are equal to it.
 KILLABLE = """
 from kitting_drake import train
-from kitting_drake.policies import training_run, validation
+from kitting_drake.policies.training import training_run, validation
 assert training_run._CHECKPOINT_EVERY
 training_run._CHECKPOINT_EVERY = 3
 validation._LOST = 1e9

@@ -16,10 +16,10 @@ import yaml
 import kitting_drake
 from kitting_drake.common.errors import UserError
 from kitting_drake.common.files import replace_folder, write_json
+from kitting_drake.hkd.fabrication.block_files import stl_bytes, threemf_bytes
 from kitting_drake.hkd.fabrication.design import Design, design_kit, solid
 from kitting_drake.hkd.fabrication.drawings import dxf_text, svg_text
 from kitting_drake.hkd.fabrication.picture import picture_png
-from kitting_drake.hkd.fabrication.solids import stl_bytes, threemf_bytes
 from kitting_drake.hkd.kits.kit import make_kit
 from kitting_drake.hkd.kits.layout import MOST_TOOLS
 from kitting_drake.hkd.kits.parameters import KitParameters

@@ -7,7 +7,7 @@ from manifold3d import Manifold
 from kitting_drake.common.errors import UserError
 from kitting_drake.hkd.grasps.proposals import WIDEST, propose_grasps
 from kitting_drake.hkd.importing.materials import bodies_of
-from kitting_drake.hkd.importing.stable_pose import centred, size
+from kitting_drake.hkd.importing.tool_frame import centred, size
 from kitting_drake.hkd.kits.layout import layout_kit
 from kitting_drake.hkd.kits.parameters import KitParameters
 from kitting_drake.hkd.tools import meshes
@@ -47,7 +47,7 @@ def guess_unit(length: float) -> str | None:
 
 def material_of(category: str) -> str:
     """The material of which an imported tool of a category seems to be: a key of `MATERIALS` of
-    `hkd.tools.solids`."""
+    `hkd.families.solids`."""
     return "polished_steel" if category == "wrench" else "steel"
 
 

@@ -45,7 +45,7 @@ from kitting_drake.hkd.importing.outline import (
 )
 from kitting_drake.hkd.importing.repair import NOMINAL_MM, make_solid, read_mesh
 from kitting_drake.hkd.importing.resting_pose import resting_tilt
-from kitting_drake.hkd.importing.stable_pose import (
+from kitting_drake.hkd.importing.tool_frame import (
     facing_forward,
     size,
     tipping_deg,

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from kitting_drake.common.errors import UserError
 from kitting_drake.common.extras import import_extra
 from kitting_drake.hkd.importing.repair import NOMINAL_MM
-from kitting_drake.hkd.importing.stable_pose import long_direction_deg
+from kitting_drake.hkd.importing.tool_frame import long_direction_deg
 
 OUTLINE_FORMATS = (".svg", ".dxf")
 LENGTHS_MM = (20.0, 250.0)

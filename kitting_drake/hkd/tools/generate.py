@@ -19,8 +19,10 @@ from scipy.spatial import ConvexHull, QhullError
 
 from kitting_drake.common.errors import MachineError, UserError
 from kitting_drake.common.files import replace_folder
+from kitting_drake.hkd.families import hammer, pliers, screwdriver, wrench
+from kitting_drake.hkd.families.solids import MATERIALS, Part
 from kitting_drake.hkd.grasps.grip import Grip, find_grip, jaw_axes
-from kitting_drake.hkd.tools import hammer, meshes, pliers, screwdriver, wrench
+from kitting_drake.hkd.tools import meshes
 from kitting_drake.hkd.tools.collision import (
     closed,
     cover,
@@ -30,7 +32,6 @@ from kitting_drake.hkd.tools.collision import (
 )
 from kitting_drake.hkd.tools.mass import Body, mass_properties
 from kitting_drake.hkd.tools.sdf import tool_sdf
-from kitting_drake.hkd.tools.solids import MATERIALS, Part
 from kitting_drake.hkd.tools.stable_pose import stable_poses
 from kitting_drake.hkd.tools.symmetry import symmetry_order
 from systems.hand_geometry import FINGER_LENGTH, PAD_LENGTH

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from kitting_drake.policies.images import make_action
+from kitting_drake.policies.data.images import make_action
 from kitting_drake.policies.matching.jaw_clearance import jaw_grasps
 from kitting_drake.policies.matching.segmentation import Region, Segmentation
 from systems.signals import Observation, PickPlaceAction, PlanarPose

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from kitting_drake.policies.images import rotation_matrix
+from kitting_drake.policies.data.images import rotation_matrix
 from kitting_drake.policies.matching.jaw_clearance import JawGrasp, jaw_grasps, untried
 from kitting_drake.policies.matching.registration import (
     Outline,

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from kitting_drake.policies.images import rotation_matrix
+from kitting_drake.policies.data.images import rotation_matrix
 from kitting_drake.policies.matching.segmentation import Mask, Region
 
 Array = NDArray[np.float64]

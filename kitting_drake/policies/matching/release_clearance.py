@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from kitting_drake.policies.images import rotation_matrix
+from kitting_drake.policies.data.images import rotation_matrix
 from kitting_drake.policies.matching.jaw_clearance import tip_height
 from systems.hand_geometry import FINGER_LENGTH, FINGERTIP_DEPTH, MAX_OPENING
 from systems.pick_place_parameters import PickPlaceParameters

@@ -9,8 +9,8 @@ from pydrake.math import RigidTransform, RollPitchYaw
 
 from kitting_drake.common.paths import MODELS
 from kitting_drake.tasks.boxes import box_footprint, box_grasps, box_object, random_brown
+from kitting_drake.tasks.footprints import Footprint, draw_poses, rectangle
 from kitting_drake.tasks.ravens.ravens_task import PoseTask
-from kitting_drake.tasks.sampling import Footprint, draw_poses, rectangle
 from kitting_drake.tasks.task import Fixture, Scene
 from systems.bounds import bounded
 from systems.grasp import Grasp

@@ -8,8 +8,8 @@ import numpy as np
 
 from kitting_drake.common.paths import MODELS
 from kitting_drake.tasks.boxes import box_points
+from kitting_drake.tasks.footprints import Footprint, draw_poses, rectangle
 from kitting_drake.tasks.ravens.ravens_task import PoseTask
-from kitting_drake.tasks.sampling import Footprint, draw_poses, rectangle
 from kitting_drake.tasks.task import Fixture, Scene, SceneObject
 from systems.grasp import Grasp
 from systems.placement import Goal

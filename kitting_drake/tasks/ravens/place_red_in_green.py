@@ -6,10 +6,10 @@ from pathlib import Path
 import numpy as np
 from pydrake.math import RigidTransform
 
-from kitting_drake.policies.learning import Learning
+from kitting_drake.policies.data.learning import Learning
 from kitting_drake.tasks.boxes import COLOURS, CUBE_FOOTPRINT, coloured, cube_object
+from kitting_drake.tasks.footprints import Footprint, disc, draw_poses
 from kitting_drake.tasks.ravens.ravens_task import RavensTask
-from kitting_drake.tasks.sampling import Footprint, disc, draw_poses
 from kitting_drake.tasks.task import Fixture, Scene, SceneObject
 from systems.bounds import bounded
 from systems.placement import Goal, PoseWithin

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from pydrake.math import RigidTransform
 
-from kitting_drake.policies.learning import Learning
+from kitting_drake.policies.data.learning import Learning
 from kitting_drake.tasks.task import MISPLACED, ActionRecord, Scene, TaskConfig
 from systems.bounds import bounded
 from systems.placement import Placement, PoseWithin

@@ -9,8 +9,8 @@ from pydrake.math import RigidTransform, RollPitchYaw
 
 from kitting_drake.common.paths import MODELS
 from kitting_drake.tasks.boxes import COLOURS, CUBE_FOOTPRINT, CUBE_SIDE, cube_object
+from kitting_drake.tasks.footprints import Footprint, draw_poses, rectangle
 from kitting_drake.tasks.ravens.ravens_task import PoseTask
-from kitting_drake.tasks.sampling import Footprint, draw_poses, rectangle
 from kitting_drake.tasks.task import Fixture, Scene
 from systems.grasp import Grasp
 from systems.placement import Goal

@@ -1,4 +1,4 @@
-"""`RayWorkers` without Ray: `tests/kitting_drake/cluster_test.py` has a real cluster."""
+"""`RayWorkers` without Ray: `tests/kitting_drake/ray_cluster_test.py` has a real cluster."""
 
 import functools
 import os

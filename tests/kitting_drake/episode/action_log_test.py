@@ -7,10 +7,10 @@ import pytest
 from pydrake.math import RigidTransform, RollPitchYaw
 from pydrake.systems.framework import Context
 
-from kitting_drake.cell import Cell, build_cell
 from kitting_drake.episode import ModeChange
 from kitting_drake.episode.action_log import ActionLog, nearest_object
 from kitting_drake.scenario import Scenario
+from kitting_drake.station import Cell, build_cell
 from kitting_drake.tasks import Kitting
 from kitting_drake.tasks.task import ActionRecord
 from systems.oracle_policy import gripper_pose

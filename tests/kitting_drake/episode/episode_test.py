@@ -10,13 +10,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from kitting_drake.cell import Cell, build_cell
 from kitting_drake.episode import EpisodeObserver, EpisodeResult, ModeChange, run_episode
 from kitting_drake.scenario import Scenario
 from kitting_drake.scenario.policies import PythonPolicy
 from kitting_drake.scenario.schema import Pinhole
+from kitting_drake.station import Cell, build_cell
 from kitting_drake.tasks import ArrangedKitting
-from kitting_drake.tasks.kitting.sampling import TablePose
+from kitting_drake.tasks.kitting.tool_poses import TablePose
 from systems.pick_place_parameters import Mode, PickPlaceParameters
 from systems.signals import Observation, PickPlaceAction, PlanarPose
 

@@ -6,7 +6,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from kitting_drake.policies.correlation import lift
+from kitting_drake.policies.networks.layers.correlation import lift
 
 
 def distance_from_middle(side: int) -> Tensor:

@@ -7,18 +7,18 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from kitting_drake.policies.config import PLACE_CROP, NetworkConfig
-from kitting_drake.policies.correlation import Candidate
-from kitting_drake.policies.images import Image
+from kitting_drake.policies.data.images import Image
 from kitting_drake.policies.learned_policy import (
     Decision,
     LearnedPolicy,
     best_placement,
     expected_position,
 )
-from kitting_drake.policies.methods import make_networks
-from kitting_drake.policies.networks import AnglePrediction, Networks, PickPrediction
-from kitting_drake.policies.steerable import PlainConv2d
+from kitting_drake.policies.networks.architecture import PLACE_CROP, NetworkConfig
+from kitting_drake.policies.networks.factored import AnglePrediction, Networks, PickPrediction
+from kitting_drake.policies.networks.layers.correlation import Candidate
+from kitting_drake.policies.networks.layers.steerable import PlainConv2d
+from kitting_drake.policies.networks.methods import make_networks
 from systems.signals import Observation, PickPlaceAction, PixelGrid, PlanarPose
 
 # No defaults, no two numbers alike.

@@ -5,8 +5,8 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from kitting_drake.policies.config import NetworkConfig
-from kitting_drake.policies.images import Image, LabelledImage, rotation_matrix
+from kitting_drake.policies.data.images import Image, LabelledImage, rotation_matrix
+from kitting_drake.policies.networks.architecture import NetworkConfig
 
 SIDE = 113
 ORIENTATIONS = 36

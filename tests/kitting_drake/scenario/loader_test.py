@@ -8,7 +8,7 @@ from kitting_drake.scenario import load_scenario
 from kitting_drake.scenario.policies import Learned, PythonPolicy
 from kitting_drake.scenario.schema import LookAt, Pinhole
 from kitting_drake.tasks import ArrangedKitting, Kitting, ToolsetKitting
-from kitting_drake.tasks.kitting.sampling import TablePose
+from kitting_drake.tasks.kitting.tool_poses import TablePose
 from systems.insertion_search import InsertionSearch
 
 TEST_SCENARIOS = Path(__file__).parent / "test_scenarios.yaml"

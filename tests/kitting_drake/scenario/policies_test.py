@@ -12,9 +12,9 @@ from pydrake.common.value import Value
 from safetensors.torch import save_file
 
 from kitting_drake.common.errors import UserError
-from kitting_drake.policies.device import preferred_type
 from kitting_drake.policies.learned_policy import Decision, LearnedPolicy
-from kitting_drake.policies.weights import load_networks
+from kitting_drake.policies.networks.device import preferred_type
+from kitting_drake.policies.networks.weights import load_networks
 from kitting_drake.scenario.policies import (
     Learned,
     Oracle,

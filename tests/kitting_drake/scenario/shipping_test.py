@@ -8,12 +8,12 @@ from pathlib import Path
 import pytest
 
 from kitting_drake.common.paths import MODELS, SCENARIOS
-from kitting_drake.scenario.command_line import ChosenScenario
+from kitting_drake.scenario.choosing import ChosenScenario
 from kitting_drake.scenario.policies import Learned, PythonPolicy
 from kitting_drake.scenario.schema import Scenario
 from kitting_drake.scenario.shipping import Shipment, pack
 from kitting_drake.tasks import ArrangedKitting, Kitting
-from kitting_drake.tasks.kitting.config import TablePose
+from kitting_drake.tasks.kitting.kitting import TablePose
 
 WRENCH = MODELS / "tools" / "combination_wrench"
 

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from kitting_drake.common.processes import LocalWorkers
-from kitting_drake.scenario.command_line import ChosenScenario
+from kitting_drake.scenario.choosing import ChosenScenario
 from kitting_drake.scenario.policies import Oracle, PythonPolicy
 from kitting_drake.scenario.schema import Scenario
 from kitting_drake.scenario.workers import add_workers_flags, open_workers

@@ -3,7 +3,7 @@ import math
 import numpy as np
 import pytest
 
-from kitting_drake.policies.images import rotation_matrix
+from kitting_drake.policies.data.images import rotation_matrix
 from kitting_drake.policies.matching.registration import (
     coarse_cost,
     preference,

@@ -7,10 +7,10 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
-from kitting_drake.policies.config import PLACE_CROP, NetworkConfig
 from kitting_drake.policies.learned_policy import LearnedPolicy
 from kitting_drake.policies.matching.release_clearance import blocked_at_place
-from kitting_drake.policies.networks import AnglePrediction, Networks, PickPrediction
+from kitting_drake.policies.networks.architecture import PLACE_CROP, NetworkConfig
+from kitting_drake.policies.networks.factored import AnglePrediction, Networks, PickPrediction
 from systems.signals import Observation, PixelGrid
 
 GRID = PixelGrid(x_min=0.3, y_min=-0.2, resolution=0.004, rows=97, cols=129, z_min=0.0, z_max=0.3)

@@ -10,9 +10,9 @@ from pydrake.geometry import HydroelasticContactRepresentation
 from pydrake.math import RigidTransform
 from pydrake.systems.analysis import Simulator
 
-from kitting_drake.cell import Cell, build_cell
 from kitting_drake.common.errors import UserError
 from kitting_drake.scenario.schema import Scenario
+from kitting_drake.station import Cell, build_cell
 from kitting_drake.tasks import (
     AlignBoxCorner,
     BlockInsertion,

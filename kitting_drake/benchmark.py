@@ -1,0 +1,207 @@
+"""`python -m kitting_drake.benchmark simulation | networks | kits | recovery | mujoco | paper`."""
+
+import argparse
+import os
+from fnmatch import fnmatch
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.table import Table
+
+from kitting_drake.common.command_line import FAILED, count_type, run_command, seed_type
+from kitting_drake.common.errors import UserError
+from kitting_drake.common.files import require_folder, write_atomically, write_json
+from kitting_drake.scenario.choosing import add_scenario_flags, choose_scenario
+
+
+def main() -> int:
+    """Parses the command line and measures; returns the exit code."""
+    arguments = _parser().parse_args()
+    console = Console(quiet=arguments.quiet)
+    folder = require_folder(arguments.output)
+    if arguments.benchmark == "paper":
+        return _paper(arguments, console, folder)
+    if arguments.benchmark == "recovery":
+        return _recovery(arguments, console, folder)
+    measure = {
+        "simulation": _simulation,
+        "networks": _networks,
+        "kits": _kits,
+        "mujoco": _mujoco,
+    }[arguments.benchmark]
+    for table in measure(arguments, console, folder):
+        console.print(table)
+    console.print(f"files: {folder}/", highlight=False, markup=False)
+    return 0
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="python -m kitting_drake.benchmark", description="Measure; print and keep tables."
+    )
+    benchmarks = parser.add_subparsers(dest="benchmark", required=True)
+    simulation = benchmarks.add_parser("simulation", help="phases of an episode, start-up, images")
+    simulation.add_argument("--episodes", type=count_type, default=3, help="how many to run (3)")
+    simulation.add_argument("--seed", type=seed_type, default=0, help="of the first (0)")
+    networks = benchmarks.add_parser(
+        "networks", help="parameters and time of the policies' networks, and how fast they could be"
+    )
+    networks.add_argument("--preset", default="small", help="size of the networks (small)")
+    networks.add_argument(
+        "--demos",
+        type=Path,
+        metavar="FILE.h5",
+        help="demonstrations, of whose first observation to decide (default: one is drawn)",
+    )
+    networks.add_argument(
+        "--repeats", type=count_type, default=9, help="runs of which the median is taken (9)"
+    )
+    kits = benchmarks.add_parser(
+        "kits", help="building time, clearance and size of the dataset's kits"
+    )
+    kits.add_argument("--kits", type=count_type, help="how many of each split (default: all)")
+    recovery = benchmarks.add_parser(
+        "recovery", help="what a policy makes of actions that go wrong"
+    )
+    add_scenario_flags(recovery)
+    recovery.add_argument("--episodes", type=count_type, default=10, help="of each kind (10)")
+    recovery.add_argument("--seed", type=seed_type, default=0, help="of the first (0)")
+    opinion = benchmarks.add_parser(
+        "mujoco", help="whether tools come to rest in MuJoCo where they do here"
+    )
+    opinion.add_argument("--placements", type=count_type, default=50, help="how many (50)")
+    opinion.add_argument("--seed", type=seed_type, default=0, help="of the first (0)")
+    opinion.add_argument(
+        "--orientations", type=count_type, help="round the oracle's actions to so many (no)"
+    )
+    paper = benchmarks.add_parser(
+        "paper", help="collect, train and evaluate the cells of the paper's tables; it takes days"
+    )
+    paper.add_argument(
+        "--cells",
+        nargs="+",
+        default=["*"],
+        metavar="PATTERN",
+        help="only those of such names, in this order (*: all, the most telling first)",
+    )
+    paper.add_argument(
+        "--results",
+        type=Path,
+        metavar="DIR",
+        default=Path("docs/results/paper"),
+        help="where the summaries of the cells go (docs/results/paper)",
+    )
+    paper.add_argument(
+        "--workers", type=count_type, default=1, help="episodes side by side, beside trainings (1)"
+    )
+    paper.add_argument("--trainings", type=count_type, default=1, help="trainings side by side (1)")
+    for benchmark in (simulation, networks, kits, recovery, opinion, paper):
+        benchmark.add_argument(
+            "--output", type=Path, default=Path("output/benchmark"), help="where the files go"
+        )
+        benchmark.add_argument("--quiet", action="store_true", help="print nothing but errors")
+    return parser
+
+
+# Each imports what it measures: nobody waits for what the others need.
+
+
+def _simulation(arguments: argparse.Namespace, console: Console, folder: Path) -> list[Table]:
+    from kitting_drake.reproduction.benchmarks.simulation import (
+        benchmark_simulation,
+        simulation_tables,
+    )
+
+    _use_one_core()
+    measured = benchmark_simulation(arguments.episodes, arguments.seed, console)
+    write_json(folder / "simulation.json", measured)
+    return simulation_tables(measured)
+
+
+def _kits(arguments: argparse.Namespace, console: Console, folder: Path) -> list[Table]:
+    from kitting_drake.reproduction.benchmarks.kits_benchmark import benchmark_kits, kits_table
+
+    _use_one_core()
+    measured = benchmark_kits(arguments.kits, console)
+    write_json(folder / "kits.json", measured)
+    return [kits_table(measured)]
+
+
+def _networks(arguments: argparse.Namespace, console: Console, folder: Path) -> list[Table]:
+    from kitting_drake.reproduction.network_speed import benchmark_networks
+    from kitting_drake.reproduction.network_speed.plan import Plan
+    from kitting_drake.reproduction.network_speed.speed_tables import network_tables
+
+    plan = Plan(preset=arguments.preset, repeats=arguments.repeats, demonstrations=arguments.demos)
+    measured: dict[str, Any] = benchmark_networks(plan, console)
+    write_json(folder / "networks.json", measured)
+    # Not before the figures are safe.
+    from kitting_drake.reproduction.network_speed.speed_figure import draw_networks
+
+    draw_networks(measured, folder / "networks.png")
+    return network_tables(measured)
+
+
+def _recovery(arguments: argparse.Namespace, console: Console, folder: Path) -> int:
+    """Measures recovery; returns the exit code."""
+    from kitting_drake.reproduction.benchmarks.recovery_benchmark import (
+        benchmark_recovery,
+        recovery_table,
+    )
+
+    chosen = choose_scenario(arguments)
+    measured, strips = benchmark_recovery(chosen, arguments.episodes, arguments.seed, console)
+    measured |= {"scenario": chosen.name, "perturbed": chosen.perturbed, "text": chosen.text}
+    write_json(folder / "recovery.json", measured)
+    if strips:
+        write_atomically(folder / "recovery.png", strips)
+    console.print(recovery_table(measured))
+    console.print(f"files: {folder}/", highlight=False, markup=False)
+    counts = measured["disturbances"].values()
+    return FAILED if all(count["failed"] == arguments.episodes for count in counts) else 0
+
+
+def _mujoco(arguments: argparse.Namespace, console: Console, folder: Path) -> list[Table]:
+    from kitting_drake.reproduction.benchmarks.second_opinion import ask_mujoco, opinion_table
+
+    measured = ask_mujoco(arguments.placements, arguments.seed, arguments.orientations, console)
+    write_json(folder / "mujoco.json", measured)
+    return [opinion_table(measured)]
+
+
+def _paper(arguments: argparse.Namespace, console: Console, folder: Path) -> int:
+    """Fills the paper's cells; returns the exit code."""
+    from kitting_drake.reproduction.paper.cells import Cell
+    from kitting_drake.reproduction.paper.paper_tables import paper_cells
+    from kitting_drake.reproduction.paper.queue import Queue, run_paper
+
+    chosen: dict[str, Cell] = {}
+    for pattern in arguments.cells:
+        matching = {cell.name: cell for cell in paper_cells() if fnmatch(cell.name, pattern)}
+        if not matching:
+            raise UserError(f"--cells: there is no cell of the name '{pattern}'")
+        chosen |= matching
+    cells = list(chosen.values())
+    queue = Queue(
+        require_folder(folder / "paper"),
+        require_folder(arguments.results),
+        console,
+        workers=arguments.workers,
+        trainings=arguments.trainings,
+    )
+    failures = run_paper(queue, cells)
+    table = Table("cell", "state", title="the paper's experiments")
+    for cell in cells:
+        table.add_row(cell.name, failures.get(cell.name, "done"))
+    console.print(table)
+    return FAILED if failures else 0
+
+
+def _use_one_core() -> None:
+    """Uses one core, as the tables claim; children inherit it."""
+    os.sched_setaffinity(0, {max(os.sched_getaffinity(0))})
+
+
+if __name__ == "__main__":
+    run_command(main)

@@ -1,5 +1,0 @@
-"""From a scenario to the Diagram of the cell: the only place where systems are wired together."""
-
-from kitting_drake.cell.cell import Cell, build_cell
-
-__all__ = ["Cell", "build_cell"]

@@ -1,0 +1,95 @@
+"""A strip of frames: what the cameras saw before each action of an episode, and what came of it."""
+
+import io
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from kitting_drake.episode import ModeChange
+from kitting_drake.station import Cell
+from systems.signals import Observation, PlanarPose
+
+_MOST_FRAMES = 7
+_PICK, _PLACE = "#e4572e", "#1b998b"
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One observation, and the action that follows it."""
+
+    colours: NDArray[np.float32]
+    """(rows, cols, 3), in [0, 1]."""
+    pick: NDArray[np.float64] | None
+    """(row, col); None where there is no action."""
+    place: NDArray[np.float64] | None
+    """The same."""
+
+
+class ActionStrip:
+    """An `EpisodeObserver` that keeps what was seen before each action, and at the end."""
+
+    def __init__(self, cell: Cell) -> None:
+        """
+        Args:
+            cell: the cell that the episode runs; it has cameras.
+        """
+        self._cell = cell
+        self.frames: list[Frame] = []
+
+    def observe(self, event: ModeChange) -> None:
+        """Keeps what an event shows."""
+        if not (event.is_action_start or event.is_stop):
+            return
+        diagram = self._cell.diagram
+        seen: Observation = diagram.GetOutputPort("observation").Eval(event.root_context)
+        colours = np.clip(seen.rgb.transpose(1, 2, 0), 0, 1)
+        if event.is_stop:
+            self.frames.append(Frame(colours, None, None))
+            return
+        context = self._cell.planner.GetMyContextFromRoot(event.root_context)
+        pick, place = (_pixel(seen, pose) for pose in self._cell.planner.action(context))
+        self.frames.append(Frame(colours, pick, place))
+
+
+def _pixel(observation: Observation, pose: PlanarPose) -> NDArray[np.float64]:
+    return observation.grid.to_pixel((pose.x, pose.y))
+
+
+def draw_strips(rows: Sequence[tuple[str, Sequence[Frame], Sequence[str]]]) -> bytes:
+    """Several strips, one below the other.
+
+    Args:
+        rows: of each its title, its frames, and what came of each action.
+
+    Returns:
+        A PNG.
+    """
+    columns = min(_MOST_FRAMES, max(len(frames) for _, frames, _ in rows))
+    figure = Figure(figsize=(3.1 * columns, 1.95 * len(rows)), layout="constrained", dpi=110)
+    grid = figure.subplots(len(rows), columns, squeeze=False)
+    for line, (title, frames, outcomes) in zip(grid, rows, strict=True):
+        for axes in line:
+            axes.set_axis_off()
+        for number, (axes, frame) in enumerate(zip(line, frames, strict=False)):
+            outcome = outcomes[number] if number < len(outcomes) else "done"
+            _draw(axes, frame, f"{title}: {outcome}" if number == 0 else outcome)
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png")
+    return buffer.getvalue()
+
+
+def _draw(axes: Axes, frame: Frame, title: str) -> None:
+    axes.imshow(frame.colours)
+    axes.set_title(title, loc="left", fontsize=9)
+    if frame.pick is None or frame.place is None:
+        return
+    ends = np.stack([frame.pick, frame.place])
+    axes.plot(ends[:, 1], ends[:, 0], color="white", lw=1.0)
+    for pixel, colour in ((frame.pick, _PICK), (frame.place, _PLACE)):
+        axes.plot(pixel[1], pixel[0], "o", color=colour, mec="white", mew=0.8, ms=6)
+    rows, cols = frame.colours.shape[:2]
+    axes.set(xlim=(-0.5, cols - 0.5), ylim=(rows - 0.5, -0.5))

@@ -1,0 +1,275 @@
+"""`summary.json`: many episodes in numbers."""
+
+import math
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from kitting_drake.common.provenance import commit, versions
+from kitting_drake.evaluation.intervals import mean_interval, proportion_interval
+from kitting_drake.scenario.choosing import ChosenScenario
+from systems.placement import STRICT_ANGLE, STRICT_HEIGHT, AddS, SuccessPredicate
+
+Episode = dict[str, Any]
+"""A line of `episodes.jsonl`: what `EpisodeResult.as_dict` gives."""
+
+Entry = dict[str, Any]
+"""An object or an action of an episode."""
+
+FAILED = "failed episode"
+TIMED_OUT = "timed out"
+"""The cause of all objects of an episode that failed, or whose time was up."""
+
+UNKNOWN = "unknown"
+"""The category of the object of an episode that failed, when no episode tells what it held."""
+
+AMBIGUITIES = {
+    "protruding": ("height_error_mm", 1e3 * STRICT_HEIGHT),
+    "reversed": ("angle_error_deg", math.degrees(STRICT_ANGLE)),
+}
+"""Why a success may not be strict: an error that the task's own measure forgives, and the magnitude
+beyond which it counts. The angle is modulo the symmetry that the object declares."""
+
+ERRORS = ("add_s_mm", "position_error_mm", "angle_error_deg", "height_error_mm")
+"""The errors of an object where it ended."""
+
+ACTION_ERRORS = (
+    "pick_position_error_mm",
+    "pick_angle_error_deg",
+    "place_position_error_mm",
+    "place_angle_error_deg",
+)
+"""The errors of a policy's action; see `kitting_drake.tasks.task.ActionRecord`."""
+
+
+def summarise(
+    episodes: Sequence[Episode],
+    chosen: ChosenScenario,
+    success: SuccessPredicate,
+    *,
+    wall_seconds_total: float,
+) -> dict[str, Any]:
+    """The content of `summary.json`.
+
+    Rates are means of the episodes' rewards; an episode that failed or timed out counts 0. Where
+    reward is the share of the objects that are successes, and the task says that each is one by
+    itself, the interval is Wilson's over the objects, as if each were drawn anew. Where it is
+    anything else (partial rewards, weights, cubes that stand on one another), it is one over the
+    episodes (see `mean_interval`); `ci95_method` says which.
+
+    `outcomes` has for each episode its seed, both rates, and for each object, by its name, 2: a
+    strict success, 1: a success, 0: none. Two runs of the same seeds are compared by them.
+
+    Errors are those of all objects, and all actions, of the episodes that came to an end, missed
+    ones included; an object that no goal was left for is in no statistic.
+
+    Args:
+        episodes: at least one.
+        chosen: what was run.
+        success: the predicate of the scenario's scenes.
+        wall_seconds_total: how long all calls took that ran the episodes, in s; `wall_seconds` adds
+            up the episodes' own.
+    """
+    objects_of = counted_objects(episodes)
+    objects = [item for items in objects_of for item in items]
+    actions = counted_actions(episodes)
+    categories = sorted({item["category"] for item in objects})
+    policy, causes = chosen.scenario.policy, (*chosen.scenario.task.causes, FAILED, TIMED_OUT)
+    return {
+        "scenario": chosen.name,
+        "task": chosen.scenario.task.title,
+        "policy": chosen.policy,
+        "policy_details": policy.details(chosen.base),
+        "policy_digest": policy.digest(chosen.base),
+        "success_description": success.description,
+        "success_threshold_mm": 1e3 * success.threshold if isinstance(success, AddS) else None,
+        "seeds": [episode["seed"] for episode in episodes],
+        "episodes": len(episodes),
+        "failed_episodes": sum(bool(episode["failure"]) for episode in episodes),
+        "timed_out_episodes": sum(episode["timed_out"] for episode in episodes),
+        **_rates(episodes, objects_of, chosen.scenario.task.objects_are_independent),
+        **_statistics(objects, actions, causes),
+        "categories": {
+            name: _summarise_category(
+                [item for item in objects if item["category"] == name],
+                [item for item in actions if item["category"] == name],
+                causes,
+            )
+            for name in categories
+        },
+        "outcomes": [
+            _outcome(episode, objects)
+            for episode, objects in zip(episodes, objects_of, strict=True)
+        ],
+        "actions": sum(episode["actions"] for episode in episodes),
+        "needless_actions": sum(needless_actions(episode) for episode in episodes),
+        "missed_grasps": sum(episode["missed_grasps"] for episode in episodes),
+        "dropped_objects": sum(episode["dropped_objects"] for episode in episodes),
+        "moving_at_end": sum(len(episode["moving_at_end"]) for episode in episodes),
+        "point_contact_pairs": max(episode["point_contact_pairs"] for episode in episodes),
+        "sim_seconds": sum(episode["sim_seconds"] for episode in episodes),
+        "wall_seconds": sum(episode["wall_seconds"] for episode in episodes),
+        "wall_seconds_total": wall_seconds_total,
+        "versions": versions(),
+        "commit": _commits(episodes),
+        "resolved_scenario": chosen.described,
+    }
+
+
+def _commits(episodes: Sequence[Episode]) -> str | None:
+    """The commit of the code that ran the episodes; several if an evaluation was taken up by
+    other code. Older episodes do not tell."""
+    found = dict.fromkeys(str(episode["commit"]) for episode in episodes if episode.get("commit"))
+    return ", ".join(found) or commit()
+
+
+def needless_actions(episode: Episode) -> int:
+    """The actions on objects that no goal was left for: no success rate tells of them, and they may
+    do harm."""
+    useful = {item["name"] for item in episode["objects"] if item["add_s_mm"] is not None}
+    if not useful:
+        # It failed, and does not tell.
+        return 0
+    return sum(action["object"] not in useful for action in episode["actions_taken"])
+
+
+def counted_objects(episodes: Sequence[Episode]) -> list[list[Entry]]:
+    """The objects of each episode that its reward is about: those that a goal was left for.
+
+    In an episode that failed or timed out none is a success, and none has errors. If its process
+    was lost and with it the names of its objects, it held as many of each category as any other
+    episode held at most.
+    """
+    found = [
+        [item for item in episode["objects"] if item["add_s_mm"] is not None]
+        for episode in episodes
+    ]
+    most: Counter[str] = Counter()
+    for objects in found:
+        most |= Counter(item["category"] for item in objects)
+    usual = list(most.elements()) or [UNKNOWN]
+    return [
+        objects if cause is None else _lost(objects, usual, cause)
+        for objects, cause in zip(found, map(_lost_cause, episodes), strict=True)
+    ]
+
+
+def _outcome(episode: Episode, objects: list[Entry]) -> dict[str, Any]:
+    """One of the `outcomes`; an object whose name is lost with its process is in none."""
+    return {key: episode[key] for key in ("seed", "success_rate", "strict_success_rate")} | {
+        "objects": {
+            item["name"]: int(item["success"]) + int(item["strict_success"])
+            for item in objects
+            if "name" in item
+        }
+    }
+
+
+def _lost(objects: list[Entry], usual: list[str], cause: str) -> list[Entry]:
+    known = [{key: item[key] for key in ("name", "category")} for item in objects]
+    return [
+        {**item, "success": False, "strict_success": False, "cause": cause, **dict.fromkeys(ERRORS)}
+        for item in known or [{"category": name} for name in usual]
+    ]
+
+
+def _lost_cause(episode: Episode) -> str | None:
+    if episode["failure"]:
+        return FAILED
+    return TIMED_OUT if episode["timed_out"] else None
+
+
+def counted_actions(episodes: Sequence[Episode]) -> list[Entry]:
+    """The actions of the episodes that neither failed nor timed out."""
+    return [
+        action
+        for episode in episodes
+        if _lost_cause(episode) is None
+        for action in episode["actions_taken"]
+    ]
+
+
+def _rates(
+    episodes: Sequence[Episode], objects_of: list[list[Entry]], are_independent: bool
+) -> dict[str, Any]:
+    """Both rates and their intervals."""
+    scores, strict_scores = (
+        [float(episode[key]) for episode in episodes]
+        for key in ("success_rate", "strict_success_rate")
+    )
+    counts, strict_counts = (
+        [sum(item[key] for item in objects) for objects in objects_of]
+        for key in ("success", "strict_success")
+    )
+    sizes = [len(objects) for objects in objects_of]
+    over_objects = (
+        are_independent
+        and len(set(sizes)) == 1
+        and sizes[0] > 0
+        and np.allclose([scores, strict_scores], np.array([counts, strict_counts]) / sizes[0])
+    )
+
+    def interval(scores: list[float], counts: list[int]) -> list[float]:
+        if over_objects:
+            return proportion_interval(sum(counts), sum(sizes))
+        return mean_interval(scores)
+
+    method = "Wilson, over objects" if over_objects else "Student or Wilson, over episodes"
+    return {
+        "success_rate": float(np.mean(scores)),
+        "ci95": interval(scores, counts),
+        "strict_success_rate": float(np.mean(strict_scores)),
+        "strict_ci95": interval(strict_scores, strict_counts),
+        "ci95_method": method,
+    }
+
+
+def _summarise_category(
+    objects: list[Entry], actions: list[Entry], causes: Sequence[str]
+) -> dict[str, Any]:
+    """The summary of the objects of one category; its rates are shares of them."""
+    successes, strict_successes = (
+        sum(item[key] for item in objects) for key in ("success", "strict_success")
+    )
+    return {
+        "objects": len(objects),
+        "success_rate": successes / len(objects),
+        "ci95": proportion_interval(successes, len(objects)),
+        "strict_success_rate": strict_successes / len(objects),
+        "strict_ci95": proportion_interval(strict_successes, len(objects)),
+        **_statistics(objects, actions, causes),
+    }
+
+
+def _statistics(
+    objects: list[Entry], actions: list[Entry], causes: Sequence[str]
+) -> dict[str, Any]:
+    found = Counter(item["cause"] for item in objects if item["cause"] is not None)
+    ambiguous = Counter(name for item in objects for name in find_ambiguities(item))
+    return {
+        **{key: _describe(objects, key) for key in ERRORS},
+        "action_errors": {key: _describe(actions, key) for key in ACTION_ERRORS},
+        "causes": {cause: found[cause] for cause in dict.fromkeys((*causes, *found))},
+        "ambiguous": {name: ambiguous[name] for name in AMBIGUITIES},
+    }
+
+
+def find_ambiguities(item: Mapping[str, Any]) -> list[str]:
+    """Why an object that is a success is no strict one: some of `AMBIGUITIES`."""
+    if not item["success"] or item["strict_success"]:
+        return []
+    return [name for name, (key, limit) in AMBIGUITIES.items() if abs(item[key]) > limit]
+
+
+def _describe(items: list[Entry], key: str) -> dict[str, float | None]:
+    """Median, 95th percentile and maximum of the magnitudes that there are."""
+    values = [abs(item[key]) for item in items if item[key] is not None]
+    if not values:
+        return {"median": None, "p95": None, "max": None}
+    return {
+        "median": float(np.median(values)),
+        "p95": float(np.percentile(values, 95)),
+        "max": float(np.max(values)),
+    }

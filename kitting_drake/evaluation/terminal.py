@@ -1,0 +1,156 @@
+"""Tables for the terminal: of one episode, and of the summary of many."""
+
+import dataclasses
+from typing import Any
+
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+from kitting_drake.episode import EpisodeResult
+from kitting_drake.episode.episode import ObjectResult
+from kitting_drake.evaluation.summary import ACTION_ERRORS, ERRORS, find_ambiguities
+
+_ERROR_HEADINGS = ("ADD-S mm", "position mm", "angle deg", "height mm")
+
+
+def episode_table(result: EpisodeResult) -> Table:
+    """A row for each object that a goal takes."""
+    table = Table(
+        title=escape(f"{result.scenario}, seed {result.seed}"),
+        title_justify="left",
+    )
+    table.add_column("object", no_wrap=True)
+    table.add_column("success", justify="center")
+    for heading in _ERROR_HEADINGS:
+        table.add_column(heading, justify="right")
+    for item in result.objects:
+        table.add_row(
+            escape(item.name),
+            _verdict(item),
+            number(item.add_s_mm),
+            number(item.position_error_mm),
+            number(item.angle_error_deg, "+.2f"),
+            number(item.height_error_mm, "+.2f"),
+        )
+    return table
+
+
+def _verdict(item: ObjectResult) -> str:
+    if item.add_s_mm is None:
+        return "-"
+    if item.strict_success:
+        return "[green]yes[/]"
+    if item.success:
+        return f"[yellow]{', '.join(find_ambiguities(dataclasses.asdict(item)))}[/]"
+    return "[red]no[/]"
+
+
+def print_episode(console: Console, result: EpisodeResult) -> None:
+    """The table of an episode and its summary."""
+    console.print(episode_table(result))
+    rate = result.sim_seconds / result.wall_seconds if result.wall_seconds else 0.0
+    console.print(
+        f"{result.strict_success_rate:.0%} strict success, {result.success_rate:.0%} by the task's "
+        f"measure, in {result.actions} actions, "
+        f"{result.sim_seconds:.1f} s simulated in {result.wall_seconds:.1f} s ({rate:.1f}x), "
+        f"{result.point_contact_pairs} point contacts"
+    )
+    causes = [
+        f"{item.name} ({item.cause})"
+        for item in result.objects
+        if item.cause is not None and item.add_s_mm is not None
+    ]
+    if causes:
+        console.print(f"no success: {escape(', '.join(causes))}", highlight=False)
+    if result.missed_grasps or result.dropped_objects:
+        console.print(
+            f"{result.missed_grasps} missed grasps, {result.dropped_objects} dropped objects"
+        )
+    if result.moving_at_end:
+        moving = escape(", ".join(result.moving_at_end))
+        console.print(f"[yellow]still moving at the end:[/] {moving}", highlight=False)
+    if result.failure:
+        console.print(
+            f"[red]failed:[/] {escape(result.failure)}; the episode scores 0", highlight=False
+        )
+    if result.timed_out:
+        console.print(
+            "[yellow]timed out:[/] the scenario's time_limit was reached before the policy was "
+            "done; the episode scores 0"
+        )
+    if result.interrupted:
+        console.print("[yellow]interrupted:[/] the result is of the episode so far")
+
+
+def summary_table(summary: dict[str, Any]) -> Table:
+    """The summary of many episodes: a row for each category. Columns count objects."""
+    table = Table(title=_summary_title(summary), title_justify="left")
+    table.add_column("category", no_wrap=True)
+    for heading in ("strict", "success", "ADD-S mm", "95 %", *_ERROR_HEADINGS[1:]):
+        # In a narrow terminal headings break between words, not within them.
+        table.add_column(heading, justify="right", min_width=max(map(len, heading.split())))
+    categories = summary["categories"]
+    rows = [(name, row, _counts(row)) for name, row in categories.items()]
+    totals = tuple(sum(column) for column in zip(*(counts for *_, counts in rows), strict=True))
+    for name, row, (objects, strict_successes, successes) in [*rows, ("all", summary, totals)]:
+        table.add_row(
+            escape(name),
+            f"{strict_successes}/{objects}",
+            f"{successes}/{objects}",
+            number(row["add_s_mm"]["median"]),
+            number(row["add_s_mm"]["p95"]),
+            *(number(row[key]["median"]) for key in ERRORS[1:]),
+        )
+    return table
+
+
+def _summary_title(summary: dict[str, Any]) -> str:
+    def rate(key: str, interval_key: str) -> str:
+        low, high = summary[interval_key]
+        return f"{summary[key]:.1%} (95 %: {low:.1%} to {high:.1%})"
+
+    return escape(
+        f"{summary['scenario']} by {summary['policy']}: {summary['episodes']} episodes, "
+        f"{summary['failed_episodes']} failed, {summary['timed_out_episodes']} timed out\n"
+        f"strict success: {rate('strict_success_rate', 'strict_ci95')}\n"
+        f"{summary['success_description']}: {rate('success_rate', 'ci95')}"
+    )
+
+
+def _counts(category: dict[str, Any]) -> tuple[int, int, int]:
+    """The numbers of objects, strict successes and successes."""
+    objects = category["objects"]
+    return (
+        objects,
+        round(category["strict_success_rate"] * objects),
+        round(category["success_rate"] * objects),
+    )
+
+
+def summary_notes(summary: dict[str, Any]) -> str:
+    """The lines below the table: causes, ambiguous successes, and how good the actions were."""
+    causes = [f"{count} {cause}" for cause, count in summary["causes"].items() if count]
+    ambiguous = [f"{count} {name}" for name, count in summary["ambiguous"].items() if count]
+    pick_position, pick_angle, place_position, place_angle = (
+        number(summary["action_errors"][key]["median"]) for key in ACTION_ERRORS
+    )
+    lines = [
+        f"no success: {', '.join(causes) or 'none'}",
+        f"success, but not strict: {', '.join(ambiguous) or 'none'}",
+        f"actions, median error: pick {pick_position} mm {pick_angle} deg, "
+        f"place {place_position} mm {place_angle} deg",
+    ]
+    if summary["needless_actions"]:
+        lines.append(
+            f"actions on objects that have no goal: {summary['needless_actions']} of "
+            f"{summary['actions']}"
+        )
+    if summary["moving_at_end"]:
+        lines.append(f"still moving at the end: {summary['moving_at_end']} objects")
+    return "\n".join(lines)
+
+
+def number(value: float | None, form: str = ".2f") -> str:
+    """A number for a table; a dash where there is none."""
+    return "-" if value is None else format(value, form)

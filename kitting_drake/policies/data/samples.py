@@ -1,0 +1,168 @@
+"""Training samples: the labels that demonstrations give each of their observations."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import overload
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kitting_drake.policies.data.demonstrations import Demonstration
+from kitting_drake.policies.data.images import Image, LabelledImage, Pictured
+from kitting_drake.policies.data.recorded import FinalObservation
+from kitting_drake.policies.networks.architecture import NetworkConfig
+from systems.signals import Observation, PickPlaceAction, PixelGrid, fill_unseen
+
+
+@dataclass(frozen=True)
+class HeightsOnly:
+    """A recorded observation as networks that see heights alone are shown it."""
+
+    recorded: Pictured
+
+    @property
+    def image(self) -> Image:
+        """(4, rows, cols): black, and what no camera saw filled in; made anew each time."""
+        image = self.recorded.image
+        image[3] = fill_unseen(image[3], image.any(axis=0))
+        image[:3] = 0
+        return image
+
+
+def observed(image: Image, grid: PixelGrid) -> Observation:
+    """The observation of a recorded image.
+
+    Args:
+        image: (4, rows, cols). Where it is black, what was unseen has been filled in.
+        grid: its pixels.
+    """
+    valid = None if image[:3].any() else np.ones(image.shape[1:], bool)
+    return Observation(image, grid, valid)  # type: ignore[arg-type]
+
+
+@dataclass(frozen=True)
+class Scene:
+    """One observation, and the actions that an expert may take next."""
+
+    recorded: Pictured
+    actions: tuple[PickPlaceAction, ...]
+    """First the one that the expert took."""
+    grid: PixelGrid
+
+    @property
+    def observation(self) -> Observation:
+        """The observation; made anew each time."""
+        return observed(self.recorded.image, self.grid)
+
+    @property
+    def targets(self) -> tuple[LabelledImage, ...]:
+        """A label for each of the actions; the image is made anew each time, once for all."""
+        image = self.recorded.image
+        return tuple(LabelledImage.from_action(image, action, self.grid) for action in self.actions)
+
+
+def scenes(
+    demonstrations: Iterable[Demonstration], grid: PixelGrid, *, later_picks_possible: bool
+) -> list[Scene]:
+    """Every observation of some demonstrations in which there is something to pick.
+
+    Args:
+        demonstrations: of an expert.
+        grid: of their observations.
+        later_picks_possible: see `Learning`: an object that is picked later lies where it lay, so
+            that the expert's later actions are possible at once.
+    """
+    result = []
+    for demonstration in demonstrations:
+        actions = tuple(PickPlaceAction(step.pick, step.place) for step in demonstration.steps)
+        for index, step in enumerate(demonstration.steps):
+            last = len(actions) if later_picks_possible else index + 1
+            result.append(Scene(step, actions[index:last], grid))
+    return result
+
+
+def final_observations(demonstrations: Iterable[Demonstration]) -> list[FinalObservation]:
+    """The observations of some demonstrations in which there is nothing left to pick."""
+    return [item.final for item in demonstrations if item.final is not None]
+
+
+def labelled_images(observed: Iterable[Scene], *, taken_only: bool) -> Sequence[LabelledImage]:
+    """The samples to learn from; their images are made when a sample is asked for.
+
+    Args:
+        observed: the observations.
+        taken_only: as in the paper, one sample for each observation, of the action that the expert
+            took; otherwise one for each possible action, which knows of the others.
+    """
+    return _Samples(list(observed), taken_only)
+
+
+class _Samples(Sequence[LabelledImage]):
+    """Samples that are made of their observations when they are asked for."""
+
+    def __init__(self, observed: list[Scene], taken_only: bool) -> None:
+        self._observed, self._taken_only = observed, taken_only
+        self._indices = [
+            (scene, target)
+            for scene, item in enumerate(observed)
+            for target in range(1 if taken_only else len(item.actions))
+        ]
+
+    def __len__(self) -> int:
+        return len(self._indices)
+
+    @overload
+    def __getitem__(self, index: int) -> LabelledImage: ...
+
+    @overload
+    def __getitem__(self, index: slice) -> Sequence[LabelledImage]: ...
+
+    def __getitem__(self, index: int | slice) -> LabelledImage | Sequence[LabelledImage]:
+        if isinstance(index, slice):
+            return [self[i] for i in range(*index.indices(len(self)))]
+        scene, chosen = self._indices[index]
+        targets = self._observed[scene].targets
+        if self._taken_only:
+            return targets[chosen]
+        others = [other for i, other in enumerate(targets) if i != chosen]
+        return dataclasses.replace(
+            targets[chosen],
+            other_picks=np.array([other.pick for other in others]).reshape(-1, 2),
+            other_thetas=np.array([other.pick_theta for other in others]),
+        )
+
+
+def normalisation(observed: list[Scene]) -> dict[str, float]:
+    """The fields of a `NetworkConfig` by which inputs are normalised."""
+    # One image in memory at a time.
+    images = (scene.recorded.image for scene in observed)
+    moments = np.array([[_moments(image[:3]), _moments(image[3])] for image in images])
+    default = NetworkConfig()
+    (colour, colour_std), (height, height_std) = map(_mean_and_std, moments.transpose(1, 2, 0))
+    return {
+        "colour_mean": colour,
+        "colour_std": colour_std or default.colour_std,
+        "height_mean": height,
+        "height_std": height_std or default.height_std,
+    }
+
+
+def _moments(values: NDArray[np.float32]) -> tuple[float, float]:
+    """The means of some values and of their squares."""
+    return float(values.mean(dtype=float)), float(np.square(values, dtype=float).mean())
+
+
+def _mean_and_std(moments: NDArray[np.float64]) -> tuple[float, float]:
+    """Mean and standard deviation from what `_moments` returns for equal shares of all values.
+
+    Args:
+        moments: (2, n).
+    """
+    mean, square = moments.mean(axis=1)
+    variance = float(square) - float(mean) ** 2
+    # Where all values are alike, the difference is a rounding error.
+    return float(mean), math.sqrt(variance) if variance > 1e-12 else 0.0

@@ -1,0 +1,222 @@
+"""The data of a training run, or of its validation: demonstrations, or static scenes."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+
+from kitting_drake.common.errors import UserError
+from kitting_drake.policies.data.demonstrations import (
+    Demonstration,
+    Demonstrations,
+    content_digest,
+    read_demonstrations,
+)
+from kitting_drake.policies.data.images import LabelledImage, Pictured
+from kitting_drake.policies.data.learning import Learning
+from kitting_drake.policies.data.recorded import FinalObservation, Recorded
+from kitting_drake.policies.data.samples import (
+    HeightsOnly,
+    Scene,
+    final_observations,
+    labelled_images,
+    scenes,
+)
+from kitting_drake.policies.data.static_scenes import (
+    STATIC,
+    StaticSamples,
+    StaticScenes,
+    is_static_scenes,
+    read_static_scenes,
+)
+from systems.signals import PickPlaceAction, PixelGrid, PlanarPose
+
+Item = TypeVar("Item")
+
+_TABLE = ("task", "heightmap")
+"""The fields of a scenario that determine, with the seed, what stands where."""
+_NO_SCENE = (
+    *("tries", "random_order", "distractors"),
+    *("success_threshold", "position_threshold", "angle_threshold_deg"),
+)
+"""Fields of a task that change nothing about that, or nothing but what lies about beside it."""
+
+
+@dataclass(frozen=True)
+class TrainingData:
+    """Observations and labels of one origin."""
+
+    scenario: str
+    origin: dict[str, Any]
+    """The scenario's fields, as JSON has them."""
+    grid: PixelGrid
+    learning: Learning
+    colour: bool
+    """Whether there are colours to learn from."""
+    seeds: tuple[int, ...]
+    """The seeds of the demonstrations, or the first seed of static scenes."""
+    items: tuple[Demonstration, ...] | StaticScenes
+    made_by: dict[str, str]
+    """The versions that made them and a digest of the content, which distinguish data of the same
+    seeds."""
+
+    @property
+    def count(self) -> int:
+        """How many demonstrations, or static scenes."""
+        return len(self.items.scenes if isinstance(self.items, StaticScenes) else self.items)
+
+    @property
+    def kind(self) -> str:
+        """Its items' name, for people."""
+        return "scenes" if isinstance(self.items, StaticScenes) else "demonstrations"
+
+    @property
+    def has_taken(self) -> bool:
+        """Whether it is told what was picked, not only what could be."""
+        return not isinstance(self.items, StaticScenes)
+
+    @property
+    def made(self) -> str:
+        """The command by which one gets some, for people."""
+        return "draw" if isinstance(self.items, StaticScenes) else "collect"
+
+    @property
+    def unrelated(self) -> tuple[int, ...]:
+        """After how many of them they may be cut in two, so that neither side shows what the other
+        one does: static scenes of one batch share their tools, demonstrations nothing."""
+        if isinstance(self.items, StaticScenes):
+            return self.items.batch_ends
+        return tuple(range(1, self.count + 1))
+
+    def part(self, first: int, last: int) -> TrainingData:
+        """Some of them."""
+        if isinstance(self.items, StaticScenes):
+            return dataclasses.replace(self, items=self.items.part(first, last))
+        items = self.items[first:last]
+        return dataclasses.replace(
+            self,
+            items=items,
+            seeds=tuple(item.seed for item in items),
+            made_by={**self.made_by, "content": content_digest(items)},
+        )
+
+    def scenes(self, most: int | None = None) -> list[Scene]:
+        """The observations in which there is something to pick.
+
+        Args:
+            most: evenly chosen ones if there are more than this.
+        """
+        if not isinstance(self.items, StaticScenes):
+            possible = self.learning.later_picks_possible
+            found = scenes(self.items, self.grid, later_picks_possible=possible)
+            return evenly_chosen(found, most)
+        result = []
+        loose = [scene for scene in self.items.scenes if len(scene.actions)]
+        for scene in evenly_chosen(loose, most):
+            actions = tuple(
+                PickPlaceAction(PlanarPose(*row[2:5]), PlanarPose(*row[5:8]))
+                for row in scene.actions.tolist()
+            )
+            result.append(Scene(_recorded(Recorded, scene.image), actions, self.grid))
+        return result
+
+    def finals(self, most: int | None = None, *, colour: bool = True) -> Sequence[Pictured]:
+        """The observations in which there is nothing left to pick; `most` as for `scenes`, `colour`
+        as for `samples`."""
+        if not isinstance(self.items, StaticScenes):
+            found = evenly_chosen(final_observations(self.items), most)
+            return found if colour else [HeightsOnly(final) for final in found]
+        seated = [scene for scene in self.items.scenes if not len(scene.actions)]
+        return [_recorded(FinalObservation, item.image) for item in evenly_chosen(seated, most)]
+
+    def samples(self, *, taken_only: bool, colour: bool = True) -> Sequence[LabelledImage]:
+        """The samples to learn from, of the observations in which there is something to pick.
+
+        Args:
+            taken_only: see `labelled_images`.
+            colour: whether the networks see colours. If not, they learn from what they will be
+                shown: what no camera saw is filled in.
+        """
+        if isinstance(self.items, StaticScenes):
+            return StaticSamples(self.items)
+        found = self.scenes()
+        if not colour:
+            found = [
+                dataclasses.replace(scene, recorded=HeightsOnly(scene.recorded)) for scene in found
+            ]
+        return labelled_images(found, taken_only=taken_only)
+
+    def shares_scenes(self, other: TrainingData) -> int | None:
+        """A seed of which both hold the same scene; None if there is none."""
+        shared = set(self.seeds) & set(other.seeds)
+        same = all(_alike(self.origin.get(key), other.origin.get(key)) for key in _TABLE)
+        return min(shared) if shared and same else None
+
+
+def _alike(one: Any, other: Any) -> bool:
+    """Whether scenes may be the same by these fields; older files lack some, which says nothing."""
+    if not isinstance(one, Mapping) or not isinstance(other, Mapping):
+        return bool(one == other)
+    both = (one.keys() & other.keys()) - {*_NO_SCENE}
+    return all(one[key] == other[key] for key in both)
+
+
+def evenly_chosen(items: list[Item], most: int | None) -> list[Item]:
+    """All of them, or evenly chosen ones if there are more than `most`."""
+    count = len(items) if most is None else min(len(items), most)
+    return [items[i * len(items) // count] for i in range(count)]
+
+
+def _recorded(kind: Any, image: np.ndarray) -> Any:
+    return kind(np.zeros((3, *image.shape[1:]), np.uint8), image[3])
+
+
+def read_training_data(path: Path) -> TrainingData:
+    """Reads a file of demonstrations or of static scenes.
+
+    Raises:
+        UserError: it is neither, cannot be read, or is empty.
+    """
+    if is_static_scenes(path):
+        content = read_static_scenes(path)
+        data = TrainingData(
+            scenario=STATIC,
+            origin={"task": STATIC},
+            grid=content.grid,
+            learning=Learning(later_picks_possible=True, curvature=True, reflection=True),
+            colour=False,
+            seeds=(content.first_seed,),
+            items=content,
+            made_by={**content.versions, "content": content.digest()},
+        )
+    else:
+        demonstrations: Demonstrations = read_demonstrations(path)
+        origin = demonstrations.origin
+        # On a bench the grid begins at the table, wherever that is.
+        z_min = (origin.scenario.get("heightmap") or {}).get("z_min", 0.0)
+        if z_min != 0:
+            raise UserError(
+                f"{path} was collected with heightmap.z_min {z_min:g}, and networks learn from "
+                "heights above the table: collect with 0"
+            )
+        data = TrainingData(
+            scenario=origin.scenario_name,
+            origin=origin.scenario,
+            grid=origin.grid,
+            learning=origin.learning,
+            colour=True,
+            seeds=tuple(item.seed for item in demonstrations.demonstrations),
+            items=demonstrations.demonstrations,
+            made_by={
+                **origin.versions,
+                "content": content_digest(demonstrations.demonstrations),
+            },
+        )
+    if not data.count:
+        raise UserError(f"{path} holds no {data.kind}: {data.made} some")
+    return data

@@ -1,0 +1,147 @@
+"""The training-free policy: outlines matched to recesses, jaws where o_t leaves them room."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import linear_sum_assignment
+
+from kitting_drake.policies.data.images import make_action
+from kitting_drake.policies.matching.jaw_clearance import jaw_grasps, untried
+from kitting_drake.policies.matching.recovery import recovery_action
+from kitting_drake.policies.matching.registration import (
+    Registration,
+    coarse_cost,
+    is_covered,
+    mismatch,
+    register,
+    trace_outline,
+)
+from kitting_drake.policies.matching.segmentation import Segmentation, segment
+from systems.signals import Observation, PickPlaceAction, PlanarPose
+
+_WORST_COST = 0.0019
+"""An outline and a recess that differ by more than this on average do not belong together, in
+metres."""
+_CERTAIN_COST = 0.0010
+"""Those that differ by less certainly do."""
+_PROMISING = 2.0
+"""A recess is registered if its coarse cost is at most this many times the least of the object."""
+
+
+@dataclass(frozen=True)
+class Matched:
+    """An action, and how well the outlines behind it agree."""
+
+    action: PickPlaceAction
+    agreement: float | None = None
+    """1: the outlines of object and recess are the same; 0: they differ by as much as they may.
+    None where no outlines were matched: the action mends something, or stops."""
+
+
+class ShapeMatchingPolicy:
+    """A function from an observation to an action that needs neither training nor colour.
+
+    Loose objects and recesses are segmented by height. Every outline is registered to every recess,
+    and a linear assignment chooses which object goes into which. Of the pairs that fit, the one
+    whose outlines agree best, and which the jaws can take, is next. It stops where nothing is left
+    that fits. It has no memory.
+    """
+
+    def __init__(self, *, recover: bool = False) -> None:
+        """
+        Args:
+            recover: press down what protrudes at once, and take out what could not be pressed
+                down where nothing else is left that fits (`recovery_action`).
+        """
+        self._recover = recover
+
+    def __call__(
+        self, observation: Observation, failed_picks: Sequence[PlanarPose] = ()
+    ) -> PickPlaceAction:
+        """The action; both gripper poses are in the world.
+
+        Args:
+            observation: o_t.
+            failed_picks: where a grasp failed before: there it is not tried again.
+        """
+        return self.decide(observation, failed_picks).action
+
+    def decide(self, observation: Observation, failed_picks: Sequence[PlanarPose] = ()) -> Matched:
+        """The action, and how well the outlines behind it agree; see `__call__`."""
+        segmentation = segment(observation)
+        mending = None
+        if self._recover:
+            mending = recovery_action(observation, segmentation, failed_picks)
+        if mending is not None and mending.press:
+            return Matched(mending)
+        places = np.array([(pick.x, pick.y) for pick in failed_picks]).reshape(-1, 2)
+        failed = observation.grid.to_pixel(places)
+        resolution = observation.grid.resolution
+        for index, fit in match(segmentation, resolution):
+            grasps = untried(
+                jaw_grasps(segmentation, segmentation.objects[index], resolution),
+                failed,
+                resolution,
+            )
+            if grasps:
+                best = grasps[0]
+                place = fit.moved(best.pixel)
+                action = make_action(observation, best.pixel, best.theta, place, fit.rotation)
+                return Matched(action, min(max(1 - fit.cost / _WORST_COST, 0.0), 1.0))
+        # What must be taken out waits for all else: it may fail again, and actions are counted.
+        return Matched(mending or PickPlaceAction(stop=True))
+
+
+def certain_fits(segmentation: Segmentation, resolution: float) -> NDArray[np.bool_]:
+    """(rows, cols): the loose objects that certainly belong into a free recess; see `match`."""
+    mask = np.zeros(segmentation.fixture.shape, bool)
+    for index, fit in match(segmentation, resolution):
+        if fit.cost < _CERTAIN_COST:
+            mask |= segmentation.objects[index].mask
+    return mask
+
+
+def belonging(segmentation: Segmentation, resolution: float) -> NDArray[np.bool_] | None:
+    """(rows, cols): the loose objects that belong into a recess, by the assignment of `match`; what
+    else lies about is no business of a policy. None where nothing is seen that has recesses.
+    """
+    if not segmentation.fixture.any():
+        return None
+    mask = np.zeros(segmentation.fixture.shape, bool)
+    for index, _ in match(segmentation, resolution):
+        mask |= segmentation.objects[index].mask
+    return mask
+
+
+def match(segmentation: Segmentation, resolution: float) -> list[tuple[int, Registration]]:
+    """Which loose objects go where: their indices and registrations, the best fit first.
+
+    Args:
+        segmentation: of an observation.
+        resolution: of its pixels, in metres.
+    """
+    objects, regions = segmentation.objects, segmentation.recesses
+    if not objects or not regions:
+        return []
+    outlines = [trace_outline(item.mask, resolution, close=True) for item in objects]
+    recesses = [trace_outline(item.mask, resolution) for item in regions]
+    coarse = np.array([[coarse_cost(o, c) for c in recesses] for o in outlines])
+    fits: dict[tuple[int, int], Registration] = {}
+    costs = np.full(coarse.shape, 10 * _WORST_COST)
+    for i, j in np.argwhere(coarse <= _PROMISING * coarse.min(axis=1, keepdims=True)):
+        fits[i, j] = register(outlines[i], recesses[j])
+        if is_covered(outlines[i], recesses[j], fits[i, j]):
+            costs[i, j] = mismatch(fits[i, j], objects[i], regions[j])
+    chosen = _assign(costs)
+    good = [(i, j) for i, j in chosen if costs[i, j] < _WORST_COST]
+    return [(int(i), fits[i, j]) for i, j in sorted(good, key=lambda pair: costs[pair])]
+
+
+def _assign(costs: NDArray[np.float64]) -> list[tuple[int, int]]:
+    """The pairs of the assignment with the least sum; more than `_WORST_COST` is as none."""
+    rows, cols = linear_sum_assignment(np.minimum(costs, _WORST_COST))
+    return list(zip(rows.tolist(), cols.tolist(), strict=True))

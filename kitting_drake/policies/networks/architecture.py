@@ -1,0 +1,139 @@
+"""The architecture of a policy's networks: all that a weights file must say beside the weights."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from dataclasses import dataclass, field
+from typing import Any
+
+from kitting_drake.policies.networks.angle_net import AngleNetSize
+from kitting_drake.policies.networks.unet import UNetSize
+
+METHODS = ("so2", "equivariant_transporter", "transporter")
+"""The paper's own method and its two baselines (section V-C.3)."""
+
+
+@dataclass(frozen=True)
+class Preset:
+    """The size of the networks of each method."""
+
+    unet: UNetSize = field(default_factory=UNetSize)
+    """The U-nets alpha, phi and psi."""
+    samples: int = 16
+    """How many samples of each SO(2) field of the U-nets their nonlinearity acts on."""
+    angle: AngleNetSize = field(
+        default_factory=lambda: AngleNetSize(
+            stages=((16,), (32, 32), (16, 16), (16, 16), (8,)), residual=True
+        )
+    )
+    """The pick-angle network beta."""
+    angle_band: int = 6
+    """j_c of beta's hidden fields."""
+    angle_samples: int = 32
+    """How many samples of each of beta's SO(2) fields its nonlinearity acts on."""
+    group_angle: AngleNetSize = field(
+        default_factory=lambda: AngleNetSize(
+            stages=((18,), (36, 36), (18, 18), (18, 18), (8,)), residual=True
+        )
+    )
+    """The Equivariant Transporter's angle network, in regular fields of N / 2 channels. In residual
+    blocks it has the authors' 0.90, 1.81, 3.01 and 4.51 M parameters at N = 36, 72, 120, 180."""
+    resnet: tuple[int, int, int, int, int] = (64, 64, 128, 256, 512)
+    """Channels of the Transporter's stem and of its four stages."""
+
+
+PRESETS = {
+    # Section V-A of the paper.
+    "paper": Preset(),
+    # For machines without an accelerator: each U-net has 0.2 M parameters.
+    "small": Preset(
+        unet=UNetSize(down=(4, 8, 16, 24, 24), up=(16, 8, 4, 4), head=8, skip=1),
+        samples=8,
+        angle=AngleNetSize(
+            stages=((12, 12), (24, 24), (24, 24), (24,)), kernel=3, readout=9, full_readout=True
+        ),
+        angle_band=3,
+        angle_samples=8,
+        group_angle=AngleNetSize(
+            stages=((2, 2), (4, 4), (6, 6), (6,)), kernel=3, readout=9, full_readout=True
+        ),
+        resnet=(16, 16, 24, 32, 48),
+    ),
+    # For tests: every part of the architecture, as small as it can be.
+    "tiny": Preset(
+        unet=UNetSize(down=(2, 4, 4, 4, 4), up=(4, 4, 2, 2), head=4, skip=1),
+        samples=8,
+        angle=AngleNetSize(stages=((4, 4), (6, 6), (6,)), kernel=3, readout=17, full_readout=True),
+        angle_band=3,
+        angle_samples=8,
+        group_angle=AngleNetSize(
+            stages=((1,), (2,), (2,), (2,)), kernel=3, readout=9, full_readout=True
+        ),
+        resnet=(8, 8, 8, 12, 16),
+    ),
+}
+
+BAND = 3
+"""The cutoff frequency j_c of alpha, phi and psi (section V-A.1)."""
+ANGLE_FREQUENCIES = (0, 2, 4, 6, 8, 10, 12)
+"""The frequencies of beta's output on SO(2)/C_2: j = 0 to 6, period pi (section V-A.2)."""
+FEATURES = 3
+"""The number of channels of phi's and psi's encodings."""
+PICK_CROP = 65
+"""The side of c_1, the crop that beta takes, in pixels."""
+PLACE_CROP = 97
+"""The side of c_2, the crop that psi takes, in pixels."""
+
+
+@dataclass(frozen=True)
+class NetworkConfig:
+    """The architecture of a method's networks, and how their inputs are normalised."""
+
+    method: str = "so2"
+    """One of METHODS."""
+    preset: str = "small"
+    """One of PRESETS."""
+    orientations: int = 180
+    """N, the number of orientations, at which the networks are trained."""
+    colour_mean: float = 0.5
+    """Mean of the colours that the networks are trained on; inputs are normalised by it."""
+    colour_std: float = 0.25
+    """Standard deviation of these colours."""
+    height_mean: float = 0.005
+    """Mean of the heights that the networks are trained on, in metres."""
+    height_std: float = 0.01
+    """Standard deviation of these heights, in metres."""
+    band: int = BAND
+    """j_c of the U-nets' fields."""
+    angle_frequencies: tuple[int, ...] = ANGLE_FREQUENCIES
+    """The frequencies of beta's output."""
+    colour: bool = True
+    """Whether the networks see colours; if not, what no camera saw is filled in for them (see
+    `systems.signals.fill_unseen`)."""
+    stop: bool = False
+    """Whether the picking module has a class "nothing to pick" (see `losses.log_odds`)."""
+
+    def __post_init__(self) -> None:
+        if self.method not in METHODS:
+            raise ValueError(f"method must be one of {', '.join(METHODS)}, not '{self.method}'")
+        if self.preset not in PRESETS:
+            raise ValueError(f"preset must be one of {', '.join(PRESETS)}, not '{self.preset}'")
+        if self.orientations < 2 or self.orientations % 2:
+            raise ValueError(f"orientations must be an even number, not {self.orientations}")
+        if not isinstance(self.colour, bool):
+            raise ValueError(f"colour must be true or false, not '{self.colour}'")
+        scales = (self.colour_std, self.height_std)
+        if not all(map(math.isfinite, (self.colour_mean, self.height_mean, *scales))):
+            raise ValueError("means and standard deviations must be finite")
+        if min(scales) <= 0:
+            raise ValueError("a standard deviation must be positive")
+
+    @property
+    def channels(self) -> int:
+        """The number of input channels: red, green, blue and height, or height alone."""
+        return 4 if self.colour else 1
+
+    def as_dict(self) -> dict[str, Any]:
+        """The fields, as JSON takes them."""
+        return dataclasses.asdict(self)

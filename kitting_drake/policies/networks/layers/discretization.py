@@ -1,0 +1,75 @@
+"""The group discretization operation of the paper (section III-B.2), and its continuous limit.
+
+The number of orientations N is no property of the network: the same Fourier coefficients can be
+discretized at any N that the band limit allows, and the maximum of the series needs no N at all.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kitting_drake.policies.networks.layers.fibres import fourier_basis
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+
+def discretization_matrix(
+    orientations: int, frequencies: Sequence[int], *, quotient: int = 1
+) -> NDArray[np.float64]:
+    """Q of the paper, the matrix of Dis from SO(2) to C_N (equations 5, 6) or of its quotient form.
+
+    Args:
+        orientations: N, the number of bins over a full rotation.
+        frequencies: j of the irreps, ascending.
+        quotient: 2 for SO(2)/C_2 to C_N/C_2: the matrix has bins 0 to N/2 - 1 only, at the same
+            angles 2 pi i / N, and every frequency must be even.
+
+    Returns:
+        (N / quotient, d).
+
+    Raises:
+        ValueError: N is not a multiple of `quotient`, a frequency is no multiple of it either, or N
+            / quotient is smaller than d, which aliases (Nyquist).
+    """
+    if orientations < 1 or orientations % quotient:
+        raise ValueError(f"{orientations} orientations are not a multiple of {quotient}")
+    odd = [j for j in frequencies if j % quotient]
+    if odd:
+        raise ValueError(f"frequency {odd[0]} is not one of SO(2)/C_{quotient}")
+    bins = orientations // quotient
+    size = sum(2 if j else 1 for j in frequencies)
+    # The band limit within the quotient's own period.
+    needed = max(size, 2 * (max(frequencies) // quotient) + 1)
+    if bins < needed:
+        raise ValueError(
+            f"{orientations} orientations alias a function of frequencies up to "
+            f"{max(frequencies)}: at least {needed * quotient} are needed (Nyquist)"
+        )
+    angles = 2 * np.pi * np.arange(bins) / orientations
+    return fourier_basis(angles, frequencies)
+
+
+def discretize(
+    coefficients: Tensor, orientations: int, frequencies: Sequence[int], *, quotient: int = 1
+) -> Tensor:
+    """Dis (equation 6): maps an irrep vector to a regular one.
+
+    Args:
+        coefficients: (..., d).
+        orientations: as for `discretization_matrix`.
+        frequencies: as for `discretization_matrix`.
+        quotient: as for `discretization_matrix`.
+
+    Returns:
+        (..., N / quotient): the function at the angles 2 pi i / N.
+    """
+    # `onnx_runner` uses the matrix where there is no torch.
+    import torch
+
+    matrix = discretization_matrix(orientations, frequencies, quotient=quotient)
+    return coefficients @ torch.from_numpy(matrix).to(coefficients).T

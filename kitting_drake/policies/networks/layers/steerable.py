@@ -1,0 +1,390 @@
+"""Steerable convolutions that run as plain ones.
+
+A kernel is a linear combination of escnn's basis kernels. The Fourier transforms that a pointwise
+nonlinearity needs before and after it are folded into the kernels,
+
+    kernel' = synthesis_out . kernel . analysis_in,
+
+so that feature maps are stored as samples and ELU acts on them directly, without a transform of the
+feature map around it. With the same weights this is the same function as escnn's R2Conv followed by
+FourierELU.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+import warnings
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from numpy.typing import NDArray
+from torch import Tensor, nn
+from torch.autograd.function import once_differentiable
+
+from kitting_drake.policies.networks.layers.fibres import Fibre, Irreps, Regular, Scalar
+
+Convolution = Callable[..., nn.Module]
+"""A class of layers: `SteerableConv2d`, `GroupConv2d` or `PlainConv2d`. It makes a layer from
+(in_fields, in_fibre, out_fields, out_fibre, size, padding=..., bias=..., gain=...)."""
+
+
+_TOGETHER = 64
+"""The most channels that `BandLimit` and `InvariantPart` take in one product."""
+
+
+class ExpandedConv2d(nn.Module):
+    """A trainable convolution between fields, whose kernel is computed from fewer weights."""
+
+    def __init__(
+        self,
+        in_fibre: Fibre,
+        out_fibre: Fibre,
+        size: int,
+        padding: int | None,
+        weights: Tensor,
+        bias: bool,
+    ) -> None:
+        super().__init__()
+        self.in_fibre, self.out_fibre = in_fibre, out_fibre
+        self.padding = size // 2 if padding is None else padding
+        self.weights = nn.Parameter(weights)
+        self.bias = nn.Parameter(torch.zeros(len(weights))) if bias else None
+
+    def kernel(self, dtype: torch.dtype = torch.float32) -> Tensor:
+        """(out channels, in channels, size, size), in channels_last: what a plain convolution
+        takes."""
+        raise NotImplementedError
+
+    @torch.no_grad()
+    def fit(self, kernel: Tensor) -> None:
+        """Sets the weights to those of a plain kernel that came from such a layer.
+
+        Args:
+            kernel: as `kernel` returns it.
+        """
+        out_fields, in_fields = self.weights.shape[:2]
+        out_channels, in_channels = self.out_fibre.channels, self.in_fibre.channels
+        shape = self.weights.shape[2:]
+        rows = []
+        for unit in torch.eye(shape.numel()):
+            # All blocks of fields are alike then: the first is what this weight brings.
+            self.weights.copy_(unit.view(shape).expand_as(self.weights))
+            rows.append(self.kernel()[:out_channels, :in_channels].flatten())
+        blocks = kernel.reshape(out_fields, out_channels, in_fields, in_channels, *kernel.shape[2:])
+        targets = blocks.transpose(1, 2).flatten(2).flatten(0, 1)
+        found = torch.linalg.lstsq(torch.stack(rows).double().T, targets.double().T).solution
+        self.weights.copy_(found.T.reshape(self.weights.shape))
+
+    def channel_bias(self) -> Tensor | None:
+        """(out channels,), if there is a bias."""
+        return None if self.bias is None else self.bias.repeat_interleave(self.out_fibre.channels)
+
+    def forward(self, features: Tensor) -> Tensor:
+        """(batch, in channels, rows, cols) to (batch, out channels, rows, cols)."""
+        bias = self.channel_bias()
+        return F.conv2d(
+            features,
+            self.kernel(features.dtype),
+            None if bias is None else bias.to(features.dtype),
+            padding=self.padding,
+        )
+
+
+class SteerableConv2d(ExpandedConv2d):
+    """An equivariant convolution between fields (equation 3), in escnn's basis of kernels."""
+
+    basis: Tensor
+
+    def __init__(
+        self,
+        in_fields: int,
+        in_fibre: Fibre,
+        out_fields: int,
+        out_fibre: Fibre,
+        size: int,
+        *,
+        padding: int | None = None,
+        bias: bool = False,
+        gain: float = 1.0,
+    ) -> None:
+        """
+        Args:
+            in_fields: the number of input fields.
+            in_fibre: the fibre of each of them.
+            out_fields: the number of output fields.
+            out_fibre: the fibre of each of them.
+            size: the side of the kernel, odd, in pixels.
+            padding: zeros around the image, in pixels; by default the image keeps its size.
+            bias: whether each output field has a bias, on its invariant part. The output fibre must
+                be stored as samples or be scalar.
+            gain: a factor of the initial weights' standard deviation.
+        """
+        basis = kernel_basis(in_fibre, out_fibre, size)
+        # He initialisation. The samples of a field are no more independent than its coefficients.
+        repeated = in_fibre.channels / in_fibre.size
+        gathered = in_fields * float(basis.square().sum()) * repeated / out_fibre.channels
+        scale = math.sqrt(2 / gathered)
+        weights = torch.randn(out_fields, in_fields, len(basis)) * (gain * scale)
+        super().__init__(in_fibre, out_fibre, size, padding, weights, bias)
+        # In the memory order that `expand_kernel` needs.
+        order = basis.permute(0, 1, 3, 4, 2).to(torch.get_default_dtype()).contiguous()
+        self.register_buffer("basis", order.permute(0, 1, 4, 2, 3), persistent=False)
+
+    def kernel(self, dtype: torch.dtype = torch.float32) -> Tensor:
+        return expand_kernel(self.weights, self.basis, dtype)
+
+
+def expand_kernel(weights: Tensor, basis: Tensor, dtype: torch.dtype = torch.float32) -> Tensor:
+    """A plain kernel from weights in a basis.
+
+    Args:
+        weights: (out fields, in fields, D).
+        basis: (D, out channels, in channels, size, size), from one field to one field.
+        dtype: of the kernel.
+
+    Returns:
+        (out fields * out channels, in fields * in channels, size, size), in channels_last.
+    """
+    out_fields, in_fields, _ = weights.shape
+    _, out_channels, in_channels, size, _ = basis.shape
+    kernel = weights.flatten(0, 1) @ basis.permute(0, 1, 3, 4, 2).flatten(1)
+    # Before the fields are interleaved, which is then cheaper.
+    kernel = kernel.to(dtype)
+    kernel = kernel.view(out_fields, in_fields, out_channels, size, size, in_channels)
+    kernel = kernel.permute(0, 2, 3, 4, 1, 5).reshape(
+        out_fields * out_channels, size, size, in_fields * in_channels
+    )
+    return kernel.permute(0, 3, 1, 2)
+
+
+class PlainConv2d(nn.Conv2d):
+    """An `ExpandedConv2d` as it is exported for inference: an ordinary convolution.
+
+    It computes in the type of its input. If its weights are of another type, they are cast at every
+    call; `MixedPrecision.cast` casts them once.
+    """
+
+    def __init__(
+        self,
+        in_fields: int,
+        in_fibre: Fibre,
+        out_fields: int,
+        out_fibre: Fibre,
+        size: int,
+        *,
+        padding: int | None = None,
+        bias: bool = False,
+        gain: float = 1.0,
+    ) -> None:
+        super().__init__(
+            in_fields * in_fibre.channels,
+            out_fields * out_fibre.channels,
+            size,
+            padding=size // 2 if padding is None else padding,
+            bias=bias,
+        )
+
+    def forward(self, features: Tensor) -> Tensor:
+        """(batch, in channels, rows, cols) to (batch, out channels, rows, cols)."""
+        weight = self.weight.to(features.dtype)
+        bias = None if self.bias is None else self.bias.to(features.dtype)
+        return F.conv2d(features, weight, bias, padding=self.padding)
+
+
+@functools.lru_cache(maxsize=64)
+@torch.inference_mode(False)  # escnn keeps tensors for later, and those are for any mode.
+def kernel_basis(in_fibre: Fibre, out_fibre: Fibre, size: int) -> Tensor:
+    """escnn's basis of the steerable kernels between two fields, with the transforms folded in.
+
+    Returns:
+        (D, out channels, in channels, size, size), float64.
+    """
+    # escnn warns of an optional package that planar groups never use.
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        from escnn import gspaces
+        from escnn import nn as enn
+
+    orders = {fibre.order for fibre in (in_fibre, out_fibre) if isinstance(fibre, Regular)}
+    irreps = [fibre for fibre in (in_fibre, out_fibre) if isinstance(fibre, Irreps)]
+    if len(orders) > 1 or (orders and irreps):
+        raise ValueError(f"no kernels lead from {in_fibre} to {out_fibre}: their groups differ")
+    if orders:
+        space = gspaces.rot2dOnR2(orders.pop())
+    else:
+        band = max((max(fibre.frequencies) for fibre in irreps), default=0)
+        space = gspaces.rot2dOnR2(-1, maximum_frequency=max(band, 1))
+
+    def field(fibre: Fibre) -> enn.FieldType:
+        if isinstance(fibre, Scalar):
+            return enn.FieldType(space, [space.trivial_repr])
+        if isinstance(fibre, Irreps):
+            irreps = [(j,) for j in fibre.frequencies]
+            return enn.FieldType(
+                space, [space.fibergroup.spectral_regular_representation(*irreps, name=None)]
+            )
+        assert isinstance(fibre, Regular)
+        if fibre.quotient == 1:
+            return enn.FieldType(space, [space.regular_repr])
+        return enn.FieldType(space, [space.quotient_repr(fibre.quotient)])
+
+    convolution = enn.R2Conv(
+        field(in_fibre),
+        field(out_fibre),
+        size,
+        bias=False,
+        initialize=False,
+        frequencies_cutoff=frequencies_cutoff(in_fibre, out_fibre, size),
+    )
+    with torch.no_grad():
+        # Unit vectors of weights give the basis kernels one by one.
+        units = torch.eye(convolution.weights.numel())
+        stack = torch.vmap(convolution.basisexpansion)(units).unflatten(-1, (size, size)).double()
+    synthesis = torch.from_numpy(out_fibre.synthesis())
+    analysis = torch.from_numpy(in_fibre.analysis())
+    return torch.einsum("ms,dstxy,tn->dmnxy", synthesis, stack, analysis).contiguous()
+
+
+def frequencies_cutoff(in_fibre: Fibre, out_fibre: Fibre, size: int) -> float | None:
+    """The largest angular frequency of the kernels on a ring of pixels, in units of its radius.
+
+    A kernel of angular frequency k maps rho_i to rho_j with j up to i + k. Where escnn's own limit
+    would leave the highest frequencies of the output zero for ever, the limit is raised to exactly
+    what these need on the outermost ring; any higher frequency would alias on the pixels.
+
+    Returns:
+        The limit; None for escnn's own.
+    """
+    if not (isinstance(in_fibre, Irreps) and isinstance(out_fibre, Irreps)):
+        return None
+    missing = max(out_fibre.frequencies) - max(in_fibre.frequencies)
+    radius = size // 2
+    if missing > 0 and not radius:
+        raise ValueError("a kernel of one pixel cannot lead to higher frequencies")
+    return missing / radius if missing > radius else None
+
+
+class MixedPrecision(nn.Module):
+    """A network that computes in the type of its input, except for parts that stay in float32."""
+
+    def reduced_precision_parts(self) -> Iterator[nn.Module]:
+        """The submodules that compute in the type of the input."""
+        raise NotImplementedError
+
+    def cast(self, compute_type: torch.dtype) -> None:
+        """Casts these submodules for good, for inputs of a type."""
+        for part in self.reduced_precision_parts():
+            part.to(compute_type).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+
+
+class BandLimit(nn.Module):
+    """Projects the samples of each field onto its irreps, as ELU introduces higher frequencies."""
+
+    projection: Tensor
+
+    def __init__(self, fibre: Fibre, fields: int) -> None:
+        super().__init__()
+        projection = fibre.synthesis() @ fibre.analysis()
+        self.trivial = bool(np.allclose(projection, np.eye(len(projection))))
+        self.register_buffer("projection", _of_several_fields(projection, fields), persistent=False)
+
+    def forward(self, features: Tensor) -> Tensor:
+        """(batch, fields * channels, rows, cols) to the same shape."""
+        return features if self.trivial else _multiply_fields(features, self.projection)
+
+
+class InvariantPart(nn.Module):
+    """Takes the part of each field that is invariant to rotations: its frequency 0."""
+
+    functional: Tensor
+
+    def __init__(self, fibre: Fibre, fields: int) -> None:
+        super().__init__()
+        functional = fibre.invariant()[:, None]
+        self.register_buffer("functional", _of_several_fields(functional, fields), persistent=False)
+
+    def forward(self, features: Tensor) -> Tensor:
+        """(batch, fields * channels, rows, cols) to (batch, fields, rows, cols)."""
+        return _multiply_fields(features, self.functional)
+
+
+def _of_several_fields(matrix: NDArray[np.float64], fields: int) -> Tensor:
+    """A matrix that acts on each of a few fields, as one matrix for their channels together.
+
+    With its zeros, a product with about 64 channels takes half as long as one with eight.
+    """
+    together = math.gcd(fields, max(_TOGETHER // len(matrix), 1))
+    blocks = np.kron(np.eye(together), matrix)
+    return torch.from_numpy(blocks).to(torch.get_default_dtype())
+
+
+def _multiply_fields(features: Tensor, matrix: Tensor) -> Tensor:
+    """Multiplies the channels of fields at each pixel, from the left, by a matrix.
+
+    Args:
+        features: (batch, fields * channels, rows, cols), in channels_last.
+        matrix: of `_of_several_fields`.
+    """
+    last = features.permute(0, 2, 3, 1)
+    product = last.reshape(-1, len(matrix)) @ matrix.to(features.dtype)
+    return product.view(*last.shape[:3], -1).permute(0, 3, 1, 2)
+
+
+class BlurPool(nn.Module):
+    """Antialiased pooling to every other pixel, the outermost ones included.
+
+    A side of 2 n + 1 pixels becomes n + 1, so that equivariance to rotations by 90 degrees about
+    the middle of the image is exact.
+    """
+
+    kernel: Tensor
+    _SIGMA = 0.66
+
+    def __init__(self) -> None:
+        super().__init__()
+        taps = torch.exp(-(torch.arange(-2, 3) ** 2) / (2 * self._SIGMA**2))
+        kernel = torch.outer(taps, taps)
+        self.register_buffer("kernel", kernel / kernel.sum(), persistent=False)
+
+    def forward(self, features: Tensor) -> Tensor:
+        """(batch, channels, rows, cols), odd sides, to half the resolution."""
+        return _Blur.apply(features, self.kernel)
+
+
+class _Blur(torch.autograd.Function):
+    """The convolution of `BlurPool`, with a gradient that is always computed in float32: on a CPU
+    that of depthwise convolutions takes six times as long in bfloat16."""
+
+    @staticmethod
+    def forward(ctx: Any, features: Tensor, kernel: Tensor) -> Tensor:
+        channels = features.shape[1]
+        ctx.kernel = kernel.expand(channels, 1, 5, 5)
+        weight = ctx.kernel.to(features.dtype)
+        return F.conv2d(features, weight, stride=2, padding=2, groups=channels)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None]:
+        channels = gradient.shape[1]
+        result = F.conv_transpose2d(
+            gradient.float(), ctx.kernel.float(), stride=2, padding=2, groups=channels
+        )
+        return result.to(gradient.dtype), None
+
+
+def upsample(features: Tensor) -> Tensor:
+    """Bilinear upsampling from n + 1 pixels to 2 n + 1: inverts `BlurPool`'s change of size."""
+    rows, cols = features.shape[2:]
+    larger = F.interpolate(
+        features, size=(2 * rows - 1, 2 * cols - 1), mode="bilinear", align_corners=True
+    )
+    if larger.requires_grad:
+        # That of a part of a concatenation has gaps, with which torch takes many times as long.
+        larger.register_hook(
+            lambda gradient: gradient.contiguous(memory_format=torch.channels_last)
+        )
+    return larger

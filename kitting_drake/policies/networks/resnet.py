@@ -1,0 +1,127 @@
+"""The Transporter's backbone (Zeng et al.): an hourglass of ordinary convolutions."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Iterator
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from kitting_drake.policies.networks.layers.steerable import MixedPrecision, upsample
+
+
+class PlainLayer(nn.Module):
+    """A convolution that computes in the type of its input, whatever the type of its weights."""
+
+    def __init__(
+        self, channels_in: int, channels: int, size: int, *, stride: int = 1, gain: float = 1.0
+    ) -> None:
+        super().__init__()
+        self.stride, self.padding = stride, size // 2
+        scale = gain * math.sqrt(2 / (channels_in * size**2))
+        self.weight = nn.Parameter(torch.randn(channels, channels_in, size, size) * scale)
+        self.bias = nn.Parameter(torch.zeros(channels))
+
+    def forward(self, features: Tensor) -> Tensor:
+        """(batch, channels in, rows, cols) to (batch, channels, rows / stride, cols / stride)."""
+        weight = self.weight.to(features.dtype, memory_format=torch.channels_last)
+        bias = self.bias.to(features.dtype)
+        return F.conv2d(features, weight, bias, stride=self.stride, padding=self.padding)
+
+
+class Bottleneck(nn.Module):
+    """Three convolutions, of one, three and one pixels, with a shortcut beside them."""
+
+    def __init__(
+        self,
+        channels_in: int,
+        width: int,
+        channels: int,
+        *,
+        stride: int = 1,
+        identity: bool = False,
+        gain: float = 1.0,
+    ) -> None:
+        """
+        Args:
+            channels_in: the number of input channels.
+            width: the number of hidden channels.
+            channels: the number of output channels.
+            stride: of the first convolution and of the shortcut.
+            identity: whether the shortcut is the input itself instead of a convolution.
+            gain: a factor of the output's initial scale.
+        """
+        super().__init__()
+        self.first = PlainLayer(channels_in, width, 1, stride=stride)
+        self.second = PlainLayer(width, width, 3)
+        # There is no normalisation: fourteen blocks at full gain would let the features grow too
+        # large.
+        self.third = PlainLayer(width, channels, 1, gain=0.5 * gain)
+        self.shortcut = (
+            nn.Identity()
+            if identity
+            else PlainLayer(channels_in, channels, 1, stride=stride, gain=0.7 * gain)
+        )
+
+    def forward(self, features: Tensor, result_type: torch.dtype | None = None) -> Tensor:
+        """(batch, channels in, rows, cols) to (batch, channels, rows / stride, cols / stride).
+
+        Args:
+            features: what comes in.
+            result_type: in which the last convolution and the shortcut compute, if not in that of
+                the input.
+        """
+        hidden = F.relu_(self.second(F.relu_(self.first(features))))
+        result_type = result_type or features.dtype
+        return self.third(hidden.to(result_type)) + self.shortcut(features.to(result_type))
+
+
+class ResNet(MixedPrecision):
+    """The Transporter's hourglass, which goes down to an eighth of the resolution and up again.
+
+    It has 43 layers: a stem, and two blocks of three convolutions in each of four stages down and
+    three up. Convolutions in shortcuts are not counted.
+    """
+
+    def __init__(
+        self, in_channels: int, out_channels: int, widths: tuple[int, int, int, int, int]
+    ) -> None:
+        super().__init__()
+        stem, *stages = widths
+        top, second = stages[:2]
+        self.stem = PlainLayer(in_channels, stem, 3)
+        self.down = nn.ModuleList([_stage(stem, top)])
+        self.down.extend(_stage(a, b, stride=2) for a, b in itertools.pairwise(stages))
+        self.up = nn.ModuleList(_stage(a, b) for a, b in itertools.pairwise(stages[:0:-1]))
+        self.last = Bottleneck(second, top, top)
+        self.out = Bottleneck(top, top, out_channels, gain=0.1)
+
+    def forward(self, image: Tensor) -> Tensor:
+        """(batch, in channels, rows, cols) to (batch, out channels, rows, cols) in float32.
+
+        Computes in the type of the image, whose sides are one more than a multiple of 8.
+        """
+        features = F.relu_(self.stem(image.contiguous(memory_format=torch.channels_last)))
+        for stage in self.down:
+            features = stage(features)
+        for stage in self.up:
+            features = stage(upsample(features))
+        features = F.relu_(self.last(upsample(features)))
+        # Logits need more than eight bits.
+        return self.out(features, torch.float32)
+
+    def reduced_precision_parts(self) -> Iterator[nn.Module]:
+        yield from (self.stem, self.down, self.up, self.last, self.out.first, self.out.second)
+
+
+def _stage(channels_in: int, channels: int, *, stride: int = 1) -> nn.Sequential:
+    """Two blocks, of which the first has the stride."""
+    return nn.Sequential(
+        Bottleneck(channels_in, channels, channels, stride=stride),
+        nn.ReLU(inplace=True),
+        Bottleneck(channels, channels, channels, identity=True),
+        nn.ReLU(inplace=True),
+    )

@@ -1,0 +1,324 @@
+"""The Transporter, the second baseline of the paper (section V-C.3): ordinary convolutions.
+
+Its networks are not equivariant to rotations, so it shows them rotated images. For a parallel jaw
+the scene is rotated N / 2 times, and f_pick predicts for each rotated scene where a gripper at
+angle zero would pick. For placing, as in the original (Zeng et al.), the crop is rotated N times
+and each rotated crop is encoded by psi; the equivariant methods encode the crop once instead.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from kitting_drake.policies.data.images import Image, LabelledImage
+from kitting_drake.policies.networks import architecture as sizes
+from kitting_drake.policies.networks.architecture import NetworkConfig
+from kitting_drake.policies.networks.factored import (
+    AnglePrediction,
+    Networks,
+    PickPrediction,
+    PlacePrediction,
+)
+from kitting_drake.policies.networks.layers.correlation import (
+    KERNEL,
+    Candidate,
+    cross_correlation_fft,
+    finer_bins,
+    kernel_window,
+    peaks,
+    ranked,
+    window_around,
+)
+from kitting_drake.policies.networks.layers.steerable import Convolution, SteerableConv2d
+from kitting_drake.policies.networks.resnet import ResNet
+from kitting_drake.policies.training.losses import (
+    interpolate_label,
+    joint_loss,
+    log_odds,
+    presence_loss,
+)
+
+_NEAR = math.radians(10)
+"""Rotations up to this far from a label are easily confused with it: they are a stratum of their
+own (see `draw_bins`)."""
+_DRAWS = 2
+"""The number of rotations that a training step draws in each stratum. More make a step slower. In
+the one comparison that was made they taught no more: after 750 steps of the place networks alone on
+align-box-corner, at a learning rate of 3e-4, the cross-entropy over all rotations of validation
+scenes was 6.6 with 2, and 7.9 with 16 (the script is not kept)."""
+_COARSE = 36
+"""The most rotations of the crop that are all encoded at inference."""
+_CANDIDATES = 3
+"""The number of peaks among the coarse rotations that are refined at inference."""
+
+
+class TransporterNetworks(Networks):
+    """f_pick, and phi and psi, as three residual networks of 43 layers."""
+
+    picking = "pick"
+
+    def __init__(self, config: NetworkConfig, convolution: Convolution = SteerableConv2d) -> None:
+        """
+        Args:
+            config: what to make.
+            convolution: not used, as there are no steerable convolutions.
+        """
+        super().__init__(config)
+        widths = self.preset.resnet
+        self.f_pick = ResNet(config.channels, 1, widths)
+        self.phi = ResNet(config.channels, sizes.FEATURES, widths)
+        self.psi = ResNet(config.channels, sizes.FEATURES, widths)
+
+    def check_orientations(self, orientations: int) -> None:
+        """Raises ValueError if N is odd: N / 2 of them must span half a rotation."""
+        if orientations < 2 or orientations % 2:
+            raise ValueError(f"orientations must be an even number, not {orientations}")
+
+    def pick_volume(self, image: Image, orientations: int) -> Tensor:
+        """f_pick: (N / 2, rows, cols), the logits of all gripper angles 2 pi i / N and pixels."""
+        self.check_orientations(orientations)
+        step = math.tau / orientations
+        return torch.stack([self._pick_scores(image, i * step) for i in range(orientations // 2)])
+
+    def _pick_scores(self, image: Image, theta: float) -> Tensor:
+        """(rows, cols): the logits of picking with the gripper at angle `theta`."""
+        rows, cols = image.shape[1:]
+        canvas = canvas_shape((rows, cols), theta)
+        scene = rotated(self._on_device(image), -theta, canvas)
+        scores = self.f_pick(self.prepare_batch(scene))[:, :, : canvas[0], : canvas[1]]
+        return rotated(scores, theta, (rows, cols))[0, 0]
+
+    def _on_device(self, image: Image) -> Tensor:
+        """(1, 4, rows, cols)."""
+        return torch.from_numpy(np.array(image, order="C")).to(self.device)[None]
+
+    def predict_pick(self, image: Image, orientations: int) -> PickPrediction:
+        """Position and angle are read off one volume: the position is that of its maximum, and the
+        angle the best one there."""
+        volume = self.pick_volume(image, orientations)
+        return PickPrediction(
+            position=volume.amax(0),
+            angle=lambda pixel: AnglePrediction(volume[:, pixel[0], pixel[1]], None),
+            log_odds=float(log_odds(volume, len(volume))) if self.config.stop else None,
+        )
+
+    def pick_losses(
+        self,
+        sample: LabelledImage,
+        pixels: list[tuple[int, int]],
+        random: np.random.Generator,
+    ) -> Iterator[tuple[str, Callable[[], Tensor]]]:
+        step = math.tau / self.config.orientations
+        bins = self.config.orientations // 2
+        thetas = (sample.pick_theta, *sample.other_thetas)
+        angles = [interpolate_label(theta % math.pi / step, bins, cyclic=True) for theta in thetas]
+        drawn = draw_bins({bin_ for angle in angles for bin_, _ in angle}, bins, step, random)
+        picks = [(float(row), float(col)) for row, col in (sample.pick, *sample.other_picks)]
+
+        def loss() -> Tensor:
+            logits = self._drawn_scores(sample.image, drawn)
+            labels = [
+                (among(angle, drawn), pick) for angle, pick in zip(angles, picks, strict=True)
+            ]
+            value = joint_loss(logits, *labels)
+            if self.config.stop:
+                value = value + presence_loss(log_odds(logits, bins), present=True)
+            return value
+
+        yield "pick", loss
+
+    def stop_loss(self, image: Image, random: np.random.Generator) -> Tensor:
+        bins = self.config.orientations // 2
+        drawn = draw_bins(set(), bins, math.tau / self.config.orientations, random)
+        return presence_loss(log_odds(self._drawn_scores(image, drawn), bins), present=False)
+
+    def _drawn_scores(self, image: Image, drawn: dict[int, float]) -> Tensor:
+        """(n, rows, cols): the logits at the angles that `draw_bins` drew, weighted accordingly."""
+        step = math.tau / self.config.orientations
+        scores = [self._pick_scores(image, bin_ * step) + stands for bin_, stands in drawn.items()]
+        return torch.stack(scores)
+
+    def encode_crops(self, image: Image, pixel: tuple[int, int], angles: Sequence[float]) -> Tensor:
+        """psi of crops around a pixel of the rotated scene, the kernels of f_place.
+
+        Args:
+            image: the observation.
+            pixel: (row, col).
+            angles: n rotations of the scene about that pixel, in radians.
+
+        Returns:
+            (n, channels, KERNEL, KERNEL).
+        """
+        crops = rotated_crops(self._on_device(image), pixel, angles)
+        encodings = self.psi(self.prepare_batch(crops))
+        margin = (sizes.PLACE_CROP - KERNEL) // 2
+        return encodings[:, :, margin:-margin, margin:-margin]
+
+    def predict_place(
+        self, image: Image, pixel: tuple[int, int], orientations: int
+    ) -> PlacePrediction:
+        """f_place, all pixels at once, at all rotations for N up to 36.
+
+        For larger N, 36 nearly evenly spaced bins come first. Around the three best peaks among
+        them, all bins between the neighbouring ones are then encoded and correlated as well, at
+        pixels near the peak.
+        """
+        shape = (image.shape[1], image.shape[2])
+        step = math.tau / orientations
+        scene = self.encode_scene(image)
+        coarse = coarse_bins(orientations)
+        kernels = self.encode_crops(image, pixel, [bin_ * step for bin_ in coarse])
+        volume = cross_correlation_fft(scene, kernels)[:, : shape[0], : shape[1]]
+        candidates = []
+        for rotation, row, col in peaks(volume, _CANDIDATES):
+            first, last = finer_bins(rotation, len(coarse), orientations)
+            corner, size = window_around((row, col), shape)
+            if len(coarse) == orientations:
+                around = [bin_ % orientations for bin_ in range(first, last + 1)]
+                rows, cols = (slice(a, a + n) for a, n in zip(corner, size, strict=True))
+                scores = volume[around][:, rows, cols]
+            else:
+                angles = [bin_ * step for bin_ in range(first, last + 1)]
+                finer = self.encode_crops(image, pixel, angles)
+                scores = kernel_window(scene, finer, corner, size)
+            candidates.append(Candidate(scores, first, corner))
+        return PlacePrediction(ranked(candidates, orientations), volume.amax(0))
+
+    def place_loss(self, sample: LabelledImage, pixel: tuple[int, int], seed: int) -> Tensor:
+        """Cross-entropy over all pixels and a sample of the rotations: the label's own, some near
+        it and some elsewhere (see `draw_bins`)."""
+        orientations = self.config.orientations
+        step = math.tau / orientations
+        row, col = sample.place_of(np.array(pixel, float))
+        bins = interpolate_label(sample.rotation % math.tau / step, orientations, cyclic=True)
+        drawn = draw_bins(
+            {bin_ for bin_, _ in bins}, orientations, step, np.random.default_rng(seed)
+        )
+        kernels = self.encode_crops(sample.image, pixel, [bin_ * step for bin_ in drawn])
+        logits = cross_correlation_fft(self.encode_scene(sample.image), kernels)
+        stands = logits.new_tensor(list(drawn.values()))
+        label = (among(bins, drawn), (float(row), float(col)))
+        return joint_loss(logits + stands[:, None, None], label)
+
+    def modules_by_loss(self) -> dict[str, list[nn.Module]]:
+        return {"pick": [self.f_pick], "place": [self.phi, self.psi]}
+
+
+def coarse_bins(orientations: int) -> list[int]:
+    """The rotations of the crop, in bins, that are all encoded at inference: at most 36."""
+    count = min(orientations, _COARSE)
+    return [round(i * orientations / count) for i in range(count)]
+
+
+def encodings_per_decision(orientations: int) -> int:
+    """The number of rotated crops that `TransporterNetworks.predict_place` encodes at N."""
+    coarse = len(coarse_bins(orientations))
+    if coarse == orientations:
+        return coarse
+    first, last = finer_bins(0, coarse, orientations)
+    return coarse + _CANDIDATES * (last - first + 1)
+
+
+def draw_bins(
+    labels: set[int], bins: int, step: float, random: np.random.Generator
+) -> dict[int, float]:
+    """The rotations that a training step computes: sampled softmax in two strata.
+
+    Args:
+        labels: bins that must be among them.
+        bins: how many there are, over half a rotation or a full one.
+        step: between neighbours, in radians.
+        random: draws the others.
+
+    Returns:
+        The bins, each with what is added to its logits, in nats, so that those that were drawn
+        stand for all of their stratum.
+    """
+    strata: tuple[list[int], list[int]] = ([], [])
+    for bin_ in range(bins):
+        if bin_ in labels:
+            continue
+        apart = [abs(math.remainder((bin_ - label) * step, bins * step)) for label in labels]
+        strata[min(apart, default=math.inf) > _NEAR].append(bin_)
+    drawn = dict.fromkeys(sorted(labels), 0.0)
+    for stratum in strata:
+        count = min(_DRAWS, len(stratum))
+        for bin_ in random.choice(stratum, count, replace=False) if count else ():
+            drawn[int(bin_)] = math.log(len(stratum) / count)
+    return drawn
+
+
+def among(label: list[tuple[int, float]], drawn: dict[int, float]) -> list[tuple[int, float]]:
+    """An interpolated label in terms of positions among the bins that `draw_bins` drew."""
+    index = {bin_: position for position, bin_ in enumerate(drawn)}
+    return [(index[bin_], weight) for bin_, weight in label]
+
+
+def canvas_shape(shape: tuple[int, int], angle: float) -> tuple[int, int]:
+    """Rows and cols that hold all pixel centres of an image of some rows and cols, rotated."""
+    cos, sin = abs(math.cos(angle)), abs(math.sin(angle))
+    height, width = shape[0] - 1, shape[1] - 1
+    # Rounding errors must not make a rotation by 90 degrees a pixel larger.
+    rows = math.ceil(height * cos + width * sin - 1e-6)
+    cols = math.ceil(height * sin + width * cos - 1e-6)
+    return rows + 1, cols + 1
+
+
+def rotated(image: Tensor, angle: float, shape: tuple[int, int]) -> Tensor:
+    """An image rotated about its middle, bilinearly sampled; zero, as if unseen, outside it.
+
+    Args:
+        image: (1, channels, rows, cols).
+        angle: counter-clockwise, in radians.
+        shape: rows and cols of the result; its middle is the image's.
+
+    Returns:
+        (1, channels, *shape).
+    """
+    rows, cols = image.shape[2:]
+    return _sampled(image, ((rows - 1) / 2, (cols - 1) / 2), [angle], shape)
+
+
+def rotated_crops(image: Tensor, pixel: tuple[int, int], angles: Sequence[float]) -> Tensor:
+    """Crops of the scene rotated about a pixel, which is in the middle of each: no corner of a crop
+    is missing that is in the scene.
+
+    Args:
+        image: (1, channels, rows, cols).
+        pixel: (row, col).
+        angles: n of them, counter-clockwise, in radians.
+
+    Returns:
+        (n, channels, PLACE_CROP, PLACE_CROP); zero, as if unseen, outside the image.
+    """
+    return _sampled(image, pixel, angles, (sizes.PLACE_CROP, sizes.PLACE_CROP))
+
+
+def _sampled(
+    image: Tensor, centre: tuple[float, float], angles: Sequence[float], shape: tuple[int, int]
+) -> Tensor:
+    """An image rotated about a point by each of some angles, with that point in the middle."""
+    axes = [
+        torch.arange(side, dtype=image.dtype, device=image.device) - (side - 1) / 2
+        for side in shape
+    ]
+    row, col = torch.meshgrid(*axes, indexing="ij")
+    rows, cols = image.shape[2:]
+    sources = []
+    for angle in angles:
+        cos, sin = math.cos(angle), math.sin(angle)
+        # Each pixel is taken from where the inverse rotation brings it: (col, row) from -1 to 1.
+        source_row = cos * row + sin * col + (centre[0] - (rows - 1) / 2)
+        source_col = cos * col - sin * row + (centre[1] - (cols - 1) / 2)
+        source = [source_col * (2 / (cols - 1)), source_row * (2 / (rows - 1))]
+        sources.append(torch.stack(source, dim=-1))
+    stack = image.expand(len(sources), -1, -1, -1)
+    return F.grid_sample(
+        stack, torch.stack(sources), mode="bilinear", padding_mode="zeros", align_corners=True
+    )

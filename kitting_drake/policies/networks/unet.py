@@ -1,0 +1,125 @@
+"""The U-net of alpha, phi and psi (section V-A.1 of the paper)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from kitting_drake.policies.networks.layers.fibres import Fibre, Scalar
+from kitting_drake.policies.networks.layers.steerable import (
+    BandLimit,
+    BlurPool,
+    Convolution,
+    InvariantPart,
+    MixedPrecision,
+    upsample,
+)
+
+STRIDE = 16
+"""The sides of an image must be one more than a multiple of this, in pixels."""
+
+
+@dataclass(frozen=True)
+class UNetSize:
+    """The width of a U-net."""
+
+    down: tuple[int, int, int, int, int] = (16, 32, 64, 128, 128)
+    """The number of fields of each of the five blocks of the encoder, with poolings between."""
+    up: tuple[int, int, int, int] = (64, 32, 16, 16)
+    """The number of fields of each of the four blocks of the decoder."""
+    head: int = 16
+    """The number of scalar channels before the last layer."""
+    skip: int = 3
+    """The side of the kernel in a residual block's shortcut that changes the number of fields."""
+
+
+class ResidualBlock(nn.Module):
+    """Two convolutions with a shortcut beside them, and ELU after each."""
+
+    def __init__(
+        self,
+        fields_in: int,
+        fields: int,
+        fibre: Fibre,
+        convolution: Convolution,
+        skip: int,
+        size: int = 3,
+    ) -> None:
+        super().__init__()
+        self.first = convolution(fields_in, fibre, fields, fibre, size)
+        # There is no normalisation: nine blocks at full gain would let the features grow too large.
+        self.second = convolution(fields, fibre, fields, fibre, size, gain=0.5)
+        self.shortcut = (
+            BandLimit(fibre, fields)
+            if fields_in == fields
+            else convolution(fields_in, fibre, fields, fibre, skip, gain=0.7)
+        )
+
+    def forward(self, features: Tensor) -> Tensor:
+        """(batch, channels, rows, cols) to the same rows and cols."""
+        hidden = self.second(F.elu_(self.first(features)))
+        return F.elu_(hidden + self.shortcut(features))
+
+
+class UNet(MixedPrecision):
+    """Maps scalar images to scalar images through hidden fields of one fibre, in 21 layers.
+
+    It commutes with rotations of the image (equation 3): its input and output are trivial fields.
+    """
+
+    def __init__(
+        self,
+        in_channels: int,
+        out_channels: int,
+        fibre: Fibre,
+        size: UNetSize,
+        convolution: Convolution,
+    ) -> None:
+        super().__init__()
+        down, up = size.down, size.up
+        self.lift = convolution(in_channels, Scalar(), down[0], fibre, 3)
+        before = (down[0], *down[:-1])
+        self.down = nn.ModuleList(
+            ResidualBlock(a, b, fibre, convolution, size.skip)
+            for a, b in zip(before, down, strict=True)
+        )
+        below = (down[-1], *up[:-1])
+        beside = down[-2::-1]
+        self.up = nn.ModuleList(
+            ResidualBlock(a + b, c, fibre, convolution, size.skip)
+            for a, b, c in zip(below, beside, up, strict=True)
+        )
+        self.pool = BlurPool()
+        self.invariant = InvariantPart(fibre, up[-1])
+        self.mix = convolution(up[-1], Scalar(), size.head, Scalar(), 3, bias=True)
+        self.out = convolution(size.head, Scalar(), out_channels, Scalar(), 1, bias=True, gain=0.1)
+
+    def forward(self, image: Tensor) -> Tensor:
+        """(batch, in channels, rows, cols) to (batch, out channels, rows, cols) in float32.
+
+        Computes in the type of the image, whose sides are one above a multiple of 16.
+        """
+        if image.shape[2] % STRIDE != 1 or image.shape[3] % STRIDE != 1:
+            raise ValueError(
+                f"an image of {tuple(image.shape[2:])} pixels cannot be halved 4 times"
+            )
+        features = F.elu_(self.lift(image.contiguous(memory_format=torch.channels_last)))
+        levels = []
+        for index, block in enumerate(self.down):
+            if index:
+                levels.append(features)
+                features = self.pool(features)
+            features = block(features)
+        for block in self.up:
+            features = block(torch.cat([upsample(features), levels.pop()], dim=1))
+        # The last two layers are small and always compute in float32: logits need more than eight
+        # bits.
+        scalars = self.invariant(features).float()
+        return self.out(F.elu(self.mix(scalars)))
+
+    def reduced_precision_parts(self) -> Iterator[nn.Module]:
+        yield from (self.lift, self.down, self.up)

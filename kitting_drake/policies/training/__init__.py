@@ -1,0 +1,1 @@
+"""Training: losses, steps, runs that resume, validation, export."""

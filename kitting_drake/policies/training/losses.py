@@ -1,0 +1,214 @@
+"""Cross-entropy losses over pixels, orientations and both (section V-C.1 of the paper).
+
+A label between two pixels or orientations becomes a soft label: it is interpolated linearly between
+its neighbours, so that the mean of the best prediction is the label. A label on a pixel is one-hot,
+as in the paper.
+
+Networks that can stop have one more class beside the pixels, "nothing to pick", whose logit is the
+constant `NOTHING_LOGIT`. The cross-entropy over all classes is then the sum of two losses: the one
+over the pixels alone, and `presence_loss` of the log-odds that there is something to pick.
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from kitting_drake.policies.networks.layers.correlation import (
+    COARSE_ROTATIONS,
+    coarse_volume,
+    rotation_angles,
+    window,
+)
+
+NOTHING_LOGIT = math.log(160 * 320)
+"""The logit of "nothing to pick". Fresh networks, whose logits are nearly zero, then find it about
+as likely as that there is something to pick in an image of the paper's size."""
+
+_WINDOW = 17
+"""The side of the window of the plain correlation around a label, in pixels."""
+_FINE_REACH = math.radians(10)
+"""How far from the label's rotation the window reaches, in radians."""
+
+
+def interpolate_label(
+    position: float, count: int, *, cyclic: bool = False
+) -> list[tuple[int, float]]:
+    """A position between whole numbers as (index, weight) pairs: linear interpolation.
+
+    Args:
+        position: in bins.
+        count: the number of bins; weight beyond them goes to the outermost.
+        cyclic: whether bin `count` is bin 0.
+    """
+    first = math.floor(position)
+    share = position - first
+    ends = [(first, 1 - share), (first + 1, share)]
+    if cyclic:
+        return [(index % count, weight) for index, weight in ends if weight > 0]
+    return [(min(max(index, 0), count - 1), weight) for index, weight in ends if weight > 0]
+
+
+def soft_label(*axes: list[tuple[int, float]], like: Tensor) -> Tensor:
+    """The outer product of one interpolated label for each axis, shaped as `like`."""
+    label = torch.zeros_like(like)
+    corners: list[tuple[tuple[int, ...], float]] = [((), 1.0)]
+    for axis in axes:
+        corners = [
+            ((*index, bin_), weight * share) for index, weight in corners for bin_, share in axis
+        ]
+    for index, weight in corners:
+        label[index] += weight
+    return label
+
+
+def cross_entropy(logits: Tensor, label: Tensor) -> Tensor:
+    """The cross-entropy of a softmax over all entries of `logits`, for a label of their shape."""
+    return logits.flatten().logsumexp(0) - (label * logits).sum()
+
+
+def log_odds(logits: Tensor, orientations: int = 1) -> Tensor:
+    """The log-odds that there is something to pick, against the class "nothing to pick".
+
+    Args:
+        logits: of all actions: (rows, cols), or (orientations, rows, cols) where a method has
+            logits of both at once.
+        orientations: over which the logits range; the odds do not depend on how many there are.
+    """
+    return logits.flatten().logsumexp(0) - math.log(orientations) - NOTHING_LOGIT
+
+
+def presence_loss(odds: Tensor, *, present: bool) -> Tensor:
+    """The cross-entropy of the classes "something to pick" and "nothing to pick".
+
+    Args:
+        odds: see `log_odds`.
+        present: whether there is something to pick.
+    """
+    return F.softplus(-odds if present else odds)
+
+
+def position_loss(logits: Tensor, *pixels: tuple[float, float]) -> Tensor:
+    """Cross-entropy over the pixels of f_p.
+
+    Args:
+        logits: (rows, cols).
+        pixels: the labels (row, col), which need not be whole numbers; all are equally likely.
+    """
+    rows, cols = logits.shape
+    labels = [
+        soft_label(interpolate_label(row, rows), interpolate_label(col, cols), like=logits)
+        for row, col in pixels
+    ]
+    return cross_entropy(logits, torch.stack(labels).mean(0))
+
+
+def angle_loss(logits: Tensor, theta: float, orientations: int) -> Tensor:
+    """Cross-entropy over the orientations of f_theta, modulo pi.
+
+    Args:
+        logits: (N / 2,), at the angles 2 pi i / N.
+        theta: the label, in radians.
+        orientations: N.
+    """
+    bins = theta / (math.tau / orientations)
+    label = soft_label(interpolate_label(bins, orientations // 2, cyclic=True), like=logits)
+    return cross_entropy(logits, label)
+
+
+def place_loss(
+    scene: Tensor,
+    encoding: Tensor,
+    pixel: tuple[float, float],
+    rotation: float,
+    orientations: int,
+    generator: torch.Generator,
+) -> Tensor:
+    """Cross-entropy over all pixels and rotations of f_place (equation 8), estimated.
+
+    Near the label the plain correlation is computed at every pixel and rotation. Everywhere else
+    the cells of the coarse volume stand for the pixels and rotations that they cover. The coarse
+    volume has a cross-entropy loss of its own besides, as the search at inference starts from it.
+
+    Args:
+        scene: (1, channels, rows, cols), phi(o_t).
+        encoding: (1, channels, side, side), psi(c).
+        pixel: the label (row, col).
+        rotation: the label, in radians.
+        orientations: N.
+        generator: draws where the window and the coarse rotations lie about the label.
+    """
+    draws = torch.rand(3, generator=generator).tolist()
+    coarse_angles = rotation_angles(COARSE_ROTATIONS, scene, draws[0])
+    coarse = coarse_volume(scene, encoding, coarse_angles)
+    coarse_bin = rotation / (math.tau / COARSE_ROTATIONS) - draws[0]
+    label = soft_label(
+        interpolate_label(coarse_bin, COARSE_ROTATIONS, cyclic=True),
+        interpolate_label(pixel[0] / 2, coarse.shape[1]),
+        interpolate_label(pixel[1] / 2, coarse.shape[2]),
+        like=coarse,
+    )
+    coarse_loss = cross_entropy(coarse, label)
+
+    step = math.tau / orientations
+    first = math.ceil((rotation - _FINE_REACH) / step)
+    first = min(first, math.floor(rotation / step))
+    last = max(math.floor((rotation + _FINE_REACH) / step), math.floor(rotation / step) + 1)
+    margin = _WINDOW // 2
+    # The label lies anywhere in the middle half of the window.
+    top = round(pixel[0]) - margin + round((draws[1] - 0.5) * margin)
+    left = round(pixel[1]) - margin + round((draws[2] - 0.5) * margin)
+    angles = torch.arange(first, last + 1, dtype=scene.dtype, device=scene.device) * step
+    fine = window(scene, encoding, angles, (top, left), (_WINDOW, _WINDOW))
+    label = soft_label(
+        interpolate_label(rotation / step - first, len(angles)),
+        interpolate_label(pixel[0] - top, _WINDOW),
+        interpolate_label(pixel[1] - left, _WINDOW),
+        like=fine,
+    )
+
+    # Coarse cells stand for what lies outside the window.
+    stands_for = math.log(4 * orientations / COARSE_ROTATIONS)
+    covered = _covered(coarse, coarse_angles - rotation, (top, left))
+    outside = (coarse + stands_for).masked_fill(covered, -torch.inf)
+    everything = torch.cat([fine.flatten(), outside.flatten()]).logsumexp(0)
+    return coarse_loss + everything - (label * fine).sum()
+
+
+def _covered(coarse: Tensor, differences: Tensor, corner: tuple[int, int]) -> Tensor:
+    """Which cells of a coarse volume lie in the window around a label.
+
+    Args:
+        coarse: (n, rows, cols), at half the resolution.
+        differences: (n,), of the cells' rotations to the label's, in radians.
+        corner: the window's first pixel (row, col).
+    """
+    row = torch.arange(coarse.shape[1], device=coarse.device) * 2 - corner[0]
+    col = torch.arange(coarse.shape[2], device=coarse.device) * 2 - corner[1]
+    away = torch.remainder(differences + math.pi, math.tau) - math.pi
+    return (
+        (away.abs() < _FINE_REACH)[:, None, None]
+        & ((row >= 0) & (row < _WINDOW))[None, :, None]
+        & ((col >= 0) & (col < _WINDOW))[None, None, :]
+    )
+
+
+def joint_loss(
+    logits: Tensor, *labels: tuple[list[tuple[int, float]], tuple[float, float]]
+) -> Tensor:
+    """Cross-entropy over orientations and pixels at once, as in the Transporter.
+
+    Args:
+        logits: (orientations, rows, cols).
+        labels: for each its orientation as (index, weight) pairs (see `interpolate_label`) and its
+            pixel (row, col); all are equally likely.
+    """
+    _, rows, cols = logits.shape
+    parts = [
+        soft_label(bins, interpolate_label(row, rows), interpolate_label(col, cols), like=logits)
+        for bins, (row, col) in labels
+    ]
+    return cross_entropy(logits, torch.stack(parts).mean(0))

@@ -1,0 +1,132 @@
+"""Networks as ONNX, for what runs them without torch: see `onnx_runner` and docs/learning.md."""
+
+from __future__ import annotations
+
+import copy
+import dataclasses
+import tempfile
+import warnings
+from pathlib import Path
+from types import ModuleType
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from kitting_drake.common.errors import UserError
+from kitting_drake.common.extras import import_extra
+from kitting_drake.common.files import require_folder, write_atomically, write_json
+from kitting_drake.policies.networks import architecture as sizes
+from kitting_drake.policies.networks.factored import FactoredNetworks
+from kitting_drake.policies.networks.layers.steerable import BlurPool
+from kitting_drake.policies.networks.unet import STRIDE
+from kitting_drake.policies.networks.weights import load_networks, read_weights_file
+from kitting_drake.policies.onnx_runner import GRAPHS
+
+_OPSET = 17
+
+
+class _Blur(nn.Module):
+    """`BlurPool` in operators that ONNX has for images of any size."""
+
+    kernel: Tensor
+
+    def __init__(self, pool: BlurPool) -> None:
+        super().__init__()
+        self.register_buffer("kernel", pool.kernel[None, None].clone())
+
+    def forward(self, features: Tensor) -> Tensor:
+        """(batch, channels, rows, cols), odd sides, to half the resolution."""
+        alone = features.reshape(-1, 1, features.shape[2], features.shape[3])
+        halved = F.conv2d(alone, self.kernel, stride=2, padding=2)
+        return halved.reshape(features.shape[0], -1, halved.shape[2], halved.shape[3])
+
+
+def require_onnx() -> ModuleType:
+    """The package onnx.
+
+    Raises:
+        UserError: it is not installed.
+    """
+    return import_extra("onnx", purpose="--export onnx", extra="onnx")
+
+
+def export_onnx(weights: Path, folder: Path) -> list[Path]:
+    """Writes the networks of a weights file as ONNX, in float32, and `policy.json`.
+
+    Each graph maps `image`, prepared as `policy.json` says, to `output`. The U-nets alpha, phi and
+    psi take any sides that are one above a multiple of 16 pixels; beta takes its crop. What is
+    between them (crops, rotations, correlation) is in `onnx_runner`, in numpy.
+
+    Args:
+        weights: a file that `train` wrote.
+        folder: where to.
+
+    Returns:
+        The files.
+
+    Raises:
+        UserError: the weights cannot be used, are those of a Transporter, which rotates whole
+            images between its networks, or the package onnx is not installed.
+    """
+    networks = load_networks(weights)
+    card = read_weights_file(weights).card
+    if not isinstance(networks, FactoredNetworks):
+        raise UserError(f"{weights}: a {networks.config.method} cannot be exported as ONNX")
+    onnx = require_onnx()
+    require_folder(folder)
+    config = networks.config
+    written = []
+    # It is written last: a folder without it is none, should this not come to its end.
+    described_in = folder / "policy.json"
+    described_in.unlink(missing_ok=True)
+    for name in GRAPHS:
+        side = sizes.PICK_CROP if name == "beta" else 4 * STRIDE + 1
+        example = torch.zeros(1, config.channels, side, side)
+        content = _graph(getattr(networks, name), example, any_size=name != "beta")
+        onnx.checker.check_model(onnx.load_from_string(content))
+        written.append(folder / f"{name}.onnx")
+        write_atomically(written[-1], content)
+    described = {
+        "format": "kitting_drake ONNX policy",
+        "format_version": 1,
+        **dataclasses.asdict(config),
+        "stop_threshold": networks.stop_threshold,
+        "channels": config.channels,
+        "pick_crop": sizes.PICK_CROP,
+        "place_crop": sizes.PLACE_CROP,
+        "stride": STRIDE,
+        "resolution": card.get("resolution"),
+        "weights": weights.name,
+    }
+    write_json(described_in, described)
+    return [*written, described_in]
+
+
+def _graph(network: nn.Module, example: Tensor, *, any_size: bool) -> bytes:
+    exported = copy.deepcopy(network)
+    for module in list(exported.modules()):
+        for name, child in module.named_children():
+            if isinstance(child, BlurPool):
+                setattr(module, name, _Blur(child))
+    axes = {2: "rows", 3: "cols"}
+    with (
+        tempfile.TemporaryDirectory() as scratch,
+        warnings.catch_warnings(),
+        torch.no_grad(),
+    ):
+        # Of shapes that it checks while it traces, and of itself: torch's newer exporter takes a
+        # minute for each network, this one a second.
+        warnings.simplefilter("ignore")
+        file = Path(scratch) / "network.onnx"
+        torch.onnx.export(
+            exported.eval(),
+            (example,),
+            file,
+            dynamo=False,
+            opset_version=_OPSET,
+            input_names=["image"],
+            output_names=["output"],
+            dynamic_axes={"image": axes, "output": axes} if any_size else None,
+        )
+        return file.read_bytes()

@@ -1,0 +1,194 @@
+"""One training step, for every method (section V-C.1)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+
+from kitting_drake.policies.data.images import Image, LabelledImage, Motion, Pictured, augment
+from kitting_drake.policies.networks.factored import Networks
+
+BETAS = (0.9, 0.999)
+
+_STOP_PROBABILITY = 1 / 8
+"""The probability that a training step also learns from a final observation."""
+
+
+@dataclass(frozen=True)
+class _Draw:
+    """The sample, and perhaps the final observation, of a step."""
+
+    sample: LabelledImage
+    random: np.random.Generator
+    """For the draws of the losses."""
+    final: Image | None
+    """A final observation, if the step has one."""
+    stop_random: np.random.Generator
+    """For the draws of its loss."""
+
+
+@dataclass(frozen=True)
+class _Prepared:
+    """The draw that is being prepared for a later step."""
+
+    step: int
+    samples: Sequence[LabelledImage]
+    finals: Sequence[Pictured]
+    draw: Future[_Draw]
+
+    def of(self, samples: Sequence[LabelledImage], finals: Sequence[Pictured]) -> bool:
+        """Whether it is drawn from these very samples and final observations."""
+        return self.samples is samples and self.finals is finals
+
+
+class Trainer:
+    """Networks and their optimisers, an Adam for each loss.
+
+    All random draws of a step depend on the seed and the step's number alone, so that a run which
+    is resumed continues as if it had not been interrupted. What a step learns from is prepared in
+    another thread, during the step before.
+    """
+
+    def __init__(
+        self,
+        networks: Networks,
+        *,
+        seed: int,
+        steps: int = 10_000,
+        learning_rate: float = 1e-4,
+        decay: bool = False,
+        curvature: bool = False,
+        reflection: bool = False,
+        only: str | None = None,
+    ) -> None:
+        """
+        Args:
+            networks: what to train.
+            seed: of all draws.
+            steps: how many there will be.
+            learning_rate: Adam's.
+            decay: let the learning rate fall to zero over the steps (half a cosine, after a rise
+                over the first hundred) instead of keeping it constant.
+            curvature: see `augment`.
+            reflection: see `augment`.
+            only: the loss whose modules are trained, in the very steps that they take when all
+                are; the others keep their weights. None: all losses.
+        """
+        self.networks = networks
+        self.seed = seed
+        self.steps = steps
+        self.learning_rate = learning_rate
+        self.decay = decay
+        self.curvature = curvature
+        self.reflection = reflection
+        self.step_count = 0
+        self._thread = ThreadPoolExecutor(1, thread_name_prefix="samples")
+        self._prepared: _Prepared | None = None
+        self.optimisers = {
+            name: torch.optim.Adam(
+                [weight for module in modules for weight in module.parameters()],
+                lr=learning_rate,
+                betas=BETAS,
+                fused=True,
+            )
+            for name, modules in networks.modules_by_loss().items()
+            if only in (None, name)
+        }
+
+    def rate(self, step: int) -> float:
+        """Adam's learning rate at a step."""
+        if not self.decay:
+            return self.learning_rate
+        rise = min(1.0, (step + 1) / 100)
+        share = min(1.0, step / self.steps)
+        return self.learning_rate * rise * 0.5 * (1 + math.cos(math.pi * share))
+
+    def step(
+        self, samples: Sequence[LabelledImage], finals: Sequence[Pictured] = ()
+    ) -> dict[str, float]:
+        """One step on a sample that is drawn at random and augmented.
+
+        Networks that can stop also learn, in one step of eight, from one of the final observations.
+        Its loss is added to that of the picking module; all else sees as many samples as ever.
+
+        Args:
+            samples: observations with something to pick.
+            finals: observations in which nothing is left to pick.
+
+        Returns:
+            Each loss, in nats; `stop`, that of a final observation, only where there was one.
+        """
+        draw = self._take(samples, finals)
+        self.networks.train()
+        values = {}
+        for name, loss_of in self.networks.losses(draw.sample, draw.random):
+            optimiser = self.optimisers.get(name)
+            if optimiser is None:
+                continue
+            for group in optimiser.param_groups:
+                group["lr"] = self.rate(self.step_count)
+            optimiser.zero_grad(set_to_none=True)
+            loss = loss_of()
+            loss.backward()
+            values[name] = float(loss.detach())
+            if name == self.networks.picking and draw.final is not None:
+                stop_loss = self.networks.stop_loss(draw.final, draw.stop_random)
+                stop_loss.backward()
+                values["stop"] = float(stop_loss.detach())
+            optimiser.step()
+        self.step_count += 1
+        return values
+
+    def _take(self, samples: Sequence[LabelledImage], finals: Sequence[Pictured]) -> _Draw:
+        """The draw of this step; the preparation of the next one's begins."""
+        prepared = self._prepared
+        if prepared and prepared.step == self.step_count and prepared.of(samples, finals):
+            draw = prepared.draw.result()
+        else:
+            draw = self._draw(self.step_count, samples, finals)
+        following = self.step_count + 1
+        future = self._thread.submit(self._draw, following, samples, finals)
+        self._prepared = _Prepared(following, samples, finals, future)
+        return draw
+
+    def _draw(
+        self, step: int, samples: Sequence[LabelledImage], finals: Sequence[Pictured]
+    ) -> _Draw:
+        """The draw of a step: a random sample, augmented, and perhaps a final observation."""
+        random = np.random.default_rng([self.seed, step])
+        sample = augment(
+            samples[random.integers(len(samples))],
+            random,
+            curvature=self.curvature,
+            reflection=self.reflection,
+        )
+        # Has draws of its own, so that the sample is the same with and without final observations.
+        stop_random = np.random.default_rng([self.seed, step, 1])
+        return _Draw(sample, random, self._draw_final(finals, stop_random), stop_random)
+
+    def _draw_final(self, finals: Sequence[Pictured], random: np.random.Generator) -> Image | None:
+        """A final observation after a random motion, if this step has one."""
+        if not (self.networks.config.stop and finals) or random.random() >= _STOP_PROBABILITY:
+            return None
+        return Motion.draw(finals[random.integers(len(finals))].image, random).moved_image()
+
+    def state_dict(self) -> dict[str, Any]:
+        """All that `load_state_dict` needs to continue bit by bit."""
+        return {
+            "step_count": self.step_count,
+            "networks": self.networks.state_dict(),
+            "optimisers": {name: item.state_dict() for name, item in self.optimisers.items()},
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Resumes a run of the same networks and seed."""
+        self.networks.load_state_dict(state["networks"])
+        for name, optimiser in self.optimisers.items():
+            optimiser.load_state_dict(state["optimisers"][name])
+        self.step_count = state["step_count"]

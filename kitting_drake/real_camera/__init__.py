@@ -1,0 +1,40 @@
+"""From a real camera's frames to one pick and place in the robot's frame; no pydrake here.
+
+from pathlib import Path
+from kitting_drake.real_camera import Frame, decide, load_policy, read_calibration
+
+calibration = read_calibration(Path("calibration.yaml"))
+policy = load_policy()                      # once: the generalist's networks
+failed = []
+while True:
+    color, depth = my_camera()              # (480, 640, 3) bytes, (480, 640) metres
+    decision = decide({"front": Frame(color, depth)}, calibration, policy, failed)
+    if decision.action.stop:
+        break
+    if not my_robot(decision.as_dict()):    # fingertips in the base frame: docs/bench.md
+        failed.append(decision.action.pick)
+"""
+
+from kitting_drake.real_camera.calibrations.calibration import (
+    BenchCamera,
+    Calibration,
+    read_calibration,
+    write_calibration,
+)
+from kitting_drake.real_camera.deciders import BenchPolicy, ShapeMatching, load_policy
+from kitting_drake.real_camera.decision import BenchDecision, decide
+from kitting_drake.real_camera.frames import Frame, read_frames
+
+__all__ = [
+    "BenchCamera",
+    "BenchDecision",
+    "BenchPolicy",
+    "Calibration",
+    "Frame",
+    "ShapeMatching",
+    "decide",
+    "load_policy",
+    "read_calibration",
+    "read_frames",
+    "write_calibration",
+]

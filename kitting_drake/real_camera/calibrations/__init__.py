@@ -1,0 +1,1 @@
+"""Calibrations of real cameras, and the YAML layouts they are read from."""

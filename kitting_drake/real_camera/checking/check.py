@@ -1,0 +1,247 @@
+"""Finds errors of cameras from a look at the empty table, or at a block of known size on it."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from kitting_drake.common.errors import UserError
+from kitting_drake.real_camera.calibrations.calibration import BenchCamera, Calibration, with_poses
+from kitting_drake.real_camera.checking.kit_block import Block, SeenBlock, see_block
+from kitting_drake.real_camera.checking.planes import FARTHEST, Plane, fit_plane, table_points
+from kitting_drake.real_camera.frames import Frame
+from kitting_drake.real_camera.views import make_views, table_depth
+from systems.heightmap import project
+from systems.signals import PixelGrid
+
+Array = NDArray[np.float64]
+
+_LEAST_POINTS = 500
+_SHARED = 100
+"""Two cameras are compared over at least so many pixels of o_t."""
+
+
+@dataclass(frozen=True)
+class TableCheck:
+    """The table, as some cameras see it: level, and at its height, if all is well."""
+
+    tilt: Array
+    """(2,): the rotation about base x and y by which it looks rotated, in radians."""
+    bias: float
+    """By how much the middle of the workspace looks too high, in metres."""
+    noise: float
+    """Standard deviation of heights, robustly, in metres."""
+    holes: float
+    """The share of what should be seen of the table that has no depth."""
+
+    @property
+    def tilt_angle(self) -> float:
+        """In radians."""
+        return float(np.linalg.norm(self.tilt))
+
+
+@dataclass(frozen=True)
+class CameraCheck:
+    """The check of one camera."""
+
+    table: TableCheck
+    distance: float
+    """From the camera to the middle of what it sees of the table, in metres."""
+    depth_bias: float
+    """The constant by which its depths would be too long if its pose were right, in metres."""
+    depth_bias_noise: float
+    """Standard deviation of heights that such a constant leaves, in metres."""
+    block: SeenBlock | None
+
+
+@dataclass(frozen=True)
+class Check:
+    """The errors that were found, and the poses that correct them."""
+
+    cameras: dict[str, CameraCheck]
+    together: TableCheck
+    """The check of o_t, in which the highest point of a pixel wins."""
+    disagreements: dict[tuple[str, str], float]
+    """By how much the first of two cameras sees the table higher, in metres."""
+    block_shifts: dict[tuple[str, str], Array]
+    """(2,) how far beside the second of two cameras the first one sees the block, in metres."""
+    block: Block | None
+    corrected: Calibration
+    heights: dict[str, NDArray[np.float32]]
+    """(rows, cols) above the table by each camera, and by all as ''; NaN where unseen."""
+
+
+def check_cameras(
+    frames: Mapping[str, Frame], calibration: Calibration, block: Block | None = None
+) -> Check:
+    """Checks cameras by the table, which is level and at its height in the base frame.
+
+    A camera's corrected pose is rotated about the camera until the table is level, as poses err by
+    rotations first, and then lifted. With a block, the cameras are also shifted and rotated about
+    the vertical until each sees it where it is or, if that is not known, where they see it on
+    average.
+
+    Args:
+        frames: of each camera by its name; the table is empty, but for the block.
+        calibration: of the cameras.
+        block: what lies on the table, if anything.
+
+    Raises:
+        UserError: a camera does not see the table, or the block.
+    """
+    views = make_views(frames, calibration)
+    grid = calibration.grid
+    poses: dict[str, Array] = {}
+    found: dict[str, CameraCheck] = {}
+    maps: dict[str, NDArray[np.float32]] = {}
+    for camera in calibration.cameras:
+        frame = frames[camera.name]
+        points = table_points(frame, camera, camera.X_BC, grid)
+        plane = _plane_of(points, camera)
+        poses[camera.name] = levelled(camera.X_BC, plane, grid)
+        seen = None
+        if block is not None:
+            level = table_points(frame, camera, poses[camera.name], grid)
+            seen = see_block(level, camera, poses[camera.name], block, grid.z_min, plane.noise)
+        found[camera.name] = _check_camera(camera, points, plane, grid, seen)
+        maps[camera.name] = _height_map(points, grid)
+    if block is not None:
+        seen_by = {name: item.block for name, item in found.items() if item.block is not None}
+        poses = _aligned(poses, seen_by, block)
+    # What is below the table is told too: o_t itself would cut it off.
+    fused = project(views, dataclasses.replace(grid, z_min=grid.z_min - FARTHEST))
+    maps[""] = np.where(fused.valid, fused.height - FARTHEST, np.nan).astype(np.float32)
+    return Check(
+        cameras=found,
+        together=_check_together(maps[""], found, grid),
+        disagreements=_disagreements(maps),
+        block_shifts={
+            (one, other): a.middle - b.middle
+            for (one, a), (other, b) in itertools.combinations(
+                [(name, item.block) for name, item in found.items()], 2
+            )
+            if a is not None and b is not None
+        },
+        block=block,
+        corrected=with_poses(calibration, poses),
+        heights=maps,
+    )
+
+
+def levelled(X_BC: Array, plane: Plane, grid: PixelGrid) -> Array:
+    """(4, 4): a camera's pose by which the plane that it sees is the table."""
+    R = plane.levelling()
+    corrected = X_BC.copy()
+    corrected[:3, :3] = R @ X_BC[:3, :3]
+    # A point of the plane, rotated about the camera.
+    point = np.array([*X_BC[:2, 3], float(plane.height(X_BC[:2, 3]))])
+    height = (R @ (point - X_BC[:3, 3]) + X_BC[:3, 3])[2]
+    corrected[2, 3] += grid.z_min - height
+    return corrected
+
+
+def middle_of(grid: PixelGrid) -> Array:
+    """(2,) the middle of the workspace, in metres."""
+    return np.array([(grid.x_min + grid.x_max) / 2, (grid.y_min + grid.y_max) / 2])
+
+
+def _plane_of(points: Array, camera: BenchCamera) -> Plane:
+    seen = points[np.isfinite(points[..., 2])]
+    if len(seen) < _LEAST_POINTS:
+        raise UserError(
+            f"camera {camera.name} sees next to nothing within "
+            f"{1e3 * FARTHEST:.0f} mm of the table's height: check its pose and table_height"
+        )
+    return fit_plane(seen)
+
+
+def _check_camera(
+    camera: BenchCamera, points: Array, plane: Plane, grid: PixelGrid, block: SeenBlock | None
+) -> CameraCheck:
+    expected = table_depth(camera, camera.X_BC, grid)
+    towards = np.isfinite(expected)
+    has_point = np.isfinite(points[..., 2])
+    holes = 1 - (has_point & towards).sum() / max(towards.sum(), 1)
+    z = points[..., 2]
+    with np.errstate(invalid="ignore"):
+        on_table = has_point & towards & (np.abs(z - plane.height(points[..., :2])) < 0.004)
+    above = z[on_table] - grid.z_min
+    # A depth that is longer by d moves a point down by d times the camera's height over its depth.
+    falls = -(camera.X_BC[2, 3] - grid.z_min) / expected[on_table]
+    depth_bias = float((falls * above).sum() / (falls * falls).sum())
+    rest = above - falls * depth_bias
+    return CameraCheck(
+        table=TableCheck(
+            tilt=plane.tilt,
+            bias=float(plane.height(middle_of(grid))) - grid.z_min,
+            noise=plane.noise,
+            holes=float(np.clip(holes, 0.0, 1.0)),
+        ),
+        distance=float(np.linalg.norm(points[on_table].mean(axis=0) - camera.X_BC[:3, 3])),
+        depth_bias=depth_bias,
+        depth_bias_noise=1.4826 * float(np.median(np.abs(rest))),
+        block=block,
+    )
+
+
+def _height_map(points: Array, grid: PixelGrid) -> NDArray[np.float32]:
+    """(rows, cols): the mean height of a camera's points above the table; NaN where unseen."""
+    seen = points[np.isfinite(points[..., 2])]
+    row, col = np.rint(grid.to_pixel(seen[:, :2])).astype(int).T
+    inside = (row >= 0) & (row < grid.rows) & (col >= 0) & (col < grid.cols)
+    cell = (row * grid.cols + col)[inside]
+    size = grid.rows * grid.cols
+    total = np.bincount(cell, seen[inside, 2] - grid.z_min, size)
+    count = np.bincount(cell, minlength=size)
+    mean = np.where(count > 0, total / np.maximum(count, 1), np.nan)
+    return mean.reshape(grid.shape).astype(np.float32)
+
+
+def _check_together(
+    height: NDArray[np.float32], found: dict[str, CameraCheck], grid: PixelGrid
+) -> TableCheck:
+    rows, cols = np.nonzero(np.isfinite(height))
+    xy = grid.to_world(np.column_stack([rows, cols]))
+    plane = fit_plane(np.column_stack([xy, height[rows, cols]]))
+    seen = len(rows) / height.size
+    return TableCheck(plane.tilt, float(plane.height(middle_of(grid))), plane.noise, 1 - seen)
+
+
+def _disagreements(maps: Mapping[str, NDArray[np.float32]]) -> dict[tuple[str, str], float]:
+    result = {}
+    for one, other in itertools.combinations([name for name in maps if name], 2):
+        rest = maps[one] - maps[other]
+        rest = rest[np.isfinite(rest)]
+        if len(rest) >= _SHARED:
+            result[one, other] = float(np.median(rest))
+    return result
+
+
+def _aligned(
+    poses: Mapping[str, Array], seen: Mapping[str, SeenBlock], block: Block
+) -> dict[str, Array]:
+    """The poses, shifted and rotated in the plane until the cameras see the block at one place."""
+    period = block.period
+    if block.pose is None:
+        first = next(iter(seen.values())).yaw
+        yaw = first + float(
+            np.mean([math.remainder(item.yaw - first, period) for item in seen.values()])
+        )
+        middle = np.mean([item.middle for item in seen.values()], axis=0)
+    else:
+        middle, yaw = np.array(block.pose[:2]), block.pose[2]
+    result = {}
+    for name, X_BC in poses.items():
+        R = Rotation.from_euler("z", math.remainder(yaw - seen[name].yaw, period)).as_matrix()
+        corrected = X_BC.copy()
+        corrected[:3, :3] = R @ X_BC[:3, :3]
+        corrected[:2, 3] = R[:2, :2] @ (X_BC[:2, 3] - seen[name].middle) + middle
+        result[name] = corrected
+    return result

@@ -1,0 +1,174 @@
+"""A block of known size on the table: the scale of what a camera sees, and where it sees it."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+from scipy.spatial import ConvexHull
+
+from kitting_drake.common.errors import UserError
+from kitting_drake.real_camera.calibrations.calibration import BenchCamera
+
+Array = NDArray[np.float64]
+
+_LEAST_PIXELS = 400
+_CLEAN = 0.0005
+"""Heights with more noise than this are smoothed, in metres."""
+_LEAST_BAND = 0.001
+"""Points this near to the height of the block's top are of it, or three times their noise."""
+
+
+@dataclass(frozen=True)
+class Block:
+    """A block, as a ruler knows it."""
+
+    size: tuple[float, float, float]
+    """Length, width and height, in metres."""
+    pose: tuple[float, float, float] | None = None
+    """x, y of its middle in the base frame, in metres, and the yaw of its length, in radians."""
+
+    @property
+    def period(self) -> float:
+        """The rotation after which it looks the same, in radians; a quarter where length and width
+        are too much alike to be told apart."""
+        length, width, _ = self.size
+        return math.pi / 2 if math.isclose(length, width, rel_tol=0.05) else math.pi
+
+
+@dataclass(frozen=True)
+class SeenBlock:
+    """A block, as one camera sees it."""
+
+    middle: Array
+    """(2,) in the base frame, in metres."""
+    yaw: float
+    """The direction of the length about z, in radians, modulo `Block.period`."""
+    size: tuple[float, float, float]
+    """Length, width and height, in metres."""
+    corner: float
+    """The angle between its sides, in radians: a right one, if the camera is square."""
+
+
+def see_block(
+    points: Array, camera: BenchCamera, X_BC: Array, block: Block, table: float, noise: float
+) -> SeenBlock:
+    """Measures the block in a camera's image.
+
+    Its top is a region of the image whose pixels look at parts of the plane of the top that are
+    known exactly, so the moments of these areas give its middle, its direction and its sides
+    without bias; depth tells only which pixels are of the top. The walls that the camera sees add a
+    strip that is as high as the band of depths that counts as the top; its width is known, and is
+    taken off again. Cavities within the outline do not matter; notches in it do.
+
+    Args:
+        points: (height, width, 3) in the base frame, as `table_points` gives them.
+        camera: whose.
+        X_BC: its pose.
+        block: what to look for.
+        table: height of the table, in metres.
+        noise: of the heights, in metres.
+
+    Raises:
+        UserError: no such block is seen.
+    """
+    z = np.where(np.isfinite(points[..., 2]), points[..., 2] - table, -1.0)
+    if noise > _CLEAN:
+        z = ndimage.median_filter(z, 5)
+    near = (z > block.size[2] / 2) & (z < 1.5 * block.size[2] + 0.005)
+    if near.sum() < _LEAST_PIXELS:
+        raise UserError(f"camera {camera.name} sees no block {1e3 * block.size[2]:g} mm high")
+    values = z[near]
+    # A millimetre each, also where all heights are the same.
+    low, high = values.min() - 0.002, values.max() + 0.002
+    counts, edges = np.histogram(values, math.ceil((high - low) / 0.001), (low, high))
+    mode = edges[counts.argmax()] + (edges[1] - edges[0]) / 2
+    band = max(_LEAST_BAND, 3 * noise)
+    top = float(np.median(values[np.abs(values - mode) < max(2 * band, 0.002)]))
+    mask = _filled(np.abs(z - top) < band, camera)
+    hit, area = _on_plane(camera, X_BC, table + top)
+    q, weights = hit[mask], area[mask]
+    middle = np.average(q, axis=0, weights=weights)
+    border = hit[mask & ~ndimage.binary_erosion(mask)] - middle
+    axes = _least_rectangle(border)
+    for _ in range(2):
+        turned, other = _side_angles(border @ axes)
+        axes = axes @ _rotation((turned + other) / 2)
+    variances = np.average(((q - middle) @ axes) ** 2, axis=0, weights=weights)
+    sides = np.sqrt(12 * variances)
+    if (sides[0] < sides[1]) != (block.size[0] < block.size[1]):
+        axes, sides = np.column_stack([axes[:, 1], -axes[:, 0]]), sides[::-1]
+    towards = (X_BC[:2, 3] - middle) @ axes / (X_BC[2, 3] - table - top)
+    strips = band * np.maximum(np.abs(towards) - sides / 2 / (X_BC[2, 3] - table - top), 0.0)
+    middle = middle - axes @ (np.sign(towards) * strips / 2)
+    length, width = sides - strips
+    if not (0.5 < length / block.size[0] < 2 and 0.5 < width / block.size[1] < 2):
+        raise UserError(
+            f"camera {camera.name} sees a block of {1e3 * length:.0f} x {1e3 * width:.0f} x "
+            f"{1e3 * top:.0f} mm: nothing else as high may be in the workspace"
+        )
+    turned, other = _side_angles(border @ axes)
+    yaw = math.atan2(axes[1, 0], axes[0, 0])
+    return SeenBlock(middle, yaw, (length, width, top), math.pi / 2 + other - turned)
+
+
+def _filled(mask: NDArray[np.bool_], camera: BenchCamera) -> NDArray[np.bool_]:
+    """The largest part of a mask, with the holes in it. Not its convex hull: of a noisy outline
+    that is the outermost."""
+    mask = ndimage.binary_fill_holes(ndimage.binary_closing(mask, iterations=2))
+    mask = ndimage.binary_opening(mask, iterations=3)
+    labels, count = ndimage.label(mask)
+    if not count:
+        raise UserError(f"camera {camera.name} sees no block with a flat top")
+    part = labels == np.bincount(labels.ravel())[1:].argmax() + 1
+    if part[0].any() or part[-1].any() or part[:, 0].any() or part[:, -1].any():
+        raise UserError(f"camera {camera.name} does not see the whole block")
+    return part
+
+
+def _on_plane(camera: BenchCamera, X_BC: Array, height: float) -> tuple[Array, Array]:
+    """(height, width, 2) where each pixel's ray meets a horizontal plane, in metres, and
+    (height, width) the area of it that the pixel covers, up to a factor."""
+    u, v = (item.astype(float) for item in np.broadcast_arrays(camera.rays.u, camera.rays.v))
+    directions = np.stack([u, v, np.ones_like(u)], axis=-1) @ X_BC[:3, :3].T
+    # What a pixel covers at depth 1: all alike, unless the lens distorts.
+    (u_row, u_col), (v_row, v_col) = np.gradient(u), np.gradient(v)
+    covered = np.abs(u_col * v_row - u_row * v_col)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        depth = (height - X_BC[2, 3]) / directions[..., 2]
+        hit = X_BC[:2, 3] + depth[..., None] * directions[..., :2]
+        return hit, covered * np.abs(depth) ** 3
+
+
+def _rotation(angle: float) -> Array:
+    return np.array([[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]])
+
+
+def _least_rectangle(points: Array) -> Array:
+    """(2, 2): the directions, as columns, of the least rectangle around points (n, 2)."""
+    corners = points[ConvexHull(points).vertices]
+    edges = np.diff(corners, axis=0, append=corners[:1])
+    candidates = [_rotation(angle) for angle in np.arctan2(edges[:, 1], edges[:, 0])]
+    return min(candidates, key=lambda axes: float(np.prod(np.ptp(corners @ axes, axis=0))))
+
+
+def _side_angles(local: Array) -> tuple[float, float]:
+    """By how much the sides along x, and those along y, of the outline (n, 2) of a rectangle about
+    the origin are rotated from these axes, in radians, counter-clockwise."""
+    half = np.abs(local).max(axis=0)
+    angles = []
+    for along in (0, 1):
+        across = 1 - along
+        slopes = []
+        for side in (-1, 1):
+            # Not the corners, which belong to two sides.
+            own = (side * local[:, across] > half[across] - 0.2 * half.min()) & (
+                np.abs(local[:, along]) < 0.8 * half[along]
+            )
+            if own.sum() > 10:
+                slopes.append(np.polyfit(local[own, along], local[own, across], 1)[0])
+        angles.append(math.atan(float(np.mean(slopes))) if slopes else 0.0)
+    return angles[0], -angles[1]

@@ -1,0 +1,196 @@
+"""The report of a check of cameras: numbers, and their meaning for the clearance."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from kitting_drake.real_camera.checking.check import CameraCheck, Check, TableCheck
+from kitting_drake.real_camera.checking.kit_block import Block, SeenBlock
+from systems.pick_place_parameters import PickPlaceParameters
+
+CLEARANCE = 0.002
+"""Between a tool and the wall of its cavity, in metres."""
+GOOD, TIGHT, BAD = "good", "tight", "too much"
+_HALF_KIT = 0.1
+"""From the middle of a kit to its edge, in metres."""
+_OUT_OF_SCALE = 0.008
+"""A scale that is off by less may be noise."""
+_HALF_WORKSPACE = 0.5
+"""In metres."""
+_LEVEL = math.radians(0.02)
+"""A table that looks tilted by less than this looks level."""
+_CLEAN, _NOISY = 0.0005, 0.0016
+"""Heights with less noise than the first are taken as they are; with more than the second, what is
+3 mm high or deep is lost (`policies/matching/segmentation.py`). In metres."""
+_LOST = 1.8
+"""Anything lower than this many times the noise is lost: two standard deviations of what smoothing
+leaves of it, nine tenths where neighbouring pixels err alike."""
+_FEW_HOLES, _MANY_HOLES = 0.02, 0.10
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One line of a report."""
+
+    who: str
+    """A camera, two of them, or `together`."""
+    what: str
+    value: str
+    verdict: str
+    meaning: str
+
+
+def findings(check: Check) -> list[Finding]:
+    """All lines of a report, camera by camera."""
+    lines: list[Finding] = []
+    for name, camera in check.cameras.items():
+        lines += _of_table(name, camera.table, camera.distance)
+        if explains_depth(camera):
+            lines.append(
+                Finding(
+                    name,
+                    "depth",
+                    f"{1e3 * camera.depth_bias:+.2f} mm",
+                    _verdict(camera.depth_bias),
+                    "a constant error of its depths explains tilt and bias as well as its pose "
+                    "does: measure one distance before you correct the pose",
+                )
+            )
+        if camera.block is not None and check.block is not None:
+            lines += _of_block(name, camera.block, check.block)
+    lines += _of_table("together", check.together, None)
+    for (one, other), height in check.disagreements.items():
+        lines.append(
+            Finding(
+                f"{one}, {other}",
+                "disagreement",
+                f"{1e3 * height:+.2f} mm",
+                _verdict(height),
+                "in height: an edge that both see at a slant is drawn twice, about as far apart",
+            )
+        )
+    for (one, other), shift in check.block_shifts.items():
+        lines.append(
+            Finding(
+                f"{one}, {other}",
+                "disagreement",
+                f"({1e3 * shift[0]:+.2f}, {1e3 * shift[1]:+.2f}) mm",
+                _verdict(float(np.linalg.norm(shift))),
+                "of where the block is, in x and y: objects look wider by it, cavities narrower",
+            )
+        )
+    return lines
+
+
+def explains_depth(camera: CameraCheck) -> bool:
+    """Whether a constant error of depth explains what is seen as well as an error of the pose."""
+    if abs(camera.depth_bias) < CLEARANCE / 4:
+        return False
+    return camera.depth_bias_noise < 1.05 * camera.table.noise + 5e-5
+
+
+def _of_table(who: str, table: TableCheck, distance: float | None) -> list[Finding]:
+    floor = PickPlaceParameters().floor_clearance
+    angle = table.tilt_angle
+    aside = (_HALF_WORKSPACE if distance is None else distance) * angle
+    if angle < _LEVEL:
+        tilted = "the table looks level"
+    elif distance is None:
+        tilted = f"heights change by {1e3 * aside:.1f} mm over half a metre"
+    else:
+        about_x, about_y = np.degrees(table.tilt)
+        tilted = (
+            f"{about_x:+.3f} about x and {about_y:+.3f} about y: a camera that is rotated so sees "
+            f"everything {1e3 * aside:.1f} mm aside"
+        )
+    high = "high" if table.bias > 0 else "low"
+    bias = f"grasps and rims look {1e3 * abs(table.bias):.1f} mm too {high}"
+    if table.bias > floor:
+        # The hand stops that much above `table_height`, wherever the depths are.
+        into = f"{1e3 * (table.bias - floor):.1f} mm"
+        bias += f"; if it is table_height that is too low, fingertips may go {into} into the table"
+    if table.noise <= _CLEAN:
+        noise, blurred = "heights are taken as they are", GOOD
+    else:
+        least = max(3.0, 1e3 * _LOST * table.noise)
+        noise = f"heights are smoothed, and what is less than {least:.1f} mm high or deep is lost"
+        blurred = TIGHT if table.noise <= _NOISY else BAD
+    holes = GOOD if table.holes < _FEW_HOLES else TIGHT if table.holes < _MANY_HOLES else BAD
+    return [
+        Finding(who, "tilt", f"{math.degrees(angle):.3f} deg", _verdict(aside), tilted),
+        Finding(who, "height bias", f"{1e3 * table.bias:+.2f} mm", _verdict(table.bias), bias),
+        Finding(who, "noise", f"{1e3 * table.noise:.2f} mm", blurred, noise),
+        Finding(
+            who,
+            "holes",
+            f"{100 * table.holes:.1f} %",
+            holes,
+            "what no camera sees is filled in from around it",
+        ),
+    ]
+
+
+def _of_block(who: str, seen: SeenBlock, block: Block) -> list[Finding]:
+    length, width, height = scales(seen, block)
+    # Opposite errors of length and width do not make up for one another.
+    worst = max(length, width, key=lambda share: abs(share - 1))
+    wrong = (worst - 1) * _HALF_KIT
+    reason = ""
+    if abs(worst - 1) > _OUT_OF_SCALE:
+        alike = max(abs(s - worst) for s in (length, width, height)) < 0.4 * abs(worst - 1)
+        reason = "; depth_scale may be wrong" if alike else "; the focal length may be wrong"
+    skew = (seen.corner - math.pi / 2) * _HALF_KIT
+    lines = [
+        Finding(
+            who,
+            "scale",
+            f"{worst:.4f}",
+            _verdict(wrong),
+            f"length {length:.4f}, width {width:.4f}, height {height:.4f}: 10 cm look "
+            f"{1e3 * abs(wrong):.2f} mm too {'long' if wrong > 0 else 'short'}{reason}",
+        ),
+        Finding(
+            who,
+            "squareness",
+            f"{math.degrees(seen.corner):.2f} deg",
+            _verdict(skew),
+            f"a right angle is {1e3 * abs(skew):.2f} mm off over 10 cm",
+        ),
+    ]
+    off = offset(seen, block)
+    if off is not None:
+        x, y, yaw = off
+        lines.append(
+            Finding(
+                who,
+                "offset",
+                f"({1e3 * x:+.2f}, {1e3 * y:+.2f}) mm, {math.degrees(yaw):+.2f} deg",
+                _verdict(math.hypot(x, y) + _HALF_KIT * abs(yaw)),
+                "picks and places go as far beside, and by the angle farther away from the block",
+            )
+        )
+    return lines
+
+
+def scales(seen: SeenBlock, block: Block) -> tuple[float, float, float]:
+    """How long, wide and high a block looks, as shares of what it is."""
+    length, width, height = np.divide(seen.size, block.size).tolist()
+    return length, width, height
+
+
+def offset(seen: SeenBlock, block: Block) -> tuple[float, float, float] | None:
+    """x, y in metres and yaw in radians by which a block looks displaced, if it is known where it
+    is; yaw modulo `Block.period`."""
+    if block.pose is None:
+        return None
+    x, y = seen.middle - np.array(block.pose[:2])
+    return float(x), float(y), math.remainder(seen.yaw - block.pose[2], block.period)
+
+
+def _verdict(error: float) -> str:
+    """The word for an error, in metres, by its share of the clearance."""
+    share = abs(error) / CLEARANCE
+    return GOOD if share < 0.25 else TIGHT if share < 0.75 else BAD

@@ -1,0 +1,101 @@
+"""Points in the base frame, and the plane that most of them lie on."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from kitting_drake.real_camera.calibrations.calibration import BenchCamera
+from kitting_drake.real_camera.frames import Frame
+from systems.signals import PixelGrid
+
+Array = NDArray[np.float64]
+
+FARTHEST = 0.15
+"""Points farther above or below the table than this are not part of it, in metres."""
+_TRIALS = 200
+_TRIED = 4000
+"""So many of the points judge a trial."""
+_BAND = 0.004
+"""Points within this of a trial's plane speak for it, in metres."""
+_REFITS = 4
+
+
+@dataclass(frozen=True)
+class Plane:
+    """z = slope[0] x + slope[1] y + offset, in the base frame."""
+
+    slope: Array
+    """(2,)."""
+    offset: float
+    noise: float
+    """The standard deviation of its points about it, robustly, in metres."""
+
+    def height(self, xy: Array) -> Array:
+        """(...) of positions (..., 2), in metres."""
+        return np.asarray(xy @ self.slope + self.offset)
+
+    @property
+    def normal(self) -> Array:
+        """(3,) of unit length, upwards."""
+        normal = np.array([-self.slope[0], -self.slope[1], 1.0])
+        return normal / np.linalg.norm(normal)
+
+    @property
+    def tilt(self) -> Array:
+        """(2,): the rotation vector, about base x and y, that brings the base's xy plane onto this
+        one, in radians."""
+        axis = np.cross([0.0, 0.0, 1.0], self.normal)
+        sine = np.linalg.norm(axis)
+        return axis[:2] * (math.asin(min(float(sine), 1.0)) / sine if sine > 0 else 0.0)
+
+    def levelling(self) -> Array:
+        """(3, 3): the least rotation that makes it horizontal."""
+        return Rotation.from_rotvec([*-self.tilt, 0.0]).as_matrix()
+
+
+def table_points(frame: Frame, camera: BenchCamera, X_BC: Array, grid: PixelGrid) -> Array:
+    """(height, width, 3): the point in the base frame that each pixel sees; NaN where it has no
+    depth, or sees beside the workspace or far from the table."""
+    rays, depth = camera.rays, frame.depth
+    with np.errstate(invalid="ignore"):
+        good = np.isfinite(depth) & (depth >= rays.min_depth) & (depth <= rays.max_depth)
+    z = np.where(good, depth, np.nan).astype(float)
+    p_C = np.stack([rays.u * z, rays.v * z, z], axis=-1)
+    p_B = p_C @ X_BC[:3, :3].T + X_BC[:3, 3]
+    with np.errstate(invalid="ignore"):
+        inside = grid.contains(p_B[..., :2]) & (np.abs(p_B[..., 2] - grid.z_min) < FARTHEST)
+    return np.where(inside[..., None], p_B, np.nan)
+
+
+def fit_plane(points: Array) -> Plane:
+    """The plane that most points lie on: of random triples the best, refitted to what is near it.
+
+    Args:
+        points: (n, 3), a hundred or more.
+    """
+    random = np.random.default_rng(0)
+    some = points[random.integers(0, len(points), min(_TRIED, len(points)))]
+    best, most = np.array([0.0, 0.0, float(np.median(points[:, 2]))]), -1
+    for _ in range(_TRIALS):
+        triple = some[random.integers(0, len(some), 3)]
+        design = np.column_stack([triple[:, :2], np.ones(3)])
+        if abs(np.linalg.det(design)) < 1e-3:
+            continue
+        plane = np.linalg.solve(design, triple[:, 2])
+        near = np.abs(some[:, :2] @ plane[:2] + plane[2] - some[:, 2]) < _BAND
+        if near.sum() > most and np.hypot(*plane[:2]) < 0.3:
+            best, most = plane, int(near.sum())
+    design = np.column_stack([points[:, :2], np.ones(len(points))])
+    noise = _BAND
+    for _ in range(_REFITS):
+        rest = points[:, 2] - design @ best
+        near = np.abs(rest) < max(3.5 * noise, 0.0005)
+        best = np.linalg.lstsq(design[near], points[near, 2], rcond=None)[0]
+        rest = (points[:, 2] - design @ best)[near]
+        noise = max(1.4826 * float(np.median(np.abs(rest - np.median(rest)))), 1e-6)
+    return Plane(best[:2], float(best[2]), noise)

@@ -1,0 +1,202 @@
+"""The policies that decide on a bench, each with how sure it is and a picture of why."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kitting_drake.common.errors import UserError
+from kitting_drake.common.paths import GENERALIST
+from kitting_drake.policies.matching.shape_matching import ShapeMatchingPolicy
+from systems.signals import Observation, PickPlaceAction, PixelGrid, PlanarPose
+
+if TYPE_CHECKING:
+    from kitting_drake.policies.learned_policy import Decision, LearnedPolicy
+
+_SAME_PICK = 0.010
+"""The networks' probability within this of a pick speaks for it, in metres ..."""
+_OTHER_PICKS = 0.060
+"""... and that within this speaks of the same object."""
+_SAME_ANGLE = math.radians(10)
+"""The same of the pick's angle, in radians."""
+
+
+@dataclass(frozen=True)
+class Choice:
+    """The choice of a policy."""
+
+    action: PickPlaceAction
+    confidence: float | None
+    """0 to 1; None where a rule of geometry decided, which weighs nothing."""
+    parts: dict[str, float] = field(default_factory=dict)
+    """The factors of the confidence."""
+    draw: Callable[[], bytes] = bytes
+    """Draws the decision: a PNG."""
+
+
+class BenchPolicy(Protocol):
+    """A policy that decides on a frame."""
+
+    @property
+    def name(self) -> str:
+        """For the record."""
+        ...
+
+    def check_grid(self, grid: PixelGrid) -> None:
+        """Makes sure that it can decide on such observations.
+
+        Raises:
+            UserError: it cannot.
+        """
+        ...
+
+    def choose(self, observation: Observation, failed_picks: Sequence[PlanarPose] = ()) -> Choice:
+        """The choice for an observation; where picks failed they are not tried again."""
+        ...
+
+
+@dataclass(frozen=True)
+class ShapeMatching:
+    """The training-free policy: outlines by height; see `ShapeMatchingPolicy`.
+
+    Its confidence is 1 where the outlines of object and recess agree wholly, and 0 where they
+    differ by as much as they may at all.
+    """
+
+    recover: bool = False
+
+    @property
+    def name(self) -> str:
+        return "shape_matching"
+
+    def check_grid(self, grid: PixelGrid) -> None:
+        """It takes any grid."""
+
+    def choose(self, observation: Observation, failed_picks: Sequence[PlanarPose] = ()) -> Choice:
+        matched = ShapeMatchingPolicy(recover=self.recover).decide(observation, failed_picks)
+        parts = {} if matched.agreement is None else {"outlines": matched.agreement}
+        return Choice(
+            matched.action,
+            matched.agreement,
+            parts,
+            lambda: _draw_action(observation, matched.action),
+        )
+
+
+@dataclass(frozen=True)
+class _Networks:
+    """A learned policy; made by `load_policy`."""
+
+    policy: LearnedPolicy
+    name: str
+    resolution: float | None
+    """The size of the pixels that it learned from, in metres, if its file tells."""
+
+    def check_grid(self, grid: PixelGrid) -> None:
+        learned, given = self.resolution, grid.resolution
+        if learned is not None and not math.isclose(learned, given, rel_tol=1e-6):
+            raise UserError(
+                f"workspace.resolution is {given:g} m, and the policy {self.name} learned from "
+                f"pixels of {learned:g} m"
+            )
+
+    def choose(self, observation: Observation, failed_picks: Sequence[PlanarPose] = ()) -> Choice:
+        action, decision = self.policy.act(observation, failed_picks)
+        if decision is None:
+            return Choice(action, None, draw=lambda: _draw_action(observation, action))
+        parts = confidence_parts(decision, observation.grid.resolution)
+
+        def draw() -> bytes:
+            # Who draws nothing does not wait for matplotlib.
+            from kitting_drake.evaluation.decision_figure import draw_decision
+
+            return draw_decision(observation, decision)
+
+        return Choice(action, math.prod(parts.values()) if parts else None, parts, draw)
+
+
+def load_policy(
+    weights: Path | None = None,
+    *,
+    orientations: int = 180,
+    fit_outlines: bool = True,
+    recover: bool = False,
+) -> BenchPolicy:
+    """A learned policy, as `policy: !Learned` of a scenario has it.
+
+    Args:
+        weights: a file that `train` wrote; None: the generalist's.
+        orientations: N.
+        fit_outlines: refine places by outlines and grasps by the room for the jaws: for tasks in
+            which objects are inserted; False: of equivalent rotations of a place, take one in which
+            the jaws have room to let go.
+        recover: mend what is not seated; see `LearnedPolicy`.
+
+    Raises:
+        UserError: the file cannot be used, or not at so many orientations.
+    """
+    # Only who uses a network waits for torch.
+    from kitting_drake.policies.learned_policy import LearnedPolicy
+    from kitting_drake.policies.networks.device import preferred_device, preferred_type
+    from kitting_drake.policies.networks.weights import load_networks, read_weights_file
+
+    path = GENERALIST if weights is None else weights
+    resolution = read_weights_file(path).card.get("resolution")
+    networks = load_networks(path, preferred_type()).to(preferred_device())
+    try:
+        policy = LearnedPolicy(
+            networks,
+            orientations=orientations,
+            fit_outlines=fit_outlines,
+            clear_jaws=not fit_outlines,
+            recover=recover,
+        )
+    except ValueError as error:
+        raise UserError(f"--orientations: {error}") from error
+    return _Networks(policy, path.stem, resolution)
+
+
+def confidence_parts(decision: Decision, resolution: float) -> dict[str, float]:
+    """How sure the networks are of a decision, as shares of their own probabilities.
+
+    - `something_to_pick` (of a stop: `nothing_to_pick`), by alpha's class for it, where they have
+      one;
+    - `pick`: of alpha's probability within 6 cm of the pick, the share within 1 cm: other objects
+      that could be picked as well are no doubt about this one;
+    - `angle`: beta's probability within 10 degrees of the pick's angle.
+
+    The place has none: its scores say which is best, not how good it is.
+    """
+    parts: dict[str, float] = {}
+    if decision.log_odds is not None:
+        odds = decision.log_odds if not decision.stop else -decision.log_odds
+        name = "nothing_to_pick" if decision.stop else "something_to_pick"
+        parts[name] = 1 / (1 + math.exp(-max(-50.0, min(odds, 50.0))))
+    if decision.stop:
+        return parts
+    rows, cols = np.indices(decision.pick_map.shape)
+    row, col = decision.pick_pixel
+    distance = np.hypot(rows - row, cols - col) * resolution
+    about = _mass(decision.pick_map, distance < _OTHER_PICKS)
+    parts["pick"] = _mass(decision.pick_map, distance < _SAME_PICK) / max(about, 1e-12)
+    count = len(decision.angle_curve)
+    angles = np.arange(count) * math.pi / count - decision.action.pick.theta
+    off = np.abs((angles + math.pi / 2) % math.pi - math.pi / 2)
+    parts["angle"] = _mass(decision.angle_curve, off <= _SAME_ANGLE)
+    return {key: min(max(value, 0.0), 1.0) for key, value in parts.items()}
+
+
+def _mass(probabilities: NDArray[np.float32], where: NDArray[np.bool_]) -> float:
+    return float(probabilities[where].sum(dtype=float))
+
+
+def _draw_action(observation: Observation, action: PickPlaceAction) -> bytes:
+    from kitting_drake.evaluation.decision_figure import draw_action
+
+    return draw_action(observation, action)

@@ -1,0 +1,127 @@
+"""Decisions and checks as files, and as text on a terminal."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+from kitting_drake.common.files import write_atomically, write_json
+from kitting_drake.real_camera.calibrations.calibration import write_calibration
+from kitting_drake.real_camera.checking.check import Check, TableCheck
+from kitting_drake.real_camera.checking.meaning import BAD, GOOD, findings, offset, scales
+
+CHECK_FILES = ("check.json", "corrected.yaml", "check.png")
+"""The files that `save_check` writes."""
+_WELL_SEEN = 0.9
+"""Where less than this share of what is in view is seen, it is told."""
+
+
+def print_decision(console: Console, record: dict[str, Any]) -> None:
+    """Prints the content of an `action.json`."""
+    confidence = record["confidence"]
+    sure = "" if confidence is None else f", confidence {confidence:.2f}"
+    said = "stop" if record["stop"] else "press" if record["press"] else "pick and place"
+    by = f"({record['policy']}, {record['seconds']:.2f} s)"
+    console.print(f"{said}{sure} {by}", highlight=False, markup=False)
+    if record["seen"] < _WELL_SEEN:
+        console.print(
+            f"  only {100 * record['seen']:.0f} % of what is in view is seen; the rest is filled "
+            "in from around it",
+            highlight=False,
+        )
+    for name in ("pick", "place"):
+        pose = record.get(name)
+        if pose is not None:
+            console.print(
+                f"  {name:5}  x {pose['x']:.4f}  y {pose['y']:+.4f}  z {pose['z']:.4f} m  "
+                f"yaw {math.degrees(pose['yaw']):+.1f} deg",
+                highlight=False,
+            )
+
+
+def save_check(folder: Path, check: Check) -> None:
+    """Writes `check.json`, the corrected calibration `corrected.yaml`, and `check.png`.
+
+    Raises:
+        UserError: a file cannot be written.
+    """
+    # Who draws nothing does not wait for matplotlib.
+    from kitting_drake.evaluation.check_figure import draw_heights
+
+    record, calibration, picture = (folder / name for name in CHECK_FILES)
+    write_json(record, check_record(check))
+    write_calibration(calibration, check.corrected)
+    write_atomically(picture, draw_heights(check.heights, check.corrected.grid))
+
+
+def check_record(check: Check) -> dict[str, Any]:
+    """A check as JSON: mm, degrees and percent."""
+    cameras = {}
+    for name, camera in check.cameras.items():
+        record = {**_table(camera.table), "depth_bias_mm": _mm(camera.depth_bias)}
+        if camera.block is not None and check.block is not None:
+            seen = camera.block
+            record["block"] = {
+                "size_mm": [_mm(side) for side in seen.size],
+                "scale": [round(scale, 5) for scale in scales(seen, check.block)],
+                "corner_deg": round(math.degrees(seen.corner), 3),
+                "middle": seen.middle.tolist(),
+                "yaw": seen.yaw,
+            }
+            off = offset(seen, check.block)
+            if off is not None:
+                record["block"]["offset_mm"] = [_mm(off[0]), _mm(off[1])]
+                record["block"]["offset_deg"] = round(math.degrees(off[2]), 3)
+        cameras[name] = record
+    return {
+        "cameras": cameras,
+        "together": _table(check.together),
+        "disagreement_mm": {
+            f"{one}, {other}": _mm(height) for (one, other), height in check.disagreements.items()
+        },
+        "block_disagreement_mm": {
+            f"{one}, {other}": [_mm(value) for value in shift]
+            for (one, other), shift in check.block_shifts.items()
+        },
+    }
+
+
+def print_check(console: Console, check: Check) -> None:
+    """Prints what was found, and what each finding means for a clearance of 2 mm."""
+    table = Table(box=None, pad_edge=False)
+    for title in ("camera", "", "", "2 mm clearance", "meaning"):
+        table.add_column(title, overflow="fold")
+    last = ""
+    for line in findings(check):
+        colour = {GOOD: "green", BAD: "red"}.get(line.verdict, "yellow")
+        table.add_row(
+            escape(line.who) if line.who != last else "",
+            line.what,
+            line.value,
+            f"[{colour}]{line.verdict}[/]",
+            line.meaning,
+            end_section=False,
+        )
+        last = line.who
+    console.print(table, highlight=False)
+    console.print("corrected poses: corrected.yaml", highlight=False)
+
+
+def _table(table: TableCheck) -> dict[str, Any]:
+    return {
+        "tilt_deg": round(math.degrees(table.tilt_angle), 4),
+        "tilt_about_x_deg": round(math.degrees(table.tilt[0]), 4),
+        "tilt_about_y_deg": round(math.degrees(table.tilt[1]), 4),
+        "height_bias_mm": _mm(table.bias),
+        "noise_mm": _mm(table.noise),
+        "holes_percent": round(100 * table.holes, 2),
+    }
+
+
+def _mm(metres: float) -> float:
+    return round(1e3 * float(metres), 3)

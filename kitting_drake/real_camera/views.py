@@ -1,0 +1,192 @@
+"""Whether cameras see the workspace, and whether their depths can be metres."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from kitting_drake.common.errors import UserError
+from kitting_drake.real_camera.calibrations.calibration import BenchCamera, Calibration
+from kitting_drake.real_camera.frames import Frame, check_frame
+from systems.heightmap import View, project
+from systems.signals import Observation, PixelGrid
+
+Array = NDArray[np.float64]
+
+_LEAST_SEEN = 0.01
+"""A camera that sees less than this share of the workspace looks elsewhere."""
+_LEAST_DEPTH = 0.01
+"""The same for the share of pixels towards the workspace that have any depth."""
+_NEAREST, _FARTHEST = 0.8, 1.25
+"""Depths, as shares of that of the table, that may be something on the table, or a pose that is
+off: beyond these the unit is wrong, or the pose."""
+_TALL = 0.1
+"""Depths may be those of what stands on the table, up to this height in metres."""
+_WIDEST = 0.15
+"""Half of these shares lie within a range as narrow as this, or what is seen is no table."""
+_STEP = 4
+"""Every so many pixels are enough to judge by."""
+_OPTICAL = np.eye(4)
+_OPTICAL[:3, :3] = Rotation.from_euler("xyz", [-90, 0, -90], degrees=True).as_matrix()
+"""The optical frame in a camera's body frame as ROS has it (x forward, y left, z up)."""
+
+
+def observe(frames: Mapping[str, Frame], calibration: Calibration) -> Observation:
+    """o_t, by the arithmetic of the simulated cell.
+
+    Args:
+        frames: of each camera by its name.
+        calibration: of the cameras.
+
+    Raises:
+        UserError: a frame is missing, has a wrong size or type, or does not fit the calibration.
+    """
+    return project(make_views(frames, calibration), calibration.grid)
+
+
+def make_views(frames: Mapping[str, Frame], calibration: Calibration) -> list[View]:
+    """The cameras' views, once it is plausible that they show the workspace.
+
+    Raises:
+        UserError: a camera has no frame or one of a wrong size or type, sees nothing of the
+            workspace, or has no depths or depths in another unit.
+    """
+    views = []
+    for camera in calibration.cameras:
+        frame = frames.get(camera.name)
+        if frame is None:
+            raise UserError(f"there is no frame of camera {camera.name}")
+        frame = check_frame(frame, camera)
+        _check_pose(camera, calibration.grid)
+        _check_depth(frame, camera, calibration.grid)
+        views.append(View(frame.color, frame.depth, camera.X_BC, camera.rays))
+    return views
+
+
+def table_depth(
+    camera: BenchCamera, X_BC: Array, grid: PixelGrid, step: int = 1
+) -> NDArray[np.float64]:
+    """(height, width): the depth of the table where a pixel looks at the workspace, in metres, by
+    the camera's pose alone; NaN elsewhere. Of every `step`th pixel along rows and columns."""
+    rays = camera.rays
+    u, v = (item[::step, ::step] for item in np.broadcast_arrays(rays.u, rays.v))
+    directions = np.stack([u, v, np.ones_like(u)], axis=-1) @ X_BC[:3, :3].T
+    with np.errstate(divide="ignore", invalid="ignore"):
+        depth = (grid.z_min - X_BC[2, 3]) / directions[..., 2]
+        xy = X_BC[:2, 3] + depth[..., None] * directions[..., :2]
+        seen = (depth > 0) & grid.contains(xy)
+    return np.where(seen, depth, np.nan)
+
+
+def seen_share(observation: Observation, calibration: Calibration) -> float:
+    """The share of o_t's pixels in view of any camera that one sees, from 0 to 1."""
+    grid = observation.grid
+    views = [_in_view(camera, camera.X_BC, grid, 1) for camera in calibration.cameras]
+    return float(observation.valid.ravel()[np.any(views, axis=0)].mean())
+
+
+def _in_view(
+    camera: BenchCamera, X_BC: Array, grid: PixelGrid, step: int = _STEP
+) -> NDArray[np.bool_]:
+    """(n,) of every `step`th of the workspace's pixels along rows and columns, whether it is in the
+    image, at the table's height."""
+    rows, cols = np.meshgrid(
+        np.arange(0, grid.rows, step), np.arange(0, grid.cols, step), indexing="ij"
+    )
+    xy = grid.to_world(np.stack([rows.ravel(), cols.ravel()], axis=-1))
+    p_C = (np.column_stack([xy, np.full(len(xy), grid.z_min)]) - X_BC[:3, 3]) @ X_BC[:3, :3]
+    lens, inside = camera.intrinsics, p_C[:, 2] > 0
+    x, y = (p_C[inside, :2] / p_C[inside, 2:]).T * np.array(lens.focal)[:, None]
+    inside[inside] = (np.abs(x + lens.centre[0] - lens.size[0] / 2) <= lens.size[0] / 2) & (
+        np.abs(y + lens.centre[1] - lens.size[1] / 2) <= lens.size[1] / 2
+    )
+    return inside
+
+
+def _check_pose(camera: BenchCamera, grid: PixelGrid) -> None:
+    X_BC = camera.X_BC
+    if _in_view(camera, X_BC, grid).mean() >= _LEAST_SEEN and X_BC[2, 3] > grid.z_min:
+        return
+    others = {
+        "its inverse would: is it the pose of the base in the camera?": np.linalg.inv(X_BC),
+        "it would if this were the pose of ROS's body frame: give that of the optical frame, z "
+        "forward": X_BC @ _OPTICAL,
+        "it would if the pose were in millimetres: positions are in metres": np.vstack(
+            [np.column_stack([X_BC[:3, :3], X_BC[:3, 3] / 1e3]), X_BC[3:]]
+        ),
+    }
+    hints = [
+        text
+        for text, X in others.items()
+        if X[2, 3] > grid.z_min and _in_view(camera, X, grid).mean() >= 0.1
+    ]
+    if hints:
+        hint = hints[0]
+    elif X_BC[2, 3] <= grid.z_min:
+        hint = f"it is {1e3 * (grid.z_min - X_BC[2, 3]):.0f} mm below the table"
+    elif X_BC[2, 2] > 0:
+        hint = "it looks upwards"
+    else:
+        x, y, _ = X_BC[:3, 3] + X_BC[:3, 2] * (grid.z_min - X_BC[2, 3]) / X_BC[2, 2]
+        hint = f"it looks at ({x:.2f}, {y:.2f}) m on the table"
+    raise UserError(
+        f"by its pose camera {camera.name} sees nothing of the workspace "
+        f"({grid.x_min:g} to {grid.x_max:g}, {grid.y_min:g} to {grid.y_max:g} m): {hint}"
+    )
+
+
+def _check_depth(frame: Frame, camera: BenchCamera, grid: PixelGrid) -> None:
+    expected = table_depth(camera, camera.X_BC, grid, _STEP)
+    towards = np.isfinite(expected)
+    if not towards.any():
+        raise UserError(
+            f"the workspace is too small for camera {camera.name}, which has next to no pixel of "
+            "it: give it more rows and cols"
+        )
+    depth = frame.depth[::_STEP, ::_STEP][towards]
+    with np.errstate(invalid="ignore"):
+        returned = np.isfinite(depth) & (depth > 0)
+    if returned.mean() < _LEAST_DEPTH:
+        raise UserError(
+            f"depth of camera {camera.name} is all zero or NaN where it looks at the workspace"
+        )
+    ratios = depth[returned] / expected[towards][returned]
+    # Along a ray, the share that is left is that of the camera's height.
+    on_table = (ratios < 1) & (ratios > 1 - _TALL / (camera.X_BC[2, 3] - grid.z_min))
+    ratios[on_table] = 1
+    low, ratio, high = (float(value) for value in np.percentile(ratios, (25, 50, 75)))
+    if _NEAREST <= ratio <= _FARTHEST:
+        if high - low <= _WIDEST:
+            _check_limits(depth[returned], camera)
+            return
+        raise UserError(
+            f"by its pose camera {camera.name} sees no table: half of its depths are from "
+            f"{low:.2f} to {high:.2f} times that of the table: check the pose (or is it the "
+            "inverse, that of the base in the camera?)"
+        )
+    found = float(np.median(depth[returned]))
+    told = (
+        f"depth of camera {camera.name} is {found:.3g} m, the median, where by its pose the table"
+    )
+    told += f" is {found / ratio:.3g} m away"
+    if 500 < ratio < 2000:
+        hint = "these are millimetres: a .npy file holds metres, and depth_scale is metres a step"
+    elif 1 / 2000 < ratio < 1 / 500 or found < 1.5 * camera.depth_scale:
+        hint = "these are metres: a 16-bit PNG holds steps of depth_scale, of 1 mm by default"
+    else:
+        scale = camera.depth_scale / ratio
+        hint = f"check the pose, table_height and depth_scale (of {scale:.2g} it would agree)"
+    raise UserError(f"{told}: {hint}")
+
+
+def _check_limits(depth: NDArray[np.float32], camera: BenchCamera) -> None:
+    """Raises UserError where a camera's limits leave next to nothing of its depths (n), in m."""
+    low, high = camera.min_depth, camera.max_depth
+    if ((depth >= low) & (depth <= high)).mean() < _LEAST_DEPTH:
+        raise UserError(
+            f"depth of camera {camera.name} is {np.median(depth):.3g} m, the median, and by its "
+            f"min_depth {low:g} and max_depth {high:g} next to none is taken: these are in metres"
+        )

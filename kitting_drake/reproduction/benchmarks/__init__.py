@@ -1,0 +1,1 @@
+"""The measurements of the command `benchmark`, apart from networks and the paper."""

@@ -1,0 +1,336 @@
+"""`benchmark recovery`: what a policy makes of an action that goes wrong, and of one that does not.
+
+In each episode the first action is made to fail in one of three ways: the object is moved while the
+hand comes down, the grasp is off, or the place is off. What is counted is whether that
+object is kitted at the end all the same, and how often an object that was kitted is touched again.
+"""
+
+import dataclasses
+import enum
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, cast
+
+import numpy as np
+from numpy.typing import NDArray
+from pydrake.common.value import Value
+from pydrake.math import RigidTransform, RollPitchYaw
+from pydrake.systems.framework import BasicVector, Context, Diagram, DiagramBuilder, LeafSystem
+from rich.console import Console
+from rich.progress import track
+from rich.table import Table
+from scipy.spatial import cKDTree
+
+from kitting_drake.common.errors import UserError
+from kitting_drake.episode import ModeChange
+from kitting_drake.episode.action_log import nearest_object
+from kitting_drake.episode.chosen import build_chosen, run_chosen
+from kitting_drake.evaluation.action_strip import ActionStrip, Frame, draw_strips
+from kitting_drake.evaluation.intervals import proportion_interval
+from kitting_drake.scenario.choosing import ChosenScenario
+from kitting_drake.scenario.policies import Policy, PolicyConfig, PolicySite
+from kitting_drake.station import Cell
+from systems.pick_place_parameters import Mode
+from systems.signals import PickPlaceAction, PixelGrid, PlanarPose
+from systems.weak_calc import weak_calc
+
+_MOVED = (0.03, 0.06)
+"""How far an object is moved, in metres, ..."""
+_MOVED_YAW = math.radians(45)
+"""... and turned, at most."""
+_MISSED = 0.04
+"""By how much a grasp is off, in metres."""
+_BLOCKED = 0.003
+"""By how much a place is off, in metres."""
+_ROOM = 0.012
+"""An object is moved to where it is at least this far from all others, in metres."""
+_INSIDE = 0.02
+"""An object is moved to where all of it is at least this far within o_t, in metres."""
+_DRAWS = 200
+
+
+class Disturbance(enum.Enum):
+    """The fault of the first action of an episode."""
+
+    NONE = "nothing"
+    MOVED = "object moved"
+    MISSED = "grasp off by 40 mm"
+    BLOCKED = "place off by 3 mm"
+
+
+class ActionOffset(LeafSystem):
+    """Shifts the poses of an action.
+
+    .. pydrake_system::
+
+        name: ActionOffset
+        input_ports:
+        - action
+        output_ports:
+        - action
+
+    Both abstract, `PickPlaceAction`. The numeric parameter 0 has the shifts of pick x, pick y,
+    place x and place y, in metres; zero changes nothing.
+    """
+
+    def __init__(self, offset: NDArray[np.float64]) -> None:
+        """
+        Args:
+            offset: (4,) at the beginning.
+        """
+        super().__init__()
+        self._action = self.DeclareAbstractInputPort("action", Value(PickPlaceAction()))
+        self._offset = self.DeclareNumericParameter(BasicVector(offset))
+        self.DeclareAbstractOutputPort(
+            "action", lambda: Value(PickPlaceAction()), weak_calc(self._calc)
+        )
+
+    def stop(self, context: Context) -> None:
+        """From now on nothing is shifted."""
+        context.get_mutable_numeric_parameter(self._offset).SetFromVector(np.zeros(4))
+
+    def _calc(self, context: Context, output: Any) -> None:
+        action: PickPlaceAction = self._action.Eval(context)
+        offset = context.get_numeric_parameter(self._offset).value()
+        if action.stop or action.press or not offset.any():
+            output.set_value(action)
+            return
+        output.set_value(
+            dataclasses.replace(
+                action,
+                pick=_shifted(action.pick, offset[:2]),
+                place=_shifted(action.place, offset[2:]),
+            )
+        )
+
+
+def _shifted(pose: PlanarPose, offset: NDArray[np.float64]) -> PlanarPose:
+    return PlanarPose(pose.x + float(offset[0]), pose.y + float(offset[1]), pose.theta)
+
+
+@dataclass
+class _Disturbed(PolicyConfig):
+    """A policy whose actions go through an `ActionOffset`."""
+
+    policy: PolicyConfig
+    offset: NDArray[np.float64]
+
+    def __post_init__(self) -> None:
+        self.needs_observation = self.policy.needs_observation
+
+    def make_system(self, site: PolicySite) -> Diagram:
+        builder = DiagramBuilder()
+        inner = builder.AddNamedSystem("policy", self.policy.make_system(site))
+        shift = builder.AddNamedSystem("offset", ActionOffset(self.offset))
+        builder.Connect(inner.GetOutputPort("action"), shift.GetInputPort("action"))
+        for index in range(inner.num_input_ports()):
+            port = inner.get_input_port(index)
+            builder.ExportInput(port, port.get_name())
+        builder.ExportOutput(shift.GetOutputPort("action"), "action")
+        return builder.Build()
+
+
+class _Adversary:
+    """An `EpisodeObserver` that brings a disturbance about, and counts what is touched again."""
+
+    def __init__(
+        self,
+        cell: Cell,
+        kind: Disturbance,
+        offset: NDArray[np.float64],
+        rng: np.random.Generator,
+        grid: PixelGrid,
+    ) -> None:
+        self._cell, self._kind, self._offset, self._rng = cell, kind, offset, rng
+        self._grid = grid
+        self._actions = 0
+        self.victim: int | None = None
+        """The object whose action went wrong; None if nothing could be done to it."""
+        self.seated: set[int] = set()
+        """The objects that were kitted when an action began."""
+        self.touched: set[int] = set()
+        """Those of them that the action went for."""
+
+    def observe(self, event: ModeChange) -> None:
+        if event.is_last:
+            return
+        if event.is_action_start:
+            self._begin(event.root_context)
+        elif self._actions != 1:
+            return
+        elif event.mode == Mode.DESCEND and self._kind == Disturbance.MOVED:
+            self._move(event.root_context)
+        elif event.mode == Mode.RETREAT:
+            offset = self._cell.diagram.GetSubsystemByName("policy").GetSubsystemByName("offset")
+            offset.stop(offset.GetMyContextFromRoot(event.root_context))
+
+    def _begin(self, root_context: Context) -> None:
+        cell = self._cell
+        self._actions += 1
+        pick, _ = cell.planner.action(cell.planner.GetMyContextFromRoot(root_context))
+        if self._actions == 1:
+            pick = _shifted(pick, -self._offset[:2])
+        wanted = nearest_object(cell, cell.object_poses(root_context), pick)
+        if self._actions == 1:
+            self.victim = wanted if wanted in cell.scene.goal_objects else None
+        placements = cell.placements(root_context)
+        seated = {i for i in cell.scene.goal_objects if placements[i].strict_success}
+        self.seated |= seated
+        self.touched |= seated & {wanted}
+
+    def _move(self, root_context: Context) -> None:
+        """Moves the object on the table to where there is room."""
+        cell, rng = self._cell, self._rng
+        if self.victim is None:
+            return
+        poses = cell.object_poses(root_context)
+        clouds = [
+            (X @ item.p_BPoints.T).T[:, :2] for X, item in zip(poses, cell.objects, strict=True)
+        ]
+        own = clouds.pop(self.victim)
+        clouds += [
+            (X @ cell.objects[goal.objects[0]].p_BPoints.T).T[:, :2]
+            for goal in cell.scene.goals
+            for X in goal.poses
+        ]
+        others = cKDTree(np.concatenate(clouds))
+        middle = own.mean(axis=0)
+        grid = self._grid
+        low = np.array([grid.x_min, grid.y_min]) + _INSIDE
+        high = low + grid.resolution * np.array(grid.shape) - 2 * _INSIDE
+        for _ in range(_DRAWS):
+            way, turn = rng.uniform(0, math.tau), rng.uniform(-_MOVED_YAW, _MOVED_YAW)
+            shift = rng.uniform(*_MOVED) * np.array([math.cos(way), math.sin(way)])
+            R = RollPitchYaw(0, 0, turn).ToRotationMatrix()
+            there = (own - middle) @ R.matrix()[:2, :2].T + middle + shift
+            outside = np.any(there < low) or np.any(there > high)
+            if outside or others.query(there)[0].min() < _ROOM:
+                continue
+            about = np.append(middle, 0.0)
+            X = RigidTransform(about + [*shift, 0.0]) @ RigidTransform(R, -(R @ about))
+            context = cell.plant.GetMyMutableContextFromRoot(root_context)
+            body = cell.plant.get_body(cell.objects[self.victim].body)
+            cell.plant.SetFreeBodyPose(context, body, X @ poses[self.victim])
+            return
+        self.victim = None
+
+
+_Strip = tuple[str, Sequence[Frame], Sequence[str]]
+
+
+@dataclass
+class _Count:
+    recovered: int = 0
+    disturbed: int = 0
+    kitted: int = 0
+    objects: int = 0
+    touched: int = 0
+    seated: int = 0
+    actions: int = 0
+    failed: int = 0
+    """Episodes that failed: none of their objects counts as kitted."""
+    timed_out: int = 0
+    """Episodes that timed out: none of their objects counts as kitted either."""
+
+
+def benchmark_recovery(
+    chosen: ChosenScenario, episodes: int, seed: int, console: Console
+) -> tuple[dict[str, Any], bytes]:
+    """Runs episodes with each disturbance.
+
+    Returns the figures, and a PNG of one episode of each as a strip of frames: the one that took
+    the most actions, but recovered.
+
+    Args:
+        chosen: the scenario, with the policy that is to recover.
+        episodes: with each disturbance.
+        seed: of the first; the others follow.
+        console: for progress.
+
+    Raises:
+        UserError: there are no cameras, by whose images episodes are drawn, or the scene of a seed
+            cannot be built.
+    """
+    if not chosen.scenario.cameras:
+        raise UserError(
+            f"{chosen.path}: cameras is empty: the strips of episodes need at least one"
+        )
+    counts = {kind: _Count() for kind in Disturbance}
+    strips: dict[Disturbance, _Strip] = {}
+    runs = [(kind, seed + number) for kind in Disturbance for number in range(episodes)]
+    for kind, number in track(runs, "episodes", console=console, disable=console.quiet):
+        strip = _run(chosen, kind, number, counts[kind])
+        if strip is not None and len(strip[1]) > len(strips.get(kind, ("", (), ()))[1]):
+            strips[kind] = strip
+    measured = {
+        "episodes": episodes,
+        "seed": seed,
+        "policy": {"name": chosen.policy, **chosen.scenario.policy.details(chosen.base)},
+        "disturbances": {kind.value: dataclasses.asdict(count) for kind, count in counts.items()},
+    }
+    return measured, draw_strips(list(strips.values())) if strips else b""
+
+
+def _run(chosen: ChosenScenario, kind: Disturbance, seed: int, count: _Count) -> _Strip | None:
+    """Runs an episode and counts; returns it as a strip if everything was kitted."""
+    rng = np.random.default_rng([seed, list(Disturbance).index(kind)])
+    way = rng.uniform(0, math.tau)
+    direction = np.array([math.cos(way), math.sin(way)])
+    offset = np.zeros(4)
+    if kind == Disturbance.MISSED:
+        offset[:2] = _MISSED * direction
+    elif kind == Disturbance.BLOCKED:
+        offset[2:] = _BLOCKED * direction
+    policy = cast(Policy, _Disturbed(chosen.scenario.policy, offset))
+    disturbed = dataclasses.replace(
+        chosen, scenario=dataclasses.replace(chosen.scenario, policy=policy)
+    )
+    cell = build_chosen(disturbed, seed=seed)
+    adversary = _Adversary(cell, kind, offset, rng, chosen.scenario.heightmap.grid())
+    strip = ActionStrip(cell)
+    observers = [adversary.observe, strip.observe]
+    result = run_chosen(disturbed, cell, seed=seed, observers=observers)
+    count.failed += bool(result.failure)
+    count.timed_out += result.timed_out
+    lost = bool(result.failure) or result.timed_out
+    strict = {item.name for item in result.objects if item.strict_success and not lost}
+    if adversary.victim is not None and kind != Disturbance.NONE:
+        count.disturbed += 1
+        count.recovered += cell.scene.objects[adversary.victim].name in strict
+    ended = {i for i in cell.scene.goal_objects if cell.scene.objects[i].name in strict}
+    count.kitted += len(strict)
+    count.objects += len(result.objects)
+    if not lost:
+        count.seated += len(adversary.seated)
+        count.touched += len(adversary.touched | (adversary.seated - ended))
+    count.actions += result.actions
+    if len(strict) < len(result.objects):
+        return None
+    return kind.value, strip.frames, [record.outcome for record in result.actions_taken]
+
+
+def recovery_table(measured: dict[str, Any]) -> Table:
+    """The measurements, for a person."""
+    table = Table(title=f"{measured['policy']['name']}: {measured['episodes']} episodes each")
+    columns = ("recovered", "kitted in all", "disturbed again", "actions", "failed, timed out")
+    table.add_column("the first action")
+    for column in columns:
+        table.add_column(column, justify="right")
+    for name, count in measured["disturbances"].items():
+        table.add_row(
+            name,
+            _share(count["recovered"], count["disturbed"]),
+            _share(count["kitted"], count["objects"]),
+            _share(count["touched"], count["seated"]),
+            str(count["actions"]),
+            f"{count['failed']}, {count['timed_out']}",
+        )
+    return table
+
+
+def _share(part: int, whole: int) -> str:
+    if not whole:
+        return "-"
+    low, high = proportion_interval(part, whole)
+    return f"{part}/{whole}, {100 * part / whole:.0f} % ({100 * low:.0f} to {100 * high:.0f})"

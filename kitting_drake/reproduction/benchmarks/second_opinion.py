@@ -1,0 +1,218 @@
+"""The second opinion: tools let go of in MuJoCo where they were here, and the verdicts compared."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from pydrake.common.eigen_geometry import Quaternion
+from pydrake.math import RigidTransform
+from rich.console import Console
+from rich.table import Table
+
+from kitting_drake.common.errors import UserError
+from kitting_drake.common.extras import import_extra
+from kitting_drake.common.processes import counting_bar
+from kitting_drake.episode import ModeChange, run_episode
+from kitting_drake.episode.action_log import nearest_object
+from kitting_drake.hkd.mjcf import kit_mjcf, tool_mjcf
+from kitting_drake.scenario import Scenario
+from kitting_drake.scenario.policies import Oracle, QuantizedOracle
+from kitting_drake.station import Cell, build_cell
+from kitting_drake.tasks import ToolsetKitting
+from systems.pick_place_parameters import Mode
+from systems.placement import Placement, evaluate_placements
+
+_TIME_STEP = 0.001
+_REST = 2.0
+"""How long a tool may fall and come to rest, in s."""
+_CONTACT_TIME = 0.004
+"""MuJoCo's time constant of contact, in s: twice the step at least, and stiff."""
+_FRICTION = 0.375
+"""Drake combines a tool's 0.5 and a kit's 0.3 to their harmonic mean; MuJoCo would take 0.5."""
+
+_MOST_FRUITLESS = 5
+"""So many episodes in a row in which nothing is let go of mean that the policy cannot do it."""
+
+
+@dataclass(frozen=True)
+class Release:
+    """A tool as the jaws begin to open over it, and the scene that it is in."""
+
+    cell: Cell
+    index: int
+    """The index of the object."""
+    X_WB: RigidTransform
+
+
+def ask_mujoco(
+    placements: int, seed: int, orientations: int | None, console: Console
+) -> dict[str, Any]:
+    """Lets go of tools in MuJoCo where oracles on unseen toolsets let go of them here.
+
+    The grasp is left out: there is the table, the kit and the one tool, at rest.
+
+    Args:
+        placements: how many.
+        seed: of the first episode.
+        orientations: those of a quantized oracle, which misses more; None: the oracle.
+        console: for the progress bar.
+
+    Returns:
+        What `benchmark mujoco` writes: the share of equal verdicts, and each placement.
+
+    Raises:
+        UserError: the package mujoco is not installed; or the oracle lets go of nothing.
+    """
+    mujoco = import_extra("mujoco", purpose="benchmark mujoco", extra="mujoco")
+    rows: list[dict[str, Any]] = []
+    fruitless = 0
+    with counting_bar(console, "placements") as progress:
+        bar = progress.add_task("", total=placements)
+        while len(rows) < placements:
+            witness = _episode(seed, orientations)
+            fruitless = 0 if witness.releases else fruitless + 1
+            if fruitless == _MOST_FRUITLESS:
+                raise UserError(
+                    f"nothing was let go of in {fruitless} episodes: raise --orientations"
+                )
+            for release in witness.releases.values():
+                rows.append(_row(seed, witness, release, _fall(mujoco, release)))
+                progress.update(bar, completed=len(rows))
+            seed += 1
+    rows = rows[:placements]
+    counts = {
+        key: sum(row["here"][key] == row["mujoco"][key] for row in rows) / len(rows)
+        for key in ("success", "strict_success")
+    }
+    return {
+        "placements": len(rows),
+        "policy": "oracle" if orientations is None else f"quantized oracle, N = {orientations}",
+        "mujoco": mujoco.__version__,
+        "time_step": _TIME_STEP,
+        "equal_success": counts["success"],
+        "equal_strict_success": counts["strict_success"],
+        "rows": rows,
+    }
+
+
+class _Witness:
+    """Keeps where tools are let go of, and how they end: an `EpisodeObserver`."""
+
+    def __init__(self, cell: Cell) -> None:
+        self._cell = cell
+        self.releases: dict[int, Release] = {}
+        """The last of each object, by its index."""
+        self.final_poses: list[RigidTransform] = []
+        self.placements: list[Placement] = []
+
+    def observe(self, event: ModeChange) -> None:
+        """Takes down a release, and the end."""
+        cell = self._cell
+        poses = cell.object_poses(event.root_context)
+        if event.is_last:
+            self.final_poses, self.placements = poses, cell.placements(event.root_context)
+        elif event.mode == Mode.RELEASE:
+            _, place = cell.planner.action(cell.planner.GetMyContextFromRoot(event.root_context))
+            index = nearest_object(cell, poses, place)
+            self.releases[index] = Release(cell, index, poses[index])
+
+
+def _episode(seed: int, orientations: int | None) -> _Witness:
+    """An episode of an oracle, which needs no cameras, on an unseen toolset."""
+    policy = Oracle() if orientations is None else QuantizedOracle(orientations=orientations)
+    scenario = Scenario(task=ToolsetKitting(split="test"), policy=policy, cameras={})
+    cell = build_cell(scenario, seed=seed, base=Path.cwd())
+    witness = _Witness(cell)
+    run_episode(
+        cell,
+        task=scenario.task,
+        scenario="unseen",
+        policy=policy.name,
+        seed=seed,
+        time_limit=scenario.time_limit,
+        observers=[witness.observe],
+    )
+    return witness
+
+
+def _row(seed: int, witness: _Witness, release: Release, X_WB: RigidTransform) -> dict[str, Any]:
+    """A placement here and, at X_WB, in MuJoCo: each scored among all that ended here."""
+    cell, index = release.cell, release.index
+    poses = list(witness.final_poses)
+    poses[index] = X_WB
+    scene = cell.scene
+    theirs = evaluate_placements(cell.objects, scene.goals, scene.success, poses)[index]
+    ours = witness.final_poses[index]
+    apart = np.linalg.norm(
+        X_WB @ cell.objects[index].p_BMiddle - ours @ cell.objects[index].p_BMiddle
+    )
+    return {
+        "seed": seed,
+        "object": scene.objects[index].name,
+        "here": _verdict(witness.placements[index]),
+        "mujoco": _verdict(theirs),
+        "apart_mm": 1e3 * float(apart),
+    }
+
+
+def _verdict(placement: Placement) -> dict[str, Any]:
+    return {
+        "success": placement.success,
+        "strict_success": placement.strict_success,
+        "add_s_mm": 1e3 * placement.add_s,
+        "height_error_mm": 1e3 * placement.height_error,
+    }
+
+
+def _fall(mujoco: Any, release: Release) -> RigidTransform:
+    """X_WB of a tool that was let go of, at rest in MuJoCo."""
+    scene = release.cell.scene
+    item = scene.objects[release.index]
+    world = mujoco.MjSpec()
+    world.option.timestep = _TIME_STEP
+    world.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    world.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_PLANE, size=[2, 2, 0.1])
+    for number, fixture in enumerate(scene.fixtures):
+        kit = _spec(mujoco, kit_mjcf(fixture.model), fixture.model.parent)
+        for geom in kit.geoms:
+            # The kit's friction counts, whatever the tool's is.
+            geom.priority, geom.friction[0] = 1, _FRICTION
+        _attach(world, kit, fixture.X_WF, f"fixture_{number}_")
+    tool = _spec(mujoco, tool_mjcf(item.model), item.model.parent)
+    _attach(world, tool, release.X_WB, "tool_")
+    for geom in world.geoms:
+        geom.solref[0] = _CONTACT_TIME
+    model = world.compile()
+    data = mujoco.MjData(model)
+    for _ in range(round(_REST / _TIME_STEP)):
+        mujoco.mj_step(model, data)
+    quaternion = data.qpos[3:7] / np.linalg.norm(data.qpos[3:7])
+    return RigidTransform(Quaternion(quaternion), data.qpos[:3])
+
+
+def _spec(mujoco: Any, text: str, folder: Path) -> Any:
+    spec = mujoco.MjSpec.from_string(text)
+    spec.meshdir = str(folder)
+    return spec
+
+
+def _attach(world: Any, spec: Any, X_WF: RigidTransform, prefix: str) -> None:
+    """Puts what a model holds into the world, at a pose."""
+    quaternion = X_WF.rotation().ToQuaternion().wxyz()
+    frame = world.worldbody.add_frame(pos=X_WF.translation(), quat=quaternion)
+    world.attach(spec, prefix=prefix, frame=frame)
+
+
+def opinion_table(measured: dict[str, Any]) -> Table:
+    """The verdicts here against those in MuJoCo."""
+    table = Table(title=f"{measured['placements']} placements of the {measured['policy']}")
+    for heading in ("measure", "yes here", "yes in MuJoCo", "alike"):
+        table.add_column(heading, justify="left" if heading == "measure" else "right")
+    rows = measured["rows"]
+    for key, name in (("success", "ADD-S"), ("strict_success", "strict")):
+        counts = [str(sum(row[where][key] for row in rows)) for where in ("here", "mujoco")]
+        table.add_row(name, *counts, f"{100 * measured[f'equal_{key}']:.0f} %")
+    apart = np.median([row["apart_mm"] for row in rows])
+    table.caption = f"they come to rest {apart:.2f} mm apart (median)"
+    return table

@@ -1,0 +1,220 @@
+"""`benchmark simulation`: where the time of an episode goes, start-up, images."""
+
+import os
+import platform
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+from rich.progress import track
+from rich.table import Table
+
+from kitting_drake.common.errors import UserError
+from kitting_drake.common.paths import SCENARIOS
+from kitting_drake.common.provenance import versions
+from kitting_drake.common.rendering import require_rendering
+from kitting_drake.episode import EpisodeResult, ModeChange, run_episode
+from kitting_drake.scenario.loader import load_scenario
+from kitting_drake.scenario.schema import Scenario
+from kitting_drake.station import Cell, build_cell
+
+_SCENARIO = SCENARIOS / "kitting_oracle.yaml"
+_LEARNED = SCENARIOS / "kitting_seen.yaml"
+
+
+def benchmark_simulation(episodes: int, seed: int, console: Console) -> dict[str, Any]:
+    """Measures everything that `benchmark simulation` shows.
+
+    Args:
+        episodes: how many whole episodes to run of the oracle, and as many of the learned policy.
+        seed: of the first; the others follow.
+        console: for progress.
+    """
+    # Before PyTorch is loaded: one thread, as `evaluate` gives each of its workers.
+    os.environ["OMP_NUM_THREADS"] = "1"
+    stopwatch = PhaseStopwatch()
+    return {
+        "machine": f"{platform.machine()}, {os.cpu_count()} cores",
+        "python": platform.python_version(),
+        "drake": versions()["drake"],
+        "episodes": episodes,
+        "policies": {
+            "oracle": _whole_episodes(_SCENARIO, episodes, seed, stopwatch, console),
+            "learned": _whole_episodes(_LEARNED, episodes, seed, PhaseStopwatch(), console),
+        },
+        "phases": {
+            name: {
+                "simulated_s": simulated,
+                "wall_s": wall,
+                "wall_s_per_simulated_s": wall / simulated if simulated else None,
+            }
+            for name, (simulated, wall) in stopwatch.phases.items()
+        },
+        "start_up_s": _start_up_times(),
+        "images_s": _image_times(load_scenario(_SCENARIO), seed),
+    }
+
+
+def _whole_episodes(
+    path: Path, episodes: int, seed: int, stopwatch: "PhaseStopwatch", console: Console
+) -> dict[str, Any]:
+    """Runs whole episodes; gives their cost for each object kitted, without building the cell."""
+    scenario = load_scenario(path)
+    simulated = wall = kitted = 0.0
+    for number in track(
+        range(episodes), path.stem, console=console, transient=True, disable=console.quiet
+    ):
+        cell = _build(scenario, seed + number)
+        stopwatch.start()
+        result = run_episode(
+            cell,
+            task=scenario.task,
+            scenario=path.stem,
+            policy=scenario.policy.name,
+            seed=seed + number,
+            time_limit=scenario.time_limit,
+            observers=[stopwatch.observe],
+        )
+        _require_whole(result)
+        simulated += result.sim_seconds
+        wall += result.wall_seconds
+        kitted += sum(item.strict_success for item in result.objects)
+    return {
+        "objects": int(kitted),
+        "wall_s_per_object": wall / kitted if kitted else None,
+        "real_time_rate": simulated / wall,
+        "objects_per_simulated_hour": 3600 * kitted / simulated,
+    }
+
+
+def _require_whole(result: EpisodeResult) -> None:
+    """Raises UserError for an episode that failed or timed out, which is no measurement."""
+    if result.failure or result.timed_out:
+        reason = result.failure or "timed out"
+        raise UserError(
+            f"{result.scenario}, seed {result.seed}: the episode cannot count: {reason}"
+        )
+
+
+def _build(scenario: Scenario, seed: int) -> Cell:
+    return build_cell(scenario, seed=seed, base=SCENARIOS)
+
+
+class PhaseStopwatch:
+    """Adds up simulated and wall time by the planner's mode, over episodes."""
+
+    def __init__(self) -> None:
+        self.phases: dict[str, tuple[float, float]] = {}
+        """Simulated and wall time by mode, in s."""
+        self._last = (0.0, 0.0)
+
+    def start(self) -> None:
+        """An episode begins."""
+        self._last = (0.0, time.perf_counter())
+
+    def observe(self, event: ModeChange) -> None:
+        """Adds the time since the last event to the mode that it was spent in: an
+        `EpisodeObserver`."""
+        now = (event.root_context.get_time(), time.perf_counter())
+        name = event.previous.name.lower()
+        simulated, wall = self.phases.get(name, (0.0, 0.0))
+        self.phases[name] = (simulated + now[0] - self._last[0], wall + now[1] - self._last[1])
+        self._last = now
+
+
+def _start_up_times() -> dict[str, float]:
+    """The times from the shell to the end of a run of a few steps, Meshcat and files included."""
+    times = {}
+    with tempfile.TemporaryDirectory() as folder:
+        # The first run finds nothing in the cache, the second what the first has built.
+        environment = os.environ | {"XDG_CACHE_HOME": folder}
+        command = [sys.executable, "-m", "kitting_drake.run", str(_SCENARIO), "--quiet"]
+        command += ["--scenario_text", "{time_limit: 0.1}", "--output", folder]
+        for name in ("cache_empty", "cache_filled"):
+            start = time.perf_counter()
+            subprocess.run(command, env=environment, check=True)
+            times[name] = time.perf_counter() - start
+    return times
+
+
+def _image_times(scenario: Scenario, seed: int) -> dict[str, float]:
+    """The times of one RGB-D image, and of the heightmap from all cameras' images.
+
+    Raises:
+        UserError: images cannot be rendered here.
+    """
+    require_rendering()
+    cell = _build(scenario, seed)
+    context = cell.diagram.CreateDefaultContext()
+    sensors = [cell.diagram.GetSubsystemByName(f"camera_{name}") for name in scenario.cameras]
+    projector = cell.diagram.GetSubsystemByName("heightmap_projector")
+
+    def render() -> None:
+        for sensor in sensors:
+            for port in ("color_image", "depth_image_32f"):
+                sensor.GetOutputPort(port).Eval(sensor.GetMyContextFromRoot(context))
+
+    def project() -> None:
+        projector.GetOutputPort("observation").Eval(projector.GetMyContextFromRoot(context))
+
+    render_times, project_times = [], []
+    for second in range(6):
+        # Images depend on time, so that what was rendered before is stale.
+        context.SetTime(float(second + 1))
+        render_times.append(_timed(render))
+        project_times.append(_timed(project))
+    # The first one loads meshes into the engine.
+    return {
+        "rgbd_image": float(np.median(render_times[1:])) / len(sensors),
+        "heightmap": float(np.median(project_times[1:])),
+    }
+
+
+def _timed(function: Callable[[], None]) -> float:
+    start = time.perf_counter()
+    function()
+    return time.perf_counter() - start
+
+
+def simulation_tables(measured: dict[str, Any]) -> list[Table]:
+    """For the terminal."""
+    whole = Table(title="whole episodes, one thread", title_justify="left")
+    whole.add_column("policy")
+    for heading in ("objects", "wall s per object", "real-time rate", "objects per simulated hour"):
+        whole.add_column(heading, justify="right")
+    for name, row in measured["policies"].items():
+        wall = row["wall_s_per_object"]
+        whole.add_row(
+            name,
+            str(row["objects"]),
+            "-" if wall is None else f"{wall:.2f}",
+            f"{row['real_time_rate']:.1f}",
+            f"{row['objects_per_simulated_hour']:.0f}",
+        )
+    phases = Table(title="the oracle's episodes by phase", title_justify="left")
+    phases.add_column("phase")
+    for heading in ("simulated s", "wall s", "wall s per simulated s"):
+        phases.add_column(heading, justify="right")
+    for name, row in measured["phases"].items():
+        ratio = row["wall_s_per_simulated_s"]
+        phases.add_row(
+            name,
+            f"{row['simulated_s']:.1f}",
+            f"{row['wall_s']:.1f}",
+            "-" if ratio is None else f"{ratio:.2f}",
+        )
+    once = Table(title="once", title_justify="left")
+    once.add_column("what")
+    once.add_column("wall s", justify="right")
+    start, images = measured["start_up_s"], measured["images_s"]
+    once.add_row("shell to first steps and out again, cache empty", f"{start['cache_empty']:.2f}")
+    once.add_row("the same, everything in the cache", f"{start['cache_filled']:.2f}")
+    once.add_row("one RGB-D image", f"{images['rgbd_image']:.3f}")
+    once.add_row("heightmap from all cameras' images", f"{images['heightmap']:.3f}")
+    return [whole, phases, once]

@@ -1,0 +1,99 @@
+"""The convolutions of a function, alone: what it would take if nothing else took any time."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+from torch.utils._python_dispatch import TorchDispatchMode
+
+from kitting_drake.reproduction.network_speed.timing import Timing
+
+_GROUPS = {"aten::conv2d": 6, "aten::convolution": 8, "aten::convolution_backward": 9}
+"""torch's convolutions, each with the position of its number of groups among its arguments."""
+
+
+class _Outline(NamedTuple):
+    """A tensor without its values."""
+
+    shape: tuple[int, ...]
+    type: torch.dtype
+    channels_last: bool
+
+    @classmethod
+    def of(cls, tensor: Tensor) -> _Outline:
+        channels_last = tensor.dim() == 4 and tensor.is_contiguous(
+            memory_format=torch.channels_last
+        )
+        return cls(tuple(tensor.shape), tensor.dtype, channels_last)
+
+    def filled(self, device: torch.device) -> Tensor:
+        """A tensor of random numbers with this outline."""
+        tensor = torch.randn(self.shape, device=device).to(self.type)
+        return (
+            tensor.contiguous(memory_format=torch.channels_last) if self.channels_last else tensor
+        )
+
+
+@dataclass(frozen=True)
+class Convolutions:
+    """The convolutions that a function computes, in both directions if it differentiates.
+
+    Depthwise ones, which are filters and no layers, are not among them.
+    """
+
+    calls: Counter[tuple[Any, tuple[Any, ...]]]
+    """How often each is called: torch's function and its arguments, tensors outlined."""
+
+    @classmethod
+    def of(cls, function: Callable[[], object]) -> Convolutions:
+        """Those of a function, which is run once."""
+        with _Recorder() as recorder:
+            function()
+        return cls(recorder.calls)
+
+    def alone(self, device: torch.device) -> dict[Any, Callable[[], object]]:
+        """A function for each key of `calls`, which computes it once, of random numbers."""
+        return {call: _replay(*call, device) for call in self.calls}
+
+    def seconds(self, timings: dict[Any, Timing]) -> float:
+        """The time of all of them.
+
+        Args:
+            timings: of each function of `alone`.
+        """
+        return sum(count * timings[call].seconds for call, count in self.calls.items())
+
+
+def _replay(function: Any, outlined: tuple[Any, ...], device: torch.device) -> Callable[[], object]:
+    arguments = [item.filled(device) if isinstance(item, _Outline) else item for item in outlined]
+    return lambda: function(*arguments)
+
+
+class _Recorder(TorchDispatchMode):
+    """Records convolutions as they are called."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.calls: Counter[tuple[Any, tuple[Any, ...]]] = Counter()
+
+    def __torch_dispatch__(
+        self, function: Any, types: Any, args: Any = (), kwargs: Any = None
+    ) -> Any:
+        place = _GROUPS.get(function.name())
+        # A trailing argument that has its default is left out: there is one group then.
+        if place is not None and args[place : place + 1] in ((), (1,)):
+            outlined = (
+                _Outline.of(item)
+                if isinstance(item, Tensor)
+                else tuple(item)
+                if isinstance(item, list)
+                else item
+                for item in args
+            )
+            self.calls[function, tuple(outlined)] += 1
+        return function(*args, **(kwargs or {}))

@@ -1,0 +1,238 @@
+"""The cost of a prediction at N orientations: figure 6(c) of the paper, and the whole decision."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import torch
+from torch import nn
+
+from kitting_drake.policies.data.images import crop
+from kitting_drake.policies.learned_policy import LearnedPolicy
+from kitting_drake.policies.networks.architecture import METHODS, PICK_CROP, NetworkConfig
+from kitting_drake.policies.networks.device import preferred_type
+from kitting_drake.policies.networks.factored import FactoredNetworks, Networks
+from kitting_drake.policies.networks.layers.steerable import PlainConv2d
+from kitting_drake.policies.networks.methods import make_networks
+from kitting_drake.policies.networks.transporter import TransporterNetworks, encodings_per_decision
+from kitting_drake.reproduction.network_speed.plan import Bench, Plan, times_of
+from kitting_drake.reproduction.network_speed.timing import Timing, count_operations, read_clock
+
+PARTS = {
+    "pick_position": ("alpha", "f_pick"),
+    "pick_angle": ("beta",),
+    "phi": ("phi",),
+    "psi": ("psi",),
+}
+"""The networks that compute each part of a decision. The rest of a decision is `search`: the
+correlation, what is read off the networks' outputs, and the preparation of their inputs."""
+
+_MADE_FOR_N = ("equivariant_transporter",)
+"""Methods of whose architecture N is a part; the other methods' networks predict at any N."""
+
+
+def measure_pick_angles(bench: Bench, preset: str) -> list[dict[str, Any]]:
+    """Parameters and inference time of the models that predict the pick angle.
+
+    For the Transporter that is all of its picking: one network that takes the scene at every angle.
+
+    Returns:
+        A row for each method and N.
+    """
+    rows = []
+    for method, orientations in _cells(bench.plan):
+        config = NetworkConfig(method, preset, max(orientations))
+        trained = make_networks(config)
+        losses = trained.modules_by_loss()
+        models = losses.get("pick_angle", next(iter(losses.values())))
+        parameters = sum(weight.numel() for model in models for weight in model.parameters())
+        names = {name for name, child in trained.named_children() if child in models}
+        del trained, losses, models
+
+        outlined = _without_others(_outlined(config), names)
+        operations = {
+            n: count_operations(_compute_angles(outlined, bench, n)) for n in orientations
+        }
+        skipped = {n: bench.why_not(outlined, count) for n, count in operations.items()}
+        timings: dict[int, Timing] = {}
+        if not all(skipped.values()):
+            # Fresh weights take as long as trained ones; some of these would be files of gigabytes.
+            networks = _without_others(make_networks(config, PlainConv2d), names).to(bench.device)
+            networks.freeze(preferred_type())
+            timings = bench.time_each(
+                {n: _predict_angle(networks, bench, n) for n in orientations if not skipped[n]}
+            )
+        rows += [
+            {
+                "preset": preset,
+                "method": method,
+                "orientations": n,
+                "parameters": parameters,
+                "operations": operations[n],
+                "skipped": skipped[n],
+                **times_of(timings.get(n)),
+            }
+            for n in orientations
+        ]
+    return rows
+
+
+def _cells(plan: Plan) -> Iterator[tuple[str, tuple[int, ...]]]:
+    """Each method, with the N at which one set of its networks is measured."""
+    for method in METHODS:
+        if method in _MADE_FOR_N:
+            yield from ((method, (n,)) for n in plan.orientations)
+        elif method == "so2":
+            yield method, (*plan.orientations, plan.finer)
+        else:
+            yield method, plan.orientations
+
+
+def _outlined(config: NetworkConfig) -> Networks:
+    """Plain networks on the meta device: their operations are counted without being carried out."""
+    with torch.device("meta"):
+        return make_networks(config, PlainConv2d).to("meta").requires_grad_(False)
+
+
+def _without_others(networks: Networks, names: set[str]) -> Networks:
+    """The networks with none but the named children; the memory of the others is freed."""
+    for name in [name for name, _ in networks.named_children() if name not in names]:
+        delattr(networks, name)
+    return networks
+
+
+def _compute_angles(networks: Networks, bench: Bench, orientations: int) -> Callable[[], object]:
+    """The computation of all angles at a known pixel; nothing is read off the result, which has no
+    values on the meta device."""
+    if isinstance(networks, FactoredNetworks):
+        crops = networks.prepare(crop(bench.image, bench.pixel, PICK_CROP))
+        return lambda: networks.crop_angle_logits(crops, orientations)
+    return _predict_angle(networks, bench, orientations)
+
+
+def _predict_angle(networks: Networks, bench: Bench, orientations: int) -> Callable[[], object]:
+    """The prediction of the angle at a known pixel."""
+    if isinstance(networks, FactoredNetworks):
+        return lambda: networks.predict_angle(bench.image, bench.pixel, orientations)
+    return lambda: networks.predict_pick(bench.image, orientations).angle(bench.pixel)
+
+
+def measure_decisions(bench: Bench) -> list[dict[str, Any]]:
+    """Time of a whole decision on exported networks, and of its parts.
+
+    Returns:
+        A row for each method and N; the parts are those of the run of median time.
+    """
+    rows = []
+    for method, orientations in _cells(bench.plan):
+        config = NetworkConfig(method, bench.plan.preset, max(orientations))
+        outlined = _outlined(config)
+        operations = {n: count_operations(_compute_all(outlined, bench, n)) for n in orientations}
+        skipped = {n: bench.why_not(outlined, count) for n, count in operations.items()}
+        timings: dict[int, Timing] = {}
+        runs: dict[int, list[dict[str, float]]] = {n: [] for n in orientations}
+        trained = make_networks(config)
+        parameters = sum(weight.numel() for weight in trained.parameters())
+        if not all(skipped.values()):
+            watched = _WatchedPolicy(bench, bench.export(trained, preferred_type()))
+            timings = bench.time_each(
+                {n: watched.deciding(n, runs[n]) for n in orientations if not skipped[n]}
+            )
+        for n in orientations:
+            timing = timings.get(n)
+            counted = runs[n][-timing.runs :] if timing else []
+            typical = sorted(counted, key=lambda run: sum(run.values()))
+            rows.append(
+                {
+                    "preset": bench.plan.preset,
+                    "method": method,
+                    "orientations": n,
+                    "parameters": parameters,
+                    "operations": operations[n],
+                    "skipped": skipped[n],
+                    **times_of(timing),
+                    "parts": typical[len(typical) // 2] if typical else None,
+                }
+            )
+    return rows
+
+
+def _compute_all(networks: Networks, bench: Bench, orientations: int) -> Callable[[], object]:
+    """All that the networks compute for a decision; the search is left out."""
+    angles = _compute_angles(networks, bench, orientations)
+
+    def compute() -> None:
+        # The Transporter computes positions and angles at once.
+        if isinstance(networks, FactoredNetworks):
+            networks.position_logits(bench.image)
+        angles()
+        networks.encode_scene(bench.image)
+        if isinstance(networks, TransporterNetworks):
+            rotations = [0.0] * encodings_per_decision(orientations)
+            networks.encode_crops(bench.image, bench.pixel, rotations)
+        else:
+            networks.encode_crop(bench.image, bench.pixel)
+
+    return compute
+
+
+class _WatchedPolicy:
+    """A policy that takes the time of each part of its decisions."""
+
+    def __init__(self, bench: Bench, networks: Networks) -> None:
+        self._bench, self._device = bench, bench.device
+        self._networks = networks
+        self._parts: dict[str, float] = {}
+        self._start = 0.0
+        for part, names in PARTS.items():
+            for name, network in networks.named_children():
+                if name in names:
+                    network.register_forward_pre_hook(self._before)
+                    network.register_forward_hook(self._after(part))
+
+    def _before(self, module: nn.Module, inputs: Any) -> None:
+        self._start = read_clock(self._device)
+
+    def _after(self, part: str) -> Callable[..., None]:
+        def hook(module: nn.Module, inputs: Any, output: Any) -> None:
+            self._parts[part] += read_clock(self._device) - self._start
+
+        return hook
+
+    def deciding(self, orientations: int, runs: list[dict[str, float]]) -> Callable[[], object]:
+        """A decision at N, which appends the seconds of its parts to `runs`."""
+        policy = LearnedPolicy(self._networks, orientations=orientations)
+
+        def decide() -> None:
+            self._parts = dict.fromkeys(PARTS, 0.0)
+            observation = self._bench.observe()
+            start = read_clock(self._device)
+            policy.decide(observation)
+            total = read_clock(self._device) - start
+            runs.append(self._parts | {"search": total - sum(self._parts.values())})
+
+        return decide
+
+
+def growth(rows: list[dict[str, Any]], orientations: tuple[int, ...]) -> list[dict[str, Any]]:
+    """The cost at the largest N relative to that at the smallest.
+
+    Args:
+        rows: of `measure_pick_angles` or `measure_decisions`.
+        orientations: N.
+
+    Returns:
+        A row for each preset and method: ratios, or None where one of the two was not measured.
+    """
+    ends = (min(orientations), max(orientations))
+    cells = {(row["preset"], row["method"], row["orientations"]): row for row in rows}
+    result = []
+    for preset, method in dict.fromkeys((row["preset"], row["method"]) for row in rows):
+        few, many = (cells[preset, method, n] for n in ends)
+        ratios = {
+            key: many[key] / few[key] if many[key] and few[key] else None
+            for key in ("parameters", "operations", "seconds")
+        }
+        result.append({"preset": preset, "method": method, "from": ends[0], "to": ends[1]} | ratios)
+    return result

@@ -1,0 +1,210 @@
+"""The results of `benchmark networks` as tables for the terminal."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from rich.table import Table
+
+from kitting_drake.evaluation.quantities import count_text, seconds_text
+
+METHOD_NAMES = {
+    "so2": "SO(2)",
+    "equivariant_transporter": "Equiv. Transporter",
+    "transporter": "Transporter",
+}
+RUNG_NAMES = {
+    "escnn_float32": "escnn, float32",
+    "escnn_bfloat16": "escnn, bfloat16 autocast",
+    "ours_float32": "folded, float32",
+    "ours_bfloat16": "folded, bfloat16",
+}
+MEASURE_NAMES = {
+    "training_step": "training step, all networks",
+    "alpha_training_step": "training step, alpha",
+    "decision": "decision",
+    "alpha_inference": "inference, alpha",
+}
+
+
+def network_tables(measured: dict[str, Any]) -> list[Table]:
+    """All tables.
+
+    Args:
+        measured: what `benchmark_networks` returns.
+    """
+    presets = dict.fromkeys(row["preset"] for row in measured["pick_angle"])
+    return [
+        *(_pick_angle_table(measured, preset) for preset in presets),
+        _decision_table(measured),
+        _folding_table(measured),
+        _share_table(measured),
+        _level_table(measured),
+    ]
+
+
+def _table(title: str, *headings: str) -> Table:
+    """A table whose first column holds words, left-aligned, and the others numbers."""
+    table = Table(title=title, title_justify="left")
+    for index, heading in enumerate(headings):
+        table.add_column(heading, justify="right" if index else "left", no_wrap=not index)
+    return table
+
+
+def _milliseconds_text(seconds: float | None) -> str:
+    """A time in ms, without the unit."""
+    if seconds is None:
+        return "-"
+    return f"{1e3 * seconds:.0f}" if seconds >= 0.1 else f"{1e3 * seconds:.2g}"
+
+
+def _ratio_text(ratio: float | None) -> str:
+    return "-" if ratio is None else f"{ratio:.2f}"
+
+
+def _growth(measured: dict[str, Any], name: str, preset: str, method: str) -> dict[str, Any]:
+    rows = measured[f"{name}_growth"]
+    return next(row for row in rows if (row["preset"], row["method"]) == (preset, method))
+
+
+def _pick_angle_table(measured: dict[str, Any], preset: str) -> Table:
+    table = _table(
+        f"models that predict the pick angle, preset {preset} (Transporter: all of its picking); "
+        "MAC: multiply-accumulates",
+        "method",
+        "N",
+        "parameters",
+        "MAC",
+        "time",
+    )
+    rows = [row for row in measured["pick_angle"] if row["preset"] == preset]
+    for method in dict.fromkeys(row["method"] for row in rows):
+        for row in rows:
+            if row["method"] == method:
+                table.add_row(
+                    METHOD_NAMES[method],
+                    str(row["orientations"]),
+                    count_text(row["parameters"]),
+                    count_text(row["operations"] / 2),
+                    row["skipped"] or seconds_text(row["seconds"]),
+                )
+        growth = _growth(measured, "pick_angle", preset, method)
+        table.add_row(
+            "",
+            f"{growth['to']}/{growth['from']}",
+            *(_ratio_text(growth[key]) for key in ("parameters", "operations", "seconds")),
+            style="bold",
+            end_section=True,
+        )
+    return table
+
+
+def _decision_table(measured: dict[str, Any]) -> Table:
+    headings = {
+        "pick_position": "pixel",
+        "pick_angle": "angle",
+        "phi": "phi",
+        "psi": "psi",
+        "search": "search",
+    }
+    table = _table(
+        f"a decision, in ms, preset {measured['preset']}, {measured['inference_type']}",
+        "method",
+        "N",
+        *headings.values(),
+        "all",
+    )
+    rows = measured["decision"]
+    for method in dict.fromkeys(row["method"] for row in rows):
+        for row in rows:
+            if row["method"] == method:
+                split = row["parts"] or dict.fromkeys(headings)
+                table.add_row(
+                    METHOD_NAMES[method],
+                    str(row["orientations"]),
+                    *(_milliseconds_text(split[part]) for part in headings),
+                    row["skipped"] or _milliseconds_text(row["seconds"]),
+                )
+        growth = _growth(measured, "decision", measured["preset"], method)
+        ends = f"{growth['to']}/{growth['from']}"
+        blanks = [""] * len(headings)
+        ratio = _ratio_text(growth["seconds"])
+        table.add_row("", ends, *blanks, ratio, style="bold", end_section=True)
+    return table
+
+
+def _folding_table(measured: dict[str, Any]) -> Table:
+    folding = measured["folding"]
+    rungs = list(folding["rungs"])
+    operations = {name: count_text(n / 2) for name, n in folding["alpha_operations"].items()}
+    table = _table(
+        f"the same networks, preset {measured['preset']}: time, and times faster than escnn's "
+        f"float32 (MAC of alpha: escnn {operations['escnn']}, folded {operations['ours']})",
+        "what",
+        *(RUNG_NAMES[rung] for rung in rungs),
+    )
+    for name, title in MEASURE_NAMES.items():
+        cells = [
+            f"{seconds_text(folding['rungs'][rung][name]['seconds'])}\n"
+            f"[bold]{folding['speed_up'][rung][name]:.2f}x[/]"
+            for rung in rungs
+        ]
+        table.add_row(title, *cells)
+    for name in ("training_step", "decision"):
+        shares = folding["convolution_share"]
+        cells = [f"{shares[rung][name]:.0%}" if rung in shares else "-" for rung in rungs]
+        table.add_row(f"{MEASURE_NAMES[name]}: share of its convolutions", *cells)
+    differences = (folding["alpha_difference"][rung] for rung in rungs)
+    table.add_row("difference of alpha's output", *(f"{value:.1e}" for value in differences))
+    return table
+
+
+def _share_table(measured: dict[str, Any]) -> Table:
+    peaks = ", ".join(
+        f"{name} {count_text(rates['best'])}FLOP/s" for name, rates in measured["peak"].items()
+    )
+    table = _table(
+        f"share of the machine's peak ({peaks})",
+        "network",
+        "type",
+        "MAC",
+        "inference",
+        "share",
+        "training step",
+        "share",
+    )
+    rows = {(row["network"], row["type"], row["mode"]): row for row in measured["share_of_peak"]}
+    for name, type_ in dict.fromkeys((name, type_) for name, type_, _ in rows):
+        infer, train = (rows[name, type_, mode] for mode in ("inference", "training"))
+        table.add_row(
+            name,
+            type_,
+            count_text(infer["operations"] / 2),
+            seconds_text(infer["seconds"]),
+            f"{infer['share']:.0%}",
+            seconds_text(train["seconds"]),
+            f"{train['share']:.0%}",
+        )
+    return table
+
+
+def _level_table(measured: dict[str, Any]) -> Table:
+    table = _table(
+        f"alpha's inference, preset {measured['preset']}, level by level",
+        "level",
+        "MAC",
+        "time",
+        "in convolutions",
+        "their share of peak",
+        "share of peak",
+    )
+    for row in measured["alpha_levels"]["levels"]:
+        table.add_row(
+            row["level"],
+            count_text(row["operations"] / 2),
+            seconds_text(row["seconds"]),
+            seconds_text(row["convolution_s"]),
+            f"{row['convolution_share']:.0%}",
+            f"{row['share']:.0%}",
+        )
+    return table

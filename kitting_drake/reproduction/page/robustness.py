@@ -1,0 +1,225 @@
+"""The table of what each perturbation costs each policy: a part of `docs/robustness.md`."""
+
+from collections import Counter, defaultdict
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from kitting_drake.common.errors import UserError
+from kitting_drake.common.paths import SCENARIOS
+from kitting_drake.evaluation.intervals import proportion_interval
+from kitting_drake.reproduction.page.markdown import markdown_table
+from kitting_drake.reproduction.page.paired import STRICT, paired_difference, points_text
+from kitting_drake.reproduction.page.runs import Run, described, scenario_differences
+from kitting_drake.scenario.loader import load_scenario
+from kitting_drake.scenario.perturbations import LEVELS, NAMES
+from kitting_drake.scenario.policies import Learned
+
+_UNSEEN = SCENARIOS / "kitting_unseen.yaml"
+_BEGIN, _END = "<!-- figures -->\n", "<!-- end of figures -->\n"
+_AS_IT_IS = "as it is"
+_COLUMNS = {
+    "so2": "of 100 demonstrations",
+    "generalist": "generalist",
+    "shape_matching": "shape matching",
+}
+_COMPARED = ("generalist, minus as it is", "generalist, minus shape matching")
+"""In points, on the seeds that both ran."""
+_TRIES = 2
+_FRAMES = 5
+"""So many images are averaged in further rows."""
+_SEEDS = range(2870, 2895)
+"""Those on which every policy meets every perturbation; nobody had looked at them before
+their first run."""
+_FEWEST = 12
+"""At other levels than moderate at least so many of them, the first ones."""
+
+Key = tuple[str, str]
+"""A row of the table and a method."""
+
+
+def robustness_table(runs: Sequence[Run]) -> str:
+    """Strict success on unseen toolsets, with two tries a tool and policies that recover.
+
+    Of the first table all runs are of the same seeds, of the second, of the other levels, of the
+    first ones of these; a third one, of what was run on further seeds too, takes all of them
+    together: choosing among them would be flattering.
+
+    Args:
+        runs: all; those that are none of these, or of other weights than the shipped ones, are left
+            out.
+
+    Raises:
+        UserError: of two runs of one cell some seeds are the same.
+    """
+    expected, shipped = _expected(), _shipped()
+    found: dict[Key, list[Run]] = defaultdict(list)
+    for run in runs:
+        if run.method not in _COLUMNS or not run.detail("recover"):
+            continue
+        if run.method in shipped and run.summary.get("policy_digest") != shipped[run.method]:
+            continue
+        scenario = run.summary["resolved_scenario"]
+        for label, wanted in expected.items():
+            if not scenario_differences(scenario, wanted):
+                found[label, run.method].append(run)
+                break
+    _check_seeds(found)
+    common = {
+        key: chosen
+        for key, every in found.items()
+        if (chosen := [run for run in every if _common(run, key[0])])
+    }
+    further = {key[0] for key, every in found.items() if len(common.get(key, ())) < len(every)}
+    parts = []
+    if common:
+        parts.append(
+            f"{len(_SEEDS)} episodes from seed {_SEEDS[0]}, the same in every cell:\n\n"
+            + _table(common, [label for label in expected if not _is_other_level(label)])
+        )
+    if any(_is_other_level(label) for label, _ in common):
+        parts.append(
+            f"The other levels, on the first {_FEWEST} or more of these seeds, with the number of "
+            "objects:\n\n"
+            + _table(common, [label for label in expected if _is_other_level(label)], counted=True)
+        )
+    needless = _needless_table(common, list(expected))
+    if needless:
+        parts.append(
+            "Of these runs, the actions on boxes and whatever else has no cavity, and of how many. "
+            "No rate of success\ntells of them:\n\n" + needless
+        )
+    if further:
+        parts.append(
+            "All seeds together, where there are more, with the number of objects:\n\n"
+            + _table(found, [label for label in expected if label in further], counted=True)
+        )
+    return "\n".join(parts) or "No runs yet.\n"
+
+
+def _table(found: Mapping[Key, Sequence[Run]], labels: Sequence[str], counted: bool = False) -> str:
+    """One row for each perturbation that was run.
+
+    Args:
+        counted: tells the number of objects.
+    """
+
+    def share(key: Key) -> str:
+        if key not in found:
+            return "-"
+        good, objects = np.sum([_strict(run) for run in found[key]], axis=0)
+        low, high = (100 * value for value in proportion_interval(int(good), int(objects)))
+        text = f"{100 * good / objects:.1f} ({low:.0f} to {high:.0f})"
+        return f"{text}, {objects}" if counted else text
+
+    def outcomes(key: Key) -> dict[str, Any]:
+        # Older summaries tell of no episode.
+        return {
+            "outcomes": [
+                item for run in found.get(key, ()) for item in run.summary.get("outcomes", ())
+            ]
+        }
+
+    def difference(first: Key, second: Key) -> str:
+        if first == second:
+            return "-"
+        points = paired_difference(outcomes(first), outcomes(second), STRICT)
+        return "-" if points is None else points_text(points)
+
+    rows = [
+        [
+            label,
+            *(share((label, method)) for method in _COLUMNS),
+            difference((label, "generalist"), (_AS_IT_IS, "generalist")),
+            difference((label, "generalist"), (label, "shape_matching")),
+        ]
+        for label in labels
+        if any((label, method) in found for method in _COLUMNS)
+    ]
+    return markdown_table(["perturbation", *_COLUMNS.values(), *_COMPARED], rows)
+
+
+def _needless_table(found: Mapping[Key, Sequence[Run]], labels: Sequence[str]) -> str:
+    """One row for each perturbation that lays other things on the table; empty without runs."""
+
+    def share(key: Key) -> str:
+        summaries = [run.summary for run in found.get(key, ())]
+        # Older ones do not tell.
+        if not summaries or not all("needless_actions" in item for item in summaries):
+            return "-"
+        needless, every = (
+            sum(item[field] for item in summaries) for field in ("needless_actions", "actions")
+        )
+        return f"{needless} of {every}"
+
+    rows = [
+        [label, *cells]
+        for label in labels
+        if label.startswith(("`distractors", "`all"))
+        and set(cells := [share((label, method)) for method in _COLUMNS]) != {"-"}
+    ]
+    return markdown_table(["perturbation", *_COLUMNS.values()], rows) if rows else ""
+
+
+def _check_seeds(found: Mapping[Key, Sequence[Run]]) -> None:
+    for (label, method), runs in found.items():
+        counts = Counter(seed for run in runs for seed in run.summary["seeds"])
+        twice = min((seed for seed, count in counts.items() if count > 1), default=None)
+        if twice is not None:
+            files = " and ".join(run.file for run in runs if twice in run.summary["seeds"])
+            raise UserError(
+                f"{files} are both of {_COLUMNS[method]}, {label}, seed {twice}: delete one"
+            )
+
+
+def _common(run: Run, label: str) -> bool:
+    """Whether its seeds are those that all are run on."""
+    seeds = list(run.summary["seeds"])
+    if _is_other_level(label):
+        return len(seeds) >= _FEWEST and seeds == list(_SEEDS)[: len(seeds)]
+    return seeds == list(_SEEDS)
+
+
+def _is_other_level(label: str) -> bool:
+    return ":mild" in label or ":severe" in label
+
+
+def _strict(run: Run) -> tuple[int, int]:
+    """How many objects were a strict success, and how many there were."""
+    objects = sum(category["objects"] for category in run.summary["categories"].values())
+    return round(run.summary["strict_success_rate"] * objects), objects
+
+
+def with_figures(page: str, figures: str) -> str:
+    """A page with the text between its two marks replaced.
+
+    Raises:
+        UserError: it lacks the marks.
+    """
+    head, begin, rest = page.partition(_BEGIN)
+    _, end, tail = rest.partition(_END)
+    if not begin or not end:
+        raise UserError(f"the page on robustness lacks {_BEGIN.strip()} and {_END.strip()}")
+    return f"{head}{begin}{figures}{end}{tail}"
+
+
+def _shipped() -> dict[str, str | None]:
+    """The digests of the weights that come with the package, by method."""
+    policies = {"generalist": Learned(weights=""), "so2": load_scenario(_UNSEEN).policy}
+    return {method: policy.digest(SCENARIOS) for method, policy in policies.items()}
+
+
+def _expected() -> dict[str, dict[str, Any]]:
+    """The scenario of each row, as JSON holds it."""
+    path, task = _UNSEEN, f"task: {{tries: {_TRIES}}}"
+    one, more = f"{{{task}}}", f"{{{task}, sensor_noise: {{frames: {_FRAMES}}}}}"
+    rows: dict[str, tuple[str, str | None]] = {_AS_IT_IS: (one, None)}
+    for level in LEVELS:
+        rows |= {f"`{name}:{level}`": (one, f"{name}:{level}") for name in NAMES}
+    for name in ("depth_noise", "all"):
+        rows[f"`{name}:moderate`, {_FRAMES} frames"] = (more, f"{name}:moderate")
+    return {
+        label: described(load_scenario(path, text=text, perturb=perturb))
+        for label, (text, perturb) in rows.items()
+    }

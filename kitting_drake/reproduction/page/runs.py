@@ -1,0 +1,257 @@
+"""The runs that the page of results is made of: files of `evaluate`, and how they depart from the
+paper's tasks."""
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cache, cached_property
+from pathlib import Path
+from typing import Any
+
+from kitting_drake.common.errors import UserError
+from kitting_drake.evaluation.summary import ERRORS
+from kitting_drake.policies.data.static_scenes import STATIC
+from kitting_drake.scenario.choosing import ChosenScenario
+from kitting_drake.scenario.schema import Scenario
+from kitting_drake.tasks import PAPER_TASKS, RAVENS_TASKS
+
+METHODS = {
+    "so2": "SO(2)-equivariant (ours)",
+    "equivariant_transporter": "Equivariant Transporter",
+    "transporter": "Transporter",
+    "generalist": "generalist, of static scenes",
+    "shape_matching": "shape matching, of nothing",
+    "quantized_oracle": "oracle, quantized",
+    "oracle": "oracle, exact",
+}
+"""Names of methods for people; any other is called as it calls itself."""
+
+LEARNED = ("so2", "equivariant_transporter", "transporter")
+"""The methods that the paper compares."""
+
+_NOT_THE_TASK = ("policy", "random_seed", "target_realtime_rate")
+"""The fields of a scenario in which runs of one task may differ."""
+
+_ADDED: dict[str, Any] = {
+    "task.distractors": 0,
+    "task.tries": 1,
+    "task.pool": [],
+    "task.kit.always_nested": False,
+    "task.kit.fixed_size": False,
+    "plant.friction_variation": 0.0,
+    "plant.mass_variation": 0.0,
+    "sensor_noise.frames": 1,
+    "end_at_success": False,
+}
+"""Fields that older runs lack, with what those did."""
+
+_ADDED_WHOLE = ("sensor_noise", "appearance")
+"""The same, where it is what a scenario does by default."""
+
+_HAND = (
+    "planner.firm_grasp_force",
+    "planner.heavy_load",
+    "planner.press_force",
+    "planner.press_depth",
+    "planner.search.reach",
+    "planner.search.speed",
+)
+_EARLIER_HAND = "an earlier hand"
+"""How it is told that these fields are lacking: it did not grip what is heavy more firmly, nor
+press, nor search in a spiral, and took what is thinner than 3 mm for not gripped."""
+
+_MOST_SHOWN = 4
+"""So many differences of one run are listed; more are counted."""
+
+_TYPES: dict[str, type | tuple[type, ...]] = {
+    **dict.fromkeys(("task", "policy", "success_description"), str),
+    **dict.fromkeys(("policy_details", "resolved_scenario", *ERRORS, "action_errors"), dict),
+    **dict.fromkeys(("causes", "ambiguous", "categories"), dict),
+    **dict.fromkeys(("seeds", "ci95", "strict_ci95"), list),
+    "episodes": int,
+    "wall_seconds": (int, float),
+}
+"""The types of a summary's fields."""
+_SHARES = ("success_rate", "strict_success_rate")
+"""The fields that are numbers from 0 to 1."""
+
+
+@dataclass(frozen=True)
+class Run:
+    """One summary."""
+
+    file: str
+    summary: dict[str, Any]
+
+    def detail(self, key: str) -> Any:
+        """An entry of the policy's details; None if it has no such entry."""
+        return self.summary["policy_details"].get(key)
+
+    @property
+    def method(self) -> str:
+        """The policy's method: a key of `METHODS`, or the policy's name."""
+        if self.detail("scenario") == STATIC:
+            return "generalist"
+        return self.detail("method") or self.summary["policy"]
+
+    @property
+    def seeds(self) -> str:
+        """The first and the last seed, for a person."""
+        seeds = self.summary["seeds"]
+        first, last = min(seeds), max(seeds)
+        return f"{first} to {last}" if last - first + 1 == len(seeds) else f"{first} .. {last}"
+
+    @property
+    def label(self) -> str:
+        """The policy and the parameters that the paper varies, for a person."""
+        parts = [METHODS.get(self.method, self.method)]
+        for key, text in (
+            ("orientations", "N = {}"),
+            (
+                "demonstrations",
+                f"{{}} {'scenes' if self.method == 'generalist' else 'demonstrations'}",
+            ),
+            ("preset", "preset {}"),
+        ):
+            if self.detail(key) is not None:
+                parts.append(text.format(self.detail(key)))
+        return ", ".join(parts)
+
+    @cached_property
+    def departures(self) -> list[str]:
+        """Where its scenario differs, but for the policy, from that of the paper's task of its
+        kind, or from the Ravens task; or, if the paper has none, from the default one, but for the
+        task."""
+        found = self.summary["resolved_scenario"]
+        for task in PAPER_TASKS.values():
+            expected = described(Scenario(task=task))
+            if found["task"]["_tag"] == expected["task"]["_tag"]:
+                return _differences(_without(found), _without(expected))
+        for other in RAVENS_TASKS:
+            expected = described(Scenario(task=other))
+            if found["task"]["_tag"] == expected["task"]["_tag"]:
+                # The longest of them has a limit of its own.
+                return _differences(_without(found, "time_limit"), _without(expected, "time_limit"))
+        expected = described(Scenario())
+        return _differences(_without(found, "task"), _without(expected, "task"))
+
+    @property
+    def paper_task(self) -> str | None:
+        """The title of the paper's task that it is a run of, where nothing but the policy differs
+        from it."""
+        task = self.summary["task"]
+        return task if task in PAPER_TASKS and not self.departures else None
+
+    @property
+    def departures_text(self) -> str:
+        """The departures in a few words."""
+        shown = "; ".join(f"`{item}`" for item in self.departures[:_MOST_SHOWN])
+        more = len(self.departures) - _MOST_SHOWN
+        return f"{shown}; and {more} more" if more > 0 else shown
+
+
+def described(scenario: Scenario) -> dict[str, Any]:
+    """The scenario as JSON holds it."""
+    fields = ChosenScenario(scenario, Path(), "", None).described
+    return json.loads(json.dumps(fields, default=str))
+
+
+def scenario_differences(found: dict[str, Any], expected: dict[str, Any]) -> list[str]:
+    """The fields, policy aside, in which two scenarios differ, as `described` has them."""
+    return _differences(_without(found), _without(expected))
+
+
+def _without(scenario: dict[str, Any], *more: str) -> dict[str, Any]:
+    return {key: value for key, value in scenario.items() if key not in (*_NOT_THE_TASK, *more)}
+
+
+@cache
+def _added() -> dict[str, Any]:
+    defaults = described(Scenario())
+    return _ADDED | {key: defaults[key] for key in _ADDED_WHOLE}
+
+
+def _differences(found: Any, expected: Any, path: str = "") -> list[str]:
+    """The fields, by their paths, in which JSON values differ, with what was found there."""
+    if found == expected:
+        return []
+    if not isinstance(found, Mapping) or not isinstance(expected, Mapping):
+        return [f"{path}: {json.dumps(found)}"]
+    if found.get("_tag") != expected.get("_tag"):
+        return [f"{path}: {found.get('_tag')}"]
+    differences = []
+    for key in dict.fromkeys((*expected, *found)):
+        here = f"{path}.{key}" if path else key
+        if key not in found and here in _HAND:
+            differences.append(_EARLIER_HAND)
+        elif key not in found and here not in _added():
+            differences.append(f"{here}: not there")
+        elif key not in expected:
+            differences.append(f"{here}: {json.dumps(found[key])}")
+        else:
+            was = found[key] if key in found else _added()[here]
+            differences += _differences(was, expected[key], here)
+    return list(dict.fromkeys(differences))
+
+
+def read_runs(folder: Path) -> list[Run]:
+    """The summaries of a folder, in the order of the names of their files; there may be none.
+
+    Raises:
+        UserError: there is no such folder, or a file in it is not what `evaluate` writes.
+    """
+    if not folder.is_dir():
+        raise UserError(f"there is no folder {folder}: make it, and copy summary.json files there")
+    return [Run(path.name, _read_summary(path)) for path in sorted(folder.glob("*.json"))]
+
+
+def _read_summary(path: Path) -> dict[str, Any]:
+    try:
+        summary = json.loads(path.read_text())
+    except (OSError, ValueError) as error:
+        raise UserError(f"{path} cannot be read: {error}") from error
+    check_summary(summary, path)
+    _check_details(summary["policy_details"], f"{path}: policy_details")
+    return summary
+
+
+def check_summary(summary: Any, path: Path) -> None:
+    """Checks that a file's content has the fields of `evaluate`, and that each is of its kind.
+
+    Raises:
+        UserError: it has not; names the file and the field.
+    """
+    must = "it must be a summary.json of evaluate"
+    for key in (*_TYPES, *_SHARES):
+        if not isinstance(summary, dict) or key not in summary:
+            raise UserError(f"{path} lacks '{key}': {must}")
+    wrong = [key for key, kind in _TYPES.items() if not isinstance(summary[key], kind)]
+    if not wrong:
+        wrong = [key for key in _SHARES if not _are_shares([summary[key]], 1)]
+        wrong += [key for key in ("ci95", "strict_ci95") if not _are_shares(summary[key], 2)]
+    if wrong:
+        raise UserError(f"{path}: '{wrong[0]}' is {summary[wrong[0]]!r}: {must}")
+    seeds = summary["seeds"]
+    if not seeds or not all(isinstance(seed, int) for seed in seeds):
+        raise UserError(f"{path} has no seeds, or some that are no whole numbers: {must}")
+    task = summary["resolved_scenario"].get("task")
+    if not isinstance(task, dict) or not isinstance(task.get("_tag"), str):
+        raise UserError(f"{path}: resolved_scenario has no task")
+
+
+def _are_shares(values: list[Any], count: int) -> bool:
+    return len(values) == count and all(
+        isinstance(value, int | float) and 0 <= value <= 1 for value in values
+    )
+
+
+def _check_details(details: Any, where: str) -> None:
+    if not isinstance(details, dict):
+        raise UserError(f"{where} must be a mapping")
+    method = details.get("method")
+    needed = ["orientations"] if method in (*LEARNED, "quantized_oracle") else []
+    if method in LEARNED:
+        needed.append("demonstrations")
+    for key in needed:
+        if not isinstance(details.get(key), int):
+            raise UserError(f"{where}.{key} must be a whole number for the method {method}")

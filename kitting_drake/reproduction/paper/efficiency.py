@@ -1,0 +1,99 @@
+"""Figure 6(c), what it costs to predict the pick angle: the section of the page of results, from a
+file of `benchmark networks` alone."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from kitting_drake.common.errors import UserError
+from kitting_drake.evaluation.quantities import count_text, seconds_text
+from kitting_drake.reproduction.page.markdown import markdown_table
+from kitting_drake.reproduction.page.runs import LEARNED, METHODS
+
+EFFICIENCY = "networks.json"
+"""The file, beside the results: a copy of the one that `benchmark networks` leaves."""
+
+_INTRODUCTION = """\
+### Efficiency, figure 6(c)
+
+Parameters and inference time of the pick-angle networks, of the size that the paper gives (preset
+`paper`) and of the size used elsewhere on this page (`small`). {machine}, in {type}, the median
+of {repeats}. The last column is the growth from N = {fewest} to N = {most}, of parameters and of
+time. The Transporter has no such network: its one picking network sees the scene at N / 2 angles.
+
+![Parameters and time of the networks](networks.png)
+
+"""
+
+
+def read_efficiency(folder: Path) -> dict[str, Any] | None:
+    """The measurements of `benchmark networks`; None where there is no file.
+
+    Raises:
+        UserError: the file is damaged.
+    """
+    path = folder / EFFICIENCY
+    if not path.exists():
+        return None
+    try:
+        measured: dict[str, Any] = json.loads(path.read_text())
+        efficiency_section(measured)
+    except (OSError, ValueError, LookupError, TypeError) as error:
+        raise UserError(f"{path} is no file of benchmark networks: delete it") from error
+    return measured
+
+
+def efficiency_section(measured: Mapping[str, Any]) -> str:
+    """The section of the page.
+
+    Args:
+        measured: what `benchmark_networks` returns.
+    """
+    machine = measured["machine"]
+    place = machine["cpu"] if machine["device"] == "cpu" else machine["device"]
+    growths = {(row["method"], row["preset"]): row for row in measured["pick_angle_growth"]}
+    presets = list(dict.fromkeys(row["preset"] for row in measured["pick_angle"]))
+    ends = growths[LEARNED[0], presets[0]]
+    counts = [
+        n
+        for n in sorted({row["orientations"] for row in measured["pick_angle"]})
+        if ends["from"] <= n <= ends["to"]
+    ]
+    rows = []
+    for preset in presets:
+        for method in LEARNED[:2]:
+            by_n = {
+                row["orientations"]: row
+                for row in measured["pick_angle"]
+                if (row["method"], row["preset"]) == (method, preset)
+            }
+            growth = growths[method, preset]
+            rows.append(
+                [
+                    METHODS[method],
+                    preset,
+                    *(_cost_text(by_n[n]) for n in counts),
+                    f"{_ratio_text(growth['parameters'])}, {_ratio_text(growth['seconds'])}",
+                ]
+            )
+    return _INTRODUCTION.format(
+        machine=f"{place}, {machine['threads']} threads",
+        type=measured["inference_type"],
+        repeats=measured["repeats"],
+        fewest=ends["from"],
+        most=ends["to"],
+    ) + markdown_table(
+        ["method", "preset", *(f"N = {n}" for n in counts), "growth"], rows, left_columns=2
+    )
+
+
+def _cost_text(row: Mapping[str, Any]) -> str:
+    """Parameters, and the time or why there is none."""
+    return f"{count_text(row['parameters'])}, {row['skipped'] or seconds_text(row['seconds'])}"
+
+
+def _ratio_text(ratio: float | None) -> str:
+    return "-" if ratio is None else f"{ratio:.2f}"

@@ -1,0 +1,190 @@
+"""Figures 6(a) and 6(b) of the paper, and its table I as a figure, from the results of
+`benchmark paper`."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+from kitting_drake.reproduction.page.ravens_table import PAPER as TABLE_1
+from kitting_drake.reproduction.page.runs import METHODS
+from kitting_drake.reproduction.paper.cell_results import Result
+from kitting_drake.reproduction.paper.cells import TASKS
+from kitting_drake.reproduction.paper.paper_sections import COLUMNS
+from kitting_drake.reproduction.paper.paper_tables import DEMONSTRATIONS, RAVENS_DEMONSTRATIONS
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+_COLOURS = {10: "#009e73", 100: "#d55e00"}
+"""Green and orange, as in the paper."""
+_MARKERS = {"so2": "o", "equivariant_transporter": "s", "transporter": "^"}
+_STEP = 0.12
+"""Between the markers of one N."""
+_ROWS = {
+    ("so2", 36): "#d55e00",
+    ("so2", 180): "#a01a3a",
+    ("equivariant_transporter", 36): "#0072b2",
+    ("transporter", 36): "#666666",
+}
+"""The rows of table I, method and N, and their colours."""
+_ROW_STEP = 0.19
+"""Between the markers of one number of demonstrations."""
+_STYLE = {"font.size": 10, "axes.spines.top": False, "axes.spines.right": False}
+
+
+def draw_figure_6(task: str, results: Mapping[str, Result]) -> bytes:
+    """A PNG: success over N, after 10 and after 100 demonstrations.
+
+    A filled marker is the strict success rate with its 95 % interval, a hollow one above it the
+    rate by the paper's measure, which the paper draws. A black line is the strict rate of the
+    rounded oracle. What was not run is not there.
+
+    Args:
+        task: `seen` or `unseen`.
+        results: by the names of their cells.
+    """
+    # Imported here: the other commands should not wait for it.
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    series = [(method, count) for count in sorted(DEMONSTRATIONS) for method in _MARKERS]
+    with plt.rc_context(_STYLE):
+        figure, axis = plt.subplots(figsize=(7.0, 3.8), layout="constrained")
+        for index, (method, count) in enumerate(series):
+            for place, n in enumerate(COLUMNS):
+                result = results.get(f"{task}_{method}_{n}_{count}")
+                if result is None:
+                    continue
+                where = place + _STEP * (index - (len(series) - 1) / 2)
+                _draw_marker(axis, where, result.summary, method, count)
+        for place, n in enumerate(COLUMNS):
+            oracle = results.get(f"{task}_quantized_oracle_{n}")
+            if oracle is not None:
+                rate = 100 * oracle.summary["strict_success_rate"]
+                ends = (place - 0.42, place + 0.42)
+                axis.hlines(rate, *ends, color="black", linewidth=1.0, label="oracle, quantized")
+        axis.set_xticks(range(len(COLUMNS)), [f"N = {n}" for n in COLUMNS])
+        axis.set_xlim(-0.55, len(COLUMNS) - 0.45)
+        axis.set_ylim(top=101)
+        axis.set_ylabel("success, %")
+        axis.grid(axis="y", color="0.9", zorder=0)
+        axis.set_axisbelow(True)
+        _explain(axis, "strict success", "by the paper's measure")
+        return _finish(figure)
+
+
+def _draw_marker(
+    axis: Axes, where: float, summary: Mapping[str, Any], method: str, count: int
+) -> None:
+    """Both rates of a cell."""
+    rate, (low, high) = summary["strict_success_rate"], summary["strict_ci95"]
+    look = {"color": _COLOURS[count], "marker": _MARKERS[method], "markersize": 6, "linestyle": ""}
+    axis.errorbar(
+        where,
+        100 * rate,
+        yerr=[[100 * (rate - low)], [100 * (high - rate)]],
+        elinewidth=1.2,
+        label=f"{METHODS[method]}, {count} demonstrations",
+        zorder=3,
+        **look,
+    )
+    axis.plot(where, 100 * summary["success_rate"], markerfacecolor="white", zorder=2, **look)
+
+
+def draw_table_1(results: Mapping[str, Result]) -> bytes:
+    """A PNG: the mean reward of each Ravens task over the number of demonstrations.
+
+    A filled marker is measured, with its 95 % interval; a diamond is with what goes beyond the
+    paper; a hollow one is what the paper gives for the same cell. What was not run is not there,
+    nor is the paper's beside it.
+
+    Args:
+        results: by the names of their cells.
+    """
+    # Imported here: the other commands should not wait for it.
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    tasks = [task.name for task in TASKS.values() if task.table == "I"]
+    counts = sorted(RAVENS_DEMONSTRATIONS)
+    with plt.rc_context(_STYLE):
+        figure, axes = plt.subplots(
+            1, len(tasks), figsize=(9.6, 3.4), sharey=True, layout="constrained"
+        )
+        for column, (task, axis) in enumerate(zip(tasks, axes, strict=True)):
+            _draw_task(axis, task, column, results)
+            axis.set_title(task.replace("_", " "), fontsize=10)
+            axis.set_xticks(range(len(counts)), [str(count) for count in counts])
+            axis.set_xlim(-0.5, len(counts) - 0.5)
+            axis.grid(axis="y", color="0.9", zorder=0)
+            axis.set_axisbelow(True)
+        axes[0].set_ylim(top=102)
+        axes[0].set_ylabel("mean reward, %")
+        axes[len(tasks) // 2].set_xlabel("demonstrations")
+        _explain(axes[0], "measured here", "the paper's")
+        return _finish(figure)
+
+
+def _draw_task(axis: Axes, task: str, column: int, results: Mapping[str, Result]) -> None:
+    """The panel of a task: its cells, and the paper's beside those as in the paper."""
+    for index, ((method, n), colour) in enumerate(_ROWS.items()):
+        for place, count in enumerate(sorted(RAVENS_DEMONSTRATIONS)):
+            where = place + _ROW_STEP * (index - (len(_ROWS) - 1) / 2)
+            name, row = f"{task}_{method}_{n}_{count}", f"{METHODS[method]}, N = {n}"
+            if name in results:
+                look = {"color": colour, "marker": _MARKERS[method], "linestyle": ""}
+                paper = TABLE_1[METHODS[method], n][column][place]
+                axis.plot(where, paper, markerfacecolor="white", zorder=2, **look)
+                _draw_reward(axis, where, results[name].summary, row, look)
+            if f"{name}_ours" in results:
+                look = {"color": colour, "marker": "d", "linestyle": ""}
+                summary = results[f"{name}_ours"].summary
+                _draw_reward(axis, where, summary, f"{row}, with extensions", look)
+
+
+def _draw_reward(
+    axis: Axes, where: float, summary: Mapping[str, Any], label: str, look: Mapping[str, str]
+) -> None:
+    rate, (low, high) = summary["success_rate"], summary["ci95"]
+    axis.errorbar(
+        where,
+        100 * rate,
+        yerr=[[100 * (rate - low)], [100 * (high - rate)]],
+        elinewidth=1.2,
+        label=label,
+        zorder=3,
+        **look,
+    )
+
+
+def _explain(axis: Axes, filled: str, hollow: str) -> None:
+    """Adds to the legend what filled and hollow markers are."""
+    axis.plot([], [], "o", color="0.4", label=f"filled: {filled}")
+    axis.plot([], [], "o", color="0.4", markerfacecolor="white", label=f"hollow: {hollow}")
+
+
+def _finish(figure: Figure) -> bytes:
+    """A PNG of a figure with its legend, in which each label stands once; closes the figure."""
+    import matplotlib.pyplot as plt
+
+    pairs = [axis.get_legend_handles_labels() for axis in figure.axes]
+    once = {label: handle for pair in pairs for handle, label in zip(*pair, strict=True)}
+    figure.legend(
+        once.values(),
+        once.keys(),
+        loc="outside lower center",
+        ncols=2,
+        frameon=False,
+        fontsize=9,
+    )
+    image = io.BytesIO()
+    figure.savefig(image, format="png", dpi=130)
+    plt.close(figure)
+    return image.getvalue()

@@ -1,0 +1,49 @@
+"""The section of the page of results on how much one training differs from another."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from statistics import mean, stdev
+
+from kitting_drake.reproduction.page.markdown import markdown_table
+from kitting_drake.reproduction.page.paired import OWN, STRICT
+from kitting_drake.reproduction.page.runs import LEARNED, METHODS
+from kitting_drake.reproduction.paper.cell_results import Result
+from kitting_drake.reproduction.paper.paper_tables import FIGURE_6, HEADLINE_SEEDS, headline
+
+_INTRODUCTION = """\
+Three trainings of each method at N = 180 after 100 demonstrations. The seed of a training sets
+its initial weights, and the order and augmentation of its samples; demonstrations, validation
+scenes and test episodes are the same. Success rates in percent, strict and by the paper's
+measure; the mean is given with the standard deviation over trainings.
+"""
+
+
+def trainings(results: Mapping[str, Result]) -> list[str]:
+    """The section; empty where nothing has been trained from a second seed."""
+    rows = []
+    for task in FIGURE_6:
+        for method in LEARNED[:2]:
+            found = [results.get(headline(task, method, seed).name) for seed in HEADLINE_SEEDS]
+            there = [result for result in found if result is not None]
+            if len(there) > 1:
+                cells = ["-" if result is None else _rates([result]) for result in found]
+                rows.append([METHODS[method], task, *cells, _rates(there)])
+    if not rows:
+        return []
+    headings = ["method", "toolsets", *(f"seed {seed}" for seed in HEADLINE_SEEDS), "mean"]
+    return [
+        "### Variation between trainings\n",
+        _INTRODUCTION,
+        markdown_table(headings, rows, left_columns=2),
+    ]
+
+
+def _rates(results: Sequence[Result]) -> str:
+    """The mean of both rates, and its standard deviation where there are several."""
+    texts = []
+    for rate in (STRICT, OWN):
+        percents = [100 * result.summary[rate] for result in results]
+        spread = f" ± {stdev(percents):.1f}" if len(percents) > 1 else ""
+        texts.append(f"{mean(percents):.1f}{spread}")
+    return " / ".join(texts)

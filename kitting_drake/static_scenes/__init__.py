@@ -1,0 +1,1 @@
+"""Static scenes to learn from, rendered without physics."""

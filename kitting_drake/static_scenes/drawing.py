@@ -1,0 +1,312 @@
+"""Static scenes to learn from: random tools and kits, rendered where they stand; no physics.
+
+Tools are drawn (`hkd.tools.random_tools`), a kit is laid out for some of them, and several scenes
+are rendered of it: other poses, other tools already seated, other things lying about that have no
+cavity, another camera noise. The labels are geometry: every grasp that leaves the jaws room, and
+the pose that seats the tool.
+"""
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from manifold3d import CrossSection, Manifold
+from numpy.typing import NDArray
+from pydrake.common import MemoryFile
+from pydrake.geometry import (
+    ColorRenderCamera,
+    GeometryInstance,
+    InMemoryMesh,
+    Mesh,
+    PerceptionProperties,
+    RenderLabel,
+    SceneGraph,
+)
+from pydrake.math import RigidTransform, RollPitchYaw
+from pydrake.systems.framework import DiagramBuilder
+from pydrake.systems.sensors import RgbdSensor
+
+from kitting_drake.common.errors import UserError
+from kitting_drake.common.paths import MODELS
+from kitting_drake.common.rendering import add_observation_renderer, require_rendering
+from kitting_drake.hkd.kits.block import build_block
+from kitting_drake.hkd.kits.kit import Kit
+from kitting_drake.hkd.kits.layout import kit_cavities, layout_kit
+from kitting_drake.hkd.kits.parameters import KitParameters
+from kitting_drake.hkd.tools.generate import load_catalogue
+from kitting_drake.hkd.tools.meshes import vertices_and_faces
+from kitting_drake.hkd.tools.random_tools import RandomTool, draw_tool
+from kitting_drake.policies.data.static_scenes import StaticScene
+from kitting_drake.scenario.cameras import camera_pose, depth_camera
+from kitting_drake.scenario.schema import Scenario
+from kitting_drake.tasks.kitting.tool_poses import DrawnBox, draw_boxes, draw_poses
+from systems.hand_geometry import FINGER_DEPTH, FINGER_LENGTH, MAX_OPENING
+from systems.heightmap_projector import HeightmapProjector
+from systems.sensor_noise import SensorNoise, SensorNoiseParameters
+from systems.signals import Observation, PixelGrid
+
+_TOOLS_A_BATCH = 12
+_TOOLSETS_A_BATCH = 10
+_SCENES_A_TOOLSET = 4
+"""At most: a toolset for which there is no room is left out."""
+
+_COUNTS = np.array([2, 4, 8, 24, 8, 6, 4, 2, 2, 1, 1, 1], float)
+"""How often kits of 1, 2, ... 12 tools are drawn: mostly of four."""
+_MOST_LOOSE = 8
+"""The most loose tools; any others are seated, as the workspace has no room for all."""
+_CLUTTERED = 0.5
+"""The share of scenes with things that have no cavity, ..."""
+_MOST_STRANGERS, _MOST_BOXES = 2, 6
+"""... at most so many other tools, and boxes."""
+_WALL = 0.003
+_IN_CAVITY = 0.0008
+"""Standard deviation of where a seated tool lies in its clearance, in metres."""
+
+
+def draw_batch(seed: int) -> Iterator[StaticScene]:
+    """The static scenes of a seed.
+
+    Args:
+        seed: of all draws; different seeds share neither tools nor kits.
+
+    Raises:
+        UserError: images cannot be rendered here.
+    """
+    require_rendering()
+    rng = np.random.default_rng([seed, 0])
+    catalogue = load_catalogue(MODELS / "tools" / "catalogue.yaml")
+    entries = [entry for entry in catalogue if entry.split == "train"]
+    tools = [draw_tool(entries, rng, f"tool_{index}") for index in range(_TOOLS_A_BATCH)]
+    for number in range(_TOOLSETS_A_BATCH):
+        count = 1 + int(rng.choice(len(_COUNTS), p=_COUNTS / _COUNTS.sum()))
+        chosen = [tools[i] for i in rng.choice(len(tools), count, replace=False)]
+        if rng.random() < 0.5:
+            # Of one kind, tools are nested; of four, they take the slots of a toolset.
+            chosen = [replace(tool, category="drawn") for tool in chosen]
+        try:
+            kit = _draw_kit(chosen, rng)
+            others = [tool for tool in tools if all(tool.name != own.name for own in chosen)]
+            for scene in range(_SCENES_A_TOOLSET):
+                # Of its own, so that noise and scene have nothing to do with each other.
+                own = np.random.SeedSequence([seed, 1, number, scene])
+                noise_seed = int(own.generate_state(1)[0])
+                yield _draw_scene(kit, chosen, others, rng, noise_seed)
+        except UserError:
+            # There is no room for so many such tools.
+            continue
+
+
+@dataclass(frozen=True)
+class _DrawnKit:
+    kit: Kit
+    text: str
+    """The Wavefront text of the block."""
+
+
+def _draw_kit(tools: Sequence[RandomTool], rng: np.random.Generator) -> _DrawnKit:
+    highest = max(tool.height for tool in tools)
+    parameters = KitParameters(
+        height=max(highest + _WALL, float(rng.uniform(0.03, 0.06))),
+        clearance=float(rng.uniform(0.0015, 0.003)),
+        closing_radius=float(rng.uniform(0.004, 0.009)),
+        minimum_wall=0.002,
+    )
+    layout = layout_kit(tools, parameters)
+    block = build_block(kit_cavities(tools, layout.parameters, layout.poses), layout.parameters)
+    return _DrawnKit(Kit(Path("kit.sdf"), tuple(tools), layout), _solid_text(block))
+
+
+def _draw_scene(
+    drawn: _DrawnKit,
+    tools: Sequence[RandomTool],
+    others: Sequence[RandomTool],
+    rng: np.random.Generator,
+    noise_seed: int,
+) -> StaticScene:
+    """A scene of a kit, its tools, and perhaps some of the others, for which it has no cavity."""
+    grid = PixelGrid()
+    kit = drawn.kit
+    loose = _draw_loose(len(tools), rng)
+    strangers: list[RandomTool] = []
+    box_count = 0
+    if rng.random() < _CLUTTERED:
+        room = max(0, min(_MOST_LOOSE - len(loose), len(others)))
+        count = min(int(rng.integers(0, _MOST_STRANGERS + 1)), room)
+        strangers = [others[i] for i in rng.choice(len(others), count, replace=False)]
+        box_count = int(rng.integers(0, _MOST_BOXES + 1))
+    lying = [*(tools[index] for index in loose), *strangers]
+    X_WKit, X_WTools = draw_poses(
+        kit,
+        lying,
+        grid=grid,
+        spacing=float(rng.uniform(0.004, 0.02)),
+        yaw_range_deg=180.0,
+        rng=rng,
+    )
+    boxes = draw_boxes(box_count, kit, X_WKit, lying, X_WTools, grid=grid, rng=rng)
+    X_WGoals = []
+    for index in range(len(tools)):
+        pose = kit.goal(index)
+        X_WGoals.append(
+            X_WKit @ RigidTransform(RollPitchYaw(0, 0, pose.yaw), [pose.x, pose.y, pose.z])
+        )
+    bodies = [(drawn.text, X_WKit)]
+    bodies += [(_text(tool), X) for tool, X in zip(lying, X_WTools, strict=True)]
+    for index in sorted(set(range(len(tools))) - set(loose)):
+        dx, dy = np.clip(rng.normal(0, _IN_CAVITY, 2), -0.0015, 0.0015)
+        bodies.append((_text(tools[index]), RigidTransform([dx, dy, 0.0]) @ X_WGoals[index]))
+    bodies += [(_solid_text(_box(box)), box.X_WB) for box in boxes]
+    observation = render(bodies, grid, _draw_noise(rng), noise_seed)
+
+    standing = [_standing(CrossSection.square(kit.size[:2], True), X_WKit)]
+    standing += [
+        _standing(tool.footprint.hull(), X) for tool, X in zip(lying, X_WTools, strict=True)
+    ]
+    standing += [_standing(CrossSection.square(box.size[:2], True), box.X_WB) for box in boxes]
+    actions = []
+    for place, index in enumerate(loose):
+        around = [item for k, item in enumerate(standing) if k != place + 1]
+        actions += _actions(place, tools[index], X_WTools[place], X_WGoals[index], around)
+    return StaticScene.of(observation, np.array(actions).reshape(-1, 8))
+
+
+def _draw_loose(count: int, rng: np.random.Generator) -> list[int]:
+    """Which of so many tools are not seated yet."""
+    order = rng.permutation(count)
+    seated = int(rng.integers(0, count + 1))
+    if rng.random() < 0.5:
+        seated //= 2
+    return sorted(order[max(seated, count - _MOST_LOOSE) :].tolist())
+
+
+def _actions(
+    number: int,
+    tool: RandomTool,
+    X_WT: RigidTransform,
+    X_WGoal: RigidTransform,
+    others: Sequence[CrossSection],
+) -> list[tuple[float, ...]]:
+    """The rows of `StaticScene.actions` of one loose tool."""
+    rows: list[tuple[float, ...]] = []
+    yaw = RollPitchYaw(X_WT.rotation()).yaw_angle()
+    rotation = RollPitchYaw(X_WGoal.rotation()).yaw_angle() - yaw
+    for grasp in tool.grasps:
+        pick = X_WT @ np.array([grasp.x, grasp.y, 0.0])
+        theta = yaw + grasp.theta
+        fingers = CrossSection.square((FINGER_LENGTH, MAX_OPENING + 2 * FINGER_DEPTH), True)
+        fingers = fingers.rotate(math.degrees(theta)).translate((pick[0], pick[1]))
+        if any((fingers ^ other).area() > 1e-9 for other in others):
+            continue
+        place = X_WGoal @ np.array([grasp.x, grasp.y, 0.0])
+        rows.append(
+            (number, grasp.cost, pick[0], pick[1], theta, place[0], place[1], theta + rotation)
+        )
+    return rows
+
+
+def _standing(outline: CrossSection, X: RigidTransform) -> CrossSection:
+    yaw = RollPitchYaw(X.rotation()).yaw_angle()
+    return outline.rotate(math.degrees(yaw)).translate(tuple(X.translation()[:2]))
+
+
+def _draw_noise(rng: np.random.Generator) -> SensorNoiseParameters:
+    """From none to what a poor camera, poorly calibrated, has."""
+    if rng.random() < 0.25:
+        return SensorNoiseParameters()
+    severity = rng.uniform(0.0, 1.0, 8)
+    return SensorNoiseParameters(
+        depth_std=float(0.0035 * severity[0]),
+        correlation=float(0.5 + 3 * severity[1]),
+        depth_step=float(0.002 * severity[2]),
+        flying_share=float(0.5 * severity[3]),
+        hole_share=float(0.06 * severity[4]),
+        steepest_deg=float(rng.uniform(70.0, 90.0)),
+        camera_position_error=float(0.002 * severity[5]),
+        camera_angle_error_deg=float(0.15 * severity[5]),
+        rig_position_error=float(0.004 * severity[6]),
+        rig_angle_error_deg=float(0.4 * severity[7]),
+    )
+
+
+Body = tuple[str, RigidTransform]
+"""A mesh as Wavefront text, in metres, and its pose in the world."""
+
+
+def render(
+    bodies: Sequence[Body], grid: PixelGrid, noise: SensorNoiseParameters, seed: int
+) -> Observation:
+    """o_t of bodies on a table, by the scenario's default cameras; heights only, colours are black.
+
+    Args:
+        bodies: what stands on the table, the plane z = 0.
+        grid: of the observation.
+        noise: of the cameras.
+        seed: of the noise.
+    """
+    builder = DiagramBuilder()
+    scene_graph = builder.AddSystem(SceneGraph())
+    source = scene_graph.RegisterSource("static")
+    renderer = add_observation_renderer(scene_graph)
+    corners = np.array([[-1, -2, 0], [2, -2, 0], [2, 2, 0], [-1, 2, 0]], float)
+    table = (_obj(corners, np.array([[0, 1, 2], [0, 2, 3]])), RigidTransform())
+    for number, (text, X) in enumerate([table, *bodies]):
+        file = MemoryFile(text, ".obj", f"body_{number}")
+        mesh = Mesh(InMemoryMesh(mesh_file=file))
+        instance = GeometryInstance(X, mesh, f"body_{number}")
+        properties = PerceptionProperties()
+        properties.AddProperty("label", "id", RenderLabel(number))
+        instance.set_perception_properties(properties)
+        scene_graph.RegisterAnchoredGeometry(source, instance)
+    configs = Scenario().cameras
+    cameras = {name: depth_camera(config, renderer) for name, config in configs.items()}
+    projector = builder.AddSystem(HeightmapProjector(cameras=cameras, grid=grid))
+    for number, (name, config) in enumerate(configs.items()):
+        sensor = builder.AddSystem(
+            RgbdSensor(
+                parent_id=scene_graph.world_frame_id(),
+                X_PB=camera_pose(config),
+                color_camera=ColorRenderCamera(cameras[name].core()),
+                depth_camera=cameras[name],
+            )
+        )
+        imperfect = builder.AddSystem(
+            SensorNoise(parameters=noise, camera=cameras[name], seed=seed, number=number)
+        )
+        builder.Connect(scene_graph.get_query_output_port(), sensor.query_object_input_port())
+        for output, port in (
+            ("depth_image_32f", "depth_image"),
+            ("body_pose_in_world", "body_pose_in_world"),
+        ):
+            builder.Connect(sensor.GetOutputPort(output), imperfect.GetInputPort(output))
+            builder.Connect(
+                imperfect.GetOutputPort(output), projector.GetInputPort(f"{port}_{name}")
+            )
+    builder.ExportOutput(projector.GetOutputPort("heights"), "heights")
+    diagram = builder.Build()
+    return diagram.GetOutputPort("heights").Eval(diagram.CreateDefaultContext())
+
+
+def _box(box: DrawnBox) -> Manifold:
+    return Manifold.cube(box.size, True).translate((0, 0, box.size[2] / 2))
+
+
+def _text(tool: RandomTool) -> str:
+    corners = tool.triangles.reshape(-1, 3)
+    return _obj(corners, np.arange(len(corners)).reshape(-1, 3))
+
+
+def _solid_text(solid: Manifold) -> str:
+    return _obj(*vertices_and_faces(solid))
+
+
+def _obj(vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> str:
+    """Wavefront text with the faces' normals, which the renderer insists on."""
+    a, b, c = np.moveaxis(vertices[faces], 1, 0)
+    normals = np.cross(b - a, c - a)
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)
+    lines = [f"v {x:.6f} {y:.6f} {z:.6f}" for x, y, z in vertices]
+    lines += [f"vn {x:.3f} {y:.3f} {z:.3f}" for x, y, z in normals]
+    lines += [f"f {i}//{n} {j}//{n} {k}//{n}" for n, (i, j, k) in enumerate(faces + 1, start=1)]
+    return "\n".join(lines) + "\n"

@@ -1,0 +1,73 @@
+"""Whether the hand, where it waits, hides part of the table from a camera."""
+
+import itertools
+
+import numpy as np
+from numpy.typing import NDArray
+from pydrake.math import RigidTransform, RollPitchYaw
+
+from kitting_drake.scenario.cameras import camera_pose
+from kitting_drake.scenario.schema import LookAt, Pinhole, Scenario
+from systems.hand_geometry import FINGERTIP_DISTANCE, PALM_SIZE
+from systems.signals import PixelGrid
+
+_YAWS = np.deg2rad([0.0, 45.0, 90.0, 135.0])
+_PLACES = 9
+"""Along the workspace's y, at which the hand may wait after an action: it keeps its y."""
+
+
+def hidden_table_note(scenario: Scenario) -> str | None:
+    """A sentence for people where the waiting hand hides part of the workspace from a camera.
+
+    There o_t has a hole or, where others see what it hides, is of fewer cameras. None where it
+    hides nothing, as from the three default cameras.
+    """
+    grid = scenario.heightmap.grid()
+    p_WPoints = _waiting_hand(scenario.planner.home, grid)
+    names = [name for name, config in scenario.cameras.items() if _hides(p_WPoints, config, grid)]
+    if not names:
+        return None
+    which = f"camera {names[0]}" if len(names) == 1 else f"cameras {', '.join(names)}"
+    return (
+        f"where the hand waits (planner.home) it hides part of the table from {which}: choose "
+        "another home, such as [-0.4, 0, 0.4, 0]"
+    )
+
+
+def _waiting_hand(home: list[float], grid: PixelGrid) -> NDArray[np.float64]:
+    """(n, 3): points of boxes about the hand, wherever it may wait, in the world, in metres."""
+    half_x, half_y = PALM_SIZE[0] / 2, PALM_SIZE[1] / 2
+    p_GPoints = np.stack(
+        np.meshgrid(
+            np.linspace(-half_x, half_x, 3),
+            np.linspace(-half_y, half_y, 5),
+            np.linspace(0.0, FINGERTIP_DISTANCE, 4),
+        ),
+        axis=-1,
+    ).reshape(-1, 3)
+    x, y, z, yaw = home
+    found = []
+    for at_y, turn in itertools.product([y, *np.linspace(grid.y_min, grid.y_max, _PLACES)], _YAWS):
+        X_WG = RigidTransform(RollPitchYaw(0, 0, yaw + turn), [x, at_y, z])
+        found.append(X_WG.multiply(p_GPoints.T).T)
+    return np.concatenate(found)
+
+
+def _hides(p_WPoints: NDArray[np.float64], config: Pinhole | LookAt, grid: PixelGrid) -> bool:
+    """Whether a camera sees one of some points before a place of the workspace."""
+    X_WC = camera_pose(config)
+    x, y, z = X_WC.inverse().multiply(p_WPoints.T)
+    ahead = z > 0.01
+    depth = np.where(ahead, z, 1.0)
+    in_image = (
+        ahead
+        & (np.abs(config.focal_length * x / depth) < config.width / 2)
+        & (np.abs(config.focal_length * y / depth) < config.height / 2)
+    )
+    p_WC = X_WC.translation()
+    rays = p_WPoints - p_WC
+    # Where each ray meets the table, if it goes down.
+    down = in_image & (rays[:, 2] < -1e-6)
+    along = (grid.z_min - p_WC[2]) / np.where(down, rays[:, 2], -1.0)
+    p_WTable = p_WC + along[:, np.newaxis] * rays
+    return bool(grid.contains(p_WTable[down & (along > 1), :2]).any())

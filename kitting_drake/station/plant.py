@@ -1,0 +1,122 @@
+"""The cell's plant: table, fixtures, objects and hand."""
+
+from pathlib import Path
+
+import numpy as np
+from pydrake.geometry import SceneGraph
+from pydrake.math import RigidTransform
+from pydrake.multibody.parsing import Parser
+from pydrake.multibody.plant import AddMultibodyPlant, MultibodyPlant, MultibodyPlantConfig
+from pydrake.multibody.tree import RigidBody
+from pydrake.systems.framework import DiagramBuilder
+
+from kitting_drake.common.errors import UserError
+from kitting_drake.common.paths import MODELS
+from kitting_drake.scenario.schema import Plant, Scenario
+from kitting_drake.station.variation import varied_model
+from kitting_drake.tasks.task import Scene
+from systems.placement import PlacedObject
+from systems.rest_detector import BoundedBody, Box
+
+_X_WTABLE = RigidTransform([0.5, 0.0, 0.0])
+
+_VARIATION_STREAM = 13
+"""Stream of the seed: what is drawn here changes nothing else that is drawn."""
+
+
+def add_plant(builder: DiagramBuilder, scenario: Scenario) -> tuple[MultibodyPlant, SceneGraph]:
+    """Adds an empty plant, in strictly hydroelastic contact."""
+    config = MultibodyPlantConfig(
+        time_step=scenario.plant.time_step,
+        # Strict: a pair that cannot be hydroelastic is an error, not a point contact in disguise.
+        contact_model="hydroelastic",
+        discrete_contact_approximation=scenario.plant.contact_approximation,
+    )
+    return AddMultibodyPlant(config, builder)
+
+
+def add_models(
+    plant: MultibodyPlant, scene: Scene, variation: Plant, seed: int
+) -> tuple[tuple[PlacedObject, ...], tuple[RigidBody, ...]]:
+    """Adds the table, the scene's fixtures and objects, and the hand.
+
+    Args:
+        plant: not finalized yet.
+        scene: the episode's.
+        variation: says how much friction and mass vary; the hand's do not.
+        seed: of their draws.
+
+    Returns:
+        The scene's objects with their bodies, and the bodies that never move.
+
+    Raises:
+        UserError: a model cannot be loaded, or is not of one link.
+    """
+    parser = Parser(plant)
+    # The same model may be there several times.
+    parser.SetAutoRenaming(True)
+    parser.package_map().AddPackageXml(str(MODELS / "package.xml"))
+    rng = np.random.default_rng([seed, _VARIATION_STREAM])
+
+    def add(model: Path) -> RigidBody:
+        friction, mass = 1 + rng.uniform(-1, 1, 2) * (
+            variation.friction_variation,
+            variation.mass_variation,
+        )
+        if friction == mass == 1:
+            return _add_body(parser, plant, model)
+        text = varied_model(model, friction=float(friction), mass=float(mass))
+        return _add_body(parser, plant, model, text)
+
+    still = [add(MODELS / "table" / "table.sdf")]
+    plant.WeldFrames(plant.world_frame(), still[0].body_frame(), _X_WTABLE)
+    for fixture in scene.fixtures:
+        still.append(add(fixture.model))
+        plant.WeldFrames(plant.world_frame(), still[-1].body_frame(), fixture.X_WF)
+    objects = []
+    for item in scene.objects:
+        body = add(item.model)
+        objects.append(PlacedObject(item.name, body.index(), item.p_BPoints, item.symmetry))
+    parser.AddModels(str(MODELS / "franka_hand" / "franka_hand.sdf"))
+    return tuple(objects), tuple(still)
+
+
+def _add_body(
+    parser: Parser, plant: MultibodyPlant, model: Path, text: str | None = None
+) -> RigidBody:
+    """Adds a model of one link from its file, or from a text that replaces it."""
+    try:
+        if text is None:
+            instances = parser.AddModels(str(model))
+        else:
+            instances = parser.AddModelsFromString(text, "sdf")
+    except (RuntimeError, ValueError) as error:
+        reason = str(error).splitlines()[0]
+        raise UserError(f"task: {model} cannot be loaded: {reason}") from error
+    bodies = [body for instance in instances for body in plant.GetBodyIndices(instance)]
+    if len(bodies) != 1:
+        raise UserError(f"task: {model} has {len(bodies)} links: it must have one")
+    return plant.get_body(bodies[0])
+
+
+def set_initial_poses(
+    plant: MultibodyPlant, scenario: Scenario, scene: Scene, objects: tuple[PlacedObject, ...]
+) -> None:
+    """Makes the scene's poses, and the hand at home with open jaws, the plant's default state."""
+    for placed, item in zip(objects, scene.objects, strict=True):
+        plant.SetDefaultFloatingBaseBodyPose(plant.get_body(placed.body), item.X_WB)
+    for joint, position in zip(("x", "y", "z", "yaw"), scenario.planner.home, strict=True):
+        plant.GetJointByName(joint).set_default_positions([position])
+    for joint in ("left_finger_slide", "right_finger_slide"):
+        plant.GetJointByName(joint).set_default_positions([scenario.planner.open_width / 2])
+
+
+def bounded_body(plant: MultibodyPlant, scene_graph: SceneGraph, body: RigidBody) -> BoundedBody:
+    """A body with the boxes around its collision geometry."""
+    inspector = scene_graph.model_inspector()
+    boxes = []
+    for geometry in plant.GetCollisionGeometriesForBody(body):
+        box = inspector.GetObbInGeometryFrame(geometry)
+        X_BBox = inspector.GetPoseInFrame(geometry) @ box.pose()
+        boxes.append(Box(X_BBox, np.asarray(box.half_width())))
+    return BoundedBody(body.index(), boxes)

@@ -1,0 +1,114 @@
+"""Adds to the cell its cameras and the projector of their images, and the camera of a film."""
+
+from pathlib import Path
+
+from pydrake.geometry import ColorRenderCamera, DepthRange, DepthRenderCamera, SceneGraph
+from pydrake.systems.framework import DiagramBuilder, LeafSystem
+from pydrake.systems.sensors import RgbdSensor
+from pydrake.visualization import VideoWriter
+
+from kitting_drake.common.errors import UserError
+from kitting_drake.common.rendering import (
+    X_WOVERVIEW,
+    add_film_renderer,
+    add_observation_renderer,
+    picture_camera,
+)
+from kitting_drake.scenario.cameras import camera_pose, depth_camera
+from kitting_drake.scenario.schema import Scenario
+from kitting_drake.station.paint import lights_of
+from systems.heightmap_projector import HeightmapProjector
+from systems.sensor_noise import SensorNoise
+from systems.signals import PixelGrid
+
+_IMAGES = {
+    "color_image": "color_image",
+    "depth_image_32f": "depth_image",
+    "body_pose_in_world": "body_pose_in_world",
+}
+"""A camera's output ports, and the projector's input ports but for the camera's name."""
+
+
+def add_cameras(
+    builder: DiagramBuilder,
+    scenario: Scenario,
+    scene_graph: SceneGraph,
+    grid: PixelGrid,
+    seed: int,
+) -> HeightmapProjector:
+    """Adds a scenario's cameras, what makes them imperfect, and what fuses their images.
+
+    Args:
+        builder: of the cell.
+        scenario: whose cameras, appearance and sensor noise they are.
+        scene_graph: what they see.
+        grid: of the observation.
+        seed: of lights and noise.
+
+    Returns:
+        The projector, whose port `observation` is o_t.
+
+    Raises:
+        UserError: there are no cameras, or images cannot be rendered here.
+    """
+    if not scenario.cameras:
+        raise UserError("cameras is empty: the heightmap needs at least one")
+    lights = lights_of(scenario.appearance, seed)
+    renderer = add_observation_renderer(scene_graph, lights)
+    cameras = {name: depth_camera(config, renderer) for name, config in scenario.cameras.items()}
+    projector = builder.AddNamedSystem(
+        "heightmap_projector", HeightmapProjector(cameras=cameras, grid=grid)
+    )
+    for number, (name, config) in enumerate(scenario.cameras.items()):
+        sensor = builder.AddNamedSystem(
+            f"camera_{name}",
+            RgbdSensor(
+                parent_id=scene_graph.world_frame_id(),
+                X_PB=camera_pose(config),
+                color_camera=ColorRenderCamera(cameras[name].core()),
+                depth_camera=cameras[name],
+            ),
+        )
+        builder.Connect(scene_graph.get_query_output_port(), sensor.query_object_input_port())
+        source: LeafSystem = sensor
+        use_labels = bool(scenario.appearance.sheen)
+        if use_labels or not scenario.sensor_noise.is_none:
+            source = builder.AddNamedSystem(
+                f"sensor_noise_{name}",
+                SensorNoise(
+                    parameters=scenario.sensor_noise,
+                    camera=cameras[name],
+                    seed=seed,
+                    number=number,
+                    workspace_middle=((grid.x_min + grid.x_max) / 2, (grid.y_min + grid.y_max) / 2),
+                    use_labels=use_labels,
+                ),
+            )
+            for port in (*_IMAGES, *(["label_image"] if use_labels else [])):
+                builder.Connect(sensor.GetOutputPort(port), source.GetInputPort(port))
+        for output, port in _IMAGES.items():
+            builder.Connect(source.GetOutputPort(output), projector.GetInputPort(f"{port}_{name}"))
+    return projector
+
+
+def add_video(builder: DiagramBuilder, scene_graph: SceneGraph, path: Path) -> VideoWriter:
+    """Adds a camera that sees the whole cell, and the writer of its film to a .gif or .webp file.
+
+    Raises:
+        UserError: images cannot be rendered here.
+    """
+    core = picture_camera(add_film_renderer(scene_graph), width=640, height=400)
+    sensor = builder.AddNamedSystem(
+        # No camera of a scenario can be called so.
+        "film_camera",
+        RgbdSensor(
+            parent_id=scene_graph.world_frame_id(),
+            X_PB=X_WOVERVIEW,
+            color_camera=ColorRenderCamera(core),
+            depth_camera=DepthRenderCamera(core, DepthRange(0.05, 10.0)),
+        ),
+    )
+    builder.Connect(scene_graph.get_query_output_port(), sensor.query_object_input_port())
+    writer = builder.AddNamedSystem("video_writer", VideoWriter(filename=str(path), fps=16.0))
+    writer.ConnectRgbdSensor(builder=builder, sensor=sensor)
+    return writer

@@ -1,0 +1,55 @@
+import multiprocessing
+import subprocess
+import sys
+from multiprocessing.connection import Connection
+
+import pytest
+
+from kitting_drake.common.errors import MachineError
+from kitting_drake.common.rendering import can_render, require_rendering
+
+pytestmark = pytest.mark.skipif(not can_render(), reason="images cannot be rendered here")
+
+RENDER_THEN_TRAIN = """
+from pathlib import Path
+import torch
+from kitting_drake.station.station import build_cell
+from kitting_drake.scenario.schema import Scenario
+
+cell = build_cell(Scenario(), seed=0, base=Path())
+cell.diagram.GetOutputPort("observation").Eval(cell.diagram.CreateDefaultContext())
+torch.optim.Adam([torch.zeros(1, requires_grad=True)])
+"""
+
+
+def test_an_optimizer_can_be_made_after_an_image_was_rendered():
+    """As a person does who trains on a gymnasium environment: PyTorch's Triton and Mesa each bring
+    an LLVM."""
+    result = subprocess.run(
+        [sys.executable, "-c", RENDER_THEN_TRAIN], capture_output=True, text=True, check=False
+    )
+    assert result.returncode == 0, result.stderr
+
+
+def tell_refusal(connection: Connection) -> None:
+    try:
+        require_rendering()
+    except MachineError as error:
+        connection.send(str(error))
+    else:
+        connection.send("nothing")
+
+
+@pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")
+@pytest.mark.parametrize(
+    ("start", "refusal"), [("fork", "this process was forked from"), ("spawn", "nothing")]
+)
+def test_a_fork_of_a_process_that_rendered_is_told_so(start: str, refusal: str):
+    """It would wait for ever for threads that only its parent has."""
+    require_rendering()
+    context = multiprocessing.get_context(start)
+    here, there = context.Pipe()
+    process = context.Process(target=tell_refusal, args=(there,))
+    process.start()
+    assert here.recv().startswith(refusal)
+    process.join()

@@ -1,0 +1,437 @@
+"""From files of frames to an action: that of the cell, and without Drake."""
+
+import dataclasses
+import io
+import json
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from kitting_drake.common.errors import UserError
+from kitting_drake.common.paths import GENERALIST
+from kitting_drake.policies.learned_policy import LearnedPolicy
+from kitting_drake.policies.matching.recovery import recovery_action
+from kitting_drake.policies.matching.segmentation import segment
+from kitting_drake.policies.networks.device import preferred_type
+from kitting_drake.policies.networks.weights import load_networks
+from kitting_drake.real_camera import Frame, ShapeMatching, decide, load_policy, read_frames
+from kitting_drake.real_camera.calibrations.calibration import (
+    Calibration,
+    read_calibration,
+    write_calibration,
+)
+from kitting_drake.real_camera.checking.kit_block import Block
+from kitting_drake.scenario import load_scenario
+from kitting_drake.scenario.cameras import camera_pose
+from kitting_drake.scenario.schema import LookAt, Scenario
+from tests.kitting_drake.real_camera.frames import (
+    ROOT,
+    Rendered,
+    calibration_of,
+    cast,
+    difference,
+    render,
+    write_frames,
+)
+
+TRUE = calibration_of(Scenario())
+BLOCK = Block((0.20, 0.15, 0.05), (0.45, -0.2, 1.1))
+
+
+def rendered(seed: int, policy: str) -> Rendered:
+    path = ROOT / "scenarios" / "kitting_unseen.yaml"
+    return render(load_scenario(path, None, f"{{policy: {policy}}}"), seed)
+
+
+def check_against_cell(seed: int, folder: Path) -> None:
+    """The generalist's decision on files is the cell's: on .npy to the last bit."""
+    found = rendered(seed, '!Learned {weights: ""}')
+    write_calibration(folder / "calibration.yaml", found.calibration)
+    calibration = read_calibration(folder / "calibration.yaml")
+    exact = read_frames([write_frames(folder / "npy", found.frames)], calibration)
+    policy = load_policy()
+    decision = decide(exact, calibration, policy)
+    np.testing.assert_array_equal(decision.observation.image, found.observation.image)
+    np.testing.assert_array_equal(decision.observation.valid, found.observation.valid)
+    assert decision.action == found.action
+    assert 0 <= decision.choice.confidence <= 1
+    # In steps of a millimetre the grasp may be another, but the same tool comes to the same place.
+    stepped = read_frames([write_frames(folder / "png", found.frames, "png")], calibration)
+    other = decide(stepped, calibration, policy).action
+    assert (difference(other, decision.action) < (10.0, 1.0, 0.7)).all()
+
+
+@pytest.mark.usefixtures("rendering")
+@pytest.mark.parametrize("high", [0.008, 0.04])
+def test_what_stands_out_is_mended_when_the_cell_mends_it(high: float):
+    """A little: pressed down at once. By more: taken out when nothing else is left that fits."""
+    seen = rendered(1500, "!Oracle {}").observation
+    fixture = segment(seen).fixture
+    rows, cols = np.nonzero(fixture)
+    image = seen.image.copy()
+    top = float(np.median(seen.height[fixture]))
+    row, col = int(rows.mean()), cols.min() + 3
+    image[3, row : row + 4, col : col + 26] = top + high
+    seen = dataclasses.replace(seen, image=image)
+    assert recovery_action(seen, segment(seen)) is not None
+    cells = LearnedPolicy(
+        load_networks(GENERALIST, preferred_type()), fit_outlines=True, recover=True
+    )
+    chosen = load_policy(recover=True).choose(seen)
+    assert chosen.action == cells(seen)
+    assert chosen.action.press == (high < 0.01)
+    assert (chosen.confidence is None) == chosen.action.press
+
+
+@pytest.mark.usefixtures("rendering")
+@pytest.mark.parametrize("seed", [1500, 1503])
+def test_frames_as_files_are_decided_on_as_in_the_cell(seed: int, tmp_path: Path):
+    check_against_cell(seed, tmp_path)
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("rendering")
+@pytest.mark.parametrize("seed", range(1500, 1520))
+def test_twenty_scenes_are_decided_on_as_in_the_cell(seed: int, tmp_path: Path):
+    check_against_cell(seed, tmp_path)
+
+
+@pytest.fixture(scope="module")
+def scene(rendering: None) -> Rendered:
+    return rendered(1501, "!ShapeMatching {}")
+
+
+def test_shape_matching_decides_as_in_the_cell_too(scene: Rendered):
+    decision = decide(scene.frames, scene.calibration, ShapeMatching())
+    assert decision.action == scene.action
+    record = decision.as_dict()
+    assert not record["stop"]
+    assert 0 < record["confidence"] <= 1
+    heights = [record["pick"]["z"], record["pick"]["hover_z"], record["travel"]["empty_z"]]
+    assert heights == sorted(heights)
+    place = record["place"]
+    assert place["lowest_z"] <= place["z"] < place["hover_z"]
+    # Where a grasp failed it is not tried again.
+    second = decide(scene.frames, scene.calibration, ShapeMatching(), [decision.action.pick])
+    assert difference(second.action, decision.action)[0] > 9
+    with Image.open(io.BytesIO(decision.draw())) as picture:
+        assert picture.format == "PNG"
+
+
+def test_a_table_that_is_higher_raises_the_action_by_as_much(scene: Rendered):
+    """The same scene in a base frame whose origin is 0.3 m below the table."""
+    calibration = scene.calibration
+    raised = dataclasses.replace(
+        calibration,
+        grid=dataclasses.replace(calibration.grid, z_min=0.3, z_max=calibration.grid.z_max + 0.3),
+        cameras=tuple(
+            dataclasses.replace(
+                camera, X_BC=camera.X_BC + 0.3 * np.outer([0, 0, 1, 0], [0, 0, 0, 1])
+            )
+            for camera in calibration.cameras
+        ),
+    )
+    low = decide(scene.frames, calibration, ShapeMatching()).as_dict()
+    high = decide(scene.frames, raised, ShapeMatching()).as_dict()
+    for part, key in (("pick", "z"), ("pick", "hover_z"), ("place", "z"), ("place", "lowest_z")):
+        assert high[part][key] == pytest.approx(low[part][key] + 0.3, abs=1e-5)
+    assert high["pick"]["x"] == pytest.approx(low["pick"]["x"], abs=1e-4)
+
+
+# The command, where there is no Drake.
+
+_NO_DRAKE = """
+import runpy, sys
+sys.modules["pydrake"] = None
+sys.argv[0] = "decide"
+try:
+    runpy.run_module("kitting_drake.decide", run_name="__main__")
+finally:
+    print("torch" in sys.modules, file=sys.stderr)
+"""
+
+
+@pytest.fixture
+def bench(tmp_path: Path) -> Path:
+    """A folder with frames of a block on a table, and their calibration."""
+    write_frames(tmp_path, cast(TRUE, BLOCK))
+    write_calibration(tmp_path / "calibration.yaml", TRUE)
+    return tmp_path
+
+
+def command(bench: Path, *flags: object) -> subprocess.CompletedProcess[str]:
+    """`decide` in a process that has no Drake."""
+    arguments = [bench, "--camera", bench / "calibration.yaml", "--output", bench / "out", *flags]
+    return subprocess.run(
+        [sys.executable, "-c", _NO_DRAKE, *map(str, arguments)],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        timeout=300,
+    )
+
+
+def test_the_command_needs_neither_drake_nor_torch_to_match_shapes(bench: Path):
+    done = command(bench, "--shape_matching")
+    assert (done.returncode, done.stderr.strip()) == (0, "False"), done.stderr
+    record = json.loads((bench / "out" / "action.json").read_text())
+    assert record["stop"] is True
+    assert "pick" not in record
+    assert (bench / "out" / "decision.png").stat().st_size > 10_000
+
+
+def test_the_command_decides_by_networks_without_drake(bench: Path, weights_file: Path):
+    done = command(bench, "--weights", weights_file, "--orientations", 36)
+    assert (done.returncode, done.stderr.strip()) == (0, "True"), done.stderr
+    record = json.loads((bench / "out" / "action.json").read_text())
+    assert set(record["pick"]) == {"x", "y", "z", "yaw", "jaw_opening", "hover_z"}
+    assert 0 <= record["confidence"] <= 1
+
+
+def test_the_command_checks_cameras_without_drake(bench: Path):
+    done = command(bench, "--check", "--kit_size_mm", 200, 150, 50)
+    assert (done.returncode, done.stderr.strip()) == (0, "False"), done.stderr
+    record = json.loads((bench / "out" / "check.json").read_text())
+    for camera in record["cameras"].values():
+        assert camera["tilt_deg"] < 0.01
+        assert camera["block"]["scale"] == pytest.approx([1, 1, 1], abs=0.01)
+    assert "noise" in done.stdout
+    read_calibration(bench / "out" / "corrected.yaml")
+    nowhere = command(bench, "--check", "--kit_size_mm", 200, 150, 50, "--kit_pose", 0.5, "nan", 0)
+    assert nowhere.returncode == 2
+    assert nowhere.stderr.startswith("error: --kit_pose takes three finite numbers")
+    in_mm = command(bench, "--check", "--kit_size_mm", 200, 150, 50, "--kit_pose", 500, 0, 0)
+    assert in_mm.stderr.startswith("error: --kit_pose: (500, 0) m is outside the workspace")
+    in_deg = command(bench, "--check", "--kit_size_mm", 200, 150, 50, "--kit_pose", 0.5, 0, 90)
+    assert in_deg.stderr.startswith("error: --kit_pose: the yaw 90 is more than a rotation")
+
+
+def test_input_that_cannot_be_used_ends_with_one_sentence(bench: Path):
+    (bench / "left_depth.npy").unlink()
+    (bench / "out").mkdir()
+    (bench / "out" / "action.json").write_text('{"policy": "generalist", "seconds": 0.3}')
+    (bench / "out" / "check.json").write_text("{}")
+    assert command(bench, "--check").returncode == 2
+    assert [path.name for path in (bench / "out").iterdir()] == ["action.json"]
+    done = command(bench, "--shape_matching")
+    # What an earlier frame was answered is no answer to this one.
+    assert not list((bench / "out").iterdir())
+    assert done.returncode == 2
+    assert done.stderr.startswith("error: camera left: ")
+    assert "neither left_depth.npy nor" in done.stderr
+    assert "Traceback" not in done.stderr
+
+
+def test_the_action_of_a_demonstration_is_not_lost(bench: Path):
+    (bench / "out").mkdir()
+    kept = bench / "out" / "action.json"
+    for text in ('{"pick": {}, "place": {}, "object": "hammer"}', "{", "[]"):
+        kept.write_text(text)
+        done = command(bench, "--shape_matching")
+        assert done.returncode == 2
+        assert "action.json was not decided here: give another --output" in done.stderr
+        assert kept.read_text() == text
+
+
+@pytest.mark.parametrize("flags", [("--orientations", 36), ("--no_outlines",)])
+def test_flags_of_networks_are_not_ignored(bench: Path, flags: tuple):
+    done = command(bench, "--shape_matching", *flags)
+    assert done.returncode == 2
+    assert f"{flags[0]} is for networks, and --shape_matching has none" in done.stderr
+
+
+# What may be wrong with frames.
+
+
+def spoil(change: Callable[[np.ndarray], np.ndarray]) -> Callable[[Path], None]:
+    def apply(folder: Path) -> None:
+        path = folder / "front_depth.npy"
+        np.save(path, change(np.load(path)))
+
+    return apply
+
+
+def as_png(scale: float) -> Callable[[Path], None]:
+    def apply(folder: Path) -> None:
+        depth = np.load(folder / "front_depth.npy")
+        (folder / "front_depth.npy").unlink()
+        Image.fromarray(np.rint(scale * depth).astype(np.uint16)).save(folder / "front_depth.png")
+
+    return apply
+
+
+def small_colour(folder: Path) -> None:
+    Image.new("RGB", (320, 240)).save(folder / "front_color.png")
+
+
+def archive(folder: Path) -> None:
+    with (folder / "front_depth.npy").open("wb") as file:
+        np.savez(file, depth=np.ones((480, 640)))
+
+
+def broken(folder: Path) -> None:
+    (folder / "front_depth.npy").write_bytes(b"not numbers")
+
+
+def broken_header(folder: Path) -> None:
+    path = folder / "front_depth.npy"
+    path.write_bytes(path.read_bytes().replace(b"{'descr'", b"{('descr'", 1))
+
+
+def broken_chunk(folder: Path) -> None:
+    """Of the kind that a faulty disk makes: what follows the first data is no chunk."""
+    path = folder / "front_color.png"
+    image = np.random.default_rng(0).integers(0, 255, (480, 640, 3), np.uint8)
+    Image.fromarray(image).save(path)
+    content = bytearray(path.read_bytes())
+    second = content.index(b"IDAT", content.index(b"IDAT") + 4)
+    content[second : second + 4] = b"\x00\x01\x02\x03"
+    path.write_bytes(bytes(content))
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (broken_header, "no whole .npy file"),
+        (broken_chunk, "front_color.png is damaged: broken PNG file"),
+        (spoil(lambda depth: 1000 * depth), "these are millimetres"),
+        (as_png(1.0), "these are metres"),
+        (as_png(4000.0), r"depth_scale \(of 0.00025 it would agree\)"),
+        (spoil(lambda depth: depth[:240]), "is 640x240 pixels, but .* calibrated at 640x480"),
+        (small_colour, "front_color.png is 320x240 pixels"),
+        (spoil(lambda depth: 0 * depth), "depth of camera front is all zero or NaN"),
+        (spoil(lambda depth: np.nan * depth), "depth of camera front is all zero or NaN"),
+        (spoil(lambda depth: np.dstack([depth] * 3)), "must have one channel, not 3"),
+        (broken, "no whole .npy file"),
+        (archive, r"is an archive of arrays \(.npz\)"),
+    ],
+)
+def test_frames_that_cannot_be_are_refused(
+    bench: Path, change: Callable[[Path], None], message: str
+):
+    change(bench)
+    with pytest.raises(UserError, match=message) as raised:
+        decide(read_frames([bench], TRUE), TRUE, ShapeMatching())
+    assert "\n" not in str(raised.value)
+
+
+def test_a_frame_of_ones_own_has_the_shape_of_an_image():
+    """Drake and others have a last axis of one channel."""
+    frames = cast(TRUE)
+    frames["left"] = Frame(frames["left"].color, frames["left"].depth[..., None])
+    with pytest.raises(UserError, match=r"must be \(height, width\), not \(480, 640, 1\)"):
+        decide(frames, TRUE, ShapeMatching())
+
+
+def test_steps_of_more_than_16_bits_are_not_wrapped(tmp_path: Path):
+    front = Calibration((dataclasses.replace(TRUE.cameras[0], depth_scale=1e-5),), TRUE.grid)
+    frames = cast(front)
+    write_frames(tmp_path, frames)
+    (tmp_path / "front_depth.npy").unlink()
+    steps = np.rint(1e5 * frames["front"].depth).astype(np.int32)
+    assert steps.max() > 2**16
+    Image.fromarray(steps).save(tmp_path / "front_depth.png", "TIFF")
+    found = read_frames([tmp_path], front)["front"].depth
+    np.testing.assert_allclose(found, frames["front"].depth, atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("camera", "grid", "message"),
+    [
+        ({"max_depth": 0.3}, {}, "is 0.831 m, the median, and by its min_depth 0.01 and max_depth"),
+        ({}, {"rows": 1, "cols": 1}, "the workspace is too small for camera"),
+    ],
+)
+def test_what_leaves_nothing_to_see_is_told(
+    camera: dict[str, float], grid: dict[str, int], message: str
+):
+    cameras = (dataclasses.replace(TRUE.cameras[0], **camera), *TRUE.cameras[1:])
+    blind = Calibration(cameras, dataclasses.replace(TRUE.grid, **grid))
+    with pytest.raises(UserError, match=message):
+        decide(cast(TRUE), blind, ShapeMatching())
+
+
+def test_missing_depths_are_unseen_and_no_error():
+    """Zero and NaN are what cameras say where light did not come back."""
+    front = Calibration(TRUE.cameras[:1], TRUE.grid)
+    frames = cast(front, BLOCK)
+    depth = frames["front"].depth.copy()
+    depth[300:320], depth[320:340] = 0, np.nan
+    seen = decide({"front": Frame(frames["front"].color, depth)}, front, ShapeMatching())
+    whole = decide(frames, front, ShapeMatching())
+    assert 500 < (whole.observation.valid & ~seen.observation.valid).sum() < 12000
+
+
+def test_nobody_stops_where_little_is_seen():
+    front = Calibration(TRUE.cameras[:1], TRUE.grid)
+    color, depth = (getattr(cast(front)["front"], name).copy() for name in ("color", "depth"))
+    assert decide({"front": Frame(color, depth)}, front, ShapeMatching()).action.stop
+    depth[:, 200:] = 0
+    with pytest.raises(UserError, match=r"only \d+ % of what is in view is seen, too"):
+        decide({"front": Frame(color, depth)}, front, ShapeMatching())
+
+
+def test_a_near_camera_may_see_little_but_a_kit():
+    down = dataclasses.replace(
+        TRUE.cameras[0],
+        X_BC=np.array([[0.0, -1, 0, 0.5], [-1, 0, 0, 0], [0, 0, -1, 0.3], [0, 0, 0, 1]]),
+    )
+    near = Calibration((down,), TRUE.grid)
+    frames = cast(near, Block((0.24, 0.22, 0.05), (0.5, 0.0, 0.0)))
+    # The kit hides some of the table.
+    assert decide(frames, near, ShapeMatching()).seen > 0.8
+
+
+def turned(camera: str, X: np.ndarray) -> Calibration:
+    cameras = tuple(
+        dataclasses.replace(item, X_BC=X) if item.name == camera else item for item in TRUE.cameras
+    )
+    return dataclasses.replace(TRUE, cameras=cameras)
+
+
+FRONT = TRUE.cameras[0].X_BC
+AWAY = FRONT @ np.diag([1.0, -1, -1, 1])
+OPTICAL = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
+STEEP = camera_pose(LookAt(position=[1.2, 0, 0.6], target=[0.5, 0, 0])).GetAsMatrix4()
+ASIDE = FRONT + np.outer([0, 1, 0, 0], [0, 0, 0, 3.0])
+
+
+@pytest.mark.parametrize(
+    ("pose", "message"),
+    [
+        (AWAY, "looks upwards"),
+        (ASIDE, r"looks at \(0.25, 3.00\) m on the table"),
+        (np.linalg.inv(STEEP), "is it the pose of the base in the camera"),
+        (np.linalg.inv(TRUE.cameras[1].X_BC), "table: .* is it the inverse"),
+        (FRONT @ np.linalg.inv(OPTICAL), "give that of the optical frame"),
+        (FRONT - np.outer([0, 0, 1, 0], [0, 0, 0, 1.0]), "below the table"),
+    ],
+)
+def test_a_camera_that_looks_elsewhere_is_told_where(pose: np.ndarray, message: str):
+    with pytest.raises(UserError, match=f"camera front sees no.*{message}"):
+        decide(cast(TRUE), turned("front", pose), ShapeMatching())
+
+
+def test_frames_may_be_pairs_of_files(bench: Path):
+    names = ("front", "left", "right")
+    files = [bench / f"{name}_{what}" for name in names for what in ("depth.npy", "color.png")]
+    found = read_frames(files, TRUE)
+    np.testing.assert_array_equal(found["left"].depth, np.load(bench / "left_depth.npy"))
+    with pytest.raises(UserError, match="has 3 cameras"):
+        read_frames(files[:2], TRUE)
+    with pytest.raises(UserError, match="are both colour"):
+        read_frames([files[1]] * 6, TRUE)
+    with pytest.raises(UserError, match="there is no frame"):
+        read_frames([bench / "nowhere"], TRUE)
+
+
+def test_networks_are_asked_only_about_pixels_of_their_size(weights_file: Path):
+    coarse = dataclasses.replace(TRUE, grid=dataclasses.replace(TRUE.grid, resolution=0.004))
+    policy = load_policy(weights_file, orientations=36)
+    with pytest.raises(UserError, match=r"workspace\.resolution is 0.004 m"):
+        decide(cast(TRUE), coarse, policy)

@@ -1,0 +1,74 @@
+import dataclasses
+import io
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from kitting_drake.evaluation.decision_figure import draw_decision
+from kitting_drake.policies.data.images import make_action
+from kitting_drake.policies.learned_policy import Decision
+from systems.signals import Observation, PickPlaceAction, PixelGrid
+
+GRID = PixelGrid(rows=33, cols=49)
+
+
+def decision(
+    observation: Observation, theta: float = 1.0, pick: tuple[float, float] = (8.5, 12.0)
+) -> Decision:
+    random = np.random.default_rng(0)
+    pick_map = random.random(GRID.shape, np.float32)
+    curve = random.random(90, np.float32)
+    picked, placed = np.array(pick), np.array([30.0, 40.0])
+    return Decision(
+        action=make_action(observation, picked, theta, placed, 2.0),
+        pick_map=pick_map / pick_map.sum(),
+        angle_curve=curve / curve.sum(),
+        place_map=-20 * random.random(GRID.shape, np.float32),
+        pick_pixel=picked,
+        place_pixel=placed,
+    )
+
+
+@pytest.fixture
+def observation() -> Observation:
+    return Observation(np.random.default_rng(1).random((4, *GRID.shape), np.float32), GRID)
+
+
+def drawn(observation: Observation, decision: Decision) -> np.ndarray:
+    with Image.open(io.BytesIO(draw_decision(observation, decision))) as picture:
+        assert picture.format == "PNG"
+        return np.asarray(picture.convert("RGB"))
+
+
+def test_a_picture_shows_the_decision(observation: Observation):
+    picture = drawn(observation, decision(observation))
+    assert picture.shape == (880, 1320, 3)
+    np.testing.assert_array_equal(picture, drawn(observation, decision(observation)))
+    for other in (
+        decision(observation, theta=1.5),
+        decision(observation, pick=(20.0, 12.0)),
+        dataclasses.replace(decision(observation), log_odds=3.0),
+    ):
+        assert (drawn(observation, other) != picture).any()
+
+
+def test_a_policy_that_stops_moves_no_gripper(observation: Observation):
+    pick_colour, place_colour = (228, 87, 46), (27, 153, 139)
+    acts = decision(observation)
+    stops = dataclasses.replace(acts, action=PickPlaceAction(stop=True), log_odds=-4.0)
+    for colour, shown_in_curve in ((pick_colour, True), (place_colour, False)):
+        counts = [
+            int((drawn(observation, item) == colour).all(axis=2).sum()) for item in (acts, stops)
+        ]
+        assert counts[0] > counts[1]
+        assert (counts[1] > 0) == shown_in_curve
+
+
+def test_a_decision_upon_nothing_and_without_doubt_is_drawn_too():
+    """No colour, no height, all probability in one place, and a grasp at the edge."""
+    nothing = Observation(np.zeros((4, *GRID.shape), np.float32), GRID)
+    sure = decision(nothing, pick=(0.0, 0.0))
+    sure.pick_map[:], sure.angle_curve[:], sure.place_map[:] = 0, 0, 0
+    sure.pick_map[0, 0] = sure.angle_curve[0] = 1
+    assert drawn(nothing, sure).shape == (880, 1320, 3)

@@ -1,0 +1,305 @@
+"""The training-free policy, and the refinement of places, on rendered observations."""
+
+import dataclasses
+import math
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from pydrake.math import RollPitchYaw
+
+from kitting_drake.common.paths import GENERALIST, SCENARIOS
+from kitting_drake.common.rendering import can_render
+from kitting_drake.policies.data.images import rotation_matrix
+from kitting_drake.policies.learned_policy import LearnedPolicy
+from kitting_drake.policies.matching.refinement import refine_grasp, refine_place
+from kitting_drake.policies.matching.segmentation import segment
+from kitting_drake.policies.matching.shape_matching import ShapeMatchingPolicy, certain_fits, match
+from kitting_drake.policies.networks.weights import load_networks
+from kitting_drake.scenario.loader import load_scenario
+from kitting_drake.station import build_cell
+from systems.signals import Observation, PixelGrid, PlanarPose, fill_unseen
+
+pytestmark = pytest.mark.skipif(not can_render(), reason="images cannot be rendered here")
+
+
+@pytest.fixture(scope="module", params=[None, "colour:severe,depth_noise,depth_holes"])
+def seen(request):
+    """An observation of four tools beside their kit, and the truth."""
+    scenario = load_scenario(
+        SCENARIOS / "kitting_seen.yaml", None, "{policy: !Oracle {}}", request.param
+    )
+    cell = build_cell(scenario, seed=4, base=SCENARIOS)
+    context = cell.diagram.CreateDefaultContext()
+    return cell.diagram.GetOutputPort("observation").Eval(context), cell.scene
+
+
+def true_places(scene):
+    """For each object (x, y, yaw) where it lies, and where it belongs."""
+    result = []
+    for index, item in enumerate(scene.objects):
+        goal = next(g for g in scene.goals if index in g.objects)
+        poses = [item.X_WB, goal.poses[0]]
+        result.append(
+            [(*X.translation()[:2], RollPitchYaw(X.rotation()).yaw_angle()) for X in poses]
+        )
+    return result
+
+
+def errors_of(action, scene) -> tuple[float, float]:
+    """Of the place of the object nearest to the pick: in metres, and in radians."""
+    pick, place = (np.array([p.x, p.y]) for p in (action.pick, action.place))
+    lies, belongs = min(true_places(scene), key=lambda o: math.dist(o[0][:2], pick))
+    rotation = belongs[2] - lies[2]
+    want = np.array(belongs[:2]) + rotation_matrix(rotation) @ (pick - lies[:2])
+    turned = action.place.theta - action.pick.theta
+    return math.dist(want, place), abs(math.remainder(turned - rotation, math.tau))
+
+
+def test_it_finds_kit_tools_and_recesses(seen):
+    observation, scene = seen
+    found = segment(observation)
+    assert len(found.objects) == 4
+    assert len(found.recesses) >= 4
+    X = scene.fixtures[0].X_WF.translation()
+    middle = np.argwhere(found.fixture).mean(axis=0)
+    assert np.linalg.norm(observation.grid.to_world(middle) - X[:2]) < 0.004
+
+
+def test_its_action_brings_a_tool_to_its_place(seen):
+    observation, scene = seen
+    action = ShapeMatchingPolicy()(observation)
+    assert not action.stop
+    distance, angle = errors_of(action, scene)
+    assert distance < 0.003
+    assert angle < math.radians(2)
+
+
+def test_where_a_grasp_failed_another_is_tried(seen):
+    observation, _ = seen
+    tried = []
+    for _ in range(3):
+        action = ShapeMatchingPolicy()(observation, tried)
+        assert not action.stop
+        for pick in tried:
+            assert math.dist((pick.x, pick.y), (action.pick.x, action.pick.y)) > 0.0099
+        tried.append(action.pick)
+
+
+def test_what_must_be_taken_out_waits_for_all_that_fits(seen):
+    observation, _ = seen
+    segmentation = segment(observation)
+    policy = ShapeMatchingPolicy(recover=True)
+    # Something that stands 40 mm out of the fixture, where there is no recess.
+    top = float(np.median(observation.height[segmentation.fixture]))
+    rows, cols = np.nonzero(segmentation.fixture)
+    image = observation.image.copy()
+    image[3, rows.min() + 3 : rows.min() + 7, cols.min() + 4 : cols.min() + 30] = top + 0.04
+    blocked = dataclasses.replace(observation, image=image)
+    (standing,) = segment(blocked).protruding
+    action = policy(blocked)
+    assert not standing.mask[pixel_of(blocked, action)]
+    for region in segment(blocked).objects:
+        image[:, np.pad(region.mask, 2)[2:-2, 2:-2]] = image[:, :5, :5].mean(axis=(1, 2))[:, None]
+    action = policy(dataclasses.replace(blocked, image=image))
+    assert not action.stop
+    assert standing.mask[pixel_of(blocked, action)]
+
+
+def pixel_of(observation: Observation, action) -> tuple[int, int]:
+    row, col = np.rint(observation.grid.to_pixel((action.pick.x, action.pick.y))).astype(int)
+    return row, col
+
+
+def test_it_stops_where_nothing_is_left(seen):
+    observation, _ = seen
+    image = observation.image.copy()
+    for region in segment(observation).objects:
+        image[:, np.pad(region.mask, 2)[2:-2, 2:-2]] = image[:, :5, :5].mean(axis=(1, 2))[:, None]
+    cleared = dataclasses.replace(observation, image=image)
+    assert ShapeMatchingPolicy()(cleared).stop
+    assert ShapeMatchingPolicy()(Observation()).stop
+
+
+@pytest.mark.parametrize("seen", [None], indirect=True)
+def test_what_certainly_fits_is_picked_though_the_networks_see_nothing(seen):
+    observation, _ = seen
+    networks = load_networks(GENERALIST)
+    predict = networks.predict_pick
+
+    def blind(*arguments):
+        found = predict(*arguments)
+        position = found.position.clone()
+        position[0, 0] = 1e3
+        return dataclasses.replace(found, position=position, log_odds=-99.0)
+
+    networks.predict_pick = blind
+    action = LearnedPolicy(networks, fit_outlines=True)(observation)
+    assert not action.stop
+    assert certain_fits(segment(observation), observation.grid.resolution)[
+        pixel_of(observation, action)
+    ]
+    assert LearnedPolicy(networks)(observation).stop
+    # Where a grasp of each of them failed everywhere, nothing is left.
+    grid = observation.grid
+    everywhere = [
+        PlanarPose(*grid.to_world(pixel), 0.0)
+        for region in segment(observation).objects
+        for pixel in np.argwhere(region.mask)[::3]
+    ]
+    assert LearnedPolicy(networks, fit_outlines=True)(observation, everywhere).stop
+
+
+@pytest.mark.parametrize("turn", [0.0, math.pi])
+def test_a_place_that_is_nearly_right_or_reversed_is_put_right(seen, turn: float):
+    observation, scene = seen
+    grid = observation.grid
+    # The second is a screwdriver, the recess of whose shaft is lost in noise.
+    for lies, belongs in true_places(scene)[: 1 if turn and not observation.valid.all() else 2]:
+        pick, place = grid.to_pixel(lies[:2]), grid.to_pixel(belongs[:2])
+        rotation = belongs[2] - lies[2]
+        off = place + (1.1, -0.7)
+        if turn:
+            # What a network takes for the place then: the recess the wrong way round.
+            recess = min(
+                segment(observation).recesses,
+                key=lambda item: np.linalg.norm(item.pixels - place, axis=1).min(),
+            )
+            off = 2 * recess.pixels.mean(axis=0) - off
+        found = refine_place(
+            segment(observation), pick, rotation + turn + 0.05, off, grid.resolution
+        )
+        assert found is not None
+        assert np.linalg.norm(found.place - place) * grid.resolution < 0.003
+        assert abs(math.remainder(found.rotation - rotation, math.tau)) < math.radians(2)
+
+
+def test_a_place_in_a_recess_that_fits_far_worse_than_another_moves_there():
+    """A precision screwdriver, thin enough to lie in a hammer's cavity, and placed there."""
+    scenario = load_scenario(SCENARIOS / "kitting_unseen.yaml", None, "{policy: !Oracle {}}")
+    cell = build_cell(scenario, seed=1216, base=SCENARIOS)
+    context = cell.diagram.CreateDefaultContext()
+    observation = cell.diagram.GetOutputPort("observation").Eval(context)
+    grid, segmentation = observation.grid, segment(observation)
+    names = [item.name for item in cell.scene.objects]
+    places = true_places(cell.scene)
+    lies, belongs = places[names.index("precision_screwdriver")]
+    pick, place = grid.to_pixel(lies[:2]), grid.to_pixel(belongs[:2])
+    rotation = belongs[2] - lies[2]
+    hammer = grid.to_pixel(places[names.index("cross_peen_hammer")][1][:2])
+    recess = min(
+        segmentation.recesses,
+        key=lambda item: np.linalg.norm(item.pixels - hammer, axis=1).min(),
+    )
+    wrong = recess.pixels.mean(axis=0)
+    found = refine_place(segmentation, pick, rotation, wrong, grid.resolution)
+    assert found is not None
+    assert np.linalg.norm(found.place - place) * grid.resolution < 0.003
+    assert abs(math.remainder(found.rotation - rotation, math.tau)) < math.radians(2)
+
+
+def test_a_grasp_with_no_room_for_the_jaws_moves_to_where_there_is(seen):
+    observation, scene = seen
+    grid = observation.grid
+    for index, (lies, _) in enumerate(true_places(scene)):
+        grasp = scene.objects[index].grasps[0]
+        pick = grid.to_pixel(rotation_matrix(lies[2]) @ (grasp.x, grasp.y) + lies[:2])
+        theta = lies[2] + grasp.theta
+        near = refine_grasp(segment(observation), pick, theta, grid.resolution)
+        if near is not None:
+            assert np.linalg.norm(near.pick - pick) * grid.resolution < 0.04
+        # Along the handle instead of across it, the jaws would close on nothing.
+        along = refine_grasp(segment(observation), pick, theta + math.pi / 2, grid.resolution)
+        assert along is not None
+        assert abs(math.remainder(along.theta - theta, math.pi)) < math.radians(40)
+        # Not where a grasp failed before; and where all failed, nowhere.
+        other = refine_grasp(
+            segment(observation), pick, theta + math.pi / 2, grid.resolution, along.pick[None]
+        )
+        if other is not None:
+            assert np.linalg.norm(other.pick - along.pick) * grid.resolution > 0.0099
+        everywhere = np.argwhere(np.ones(grid.shape))[::2]
+        assert (
+            refine_grasp(
+                segment(observation), pick, theta + math.pi / 2, grid.resolution, everywhere
+            )
+            is None
+        )
+    assert (
+        refine_grasp(segment(Observation()), np.array([80.0, 160.0]), 0.0, grid.resolution) is None
+    )
+
+
+def test_a_place_without_a_recess_stays(seen):
+    observation, scene = seen
+    grid = observation.grid
+    lies = true_places(scene)[0][0]
+    pick = grid.to_pixel(lies[:2])
+    far = segment(observation).fixture
+    away = np.argwhere(~far)[np.linalg.norm(np.argwhere(~far) - pick, axis=1).argmax()]
+    assert (
+        refine_place(segment(observation), pick, 0.3, away.astype(float), grid.resolution) is None
+    )
+
+
+def test_holes_take_the_lowest_of_their_neighbours():
+    height = np.full((20, 20), 0.05, np.float32)
+    height[:, 10:] = 0.0
+    valid = np.ones(height.shape, bool)
+    valid[5:8, 8:11] = False
+    broken = np.where(valid, height, 0.9).astype(np.float32)
+    filled = fill_unseen(broken, valid)
+    np.testing.assert_array_equal(filled[valid], broken[valid])
+    assert filled[6, 10] == filled[6, 9] == 0.0
+    assert set(np.unique(filled)) == {np.float32(0.0), np.float32(0.05)}
+
+
+def test_it_needs_no_torch():
+    code = (
+        "import sys, kitting_drake.policies.matching.shape_matching; print('torch' in sys.modules)"
+    )
+    out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert out.stdout.strip() == "False"
+    assert PixelGrid() == Observation().grid
+
+
+@pytest.fixture(scope="module", params=[7402, 7417])
+def kitted(request) -> Observation:
+    """A kit with all of its tools, and four boxes on the table."""
+    scenario = load_scenario(
+        SCENARIOS / "kitting_unseen.yaml",
+        "KittingUnseenToolsetsTraining",
+        "{policy: !Oracle {}}",
+        "distractors",
+    )
+    cell = build_cell(scenario, seed=request.param, base=SCENARIOS)
+    context = cell.diagram.CreateDefaultContext()
+    plant_context = cell.plant.GetMyMutableContextFromRoot(context)
+    for goal in cell.scene.goals:
+        body = cell.plant.get_body(cell.objects[goal.objects[0]].body)
+        cell.plant.SetFreeBodyPose(plant_context, body, goal.poses[0])
+    return cell.diagram.GetOutputPort("observation").Eval(context)
+
+
+def test_boxes_fit_nothing_that_tools_leave_of_their_cavities(kitted: Observation):
+    """What is left to be seen of a filled cavity is narrow, and lies well along a box's side."""
+    segmentation = segment(kitted)
+    assert segmentation.recesses
+    assert len(segmentation.objects) == 4
+    policy = LearnedPolicy(load_networks(GENERALIST), fit_outlines=True, recover=True)
+    assert policy(kitted).stop
+
+
+def test_a_box_is_no_tool_and_a_tool_is(seen):
+    observation, _ = seen
+    segmentation = segment(observation)
+    resolution = observation.grid.resolution
+    assert len(match(segmentation, resolution)) == 4
+    # A square among the tools: the largest that a cavity would hold.
+    box = np.zeros(segmentation.fixture.shape, bool)
+    box[4:18, 4:18] = True
+    recesses = dataclasses.replace(
+        segmentation, objects=(dataclasses.replace(segmentation.objects[0], mask=box),)
+    )
+    assert match(recesses, resolution) == []

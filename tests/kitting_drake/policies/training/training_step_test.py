@@ -1,0 +1,161 @@
+import copy
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from kitting_drake.policies.data.recorded import FinalObservation
+from kitting_drake.policies.networks.architecture import METHODS
+from kitting_drake.policies.networks.methods import make_networks
+from kitting_drake.policies.training import training_step as training
+from kitting_drake.policies.training.training_step import Trainer
+from systems.signals import Observation
+from tests.kitting_drake.policies.scenes import config, final_scene, scene
+
+FINALS = [FinalObservation.of(Observation(final_scene(seed))) for seed in range(2)]
+
+
+def trainer(
+    *, weights: int = 0, method: str = "so2", stop: bool = False, **arguments: Any
+) -> Trainer:
+    torch.manual_seed(weights)
+    return Trainer(make_networks(config(method, stop=stop)), **{"seed": 0, **arguments})
+
+
+def assert_same(one: Trainer, other: Trainer) -> None:
+    pairs = zip(one.networks.parameters(), other.networks.parameters(), strict=True)
+    assert all(torch.equal(a, b) for a, b in pairs)
+
+
+def test_all_draws_are_those_of_the_seed():
+    samples = [scene(0), scene(1)]
+    one, same, other = trainer(), trainer(), trainer(seed=1)
+    losses = [[item.step(samples) for _ in range(2)] for item in (one, same, other)]
+    assert losses[0] == losses[1] != losses[2]
+    assert_same(one, same)
+
+
+@pytest.mark.parametrize(("decay", "stop"), [(False, False), (True, True)])
+def test_a_resumed_run_continues_bit_by_bit(
+    decay: bool, stop: bool, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr(training, "_STOP_PROBABILITY", 0.5)
+    samples = [scene(0), scene(1)]
+    whole, before, after = (
+        trainer(weights=weights, steps=4, decay=decay, stop=stop, learning_rate=1e-2)
+        for weights in (0, 0, 1)
+    )
+    expected = [whole.step(samples, FINALS) for _ in range(4)]
+    found = [before.step(samples, FINALS) for _ in range(2)]
+    after.load_state_dict(copy.deepcopy(before.state_dict()))
+    found += [after.step(samples, FINALS) for _ in range(2)]
+    assert found == expected
+    assert after.step_count == 4
+    assert_same(after, whole)
+    # Some steps had a final observation and some had none, unless the networks cannot stop.
+    assert {"stop" in losses for losses in found} == ({True, False} if stop else {False})
+
+
+def test_a_final_observation_trains_where_to_pick_and_changes_nothing_else(
+    monkeypatch: pytest.MonkeyPatch,
+):
+    outcomes = []
+    for probability in (0.0, 1.0):
+        monkeypatch.setattr(training, "_STOP_PROBABILITY", probability)
+        learner = trainer(stop=True, learning_rate=1e-3)
+        losses = learner.step([scene(0)], FINALS)
+        outcomes.append((losses, copy.deepcopy(learner.networks.state_dict())))
+    (without, before), (with_final, after) = outcomes
+    assert with_final.pop("stop") > 0
+    assert with_final == without
+    changed = {name.split(".")[0] for name in before if not torch.equal(before[name], after[name])}
+    assert changed == {"alpha"}
+
+
+def test_one_loss_alone_is_trained_as_beside_the_others():
+    whole, alone = trainer(learning_rate=1e-3), trainer(learning_rate=1e-3, only="pick_angle")
+    before = copy.deepcopy(alone.networks.state_dict())
+    for _ in range(2):
+        losses = whole.step([scene(0)]), alone.step([scene(0)])
+        assert losses[1] == {"pick_angle": losses[0]["pick_angle"]}
+    expected, found = (item.networks.state_dict() for item in (whole, alone))
+    for name, values in found.items():
+        trained = name.startswith("beta.")
+        assert torch.equal(values, (expected if trained else before)[name]), name
+    assert not torch.equal(expected["alpha.lift.weights"], before["alpha.lift.weights"])
+
+
+def test_what_is_prepared_is_only_for_the_step_and_the_samples_that_it_was_drawn_for():
+    samples, others = [scene(0), scene(1)], [scene(2)]
+    one, other = trainer(), trainer()
+    for learner, first in ((one, samples), (other, others)):
+        learner.step(first)
+        learner.load_state_dict(copy.deepcopy(trainer().state_dict()))
+    assert one.step(others) == other.step(others)
+    one.step_count = other.step_count = 7
+    assert one.step(samples) == other.step(samples)
+
+
+def test_one_step_in_eight_has_a_final_observation(monkeypatch: pytest.MonkeyPatch):
+    learner = trainer(stop=True)
+    monkeypatch.setattr(learner.networks, "losses", lambda *_: iter(()))
+    drawn = []
+    draw = learner._draw_final
+    monkeypatch.setattr(
+        learner, "_draw_final", lambda *arguments: drawn.append(draw(*arguments)) or drawn[-1]
+    )
+    samples = [scene(0)]
+    for _ in range(400):
+        learner.step(samples, FINALS)
+    images = [image for image in drawn if image is not None]
+    assert 30 < len(images) < 75
+    # Each after a motion of its own.
+    assert len({image.tobytes() for image in images}) == len(images)
+
+
+def test_the_rate_is_that_of_the_step():
+    learner = trainer(steps=300, decay=True)
+    for step in range(3):
+        learner.step([scene(0)])
+        for optimiser in learner.optimisers.values():
+            assert [group["lr"] for group in optimiser.param_groups] == [learner.rate(step)]
+    assert learner.rate(0) < learner.rate(1)
+
+
+def test_every_loss_falls():
+    learner = trainer(learning_rate=3e-3)
+    losses = [learner.step([scene(0)]) for _ in range(30)]
+    for name in ("pick_position", "pick_angle", "place"):
+        first, last = (np.mean([step[name] for step in part]) for part in (losses[:5], losses[-5:]))
+        assert last < 0.9 * first, name
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_every_weight_is_trained_by_one_loss(method: str):
+    networks = make_networks(config(method))
+    trained = [
+        weight
+        for modules in networks.modules_by_loss().values()
+        for module in modules
+        for weight in module.parameters()
+    ]
+    assert sorted(map(id, trained)) == sorted(map(id, networks.parameters()))
+    before = copy.deepcopy(networks.state_dict())
+    Trainer(networks, seed=0).step([scene(0)])
+    after = networks.state_dict()
+    unmoved = {name for name in before if torch.equal(before[name], after[name])}
+    # A softmax does not depend on what is added to all logits: only rounding moves these.
+    assert unmoved <= {"alpha.out.bias", "f_pick.out.third.bias", "f_pick.out.shortcut.bias"}
+
+
+def test_the_learning_rate_rises_and_falls_to_nothing():
+    constant, decaying = trainer(steps=1000), trainer(steps=1000, decay=True)
+    assert {constant.rate(step) for step in (0, 500, 2000)} == {1e-4}
+    rates = [decaying.rate(step) for step in range(1001)]
+    assert rates[0] == pytest.approx(1e-6, rel=0.01)
+    assert max(rates) == pytest.approx(1e-4, rel=0.05)
+    assert (np.diff(rates[100:]) < 0).all()
+    assert rates[1000] == pytest.approx(0, abs=1e-12)
+    # Beyond the last step it does not rise again.
+    assert decaying.rate(1500) == pytest.approx(0, abs=1e-12)

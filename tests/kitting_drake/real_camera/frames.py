@@ -1,0 +1,163 @@
+"""Frames of the simulated cell's cameras, as files and as a bench has them."""
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+from pydrake.geometry import Box, ColorRenderCamera
+from pydrake.math import RigidTransform
+from pydrake.multibody.plant import AddMultibodyPlantSceneGraph
+from pydrake.systems.framework import Context, DiagramBuilder
+
+from kitting_drake.common.rendering import add_observation_renderer
+from kitting_drake.real_camera.calibrations.calibration import BenchCamera, Calibration, with_poses
+from kitting_drake.real_camera.calibrations.layouts import Intrinsics
+from kitting_drake.real_camera.checking.kit_block import Block
+from kitting_drake.real_camera.frames import Frame
+from kitting_drake.scenario.cameras import camera_pose, depth_camera
+from kitting_drake.scenario.schema import Scenario
+from kitting_drake.station import Cell, build_cell
+from systems.signals import Observation, PickPlaceAction
+
+ROOT = Path(__file__).resolve().parents[3]
+
+
+@dataclass(frozen=True)
+class Rendered:
+    """What the cameras of a cell see as an episode begins."""
+
+    frames: dict[str, Frame]
+    calibration: Calibration
+    """With the poses that the cell believes."""
+    cell: Cell
+    context: Context
+
+    @property
+    def observation(self) -> Observation:
+        return self.cell.diagram.GetOutputPort("observation").Eval(self.context)
+
+    @property
+    def action(self) -> PickPlaceAction:
+        """Of the cell's own policy."""
+        return self.cell.diagram.GetOutputPort("action").Eval(self.context)
+
+
+def render(scenario: Scenario, seed: int, *, cell: Cell | None = None) -> Rendered:
+    """The frames that the cell's policy would see first."""
+    cell = cell or build_cell(scenario, seed=seed, base=ROOT / "scenarios")
+    context = cell.diagram.CreateDefaultContext()
+    noisy = not scenario.sensor_noise.is_none
+    frames, poses = {}, {}
+    for name in scenario.cameras:
+        source = cell.diagram.GetSubsystemByName(f"{'sensor_noise' if noisy else 'camera'}_{name}")
+        own = source.GetMyContextFromRoot(context)
+        color, depth, X_WB = (
+            source.GetOutputPort(port).Eval(own)
+            for port in ("color_image", "depth_image_32f", "body_pose_in_world")
+        )
+        frames[name] = Frame(color.data[:, :, :3].copy(), depth.data[:, :, 0].copy())
+        poses[name] = X_WB.GetAsMatrix4()
+    calibration = with_poses(calibration_of(scenario), poses)
+    return Rendered(frames, calibration, cell, context)
+
+
+def write_frames(folder: Path, frames: dict[str, Frame], depth: str = "npy") -> Path:
+    """Writes `NAME_color.png`, and `NAME_depth.npy` in m or `NAME_depth.png` in mm."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for name, frame in frames.items():
+        Image.fromarray(frame.color).save(folder / f"{name}_color.png")
+        if depth == "npy":
+            np.save(folder / f"{name}_depth.npy", frame.depth)
+        else:
+            steps = np.rint(1e3 * np.where(np.isfinite(frame.depth), frame.depth, 0))
+            Image.fromarray(steps.astype(np.uint16)).save(folder / f"{name}_depth.png")
+    return folder
+
+
+def difference(one: PickPlaceAction, other: PickPlaceAction) -> NDArray[np.float64]:
+    """(3,) between two actions: the picks and where the picked point of the object comes to, in mm,
+    and the object's rotation in degrees. A grasp further along the object, or from its other side,
+    is as good, if the object moves alike."""
+    turned, other_turned = (item.place.theta - item.pick.theta for item in (one, other))
+    c, s = math.cos(turned), math.sin(turned)
+    x, y = other.pick.x - one.pick.x, other.pick.y - one.pick.y
+    moved = (one.place.x + c * x - s * y, one.place.y + s * x + c * y)
+    return np.array(
+        [
+            1e3 * math.hypot(x, y),
+            1e3 * math.dist(moved, (other.place.x, other.place.y)),
+            math.degrees(abs(math.remainder(turned - other_turned, math.tau))),
+        ]
+    )
+
+
+def calibration_of(scenario: Scenario) -> Calibration:
+    """The cameras of a scenario, as they are."""
+    cameras = tuple(
+        BenchCamera(
+            name,
+            Intrinsics(
+                (config.width, config.height),
+                (config.focal_length, config.focal_length),
+                (config.width / 2 - 0.5, config.height / 2 - 0.5),
+            ),
+            camera_pose(config).GetAsMatrix4(),
+        )
+        for name, config in scenario.cameras.items()
+    )
+    return Calibration(cameras, scenario.heightmap.grid())
+
+
+def cast(calibration: Calibration, block: Block | None = None) -> dict[str, Frame]:
+    """What the cameras see of a table that is empty, or but for a block: rays met exactly."""
+    frames = {}
+    for camera in calibration.cameras:
+        u, v = np.broadcast_arrays(camera.rays.u, camera.rays.v)
+        rays = np.stack([u, v, np.ones_like(u)], axis=-1).astype(float) @ camera.X_BC[:3, :3].T
+        depth = (calibration.table_height - camera.X_BC[2, 3]) / rays[..., 2]
+        depth = np.where(depth > 0, depth, 0)
+        if block is not None:
+            entered = _entered(block, camera.X_BC[:3, 3], rays, calibration.table_height)
+            depth = np.where(np.isfinite(entered), entered, depth)
+        color = np.full((*depth.shape, 3), 120, np.uint8)
+        frames[camera.name] = Frame(color, depth.astype(np.float32))
+    return frames
+
+
+def _entered(
+    block: Block, origin: NDArray[np.float64], rays: NDArray[np.float64], table: float
+) -> NDArray[np.float64]:
+    """The depth at which rays enter a block; NaN for those that do not."""
+    assert block.pose is not None
+    x, y, yaw = block.pose
+    R = np.array([[math.cos(yaw), math.sin(yaw)], [-math.sin(yaw), math.cos(yaw)]])
+    start = np.array([*(R @ (origin[:2] - (x, y))), origin[2] - table])
+    along = np.concatenate([rays[..., :2] @ R.T, rays[..., 2:]], axis=-1)
+    length, width, height = block.size
+    low, high = np.array([-length / 2, -width / 2, 0]), np.array([length / 2, width / 2, height])
+    slabs = np.sort([(side - start) / along for side in (low, high)], axis=0)
+    enter, leave = slabs[0].max(axis=-1), slabs[1].min(axis=-1)
+    return np.where((leave > enter) & (enter > 0), enter, np.nan)
+
+
+def render_table(scenario: Scenario) -> dict[str, Frame]:
+    """What a scenario's cameras see of an empty table, rendered."""
+    builder = DiagramBuilder()
+    plant, scene_graph = AddMultibodyPlantSceneGraph(builder, time_step=0.01)
+    X, size = RigidTransform([0.5, 0, -0.05]), Box(2, 3, 0.1)
+    plant.RegisterVisualGeometry(plant.world_body(), X, size, "table", np.full(4, 0.5))
+    renderer = add_observation_renderer(scene_graph)
+    plant.Finalize()
+    diagram = builder.Build()
+    context = scene_graph.GetMyContextFromRoot(diagram.CreateDefaultContext())
+    query = scene_graph.get_query_output_port().Eval(context)
+    world, frames = scene_graph.world_frame_id(), {}
+    for name, config in scenario.cameras.items():
+        camera, X_WC = depth_camera(config, renderer), camera_pose(config)
+        color = query.RenderColorImage(ColorRenderCamera(camera.core()), world, X_WC)
+        depth = query.RenderDepthImage(camera, world, X_WC)
+        frames[name] = Frame(color.data[:, :, :3].copy(), depth.data[:, :, 0].copy())
+    return frames

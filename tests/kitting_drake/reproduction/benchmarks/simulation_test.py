@@ -1,0 +1,63 @@
+from pathlib import Path
+
+import pytest
+from rich.console import Console
+
+from kitting_drake.episode import run_episode
+from kitting_drake.reproduction.benchmarks.simulation import PhaseStopwatch, simulation_tables
+from kitting_drake.scenario.schema import Scenario
+from kitting_drake.station import build_cell
+
+
+def test_phases_add_up_to_their_episodes():
+    scenario = Scenario(cameras={}, time_limit=1.5)
+    stopwatch = PhaseStopwatch()
+    simulated = wall = 0.0
+    for seed in range(2):
+        cell = build_cell(scenario, seed=seed, base=Path())
+        stopwatch.start()
+        result = run_episode(
+            cell,
+            task=scenario.task,
+            scenario="mine",
+            policy="oracle",
+            seed=seed,
+            time_limit=scenario.time_limit,
+            observers=[stopwatch.observe],
+        )
+        simulated += result.sim_seconds
+        wall += result.wall_seconds
+    # It ends in the middle of a phase, which counts too.
+    assert list(stopwatch.phases)[:2] == ["observe", "approach"]
+    assert sum(phase[0] for phase in stopwatch.phases.values()) == pytest.approx(simulated)
+    assert sum(phase[1] for phase in stopwatch.phases.values()) == pytest.approx(wall, rel=0.5)
+    assert all(phase[0] > 0 for phase in stopwatch.phases.values())
+
+
+def test_tables_of_the_terminal():
+    measured = {
+        "policies": {
+            "oracle": {
+                "objects": 8,
+                "wall_s_per_object": 1.234,
+                "real_time_rate": 5.06,
+                "objects_per_simulated_hour": 800.4,
+            },
+            "learned": {
+                "objects": 0,
+                "wall_s_per_object": None,
+                "real_time_rate": 2.0,
+                "objects_per_simulated_hour": 0.0,
+            },
+        },
+        "phases": {"done": {"simulated_s": 0.0, "wall_s": 0.1, "wall_s_per_simulated_s": None}},
+        "start_up_s": {"cache_empty": 3.0, "cache_filled": 2.0},
+        "images_s": {"rgbd_image": 0.01, "heightmap": 0.02},
+    }
+    console = Console(width=100)
+    with console.capture() as shown:
+        console.print(*simulation_tables(measured))
+    rows = {row[1]: row[1::2] for line in shown.get().splitlines() if (row := line.split())[1:]}
+    assert rows["done"] == ["done", "0.0", "0.1", "-"]
+    assert rows["oracle"] == ["oracle", "8", "1.23", "5.1", "800"]
+    assert rows["learned"] == ["learned", "0", "-", "2.0", "0"]

@@ -1,0 +1,449 @@
+"""The queue of the paper's experiments, with commands that only pretend."""
+
+import dataclasses
+import itertools
+import json
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+
+import pytest
+from rich.console import Console
+
+from kitting_drake import benchmark
+from kitting_drake.common.errors import DIVERGED, UserError
+from kitting_drake.common.files import alone_in
+from kitting_drake.common.paths import SCENARIOS
+from kitting_drake.reproduction.page.runs import described
+from kitting_drake.reproduction.paper.cells import (
+    LEARNING_RATES,
+    PRESET,
+    TASKS,
+    Cell,
+    Training,
+    reference,
+)
+from kitting_drake.reproduction.paper.learning_rates import RATES
+from kitting_drake.reproduction.paper.paper_tables import paper_cells
+from kitting_drake.reproduction.paper.queue import Failed, Queue, run_paper
+from kitting_drake.scenario.loader import load_scenario
+
+PAPER_RESULTS = SCENARIOS.parent / "docs" / "results" / "paper"
+ORACLE = Cell("unseen", "!QuantizedOracle {orientations: 180}", 180, "quantized_oracle")
+OURS = Cell("unseen", Training("unseen", "so2", 180, 10), 36, end_at_success=True)
+THEIRS = Cell("unseen", Training("unseen", "transporter", 36, 10), 36)
+
+
+COUNTED = ("orientations", "demonstrations", "steps", "seed")
+
+
+class Pretending(Queue):
+    """A queue whose commands leave the files that the real ones would."""
+
+    def __init__(self, *arguments, **options) -> None:
+        super().__init__(*arguments, **options)
+        self.calls: list[str] = []
+        self.broken: set[str] = set()
+        self.why = "it broke"
+        self.collected: dict[str, int] = {}
+        """How many demonstrations were asked for, by folder."""
+        self.slow = ""
+        self.together: threading.Barrier | None = None
+        """Where trainings wait for each other."""
+        self._has_evaluated = threading.Event()
+
+    def _command(self, verb: str, *arguments, folder: Path) -> None:
+        self.calls.append(f"{verb} {folder.name}")
+        if folder.name in self.broken:
+            raise Failed(self.why)
+        if folder.name == self.slow:
+            self._has_evaluated.wait(10.0)
+        folder.mkdir(parents=True, exist_ok=True)
+        words = list(map(str, arguments))
+        flags = dict(itertools.pairwise(words))
+        if verb == "collect":
+            self.collected[folder.name] = int(flags["--demos"])
+            (folder / "demonstrations.h5").touch()
+        elif verb == "train":
+            if self.together:
+                self.together.wait(10.0)
+            rate = float(flags["--learning-rate"])
+            summary = {"best": {"cost_mm": 1.0 if rate == LEARNING_RATES[1] else 2.0}}
+            summary |= {key: int(flags[f"--{key}"]) for key in COUNTED}
+            if folder.name.startswith("stack_block_pyramid"):
+                # Chosen by its loss, as that of a Ravens task: the cost says nothing.
+                summary["best"]["loss"] = 7.0 + (rate != LEARNING_RATES[0])
+            summary |= {"method": flags["--method"], "preset": flags["--preset"]}
+            summary["angle_only"] = "--angle-only" in words
+            (folder / "summary.json").write_text(json.dumps(summary))
+            (folder / "policy.safetensors").touch()
+        else:
+            self._has_evaluated.set()
+            (folder / "summary.json").write_text(json.dumps(self.summary(words, flags)))
+
+    def summary(self, words: list[str], flags: dict[str, str]) -> dict:
+        scenario = load_scenario(Path(words[0]), flags["--scenario_name"], flags["--scenario_text"])
+        policy = scenario.policy
+        first, count = int(flags["--seed"]), int(flags["--episodes"])
+        details = {"orientations": policy.orientations}
+        if hasattr(policy, "weights"):
+            trained_by = Path(policy.weights).with_name("summary.json")
+            folder = trained_by.parent.name
+            task, method, trained, demonstrations = folder.split("_")[:4]
+            details |= {
+                "method": method,
+                "scenario": f"{Path(TASKS[task].file).stem}:{TASKS[task].demonstrated}",
+                "preset": PRESET,
+                "trained_orientations": int(trained),
+                "demonstrations": int(demonstrations),
+                "training_seed": 0,
+                "steps": json.loads(trained_by.read_text())["steps"],
+                "learning_rate": float(folder.rpartition("_lr")[2]),
+                "decay": True,
+                "continuous": policy.continuous,
+                "fit_outlines": policy.fit_outlines,
+                "recover": policy.recover,
+                "taken_only": "ours" not in folder,
+                "rigid": "ours" not in folder,
+            }
+        return {
+            "resolved_scenario": described(scenario),
+            "seeds": list(range(first, first + count)),
+            "policy_details": details,
+            "policy_digest": None,
+            "strict_success_rate": 1.0,
+            "success_rate": 1.0,
+        }
+
+
+@pytest.fixture
+def queue(tmp_path: Path) -> Pretending:
+    (tmp_path / "results").mkdir()
+    return Pretending(tmp_path / "work", tmp_path / "results", Console(quiet=True))
+
+
+def test_cells_have_names_of_their_own_and_scenarios_that_load():
+    cells = paper_cells()
+    assert len({cell.name for cell in cells}) == len(cells) > 100
+    for cell in cells:
+        task = TASKS[cell.task]
+        text = cell.scenario_text("w.safetensors")
+        scenario = load_scenario(SCENARIOS / task.file, task.tested, text)
+        assert (scenario.planner.search.steps > 0) == cell.search
+        assert scenario.end_at_success == cell.end_at_success
+        load_scenario(SCENARIOS / task.file, task.demonstrated, "{policy: !Oracle {}}")
+
+
+def test_it_chooses_a_learning_rate_and_does_nothing_twice(queue: Pretending):
+    cells = [OURS, THEIRS, ORACLE]
+    assert queue.run(cells) == {}
+    first, best, _ = LEARNING_RATES
+    assert [call for call in queue.calls if call.startswith("train")] == [
+        f"train unseen_so2_180_10_seed0_lr{first:g}",
+        *(f"train {reference(THEIRS.policy).name}_lr{rate:g}" for rate in LEARNING_RATES),
+        f"train unseen_transporter_36_10_seed0_lr{best:g}",
+    ]
+    assert [c for c in queue.calls if c.startswith("collect")] == [
+        "collect unseen",
+        "collect unseen_validation",
+    ]
+    rates = json.loads((queue.results / RATES).read_text())
+    costs = {f"{rate:g}": 1.0 if rate == best else 2.0 for rate in LEARNING_RATES}
+    assert rates == {"unseen_transporter": costs}
+    written = (queue.results / f"{OURS.name}.json").read_text()
+    assert str(queue.folder) not in written
+    assert "trainings/unseen_so2_180_10" in written
+
+    queue.calls.clear()
+    assert queue.run(cells) == {}
+    assert queue.calls == []
+
+
+def test_learning_rates_that_are_known_are_not_tried_again(queue: Pretending):
+    costs = {f"{rate:g}": 1.0 + (rate != LEARNING_RATES[1]) for rate in LEARNING_RATES}
+    (queue.results / RATES).write_text(json.dumps({"unseen_transporter": costs}))
+    queue.run([THEIRS])
+    assert [call for call in queue.calls if call.startswith("train")] == [
+        f"train unseen_transporter_36_10_seed0_lr{LEARNING_RATES[1]:g}"
+    ]
+
+
+def test_tasks_that_the_first_rate_leaves_short_have_one_of_their_own(queue: Pretending):
+    costs = {f"{rate:g}": 1.0 + (rate != LEARNING_RATES[1]) for rate in LEARNING_RATES}
+    (queue.results / RATES).write_text(json.dumps({"unseen_transporter": costs}))
+    cells = {cell.name: cell for cell in paper_cells()}
+    queue.train(cells["palletizing_boxes_transporter_36_10"].policy)
+    queue.train(cells["block_insertion_transporter_36_10"].policy)
+    best = f"{LEARNING_RATES[0]:g}"
+    assert [call for call in queue.calls if call.startswith("train")] == [
+        *(f"train stack_block_pyramid_transporter_36_100_seed0_lr{r:g}" for r in LEARNING_RATES),
+        f"train palletizing_boxes_transporter_36_10_seed0_lr{best}",
+        f"train block_insertion_transporter_36_10_seed0_lr{LEARNING_RATES[1]:g}",
+    ]
+    losses = {f"{rate:g}": 7.0 + (rate != LEARNING_RATES[0]) for rate in LEARNING_RATES}
+    assert json.loads((queue.results / RATES).read_text()) == {
+        "stack_block_pyramid_transporter": losses,
+        "unseen_transporter": costs,
+    }
+
+
+def test_a_baseline_may_have_a_rate_of_its_own(queue: Pretending):
+    rates = {"unseen_transporter": {f"{rate:g}": rate for rate in LEARNING_RATES}}
+    (queue.results / RATES).write_text(json.dumps(rates))
+    steadier = dataclasses.replace(THEIRS.policy, learning_rate=LEARNING_RATES[0])
+    cell = dataclasses.replace(THEIRS, policy=steadier)
+    assert queue.run([cell]) == {}
+    assert f"train {steadier.name}_lr{LEARNING_RATES[0]:g}" in queue.calls
+    summary = json.loads((queue.results / f"{cell.name}.json").read_text())
+    assert cell.departure(summary, rates) is None
+    assert THEIRS.departure(summary, rates).startswith("learning_rate is 0.001, not 0.0003")
+
+
+def test_what_has_no_n_is_trained_once(queue: Pretending):
+    """Of the Equivariant Transporter everything but the angle network."""
+    costs = {f"{rate:g}": rate for rate in LEARNING_RATES}
+    (queue.results / RATES).write_text(json.dumps({"unseen_equivariant_transporter": costs}))
+    cells = {cell.name: cell for cell in paper_cells()}
+    for n in (36, 72):
+        queue.train(cells[f"seen_equivariant_transporter_{n}_100"].policy)
+    rate = min(LEARNING_RATES)
+    assert [call for call in queue.calls if call.startswith("train")] == [
+        f"train seen_equivariant_transporter_180_100_seed0_lr{rate:g}",
+        f"train seen_equivariant_transporter_36_100_angle_only_seed0_lr{rate:g}",
+        f"train seen_equivariant_transporter_72_100_angle_only_seed0_lr{rate:g}",
+    ]
+    whole = cells["seen_equivariant_transporter_180_100"].policy
+    assert whole.base is None
+    assert cells["seen_equivariant_transporter_36_100"].policy.base == whole
+    assert cells["block_insertion_equivariant_transporter_36_100"].policy.base is None
+
+
+def test_more_patience_is_another_training(queue: Pretending):
+    patient = Cell(
+        "unseen",
+        dataclasses.replace(THEIRS.policy, times=3, learning_rate=LEARNING_RATES[0]),
+        36,
+        "3_times_the_steps",
+    )
+    assert patient.policy.steps == 3 * THEIRS.policy.steps
+    assert queue.run([patient]) == {}
+    summary = json.loads((queue.results / f"{patient.name}.json").read_text())
+    assert patient.departure(summary) is None
+    at_once = dataclasses.replace(patient, policy=dataclasses.replace(patient.policy, times=1))
+    assert at_once.departure(summary).startswith("steps is")
+
+
+def test_what_is_trained_does_not_wait_behind_what_is_not(queue: Pretending):
+    queue.train(OURS.policy)
+    other = dataclasses.replace(OURS, policy=Training("unseen", "so2", 180, 100))
+    queue.slow = f"{other.policy.name}_lr{LEARNING_RATES[0]:g}"
+    assert queue.run([other, OURS]) == {}
+    assert [call for call in queue.calls if call.startswith("evaluate")] == [
+        f"evaluate {OURS.name}",
+        f"evaluate {other.name}",
+    ]
+
+
+def test_networks_at_another_learning_rate_do_not_count_as_trained(queue: Pretending):
+    many, few = (Training("seen", "transporter", 36, count) for count in (100, 10))
+    for rate in LEARNING_RATES:
+        queue.train(dataclasses.replace(reference(many), learning_rate=rate))
+    other, _, chosen = sorted(LEARNING_RATES, reverse=True)
+    queue.train(dataclasses.replace(few, learning_rate=other))
+    queue.calls.clear()
+    assert queue.run([Cell("seen", many, 36), Cell("seen", few, 36)]) == {}
+    assert [call for call in queue.calls if call.startswith("train")] == [
+        f"train {training.name}_lr{chosen:g}" for training in (many, few)
+    ]
+
+
+def test_trainings_side_by_side_collect_once(tmp_path: Path):
+    (tmp_path / "results").mkdir()
+    queue = Pretending(tmp_path, tmp_path / "results", Console(quiet=True), trainings=2)
+    queue.together = threading.Barrier(2)
+    other = dataclasses.replace(OURS, policy=Training("unseen", "so2", 180, 100))
+    assert queue.run([OURS, other]) == {}
+    assert [call for call in queue.calls if call.startswith("collect")] == [
+        "collect unseen",
+        "collect unseen_validation",
+    ]
+
+
+def test_learning_rates_are_tried_side_by_side(tmp_path: Path):
+    (tmp_path / "results").mkdir()
+    queue = Pretending(tmp_path, tmp_path / "results", Console(quiet=True), trainings=3)
+    queue.together = threading.Barrier(3, action=lambda: setattr(queue, "together", None))
+    assert queue.run([THEIRS]) == {}
+    tried = {f"train {reference(THEIRS.policy).name}_lr{rate:g}" for rate in LEARNING_RATES}
+    assert set(queue.calls[2:5]) == tried
+
+
+def test_a_run_collects_as_many_demonstrations_as_its_cells_need(queue: Pretending):
+    assert queue.run([OURS]) == {}
+    assert queue.collected == {"unseen": 10, "unseen_validation": TASKS["unseen"].validation}
+    more = dataclasses.replace(OURS, policy=Training("unseen", "so2", 180, 100))
+    again = Pretending(queue.folder, queue.results, Console(quiet=True))
+    assert again.run([OURS, more]) == {}
+    assert again.collected["unseen"] == 100
+
+
+def test_what_fails_keeps_nothing_else_up(queue: Pretending):
+    queue.broken = {f"{reference(THEIRS.policy).name}_lr{LEARNING_RATES[2]:g}"}
+    assert queue.run([THEIRS, OURS, ORACLE]) == {THEIRS.name: "it broke"}
+    assert queue.is_done(ORACLE)
+    assert queue.is_done(OURS)
+    assert not queue.is_done(THEIRS)
+    queue.broken = set()
+    queue.calls.clear()
+    assert queue.run([THEIRS, OURS, ORACLE]) == {}
+    assert queue.calls[0].endswith(f"_lr{LEARNING_RATES[2]:g}")
+
+
+def test_a_learning_rate_that_diverges_is_the_worst(queue: Pretending):
+    queue.broken = {f"{reference(THEIRS.policy).name}_lr{LEARNING_RATES[1]:g}"}
+    queue.why = f"train failed with exit code 2: error: {DIVERGED} at step 3"
+    assert queue.run([THEIRS]) == {}
+    assert json.loads((queue.results / RATES).read_text())["unseen_transporter"] == {
+        f"{rate:g}": None if rate == LEARNING_RATES[1] else 2.0 for rate in LEARNING_RATES
+    }
+    assert queue.calls[-1] == f"evaluate {THEIRS.name}"
+    queue.calls.clear()
+    assert queue.run([THEIRS]) == {}
+    assert queue.calls == []
+
+
+def test_demonstrations_that_are_there_are_looked_at_once(queue: Pretending):
+    """`collect` refuses those of another scenario."""
+    queue.collect(TASKS["unseen"], validation=False)
+    again = Pretending(queue.folder, queue.results, Console(quiet=True))
+    for _ in range(2):
+        again.collect(TASKS["unseen"], validation=False)
+    assert again.calls == ["collect unseen"]
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (lambda s: s["resolved_scenario"]["planner"]["search"].update(reach=0.004), "search.reach"),
+        (lambda s: s["resolved_scenario"]["plant"].update(time_step=0.5), "plant.time_step"),
+        (lambda s: s["resolved_scenario"].pop("end_at_success"), "end_at_success: false"),
+        (lambda s: s["policy_details"].update(steps=7), "steps is 7, not"),
+        (lambda s: s["policy_details"].update(learning_rate=0.1), "learning_rate is 0.1, not"),
+        (lambda s: s["policy_details"].update(decay=False), "decay is False, not"),
+        (lambda s: s["resolved_scenario"]["planner"].pop("heavy_load"), "an earlier hand"),
+        (lambda s: s["policy_details"].update(scenario="kitting_seen:Mine"), "scenario is kitting"),
+        (lambda s: s["policy_details"].update(continuous=True), "continuous is True"),
+        (lambda s: s["policy_details"].update(angle_only=True), "angle_only is True"),
+        (lambda s: s["seeds"].pop(), "seeds are not 3000 to 3099"),
+    ],
+)
+def test_a_summary_of_something_else_is_refused(queue: Pretending, change, said: str):
+    queue.run([OURS])
+    path = queue.results / f"{OURS.name}.json"
+    summary = json.loads(path.read_text())
+    assert OURS.departure(summary) is None
+    change(summary)
+    path.write_text(json.dumps(summary))
+    with pytest.raises(UserError, match="delete it") as caught:
+        queue.is_done(OURS)
+    assert said in str(caught.value)
+
+
+def test_a_policy_of_its_own_is_checked_too(queue: Pretending):
+    queue.run([ORACLE])
+    path = queue.results / f"{ORACLE.name}.json"
+    path.write_text(path.read_text().replace('"orientations": 180', '"orientations": 72'))
+    with pytest.raises(
+        UserError, match=r"its policy is not !QuantizedOracle \{orientations: 180\}"
+    ):
+        queue.is_done(ORACLE)
+    path.write_text("[]")
+    with pytest.raises(UserError, match="is no summary of evaluate"):
+        queue.is_done(ORACLE)
+
+
+def test_shipped_policies_must_have_the_weights_that_come_with_the_package():
+    cell = next(cell for cell in paper_cells() if cell.name == "fresh_generalist")
+    path = PAPER_RESULTS / "fresh_generalist.json"
+    summary = json.loads(path.read_text())
+    assert cell.departure(summary) is None
+    summary["policy_digest"] = "sha256 of others"
+    assert cell.departure(summary) == "its weights are not those that come with the package"
+
+
+def test_what_an_earlier_version_trained_is_not_taken_for_what_is_asked(queue: Pretending):
+    path = queue.train(OURS.policy).with_name("summary.json")
+    path.write_text(path.read_text().replace(f'"steps": {OURS.policy.steps}', '"steps": 7'))
+    (failure,) = queue.run([OURS]).values()
+    assert failure == f"{path.parent}: its steps is 7, not {OURS.policy.steps}: delete it"
+
+
+def test_commands_take_the_folders_that_they_are_given(tmp_path: Path):
+    """They refuse one that holds anything of something else."""
+    queue = Queue(tmp_path / "out", tmp_path / "results", Console(quiet=True))
+    folder = tmp_path / "out" / "evaluations" / "short"
+    text = "{policy: !Oracle {}, time_limit: 0.1}"
+    arguments = (SCENARIOS / "kitting_oracle.yaml", "--scenario_text", text, "--episodes", 1)
+    queue._command("evaluate", *arguments, "--workers", 1, folder=folder)
+    assert (folder / "summary.json").exists()
+
+
+def test_a_command_that_fails_is_told_by_its_last_line(tmp_path: Path):
+    """The real one: the scenario of this task does not exist."""
+    (tmp_path / "results").mkdir()
+    cell = dataclasses.replace(ORACLE, policy="!Nobody {}")
+    queue = Queue(tmp_path / "work", tmp_path / "results", Console(quiet=True))
+    failures = run_paper(queue, [cell])
+    assert list(failures) == [cell.name]
+    assert failures[cell.name].startswith("evaluate failed with exit code 2: error: ")
+    assert "!Nobody" in failures[cell.name]
+
+
+def test_cells_are_chosen_by_patterns_in_their_order(tmp_path: Path, monkeypatch, capsys):
+    chosen: list[str] = []
+
+    def fill(_: Queue, cells: list[Cell]) -> dict[str, str]:
+        chosen.extend(cell.name for cell in cells)
+        return {}
+
+    monkeypatch.setattr("kitting_drake.reproduction.paper.queue.run_paper", fill)
+    patterns = ["seen_quantized_oracle_36", "*_quantized_oracle_36"]
+    arguments = ["benchmark", "paper", "--output", str(tmp_path), "--cells", *patterns]
+    arguments += ["--results", str(tmp_path / "results")]
+    monkeypatch.setattr(sys, "argv", arguments)
+    assert benchmark.main() == 0
+    assert chosen == ["seen_quantized_oracle_36", "unseen_quantized_oracle_36"]
+    monkeypatch.setattr(sys, "argv", [*arguments, "--cells", "seen_*", "nothing_*"])
+    with pytest.raises(UserError, match="no cell of the name 'nothing_\\*'"):
+        benchmark.main()
+
+
+@pytest.mark.parametrize(("failures", "code"), [({}, 0), ({ORACLE.name: "it broke"}, 1)])
+def test_what_failed_is_told_by_the_exit_code(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys, failures: dict, code: int
+):
+    monkeypatch.setattr("kitting_drake.reproduction.paper.queue.run_paper", lambda *_: failures)
+    arguments = ["benchmark", "paper", "--cells", ORACLE.name, "--output", str(tmp_path)]
+    arguments += ["--results", str(tmp_path / "results")]
+    monkeypatch.setattr(sys, "argv", arguments)
+    assert benchmark.main() == code
+    assert ("it broke" in capsys.readouterr().out) == bool(code)
+
+
+def test_who_ends_it_ends_what_it_began(tmp_path: Path):
+    command = [sys.executable, "-m", "kitting_drake.benchmark", "paper", "--quiet"]
+    command += ["--cells", "unseen_quantized_oracle_180", "--results", str(tmp_path / "results")]
+    work = tmp_path / "work"
+    queue = subprocess.Popen([*command, "--output", str(work)], text=True)
+    folder = work / "paper" / "evaluations" / "unseen_quantized_oracle_180"
+    deadline = time.monotonic() + 120
+    while not (folder / ".lock").exists():
+        assert time.monotonic() < deadline
+        assert queue.poll() is None
+        time.sleep(0.2)
+    queue.terminate()
+    assert queue.wait(timeout=60) != 0
+    with alone_in(folder):
+        pass

@@ -1,0 +1,100 @@
+import argparse
+import dataclasses
+import json
+import subprocess
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from kitting_drake.common.paths import SCENARIOS
+from kitting_drake.scenario import Scenario
+from kitting_drake.scenario.choosing import (
+    ChosenScenario,
+    choose_scenario,
+    output_folder,
+    scenario_parser,
+)
+
+
+def parse(*flags: object) -> argparse.Namespace:
+    return scenario_parser("run", "").parse_args(list(map(str, flags)))
+
+
+def write(folder: Path, text: str) -> Path:
+    path = folder / "mine.yaml"
+    path.write_text(text)
+    return path
+
+
+def test_a_chosen_scenario_describes_all_of_itself(tmp_path: Path):
+    path = write(tmp_path, "A: {time_limit: 2.0}\nB: {task: !ToolsetKitting {split: train}}\n")
+    text = "{policy: !Learned {weights: w}, cameras: {top: !LookAt {width: 99}}}"
+    chosen = choose_scenario(parse(path, "--scenario_name", "B", "--scenario_text", text))
+    assert (chosen.name, chosen.policy, chosen.base) == ("mine:B", "learned", tmp_path)
+    described = chosen.described
+    assert described["policy"] == {
+        "_tag": "!Learned",
+        "weights": "w",
+        "orientations": 180,
+        "continuous": True,
+        "fit_outlines": True,
+        "recover": False,
+    }
+    task = described["task"]
+    assert (task["_tag"], task["split"], task["spacing"]) == ("!ToolsetKitting", "train", 0.008)
+    assert task["kit"]["height"] == 0.05
+    assert described["cameras"]["top"]["_tag"] == "!LookAt"
+    assert described["cameras"]["front"]["_tag"] == "!Pinhole"
+    assert described["planner"]["search"]["amplitude"] == 0.12
+    # Nothing is left out, and it is what JSON makes of it.
+    assert described.keys() == {item.name for item in dataclasses.fields(Scenario)}
+    assert described["planner"].keys() - {"_tag"} == {
+        item.name for item in dataclasses.fields(chosen.scenario.planner)
+    }
+    assert json.loads(json.dumps(described)) == described
+
+
+def test_what_differs_is_described_differently():
+    """By this two folders of results are told apart."""
+    one, other = (
+        ChosenScenario(scenario, Path("a.yaml"), "a", None).described
+        for scenario in (Scenario(), Scenario(time_limit=2.0))
+    )
+    assert one != other
+    assert {key for key in one if one[key] != other[key]} == {"time_limit"}
+
+
+def test_shipped_scenarios_are_found_from_anywhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.chdir(tmp_path)
+    for path in ("kitting_oracle.yaml", "scenarios/kitting_oracle.yaml"):
+        chosen = choose_scenario(parse(path))
+        assert chosen.path == SCENARIOS / "kitting_oracle.yaml"
+        assert chosen.name == "kitting_oracle"
+
+
+def test_files_go_where_one_says_or_into_a_folder_of_the_scenario():
+    assert output_folder(parse("a.yaml", "--output", "here"), "a:B") == Path("here")
+    assert output_folder(parse("a.yaml"), "a:B") == Path("output/a-B")
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("A: {planner: {hom: 1}}", "planner.hom is an unknown field: did you mean 'home'?"),
+        ("A: {task: !Kitting {tools: [spoon]}}", "mine.yaml: task.tools: there is no tool 'spoon'"),
+    ],
+)
+def test_bad_input_is_told_in_one_sentence(
+    tmp_path: Path,
+    verb: Callable[..., subprocess.CompletedProcess[str]],
+    text: str,
+    words: str,
+):
+    done = verb("run", write(tmp_path, text), "--no-meshcat", "--output", tmp_path / "out")
+    assert done.returncode == 2
+    assert done.stdout == ""
+    assert done.stderr.startswith("error: ")
+    assert words in done.stderr
+    assert done.stderr.count("\n") == 1
+    assert not list(tmp_path.glob("out/*"))

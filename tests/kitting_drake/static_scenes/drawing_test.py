@@ -1,0 +1,158 @@
+"""Random tools, the static scenes made of them, and the samples drawn of those."""
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from kitting_drake.common.errors import UserError
+from kitting_drake.common.paths import MODELS
+from kitting_drake.common.rendering import can_render
+from kitting_drake.hkd.tools.generate import ToolEntry, load_catalogue
+from kitting_drake.hkd.tools.random_tools import draw_tool
+from kitting_drake.policies.data.static_scenes import (
+    StaticSamples,
+    StaticScene,
+    StaticScenes,
+    is_static_scenes,
+    read_static_scenes,
+    write_static_scenes,
+)
+from kitting_drake.policies.data.training_data import read_training_data
+from kitting_drake.static_scenes import drawing as static_scenes
+from systems.signals import Observation, PixelGrid
+
+GRID = PixelGrid()
+ENTRIES = [e for e in load_catalogue(MODELS / "tools" / "catalogue.yaml") if e.split == "train"]
+needs_renderer = pytest.mark.skipif(not can_render(), reason="images cannot be rendered here")
+
+
+def test_random_tools_lie_on_the_table_and_differ():
+    tools = [draw_tool(ENTRIES, np.random.default_rng(seed), str(seed)) for seed in range(4)]
+    for tool in tools:
+        low, high = tool.triangles.min(axis=(0, 1)), tool.triangles.max(axis=(0, 1))
+        np.testing.assert_allclose(low[2], 0, atol=1e-9)
+        np.testing.assert_allclose(low[:2], -high[:2], atol=1e-9)
+        np.testing.assert_allclose(high - low, (tool.length, tool.width, tool.height), atol=1e-9)
+        assert 0.1 < max(tool.length, tool.width) < 0.24
+        assert tool.grasps
+        assert all(0.003 <= grasp.width <= 0.07 for grasp in tool.grasps)
+        assert tool.footprint.area() > 0
+    assert len({round(tool.footprint.area(), 9) for tool in tools}) == len(tools)
+    again = draw_tool(ENTRIES, np.random.default_rng(2), "2")
+    np.testing.assert_array_equal(again.triangles, tools[2].triangles)
+
+
+def test_random_tools_depart_from_tools_to_train_with_only(monkeypatch: pytest.MonkeyPatch):
+    given: list[ToolEntry] = []
+
+    def take_down(entries: list[ToolEntry], *_: object) -> None:
+        given.extend(entries)
+        raise UserError("seen enough")
+
+    monkeypatch.setattr(static_scenes, "require_rendering", lambda: None)
+    monkeypatch.setattr(static_scenes, "draw_tool", take_down)
+    with pytest.raises(UserError, match="seen enough"):
+        next(static_scenes.draw_batch(0))
+    assert len(given) == 40
+    assert {entry.split for entry in given} == {"train"}
+
+
+@pytest.fixture(scope="module")
+def scenes() -> list[StaticScene]:
+    if not can_render():
+        pytest.skip("images cannot be rendered here")
+    rng = np.random.default_rng(1)
+    tools = [draw_tool(ENTRIES, rng, str(index)) for index in range(3)]
+    kit = static_scenes._draw_kit(tools, rng)
+    return [static_scenes._draw_scene(kit, tools, (), rng, seed) for seed in range(6)]
+
+
+def test_picks_are_on_tools_and_places_in_the_kit(scenes: list[StaticScene]):
+    loose = [scene for scene in scenes if len(scene.actions)]
+    assert loose
+    for scene in loose:
+        height = scene.image[3]
+        top = np.percentile(height, 99)
+        for row in scene.actions:
+            pick, place = (np.rint(GRID.to_pixel(row[i : i + 2])).astype(int) for i in (2, 5))
+            around = height[pick[0] - 1 : pick[0] + 2, pick[1] - 1 : pick[1] + 2]
+            assert around.max() > 0.003
+            # In a cavity, within the block.
+            window = height[place[0] - 10 : place[0] + 11, place[1] - 10 : place[1] + 11]
+            assert window.max() > 0.8 * top
+
+
+@needs_renderer
+def test_a_place_brings_the_tool_into_a_cavity_of_its_shape():
+    """What rises at the tool's pixels finds room where the action brings them."""
+    rng = np.random.default_rng(5)
+    tools = [draw_tool(ENTRIES, rng, str(index)) for index in range(2)]
+    kit = static_scenes._draw_kit(tools, rng)
+    free = 0
+    while not free:
+        scene = static_scenes._draw_scene(kit, tools, (), rng, 0)
+        if len(np.unique(scene.actions[:, 0])) < 2:
+            continue
+        height = scene.image[3]
+        block = np.percentile(height, 99)
+        for row in scene.actions[:1]:
+            pick, place = GRID.to_pixel(row[2:4]), GRID.to_pixel(row[5:7])
+            rotation = row[7] - row[4]
+            along = np.array([math.cos(row[4]), math.sin(row[4])])
+            for step in np.linspace(-6, 6, 7):
+                here = np.rint(pick + step * along).astype(int)
+                turned = row[4] + rotation
+                there = place + step * np.array([math.cos(turned), math.sin(turned)])
+                there = np.rint(there).astype(int)
+                if height[tuple(here)] > 0.004:
+                    free += 1
+                    assert height[tuple(there)] < block - 0.003
+
+
+def test_a_file_gives_back_what_was_written(scenes: list[StaticScene], tmp_path: Path):
+    path = tmp_path / "scenes.h5"
+    write_static_scenes(path, StaticScenes(GRID, tuple(scenes), 7, {"drake": "x"}))
+    assert is_static_scenes(path)
+    found = read_static_scenes(path)
+    assert (found.grid, found.first_seed, found.versions) == (GRID, 7, {"drake": "x"})
+    for one, other in zip(found.scenes, scenes, strict=True):
+        np.testing.assert_array_equal(one.height, other.height)
+        np.testing.assert_array_equal(one.actions, other.actions)
+    data = read_training_data(path)
+    assert (data.count, data.colour, data.seeds) == (len(scenes), False, (7,))
+    loose = sum(bool(len(scene.actions)) for scene in scenes)
+    assert len(data.scenes()) == loose
+    assert len(data.finals()) == len(scenes) - loose
+    assert len(data.scenes(1)) == 1
+    (tmp_path / "broken.h5").write_bytes(path.read_bytes()[:2000])
+    with pytest.raises(UserError, match=r"broken\.h5"):
+        read_static_scenes(tmp_path / "broken.h5")
+
+
+def test_samples_have_a_grasp_of_each_loose_tool():
+    actions = np.zeros((5, 8))
+    actions[:, 0] = (0, 0, 0, 1, 1)
+    actions[:, 1] = (0.0, 0.5, 30.0, 0.2, 0.2)
+    actions[:, 2] = np.linspace(0.3, 0.6, 5)
+    scene = StaticScene.of(Observation(), actions)
+    final = StaticScene.of(Observation(), np.zeros((0, 8)))
+    samples = StaticSamples(StaticScenes(GRID, (final, scene)))
+    # As of any sequence, the last follows from its end, and there is an end.
+    assert (samples[-1].pick == samples[len(samples) - 1].pick).all()
+    with pytest.raises(IndexError):
+        samples[len(samples)]
+    rows = GRID.to_pixel(actions[:, 2:4])[:, 0]
+    seen = set()
+    for index in range(len(samples)):
+        sample = samples[index]
+        assert len(sample.other_picks) == 1
+        picks = {
+            int(np.abs(rows - pick[0]).argmin()) for pick in (sample.pick, *sample.other_picks)
+        }
+        assert len(picks & {0, 1, 2}) == len(picks & {3, 4}) == 1
+        seen |= picks
+    # The one that would not hold is never drawn.
+    assert seen == {0, 1, 3, 4}
+    np.testing.assert_array_equal(samples[3].pick, samples[3].pick)

@@ -1,0 +1,117 @@
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from pydrake.multibody.parsing import Parser
+from pydrake.multibody.plant import AddMultibodyPlantSceneGraph
+from pydrake.systems.framework import DiagramBuilder
+
+from kitting_drake.common.errors import UserError
+from kitting_drake.common.paths import MODELS, SCENARIOS
+from kitting_drake.common.rendering import can_render
+from kitting_drake.scenario.appearance import Appearance
+from kitting_drake.scenario.loader import load_scenario
+from kitting_drake.station import build_cell
+from kitting_drake.station.paint import lights_of
+from kitting_drake.station.variation import varied_model
+
+needs_renderer = pytest.mark.skipif(not can_render(), reason="images cannot be rendered here")
+
+
+def cell_of(text: str, seed: int = 2):
+    scenario = load_scenario(SCENARIOS / "kitting_oracle.yaml", None, text)
+    return build_cell(scenario, seed=seed, base=SCENARIOS)
+
+
+def observed(text: str, seed: int = 2) -> np.ndarray:
+    cell = cell_of(text, seed)
+    port = cell.diagram.GetOutputPort("observation")
+    return port.Eval(cell.diagram.CreateDefaultContext()).image
+
+
+@needs_renderer
+def test_colours_are_painted_and_heights_stay():
+    plain = observed("{}")
+    red = observed('{appearance: {paints: {"*": !Fixed {rgb: [1.0, 0.0, 0.0]}}}}')
+    np.testing.assert_array_equal(red[3], plain[3])
+    assert red[1:3].max() == 0
+    assert red[0].max() > 0.5
+
+
+@needs_renderer
+def test_drawn_colours_are_the_seeds():
+    text = '{appearance: {paints: {"table/*": !Drawn {}, "fixtures/*": !Drawn {shared: true}}}}'
+    one = observed(text)
+    np.testing.assert_array_equal(one, observed(text))
+    plain = observed("{}")
+    changed = (one[:3] != plain[:3]).any(axis=0)
+    # The tools stay as they are.
+    assert 0.8 < changed.mean() < 1.0
+    np.testing.assert_array_equal(one[3], plain[3])
+
+
+def test_a_pattern_that_names_nothing_is_told():
+    with pytest.raises(UserError, match=r"appearance\.paints: no surface is called tabel/\*"):
+        cell_of('{appearance: {paints: {"tabel/*": !Drawn {}}}}')
+    with pytest.raises(UserError, match=r"appearance\.sheen\.\* must be from 0 to 1, not 2"):
+        cell_of('{appearance: {sheen: {"*": 2.0}}}')
+
+
+@needs_renderer
+def test_sheen_makes_holes_on_what_has_it():
+    plain = cell_of("{}").diagram
+    port = plain.GetOutputPort("observation")
+    whole = port.Eval(plain.CreateDefaultContext())
+    shiny = cell_of('{appearance: {sheen: {"objects/*": 0.9}}}').diagram
+    holed = shiny.GetOutputPort("observation").Eval(shiny.CreateDefaultContext())
+    lost = whole.valid & ~holed.valid
+    tools = (whole.height > 0.004) & (whole.height < 0.04)
+    assert lost[tools].mean() > 5 * lost[whole.height < 0.001].mean()
+
+
+def test_drawn_lights_are_the_seeds_and_point_down():
+    appearance = Appearance(drawn_lights=0.6)
+    drawn = [lights_of(appearance, seed) for seed in range(20)]
+    assert {len(lights) for lights in drawn} == {1, 2, 3}
+    assert all(light.direction[2] < 0 for lights in drawn for light in lights)
+    again = lights_of(appearance, 3)
+    assert [light.intensity for light in again] == [light.intensity for light in drawn[3]]
+    assert lights_of(Appearance(), 0) == []
+
+
+def test_mass_varies_with_the_seed_within_its_range():
+    def masses(text: str, seed: int) -> np.ndarray:
+        cell = cell_of(text, seed)
+        return (
+            np.array([cell.plant.get_body(item.body).default_mass() for item in cell.objects]) / 1.0
+        )
+
+    plain = {seed: masses("{}", seed) for seed in (1, 2)}
+    varied = {seed: masses("{plant: {mass_variation: 0.3}}", seed) for seed in (1, 2)}
+    for seed in plain:
+        factors = varied[seed] / plain[seed]
+        assert ((factors > 0.7) & (factors < 1.3) & (factors != 1)).all()
+        assert len(set(factors.round(9))) == len(factors)
+    np.testing.assert_array_equal(masses("{plant: {mass_variation: 0.3}}", 1), varied[1])
+
+
+def test_a_models_friction_is_scaled_and_its_meshes_are_found(tmp_path: Path):
+    text = varied_model(MODELS / "table" / "table.sdf", friction=1.5, mass=1.0)
+    assert "mu_dynamic>0.75<" in text
+    tool = varied_model(
+        MODELS / "tools" / "claw_hammer" / "claw_hammer.sdf", friction=0.5, mass=2.0
+    )
+    assert "<mass>0.1805997838</mass>" in tool
+    assert "mu_static>0.25<" in tool
+    assert f"file://{MODELS / 'tools' / 'claw_hammer' / 'steel.obj'}" in tool
+    # Where homes have such names; Drake decodes nothing.
+    folder = tmp_path / "ä b#c%20d"
+    shutil.copytree(MODELS / "tools" / "claw_hammer", folder)
+    plant, _ = AddMultibodyPlantSceneGraph(DiagramBuilder(), time_step=0.01)
+    moved = varied_model(folder / "claw_hammer.sdf", friction=0.5, mass=2.0)
+    assert Parser(plant).AddModelsFromString(moved, "sdf")
+    broken = tmp_path / "broken.sdf"
+    broken.write_text("<sdf")
+    with pytest.raises(UserError, match=r"broken\.sdf cannot be read"):
+        varied_model(broken, friction=1, mass=1)

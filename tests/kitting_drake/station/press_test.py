@@ -1,0 +1,44 @@
+"""An action that presses, in the physics of the cell."""
+
+import sys
+import types
+from pathlib import Path
+
+import pytest
+from pydrake.systems.analysis import Simulator
+from pydrake.systems.framework import Context, EventStatus
+
+from kitting_drake.scenario import Scenario
+from kitting_drake.scenario.policies import PythonPolicy
+from kitting_drake.station import build_cell
+from kitting_drake.tasks import ArrangedKitting
+from kitting_drake.tasks.kitting.tool_poses import TablePose
+from systems.pick_place_parameters import PickPlaceParameters
+from systems.signals import PickPlaceAction, PlanarPose
+
+
+@pytest.mark.parametrize("force", [30.0, 60.0])
+@pytest.mark.usefixtures("rendering")
+def test_it_presses_as_hard_as_it_is_told(monkeypatch: pytest.MonkeyPatch, force: float):
+    """Through an impact at `lower_speed`, and from one period of the planner to the next."""
+    action = PickPlaceAction(pick=PlanarPose(0.42, 0.14), press=True)
+    monkeypatch.setitem(sys.modules, "presser", types.SimpleNamespace(press=lambda _: action))
+    scenario = Scenario(
+        task=ArrangedKitting(tools={"claw_hammer": TablePose(x=0.42, y=0.14)}),
+        policy=PythonPolicy(function="presser:press"),
+        planner=PickPlaceParameters(press_force=force, max_actions=1),
+        cameras={"front": Scenario().cameras["front"]},
+    )
+    cell = build_cell(scenario, seed=0, base=Path())
+    peak = 0.0
+
+    def watch(root: Context) -> EventStatus:
+        nonlocal peak
+        context = cell.planner.GetMyContextFromRoot(root)
+        peak = max(peak, cell.planner.GetInputPort("hand_contact_force").Eval(context)[2])
+        return EventStatus.DidNothing()
+
+    simulator = Simulator(cell.diagram)
+    simulator.set_monitor(watch)
+    simulator.AdvanceTo(3.0)
+    assert force < peak < force + 8
