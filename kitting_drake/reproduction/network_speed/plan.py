@@ -17,7 +17,7 @@ from kitting_drake.common.errors import UserError
 from kitting_drake.policies.data.demonstrations import read_demonstrations
 from kitting_drake.policies.data.images import Image, crop, rotation_matrix
 from kitting_drake.policies.data.recorded import record
-from kitting_drake.policies.data.samples import Scene, scenes
+from kitting_drake.policies.data.samples import ObservedScene, scenes
 from kitting_drake.policies.networks import architecture as sizes
 from kitting_drake.policies.networks.architecture import PRESETS
 from kitting_drake.policies.networks.device import preferred_type
@@ -64,7 +64,7 @@ class Bench:
     device: torch.device
     folder: Path
     """The folder for the weights of exported networks."""
-    scene: Scene
+    scene: ObservedScene
     peak: dict[torch.dtype, dict[str, float]] = field(default_factory=dict)
     """The results of `measure_peak`, by type."""
 
@@ -131,7 +131,7 @@ def type_name(type_: torch.dtype) -> str:
     return str(type_).removeprefix("torch.")
 
 
-def observed_scene(path: Path | None) -> Scene:
+def observed_scene(path: Path | None) -> ObservedScene:
     """The first observation of a demonstration, or a synthetic one.
 
     Raises:
@@ -147,7 +147,7 @@ def observed_scene(path: Path | None) -> Scene:
     return observed[0]
 
 
-def synthetic_scene(grid: PixelGrid) -> Scene:
+def synthetic_scene(grid: PixelGrid) -> ObservedScene:
     """Four bars on a table, and a block with a hole for each."""
     random = np.random.default_rng(0)
     pixel = np.stack(np.meshgrid(np.arange(grid.rows), np.arange(grid.cols), indexing="ij"), -1)
@@ -177,4 +177,4 @@ def synthetic_scene(grid: PixelGrid) -> Scene:
         actions.append(
             PickPlaceAction(PlanarPose(pick_x, pick_y, theta), PlanarPose(place_x, place_y, 0.0))
         )
-    return Scene(record(Observation(image, grid)), tuple(actions), grid)
+    return ObservedScene(record(Observation(image, grid)), tuple(actions), grid)

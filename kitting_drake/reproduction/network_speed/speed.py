@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from kitting_drake.policies.data.samples import Scene, labelled_images
+from kitting_drake.policies.data.samples import ObservedScene, labelled_images
 from kitting_drake.policies.learned_policy import LearnedPolicy
 from kitting_drake.policies.networks.architecture import NetworkConfig
 from kitting_drake.policies.networks.device import preferred_type
@@ -147,7 +147,7 @@ def _computing_in(networks: Networks, type_: torch.dtype) -> Networks:
     return networks
 
 
-def _training(networks: Networks, scene: Scene) -> Callable[[], object]:
+def _training(networks: Networks, scene: ObservedScene) -> Callable[[], object]:
     """Training steps of all four networks, augmentation and losses included: the same ones,
     whatever the networks."""
     trainer = Trainer(networks, seed=0, curvature=True)
