@@ -29,6 +29,10 @@ class PolicyFunction(Protocol):
         ...
 
 
+class PolicyError(RuntimeError):
+    """A policy's own function failed; `__cause__` is what it raised."""
+
+
 class PickPlacePolicy(LeafSystem):
     """Wraps a policy p(a_pick, a_place | o_t), section III-A of the paper.
 
@@ -55,9 +59,9 @@ class PickPlacePolicy(LeafSystem):
     def __init__(self, *, policy: PolicyFunction, heights_only: bool = False) -> None:
         """
         Args:
-            policy: what it raises ends the evaluation of the port; an answer that is not a
-                `PickPlaceAction` is a `TypeError`, and one whose poses are not finite numbers a
-                `ValueError`.
+            policy: what it raises ends the evaluation of the port as a `PolicyError`; an answer
+                that is not a `PickPlaceAction` does as a `TypeError`, and one whose poses are not
+                finite numbers as a `ValueError`.
             heights_only: whether it looks at heights alone.
         """
         super().__init__()
@@ -75,7 +79,11 @@ class PickPlacePolicy(LeafSystem):
     def _calc_action(self, context: Context, output: AbstractValue) -> None:
         given = self._failed_picks.HasValue(context)
         failed_picks = self._failed_picks.Eval(context) if given else ()
-        action = self._policy(self._observation.Eval(context), failed_picks)
+        observation = self._observation.Eval(context)
+        try:
+            action = self._policy(observation, failed_picks)
+        except (Exception, SystemExit) as error:
+            raise PolicyError(f"the policy {self._policy!r} failed: {error}") from error
         if not isinstance(action, PickPlaceAction):
             raise TypeError(
                 f"the policy {self._policy!r} answered with {type(action).__name__}, "

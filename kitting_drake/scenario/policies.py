@@ -59,18 +59,15 @@ class PolicySite:
     """False where the episode ends by itself once all is done."""
     planner: PickPlaceParameters = field(default_factory=PickPlaceParameters)
     """How the hand will pick and place."""
+    has_cameras: bool = True
+    """Whether there is an o_t: else the oracle tells the planner how high things are."""
 
 
 class PolicyConfig:
     """The interface of a policy; each variant of the scenario's `policy:` derives from it."""
 
     needs_observation: bool = True
-    """Whether the policy sees by cameras, which are then needed. The system has the input port
-    `observation`, or `observation_heights` where it looks at heights alone, or `body_poses`, or
-    none of these where it is told what to do."""
-
-    planner_observes: bool = True
-    """Whether the planner reads heights off o_t itself; else each action brings them."""
+    """Whether it sees by cameras, which are then needed."""
 
     @property
     def name(self) -> str:
@@ -78,7 +75,8 @@ class PolicyConfig:
         return "".join(f"_{c.lower()}" if c.isupper() else c for c in type(self).__name__)[1:]
 
     def make_system(self, site: PolicySite) -> LeafSystem:
-        """The system; it has the output port `action`.
+        """The system. Its input ports are named after the station's output ports that they are
+        connected to (see `station.KittingStation`); it has the output port `action`.
 
         Raises:
             UserError: it cannot be made.
@@ -285,7 +283,9 @@ class PythonPolicy(PolicyConfig):
             raise UserError(f"policy.function: cannot import {self.function}: {reason}") from error
         if not callable(function):
             raise UserError(f"policy.function: {self.function} is not a function")
-        return PickPlacePolicy(policy=function if self.takes_failed_picks else _Seeing(function))
+        return PickPlacePolicy(
+            policy=function if self.takes_failed_picks else _OfObservationAlone(function)
+        )
 
     def digest(self, base: Path) -> str | None:
         try:
@@ -311,7 +311,7 @@ class PythonPolicy(PolicyConfig):
 
 
 @dataclass(frozen=True)
-class _Seeing:
+class _OfObservationAlone:
     """A function of an observation alone, as a policy that may be given failed picks too."""
 
     function: Callable[[Observation], PickPlaceAction]
@@ -336,6 +336,7 @@ def _make_oracle(site: PolicySite, quantizer: ActionQuantizer | None) -> OracleP
         goals=site.scene.goals,
         success=site.scene.success,
         quantizer=quantizer,
+        brings_heights=not site.has_cameras,
     )
 
 

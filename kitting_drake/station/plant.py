@@ -1,4 +1,4 @@
-"""The cell's plant: table, fixtures, objects and hand."""
+"""The station's plant: table, fixtures, objects and hand."""
 
 from pathlib import Path
 
@@ -6,13 +6,13 @@ import numpy as np
 from pydrake.geometry import SceneGraph
 from pydrake.math import RigidTransform
 from pydrake.multibody.parsing import Parser
-from pydrake.multibody.plant import AddMultibodyPlant, MultibodyPlant, MultibodyPlantConfig
+from pydrake.multibody.plant import AddMultibodyPlant, MultibodyPlant
 from pydrake.multibody.tree import RigidBody
 from pydrake.systems.framework import DiagramBuilder
 
 from kitting_drake.common.errors import UserError
 from kitting_drake.common.paths import MODELS
-from kitting_drake.scenario.schema import Plant, Scenario
+from kitting_drake.scenario.schema import Scenario, Variation
 from kitting_drake.station.variation import varied_model
 from kitting_drake.tasks.task import Scene
 from systems.placement import PlacedObject
@@ -25,18 +25,12 @@ _VARIATION_STREAM = 13
 
 
 def add_plant(builder: DiagramBuilder, scenario: Scenario) -> tuple[MultibodyPlant, SceneGraph]:
-    """Adds an empty plant, in strictly hydroelastic contact."""
-    config = MultibodyPlantConfig(
-        time_step=scenario.plant.time_step,
-        # Strict: a pair that cannot be hydroelastic is an error, not a point contact in disguise.
-        contact_model="hydroelastic",
-        discrete_contact_approximation=scenario.plant.contact_approximation,
-    )
-    return AddMultibodyPlant(config, builder)
+    """Adds an empty plant and its scene graph."""
+    return AddMultibodyPlant(scenario.plant, builder)
 
 
 def add_models(
-    plant: MultibodyPlant, scene: Scene, variation: Plant, seed: int
+    plant: MultibodyPlant, scene: Scene, variation: Variation, seed: int
 ) -> tuple[tuple[PlacedObject, ...], tuple[RigidBody, ...]]:
     """Adds the table, the scene's fixtures and objects, and the hand.
 
@@ -60,8 +54,8 @@ def add_models(
 
     def add(model: Path) -> RigidBody:
         friction, mass = 1 + rng.uniform(-1, 1, 2) * (
-            variation.friction_variation,
-            variation.mass_variation,
+            variation.friction,
+            variation.mass,
         )
         if friction == mass == 1:
             return _add_body(parser, plant, model)

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from pydrake.common.value import Value
 
-from systems.pick_place_policy import PickPlacePolicy
+from systems.pick_place_policy import PickPlacePolicy, PolicyError
 from systems.signals import Observation, PickPlaceAction, PlanarPose
 
 ACTION = PickPlaceAction(PlanarPose(0.4, 0.1, 0.2), PlanarPose(0.5, -0.1, 1.0))
@@ -82,15 +82,16 @@ def test_what_means_nothing_is_not_looked_at():
         assert policy.GetOutputPort("action").Eval(context).press == answer.press
 
 
-def test_what_the_policy_raises_comes_through():
+def test_what_the_policy_raises_is_told_as_its_error():
     def fail(*_) -> PickPlaceAction:
         raise KeyError("no such weight")
 
     policy = PickPlacePolicy(policy=fail)
     context = policy.CreateDefaultContext()
     policy.GetInputPort("observation").FixValue(context, Value(Observation()))
-    with pytest.raises(KeyError, match="no such weight"):
+    with pytest.raises(PolicyError, match="no such weight") as caught:
         policy.GetOutputPort("action").Eval(context)
+    assert isinstance(caught.value.__cause__, KeyError)
 
 
 def test_a_policy_is_given_where_grasps_failed():
