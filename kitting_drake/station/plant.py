@@ -7,7 +7,7 @@ from pydrake.geometry import SceneGraph
 from pydrake.math import RigidTransform
 from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import AddMultibodyPlant, MultibodyPlant
-from pydrake.multibody.tree import RigidBody
+from pydrake.multibody.tree import BodyIndex, RigidBody
 from pydrake.systems.framework import DiagramBuilder
 
 from kitting_drake.common.errors import UserError
@@ -31,7 +31,7 @@ def add_plant(builder: DiagramBuilder, scenario: Scenario) -> tuple[MultibodyPla
 
 def add_models(
     plant: MultibodyPlant, scene: Scene, variation: Variation, seed: int
-) -> tuple[tuple[PlacedObject, ...], tuple[RigidBody, ...]]:
+) -> tuple[tuple[PlacedObject, ...], tuple[BodyIndex, ...]]:
     """Adds the table, the scene's fixtures and objects, and the hand.
 
     Args:
@@ -41,7 +41,8 @@ def add_models(
         seed: of their draws.
 
     Returns:
-        The scene's objects with their bodies, and the bodies that never move.
+        The scene's objects with their bodies, and the bodies that never move: the table, then the
+        fixtures.
 
     Raises:
         UserError: a model cannot be loaded, or is not of one link.
@@ -72,7 +73,7 @@ def add_models(
         body = add(item.model)
         objects.append(PlacedObject(item.name, body.index(), item.p_BPoints, item.symmetry))
     parser.AddModels(str(MODELS / "franka_hand" / "franka_hand.sdf"))
-    return tuple(objects), tuple(still)
+    return tuple(objects), tuple(body.index() for body in still)
 
 
 def _add_body(

@@ -21,6 +21,12 @@ _IMAGES = {
     "body_pose_in_world": "body_pose_in_world",
 }
 """A camera's output ports, and the projector's input ports but for the camera's name."""
+_EXPORTED = {
+    "color_image": "color_image",
+    "depth_image_32f": "depth_image",
+    "body_pose_in_world": "camera_pose",
+}
+"""A camera's output ports, and the station's but for the camera's name."""
 
 
 def add_cameras(
@@ -82,6 +88,6 @@ def add_cameras(
                 builder.Connect(sensor.GetOutputPort(port), source.GetInputPort(port))
         for output, port in _IMAGES.items():
             builder.Connect(source.GetOutputPort(output), projector.GetInputPort(f"{port}_{name}"))
-        for output in ("color_image", "depth_image_32f"):
-            builder.ExportOutput(source.GetOutputPort(output), f"{_IMAGES[output]}_{name}")
+        for output, port in _EXPORTED.items():
+            builder.ExportOutput(source.GetOutputPort(output), f"{port}_{name}")
     return projector

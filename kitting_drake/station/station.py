@@ -1,6 +1,5 @@
 """The station: a Diagram of everything but the policy, with ports to plug one into."""
 
-import functools
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -65,6 +64,7 @@ class KittingStation(Diagram):
         - height_error
         - color_image_<camera>
         - depth_image_<camera>
+        - camera_pose_<camera>
 
     - `action` (abstract, `PickPlaceAction`): evaluated only when the planner asks.
     - `observation` (abstract, `Observation`): o_t. `observation_heights`: o_t without colours, for
@@ -78,7 +78,8 @@ class KittingStation(Diagram):
     - `body_poses`, `contact_results`: the plant's. `query_object`: the scene graph's.
     - `at_rest` (n): 1 for an object that is at rest: the `RestDetector`'s.
     - The others are those of the `PlacementMonitor`, one element for each of the n objects.
-    - `color_image_<camera>`, `depth_image_<camera>`: what o_t is projected from, noise included.
+    - `color_image_<camera>`, `depth_image_<camera>`, `camera_pose_<camera>`: what o_t is projected
+      from, noise included, and X_WB as the calibration has it.
 
     All memory is in the Context. Ports compute only on demand: images are rendered when something
     asks for an observation.
@@ -99,7 +100,8 @@ class KittingStation(Diagram):
         self.objects, self.still_bodies = add_models(
             self.plant, self.scene, scenario.variation, seed
         )
-        """The scene's objects with their bodies; the bodies of the table and the fixtures."""
+        """The scene's objects with their bodies; the bodies of the table and the fixtures. By their
+        indices: a body would keep the plant, and that the station, in memory for good."""
         self.plant.Finalize()
         set_initial_poses(self.plant, scenario, self.scene, self.objects)
         groups = _surface_groups(self.scene, self.still_bodies, self.objects)
@@ -232,10 +234,10 @@ class KittingStation(Diagram):
         if not self.scenario.sleep.enabled:
             return
         plant_context = self.plant.GetMyMutableContextFromRoot(root_context)
-        at_rest = self.at_rest(root_context).tolist()
+        bodies, at_rest = self._bodies, self.at_rest(root_context).tolist()
         changed = [
             (body, resting)
-            for body, resting in zip(self._bodies, at_rest, strict=True)
+            for body, resting in zip(bodies, at_rest, strict=True)
             if resting != body.is_locked(plant_context)
         ]
         if not changed:
@@ -243,20 +245,21 @@ class KittingStation(Diagram):
         filters = self.scene_graph.collision_filter_manager(
             self.scene_graph.GetMyMutableContextFromRoot(root_context)
         )
+        still = [self.plant.get_body(index) for index in self.still_bodies]
         # First those that wake, as they are free of all; then those that fall asleep.
         for body, resting in sorted(changed, key=lambda change: change[1]):
             own = self._geometry([body])
             if resting:
                 body.Lock(plant_context)
-                frozen = [other for other in self._bodies if other.is_locked(plant_context)]
-                others = self._geometry([*self.still_bodies, *frozen])
+                frozen = [other for other in bodies if other.is_locked(plant_context)]
+                others = self._geometry([*still, *frozen])
                 filters.Apply(CollisionFilterDeclaration().ExcludeBetween(own, others))
             else:
                 body.Unlock(plant_context)
-                others = self._geometry([*self.still_bodies, *self._bodies])
+                others = self._geometry([*still, *bodies])
                 filters.Apply(CollisionFilterDeclaration().AllowBetween(own, others))
 
-    @functools.cached_property
+    @property
     def _bodies(self) -> list[RigidBody]:
         """The bodies of the scene's objects."""
         return [self.plant.get_body(item.body) for item in self.objects]
@@ -303,10 +306,10 @@ def _check_scene(scenario: Scenario, scene: Scene) -> None:
 
 
 def _surface_groups(
-    scene: Scene, still_bodies: Sequence[RigidBody], objects: Sequence[PlacedObject]
+    scene: Scene, still_bodies: Sequence[BodyIndex], objects: Sequence[PlacedObject]
 ) -> dict[BodyIndex, str]:
     """The names by which a scenario's `appearance` calls the bodies' surfaces."""
-    groups = {still_bodies[0].index(): "table"}
+    groups = {still_bodies[0]: "table"}
     for fixture, body in zip(scene.fixtures, still_bodies[1:], strict=True):
-        groups[body.index()] = f"fixtures/{fixture.name}"
+        groups[body] = f"fixtures/{fixture.name}"
     return groups | {item.body: f"objects/{item.name}" for item in objects}
