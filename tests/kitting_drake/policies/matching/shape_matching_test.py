@@ -158,7 +158,7 @@ def test_what_certainly_fits_is_picked_though_the_networks_see_nothing(seen):
 @pytest.mark.parametrize("turn", [0.0, math.pi])
 def test_a_place_that_is_nearly_right_or_reversed_is_put_right(seen, turn: float):
     observation, scene = seen
-    grid = observation.grid
+    grid, segmentation = observation.grid, segment(observation)
     # The second is a screwdriver, the recess of whose shaft is lost in noise.
     for lies, belongs in true_places(scene)[: 1 if turn and not observation.valid.all() else 2]:
         pick, place = grid.to_pixel(lies[:2]), grid.to_pixel(belongs[:2])
@@ -167,13 +167,11 @@ def test_a_place_that_is_nearly_right_or_reversed_is_put_right(seen, turn: float
         if turn:
             # What a network takes for the place then: the recess the wrong way round.
             recess = min(
-                segment(observation).recesses,
+                segmentation.recesses,
                 key=lambda item: np.linalg.norm(item.pixels - place, axis=1).min(),
             )
             off = 2 * recess.pixels.mean(axis=0) - off
-        found = refine_place(
-            segment(observation), pick, rotation + turn + 0.05, off, grid.resolution
-        )
+        found = refine_place(segmentation, pick, rotation + turn + 0.05, off, grid.resolution)
         assert found is not None
         assert np.linalg.norm(found.place - place) * grid.resolution < 0.003
         assert abs(math.remainder(found.rotation - rotation, math.tau)) < math.radians(2)

@@ -31,8 +31,9 @@ def assert_same(one: Trainer, other: Trainer) -> None:
 def test_all_draws_are_those_of_the_seed():
     samples = [scene(0), scene(1)]
     one, same, other = trainer(), trainer(), trainer(seed=1)
-    losses = [[item.step(samples) for _ in range(2)] for item in (one, same, other)]
-    assert losses[0] == losses[1] != losses[2]
+    losses = [[item.step(samples) for _ in range(2)] for item in (one, same)]
+    assert losses[0] == losses[1]
+    assert other.step(samples) != losses[0][0]
     assert_same(one, same)
 
 
@@ -114,21 +115,21 @@ def rates(learner: Trainer) -> set[float]:
 
 def test_the_rate_is_that_of_the_step():
     learner, constant = trainer(steps=300, decay=True), trainer(steps=300)
-    for step in range(3):
+    constant.step([scene(0)])
+    assert rates(constant) == {1e-4}
+    for step in range(2):
         assert rates(learner) == {1e-4 * decayed(step, 300)}
-        assert rates(constant) == {1e-4}
         learner.step([scene(0)])
-        constant.step([scene(0)])
     resumed = trainer(steps=300, decay=True)
     resumed.load_state_dict(copy.deepcopy(learner.state_dict()))
-    assert rates(resumed) == rates(learner) == {1e-4 * decayed(3, 300)}
+    assert rates(resumed) == rates(learner) == {1e-4 * decayed(2, 300)}
 
 
 def test_every_loss_falls():
     learner = trainer(learning_rate=3e-3)
-    losses = [learner.step([scene(0)]) for _ in range(30)]
+    losses = [learner.step([scene(0)]) for _ in range(20)]
     for name in ("pick_position", "pick_angle", "place"):
-        first, last = (np.mean([step[name] for step in part]) for part in (losses[:5], losses[-5:]))
+        first, last = (np.mean([step[name] for step in part]) for part in (losses[:3], losses[-3:]))
         assert last < 0.9 * first, name
 
 
