@@ -35,9 +35,10 @@ PAPER = {
 _INTRODUCTION = """\
 # Results
 
-Written by `python -m kitting_drake.results` from the `summary.json` of many runs of `evaluate`,
-listed at the end: do not edit. First come the paper's experiments, measured as in the paper; then
-the policies on the scenarios as they are by default, with all extensions; then every other run.
+Written by `python -m kitting_drake.results` from [a table]({link}/runs.csv) of runs of `evaluate`
+and the file of their episodes beside it: do not edit. First come the paper's experiments, measured
+as in the paper; then the policies on the scenarios as they are by default, with all extensions;
+then every other run.
 
 ## How to read the tables
 
@@ -67,9 +68,6 @@ to 3236, 3252 and 3299 of stack-block-pyramid, of 3200 to 3233 of palletizing-bo
 3299 of place-red-in-green. Three ways to grip were compared by the errors of 3600 to 3614. No
 others were looked at before they were run for the first time. What was run again, or with other
 steps or learning rates, when results of these seeds were known, is told where it stands.
-
-Runs of the first version of the code, which are not comparable with these, are in
-[results_first_turn.md](results_first_turn.md).
 """
 
 _DEFAULTS = """\
@@ -90,10 +88,10 @@ def results_page(runs: Sequence[Run], link: str, paper: Sequence[str] = ()) -> s
 
     Args:
         runs: from `read_runs`; there may be none of a task, or none at all.
-        link: the folder of the files, from the page's own.
+        link: the folder of the table of runs, from the page's own.
         paper: the sections of `kitting_drake.reproduction.paper.paper_sections`.
     """
-    sections = [_INTRODUCTION, *paper]
+    sections = [_INTRODUCTION.format(link=link), *paper]
     if runs:
         sections.append(_DEFAULTS)
     for task in PAPER_TASKS:
@@ -103,8 +101,8 @@ def results_page(runs: Sequence[Run], link: str, paper: Sequence[str] = ()) -> s
     others = [run for run in runs if run.paper_task is None and not in_ravens_table(run)]
     if others:
         sections += ["## Other runs\n", _others_table(others)]
-    sections.append("## Files\n")
-    sections.append(_files_table(runs, link) if runs else "There are none yet.\n")
+    sections.append("## Runs\n")
+    sections.append(_runs_table(runs) if runs else "There are none yet.\n")
     return "\n".join(sections)
 
 
@@ -185,7 +183,7 @@ def _most_tested_run(runs: list[Run]) -> list[str]:
     """Tables by category of the network that was tested most; if there is none, of another run."""
     learned = [run for run in runs if run.method in LEARNED]
     # Not the best: of few episodes, that is the luckiest.
-    most = max(learned or runs, key=lambda run: (run.summary["episodes"], run.file))
+    most = max(learned or runs, key=lambda run: (run.summary["episodes"], run.name))
     rows = [*most.summary["categories"].items(), ("all", most.summary)]
 
     def errors(of: dict[str, Any]) -> str:
@@ -239,7 +237,7 @@ def _causes(runs: list[Run]) -> list[str]:
 def _others_table(runs: list[Run]) -> str:
     rows = [
         [
-            run.file,
+            run.name,
             run.summary["task"],
             run.label,
             run.departures_text,
@@ -251,14 +249,14 @@ def _others_table(runs: list[Run]) -> str:
         ]
         for run in runs
     ]
-    headings = ["file", "task", "run", "what differs", "success", "strict, %", "success, %"]
+    headings = ["name", "task", "run", "what differs", "success", "strict, %", "success, %"]
     return markdown_table([*headings, "episodes", "seeds"], rows, left_columns=5)
 
 
-def _files_table(runs: Sequence[Run], link: str) -> str:
+def _runs_table(runs: Sequence[Run]) -> str:
     rows = [
         [
-            f"[{run.file}]({link}/{run.file})",
+            run.name,
             run.summary["task"],
             run.label,
             str(run.detail("steps") or ""),
@@ -268,5 +266,5 @@ def _files_table(runs: Sequence[Run], link: str) -> str:
         ]
         for run in runs
     ]
-    headings = ["file", "task", "run", "training steps", "episodes", "seeds", "hours, summed"]
+    headings = ["name", "task", "run", "training steps", "episodes", "seeds", "hours, summed"]
     return markdown_table(headings, rows, left_columns=3)

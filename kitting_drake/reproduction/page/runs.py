@@ -1,5 +1,4 @@
-"""The runs that the page of results is made of: files of `evaluate`, and how they depart from the
-paper's tasks."""
+"""The runs that the page of results is made of, and how they depart from the paper's tasks."""
 
 import json
 from collections.abc import Mapping
@@ -11,6 +10,7 @@ from typing import Any
 from kitting_drake.common.errors import UserError
 from kitting_drake.evaluation.summary import ERRORS
 from kitting_drake.policies.data.static_scenes import STATIC
+from kitting_drake.reproduction.page.run_table import TABLE, Summary, read_summaries
 from kitting_drake.scenario.choosing import ChosenScenario
 from kitting_drake.scenario.schema import Scenario
 from kitting_drake.tasks import PAPER_TASKS, RAVENS_TASKS
@@ -66,7 +66,7 @@ _MOST_SHOWN = 4
 _TYPES: dict[str, type | tuple[type, ...]] = {
     **dict.fromkeys(("task", "policy", "success_description"), str),
     **dict.fromkeys(("policy_details", "resolved_scenario", *ERRORS, "action_errors"), dict),
-    **dict.fromkeys(("causes", "ambiguous", "categories"), dict),
+    **dict.fromkeys(("causes", "ambiguous", "categories", "versions"), dict),
     **dict.fromkeys(("seeds", "ci95", "strict_ci95"), list),
     "episodes": int,
     "wall_seconds": (int, float),
@@ -78,10 +78,10 @@ _SHARES = ("success_rate", "strict_success_rate")
 
 @dataclass(frozen=True)
 class Run:
-    """One summary."""
+    """A run of `evaluate`."""
 
-    file: str
-    summary: dict[str, Any]
+    name: str
+    summary: Summary
 
     def detail(self, key: str) -> Any:
         """An entry of the policy's details; None if it has no such entry."""
@@ -195,63 +195,78 @@ def _differences(found: Any, expected: Any, path: str = "") -> list[str]:
 
 
 def read_runs(folder: Path) -> list[Run]:
-    """The summaries of a folder, in the order of the names of their files; there may be none.
+    """All runs of the table in a folder, in the order of their names; there may be none.
 
     Raises:
-        UserError: there is no such folder, or a file in it is not what `evaluate` writes.
+        UserError: there is no table, its files are damaged, or a run is not one of `evaluate`.
     """
-    if not folder.is_dir():
-        raise UserError(f"there is no folder {folder}: make it, and copy summary.json files there")
-    return [Run(path.name, _read_summary(path)) for path in sorted(folder.glob("*.json"))]
+    if not (folder / TABLE).exists():
+        raise UserError(
+            f"there is no {folder / TABLE}: add a run to it, with `results --add NAME FOLDER`"
+        )
+    summaries = read_summaries(folder)
+    for name, summary in summaries.items():
+        check_summary(summary, f"{folder / TABLE}, run '{name}'")
+    return [Run(name, summary) for name, summary in summaries.items()]
 
 
-def _read_summary(path: Path) -> dict[str, Any]:
+def read_evaluation(path: Path) -> Summary:
+    """The summary that `evaluate` left.
+
+    Args:
+        path: its file, or the folder with its `summary.json`.
+
+    Raises:
+        UserError: it cannot be read, or is not one.
+    """
+    path = path / "summary.json" if path.is_dir() else path
     try:
         summary = json.loads(path.read_text())
     except (OSError, ValueError) as error:
         raise UserError(f"{path} cannot be read: {error}") from error
-    check_summary(summary, path)
-    _check_details(summary["policy_details"], f"{path}: policy_details")
+    check_summary(summary, str(path))
     return summary
 
 
-def check_summary(summary: Any, path: Path) -> None:
-    """Checks that a file's content has the fields of `evaluate`, and that each is of its kind.
+def check_summary(summary: Any, where: str) -> None:
+    """Checks that a summary has the fields of `evaluate`, and that each is of its kind.
+
+    Args:
+        summary: the content of a file, or of a row.
+        where: it is from, for the error.
 
     Raises:
-        UserError: it has not; names the file and the field.
+        UserError: it has not; names the field.
     """
     must = "it must be a summary.json of evaluate"
     for key in (*_TYPES, *_SHARES):
         if not isinstance(summary, dict) or key not in summary:
-            raise UserError(f"{path} lacks '{key}': {must}")
+            raise UserError(f"{where} lacks '{key}': {must}")
     wrong = [key for key, kind in _TYPES.items() if not isinstance(summary[key], kind)]
     if not wrong:
         wrong = [key for key in _SHARES if not _are_shares([summary[key]], 1)]
         wrong += [key for key in ("ci95", "strict_ci95") if not _are_shares(summary[key], 2)]
     if wrong:
-        raise UserError(f"{path}: '{wrong[0]}' is {summary[wrong[0]]!r}: {must}")
+        raise UserError(f"{where}: '{wrong[0]}' is {summary[wrong[0]]!r}: {must}")
     seeds = summary["seeds"]
     if not seeds or not all(isinstance(seed, int) for seed in seeds):
-        raise UserError(f"{path} has no seeds, or some that are no whole numbers: {must}")
+        raise UserError(f"{where} has no seeds, or some that are no whole numbers: {must}")
     task = summary["resolved_scenario"].get("task")
     if not isinstance(task, dict) or not isinstance(task.get("_tag"), str):
-        raise UserError(f"{path}: resolved_scenario has no task")
-
-
-def _are_shares(values: list[Any], count: int) -> bool:
-    return len(values) == count and all(
-        isinstance(value, int | float) and 0 <= value <= 1 for value in values
-    )
-
-
-def _check_details(details: Any, where: str) -> None:
-    if not isinstance(details, dict):
-        raise UserError(f"{where} must be a mapping")
+        raise UserError(f"{where}: resolved_scenario has no task")
+    details = summary["policy_details"]
     method = details.get("method")
     needed = ["orientations"] if method in (*LEARNED, "quantized_oracle") else []
     if method in LEARNED:
         needed.append("demonstrations")
     for key in needed:
         if not isinstance(details.get(key), int):
-            raise UserError(f"{where}.{key} must be a whole number for the method {method}")
+            raise UserError(
+                f"{where}: policy_details.{key} must be a whole number for the method {method}"
+            )
+
+
+def _are_shares(values: list[Any], count: int) -> bool:
+    return len(values) == count and all(
+        isinstance(value, int | float) and 0 <= value <= 1 for value in values
+    )

@@ -59,15 +59,13 @@ _TOLD = ("trained_orientations", "steps", "learning_rate", "training_seed", "com
 def paper_sections(
     results: Sequence[Result],
     rates: Rates,
-    link: str,
     efficiency: Mapping[str, Any] | None = None,
 ) -> list[str]:
     """The sections of the page; none without results.
 
     Args:
-        results: of `read_results`.
+        results: of `cell_results`.
         rates: what each learning rate of each baseline came to on validation scenes.
-        link: the folder of all results, from the page's own.
         efficiency: what `benchmark networks` measured, if it was.
     """
     if not results:
@@ -94,7 +92,7 @@ def paper_sections(
     sections += _table_1(by_name)
     sections += _fresh_tools(by_name)
     sections += differences(by_name)
-    sections += ["### Every cell\n", _every_cell(results, link)]
+    sections += ["### Every cell\n", _every_cell(results)]
     return sections
 
 
@@ -269,7 +267,7 @@ def _both(result: Result) -> list[str]:
     ]
 
 
-def _every_cell(results: Sequence[Result], link: str) -> str:
+def _every_cell(results: Sequence[Result]) -> str:
     def detail(result: Result, key: str) -> str:
         value = result.summary["policy_details"].get(key)
         return "" if value is None else str(value)
@@ -279,7 +277,7 @@ def _every_cell(results: Sequence[Result], link: str) -> str:
         summary = result.summary
         rows.append(
             [
-                f"[{result.cell.name}]({link}/paper/{result.cell.name}.json)",
+                result.cell.name,
                 *(detail(result, key) for key in _TOLD),
                 str(summary["episodes"]),
                 f"{min(summary['seeds'])} to {max(summary['seeds'])}",

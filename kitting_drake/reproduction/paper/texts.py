@@ -205,6 +205,6 @@ is on the narrow side; `-` where fewer than three tools fail, which tells nothin
 where no tools are drawn. `causes`: of failures, and of successes that are not strict. `weights`:
 the first digits of their digest. `Drake`: the version that ran the episodes. It matters little:
 the quantized oracle at N = 36, which sees no images, came to 93.8 % strict with the same causes
-by 1.51 and by 1.58 (`unseen_quantized_oracle_36_drake_1.58.json`); two of its 100 episodes
+by 1.51 and by 1.58 (`unseen_quantized_oracle_36_drake_1.58`); two of its 100 episodes
 differ, one each way.
 """
