@@ -20,6 +20,10 @@ PolicyFunction = Callable[..., PickPlaceAction]
 second argument of any other name is taken for it too, unless it has a default."""
 
 
+class PolicyError(RuntimeError):
+    """A policy's own function failed; `__cause__` is what it raised."""
+
+
 class PickPlacePolicy(LeafSystem):
     """Wraps a callable policy p(a_pick, a_place | o_t), section III-A of the paper.
 
@@ -53,7 +57,8 @@ class PickPlacePolicy(LeafSystem):
         super().__init__()
         self._policy = policy
         self.heights_only = heights_only
-        self._observation = self.DeclareAbstractInputPort("observation", Value(Observation()))
+        name = "observation_heights" if heights_only else "observation"
+        self._observation = self.DeclareAbstractInputPort(name, Value(Observation()))
         tickets = {self._observation.ticket()}
         self._failed_picks = None
         self._by_name, by_place = _takes_failed_picks(policy)
@@ -72,7 +77,10 @@ class PickPlacePolicy(LeafSystem):
                 named["failed_picks"] = failed_picks
             else:
                 arguments.append(failed_picks)
-        action = self._policy(*arguments, **named)
+        try:
+            action = self._policy(*arguments, **named)
+        except (Exception, SystemExit) as error:
+            raise PolicyError(f"the policy {self._policy!r} failed: {error}") from error
         if not isinstance(action, PickPlaceAction):
             raise TypeError(
                 f"the policy {self._policy!r} answered with {type(action).__name__}, "

@@ -1,13 +1,17 @@
 """The command line of every command on a scenario."""
 
 import argparse
+import contextlib
 import dataclasses
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from kitting_drake.common.errors import UserError
 from kitting_drake.common.paths import SCENARIOS
+from kitting_drake.scenario.drake_configs import struct_fields
 from kitting_drake.scenario.loader import load_scenario
 from kitting_drake.scenario.perturbations import LEVELS, NAMES
 from kitting_drake.scenario.schema import Scenario
@@ -65,6 +69,14 @@ class ChosenScenario:
         """Where relative paths in the scenario start."""
         return (self.moved_to or self.path.resolve().parent).resolve()
 
+    @contextlib.contextmanager
+    def named_in_errors(self) -> Iterator[None]:
+        """Puts the file's name before the text of any UserError that is raised within."""
+        try:
+            yield
+        except UserError as error:
+            raise type(error)(f"{self.path}: {error}") from error
+
     @property
     def policy(self) -> str:
         """The policy's name for results."""
@@ -82,6 +94,8 @@ def _described(value: Any) -> Any:
             item.name: _described(getattr(value, item.name)) for item in dataclasses.fields(value)
         }
         return fields if isinstance(value, Scenario) else {"_tag": _tag(value), **fields}
+    if (names := struct_fields(type(value))) is not None:
+        return {"_tag": _tag(value), **{name: _described(getattr(value, name)) for name in names}}
     if isinstance(value, dict):
         return {key: _described(item) for key, item in value.items()}
     if isinstance(value, list | tuple | np.ndarray):

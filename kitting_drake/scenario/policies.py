@@ -58,17 +58,15 @@ class PolicySite:
     observer: DecisionObserver | None = None
     may_stop: bool = True
     """False where the episode ends by itself once all is done."""
+    has_cameras: bool = True
+    """Whether there is an o_t: else the oracle tells the planner how high things are."""
 
 
 class PolicyConfig:
     """The interface of a policy; each variant of the scenario's `policy:` derives from it."""
 
     needs_observation: bool = True
-    """Whether whoever decides sees by cameras, which are then needed. The system has an input port
-    `observation` or one called `body_poses`, or neither where it is told what to do."""
-
-    planner_observes: bool = True
-    """Whether the planner reads heights off o_t itself; else each action brings them."""
+    """Whether it sees by cameras, which are then needed."""
 
     @property
     def name(self) -> str:
@@ -76,7 +74,8 @@ class PolicyConfig:
         return "".join(f"_{c.lower()}" if c.isupper() else c for c in type(self).__name__)[1:]
 
     def make_system(self, site: PolicySite) -> LeafSystem:
-        """The system; it has the output port `action`.
+        """The system. Its input ports are named after the station's output ports that they are
+        connected to (see `station.KittingStation`); it has the output port `action`.
 
         Raises:
             UserError: it cannot be made.
@@ -335,6 +334,7 @@ def _make_oracle(site: PolicySite, quantizer: ActionQuantizer | None) -> OracleP
         goals=site.scene.goals,
         success=site.scene.success,
         quantizer=quantizer,
+        brings_heights=not site.has_cameras,
     )
 
 

@@ -1,4 +1,4 @@
-"""From files of frames to an action: that of the cell, and without Drake."""
+"""From files of frames to an action: that of the rig, and without Drake."""
 
 import dataclasses
 import io
@@ -27,8 +27,8 @@ from kitting_drake.real_camera.calibrations.calibration import (
 )
 from kitting_drake.real_camera.checking.kit_block import Block
 from kitting_drake.scenario import load_scenario
-from kitting_drake.scenario.cameras import camera_pose
-from kitting_drake.scenario.schema import LookAt, Scenario
+from kitting_drake.scenario.cameras import LookAt, camera_pose
+from kitting_drake.scenario.schema import Scenario
 from tests.kitting_drake.real_camera.frames import (
     ROOT,
     Rendered,

@@ -22,7 +22,7 @@ from kitting_drake.common.rendering import require_rendering
 from kitting_drake.episode import EpisodeResult, ModeChange, run_episode
 from kitting_drake.scenario.loader import load_scenario
 from kitting_drake.scenario.schema import Scenario
-from kitting_drake.station import Cell, build_cell
+from kitting_drake.station import build_station, with_policy
 
 _SCENARIO = SCENARIOS / "kitting_oracle.yaml"
 _LEARNED = SCENARIOS / "kitting_seen.yaml"
@@ -64,21 +64,20 @@ def benchmark_simulation(episodes: int, seed: int, console: Console) -> dict[str
 def _whole_episodes(
     path: Path, episodes: int, seed: int, stopwatch: "PhaseStopwatch", console: Console
 ) -> dict[str, Any]:
-    """Runs whole episodes; gives their cost for each object kitted, without building the cell."""
+    """Runs whole episodes; gives their cost for each object kitted, building aside."""
     scenario = load_scenario(path)
     simulated = wall = kitted = 0.0
     for number in track(
         range(episodes), path.stem, console=console, transient=True, disable=console.quiet
     ):
-        cell = _build(scenario, seed + number)
+        station = build_station(scenario, seed + number, SCENARIOS)
+        diagram = with_policy(station)
         stopwatch.start()
         result = run_episode(
-            cell,
-            task=scenario.task,
+            diagram,
+            station,
             scenario=path.stem,
             policy=scenario.policy.name,
-            seed=seed + number,
-            time_limit=scenario.time_limit,
             observers=[stopwatch.observe],
         )
         _require_whole(result)
@@ -100,10 +99,6 @@ def _require_whole(result: EpisodeResult) -> None:
         raise UserError(
             f"{result.scenario}, seed {result.seed}: the episode cannot count: {reason}"
         )
-
-
-def _build(scenario: Scenario, seed: int) -> Cell:
-    return build_cell(scenario, seed=seed, base=SCENARIOS)
 
 
 class PhaseStopwatch:
@@ -150,18 +145,16 @@ def _image_times(scenario: Scenario, seed: int) -> dict[str, float]:
         UserError: images cannot be rendered here.
     """
     require_rendering()
-    cell = _build(scenario, seed)
-    context = cell.diagram.CreateDefaultContext()
-    sensors = [cell.diagram.GetSubsystemByName(f"camera_{name}") for name in scenario.cameras]
-    projector = cell.diagram.GetSubsystemByName("heightmap_projector")
+    station = build_station(scenario, seed, SCENARIOS)
+    context = station.CreateDefaultContext()
 
     def render() -> None:
-        for sensor in sensors:
-            for port in ("color_image", "depth_image_32f"):
-                sensor.GetOutputPort(port).Eval(sensor.GetMyContextFromRoot(context))
+        for name in scenario.cameras:
+            for port in (f"color_image_{name}", f"depth_image_{name}"):
+                station.GetOutputPort(port).Eval(context)
 
     def project() -> None:
-        projector.GetOutputPort("observation").Eval(projector.GetMyContextFromRoot(context))
+        station.GetOutputPort("observation").Eval(context)
 
     render_times, project_times = [], []
     for second in range(6):
@@ -171,7 +164,7 @@ def _image_times(scenario: Scenario, seed: int) -> dict[str, float]:
         project_times.append(_timed(project))
     # The first one loads meshes into the engine.
     return {
-        "rgbd_image": float(np.median(render_times[1:])) / len(sensors),
+        "rgbd_image": float(np.median(render_times[1:])) / len(scenario.cameras),
         "heightmap": float(np.median(project_times[1:])),
     }
 

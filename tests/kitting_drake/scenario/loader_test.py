@@ -5,8 +5,8 @@ import pytest
 
 from kitting_drake.common.errors import UserError
 from kitting_drake.scenario import load_scenario
+from kitting_drake.scenario.cameras import LookAt, Pinhole
 from kitting_drake.scenario.policies import Learned, PythonPolicy
-from kitting_drake.scenario.schema import LookAt, Pinhole
 from kitting_drake.tasks import ArrangedKitting, Kitting, ToolsetKitting
 from kitting_drake.tasks.kitting.tool_poses import TablePose
 from systems.insertion_search import InsertionSearch

@@ -12,22 +12,22 @@ from kitting_drake.common.paths import MODELS, SCENARIOS
 from kitting_drake.common.rendering import can_render
 from kitting_drake.scenario.appearance import Appearance
 from kitting_drake.scenario.loader import load_scenario
-from kitting_drake.station import build_cell
 from kitting_drake.station.paint import lights_of
 from kitting_drake.station.variation import varied_model
+from tests.kitting_drake.rig import build_rig
 
 needs_renderer = pytest.mark.skipif(not can_render(), reason="images cannot be rendered here")
 
 
 def cell_of(text: str, seed: int = 2):
     scenario = load_scenario(SCENARIOS / "kitting_oracle.yaml", None, text)
-    return build_cell(scenario, seed=seed, base=SCENARIOS)
+    return build_rig(scenario, seed=seed, base=SCENARIOS)
 
 
 def observed(text: str, seed: int = 2) -> np.ndarray:
-    cell = cell_of(text, seed)
-    port = cell.diagram.GetOutputPort("observation")
-    return port.Eval(cell.diagram.CreateDefaultContext()).image
+    rig = cell_of(text, seed)
+    port = rig.diagram.GetOutputPort("observation")
+    return port.Eval(rig.diagram.CreateDefaultContext()).image
 
 
 @needs_renderer
@@ -82,9 +82,9 @@ def test_drawn_lights_are_the_seeds_and_point_down():
 
 def test_mass_varies_with_the_seed_within_its_range():
     def masses(text: str, seed: int) -> np.ndarray:
-        cell = cell_of(text, seed)
+        rig = cell_of(text, seed)
         return (
-            np.array([cell.plant.get_body(item.body).default_mass() for item in cell.objects]) / 1.0
+            np.array([rig.plant.get_body(item.body).default_mass() for item in rig.objects]) / 1.0
         )
 
     plain = {seed: masses("{}", seed) for seed in (1, 2)}

@@ -18,8 +18,8 @@ from kitting_drake.policies.matching.segmentation import segment
 from kitting_drake.policies.matching.shape_matching import ShapeMatchingPolicy, certain_fits, match
 from kitting_drake.policies.networks.weights import load_networks
 from kitting_drake.scenario.loader import load_scenario
-from kitting_drake.station import build_cell
 from systems.signals import Observation, PixelGrid, PlanarPose, fill_unseen
+from tests.kitting_drake.rig import build_rig
 
 pytestmark = pytest.mark.skipif(not can_render(), reason="images cannot be rendered here")
 
@@ -30,9 +30,9 @@ def seen(request):
     scenario = load_scenario(
         SCENARIOS / "kitting_seen.yaml", None, "{policy: !Oracle {}}", request.param
     )
-    cell = build_cell(scenario, seed=4, base=SCENARIOS)
-    context = cell.diagram.CreateDefaultContext()
-    return cell.diagram.GetOutputPort("observation").Eval(context), cell.scene
+    rig = build_rig(scenario, seed=4, base=SCENARIOS)
+    context = rig.diagram.CreateDefaultContext()
+    return rig.port("observation", context), rig.scene
 
 
 def true_places(scene):
@@ -178,12 +178,12 @@ def test_a_place_that_is_nearly_right_or_reversed_is_put_right(seen, turn: float
 def test_a_place_in_a_recess_that_fits_far_worse_than_another_moves_there():
     """A precision screwdriver, thin enough to lie in a hammer's cavity, and placed there."""
     scenario = load_scenario(SCENARIOS / "kitting_unseen.yaml", None, "{policy: !Oracle {}}")
-    cell = build_cell(scenario, seed=1216, base=SCENARIOS)
-    context = cell.diagram.CreateDefaultContext()
-    observation = cell.diagram.GetOutputPort("observation").Eval(context)
+    rig = build_rig(scenario, seed=1216, base=SCENARIOS)
+    context = rig.diagram.CreateDefaultContext()
+    observation = rig.port("observation", context)
     grid, segmentation = observation.grid, segment(observation)
-    names = [item.name for item in cell.scene.objects]
-    places = true_places(cell.scene)
+    names = [item.name for item in rig.scene.objects]
+    places = true_places(rig.scene)
     lies, belongs = places[names.index("precision_screwdriver")]
     pick, place = grid.to_pixel(lies[:2]), grid.to_pixel(belongs[:2])
     rotation = belongs[2] - lies[2]
@@ -273,13 +273,13 @@ def kitted(request) -> Observation:
         "{policy: !Oracle {}}",
         "distractors",
     )
-    cell = build_cell(scenario, seed=request.param, base=SCENARIOS)
-    context = cell.diagram.CreateDefaultContext()
-    plant_context = cell.plant.GetMyMutableContextFromRoot(context)
-    for goal in cell.scene.goals:
-        body = cell.plant.get_body(cell.objects[goal.objects[0]].body)
-        cell.plant.SetFreeBodyPose(plant_context, body, goal.poses[0])
-    return cell.diagram.GetOutputPort("observation").Eval(context)
+    rig = build_rig(scenario, seed=request.param, base=SCENARIOS)
+    context = rig.diagram.CreateDefaultContext()
+    plant_context = rig.plant.GetMyMutableContextFromRoot(context)
+    for goal in rig.scene.goals:
+        body = rig.plant.get_body(rig.objects[goal.objects[0]].body)
+        rig.plant.SetFreeBodyPose(plant_context, body, goal.poses[0])
+    return rig.port("observation", context)
 
 
 def test_boxes_fit_nothing_that_tools_leave_of_their_cavities(kitted: Observation):
