@@ -29,7 +29,7 @@ METHODS = {
 LEARNED = ("so2", "equivariant_transporter", "transporter")
 """The methods that the paper compares."""
 
-_NOT_THE_TASK = ("policy", "random_seed", "target_realtime_rate")
+_NOT_THE_TASK = ("policy", "random_seed", "target_realtime_rate", "meshcat")
 """The fields of a scenario in which runs of one task may differ."""
 
 _ADDED: dict[str, Any] = {
@@ -38,8 +38,6 @@ _ADDED: dict[str, Any] = {
     "task.pool": [],
     "task.kit.always_nested": False,
     "task.kit.fixed_size": False,
-    "plant.friction_variation": 0.0,
-    "plant.mass_variation": 0.0,
     "sensor_noise.frames": 1,
     "end_at_success": False,
 }
@@ -132,7 +130,7 @@ class Run:
             if found["task"]["_tag"] == expected["task"]["_tag"]:
                 # The longest of them has a limit of its own.
                 return _differences(_without(found, "time_limit"), _without(expected, "time_limit"))
-        expected = described(Scenario())
+        expected = _defaults()
         return _differences(_without(found, "task"), _without(expected, "task"))
 
     @property
@@ -162,13 +160,34 @@ def scenario_differences(found: dict[str, Any], expected: dict[str, Any]) -> lis
 
 
 def _without(scenario: dict[str, Any], *more: str) -> dict[str, Any]:
-    return {key: value for key, value in scenario.items() if key not in (*_NOT_THE_TASK, *more)}
+    fields = scenario | _translated(scenario.get("plant"))
+    return {key: value for key, value in fields.items() if key not in (*_NOT_THE_TASK, *more)}
+
+
+def _translated(plant: Any) -> dict[str, Any]:
+    """What older runs have in `plant`, in the fields that it is in since; else nothing."""
+    if not isinstance(plant, dict) or "contact_approximation" not in plant:
+        return {}
+    defaults = _defaults()
+    return {
+        "plant": defaults["plant"]
+        | {
+            "time_step": plant["time_step"],
+            "discrete_contact_approximation": plant["contact_approximation"],
+        },
+        "variation": defaults["variation"]
+        | {key: plant.get(f"{key}_variation", 0.0) for key in ("friction", "mass")},
+    }
+
+
+@cache
+def _defaults() -> dict[str, Any]:
+    return described(Scenario())
 
 
 @cache
 def _added() -> dict[str, Any]:
-    defaults = described(Scenario())
-    return _ADDED | {key: defaults[key] for key in _ADDED_WHOLE}
+    return _ADDED | {key: _defaults()[key] for key in _ADDED_WHOLE}
 
 
 def _differences(found: Any, expected: Any, path: str = "") -> list[str]:
