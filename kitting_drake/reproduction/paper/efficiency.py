@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from kitting_drake.common.errors import UserError
-from kitting_drake.evaluation.quantities import count_text, seconds_text
+from kitting_drake.evaluation.quantities import count_text, ratio_text, seconds_text
 from kitting_drake.reproduction.page.markdown import markdown_table
 from kitting_drake.reproduction.page.prose import prose
 from kitting_drake.reproduction.page.runs import LEARNED, METHODS
@@ -65,7 +65,7 @@ def efficiency_section(measured: Mapping[str, Any]) -> str:
                     METHODS[method],
                     preset,
                     *(_cost_text(by_n[n]) for n in counts),
-                    f"{_ratio_text(growth['parameters'])}, {_ratio_text(growth['seconds'])}",
+                    f"{ratio_text(growth['parameters'])}, {ratio_text(growth['seconds'])}",
                 ]
             )
     text = prose(
@@ -83,7 +83,3 @@ def efficiency_section(measured: Mapping[str, Any]) -> str:
 def _cost_text(row: Mapping[str, Any]) -> str:
     """Parameters, and the time or why there is none."""
     return f"{count_text(row['parameters'])}, {row['skipped'] or seconds_text(row['seconds'])}"
-
-
-def _ratio_text(ratio: float | None) -> str:
-    return "-" if ratio is None else f"{ratio:.2f}"

@@ -1,13 +1,11 @@
 """The table of runs: it gives back what it was given, and tells what is damaged."""
 
-import math
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from kitting_drake.common.errors import UserError
-from kitting_drake.common.paths import SCENARIOS
 from kitting_drake.reproduction.page.run_table import (
     EPISODES,
     TABLE,
@@ -15,7 +13,6 @@ from kitting_drake.reproduction.page.run_table import (
     read_summaries,
     remove_runs,
 )
-from kitting_drake.reproduction.page.runs import read_runs
 
 FIRST: dict[str, Any] = {
     "policy": "mine",
@@ -106,13 +103,3 @@ def test_a_table_that_was_spoiled_is_told(folder: Path):
     # As after a write that was ended between the two files.
     add_run(folder, "first", FIRST)
     assert (folder / TABLE).read_text() == content
-
-
-def test_the_runs_of_this_tree_can_be_read():
-    runs = read_runs(SCENARIOS.parent / "docs" / "results")
-    assert len(runs) >= 230
-    for run in runs:
-        assert run.summary["episodes"] == len(run.summary["seeds"])
-        rates = [item["success_rate"] for item in run.summary.get("outcomes", ())]
-        if rates:
-            assert math.isclose(run.summary["success_rate"], sum(rates) / len(rates))
