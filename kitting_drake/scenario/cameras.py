@@ -117,7 +117,7 @@ def check_camera(camera: Camera) -> None:
     if camera.X_PB.base_frame not in (None, "", "world"):
         raise ValueError("must be fixed to the world: leave X_PB.base_frame out")
     try:
-        camera.ValidateOrThrow()
+        camera.MakeCameras()
         X_BC, X_BD = (X.GetDeterministicValue() for X in (camera.X_BC, camera.X_BD))
         camera.X_PB.GetDeterministicValue()
     except RuntimeError as error:

@@ -7,11 +7,9 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from kitting_drake.common.errors import UserError
 from kitting_drake.common.paths import SCENARIOS
-from kitting_drake.scenario.drake_configs import struct_fields
+from kitting_drake.scenario.description import describe
 from kitting_drake.scenario.loader import load_scenario
 from kitting_drake.scenario.perturbations import LEVELS, NAMES
 from kitting_drake.scenario.schema import Scenario
@@ -85,26 +83,7 @@ class ChosenScenario:
     @property
     def described(self) -> dict[str, Any]:
         """The whole scenario, defaults included, as JSON holds it; variants have a `_tag`."""
-        return _described(self.scenario)
-
-
-def _described(value: Any) -> Any:
-    if dataclasses.is_dataclass(value):
-        fields = {
-            item.name: _described(getattr(value, item.name)) for item in dataclasses.fields(value)
-        }
-        return fields if isinstance(value, Scenario) else {"_tag": _tag(value), **fields}
-    if (names := struct_fields(type(value))) is not None:
-        return {"_tag": _tag(value), **{name: _described(getattr(value, name)) for name in names}}
-    if isinstance(value, dict):
-        return {key: _described(item) for key, item in value.items()}
-    if isinstance(value, list | tuple | np.ndarray):
-        return [_described(item) for item in value]
-    return str(value) if isinstance(value, Path) else value
-
-
-def _tag(value: Any) -> str:
-    return f"!{type(value).__name__}"
+        return describe(self.scenario)
 
 
 def choose_scenario(arguments: argparse.Namespace) -> ChosenScenario:

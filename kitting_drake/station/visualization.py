@@ -92,7 +92,7 @@ def draw_diagram(diagram: Diagram, path: Path) -> None:
         UserError: an ending other than .svg, .png, .pdf and .dot, or Graphviz is not there or
             cannot write it.
     """
-    source = diagram.GetGraphvizString(max_depth=1)
+    source = diagram.GetGraphvizString(max_depth=2)
     if path.suffix == ".dot":
         write_atomically(path, source)
         return

@@ -34,7 +34,7 @@ SMALL = {
 HASTY = PickPlaceParameters(observe_settle=0.02)
 
 
-def cell_of(*tools: str, **more: object) -> Rig:
+def rig_of(*tools: str, **more: object) -> Rig:
     poses = [TablePose(x=0.42, y=0.14), TablePose(x=0.60, y=0.3, yaw_deg=20.0)]
     task = ArrangedKitting(tools=dict(zip(tools, poses, strict=False)))
     scenario = Scenario(task=task, cameras=SMALL, **more)  # type: ignore[arg-type]
@@ -51,7 +51,7 @@ def assert_shows(step: DemonstrationStep, observation: Observation) -> None:
 
 
 def test_a_demonstration_is_what_was_acted_upon_and_what_was_left():
-    rig = cell_of("combination_wrench", planner=HASTY)
+    rig = rig_of("combination_wrench", planner=HASTY)
     recorder = DemonstrationRecorder(rig.station)
     latched: list[tuple[PlanarPose, PlanarPose]] = []
 
@@ -83,7 +83,7 @@ def test_what_is_taken_down_is_what_a_policy_has_seen(monkeypatch: pytest.Monkey
         return action
 
     monkeypatch.setitem(sys.modules, "looking", types.SimpleNamespace(look=look))
-    rig = cell_of("claw_hammer", planner=HASTY, policy=PythonPolicy(function="looking:look"))
+    rig = rig_of("claw_hammer", planner=HASTY, policy=PythonPolicy(function="looking:look"))
     recorder = DemonstrationRecorder(rig.station)
     result = run(rig, 0.1, recorder.observe)
     made = recorder.demonstration(as_success(result, "placed"))
@@ -108,7 +108,7 @@ def as_success(result: EpisodeResult, *outcomes: str) -> EpisodeResult:
 
 def test_only_what_was_placed_is_a_step():
     """Told of actions on two tools that do not move, of which the first fails twice."""
-    rig = cell_of("claw_hammer", "flat_screwdriver")
+    rig = rig_of("claw_hammer", "flat_screwdriver")
     recorder = DemonstrationRecorder(rig.station)
     root: Context = rig.diagram.CreateDefaultContext()
     context = rig.plant.GetMyMutableContextFromRoot(root)
