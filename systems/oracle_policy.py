@@ -228,21 +228,19 @@ class OraclePolicy(LeafSystem):
 
         def obstruction(grasp: Grasp) -> int:
             place = self._arrival(poses[item], X_WGoal, goal)
+            tip, half = grasp.surface_height - self._tip_depth, grasp.width / 2
             return sum(
-                _count_within_fingers(others, gripper_pose(X_WB, grasp), tip, reach)
-                for X_WB, tip, reach in (
+                _count_within_fingers(others, gripper_pose(X_WB, grasp), height, reach)
+                for X_WB, height, reach in (
                     (
                         poses[item],
-                        poses[item].translation()[2] + grasp.surface_height - self._tip_depth,
-                        (grasp.width / 2, MAX_OPENING / 2 + FINGERTIP_DEPTH),
+                        poses[item].translation()[2] + tip,
+                        (half, MAX_OPENING / 2 + FINGERTIP_DEPTH),
                     ),
                     (
                         place,
-                        X_WGoal.translation()[2] + grasp.surface_height - self._tip_depth,
-                        (
-                            grasp.width / 2,
-                            grasp.width / 2 + self._release_clearance + FINGERTIP_DEPTH,
-                        ),
+                        X_WGoal.translation()[2] + tip,
+                        (half, half + self._release_clearance + FINGERTIP_DEPTH),
                     ),
                 )
             )
