@@ -20,6 +20,7 @@ from kitting_drake.common.paths import SCENARIOS
 from kitting_drake.common.provenance import versions
 from kitting_drake.common.rendering import require_rendering
 from kitting_drake.episode import EpisodeResult, ModeChange, run_episode
+from kitting_drake.evaluation.quantities import numbers_table, ratio_text
 from kitting_drake.scenario.loader import load_scenario
 from kitting_drake.scenario.schema import Scenario
 from kitting_drake.station import build_station, with_policy
@@ -177,34 +178,28 @@ def _timed(function: Callable[[], None]) -> float:
 
 def simulation_tables(measured: dict[str, Any]) -> list[Table]:
     """For the terminal."""
-    whole = Table(title="whole episodes, one thread", title_justify="left")
-    whole.add_column("policy")
-    for heading in ("objects", "wall s per object", "real-time rate", "objects per simulated hour"):
-        whole.add_column(heading, justify="right")
+    whole = numbers_table(
+        "whole episodes, one thread",
+        "policy",
+        "objects",
+        "wall s per object",
+        "real-time rate",
+        "objects per simulated hour",
+    )
     for name, row in measured["policies"].items():
-        wall = row["wall_s_per_object"]
         whole.add_row(
             name,
             str(row["objects"]),
-            "-" if wall is None else f"{wall:.2f}",
+            ratio_text(row["wall_s_per_object"]),
             f"{row['real_time_rate']:.1f}",
             f"{row['objects_per_simulated_hour']:.0f}",
         )
-    phases = Table(title="the oracle's episodes by phase", title_justify="left")
-    phases.add_column("phase")
-    for heading in ("simulated s", "wall s", "wall s per simulated s"):
-        phases.add_column(heading, justify="right")
+    headings = ("phase", "simulated s", "wall s", "wall s per simulated s")
+    phases = numbers_table("the oracle's episodes by phase", *headings)
     for name, row in measured["phases"].items():
-        ratio = row["wall_s_per_simulated_s"]
-        phases.add_row(
-            name,
-            f"{row['simulated_s']:.1f}",
-            f"{row['wall_s']:.1f}",
-            "-" if ratio is None else f"{ratio:.2f}",
-        )
-    once = Table(title="once", title_justify="left")
-    once.add_column("what")
-    once.add_column("wall s", justify="right")
+        simulated, wall = (f"{row[key]:.1f}" for key in ("simulated_s", "wall_s"))
+        phases.add_row(name, simulated, wall, ratio_text(row["wall_s_per_simulated_s"]))
+    once = numbers_table("once", "what", "wall s")
     start, images = measured["start_up_s"], measured["images_s"]
     once.add_row("shell to first steps and out again, cache empty", f"{start['cache_empty']:.2f}")
     once.add_row("the same, everything in the cache", f"{start['cache_filled']:.2f}")

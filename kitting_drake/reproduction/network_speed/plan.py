@@ -1,9 +1,9 @@
-"""The common part of a benchmark's measurements: the plan, the machine and the observation."""
+"""The common part of all measurements of networks: the plan, the machine and the observation."""
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Hashable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -23,7 +23,12 @@ from kitting_drake.policies.networks.architecture import PRESETS
 from kitting_drake.policies.networks.device import preferred_type
 from kitting_drake.policies.networks.factored import Networks
 from kitting_drake.policies.networks.weights import load_networks, save_weights
-from kitting_drake.reproduction.network_speed.timing import Timing, memory_bytes, time_each
+from kitting_drake.reproduction.network_speed.timing import (
+    Timing,
+    count_operations,
+    memory_bytes,
+    time_each,
+)
 from systems.signals import Observation, PickPlaceAction, PixelGrid, PlanarPose
 
 _EXPECTED_SHARE = 0.3
@@ -57,7 +62,7 @@ class Plan:
 
 
 @dataclass
-class Bench:
+class SpeedSetup:
     """The plan, the machine and the observation of all measurements."""
 
     plan: Plan
@@ -67,15 +72,14 @@ class Bench:
     scene: ObservedScene
     peak: dict[torch.dtype, dict[str, float]] = field(default_factory=dict)
     """The results of `measure_peak`, by type."""
+    _counts: dict[Hashable, int] = field(default_factory=dict, init=False)
 
     def __post_init__(self) -> None:
         self.image: Image = self.scene.recorded.image
-
-    @property
-    def pixel(self) -> tuple[int, int]:
-        """(row, col) of the expert's pick."""
         row, col = np.rint(self.scene.targets[0].pick).astype(int)
-        return int(row), int(col)
+        # Here, as `targets` decodes the image: that is not to be timed.
+        self.pixel = int(row), int(col)
+        """(row, col) of the expert's pick."""
 
     def observe(self) -> Observation:
         """The observation of the decisions that are timed."""
@@ -104,6 +108,12 @@ class Bench:
         path = self.folder / "networks.safetensors"
         save_weights(path, networks, {})
         return load_networks(path, type_).to(self.device)
+
+    def count(self, key: Hashable, function: Callable[[], object]) -> int:
+        """`timing.count_operations`, once for each key."""
+        if key not in self._counts:
+            self._counts[key] = count_operations(function)
+        return self._counts[key]
 
     def why_not(self, outlined: Networks, operations: int) -> str | None:
         """The reason not to time something, if there is one.
