@@ -21,6 +21,7 @@ _ON_THE_NODE = """
 import importlib, pickle, sys
 from pathlib import Path
 import kitting_drake, systems
+from kitting_drake.common.own_modules import modules_beside
 from kitting_drake.common.paths import MODELS
 
 here = Path.cwd()
@@ -33,7 +34,8 @@ for path in (*chosen.scenario.policy.input_files(chosen.base),
     assert path.resolve().is_relative_to(here), path
     assert path.is_file(), path
 for module in chosen.scenario.policy.modules():
-    assert Path(importlib.import_module(module).__file__).is_relative_to(here), module
+    with modules_beside(chosen.base):
+        assert Path(importlib.import_module(module).__file__).is_relative_to(here), module
 print(chosen.name, chosen.path)
 """
 
@@ -98,21 +100,24 @@ def test_absolute_paths_are_made_relative(tmp_path: Path):
 
 
 @pytest.mark.parametrize(
-    ("name", "module"),
+    ("name", "module", "folder"),
     [
-        ("policy_of_mine.py", "policy_of_mine"),
-        ("policy_of_mine/__init__.py", "policy_of_mine"),
-        ("policies_of_mine/policy.py", "policies_of_mine.policy"),
+        ("policy_of_mine.py", "policy_of_mine", "where_i_run"),
+        ("policy_of_mine/__init__.py", "policy_of_mine", "where_i_run"),
+        ("policies_of_mine/policy.py", "policies_of_mine.policy", "where_i_run"),
+        ("policies_of_mine/policy.py", "policies_of_mine.policy", "beside_the_scenario"),
     ],
 )
 def test_a_policy_of_ones_own_travels_along(
-    name: str, module: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    name: str, module: str, folder: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    source = tmp_path / "where_i_run" / name
+    source = tmp_path / folder / name
     source.parent.mkdir(parents=True)
     source.write_text("def act(observation): ...\n")
     monkeypatch.syspath_prepend(tmp_path / "where_i_run")
     scenario = Scenario(policy=PythonPolicy(f"{module}:act"))
-    chosen = ChosenScenario(scenario, tmp_path / "mine.yaml", "mine", None)
+    yaml = tmp_path / "beside_the_scenario" / "mine.yaml"
+    yaml.parent.mkdir(exist_ok=True)
+    chosen = ChosenScenario(scenario, yaml, "mine", None)
     shipment = pack(chosen, tmp_path / "a.zip")
     unpacked(shipment, tmp_path / "a.zip", tmp_path / "node")
