@@ -18,7 +18,7 @@ _PICK, _PLACE = "#e4572e", "#1b998b"
 
 
 @dataclass(frozen=True)
-class Frame:
+class StripFrame:
     """One observation, and the action that follows it."""
 
     colours: NDArray[np.float32]
@@ -38,7 +38,7 @@ class ActionStrip:
             cell: the cell that the episode runs; it has cameras.
         """
         self._cell = cell
-        self.frames: list[Frame] = []
+        self.frames: list[StripFrame] = []
 
     def observe(self, event: ModeChange) -> None:
         """Keeps what an event shows."""
@@ -48,18 +48,18 @@ class ActionStrip:
         seen: Observation = diagram.GetOutputPort("observation").Eval(event.root_context)
         colours = np.clip(seen.rgb.transpose(1, 2, 0), 0, 1)
         if event.is_stop:
-            self.frames.append(Frame(colours, None, None))
+            self.frames.append(StripFrame(colours, None, None))
             return
         context = self._cell.planner.GetMyContextFromRoot(event.root_context)
         pick, place = (_pixel(seen, pose) for pose in self._cell.planner.action(context))
-        self.frames.append(Frame(colours, pick, place))
+        self.frames.append(StripFrame(colours, pick, place))
 
 
 def _pixel(observation: Observation, pose: PlanarPose) -> NDArray[np.float64]:
     return observation.grid.to_pixel((pose.x, pose.y))
 
 
-def draw_strips(rows: Sequence[tuple[str, Sequence[Frame], Sequence[str]]]) -> bytes:
+def draw_strips(rows: Sequence[tuple[str, Sequence[StripFrame], Sequence[str]]]) -> bytes:
     """Several strips, one below the other.
 
     Args:
@@ -82,7 +82,7 @@ def draw_strips(rows: Sequence[tuple[str, Sequence[Frame], Sequence[str]]]) -> b
     return buffer.getvalue()
 
 
-def _draw(axes: Axes, frame: Frame, title: str) -> None:
+def _draw(axes: Axes, frame: StripFrame, title: str) -> None:
     axes.imshow(frame.colours)
     axes.set_title(title, loc="left", fontsize=9)
     if frame.pick is None or frame.place is None:

@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 
 from kitting_drake.common.errors import UserError
 from kitting_drake.policies.data.images import Image, crop, make_action, rotation_matrix
-from kitting_drake.policies.matching.shape_matching import certain_fits
 from kitting_drake.policies.matching.refinement import refine_grasp, refine_place
 from kitting_drake.policies.matching.segmentation import segment
+from kitting_drake.policies.matching.shape_matching import certain_fits
 from kitting_drake.policies.networks.layers.discretization import discretization_matrix
 from kitting_drake.policies.networks.layers.fourier_series import series_maximum
 from kitting_drake.policies.numpy_correlation import Array, search

@@ -1,9 +1,9 @@
 """Static scenes to learn from: random tools and kits, rendered where they stand; no physics.
 
-Tools are drawn (`hkd.tools.random_tools`), a kit is laid out for some of them, and several scenes
-are rendered of it: other poses, other tools already seated, other things lying about that have no
-cavity, another camera noise. The labels are geometry: every grasp that leaves the jaws room, and
-the pose that seats the tool.
+Tools are drawn (`hkd.generation.random_tools`), a kit is laid out for some of them, and several
+scenes are rendered of it. They differ in the poses, in which tools are seated already, in the
+things without a cavity that lie about, and in the noise of the cameras. The labels are geometry:
+every grasp that leaves the jaws room, and the pose that seats the tool.
 """
 
 import math
@@ -31,13 +31,13 @@ from pydrake.systems.sensors import RgbdSensor
 from kitting_drake.common.errors import UserError
 from kitting_drake.common.paths import MODELS
 from kitting_drake.common.rendering import add_observation_renderer, require_rendering
+from kitting_drake.hkd.generation.catalogue import load_catalogue
+from kitting_drake.hkd.generation.random_tools import RandomTool, draw_tool
 from kitting_drake.hkd.kits.block import build_block
 from kitting_drake.hkd.kits.kit import Kit
 from kitting_drake.hkd.kits.layout import kit_cavities, layout_kit
 from kitting_drake.hkd.kits.parameters import KitParameters
-from kitting_drake.hkd.tools.generate import load_catalogue
 from kitting_drake.hkd.tools.meshes import vertices_and_faces
-from kitting_drake.hkd.tools.random_tools import RandomTool, draw_tool
 from kitting_drake.policies.data.static_scenes import StaticScene
 from kitting_drake.scenario.cameras import camera_pose, depth_camera
 from kitting_drake.scenario.schema import Scenario

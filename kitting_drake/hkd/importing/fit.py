@@ -47,7 +47,7 @@ def guess_unit(length: float) -> str | None:
 
 def material_of(category: str) -> str:
     """The material of which an imported tool of a category seems to be: a key of `MATERIALS` of
-    `hkd.families.solids`."""
+    `hkd.tools.solids`."""
     return "polished_steel" if category == "wrench" else "steel"
 
 

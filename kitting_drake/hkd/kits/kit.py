@@ -17,9 +17,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from kitting_drake.common.cached_folder import cached_folder
 from kitting_drake.common.errors import UserError
 from kitting_drake.common.paths import cache_directory
-from kitting_drake.hkd.cache import cached_folder
 from kitting_drake.hkd.kits.block import build_block, contact_surfaces
 from kitting_drake.hkd.kits.layout import CavityPose, KitLayout, kit_cavities, layout_kit
 from kitting_drake.hkd.kits.parameters import KitParameters

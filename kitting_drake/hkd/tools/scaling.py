@@ -9,9 +9,9 @@ import hashlib
 import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 
+from kitting_drake.common.cached_folder import cached_folder
 from kitting_drake.common.errors import UserError
 from kitting_drake.common.paths import cache_directory
-from kitting_drake.hkd.cache import cached_folder
 from kitting_drake.hkd.tools.tool import Tool
 
 _FORMAT_VERSION = "1"

@@ -9,8 +9,8 @@ import pytest
 from kitting_drake.common.errors import UserError
 from kitting_drake.common.paths import MODELS
 from kitting_drake.common.rendering import can_render
-from kitting_drake.hkd.tools.generate import ToolEntry, load_catalogue
-from kitting_drake.hkd.tools.random_tools import draw_tool
+from kitting_drake.hkd.generation.catalogue import ToolEntry, load_catalogue
+from kitting_drake.hkd.generation.random_tools import draw_tool
 from kitting_drake.policies.data.static_scenes import (
     StaticSamples,
     StaticScene,

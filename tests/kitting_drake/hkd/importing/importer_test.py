@@ -11,7 +11,7 @@ import yaml
 from manifold3d import Manifold, OpType
 
 from kitting_drake.common.errors import UserError
-from kitting_drake.hkd.grasps.annotate import save_grasp
+from kitting_drake.hkd.annotate import save_grasp
 from kitting_drake.hkd.importing import importer
 from kitting_drake.hkd.importing.fit import guess_unit
 from kitting_drake.hkd.importing.importer import ImportRequest, import_tool

@@ -8,7 +8,7 @@ Solids are handled in mm and written in metres.
 import dataclasses
 import tempfile
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -17,10 +17,10 @@ import yaml
 from manifold3d import CrossSection, JoinType, Manifold, OpType
 from scipy.spatial import ConvexHull, QhullError
 
-from kitting_drake.common.errors import MachineError, UserError
+from kitting_drake.common.errors import MachineError
 from kitting_drake.common.files import replace_folder
 from kitting_drake.hkd.families import hammer, pliers, screwdriver, wrench
-from kitting_drake.hkd.families.solids import MATERIALS, Part
+from kitting_drake.hkd.generation.catalogue import CatalogueError, GraspEntry, ToolEntry
 from kitting_drake.hkd.grasps.grip import Grip, find_grip, jaw_axes
 from kitting_drake.hkd.tools import meshes
 from kitting_drake.hkd.tools.collision import (
@@ -32,6 +32,7 @@ from kitting_drake.hkd.tools.collision import (
 )
 from kitting_drake.hkd.tools.mass import Body, mass_properties
 from kitting_drake.hkd.tools.sdf import tool_sdf
+from kitting_drake.hkd.tools.solids import MATERIALS, Part
 from kitting_drake.hkd.tools.stable_pose import stable_poses
 from kitting_drake.hkd.tools.symmetry import symmetry_order
 from systems.hand_geometry import FINGER_LENGTH, PAD_LENGTH
@@ -61,33 +62,6 @@ DESIGNS: dict[str, tuple[type, Callable[[Any], list[Part]]]] = {
 }
 
 
-class CatalogueError(UserError):
-    """A catalogue entry that cannot be used; the message names entry and field."""
-
-
-@dataclass
-class GraspEntry:
-    """A grasp annotated by hand in frame T: the jaws close along +y rotated by theta about +z."""
-
-    x_mm: float = 0.0
-    y_mm: float = 0.0
-    theta_deg: float = 0.0
-
-
-@dataclass
-class ToolEntry:
-    """One entry of the catalogue."""
-
-    name: str
-    category: str
-    split: str
-    # The design is scaled to this length.
-    length_mm: float
-    grasp: GraspEntry
-    # Departures from the defaults of the category's parameters.
-    parameters: dict[str, Any] = field(default_factory=dict)
-
-
 @dataclass
 class Report:
     """Measurements of a generated tool; lengths in mm."""
@@ -111,34 +85,6 @@ class Report:
     # its support.
     tilt_deg: float
     support_margin_mm: float
-
-
-def load_catalogue(path: Path) -> list[ToolEntry]:
-    """Reads `catalogue.yaml`; raises CatalogueError for an entry that cannot be used."""
-    try:
-        data = yaml.safe_load(path.read_text())
-    except OSError as error:
-        raise CatalogueError(f"cannot read {path}: {error.strerror}") from error
-    except yaml.YAMLError as error:
-        raise CatalogueError(f"{path}: {' '.join(str(error).split())}") from error
-    if not isinstance(data, dict) or not isinstance(data.get("tools"), list):
-        raise CatalogueError(f"{path}: it has to hold a list named `tools`")
-    entries: list[ToolEntry] = []
-    for item in data["tools"]:
-        name = item.get("name", f"number {len(entries) + 1}")
-        try:
-            entries.append(ToolEntry(**{**item, "grasp": GraspEntry(**item["grasp"])}))
-        except (KeyError, TypeError) as error:
-            raise CatalogueError(f"{path}: tool {name}: {error}") from error
-        if entries[-1].category not in DESIGNS:
-            raise CatalogueError(
-                f"{path}: tool {name}: category {entries[-1].category!r} is none of "
-                f"{', '.join(DESIGNS)}"
-            )
-    names = [e.name for e in entries]
-    if len(set(names)) != len(names):
-        raise CatalogueError(f"{path}: two tools share a name")
-    return entries
 
 
 def build_parts(entry: ToolEntry) -> list[Part]:
