@@ -15,7 +15,6 @@ from typing import Any
 import numpy as np
 import yaml
 from manifold3d import CrossSection, JoinType, Manifold, OpType
-from scipy.spatial import ConvexHull, QhullError
 
 from kitting_drake.common.errors import MachineError
 from kitting_drake.common.files import replace_folder
@@ -69,7 +68,6 @@ class Report:
     description: dict[str, Any]
     triangles: int
     collision_hulls: int
-    collision_triangles: int
     # The furthest that the collision outline is outside and inside the visual outline.
     outside_mm: float
     inside_mm: float
@@ -81,10 +79,8 @@ class Report:
     # stands out where the fingers pass.
     grip_flatness_mm: float
     finger_overhang_mm: float
-    # Tilt of the stable pose from the design's, and distance of the centre of mass from the rim of
-    # its support.
+    # Tilt of the stable pose from the design's.
     tilt_deg: float
-    support_margin_mm: float
 
 
 def build_parts(entry: ToolEntry) -> list[Part]:
@@ -161,10 +157,10 @@ def _write_tool(entry: ToolEntry, directory: Path) -> Report:
     center = R_TD @ center + 1e-3 * p_T
     inertia = R_TD @ inertia @ R_TD.T
     visuals, triangles = _write_visuals(parts, R_TD, p_T, directory)
-    collisions, collision_triangles = [], 0
+    collisions = []
     for i, hull in enumerate(hulls):
         collisions.append(f"collision_{i}.obj")
-        collision_triangles += meshes.write_convex_obj(directory / collisions[-1], hull)
+        meshes.write_convex_obj(directory / collisions[-1], hull)
     (directory / f"{entry.name}.sdf").write_text(
         tool_sdf(entry.name, mass, center, inertia, visuals, collisions)
     )
@@ -179,7 +175,6 @@ def _write_tool(entry: ToolEntry, directory: Path) -> Report:
         description,
         triangles,
         len(hulls),
-        collision_triangles,
         outside_mm=furthest(projection(hulls), outline),
         inside_mm=furthest(outline, closed(projection(hulls), CAVITY_CLEARANCE_MM)),
         bottom_error_mm=points[:, 2].min() - box[0, 2],
@@ -188,7 +183,6 @@ def _write_tool(entry: ToolEntry, directory: Path) -> Report:
         grip_flatness_mm=grip.flatness,
         finger_overhang_mm=grip.overhang,
         tilt_deg=float(np.degrees(np.arccos(min(1.0, R_TD[2, 2])))),
-        support_margin_mm=_support_margin(points, 1e3 * center),
     )
 
 
@@ -306,16 +300,6 @@ def _measure_grasp(grasp: GraspEntry, solid: Manifold) -> _GripReport:
         overhang=max(finger.high - pad.high, pad.low - finger.low),
         top=pad.top,
     )
-
-
-def _support_margin(points: np.ndarray, center_of_mass: np.ndarray) -> float:
-    """Distance (mm) of the centre of mass, seen from above, from the rim of the support."""
-    touching = points[points[:, 2] < 0.02][:, :2]
-    try:
-        equations = ConvexHull(touching).equations
-    except QhullError:
-        return 0.0
-    return float(-(equations[:, :2] @ center_of_mass[:2] + equations[:, 2]).max())
 
 
 def _description(
