@@ -1,6 +1,7 @@
 """The rooms of the house: imports go one way, nothing goes in circles, and a name occurs once."""
 
 import ast
+import itertools
 import subprocess
 import sys
 from collections import Counter, defaultdict
@@ -139,7 +140,7 @@ def test_no_folder_is_in_a_circle(tree: Tree):
             if tree.folder(name) != tree.folder(other):
                 graph[tree.folder(name)].setdefault(tree.folder(other), tree.where(name, other))
     found = circle(graph)
-    steps = [graph[above][below] for below, above in zip(found, found[1:], strict=False)]
+    steps = [graph[above][below] for below, above in itertools.pairwise(found)]
     assert not found, "\n".join(steps)
 
 
