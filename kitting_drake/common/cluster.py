@@ -123,10 +123,10 @@ class RayWorkers:
 
 
 def _find_cluster(address: str) -> str:
-    """The address of a cluster that answers: where there is none, Ray itself would try for minutes.
+    """The address of a cluster that answers. Where none does, Ray itself would try for minutes.
 
     Raises:
-        UserError: nobody listens there, or this machine knows of none.
+        UserError: nothing answers at the address, or this machine has no cluster.
     """
     found = address
     if address == "auto":
@@ -172,7 +172,7 @@ def _answer(versions_wanted: dict[str, str], call: bytes) -> bytes:
     try:
         found = versions()
         if found != versions_wanted:
-            # What is not installed has no version.
+            # A package that is not installed has no version.
             names = (*versions_wanted, *found)
             name = next(key for key in names if found.get(key) != versions_wanted.get(key))
             there, here = (which.get(name, "none") for which in (found, versions_wanted))

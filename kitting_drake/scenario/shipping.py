@@ -98,15 +98,17 @@ def _own_modules(modules: Iterable[str]) -> list[Path]:
             continue
         # A package without an `__init__.py` may have several folders.
         places = [Path(place) for place in spec.submodule_search_locations or [spec.origin or ""]]
-        # What is installed here has to be installed there, too.
+        # Installed packages have to be installed on the node, too.
         installed = sysconfig.get_path("purelib")
         found += [path for path in places if path.exists() and not path.is_relative_to(installed)]
     return found
 
 
 def _relative(value: Any, base: Path, places: set[Path]) -> Any:
-    """A value with every text that names one of `places` made relative to `base`: what is absolute
-    here is elsewhere there, and what is a symbolic link here is none there."""
+    """A value with every text that names one of `places` made relative to `base`.
+
+    An absolute path is another one on the node, and symbolic links are not kept there.
+    """
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         fields = {
             item.name: _relative(getattr(value, item.name), base, places)

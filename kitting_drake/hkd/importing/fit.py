@@ -78,7 +78,7 @@ def fit(
     """The tool, with its visual mesh written, at the first length at which it can be used.
 
     Raises:
-        UserError: there is none; what was wrong with the first.
+        UserError: no length makes a usable tool; says what was wrong with the first one.
     """
     refusal: UserError | None = None
     for length in lengths:

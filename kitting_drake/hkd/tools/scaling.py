@@ -80,7 +80,7 @@ def scaled_sdf(text: str, directory: Path, factor: float) -> str:
         factor: the scale.
 
     Raises:
-        ValueError: the model has geometry that is not a mesh, or a number that is none.
+        ValueError: the model has geometry that is not a mesh, or text where a number belongs.
         xml.etree.ElementTree.ParseError: the text is not XML.
     """
     ElementTree.register_namespace("drake", _DRAKE)

@@ -205,7 +205,7 @@ def draw_boxes(
     grid: PixelGrid,
     rng: np.random.Generator,
 ) -> list[DrawnBox]:
-    """Boxes of any size and colour that have no business on the table.
+    """Boxes of any size and colour, which no cavity takes.
 
     They keep clear of kit and tools and of the hand that grasps a tool. Where there is no room for
     as many, there are fewer.
