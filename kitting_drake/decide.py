@@ -24,7 +24,12 @@ from kitting_drake.real_camera import (
 )
 from kitting_drake.real_camera.checking.check import check_cameras
 from kitting_drake.real_camera.checking.kit_block import Block
-from kitting_drake.real_camera.report import CHECK_FILES, print_check, print_decision, save_check
+from kitting_drake.real_camera.checking.report import (
+    CHECK_FILES,
+    print_check,
+    print_decision,
+    save_check,
+)
 from systems.signals import PixelGrid
 
 

@@ -30,10 +30,11 @@ from kitting_drake.static_scenes.drawing import draw_batch
 from systems.signals import PixelGrid
 
 _DRAWN_BY = (
+    "kitting_drake.common.rendering",
     "kitting_drake.hkd",
     "kitting_drake.tasks",
-    "kitting_drake.station",
     "kitting_drake.scenario",
+    "kitting_drake.static_scenes",
     "kitting_drake.policies.data.static_scenes",
     "systems",
 )

@@ -12,7 +12,6 @@ import sys
 import threading
 from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, Self, TypeVar
 
 from kitting_drake.common.errors import MachineError, UserError
@@ -43,18 +42,14 @@ class RayWorkers:
     dies, it runs again on another. Results come back to this process, which alone writes files.
     """
 
-    def __init__(self, address: str, archive: Path, environment: dict[str, str]) -> None:
+    def __init__(self, address: str, runtime_env: dict[str, Any]) -> None:
         """
         Args:
             address: `auto`, `HOST:PORT` or `ray://HOST:PORT`.
-            archive: a .zip file: unpacked at each node, the folder to run in and to import from.
-            environment: environment variables for the processes there.
+            runtime_env: Ray's, of the processes there; in its `working_dir` is this package.
         """
         self._address = address
-        self._runtime_env = {
-            "working_dir": str(archive),
-            "env_vars": {"OMP_NUM_THREADS": "1", **environment},
-        }
+        self._runtime_env = runtime_env
         self._versions = versions()
         self._lock = threading.Lock()
         self._stopped = False
@@ -64,7 +59,7 @@ class RayWorkers:
         """Connects to the cluster.
 
         Raises:
-            UserError: Ray is not installed, there is no such cluster, or it refuses the archive.
+            UserError: Ray is not installed, there is no such cluster, or it refuses the files.
         """
         # When a node dies, Ray prints why; without this, pages of that node's log, too.
         os.environ.setdefault("RAY_DEDUP_LOGS_SKIP_REGEX", "Raylet is terminated")
@@ -77,7 +72,12 @@ class RayWorkers:
                 logging_level=logging.ERROR,
                 log_to_driver=False,
             )
-        except (ConnectionError, RuntimeError, ValueError) as error:
+        except (
+            OSError,
+            RuntimeError,
+            ValueError,
+            self._ray.exceptions.RuntimeEnvSetupError,
+        ) as error:
             reason = next(iter(str(error).strip().splitlines()), type(error).__name__)
             raise UserError(f"--ray {self._address}: cannot use the cluster: {reason}") from error
         self._remote = self._ray.remote(num_cpus=1, max_retries=_RETRIES)(_serve)
@@ -123,10 +123,10 @@ class RayWorkers:
 
 
 def _find_cluster(address: str) -> str:
-    """The address of a cluster that answers: where there is none, Ray itself would try for minutes.
+    """The address of a cluster that answers. Where none does, Ray itself would try for minutes.
 
     Raises:
-        UserError: nobody listens there, or this machine knows of none.
+        UserError: nothing answers at the address, or this machine has no cluster.
     """
     found = address
     if address == "auto":
@@ -172,7 +172,7 @@ def _answer(versions_wanted: dict[str, str], call: bytes) -> bytes:
     try:
         found = versions()
         if found != versions_wanted:
-            # What is not installed has no version.
+            # A package that is not installed has no version.
             names = (*versions_wanted, *found)
             name = next(key for key in names if found.get(key) != versions_wanted.get(key))
             there, here = (which.get(name, "none") for which in (found, versions_wanted))

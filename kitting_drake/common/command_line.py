@@ -68,7 +68,7 @@ def interrupts_wait() -> Iterator[Callable[[], bool]]:
 
 
 def run_command(main: Callable[[], int]) -> None:
-    """Runs a command and leaves with its exit code; a user's error is told in one sentence."""
+    """Runs a command and exits with its code; prints a user's error as one sentence."""
     # Drake announces ports and frame names; a command says itself what a person needs to know.
     logging.getLogger("drake").setLevel(logging.WARNING)
     try:

@@ -74,7 +74,7 @@ class Subprocess:
             arguments: its arguments.
 
         Returns:
-            What the function returned, or how the process ended if it did not.
+            The function's result, or how the process ended if it returned none.
 
         Raises:
             MachineError: the function raised it.

@@ -4,6 +4,7 @@ import contextlib
 import hashlib
 import importlib.metadata
 import importlib.util
+import os
 import platform
 import subprocess
 from pathlib import Path
@@ -11,6 +12,9 @@ from pathlib import Path
 import numpy as np
 
 import kitting_drake
+
+COMMIT_VARIABLE = "KITTING_DRAKE_COMMIT"
+"""The environment variable that names the commit of copied sources, which have no history."""
 
 
 def versions() -> dict[str, str]:
@@ -22,8 +26,12 @@ def versions() -> dict[str, str]:
 
 
 def commit() -> str | None:
-    """The checkout's commit, with `+` behind it if tracked files were changed since; None for an
-    installed package."""
+    """The checkout's commit, with `+` behind it if tracked files were changed since.
+
+    On a node of a cluster, `COMMIT_VARIABLE` says it. None for an installed package.
+    """
+    if given := os.environ.get(COMMIT_VARIABLE):
+        return given
     root = Path(kitting_drake.__file__).resolve().parents[1]
     if not (root / ".git").exists():
         return None

@@ -18,7 +18,7 @@ _PICK, _PLACE = "#e4572e", "#1b998b"
 
 
 @dataclass(frozen=True)
-class Frame:
+class StripFrame:
     """One observation, and the action that follows it."""
 
     colours: NDArray[np.float32]
@@ -38,7 +38,7 @@ class ActionStrip:
             station: the episode's; it has cameras.
         """
         self._station = station
-        self.frames: list[Frame] = []
+        self.frames: list[StripFrame] = []
 
     def observe(self, event: ModeChange) -> None:
         """Keeps what an event shows."""
@@ -47,18 +47,18 @@ class ActionStrip:
         seen = self._station.observation(event.root_context)
         colours = np.clip(seen.rgb.transpose(1, 2, 0), 0, 1)
         if event.is_stop:
-            self.frames.append(Frame(colours, None, None))
+            self.frames.append(StripFrame(colours, None, None))
             return
         action = self._station.accepted_action(event.root_context)
         pick, place = (_pixel(seen, pose) for pose in (action.pick, action.place))
-        self.frames.append(Frame(colours, pick, place))
+        self.frames.append(StripFrame(colours, pick, place))
 
 
 def _pixel(observation: Observation, pose: PlanarPose) -> NDArray[np.float64]:
     return observation.grid.to_pixel((pose.x, pose.y))
 
 
-def draw_strips(rows: Sequence[tuple[str, Sequence[Frame], Sequence[str]]]) -> bytes:
+def draw_strips(rows: Sequence[tuple[str, Sequence[StripFrame], Sequence[str]]]) -> bytes:
     """Several strips, one below the other.
 
     Args:
@@ -81,7 +81,7 @@ def draw_strips(rows: Sequence[tuple[str, Sequence[Frame], Sequence[str]]]) -> b
     return buffer.getvalue()
 
 
-def _draw(axes: Axes, frame: Frame, title: str) -> None:
+def _draw(axes: Axes, frame: StripFrame, title: str) -> None:
     axes.imshow(frame.colours)
     axes.set_title(title, loc="left", fontsize=9)
     if frame.pick is None or frame.place is None:

@@ -4,93 +4,24 @@ import argparse
 import shlex
 from pathlib import Path
 
-import yaml
 from rich.console import Console
 from rich.markup import escape
-from rich.measure import Measurement
 from rich.progress import Progress, track
 from rich.table import Table
 
 from kitting_drake.common.command_line import count_type, run_command
 from kitting_drake.common.errors import UserError
 from kitting_drake.common.paths import MODELS
-from kitting_drake.hkd.tools.generate import (
-    CatalogueError,
-    ToolEntry,
-    generate_tool,
-    load_catalogue,
-)
-from kitting_drake.hkd.tools.tool import CATEGORIES, load_tool, user_tool_names, user_tools
+from kitting_drake.hkd.generation.catalogue import ToolEntry, load_catalogue
+from kitting_drake.hkd.generation.generate import generate_tool
+from kitting_drake.hkd.listing import chosen_entries, chosen_with_own, print_tools, size_text
+from kitting_drake.hkd.tools.tool import CATEGORIES, load_tool
 from kitting_drake.hkd.tools.toolsets import SPLITS, toolsets
-
-
-def _chosen(entries: list[ToolEntry], names: list[str]) -> list[ToolEntry]:
-    """The entries named, in the catalogue's order; all of them if none is named."""
-    known = {entry.name for entry in entries}
-    for name in names:
-        if name not in known:
-            raise CatalogueError(
-                f"no tool is called {name!r}; the catalogue has {', '.join(sorted(known))}"
-            )
-    return [entry for entry in entries if not names or entry.name in names]
-
-
-def _with_own(entries: list[ToolEntry], names: list[str]) -> tuple[list[ToolEntry], list[str]]:
-    """The entries named and the user's own tools named; where no name is given, all of both."""
-    own = [name for name in user_tool_names() if not names or name in names]
-    known = [name for name in names if name not in own]
-    return [] if names and not known else _chosen(entries, known), own
-
-
-def _description(models: Path, name: str) -> dict:
-    path = models / "tools" / name / "tool.yaml"
-    if not path.exists():
-        raise CatalogueError(
-            f"{path} is missing: run `python -m kitting_drake.hkd generate {name}` first"
-        )
-    return yaml.safe_load(path.read_text())
 
 
 def list_tools(args: argparse.Namespace, entries: list[ToolEntry]) -> None:
     """Prints a table of the generated tools."""
-    table = Table()
-    table.add_column("name", no_wrap=True)
-    table.add_column("category", no_wrap=True)
-    table.add_column("split", no_wrap=True)
-    for heading in ("size, mm", "mass, g", "grasp, mm"):
-        table.add_column(heading, justify="right", no_wrap=True)
-    chosen, own = _with_own(entries, args.names)
-    descriptions = [_description(args.models, entry.name) for entry in chosen]
-    console, broken = Console(markup=False), []
-    for name in own:
-        try:
-            load_tool(str(user_tools() / name))
-        except UserError as error:
-            broken.append(f"not listed: {error}")
-            continue
-        descriptions.append(yaml.safe_load((user_tools() / name / "tool.yaml").read_text()))
-    # Most tools have none, and a terminal is narrow.
-    symmetric = any(d.get("symmetry", 1) != 1 for d in descriptions)
-    if symmetric:
-        table.add_column("symmetry", justify="right", no_wrap=True)
-    for d in descriptions:
-        size = " x ".join(f"{1e3 * d[key]:.0f}" for key in ("length", "width", "height"))
-        grasp = f"{1e3 * d['grasp']['width']:.1f}"
-        row = (
-            d["name"],
-            d["category"],
-            d["split"],
-            size,
-            f"{1e3 * d['mass']:.0f}",
-            grasp,
-        )
-        table.add_row(*row, *([str(d.get("symmetry", 1))] if symmetric else []))
-    # Names are what the other commands take: they are never cut.
-    wide = console.options.update(width=1000)
-    console.width = max(console.width, Measurement.get(console, wide, table).maximum)
-    console.print(table)
-    for line in broken:
-        console.print(line, highlight=False, soft_wrap=True)
+    print_tools(args.models, entries, args.names, Console(markup=False))
 
 
 def generate(args: argparse.Namespace, entries: list[ToolEntry]) -> None:
@@ -99,7 +30,7 @@ def generate(args: argparse.Namespace, entries: list[ToolEntry]) -> None:
     table.add_column("name", no_wrap=True)
     for heading in ("triangles", "hulls", "outline", "top", "grip", "tilt, deg"):
         table.add_column(heading, justify="right")
-    chosen = _chosen(entries, args.names)
+    chosen = chosen_entries(entries, args.names)
     for entry in track(chosen, "generating", console=Console(stderr=True), disable=args.quiet):
         r = generate_tool(entry, args.models / "tools" / entry.name)
         outline = f"+{r.outside_mm:.2f}/-{r.inside_mm:.2f}"
@@ -123,7 +54,7 @@ def sheet(args: argparse.Namespace, entries: list[ToolEntry]) -> None:
         kits = [make_kit([load_tool(name) for name in names], KitParameters()) for names in chosen]
         subjects = [kit_subject(f"{args.split} {i:03d}", kit) for i, kit in enumerate(kits)]
     else:
-        shown, own = _with_own(entries, args.names)
+        shown, own = chosen_with_own(entries, args.names)
         names = [*(entry.name for entry in shown), *own]
         subjects = [tool_subject(load_tool(name)) for name in names]
     write_sheet(subjects, args.output)
@@ -147,7 +78,7 @@ def build(args: argparse.Namespace, entries: list[ToolEntry]) -> None:
 
 def annotate(args: argparse.Namespace, entries: list[ToolEntry]) -> None:
     """Opens a page to look at a tool, move a gripper over it, and save its grasp."""
-    from kitting_drake.hkd.grasps.annotate import annotate as annotate_tool
+    from kitting_drake.hkd.annotate import annotate as annotate_tool
 
     annotate_tool(args.name, Console())
 
@@ -169,9 +100,8 @@ def import_mesh(args: argparse.Namespace, entries: list[ToolEntry]) -> None:
     with Console(stderr=True, quiet=args.quiet).status(f"importing {escape(str(args.mesh))}"):
         report = import_tool(request)
     d = report.record
-    size = " x ".join(f"{1e3 * d[key]:.0f}" for key in ("length", "width", "height"))
     held = f"held by {1e3 * d['grasp']['width']:.1f} mm"
-    console.print(f"{d['name']}: {size} mm, {1e3 * d['mass']:.0f} g, {held}")
+    console.print(f"{d['name']}: {size_text(d)} mm, {1e3 * d['mass']:.0f} g, {held}")
     for note in report.notes:
         console.print(f"  {note}")
     named = d["name"] if args.output is None else report.directory.resolve()
@@ -205,8 +135,8 @@ def kit(args: argparse.Namespace, entries: list[ToolEntry]) -> None:
 
 
 def _check_scenario(path: Path, console: Console) -> None:
-    """Says how to run a kit's scenario, or that the cell's table is too small for it."""
-    # Imported here, and used by no other part of the dataset: tasks are made of it.
+    """Says how to run a kit's scenario, or that the simulated table is too small for it."""
+    # Imported here: the other verbs do not need it, and it is slow to load.
     from kitting_drake.scenario.loader import load_scenario
     from systems.signals import PixelGrid
 

@@ -39,7 +39,7 @@ def tool_mjcf(sdf: Path) -> str:
             SDFormat does.
 
     Raises:
-        UserError: it cannot be read.
+        UserError: the file is missing, or is not the model of a tool.
     """
     try:
         model = _child(ElementTree.parse(sdf).getroot(), "model")
@@ -82,7 +82,7 @@ def kit_mjcf(sdf: Path) -> str:
         sdf: its SDFormat model; `kit.obj` and the visual meshes are beside it.
 
     Raises:
-        UserError: it, or its block, cannot be read.
+        UserError: the model or its block is missing, or is not that of a kit.
     """
     try:
         link = _child(ElementTree.parse(sdf).getroot(), "model/link")
@@ -153,7 +153,7 @@ def _prism(polygon: NDArray[np.float64], bottom: float, top: float) -> NDArray[n
 
 
 def _child(element: ElementTree.Element, path: str) -> ElementTree.Element:
-    """The element at a path; ValueError where there is none."""
+    """The element at a path. Raises ValueError if it is missing."""
     child = element.find(path)
     if child is None:
         raise ValueError(f"there is no {path}")
@@ -161,7 +161,7 @@ def _child(element: ElementTree.Element, path: str) -> ElementTree.Element:
 
 
 def _name(element: ElementTree.Element) -> str:
-    """The attribute `name`; ValueError where there is none."""
+    """The attribute `name`. Raises ValueError if it is missing."""
     name = element.get("name")
     if not name:
         raise ValueError(f"a {element.tag} has no name")

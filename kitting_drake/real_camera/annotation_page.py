@@ -67,7 +67,7 @@ class AnnotationServer(ThreadingHTTPServer):
         self.calibration = calibration
         self._lock = threading.Lock()
         self._read = lru_cache(maxsize=8)(lambda path: read_observation(path, calibration))
-        # A calibration that does not fit is told here, and not only on the page.
+        # Fail early: a calibration that does not fit would otherwise be reported on the page only.
         self.observation(0)
         try:
             super().__init__((_HOST, port), _Handler)

@@ -17,7 +17,7 @@ from systems.signals import Observation, PickPlaceAction, PlanarPose, SurfaceHei
 from systems.surface_heights import read_surface_heights
 
 _SEEN_TO_STOP = 0.7
-"""An object may lie in what is not seen: with less than this share there is no stop."""
+"""Below this share of pixels seen, the decision is never to stop: an object may be hidden."""
 
 
 @dataclass(frozen=True)

@@ -103,7 +103,7 @@ def read_action(step: Path, grid: PixelGrid) -> StepAction:
         grid: as for `parse_action`.
 
     Raises:
-        UserError: there is none, or it cannot be used; names the file.
+        UserError: the file is missing or cannot be used; names it.
     """
     path = step / NAME
     if not path.is_file():

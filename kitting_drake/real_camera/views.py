@@ -26,7 +26,7 @@ off: beyond these the unit is wrong, or the pose."""
 _TALL = 0.1
 """Depths may be those of what stands on the table, up to this height in metres."""
 _WIDEST = 0.15
-"""Half of these shares lie within a range as narrow as this, or what is seen is no table."""
+"""Half of these shares lie within a range as narrow as this if a table is seen."""
 _STEP = 4
 """Every so many pixels are enough to judge by."""
 _OPTICAL = np.eye(4)

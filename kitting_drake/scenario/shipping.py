@@ -1,24 +1,24 @@
-"""A scenario and all that it takes to run it, in one archive for other machines."""
+"""A scenario and all that it takes to run it, as a Ray cluster's `runtime_env` carries it."""
 
 import dataclasses
 import importlib.util
 import os
 import sysconfig
-import zipfile
-from collections.abc import Iterator
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
 import kitting_drake
 from kitting_drake.common.errors import UserError
 from kitting_drake.common.paths import MODELS
+from kitting_drake.common.provenance import COMMIT_VARIABLE, commit
 from kitting_drake.hkd.tools.tool import user_tools
 from kitting_drake.scenario.choosing import ChosenScenario
 
 _PACKAGES = ("kitting_drake", "systems")
 
 _FILES = Path("files")
-"""In the archive: copies of the scenario's files, each at its path on this machine."""
+"""In the folder: links to the scenario's files, each at its path on this machine."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -26,86 +26,89 @@ class Shipment:
     """The result of `pack`."""
 
     chosen: ChosenScenario
-    """The scenario for a process that runs in the folder where the archive was unpacked."""
-    environment: dict[str, str]
-    """The environment variables that the process needs."""
+    """The scenario for a process that runs in the folder's copy."""
+    runtime_env: dict[str, Any]
+    """Ray's: the folder to run in, a person's own modules, and environment variables."""
 
 
-def pack(chosen: ChosenScenario, archive: Path) -> Shipment:
-    """Writes the archive that another machine needs to run a scenario.
+def pack(chosen: ChosenScenario, folder: Path) -> Shipment:
+    """Gathers what another machine needs to run a scenario, as links; Ray copies what they name.
 
-    It holds this checkout's or wheel's packages and models, the files that task and policy read
-    (weights, tools of one's own), and the module or package of a `!PythonPolicy`. Unpacked, it is
-    the folder to run in and to import from; other packages have to be installed there.
+    It is this checkout's or wheel's packages and models, the files that task and policy read
+    (weights, tools of one's own), and the module or package of a `!PythonPolicy`. Other packages
+    have to be installed there.
 
     Args:
         chosen: the scenario; it can be built here.
-        archive: the .zip file to write.
+        folder: an empty folder for the links; the command needs it until Ray has connected.
 
     Raises:
-        UserError: a file cannot be found or read.
+        UserError: a file cannot be found, or a link cannot be made.
     """
     scenario, base = chosen.scenario, chosen.base
-    files = {
-        path.resolve()
-        for path in (*scenario.task.input_files(base), *scenario.policy.input_files(base))
-    }
+    root = Path(kitting_drake.__file__).resolve().parents[1]
+    # A wheel carries its models inside the package.
+    shipped = [*_PACKAGES, *([MODELS.name] if MODELS.parent == root else [])]
     try:
-        with zipfile.ZipFile(
-            archive, "w", zipfile.ZIP_DEFLATED, compresslevel=1, strict_timestamps=False
-        ) as file:
-            for path, name in _sources(scenario.policy.modules()):
-                file.write(path, name)
-            for path in sorted(files):
-                file.write(path, _copy(path))
-            # A path that begins with `..` needs the folder, empty or not.
-            file.mkdir(str(_copy(base)))
+        files = {
+            path.resolve(strict=True)
+            for path in (*scenario.task.input_files(base), *scenario.policy.input_files(base))
+        }
+        for name in shipped:
+            (folder / name).symlink_to(root / name)
+        for path in files:
+            link = folder / _copy(path)
+            link.parent.mkdir(parents=True, exist_ok=True)
+            link.symlink_to(path)
+        # A path that begins with `..` needs the folder, empty or not.
+        (folder / _copy(base)).mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise UserError(f"cannot pack {error.filename}: {error.strerror}") from error
     places = files | {path.parent for path in files}
     moved = dataclasses.replace(
         chosen, scenario=_relative(scenario, base, places), moved_to=_copy(base)
     )
-    return Shipment(moved, {"KITTING_DRAKE_TOOLS": str(_copy(user_tools().resolve()))})
+    environment = {
+        "OMP_NUM_THREADS": "1",
+        "KITTING_DRAKE_TOOLS": str(_copy(user_tools().resolve())),
+        COMMIT_VARIABLE: commit() or "",
+    }
+    runtime_env: dict[str, Any] = {
+        "working_dir": str(folder),
+        "excludes": ["__pycache__"],
+        "env_vars": environment,
+    }
+    # Ray fails on an empty list.
+    if modules := _own_modules(scenario.policy.modules()):
+        runtime_env["py_modules"] = [str(path) for path in modules]
+    return Shipment(moved, runtime_env)
 
 
 def _copy(path: Path) -> Path:
-    """Where the copy of a file or folder is in the archive."""
+    """Where the link to a file or folder is."""
     return _FILES / path.relative_to(path.anchor)
 
 
-def _sources(modules: list[str]) -> Iterator[tuple[Path, Path]]:
-    """Files of this project and of a person's own modules, and their names in the archive."""
-    root = Path(kitting_drake.__file__).resolve().parents[1]
-    folders = [root / name for name in _PACKAGES]
-    if MODELS.parent == root:
-        # A wheel carries its models inside the package.
-        folders.append(MODELS)
-    for name in {module.partition(".")[0] for module in modules} - set(_PACKAGES):
+def _own_modules(modules: Iterable[str]) -> list[Path]:
+    """The files, or the packages' folders, of modules that are neither ours nor installed."""
+    found: list[Path] = []
+    for name in sorted({module.partition(".")[0] for module in modules} - set(_PACKAGES)):
         spec = importlib.util.find_spec(name)
         if spec is None:
             continue
-        # A package without an `__init__.py` has folders and no origin.
-        places = [Path(place) for place in spec.submodule_search_locations or ()]
-        if spec.origin is not None:
-            places = places or [Path(spec.origin)]
-        for place in places:
-            if place.is_relative_to(sysconfig.get_path("purelib")):
-                # Installed: it has to be there, too.
-                continue
-            if place.is_dir():
-                folders.append(place)
-            else:
-                yield place, Path(place.name)
-    for folder in folders:
-        for path in sorted(folder.rglob("*")):
-            if path.is_file() and "__pycache__" not in path.parts:
-                yield path, path.relative_to(folder.parent)
+        # A package without an `__init__.py` may have several folders.
+        places = [Path(place) for place in spec.submodule_search_locations or [spec.origin or ""]]
+        # Installed packages have to be installed on the node, too.
+        installed = sysconfig.get_path("purelib")
+        found += [path for path in places if path.exists() and not path.is_relative_to(installed)]
+    return found
 
 
 def _relative(value: Any, base: Path, places: set[Path]) -> Any:
-    """A value with every text that names one of `places` made relative to `base`: what is absolute
-    here is elsewhere there, and what is a symbolic link here is none there."""
+    """A value with every text that names one of `places` made relative to `base`.
+
+    An absolute path is another one on the node, and symbolic links are not kept there.
+    """
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         fields = {
             item.name: _relative(getattr(value, item.name), base, places)

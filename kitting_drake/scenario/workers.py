@@ -47,7 +47,6 @@ def open_workers(
             yield local, chosen
         return
     with tempfile.TemporaryDirectory() as folder:
-        archive = Path(folder) / "kitting_drake.zip"
-        shipment = pack(chosen, archive)
-        with RayWorkers(arguments.ray, archive, shipment.environment) as cluster:
+        shipment = pack(chosen, Path(folder))
+        with RayWorkers(arguments.ray, shipment.runtime_env) as cluster:
             yield cluster, shipment.chosen

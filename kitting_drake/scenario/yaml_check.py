@@ -1,4 +1,4 @@
-"""Checks YAML against a schema of dataclasses, so that a mistake is told by its path.
+"""Checks YAML against a schema of dataclasses, so that an error names the path of the field.
 
 Drake's `yaml_load_typed` does the loading; its complaints name neither the file nor, often, the
 field, which is what a person needs to mend it.

@@ -1,12 +1,11 @@
 """Static scenes to learn from: random tools and kits, rendered where they stand; no physics.
 
-Tools are drawn (`hkd.tools.random_tools`), a kit is laid out for some of them, and several scenes
-are rendered of it: other poses, other tools already seated, other things lying about that have no
-cavity, another camera noise. The labels are geometry: every grasp that leaves the jaws room, and
-the pose that seats the tool.
+Tools are drawn (`hkd.generation.random_tools`), a kit is laid out for some of them, and several
+scenes are rendered of it. They differ in the poses, in which tools are seated already, in the
+things without a cavity that lie about, and in the noise of the cameras. The labels are geometry:
+every grasp that leaves the jaws room, and the pose that seats the tool.
 """
 
-import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -31,18 +30,25 @@ from pydrake.systems.sensors import RgbdSensor
 from kitting_drake.common.errors import UserError
 from kitting_drake.common.paths import MODELS
 from kitting_drake.common.rendering import add_observation_renderer, require_rendering
+from kitting_drake.hkd.generation.catalogue import load_catalogue
+from kitting_drake.hkd.generation.random_tools import RandomTool, draw_tool
 from kitting_drake.hkd.kits.block import build_block
 from kitting_drake.hkd.kits.kit import Kit
 from kitting_drake.hkd.kits.layout import kit_cavities, layout_kit
 from kitting_drake.hkd.kits.parameters import KitParameters
-from kitting_drake.hkd.tools.generate import load_catalogue
-from kitting_drake.hkd.tools.meshes import vertices_and_faces
-from kitting_drake.hkd.tools.random_tools import RandomTool, draw_tool
+from kitting_drake.hkd.tools.meshes import flat_obj, vertices_and_faces
 from kitting_drake.policies.data.static_scenes import StaticScene
 from kitting_drake.scenario.cameras import camera_pose, depth_camera
 from kitting_drake.scenario.schema import Scenario
-from kitting_drake.tasks.kitting.tool_poses import DrawnBox, draw_boxes, draw_poses
-from systems.hand_geometry import FINGER_DEPTH, FINGER_LENGTH, MAX_OPENING
+from kitting_drake.tasks.footprints import OPEN_FINGERS
+from kitting_drake.tasks.kitting.tool_poses import (
+    DrawnBox,
+    block_outline,
+    draw_boxes,
+    draw_poses,
+    outline_at,
+    rectangle_at,
+)
 from systems.heightmap_projector import HeightmapProjector
 from systems.sensor_noise import SensorNoise, SensorNoiseParameters
 from systems.signals import Observation, PixelGrid
@@ -160,11 +166,11 @@ def _draw_scene(
     bodies += [(_solid_text(_box(box)), box.X_WB) for box in boxes]
     observation = render(bodies, grid, _draw_noise(rng), noise_seed)
 
-    standing = [_standing(CrossSection.square(kit.size[:2], True), X_WKit)]
+    standing = [outline_at(block_outline(kit), X_WKit)]
     standing += [
-        _standing(tool.footprint.hull(), X) for tool, X in zip(lying, X_WTools, strict=True)
+        outline_at(tool.footprint.hull(), X) for tool, X in zip(lying, X_WTools, strict=True)
     ]
-    standing += [_standing(CrossSection.square(box.size[:2], True), box.X_WB) for box in boxes]
+    standing += [outline_at(CrossSection.square(box.size[:2], True), box.X_WB) for box in boxes]
     actions = []
     for place, index in enumerate(loose):
         around = [item for k, item in enumerate(standing) if k != place + 1]
@@ -195,8 +201,7 @@ def _actions(
     for grasp in tool.grasps:
         pick = X_WT @ np.array([grasp.x, grasp.y, 0.0])
         theta = yaw + grasp.theta
-        fingers = CrossSection.square((FINGER_LENGTH, MAX_OPENING + 2 * FINGER_DEPTH), True)
-        fingers = fingers.rotate(math.degrees(theta)).translate((pick[0], pick[1]))
+        fingers = rectangle_at(OPEN_FINGERS, pick[0], pick[1], theta)
         if any((fingers ^ other).area() > 1e-9 for other in others):
             continue
         place = X_WGoal @ np.array([grasp.x, grasp.y, 0.0])
@@ -204,11 +209,6 @@ def _actions(
             (number, grasp.cost, pick[0], pick[1], theta, place[0], place[1], theta + rotation)
         )
     return rows
-
-
-def _standing(outline: CrossSection, X: RigidTransform) -> CrossSection:
-    yaw = RollPitchYaw(X.rotation()).yaw_angle()
-    return outline.rotate(math.degrees(yaw)).translate(tuple(X.translation()[:2]))
 
 
 def _draw_noise(rng: np.random.Generator) -> SensorNoiseParameters:
@@ -303,10 +303,4 @@ def _solid_text(solid: Manifold) -> str:
 
 def _obj(vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> str:
     """Wavefront text with the faces' normals, which the renderer insists on."""
-    a, b, c = np.moveaxis(vertices[faces], 1, 0)
-    normals = np.cross(b - a, c - a)
-    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)
-    lines = [f"v {x:.6f} {y:.6f} {z:.6f}" for x, y, z in vertices]
-    lines += [f"vn {x:.3f} {y:.3f} {z:.3f}" for x, y, z in normals]
-    lines += [f"f {i}//{n} {j}//{n} {k}//{n}" for n, (i, j, k) in enumerate(faces + 1, start=1)]
-    return "\n".join(lines) + "\n"
+    return flat_obj(vertices, faces, digits=6, normal_digits=3)

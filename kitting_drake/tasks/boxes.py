@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 from pydrake.math import RigidTransform
 
+from kitting_drake.common.cached_folder import cached_folder
 from kitting_drake.common.paths import MODELS, cache_directory
-from kitting_drake.hkd.cache import cached_folder
 from kitting_drake.tasks.footprints import Footprint, rectangle
 from kitting_drake.tasks.task import SceneObject
 from systems.grasp import Grasp

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,8 +18,14 @@ from systems.grasp import Grasp
 from systems.hand_geometry import FINGER_DEPTH, FINGER_LENGTH, MAX_OPENING, PALM_SIZE
 from systems.signals import PixelGrid
 
+OPEN_FINGERS = (FINGER_LENGTH, MAX_OPENING + 2 * FINGER_DEPTH)
+"""The open fingers and the room between them, seen from above: along the pads and across, in m."""
+
 _TRIES = 200
 _RESTARTS = 50
+
+_Item = TypeVar("_Item")
+_Found = TypeVar("_Found")
 
 Polygon = NDArray[np.float64]
 """(n, 2) corners of a convex polygon, counter-clockwise, in metres."""
@@ -69,7 +76,7 @@ class Footprint:
     @cached_property
     def fingers(self) -> tuple[Polygon, ...]:
         """The areas of the open fingers and of the room between them, at each of the grasps."""
-        return self._at_grasps((FINGER_LENGTH, MAX_OPENING + 2 * FINGER_DEPTH))
+        return self._at_grasps(OPEN_FINGERS)
 
     @cached_property
     def palm(self) -> tuple[Polygon, ...]:
@@ -114,6 +121,12 @@ class Placed:
         )
 
 
+@dataclass(frozen=True)
+class _Drawn:
+    X_W: RigidTransform
+    placed: Placed
+
+
 def draw_poses(
     footprints: Sequence[Footprint],
     *,
@@ -140,22 +153,46 @@ def draw_poses(
     """
     lower = np.maximum((grid.x_min, grid.y_min), TABLE[0])
     upper = np.minimum((grid.x_max, grid.y_max), TABLE[1])
-    for _ in range(_RESTARTS):
-        placed: list[Placed] = []
-        poses: list[RigidTransform] = []
-        for footprint in footprints:
-            found = _draw_pose(footprint, placed, lower, upper, rng, spacing)
+
+    def draw(footprint: Footprint, placed: list[_Drawn]) -> _Drawn | None:
+        others = [drawn.placed for drawn in placed]
+        return _draw_pose(footprint, others, lower, upper, rng, spacing)
+
+    found = draw_in_turn(footprints, draw, restarts=_RESTARTS)
+    if found is None:
+        raise UserError(
+            f"there is no free space in the workspace for the {len(footprints)} things of the "
+            "task: enlarge heightmap.rows and heightmap.cols"
+        )
+    return [drawn.X_W for drawn in found]
+
+
+def draw_in_turn(
+    items: Sequence[_Item],
+    draw: Callable[[_Item, list[_Found]], _Found | None],
+    *,
+    restarts: int,
+) -> list[_Found] | None:
+    """Draws a place for one thing after the other, and begins anew where one finds none.
+
+    Args:
+        items: what is to be placed, in the order in which it is drawn.
+        draw: draws the place of an item, given those of the items before it; None for no place.
+        restarts: how often to begin.
+
+    Returns:
+        The places, in the same order; None if none were found.
+    """
+    for _ in range(restarts):
+        placed: list[_Found] = []
+        for item in items:
+            found = draw(item, placed)
             if found is None:
                 break
-            x, y, yaw = found
-            placed.append(footprint.moved(x, y, yaw))
-            poses.append(RigidTransform(RollPitchYaw(0, 0, yaw), [x, y, 0]))
+            placed.append(found)
         else:
-            return poses
-    raise UserError(
-        f"there is no free space in the workspace for the {len(footprints)} things of the task: "
-        "enlarge heightmap.rows and heightmap.cols"
-    )
+            return placed
+    return None
 
 
 def _draw_pose(
@@ -165,8 +202,8 @@ def _draw_pose(
     upper: NDArray[np.float64],
     rng: np.random.Generator,
     spacing: float,
-) -> tuple[float, float, float] | None:
-    """A free (x, y, yaw); None if none was found."""
+) -> _Drawn | None:
+    """A free pose; None if none was found."""
     if (upper <= lower).any():
         return None
     for _ in range(_TRIES):
@@ -176,7 +213,7 @@ def _draw_pose(
         if candidate.is_within(lower, upper) and all(
             candidate.is_clear_of(other, spacing) for other in placed
         ):
-            return x, y, yaw
+            return _Drawn(RigidTransform(RollPitchYaw(0, 0, yaw), [x, y, 0]), candidate)
     return None
 
 

@@ -182,7 +182,7 @@ class TaskConfig:
 
 
 def last_action_on(name: str, records: Sequence[ActionRecord]) -> ActionRecord | str:
-    """The last action that held an object; or why there is none, as a cause."""
+    """The last action that held an object, or the cause why no action did."""
     grasped = [item for item in records if item.outcome not in ("unfinished", "pressed")]
     own = [item for item in grasped if item.object == name]
     held = [item for item in own if item.outcome != "missed"]

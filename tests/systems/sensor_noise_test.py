@@ -1,4 +1,5 @@
 import math
+from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -218,17 +219,64 @@ def test_a_median_is_of_what_has_a_depth():
     np.testing.assert_array_equal(found, np.array([[2, 3, np.inf, 1]], np.float32))
 
 
-def test_errors_have_streams_of_their_own():
-    """Scenes are drawn from [seed] and [seed, k] with a k of a few; numpy pads with zeros."""
-    noise = system(seed=7, camera_position_error=0.01)
-    context = context_of(noise, np.full((HEIGHT, WIDTH), 0.8))
-    seen = noise.GetOutputPort("body_pose_in_world").Eval(context)
-    away = POSE.inverse() @ seen.translation()
-    for stream in range(14):
-        rng = np.random.default_rng([7, stream])
-        direction = rng.standard_normal(3)
-        cosine = away @ direction / np.linalg.norm(away) / np.linalg.norm(direction)
-        assert abs(cosine) < 0.999
+def believed_pose(*, seed: int, number: int = 0, **errors: float) -> RigidTransform:
+    noise = system(seed=seed, number=number, **errors)
+    context = context_of(noise, np.ones((HEIGHT, WIDTH)))
+    return noise.GetOutputPort("body_pose_in_world").Eval(context)
+
+
+def rig_error(seed: int) -> RigidTransform:
+    """The error of all cameras together, about the middle of the workspace."""
+    middle = RigidTransform([0.5, 0.0, 0.0])
+    errors = {"rig_position_error": 0.01, "rig_angle_error_deg": 2.0}
+    return middle.inverse() @ believed_pose(seed=seed, **errors) @ POSE.inverse() @ middle
+
+
+def camera_error(seed: int, number: int = 0) -> RigidTransform:
+    errors = {"camera_position_error": 0.01, "camera_angle_error_deg": 2.0}
+    return POSE.inverse() @ believed_pose(seed=seed, number=number, **errors)
+
+
+@pytest.mark.parametrize("error", [rig_error, camera_error])
+def test_errors_of_poses_follow_the_seed(error: Callable[[int], RigidTransform]):
+    first, other = error(7), error(8)
+    assert error(7).IsExactlyEqualTo(first)
+    assert np.linalg.norm(first.translation() - other.translation()) > 1e-3
+    assert (first.rotation().inverse() @ other.rotation()).ToAngleAxis().angle() > 1e-3
+
+
+@pytest.mark.parametrize(
+    ("error", "own"),
+    [(rig_error, [14]), (camera_error, [15, 0]), (lambda seed: camera_error(seed, 2), [15, 2])],
+)
+def test_errors_of_poses_have_streams_of_their_own(
+    error: Callable[[int], RigidTransform], own: list[int]
+):
+    """Scenes are drawn from [seed] and [seed, k] with a k of a few, the rest of a cell from greater
+    ones. numpy pads with zeros: [seed, 15, 0] is [seed, 15]."""
+    shift = error(7).translation()
+    shift /= np.linalg.norm(shift)
+    others = [[stream, number] for stream in range(20) for number in range(3)]
+    for stream in others:
+        direction = np.random.default_rng([7, *stream]).standard_normal(3)
+        cosine = shift @ direction / np.linalg.norm(direction)
+        is_own = stream == [*own, 0][:2]
+        assert (cosine > 0.999999) == is_own, f"stream {stream}"
+
+
+def test_no_two_draws_share_a_stream(monkeypatch: pytest.MonkeyPatch):
+    streams: list[list[int]] = []
+
+    def recorded(stream: list[int]) -> np.random.Generator:
+        streams.append([*stream, 0, 0, 0, 0][:5])
+        return np.random.Generator(np.random.PCG64(np.random.SeedSequence(stream)))
+
+    monkeypatch.setattr("numpy.random.default_rng", recorded)
+    noise = system(seed=7, depth_std=0.001)
+    depth_of(noise, context_of(noise, np.ones((HEIGHT, WIDTH))))
+    # Of the rig, of the camera, and of the image.
+    assert len(streams) == 3
+    assert len(set(map(tuple, streams))) == 3
 
 
 def test_calibration_is_off_by_what_was_asked():

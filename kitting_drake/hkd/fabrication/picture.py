@@ -8,7 +8,7 @@ from manifold3d import CrossSection, JoinType
 from numpy.typing import NDArray
 
 from kitting_drake.hkd.fabrication.design import Design, loops_mm
-from kitting_drake.hkd.families.solids import MATERIALS
+from kitting_drake.hkd.tools.solids import MATERIALS
 from kitting_drake.hkd.tools.tool import Tool
 
 _PAPER, _INK, _FAINT = "#f6f5f1", "#26282c", "#8a8d91"

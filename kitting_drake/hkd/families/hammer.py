@@ -9,7 +9,7 @@ from manifold3d import Manifold, OpType
 from kitting_drake.common.errors import UserError
 from kitting_drake.hkd.families.hammer_heads import HeadEnd, build_head
 from kitting_drake.hkd.families.hammer_shafts import PROUD_MM, Shaft, build_shaft
-from kitting_drake.hkd.families.solids import (
+from kitting_drake.hkd.tools.solids import (
     Part,
     Shape,
     across_path,

@@ -11,7 +11,8 @@ from typing import NamedTuple
 import numpy as np
 from manifold3d import Manifold, OpType
 
-from kitting_drake.hkd.families.solids import (
+from kitting_drake.hkd.tools.collision import runs
+from kitting_drake.hkd.tools.solids import (
     Part,
     Shape,
     across_path,
@@ -19,7 +20,6 @@ from kitting_drake.hkd.families.solids import (
     loft,
     rounded_rectangle,
 )
-from kitting_drake.hkd.tools.collision import runs
 
 # How far the hulls of a full-size head or shaft may stand out of it, in the outline and in height.
 OUTLINE_MM, HEIGHT_MM = 0.4, 1.2
@@ -52,7 +52,7 @@ class HeadEnd:
     tip_material: str = "polished_steel"
 
 
-class Station(NamedTuple):
+class Section(NamedTuple):
     """A section of a head: where along y, its height along x, thickness along z, place along x."""
 
     y: float
@@ -62,7 +62,7 @@ class Station(NamedTuple):
     x: float = 0.0
 
 
-def head_loft(stations: Sequence[Station], octagonal: bool = False) -> Shape:
+def head_loft(stations: Sequence[Section], octagonal: bool = False) -> Shape:
     """A skin through stations; its hulls have fewer corners and the same shadows on the planes."""
 
     def sections(segments: int) -> list[np.ndarray]:
@@ -95,7 +95,7 @@ def build_head(
     half = cheek_length / 2
     cheeks = head_loft(
         [
-            Station(
+            Section(
                 y * half,
                 cheek_height * (0.5 + 0.5 * s),
                 thickness * (0.35 + 0.65 * s),
@@ -127,10 +127,10 @@ def _bell(e: HeadEnd, height: float, thickness: float, start: float) -> tuple[Sh
     bell = end - 0.30 * size
     body = head_loft(
         [
-            Station(start, height, thickness, 0.5 * r),
-            Station(bell - 2.5, neck, neck * ratio, r),
-            Station(bell + 2.0, size, deep, r),
-            Station(end - 3.0, size, deep, r),
+            Section(start, height, thickness, 0.5 * r),
+            Section(bell - 2.5, neck, neck * ratio, r),
+            Section(bell + 2.0, size, deep, r),
+            Section(end - 3.0, size, deep, r),
         ],
         e.octagonal,
     )
@@ -141,11 +141,11 @@ def _face(e: HeadEnd, start: float) -> Shape:
     """The last millimetres of a striking end; the crown is left out of its hulls."""
     size, deep, end = e.size_mm, e.thickness_mm or e.size_mm, e.reach_mm
     rim = [
-        Station(start, size, deep, e.roundness),
-        Station(end - 1.6, size, deep, e.roundness),
-        Station(end - 0.3, size - 3.0, deep - 3.0, e.roundness),
+        Section(start, size, deep, e.roundness),
+        Section(end - 1.6, size, deep, e.roundness),
+        Section(end - 0.3, size - 3.0, deep - 3.0, e.roundness),
     ]
-    crown = Station(end, 0.45 * size, 0.45 * deep, e.roundness)
+    crown = Section(end, 0.45 * size, 0.45 * deep, e.roundness)
     shape = head_loft([*rim, crown], e.octagonal)
     solid = shape.solid
     if e.milled:
@@ -161,9 +161,9 @@ def _plain(e: HeadEnd, height: float, thickness: float, start: float) -> tuple[S
     size, deep, r = e.size_mm, e.thickness_mm or e.size_mm, e.roundness
     body = head_loft(
         [
-            Station(start, min(height, size), min(thickness, deep), r),
-            Station(start + 0.25 * (e.reach_mm - start), size, deep, r),
-            Station(e.reach_mm - 5.0, size, deep, r),
+            Section(start, min(height, size), min(thickness, deep), r),
+            Section(start + 0.25 * (e.reach_mm - start), size, deep, r),
+            Section(e.reach_mm - 5.0, size, deep, r),
         ],
         e.octagonal,
     )
@@ -177,19 +177,19 @@ def _capped(e: HeadEnd, height: float, thickness: float, start: float) -> tuple[
     neck = e.neck_mm
     body = head_loft(
         [
-            Station(start, height, thickness, e.roundness),
-            Station(start + 0.35 * (seam - start), neck, neck, e.roundness),
-            Station(seam - 4.0, neck, neck, e.roundness),
-            Station(seam - 2.5, 0.95 * size, 0.95 * deep, e.roundness),
-            Station(seam, 0.95 * size, 0.95 * deep, e.roundness),
+            Section(start, height, thickness, e.roundness),
+            Section(start + 0.35 * (seam - start), neck, neck, e.roundness),
+            Section(seam - 4.0, neck, neck, e.roundness),
+            Section(seam - 2.5, 0.95 * size, 0.95 * deep, e.roundness),
+            Section(seam, 0.95 * size, 0.95 * deep, e.roundness),
         ]
     )
     cap = head_loft(
         [
-            Station(seam, size, deep, e.roundness),
-            Station(e.reach_mm - 4.0, size, deep, e.roundness),
-            Station(e.reach_mm - 1.2, size - 1.6, deep - 1.6, e.roundness),
-            Station(e.reach_mm, size - 6.0, deep - 6.0, e.roundness),
+            Section(seam, size, deep, e.roundness),
+            Section(e.reach_mm - 4.0, size, deep, e.roundness),
+            Section(e.reach_mm - 1.2, size - 1.6, deep - 1.6, e.roundness),
+            Section(e.reach_mm, size - 6.0, deep - 6.0, e.roundness),
         ]
     )
     return body, cap
@@ -202,19 +202,19 @@ def _ball(e: HeadEnd, height: float, thickness: float, start: float) -> tuple[Sh
     join = np.arcsin(0.8 * neck / e.size_mm)
     body = head_loft(
         [
-            Station(start, height, thickness, 0.6),
-            Station(start + 0.4 * (center - start), 0.9 * neck, 0.9 * neck),
-            Station(center - radius * np.cos(join), 0.8 * neck, 0.8 * neck),
+            Section(start, height, thickness, 0.6),
+            Section(start + 0.4 * (center - start), 0.9 * neck, 0.9 * neck),
+            Section(center - radius * np.cos(join), 0.8 * neck, 0.8 * neck),
         ]
     )
     angles = np.linspace(join, np.pi - 0.12, 12)
     ball = head_loft(
-        [Station(center - radius * np.cos(a), *[e.size_mm * np.sin(a)] * 2) for a in angles]
+        [Section(center - radius * np.cos(a), *[e.size_mm * np.sin(a)] * 2) for a in angles]
     )
     # Every other ring is enough to touch.
     keep = head_loft(
         [
-            Station(center - radius * np.cos(a), *[e.size_mm * np.sin(a)] * 2)
+            Section(center - radius * np.cos(a), *[e.size_mm * np.sin(a)] * 2)
             for a in (join, 1.0, 1.3, np.pi / 2, 1.84, 2.1, 2.45, np.pi - 0.3)
         ]
     )
@@ -228,7 +228,7 @@ def _wedge(e: HeadEnd, height: float, thickness: float, start: float) -> tuple[S
     for t in np.linspace(0.0, 1.0, 9):
         y = start + 4.0 + t * (e.reach_mm - start - 4.0)
         stations.append(
-            Station(
+            Section(
                 y,
                 e.size_mm + (e.neck_mm - e.size_mm) * (1 - t),
                 deep + (0.88 * thickness - deep) * (1 - t),
@@ -236,9 +236,9 @@ def _wedge(e: HeadEnd, height: float, thickness: float, start: float) -> tuple[S
                 -e.drop_mm * t**e.curve,
             )
         )
-    first = Station(start, height, thickness, 0.4)
+    first = Section(start, height, thickness, 0.4)
     last = stations[-1]
-    round_edge = Station(
+    round_edge = Section(
         last.y + min(1.0, 0.3 * min(last.height, last.thickness)),
         0.55 * last.height if last.height < last.thickness else last.height - 1.0,
         0.55 * last.thickness if last.thickness <= last.height else last.thickness - 1.0,
@@ -253,11 +253,11 @@ def _point(e: HeadEnd, height: float, thickness: float, start: float) -> tuple[S
     deep = e.neck_mm
     return head_loft(
         [
-            Station(start, height, thickness, 0.5),
-            Station(start + 7.0, e.neck_mm, deep, e.roundness),
-            Station(start + 0.35 * (e.reach_mm - start), 0.92 * e.neck_mm, deep, e.roundness),
-            Station(e.reach_mm - 2.0, e.size_mm, e.thickness_mm or e.size_mm, e.roundness),
-            Station(e.reach_mm, 0.5 * e.size_mm, 0.5 * (e.thickness_mm or e.size_mm), e.roundness),
+            Section(start, height, thickness, 0.5),
+            Section(start + 7.0, e.neck_mm, deep, e.roundness),
+            Section(start + 0.35 * (e.reach_mm - start), 0.92 * e.neck_mm, deep, e.roundness),
+            Section(e.reach_mm - 2.0, e.size_mm, e.thickness_mm or e.size_mm, e.roundness),
+            Section(e.reach_mm, 0.5 * e.size_mm, 0.5 * (e.thickness_mm or e.size_mm), e.roundness),
         ]
     ), None
 

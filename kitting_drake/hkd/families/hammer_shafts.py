@@ -6,8 +6,8 @@ import numpy as np
 from manifold3d import Manifold
 
 from kitting_drake.hkd.families.hammer_heads import HEIGHT_MM, OUTLINE_MM
-from kitting_drake.hkd.families.solids import Part, Shape, across_x, fillet, loft, rounded_rectangle
 from kitting_drake.hkd.tools.collision import runs
+from kitting_drake.hkd.tools.solids import Part, Shape, across_x, fillet, loft, rounded_rectangle
 
 # How far the handle's end stands out of the eye.
 PROUD_MM = 1.4

@@ -11,7 +11,7 @@ from kitting_drake.common.errors import UserError
 from kitting_drake.hkd.families.pliers_jaws import Jaws
 from kitting_drake.hkd.families.pliers_levers import Levers, build_levers
 from kitting_drake.hkd.families.pliers_locking import Locking, build_locking
-from kitting_drake.hkd.families.solids import (
+from kitting_drake.hkd.tools.solids import (
     SEGMENTS,
     Part,
     Shape,

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from kitting_drake.hkd.families.solids import fillet
+from kitting_drake.hkd.tools.solids import fillet
 
 Line = list[tuple[float, float]]
 

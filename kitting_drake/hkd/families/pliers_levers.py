@@ -8,7 +8,8 @@ import numpy as np
 from manifold3d import CrossSection, JoinType, Manifold, OpType
 
 from kitting_drake.hkd.families.pliers_jaws import Jaws, bent, upper_jaw
-from kitting_drake.hkd.families.solids import (
+from kitting_drake.hkd.tools.collision import runs
+from kitting_drake.hkd.tools.solids import (
     SEGMENTS,
     Part,
     Shape,
@@ -21,7 +22,6 @@ from kitting_drake.hkd.families.solids import (
     rounded_rectangle,
     without_holes,
 )
-from kitting_drake.hkd.tools.collision import runs
 
 # How far the hulls of full-size pliers may stand out of them, in the outline and in height; and
 # how far within the outline those of a sleeve lie, so that chords may cut its hollow side.

@@ -6,7 +6,7 @@ import numpy as np
 from manifold3d import CrossSection, OpType
 
 from kitting_drake.hkd.families.pliers_levers import slab_hulls
-from kitting_drake.hkd.families.solids import (
+from kitting_drake.hkd.tools.solids import (
     Part,
     Shape,
     across_x,

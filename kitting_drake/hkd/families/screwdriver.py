@@ -6,7 +6,7 @@ import numpy as np
 
 from kitting_drake.hkd.families.screwdriver_handles import handle
 from kitting_drake.hkd.families.screwdriver_tips import TIPS
-from kitting_drake.hkd.families.solids import (
+from kitting_drake.hkd.tools.solids import (
     Part,
     Shape,
     across_path,

@@ -9,10 +9,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from kitting_drake.hkd.families.solids import Shape, across_x, fillet, loft, rounded_rectangle
+from kitting_drake.hkd.tools.solids import Shape, across_x, fillet, loft, rounded_rectangle
 
 
-class Station(NamedTuple):
+class HandleSection(NamedTuple):
     """A section of a handle."""
 
     # Share of the handle's length, 0 at the butt, 1 at the front.
@@ -27,7 +27,7 @@ class Zone(NamedTuple):
     """A stretch of a handle in one material: `grip`, `accent` or `metal`."""
 
     material: str
-    stations: Sequence[Station]
+    stations: Sequence[HandleSection]
     # Whether it is straight but for rings too fine to touch.
     knurled: bool = False
 
@@ -108,7 +108,7 @@ def _oval(width: float, height: float, flute: float) -> np.ndarray:
     return rounded_rectangle(width, height, 0.75 * min(y, z), 3)
 
 
-S = Station
+S = HandleSection
 STYLES: dict[str, Style] = {
     # Soft sides on a hard core: a waist for the fingertips, a guard before it.
     "two_tone": Style(

@@ -5,7 +5,7 @@ from collections.abc import Callable
 import numpy as np
 from manifold3d import CrossSection
 
-from kitting_drake.hkd.families.solids import Shape, across_x, circle, loft
+from kitting_drake.hkd.tools.solids import Shape, across_x, circle, loft
 
 _SEGMENTS = 24
 

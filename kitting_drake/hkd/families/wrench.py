@@ -7,8 +7,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from manifold3d import CrossSection, Manifold
 
-from kitting_drake.hkd.families.solids import Part, Shape, blend, circle, fillet, plate, ribbon
 from kitting_drake.hkd.families.wrench_heads import Head, head_shape
+from kitting_drake.hkd.tools.solids import Part, Shape, blend, circle, fillet, plate, ribbon
 
 # Where an S-shaped shank bends, as a share of the way from its middle to a head.
 _BEND = 0.56

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from manifold3d import CrossSection
 
-from kitting_drake.hkd.families.solids import (
+from kitting_drake.hkd.tools.solids import (
     Part,
     across_x,
     circle,

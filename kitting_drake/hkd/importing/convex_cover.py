@@ -126,7 +126,7 @@ def _grown(seed: int, cells: list[CrossSection], outer: CrossSection) -> set[int
 
 
 def _pushed(polygon: CrossSection, outline: CrossSection, outer: CrossSection) -> CrossSection:
-    """The polygon with its edges moved out, as far as that makes it truer to the outline."""
+    """The polygon with its edges moved out where that brings it nearer to the outline."""
     corners = _corners(polygon.simplify(0.05))
     edges = np.roll(corners, -1, axis=0) - corners
     normals = np.column_stack([edges[:, 1], -edges[:, 0]])

@@ -12,10 +12,10 @@ import numpy as np
 from manifold3d import CrossSection, JoinType, Manifold
 from scipy.spatial import QhullError
 
-from kitting_drake.hkd.families.solids import SEGMENTS
+from kitting_drake.hkd.generation.generate import FINGER_LENGTH_MM
 from kitting_drake.hkd.importing.convex_cover import convex_cover
 from kitting_drake.hkd.tools.collision import closed, furthest, projection, thinned
-from kitting_drake.hkd.tools.generate import FINGER_LENGTH_MM
+from kitting_drake.hkd.tools.solids import SEGMENTS
 from systems.grasp import Grasp
 
 MOST_HULLS = 16

@@ -47,7 +47,7 @@ def guess_unit(length: float) -> str | None:
 
 def material_of(category: str) -> str:
     """The material of which an imported tool of a category seems to be: a key of `MATERIALS` of
-    `hkd.families.solids`."""
+    `hkd.tools.solids`."""
     return "polished_steel" if category == "wrench" else "steel"
 
 
@@ -78,7 +78,7 @@ def fit(
     """The tool, with its visual mesh written, at the first length at which it can be used.
 
     Raises:
-        UserError: there is none; what was wrong with the first.
+        UserError: no length makes a usable tool; says what was wrong with the first one.
     """
     refusal: UserError | None = None
     for length in lengths:

@@ -297,7 +297,7 @@ def _prepare(request: ImportRequest, name: str, directory: Path) -> Prepared:
     nominal = NOMINAL_MM / longest
     solid, notes = make_solid((vertices - (low + high) / 2) * nominal, faces)
     drawn = is_outline(request.mesh)
-    # What is drawn is a tool as it lies, seen from above.
+    # An outline shows the tool as it lies, seen from above.
     solid = (facing_forward if drawn else to_tool_frame)(solid, request.category)
     length = size(solid)[0] / nominal
     if drawn:

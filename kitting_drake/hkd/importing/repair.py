@@ -32,8 +32,8 @@ _GAP_MM, _DIRT = 1.5, 0.02
 _LOST = 0.03
 # Projections are compared in pixels of this size.
 _PIXEL_MM = 0.5
-# What is added to close a surface is told if it is more than this share of the result's: points
-# that are so far from the surface that was there, in mm, of so many.
+# A note says how much of the surface was added to close it, if that is more than this share. It is
+# measured at so many points; those further from the given surface than this, in mm, were added.
 _TELLING, _AWAY_MM, _PROBES = 0.03, 1.5, 20_000
 _MOST_COMPONENTS = 3000
 _VOXEL_MM = 0.75

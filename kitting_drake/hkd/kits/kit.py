@@ -15,14 +15,14 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from kitting_drake.common.cached_folder import cached_folder
 from kitting_drake.common.errors import UserError
 from kitting_drake.common.paths import cache_directory
-from kitting_drake.hkd.cache import cached_folder
 from kitting_drake.hkd.kits.block import build_block, contact_surfaces
 from kitting_drake.hkd.kits.layout import CavityPose, KitLayout, kit_cavities, layout_kit
 from kitting_drake.hkd.kits.parameters import KitParameters
+from kitting_drake.hkd.tools.meshes import flat_obj
 from kitting_drake.hkd.tools.tool import Tool
 
 _DIGITS = 7
@@ -146,32 +146,18 @@ def _write(tools: Sequence[Tool], layout: KitLayout, directory: Path) -> None:
     faces = index[np.asarray(mesh.tri_verts, dtype=int)]
     a, b, c = faces.T
     faces = faces[(a != b) & (b != c) & (c != a)]
-    _write_obj(directory / "kit.obj", vertices, faces, normals=False)
-    for name, triangles in contact_surfaces(cavities, parameters).items():
-        _write_obj(directory / f"contact_{name}.obj", *triangles, normals=False)
+    (directory / "kit.obj").write_text(flat_obj(vertices, faces, digits=_DIGITS))
+    for name, surface in contact_surfaces(cavities, parameters).items():
+        (directory / f"contact_{name}.obj").write_text(flat_obj(*surface, digits=_DIGITS))
     # Two colours, as tool foam has: what is inside the block's faces is a cavity.
     bounds = np.array(block.bounding_box()).reshape(2, 3)
     centres = vertices[faces].mean(axis=1)
     on_hull = np.isclose(centres[:, None], bounds[None], atol=1e-6).any(axis=(1, 2))
-    _write_obj(directory / "block.obj", vertices, faces[on_hull], normals=True)
-    _write_obj(directory / "cavities.obj", vertices, faces[~on_hull], normals=True)
+    for name, part in (("block", faces[on_hull]), ("cavities", faces[~on_hull])):
+        text = flat_obj(vertices, part, digits=_DIGITS, normal_digits=4)
+        (directory / f"{name}.obj").write_text(text)
     collisions = "".join(_COLLISION.format(name=name) for name in _CONTACT)
     (directory / "kit.sdf").write_text(_SDF.format(collisions=collisions))
     described = {"length": parameters.length, "width": parameters.width}
     poses = [dataclasses.asdict(pose) for pose in layout.poses]
     (directory / _LAYOUT).write_text(json.dumps({**described, "poses": poses}, indent=2) + "\n")
-
-
-def _write_obj(
-    path: Path, vertices: NDArray[np.float64], faces: NDArray[np.int64], *, normals: bool
-) -> None:
-    lines = [f"v {x:.{_DIGITS}f} {y:.{_DIGITS}f} {z:.{_DIGITS}f}" for x, y, z in vertices]
-    if normals:
-        a, b, c = np.moveaxis(vertices[faces], 1, 0)
-        normal = np.cross(b - a, c - a)
-        normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-30)
-        lines += [f"vn {x:.4f} {y:.4f} {z:.4f}" for x, y, z in normal]
-        lines += [f"f {i}//{n} {j}//{n} {k}//{n}" for n, (i, j, k) in enumerate(faces + 1, start=1)]
-    else:
-        lines += [f"f {i} {j} {k}" for i, j, k in faces + 1]
-    path.write_text("\n".join(lines) + "\n")

@@ -14,7 +14,7 @@ import numpy as np
 from manifold3d import CrossSection, JoinType, Manifold
 from scipy.spatial import ConvexHull
 
-from kitting_drake.hkd.families.solids import SEGMENTS
+from kitting_drake.hkd.tools.solids import SEGMENTS
 
 # Grid of the vertices of collision hulls.
 GRID_MM = 0.05

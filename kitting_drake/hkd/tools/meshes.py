@@ -49,8 +49,32 @@ def write_smooth_obj(path: Path, solid: Manifold, crease_angle_deg: float) -> in
     return len(faces)
 
 
-def write_convex_obj(path: Path, points: np.ndarray) -> int:
-    """Writes the convex hull of points (n, 3) in mm; returns its number of triangles."""
+def flat_obj(
+    vertices: np.ndarray, faces: np.ndarray, *, digits: int, normal_digits: int | None = None
+) -> str:
+    """The text of a mesh as it is, with a normal for each face where those have digits.
+
+    Args:
+        vertices: (n, 3), in metres.
+        faces: (m, 3).
+        digits: of the vertices, behind the point.
+        normal_digits: the same of the normals; None for a file without normals.
+    """
+    lines = [f"v {x:.{digits}f} {y:.{digits}f} {z:.{digits}f}" for x, y, z in vertices]
+    if normal_digits is None:
+        lines += [f"f {i} {j} {k}" for i, j, k in faces + 1]
+    else:
+        a, b, c = np.moveaxis(vertices[faces], 1, 0)
+        normals = np.cross(b - a, c - a)
+        normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)
+        n = normal_digits
+        lines += [f"vn {x:.{n}f} {y:.{n}f} {z:.{n}f}" for x, y, z in normals]
+        lines += [f"f {i}//{n} {j}//{n} {k}//{n}" for n, (i, j, k) in enumerate(faces + 1, start=1)]
+    return "\n".join(lines) + "\n"
+
+
+def write_convex_obj(path: Path, points: np.ndarray) -> None:
+    """Writes the convex hull of points (n, 3) in mm."""
     hull = ConvexHull(points)
     # Qhull does not orient its facets: turn those that wind against their outward normal.
     a, b, c = (points[hull.simplices[:, k]] for k in range(3))
@@ -58,7 +82,6 @@ def write_convex_obj(path: Path, points: np.ndarray) -> int:
     faces = np.where(inward[:, None], hull.simplices[:, ::-1], hull.simplices)
     lines = [*_vertex_lines(points), *(f"f {i} {j} {k}" for i, j, k in faces + 1)]
     path.write_text("\n".join(lines) + "\n")
-    return len(faces)
 
 
 def _vertex_lines(vertices: np.ndarray) -> list[str]:

@@ -9,9 +9,9 @@ import hashlib
 import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 
+from kitting_drake.common.cached_folder import cached_folder
 from kitting_drake.common.errors import UserError
 from kitting_drake.common.paths import cache_directory
-from kitting_drake.hkd.cache import cached_folder
 from kitting_drake.hkd.tools.tool import Tool
 
 _FORMAT_VERSION = "1"
@@ -80,7 +80,7 @@ def scaled_sdf(text: str, directory: Path, factor: float) -> str:
         factor: the scale.
 
     Raises:
-        ValueError: the model has geometry that is not a mesh, or a number that is none.
+        ValueError: the model has geometry that is not a mesh, or text where a number belongs.
         xml.etree.ElementTree.ParseError: the text is not XML.
     """
     ElementTree.register_namespace("drake", _DRAKE)

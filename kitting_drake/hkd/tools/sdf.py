@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from kitting_drake.hkd.families.solids import MATERIALS
+from kitting_drake.hkd.tools.solids import MATERIALS
 
 # Contact, for every tool: Drake's hydroelastic modulus (Pa), dissipation (s/m), margin (m; 0 for
 # none) and friction. Drake 1.51 fails on the margin of finely faceted convex hulls, when it loads

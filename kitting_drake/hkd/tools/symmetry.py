@@ -1,7 +1,7 @@
 """Which rotations about z leave a tool as it was.
 
-A tool is symmetric only if nobody could tell it from its rotated copy, neither by its surface nor
-by the fit in its cavity. Then the rotation in its cavity is the same placement.
+A tool is symmetric if its rotated copy has nearly the same surface and nearly the same outline, and
+so fits the same cavity. Then the rotated tool in its cavity counts as the same placement.
 """
 
 from collections.abc import Callable
@@ -42,7 +42,7 @@ class Difference:
 
     @property
     def is_symmetric(self) -> bool:
-        """Whether nobody could tell the two apart."""
+        """Whether the two look and fit alike."""
         return (
             self.outline_deviation_mm < MOST_OUTLINE_DEVIATION_MM
             and self.surface_distance_mm < MOST_SURFACE_DISTANCE_MM

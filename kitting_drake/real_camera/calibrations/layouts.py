@@ -121,7 +121,8 @@ def read_pose(node: dict[str, Any], where: str) -> Array:
     """(4, 4) the pose of the camera's optical frame in the base frame, in any of the layouts.
 
     Raises:
-        UserError: there is none, or more than one, or its rotation is none; names the field.
+        UserError: there is no pose, or more than one, or its rotation is not a rotation; names the
+            field.
     """
     given = [key for key in ("R_cam2base", *_POSES) if key in node]
     if "t_cam2base" in node and "R_cam2base" not in node:
@@ -221,7 +222,7 @@ def _refuse_two(node: dict[str, Any], keys: tuple[str, ...], where: str) -> str 
 
 
 def _refuse_unknown(node: dict[str, Any], keys: tuple[str, ...], where: str) -> None:
-    """Raises UserError for a field that is none of some."""
+    """Raises UserError for a field that is not among the known ones."""
     for key in node:
         if key not in keys:
             raise UserError(f"{where} has '{key}', which means nothing there")

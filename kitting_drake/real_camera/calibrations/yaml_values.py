@@ -41,7 +41,7 @@ def read_yaml(path: Path) -> dict[str, Any]:
     """The mapping of a YAML file; of several documents, the first.
 
     Raises:
-        UserError: it cannot be read, or is no mapping.
+        UserError: the file cannot be read, or does not hold a mapping.
     """
     try:
         text = path.read_text()
@@ -60,7 +60,7 @@ def read_yaml(path: Path) -> dict[str, Any]:
         problem = getattr(error, "problem", None) or "it is not YAML"
         raise UserError(f"{path}:{where} {problem}") from error
     except (ValueError, KeyError, AttributeError) as error:
-        # What looks like a date, and is none; what is tagged as of a type that it is not of.
+        # A text that looks like a date but is not one, or a tag that does not fit its value.
         raise UserError(f"{path} is not YAML: {error}") from error
     except RecursionError as error:
         raise UserError(f"{path} is nested too deeply") from error
@@ -73,7 +73,7 @@ def number(value: Any, where: str) -> float:
     """A finite number.
 
     Raises:
-        UserError: it is none; names the field.
+        UserError: the value is something else; names the field.
     """
     try:
         # YAML 1.1 takes 4e2 for a text.
@@ -89,7 +89,7 @@ def whole_number(value: Any, where: str) -> int:
     """A whole number of 1 or more.
 
     Raises:
-        UserError: it is none; names the field.
+        UserError: the value is something else; names the field.
     """
     result = number(value, where)
     if result < 1 or result != int(result):

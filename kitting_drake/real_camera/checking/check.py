@@ -115,7 +115,7 @@ def check_cameras(
     if block is not None:
         seen_by = {name: item.block for name, item in found.items() if item.block is not None}
         poses = _aligned(poses, seen_by, block)
-    # What is below the table is told too: o_t itself would cut it off.
+    # Heights below the table are reported, too; o_t itself would cut them off.
     fused = project(views, dataclasses.replace(grid, z_min=grid.z_min - FARTHEST))
     maps[""] = np.where(fused.valid, fused.height - FARTHEST, np.nan).astype(np.float32)
     return Check(

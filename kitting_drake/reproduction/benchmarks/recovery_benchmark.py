@@ -26,7 +26,7 @@ from kitting_drake.common.errors import UserError
 from kitting_drake.episode import ModeChange
 from kitting_drake.episode.action_log import nearest_object
 from kitting_drake.episode.chosen import run_chosen
-from kitting_drake.evaluation.action_strip import ActionStrip, Frame, draw_strips
+from kitting_drake.evaluation.action_strip import ActionStrip, StripFrame, draw_strips
 from kitting_drake.evaluation.intervals import proportion_interval
 from kitting_drake.scenario.choosing import ChosenScenario
 from kitting_drake.station import KittingStation, build_station, connect_policy, make_policy
@@ -193,7 +193,7 @@ class _Adversary:
         self.victim = None
 
 
-_Strip = tuple[str, Sequence[Frame], Sequence[str]]
+_Strip = tuple[str, Sequence[StripFrame], Sequence[str]]
 
 
 @dataclass

@@ -41,7 +41,7 @@ def find_cause(
     placement: Placement,
     records: Sequence[ActionRecord],
 ) -> str:
-    """One of `CAUSES`, for a tool that is no success.
+    """Why a tool was not placed: one of `CAUSES`.
 
     - `never picked`: no action on it came to an end.
     - `missed grasp`: it was tried, and never held.

@@ -93,7 +93,7 @@ class _DrawnKitting(_KittingTask):
     # The order in which an oracle takes the tools: drawn from the seed, or as listed.
     random_order: bool = True
 
-    # Boxes that have no business on the table; fewer where there is no room.
+    # Boxes in the way, which no cavity takes; fewer where there is no room.
     distractors: int = bounded(0, 0, 12)
 
     def _draw_scene(self, tools: list[Tool], grid: PixelGrid, seed: int) -> Scene:

@@ -1,5 +1,6 @@
 """Poses of kit and tools on the table: drawn from a seed, or checked where a person gives them."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -10,9 +11,10 @@ from pydrake.math import RigidTransform, RollPitchYaw
 from kitting_drake.common.errors import UserError
 from kitting_drake.hkd.kits.kit import Kit
 from kitting_drake.hkd.tools.tool import Tool
+from kitting_drake.tasks.footprints import OPEN_FINGERS, draw_in_turn
 from kitting_drake.tasks.task import TABLE
 from systems.bounds import bounded
-from systems.hand_geometry import FINGER_DEPTH, FINGER_LENGTH, MAX_OPENING, PALM_SIZE
+from systems.hand_geometry import PALM_SIZE
 from systems.signals import PixelGrid
 
 _TRIES = 300
@@ -56,6 +58,15 @@ class _Footprint:
                 for shape in (self.outline, self.fingers, self.palm)
             )
         )
+
+
+_Drawn = tuple[TablePose, _Footprint]
+
+
+def outline_at(outline: CrossSection, X_W: RigidTransform) -> CrossSection:
+    """The outline of something upright, at a pose on the table."""
+    yaw = RollPitchYaw(X_W.rotation()).yaw_angle()
+    return outline.rotate(math.degrees(yaw)).translate(tuple(X_W.translation()[:2]))
 
 
 def block_outline(kit: Kit) -> CrossSection:
@@ -129,22 +140,20 @@ def draw_poses(
     order = list(range(len(shapes)))
     if len(tools) > _MANY:
         order.sort(key=lambda index: (index > 0, -shapes[index].outline.area()))
-    for _ in range(_RESTARTS):
-        poses: dict[int, TablePose] = {}
-        placed: list[_Footprint] = []
-        for index in order:
-            found = _draw_pose(shapes[index], placed, room, grid, spacing, yaw_range_deg, rng)
-            if found is None:
-                break
-            poses[index], footprint = found
-            placed.append(footprint)
-        else:
-            transforms = [poses[index].transform() for index in range(len(shapes))]
-            return transforms[0], transforms[1:]
-    raise UserError(
-        f"there is no free space in the workspace for the kit and {len(tools)} tools: "
-        "enlarge heightmap.rows and heightmap.cols, or lessen task.spacing"
-    )
+
+    def draw(index: int, placed: list[_Drawn]) -> _Drawn | None:
+        others = [footprint for _, footprint in placed]
+        return _draw_pose(shapes[index], others, room, grid, spacing, yaw_range_deg, rng)
+
+    found = draw_in_turn(order, draw, restarts=_RESTARTS)
+    if found is None:
+        raise UserError(
+            f"there is no free space in the workspace for the kit and {len(tools)} tools: "
+            "enlarge heightmap.rows and heightmap.cols, or lessen task.spacing"
+        )
+    drawn = {index: pose for index, (pose, _) in zip(order, found, strict=True)}
+    transforms = [drawn[index].transform() for index in range(len(shapes))]
+    return transforms[0], transforms[1:]
 
 
 def _draw_pose(
@@ -155,7 +164,7 @@ def _draw_pose(
     spacing: float,
     yaw_range_deg: float,
     rng: np.random.Generator,
-) -> tuple[TablePose, _Footprint] | None:
+) -> _Drawn | None:
     """A free pose, the first of them that is placed being the kit; None if none was found."""
     for _ in range(_TRIES):
         x, y = rng.uniform((grid.x_min, grid.y_min), (grid.x_max, grid.y_max))
@@ -196,7 +205,7 @@ def draw_boxes(
     grid: PixelGrid,
     rng: np.random.Generator,
 ) -> list[DrawnBox]:
-    """Boxes of any size and colour that have no business on the table.
+    """Boxes of any size and colour, which no cavity takes.
 
     They keep clear of kit and tools and of the hand that grasps a tool. Where there is no room for
     as many, there are fewer.
@@ -236,15 +245,17 @@ def _pose(X: RigidTransform) -> TablePose:
 
 
 def _tool_footprint(tool: Tool) -> _Footprint:
-    def at_grasp(size: tuple[float, float]) -> CrossSection:
-        rectangle = CrossSection.square(size, True)
-        return rectangle.rotate(np.rad2deg(tool.grasp.theta)).translate(
-            (tool.grasp.x, tool.grasp.y)
-        )
-
-    open_fingers = (FINGER_LENGTH, MAX_OPENING + 2 * FINGER_DEPTH)
+    grasp = tool.grasp
+    fingers, palm = (
+        rectangle_at(size, grasp.x, grasp.y, grasp.theta) for size in (OPEN_FINGERS, PALM_SIZE)
+    )
     # The hull is coarser than the outline and never smaller.
-    return _Footprint(tool.footprint.hull(), at_grasp(open_fingers), at_grasp(PALM_SIZE))
+    return _Footprint(tool.footprint.hull(), fingers, palm)
+
+
+def rectangle_at(size: tuple[float, float], x: float, y: float, theta: float) -> CrossSection:
+    """A rectangle with its middle at (x, y), in metres, rotated by theta radians."""
+    return CrossSection.square(size, True).rotate(math.degrees(theta)).translate((x, y))
 
 
 def _rectangle(lower: tuple[float, float], upper: tuple[float, float]) -> CrossSection:

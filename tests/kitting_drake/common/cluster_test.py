@@ -20,6 +20,7 @@ from kitting_drake.common.errors import UserError
 from kitting_drake.common.processes import ProcessCrashed
 from kitting_drake.common.provenance import versions
 
+RUNTIME_ENV = {"working_dir": "folder", "env_vars": {"HERE": "there"}}
 KILLED = ProcessCrashed(-signal.SIGKILL)
 
 
@@ -85,17 +86,14 @@ def ray(monkeypatch: pytest.MonkeyPatch) -> Iterator[FakeRay]:
 
 
 def workers(address: str = "auto") -> RayWorkers:
-    return RayWorkers(address, Path("package.zip"), {"HERE": "there"})
+    return RayWorkers(address, RUNTIME_ENV)
 
 
 def test_a_function_runs_in_a_process_of_its_own(ray: FakeRay):
     with workers() as there:
         assert there.run(os.getpid) not in (os.getpid(), None)
         assert there.run(os._exit, 3) == ProcessCrashed(3)
-    assert ray.options["runtime_env"] == {
-        "working_dir": "package.zip",
-        "env_vars": {"OMP_NUM_THREADS": "1", "HERE": "there"},
-    }
+    assert ray.options["runtime_env"] == RUNTIME_ENV
 
 
 def test_there_is_room_for_as_many_as_there_are_cpus(ray: FakeRay):
@@ -205,9 +203,8 @@ def test_a_cluster_that_is_gone_is_told_of(ray: FakeRay):
         workers().__enter__()
 
 
-def test_a_cluster_that_refuses_is_told_of(ray: FakeRay):
-    ray.error = ConnectionError("Could not find any running Ray instance.\nAnd more.")
-    with pytest.raises(
-        UserError, match=r"--ray auto: cannot .*: Could not find any running Ray .*"
-    ):
+@pytest.mark.parametrize("error", [ConnectionError, FakeRay.exceptions.RuntimeEnvSetupError])
+def test_a_cluster_that_refuses_is_told_of(error: type[Exception], ray: FakeRay):
+    ray.error = error("It is too large.\nAnd more.")
+    with pytest.raises(UserError, match=r"^--ray auto: cannot use the cluster: It is too large\.$"):
         workers().__enter__()

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 import kitting_drake
-from kitting_drake.common.provenance import commit, versions
+from kitting_drake.common.provenance import COMMIT_VARIABLE, commit, versions
 
 
 def git(folder: Path, *arguments: str) -> str:
@@ -53,3 +53,10 @@ def test_versions_are_those_that_results_depend_on():
     assert found["drake"] == importlib.metadata.version("drake")
     assert found["kitting_drake"] == kitting_drake.__version__
     assert all(isinstance(text, str) and text for text in found.values())
+
+
+def test_copied_sources_are_of_the_commit_that_is_said(
+    checkout: Path, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setenv(COMMIT_VARIABLE, "f00d+")
+    assert commit() == "f00d+"

@@ -1,13 +1,15 @@
+import os
 import pickle
 import shutil
 import subprocess
 import sys
-import zipfile
 from pathlib import Path
 
 import pytest
 
+from kitting_drake.common.errors import UserError
 from kitting_drake.common.paths import MODELS, SCENARIOS
+from kitting_drake.common.provenance import commit
 from kitting_drake.scenario.choosing import ChosenScenario
 from kitting_drake.scenario.policies import Learned, PythonPolicy
 from kitting_drake.scenario.schema import Scenario
@@ -21,12 +23,15 @@ _ON_THE_NODE = """
 import importlib, pickle, sys
 from pathlib import Path
 import kitting_drake, systems
+from kitting_drake.common.errors import UserError
 from kitting_drake.common.own_modules import modules_beside
 from kitting_drake.common.paths import MODELS
+from kitting_drake.common.provenance import commit
 
 here = Path.cwd()
 assert all(Path(item.__file__).is_relative_to(here) for item in (kitting_drake, systems)), sys.path
 assert MODELS.is_relative_to(here)
+print(commit())
 chosen = pickle.loads(sys.stdin.buffer.read())
 assert chosen.base.is_relative_to(here)
 for path in (*chosen.scenario.policy.input_files(chosen.base),
@@ -40,25 +45,42 @@ print(chosen.name, chosen.path)
 """
 
 
-def unpacked(shipment: Shipment, archive: Path, folder: Path) -> str:
-    """What a process finds that runs in a folder where the archive was unpacked."""
-    with zipfile.ZipFile(archive) as file:
-        file.extractall(folder)
+def on_a_node(shipment: Shipment, node: Path) -> str:
+    """What a process finds where Ray put the copies of a shipment's folder and modules."""
+    env = shipment.runtime_env
+    ignored = shutil.ignore_patterns(*env["excludes"])
+    shutil.copytree(env["working_dir"], node, ignore=ignored)
+    paths = [str(node)]
+    for number, module in enumerate(map(Path, env.get("py_modules", []))):
+        place = node / f"module_{number}" / module.name
+        place.parent.mkdir()
+        shutil.copytree(module, place) if module.is_dir() else shutil.copy(module, place)
+        paths.append(str(place.parent))
     done = subprocess.run(
         [sys.executable, "-c", _ON_THE_NODE],
         input=pickle.dumps(shipment.chosen),
-        cwd=folder,
-        env=shipment.environment | {"PYTHONPATH": str(folder)},
+        cwd=node,
+        env=env["env_vars"] | {"PYTHONPATH": os.pathsep.join(paths)},
         capture_output=True,
     )
     assert done.returncode == 0, done.stderr.decode()
     return done.stdout.decode().strip()
 
 
-def test_all_that_a_scenario_names_is_found_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """An empty one, for links."""
+    folder = tmp_path / "links"
+    folder.mkdir()
+    return folder
+
+
+def test_all_that_a_scenario_names_is_found_there(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
     own, mine, elsewhere = tmp_path / "tools", tmp_path / "mine", tmp_path / "elsewhere"
-    for folder in (own / "imported", mine / "beside", elsewhere / "absolute", elsewhere / "linked"):
-        shutil.copytree(WRENCH, folder)
+    for tool in (own / "imported", mine / "beside", elsewhere / "absolute", elsewhere / "linked"):
+        shutil.copytree(WRENCH, tool)
     (mine / "link").symlink_to(elsewhere / "linked")
     (mine / "policies").mkdir()
     weights = tmp_path / "weights" / "policy.safetensors"
@@ -72,26 +94,27 @@ def test_all_that_a_scenario_names_is_found_there(tmp_path: Path, monkeypatch: p
         "mine",
         None,
     )
-    shipment = pack(chosen, tmp_path / "a.zip")
+    shipment = pack(chosen, folder)
+    found = on_a_node(shipment, tmp_path / "node")
     # Messages name the file as here.
-    found = unpacked(shipment, tmp_path / "a.zip", tmp_path / "node")
-    assert found == f"mine {mine / 'mine.yaml'}"
-    names = zipfile.ZipFile(tmp_path / "a.zip").namelist()
-    assert len(names) == len(set(names))
-    assert not any("__pycache__" in name or "/.venv/" in name for name in names)
+    assert found.splitlines() == [str(commit()), f"mine {mine / 'mine.yaml'}"]
+    shipped = {path.name for path in folder.iterdir()}
+    assert shipped == {"kitting_drake", "systems", "models", "files"}
+    # Ray fails on an empty list.
+    assert "py_modules" not in shipment.runtime_env
     # What the user is working with is as it was.
     assert chosen.scenario.task.tools == tools
     assert chosen.base == mine
 
 
-def test_absolute_paths_are_made_relative(tmp_path: Path):
+def test_absolute_paths_are_made_relative(folder: Path, tmp_path: Path):
     shutil.copytree(WRENCH, tmp_path / "tool")
     weights = tmp_path / "policy.safetensors"
     weights.write_bytes(b"trained")
     task = ArrangedKitting(tools={str(tmp_path / "tool"): TablePose(), "claw_hammer": TablePose()})
     scenario = Scenario(task=task, policy=Learned(str(weights)))
     chosen = ChosenScenario(scenario, SCENARIOS / "mine.yaml", "mine", None)
-    sent = pack(chosen, tmp_path / "a.zip").chosen.scenario
+    sent = pack(chosen, folder).chosen.scenario
     assert not Path(sent.policy.weights).is_absolute()
     assert (SCENARIOS / sent.policy.weights).resolve() == weights
     first, second = sent.task.tools
@@ -100,7 +123,7 @@ def test_absolute_paths_are_made_relative(tmp_path: Path):
 
 
 @pytest.mark.parametrize(
-    ("name", "module", "folder"),
+    ("name", "module", "place"),
     [
         ("policy_of_mine.py", "policy_of_mine", "where_i_run"),
         ("policy_of_mine/__init__.py", "policy_of_mine", "where_i_run"),
@@ -109,9 +132,14 @@ def test_absolute_paths_are_made_relative(tmp_path: Path):
     ],
 )
 def test_a_policy_of_ones_own_travels_along(
-    name: str, module: str, folder: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    name: str,
+    module: str,
+    place: str,
+    folder: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ):
-    source = tmp_path / folder / name
+    source = tmp_path / place / name
     source.parent.mkdir(parents=True)
     source.write_text("def act(observation): ...\n")
     monkeypatch.syspath_prepend(tmp_path / "where_i_run")
@@ -119,5 +147,12 @@ def test_a_policy_of_ones_own_travels_along(
     yaml = tmp_path / "beside_the_scenario" / "mine.yaml"
     yaml.parent.mkdir(exist_ok=True)
     chosen = ChosenScenario(scenario, yaml, "mine", None)
-    shipment = pack(chosen, tmp_path / "a.zip")
-    unpacked(shipment, tmp_path / "a.zip", tmp_path / "node")
+    on_a_node(pack(chosen, folder), tmp_path / "node")
+
+
+def test_a_file_that_is_gone_is_named(folder: Path, tmp_path: Path):
+    chosen = ChosenScenario(
+        Scenario(policy=Learned("gone.safetensors")), tmp_path / "mine.yaml", "mine", None
+    )
+    with pytest.raises(UserError, match=r"cannot pack .*gone\.safetensors: No such file"):
+        pack(chosen, folder)

@@ -56,7 +56,7 @@ def test_the_bottom_stays_flat_and_nothing_is_below_it():
 def test_an_outline_of_too_many_corners_is_told():
     # A comb whose gaps are too broad to be bridged.
     teeth = [
-        Manifold.cube((4, 30, 10)).translate((10.0 * index - 95.0, -40, 0)) for index in range(20)
+        Manifold.cube((4, 30, 10)).translate((11.5 * index - 94.0, -40, 0)) for index in range(17)
     ]
     comb = Manifold.batch_boolean([Manifold.cube((200, 20, 10), True), *teeth], OpType.Add)
     found = decompose(comb.translate((0, 0, 5)), GRASP)

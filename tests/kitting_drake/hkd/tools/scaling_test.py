@@ -1,6 +1,4 @@
-import os
 import threading
-import time
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -12,8 +10,6 @@ from pydrake.multibody.plant import AddMultibodyPlantSceneGraph
 from pydrake.systems.framework import DiagramBuilder
 
 from kitting_drake.common.errors import UserError
-from kitting_drake.hkd import cache as cache_module
-from kitting_drake.hkd.cache import cached_folder, prune
 from kitting_drake.hkd.tools.scaling import scaled_sdf, scaled_tool
 from kitting_drake.hkd.tools.tool import Tool, load_tool
 
@@ -127,25 +123,3 @@ def test_two_that_scale_the_same_tool_at_once_both_get_it(cache: Path):
         made = list(pool.map(scale, range(4)))
     assert len({one.sdf for one in made}) == 1
     assert list(cache.iterdir()) == [made[0].directory]
-
-
-def test_the_cache_keeps_the_newest_and_the_young(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(cache_module, "KEPT_ENTRIES", 3)
-    now = time.time()
-    hour = cache_module.YOUNGEST_REMOVED
-
-    def write(folder: Path) -> None:
-        (folder / "file").write_text("content")
-
-    for name, age in (("a", 9), ("b", 8), ("c", 7), ("d", 6), ("e", 0.5), (".making-x", 2)):
-        folder = tmp_path / name
-        folder.mkdir()
-        write(folder)
-        os.utime(folder, (now - age * hour,) * 2)
-    # A use makes the oldest the newest.
-    cached_folder(tmp_path / "a", ["file"], write)
-    prune(tmp_path)
-    assert {path.name for path in tmp_path.iterdir()} == {"a", "e", "d"}
-    monkeypatch.setattr(cache_module, "KEPT_ENTRIES", 1)
-    prune(tmp_path)
-    assert {path.name for path in tmp_path.iterdir()} == {"a", "e"}

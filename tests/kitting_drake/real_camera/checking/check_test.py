@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+from typing import Any
 
 import numpy as np
 import pytest
@@ -32,6 +33,11 @@ BLOCK = Block((0.20, 0.15, 0.05), (0.45, -0.2, 1.1))
 MODERATE = SensorNoiseParameters(depth_std=0.002, depth_step=0.001, flying_share=0.2)
 """As `--perturb depth_noise:moderate` has it."""
 MILD = SensorNoiseParameters(depth_std=0.001, depth_step=0.0005, flying_share=0.1)
+
+
+def slow(value: Any) -> Any:
+    """One more value of a parameter, for `make test-slow`."""
+    return pytest.param(value, marks=pytest.mark.slow)
 
 
 @pytest.fixture(scope="module")
@@ -81,7 +87,7 @@ def test_depths_that_are_too_long_are_found(table: dict[str, Frame], longer: flo
         assert camera.table.bias * longer < 0
 
 
-@pytest.mark.parametrize("axis", [(0.3, 0, 0), (0, -0.3, 0), (0.18, 0.24, 0)])
+@pytest.mark.parametrize("axis", [slow((0.3, 0, 0)), slow((0, -0.3, 0)), (0.18, 0.24, 0)])
 def test_a_tilt_is_found_and_about_which_axis(
     table: dict[str, Frame], axis: tuple[float, float, float]
 ):
@@ -107,7 +113,9 @@ def test_a_camera_that_is_too_high_is_found(table: dict[str, Frame]):
     assert check.cameras["front"].table.noise == pytest.approx(0.0016, rel=0.5)
 
 
-@pytest.mark.parametrize("size", [(0.20, 0.15, 0.05), (0.15, 0.20, 0.03), (0.16, 0.16, 0.05)])
+@pytest.mark.parametrize(
+    "size", [(0.20, 0.15, 0.05), slow((0.15, 0.20, 0.03)), slow((0.16, 0.16, 0.05))]
+)
 def test_a_block_tells_where_a_camera_is_beside_itself(size: tuple[float, float, float]):
     block = dataclasses.replace(BLOCK, size=size)
     believed = moved("left", shift=(0.003, 0, 0), rotvec_deg=(0, 0, 0.4))
@@ -126,14 +134,14 @@ def test_a_block_tells_where_a_camera_is_beside_itself(size: tuple[float, float,
     assert math.degrees(yaw) == pytest.approx(0.4, abs=0.2)
 
 
-@pytest.mark.parametrize("yaw", [-0.5, 0.7, 1.2])
+@pytest.mark.parametrize("yaw", [slow(-0.5), 0.7, slow(1.2)])
 def test_a_square_block_is_not_seen_rotated_by_a_quarter(yaw: float):
     block = Block((0.16, 0.16, 0.05), (0.45, -0.2, yaw))
     for camera in check_cameras(cast(TRUE, block), TRUE, block).cameras.values():
         assert math.degrees(offset(camera.block, block)[2]) == pytest.approx(0, abs=0.3)
 
 
-@pytest.mark.parametrize("pose", [(0.45, -0.2, 1.1), (0.6, 0.2, 0.3)])
+@pytest.mark.parametrize("pose", [slow((0.45, -0.2, 1.1)), (0.6, 0.2, 0.3)])
 def test_a_block_is_where_it_is_through_a_lens_that_distorts(pose: tuple[float, float, float]):
     """A pixel near the border covers more of the block than one in the middle."""
     block = Block((0.20, 0.15, 0.05), pose)

@@ -50,9 +50,10 @@ def placements(scene: Scene, X_WB: list[RigidTransform]) -> list[Placement]:
 
 
 def test_the_seed_is_the_scene():
-    assert poses(draw(3)) == poses(draw(3))
-    assert names(draw(3)) == names(draw(3))
-    assert poses(draw(3)) != poses(draw(4))
+    scene, again = draw(3), draw(3)
+    assert poses(scene) == poses(again)
+    assert names(scene) == names(again)
+    assert poses(scene) != poses(draw(4))
 
 
 def test_poses_and_goals_follow_the_order():
@@ -118,7 +119,7 @@ def test_of_three_alike_all_are_named():
     assert {goal.objects for goal in scene.goals} == {(0, 1, 2)}
 
 
-@pytest.mark.parametrize("count", [1, 2, 7, 12])
+@pytest.mark.parametrize("count", [1, 2, pytest.param(7, marks=pytest.mark.slow), 12])
 def test_kits_of_any_number_of_tools(count: int):
     # Every fifth, so that all categories are there, and several times.
     tools = tool_names()[:: len(tool_names()) // 12][:count]
@@ -151,14 +152,14 @@ def test_arranged_stands_where_you_say():
 @pytest.mark.parametrize("split", ["test", "fresh"])
 def test_toolsets_are_drawn_from_their_split(split: str):
     drawn = set()
-    for seed in range(4):
+    for seed in (0, 3):
         scene = draw(seed, ToolsetKitting(split=split))
         drawn |= set(names(scene))
         assert sorted(item.category for item in scene.objects) == sorted(CATEGORIES)
         assert {load_tool(name).split for name in names(scene)} == {split}
         lengths = [float(np.ptp(item.p_BPoints[:, 0])) for item in scene.objects]
         assert all(0.145 < length < 0.201 for length in lengths)
-    assert len(drawn) > 6
+    assert len(drawn) > 4
 
 
 def test_toolsets_are_drawn_from_a_pool():
@@ -191,13 +192,14 @@ def test_lengths_are_drawn_only_if_asked_for():
         scene = draw(0, ToolsetKitting(split="test", **fields))
         return {item.name: float(np.ptp(item.p_BPoints[:, 0])) for item in scene.objects}
 
-    assert lengths() == lengths()
+    scaled = lengths()
+    assert scaled == lengths()
     as_made = lengths(random_lengths=False)
     for name, length in as_made.items():
         assert length == pytest.approx(load_tool(name).length, rel=0.02)
     # Whatever their lengths, the tools of a seed are the same.
-    assert lengths().keys() == as_made.keys()
-    assert lengths() != as_made
+    assert scaled.keys() == as_made.keys()
+    assert scaled != as_made
 
 
 def test_only_what_is_unchanged_is_called_as_in_the_paper():

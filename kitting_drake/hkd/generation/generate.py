@@ -8,19 +8,18 @@ Solids are handled in mm and written in metres.
 import dataclasses
 import tempfile
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import yaml
 from manifold3d import CrossSection, JoinType, Manifold, OpType
-from scipy.spatial import ConvexHull, QhullError
 
-from kitting_drake.common.errors import MachineError, UserError
+from kitting_drake.common.errors import MachineError
 from kitting_drake.common.files import replace_folder
 from kitting_drake.hkd.families import hammer, pliers, screwdriver, wrench
-from kitting_drake.hkd.families.solids import MATERIALS, Part
+from kitting_drake.hkd.generation.catalogue import CatalogueError, GraspEntry, ToolEntry
 from kitting_drake.hkd.grasps.grip import Grip, find_grip, jaw_axes
 from kitting_drake.hkd.tools import meshes
 from kitting_drake.hkd.tools.collision import (
@@ -32,6 +31,7 @@ from kitting_drake.hkd.tools.collision import (
 )
 from kitting_drake.hkd.tools.mass import Body, mass_properties
 from kitting_drake.hkd.tools.sdf import tool_sdf
+from kitting_drake.hkd.tools.solids import MATERIALS, Part
 from kitting_drake.hkd.tools.stable_pose import stable_poses
 from kitting_drake.hkd.tools.symmetry import symmetry_order
 from systems.hand_geometry import FINGER_LENGTH, PAD_LENGTH
@@ -61,33 +61,6 @@ DESIGNS: dict[str, tuple[type, Callable[[Any], list[Part]]]] = {
 }
 
 
-class CatalogueError(UserError):
-    """A catalogue entry that cannot be used; the message names entry and field."""
-
-
-@dataclass
-class GraspEntry:
-    """A grasp annotated by hand in frame T: the jaws close along +y rotated by theta about +z."""
-
-    x_mm: float = 0.0
-    y_mm: float = 0.0
-    theta_deg: float = 0.0
-
-
-@dataclass
-class ToolEntry:
-    """One entry of the catalogue."""
-
-    name: str
-    category: str
-    split: str
-    # The design is scaled to this length.
-    length_mm: float
-    grasp: GraspEntry
-    # Departures from the defaults of the category's parameters.
-    parameters: dict[str, Any] = field(default_factory=dict)
-
-
 @dataclass
 class Report:
     """Measurements of a generated tool; lengths in mm."""
@@ -95,7 +68,6 @@ class Report:
     description: dict[str, Any]
     triangles: int
     collision_hulls: int
-    collision_triangles: int
     # The furthest that the collision outline is outside and inside the visual outline.
     outside_mm: float
     inside_mm: float
@@ -107,38 +79,8 @@ class Report:
     # stands out where the fingers pass.
     grip_flatness_mm: float
     finger_overhang_mm: float
-    # Tilt of the stable pose from the design's, and distance of the centre of mass from the rim of
-    # its support.
+    # Tilt of the stable pose from the design's.
     tilt_deg: float
-    support_margin_mm: float
-
-
-def load_catalogue(path: Path) -> list[ToolEntry]:
-    """Reads `catalogue.yaml`; raises CatalogueError for an entry that cannot be used."""
-    try:
-        data = yaml.safe_load(path.read_text())
-    except OSError as error:
-        raise CatalogueError(f"cannot read {path}: {error.strerror}") from error
-    except yaml.YAMLError as error:
-        raise CatalogueError(f"{path}: {' '.join(str(error).split())}") from error
-    if not isinstance(data, dict) or not isinstance(data.get("tools"), list):
-        raise CatalogueError(f"{path}: it has to hold a list named `tools`")
-    entries: list[ToolEntry] = []
-    for item in data["tools"]:
-        name = item.get("name", f"number {len(entries) + 1}")
-        try:
-            entries.append(ToolEntry(**{**item, "grasp": GraspEntry(**item["grasp"])}))
-        except (KeyError, TypeError) as error:
-            raise CatalogueError(f"{path}: tool {name}: {error}") from error
-        if entries[-1].category not in DESIGNS:
-            raise CatalogueError(
-                f"{path}: tool {name}: category {entries[-1].category!r} is none of "
-                f"{', '.join(DESIGNS)}"
-            )
-    names = [e.name for e in entries]
-    if len(set(names)) != len(names):
-        raise CatalogueError(f"{path}: two tools share a name")
-    return entries
 
 
 def build_parts(entry: ToolEntry) -> list[Part]:
@@ -215,10 +157,10 @@ def _write_tool(entry: ToolEntry, directory: Path) -> Report:
     center = R_TD @ center + 1e-3 * p_T
     inertia = R_TD @ inertia @ R_TD.T
     visuals, triangles = _write_visuals(parts, R_TD, p_T, directory)
-    collisions, collision_triangles = [], 0
+    collisions = []
     for i, hull in enumerate(hulls):
         collisions.append(f"collision_{i}.obj")
-        collision_triangles += meshes.write_convex_obj(directory / collisions[-1], hull)
+        meshes.write_convex_obj(directory / collisions[-1], hull)
     (directory / f"{entry.name}.sdf").write_text(
         tool_sdf(entry.name, mass, center, inertia, visuals, collisions)
     )
@@ -233,7 +175,6 @@ def _write_tool(entry: ToolEntry, directory: Path) -> Report:
         description,
         triangles,
         len(hulls),
-        collision_triangles,
         outside_mm=furthest(projection(hulls), outline),
         inside_mm=furthest(outline, closed(projection(hulls), CAVITY_CLEARANCE_MM)),
         bottom_error_mm=points[:, 2].min() - box[0, 2],
@@ -242,7 +183,6 @@ def _write_tool(entry: ToolEntry, directory: Path) -> Report:
         grip_flatness_mm=grip.flatness,
         finger_overhang_mm=grip.overhang,
         tilt_deg=float(np.degrees(np.arccos(min(1.0, R_TD[2, 2])))),
-        support_margin_mm=_support_margin(points, 1e3 * center),
     )
 
 
@@ -360,16 +300,6 @@ def _measure_grasp(grasp: GraspEntry, solid: Manifold) -> _GripReport:
         overhang=max(finger.high - pad.high, pad.low - finger.low),
         top=pad.top,
     )
-
-
-def _support_margin(points: np.ndarray, center_of_mass: np.ndarray) -> float:
-    """Distance (mm) of the centre of mass, seen from above, from the rim of the support."""
-    touching = points[points[:, 2] < 0.02][:, :2]
-    try:
-        equations = ConvexHull(touching).equations
-    except QhullError:
-        return 0.0
-    return float(-(equations[:, :2] @ center_of_mass[:2] + equations[:, 2]).max())
 
 
 def _description(

@@ -18,14 +18,14 @@ from numpy.typing import NDArray
 from scipy.spatial import QhullError
 
 from kitting_drake.common.errors import UserError
-from kitting_drake.hkd.grasps.proposals import GraspProposal, propose_grasps
-from kitting_drake.hkd.tools.generate import (
+from kitting_drake.hkd.generation.catalogue import ToolEntry
+from kitting_drake.hkd.generation.generate import (
     DESIGNS,
-    ToolEntry,
     build_parts,
     homogeneous,
     rest_rotation,
 )
+from kitting_drake.hkd.grasps.proposals import GraspProposal, propose_grasps
 from kitting_drake.hkd.tools.mass import mass_properties
 from kitting_drake.hkd.tools.meshes import vertices_and_faces
 from kitting_drake.hkd.tools.tool import Tool

@@ -7,7 +7,7 @@ import yaml
 
 from kitting_drake.common.errors import UserError
 from kitting_drake.common.paths import MODELS
-from kitting_drake.hkd.grasps.annotate import measure_grasp, save_grasp, with_grasp
+from kitting_drake.hkd.annotate import measure_grasp, save_grasp, with_grasp
 from kitting_drake.hkd.tools.tool import Tool, load_tool
 from kitting_drake.tasks.kitting.kitting import Kitting
 from systems.grasp import Grasp

@@ -16,6 +16,8 @@ from rich.table import Table
 from kitting_drake.common.errors import UserError
 from kitting_drake.common.files import write_atomically
 from kitting_drake.common.paths import MODELS
+from kitting_drake.hkd.generation.catalogue import load_catalogue
+from kitting_drake.hkd.generation.generate import generate_tool
 from kitting_drake.hkd.grasps.grip import find_grip, jaw_axes
 from kitting_drake.hkd.grasps.proposals import (
     FLOOR_CLEARANCE,
@@ -24,7 +26,6 @@ from kitting_drake.hkd.grasps.proposals import (
     GraspProposal,
     propose_grasps,
 )
-from kitting_drake.hkd.tools.generate import generate_tool, load_catalogue
 from kitting_drake.hkd.tools.tool import Tool, load_tool
 from systems.grasp import Grasp
 from systems.hand_geometry import FINGER_BASE_DISTANCE, FINGERTIP_DISTANCE, PAD_LENGTH

@@ -18,7 +18,7 @@ from kitting_drake.real_camera.checking.meaning import BAD, GOOD, findings, offs
 CHECK_FILES = ("check.json", "corrected.yaml", "check.png")
 """The files that `save_check` writes."""
 _WELL_SEEN = 0.9
-"""Where less than this share of what is in view is seen, it is told."""
+"""A note says so where less than this share of the workspace in view is seen."""
 
 
 def print_decision(console: Console, record: dict[str, Any]) -> None:
@@ -50,7 +50,7 @@ def save_check(folder: Path, check: Check) -> None:
     Raises:
         UserError: a file cannot be written.
     """
-    # Who draws nothing does not wait for matplotlib.
+    # Import matplotlib lazily.
     from kitting_drake.evaluation.check_figure import draw_heights
 
     record, calibration, picture = (folder / name for name in CHECK_FILES)

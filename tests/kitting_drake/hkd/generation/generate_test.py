@@ -6,8 +6,9 @@ import pytest
 
 from kitting_drake.common.errors import MachineError
 from kitting_drake.common.paths import MODELS
-from kitting_drake.hkd.tools import generate
-from kitting_drake.hkd.tools.generate import CatalogueError, generate_tool, load_catalogue
+from kitting_drake.hkd.generation import generate
+from kitting_drake.hkd.generation.catalogue import CatalogueError, load_catalogue
+from kitting_drake.hkd.generation.generate import generate_tool
 from kitting_drake.hkd.tools.tool import tool_names
 
 CATALOGUE = MODELS / "tools" / "catalogue.yaml"

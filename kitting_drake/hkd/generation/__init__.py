@@ -1,0 +1,1 @@
+"""Tools made from their catalogue entries, or drawn at random."""

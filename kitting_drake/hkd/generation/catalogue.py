@@ -1,0 +1,65 @@
+"""The catalogue: what makes up each generated tool, `models/tools/catalogue.yaml`."""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from kitting_drake.common.errors import UserError
+from kitting_drake.hkd.tools.tool import CATEGORIES
+
+
+class CatalogueError(UserError):
+    """A catalogue entry that cannot be used; the message names entry and field."""
+
+
+@dataclass
+class GraspEntry:
+    """A grasp annotated by hand in frame T: the jaws close along +y rotated by theta about +z."""
+
+    x_mm: float = 0.0
+    y_mm: float = 0.0
+    theta_deg: float = 0.0
+
+
+@dataclass
+class ToolEntry:
+    """One entry of the catalogue."""
+
+    name: str
+    category: str
+    split: str
+    # The design is scaled to this length.
+    length_mm: float
+    grasp: GraspEntry
+    # Departures from the defaults of the category's parameters.
+    parameters: dict[str, Any] = field(default_factory=dict)
+
+
+def load_catalogue(path: Path) -> list[ToolEntry]:
+    """Reads `catalogue.yaml`; raises CatalogueError for an entry that cannot be used."""
+    try:
+        data = yaml.safe_load(path.read_text())
+    except OSError as error:
+        raise CatalogueError(f"cannot read {path}: {error.strerror}") from error
+    except yaml.YAMLError as error:
+        raise CatalogueError(f"{path}: {' '.join(str(error).split())}") from error
+    if not isinstance(data, dict) or not isinstance(data.get("tools"), list):
+        raise CatalogueError(f"{path}: it has to hold a list named `tools`")
+    entries: list[ToolEntry] = []
+    for item in data["tools"]:
+        name = item.get("name", f"number {len(entries) + 1}")
+        try:
+            entries.append(ToolEntry(**{**item, "grasp": GraspEntry(**item["grasp"])}))
+        except (KeyError, TypeError) as error:
+            raise CatalogueError(f"{path}: tool {name}: {error}") from error
+        if entries[-1].category not in CATEGORIES:
+            raise CatalogueError(
+                f"{path}: tool {name}: category {entries[-1].category!r} is none of "
+                f"{', '.join(CATEGORIES)}"
+            )
+    names = [e.name for e in entries]
+    if len(set(names)) != len(names):
+        raise CatalogueError(f"{path}: two tools share a name")
+    return entries
