@@ -121,7 +121,7 @@ def _top(triangles: Array, grasp: Grasp) -> float:
 
 def _levels(height: float) -> Array:
     step = min(0.001, height / 12)
-    return (np.arange(int(np.ceil(height / step - 1e-9))) + 0.5) * step
+    return (np.arange(np.ceil(height / step - 1e-9), dtype=float) + 0.5) * step
 
 
 def _slices(triangles: Array, levels: Array) -> tuple[Array, NDArray[np.int64]]:
@@ -217,7 +217,7 @@ def _search(
         centres = centres[(centres >= first) & (centres < last)]
     result = []
     for centre in centres:
-        hold = _hold(reach, centre, levels, touch)
+        hold = _hold(reach, int(centre), levels, touch)
         if hold is not None:
             result.append(_proposal(hold, reach.u_min + centre * _BIN, theta, com))
     return result

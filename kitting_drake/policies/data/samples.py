@@ -28,7 +28,7 @@ class HeightsOnly:
     def image(self) -> Image:
         """(4, rows, cols): black, and what no camera saw filled in; made anew each time."""
         image = self.recorded.image
-        image[3] = fill_unseen(image[3], image.any(axis=0))
+        image[3] = fill_unseen(image[3], np.any(image, axis=0))
         image[:3] = 0
         return image
 

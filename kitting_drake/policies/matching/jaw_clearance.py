@@ -97,7 +97,7 @@ def jaw_grasps(
 
     thetas = np.arange(_ANGLES) * math.pi / _ANGLES
     place, theta = (item.ravel() for item in np.meshgrid(np.arange(len(places)), thetas))
-    found = grip(places[place.astype(int)], theta)
+    found = grip(places[place.astype(int)], theta.astype(float))
     if not found:
         return []
     # The best at the angle at which its faces are parallel to the pads.

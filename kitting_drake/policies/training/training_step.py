@@ -163,7 +163,7 @@ class Trainer:
         """The draw of a step: a random sample, augmented, and perhaps a final observation."""
         random = np.random.default_rng([self.seed, step])
         sample = augment(
-            samples[random.integers(len(samples))],
+            samples[int(random.integers(len(samples)))],
             random,
             curvature=self.curvature,
             reflection=self.reflection,
@@ -176,7 +176,7 @@ class Trainer:
         """A final observation after a random motion, if this step has one."""
         if not (self.networks.config.stop and finals) or random.random() >= _STOP_PROBABILITY:
             return None
-        return Motion.draw(finals[random.integers(len(finals))].image, random).moved_image()
+        return Motion.draw(finals[int(random.integers(len(finals)))].image, random).moved_image()
 
     def state_dict(self) -> dict[str, Any]:
         """All that `load_state_dict` needs to continue bit by bit."""
