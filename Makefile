@@ -1,9 +1,13 @@
 # `make run` kits; `make test` tests. Both first make .venv/, once.
 
-# With 3.12 comes a newer Drake, and episodes take a tenth to a fifth less time than with 3.11.
-SUPPORTED := import ensurepip, sys, venv; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 12))
-PYTHON ?= $(shell for python in python3.12 python3 python3.11; do \
+# The newest comes first. Drake for Python 3.11 is an older one, with which episodes take longer.
+SUPPORTED := import ensurepip, sys, venv; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 14))
+PYTHON ?= $(shell for python in python3.14 python3.13 python3.12 python3 python3.11; do \
   $$python -c '$(SUPPORTED)' 2>/dev/null && echo $$python && break; done)
+# What pip installs PyTorch from. On Linux that is a build for CUDA, of 4.6 GB with all that it needs. Where
+# there is no such GPU, PyTorch's build for CPUs does with 0.7 GB: make TORCH='torch==2.13.0 --index-url URL',
+# with the URL that pytorch.org/get-started/locally shows for CPU.
+TORCH ?= torch==2.13.0
 VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/ready
@@ -28,12 +32,18 @@ lint: $(READY)
 clean:
 	rm -rf $(VENV)
 
-# The .pth file makes the checkout importable from anywhere.
+PIP := $(BIN)/python -m pip --quiet --disable-pip-version-check
+
+# An environment that is there is kept, with its PyTorch; `make clean` removes it. The .pth file makes the
+# checkout importable from anywhere.
 $(READY): requirements.txt
-	@test -n "$(PYTHON)" && $(PYTHON) -c '$(SUPPORTED)' 2>/dev/null || \
-	  { echo "error: Python 3.11 or 3.12 is needed, with its venv module (Debian and Ubuntu: apt-get install python3-venv): say 'make PYTHON=/path/to/python3.12'"; exit 2; }
-	$(PYTHON) -m venv --clear $(VENV)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c requirements.txt torch==2.13.0
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps -r requirements.txt
+	@if ! { $(PIP) --version && $(BIN)/python -c '$(SUPPORTED)'; } >/dev/null 2>&1; then \
+	  if test -z "$(PYTHON)" || ! $(PYTHON) -c '$(SUPPORTED)' 2>/dev/null; then \
+	    echo "error: Python 3.11 to 3.14 is needed, with its venv module (Debian and Ubuntu: apt-get install python3-venv): say 'make PYTHON=/path/to/python3.13'" >&2; exit 2; \
+	  fi; \
+	  echo "$(PYTHON) -m venv --clear $(VENV)"; $(PYTHON) -m venv --clear $(VENV); \
+	fi
+	$(PIP) install --no-deps -r requirements.txt
+	$(PIP) install $(TORCH)
 	@$(BIN)/python -c 'import pathlib, sysconfig; pathlib.Path(sysconfig.get_path("purelib"), "kitting_drake.pth").write_text(str(pathlib.Path.cwd()) + "\n")'
 	@touch $@

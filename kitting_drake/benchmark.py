@@ -2,7 +2,6 @@
 
 import argparse
 import os
-from fnmatch import fnmatch
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +9,6 @@ from rich.console import Console
 from rich.table import Table
 
 from kitting_drake.common.command_line import FAILED, count_type, run_command, seed_type
-from kitting_drake.common.errors import UserError
 from kitting_drake.common.files import require_folder, write_atomically, write_json
 from kitting_drake.scenario.choosing import add_scenario_flags, choose_scenario
 
@@ -89,13 +87,10 @@ def _parser() -> argparse.ArgumentParser:
         "--results",
         type=Path,
         metavar="DIR",
-        default=Path("docs/results/paper"),
-        help="where the summaries of the cells go (docs/results/paper)",
+        default=Path("docs/results"),
+        help="where the table is that finished cells are added to (docs/results)",
     )
-    paper.add_argument(
-        "--workers", type=count_type, default=1, help="episodes side by side, beside trainings (1)"
-    )
-    paper.add_argument("--trainings", type=count_type, default=1, help="trainings side by side (1)")
+    paper.add_argument("--workers", type=count_type, default=1, help="episodes side by side (1)")
     for benchmark in (simulation, networks, kits, recovery, opinion, paper):
         benchmark.add_argument(
             "--output", type=Path, default=Path("output/benchmark"), help="where the files go"
@@ -172,24 +167,12 @@ def _mujoco(arguments: argparse.Namespace, console: Console, folder: Path) -> li
 
 def _paper(arguments: argparse.Namespace, console: Console, folder: Path) -> int:
     """Fills the paper's cells; returns the exit code."""
-    from kitting_drake.reproduction.paper.cells import Cell
-    from kitting_drake.reproduction.paper.paper_tables import paper_cells
+    from kitting_drake.reproduction.paper.paper_tables import choose_cells
     from kitting_drake.reproduction.paper.queue import Queue, run_paper
 
-    chosen: dict[str, Cell] = {}
-    for pattern in arguments.cells:
-        matching = {cell.name: cell for cell in paper_cells() if fnmatch(cell.name, pattern)}
-        if not matching:
-            raise UserError(f"--cells: there is no cell of the name '{pattern}'")
-        chosen |= matching
-    cells = list(chosen.values())
-    queue = Queue(
-        require_folder(folder / "paper"),
-        require_folder(arguments.results),
-        console,
-        workers=arguments.workers,
-        trainings=arguments.trainings,
-    )
+    cells = choose_cells(arguments.cells)
+    results = require_folder(arguments.results)
+    queue = Queue(require_folder(folder / "paper"), results, console, arguments.workers)
     failures = run_paper(queue, cells)
     table = Table("cell", "state", title="the paper's experiments")
     for cell in cells:

@@ -53,7 +53,7 @@ from kitting_drake.scenario.choosing import (
 )
 from kitting_drake.scenario.policies import Oracle
 from kitting_drake.scenario.workers import add_workers_flags, open_workers
-from kitting_drake.station import Cell
+from kitting_drake.station import KittingStation
 from kitting_drake.station.hidden_table import hidden_table_note
 from systems.signals import Observation, PickPlaceAction
 
@@ -356,31 +356,31 @@ def _reject_dead(seed: int, dead: ProcessCrashed) -> Rejection:
 
 
 def _demonstrate(chosen: ChosenScenario, seed: int) -> Demonstration | Rejection:
-    # A cell whose expert does not look is built without cameras where nothing can be rendered.
+    # A station is built without cameras where nothing can be rendered.
     require_rendering()
     try:
-        cell = build_chosen(chosen, seed=seed)
+        diagram, station = build_chosen(chosen, seed=seed)
     except MachineError:
         raise
     except UserError as error:
         return Rejection(seed, 0.0, str(error))
     learning = chosen.scenario.task.learning
-    recorder = DemonstrationRecorder(cell, later_picks_possible=learning.later_picks_possible)
-    result = run_chosen(chosen, cell, seed=seed, observers=[recorder.observe])
+    recorder = DemonstrationRecorder(station, later_picks_possible=learning.later_picks_possible)
+    result = run_chosen(chosen, diagram, station, observers=[recorder.observe])
     return recorder.demonstration(result)
 
 
 class DemonstrationRecorder:
     """Takes down what the expert saw and did: an `EpisodeObserver`."""
 
-    def __init__(self, cell: Cell, *, later_picks_possible: bool = False) -> None:
+    def __init__(self, station: KittingStation, *, later_picks_possible: bool = False) -> None:
         """
         Args:
-            cell: with the oracle and an `observation`.
+            station: with cameras and the oracle.
             later_picks_possible: see `Learning`. What took two actions, as it may where there are
                 several tries, did not lie yet where it was picked later, and spoils those labels.
         """
-        self._cell = cell
+        self._station = station
         self._later_picks_possible = later_picks_possible
         self._actions: list[tuple[Observation, PickPlaceAction]] = []
         self._final: FinalObservation | None = None
@@ -389,12 +389,11 @@ class DemonstrationRecorder:
         """Takes down what the planner acts upon."""
         if event.is_last or not (event.is_action_start or event.is_stop):
             return
-        ports = self._cell.diagram
-        observation = ports.GetOutputPort("observation").Eval(event.root_context)
+        observation = self._station.observation(event.root_context)
         if event.is_stop:
             self._final = FinalObservation.of(observation)
         else:
-            action = ports.GetOutputPort("action").Eval(event.root_context)
+            action = self._station.proposed_action(event.root_context)
             self._actions.append((observation, action))
 
     def demonstration(self, result: EpisodeResult) -> Demonstration | Rejection:

@@ -227,12 +227,12 @@ def run_in_worker(workers: Workers, chosen: ChosenScenario, seed: int) -> Episod
 def _work(chosen: ChosenScenario, seed: int) -> Episode | str:
     """An episode, or why there is none of this seed."""
     try:
-        cell = build_chosen(chosen, seed=seed)
+        diagram, station = build_chosen(chosen, seed=seed)
     except MachineError:
         raise
     except UserError as error:
         return str(error)
-    return run_chosen(chosen, cell, seed=seed).as_dict() | {"commit": _commit_of_process()}
+    return run_chosen(chosen, diagram, station).as_dict() | {"commit": _commit_of_process()}
 
 
 @functools.cache

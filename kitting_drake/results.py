@@ -1,10 +1,10 @@
-"""`python -m kitting_drake.results`: docs/results.md, from the summaries in docs/results/, and the
-table of docs/robustness.md.
+"""`python -m kitting_drake.results`: docs/results.md and its figures, and the table of
+docs/robustness.md, from the runs in docs/results/.
 
-Each file there is a copy of a `summary.json` of `evaluate`, under any name; in docs/results/paper/
-are those of `benchmark paper`, each under the name of its cell, and `networks.json`, a copy of the
-file of `benchmark networks`. Nothing in the tables comes from anywhere else, but the paper's own
-figures.
+`--add` puts a run of `evaluate` among them, `--remove` takes one out. A run that has the name of a
+cell of `benchmark paper` fills that cell. Beside the runs lie `learning_rates.json` of `benchmark
+paper` and `networks.json`, a copy of the file of `benchmark networks`. Nothing in the tables comes
+from anywhere else, but the paper's own figures.
 """
 
 import argparse
@@ -19,16 +19,47 @@ from kitting_drake.common.command_line import run_command
 from kitting_drake.common.files import write_atomically
 from kitting_drake.reproduction.page.results_page import results_page
 from kitting_drake.reproduction.page.robustness import robustness_table, with_figures
-from kitting_drake.reproduction.page.runs import read_runs
-from kitting_drake.reproduction.paper.cell_results import Result, read_results
+from kitting_drake.reproduction.page.run_table import add_run, remove_runs
+from kitting_drake.reproduction.page.runs import read_evaluation, read_runs
+from kitting_drake.reproduction.paper.cell_results import Result, cell_results, check_cell
 from kitting_drake.reproduction.paper.efficiency import read_efficiency
 from kitting_drake.reproduction.paper.learning_rates import read_rates
 from kitting_drake.reproduction.paper.paper_figures import draw_figure_6, draw_table_1
 from kitting_drake.reproduction.paper.paper_sections import has_figure, has_table_1, paper_sections
+from kitting_drake.reproduction.paper.paper_tables import paper_cells
 
 
 def main() -> int:
-    """Parses the command line and writes the file; returns the exit code."""
+    """Parses the command line and writes the files; returns the exit code."""
+    arguments = _parser().parse_args()
+    folder, output = arguments.results, arguments.output
+    rates = read_rates(folder)
+    if arguments.remove:
+        remove_runs(folder, arguments.remove)
+    for name, path in arguments.add:
+        summary = read_evaluation(Path(path))
+        for cell in paper_cells():
+            if cell.name == name:
+                check_cell(cell, summary, rates)
+        add_run(folder, name, summary)
+    runs = read_runs(folder)
+    answers, others = cell_results(runs, rates)
+    efficiency = read_efficiency(folder)
+    link = os.path.relpath(folder, output.parent)
+    page = results_page(others, link, paper_sections(answers, rates, efficiency))
+    write_atomically(output, page)
+    _draw(answers, efficiency, output.parent)
+    robustness = output.with_name("robustness.md")
+    if robustness.exists():
+        page = with_figures(robustness.read_text(), robustness_table(others))
+        write_atomically(robustness, page)
+    Console(quiet=arguments.quiet).print(
+        f"{len(runs)} runs: {output}", highlight=False, markup=False
+    )
+    return 0
+
+
+def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="python -m kitting_drake.results", description="Tables of results, from files only."
     )
@@ -37,7 +68,7 @@ def main() -> int:
         type=Path,
         metavar="DIR",
         default=Path("docs/results"),
-        help="where the summaries are (docs/results)",
+        help="where runs.csv and episodes.jsonl.xz are (docs/results)",
     )
     parser.add_argument(
         "--output",
@@ -46,24 +77,19 @@ def main() -> int:
         default=Path("docs/results.md"),
         help="what to write (docs/results.md)",
     )
-    parser.add_argument("--quiet", action="store_true", help="print nothing but errors")
-    arguments = parser.parse_args()
-    runs = read_runs(arguments.results)
-    link = os.path.relpath(arguments.results, arguments.output.parent)
-    answers = read_results(arguments.results / "paper")
-    rates = read_rates(arguments.results / "paper")
-    efficiency = read_efficiency(arguments.results / "paper")
-    page = results_page(runs, link, paper_sections(answers, rates, link, efficiency))
-    write_atomically(arguments.output, page)
-    _draw(answers, efficiency, arguments.output.parent)
-    robustness = arguments.output.with_name("robustness.md")
-    if robustness.exists():
-        page = with_figures(robustness.read_text(), robustness_table(runs))
-        write_atomically(robustness, page)
-    Console(quiet=arguments.quiet).print(
-        f"{len(runs) + len(answers)} summaries: {arguments.output}", highlight=False, markup=False
+    parser.add_argument(
+        "--add",
+        nargs=2,
+        action="append",
+        default=[],
+        metavar=("NAME", "DIR"),
+        help="first add the run of which evaluate left the summary.json in a folder",
     )
-    return 0
+    parser.add_argument(
+        "--remove", action="append", metavar="NAME", help="first remove the run of this name"
+    )
+    parser.add_argument("--quiet", action="store_true", help="print nothing but errors")
+    return parser
 
 
 def _draw(answers: Sequence[Result], efficiency: dict[str, Any] | None, folder: Path) -> None:
@@ -74,7 +100,7 @@ def _draw(answers: Sequence[Result], efficiency: dict[str, Any] | None, folder: 
             path = folder / f"results_{task}.png"
             write_atomically(path, draw_figure_6(task, by_name))
     if answers and efficiency is not None:
-        # Only who has something to draw waits for torch.
+        # Imported here, as it imports torch.
         from kitting_drake.reproduction.network_speed.speed_figure import draw_networks
 
         draw_networks(efficiency, folder / "networks.png")

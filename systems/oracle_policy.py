@@ -108,6 +108,7 @@ class OraclePolicy(LeafSystem):
         goals: Sequence[Goal],
         success: SuccessPredicate,
         quantizer: ActionQuantizer | None = None,
+        brings_heights: bool = True,
     ) -> None:
         """
         Args:
@@ -116,6 +117,7 @@ class OraclePolicy(LeafSystem):
             goals: what is to be brought about, in the order in which to do it.
             success: when a goal is filled.
             quantizer: of the actions; exact when None.
+            brings_heights: whether actions have their heights; else the planner reads them off o_t.
 
         Raises:
             ValueError: no goals, or an object of a goal without a grasp.
@@ -128,7 +130,7 @@ class OraclePolicy(LeafSystem):
                 raise ValueError(f"{objects[index].name} has no grasp")
         self._objects, self._goals, self._success = tuple(objects), tuple(goals), success
         self._grasps = tuple(tuple(choices) for choices in grasps)
-        self._quantizer = quantizer
+        self._quantizer, self._brings_heights = quantizer, brings_heights
         self._body_poses = self.DeclareAbstractInputPort("body_poses", Value([RigidTransform()]))
         self._kept_goals = self.DeclareVectorInputPort("kept_goals", len(goals))
         self.DeclareAbstractOutputPort(
@@ -267,7 +269,7 @@ class OraclePolicy(LeafSystem):
         return PickPlaceAction(
             pick=PlanarPose(pick.x, pick.y, theta),
             place=PlanarPose(place.x, place.y, theta + rotation),
-            heights=self._heights(plan, poses),
+            heights=self._heights(plan, poses) if self._brings_heights else None,
         )
 
     def _heights(self, plan: _Plan, poses: list[RigidTransform]) -> SurfaceHeights:

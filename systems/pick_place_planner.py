@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +18,7 @@ from pydrake.systems.framework import (
 from systems.hand_geometry import check_reach
 from systems.hand_motion import shortest_yaws
 from systems.motion_heights import motion_heights
-from systems.pick_place_motion import YAW_LIMIT, PickPlaceMotion, PlannerState, State
+from systems.pick_place_motion import YAW, YAW_LIMIT, PickPlaceMotion, PlannerState, Z
 from systems.pick_place_parameters import Mode, PickPlaceParameters
 from systems.signals import Observation, PickPlaceAction, PlanarPose, SurfaceHeights
 from systems.surface_heights import read_surface_heights
@@ -25,6 +26,20 @@ from systems.weak_calc import weak_calc
 
 _MOST_FAILED = 16
 """So many failed picks are remembered."""
+
+
+@dataclasses.dataclass(frozen=True)
+class _Moment:
+    """What a step of the state machine looks at."""
+
+    context: Context
+    state: PlannerState
+    """The state to write."""
+    time: float
+    hand: NDArray[np.float64]
+    """The port `hand_state`."""
+    contact: NDArray[np.float64]
+    """The port `hand_contact_force`."""
 
 
 class PickPlacePlanner(LeafSystem):
@@ -45,6 +60,8 @@ class PickPlacePlanner(LeafSystem):
         - mode
         - counts
         - failed_picks
+        - asks
+        - accepted_action
 
     - `hand_state` (12): positions then velocities of (x, y, z, yaw, left finger, right finger).
     - `hand_contact_force` (6): contact as generalized force on the same coordinates, in N and N m:
@@ -52,9 +69,8 @@ class PickPlacePlanner(LeafSystem):
     - `action` (abstract, `PickPlaceAction`): evaluated only at the moment in which the planner,
       at rest out of the cameras' sight, asks for it. Nothing upstream (policy, cameras) is computed
       at other times.
-    - `observation` (abstract, `Observation`): o_t, evaluated together with the action: the heights
-      under the pick and around the place are read off it. Where it is not connected, as where
-      nothing can be rendered, the action must bring its own.
+    - `observation` (abstract, `Observation`): o_t, evaluated together with the action, unless the
+      action brings its heights: those under the pick and around the place are read off it.
     - `desired_motion` (12): q_d, v_d, a_d of (x, y, z, yaw).
     - `desired_opening` (2): the opening between the pads in m, and its rate.
     - `closing_force` (1): what each pad presses beyond that, in N.
@@ -62,6 +78,9 @@ class PickPlacePlanner(LeafSystem):
     - `counts` (3): actions begun, grasps missed, objects dropped.
     - `failed_picks` (abstract, a tuple of `PlanarPose`): where a grasp was missed or lost, or an
       object pressed down, the latest last, at most 16 of them: for a policy that is to try another.
+    - `asks` (1): 1 where the next update, due at the context's time, evaluates `action`; else 0.
+    - `accepted_action` (abstract, `PickPlaceAction`): the action begun last, its poses as the hand
+      goes there, without heights.
 
     Every motion is as short as the limits on speed and acceleration allow, and smooth (see
     `systems.hand_motion`); where `CARRY` goes on from a `LIFT` that still accelerates, velocity is
@@ -126,30 +145,15 @@ class PickPlacePlanner(LeafSystem):
             weak_calc(self._calc_failed_picks),
             {self.discrete_state_ticket(self._failed_index)},
         )
-
-    def mode(self, context: Context) -> Mode:
-        """The mode in the given context (its own)."""
-        return Mode(int(self._state(context).mode))
-
-    def action(self, context: Context) -> tuple[PlanarPose, PlanarPose]:
-        """Pick and place of the action begun last, as the hand goes there (its own context)."""
-        state = self._state(context)
-        return (
-            PlanarPose(float(state.pick_x), float(state.pick_y), float(state.pick_yaw)),
-            PlanarPose(float(state.place_x), float(state.place_y), float(state.place_yaw)),
+        self.DeclareVectorOutputPort("asks", 1, self._calc_asks, state_and_time)
+        self.DeclareAbstractOutputPort(
+            "accepted_action",
+            lambda: Value(PickPlaceAction()),
+            weak_calc(self._calc_accepted_action),
+            state_only,
         )
 
-    def asks_now(self, context: Context) -> bool:
-        """Whether its next update, due at the context's time (its own), evaluates `action`."""
-        state, time = self._state(context), context.get_time()
-        return bool(
-            state.mode == Mode.OBSERVE
-            and state.actions < self._max_actions
-            and self._has_settled(state, time)
-            and math.remainder(time, self._period) == 0.0
-        )
-
-    def _state(self, context: Context) -> State:
+    def _state(self, context: Context) -> PlannerState:
         return PlannerState(context.get_discrete_state(self._state_index).get_value())
 
     # Outputs.
@@ -177,6 +181,21 @@ class PickPlacePlanner(LeafSystem):
         kept = rows[~np.isnan(rows[:, 0])].tolist()
         output.set_value(tuple(PlanarPose(*row) for row in kept))
 
+    def _calc_asks(self, context: Context, output: BasicVector) -> None:
+        state, time = self._state(context), context.get_time()
+        asks = (
+            state.mode == Mode.OBSERVE
+            and state.actions < self._max_actions
+            and self._has_settled(state, time)
+            and math.remainder(time, self._period) == 0.0
+        )
+        output.SetFromVector([asks])
+
+    def _calc_accepted_action(self, context: Context, output: AbstractValue) -> None:
+        state = self._state(context)
+        pick, place = (PlanarPose(*map(float, pose)) for pose in (state.pick, state.place))
+        output.set_value(PickPlaceAction(pick=pick, place=place, press=bool(state.press)))
+
     # The state machine.
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> EventStatus:
@@ -185,7 +204,16 @@ class PickPlacePlanner(LeafSystem):
         hand = self._hand_state.Eval(context)
         contact = self._contact_force.Eval(context)
         mode = Mode(int(state.mode))
-        step = {
+        if mode != Mode.DONE:
+            failed = state.missed + state.dropped
+            self._step(mode)(_Moment(context, state, time, hand, contact))
+            has_pressed = mode == Mode.DESCEND and state.mode == Mode.RETREAT
+            if has_pressed or state.missed + state.dropped > failed:
+                self._remember_failed(state, discrete_state)
+        return EventStatus.Succeeded()
+
+    def _step(self, mode: Mode) -> Callable[[_Moment], None]:
+        steps: dict[Mode, Callable[[_Moment], None]] = {
             Mode.OBSERVE: self._observe,
             Mode.DESCEND: self._descend,
             Mode.CLOSE: self._close,
@@ -194,23 +222,18 @@ class PickPlacePlanner(LeafSystem):
             Mode.CARRY: self._hold,
             Mode.LOWER: self._lower,
             Mode.SEARCH: self._search,
-        }.get(mode, self._follow)
-        if mode != Mode.DONE:
-            failed = state.missed + state.dropped
-            step(context, state, time, hand, contact)
-            has_pressed = mode == Mode.DESCEND and state.mode == Mode.RETREAT
-            if has_pressed or state.missed + state.dropped > failed:
-                self._remember_failed(state, discrete_state)
-        return EventStatus.Succeeded()
+        }
+        return steps.get(mode, self._follow)
 
-    def _remember_failed(self, state: State, discrete_state: DiscreteValues) -> None:
+    def _remember_failed(self, state: PlannerState, discrete_state: DiscreteValues) -> None:
         rows = discrete_state.get_mutable_value(self._failed_index).reshape(-1, 3)
         free = np.flatnonzero(np.isnan(rows[:, 0]))
         if not len(free):
             rows[:-1] = rows[1:].copy()
-        rows[free[0] if len(free) else -1] = state.pick_x, state.pick_y, state.pick_yaw
+        rows[free[0] if len(free) else -1] = state.pick
 
-    def _observe(self, context, state, time, hand, contact) -> None:
+    def _observe(self, moment: _Moment) -> None:
+        context, state, time = moment.context, moment.state, moment.time
         if not self._has_settled(state, time):
             return
         if state.actions >= self._max_actions:
@@ -224,30 +247,30 @@ class PickPlacePlanner(LeafSystem):
         if action.press:
             action = dataclasses.replace(action, place=action.pick)
         pick_yaw, place_yaw = shortest_yaws(
-            action.pick.theta, action.place.theta, float(state.goal_yaw), YAW_LIMIT
+            action.pick.theta, action.place.theta, float(state.goal[YAW]), YAW_LIMIT
         )
-        state.pick_x, state.pick_y, state.pick_yaw = action.pick.x, action.pick.y, pick_yaw
-        state.place_x, state.place_y, state.place_yaw = action.place.x, action.place.y, place_yaw
+        state.pick = (action.pick.x, action.pick.y, pick_yaw)
+        state.place = (action.place.x, action.place.y, place_yaw)
         self._set_heights(state, self._heights(context, action))
         state.search_step, state.press = 0, action.press
         state.actions += 1
         self._motion.begin(state, Mode.APPROACH, time)
 
-    def _has_settled(self, state: State, time: float) -> bool:
+    def _has_settled(self, state: PlannerState, time: float) -> bool:
         """Whether the hand has been at rest out of sight for long enough to observe."""
         return time >= self._motion.arrival(state) + self._parameters.observe_settle
 
     def _heights(self, context: Context, action: PickPlaceAction) -> SurfaceHeights:
-        if self._observation.HasValue(context):
-            observation = self._observation.Eval(context)
-            return read_surface_heights(observation, action.pick, action.place)
-        if action.heights is None:
+        if action.heights is not None:
+            return action.heights
+        if not self._observation.HasValue(context):
             raise RuntimeError(
                 "the planner's port `observation` is not connected, and the action has no heights"
             )
-        return action.heights
+        observation = self._observation.Eval(context)
+        return read_surface_heights(observation, action.pick, action.place)
 
-    def _set_heights(self, state: State, heights: SurfaceHeights) -> None:
+    def _set_heights(self, state: PlannerState, heights: SurfaceHeights) -> None:
         motion = motion_heights(heights, self._parameters)
         state.grasp_z, state.pick_top_z = motion.grasp, heights.pick_top
         state.table_z, state.support_z = heights.table, heights.support
@@ -256,12 +279,14 @@ class PickPlacePlanner(LeafSystem):
         state.clear_z, state.travel_z = motion.clear, motion.travel
         state.pick_hover_z, state.place_hover_z = motion.pick_hover, motion.place_hover
 
-    def _follow(self, context, state, time, hand, contact) -> None:
+    def _follow(self, moment: _Moment) -> None:
+        state, time = moment.state, moment.time
         if time >= self._motion.arrival(state):
             following = Mode.OBSERVE if state.mode == Mode.RETREAT else Mode(int(state.mode) + 1)
             self._motion.begin(state, following, time)
 
-    def _descend(self, context, state, time, hand, contact) -> None:
+    def _descend(self, moment: _Moment) -> None:
+        state, time, hand, contact = moment.state, moment.time, moment.hand, moment.contact
         if state.press:
             if contact[2] > self._parameters.press_force:
                 # Braking would press harder still.
@@ -271,21 +296,23 @@ class PickPlacePlanner(LeafSystem):
         elif contact[2] > self._parameters.contact_threshold:
             self._motion.begin(state, Mode.CLOSE, time, z=hand[2])
             # Back off a little: pressed fingertips would not close.
-            state.goal_z += self._parameters.floor_clearance
+            state.goal[Z] += self._parameters.floor_clearance
             self._motion.set_times(state)
         elif time >= self._motion.arrival(state):
             self._motion.begin(state, Mode.CLOSE, time)
 
-    def _close(self, context, state, time, hand, contact) -> None:
+    def _close(self, moment: _Moment) -> None:
+        state, time, hand = moment.state, moment.time, moment.hand
         opening, rate = hand[4] + hand[5], hand[10] + hand[11]
         moving_for = time - state.start_time
         # The command runs ahead of stalled jaws by what the fingers' spring makes of it.
-        commanded, _ = self.get_output_port(1).Eval(context)
+        commanded, _ = self._motion.opening_at(state, time)
         stalled = moving_for > 0.1 and abs(rate) < 2e-3 and commanded < opening - 1e-3
         if stalled or commanded <= 0.0:
             self._motion.begin(state, Mode.CHECK, time, opening=opening)
 
-    def _check(self, context, state, time, hand, contact) -> None:
+    def _check(self, moment: _Moment) -> None:
+        state, time, hand, contact = moment.state, moment.time, moment.hand, moment.contact
         if time < self._motion.arrival(state) + self._parameters.tare_settle:
             return
         if self._is_held(hand, contact):
@@ -299,7 +326,8 @@ class PickPlacePlanner(LeafSystem):
             state.missed += 1
             self._motion.begin(state, Mode.RETREAT, time)
 
-    def _hold(self, context, state, time, hand, contact) -> None:
+    def _hold(self, moment: _Moment) -> None:
+        state, time, hand, contact = moment.state, moment.time, moment.hand, moment.contact
         if -contact[2] > self._parameters.heavy_load:
             firm = max(state.goal_force, self._parameters.firm_grasp_force)
             self._motion.set_force(state, time, firm)
@@ -313,7 +341,8 @@ class PickPlacePlanner(LeafSystem):
             state.payload = contact[2]
             self._motion.begin(state, Mode.LOWER, time)
 
-    def _lower(self, context, state, time, hand, contact) -> None:
+    def _lower(self, moment: _Moment) -> None:
+        state, time, hand, contact = moment.state, moment.time, moment.hand, moment.contact
         if not self._is_held(hand, contact):
             state.dropped += 1
             self._motion.begin(state, Mode.RETREAT, time)
@@ -326,7 +355,8 @@ class PickPlacePlanner(LeafSystem):
         elif time >= self._motion.arrival(state):
             self._motion.begin(state, Mode.RELEASE, time)
 
-    def _search(self, context, state, time, hand, contact) -> None:
+    def _search(self, moment: _Moment) -> None:
+        state, time, hand, contact = moment.state, moment.time, moment.hand, moment.contact
         free = contact[2] - state.payload < self._parameters.contact_threshold / 2
         if not self._is_held(hand, contact):
             state.dropped += 1
@@ -341,7 +371,7 @@ class PickPlacePlanner(LeafSystem):
             else:
                 self._motion.begin(state, Mode.RELEASE, time, z=hand[2])
 
-    def _is_blocked(self, state: State, hand: NDArray[np.float64]) -> bool:
+    def _is_blocked(self, state: PlannerState, hand: NDArray[np.float64]) -> bool:
         bottom = hand[2] - state.hold_z + state.support_z
         left = state.search_step < self._search_steps
         search, rim, table = self._parameters.search, float(state.rim_z), float(state.table_z)

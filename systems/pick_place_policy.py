@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
-import inspect
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Sequence
+from typing import Any, Protocol
 
 import numpy as np
 from pydrake.common.value import AbstractValue, Value
@@ -14,65 +13,77 @@ from pydrake.systems.framework import Context, LeafSystem
 from systems.signals import Observation, PickPlaceAction, PlanarPose
 from systems.weak_calc import weak_calc
 
-PolicyFunction = Callable[..., PickPlaceAction]
-"""Called with an `Observation`; and, if it has an argument `failed_picks`, with a tuple of the
-`PlanarPose`s at which a grasp failed before, the latest last; without it where none is known. A
-second argument of any other name is taken for it too, unless it has a default."""
+
+class PolicyFunction(Protocol):
+    """A policy: a function without memory."""
+
+    def __call__(
+        self, observation: Observation, failed_picks: Sequence[PlanarPose] = (), /
+    ) -> PickPlaceAction:
+        """The action for an observation.
+
+        Args:
+            observation: o_t.
+            failed_picks: where a grasp failed before, in the world, the latest last.
+        """
+        ...
+
+
+class PolicyError(RuntimeError):
+    """A policy's own function failed; `__cause__` is what it raised."""
 
 
 class PickPlacePolicy(LeafSystem):
-    """Wraps a callable policy p(a_pick, a_place | o_t), section III-A of the paper.
+    """Wraps a policy p(a_pick, a_place | o_t), section III-A of the paper.
 
     .. pydrake_system::
 
         name: PickPlacePolicy
         input_ports:
-        - observation
-        - failed_picks (if the function takes them; optional)
+        - observation (or observation_heights)
+        - failed_picks (optional)
         output_ports:
         - action
 
-    - `observation` (abstract, `Observation`): o_t.
-    - `failed_picks` (abstract, a tuple of `PlanarPose`): where a grasp failed before.
+    - `observation` (abstract, `Observation`): o_t. A policy that looks at heights alone has
+      `observation_heights` instead: o_t, perhaps without colours.
+    - `failed_picks` (abstract, a tuple of `PlanarPose`): where a grasp failed before; none where
+      the port is not connected.
     - `action` (abstract, `PickPlaceAction`): the policy's answer.
 
-    Pulled: the callable runs when the port is evaluated, once for each new observation. It lives
-    outside the Context, which must stay cheap to copy, and must therefore not remember anything:
-    what there is to remember comes in by a port.
+    The policy is called when the port is evaluated, once for each new input. It lives outside the
+    Context, which must stay cheap to copy, and must therefore not remember anything: what there is
+    to remember comes in by a port.
     """
 
     def __init__(self, *, policy: PolicyFunction, heights_only: bool = False) -> None:
         """
         Args:
-            policy: a function without memory. What it raises ends the evaluation of the port; an
-                answer that is no `PickPlaceAction` is a `TypeError`, one whose poses are no finite
-                numbers a `ValueError`.
-            heights_only: whether the function looks at heights alone, so that observations may come
-                without colours.
+            policy: what it raises ends the evaluation of the port as a `PolicyError`; an answer
+                that is not a `PickPlaceAction` does as a `TypeError`, and one whose poses are not
+                finite numbers as a `ValueError`.
+            heights_only: whether it looks at heights alone.
         """
         super().__init__()
         self._policy = policy
-        self.heights_only = heights_only
-        self._observation = self.DeclareAbstractInputPort("observation", Value(Observation()))
-        tickets = {self._observation.ticket()}
-        self._failed_picks = None
-        self._by_name, by_place = _takes_failed_picks(policy)
-        if self._by_name or by_place:
-            self._failed_picks = self.DeclareAbstractInputPort("failed_picks", Value(()))
-            tickets.add(self._failed_picks.ticket())
+        name = "observation_heights" if heights_only else "observation"
+        self._observation = self.DeclareAbstractInputPort(name, Value(Observation()))
+        self._failed_picks = self.DeclareAbstractInputPort("failed_picks", Value(()))
         self.DeclareAbstractOutputPort(
-            "action", lambda: Value(PickPlaceAction()), weak_calc(self._calc_action), tickets
+            "action",
+            lambda: Value(PickPlaceAction()),
+            weak_calc(self._calc_action),
+            {self._observation.ticket(), self._failed_picks.ticket()},
         )
 
     def _calc_action(self, context: Context, output: AbstractValue) -> None:
-        arguments, named = [self._observation.Eval(context)], {}
-        if self._failed_picks is not None and self._failed_picks.HasValue(context):
-            failed_picks = self._failed_picks.Eval(context)
-            if self._by_name:
-                named["failed_picks"] = failed_picks
-            else:
-                arguments.append(failed_picks)
-        action = self._policy(*arguments, **named)
+        given = self._failed_picks.HasValue(context)
+        failed_picks = self._failed_picks.Eval(context) if given else ()
+        observation = self._observation.Eval(context)
+        try:
+            action = self._policy(observation, failed_picks)
+        except (Exception, SystemExit) as error:
+            raise PolicyError(f"the policy {self._policy!r} failed: {error}") from error
         if not isinstance(action, PickPlaceAction):
             raise TypeError(
                 f"the policy {self._policy!r} answered with {type(action).__name__}, "
@@ -81,10 +92,10 @@ class PickPlacePolicy(LeafSystem):
         output.set_value(self._checked(action))
 
     def _checked(self, action: PickPlaceAction) -> PickPlaceAction:
-        """An action whose poses are numbers, as far as they mean anything.
+        """The action with its poses in use as floats.
 
         Raises:
-            TypeError: they are none.
+            TypeError: they are not numbers.
             ValueError: they are not finite.
         """
         numbers: dict[str, Any] = {}
@@ -105,19 +116,3 @@ class PickPlacePolicy(LeafSystem):
                     f"the policy {self._policy!r} answered with no finite numbers: {action}"
                 )
         return dataclasses.replace(action, **numbers)
-
-
-def _takes_failed_picks(policy: Callable[..., Any]) -> tuple[bool, bool]:
-    """Whether a function takes failed picks by their name, and whether as its second argument."""
-    try:
-        parameters = list(inspect.signature(policy).parameters.values())
-    except (TypeError, ValueError):
-        # Some built-in functions do not tell.
-        return False, False
-    named = (inspect.Parameter.POSITIONAL_OR_KEYWORD, inspect.Parameter.KEYWORD_ONLY)
-    by_name = any(item.name == "failed_picks" and item.kind in named for item in parameters)
-    placed = (inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD)
-    second = [item for item in parameters if item.kind in placed][1:2]
-    return by_name, any(
-        item.default is item.empty or item.name == "failed_picks" for item in second
-    )

@@ -189,7 +189,7 @@ class PickPlaceAction:
     press: bool = False
     """True: push down at the pick with closed jaws, and nothing else; the place means nothing."""
     heights: SurfaceHeights | None = None
-    """Given by the oracle, which knows them; used only where there is no observation."""
+    """None: the planner reads them off its own o_t."""
 
     @property
     def poses(self) -> dict[str, PlanarPose]:

@@ -1,18 +1,21 @@
-"""What the set-up promises to the policies: torch and escnn, without a Fortran compiler."""
+"""What the set-up promises to the policies: torch and escnn, without lie_learn or a compiler."""
 
 import subprocess
 import sys
+from pathlib import Path
 
-_PROGRAM = """
+ROOT = Path(__file__).resolve().parent.parent
+
+EQUIVARIANT = """
 import torch
-from escnn import gspaces, nn
+from kitting_drake.policies.networks.layers.planar_escnn import enn, gspaces
 
 space = gspaces.rot2dOnR2(N=-1, maximum_frequency=3)
-scalar = nn.FieldType(space, [space.trivial_repr])
-vector = nn.FieldType(space, [space.irrep(1)])
+scalar = enn.FieldType(space, [space.trivial_repr])
+vector = enn.FieldType(space, [space.irrep(1)])
 torch.manual_seed(0)
 image = torch.randn(1, 1, 9, 9)
-layer = nn.R2Conv(scalar, vector, kernel_size=3)
+layer = enn.R2Conv(scalar, vector, kernel_size=3)
 straight = layer(scalar(image)).tensor
 turned = layer(scalar(torch.rot90(image, 1, (2, 3)))).tensor
 back = torch.rot90(turned, -1, (2, 3))
@@ -20,8 +23,26 @@ expected = torch.stack([back[0, 1], -back[0, 0]])
 assert torch.allclose(straight[0], expected, atol=1e-5)
 """
 
+SOLID = """
+from kitting_drake.policies.networks.layers.planar_escnn import gspaces
+
+space = gspaces.rot3dOnR3(maximum_frequency=1)
+space.irrep(1)(space.fibergroup.element((0.1, 0.2, 0.3), "ZYZ"))
+"""
+
+
+def python(program: str) -> subprocess.CompletedProcess[str]:
+    # In a process of its own, where nothing has imported escnn.
+    command = [sys.executable, "-W", "error", "-c", program]
+    return subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
+
 
 def test_escnn_works_as_it_was_installed():
-    # In a process of its own: torch is slow to load, and no other test needs it.
-    done = subprocess.run([sys.executable, "-c", _PROGRAM], capture_output=True, text=True)
+    done = python(EQUIVARIANT)
     assert done.returncode == 0, done.stderr
+
+
+def test_groups_of_space_are_refused_with_what_would_do():
+    done = python(SOLID)
+    assert done.returncode == 1
+    assert "NotImplementedError: escnn needs the package lie_learn for SO(3)" in done.stderr

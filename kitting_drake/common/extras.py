@@ -9,9 +9,9 @@ EXTRAS = {
     "cluster": ("ray[client]>=2.50",),
     "fabrication": ("ezdxf>=1.4", "svgelements>=1.9.6"),
     "gym": ("gymnasium>=1.0",),
-    "lerobot": ("pyarrow>=21,<26",),
+    "lerobot": ("pyarrow>=21",),
     "mujoco": ("mujoco>=3.2,<4",),
-    "onnx": ("ml_dtypes<0.6", "onnx>=1.17", "onnxruntime>=1.20"),
+    "onnx": ("onnx>=1.17", "onnxruntime>=1.20"),
 }
 """The packages of each extra, as in pyproject.toml."""
 

@@ -10,7 +10,7 @@ import numpy as np
 from pydrake.math import RigidTransform, RollPitchYaw
 
 from kitting_drake.episode.events import ModeChange
-from kitting_drake.station import Cell
+from kitting_drake.station import KittingStation
 from kitting_drake.tasks.task import ActionRecord
 from systems.oracle_policy import gripper_pose
 from systems.pick_place_parameters import Mode
@@ -21,16 +21,16 @@ _LIFTED = 0.010
 """An object that rose by this while the hand went up is in the hand, in m."""
 
 
-def nearest_object(cell: Cell, poses: list[RigidTransform], pick: PlanarPose) -> int:
+def nearest_object(station: KittingStation, poses: list[RigidTransform], pick: PlanarPose) -> int:
     """The index of the object whose surface, seen from above, comes nearest to a pick.
 
     Args:
-        cell: the episode's.
+        station: the episode's.
         poses: X_WB of each object.
         pick: of the gripper, in the world.
     """
     distances = []
-    for item, X_WB in zip(cell.objects, poses, strict=True):
+    for item, X_WB in zip(station.objects, poses, strict=True):
         points = X_WB.multiply(item.p_BPoints.T)[:2]
         distances.append(np.hypot(points[0] - pick.x, points[1] - pick.y).min())
     return int(np.argmin(distances))
@@ -39,12 +39,12 @@ def nearest_object(cell: Cell, poses: list[RigidTransform], pick: PlanarPose) ->
 class ActionLog:
     """Takes down the actions of an episode: an `EpisodeObserver`."""
 
-    def __init__(self, cell: Cell) -> None:
+    def __init__(self, station: KittingStation) -> None:
         """
         Args:
-            cell: the cell that the episode runs.
+            station: the episode's.
         """
-        self._cell = cell
+        self._station = station
         self._before: list[RigidTransform] = []
         self.records: list[ActionRecord] = []
 
@@ -53,11 +53,10 @@ class ActionLog:
         if event.is_last:
             return
         if event.is_action_start:
-            self._before = self._cell.object_poses(event.root_context)
-            context = self._cell.planner.GetMyContextFromRoot(event.root_context)
-            pick, place = self._cell.planner.action(context)
-            index = nearest_object(self._cell, self._before, pick)
-            self.records.append(self._record(index, pick, place))
+            self._before = self._station.object_poses(event.root_context)
+            action = self._station.accepted_action(event.root_context)
+            index = nearest_object(self._station, self._before, action.pick)
+            self.records.append(self._record(index, action.pick, action.place))
         elif event.mode == Mode.CARRY:
             self._find_lifted(event)
         elif event.mode == Mode.RELEASE:
@@ -75,7 +74,7 @@ class ActionLog:
             self.records[-1].outcome = "missed" if event.previous == Mode.CHECK else "dropped"
 
     def _find_lifted(self, event: ModeChange) -> None:
-        now = self._cell.object_poses(event.root_context)
+        now = self._station.object_poses(event.root_context)
         rises = [
             X_WB.translation()[2] - X_before.translation()[2]
             for X_WB, X_before in zip(now, self._before, strict=True)
@@ -86,7 +85,7 @@ class ActionLog:
 
     def _record(self, index: int, pick: PlanarPose, place: PlanarPose) -> ActionRecord:
         """The record of an action on the given object, still unfinished."""
-        scene_object, item = self._cell.scene.objects[index], self._cell.objects[index]
+        scene_object, item = self._station.scene.objects[index], self._station.objects[index]
         record = ActionRecord(
             object=scene_object.name,
             category=scene_object.category,
@@ -114,7 +113,7 @@ class ActionLog:
         arrival = _arrival(X_WB, pick, place)
         errors = [
             _place_errors(item, goal, X_WGoal, arrival)
-            for goal in self._cell.scene.goals
+            for goal in self._station.scene.goals
             if index in goal.objects
             for X_WGoal in goal.poses
         ]

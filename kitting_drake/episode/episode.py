@@ -4,24 +4,19 @@ import dataclasses
 import logging
 import math
 import time
-import traceback
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
-from pydrake.systems.analysis import Simulator
-from pydrake.systems.framework import Context, EventStatus
+from pydrake.systems.framework import Context, Diagram, EventStatus
 
-import systems
 from kitting_drake.episode.action_log import ActionLog
 from kitting_drake.episode.events import EpisodeObserver, ModeChange
-from kitting_drake.station import Cell
-from kitting_drake.tasks.task import ActionRecord, TaskConfig
+from kitting_drake.station import KittingStation
+from kitting_drake.tasks.task import ActionRecord
 from systems.pick_place_parameters import Mode
+from systems.pick_place_policy import PolicyError
 from systems.placement import ALL, Placement, strict_reward
 
-_OWN = (Path(__file__).resolve().parent, Path(systems.__file__).resolve().parent)
-"""Where the innermost Python code is when Drake fails."""
 _LAST_WAIT = 2.0
 """How long the objects may take to come to rest after the last action, in s."""
 
@@ -84,14 +79,11 @@ class EpisodeResult:
 
 
 def run_episode(
-    cell: Cell,
+    diagram: Diagram,
+    station: KittingStation,
     *,
-    task: TaskConfig,
     scenario: str,
     policy: str,
-    seed: int,
-    time_limit: float,
-    end_at_success: bool = False,
     realtime_rate: float = 0.0,
     observers: Sequence[EpisodeObserver] = (),
 ) -> EpisodeResult:
@@ -101,24 +93,18 @@ def run_episode(
     Ctrl-C, end the episode, not the program: the result tells of it, and of what was reached.
 
     Args:
-        cell: fresh from `build_cell`.
-        task: the scenario's, which knows why objects fail.
+        diagram: the outermost Diagram, with the station and a policy connected to it.
+        station: fresh from `build_station`; its scenario sets the time limit and the like.
         scenario: its name, for the result.
         policy: its name, for the result.
-        seed: for the result; it has done its work in `build_cell`.
-        time_limit: simulated time at which the episode ends at the latest, in s.
-        end_at_success: end as soon as every goal is met, instead of asking for an action more.
         realtime_rate: 1 for real time, 0 for as fast as possible.
         observers: told of every event.
     """
     episode = Episode(
-        cell,
-        task=task,
+        diagram,
+        station,
         scenario=scenario,
         policy=policy,
-        seed=seed,
-        time_limit=time_limit,
-        end_at_success=end_at_success,
         realtime_rate=realtime_rate,
         observers=observers,
     )
@@ -127,47 +113,36 @@ def run_episode(
 
 
 class Episode:
-    """An episode under way: `run_episode` in parts, for who decides between them."""
+    """An episode under way: `run_episode` in parts, for callers that choose each action."""
 
     def __init__(
         self,
-        cell: Cell,
+        diagram: Diagram,
+        station: KittingStation,
         *,
-        task: TaskConfig,
         scenario: str,
         policy: str,
-        seed: int,
-        time_limit: float,
-        end_at_success: bool = False,
         realtime_rate: float = 0.0,
         observers: Sequence[EpisodeObserver] = (),
         pauses: bool = False,
     ) -> None:
         """
         Args:
-            cell: as for `run_episode`, and so are the others but for the last.
-            task: see there.
+            diagram: as for `run_episode`, and so are the others but for the last; where it pauses,
+                it may be the station alone.
+            station: see there.
             scenario: see there.
             policy: see there.
-            seed: see there.
-            time_limit: see there.
-            end_at_success: see there.
             realtime_rate: see there.
             observers: see there.
             pauses: whether `advance` returns each time the planner asks for an action.
         """
-        self._cell, self._task, self._time_limit = cell, task, time_limit
-        self._names = {"scenario": scenario, "policy": policy, "seed": seed}
-        self._simulator = Simulator(cell.diagram)
+        self._station = station
+        self._names = {"scenario": scenario, "policy": policy, "seed": station.seed}
+        self._log = ActionLog(station)
+        self._monitor = _Monitor(station, [self._log.observe, *observers], pauses=pauses)
+        self._simulator = station.make_simulator(diagram, monitor=self._monitor.step)
         self._simulator.set_target_realtime_rate(realtime_rate)
-        self._log = ActionLog(cell)
-        self._monitor = _Monitor(
-            cell,
-            [self._log.observe, *observers],
-            pauses=pauses,
-            end_at_success=end_at_success,
-        )
-        self._simulator.set_monitor(self._monitor.step)
         self._failure: str | None = None
         self._wall_seconds = 0.0
         self._has_begun = False
@@ -175,7 +150,7 @@ class Episode:
 
     @property
     def context(self) -> Context:
-        """The context of the cell's Diagram."""
+        """The context of the outermost Diagram."""
         return self._simulator.get_mutable_context()
 
     @property
@@ -200,16 +175,18 @@ class Episode:
                 self._has_begun = True
                 self._simulator.Initialize()
             if not self._monitor.is_paused:
-                self._simulator.AdvanceTo(self._time_limit)
+                self._simulator.AdvanceTo(self._station.scenario.time_limit)
             self.is_over = not self._monitor.is_paused
             self.timed_out = self.is_over and self._monitor.done_since is None
         except KeyboardInterrupt:
             self.is_over = self.interrupted = True
         except (Exception, SystemExit) as error:
-            self._failure = " ".join(f"{type(error).__name__}: {error}".split())
+            reason = error.__cause__ or error if isinstance(error, PolicyError) else error
+            self._failure = " ".join(f"{type(reason).__name__}: {reason}".split())
             self.is_over = True
-            if not _is_of_simulation(error):
-                # What a policy raises may be anything, and its author wants to know where.
+            if reason is not error or not isinstance(error, RuntimeError):
+                # Drake raises RuntimeErrors, whose text says enough. An own policy may raise
+                # anything, and its author wants to know where.
                 seed = self._names["seed"]
                 logging.getLogger(__name__).exception("the episode of seed %d failed", seed)
         self._wall_seconds += time.perf_counter() - start
@@ -218,26 +195,25 @@ class Episode:
 
     def result(self) -> EpisodeResult:
         """How it ended; before its end, how it stands now."""
-        cell, context, records = self._cell, self.context, self._log.records
-        placements = cell.placements(context)
-        planner_context = cell.planner.GetMyContextFromRoot(context)
-        counts = cell.planner.GetOutputPort("counts").Eval(planner_context)
+        station, context, records = self._station, self.context, self._log.records
+        placements, scene = station.placements(context), station.scene
+        counts = station.counts(context)
         lost = self._failure is not None or self.timed_out
-        at_rest = cell.at_rest(context)
+        at_rest = station.at_rest(context)
         return EpisodeResult(
             **self._names,  # type: ignore[arg-type]
-            objects=object_results(cell, self._task, context, placements, records),
-            success_rate=0.0 if lost else cell.reward(context),
-            strict_success_rate=0.0 if lost else strict_reward(cell.scene.goals, placements),
-            actions=int(counts[0]),
-            missed_grasps=int(counts[1]),
-            dropped_objects=int(counts[2]),
+            objects=object_results(station, context, placements, records),
+            success_rate=0.0 if lost else station.reward(context),
+            strict_success_rate=0.0 if lost else strict_reward(scene.goals, placements),
+            actions=counts[0],
+            missed_grasps=counts[1],
+            dropped_objects=counts[2],
             actions_taken=records,
             sim_seconds=context.get_time(),
             wall_seconds=self._wall_seconds,
             point_contact_pairs=self._monitor.point_contact_pairs,
             moving_at_end=[
-                item.name for item, rests in zip(cell.objects, at_rest, strict=True) if not rests
+                item.name for item, rests in zip(station.objects, at_rest, strict=True) if not rests
             ],
             failure=self._failure,
             timed_out=self.timed_out,
@@ -245,18 +221,8 @@ class Episode:
         )
 
 
-def _is_of_simulation(error: BaseException) -> bool:
-    """Whether Drake raised an error, or one of our systems did in a sentence of its own; torch and
-    people's own policies raise RuntimeErrors too."""
-    frames = traceback.extract_tb(error.__traceback__)
-    raised_in = Path(frames[-1].filename).resolve() if frames else None
-    ours = raised_in is None or any(raised_in.is_relative_to(folder) for folder in _OWN)
-    return isinstance(error, RuntimeError) and ours
-
-
 def object_results(
-    cell: Cell,
-    task: TaskConfig,
+    station: KittingStation,
     root_context: Context,
     placements: Sequence[Placement],
     records: Sequence[ActionRecord] = (),
@@ -264,19 +230,19 @@ def object_results(
     """How every object that a goal takes stands now, in the scene's order.
 
     Args:
-        cell: the episode's.
-        task: which knows why objects fail.
-        root_context: of the cell's diagram.
+        station: the episode's.
+        root_context: of the outermost Diagram.
         placements: of the scene's objects, in its order.
         records: the actions so far.
     """
-    poses = cell.object_poses(root_context)
+    scene, task = station.scene, station.scenario.task
+    poses = station.object_poses(root_context)
     results = []
-    for index in cell.scene.goal_objects:
-        item, placement = cell.scene.objects[index], placements[index]
+    for index in scene.goal_objects:
+        item, placement = scene.objects[index], placements[index]
         cause = None
         if not placement.success:
-            cause = task.find_cause(cell.scene, index, poses, placement, records)
+            cause = task.find_cause(scene, index, poses, placement, records)
         results.append(_object_result(item.name, item.category, placement, cause))
     return results
 
@@ -301,56 +267,46 @@ def _object_result(
 
 
 class _Monitor:
-    """The simulator's monitor: puts objects to sleep, tells of events, knows when to halt."""
+    """Called after every step: tells of events, knows when to halt."""
 
     def __init__(
-        self,
-        cell: Cell,
-        observers: Sequence[EpisodeObserver],
-        *,
-        pauses: bool,
-        end_at_success: bool,
+        self, station: KittingStation, observers: Sequence[EpisodeObserver], *, pauses: bool
     ) -> None:
-        self._cell = cell
+        self._station = station
         self._pauses = pauses
-        self._end_at_success = end_at_success
+        self._end_at_success = station.scenario.end_at_success and not pauses
         self.is_paused = False
         self._observers = observers
-        self._contact_results = cell.plant.get_contact_results_output_port()
         self._mode = Mode.OBSERVE
         self.point_contact_pairs = 0
         self.done_since: float | None = None
 
     def step(self, root_context: Context) -> EventStatus:
-        """The callback that the simulator calls after every step."""
-        cell = self._cell
-        cell.apply_sleep(root_context)
+        """The callback of the simulator."""
+        station = self._station
         self.tell(root_context)
         if self._pauses or self._end_at_success:
-            planner_context = cell.planner.GetMyContextFromRoot(root_context)
-            asks = cell.planner.asks_now(planner_context)
-            if asks and self._end_at_success and cell.reward(root_context) > ALL:
+            asks = station.asks(root_context)
+            if asks and self._end_at_success and station.reward(root_context) > ALL:
                 self.done_since = root_context.get_time()
-                return EventStatus.ReachedTermination(cell.diagram, "every goal is met")
+                return EventStatus.ReachedTermination(station, "every goal is met")
             self.is_paused = asks and self._pauses
             if self.is_paused:
-                return EventStatus.ReachedTermination(cell.diagram, "the planner asks")
+                return EventStatus.ReachedTermination(station, "the planner asks")
         if self._mode != Mode.DONE:
             return EventStatus.DidNothing()
         now = root_context.get_time()
         if self.done_since is None:
             self.done_since = now
-        if cell.at_rest(root_context).all() or now - self.done_since > _LAST_WAIT:
-            return EventStatus.ReachedTermination(cell.diagram, "the episode is over")
+        if station.at_rest(root_context).all() or now - self.done_since > _LAST_WAIT:
+            return EventStatus.ReachedTermination(station, "the episode is over")
         return EventStatus.DidNothing()
 
     def tell(self, root_context: Context, *, is_last: bool = False) -> None:
         """Tells the observers, if the mode has changed or the episode is over."""
-        plant, planner = self._cell.plant, self._cell.planner
-        previous, self._mode = self._mode, planner.mode(planner.GetMyContextFromRoot(root_context))
+        previous, self._mode = self._mode, self._station.mode(root_context)
         if is_last or self._mode != previous:
-            contact = self._contact_results.Eval(plant.GetMyContextFromRoot(root_context))
-            pairs = contact.num_point_pair_contacts()
+            pairs = self._station.point_contact_pairs(root_context)
             self.point_contact_pairs = max(self.point_contact_pairs, pairs)
             event = ModeChange(
                 self._mode if is_last else previous, self._mode, root_context, is_last

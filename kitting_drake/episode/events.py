@@ -20,7 +20,7 @@ class ModeChange:
     previous: Mode
     mode: Mode
     root_context: Context
-    """The context of the cell's Diagram; not to be changed, nor kept beyond the last event."""
+    """The context of the outermost Diagram; not to be changed, nor kept beyond the last event."""
     is_last: bool = False
     """Whether the episode is over; the modes are equal then."""
 

@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from kitting_drake.episode import ModeChange
-from kitting_drake.station import Cell
+from kitting_drake.station import KittingStation
 from systems.signals import Observation, PlanarPose
 
 _MOST_FRAMES = 7
@@ -32,26 +32,25 @@ class StripFrame:
 class ActionStrip:
     """An `EpisodeObserver` that keeps what was seen before each action, and at the end."""
 
-    def __init__(self, cell: Cell) -> None:
+    def __init__(self, station: KittingStation) -> None:
         """
         Args:
-            cell: the cell that the episode runs; it has cameras.
+            station: the episode's; it has cameras.
         """
-        self._cell = cell
+        self._station = station
         self.frames: list[StripFrame] = []
 
     def observe(self, event: ModeChange) -> None:
         """Keeps what an event shows."""
         if not (event.is_action_start or event.is_stop):
             return
-        diagram = self._cell.diagram
-        seen: Observation = diagram.GetOutputPort("observation").Eval(event.root_context)
+        seen = self._station.observation(event.root_context)
         colours = np.clip(seen.rgb.transpose(1, 2, 0), 0, 1)
         if event.is_stop:
             self.frames.append(StripFrame(colours, None, None))
             return
-        context = self._cell.planner.GetMyContextFromRoot(event.root_context)
-        pick, place = (_pixel(seen, pose) for pose in self._cell.planner.action(context))
+        action = self._station.accepted_action(event.root_context)
+        pick, place = (_pixel(seen, pose) for pose in (action.pick, action.place))
         self.frames.append(StripFrame(colours, pick, place))
 
 

@@ -1,6 +1,8 @@
-"""Counts and times as text, with three digits and a prefix."""
+"""Counts and times as text, with three digits and a prefix, and tables of them."""
 
 from __future__ import annotations
+
+from rich.table import Table
 
 
 def seconds_text(seconds: float | None) -> str:
@@ -18,3 +20,16 @@ def count_text(count: float) -> str:
         if count >= power:
             return f"{count / power:.3g} {letter}"
     return f"{count:.3g}"
+
+
+def ratio_text(ratio: float | None) -> str:
+    """A ratio with two decimals; a dash where there is none."""
+    return "-" if ratio is None else f"{ratio:.2f}"
+
+
+def numbers_table(title: str, *headings: str) -> Table:
+    """A table for the terminal whose first column holds words, and the others numbers."""
+    table = Table(title=title, title_justify="left")
+    for index, heading in enumerate(headings):
+        table.add_column(heading, justify="right" if index else "left", no_wrap=not index)
+    return table

@@ -2,19 +2,22 @@
 
 import dataclasses
 import gc
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import gymnasium
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from pydrake.common.value import Value
 
 from kitting_drake.common.errors import UserError
-from kitting_drake.common.rendering import render_picture
+from kitting_drake.common.rendering import (
+    add_picture_renderer,
+    render_picture,
+    require_rendering,
+)
 from kitting_drake.common.seeds import ALL_SEEDS
 from kitting_drake.episode import Episode, EpisodeResult
-from kitting_drake.episode.chosen import build_chosen
 from kitting_drake.gym.spaces import (
     action_space,
     as_action,
@@ -22,31 +25,15 @@ from kitting_drake.gym.spaces import (
     observation_space,
 )
 from kitting_drake.scenario.choosing import find_scenario
-from kitting_drake.scenario.policies import PolicyConfig, PolicySite
 from kitting_drake.scenario.schema import Scenario
-from kitting_drake.station import Cell
-from systems.given_action import GivenAction
+from kitting_drake.station import KittingStation, build_station
 from systems.placement import ALL
 from systems.signals import Observation, PickPlaceAction
 from systems.surface_heights import read_surface_heights
 
 
-@dataclass
-class _Agent(PolicyConfig):
-    """Somebody outside the Diagram, who sees and says what to do.
-
-    The simulator halts before the plant's next step, and the planner decides after it: an o_t of
-    the planner's own would be another, rendered once more.
-    """
-
-    planner_observes = False
-
-    def make_system(self, site: PolicySite) -> GivenAction:
-        return GivenAction()
-
-
 class KittingEnvironment(gymnasium.Env[dict[str, Any], NDArray[Any]]):
-    """A scenario's cell, with an agent in the place of its policy.
+    """A scenario's station, with an agent in the place of its policy.
 
     - Observation and action: see `gym.spaces`. An observation is what a policy would see, taken as
       the hand waits out of the cameras' sight for the next action.
@@ -91,23 +78,20 @@ class KittingEnvironment(gymnasium.Env[dict[str, Any], NDArray[Any]]):
         found = find_scenario(Path(scenario), scenario_name, scenario_text, perturb)
         if not found.scenario.cameras:
             raise UserError(f"{found.path}: cameras is empty: an agent needs at least one")
-        agent: Any = _Agent()
-        self._chosen = dataclasses.replace(
-            found, scenario=dataclasses.replace(found.scenario, policy=agent)
-        )
+        self._chosen = found
         self.render_mode = render_mode
         self.grid = found.scenario.heightmap.grid()
         """The pixel grid of the observations."""
         self.observation_space = observation_space(found.scenario, cameras=cameras)
         self.action_space = action_space(self.grid)
         self._with_cameras = cameras
-        self._cell: Cell | None = None
+        self._station: KittingStation | None = None
         self._episode: Episode | None = None
         self._earned = 0.0
 
     @property
     def scenario(self) -> Scenario:
-        """The scenario, with the agent for its policy; its cameras tell where images are from."""
+        """The scenario; its cameras tell where images are from, its policy means nothing here."""
         return self._chosen.scenario
 
     def reset(
@@ -124,17 +108,9 @@ class KittingEnvironment(gymnasium.Env[dict[str, Any], NDArray[Any]]):
         super().reset(seed=seed)
         chosen_seed = int(self.np_random.integers(ALL_SEEDS.stop)) if seed is None else int(seed)
         self.close()
-        self._cell = build_chosen(
-            self._chosen, seed=chosen_seed, picture=self.render_mode is not None
-        )
+        station = self._station = self._build(chosen_seed)
         self._episode = Episode(
-            self._cell,
-            task=self.scenario.task,
-            scenario=self._chosen.name,
-            policy="agent",
-            seed=chosen_seed,
-            time_limit=self.scenario.time_limit,
-            pauses=True,
+            station, station, scenario=self._chosen.name, policy="agent", pauses=True
         )
         self._earned = 0.0
         self._advance(self._episode)
@@ -148,6 +124,20 @@ class KittingEnvironment(gymnasium.Env[dict[str, Any], NDArray[Any]]):
             )
         return self._observe(), self._info(self._episode.result())
 
+    def _build(self, seed: int) -> KittingStation:
+        """The station, which has cameras.
+
+        Raises:
+            UserError: the scene cannot be made.
+            MachineError: images cannot be rendered here.
+        """
+        require_rendering()
+        with self._chosen.named_in_errors():
+            station = build_station(self.scenario, seed, self._chosen.base)
+        if self.render_mode is not None:
+            add_picture_renderer(station.scene_graph)
+        return station
+
     def step(self, action: ArrayLike) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
         """One pick and place, or the end: see Gymnasium and the class.
 
@@ -158,16 +148,16 @@ class KittingEnvironment(gymnasium.Env[dict[str, Any], NDArray[Any]]):
             ValueError: not seven finite numbers.
             gymnasium.error.ResetNeeded: there is no episode, or it is over.
         """
-        if self._cell is None or self._episode is None or self._episode.is_over:
+        if self._episode is None or self._episode.is_over:
             raise gymnasium.error.ResetNeeded("call reset() first: there is no episode under way")
-        cell, episode = self._cell, self._episode
+        episode = self._episode
         given = as_action(action, self.grid)
-        self._give(cell, episode, self._with_heights(given))
+        self._give(episode, self._with_heights(given))
         result = episode.result()
         is_done = result.success_rate > ALL
         if is_done and not episode.is_over:
             # As a policy would that sees that nothing is left to do.
-            self._give(cell, episode, PickPlaceAction(stop=True))
+            self._give(episode, PickPlaceAction(stop=True))
             result = episode.result()
             is_done = result.success_rate > ALL
         reward, self._earned = result.success_rate - self._earned, result.success_rate
@@ -184,22 +174,22 @@ class KittingEnvironment(gymnasium.Env[dict[str, Any], NDArray[Any]]):
         """
         if self.render_mode is None:
             return None
-        if self._cell is None or self._episode is None:
+        if self._station is None or self._episode is None:
             raise gymnasium.error.ResetNeeded("call reset() first: there is nothing to render")
-        scene_graph = self._cell.scene_graph
+        scene_graph = self._station.scene_graph
         context = scene_graph.GetMyContextFromRoot(self._episode.context)
         return render_picture(scene_graph, context)
 
     def close(self) -> None:
         """Lets go of the simulation. Drake 1.51, of Python 3.11, keeps some 35 MB of it all the
         same."""
-        self._cell = self._episode = None
+        self._station = self._episode = None
         # A Diagram and its systems refer to each other: without this they stay for a while.
         gc.collect()
 
-    def _give(self, cell: Cell, episode: Episode, action: PickPlaceAction) -> None:
-        agent = cell.diagram.GetSubsystemByName("policy")
-        agent.set_action(agent.GetMyMutableContextFromRoot(episode.context), action)
+    def _give(self, episode: Episode, action: PickPlaceAction) -> None:
+        assert self._station is not None
+        self._station.GetInputPort("action").FixValue(episode.context, Value(action))
         self._advance(episode)
 
     @staticmethod
@@ -209,8 +199,12 @@ class KittingEnvironment(gymnasium.Env[dict[str, Any], NDArray[Any]]):
             raise KeyboardInterrupt
 
     def _observation(self) -> Observation:
-        assert self._cell is not None and self._episode is not None
-        return self._cell.diagram.GetOutputPort("observation").Eval(self._episode.context)
+        return self._eval("observation")
+
+    def _eval(self, port: str) -> Any:
+        """The value of one of the station's output ports."""
+        assert self._station is not None and self._episode is not None
+        return self._station.GetOutputPort(port).Eval(self._episode.context)
 
     def _with_heights(self, action: PickPlaceAction) -> PickPlaceAction:
         """The action with the heights that it has to respect, off the o_t that the agent saw."""
@@ -225,22 +219,11 @@ class KittingEnvironment(gymnasium.Env[dict[str, Any], NDArray[Any]]):
 
     def _images(self, camera: str) -> dict[str, NDArray[Any]]:
         """The images that o_t was projected from, with the scenario's noise."""
-        assert self._cell is not None and self._episode is not None
-        diagram, name = self._cell.diagram, f"sensor_noise_{camera}"
-        if not diagram.HasSubsystemNamed(name):
-            name = f"camera_{camera}"
-        sensor = diagram.GetSubsystemByName(name)
-        context = sensor.GetMyContextFromRoot(self._episode.context)
-        colour = sensor.GetOutputPort("color_image").Eval(context).data
-        depth = sensor.GetOutputPort("depth_image_32f").Eval(context).data
+        colour, depth = (self._eval(f"{kind}_image_{camera}").data for kind in ("color", "depth"))
         return {"colour": np.array(colour[:, :, :3]), "depth": np.array(depth[:, :, 0])}
 
     def _info(self, result: EpisodeResult) -> dict[str, Any]:
-        assert self._cell is not None and self._episode is not None
-        planner = self._cell.planner
-        failed = planner.GetOutputPort("failed_picks").Eval(
-            planner.GetMyContextFromRoot(self._episode.context)
-        )
+        failed = self._eval("failed_picks")
         picks = tuple((pick.x, pick.y, pick.theta) for pick in failed)
         info = {**result.as_dict(), "failed_picks": picks}
         del info["wall_seconds"]

@@ -21,7 +21,8 @@ from kitting_drake.real_camera.calibrations.calibration import (
     read_calibration,
     write_calibration,
 )
-from kitting_drake.real_camera.deciders import BenchPolicy, ShapeMatching, load_policy
+from kitting_drake.real_camera.deciders import BenchPolicy, load_policy
+from kitting_drake.real_camera.deciders import ShapeMatchingDecider as ShapeMatching
 from kitting_drake.real_camera.decision import BenchDecision, decide
 from kitting_drake.real_camera.frames import Frame, read_frames
 

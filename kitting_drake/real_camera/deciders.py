@@ -11,13 +11,16 @@ from typing import TYPE_CHECKING, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from kitting_drake.common.errors import UserError
-from kitting_drake.common.paths import GENERALIST
-from kitting_drake.policies.matching.shape_matching import ShapeMatchingPolicy
+from kitting_drake.policies.factory import (
+    LoadedPolicy,
+    load_learned_policy,
+    make_shape_matching,
+)
+from systems.pick_place_parameters import PickPlaceParameters
 from systems.signals import Observation, PickPlaceAction, PixelGrid, PlanarPose
 
 if TYPE_CHECKING:
-    from kitting_drake.policies.learned_policy import Decision, LearnedPolicy
+    from kitting_drake.policies.learned_policy import Decision
 
 _SAME_PICK = 0.010
 """The networks' probability within this of a pick speaks for it, in metres ..."""
@@ -62,7 +65,7 @@ class BenchPolicy(Protocol):
 
 
 @dataclass(frozen=True)
-class ShapeMatching:
+class ShapeMatchingDecider:
     """The training-free policy: outlines by height; see `ShapeMatchingPolicy`.
 
     Its confidence is 1 where the outlines of object and recess agree wholly, and 0 where they
@@ -70,6 +73,8 @@ class ShapeMatching:
     """
 
     recover: bool = False
+    parameters: PickPlaceParameters = field(default_factory=PickPlaceParameters)
+    """How the robot picks and places; `decide` takes the same."""
 
     @property
     def name(self) -> str:
@@ -79,7 +84,8 @@ class ShapeMatching:
         """It takes any grid."""
 
     def choose(self, observation: Observation, failed_picks: Sequence[PlanarPose] = ()) -> Choice:
-        matched = ShapeMatchingPolicy(recover=self.recover).decide(observation, failed_picks)
+        policy = make_shape_matching(self.parameters, recover=self.recover)
+        matched = policy.decide(observation, failed_picks)
         parts = {} if matched.agreement is None else {"outlines": matched.agreement}
         return Choice(
             matched.action,
@@ -93,27 +99,23 @@ class ShapeMatching:
 class _Networks:
     """A learned policy; made by `load_policy`."""
 
-    policy: LearnedPolicy
-    name: str
-    resolution: float | None
-    """The size of the pixels that it learned from, in metres, if its file tells."""
+    loaded: LoadedPolicy
+
+    @property
+    def name(self) -> str:
+        return self.loaded.path.stem
 
     def check_grid(self, grid: PixelGrid) -> None:
-        learned, given = self.resolution, grid.resolution
-        if learned is not None and not math.isclose(learned, given, rel_tol=1e-6):
-            raise UserError(
-                f"workspace.resolution is {given:g} m, and the policy {self.name} learned from "
-                f"pixels of {learned:g} m"
-            )
+        self.loaded.check_grid(grid, "workspace.resolution")
 
     def choose(self, observation: Observation, failed_picks: Sequence[PlanarPose] = ()) -> Choice:
-        action, decision = self.policy.act(observation, failed_picks)
+        action, decision = self.loaded.function.act(observation, failed_picks)
         if decision is None:
             return Choice(action, None, draw=lambda: _draw_action(observation, action))
         parts = confidence_parts(decision, observation.grid.resolution)
 
         def draw() -> bytes:
-            # Who draws nothing does not wait for matplotlib.
+            # Import matplotlib lazily.
             from kitting_drake.evaluation.decision_figure import draw_decision
 
             return draw_decision(observation, decision)
@@ -127,6 +129,7 @@ def load_policy(
     orientations: int = 180,
     fit_outlines: bool = True,
     recover: bool = False,
+    parameters: PickPlaceParameters | None = None,
 ) -> BenchPolicy:
     """A learned policy, as `policy: !Learned` of a scenario has it.
 
@@ -136,30 +139,22 @@ def load_policy(
         fit_outlines: refine places by outlines and grasps by the room for the jaws: for tasks in
             which objects are inserted; False: of equivalent rotations of a place, take one in which
             the jaws have room to let go.
-        recover: mend what is not seated; see `LearnedPolicy`.
+        recover: mend what is not seated; see `Recovery`.
+        parameters: how the robot picks and places; None: as the cell does by default. `decide`
+            takes the same.
 
     Raises:
         UserError: the file cannot be used, or not at so many orientations.
     """
-    # Only who uses a network waits for torch.
-    from kitting_drake.policies.learned_policy import LearnedPolicy
-    from kitting_drake.policies.networks.device import preferred_device, preferred_type
-    from kitting_drake.policies.networks.weights import load_networks, read_weights_file
-
-    path = GENERALIST if weights is None else weights
-    resolution = read_weights_file(path).card.get("resolution")
-    networks = load_networks(path, preferred_type()).to(preferred_device())
-    try:
-        policy = LearnedPolicy(
-            networks,
-            orientations=orientations,
-            fit_outlines=fit_outlines,
-            clear_jaws=not fit_outlines,
-            recover=recover,
-        )
-    except ValueError as error:
-        raise UserError(f"--orientations: {error}") from error
-    return _Networks(policy, path.stem, resolution)
+    loaded = load_learned_policy(
+        weights,
+        PickPlaceParameters() if parameters is None else parameters,
+        insertion=fit_outlines,
+        orientations=orientations,
+        orientations_field="--orientations",
+        recover=recover,
+    )
+    return _Networks(loaded)
 
 
 def confidence_parts(decision: Decision, resolution: float) -> dict[str, float]:

@@ -110,8 +110,9 @@ def _check_pose(camera: BenchCamera, grid: PixelGrid) -> None:
     X_BC = camera.X_BC
     if _in_view(camera, X_BC, grid).mean() >= _LEAST_SEEN and X_BC[2, 3] > grid.z_min:
         return
+    inverse: NDArray[np.float64] = np.asarray(np.linalg.inv(X_BC), dtype=float)
     others = {
-        "its inverse would: is it the pose of the base in the camera?": np.linalg.inv(X_BC),
+        "its inverse would: is it the pose of the base in the camera?": inverse,
         "it would if this were the pose of ROS's body frame: give that of the optical frame, z "
         "forward": X_BC @ _OPTICAL,
         "it would if the pose were in millimetres: positions are in metres": np.vstack(

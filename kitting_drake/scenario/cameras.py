@@ -1,30 +1,143 @@
-"""Cameras: from their descriptions in a scenario to Drake's."""
+"""Cameras: their descriptions in a scenario, and Drake's cameras made of them.
 
-import numpy as np
-from pydrake.geometry import ClippingRange, DepthRange, DepthRenderCamera, RenderCameraCore
-from pydrake.math import RigidTransform, RollPitchYaw
-from pydrake.systems.sensors import CameraInfo
+Annotations are evaluated here: Drake's YAML loader reads the types of fields, not their texts.
+"""
+
+import copy
+import dataclasses as dc
+from typing import TypeAlias
+
+from pydrake.common.schema import Rotation, Transform
+from pydrake.geometry import DepthRenderCamera
+from pydrake.math import RigidTransform
+from pydrake.systems.sensors import CameraConfig
 
 from kitting_drake.common.rendering import look_at
-from kitting_drake.scenario.schema import LookAt, Pinhole
+from systems.bounds import bounded
+
+_ANGLE = (-360.0, 360.0)
+_NEAR, _FAR = 0.01, 10.0
+"""The depths that `Pinhole` and `LookAt` can see, in metres."""
 
 
-def camera_pose(config: Pinhole | LookAt) -> RigidTransform:
-    """X_WC of a camera: z looks, x points right in the image, y down."""
-    if isinstance(config, Pinhole):
-        return RigidTransform(RollPitchYaw(np.deg2rad(config.rpy_deg)), config.position)
-    return look_at(config.position, config.target)
+@dc.dataclass
+class Pinhole:
+    """An RGB-D camera placed by roll, pitch and yaw: a short form of Drake's `CameraConfig`.
+
+    Its z axis looks, its x axis points right.
+    """
+
+    # Position in the world, in m.
+    position: list[float] = bounded([1.0, 0.0, 0.75], -10.0, 10.0)
+
+    # Roll, pitch and yaw, R = Rz Ry Rx, in degrees.
+    rpy_deg: list[float] = bounded([45.0, 180.0, -90.0], *_ANGLE)
+
+    # Image size in pixels, focal length in pixels; the principal point is the image's middle.
+    width: int = bounded(640, 16, 4096)
+    height: int = bounded(480, 16, 4096)
+    focal_length: float = bounded(450.0, 10.0, 10000.0)
+
+    def to_camera_config(self) -> CameraConfig:
+        """The same camera in Drake's words."""
+        rotation = Rotation(value=Rotation.Rpy(deg=self.rpy_deg))
+        return _camera_config(self, Transform(translation=self.position, rotation=rotation))
 
 
-def depth_camera(config: Pinhole | LookAt, renderer: str) -> DepthRenderCamera:
-    """Drake's description of a camera; colour and depth are seen from the same point."""
-    info = CameraInfo(
-        width=config.width,
-        height=config.height,
-        focal_x=config.focal_length,
-        focal_y=config.focal_length,
-        center_x=config.width / 2,
-        center_y=config.height / 2,
+@dc.dataclass
+class LookAt:
+    """An RGB-D camera that looks at a point, upright: a short form of Drake's `CameraConfig`."""
+
+    # Position, and the point in the middle of the image, in the world, in m.
+    position: list[float] = bounded([1.0, 0.0, 0.75], -10.0, 10.0)
+    target: list[float] = bounded([0.5, 0.0, 0.0], -10.0, 10.0)
+
+    # Image size in pixels, focal length in pixels; the principal point is the image's middle.
+    width: int = bounded(640, 16, 4096)
+    height: int = bounded(480, 16, 4096)
+    focal_length: float = bounded(450.0, 10.0, 10000.0)
+
+    def to_camera_config(self) -> CameraConfig:
+        """The same camera in Drake's words."""
+        return _camera_config(self, Transform(look_at(self.position, self.target)))
+
+    def validate(self) -> None:
+        """Checks what ranges do not say.
+
+        Raises:
+            ValueError: one sentence that continues the name of the camera.
+        """
+        if self.position[:2] == self.target[:2]:
+            raise ValueError("looks straight down, where upright means nothing: use !Pinhole")
+
+
+Camera: TypeAlias = Pinhole | LookAt | CameraConfig
+"""The variants of a scenario's cameras."""
+
+
+def _camera_config(camera: Pinhole | LookAt, X_PB: Transform) -> CameraConfig:
+    return CameraConfig(
+        width=camera.width,
+        height=camera.height,
+        focal=CameraConfig.FocalLength(x=camera.focal_length, y=camera.focal_length),
+        center_x=camera.width / 2,
+        center_y=camera.height / 2,
+        clipping_near=_NEAR,
+        clipping_far=_FAR,
+        z_near=_NEAR,
+        z_far=_FAR,
+        X_PB=X_PB,
+        rgb=True,
+        depth=True,
     )
-    core = RenderCameraCore(renderer, info, ClippingRange(0.01, 10.0), RigidTransform())
-    return DepthRenderCamera(core, DepthRange(0.01, 10.0))
+
+
+def _config(camera: Camera) -> CameraConfig:
+    return camera if isinstance(camera, CameraConfig) else camera.to_camera_config()
+
+
+_UNUSED = ("renderer_name", "renderer_class", "fps", "capture_offset", "output_delay", "lcm_bus")
+"""Fields of a CameraConfig that mean nothing here: images are rendered when they are asked for."""
+
+
+def check_camera(camera: Camera) -> None:
+    """Checks what neither types nor ranges say.
+
+    Raises:
+        ValueError: one sentence that continues the name of the camera.
+    """
+    if isinstance(camera, LookAt):
+        camera.validate()
+    if not isinstance(camera, CameraConfig):
+        return
+    plain = CameraConfig()
+    for name in _UNUSED:
+        if getattr(camera, name) != getattr(plain, name):
+            raise ValueError(f"gives {name}, which has no effect here: leave it out")
+    if camera.X_PB.base_frame not in (None, "", "world"):
+        raise ValueError("must be fixed to the world: leave X_PB.base_frame out")
+    try:
+        camera.MakeCameras()
+        X_BC, X_BD = (X.GetDeterministicValue() for X in (camera.X_BC, camera.X_BD))
+        camera.X_PB.GetDeterministicValue()
+    except RuntimeError as error:
+        raise ValueError(f"cannot be used: {str(error).splitlines()[0]}") from error
+    if not X_BC.IsNearlyEqualTo(X_BD, 1e-9):
+        raise ValueError("must see colour and depth from the same point: X_BC and X_BD differ")
+
+
+def camera_pose(camera: Camera) -> RigidTransform:
+    """X_WB of a camera: z looks, x points right in the image, y down."""
+    return RigidTransform(_config(camera).X_PB.GetDeterministicValue())
+
+
+def depth_camera(camera: Camera, renderer: str) -> DepthRenderCamera:
+    """Drake's description of a camera; colour and depth are seen from the same point.
+
+    Args:
+        camera: of a scenario.
+        renderer: the name of the engine that it renders by.
+    """
+    config = copy.deepcopy(_config(camera))
+    config.renderer_name = renderer
+    return config.MakeCameras()[1]

@@ -1,13 +1,15 @@
 """The command line of every command on a scenario."""
 
 import argparse
+import contextlib
 import dataclasses
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
+from kitting_drake.common.errors import UserError
 from kitting_drake.common.paths import SCENARIOS
+from kitting_drake.scenario.description import describe
 from kitting_drake.scenario.loader import load_scenario
 from kitting_drake.scenario.perturbations import LEVELS, NAMES
 from kitting_drake.scenario.schema import Scenario
@@ -65,6 +67,14 @@ class ChosenScenario:
         """Where relative paths in the scenario start."""
         return (self.moved_to or self.path.resolve().parent).resolve()
 
+    @contextlib.contextmanager
+    def named_in_errors(self) -> Iterator[None]:
+        """Puts the file's name before the text of any UserError that is raised within."""
+        try:
+            yield
+        except UserError as error:
+            raise type(error)(f"{self.path}: {error}") from error
+
     @property
     def policy(self) -> str:
         """The policy's name for results."""
@@ -73,24 +83,7 @@ class ChosenScenario:
     @property
     def described(self) -> dict[str, Any]:
         """The whole scenario, defaults included, as JSON holds it; variants have a `_tag`."""
-        return _described(self.scenario)
-
-
-def _described(value: Any) -> Any:
-    if dataclasses.is_dataclass(value):
-        fields = {
-            item.name: _described(getattr(value, item.name)) for item in dataclasses.fields(value)
-        }
-        return fields if isinstance(value, Scenario) else {"_tag": _tag(value), **fields}
-    if isinstance(value, dict):
-        return {key: _described(item) for key, item in value.items()}
-    if isinstance(value, list | tuple | np.ndarray):
-        return [_described(item) for item in value]
-    return str(value) if isinstance(value, Path) else value
-
-
-def _tag(value: Any) -> str:
-    return f"!{type(value).__name__}"
+        return describe(self.scenario)
 
 
 def choose_scenario(arguments: argparse.Namespace) -> ChosenScenario:

@@ -10,12 +10,15 @@ import yaml
 from pydrake.common.yaml import yaml_load, yaml_load_typed
 
 from kitting_drake.common.errors import UserError
+from kitting_drake.scenario.cameras import check_camera
 from kitting_drake.scenario.perturbations import perturbation
-from kitting_drake.scenario.schema import LookAt, Scenario
+from kitting_drake.scenario.schema import Scenario
 from kitting_drake.scenario.yaml_check import check_yaml
 from kitting_drake.tasks import Task
 from systems.bounds import check_bounds
 from systems.hand_geometry import JOINT_LIMITS
+
+_APPROXIMATIONS = ("lagged", "similar", "sap")
 
 _PLAINLY_BELOW = 0.02
 """A grid that begins so far below the table, in m, is not taken for one that is off (see
@@ -212,10 +215,15 @@ def _load(raw: object, content: str, name: str | None, defaults: Scenario, where
 
 def _check_meaning(scenario: Scenario) -> None:
     """Checks what neither types nor ranges say."""
-    if scenario.plant.contact_approximation not in ("lagged", "similar", "sap"):
+    approximation = scenario.plant.discrete_contact_approximation
+    if approximation not in _APPROXIMATIONS:
         raise ValueError(
-            "plant.contact_approximation must be lagged, similar or sap, "
-            f"not '{scenario.plant.contact_approximation}'"
+            f"plant.discrete_contact_approximation must be {' or '.join(_APPROXIMATIONS)}, "
+            f"not '{approximation}'"
+        )
+    if not 1e-5 <= scenario.plant.time_step <= 0.02:
+        raise ValueError(
+            f"plant.time_step must be from 1e-05 to 0.02, not {scenario.plant.time_step:g}"
         )
     steps = (1 / 64) / scenario.plant.time_step
     if abs(steps - round(steps)) > 1e-9 or steps < 1:
@@ -238,10 +246,10 @@ def _check_meaning(scenario: Scenario) -> None:
     scenario.task.validate()
     scenario.appearance.validate()
     for key, camera in scenario.cameras.items():
-        if isinstance(camera, LookAt) and camera.position[:2] == camera.target[:2]:
-            raise ValueError(
-                f"cameras.{key} looks straight down, where upright means nothing: use !Pinhole"
-            )
+        try:
+            check_camera(camera)
+        except ValueError as error:
+            raise ValueError(f"cameras.{key} {error}") from error
     planner = scenario.planner
     for index, (axis, (low, high)) in enumerate(JOINT_LIMITS.items()):
         if not low <= planner.home[index] <= high:

@@ -50,8 +50,8 @@ _OVERLAYS: dict[str, tuple[dict[str, Any], ...]] = {
         }
         for scale in (1, 3, 6)
     ),
-    "friction": tuple({"plant": {"friction_variation": share}} for share in (0.15, 0.3, 0.5)),
-    "mass": tuple({"plant": {"mass_variation": share}} for share in (0.15, 0.3, 0.5)),
+    "friction": tuple({"variation": {"friction": share}} for share in (0.15, 0.3, 0.5)),
+    "mass": tuple({"variation": {"mass": share}} for share in (0.15, 0.3, 0.5)),
     "distractors": tuple({"task": {"distractors": count}} for count in (2, 4, 8)),
 }
 _WORSE_IF_LESS = ("steepest_deg",)

@@ -4,26 +4,25 @@ Annotations are evaluated here: Drake's YAML loader reads the types of fields, n
 """
 
 import hashlib
-import importlib
-import importlib.util
-import math
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pydrake.systems.framework import LeafSystem
 
 from kitting_drake.common.errors import UserError
+from kitting_drake.common.own_modules import files_beside, import_own, own_digest
 from kitting_drake.common.paths import GENERALIST
-from kitting_drake.common.provenance import source_digest
+from kitting_drake.policies.factory import load_learned_policy, make_shape_matching
 from kitting_drake.tasks.task import Scene
 from systems.action_quantizer import ActionQuantizer
 from systems.bounds import bounded
 from systems.oracle_policy import OraclePolicy
+from systems.pick_place_parameters import PickPlaceParameters
 from systems.pick_place_policy import PickPlacePolicy
 from systems.placement import PlacedObject
-from systems.signals import Observation, PixelGrid
+from systems.signals import Observation, PickPlaceAction, PixelGrid, PlanarPose
 
 if TYPE_CHECKING:
     from kitting_drake.policies.learned_policy import Decision
@@ -58,17 +57,17 @@ class PolicySite:
     observer: DecisionObserver | None = None
     may_stop: bool = True
     """False where the episode ends by itself once all is done."""
+    planner: PickPlaceParameters = field(default_factory=PickPlaceParameters)
+    """How the hand will pick and place."""
+    has_cameras: bool = True
+    """Whether there is an o_t: else the oracle tells the planner how high things are."""
 
 
 class PolicyConfig:
     """The interface of a policy; each variant of the scenario's `policy:` derives from it."""
 
     needs_observation: bool = True
-    """Whether whoever decides sees by cameras, which are then needed. The system has an input port
-    `observation` or one called `body_poses`, or neither where it is told what to do."""
-
-    planner_observes: bool = True
-    """Whether the planner reads heights off o_t itself; else each action brings them."""
+    """Whether it sees by cameras, which are then needed."""
 
     @property
     def name(self) -> str:
@@ -76,7 +75,8 @@ class PolicyConfig:
         return "".join(f"_{c.lower()}" if c.isupper() else c for c in type(self).__name__)[1:]
 
     def make_system(self, site: PolicySite) -> LeafSystem:
-        """The system; it has the output port `action`.
+        """The system. Its input ports are named after the station's output ports that they are
+        connected to (see `station.KittingStation`); it has the output port `action`.
 
         Raises:
             UserError: it cannot be made.
@@ -180,45 +180,31 @@ class Learned(PolicyConfig):
     recover: bool = False
 
     def make_system(self, site: PolicySite) -> LeafSystem:
-        # Only who uses a network waits for torch.
-        from kitting_drake.policies.learned_policy import LearnedPolicy
-        from kitting_drake.policies.networks.device import preferred_device, preferred_type
-        from kitting_drake.policies.networks.weights import load_networks, read_weights_file
-
-        path = self._path(site.base)
-        networks = load_networks(path, preferred_type()).to(preferred_device())
-        learned_at = read_weights_file(path).card.get("resolution")
-        resolution = site.grid.resolution
-        if learned_at is not None and not math.isclose(learned_at, resolution, rel_tol=1e-6):
-            raise UserError(
-                f"heightmap.resolution is {resolution:g} m, and the policy of {path.name} "
-                f"learned from pixels of {learned_at:g} m"
-            )
-        if site.grid.z_min != 0:
-            raise UserError(
-                f"heightmap.z_min is {site.grid.z_min:g}, and the policy of {path.name} learned "
-                "from heights above the table: use 0"
-            )
         # Outlines and recesses mean something only where objects are inserted.
         insertion = any(goal.rim_height is not None for goal in site.scene.goals)
         if self.recover and not insertion:
             raise UserError("policy.recover mends insertions, and in this task nothing is inserted")
-        try:
-            function = LearnedPolicy(
-                networks,
-                orientations=self.orientations,
-                continuous=self.continuous,
-                fit_outlines=insertion and self.continuous and self.fit_outlines,
-                recover=self.recover,
-                clear_jaws=not insertion and self.continuous and self.fit_outlines,
-                may_stop=site.may_stop,
-                watch=site.observer,
+        loaded = load_learned_policy(
+            self._path(site.base),
+            site.planner,
+            insertion=insertion,
+            orientations=self.orientations,
+            orientations_field="policy.orientations",
+            continuous=self.continuous,
+            fit_outlines=self.fit_outlines,
+            recover=self.recover,
+            may_stop=site.may_stop,
+            watch=site.observer,
+        )
+        loaded.check_grid(site.grid, "heightmap.resolution")
+        if site.grid.z_min != 0:
+            raise UserError(
+                f"heightmap.z_min is {site.grid.z_min:g}, and the policy of {loaded.path.name} "
+                "learned from heights above the table: use 0"
             )
-        except ValueError as error:
-            raise UserError(f"policy.orientations: {error}") from error
-        # Who watches is shown colours, whatever the networks see.
-        heights_only = not networks.config.colour and site.observer is None
-        return PickPlacePolicy(policy=function, heights_only=heights_only)
+        # An observer is shown colours, whatever the networks see.
+        heights_only = not loaded.colour and site.observer is None
+        return PickPlacePolicy(policy=loaded.function, heights_only=heights_only)
 
     def details(self, base: Path) -> dict[str, Any]:
         from kitting_drake.policies.networks.device import preferred_type
@@ -264,9 +250,7 @@ class ShapeMatching(PolicyConfig):
     recover: bool = False
 
     def make_system(self, site: PolicySite) -> LeafSystem:
-        from kitting_drake.policies.matching.shape_matching import ShapeMatchingPolicy
-
-        function = ShapeMatchingPolicy(recover=self.recover)
+        function = make_shape_matching(site.planner, recover=self.recover)
         return PickPlacePolicy(policy=function, heights_only=True)
 
     def details(self, base: Path) -> dict[str, Any]:
@@ -282,38 +266,40 @@ class PythonPolicy(PolicyConfig):
     that has changed.
     """
 
-    # `module:function`, importable from where you run; called with one Observation.
+    # `module:function`, called with one Observation; the module is importable from where you run,
+    # or lies beside the scenario's file.
     function: str = ""
 
+    # Call it with a second argument: the poses (`PlanarPose`) at which grasps failed before, the
+    # latest last.
+    takes_failed_picks: bool = False
+
     def make_system(self, site: PolicySite) -> LeafSystem:
-        module, _, name = self.function.partition(":")
         try:
-            function = getattr(importlib.import_module(module), name)
+            function = import_own(self.function, site.base)
         except (Exception, SystemExit) as error:
             # A person's own module may raise anything.
             reason = f"{type(error).__name__}: {error}"
             raise UserError(f"policy.function: cannot import {self.function}: {reason}") from error
         if not callable(function):
             raise UserError(f"policy.function: {self.function} is not a function")
-        return PickPlacePolicy(policy=function)
+        return PickPlacePolicy(
+            policy=function if self.takes_failed_picks else _OfObservationAlone(function)
+        )
 
     def digest(self, base: Path) -> str | None:
-        module = self.function.partition(":")[0]
         try:
-            spec = importlib.util.find_spec(module)
+            return f"sha256 {own_digest(self.function.partition(':')[0], base)}"
         except (ImportError, ValueError) as error:
             raise UserError(f"policy.function: cannot import {self.function}: {error}") from error
-        if spec is None or not spec.has_location:
-            raise UserError(f"policy.function: there is no file of the module {module}")
-        # What the function imports from its own package makes it another policy too.
-        package = module.partition(".")[0]
-        top = importlib.util.find_spec(package)
-        whole = package if top is not None and top.has_location else module
-        try:
-            return f"sha256 {source_digest(whole)}"
+        except LookupError as error:
+            raise UserError(f"policy.function: {error}") from error
         except OSError as error:
             reason = f"{error.filename}: {error.strerror}"
             raise UserError(f"policy.function: cannot read {reason}") from error
+
+    def input_files(self, base: Path) -> list[Path]:
+        return files_beside(self.function.partition(":")[0], base)
 
     def modules(self) -> list[str]:
         return [self.function.partition(":")[0]]
@@ -322,6 +308,21 @@ class PythonPolicy(PolicyConfig):
         module, _, function = self.function.partition(":")
         if not module or not function:
             raise ValueError(f"policy.function must be module:function, not '{self.function}'")
+
+
+@dataclass(frozen=True)
+class _OfObservationAlone:
+    """A function of an observation alone, as a policy that may be given failed picks too."""
+
+    function: Callable[[Observation], PickPlaceAction]
+
+    def __call__(
+        self, observation: Observation, failed_picks: Sequence[PlanarPose] = ()
+    ) -> PickPlaceAction:
+        return self.function(observation)
+
+    def __repr__(self) -> str:
+        return repr(self.function)
 
 
 Policy = Oracle | QuantizedOracle | Learned | ShapeMatching | PythonPolicy
@@ -335,6 +336,7 @@ def _make_oracle(site: PolicySite, quantizer: ActionQuantizer | None) -> OracleP
         goals=site.scene.goals,
         success=site.scene.success,
         quantizer=quantizer,
+        brings_heights=not site.has_cameras,
     )
 
 

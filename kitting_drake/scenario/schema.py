@@ -1,52 +1,25 @@
 """The YAML schema of a scenario, in the manner of Drake's hardware_sim.
 
 A file holds one or more scenarios, each under its name. Every field has a default, so that
-`Defaults: {}` is a scenario. Where a field is a union, a tag chooses: `policy: !Oracle {}`.
+`Defaults: {}` is a scenario. Where a field is a union, a tag chooses: `policy: !Oracle {}`. Where
+Drake has a config of its own, that is the field.
 
 Units are SI; angles that a person writes are in degrees, and the field says so.
 """
 
 import dataclasses as dc
 
+from pydrake.geometry import MeshcatParams
+from pydrake.multibody.plant import MultibodyPlantConfig
+
 from kitting_drake.scenario.appearance import Appearance
+from kitting_drake.scenario.cameras import Camera, Pinhole
 from kitting_drake.scenario.policies import Oracle, Policy
 from kitting_drake.tasks import Kitting, Task
 from systems.bounds import bounded
 from systems.pick_place_parameters import PickPlaceParameters
 from systems.sensor_noise import SensorNoiseParameters
 from systems.signals import PixelGrid
-
-_ANGLE = (-360.0, 360.0)
-
-
-@dc.dataclass
-class Pinhole:
-    """An RGB-D camera placed by roll, pitch and yaw. Its z axis looks, its x axis points right."""
-
-    # Position in the world, in m.
-    position: list[float] = bounded([1.0, 0.0, 0.75], -10.0, 10.0)
-
-    # Roll, pitch and yaw, R = Rz Ry Rx, in degrees.
-    rpy_deg: list[float] = bounded([45.0, 180.0, -90.0], *_ANGLE)
-
-    # Image size in pixels, focal length in pixels; the principal point is the image's middle.
-    width: int = bounded(640, 16, 4096)
-    height: int = bounded(480, 16, 4096)
-    focal_length: float = bounded(450.0, 10.0, 10000.0)
-
-
-@dc.dataclass
-class LookAt:
-    """An RGB-D camera placed by what it looks at, upright."""
-
-    # Position, and the point in the middle of the image, in the world, in m.
-    position: list[float] = bounded([1.0, 0.0, 0.75], -10.0, 10.0)
-    target: list[float] = bounded([0.5, 0.0, 0.0], -10.0, 10.0)
-
-    # Image size in pixels, focal length in pixels; the principal point is the image's middle.
-    width: int = bounded(640, 16, 4096)
-    height: int = bounded(480, 16, 4096)
-    focal_length: float = bounded(450.0, 10.0, 10000.0)
 
 
 @dc.dataclass
@@ -89,19 +62,13 @@ class Controller:
 
 
 @dc.dataclass
-class Plant:
-    """The physics."""
-
-    # Discrete step, in s. Powers of two divide every other period of the cell exactly.
-    time_step: float = bounded(0.0078125, 1e-5, 0.02)
-
-    # Drake's approximation of contact: lagged, similar or sap.
-    contact_approximation: str = "lagged"
+class Variation:
+    """How far the models are from what their files say. The hand's is not."""
 
     # Each model's friction coefficients, and its mass, are multiplied by factors drawn from the
     # seed: between 1 minus and 1 plus these.
-    friction_variation: float = bounded(0.0, 0.0, 0.9)
-    mass_variation: float = bounded(0.0, 0.0, 0.9)
+    friction: float = bounded(0.0, 0.0, 0.9)
+    mass: float = bounded(0.0, 0.0, 0.9)
 
 
 @dc.dataclass
@@ -135,7 +102,7 @@ class Scenario:
     # in the Ravens benchmark and the paper. Otherwise whoever decides must see that all is done.
     end_at_success: bool = False
 
-    # Live viewing: 1 is real time, 0 as fast as the machine allows.
+    # 1 is real time, 0 as fast as the machine allows.
     target_realtime_rate: float = bounded(0.0, 0.0, 100.0)
 
     # What stands on the table, and what is to be done with it; see kitting_drake/tasks/.
@@ -144,8 +111,9 @@ class Scenario:
     # Who decides: !Oracle, !QuantizedOracle, !Learned, !ShapeMatching or !PythonPolicy.
     policy: Policy = dc.field(default_factory=Oracle)
 
-    # The RGB-D cameras by name: !Pinhole or !LookAt. These three are those of Ravens.
-    cameras: dict[str, Pinhole | LookAt] = dc.field(
+    # The RGB-D cameras by name: !Pinhole, !LookAt, or Drake's own !CameraConfig. These three are
+    # those of Ravens.
+    cameras: dict[str, Camera] = dc.field(
         default_factory=lambda: {
             "front": Pinhole(position=[1.0, 0.0, 0.75], rpy_deg=[45.0, 180.0, -90.0]),
             "left": Pinhole(position=[0.0, 0.5, 0.75], rpy_deg=[40.0, 180.0, 45.0]),
@@ -166,6 +134,19 @@ class Scenario:
     planner: PickPlaceParameters = dc.field(default_factory=PickPlaceParameters)
     controller: Controller = dc.field(default_factory=Controller)
 
-    # The physics.
-    plant: Plant = dc.field(default_factory=Plant)
+    # The physics: Drake's MultibodyPlantConfig. The step divides every other period; contact is
+    # strictly hydroelastic: a pair that cannot be is an error, not a point contact in disguise.
+    plant: MultibodyPlantConfig = dc.field(
+        default_factory=lambda: MultibodyPlantConfig(
+            time_step=1 / 128,
+            contact_model="hydroelastic",
+            discrete_contact_approximation="lagged",
+        )
+    )
+    variation: Variation = dc.field(default_factory=Variation)
     sleep: Sleep = dc.field(default_factory=Sleep)
+
+    # Live viewing: Drake's MeshcatParams. Drake's own default host is every interface.
+    meshcat: MeshcatParams = dc.field(
+        default_factory=lambda: MeshcatParams(host="localhost", show_stats_plot=False)
+    )

@@ -12,6 +12,8 @@ import typing
 from pathlib import Path
 from typing import Any
 
+from kitting_drake.scenario.drake_configs import struct_fields
+
 _NAMES = {float: "a number", int: "a whole number", bool: "true or false", str: "a text"}
 
 
@@ -19,8 +21,8 @@ def check_yaml(schema: Any, value: Any, where: str) -> None:
     """Checks what `pydrake.common.yaml.yaml_load` returned against a type of the schema.
 
     Args:
-        schema: a dataclass, a union of dataclasses, `T | None`, float, int, bool, str, Path,
-            `list[T]` or `dict[str, T]`.
+        schema: a dataclass, a config of Drake's, a union of these, `T | None`, float, int, bool,
+            str, Path, `list[T]` or `dict[str, T]`.
         value: the untyped value; a mapping's YAML tag is its key `_tag`.
         where: the path to the value, for messages; empty at the root.
 
@@ -40,6 +42,8 @@ def check_yaml(schema: Any, value: Any, where: str) -> None:
             raise ValueError(f"{where} must be a mapping of names, not {_shown(value)}")
         for key, item in value.items():
             check_yaml(typing.get_args(schema)[1], item, _join(where, key))
+    elif struct_fields(schema) is not None:
+        _check_struct(schema, value, where)
     elif dataclasses.is_dataclass(schema):
         if isinstance(value, dict) and "_tag" in value:
             tag = str(value["_tag"]).lstrip("!")
@@ -64,7 +68,10 @@ def _check_union(schema: Any, value: Any, where: str) -> None:
     tag = str(value.get("_tag", options[0].__name__)).lstrip("!")
     for option in options:
         if option.__name__ == tag:
-            _check_dataclass(option, value, where)
+            if dataclasses.is_dataclass(option):
+                _check_dataclass(option, value, where)
+            else:
+                _check_struct(option, value, where)
             return
     known = ", ".join(f"!{option.__name__}" for option in options)
     raise ValueError(f"{where} has the unknown tag !{tag}: use one of {known}")
@@ -76,15 +83,30 @@ def _check_dataclass(schema: Any, value: Any, where: str) -> None:
     types_by_name = typing.get_type_hints(schema)
     # A class may annotate what is no field.
     hints = {item.name: types_by_name[item.name] for item in dataclasses.fields(schema)}
+    _check_names(hints, value, where)
     for key, item in value.items():
-        if key == "_tag":
-            continue
-        if key not in hints:
+        if key != "_tag":
+            check_yaml(hints[key], item, _join(where, key))
+
+
+def _check_struct(schema: Any, value: Any, where: str) -> None:
+    """Checks the names and the plain values of a struct of Drake's, which checks the others."""
+    hints = struct_fields(schema) or {}
+    if not isinstance(value, dict):
+        raise ValueError(f"{where} must be a mapping, not {_shown(value)}")
+    _check_names(hints, value, where)
+    for key, item in value.items():
+        if hints.get(key) in _NAMES:
+            _check_scalar(hints[key], item, _join(where, key))
+
+
+def _check_names(hints: dict[str, Any], value: dict, where: str) -> None:
+    for key in value:
+        if key != "_tag" and key not in hints:
             close = difflib.get_close_matches(str(key), hints, n=1)
             known = f"use one of {', '.join(hints)}" if hints else "it has none"
             advice = f"did you mean '{close[0]}'?" if close else known
             raise ValueError(f"{_join(where, key)} is an unknown field: {advice}")
-        check_yaml(hints[key], item, _join(where, key))
 
 
 def _check_scalar(schema: Any, value: Any, where: str) -> None:

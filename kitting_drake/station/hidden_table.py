@@ -6,8 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 from pydrake.math import RigidTransform, RollPitchYaw
 
-from kitting_drake.scenario.cameras import camera_pose
-from kitting_drake.scenario.schema import LookAt, Pinhole, Scenario
+from kitting_drake.scenario.cameras import Camera, camera_pose, depth_camera
+from kitting_drake.scenario.schema import Scenario
 from systems.hand_geometry import FINGERTIP_DISTANCE, PALM_SIZE
 from systems.signals import PixelGrid
 
@@ -53,17 +53,16 @@ def _waiting_hand(home: list[float], grid: PixelGrid) -> NDArray[np.float64]:
     return np.concatenate(found)
 
 
-def _hides(p_WPoints: NDArray[np.float64], config: Pinhole | LookAt, grid: PixelGrid) -> bool:
+def _hides(p_WPoints: NDArray[np.float64], camera: Camera, grid: PixelGrid) -> bool:
     """Whether a camera sees one of some points before a place of the workspace."""
-    X_WC = camera_pose(config)
+    X_WC = camera_pose(camera)
+    lens = depth_camera(camera, "").core().intrinsics()
     x, y, z = X_WC.inverse().multiply(p_WPoints.T)
     ahead = z > 0.01
     depth = np.where(ahead, z, 1.0)
-    in_image = (
-        ahead
-        & (np.abs(config.focal_length * x / depth) < config.width / 2)
-        & (np.abs(config.focal_length * y / depth) < config.height / 2)
-    )
+    u = lens.focal_x() * x / depth + lens.center_x()
+    v = lens.focal_y() * y / depth + lens.center_y()
+    in_image = ahead & (u > 0) & (u < lens.width()) & (v > 0) & (v < lens.height())
     p_WC = X_WC.translation()
     rays = p_WPoints - p_WC
     # Where each ray meets the table, if it goes down.

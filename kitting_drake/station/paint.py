@@ -1,4 +1,4 @@
-"""Gives the cell's surfaces the colours, the sheen and the lights that a scenario asks for."""
+"""Gives the station's surfaces the colours, the sheen and the lights that a scenario asks for."""
 
 import colorsys
 from collections.abc import Mapping

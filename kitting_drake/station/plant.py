@@ -1,4 +1,4 @@
-"""The cell's plant: table, fixtures, objects and hand."""
+"""The station's plant: table, fixtures, objects and hand."""
 
 from pathlib import Path
 
@@ -6,13 +6,13 @@ import numpy as np
 from pydrake.geometry import SceneGraph
 from pydrake.math import RigidTransform
 from pydrake.multibody.parsing import Parser
-from pydrake.multibody.plant import AddMultibodyPlant, MultibodyPlant, MultibodyPlantConfig
-from pydrake.multibody.tree import RigidBody
+from pydrake.multibody.plant import AddMultibodyPlant, MultibodyPlant
+from pydrake.multibody.tree import BodyIndex, RigidBody
 from pydrake.systems.framework import DiagramBuilder
 
 from kitting_drake.common.errors import UserError
 from kitting_drake.common.paths import MODELS
-from kitting_drake.scenario.schema import Plant, Scenario
+from kitting_drake.scenario.schema import Scenario, Variation
 from kitting_drake.station.variation import varied_model
 from kitting_drake.tasks.task import Scene
 from systems.placement import PlacedObject
@@ -25,19 +25,13 @@ _VARIATION_STREAM = 13
 
 
 def add_plant(builder: DiagramBuilder, scenario: Scenario) -> tuple[MultibodyPlant, SceneGraph]:
-    """Adds an empty plant, in strictly hydroelastic contact."""
-    config = MultibodyPlantConfig(
-        time_step=scenario.plant.time_step,
-        # Strict: a pair that cannot be hydroelastic is an error, not a point contact in disguise.
-        contact_model="hydroelastic",
-        discrete_contact_approximation=scenario.plant.contact_approximation,
-    )
-    return AddMultibodyPlant(config, builder)
+    """Adds an empty plant and its scene graph."""
+    return AddMultibodyPlant(scenario.plant, builder)
 
 
 def add_models(
-    plant: MultibodyPlant, scene: Scene, variation: Plant, seed: int
-) -> tuple[tuple[PlacedObject, ...], tuple[RigidBody, ...]]:
+    plant: MultibodyPlant, scene: Scene, variation: Variation, seed: int
+) -> tuple[tuple[PlacedObject, ...], tuple[BodyIndex, ...]]:
     """Adds the table, the scene's fixtures and objects, and the hand.
 
     Args:
@@ -47,7 +41,8 @@ def add_models(
         seed: of their draws.
 
     Returns:
-        The scene's objects with their bodies, and the bodies that never move.
+        The scene's objects with their bodies, and the bodies that never move: the table, then the
+        fixtures.
 
     Raises:
         UserError: a model cannot be loaded, or is not of one link.
@@ -60,8 +55,8 @@ def add_models(
 
     def add(model: Path) -> RigidBody:
         friction, mass = 1 + rng.uniform(-1, 1, 2) * (
-            variation.friction_variation,
-            variation.mass_variation,
+            variation.friction,
+            variation.mass,
         )
         if friction == mass == 1:
             return _add_body(parser, plant, model)
@@ -78,7 +73,7 @@ def add_models(
         body = add(item.model)
         objects.append(PlacedObject(item.name, body.index(), item.p_BPoints, item.symmetry))
     parser.AddModels(str(MODELS / "franka_hand" / "franka_hand.sdf"))
-    return tuple(objects), tuple(still)
+    return tuple(objects), tuple(body.index() for body in still)
 
 
 def _add_body(

@@ -1,18 +1,12 @@
-"""Adds to the cell its cameras and the projector of their images, and the camera of a film."""
+"""Adds to the station its cameras, their noise, and the projector of their images."""
 
-from pathlib import Path
-
-from pydrake.geometry import ColorRenderCamera, DepthRange, DepthRenderCamera, SceneGraph
+from pydrake.geometry import ColorRenderCamera, SceneGraph
 from pydrake.systems.framework import DiagramBuilder, LeafSystem
 from pydrake.systems.sensors import RgbdSensor
-from pydrake.visualization import VideoWriter
 
 from kitting_drake.common.errors import UserError
 from kitting_drake.common.rendering import (
-    X_WOVERVIEW,
-    add_film_renderer,
     add_observation_renderer,
-    picture_camera,
 )
 from kitting_drake.scenario.cameras import camera_pose, depth_camera
 from kitting_drake.scenario.schema import Scenario
@@ -27,6 +21,12 @@ _IMAGES = {
     "body_pose_in_world": "body_pose_in_world",
 }
 """A camera's output ports, and the projector's input ports but for the camera's name."""
+_EXPORTED = {
+    "color_image": "color_image",
+    "depth_image_32f": "depth_image",
+    "body_pose_in_world": "camera_pose",
+}
+"""A camera's output ports, and the station's but for the camera's name."""
 
 
 def add_cameras(
@@ -39,7 +39,7 @@ def add_cameras(
     """Adds a scenario's cameras, what makes them imperfect, and what fuses their images.
 
     Args:
-        builder: of the cell.
+        builder: of the station.
         scenario: whose cameras, appearance and sensor noise they are.
         scene_graph: what they see.
         grid: of the observation.
@@ -88,27 +88,6 @@ def add_cameras(
                 builder.Connect(sensor.GetOutputPort(port), source.GetInputPort(port))
         for output, port in _IMAGES.items():
             builder.Connect(source.GetOutputPort(output), projector.GetInputPort(f"{port}_{name}"))
+        for output, port in _EXPORTED.items():
+            builder.ExportOutput(source.GetOutputPort(output), f"{port}_{name}")
     return projector
-
-
-def add_video(builder: DiagramBuilder, scene_graph: SceneGraph, path: Path) -> VideoWriter:
-    """Adds a camera that sees the whole cell, and the writer of its film to a .gif or .webp file.
-
-    Raises:
-        UserError: images cannot be rendered here.
-    """
-    core = picture_camera(add_film_renderer(scene_graph), width=640, height=400)
-    sensor = builder.AddNamedSystem(
-        # No camera of a scenario can be called so.
-        "film_camera",
-        RgbdSensor(
-            parent_id=scene_graph.world_frame_id(),
-            X_PB=X_WOVERVIEW,
-            color_camera=ColorRenderCamera(core),
-            depth_camera=DepthRenderCamera(core, DepthRange(0.05, 10.0)),
-        ),
-    )
-    builder.Connect(scene_graph.get_query_output_port(), sensor.query_object_input_port())
-    writer = builder.AddNamedSystem("video_writer", VideoWriter(filename=str(path), fps=16.0))
-    writer.ConnectRgbdSensor(builder=builder, sensor=sensor)
-    return writer

@@ -1,81 +1,228 @@
-"""From a scenario to the Diagram of the kitting cell: here its systems are wired together."""
+"""The station: a Diagram of everything but the policy, with ports to plug one into."""
 
-import functools
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pydrake.geometry import (
-    CollisionFilterDeclaration,
-    GeometrySet,
-    Meshcat,
-    MeshcatVisualizer,
-    MeshcatVisualizerParams,
-    Role,
-    SceneGraph,
-)
+from pydrake.geometry import CollisionFilterDeclaration, GeometrySet
 from pydrake.math import RigidTransform
-from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import BodyIndex, RigidBody
-from pydrake.systems.framework import Context, Diagram, DiagramBuilder, LeafSystem
-from pydrake.visualization import VideoWriter
+from pydrake.systems.analysis import Simulator
+from pydrake.systems.framework import Context, Diagram, DiagramBuilder, EventStatus
 
 from kitting_drake.common.errors import UserError
-from kitting_drake.common.rendering import add_picture_renderer, can_render
-from kitting_drake.scenario.policies import DecisionObserver, PolicySite
+from kitting_drake.common.rendering import can_render
 from kitting_drake.scenario.schema import Scenario
+from kitting_drake.station.control import add_control
 from kitting_drake.station.paint import paint_surfaces
 from kitting_drake.station.plant import add_models, add_plant, bounded_body, set_initial_poses
-from kitting_drake.station.sensing import add_cameras, add_video
+from kitting_drake.station.sensing import add_cameras
 from kitting_drake.tasks.task import Scene
-from systems.heightmap_projector import HeightmapProjector
-from systems.pick_place_planner import PickPlacePlanner
-from systems.pick_place_policy import PickPlacePolicy
+from systems.pick_place_parameters import Mode
 from systems.placement import PlacedObject, Placement
 from systems.placement_monitor import PlacementMonitor
 from systems.rest_detector import RestDetector
-from systems.trajectory_controller import TrajectoryController
+from systems.signals import Observation, PickPlaceAction
 
-MESHCAT_PERIOD = 1 / 32
+Monitor = Callable[[Context], EventStatus]
+"""What a Simulator calls after each step, with the root context."""
 
 
-@dataclass(frozen=True)
-class Cell:
-    """The Diagram and the handles that running it takes. All memory is in its Context."""
+class KittingStation(Diagram):
+    """A robot, its cameras and its controllers, on a table with objects; the policy is outside.
 
-    diagram: Diagram
-    plant: MultibodyPlant
-    scene_graph: SceneGraph
-    planner: PickPlacePlanner
-    monitor: PlacementMonitor
-    rest_detector: RestDetector
-    scene: Scene
-    objects: tuple[PlacedObject, ...]
-    """The scene's objects, with their bodies."""
-    still_bodies: tuple[RigidBody, ...]
-    """The table and the fixtures."""
-    sleep: bool
-    video_writer: VideoWriter | None
-    """Holds the film, if one was asked for, until its `Save()`."""
+    .. pydrake_system::
+
+        name: KittingStation
+        input_ports:
+        - action
+        output_ports:
+        - observation
+        - observation_heights
+        - failed_picks
+        - accepted_action
+        - asks
+        - mode
+        - counts
+        - robot_state
+        - wrist_force
+        - commanded
+        - commanded_opening
+        - body_poses
+        - contact_results
+        - query_object
+        - at_rest
+        - placements
+        - kept_goals
+        - reward
+        - success
+        - add_s
+        - position_error
+        - angle_error
+        - height_error
+        - color_image_<camera>
+        - depth_image_<camera>
+        - camera_pose_<camera>
+
+    - `action` (abstract, `PickPlaceAction`): evaluated only when the planner asks.
+    - `observation` (abstract, `Observation`): o_t. `observation_heights`: o_t without colours, for
+      which no colour image is rendered. These and the cameras' images are there only where the
+      scenario has cameras and the machine can render.
+    - `failed_picks`, `accepted_action`, `asks`, `mode`, `counts`: the `PickPlacePlanner`'s.
+    - `robot_state` (12): positions, then velocities of x, y, z, yaw and both fingers; m, rad, s.
+    - `wrist_force` (6): contact forces on x, y, z (N), about z (N m), and on each finger (N).
+    - `commanded` (12): q_d, v_d, a_d of x, y, z and yaw. `commanded_opening` (2): the opening
+      between the pads in m, and its rate.
+    - `body_poses`, `contact_results`: the plant's. `query_object`: the scene graph's.
+    - `at_rest` (n): 1 for an object that is at rest: the `RestDetector`'s.
+    - The others are those of the `PlacementMonitor`, one element for each of the n objects.
+    - `color_image_<camera>`, `depth_image_<camera>`, `camera_pose_<camera>`: what o_t is projected
+      from, noise included, and X_WB as the calibration has it.
+
+    All memory is in the Context. Ports compute only on demand: images are rendered when something
+    asks for an observation.
+
+    Simulate it by `make_simulator`, which lets objects at rest sleep: they cost nothing then.
+    """
+
+    def __init__(self, scenario: Scenario, *, seed: int, base: Path) -> None:
+        """See `build_station`."""
+        super().__init__()
+        self.scenario, self.seed, self.base = scenario, seed, base
+        self.grid = scenario.heightmap.grid()
+        """The pixel grid of the observations."""
+        self.scene: Scene = scenario.task.make_scene(grid=self.grid, seed=seed, base=base)
+        _check_scene(scenario, self.scene)
+        builder = DiagramBuilder()
+        self.plant, self.scene_graph = add_plant(builder, scenario)
+        self.objects, self.still_bodies = add_models(
+            self.plant, self.scene, scenario.variation, seed
+        )
+        """The scene's objects with their bodies; the bodies of the table and the fixtures. By their
+        indices: a body would keep the plant, and that the station, in memory for good."""
+        self.plant.Finalize()
+        set_initial_poses(self.plant, scenario, self.scene, self.objects)
+        groups = _surface_groups(self.scene, self.still_bodies, self.objects)
+        paint_surfaces(self.plant, self.scene_graph, scenario.appearance, groups, seed)
+        projector = None
+        if scenario.cameras and can_render():
+            projector = add_cameras(builder, scenario, self.scene_graph, self.grid, seed)
+            builder.ExportOutput(projector.GetOutputPort("observation"), "observation")
+            builder.ExportOutput(projector.GetOutputPort("heights"), "observation_heights")
+        self.has_cameras = projector is not None
+        """Whether there is the port `observation`."""
+        planner = add_control(builder, scenario, self.scene, self.plant, projector)
+        self._add_score_and_rest(builder)
+        builder.Connect(planner.GetOutputPort("mode"), self._monitor.GetInputPort("mode"))
+        for name in ("body_poses", "contact_results"):
+            builder.ExportOutput(self.plant.GetOutputPort(name), name)
+        builder.ExportOutput(self.scene_graph.get_query_output_port(), "query_object")
+        builder.BuildInto(self)
+        self.set_name("station")
+
+    def _add_score_and_rest(self, builder: DiagramBuilder) -> None:
+        """Adds what watches the objects, and exports its ports."""
+        scene, plant, sleep = self.scene, self.plant, self.scenario.sleep
+        self._monitor = builder.AddNamedSystem(
+            "monitor",
+            PlacementMonitor(objects=self.objects, goals=scene.goals, success=scene.success),
+        )
+        hand = [plant.GetBodyByName(name) for name in ("hand", "left_finger", "right_finger")]
+        self._rest_detector = builder.AddNamedSystem(
+            "rest_detector",
+            RestDetector(
+                objects=[bounded_body(plant, self.scene_graph, body) for body in self._bodies],
+                movers=[bounded_body(plant, self.scene_graph, body) for body in hand],
+                position_tolerance=sleep.position_tolerance,
+                angle_tolerance=sleep.angle_tolerance,
+                time_to_sleep=sleep.time_to_sleep,
+                wake_distance=sleep.wake_distance,
+            ),
+        )
+        for system in (self._monitor, self._rest_detector):
+            builder.Connect(plant.get_body_poses_output_port(), system.GetInputPort("body_poses"))
+            for index in range(system.num_output_ports()):
+                port = system.get_output_port(index)
+                builder.ExportOutput(port, port.get_name())
+
+    # What its ports say, for callers that hold the context of a Diagram that it is part of.
 
     def object_poses(self, root_context: Context) -> list[RigidTransform]:
         """X_WB of each of the scene's objects."""
         context = self.plant.GetMyContextFromRoot(root_context)
-        return [self.plant.get_body(item.body).EvalPoseInWorld(context) for item in self.objects]
+        return [body.EvalPoseInWorld(context) for body in self._bodies]
 
     def placements(self, root_context: Context) -> list[Placement]:
-        """Where each of the scene's objects is relative to its goal."""
-        return self.monitor.placements(self.monitor.GetMyContextFromRoot(root_context))
+        """The port `placements`: where each of the scene's objects is relative to its goal."""
+        return self._monitor.placements(self._monitor.GetMyContextFromRoot(root_context))
 
     def reward(self, root_context: Context) -> float:
-        """The task's reward so far, 0 to 1: see `PlacementMonitor`."""
-        return self.monitor.reward(self.monitor.GetMyContextFromRoot(root_context))
+        """The port `reward`: the task's reward so far, 0 to 1."""
+        return self._monitor.reward(self._monitor.GetMyContextFromRoot(root_context))
 
     def at_rest(self, root_context: Context) -> NDArray[np.bool_]:
-        """(n,) which of the scene's objects are at rest."""
-        return self.rest_detector.at_rest(self.rest_detector.GetMyContextFromRoot(root_context))
+        """(n,) which of the scene's objects are at rest: the port `at_rest`."""
+        return self._rest_detector.at_rest(self._rest_detector.GetMyContextFromRoot(root_context))
+
+    def mode(self, root_context: Context) -> Mode:
+        """The port `mode`."""
+        return Mode(int(self._eval(root_context, "mode")[0]))
+
+    def asks(self, root_context: Context) -> bool:
+        """The port `asks`: whether the planner's next update evaluates the action."""
+        return bool(self._eval(root_context, "asks")[0])
+
+    def observation(self, root_context: Context) -> Observation:
+        """The port `observation`: o_t, rendered now."""
+        return self._eval(root_context, "observation")
+
+    def counts(self, root_context: Context) -> tuple[int, int, int]:
+        """The port `counts`: actions begun, grasps missed, objects dropped."""
+        actions, missed, dropped = map(int, self._eval(root_context, "counts"))
+        return actions, missed, dropped
+
+    def point_contact_pairs(self, root_context: Context) -> int:
+        """How many pairs are in point contact; 0 where contact is strictly hydroelastic."""
+        return self._eval(root_context, "contact_results").num_point_pair_contacts()
+
+    def proposed_action(self, root_context: Context) -> PickPlaceAction:
+        """The port `action`: what the policy that is plugged in would do now."""
+        return self.GetInputPort("action").Eval(self.GetMyContextFromRoot(root_context))
+
+    def accepted_action(self, root_context: Context) -> PickPlaceAction:
+        """The port `accepted_action`: the action begun last, as the hand goes there."""
+        return self._eval(root_context, "accepted_action")
+
+    def _eval(self, root_context: Context, port: str) -> Any:
+        return self.GetOutputPort(port).Eval(self.GetMyContextFromRoot(root_context))
+
+    # Sleep.
+
+    def make_simulator(
+        self, diagram: Diagram | None = None, *, monitor: Monitor | None = None
+    ) -> Simulator:
+        """A Simulator in which objects at rest sleep (see `RestDetector`), if the scenario says so.
+
+        Args:
+            diagram: the outermost Diagram that this station is part of; None: the station alone.
+            monitor: called after each step, once what rests has been put to sleep. (Drake's
+                `set_monitor` would replace the one that does that.)
+
+        Raises:
+            ValueError: no `diagram`, though the station is part of one.
+        """
+        if diagram is None and self.GetSystemPathname().strip(":").count("::"):
+            raise ValueError("give make_simulator the outermost Diagram that holds the station")
+        simulator = Simulator(self if diagram is None else diagram)
+
+        def step(root_context: Context) -> EventStatus:
+            self.apply_sleep(root_context)
+            return EventStatus.DidNothing() if monitor is None else monitor(root_context)
+
+        simulator.set_monitor(step)
+        return simulator
 
     def apply_sleep(self, root_context: Context) -> None:
         """Freezes the objects that are at rest and thaws the others.
@@ -84,11 +231,10 @@ class Cell:
         objects is not computed; what comes near it still collides with it. No LeafSystem may touch
         another's part of a context, hence a function for the simulator's monitor.
         """
-        if not self.sleep:
+        if not self.scenario.sleep.enabled:
             return
         plant_context = self.plant.GetMyMutableContextFromRoot(root_context)
-        bodies = self._bodies
-        at_rest = self.at_rest(root_context).tolist()
+        bodies, at_rest = self._bodies, self.at_rest(root_context).tolist()
         changed = [
             (body, resting)
             for body, resting in zip(bodies, at_rest, strict=True)
@@ -99,20 +245,21 @@ class Cell:
         filters = self.scene_graph.collision_filter_manager(
             self.scene_graph.GetMyMutableContextFromRoot(root_context)
         )
+        still = [self.plant.get_body(index) for index in self.still_bodies]
         # First those that wake, as they are free of all; then those that fall asleep.
         for body, resting in sorted(changed, key=lambda change: change[1]):
             own = self._geometry([body])
             if resting:
                 body.Lock(plant_context)
                 frozen = [other for other in bodies if other.is_locked(plant_context)]
-                others = self._geometry([*self.still_bodies, *frozen])
+                others = self._geometry([*still, *frozen])
                 filters.Apply(CollisionFilterDeclaration().ExcludeBetween(own, others))
             else:
                 body.Unlock(plant_context)
-                others = self._geometry([*self.still_bodies, *bodies])
+                others = self._geometry([*still, *bodies])
                 filters.Apply(CollisionFilterDeclaration().AllowBetween(own, others))
 
-    @functools.cached_property
+    @property
     def _bodies(self) -> list[RigidBody]:
         """The bodies of the scene's objects."""
         return [self.plant.get_body(item.body) for item in self.objects]
@@ -124,102 +271,18 @@ class Cell:
         return geometry
 
 
-def build_cell(
-    scenario: Scenario,
-    *,
-    seed: int,
-    base: Path,
-    meshcat: Meshcat | None = None,
-    picture: bool = False,
-    video: Path | None = None,
-    observer: DecisionObserver | None = None,
-) -> Cell:
-    """Builds the cell.
+def build_station(scenario: Scenario, seed: int = 0, base: Path | None = None) -> KittingStation:
+    """Builds the station of a scenario.
 
     Args:
-        scenario: what to build.
-        seed: of the scene; see `TaskConfig.make_scene`.
-        base: where relative paths in the scenario start: the folder of its file.
-        meshcat: where to show it, if anywhere.
-        picture: have what `render_picture` takes.
-        video: the file of a film to make (.gif or .webp), if any.
-        observer: told of every decision of a learned policy, and of the observation it is about.
-
-    Returns:
-        The cell. Its Diagram exports the output ports `observation`, `action`, `placements`,
-        `reward`, `success`, `add_s`, `position_error`, `angle_error`, `height_error`, `mode` and
-        `counts`. Where images cannot be rendered, and the policy needs none, there are no cameras
-        and there is no `observation`.
+        scenario: what to build; its policy stays outside (see `station.policy`).
+        seed: of the scene and of all noise; see `TaskConfig.make_scene`.
+        base: where relative paths in the scenario start; None: the working directory.
 
     Raises:
         UserError: something in the scenario cannot be had.
     """
-    grid = scenario.heightmap.grid()
-    scene = scenario.task.make_scene(grid=grid, seed=seed, base=base)
-    _check_scene(scenario, scene)
-    builder = DiagramBuilder()
-
-    # The plant: table, fixtures, objects, hand.
-    plant, scene_graph = add_plant(builder, scenario)
-    objects, still_bodies = add_models(plant, scene, scenario.plant, seed)
-    plant.Finalize()
-    set_initial_poses(plant, scenario, scene, objects)
-    groups = _surface_groups(scene, still_bodies, objects)
-    paint_surfaces(plant, scene_graph, scenario.appearance, groups, seed)
-
-    # Cameras, policy, planner and controller.
-    projector = None
-    if scenario.policy.needs_observation or (scenario.cameras and can_render()):
-        projector = add_cameras(builder, scenario, scene_graph, grid, seed)
-        builder.ExportOutput(projector.GetOutputPort("observation"), "observation")
-    site = PolicySite(
-        scene=scene,
-        objects=objects,
-        grid=grid,
-        base=base,
-        observer=observer,
-        may_stop=not scenario.end_at_success,
-    )
-    policy = _add_policy(builder, scenario, site, plant, projector)
-    planner = _add_planner_and_controller(builder, scenario, scene, plant, policy, projector)
-
-    monitor, rest_detector = _add_score_and_rest(
-        builder, scenario, scene, plant, scene_graph, objects
-    )
-    builder.Connect(planner.GetOutputPort("mode"), monitor.GetInputPort("mode"))
-    if policy.HasInputPort("kept_goals"):
-        builder.Connect(monitor.GetOutputPort("kept_goals"), policy.GetInputPort("kept_goals"))
-    for system, ports in (
-        (policy, ["action"]),
-        (monitor, [monitor.get_output_port(i).get_name() for i in range(7)]),
-        (planner, ["mode", "counts"]),
-    ):
-        for port in ports:
-            builder.ExportOutput(system.GetOutputPort(port), port)
-
-    # What shows it.
-    if meshcat is not None:
-        parameters = MeshcatVisualizerParams(role=Role.kIllustration)
-        parameters.publish_period = MESHCAT_PERIOD
-        MeshcatVisualizer.AddToBuilder(builder, scene_graph, meshcat, parameters)
-    if picture:
-        add_picture_renderer(scene_graph)
-    video_writer = None if video is None else add_video(builder, scene_graph, video)
-    diagram = builder.Build()
-    diagram.set_name("cell")
-    return Cell(
-        diagram=diagram,
-        plant=plant,
-        scene_graph=scene_graph,
-        planner=planner,
-        monitor=monitor,
-        rest_detector=rest_detector,
-        scene=scene,
-        objects=objects,
-        still_bodies=still_bodies,
-        sleep=scenario.sleep.enabled,
-        video_writer=video_writer,
-    )
+    return KittingStation(scenario, seed=seed, base=Path.cwd() if base is None else base)
 
 
 def _check_scene(scenario: Scenario, scene: Scene) -> None:
@@ -243,131 +306,10 @@ def _check_scene(scenario: Scenario, scene: Scene) -> None:
 
 
 def _surface_groups(
-    scene: Scene, still_bodies: Sequence[RigidBody], objects: Sequence[PlacedObject]
+    scene: Scene, still_bodies: Sequence[BodyIndex], objects: Sequence[PlacedObject]
 ) -> dict[BodyIndex, str]:
     """The names by which a scenario's `appearance` calls the bodies' surfaces."""
-    groups = {still_bodies[0].index(): "table"}
+    groups = {still_bodies[0]: "table"}
     for fixture, body in zip(scene.fixtures, still_bodies[1:], strict=True):
-        groups[body.index()] = f"fixtures/{fixture.name}"
+        groups[body] = f"fixtures/{fixture.name}"
     return groups | {item.body: f"objects/{item.name}" for item in objects}
-
-
-def _add_policy(
-    builder: DiagramBuilder,
-    scenario: Scenario,
-    site: PolicySite,
-    plant: MultibodyPlant,
-    projector: HeightmapProjector | None,
-) -> LeafSystem:
-    """Adds the scenario's policy, connected to what it looks at."""
-    policy = builder.AddNamedSystem("policy", scenario.policy.make_system(site))
-    if policy.HasInputPort("observation"):
-        assert projector is not None
-        builder.Connect(projector.GetOutputPort(_sight(policy)), policy.GetInputPort("observation"))
-    if policy.HasInputPort("body_poses"):
-        builder.Connect(plant.get_body_poses_output_port(), policy.GetInputPort("body_poses"))
-    return policy
-
-
-def _sight(policy: LeafSystem) -> str:
-    """The projector's port that policy and planner look at: in colour only if the policy sees it;
-    the planner reads heights."""
-    if isinstance(policy, PickPlacePolicy) and policy.heights_only:
-        return "heights"
-    return "observation" if policy.HasInputPort("observation") else "heights"
-
-
-def _add_planner_and_controller(
-    builder: DiagramBuilder,
-    scenario: Scenario,
-    scene: Scene,
-    plant: MultibodyPlant,
-    policy: LeafSystem,
-    projector: HeightmapProjector | None,
-) -> PickPlacePlanner:
-    """Adds both, and closes the loop through the plant."""
-    hand = plant.GetModelInstanceByName("franka_hand")
-    planner = builder.AddNamedSystem(
-        "planner",
-        PickPlacePlanner(
-            parameters=scenario.planner,
-            max_actions=scene.max_actions,
-            insertion=any(goal.rim_height is not None for goal in scene.goals),
-        ),
-    )
-    controller = builder.AddNamedSystem("controller", _make_controller(scenario, plant))
-    hand_state = plant.get_state_output_port(hand)
-    builder.Connect(policy.GetOutputPort("action"), planner.GetInputPort("action"))
-    if policy.HasInputPort("failed_picks"):
-        builder.Connect(planner.GetOutputPort("failed_picks"), policy.GetInputPort("failed_picks"))
-    if projector is not None and scenario.policy.planner_observes:
-        sight = projector.GetOutputPort(_sight(policy))
-        builder.Connect(sight, planner.GetInputPort("observation"))
-    builder.Connect(hand_state, planner.GetInputPort("hand_state"))
-    builder.Connect(
-        plant.get_generalized_contact_forces_output_port(hand),
-        planner.GetInputPort("hand_contact_force"),
-    )
-    builder.Connect(hand_state, controller.GetInputPort("hand_state"))
-    for port in ("desired_motion", "desired_opening", "closing_force"):
-        builder.Connect(planner.GetOutputPort(port), controller.GetInputPort(port))
-    builder.Connect(controller.get_output_port(), plant.get_actuation_input_port(hand))
-    return planner
-
-
-def _make_controller(scenario: Scenario, plant: MultibodyPlant) -> TrajectoryController:
-    config = scenario.controller
-    context = plant.CreateDefaultContext()
-    hand = plant.GetModelInstanceByName("franka_hand")
-    joints = [plant.GetJointByName(name) for name in ("x", "y", "z", "yaw")]
-    indices = [joint.velocity_start() for joint in joints]
-    inertia = plant.CalcMassMatrix(context).diagonal()[indices]
-    gravity = plant.CalcGravityGeneralizedForces(context)
-    assert plant.num_actuated_dofs(hand) == 6
-    return TrajectoryController(
-        inertia=inertia,
-        weight=-float(gravity[indices[2]]),
-        stiffness=np.array(config.stiffness),
-        damping=np.array(config.damping),
-        force_limit=np.array(config.force_limit),
-        finger_stiffness=config.finger_stiffness,
-        finger_damping=config.finger_damping,
-        finger_force_limit=config.finger_force_limit,
-    )
-
-
-def _add_score_and_rest(
-    builder: DiagramBuilder,
-    scenario: Scenario,
-    scene: Scene,
-    plant: MultibodyPlant,
-    scene_graph: SceneGraph,
-    objects: tuple[PlacedObject, ...],
-) -> tuple[PlacementMonitor, RestDetector]:
-    """Adds both, which watch the bodies."""
-    monitor = builder.AddNamedSystem(
-        "monitor", PlacementMonitor(objects=objects, goals=scene.goals, success=scene.success)
-    )
-    rest_detector = builder.AddNamedSystem(
-        "rest_detector", _make_rest_detector(scenario, plant, scene_graph, objects)
-    )
-    for system in (monitor, rest_detector):
-        builder.Connect(plant.get_body_poses_output_port(), system.GetInputPort("body_poses"))
-    return monitor, rest_detector
-
-
-def _make_rest_detector(
-    scenario: Scenario,
-    plant: MultibodyPlant,
-    scene_graph: SceneGraph,
-    objects: tuple[PlacedObject, ...],
-) -> RestDetector:
-    hand = [plant.GetBodyByName(name) for name in ("hand", "left_finger", "right_finger")]
-    return RestDetector(
-        objects=[bounded_body(plant, scene_graph, plant.get_body(item.body)) for item in objects],
-        movers=[bounded_body(plant, scene_graph, body) for body in hand],
-        position_tolerance=scenario.sleep.position_tolerance,
-        angle_tolerance=scenario.sleep.angle_tolerance,
-        time_to_sleep=scenario.sleep.time_to_sleep,
-        wake_distance=scenario.sleep.wake_distance,
-    )

@@ -4,25 +4,24 @@ import dataclasses
 import itertools
 import sys
 import types
-from pathlib import Path
 
 import numpy as np
 import pytest
 from pydrake.systems.framework import Context
 
 from kitting_drake.collect import DemonstrationRecorder
-from kitting_drake.episode import EpisodeObserver, EpisodeResult, ModeChange, run_episode
+from kitting_drake.episode import EpisodeObserver, EpisodeResult, ModeChange
 from kitting_drake.policies.data.demonstrations import Demonstration, Rejection
 from kitting_drake.policies.data.recorded import DemonstrationStep
 from kitting_drake.scenario import Scenario
+from kitting_drake.scenario.cameras import Pinhole
 from kitting_drake.scenario.policies import PythonPolicy
-from kitting_drake.scenario.schema import Pinhole
-from kitting_drake.station import Cell, build_cell
 from kitting_drake.tasks import ArrangedKitting
 from kitting_drake.tasks.kitting.tool_poses import TablePose
 from kitting_drake.tasks.task import ActionRecord
 from systems.pick_place_parameters import Mode, PickPlaceParameters
 from systems.signals import Observation, PickPlaceAction, PlanarPose
+from tests.kitting_drake.rig import Rig, build_rig
 
 pytestmark = pytest.mark.usefixtures("rendering")
 
@@ -35,23 +34,15 @@ SMALL = {
 HASTY = PickPlaceParameters(observe_settle=0.02)
 
 
-def cell_of(*tools: str, **more: object) -> Cell:
+def rig_of(*tools: str, **more: object) -> Rig:
     poses = [TablePose(x=0.42, y=0.14), TablePose(x=0.60, y=0.3, yaw_deg=20.0)]
     task = ArrangedKitting(tools=dict(zip(tools, poses, strict=False)))
     scenario = Scenario(task=task, cameras=SMALL, **more)  # type: ignore[arg-type]
-    return build_cell(scenario, seed=0, base=Path())
+    return build_rig(scenario, seed=3)
 
 
-def run(cell: Cell, seconds: float, *observers: EpisodeObserver) -> EpisodeResult:
-    return run_episode(
-        cell,
-        task=ArrangedKitting(),
-        scenario="",
-        policy="",
-        seed=3,
-        time_limit=seconds,
-        observers=observers,
-    )
+def run(rig: Rig, seconds: float, *observers: EpisodeObserver) -> EpisodeResult:
+    return rig.run(*observers, seconds=seconds)
 
 
 def assert_shows(step: DemonstrationStep, observation: Observation) -> None:
@@ -60,15 +51,15 @@ def assert_shows(step: DemonstrationStep, observation: Observation) -> None:
 
 
 def test_a_demonstration_is_what_was_acted_upon_and_what_was_left():
-    cell = cell_of("combination_wrench", planner=HASTY)
-    recorder = DemonstrationRecorder(cell)
+    rig = rig_of("combination_wrench", planner=HASTY)
+    recorder = DemonstrationRecorder(rig.station)
     latched: list[tuple[PlanarPose, PlanarPose]] = []
 
     def latch(event: ModeChange) -> None:
-        context = cell.planner.GetMyContextFromRoot(event.root_context)
-        latched.append(cell.planner.action(context))
+        action = rig.station.accepted_action(event.root_context)
+        latched.append((action.pick, action.place))
 
-    result = run(cell, 30.0, recorder.observe, latch)
+    result = run(rig, 30.0, recorder.observe, latch)
     made = recorder.demonstration(result)
     assert isinstance(made, Demonstration)
     assert (made.seed, made.score) == (3, 1.0)
@@ -92,9 +83,9 @@ def test_what_is_taken_down_is_what_a_policy_has_seen(monkeypatch: pytest.Monkey
         return action
 
     monkeypatch.setitem(sys.modules, "looking", types.SimpleNamespace(look=look))
-    cell = cell_of("claw_hammer", planner=HASTY, policy=PythonPolicy(function="looking:look"))
-    recorder = DemonstrationRecorder(cell)
-    result = run(cell, 0.1, recorder.observe)
+    rig = rig_of("claw_hammer", planner=HASTY, policy=PythonPolicy(function="looking:look"))
+    recorder = DemonstrationRecorder(rig.station)
+    result = run(rig, 0.1, recorder.observe)
     made = recorder.demonstration(as_success(result, "placed"))
     assert isinstance(made, Demonstration)
     (step,) = made.steps
@@ -117,25 +108,25 @@ def as_success(result: EpisodeResult, *outcomes: str) -> EpisodeResult:
 
 def test_only_what_was_placed_is_a_step():
     """Told of actions on two tools that do not move, of which the first fails twice."""
-    cell = cell_of("claw_hammer", "flat_screwdriver")
-    recorder = DemonstrationRecorder(cell)
-    root: Context = cell.diagram.CreateDefaultContext()
-    context = cell.plant.GetMyMutableContextFromRoot(root)
+    rig = rig_of("claw_hammer", "flat_screwdriver")
+    recorder = DemonstrationRecorder(rig.station)
+    root: Context = rig.diagram.CreateDefaultContext()
+    context = rig.plant.GetMyMutableContextFromRoot(root)
     seen: list[Observation] = []
 
     def tell(previous: Mode, mode: Mode, *, is_last: bool = False) -> None:
         recorder.observe(ModeChange(previous, mode, root, is_last))
 
     def act() -> None:
-        seen.append(cell.diagram.GetOutputPort("observation").Eval(root))
+        seen.append(rig.port("observation", root))
         modes = [Mode.OBSERVE, Mode.APPROACH, Mode.DESCEND, Mode.RETREAT, Mode.OBSERVE]
         for previous, mode in itertools.pairwise(modes):
             tell(previous, mode)
 
     def put_at_goal(index: int) -> None:
-        (X_WGoal,) = cell.scene.goals[index].poses
-        body = cell.plant.get_body(cell.objects[index].body)
-        cell.plant.SetFreeBodyPose(context, body, X_WGoal)
+        (X_WGoal,) = rig.scene.goals[index].poses
+        body = rig.plant.get_body(rig.objects[index].body)
+        rig.plant.SetFreeBodyPose(context, body, X_WGoal)
 
     act()
     act()
@@ -143,10 +134,10 @@ def test_only_what_was_placed_is_a_step():
     put_at_goal(0)
     act()
     put_at_goal(1)
-    left = cell.diagram.GetOutputPort("observation").Eval(root)
+    left = rig.port("observation", root)
     tell(Mode.OBSERVE, Mode.DONE)
     tell(Mode.DONE, Mode.DONE, is_last=True)
-    nothing = run(cell, 0.01)
+    nothing = run(rig, 0.01)
     result = as_success(nothing, "missed", "dropped", "placed", "placed")
     made = recorder.demonstration(result)
     assert isinstance(made, Demonstration)
@@ -166,7 +157,7 @@ def test_only_what_was_placed_is_a_step():
     twice = [first, *others, dataclasses.replace(last, object=first.object)]
     again = dataclasses.replace(result, actions_taken=twice)
     assert isinstance(recorder.demonstration(again), Demonstration)
-    labelling = DemonstrationRecorder(cell, later_picks_possible=True)
+    labelling = DemonstrationRecorder(rig.station, later_picks_possible=True)
     assert labelling.demonstration(again) == Rejection(3, 1.0, "object_0 took a second action")
     aside = as_success(nothing, "missed", "missed", "missed", "missed")
     assert recorder.demonstration(aside) == Rejection(3, 1.0, "there was nothing to do")

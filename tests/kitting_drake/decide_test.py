@@ -1,4 +1,4 @@
-"""From files of frames to an action: that of the cell, and without Drake."""
+"""From files of frames to an action: that of the rig, and without Drake."""
 
 import dataclasses
 import io
@@ -16,12 +16,9 @@ from PIL import Image
 
 from kitting_drake import decide as decide_command
 from kitting_drake.common.errors import UserError
-from kitting_drake.common.paths import GENERALIST
-from kitting_drake.policies.learned_policy import LearnedPolicy
+from kitting_drake.policies.factory import load_learned_policy
 from kitting_drake.policies.matching.recovery import recovery_action
 from kitting_drake.policies.matching.segmentation import segment
-from kitting_drake.policies.networks.device import preferred_type
-from kitting_drake.policies.networks.weights import load_networks
 from kitting_drake.real_camera import Frame, ShapeMatching, decide, load_policy, read_frames
 from kitting_drake.real_camera.calibrations.calibration import (
     Calibration,
@@ -30,8 +27,9 @@ from kitting_drake.real_camera.calibrations.calibration import (
 )
 from kitting_drake.real_camera.checking.kit_block import Block
 from kitting_drake.scenario import load_scenario
-from kitting_drake.scenario.cameras import camera_pose
-from kitting_drake.scenario.schema import LookAt, Scenario
+from kitting_drake.scenario.cameras import LookAt, camera_pose
+from kitting_drake.scenario.schema import Scenario
+from systems.pick_place_parameters import PickPlaceParameters
 from tests.kitting_drake.real_camera.frames import (
     ROOT,
     Rendered,
@@ -85,10 +83,8 @@ def test_what_stands_out_is_mended_when_the_cell_mends_it(high: float, scene: Re
     row, col = int(rows.mean()), cols.min() + 3
     image[3, row : row + 4, col : col + 26] = top + high
     seen = dataclasses.replace(seen, image=image)
-    assert recovery_action(seen, segment(seen)) is not None
-    cells = LearnedPolicy(
-        load_networks(GENERALIST, preferred_type()), fit_outlines=True, recover=True
-    )
+    assert recovery_action(seen, segment(seen), PickPlaceParameters()) is not None
+    cells = load_learned_policy(None, PickPlaceParameters(), insertion=True, recover=True).function
     chosen = load_policy(recover=True).choose(seen)
     assert chosen.action == cells(seen)
     assert chosen.action.press == (high < 0.01)

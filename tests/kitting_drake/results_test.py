@@ -1,18 +1,32 @@
 import itertools
 import json
-import math
-import subprocess
-from collections.abc import Callable
+import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
+from kitting_drake import results
 from kitting_drake.common.errors import UserError
+from kitting_drake.common.paths import SCENARIOS
 from kitting_drake.evaluation.summary import summarise
 from kitting_drake.reproduction.page.results_page import results_page
-from kitting_drake.reproduction.page.runs import read_runs
+from kitting_drake.reproduction.page.robustness import robustness_table, with_figures
+from kitting_drake.reproduction.page.run_table import (
+    EPISODES,
+    TABLE,
+    add_run,
+    read_summaries,
+    remove_runs,
+)
+from kitting_drake.reproduction.page.runs import Run, read_evaluation, read_runs
+from kitting_drake.reproduction.paper.cell_results import cell_results
+from kitting_drake.reproduction.paper.efficiency import read_efficiency
+from kitting_drake.reproduction.paper.learning_rates import read_rates
+from kitting_drake.reproduction.paper.paper_sections import paper_sections
+from kitting_drake.reproduction.paper.paper_tables import paper_cells
 from kitting_drake.scenario.policies import PythonPolicy, QuantizedOracle
 from kitting_drake.scenario.schema import Heightmap, Scenario
 from kitting_drake.tasks import PAPER_TASKS, ArrangedKitting, Kitting, ToolsetKitting
@@ -32,37 +46,42 @@ OURS = {
     "steps": 1234,
 }
 SEEN, UNSEEN = PAPER_TASKS
+OWN = SCENARIOS.parent / "docs" / "results"
+"""The results of this tree."""
 
 
 def write(
-    path: Path,
+    folder: Path,
+    name: str,
     scenario: Scenario,
     errors_mm: list[float],
     seeds: range = range(5),
     **fields: Any,
 ) -> None:
-    """A summary of episodes that are all alike, some of its fields replaced."""
+    """Adds a run of episodes that are all alike, some fields of its summary replaced."""
     episodes = [make_episode(seed, errors_mm) for seed in seeds]
     chosen = replace(CHOSEN, scenario=scenario)
-    summary = summarise(episodes, chosen, ADD_S, wall_seconds_total=1.0) | fields
-    path.write_text(json.dumps(summary))
+    add_run(folder, name, summarise(episodes, chosen, ADD_S, wall_seconds_total=1.0) | fields)
 
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    """Two summaries: of the oracle quantized to N = 36, and of a network."""
+    """Two runs: of the oracle quantized to N = 36, and of a network."""
     quantized = Scenario(policy=QuantizedOracle(orientations=36))
-    write(tmp_path / "quantized.json", quantized, [1.0, 9.0, 1.0, 1.0])
+    write(tmp_path, "quantized", quantized, [1.0, 9.0, 1.0, 1.0])
     objects = [make_object(name, 1.0) for name in ("cup", "bolt", "ring")]
     protruding = make_object("block", 2.0, height_error_mm=3.0)
     episodes = [make_result(seed, [*objects, protruding]).as_dict() for seed in range(100, 110)]
     learned = summarise(episodes, CHOSEN, ADD_S, wall_seconds_total=1.0)
-    (tmp_path / "ours.json").write_text(json.dumps(learned | {"policy_details": OURS}))
+    add_run(tmp_path, "ours", learned | {"policy_details": OURS})
     return tmp_path
 
 
-def spoil(path: Path, **fields: Any) -> None:
-    path.write_text(json.dumps(json.loads(path.read_text()) | fields))
+def spoil(folder: Path, name: str, **fields: Any) -> None:
+    """Replaces fields of a run."""
+    summary = read_summaries(folder)[name] | fields
+    remove_runs(folder, [name])
+    add_run(folder, name, summary)
 
 
 def page(folder: Path) -> str:
@@ -110,7 +129,7 @@ def test_success_by_method_and_orientations_strict_first(folder: Path):
 
 def test_a_policy_of_ones_own_has_one_figure_for_all(folder: Path):
     own = Scenario(policy=PythonPolicy(function="json:loads"))
-    write(folder / "own.json", own, [1.0, 1.0])
+    write(folder, "own", own, [1.0, 1.0])
     own_row = successes(page(folder), SEEN)["python_policy", "", ""]
     assert own_row == ["100.0 (72.2 to 100.0) / 100.0 (72.2 to 100.0), 5"] * 4
 
@@ -136,13 +155,13 @@ DENSE = Scenario(task=ToolsetKitting(split="test"), heightmap=Heightmap(resoluti
 def test_a_run_is_the_papers_only_if_nothing_but_the_policy_differs(
     scenario: Scenario, task: str | None, departures: str, tmp_path: Path
 ):
-    write(tmp_path / "run.json", scenario, [1.0, 1.0])
+    write(tmp_path, "run", scenario, [1.0, 1.0])
     (run,) = read_runs(tmp_path)
     assert (run.paper_task, run.departures_text) == (task, departures)
     text = page(tmp_path)
     if task is None:
         (others,) = tables(text)["Other runs"]
-        assert [row[0] for row in others[1:]] == ["run.json"]
+        assert [row[0] for row in others[1:]] == ["run"]
         assert others[1][3] == departures
         assert not any(title in heading for title in PAPER_TASKS for heading in tables(text))
     else:
@@ -152,10 +171,10 @@ def test_a_run_is_the_papers_only_if_nothing_but_the_policy_differs(
 
 def test_a_field_that_a_run_did_not_have_is_a_difference(tmp_path: Path):
     """A task that has since become harder is not the same task."""
-    write(tmp_path / "run.json", Scenario(task=ToolsetKitting()), [1.0])
-    found = json.loads((tmp_path / "run.json").read_text())["resolved_scenario"]
+    write(tmp_path, "run", Scenario(task=ToolsetKitting()), [1.0])
+    found = read_summaries(tmp_path)["run"]["resolved_scenario"]
     del found["task"]["random_lengths"]
-    spoil(tmp_path / "run.json", resolved_scenario=found)
+    spoil(tmp_path, "run", resolved_scenario=found)
     (run,) = read_runs(tmp_path)
     assert (run.paper_task, run.departures) == (None, ["task.random_lengths: not there"])
 
@@ -184,22 +203,19 @@ def test_the_most_tested_network_and_all_causes(folder: Path):
 )
 def test_marks_tell_how_a_run_departs(folder: Path, continuous: bool, trained: int, marks: str):
     details = OURS | {"continuous": continuous, "trained_orientations": trained}
-    spoil(folder / "ours.json", policy_details=details)
+    spoil(folder, "ours", policy_details=details)
     assert f"100.0 (91.2 to 100.0), 10{marks} |" in page(folder)
 
 
-def test_every_file_is_listed(folder: Path):
-    (files,) = tables(page(folder))["Files"]
-    assert [row[0] for row in files[1:]] == [
-        "[ours.json](results/ours.json)",
-        "[quantized.json](results/quantized.json)",
-    ]
+def test_every_run_is_listed(folder: Path):
+    assert "[a table](results/runs.csv)" in page(folder)
+    (files,) = tables(page(folder))["Runs"]
+    assert [row[0] for row in files[1:]] == ["ours", "quantized"]
     assert files[1][3:6] == ["1234", "10", "100 to 109"]
 
 
 def test_runs_that_differ_only_in_training_are_all_told(folder: Path):
-    (folder / "ours_again.json").write_text((folder / "ours.json").read_text())
-    spoil(folder / "ours_again.json", strict_success_rate=0.5)
+    add_run(folder, "ours_again", read_summaries(folder)["ours"] | {"strict_success_rate": 0.5})
     cell = successes(page(folder), SEEN)["SO(2)-equivariant (ours)", "small", "100"][-1]
     first, second = cell.split("<br>")
     assert (first.split()[0], second.split()[0]) == ("75.0", "50.0")
@@ -211,54 +227,108 @@ def test_tables_are_aligned(folder: Path):
             assert len(first) == len(second)
 
 
-def test_without_files_there_is_a_page(tmp_path: Path):
-    text = page(tmp_path)
+def test_without_runs_there_is_a_page(tmp_path: Path):
+    text = results_page([], "results")
     assert tables(text) == {}
     assert text.endswith("There are none yet.\n")
-    with pytest.raises(UserError, match=r"there is no folder .*none"):
-        read_runs(tmp_path / "none")
+    with pytest.raises(UserError, match=r"there is no .*runs\.csv: add a run to it"):
+        read_runs(tmp_path)
 
 
-def test_files_that_cannot_be_used_are_named(folder: Path):
-    ours = folder / "ours.json"
+def test_runs_that_cannot_be_used_are_named(folder: Path, tmp_path: Path):
     for details, words in (
         ("so2", "'policy_details' is 'so2': it must be"),
         ({"method": "so2", "orientations": 36}, "policy_details.demonstrations must be a whole"),
     ):
-        spoil(ours, policy_details=details)
-        with pytest.raises(UserError, match=rf"ours\.json: {words}"):
+        spoil(folder, "ours", policy_details=details)
+        with pytest.raises(UserError, match=rf"runs\.csv, run 'ours': {words}"):
             read_runs(folder)
-    spoil(ours, policy_details={"method": "oracle"})
+    good = read_summaries(folder)["quantized"]
+    path = tmp_path / "summary.json"
     for field, value in (
         ("resolved_scenario", None),
         ("resolved_scenario", {"task": {}}),
         ("seeds", 3),
-        ("seeds", ["a"]),
+        ("seeds", []),
         ("ci95", None),
-        ("success_rate", math.nan),
         ("success_rate", "all"),
         ("causes", None),
         ("categories", []),
     ):
-        before = ours.read_text()
-        spoil(ours, **{field: value})
-        with pytest.raises(UserError, match=rf"ours\.json.*({field}|seeds|must be a summary)"):
-            read_runs(folder)
-        ours.write_text(before)
-    ours.write_text("{}")
-    with pytest.raises(UserError, match=r"ours\.json lacks 'task': it must be a summary\.json"):
-        read_runs(folder)
-    ours.write_text("{")
-    with pytest.raises(UserError, match=r"ours\.json cannot be read"):
-        read_runs(folder)
+        path.write_text(json.dumps(good | {field: value}))
+        with pytest.raises(UserError, match=rf"summary\.json.*({field}|seeds|must be a summary)"):
+            read_evaluation(path)
+    path.write_text("{}")
+    with pytest.raises(UserError, match=r"lacks 'task': it must be a summary\.json of evaluate"):
+        read_evaluation(tmp_path)
+    for content in ("{", None):
+        path.write_text(content) if content else path.unlink()
+        with pytest.raises(UserError, match=r"summary\.json cannot be read"):
+            read_evaluation(path)
 
 
-def test_the_command(folder: Path, verb: Callable[..., subprocess.CompletedProcess[str]]):
-    done = verb("results", "--results", folder, "--output", folder / "docs" / "results.md")
-    assert done.returncode == 0, done.stderr
-    assert "2 summaries" in done.stdout
-    written = (folder / "docs" / "results.md").read_text()
-    assert written == results_page(read_runs(folder), "..")
-    done = verb("results", "--results", folder / "none")
-    assert done.returncode == 2
-    assert done.stderr.startswith("error: there is no folder")
+def command(monkeypatch: pytest.MonkeyPatch, folder: Path, *words: str) -> str:
+    """Runs the verb, and gives the page that it writes."""
+    output = folder / "docs" / "results.md"
+    arguments = ["results", "--results", str(folder), "--output", str(output), *words]
+    monkeypatch.setattr(sys, "argv", arguments)
+    assert results.main() == 0
+    return output.read_text()
+
+
+def test_the_command(folder: Path, monkeypatch: pytest.MonkeyPatch, capsys):
+    assert command(monkeypatch, folder) == results_page(read_runs(folder), "..")
+    assert capsys.readouterr().out.startswith("2 runs: ")
+
+
+def test_a_run_is_added_and_removed(folder: Path, monkeypatch: pytest.MonkeyPatch):
+    before = {path: path.read_bytes() for path in (folder / TABLE, folder / EPISODES)}
+    summary = read_summaries(folder)["ours"]
+    evaluated = folder / "evaluated"
+    evaluated.mkdir()
+    (evaluated / "summary.json").write_text(json.dumps(summary))
+    text = command(monkeypatch, folder, "--add", "mine", str(evaluated), "--quiet")
+    (files,) = tables(text)["Runs"]
+    assert [row[0] for row in files[1:]] == ["mine", "ours", "quantized"]
+    assert read_summaries(folder)["mine"] == summary
+    # Adding it again changes nothing; another run does not replace it.
+    command(monkeypatch, folder, "--add", "mine", str(evaluated), "--quiet")
+    (evaluated / "summary.json").write_text(json.dumps(summary | {"outcomes": []}))
+    with pytest.raises(UserError, match="has another run 'mine': give another name"):
+        command(monkeypatch, folder, "--add", "mine", str(evaluated))
+    with pytest.raises(UserError, match=r"'unseen_so2_180_100' is not that of the cell"):
+        command(monkeypatch, folder, "--add", "unseen_so2_180_100", str(evaluated))
+    command(monkeypatch, folder, "--remove", "mine", "--quiet")
+    assert {path: path.read_bytes() for path in before} == before
+    with pytest.raises(UserError, match="has no run 'mine' to remove"):
+        command(monkeypatch, folder, "--remove", "mine")
+
+
+@pytest.fixture(scope="module")
+def own_runs() -> list[Run]:
+    return read_runs(OWN)
+
+
+def test_the_runs_of_this_tree_are_what_they_say(own_runs: list[Run]):
+    """However the fields of a scenario are called since."""
+    for run in own_runs:
+        rates = [item["success_rate"] for item in run.summary.get("outcomes", ())]
+        assert not rates or np.mean(rates) == pytest.approx(run.summary["success_rate"])
+    cells, others = cell_results(own_runs, read_rates(OWN))
+    assert len(cells) == len(paper_cells())
+    assert len([run for run in others if run.paper_task]) == 6
+    known = [run for run in others if run.name.startswith("robust_friction")]
+    assert {item for run in known for item in run.departures} == {
+        "task.tries: 2",
+        *(f"variation.friction: {value}" for value in (0.15, 0.3, 0.5)),
+    }
+
+
+@pytest.mark.slow
+def test_the_pages_of_this_tree_are_made_of_its_runs(own_runs: list[Run]):
+    rates = read_rates(OWN)
+    cells, others = cell_results(own_runs, rates)
+    sections = paper_sections(cells, rates, read_efficiency(OWN))
+    assert results_page(others, "results", sections) == (OWN.parent / "results.md").read_text()
+    robustness = (OWN.parent / "robustness.md").read_text()
+    assert with_figures(robustness, robustness_table(others)) == robustness

@@ -36,6 +36,10 @@ NO_TOUCH = -1.0
 PICK_AND_PLACE = [mode for mode in Mode if mode < Mode.DONE]
 
 
+def mode_of(planner: PickPlacePlanner, context: Context) -> Mode:
+    return Mode(int(planner.GetOutputPort("mode").Eval(context)[0]))
+
+
 @dataclasses.dataclass
 class World:
     """What the hand meets: heights that its tips, or what they hold, touch; between its jaws what.
@@ -125,11 +129,13 @@ class Run:
         world: World | None = None,
         *,
         actions: int = 1,
-        answer: PickPlaceAction = ACTION,
+        answer: PickPlaceAction | None = None,
         parameters: PickPlaceParameters = PARAMETERS,
         insertion: bool = False,
         observation: Observation | None = None,
     ) -> None:
+        if answer is None:
+            answer = ACTION if observation is None else PickPlaceAction(PICK, PLACE)
         builder = DiagramBuilder()
         self.planner = builder.AddSystem(
             PickPlacePlanner(parameters=parameters, max_actions=TEN, insertion=insertion)
@@ -151,7 +157,7 @@ class Run:
         self.simulator.set_monitor(self._look)
 
     def _look(self, root: Context) -> EventStatus:
-        mode = self.planner.mode(self.planner.GetMyContextFromRoot(root))
+        mode = mode_of(self.planner, self.planner.GetMyContextFromRoot(root))
         if not self.modes or self.modes[-1][1] != mode:
             self.modes.append((root.get_time(), mode))
         if mode == Mode.DONE:
@@ -197,9 +203,12 @@ def test_ports():
         "closing_force": 1,
         "mode": 1,
         "counts": 3,
+        "asks": 1,
     }
-    assert planner.num_output_ports() == len(outputs) + 1
-    assert planner.GetOutputPort("failed_picks").Eval(planner.CreateDefaultContext()) == ()
+    assert planner.num_output_ports() == len(outputs) + 2
+    context = planner.CreateDefaultContext()
+    assert planner.GetOutputPort("failed_picks").Eval(context) == ()
+    assert not planner.GetOutputPort("accepted_action").Eval(context).press
     for name, size in outputs.items():
         assert planner.GetOutputPort(name).size() == size
 
@@ -211,7 +220,7 @@ def test_begins_at_home_with_open_jaws():
     np.testing.assert_array_equal(motion, [*PARAMETERS.home, *np.zeros(8)])
     opening = planner.GetOutputPort("desired_opening").Eval(context)
     np.testing.assert_array_equal(opening, [PARAMETERS.open_width, 0])
-    assert planner.mode(context) == Mode.OBSERVE
+    assert mode_of(planner, context) == Mode.OBSERVE
 
 
 def test_all_modes_of_a_pick_and_place_in_order():
@@ -232,7 +241,8 @@ def test_where_the_hand_goes():
     over_place = [PLACE.x, PLACE.y, HANGING + PARAMETERS.hover_clearance]
     np.testing.assert_allclose(run.output("desired_motion")[:3], over_place, atol=1e-4)
     context = run.planner.GetMyContextFromRoot(run.simulator.get_context())
-    pick, place = run.planner.action(context)
+    accepted = run.planner.GetOutputPort("accepted_action").Eval(context)
+    pick, place = accepted.pick, accepted.place
     assert (pick.x, pick.y, pick.theta) == (PICK.x, PICK.y, pytest.approx(turned))
     assert (place.x, place.y) == (PLACE.x, PLACE.y)
     # What is held turns by exactly this: the jaws being alike, the hand may be turned by pi.
@@ -387,8 +397,9 @@ def seen(**heights: float) -> Observation:
     return Observation(image, grid)
 
 
-def test_heights_are_read_off_the_observation_where_there_is_one():
-    """Not those of the action, which an oracle knows from the truth."""
+def test_heights_are_read_off_the_observation_unless_the_action_brings_its_own():
+    run = Run(observation=seen(table=0.01, pick=0.04), answer=ACTION).until(Mode.CLOSE)
+    assert run.output("desired_motion")[2] == pytest.approx(GRASP_Z)
     run = Run(observation=seen(table=0.01, pick=0.04)).until(Mode.CLOSE)
     assert run.output("desired_motion")[2] == pytest.approx(0.04 - PARAMETERS.grasp_depth)
     # Nothing goes below the table, wherever that is.

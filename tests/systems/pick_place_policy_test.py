@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from pydrake.common.value import Value
 
-from systems.pick_place_policy import PickPlacePolicy
+from systems.pick_place_policy import PickPlacePolicy, PolicyError
 from systems.signals import Observation, PickPlaceAction, PlanarPose
 
 ACTION = PickPlaceAction(PlanarPose(0.4, 0.1, 0.2), PlanarPose(0.5, -0.1, 1.0))
@@ -12,17 +12,24 @@ def observation(value: float) -> Observation:
     return Observation(image=np.full((4, 160, 320), value, np.float32))
 
 
-def test_ports():
-    policy = PickPlacePolicy(policy=lambda _: ACTION)
-    assert policy.num_input_ports() == policy.num_output_ports() == 1
-    assert isinstance(policy.GetInputPort("observation").Allocate().get_value(), Observation)
+@pytest.mark.parametrize("heights_only", [False, True])
+def test_ports(heights_only: bool):
+    policy = PickPlacePolicy(policy=lambda *_: ACTION, heights_only=heights_only)
+    name = "observation_heights" if heights_only else "observation"
+    ports = [policy.get_input_port(i).get_name() for i in range(policy.num_input_ports())]
+    assert ports == [name, "failed_picks"]
+    assert policy.num_output_ports() == 1
+    assert isinstance(policy.GetInputPort(name).Allocate().get_value(), Observation)
     assert isinstance(policy.GetOutputPort("action").Allocate().get_value(), PickPlaceAction)
+    context = policy.CreateDefaultContext()
+    policy.GetInputPort(name).FixValue(context, Value(Observation()))
+    assert policy.GetOutputPort("action").Eval(context) == ACTION
 
 
 def test_is_asked_once_for_each_observation():
     asked = []
 
-    def answer(o: Observation) -> PickPlaceAction:
+    def answer(o: Observation, _) -> PickPlaceAction:
         asked.append(float(o.image[3, 80, 160]))
         return ACTION
 
@@ -40,7 +47,7 @@ def test_is_asked_once_for_each_observation():
 
 
 def test_an_answer_of_another_type_is_refused():
-    policy = PickPlacePolicy(policy=lambda _: (0.4, 0.1))  # type: ignore[arg-type, return-value]
+    policy = PickPlacePolicy(policy=lambda *_: (0.4, 0.1))  # type: ignore[arg-type, return-value]
     context = policy.CreateDefaultContext()
     policy.GetInputPort("observation").FixValue(context, Value(Observation()))
     with pytest.raises(TypeError, match="answered with tuple, not a PickPlaceAction"):
@@ -56,7 +63,7 @@ def test_an_answer_of_another_type_is_refused():
     ],
 )
 def test_poses_that_are_no_numbers_are_refused(answer, error: type, message: str):
-    policy = PickPlacePolicy(policy=lambda _: answer)
+    policy = PickPlacePolicy(policy=lambda *_: answer)
     context = policy.CreateDefaultContext()
     policy.GetInputPort("observation").FixValue(context, Value(Observation()))
     with pytest.raises(error, match=message):
@@ -69,78 +76,47 @@ def test_what_means_nothing_is_not_looked_at():
         PickPlaceAction(nowhere, nowhere, stop=True),
         PickPlaceAction(PlanarPose(np.float32(0.5), 0, 0), nowhere, press=True),
     ):
-        policy = PickPlacePolicy(policy=lambda _, answer=answer: answer)
+        policy = PickPlacePolicy(policy=lambda *_, answer=answer: answer)
         context = policy.CreateDefaultContext()
         policy.GetInputPort("observation").FixValue(context, Value(Observation()))
         assert policy.GetOutputPort("action").Eval(context).press == answer.press
 
 
-def test_what_the_policy_raises_comes_through():
-    def fail(_: Observation) -> PickPlaceAction:
+def test_what_the_policy_raises_is_told_as_its_error():
+    def fail(*_) -> PickPlaceAction:
         raise KeyError("no such weight")
 
     policy = PickPlacePolicy(policy=fail)
     context = policy.CreateDefaultContext()
     policy.GetInputPort("observation").FixValue(context, Value(Observation()))
-    with pytest.raises(KeyError, match="no such weight"):
+    with pytest.raises(PolicyError, match="no such weight") as caught:
         policy.GetOutputPort("action").Eval(context)
+    assert isinstance(caught.value.__cause__, KeyError)
 
 
-def test_a_function_of_two_arguments_is_told_where_grasps_failed():
-    told = []
+def test_a_policy_is_given_where_grasps_failed():
+    given = []
 
-    def answer(_: Observation, failed_picks: tuple[PlanarPose, ...]) -> PickPlaceAction:
-        told.append(failed_picks)
+    def answer(_: Observation, failed_picks=None) -> PickPlaceAction:
+        given.append(failed_picks)
         return ACTION
 
     policy = PickPlacePolicy(policy=answer)
-    assert policy.num_input_ports() == 2
     context = policy.CreateDefaultContext()
     policy.GetInputPort("observation").FixValue(context, Value(Observation()))
+    port = policy.GetOutputPort("action")
+    assert port.Eval(context) == ACTION
     for failed in ((), (PlanarPose(0.4, 0.1, 0.2),)):
         policy.GetInputPort("failed_picks").FixValue(context, Value(failed))
-        assert policy.GetOutputPort("action").Eval(context) == ACTION
-    assert told == [(), (PlanarPose(0.4, 0.1, 0.2),)]
-
-
-def test_failed_picks_are_found_by_their_name():
-    told = []
-
-    def last(_: Observation, threshold: float = 0.5, *, failed_picks=()) -> PickPlaceAction:
-        told.append((threshold, failed_picks))
-        return ACTION
-
-    def third(_: Observation, threshold: float = 0.5, failed_picks=()) -> PickPlaceAction:
-        return last(_, threshold, failed_picks=failed_picks)
-
-    for function in (last, third):
-        policy = PickPlacePolicy(policy=function)
-        context = policy.CreateDefaultContext()
-        policy.GetInputPort("observation").FixValue(context, Value(Observation()))
-        policy.GetInputPort("failed_picks").FixValue(context, Value((ACTION.pick,)))
-        assert policy.GetOutputPort("action").Eval(context) == ACTION
-    assert told == [(0.5, (ACTION.pick,))] * 2
-
-
-def test_an_option_of_a_function_is_its_own():
-    thresholds = []
-
-    def answer(_: Observation, threshold: float = 0.5) -> PickPlaceAction:
-        thresholds.append(threshold)
-        return ACTION
-
-    policy = PickPlacePolicy(policy=answer)
-    assert policy.num_input_ports() == 1
-    context = policy.CreateDefaultContext()
-    policy.GetInputPort("observation").FixValue(context, Value(Observation()))
-    policy.GetOutputPort("action").Eval(context)
-    assert thresholds == [0.5]
+        assert port.Eval(context) == ACTION
+    # Not connected: none.
+    assert given == [(), (), (PlanarPose(0.4, 0.1, 0.2),)]
 
 
 @pytest.mark.parametrize("number", [np.nan, np.inf])
 def test_an_action_that_is_no_number_is_refused(number: float):
     action = PickPlaceAction(PlanarPose(0.4, 0.1, number), PlanarPose())
-    policy = PickPlacePolicy(policy=lambda _: action)
+    policy = PickPlacePolicy(policy=lambda *_: action)
     context = policy.CreateDefaultContext()
     policy.GetInputPort("observation").FixValue(context, Value(Observation()))
     with pytest.raises(ValueError, match="answered with no finite numbers"):

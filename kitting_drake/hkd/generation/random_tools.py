@@ -92,7 +92,7 @@ def _attempt(
         category, whole = "composed", _composed(rng)
         center = _centroid(whole)
     else:
-        entry = entries[rng.integers(len(entries))]
+        entry = entries[int(rng.integers(len(entries)))]
         category = entry.category
         parts = build_parts(_varied(entry, rng))
         center = 1e3 * mass_properties(homogeneous(parts))[1]
@@ -202,7 +202,7 @@ def _composed(rng: np.random.Generator) -> Manifold:
     width, height = rng.uniform(6, 30), rng.uniform(5, 28)
     solid = _bar(length, width, height, rng)
     for _ in range(int(rng.integers(1, 5))):
-        place = rng.choice([-0.5, 0.5, rng.uniform(-0.4, 0.4)], p=[0.4, 0.4, 0.2]) * length
+        place = length * float(rng.choice([-0.5, 0.5, rng.uniform(-0.4, 0.4)], p=[0.4, 0.4, 0.2]))
         kind = rng.choice(["block", "disc", "ring", "bar", "fork"], p=[0.3, 0.2, 0.15, 0.2, 0.15])
         tall = rng.uniform(0.4, 1.3) * height
         if kind == "block":

@@ -19,17 +19,17 @@ from systems.pick_place_parameters import PickPlaceParameters
 Array = NDArray[np.float64]
 
 # Lengths in m, as everywhere here.
-_PRIMITIVE = PickPlaceParameters()
-
-GRASP_DEPTH = _PRIMITIVE.grasp_depth
+PLANNER = PickPlaceParameters()
+"""How the hand picks and places by default: tools are annotated, and kits laid out, for this."""
+GRASP_DEPTH = PLANNER.grasp_depth
 """How far the pads reach below the tool's top."""
-FLOOR_CLEARANCE = _PRIMITIVE.floor_clearance
+FLOOR_CLEARANCE = PLANNER.floor_clearance
 """The pads are never lower than this above the table."""
 WIDEST = MAX_OPENING - 0.015
 """The greatest width that the jaws take, with a margin on either side."""
 NARROWEST = 0.003
 """The least width that is worth a grasp."""
-RELEASE_REACH = _PRIMITIVE.release_clearance + FINGERTIP_DEPTH
+RELEASE_REACH = PLANNER.release_clearance + FINGERTIP_DEPTH
 """How far the fingertips reach beyond the gripped faces as they let go."""
 
 # Surface that stands back by less than this touches a pad.
@@ -80,15 +80,19 @@ class GraspProposal(Grasp):
         return Grasp(self.x, self.y, self.theta, self.width, self.surface_height)
 
 
-def propose_grasps(triangles: Array, center_of_mass: Array) -> list[GraspProposal]:
+def propose_grasps(
+    triangles: Array, center_of_mass: Array, planner: PickPlaceParameters = PLANNER
+) -> list[GraspProposal]:
     """Grasps from above, the best first; empty if the hand can hold the tool nowhere.
 
     Args:
         triangles: (n, 3, 3) of the surface in frame T, in metres, the table at z = 0.
         center_of_mass: (2,) or (3,) in T, in metres.
+        planner: how deep the pads reach, how far they stay above the table, and how far the jaws
+            draw back to let go.
     """
     height = float(triangles[:, :, 2].max())
-    if not height > FLOOR_CLEARANCE:
+    if not height > planner.floor_clearance:
         return []
     levels = _levels(height)
     points, level = _slices(triangles, levels)
@@ -99,14 +103,14 @@ def propose_grasps(triangles: Array, center_of_mass: Array) -> list[GraspProposa
     # A rotation by pi swaps the jaws, which are alike.
     found: list[GraspProposal] = []
     for theta in np.radians(np.arange(-90.0, 90.0, _COARSE_DEG)):
-        found += _search(points, level, levels, com, float(theta), _COARSE_TOUCH)
+        found += _search(points, level, levels, com, float(theta), _COARSE_TOUCH, planner)
     fine = np.radians(np.arange(-_COARSE_DEG / 2, _COARSE_DEG / 2 + 1e-9, _FINE_DEG))
     result = []
     for coarse in _distinct(found):
         place = np.array([coarse.x, coarse.y])
         near: list[GraspProposal] = []
         for theta in coarse.theta + fine:
-            near += _search(points, level, levels, com, float(theta), _TOUCH, place)
+            near += _search(points, level, levels, com, float(theta), _TOUCH, planner, place)
         if near:
             result.append(min(near, key=lambda p: p.cost))
     # Heights from the slices are as coarse as their levels.
@@ -121,7 +125,7 @@ def _top(triangles: Array, grasp: Grasp) -> float:
 
 def _levels(height: float) -> Array:
     step = min(0.001, height / 12)
-    return (np.arange(int(np.ceil(height / step - 1e-9))) + 0.5) * step
+    return (np.arange(np.ceil(height / step - 1e-9), dtype=float) + 0.5) * step
 
 
 def _slices(triangles: Array, levels: Array) -> tuple[Array, NDArray[np.int64]]:
@@ -201,6 +205,7 @@ def _search(
     com: Array,
     theta: float,
     touch: float,
+    planner: PickPlaceParameters,
     near: Array | None = None,
 ) -> list[GraspProposal]:
     """The acceptable grasps at one rotation of the hand: along all of the tool, or about `near`.
@@ -217,21 +222,24 @@ def _search(
         centres = centres[(centres >= first) & (centres < last)]
     result = []
     for centre in centres:
-        hold = _hold(reach, centre, levels, touch)
+        hold = _hold(reach, int(centre), levels, touch, planner)
         if hold is not None:
-            result.append(_proposal(hold, reach.u_min + centre * _BIN, theta, com))
+            result.append(_proposal(hold, reach.u_min + centre * _BIN, theta, com, planner))
     return result
 
 
-def _proposal(hold: _Hold, u: float, theta: float, com: Array) -> GraspProposal:
+def _proposal(
+    hold: _Hold, u: float, theta: float, com: Array, planner: PickPlaceParameters
+) -> GraspProposal:
     """The proposal that a hold makes where the pads' middle is at `u`, with its penalties."""
     along, across = jaw_axes(theta)
     x, y = u * along + hold.middle * across
     lever = abs(u - float(com @ along))
     aside = abs(hold.middle - float(com @ across))
+    release_reach = planner.release_clearance + FINGERTIP_DEPTH
     fingers = (
         abs(y)
-        + (hold.width / 2 + RELEASE_REACH) * abs(np.cos(theta))
+        + (hold.width / 2 + release_reach) * abs(np.cos(theta))
         + (FINGER_LENGTH / 2 * abs(np.sin(theta)))
     )
     penalties = {
@@ -260,7 +268,9 @@ def _proposal(hold: _Hold, u: float, theta: float, com: Array) -> GraspProposal:
     )
 
 
-def _hold(reach: _Reach, centre: int, levels: Array, touch: float) -> _Hold | None:
+def _hold(
+    reach: _Reach, centre: int, levels: Array, touch: float, planner: PickPlaceParameters
+) -> _Hold | None:
     """The hold of two pads with their middle at a column; None if they cannot hold the tool.
 
     `find_grip` tells the extent of all that is between the pads; this, how they touch it.
@@ -270,6 +280,7 @@ def _hold(reach: _Reach, centre: int, levels: Array, touch: float) -> _Hold | No
         centre: the column at whose lower edge the middle of the pads is.
         levels: the heights of the slices.
         touch: surface that stands back by less than this counts as touched.
+        planner: how deep the pads reach, and how far they stay above the table.
     """
     fingers = slice(centre - _FINGER_COLUMNS, centre + _FINGER_COLUMNS)
     finger_left, finger_right = reach.left[fingers], reach.right[fingers]
@@ -280,7 +291,7 @@ def _hold(reach: _Reach, centre: int, levels: Array, touch: float) -> _Hold | No
     if not len(occupied):
         return None
     top, step = levels[occupied[-1]], levels[1] - levels[0]
-    bottom = max(top + step / 2 - GRASP_DEPTH, FLOOR_CLEARANCE)
+    bottom = max(top + step / 2 - planner.grasp_depth, planner.floor_clearance)
     held = (levels >= bottom) & (levels <= top)
     if not held.any():
         return None
@@ -311,7 +322,7 @@ def _hold(reach: _Reach, centre: int, levels: Array, touch: float) -> _Hold | No
         width=float(width),
         top=float(top),
         contact=contact,
-        depth=float(min(1.0, rows.sum() * step / GRASP_DEPTH)),
+        depth=float(min(1.0, rows.sum() * step / planner.grasp_depth)),
         slope=slope,
         overhang=float(overhang),
         twist=float(abs(twist)),

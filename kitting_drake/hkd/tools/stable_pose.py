@@ -64,7 +64,7 @@ def stable_poses(points: Array, center_of_mass: Array) -> list[StablePose]:
         if margin <= 0:
             continue
         # Among nearly coplanar triangles, the one below the centre of mass bears the body.
-        shares = [_least_share(hull, points, member, center_of_mass) for member in members]
+        shares = [_least_share(hull, points, int(member), center_of_mass) for member in members]
         bearing = members[int(np.argmax(shares))]
         normal = normals[bearing]
         height = float((corners @ normal).max() - center_of_mass @ normal)

@@ -174,7 +174,7 @@ class Motion:
         """The image after the motion, of the same size."""
         rows, cols = self.image.shape[1:]
         target = np.stack(np.meshgrid(np.arange(rows), np.arange(cols), indexing="ij"), axis=-1)
-        return nearest(self.image, self.before(target))
+        return nearest(self.image, self.before(target.astype(float)))
 
 
 def rotation_matrix(angle: float) -> NDArray[np.float64]:

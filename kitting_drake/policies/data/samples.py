@@ -28,7 +28,7 @@ class HeightsOnly:
     def image(self) -> Image:
         """(4, rows, cols): black, and what no camera saw filled in; made anew each time."""
         image = self.recorded.image
-        image[3] = fill_unseen(image[3], image.any(axis=0))
+        image[3] = fill_unseen(image[3], np.any(image, axis=0))
         image[:3] = 0
         return image
 
@@ -45,7 +45,7 @@ def observed(image: Image, grid: PixelGrid) -> Observation:
 
 
 @dataclass(frozen=True)
-class Scene:
+class ObservedScene:
     """One observation, and the actions that an expert may take next."""
 
     recorded: Pictured
@@ -67,7 +67,7 @@ class Scene:
 
 def scenes(
     demonstrations: Iterable[Demonstration], grid: PixelGrid, *, later_picks_possible: bool
-) -> list[Scene]:
+) -> list[ObservedScene]:
     """Every observation of some demonstrations in which there is something to pick.
 
     Args:
@@ -81,7 +81,7 @@ def scenes(
         actions = tuple(PickPlaceAction(step.pick, step.place) for step in demonstration.steps)
         for index, step in enumerate(demonstration.steps):
             last = len(actions) if later_picks_possible else index + 1
-            result.append(Scene(step, actions[index:last], grid))
+            result.append(ObservedScene(step, actions[index:last], grid))
     return result
 
 
@@ -90,7 +90,9 @@ def final_observations(demonstrations: Iterable[Demonstration]) -> list[FinalObs
     return [item.final for item in demonstrations if item.final is not None]
 
 
-def labelled_images(observed: Iterable[Scene], *, taken_only: bool) -> Sequence[LabelledImage]:
+def labelled_images(
+    observed: Iterable[ObservedScene], *, taken_only: bool
+) -> Sequence[LabelledImage]:
     """The samples to learn from; their images are made when a sample is asked for.
 
     Args:
@@ -104,7 +106,7 @@ def labelled_images(observed: Iterable[Scene], *, taken_only: bool) -> Sequence[
 class _Samples(Sequence[LabelledImage]):
     """Samples that are made of their observations when they are asked for."""
 
-    def __init__(self, observed: list[Scene], taken_only: bool) -> None:
+    def __init__(self, observed: list[ObservedScene], taken_only: bool) -> None:
         self._observed, self._taken_only = observed, taken_only
         self._indices = [
             (scene, target)
@@ -136,7 +138,7 @@ class _Samples(Sequence[LabelledImage]):
         )
 
 
-def normalisation(observed: list[Scene]) -> dict[str, float]:
+def normalisation(observed: list[ObservedScene]) -> dict[str, float]:
     """The fields of a `NetworkConfig` by which inputs are normalised."""
     # One image in memory at a time.
     images = (scene.recorded.image for scene in observed)

@@ -22,7 +22,7 @@ from kitting_drake.policies.data.learning import Learning
 from kitting_drake.policies.data.recorded import FinalObservation, Recorded
 from kitting_drake.policies.data.samples import (
     HeightsOnly,
-    Scene,
+    ObservedScene,
     final_observations,
     labelled_images,
     scenes,
@@ -105,7 +105,7 @@ class TrainingData:
             made_by={**self.made_by, "content": content_digest(items)},
         )
 
-    def scenes(self, most: int | None = None) -> list[Scene]:
+    def scenes(self, most: int | None = None) -> list[ObservedScene]:
         """The observations in which there is something to pick.
 
         Args:
@@ -122,7 +122,7 @@ class TrainingData:
                 PickPlaceAction(PlanarPose(*row[2:5]), PlanarPose(*row[5:8]))
                 for row in scene.actions.tolist()
             )
-            result.append(Scene(_recorded(Recorded, scene.image), actions, self.grid))
+            result.append(ObservedScene(_recorded(Recorded, scene.image), actions, self.grid))
         return result
 
     def finals(self, most: int | None = None, *, colour: bool = True) -> Sequence[Pictured]:

@@ -16,14 +16,13 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from kitting_drake.policies.matching.segmentation import Region, Segmentation
-from systems.hand_geometry import FINGERTIP_DEPTH, MAX_OPENING, PAD_LENGTH
+from systems.hand_geometry import FINGERTIP_DEPTH, PAD_LENGTH
 from systems.pick_place_parameters import PickPlaceParameters
 
 Array = NDArray[np.float64]
 
 RETRY_DISTANCE = 0.010
 """A grasp is not tried again this near to where one failed, in metres."""
-_PRIMITIVE = PickPlaceParameters()
 _ANGLES = 36
 _MOST_PLACES = 80
 _REACH = 0.055
@@ -32,8 +31,9 @@ _STEP = 0.0015
 """Between samples across the jaws, in metres."""
 _LINES = 5
 """Lines of samples along the pads' length."""
-_WIDEST = MAX_OPENING - 0.010
-"""The widest grip, with a margin on either side for the fingers to come down, in metres."""
+_ROOM = 0.010
+"""What is gripped is at least this much narrower than the open jaws, so that the fingers can come
+down on either side, in metres."""
 _NARROWEST = 0.003
 """The least width that is worth a grasp, in metres."""
 _LOWEST = 0.003
@@ -73,7 +73,12 @@ def untried(grasps: Sequence[JawGrasp], failed: Array, resolution: float) -> lis
 
 
 def jaw_grasps(
-    segmentation: Segmentation, region: Region, resolution: float, *, support: float = 0.0
+    segmentation: Segmentation,
+    region: Region,
+    resolution: float,
+    planner: PickPlaceParameters,
+    *,
+    support: float = 0.0,
 ) -> list[JawGrasp]:
     """The grasps of an object, the best first; empty if there is none.
 
@@ -81,6 +86,7 @@ def jaw_grasps(
         segmentation: of the observation.
         region: what is to be gripped.
         resolution: of a pixel, in metres.
+        planner: how deep the fingertips go, and how wide the jaws open.
         support: height above the table of what the object stands on, in metres.
     """
     relief = segmentation.relief
@@ -92,12 +98,12 @@ def jaw_grasps(
     places = near[:: max(1, math.ceil(len(near) / _MOST_PLACES))].astype(float)
 
     def grip(places: Array, thetas: Array) -> list[JawGrasp]:
-        found = _grip(relief, places, thetas, middle, resolution, support)
+        found = _grip(relief, places, thetas, middle, resolution, planner, support)
         return sorted(found, key=lambda item: item.cost)
 
     thetas = np.arange(_ANGLES) * math.pi / _ANGLES
     place, theta = (item.ravel() for item in np.meshgrid(np.arange(len(places)), thetas))
-    found = grip(places[place.astype(int)], theta)
+    found = grip(places[place.astype(int)], theta.astype(float))
     if not found:
         return []
     # The best at the angle at which its faces are parallel to the pads.
@@ -107,15 +113,18 @@ def jaw_grasps(
     return sorted([*refined, *found], key=lambda item: item.cost)
 
 
-def tip_height(top: Array, support: float) -> Array:
-    """Where the fingertips go, above the table: as the planner has it by default, but not below a
-    support."""
-    depth = np.clip(
-        _PRIMITIVE.grasp_depth_share * (top - support),
-        _PRIMITIVE.grasp_depth,
-        _PRIMITIVE.max_grasp_depth,
-    )
-    return np.maximum(top - depth, support + _LOWEST)
+def tip_height(top: Array, support: float, planner: PickPlaceParameters) -> Array:
+    """Where the fingertips go, in metres above the table: as `motion_heights` has it, but not down
+    to the support itself.
+
+    Args:
+        top: of the object, in metres above the table.
+        support: of what the object stands on, in metres above the table.
+        planner: how deep they go, and how far they stay above the table.
+    """
+    share = planner.grasp_depth_share * (top - support)
+    depth = np.maximum(planner.grasp_depth, np.minimum(share, planner.max_grasp_depth))
+    return np.maximum(top - depth, max(support + _LOWEST, planner.floor_clearance))
 
 
 def _grip(
@@ -124,16 +133,18 @@ def _grip(
     thetas: Array,
     middle: Array,
     resolution: float,
+    planner: PickPlaceParameters,
     support: float,
 ) -> list[JawGrasp]:
     """The grasps among places (n, 2) and angles (n,) that the jaws can take."""
     raised = ndimage.maximum_filter(relief, 3)
     top = raised[tuple(np.rint(places).astype(int).T)].astype(float)
-    tip = tip_height(top, support)
+    tip = tip_height(top, support, planner)
 
     along = np.column_stack([np.cos(thetas), np.sin(thetas)])
     across = np.column_stack([-np.sin(thetas), np.cos(thetas)])
-    half = MAX_OPENING / 2 + FINGERTIP_DEPTH + _FINGER_MARGIN + 0.02
+    open_half = planner.open_width / 2
+    half = open_half + FINGERTIP_DEPTH + _FINGER_MARGIN + 0.02
     s = np.arange(-half, half + _STEP / 2, _STEP)
     u = np.linspace(-PAD_LENGTH / 2, PAD_LENGTH / 2, _LINES)
     positions = (
@@ -154,12 +165,12 @@ def _grip(
     width, shift = right - left + _STEP, (left + right) / 2
 
     index = np.arange(len(s))[None]
-    beside = (s[None] > (shift + MAX_OPENING / 2 + FINGERTIP_DEPTH + _FINGER_MARGIN)[:, None]) | (
-        s[None] < (shift - MAX_OPENING / 2 - FINGERTIP_DEPTH - _FINGER_MARGIN)[:, None]
+    beside = (s[None] > (shift + open_half + FINGERTIP_DEPTH + _FINGER_MARGIN)[:, None]) | (
+        s[None] < (shift - open_half - FINGERTIP_DEPTH - _FINGER_MARGIN)[:, None]
     )
     own = (index >= first[:, None]) & (index <= last[:, None])
     blocked = (anywhere & ~own & ~beside).any(axis=1)
-    fits = held & ~blocked & (width <= _WIDEST) & (width >= _NARROWEST)
+    fits = held & ~blocked & (width <= planner.open_width - _ROOM) & (width >= _NARROWEST)
     if not fits.any():
         return []
 

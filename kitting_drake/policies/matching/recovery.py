@@ -18,6 +18,7 @@ from scipy import ndimage
 from kitting_drake.policies.data.images import make_action
 from kitting_drake.policies.matching.jaw_clearance import jaw_grasps
 from kitting_drake.policies.matching.segmentation import Region, Segmentation
+from systems.pick_place_parameters import PickPlaceParameters
 from systems.signals import Observation, PickPlaceAction, PlanarPose
 
 Array = NDArray[np.float64]
@@ -31,20 +32,24 @@ _ROOM = 0.045
 
 
 def recovery_action(
-    observation: Observation, segmentation: Segmentation, tried: Sequence[PlanarPose] = ()
+    observation: Observation,
+    segmentation: Segmentation,
+    planner: PickPlaceParameters,
+    tried: Sequence[PlanarPose] = (),
 ) -> PickPlaceAction | None:
     """The recovery of the object that is seated worst; None if there is none, or no recovery.
 
     Args:
         observation: o_t.
         segmentation: of it.
+        planner: how the hand will pick.
         tried: where grasps failed, and where was pressed, before.
     """
     for region in segmentation.protruding:
         pressed = _press(observation, segmentation, region)
         if region.height <= _PRESSED and not _is_near(pressed.pick, tried):
             return pressed
-        taken = _take_out(observation, segmentation, region, tried)
+        taken = _take_out(observation, segmentation, region, planner, tried)
         if taken is not None:
             return taken
     return None
@@ -64,14 +69,16 @@ def _take_out(
     observation: Observation,
     segmentation: Segmentation,
     region: Region,
+    planner: PickPlaceParameters,
     tried: Sequence[PlanarPose],
 ) -> PickPlaceAction | None:
     """Grips what stands out, and lays it where there is room on the table."""
-    free = _free_place(segmentation, observation.grid.resolution)
+    resolution = observation.grid.resolution
+    free = _free_place(segmentation, resolution)
     if free is None:
         return None
     top = float(np.median(segmentation.relief[segmentation.fixture]))
-    for grasp in jaw_grasps(segmentation, region, observation.grid.resolution, support=top):
+    for grasp in jaw_grasps(segmentation, region, resolution, planner, support=top):
         action = make_action(observation, grasp.pixel, grasp.theta, free, 0.0)
         if not _is_near(action.pick, tried):
             return action

@@ -27,6 +27,7 @@ from kitting_drake.policies.matching.registration import (
     trace_outline,
 )
 from kitting_drake.policies.matching.segmentation import Region, Segmentation
+from systems.pick_place_parameters import PickPlaceParameters
 from systems.signals import wrap_to_pi
 
 Array = NDArray[np.float64]
@@ -167,6 +168,7 @@ def refine_grasp(
     pick: Array,
     theta: float,
     resolution: float,
+    planner: PickPlaceParameters,
     failed: Array | None = None,
 ) -> RefinedGrasp | None:
     """A grasp near a predicted one for which o_t leaves the jaws no room; None if it does leave it,
@@ -177,6 +179,7 @@ def refine_grasp(
         pick: (row, col) predicted.
         theta: of the gripper, predicted, in radians.
         resolution: of a pixel, in metres.
+        planner: how the hand will pick.
         failed: (n, 2), the (row, col) of where grasps failed: none is taken there.
     """
     taken = _nearest(segmentation.objects, pick)
@@ -195,7 +198,7 @@ def refine_grasp(
         distance, turned = away(grasp)
         return distance + _LEVER * turned + _POOR * grasp.cost
 
-    grasps = jaw_grasps(segmentation, taken, resolution)
+    grasps = jaw_grasps(segmentation, taken, resolution, planner)
     # A network knows more of a grasp than that the jaws have room: where they have, it stays.
     if not grasps or any(is_same(*away(grasp)) for grasp in grasps):
         return None

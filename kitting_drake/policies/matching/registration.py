@@ -220,7 +220,7 @@ def _coarse_starts(outline: Outline, recess: Outline) -> list[tuple[float, Array
     candidates = np.flatnonzero(lowest)
     if not len(candidates):
         # The middle of an L may be so far from all of it that a small object reaches it nowhere.
-        candidates = costs.argmin(keepdims=True)
+        candidates = np.array([costs.argmin()])
     best = candidates[np.argsort(costs[candidates])][:_STARTS]
     return [
         (float(angle), recess.middle - rotation_matrix(float(angle)) @ outline.middle)

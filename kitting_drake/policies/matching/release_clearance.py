@@ -15,7 +15,7 @@ from scipy import ndimage
 
 from kitting_drake.policies.data.images import rotation_matrix
 from kitting_drake.policies.matching.jaw_clearance import tip_height
-from systems.hand_geometry import FINGER_LENGTH, FINGERTIP_DEPTH, MAX_OPENING
+from systems.hand_geometry import FINGER_LENGTH, FINGERTIP_DEPTH
 from systems.pick_place_parameters import PickPlaceParameters
 
 Array = NDArray[np.float64]
@@ -39,6 +39,7 @@ def blocked_at_place(
     theta: float,
     rotation: float,
     place: Array,
+    planner: PickPlaceParameters,
 ) -> float:
     """The share of what the fingers need at a place that something stands in.
 
@@ -49,14 +50,15 @@ def blocked_at_place(
         theta: of the gripper there, in radians.
         rotation: of the object on its way, in radians.
         place: (row, col) where the gripper is to let go of it.
+        planner: how deep the fingertips go, and how far the jaws draw back.
     """
     top = _highest(height, pick, resolution, resolution)
     around = _window(height, pick, _SUPPORT_REACH / resolution)
     support = float(np.percentile(around, _SUPPORT_SHARE))
-    tip = float(tip_height(np.array(top), support))
+    tip = float(tip_height(np.array(top), support, planner))
     across = np.array([-math.sin(theta), math.cos(theta)])
-    ways = np.arange(0.0, MAX_OPENING / 2, _STEP)
-    reach = FINGERTIP_DEPTH + PickPlaceParameters().release_clearance
+    ways = np.arange(0.0, planner.open_width / 2, _STEP)
+    reach = FINGERTIP_DEPTH + planner.release_clearance
     along = np.array([math.cos(theta), math.sin(theta)])
     lines = np.linspace(-FINGER_LENGTH / 2, FINGER_LENGTH / 2, _LINES)
     bottom = _highest(height, place, resolution, _UNDER)

@@ -21,6 +21,7 @@ from kitting_drake.policies.matching.registration import (
     trace_outline,
 )
 from kitting_drake.policies.matching.segmentation import Segmentation, segment
+from systems.pick_place_parameters import PickPlaceParameters
 from systems.signals import Observation, PickPlaceAction, PlanarPose
 
 _WORST_COST = 0.0019
@@ -51,12 +52,14 @@ class ShapeMatchingPolicy:
     that fits. It has no memory.
     """
 
-    def __init__(self, *, recover: bool = False) -> None:
+    def __init__(self, planner: PickPlaceParameters, *, recover: bool = False) -> None:
         """
         Args:
+            planner: how the hand will pick and place.
             recover: press down what protrudes at once, and take out what could not be pressed
                 down where nothing else is left that fits (`recovery_action`).
         """
+        self._planner = planner
         self._recover = recover
 
     def __call__(
@@ -75,7 +78,7 @@ class ShapeMatchingPolicy:
         segmentation = segment(observation)
         mending = None
         if self._recover:
-            mending = recovery_action(observation, segmentation, failed_picks)
+            mending = recovery_action(observation, segmentation, self._planner, failed_picks)
         if mending is not None and mending.press:
             return Matched(mending)
         places = np.array([(pick.x, pick.y) for pick in failed_picks]).reshape(-1, 2)
@@ -83,7 +86,7 @@ class ShapeMatchingPolicy:
         resolution = observation.grid.resolution
         for index, fit in match(segmentation, resolution):
             grasps = untried(
-                jaw_grasps(segmentation, segmentation.objects[index], resolution),
+                jaw_grasps(segmentation, segmentation.objects[index], resolution, self._planner),
                 failed,
                 resolution,
             )

@@ -7,14 +7,13 @@ feature map to samples and back. Only the benchmark and the tests need this modu
 
 from __future__ import annotations
 
-import warnings
-
 import torch
 from torch import Tensor, nn
 
 from kitting_drake.policies.networks.angle_net import AngleNet
 from kitting_drake.policies.networks.factored import Networks, SO2Networks
 from kitting_drake.policies.networks.layers.fibres import Fibre, Irreps, Scalar
+from kitting_drake.policies.networks.layers.planar_escnn import enn, gspaces
 from kitting_drake.policies.networks.layers.steerable import (
     SteerableConv2d,
     frequencies_cutoff,
@@ -22,12 +21,6 @@ from kitting_drake.policies.networks.layers.steerable import (
 )
 from kitting_drake.policies.networks.methods import make_networks
 from kitting_drake.policies.networks.unet import ResidualBlock, UNet
-
-# escnn warns of an optional package that planar groups never use.
-with warnings.catch_warnings():
-    warnings.simplefilter("ignore")
-    from escnn import gspaces
-    from escnn import nn as enn
 
 _SIGMA = 0.66
 """Standard deviation of the blur of the poolings, in pixels, as in `BlurPool`."""

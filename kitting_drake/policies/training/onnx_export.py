@@ -1,4 +1,4 @@
-"""Networks as ONNX, for what runs them without torch: see `onnx_runner` and docs/learning.md."""
+"""Networks as ONNX, for other programs; docs/learning.md says how to run them."""
 
 from __future__ import annotations
 
@@ -21,12 +21,13 @@ from kitting_drake.policies.networks.factored import FactoredNetworks
 from kitting_drake.policies.networks.layers.steerable import BlurPool
 from kitting_drake.policies.networks.unet import STRIDE
 from kitting_drake.policies.networks.weights import load_networks, read_weights_file
-from kitting_drake.policies.onnx_runner import GRAPHS
 
+GRAPHS = ("alpha", "beta", "phi", "psi")
+"""The networks; a file each."""
 _OPSET = 17
 
 
-class _Blur(nn.Module):
+class _BlurOfAnySize(nn.Module):
     """`BlurPool` in operators that ONNX has for images of any size."""
 
     kernel: Tensor
@@ -55,8 +56,8 @@ def export_onnx(weights: Path, folder: Path) -> list[Path]:
     """Writes the networks of a weights file as ONNX, in float32, and `policy.json`.
 
     Each graph maps `image`, prepared as `policy.json` says, to `output`. The U-nets alpha, phi and
-    psi take any sides that are one above a multiple of 16 pixels; beta takes its crop. What is
-    between them (crops, rotations, correlation) is in `onnx_runner`, in numpy.
+    psi take any sides that are one above a multiple of 16 pixels; beta takes its crop. What lies
+    between them (crops, rotations, correlation) is not exported; see docs/learning.md.
 
     Args:
         weights: a file that `train` wrote.
@@ -77,7 +78,7 @@ def export_onnx(weights: Path, folder: Path) -> list[Path]:
     require_folder(folder)
     config = networks.config
     written = []
-    # It is written last: a folder without it is none, should this not come to its end.
+    # Written last, as the completion marker.
     described_in = folder / "policy.json"
     described_in.unlink(missing_ok=True)
     for name in GRAPHS:
@@ -108,7 +109,7 @@ def _graph(network: nn.Module, example: Tensor, *, any_size: bool) -> bytes:
     for module in list(exported.modules()):
         for name, child in module.named_children():
             if isinstance(child, BlurPool):
-                setattr(module, name, _Blur(child))
+                setattr(module, name, _BlurOfAnySize(child))
     axes = {2: "rows", 3: "cols"}
     with (
         tempfile.TemporaryDirectory() as scratch,

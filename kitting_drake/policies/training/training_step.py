@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from torch.optim.lr_scheduler import LambdaLR
 
 from kitting_drake.policies.data.images import Image, LabelledImage, Motion, Pictured, augment
 from kitting_drake.policies.networks.factored import Networks
@@ -47,12 +48,20 @@ class _Prepared:
         return self.samples is samples and self.finals is finals
 
 
+def decayed(step: int, steps: int) -> float:
+    """The share of the learning rate at a step: it rises over the first hundred, and falls to zero
+    over all steps (half a cosine)."""
+    rise = min(1.0, (step + 1) / 100)
+    return rise * 0.5 * (1 + math.cos(math.pi * min(1.0, step / steps)))
+
+
 class Trainer:
     """Networks and their optimisers, an Adam for each loss.
 
     All random draws of a step depend on the seed and the step's number alone, so that a run which
     is resumed continues as if it had not been interrupted. What a step learns from is prepared in
-    another thread, during the step before.
+    another thread, during the step before: torch's DataLoader would prepare it in another process,
+    to which the samples, which stay in an open HDF5 file, cannot be sent.
     """
 
     def __init__(
@@ -73,8 +82,8 @@ class Trainer:
             seed: of all draws.
             steps: how many there will be.
             learning_rate: Adam's.
-            decay: let the learning rate fall to zero over the steps (half a cosine, after a rise
-                over the first hundred) instead of keeping it constant.
+            decay: let the learning rate fall to zero over the steps (`decayed`) instead of keeping
+                it constant.
             curvature: see `augment`.
             reflection: see `augment`.
             only: the loss whose modules are trained, in the very steps that they take when all
@@ -100,14 +109,21 @@ class Trainer:
             for name, modules in networks.modules_by_loss().items()
             if only in (None, name)
         }
+        self._schedules = self._scheduled()
 
-    def rate(self, step: int) -> float:
-        """Adam's learning rate at a step."""
-        if not self.decay:
-            return self.learning_rate
-        rise = min(1.0, (step + 1) / 100)
-        share = min(1.0, step / self.steps)
-        return self.learning_rate * rise * 0.5 * (1 + math.cos(math.pi * share))
+    def _scheduled(self) -> list[LambdaLR]:
+        """The schedules of the optimisers' learning rates, at the present step."""
+        for optimiser in self.optimisers.values():
+            for group in optimiser.param_groups:
+                group["initial_lr"] = self.learning_rate
+        return [
+            LambdaLR(
+                optimiser,
+                lambda step: decayed(step, self.steps) if self.decay else 1.0,
+                last_epoch=self.step_count - 1,
+            )
+            for optimiser in self.optimisers.values()
+        ]
 
     def step(
         self, samples: Sequence[LabelledImage], finals: Sequence[Pictured] = ()
@@ -131,8 +147,6 @@ class Trainer:
             optimiser = self.optimisers.get(name)
             if optimiser is None:
                 continue
-            for group in optimiser.param_groups:
-                group["lr"] = self.rate(self.step_count)
             optimiser.zero_grad(set_to_none=True)
             loss = loss_of()
             loss.backward()
@@ -142,6 +156,8 @@ class Trainer:
                 stop_loss.backward()
                 values["stop"] = float(stop_loss.detach())
             optimiser.step()
+        for schedule in self._schedules:
+            schedule.step()
         self.step_count += 1
         return values
 
@@ -163,7 +179,7 @@ class Trainer:
         """The draw of a step: a random sample, augmented, and perhaps a final observation."""
         random = np.random.default_rng([self.seed, step])
         sample = augment(
-            samples[random.integers(len(samples))],
+            samples[int(random.integers(len(samples)))],
             random,
             curvature=self.curvature,
             reflection=self.reflection,
@@ -176,7 +192,7 @@ class Trainer:
         """A final observation after a random motion, if this step has one."""
         if not (self.networks.config.stop and finals) or random.random() >= _STOP_PROBABILITY:
             return None
-        return Motion.draw(finals[random.integers(len(finals))].image, random).moved_image()
+        return Motion.draw(finals[int(random.integers(len(finals)))].image, random).moved_image()
 
     def state_dict(self) -> dict[str, Any]:
         """All that `load_state_dict` needs to continue bit by bit."""
@@ -192,3 +208,4 @@ class Trainer:
         for name, optimiser in self.optimisers.items():
             optimiser.load_state_dict(state["optimisers"][name])
         self.step_count = state["step_count"]
+        self._schedules = self._scheduled()

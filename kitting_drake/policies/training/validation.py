@@ -10,7 +10,7 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 
 from kitting_drake.policies.data.images import LabelledImage, Pictured
-from kitting_drake.policies.data.samples import Scene, observed
+from kitting_drake.policies.data.samples import ObservedScene, observed
 from kitting_drake.policies.learned_policy import Decision, LearnedPolicy
 from kitting_drake.policies.networks.factored import Networks
 
@@ -88,7 +88,7 @@ def choose_stop_threshold(present: ArrayLike, absent: ArrayLike) -> float | None
 
 
 def validate(
-    policy: LearnedPolicy, scenes: Sequence[Scene], finals: Sequence[Pictured] = ()
+    policy: LearnedPolicy, scenes: Sequence[ObservedScene], finals: Sequence[Pictured] = ()
 ) -> dict[str, float]:
     """Validates a policy on scenes with something to pick, and on final observations.
 

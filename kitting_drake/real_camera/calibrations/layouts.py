@@ -148,7 +148,7 @@ def read_pose(node: dict[str, Any], where: str) -> Array:
     else:
         X = matrix(value, 4, 4, label)
     X = _checked(X, label)
-    return np.linalg.inv(X) if key == "base_to_camera" else X
+    return np.asarray(np.linalg.inv(X), dtype=float) if key == "base_to_camera" else X
 
 
 def _pose_of_parts(value: dict[str, Any], where: str) -> Array:

@@ -43,11 +43,17 @@ class Finding:
     meaning: str
 
 
-def findings(check: Check) -> list[Finding]:
-    """All lines of a report, camera by camera."""
+def findings(check: Check, planner: PickPlaceParameters | None = None) -> list[Finding]:
+    """All lines of a report, camera by camera.
+
+    Args:
+        check: of the cameras.
+        planner: how the robot picks and places; None: as the cell does by default.
+    """
+    planner = PickPlaceParameters() if planner is None else planner
     lines: list[Finding] = []
     for name, camera in check.cameras.items():
-        lines += _of_table(name, camera.table, camera.distance)
+        lines += _of_table(name, camera.table, camera.distance, planner)
         if explains_depth(camera):
             lines.append(
                 Finding(
@@ -61,7 +67,7 @@ def findings(check: Check) -> list[Finding]:
             )
         if camera.block is not None and check.block is not None:
             lines += _of_block(name, camera.block, check.block)
-    lines += _of_table("together", check.together, None)
+    lines += _of_table("together", check.together, None, planner)
     for (one, other), height in check.disagreements.items():
         lines.append(
             Finding(
@@ -92,8 +98,10 @@ def explains_depth(camera: CameraCheck) -> bool:
     return camera.depth_bias_noise < 1.05 * camera.table.noise + 5e-5
 
 
-def _of_table(who: str, table: TableCheck, distance: float | None) -> list[Finding]:
-    floor = PickPlaceParameters().floor_clearance
+def _of_table(
+    who: str, table: TableCheck, distance: float | None, planner: PickPlaceParameters
+) -> list[Finding]:
+    floor = planner.floor_clearance
     angle = table.tilt_angle
     aside = (_HALF_WORKSPACE if distance is None else distance) * angle
     if angle < _LEVEL:

@@ -8,6 +8,7 @@ from rich.console import Console
 from rich.progress import track
 from rich.table import Table
 
+from kitting_drake.evaluation.quantities import numbers_table
 from kitting_drake.hkd.kits.block import build_block, contact_surfaces
 from kitting_drake.hkd.kits.clearance import measure_clearance
 from kitting_drake.hkd.kits.layout import kit_cavities, layout_kit
@@ -55,9 +56,7 @@ def benchmark_kits(count: int | None, console: Console) -> dict[str, Any]:
 
 def kits_table(measured: dict[str, Any]) -> Table:
     """For the terminal."""
-    table = Table(title=f"{measured['kits']} kits, one core", title_justify="left")
-    table.add_column("what")
-    table.add_column("measured", justify="right")
+    table = numbers_table(f"{measured['kits']} kits, one core", "what", "measured")
     build, triangles = measured["build_s"], measured["contact_triangles"]
     clearance = measured["clearance_mm"]
     table.add_row("building, s: median, slowest", f"{build['median']:.2f}, {build['max']:.2f}")

@@ -10,7 +10,7 @@ import enum
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,14 +25,13 @@ from scipy.spatial import cKDTree
 from kitting_drake.common.errors import UserError
 from kitting_drake.episode import ModeChange
 from kitting_drake.episode.action_log import nearest_object
-from kitting_drake.episode.chosen import build_chosen, run_chosen
+from kitting_drake.episode.chosen import run_chosen
 from kitting_drake.evaluation.action_strip import ActionStrip, StripFrame, draw_strips
 from kitting_drake.evaluation.intervals import proportion_interval
 from kitting_drake.scenario.choosing import ChosenScenario
-from kitting_drake.scenario.policies import Policy, PolicyConfig, PolicySite
-from kitting_drake.station import Cell
+from kitting_drake.station import KittingStation, build_station, connect_policy, make_policy
 from systems.pick_place_parameters import Mode
-from systems.signals import PickPlaceAction, PixelGrid, PlanarPose
+from systems.signals import PickPlaceAction, PlanarPose
 from systems.weak_calc import weak_calc
 
 _MOVED = (0.03, 0.06)
@@ -109,41 +108,19 @@ def _shifted(pose: PlanarPose, offset: NDArray[np.float64]) -> PlanarPose:
     return PlanarPose(pose.x + float(offset[0]), pose.y + float(offset[1]), pose.theta)
 
 
-@dataclass
-class _Disturbed(PolicyConfig):
-    """A policy whose actions go through an `ActionOffset`."""
-
-    policy: PolicyConfig
-    offset: NDArray[np.float64]
-
-    def __post_init__(self) -> None:
-        self.needs_observation = self.policy.needs_observation
-
-    def make_system(self, site: PolicySite) -> Diagram:
-        builder = DiagramBuilder()
-        inner = builder.AddNamedSystem("policy", self.policy.make_system(site))
-        shift = builder.AddNamedSystem("offset", ActionOffset(self.offset))
-        builder.Connect(inner.GetOutputPort("action"), shift.GetInputPort("action"))
-        for index in range(inner.num_input_ports()):
-            port = inner.get_input_port(index)
-            builder.ExportInput(port, port.get_name())
-        builder.ExportOutput(shift.GetOutputPort("action"), "action")
-        return builder.Build()
-
-
 class _Adversary:
     """An `EpisodeObserver` that brings a disturbance about, and counts what is touched again."""
 
     def __init__(
         self,
-        cell: Cell,
+        station: KittingStation,
         kind: Disturbance,
-        offset: NDArray[np.float64],
+        offset: ActionOffset,
+        shift: NDArray[np.float64],
         rng: np.random.Generator,
-        grid: PixelGrid,
     ) -> None:
-        self._cell, self._kind, self._offset, self._rng = cell, kind, offset, rng
-        self._grid = grid
+        self._station, self._kind, self._rng = station, kind, rng
+        self._offset, self._shift = offset, shift
         self._actions = 0
         self.victim: int | None = None
         """The object whose action went wrong; None if nothing could be done to it."""
@@ -162,41 +139,40 @@ class _Adversary:
         elif event.mode == Mode.DESCEND and self._kind == Disturbance.MOVED:
             self._move(event.root_context)
         elif event.mode == Mode.RETREAT:
-            offset = self._cell.diagram.GetSubsystemByName("policy").GetSubsystemByName("offset")
-            offset.stop(offset.GetMyContextFromRoot(event.root_context))
+            self._offset.stop(self._offset.GetMyContextFromRoot(event.root_context))
 
     def _begin(self, root_context: Context) -> None:
-        cell = self._cell
+        station, movable = self._station, self._station.scene.goal_objects
         self._actions += 1
-        pick, _ = cell.planner.action(cell.planner.GetMyContextFromRoot(root_context))
+        pick = station.accepted_action(root_context).pick
         if self._actions == 1:
-            pick = _shifted(pick, -self._offset[:2])
-        wanted = nearest_object(cell, cell.object_poses(root_context), pick)
+            pick = _shifted(pick, -self._shift[:2])
+        wanted = nearest_object(station, station.object_poses(root_context), pick)
         if self._actions == 1:
-            self.victim = wanted if wanted in cell.scene.goal_objects else None
-        placements = cell.placements(root_context)
-        seated = {i for i in cell.scene.goal_objects if placements[i].strict_success}
+            self.victim = wanted if wanted in movable else None
+        placements = station.placements(root_context)
+        seated = {i for i in movable if placements[i].strict_success}
         self.seated |= seated
         self.touched |= seated & {wanted}
 
     def _move(self, root_context: Context) -> None:
         """Moves the object on the table to where there is room."""
-        cell, rng = self._cell, self._rng
+        station, rng = self._station, self._rng
         if self.victim is None:
             return
-        poses = cell.object_poses(root_context)
+        poses = station.object_poses(root_context)
         clouds = [
-            (X @ item.p_BPoints.T).T[:, :2] for X, item in zip(poses, cell.objects, strict=True)
+            (X @ item.p_BPoints.T).T[:, :2] for X, item in zip(poses, station.objects, strict=True)
         ]
         own = clouds.pop(self.victim)
         clouds += [
-            (X @ cell.objects[goal.objects[0]].p_BPoints.T).T[:, :2]
-            for goal in cell.scene.goals
+            (X @ station.objects[goal.objects[0]].p_BPoints.T).T[:, :2]
+            for goal in station.scene.goals
             for X in goal.poses
         ]
         others = cKDTree(np.concatenate(clouds))
         middle = own.mean(axis=0)
-        grid = self._grid
+        grid = station.grid
         low = np.array([grid.x_min, grid.y_min]) + _INSIDE
         high = low + grid.resolution * np.array(grid.shape) - 2 * _INSIDE
         for _ in range(_DRAWS):
@@ -209,9 +185,10 @@ class _Adversary:
                 continue
             about = np.append(middle, 0.0)
             X = RigidTransform(about + [*shift, 0.0]) @ RigidTransform(R, -(R @ about))
-            context = cell.plant.GetMyMutableContextFromRoot(root_context)
-            body = cell.plant.get_body(cell.objects[self.victim].body)
-            cell.plant.SetFreeBodyPose(context, body, X @ poses[self.victim])
+            plant = station.plant
+            context = plant.GetMyMutableContextFromRoot(root_context)
+            body = plant.get_body(station.objects[self.victim].body)
+            plant.SetFreeBodyPose(context, body, X @ poses[self.victim])
             return
         self.victim = None
 
@@ -272,33 +249,42 @@ def benchmark_recovery(
     return measured, draw_strips(list(strips.values())) if strips else b""
 
 
+def _build(
+    chosen: ChosenScenario, seed: int, shift: NDArray[np.float64]
+) -> tuple[Diagram, KittingStation, ActionOffset]:
+    """A station whose policy's actions go through an `ActionOffset`."""
+    builder = DiagramBuilder()
+    with chosen.named_in_errors():
+        station = builder.AddSystem(build_station(chosen.scenario, seed, chosen.base))
+        policy = builder.AddSystem(make_policy(station))
+        offset = builder.AddSystem(ActionOffset(shift))
+        connect_policy(builder, station, policy, through=offset)
+    return builder.Build(), station, offset
+
+
 def _run(chosen: ChosenScenario, kind: Disturbance, seed: int, count: _Count) -> _Strip | None:
     """Runs an episode and counts; returns it as a strip if everything was kitted."""
     rng = np.random.default_rng([seed, list(Disturbance).index(kind)])
     way = rng.uniform(0, math.tau)
     direction = np.array([math.cos(way), math.sin(way)])
-    offset = np.zeros(4)
+    shift = np.zeros(4)
     if kind == Disturbance.MISSED:
-        offset[:2] = _MISSED * direction
+        shift[:2] = _MISSED * direction
     elif kind == Disturbance.BLOCKED:
-        offset[2:] = _BLOCKED * direction
-    policy = cast(Policy, _Disturbed(chosen.scenario.policy, offset))
-    disturbed = dataclasses.replace(
-        chosen, scenario=dataclasses.replace(chosen.scenario, policy=policy)
-    )
-    cell = build_chosen(disturbed, seed=seed)
-    adversary = _Adversary(cell, kind, offset, rng, chosen.scenario.heightmap.grid())
-    strip = ActionStrip(cell)
+        shift[2:] = _BLOCKED * direction
+    diagram, station, offset = _build(chosen, seed, shift)
+    adversary = _Adversary(station, kind, offset, shift, rng)
+    strip = ActionStrip(station)
     observers = [adversary.observe, strip.observe]
-    result = run_chosen(disturbed, cell, seed=seed, observers=observers)
+    result = run_chosen(chosen, diagram, station, observers=observers)
     count.failed += bool(result.failure)
     count.timed_out += result.timed_out
     lost = bool(result.failure) or result.timed_out
     strict = {item.name for item in result.objects if item.strict_success and not lost}
     if adversary.victim is not None and kind != Disturbance.NONE:
         count.disturbed += 1
-        count.recovered += cell.scene.objects[adversary.victim].name in strict
-    ended = {i for i in cell.scene.goal_objects if cell.scene.objects[i].name in strict}
+        count.recovered += station.scene.objects[adversary.victim].name in strict
+    ended = {i for i in station.scene.goal_objects if station.scene.objects[i].name in strict}
     count.kitted += len(strict)
     count.objects += len(result.objects)
     if not lost:

@@ -18,7 +18,7 @@ from kitting_drake.episode.action_log import nearest_object
 from kitting_drake.hkd.mjcf import kit_mjcf, tool_mjcf
 from kitting_drake.scenario import Scenario
 from kitting_drake.scenario.policies import Oracle, QuantizedOracle
-from kitting_drake.station import Cell, build_cell
+from kitting_drake.station import KittingStation, build_station, with_policy
 from kitting_drake.tasks import ToolsetKitting
 from systems.pick_place_parameters import Mode
 from systems.placement import Placement, evaluate_placements
@@ -39,7 +39,7 @@ _MOST_FRUITLESS = 5
 class Release:
     """A tool as the jaws begin to open over it, and the scene that it is in."""
 
-    cell: Cell
+    station: KittingStation
     index: int
     """The index of the object."""
     X_WB: RigidTransform
@@ -99,8 +99,8 @@ def ask_mujoco(
 class _Witness:
     """Keeps where tools are let go of, and how they end: an `EpisodeObserver`."""
 
-    def __init__(self, cell: Cell) -> None:
-        self._cell = cell
+    def __init__(self, station: KittingStation) -> None:
+        self._station = station
         self.releases: dict[int, Release] = {}
         """The last of each object, by its index."""
         self.final_poses: list[RigidTransform] = []
@@ -108,44 +108,39 @@ class _Witness:
 
     def observe(self, event: ModeChange) -> None:
         """Takes down a release, and the end."""
-        cell = self._cell
-        poses = cell.object_poses(event.root_context)
+        station = self._station
+        poses = station.object_poses(event.root_context)
         if event.is_last:
-            self.final_poses, self.placements = poses, cell.placements(event.root_context)
+            self.final_poses, self.placements = poses, station.placements(event.root_context)
         elif event.mode == Mode.RELEASE:
-            _, place = cell.planner.action(cell.planner.GetMyContextFromRoot(event.root_context))
-            index = nearest_object(cell, poses, place)
-            self.releases[index] = Release(cell, index, poses[index])
+            action = station.accepted_action(event.root_context)
+            index = nearest_object(station, poses, action.place)
+            self.releases[index] = Release(station, index, poses[index])
 
 
 def _episode(seed: int, orientations: int | None) -> _Witness:
     """An episode of an oracle, which needs no cameras, on an unseen toolset."""
     policy = Oracle() if orientations is None else QuantizedOracle(orientations=orientations)
     scenario = Scenario(task=ToolsetKitting(split="test"), policy=policy, cameras={})
-    cell = build_cell(scenario, seed=seed, base=Path.cwd())
-    witness = _Witness(cell)
+    station = build_station(scenario, seed)
+    diagram = with_policy(station)
+    witness = _Witness(station)
     run_episode(
-        cell,
-        task=scenario.task,
-        scenario="unseen",
-        policy=policy.name,
-        seed=seed,
-        time_limit=scenario.time_limit,
-        observers=[witness.observe],
+        diagram, station, scenario="unseen", policy=policy.name, observers=[witness.observe]
     )
     return witness
 
 
 def _row(seed: int, witness: _Witness, release: Release, X_WB: RigidTransform) -> dict[str, Any]:
     """A placement here and, at X_WB, in MuJoCo: each scored among all that ended here."""
-    cell, index = release.cell, release.index
+    station, index = release.station, release.index
     poses = list(witness.final_poses)
     poses[index] = X_WB
-    scene = cell.scene
-    theirs = evaluate_placements(cell.objects, scene.goals, scene.success, poses)[index]
+    scene = station.scene
+    theirs = evaluate_placements(station.objects, scene.goals, scene.success, poses)[index]
     ours = witness.final_poses[index]
     apart = np.linalg.norm(
-        X_WB @ cell.objects[index].p_BMiddle - ours @ cell.objects[index].p_BMiddle
+        X_WB @ station.objects[index].p_BMiddle - ours @ station.objects[index].p_BMiddle
     )
     return {
         "seed": seed,
@@ -167,7 +162,7 @@ def _verdict(placement: Placement) -> dict[str, Any]:
 
 def _fall(mujoco: Any, release: Release) -> RigidTransform:
     """X_WB of a tool that was let go of, at rest in MuJoCo."""
-    scene = release.cell.scene
+    scene = release.station.scene
     item = scene.objects[release.index]
     world = mujoco.MjSpec()
     world.option.timestep = _TIME_STEP

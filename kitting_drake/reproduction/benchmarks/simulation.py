@@ -20,9 +20,10 @@ from kitting_drake.common.paths import SCENARIOS
 from kitting_drake.common.provenance import versions
 from kitting_drake.common.rendering import require_rendering
 from kitting_drake.episode import EpisodeResult, ModeChange, run_episode
+from kitting_drake.evaluation.quantities import numbers_table, ratio_text
 from kitting_drake.scenario.loader import load_scenario
 from kitting_drake.scenario.schema import Scenario
-from kitting_drake.station import Cell, build_cell
+from kitting_drake.station import build_station, with_policy
 
 _SCENARIO = SCENARIOS / "kitting_oracle.yaml"
 _LEARNED = SCENARIOS / "kitting_seen.yaml"
@@ -64,21 +65,20 @@ def benchmark_simulation(episodes: int, seed: int, console: Console) -> dict[str
 def _whole_episodes(
     path: Path, episodes: int, seed: int, stopwatch: "PhaseStopwatch", console: Console
 ) -> dict[str, Any]:
-    """Runs whole episodes; gives their cost for each object kitted, without building the cell."""
+    """Runs whole episodes; gives their cost for each object kitted, building aside."""
     scenario = load_scenario(path)
     simulated = wall = kitted = 0.0
     for number in track(
         range(episodes), path.stem, console=console, transient=True, disable=console.quiet
     ):
-        cell = _build(scenario, seed + number)
+        station = build_station(scenario, seed + number, SCENARIOS)
+        diagram = with_policy(station)
         stopwatch.start()
         result = run_episode(
-            cell,
-            task=scenario.task,
+            diagram,
+            station,
             scenario=path.stem,
             policy=scenario.policy.name,
-            seed=seed + number,
-            time_limit=scenario.time_limit,
             observers=[stopwatch.observe],
         )
         _require_whole(result)
@@ -100,10 +100,6 @@ def _require_whole(result: EpisodeResult) -> None:
         raise UserError(
             f"{result.scenario}, seed {result.seed}: the episode cannot count: {reason}"
         )
-
-
-def _build(scenario: Scenario, seed: int) -> Cell:
-    return build_cell(scenario, seed=seed, base=SCENARIOS)
 
 
 class PhaseStopwatch:
@@ -150,18 +146,16 @@ def _image_times(scenario: Scenario, seed: int) -> dict[str, float]:
         UserError: images cannot be rendered here.
     """
     require_rendering()
-    cell = _build(scenario, seed)
-    context = cell.diagram.CreateDefaultContext()
-    sensors = [cell.diagram.GetSubsystemByName(f"camera_{name}") for name in scenario.cameras]
-    projector = cell.diagram.GetSubsystemByName("heightmap_projector")
+    station = build_station(scenario, seed, SCENARIOS)
+    context = station.CreateDefaultContext()
 
     def render() -> None:
-        for sensor in sensors:
-            for port in ("color_image", "depth_image_32f"):
-                sensor.GetOutputPort(port).Eval(sensor.GetMyContextFromRoot(context))
+        for name in scenario.cameras:
+            for port in (f"color_image_{name}", f"depth_image_{name}"):
+                station.GetOutputPort(port).Eval(context)
 
     def project() -> None:
-        projector.GetOutputPort("observation").Eval(projector.GetMyContextFromRoot(context))
+        station.GetOutputPort("observation").Eval(context)
 
     render_times, project_times = [], []
     for second in range(6):
@@ -171,7 +165,7 @@ def _image_times(scenario: Scenario, seed: int) -> dict[str, float]:
         project_times.append(_timed(project))
     # The first one loads meshes into the engine.
     return {
-        "rgbd_image": float(np.median(render_times[1:])) / len(sensors),
+        "rgbd_image": float(np.median(render_times[1:])) / len(scenario.cameras),
         "heightmap": float(np.median(project_times[1:])),
     }
 
@@ -184,34 +178,28 @@ def _timed(function: Callable[[], None]) -> float:
 
 def simulation_tables(measured: dict[str, Any]) -> list[Table]:
     """For the terminal."""
-    whole = Table(title="whole episodes, one thread", title_justify="left")
-    whole.add_column("policy")
-    for heading in ("objects", "wall s per object", "real-time rate", "objects per simulated hour"):
-        whole.add_column(heading, justify="right")
+    whole = numbers_table(
+        "whole episodes, one thread",
+        "policy",
+        "objects",
+        "wall s per object",
+        "real-time rate",
+        "objects per simulated hour",
+    )
     for name, row in measured["policies"].items():
-        wall = row["wall_s_per_object"]
         whole.add_row(
             name,
             str(row["objects"]),
-            "-" if wall is None else f"{wall:.2f}",
+            ratio_text(row["wall_s_per_object"]),
             f"{row['real_time_rate']:.1f}",
             f"{row['objects_per_simulated_hour']:.0f}",
         )
-    phases = Table(title="the oracle's episodes by phase", title_justify="left")
-    phases.add_column("phase")
-    for heading in ("simulated s", "wall s", "wall s per simulated s"):
-        phases.add_column(heading, justify="right")
+    headings = ("phase", "simulated s", "wall s", "wall s per simulated s")
+    phases = numbers_table("the oracle's episodes by phase", *headings)
     for name, row in measured["phases"].items():
-        ratio = row["wall_s_per_simulated_s"]
-        phases.add_row(
-            name,
-            f"{row['simulated_s']:.1f}",
-            f"{row['wall_s']:.1f}",
-            "-" if ratio is None else f"{ratio:.2f}",
-        )
-    once = Table(title="once", title_justify="left")
-    once.add_column("what")
-    once.add_column("wall s", justify="right")
+        simulated, wall = (f"{row[key]:.1f}" for key in ("simulated_s", "wall_s"))
+        phases.add_row(name, simulated, wall, ratio_text(row["wall_s_per_simulated_s"]))
+    once = numbers_table("once", "what", "wall s")
     start, images = measured["start_up_s"], measured["images_s"]
     once.add_row("shell to first steps and out again, cache empty", f"{start['cache_empty']:.2f}")
     once.add_row("the same, everything in the cache", f"{start['cache_filled']:.2f}")

@@ -16,16 +16,18 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 from kitting_drake.policies.networks.device import preferred_device, preferred_type
+from kitting_drake.reproduction.network_speed.folding import measure_folding
 from kitting_drake.reproduction.network_speed.orientations import (
     growth,
     measure_decisions,
     measure_pick_angles,
 )
-from kitting_drake.reproduction.network_speed.plan import Bench, Plan, observed_scene, type_name
-from kitting_drake.reproduction.network_speed.speed import (
-    measure_folding,
-    measure_levels,
-    measure_shares,
+from kitting_drake.reproduction.network_speed.peak_shares import measure_levels, measure_shares
+from kitting_drake.reproduction.network_speed.plan import (
+    Plan,
+    SpeedSetup,
+    observed_scene,
+    type_name,
 )
 from kitting_drake.reproduction.network_speed.timing import describe_machine, measure_peak
 
@@ -64,21 +66,21 @@ def benchmark_networks(plan: Plan, console: Console) -> dict[str, Any]:
         tempfile.TemporaryDirectory() as folder,
         Progress(*columns, console=console, transient=True, disable=console.quiet) as progress,
     ):
-        bench = Bench(plan, device, Path(folder), scene)
+        setup = SpeedSetup(plan, device, Path(folder), scene)
 
         def peak() -> dict[str, dict[str, float]]:
             side = plan.peak_side * (4 if device.type == "cuda" else 1)
-            bench.peak = {type_: measure_peak(type_, device, side=side) for type_ in types}
-            return {type_name(type_): rates for type_, rates in bench.peak.items()}
+            setup.peak = {type_: measure_peak(type_, device, side=side) for type_ in types}
+            return {type_name(type_): rates for type_, rates in setup.peak.items()}
 
         stages: dict[str, Callable[[], Any]] = {
             "peak": peak,
-            "folding": lambda: measure_folding(bench),
-            "share_of_peak": lambda: measure_shares(bench),
-            "alpha_levels": lambda: measure_levels(bench),
-            "decision": lambda: measure_decisions(bench),
+            "folding": lambda: measure_folding(setup),
+            "share_of_peak": lambda: measure_shares(setup),
+            "alpha_levels": lambda: measure_levels(setup),
+            "decision": lambda: measure_decisions(setup),
             "pick_angle": lambda: [
-                row for preset in presets for row in measure_pick_angles(bench, preset)
+                row for preset in presets for row in measure_pick_angles(setup, preset)
             ],
         }
         task = progress.add_task("", total=len(stages))

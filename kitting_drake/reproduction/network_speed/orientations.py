@@ -16,7 +16,7 @@ from kitting_drake.policies.networks.factored import FactoredNetworks, Networks
 from kitting_drake.policies.networks.layers.steerable import PlainConv2d
 from kitting_drake.policies.networks.methods import make_networks
 from kitting_drake.policies.networks.transporter import TransporterNetworks, encodings_per_decision
-from kitting_drake.reproduction.network_speed.plan import Bench, Plan, times_of
+from kitting_drake.reproduction.network_speed.plan import Plan, SpeedSetup, times_of
 from kitting_drake.reproduction.network_speed.timing import Timing, count_operations, read_clock
 
 PARTS = {
@@ -32,7 +32,7 @@ _MADE_FOR_N = ("equivariant_transporter",)
 """Methods of whose architecture N is a part; the other methods' networks predict at any N."""
 
 
-def measure_pick_angles(bench: Bench, preset: str) -> list[dict[str, Any]]:
+def measure_pick_angles(setup: SpeedSetup, preset: str) -> list[dict[str, Any]]:
     """Parameters and inference time of the models that predict the pick angle.
 
     For the Transporter that is all of its picking: one network that takes the scene at every angle.
@@ -41,7 +41,7 @@ def measure_pick_angles(bench: Bench, preset: str) -> list[dict[str, Any]]:
         A row for each method and N.
     """
     rows = []
-    for method, orientations in _cells(bench.plan):
+    for method, orientations in _cells(setup.plan):
         config = NetworkConfig(method, preset, max(orientations))
         trained = make_networks(config)
         losses = trained.modules_by_loss()
@@ -52,16 +52,16 @@ def measure_pick_angles(bench: Bench, preset: str) -> list[dict[str, Any]]:
 
         outlined = _without_others(_outlined(config), names)
         operations = {
-            n: count_operations(_compute_angles(outlined, bench, n)) for n in orientations
+            n: setup.count((config, n), _compute_angles(outlined, setup, n)) for n in orientations
         }
-        skipped = {n: bench.why_not(outlined, count) for n, count in operations.items()}
+        skipped = {n: setup.why_not(outlined, count) for n, count in operations.items()}
         timings: dict[int, Timing] = {}
         if not all(skipped.values()):
             # Fresh weights take as long as trained ones; some of these would be files of gigabytes.
-            networks = _without_others(make_networks(config, PlainConv2d), names).to(bench.device)
+            networks = _without_others(make_networks(config, PlainConv2d), names).to(setup.device)
             networks.freeze(preferred_type())
-            timings = bench.time_each(
-                {n: _predict_angle(networks, bench, n) for n in orientations if not skipped[n]}
+            timings = setup.time_each(
+                {n: _predict_angle(networks, setup, n) for n in orientations if not skipped[n]}
             )
         rows += [
             {
@@ -102,41 +102,45 @@ def _without_others(networks: Networks, names: set[str]) -> Networks:
     return networks
 
 
-def _compute_angles(networks: Networks, bench: Bench, orientations: int) -> Callable[[], object]:
+def _compute_angles(networks: Networks, setup: SpeedSetup, n: int) -> Callable[[], object]:
     """The computation of all angles at a known pixel; nothing is read off the result, which has no
     values on the meta device."""
     if isinstance(networks, FactoredNetworks):
-        crops = networks.prepare(crop(bench.image, bench.pixel, PICK_CROP))
-        return lambda: networks.crop_angle_logits(crops, orientations)
-    return _predict_angle(networks, bench, orientations)
+        crops = networks.prepare(crop(setup.image, setup.pixel, PICK_CROP))
+        return lambda: networks.crop_angle_logits(crops, n)
+    return _predict_angle(networks, setup, n)
 
 
-def _predict_angle(networks: Networks, bench: Bench, orientations: int) -> Callable[[], object]:
+def _predict_angle(networks: Networks, setup: SpeedSetup, n: int) -> Callable[[], object]:
     """The prediction of the angle at a known pixel."""
     if isinstance(networks, FactoredNetworks):
-        return lambda: networks.predict_angle(bench.image, bench.pixel, orientations)
-    return lambda: networks.predict_pick(bench.image, orientations).angle(bench.pixel)
+        return lambda: networks.predict_angle(setup.image, setup.pixel, n)
+    return lambda: networks.predict_pick(setup.image, n).angle(setup.pixel)
 
 
-def measure_decisions(bench: Bench) -> list[dict[str, Any]]:
+def measure_decisions(setup: SpeedSetup) -> list[dict[str, Any]]:
     """Time of a whole decision on exported networks, and of its parts.
 
     Returns:
         A row for each method and N; the parts are those of the run of median time.
     """
     rows = []
-    for method, orientations in _cells(bench.plan):
-        config = NetworkConfig(method, bench.plan.preset, max(orientations))
+    for method, orientations in _cells(setup.plan):
+        config = NetworkConfig(method, setup.plan.preset, max(orientations))
         outlined = _outlined(config)
-        operations = {n: count_operations(_compute_all(outlined, bench, n)) for n in orientations}
-        skipped = {n: bench.why_not(outlined, count) for n, count in operations.items()}
+        operations = {
+            n: setup.count((config, n), _compute_angles(outlined, setup, n))
+            + count_operations(_compute_others(outlined, setup, n))
+            for n in orientations
+        }
+        skipped = {n: setup.why_not(outlined, count) for n, count in operations.items()}
         timings: dict[int, Timing] = {}
         runs: dict[int, list[dict[str, float]]] = {n: [] for n in orientations}
         trained = make_networks(config)
         parameters = sum(weight.numel() for weight in trained.parameters())
         if not all(skipped.values()):
-            watched = _WatchedPolicy(bench, bench.export(trained, preferred_type()))
-            timings = bench.time_each(
+            watched = _WatchedPolicy(setup, setup.export(trained, preferred_type()))
+            timings = setup.time_each(
                 {n: watched.deciding(n, runs[n]) for n in orientations if not skipped[n]}
             )
         for n in orientations:
@@ -145,7 +149,7 @@ def measure_decisions(bench: Bench) -> list[dict[str, Any]]:
             typical = sorted(counted, key=lambda run: sum(run.values()))
             rows.append(
                 {
-                    "preset": bench.plan.preset,
+                    "preset": setup.plan.preset,
                     "method": method,
                     "orientations": n,
                     "parameters": parameters,
@@ -158,21 +162,19 @@ def measure_decisions(bench: Bench) -> list[dict[str, Any]]:
     return rows
 
 
-def _compute_all(networks: Networks, bench: Bench, orientations: int) -> Callable[[], object]:
-    """All that the networks compute for a decision; the search is left out."""
-    angles = _compute_angles(networks, bench, orientations)
+def _compute_others(networks: Networks, setup: SpeedSetup, n: int) -> Callable[[], object]:
+    """All that the networks compute for a decision but the angles; the search is left out."""
 
     def compute() -> None:
         # The Transporter computes positions and angles at once.
         if isinstance(networks, FactoredNetworks):
-            networks.position_logits(bench.image)
-        angles()
-        networks.encode_scene(bench.image)
+            networks.position_logits(setup.image)
+        networks.encode_scene(setup.image)
         if isinstance(networks, TransporterNetworks):
-            rotations = [0.0] * encodings_per_decision(orientations)
-            networks.encode_crops(bench.image, bench.pixel, rotations)
+            rotations = [0.0] * encodings_per_decision(n)
+            networks.encode_crops(setup.image, setup.pixel, rotations)
         else:
-            networks.encode_crop(bench.image, bench.pixel)
+            networks.encode_crop(setup.image, setup.pixel)
 
     return compute
 
@@ -180,8 +182,8 @@ def _compute_all(networks: Networks, bench: Bench, orientations: int) -> Callabl
 class _WatchedPolicy:
     """A policy that takes the time of each part of its decisions."""
 
-    def __init__(self, bench: Bench, networks: Networks) -> None:
-        self._bench, self._device = bench, bench.device
+    def __init__(self, setup: SpeedSetup, networks: Networks) -> None:
+        self._setup, self._device = setup, setup.device
         self._networks = networks
         self._parts: dict[str, float] = {}
         self._start = 0.0
@@ -206,7 +208,7 @@ class _WatchedPolicy:
 
         def decide() -> None:
             self._parts = dict.fromkeys(PARTS, 0.0)
-            observation = self._bench.observe()
+            observation = self._setup.observe()
             start = read_clock(self._device)
             policy.decide(observation)
             total = read_clock(self._device) - start

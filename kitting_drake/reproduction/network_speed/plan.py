@@ -1,9 +1,9 @@
-"""The common part of a benchmark's measurements: the plan, the machine and the observation."""
+"""The common part of all measurements of networks: the plan, the machine and the observation."""
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Hashable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -17,13 +17,18 @@ from kitting_drake.common.errors import UserError
 from kitting_drake.policies.data.demonstrations import read_demonstrations
 from kitting_drake.policies.data.images import Image, crop, rotation_matrix
 from kitting_drake.policies.data.recorded import record
-from kitting_drake.policies.data.samples import Scene, scenes
+from kitting_drake.policies.data.samples import ObservedScene, scenes
 from kitting_drake.policies.networks import architecture as sizes
 from kitting_drake.policies.networks.architecture import PRESETS
 from kitting_drake.policies.networks.device import preferred_type
 from kitting_drake.policies.networks.factored import Networks
 from kitting_drake.policies.networks.weights import load_networks, save_weights
-from kitting_drake.reproduction.network_speed.timing import Timing, memory_bytes, time_each
+from kitting_drake.reproduction.network_speed.timing import (
+    Timing,
+    count_operations,
+    memory_bytes,
+    time_each,
+)
 from systems.signals import Observation, PickPlaceAction, PixelGrid, PlanarPose
 
 _EXPECTED_SHARE = 0.3
@@ -57,25 +62,24 @@ class Plan:
 
 
 @dataclass
-class Bench:
+class SpeedSetup:
     """The plan, the machine and the observation of all measurements."""
 
     plan: Plan
     device: torch.device
     folder: Path
     """The folder for the weights of exported networks."""
-    scene: Scene
+    scene: ObservedScene
     peak: dict[torch.dtype, dict[str, float]] = field(default_factory=dict)
     """The results of `measure_peak`, by type."""
+    _counts: dict[Hashable, int] = field(default_factory=dict, init=False)
 
     def __post_init__(self) -> None:
         self.image: Image = self.scene.recorded.image
-
-    @property
-    def pixel(self) -> tuple[int, int]:
-        """(row, col) of the expert's pick."""
         row, col = np.rint(self.scene.targets[0].pick).astype(int)
-        return int(row), int(col)
+        # Here, as `targets` decodes the image: that is not to be timed.
+        self.pixel = int(row), int(col)
+        """(row, col) of the expert's pick."""
 
     def observe(self) -> Observation:
         """The observation of the decisions that are timed."""
@@ -105,6 +109,12 @@ class Bench:
         save_weights(path, networks, {})
         return load_networks(path, type_).to(self.device)
 
+    def count(self, key: Hashable, function: Callable[[], object]) -> int:
+        """`timing.count_operations`, once for each key."""
+        if key not in self._counts:
+            self._counts[key] = count_operations(function)
+        return self._counts[key]
+
     def why_not(self, outlined: Networks, operations: int) -> str | None:
         """The reason not to time something, if there is one.
 
@@ -131,7 +141,7 @@ def type_name(type_: torch.dtype) -> str:
     return str(type_).removeprefix("torch.")
 
 
-def observed_scene(path: Path | None) -> Scene:
+def observed_scene(path: Path | None) -> ObservedScene:
     """The first observation of a demonstration, or a synthetic one.
 
     Raises:
@@ -147,7 +157,7 @@ def observed_scene(path: Path | None) -> Scene:
     return observed[0]
 
 
-def synthetic_scene(grid: PixelGrid) -> Scene:
+def synthetic_scene(grid: PixelGrid) -> ObservedScene:
     """Four bars on a table, and a block with a hole for each."""
     random = np.random.default_rng(0)
     pixel = np.stack(np.meshgrid(np.arange(grid.rows), np.arange(grid.cols), indexing="ij"), -1)
@@ -177,4 +187,4 @@ def synthetic_scene(grid: PixelGrid) -> Scene:
         actions.append(
             PickPlaceAction(PlanarPose(pick_x, pick_y, theta), PlanarPose(place_x, place_y, 0.0))
         )
-    return Scene(record(Observation(image, grid)), tuple(actions), grid)
+    return ObservedScene(record(Observation(image, grid)), tuple(actions), grid)

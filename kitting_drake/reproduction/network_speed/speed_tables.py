@@ -2,11 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable
 from typing import Any
 
 from rich.table import Table
 
-from kitting_drake.evaluation.quantities import count_text, seconds_text
+from kitting_drake.evaluation.quantities import (
+    count_text,
+    numbers_table,
+    ratio_text,
+    seconds_text,
+)
 
 METHOD_NAMES = {
     "so2": "SO(2)",
@@ -43,14 +49,6 @@ def network_tables(measured: dict[str, Any]) -> list[Table]:
     ]
 
 
-def _table(title: str, *headings: str) -> Table:
-    """A table whose first column holds words, left-aligned, and the others numbers."""
-    table = Table(title=title, title_justify="left")
-    for index, heading in enumerate(headings):
-        table.add_column(heading, justify="right" if index else "left", no_wrap=not index)
-    return table
-
-
 def _milliseconds_text(seconds: float | None) -> str:
     """A time in ms, without the unit."""
     if seconds is None:
@@ -58,17 +56,27 @@ def _milliseconds_text(seconds: float | None) -> str:
     return f"{1e3 * seconds:.0f}" if seconds >= 0.1 else f"{1e3 * seconds:.2g}"
 
 
-def _ratio_text(ratio: float | None) -> str:
-    return "-" if ratio is None else f"{ratio:.2f}"
-
-
-def _growth(measured: dict[str, Any], name: str, preset: str, method: str) -> dict[str, Any]:
-    rows = measured[f"{name}_growth"]
-    return next(row for row in rows if (row["preset"], row["method"]) == (preset, method))
+def _add_by_method(
+    table: Table,
+    rows: list[dict[str, Any]],
+    growths: list[dict[str, Any]],
+    cells: Callable[[dict[str, Any]], Iterable[str]],
+    growth_cells: Callable[[dict[str, Any]], Iterable[str]],
+) -> None:
+    """Adds, for each method, a line for each N, and one for the growth from the least to the most
+    of them."""
+    for method in dict.fromkeys(row["method"] for row in rows):
+        chosen = [row for row in rows if row["method"] == method]
+        for row in chosen:
+            table.add_row(METHOD_NAMES[method], str(row["orientations"]), *cells(row))
+        key = (chosen[0]["preset"], method)
+        growth = next(row for row in growths if (row["preset"], row["method"]) == key)
+        ends = f"{growth['to']}/{growth['from']}"
+        table.add_row("", ends, *growth_cells(growth), style="bold", end_section=True)
 
 
 def _pick_angle_table(measured: dict[str, Any], preset: str) -> Table:
-    table = _table(
+    table = numbers_table(
         f"models that predict the pick angle, preset {preset} (Transporter: all of its picking); "
         "MAC: multiply-accumulates",
         "method",
@@ -77,25 +85,17 @@ def _pick_angle_table(measured: dict[str, Any], preset: str) -> Table:
         "MAC",
         "time",
     )
-    rows = [row for row in measured["pick_angle"] if row["preset"] == preset]
-    for method in dict.fromkeys(row["method"] for row in rows):
-        for row in rows:
-            if row["method"] == method:
-                table.add_row(
-                    METHOD_NAMES[method],
-                    str(row["orientations"]),
-                    count_text(row["parameters"]),
-                    count_text(row["operations"] / 2),
-                    row["skipped"] or seconds_text(row["seconds"]),
-                )
-        growth = _growth(measured, "pick_angle", preset, method)
-        table.add_row(
-            "",
-            f"{growth['to']}/{growth['from']}",
-            *(_ratio_text(growth[key]) for key in ("parameters", "operations", "seconds")),
-            style="bold",
-            end_section=True,
-        )
+    _add_by_method(
+        table,
+        [row for row in measured["pick_angle"] if row["preset"] == preset],
+        measured["pick_angle_growth"],
+        lambda row: (
+            count_text(row["parameters"]),
+            count_text(row["operations"] / 2),
+            row["skipped"] or seconds_text(row["seconds"]),
+        ),
+        lambda growth: (ratio_text(growth[key]) for key in ("parameters", "operations", "seconds")),
+    )
     return table
 
 
@@ -107,29 +107,23 @@ def _decision_table(measured: dict[str, Any]) -> Table:
         "psi": "psi",
         "search": "search",
     }
-    table = _table(
+    table = numbers_table(
         f"a decision, in ms, preset {measured['preset']}, {measured['inference_type']}",
         "method",
         "N",
         *headings.values(),
         "all",
     )
-    rows = measured["decision"]
-    for method in dict.fromkeys(row["method"] for row in rows):
-        for row in rows:
-            if row["method"] == method:
-                split = row["parts"] or dict.fromkeys(headings)
-                table.add_row(
-                    METHOD_NAMES[method],
-                    str(row["orientations"]),
-                    *(_milliseconds_text(split[part]) for part in headings),
-                    row["skipped"] or _milliseconds_text(row["seconds"]),
-                )
-        growth = _growth(measured, "decision", measured["preset"], method)
-        ends = f"{growth['to']}/{growth['from']}"
-        blanks = [""] * len(headings)
-        ratio = _ratio_text(growth["seconds"])
-        table.add_row("", ends, *blanks, ratio, style="bold", end_section=True)
+    _add_by_method(
+        table,
+        measured["decision"],
+        measured["decision_growth"],
+        lambda row: (
+            *(_milliseconds_text((row["parts"] or {}).get(part)) for part in headings),
+            row["skipped"] or _milliseconds_text(row["seconds"]),
+        ),
+        lambda growth: (*[""] * len(headings), ratio_text(growth["seconds"])),
+    )
     return table
 
 
@@ -137,7 +131,7 @@ def _folding_table(measured: dict[str, Any]) -> Table:
     folding = measured["folding"]
     rungs = list(folding["rungs"])
     operations = {name: count_text(n / 2) for name, n in folding["alpha_operations"].items()}
-    table = _table(
+    table = numbers_table(
         f"the same networks, preset {measured['preset']}: time, and times faster than escnn's "
         f"float32 (MAC of alpha: escnn {operations['escnn']}, folded {operations['ours']})",
         "what",
@@ -163,7 +157,7 @@ def _share_table(measured: dict[str, Any]) -> Table:
     peaks = ", ".join(
         f"{name} {count_text(rates['best'])}FLOP/s" for name, rates in measured["peak"].items()
     )
-    table = _table(
+    table = numbers_table(
         f"share of the machine's peak ({peaks})",
         "network",
         "type",
@@ -189,7 +183,7 @@ def _share_table(measured: dict[str, Any]) -> Table:
 
 
 def _level_table(measured: dict[str, Any]) -> Table:
-    table = _table(
+    table = numbers_table(
         f"alpha's inference, preset {measured['preset']}, level by level",
         "level",
         "MAC",

@@ -8,6 +8,7 @@ from typing import Any
 from kitting_drake.evaluation.summary import ACTION_ERRORS, AMBIGUITIES, ERRORS
 from kitting_drake.evaluation.terminal import number
 from kitting_drake.reproduction.page.markdown import markdown_table, rate_text
+from kitting_drake.reproduction.page.prose import prose
 from kitting_drake.reproduction.page.ravens_table import in_ravens_table, ravens_section
 from kitting_drake.reproduction.page.runs import LEARNED, METHODS, Run
 from kitting_drake.tasks import PAPER_TASKS
@@ -32,70 +33,18 @@ PAPER = {
     "kitting-unseen-toolsets": _Paper("Unseen toolsets", 87.25, 2.16),
 }
 
-_INTRODUCTION = """\
-# Results
-
-Written by `python -m kitting_drake.results` from the `summary.json` of many runs of `evaluate`,
-listed at the end: do not edit. First come the paper's experiments, measured as in the paper; then
-the policies on the scenarios as they are by default, with all extensions; then every other run.
-
-## How to read the tables
-
-- *Strict success* is an object that is a success by the paper's measure, within 2 mm of its height
-  and within 20 degrees of its heading, modulo the symmetry that the object declares.
-- *The paper's measure* (section IV-C) is ADD-S below 3.5 mm alone. It accepts a flat object that
-  protrudes, or that is reversed.
-- Episodes that failed or timed out count 0.
-- In brackets are 95 % intervals (Wilson's), as if every object of every episode were drawn anew.
-  They hold for *these* objects; of objects in general, the twenty tools of the test split tell
-  less. On the Ravens tasks they are over episodes, Student's or, where a reward is all or nothing,
-  Wilson's.
-- The oracle knows the true poses. Quantized, it acts in pixels and N orientations, and no policy at
-  that N can be expected to do better.
-- The paper gives two cells of figure 6 as numbers, over 100 episodes each and with the best of its
-  checkpoints (section V-C.2). The others are bars, and are left out.
-
-## Which seeds were looked at
-
-The policies and the hand were improved while looking at episodes of the seeds 0 to 99, 300 to 314,
-600 to 607, 640 to 689 and 700 to 728, with the tools of the test split, and of the seeds 100 to 119
-of stack-block-pyramid and 100 to 104 of palletizing-boxes; those that fit outlines also at 800 to
-849 and 960 to 974, and those that recover also at 900 to 912, 940 to 951 and 1000 to 1006. Failures
-were looked at, after the run, of 1200 to 1224, 1300 to 1366, 1900 to 1924, 2000 to 2024, 2100 to
-2124, 2200 to 2224, 2400 to 2424, 2820 to 2844, 2870 to 2894, 2900 to 2924 and 3000 to 3099, of 3200
-to 3236, 3252 and 3299 of stack-block-pyramid, of 3200 to 3233 of palletizing-boxes, and of 3200 to
-3299 of place-red-in-green. Three ways to grip were compared by the errors of 3600 to 3614. No
-others were looked at before they were run for the first time. What was run again, or with other
-steps or learning rates, when results of these seeds were known, is told where it stands.
-
-Runs of the first version of the code, which are not comparable with these, are in
-[results_first_turn.md](results_first_turn.md).
-"""
-
-_DEFAULTS = """\
-## The policies by default, with all extensions
-
-A run is in these tables only if nothing but its policy differs from the paper's task as the
-scenarios have it by default; any other is under "Other runs", with what differs. A cell is
-`strict / paper's, episodes`, and `-` was not run. A star: actions are refined to sub-pixel and
-sub-bin accuracy, which the paper does not do. Two stars: places are also fitted to the outlines of
-object and recess. A dagger: run at another N than it was trained at. What has no N has its figure
-in every column. `an earlier hand` did not grip heavy objects more firmly, press, or search in a
-spiral.
-"""
-
 
 def results_page(runs: Sequence[Run], link: str, paper: Sequence[str] = ()) -> str:
     """The whole page, in Markdown.
 
     Args:
         runs: from `read_runs`; there may be none of a task, or none at all.
-        link: the folder of the files, from the page's own.
+        link: the folder of the table of runs, from the page's own.
         paper: the sections of `kitting_drake.reproduction.paper.paper_sections`.
     """
-    sections = [_INTRODUCTION, *paper]
+    sections = [prose("how_to_read", link=link), *paper]
     if runs:
-        sections.append(_DEFAULTS)
+        sections.append(prose("by_default"))
     for task in PAPER_TASKS:
         if of_task := [run for run in runs if run.paper_task == task]:
             sections += _task_sections(task, of_task)
@@ -103,8 +52,8 @@ def results_page(runs: Sequence[Run], link: str, paper: Sequence[str] = ()) -> s
     others = [run for run in runs if run.paper_task is None and not in_ravens_table(run)]
     if others:
         sections += ["## Other runs\n", _others_table(others)]
-    sections.append("## Files\n")
-    sections.append(_files_table(runs, link) if runs else "There are none yet.\n")
+    sections.append("## Runs\n")
+    sections.append(_runs_table(runs) if runs else "There are none yet.\n")
     return "\n".join(sections)
 
 
@@ -185,7 +134,7 @@ def _most_tested_run(runs: list[Run]) -> list[str]:
     """Tables by category of the network that was tested most; if there is none, of another run."""
     learned = [run for run in runs if run.method in LEARNED]
     # Not the best: of few episodes, that is the luckiest.
-    most = max(learned or runs, key=lambda run: (run.summary["episodes"], run.file))
+    most = max(learned or runs, key=lambda run: (run.summary["episodes"], run.name))
     rows = [*most.summary["categories"].items(), ("all", most.summary)]
 
     def errors(of: dict[str, Any]) -> str:
@@ -239,7 +188,7 @@ def _causes(runs: list[Run]) -> list[str]:
 def _others_table(runs: list[Run]) -> str:
     rows = [
         [
-            run.file,
+            run.name,
             run.summary["task"],
             run.label,
             run.departures_text,
@@ -251,14 +200,14 @@ def _others_table(runs: list[Run]) -> str:
         ]
         for run in runs
     ]
-    headings = ["file", "task", "run", "what differs", "success", "strict, %", "success, %"]
+    headings = ["name", "task", "run", "what differs", "success", "strict, %", "success, %"]
     return markdown_table([*headings, "episodes", "seeds"], rows, left_columns=5)
 
 
-def _files_table(runs: Sequence[Run], link: str) -> str:
+def _runs_table(runs: Sequence[Run]) -> str:
     rows = [
         [
-            f"[{run.file}]({link}/{run.file})",
+            run.name,
             run.summary["task"],
             run.label,
             str(run.detail("steps") or ""),
@@ -268,5 +217,5 @@ def _files_table(runs: Sequence[Run], link: str) -> str:
         ]
         for run in runs
     ]
-    headings = ["file", "task", "run", "training steps", "episodes", "seeds", "hours, summed"]
+    headings = ["name", "task", "run", "training steps", "episodes", "seeds", "hours, summed"]
     return markdown_table(headings, rows, left_columns=3)

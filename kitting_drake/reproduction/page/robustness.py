@@ -167,7 +167,7 @@ def _check_seeds(found: Mapping[Key, Sequence[Run]]) -> None:
         counts = Counter(seed for run in runs for seed in run.summary["seeds"])
         twice = min((seed for seed, count in counts.items() if count > 1), default=None)
         if twice is not None:
-            files = " and ".join(run.file for run in runs if twice in run.summary["seeds"])
+            files = " and ".join(run.name for run in runs if twice in run.summary["seeds"])
             raise UserError(
                 f"{files} are both of {_COLUMNS[method]}, {label}, seed {twice}: delete one"
             )

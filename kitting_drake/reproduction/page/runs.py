@@ -1,5 +1,4 @@
-"""The runs that the page of results is made of: files of `evaluate`, and how they depart from the
-paper's tasks."""
+"""The runs that the page of results is made of, and how they depart from the paper's tasks."""
 
 import json
 from collections.abc import Mapping
@@ -11,6 +10,7 @@ from typing import Any
 from kitting_drake.common.errors import UserError
 from kitting_drake.evaluation.summary import ERRORS
 from kitting_drake.policies.data.static_scenes import STATIC
+from kitting_drake.reproduction.page.run_table import TABLE, Summary, read_summaries
 from kitting_drake.scenario.choosing import ChosenScenario
 from kitting_drake.scenario.schema import Scenario
 from kitting_drake.tasks import PAPER_TASKS, RAVENS_TASKS
@@ -29,7 +29,7 @@ METHODS = {
 LEARNED = ("so2", "equivariant_transporter", "transporter")
 """The methods that the paper compares."""
 
-_NOT_THE_TASK = ("policy", "random_seed", "target_realtime_rate")
+_NOT_THE_TASK = ("policy", "random_seed", "target_realtime_rate", "meshcat")
 """The fields of a scenario in which runs of one task may differ."""
 
 _ADDED: dict[str, Any] = {
@@ -38,8 +38,6 @@ _ADDED: dict[str, Any] = {
     "task.pool": [],
     "task.kit.always_nested": False,
     "task.kit.fixed_size": False,
-    "plant.friction_variation": 0.0,
-    "plant.mass_variation": 0.0,
     "sensor_noise.frames": 1,
     "end_at_success": False,
 }
@@ -63,25 +61,24 @@ press, nor search in a spiral, and took what is thinner than 3 mm for not grippe
 _MOST_SHOWN = 4
 """So many differences of one run are listed; more are counted."""
 
-_TYPES: dict[str, type | tuple[type, ...]] = {
+
+_KINDS: dict[str, Any] = {
     **dict.fromkeys(("task", "policy", "success_description"), str),
     **dict.fromkeys(("policy_details", "resolved_scenario", *ERRORS, "action_errors"), dict),
-    **dict.fromkeys(("causes", "ambiguous", "categories"), dict),
+    **dict.fromkeys(("causes", "ambiguous", "categories", "versions"), dict),
     **dict.fromkeys(("seeds", "ci95", "strict_ci95"), list),
+    **dict.fromkeys(("success_rate", "strict_success_rate", "wall_seconds"), int | float),
     "episodes": int,
-    "wall_seconds": (int, float),
 }
-"""The types of a summary's fields."""
-_SHARES = ("success_rate", "strict_success_rate")
-"""The fields that are numbers from 0 to 1."""
+"""The fields of a summary, and what each is."""
 
 
 @dataclass(frozen=True)
 class Run:
-    """One summary."""
+    """A run of `evaluate`."""
 
-    file: str
-    summary: dict[str, Any]
+    name: str
+    summary: Summary
 
     def detail(self, key: str) -> Any:
         """An entry of the policy's details; None if it has no such entry."""
@@ -132,7 +129,7 @@ class Run:
             if found["task"]["_tag"] == expected["task"]["_tag"]:
                 # The longest of them has a limit of its own.
                 return _differences(_without(found, "time_limit"), _without(expected, "time_limit"))
-        expected = described(Scenario())
+        expected = _defaults()
         return _differences(_without(found, "task"), _without(expected, "task"))
 
     @property
@@ -162,13 +159,34 @@ def scenario_differences(found: dict[str, Any], expected: dict[str, Any]) -> lis
 
 
 def _without(scenario: dict[str, Any], *more: str) -> dict[str, Any]:
-    return {key: value for key, value in scenario.items() if key not in (*_NOT_THE_TASK, *more)}
+    fields = scenario | _translated(scenario.get("plant"))
+    return {key: value for key, value in fields.items() if key not in (*_NOT_THE_TASK, *more)}
+
+
+def _translated(plant: Any) -> dict[str, Any]:
+    """What older runs have in `plant`, in the fields that it is in since; else nothing."""
+    if not isinstance(plant, dict) or "contact_approximation" not in plant:
+        return {}
+    defaults = _defaults()
+    return {
+        "plant": defaults["plant"]
+        | {
+            "time_step": plant["time_step"],
+            "discrete_contact_approximation": plant["contact_approximation"],
+        },
+        "variation": defaults["variation"]
+        | {key: plant.get(f"{key}_variation", 0.0) for key in ("friction", "mass")},
+    }
+
+
+@cache
+def _defaults() -> dict[str, Any]:
+    return described(Scenario())
 
 
 @cache
 def _added() -> dict[str, Any]:
-    defaults = described(Scenario())
-    return _ADDED | {key: defaults[key] for key in _ADDED_WHOLE}
+    return _ADDED | {key: _defaults()[key] for key in _ADDED_WHOLE}
 
 
 def _differences(found: Any, expected: Any, path: str = "") -> list[str]:
@@ -195,63 +213,65 @@ def _differences(found: Any, expected: Any, path: str = "") -> list[str]:
 
 
 def read_runs(folder: Path) -> list[Run]:
-    """The summaries of a folder, in the order of the names of their files; there may be none.
+    """All runs of the table in a folder, in the order of their names; there may be none.
 
     Raises:
-        UserError: there is no such folder, or a file in it is not what `evaluate` writes.
+        UserError: there is no table, its files are damaged, or a run is not one of `evaluate`.
     """
-    if not folder.is_dir():
-        raise UserError(f"there is no folder {folder}: make it, and copy summary.json files there")
-    return [Run(path.name, _read_summary(path)) for path in sorted(folder.glob("*.json"))]
+    if not (folder / TABLE).exists():
+        raise UserError(
+            f"there is no {folder / TABLE}: add a run to it, with `results --add NAME FOLDER`"
+        )
+    summaries = read_summaries(folder)
+    for name, summary in summaries.items():
+        check_summary(summary, f"{folder / TABLE}, run '{name}'")
+    return [Run(name, summary) for name, summary in summaries.items()]
 
 
-def _read_summary(path: Path) -> dict[str, Any]:
+def read_evaluation(path: Path) -> Summary:
+    """The summary that `evaluate` left.
+
+    Args:
+        path: its file, or the folder with its `summary.json`.
+
+    Raises:
+        UserError: it cannot be read, or is not one.
+    """
+    path = path / "summary.json" if path.is_dir() else path
     try:
         summary = json.loads(path.read_text())
     except (OSError, ValueError) as error:
         raise UserError(f"{path} cannot be read: {error}") from error
-    check_summary(summary, path)
-    _check_details(summary["policy_details"], f"{path}: policy_details")
+    check_summary(summary, str(path))
     return summary
 
 
-def check_summary(summary: Any, path: Path) -> None:
-    """Checks that a file's content has the fields of `evaluate`, and that each is of its kind.
+def check_summary(summary: Any, where: str) -> None:
+    """Checks that a summary has the fields of `evaluate`, and that each is of its kind.
+
+    Args:
+        summary: the content of a file, or of a row.
+        where: it is from, for the error.
 
     Raises:
-        UserError: it has not; names the file and the field.
+        UserError: it has not; names the field.
     """
     must = "it must be a summary.json of evaluate"
-    for key in (*_TYPES, *_SHARES):
+    for key, kind in _KINDS.items():
         if not isinstance(summary, dict) or key not in summary:
-            raise UserError(f"{path} lacks '{key}': {must}")
-    wrong = [key for key, kind in _TYPES.items() if not isinstance(summary[key], kind)]
-    if not wrong:
-        wrong = [key for key in _SHARES if not _are_shares([summary[key]], 1)]
-        wrong += [key for key in ("ci95", "strict_ci95") if not _are_shares(summary[key], 2)]
-    if wrong:
-        raise UserError(f"{path}: '{wrong[0]}' is {summary[wrong[0]]!r}: {must}")
-    seeds = summary["seeds"]
-    if not seeds or not all(isinstance(seed, int) for seed in seeds):
-        raise UserError(f"{path} has no seeds, or some that are no whole numbers: {must}")
+            raise UserError(f"{where} lacks '{key}': {must}")
+        if not isinstance(summary[key], kind) or summary[key] == []:
+            raise UserError(f"{where}: '{key}' is {summary[key]!r}: {must}")
     task = summary["resolved_scenario"].get("task")
-    if not isinstance(task, dict) or not isinstance(task.get("_tag"), str):
-        raise UserError(f"{path}: resolved_scenario has no task")
-
-
-def _are_shares(values: list[Any], count: int) -> bool:
-    return len(values) == count and all(
-        isinstance(value, int | float) and 0 <= value <= 1 for value in values
-    )
-
-
-def _check_details(details: Any, where: str) -> None:
-    if not isinstance(details, dict):
-        raise UserError(f"{where} must be a mapping")
+    if not isinstance(task, dict) or "_tag" not in task:
+        raise UserError(f"{where}: resolved_scenario has no task: {must}")
+    details = summary["policy_details"]
     method = details.get("method")
     needed = ["orientations"] if method in (*LEARNED, "quantized_oracle") else []
     if method in LEARNED:
         needed.append("demonstrations")
     for key in needed:
         if not isinstance(details.get(key), int):
-            raise UserError(f"{where}.{key} must be a whole number for the method {method}")
+            raise UserError(
+                f"{where}: policy_details.{key} must be a whole number for the method {method}"
+            )

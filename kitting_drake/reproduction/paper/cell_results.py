@@ -1,20 +1,18 @@
-"""The results of `benchmark paper`: cells, and their summaries."""
+"""The runs that fill the cells of the paper's tables."""
 
 from __future__ import annotations
 
-import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from pathlib import Path
 from typing import Any
 
 from kitting_drake.common.errors import UserError
 from kitting_drake.reproduction.page.markdown import rate_text
-from kitting_drake.reproduction.page.runs import check_summary
+from kitting_drake.reproduction.page.run_table import Summary
+from kitting_drake.reproduction.page.runs import Run
 from kitting_drake.reproduction.paper.cells import Cell
-from kitting_drake.reproduction.paper.efficiency import EFFICIENCY
-from kitting_drake.reproduction.paper.learning_rates import RATES, read_rates
+from kitting_drake.reproduction.paper.learning_rates import Rates
 from kitting_drake.reproduction.paper.paper_tables import paper_cells
 
 
@@ -32,33 +30,41 @@ class Result:
         return f"{strict} / {100 * self.summary['success_rate']:.1f}"
 
 
-def read_results(folder: Path) -> list[Result]:
-    """The results of `benchmark paper`, in the order of the cells; there may be none.
+def cell_results(runs: Sequence[Run], rates: Rates) -> tuple[list[Result], list[Run]]:
+    """Divides runs into those of cells and others: a run that is named as a cell must be it.
+
+    Args:
+        runs: of `read_runs`.
+        rates: of `read_rates`.
+
+    Returns:
+        The results in the order of the cells, and the other runs in theirs.
 
     Raises:
-        UserError: a file there is of no cell, or not what its cell says.
+        UserError: a run is not what its name says.
     """
-    if not folder.is_dir():
-        return []
-    cells = {cell.name: cell for cell in paper_cells()}
-    rates = read_rates(folder)
-    found = {}
-    for path in sorted(folder.glob("*.json")):
-        if path.name in (RATES, EFFICIENCY):
-            continue
-        cell = cells.get(path.stem)
-        if cell is None:
-            raise UserError(f"{path} is of no cell of the paper's tables: delete it")
-        try:
-            summary = json.loads(path.read_text())
-            check_summary(summary, path)
-            departure = cell.departure(summary, rates)
-            kinds = (type(summary["outcomes"]), type(summary["versions"]))
-            if kinds != (list, dict):
-                raise TypeError("outcomes must be a list, and versions a mapping")
-        except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
-            raise UserError(f"{path} is no summary of evaluate: {error!r}") from error
-        if departure is not None:
-            raise UserError(f"{path} is not that of its cell: {departure}")
-        found[cell.name] = Result(cell, summary)
-    return [found[name] for name in cells if name in found]
+    found = {run.name: run.summary for run in runs}
+    cells = {cell.name: cell for cell in paper_cells() if cell.name in found}
+    for name, cell in cells.items():
+        check_cell(cell, found[name], rates)
+    results = [Result(cell, found[name]) for name, cell in cells.items()]
+    return results, [run for run in runs if run.name not in cells]
+
+
+def check_cell(cell: Cell, summary: Summary, rates: Rates) -> None:
+    """Checks that a summary is that of a cell.
+
+    Raises:
+        UserError: it is not; says why.
+    """
+    try:
+        departure = cell.departure(summary, rates)
+        if departure is None and not isinstance(summary["outcomes"], list):
+            departure = "its outcomes are no list"
+    except (KeyError, TypeError, AttributeError) as error:
+        raise UserError(f"run '{cell.name}' is no summary of evaluate: {error!r}") from error
+    if departure is not None:
+        raise UserError(
+            f"run '{cell.name}' is not that of the cell of this name ({departure}): give it "
+            "another name, or remove it (results --remove)"
+        )

@@ -13,6 +13,7 @@ from kitting_drake.reproduction.page.paired import (
     paired_difference,
     points_text,
 )
+from kitting_drake.reproduction.page.prose import prose
 from kitting_drake.reproduction.page.runs import LEARNED, METHODS
 from kitting_drake.reproduction.paper.cell_results import Result
 from kitting_drake.reproduction.paper.cells import ORIENTATIONS, Cell, Training
@@ -25,14 +26,6 @@ from kitting_drake.reproduction.paper.paper_tables import (
     SHIPPED,
     headline,
 )
-
-_INTRODUCTION = """\
-The first cell minus the second on the same seeds, in points, with 95 % intervals by a bootstrap
-over episodes. They hold for these trainings; the variation between trainings is not in them.
-`none differs`: both came to the same in every episode. A mean over N is over as many trainings as
-its cells have different `weights`. On average over all N and both numbers of demonstrations, the
-paper has ours 0.63 (seen) and 2.16 (unseen) points behind the Equivariant Transporter.
-"""
 
 
 def differences(results: Mapping[str, Result]) -> list[str]:
@@ -52,7 +45,7 @@ def differences(results: Mapping[str, Result]) -> list[str]:
         return []
     return [
         "### Paired differences\n",
-        _INTRODUCTION,
+        prose("differences"),
         markdown_table(["cell", "minus", "strict", "paper's measure"], rows, left_columns=2),
     ]
 

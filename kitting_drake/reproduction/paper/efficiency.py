@@ -9,24 +9,13 @@ from pathlib import Path
 from typing import Any
 
 from kitting_drake.common.errors import UserError
-from kitting_drake.evaluation.quantities import count_text, seconds_text
+from kitting_drake.evaluation.quantities import count_text, ratio_text, seconds_text
 from kitting_drake.reproduction.page.markdown import markdown_table
+from kitting_drake.reproduction.page.prose import prose
 from kitting_drake.reproduction.page.runs import LEARNED, METHODS
 
 EFFICIENCY = "networks.json"
 """The file, beside the results: a copy of the one that `benchmark networks` leaves."""
-
-_INTRODUCTION = """\
-### Efficiency, figure 6(c)
-
-Parameters and inference time of the pick-angle networks, of the size that the paper gives (preset
-`paper`) and of the size used elsewhere on this page (`small`). {machine}, in {type}, the median
-of {repeats}. The last column is the growth from N = {fewest} to N = {most}, of parameters and of
-time. The Transporter has no such network: its one picking network sees the scene at N / 2 angles.
-
-![Parameters and time of the networks](networks.png)
-
-"""
 
 
 def read_efficiency(folder: Path) -> dict[str, Any] | None:
@@ -76,24 +65,21 @@ def efficiency_section(measured: Mapping[str, Any]) -> str:
                     METHODS[method],
                     preset,
                     *(_cost_text(by_n[n]) for n in counts),
-                    f"{_ratio_text(growth['parameters'])}, {_ratio_text(growth['seconds'])}",
+                    f"{ratio_text(growth['parameters'])}, {ratio_text(growth['seconds'])}",
                 ]
             )
-    return _INTRODUCTION.format(
+    text = prose(
+        "efficiency",
         machine=f"{place}, {machine['threads']} threads",
         type=measured["inference_type"],
         repeats=measured["repeats"],
         fewest=ends["from"],
         most=ends["to"],
-    ) + markdown_table(
-        ["method", "preset", *(f"N = {n}" for n in counts), "growth"], rows, left_columns=2
     )
+    headings = ["method", "preset", *(f"N = {n}" for n in counts), "growth"]
+    return f"{text}\n{markdown_table(headings, rows, left_columns=2)}"
 
 
 def _cost_text(row: Mapping[str, Any]) -> str:
     """Parameters, and the time or why there is none."""
     return f"{count_text(row['parameters'])}, {row['skipped'] or seconds_text(row['seconds'])}"
-
-
-def _ratio_text(ratio: float | None) -> str:
-    return "-" if ratio is None else f"{ratio:.2f}"

@@ -9,10 +9,10 @@ from typing import Any
 
 from kitting_drake.reproduction.page.markdown import markdown_table, rate_text
 from kitting_drake.reproduction.page.paired import STRICT, over_tools
+from kitting_drake.reproduction.page.prose import prose
 from kitting_drake.reproduction.page.ravens_table import PAPER as TABLE_1
 from kitting_drake.reproduction.page.results_page import PAPER
 from kitting_drake.reproduction.page.runs import LEARNED, METHODS
-from kitting_drake.reproduction.paper import texts
 from kitting_drake.reproduction.paper.cell_results import Result
 from kitting_drake.reproduction.paper.cells import (
     LEARNING_RATES,
@@ -59,23 +59,24 @@ _TOLD = ("trained_orientations", "steps", "learning_rate", "training_seed", "com
 def paper_sections(
     results: Sequence[Result],
     rates: Rates,
-    link: str,
     efficiency: Mapping[str, Any] | None = None,
 ) -> list[str]:
     """The sections of the page; none without results.
 
     Args:
-        results: of `read_results`.
+        results: of `cell_results`.
         rates: what each learning rate of each baseline came to on validation scenes.
-        link: the folder of all results, from the page's own.
         efficiency: what `benchmark networks` measured, if it was.
     """
     if not results:
         return []
     by_name = {result.cell.name: result for result in results}
     sections = [
-        texts.INTRODUCTION.format(
-            preset=PRESET, rates=_rates_text(rates), state=_state_text(results)
+        prose(
+            "as_in_the_paper",
+            preset=PRESET,
+            rates=_rates_text(rates).strip(),
+            state=_state_text(results).strip(),
         )
     ]
     for task, heading in _HEADINGS.items():
@@ -84,9 +85,9 @@ def paper_sections(
             sections.append(f"![Figure 6 of {task} tools](results_{task}.png)\n")
         sections.append(_figure_table(task, by_name))
         if task == "unseen" and "unseen_so2_180_10" in by_name:
-            sections.append(texts.TEN)
+            sections.append(prose("ten_demonstrations"))
         if task == "unseen" and "unseen_transporter_36_100" in by_name:
-            sections.append(texts.TRANSPORTER)
+            sections.append(prose("transporter"))
     sections += trainings(by_name)
     if efficiency is not None:
         sections.append(efficiency_section(efficiency))
@@ -94,7 +95,7 @@ def paper_sections(
     sections += _table_1(by_name)
     sections += _fresh_tools(by_name)
     sections += differences(by_name)
-    sections += ["### Every cell\n", _every_cell(results, link)]
+    sections += ["### Every cell\n", _every_cell(results)]
     return sections
 
 
@@ -116,9 +117,10 @@ def has_table_1(results: Iterable[Result]) -> bool:
 def _state_text(results: Sequence[Result]) -> str:
     """How many of the cells have been run, and what that took."""
     count = len(paper_cells())
-    hours = sum(result.summary["wall_seconds"] for result in results) / 3600
-    text = texts.ALL if len(results) == count else texts.NOT_ALL
-    return text.format(done=len(results), all=count, hours=hours)
+    hours = f"{sum(result.summary['wall_seconds'] for result in results) / 3600:.0f}"
+    if len(results) == count:
+        return prose("cells_complete", all=count, hours=hours)
+    return prose("cells_missing", done=len(results), all=count, hours=hours)
 
 
 def _rates_text(rates: Rates) -> str:
@@ -139,7 +141,7 @@ def _rates_text(rates: Rates) -> str:
             for rate, cost in costs.items()
         )
         parts.append(f"- {who}: {best_rate(costs)} of {tried}\n")
-    return texts.RATES.format(ours=f"{LEARNING_RATES[0]:g}") + "\n" + "".join(parts)
+    return prose("learning_rates", ours=f"{LEARNING_RATES[0]:g}") + "\n" + "".join(parts)
 
 
 def _baselines() -> list[Training]:
@@ -186,7 +188,7 @@ def _beyond_the_paper(results: Mapping[str, Result]) -> list[str]:
     ]
     return [
         "### Beyond the paper, and an ablation\n",
-        texts.BEYOND.format(steps=steps, more=steps + TASKS["unseen"].more_steps),
+        prose("beyond_the_paper", steps=steps, more=steps + TASKS["unseen"].more_steps),
         markdown_table(["ours, N = 180, 100 demonstrations", "unseen", "seen"], rows),
     ]
 
@@ -219,26 +221,25 @@ def _table_1(results: Mapping[str, Result]) -> list[str]:
     headings = ["method", "N", "demonstrations"]
     sections = [
         "### The five Ravens tasks, table I\n",
-        "The mean reward in percent with its 95 % interval over episodes, and after the stroke the "
-        "figure\nof the paper, whose checkpoints are the best on the test runs.\n",
+        prose("ravens_tasks"),
         "![Table I as a figure](results_ravens.png)\n",
         markdown_table([*headings, *tasks], rows),
     ]
     if any(name.startswith("palletizing_boxes") for name in results):
-        sections.append(texts.PALLETIZING)
+        sections.append(prose("palletizing"))
     if "palletizing_boxes_so2_180_1" in results:
-        sections.append(texts.PALLETIZING_ONCE)
+        sections.append(prose("palletizing_once"))
     if "palletizing_boxes_transporter_36_100" in results:
-        sections.append(texts.PALLETIZING_TRANSPORTER)
+        sections.append(prose("palletizing_transporter"))
     if "place_red_in_green_so2_180_1" in results:
-        sections.append(texts.RED)
+        sections.append(prose("red_in_green"))
     if any(
         f"{task}_so2" in name and name.endswith("_ours")
         for name in results
         for task in BEYOND_OF_TABLE_1
     ):
         table = markdown_table([*headings, *BEYOND_OF_TABLE_1], beyond)
-        sections += [texts.PYRAMID, table, texts.PYRAMID_SEEN]
+        sections += [prose("pyramid"), table, prose("pyramid_seen")]
     return sections
 
 
@@ -252,7 +253,7 @@ def _fresh_tools(results: Mapping[str, Result]) -> list[str]:
     ]
     return [
         "### Ten fresh tools\n",
-        texts.FRESH,
+        prose("fresh_tools"),
         markdown_table(["policy", "strict, %", "over tools", "paper's, %"], rows),
     ]
 
@@ -269,7 +270,7 @@ def _both(result: Result) -> list[str]:
     ]
 
 
-def _every_cell(results: Sequence[Result], link: str) -> str:
+def _every_cell(results: Sequence[Result]) -> str:
     def detail(result: Result, key: str) -> str:
         value = result.summary["policy_details"].get(key)
         return "" if value is None else str(value)
@@ -279,7 +280,7 @@ def _every_cell(results: Sequence[Result], link: str) -> str:
         summary = result.summary
         rows.append(
             [
-                f"[{result.cell.name}]({link}/paper/{result.cell.name}.json)",
+                result.cell.name,
                 *(detail(result, key) for key in _TOLD),
                 str(summary["episodes"]),
                 f"{min(summary['seeds'])} to {max(summary['seeds'])}",
@@ -301,7 +302,7 @@ def _every_cell(results: Sequence[Result], link: str) -> str:
     ]
     headings += ["seeds", "strict, %", "over tools", "paper's, %", "causes"]
     headings += ["weights", "Drake", "commit"]
-    return f"{texts.EVERY_CELL}\n{markdown_table(headings, rows)}"
+    return prose("every_cell") + "\n" + markdown_table(headings, rows)
 
 
 def _causes(summary: Mapping[str, Any]) -> str:

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
+from fnmatch import fnmatch
 from typing import Any
 
+from kitting_drake.common.errors import UserError
 from kitting_drake.reproduction.page.runs import LEARNED
 from kitting_drake.reproduction.paper.cells import ORIENTATIONS, TASKS, Cell, Training
 
@@ -169,7 +172,7 @@ SHIPPED = {
 
 
 def _fresh_tools() -> list[Cell]:
-    """The policies as they come, on tools that nobody had looked at."""
+    """The policies as they come, on unseen tools."""
     return [Cell("fresh", policy, None, label, search=True) for label, policy in SHIPPED.items()]
 
 
@@ -187,3 +190,18 @@ def paper_cells() -> list[Cell]:
         *_ablation()[4:],
         *_table_1(),
     ]
+
+
+def choose_cells(patterns: Sequence[str]) -> list[Cell]:
+    """The cells whose names match patterns, in the order of the patterns.
+
+    Raises:
+        UserError: a pattern matches none.
+    """
+    chosen: dict[str, Cell] = {}
+    for pattern in patterns:
+        matching = {cell.name: cell for cell in paper_cells() if fnmatch(cell.name, pattern)}
+        if not matching:
+            raise UserError(f"--cells: there is no cell of the name '{pattern}'")
+        chosen |= matching
+    return list(chosen.values())

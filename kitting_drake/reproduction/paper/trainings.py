@@ -7,16 +7,10 @@ from statistics import mean, stdev
 
 from kitting_drake.reproduction.page.markdown import markdown_table
 from kitting_drake.reproduction.page.paired import OWN, STRICT
+from kitting_drake.reproduction.page.prose import prose
 from kitting_drake.reproduction.page.runs import LEARNED, METHODS
 from kitting_drake.reproduction.paper.cell_results import Result
 from kitting_drake.reproduction.paper.paper_tables import FIGURE_6, HEADLINE_SEEDS, headline
-
-_INTRODUCTION = """\
-Three trainings of each method at N = 180 after 100 demonstrations. The seed of a training sets
-its initial weights, and the order and augmentation of its samples; demonstrations, validation
-scenes and test episodes are the same. Success rates in percent, strict and by the paper's
-measure; the mean is given with the standard deviation over trainings.
-"""
 
 
 def trainings(results: Mapping[str, Result]) -> list[str]:
@@ -34,7 +28,7 @@ def trainings(results: Mapping[str, Result]) -> list[str]:
     headings = ["method", "toolsets", *(f"seed {seed}" for seed in HEADLINE_SEEDS), "mean"]
     return [
         "### Variation between trainings\n",
-        _INTRODUCTION,
+        prose("trainings"),
         markdown_table(headings, rows, left_columns=2),
     ]
 

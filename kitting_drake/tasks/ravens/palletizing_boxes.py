@@ -110,7 +110,7 @@ def volume_points(size: tuple[float, float, float]) -> NDArray[np.float64]:
 
     def along(length: float) -> NDArray[np.float64]:
         count = math.ceil(length / _POINT_SPACING - 1e-9)
-        return (np.arange(count) - (count - 1) / 2) * _POINT_SPACING
+        return (np.arange(count, dtype=float) - (count - 1) / 2) * _POINT_SPACING
 
     x, y, z = np.meshgrid(*(along(length) for length in size), indexing="ij")
     return np.column_stack([x.ravel(), y.ravel(), z.ravel() + size[2] / 2])

@@ -11,13 +11,12 @@ from kitting_drake.common.rendering import can_render, require_rendering
 pytestmark = pytest.mark.skipif(not can_render(), reason="images cannot be rendered here")
 
 RENDER_THEN_TRAIN = """
-from pathlib import Path
 import torch
-from kitting_drake.station.station import build_cell
-from kitting_drake.scenario.schema import Scenario
+from kitting_drake.scenario import Scenario
+from kitting_drake.station import build_station
 
-cell = build_cell(Scenario(), seed=0, base=Path())
-cell.diagram.GetOutputPort("observation").Eval(cell.diagram.CreateDefaultContext())
+station = build_station(Scenario())
+station.GetOutputPort("observation").Eval(station.CreateDefaultContext())
 torch.optim.Adam([torch.zeros(1, requires_grad=True)])
 """
 

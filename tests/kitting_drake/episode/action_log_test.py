@@ -1,6 +1,5 @@
 import dataclasses
 import math
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,20 +9,20 @@ from pydrake.systems.framework import Context
 from kitting_drake.episode import ModeChange
 from kitting_drake.episode.action_log import ActionLog, nearest_object
 from kitting_drake.scenario import Scenario
-from kitting_drake.station import Cell, build_cell
+from kitting_drake.station import KittingStation, build_station
 from kitting_drake.tasks import Kitting
 from kitting_drake.tasks.task import ActionRecord
 from systems.oracle_policy import gripper_pose
 from systems.pick_place_parameters import Mode
-from systems.signals import PlanarPose
+from systems.signals import PickPlaceAction, PlanarPose
 
 OBJECT = 0
 GRASP = (Mode.DESCEND, Mode.CLOSE, Mode.CHECK)
 
 
 @pytest.fixture(scope="module")
-def cell() -> Cell:
-    return build_cell(Scenario(cameras={}), seed=0, base=Path())
+def station() -> KittingStation:
+    return build_station(Scenario(cameras={}))
 
 
 def flat(x: float, y: float, yaw: float = 0.0, z: float = 0.0) -> RigidTransform:
@@ -37,14 +36,14 @@ def planar(X: RigidTransform) -> PlanarPose:
 class Action:
     """A log that is told of one action, mode by mode, and objects that are where one says."""
 
-    def __init__(self, cell: Cell, pick: PlanarPose, place: PlanarPose) -> None:
-        self.cell = cell
-        self.root: Context = cell.diagram.CreateDefaultContext()
-        self.context = cell.plant.GetMyMutableContextFromRoot(self.root)
-        self.log = ActionLog(cell)
+    def __init__(self, station: KittingStation, pick: PlanarPose, place: PlanarPose) -> None:
+        self.station = station
+        self.root: Context = station.CreateDefaultContext()
+        self.context = station.plant.GetMyMutableContextFromRoot(self.root)
+        self.log = ActionLog(station)
         self._mode = Mode.OBSERVE
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(cell.planner, "action", lambda _: (pick, place))
+            patch.setattr(station, "accepted_action", lambda _: PickPlaceAction(pick, place))
             self.go(Mode.APPROACH)
 
     def go(self, *modes: Mode) -> "Action":
@@ -54,8 +53,8 @@ class Action:
         return self
 
     def put(self, index: int, X_WB: RigidTransform) -> None:
-        body = self.cell.plant.get_body(self.cell.objects[index].body)
-        self.cell.plant.SetFreeBodyPose(self.context, body, X_WB)
+        body = self.station.plant.get_body(self.station.objects[index].body)
+        self.station.plant.SetFreeBodyPose(self.context, body, X_WB)
 
     @property
     def record(self) -> ActionRecord:
@@ -63,17 +62,17 @@ class Action:
         return record
 
 
-def right_action(cell: Cell, index: int) -> tuple[PlanarPose, PlanarPose]:
+def right_action(station: KittingStation, index: int) -> tuple[PlanarPose, PlanarPose]:
     """What the expert does with an object."""
-    item = cell.scene.objects[index]
-    (X_WGoal,) = cell.scene.goals[index].poses
+    item = station.scene.objects[index]
+    (X_WGoal,) = station.scene.goals[index].poses
     return gripper_pose(item.X_WB, item.grasps[0]), gripper_pose(X_WGoal, item.grasps[0])
 
 
 @pytest.mark.parametrize("index", range(4))
-def test_the_right_action_has_no_error(cell: Cell, index: int):
-    record = Action(cell, *right_action(cell, index)).record
-    item = cell.scene.objects[index]
+def test_the_right_action_has_no_error(station: KittingStation, index: int):
+    record = Action(station, *right_action(station, index)).record
+    item = station.scene.objects[index]
     assert (record.object, record.category) == (item.name, item.category)
     assert record.outcome == "unfinished"
     assert record.pick_position_error_mm == pytest.approx(0.0, abs=1e-9)
@@ -82,43 +81,45 @@ def test_the_right_action_has_no_error(cell: Cell, index: int):
     assert record.place_angle_error_deg == pytest.approx(0.0, abs=1e-9)
 
 
-def test_an_action_is_judged_by_where_it_would_bring_the_object(cell: Cell):
-    pick, place = right_action(cell, OBJECT)
+def test_an_action_is_judged_by_where_it_would_bring_the_object(station: KittingStation):
+    pick, place = right_action(station, OBJECT)
     # Another grasp, to which the place is suited: only the pick is off.
     off = flat(3e-3, -4e-3, math.radians(7.0))
     shifted = [planar(flat(pose.x, pose.y, pose.theta) @ off) for pose in (pick, place)]
-    record = Action(cell, *shifted).record
+    record = Action(station, *shifted).record
     assert record.pick_position_error_mm == pytest.approx(5.0)
     assert record.pick_angle_error_deg == pytest.approx(7.0)
     assert record.place_position_error_mm == pytest.approx(0.0, abs=1e-9)
     assert record.place_angle_error_deg == pytest.approx(0.0, abs=1e-9)
 
 
-def test_half_a_rotation_of_the_jaws_is_nothing_and_of_the_object_much(cell: Cell):
-    pick, place = right_action(cell, OBJECT)
+def test_half_a_rotation_of_the_jaws_is_nothing_and_of_the_object_much(station: KittingStation):
+    pick, place = right_action(station, OBJECT)
     rotated = PlanarPose(pick.x, pick.y, pick.theta + math.pi)
-    record = Action(cell, rotated, place).record
+    record = Action(station, rotated, place).record
     assert record.pick_angle_error_deg == pytest.approx(0.0, abs=1e-9)
     assert record.place_angle_error_deg == pytest.approx(180.0)
     # About the grasp, which takes the middle of the object to its other side.
-    (grasp,) = cell.scene.objects[OBJECT].grasps
-    middle = cell.objects[OBJECT].p_BMiddle
+    (grasp,) = station.scene.objects[OBJECT].grasps
+    middle = station.objects[OBJECT].p_BMiddle
     arm = math.hypot(grasp.x - middle[0], grasp.y - middle[1])
     assert record.place_position_error_mm == pytest.approx(2e3 * arm)
 
 
-def test_headings_are_compared_modulo_the_declared_symmetry(cell: Cell):
-    objects = list(cell.objects)
+def test_headings_are_compared_modulo_the_declared_symmetry(
+    station: KittingStation, monkeypatch: pytest.MonkeyPatch
+):
+    objects = list(station.objects)
     objects[OBJECT] = dataclasses.replace(objects[OBJECT], symmetry=2)
-    reversible = dataclasses.replace(cell, objects=tuple(objects))
-    pick, place = right_action(cell, OBJECT)
+    monkeypatch.setattr(station, "objects", tuple(objects))
+    pick, place = right_action(station, OBJECT)
     rotated = PlanarPose(pick.x, pick.y, pick.theta + math.pi)
-    record = Action(reversible, rotated, place).record
+    record = Action(station, rotated, place).record
     assert record.place_angle_error_deg == pytest.approx(0.0, abs=1e-9)
 
 
-def test_outcomes_by_the_modes_gone_through(cell: Cell):
-    action = right_action(cell, OBJECT)
+def test_outcomes_by_the_modes_gone_through(station: KittingStation):
+    action = right_action(station, OBJECT)
     held = (*GRASP, Mode.LIFT, Mode.CARRY, Mode.LOWER)
     for modes, outcome in (
         ((*GRASP, Mode.RETREAT), "missed"),
@@ -130,59 +131,63 @@ def test_outcomes_by_the_modes_gone_through(cell: Cell):
         ((*held, Mode.SEARCH, Mode.LOWER, Mode.RELEASE, Mode.RETREAT), "placed"),
         ((*GRASP, Mode.LIFT), "unfinished"),
     ):
-        assert Action(cell, *action).go(*modes, Mode.OBSERVE).record.outcome == outcome
+        assert Action(station, *action).go(*modes, Mode.OBSERVE).record.outcome == outcome
 
 
-def test_the_end_of_an_episode_is_no_event_of_an_action(cell: Cell):
-    action = Action(cell, *right_action(cell, OBJECT)).go(*GRASP)
+def test_the_end_of_an_episode_is_no_event_of_an_action(station: KittingStation):
+    action = Action(station, *right_action(station, OBJECT)).go(*GRASP)
     action.log.observe(ModeChange(Mode.RELEASE, Mode.RELEASE, action.root, is_last=True))
     assert action.record.outcome == "unfinished"
 
 
-def test_what_was_lifted_is_what_was_picked(cell: Cell):
-    action = Action(cell, *right_action(cell, 0)).go(*GRASP, Mode.LIFT)
-    action.put(2, flat(0.0, 0.0, 0.0, 0.05) @ cell.scene.objects[2].X_WB)
+def test_what_was_lifted_is_what_was_picked(station: KittingStation):
+    action = Action(station, *right_action(station, 0)).go(*GRASP, Mode.LIFT)
+    action.put(2, flat(0.0, 0.0, 0.0, 0.05) @ station.scene.objects[2].X_WB)
     action.go(Mode.CARRY, Mode.LOWER, Mode.RELEASE)
-    assert action.record.object == cell.scene.objects[2].name
+    assert action.record.object == station.scene.objects[2].name
     assert action.record.outcome == "placed"
     # Judged by the pose before it was lifted, against the goal of what was lifted.
-    here, there = (cell.scene.objects[index].X_WB.translation() for index in (0, 2))
+    here, there = (station.scene.objects[index].X_WB.translation() for index in (0, 2))
     assert action.record.pick_position_error_mm > 1e3 * np.linalg.norm(there - here) / 2
     assert action.record.place_position_error_mm > 30.0
 
 
 def test_of_twins_the_nearer_cavity_is_what_was_meant():
     twins = Kitting(tools=["flat_screwdriver", "flat_screwdriver"], random_order=False)
-    cell = build_cell(Scenario(task=twins, cameras={}), seed=0, base=Path())
-    (pick, _), (_, place) = right_action(cell, 0), right_action(cell, 1)
-    record = Action(cell, pick, place).record
+    station = build_station(Scenario(task=twins, cameras={}))
+    (pick, _), (_, place) = right_action(station, 0), right_action(station, 1)
+    record = Action(station, pick, place).record
     assert record.object == "flat_screwdriver"
     assert record.place_position_error_mm == pytest.approx(0.0, abs=1e-9)
     assert record.place_angle_error_deg == pytest.approx(0.0, abs=1e-9)
 
 
-def test_an_object_without_grasp_or_goal_has_no_errors(cell: Cell):
+def test_an_object_without_grasp_or_goal_has_no_errors(
+    station: KittingStation, monkeypatch: pytest.MonkeyPatch
+):
     """A distractor: it may be picked all the same."""
-    items = list(cell.scene.objects)
+    items = list(station.scene.objects)
     items[OBJECT] = dataclasses.replace(items[OBJECT], grasps=())
     scene = dataclasses.replace(
-        cell.scene,
+        station.scene,
         objects=tuple(items),
         goals=tuple(
             dataclasses.replace(goal, reward=1 / 3)
-            for goal in cell.scene.goals
+            for goal in station.scene.goals
             if OBJECT not in goal.objects
         ),
     )
-    record = Action(dataclasses.replace(cell, scene=scene), *right_action(cell, OBJECT)).record
+    action = right_action(station, OBJECT)
+    monkeypatch.setattr(station, "scene", scene)
+    record = Action(station, *action).record
     assert record.object == items[OBJECT].name
     assert record.pick_position_error_mm is record.pick_angle_error_deg is None
     assert record.place_position_error_mm is record.place_angle_error_deg is None
 
 
-def test_the_nearest_object_is_by_surface_and_not_by_middle(cell: Cell):
-    poses = [item.X_WB for item in cell.scene.objects]
-    for index, item in enumerate(cell.objects):
+def test_the_nearest_object_is_by_surface_and_not_by_middle(station: KittingStation):
+    poses = [item.X_WB for item in station.scene.objects]
+    for index, item in enumerate(station.objects):
         end = item.p_BPoints[item.p_BPoints[:, 0].argmax()]
         x, y, _ = poses[index] @ end
-        assert nearest_object(cell, poses, PlanarPose(x, y)) == index
+        assert nearest_object(station, poses, PlanarPose(x, y)) == index

@@ -5,20 +5,19 @@ import json
 import sys
 import types
 from collections.abc import Sequence
-from pathlib import Path
 
 import numpy as np
 import pytest
 
-from kitting_drake.episode import EpisodeObserver, EpisodeResult, ModeChange, run_episode
+from kitting_drake.episode import EpisodeObserver, EpisodeResult, ModeChange
 from kitting_drake.scenario import Scenario
+from kitting_drake.scenario.cameras import Pinhole
 from kitting_drake.scenario.policies import PythonPolicy
-from kitting_drake.scenario.schema import Pinhole
-from kitting_drake.station import Cell, build_cell
 from kitting_drake.tasks import ArrangedKitting
 from kitting_drake.tasks.kitting.tool_poses import TablePose
 from systems.pick_place_parameters import Mode, PickPlaceParameters
 from systems.signals import Observation, PickPlaceAction, PlanarPose
+from tests.kitting_drake.rig import Rig, build_rig
 
 ONE_TOOL = ArrangedKitting(
     tools={"combination_wrench": TablePose(x=0.42, y=0.14)}, kit_pose=TablePose(x=0.5, y=-0.1)
@@ -26,22 +25,8 @@ ONE_TOOL = ArrangedKitting(
 BLIND = Scenario(task=ONE_TOOL, cameras={})
 
 
-def build(scenario: Scenario = BLIND) -> Cell:
-    return build_cell(scenario, seed=0, base=Path())
-
-
-def run(
-    cell: Cell, seconds: float, *observers: EpisodeObserver, scenario: Scenario = BLIND
-) -> EpisodeResult:
-    return run_episode(
-        cell,
-        task=scenario.task,
-        scenario="test",
-        policy="test",
-        seed=0,
-        time_limit=seconds,
-        observers=observers,
-    )
+def build(scenario: Scenario = BLIND) -> Rig:
+    return build_rig(scenario)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -61,13 +46,13 @@ class Seen:
 class Observer:
     """Keeps what it is told of."""
 
-    def __init__(self, cell: Cell) -> None:
-        self._cell = cell
+    def __init__(self, rig: Rig) -> None:
+        self._rig = rig
         self.seen: list[Seen] = []
 
     def observe(self, event: ModeChange) -> None:
         root = event.root_context
-        body = self._cell.plant.get_body(self._cell.objects[0].body)
+        body = self._rig.station.plant.get_body(self._rig.station.objects[0].body)
         self.seen.append(
             Seen(
                 event.previous,
@@ -76,8 +61,8 @@ class Observer:
                 event.is_stop,
                 event.is_last,
                 root.get_time(),
-                tuple(self._cell.diagram.GetOutputPort("counts").Eval(root)),
-                body.is_locked(self._cell.plant.GetMyContextFromRoot(root)),
+                tuple(self._rig.port("counts", root)),
+                body.is_locked(self._rig.station.plant.GetMyContextFromRoot(root)),
             )
         )
 
@@ -85,9 +70,9 @@ class Observer:
 @pytest.fixture(scope="module")
 def grasp_to_release() -> tuple[EpisodeResult, Sequence[Seen]]:
     """The oracle kits one tool, by real physics, without cameras."""
-    cell = build()
-    observer = Observer(cell)
-    return run(cell, 30.0, observer.observe), observer.seen
+    rig = build()
+    observer = Observer(rig)
+    return rig.run(observer.observe, seconds=30.0), observer.seen
 
 
 def test_the_oracle_kits_one_tool(grasp_to_release: tuple[EpisodeResult, Sequence[Seen]]):
@@ -139,9 +124,9 @@ def test_a_tool_sleeps_until_the_hand_comes(
 
 
 def test_an_episode_whose_time_is_up_has_no_reward():
-    cell = build()
-    observer = Observer(cell)
-    result = run(cell, 0.5, observer.observe)
+    rig = build()
+    observer = Observer(rig)
+    result = rig.run(observer.observe, seconds=0.5)
     assert (result.timed_out, result.failure) == (True, None)
     assert (result.success_rate, result.strict_success_rate) == (0.0, 0.0)
     assert result.sim_seconds == pytest.approx(0.5)
@@ -153,39 +138,30 @@ def test_an_episode_whose_time_is_up_has_no_reward():
 
 def test_what_is_there_already_counts_only_if_the_episode_ends_well():
     """Nothing is left to do: the expert says stop at once."""
-    cell = build()
-    (X_WGoal,) = cell.scene.goals[0].poses
-    cell.plant.SetDefaultFloatingBaseBodyPose(cell.plant.get_body(cell.objects[0].body), X_WGoal)
-    observer = Observer(cell)
-    result = run(cell, 5.0, observer.observe)
+    rig = build()
+    (X_WGoal,) = rig.scene.goals[0].poses
+    rig.plant.SetDefaultFloatingBaseBodyPose(rig.plant.get_body(rig.objects[0].body), X_WGoal)
+    observer = Observer(rig)
+    result = rig.run(observer.observe, seconds=5.0)
     assert (result.success_rate, result.strict_success_rate, result.actions) == (1.0, 1.0, 0)
     assert result.objects[0].success
     assert [event.mode for event in observer.seen] == [Mode.DONE, Mode.DONE]
     assert observer.seen[0].is_stop
     # The objects have come to rest, and no more time is taken.
     assert result.sim_seconds < 1.0
-    early = run(cell, 0.1)
+    early = rig.run(seconds=0.1)
     assert early.objects[0].success
     assert (early.timed_out, early.success_rate, early.strict_success_rate) == (True, 0.0, 0.0)
 
 
 def test_an_episode_that_ends_at_success_asks_for_no_action_more():
     """With two tries a tool the planner would ask again."""
-    scenario = dataclasses.replace(BLIND, task=dataclasses.replace(ONE_TOOL, tries=2))
     told: dict[bool, list[Mode]] = {}
     for ends in (False, True):
-        cell = build(scenario)
+        task = dataclasses.replace(ONE_TOOL, tries=2)
+        rig = build(dataclasses.replace(BLIND, task=task, end_at_success=ends))
         modes = told.setdefault(ends, [])
-        result = run_episode(
-            cell,
-            task=scenario.task,
-            scenario="test",
-            policy="test",
-            seed=0,
-            time_limit=30.0,
-            end_at_success=ends,
-            observers=[lambda event, modes=modes: modes.append(event.mode)],
-        )
+        result = rig.run(lambda event, modes=modes: modes.append(event.mode), seconds=30.0)
         assert (result.strict_success_rate, result.actions, result.timed_out) == (1.0, 1, False)
     assert Mode.DONE in told[False]
     assert Mode.DONE not in told[True]
@@ -200,10 +176,10 @@ def raise_at(mode: Mode, error: BaseException) -> EpisodeObserver:
 
 
 def test_a_simulation_that_fails_ends_the_episode_with_its_reason():
-    cell = build()
-    told = Observer(cell)
+    rig = build()
+    told = Observer(rig)
     fails = raise_at(Mode.APPROACH, RuntimeError("the solver did\nnot converge"))
-    result = run(cell, 5.0, fails, told.observe)
+    result = rig.run(fails, told.observe, seconds=5.0)
     assert result.failure is not None
     assert "the solver did not converge" in result.failure
     assert (result.success_rate, result.strict_success_rate) == (0.0, 0.0)
@@ -217,13 +193,13 @@ def test_a_simulation_that_fails_ends_the_episode_with_its_reason():
 
 
 def test_an_interrupted_episode_has_a_result():
-    result = run(build(), 5.0, raise_at(Mode.APPROACH, KeyboardInterrupt()))
+    result = build().run(raise_at(Mode.APPROACH, KeyboardInterrupt()), seconds=5.0)
     assert result.interrupted
     assert result.failure is None
     assert result.sim_seconds < 1.0
 
 
-# Policies that are shown the cell.
+# Policies that are shown the rig.
 
 SMALL = {
     name: dataclasses.replace(camera, width=160, height=120, focal_length=112.5)
@@ -261,14 +237,9 @@ def install(policy: object, monkeypatch: pytest.MonkeyPatch) -> Scenario:
 def test_a_policy_is_asked_only_when_the_planner_has_observed(monkeypatch: pytest.MonkeyPatch):
     stub = Stub()
     scenario = install(stub, monkeypatch)
-    cell = build(scenario)
+    rig = build(scenario)
     asked: list[tuple[Mode, int]] = []
-    result = run(
-        cell,
-        30.0,
-        lambda event: asked.append((event.mode, len(stub.seen))),
-        scenario=scenario,
-    )
+    result = rig.run(lambda event: asked.append((event.mode, len(stub.seen))), seconds=30.0)
     # Asked once before each of the two modes that follow upon OBSERVE, and at no other time.
     assert asked[0] == (Mode.APPROACH, 1)
     assert {count for mode, count in asked[:-2]} == {1}
@@ -294,7 +265,7 @@ def test_a_policy_that_fails_ends_the_episode_with_its_reason(
         raise kind("weights of the wrong shape")
 
     scenario = install(fail, monkeypatch)
-    result = run(build(scenario), 1.0, scenario=scenario)
+    result = build(scenario).run(seconds=1.0)
     assert result.failure == f"{kind.__name__}: weights of the wrong shape"
     # Its author is told where.
     assert "in fail" in caplog.text

@@ -12,15 +12,15 @@ from pydrake.math import RigidTransform, RollPitchYaw
 from pydrake.systems.analysis import Simulator
 
 from kitting_drake.common.paths import SCENARIOS
-from kitting_drake.episode import EpisodeResult, run_episode
+from kitting_drake.episode import EpisodeResult
 from kitting_drake.scenario import Scenario, load_scenario
 from kitting_drake.scenario.schema import Sleep
-from kitting_drake.station import Cell, build_cell
 from kitting_drake.tasks import ArrangedKitting, Kitting
 from kitting_drake.tasks.kitting.tool_poses import TablePose
 from kitting_drake.tasks.task import Scene
 from systems.insertion_search import InsertionSearch
 from systems.pick_place_parameters import PickPlaceParameters
+from tests.kitting_drake.rig import Rig, build_rig
 
 TOOLS = Kitting().tools
 THRESHOLD = 0.0035
@@ -30,14 +30,7 @@ THRESHOLD = 0.0035
 def run(
     scenario: Scenario, *, base: Path | None = None, time_limit: float = 180.0
 ) -> EpisodeResult:
-    return run_episode(
-        build_cell(scenario, seed=0, base=base or Path()),
-        task=scenario.task,
-        scenario="test",
-        policy=scenario.policy.name,
-        seed=0,
-        time_limit=time_limit,
-    )
+    return build_rig(scenario, base=base or Path()).run(seconds=time_limit)
 
 
 @pytest.mark.parametrize("name", ["kitting_seen", "kitting_unseen"])
@@ -104,25 +97,26 @@ class Seated:
         )
         # At its cavity a tool is done with: the oracle has nothing to do.
         scenario = Scenario(task=task, sleep=Sleep(enabled=False), cameras={})
-        self.cell: Cell = build_cell(scenario, seed=0, base=Path())
-        self.simulator = Simulator(self.cell.diagram)
+        self.rig: Rig = build_rig(scenario, seed=0, base=Path())
+        self.station = self.rig.station
+        self.simulator = Simulator(self.rig.diagram)
         root = self.simulator.get_mutable_context()
-        self.context = self.cell.plant.GetMyMutableContextFromRoot(root)
-        self.bodies = [self.cell.plant.get_body(item.body) for item in self.cell.objects]
+        self.context = self.station.plant.GetMyMutableContextFromRoot(root)
+        self.bodies = [self.station.plant.get_body(item.body) for item in self.station.objects]
 
     def put(self, index: int, X_GoalB: RigidTransform) -> None:
         """Puts a tool to a pose given in its goal's frame."""
-        X_WB = self.cell.scene.goals[index].poses[0] @ X_GoalB
-        self.cell.plant.SetFreeBodyPose(self.context, self.bodies[index], X_WB)
+        X_WB = self.station.scene.goals[index].poses[0] @ X_GoalB
+        self.station.plant.SetFreeBodyPose(self.context, self.bodies[index], X_WB)
 
     def pose(self, index: int) -> RigidTransform:
         return self.bodies[index].EvalPoseInWorld(self.context)
 
     def add_s(self) -> np.ndarray:
-        return self.cell.diagram.GetOutputPort("add_s").Eval(self.simulator.get_context())
+        return self.rig.port("add_s", self.simulator.get_context())
 
     def point_contacts(self) -> int:
-        results = self.cell.plant.get_contact_results_output_port().Eval(self.context)
+        results = self.station.plant.get_contact_results_output_port().Eval(self.context)
         return results.num_point_pair_contacts()
 
 
@@ -131,7 +125,7 @@ class Seated:
 @pytest.mark.parametrize("name", TOOLS)
 def test_a_tool_released_off_its_place_slips_in(name: str, sign: int):
     seated = Seated(name)
-    (item,) = seated.cell.scene.objects
+    (item,) = seated.station.scene.objects
     height = item.p_BPoints[:, 2].max()
     # 1 mm off, 1 degree off, its bottom 10 mm below the top of the block.
     offset = [sign * 1e-3 * np.sqrt(0.5), 1e-3 * np.sqrt(0.5), height - 0.010]
@@ -154,7 +148,7 @@ def test_tools_in_their_cavities_do_not_creep():
     seated.simulator.AdvanceTo(1.0)
     before = [seated.pose(index) for index in range(len(TOOLS))]
     seated.simulator.AdvanceTo(11.0)
-    for index, item in enumerate(seated.cell.scene.objects):
+    for index, item in enumerate(seated.station.scene.objects):
         moved = before[index].InvertAndCompose(seated.pose(index))
         # Wherever on the tool one looks.
         points = item.p_BPoints[:200]

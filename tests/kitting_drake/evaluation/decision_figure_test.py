@@ -57,10 +57,9 @@ def test_a_policy_that_stops_moves_no_gripper(observation: Observation):
     pick_colour, place_colour = (228, 87, 46), (27, 153, 139)
     acts = decision(observation)
     stops = dataclasses.replace(acts, action=PickPlaceAction(stop=True), log_odds=-4.0)
+    pictures = [drawn(observation, item) for item in (acts, stops)]
     for colour, shown_in_curve in ((pick_colour, True), (place_colour, False)):
-        counts = [
-            int((drawn(observation, item) == colour).all(axis=2).sum()) for item in (acts, stops)
-        ]
+        counts = [int((picture == colour).all(axis=2).sum()) for picture in pictures]
         assert counts[0] > counts[1]
         assert (counts[1] > 0) == shown_in_curve
 

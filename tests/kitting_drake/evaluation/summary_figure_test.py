@@ -8,7 +8,7 @@ from PIL import Image
 
 from kitting_drake.evaluation.summary import summarise
 from kitting_drake.evaluation.summary_figure import _COLOURS, _looks, draw_summary
-from systems.placement import PoseWithin
+from systems.placement import PoseWithin, SuccessPredicate
 from tests.kitting_drake.evaluation.episodes import (
     ADD_S,
     CHOSEN,
@@ -22,26 +22,27 @@ NINE = [make_object(f"thing {number}", 0.5 + number) for number in range(9)]
 
 
 @pytest.mark.parametrize(
-    ("episodes", "categories"),
+    ("episodes", "success", "categories"),
     [
-        ([make_episode(seed, [1.0, 9.0, 500.0, 0.0]) for seed in range(3)], 4),
+        ([make_episode(seed, [1.0, 9.0, 500.0, 0.0]) for seed in range(3)], ADD_S, 4),
         # More than there are colours, and one that no goal was left for.
-        ([make_result(0, [*NINE, make_object("spare", None)]).as_dict()], 9),
-        ([make_episode(0, [1.0], timed_out=True)], 1),
-        ([make_lost_episode(0)], 1),
+        ([make_result(0, [*NINE, make_object("spare", None)]).as_dict()], PoseWithin(), 9),
+        ([make_episode(0, [1.0], timed_out=True)], PoseWithin(), 1),
+        ([make_lost_episode(0)], ADD_S, 1),
     ],
 )
-def test_draws_whatever_there_is(episodes: list[dict[str, Any]], categories: int, tmp_path: Path):
-    for success in (ADD_S, PoseWithin()):
-        summary = summarise(episodes, CHOSEN, success, wall_seconds_total=1.0)
-        assert len(summary["categories"]) == categories
-        path = tmp_path / "summary.png"
-        draw_summary(summary, episodes, path)
-        pixels = np.asarray(Image.open(path).convert("RGB"))
-        assert pixels.shape[1] > 1000
-        for colour in _COLOURS[: min(categories, len(_COLOURS))]:
-            rgb = np.round(255 * np.array(to_rgb(colour)))
-            assert (pixels == rgb).all(axis=2).any(), colour
+def test_draws_whatever_there_is(
+    episodes: list[dict[str, Any]], success: SuccessPredicate, categories: int, tmp_path: Path
+):
+    summary = summarise(episodes, CHOSEN, success, wall_seconds_total=1.0)
+    assert len(summary["categories"]) == categories
+    path = tmp_path / "summary.png"
+    draw_summary(summary, episodes, path)
+    pixels = np.asarray(Image.open(path).convert("RGB"))
+    assert pixels.shape[1] > 1000
+    for colour in _COLOURS[: min(categories, len(_COLOURS))]:
+        rgb = np.round(255 * np.array(to_rgb(colour)))
+        assert (pixels == rgb).all(axis=2).any(), colour
 
 
 def test_categories_do_not_look_alike():

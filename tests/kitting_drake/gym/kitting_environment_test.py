@@ -104,7 +104,7 @@ def evaluated(
     chosen = find_scenario(path, name)
     own = PythonPolicy(function="own:policy")
     chosen = dataclasses.replace(chosen, scenario=dataclasses.replace(chosen.scenario, policy=own))
-    return run_chosen(chosen, build_chosen(chosen, seed=seed), seed=seed).as_dict()
+    return run_chosen(chosen, *build_chosen(chosen, seed=seed)).as_dict()
 
 
 def played(environment: gymnasium.Env, policy: Callable, seed: int) -> tuple[float, dict[str, Any]]:
@@ -162,10 +162,10 @@ def test_scene_after_scene_leaves_the_memory(small: Path):
     environment.reset(seed=0)
     environment.step(NOWHERE)
     environment.render()
-    first = weakref.ref(environment.unwrapped._cell.diagram)
+    first = weakref.ref(environment.unwrapped._station)
     environment.reset(seed=1)
     assert first() is None
-    second = weakref.ref(environment.unwrapped._cell.diagram)
+    second = weakref.ref(environment.unwrapped._station)
     environment.close()
     assert second() is None
 

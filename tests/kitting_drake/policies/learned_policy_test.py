@@ -8,17 +8,14 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from kitting_drake.policies.data.images import Image
-from kitting_drake.policies.learned_policy import (
-    Decision,
-    LearnedPolicy,
-    best_placement,
-    expected_position,
-)
+from kitting_drake.policies.draft import best_placement, expected_position
+from kitting_drake.policies.learned_policy import DEFAULT_STAGES, Decision, LearnedPolicy
 from kitting_drake.policies.networks.architecture import PLACE_CROP, NetworkConfig
 from kitting_drake.policies.networks.factored import AnglePrediction, Networks, PickPrediction
 from kitting_drake.policies.networks.layers.correlation import Candidate
 from kitting_drake.policies.networks.layers.steerable import PlainConv2d
 from kitting_drake.policies.networks.methods import make_networks
+from kitting_drake.policies.stages import SubPixel
 from systems.signals import Observation, PickPlaceAction, PixelGrid, PlanarPose
 
 # No defaults, no two numbers alike.
@@ -93,7 +90,7 @@ def observation() -> Observation:
 
 
 def decide(networks: Networks, *, continuous: bool, seen: Observation | None = None) -> Decision:
-    policy = LearnedPolicy(networks, orientations=N, continuous=continuous)
+    policy = LearnedPolicy(networks, orientations=N, stages=DEFAULT_STAGES if continuous else ())
     return policy.decide(seen or observation())
 
 
@@ -178,7 +175,7 @@ def test_stops_where_the_odds_that_there_is_something_to_pick_are_below_the_thre
     assert action == (PickPlaceAction(stop=True) if stop else found.action)
     assert action.heights is None
     # Where the episode ends by itself it is not asked.
-    unasked = LearnedPolicy(networks, orientations=N, may_stop=False)
+    unasked = LearnedPolicy(networks, orientations=N, stages=[SubPixel()])
     assert unasked(observation()) == dataclasses.replace(found.action, stop=False)
 
 
@@ -288,7 +285,7 @@ def test_every_decision_is_reported_to_watch():
 
 def test_where_a_grasp_failed_another_is_tried():
     networks = Known()
-    policy = LearnedPolicy(networks, orientations=N, continuous=False)
+    policy = LearnedPolicy(networks, orientations=N, stages=())
     seen = Observation(np.zeros((4, *GRID.shape), np.float32), GRID)
     first = policy(seen)
     second = policy(seen, [first.pick])

@@ -1,12 +1,15 @@
 """Synthetic scenes to learn from: a tool of a few blocks, and a kit with a cavity for it."""
 
 import math
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from kitting_drake.policies.data.images import Image, LabelledImage, rotation_matrix
+from kitting_drake.policies.data.recorded import Recorded
 from kitting_drake.policies.networks.architecture import NetworkConfig
+from systems.signals import Observation, PixelGrid
 
 SIDE = 113
 ORIENTATIONS = 36
@@ -24,6 +27,19 @@ _Blocks = frozenset[tuple[int, int]]
 _HANDLE: _Blocks = frozenset((i, 0) for i in range(-4, 1))
 _BESIDE = ((0, -1), (0, 1), (1, -1), (1, 1))
 _KIT: _Blocks = frozenset((i, j) for i in range(-5, 4) for j in range(-3, 4))
+
+
+def stored_observation(name: str) -> Observation:
+    """A rendered observation that is stored beside the tests.
+
+    `rgb` (3, rows, cols), 8 bits, and `height_tenth_mm` (rows, cols), in tenths of a millimetre.
+
+    Args:
+        name: `kitting_seen`, `kitting_unseen` or `kitting_unseen_final`.
+    """
+    stored = np.load(Path(__file__).parent / "observations" / f"{name}.npz")
+    recorded = Recorded(stored["rgb"], stored["height_tenth_mm"].astype(np.float32) * 1e-4)
+    return Observation(recorded.image, PixelGrid())
 
 
 def config(method: str, *, stop: bool = False) -> NetworkConfig:

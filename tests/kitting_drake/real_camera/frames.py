@@ -19,8 +19,8 @@ from kitting_drake.real_camera.checking.kit_block import Block
 from kitting_drake.real_camera.frames import Frame
 from kitting_drake.scenario.cameras import camera_pose, depth_camera
 from kitting_drake.scenario.schema import Scenario
-from kitting_drake.station import Cell, build_cell
 from systems.signals import Observation, PickPlaceAction
+from tests.kitting_drake.rig import Rig, build_rig
 
 ROOT = Path(__file__).resolve().parents[3]
 
@@ -32,36 +32,33 @@ class Rendered:
     frames: dict[str, Frame]
     calibration: Calibration
     """With the poses that the cell believes."""
-    cell: Cell
+    rig: Rig
     context: Context
 
     @property
     def observation(self) -> Observation:
-        return self.cell.diagram.GetOutputPort("observation").Eval(self.context)
+        return self.rig.port("observation", self.context)
 
     @property
     def action(self) -> PickPlaceAction:
         """Of the cell's own policy."""
-        return self.cell.diagram.GetOutputPort("action").Eval(self.context)
+        return self.rig.port("action", self.context)
 
 
-def render(scenario: Scenario, seed: int, *, cell: Cell | None = None) -> Rendered:
+def render(scenario: Scenario, seed: int, *, rig: Rig | None = None) -> Rendered:
     """The frames that the cell's policy would see first."""
-    cell = cell or build_cell(scenario, seed=seed, base=ROOT / "scenarios")
-    context = cell.diagram.CreateDefaultContext()
-    noisy = not scenario.sensor_noise.is_none
+    rig = rig or build_rig(scenario, seed=seed, base=ROOT / "scenarios")
+    context = rig.diagram.CreateDefaultContext()
     frames, poses = {}, {}
     for name in scenario.cameras:
-        source = cell.diagram.GetSubsystemByName(f"{'sensor_noise' if noisy else 'camera'}_{name}")
-        own = source.GetMyContextFromRoot(context)
         color, depth, X_WB = (
-            source.GetOutputPort(port).Eval(own)
-            for port in ("color_image", "depth_image_32f", "body_pose_in_world")
+            rig.port(f"{port}_{name}", context)
+            for port in ("color_image", "depth_image", "camera_pose")
         )
         frames[name] = Frame(color.data[:, :, :3].copy(), depth.data[:, :, 0].copy())
         poses[name] = X_WB.GetAsMatrix4()
     calibration = with_poses(calibration_of(scenario), poses)
-    return Rendered(frames, calibration, cell, context)
+    return Rendered(frames, calibration, rig, context)
 
 
 def write_frames(folder: Path, frames: dict[str, Frame], depth: str = "npy") -> Path:

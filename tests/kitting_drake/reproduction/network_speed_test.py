@@ -1,8 +1,6 @@
 import copy
 import io
 import json
-import subprocess
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -279,9 +277,6 @@ def test_counts():
     assert [count_text(count) for count in (12, 4_540_000, 2.3e12)] == ["12", "4.54 M", "2.3 T"]
 
 
-def test_an_unknown_preset_is_refused(
-    verb: Callable[..., subprocess.CompletedProcess[str]], tmp_path: Path
-):
-    done = verb("benchmark", "networks", "--preset", "huge", "--output", tmp_path)
-    assert done.returncode == 2
-    assert done.stderr == "error: --preset must be one of paper, small, tiny, not 'huge'\n"
+def test_an_unknown_preset_is_refused():
+    with pytest.raises(UserError, match="--preset must be one of paper, small, tiny, not 'huge'"):
+        Plan(preset="huge")

@@ -5,8 +5,8 @@ import pytest
 
 from kitting_drake.common.errors import UserError
 from kitting_drake.scenario import load_scenario
+from kitting_drake.scenario.cameras import LookAt, Pinhole
 from kitting_drake.scenario.policies import Learned, PythonPolicy
-from kitting_drake.scenario.schema import LookAt, Pinhole
 from kitting_drake.tasks import ArrangedKitting, Kitting, ToolsetKitting
 from kitting_drake.tasks.kitting.tool_poses import TablePose
 from systems.insertion_search import InsertionSearch
@@ -168,7 +168,10 @@ BAD = {
     "infinity": ("A: {time_limit: .inf}", ["time_limit", "finite"]),
     "wrong length": ("A: {planner: {home: [1.0, 2.0, 0.5]}}", ["planner.home", "4 numbers"]),
     "time step": ("A: {plant: {time_step: 0.003}}", ["plant.time_step", "1/64"]),
-    "contact": ("A: {plant: {contact_approximation: tamsi}}", ["contact_approximation", "sap"]),
+    "contact": (
+        "A: {plant: {discrete_contact_approximation: tamsi}}",
+        ["contact_approximation", "sap"],
+    ),
     "heights upside down": ("A: {heightmap: {z_max: -0.5}}", ["heightmap.z_max"]),
     "no tools": ("A: {task: !Kitting {tools: []}}", ["task.tools is empty"]),
     "no arranged tools": ("A: {task: !ArrangedKitting {tools: {}}}", ["task.tools is empty"]),

@@ -4,6 +4,7 @@ import subprocess
 import sys
 import types
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,9 +13,11 @@ from pydrake.common.value import Value
 from safetensors.torch import save_file
 
 from kitting_drake.common.errors import UserError
+from kitting_drake.policies.draft import Stage
 from kitting_drake.policies.learned_policy import Decision, LearnedPolicy
 from kitting_drake.policies.networks.device import preferred_type
 from kitting_drake.policies.networks.weights import load_networks
+from kitting_drake.policies.stages import StopRule, make_stages
 from kitting_drake.scenario.policies import (
     Learned,
     Oracle,
@@ -22,9 +25,12 @@ from kitting_drake.scenario.policies import (
     PolicySite,
     PythonPolicy,
     QuantizedOracle,
+    ShapeMatching,
 )
 from kitting_drake.tasks import ArrangedKitting
-from systems.signals import Observation, PickPlaceAction, PixelGrid
+from systems.pick_place_parameters import PickPlaceParameters
+from systems.signals import Observation, PickPlaceAction, PixelGrid, PlanarPose
+from tests.kitting_drake.policies.scenes import stored_observation
 
 ROOT = Path(__file__).resolve().parents[3]
 GRID = PixelGrid(rows=33, cols=49)
@@ -45,7 +51,10 @@ def action(config: PolicyConfig, site: PolicySite, seen: Observation) -> PickPla
     """What a policy's system makes of an observation."""
     system = config.make_system(site)
     context = system.CreateDefaultContext()
-    system.GetInputPort("observation").FixValue(context, Value(seen))
+    # A policy that looks at heights alone says so by its port.
+    heights = system.HasInputPort("observation_heights")
+    name = "observation_heights" if heights else "observation"
+    system.GetInputPort(name).FixValue(context, Value(seen))
     return system.GetOutputPort("action").Eval(context)
 
 
@@ -62,9 +71,8 @@ def test_a_learned_policy_as_the_scenario_says(
     found = action(config, site, observation())
     networks = load_networks(weights_file, preferred_type())
     # Quantized actions are those of the networks alone.
-    policy = LearnedPolicy(
-        networks, orientations=orientations, continuous=continuous, fit_outlines=continuous
-    )
+    stages = make_stages(site.planner, insertion=True) if continuous else [StopRule()]
+    policy = LearnedPolicy(networks, orientations=orientations, stages=stages)
     assert found == policy(observation())
     assert [decision.action for decision in told] == [found]
 
@@ -167,6 +175,69 @@ def test_a_function_of_ones_own(site: PolicySite, tmp_path: Path, monkeypatch: p
     first = config.digest(tmp_path)
     (package / "helper.py").write_text("WIDTH = 2\n")
     assert config.digest(tmp_path) != first
+
+
+FAILED = """
+import the_helper_beside
+from systems.signals import PickPlaceAction
+
+def act(observation, failed_picks):
+    return PickPlaceAction(place=failed_picks[-1])
+"""
+
+
+def test_a_module_beside_the_scenario_is_found(site: PolicySite, tmp_path: Path):
+    path = tmp_path / "the_policy_beside.py"
+    path.write_text(FAILED)
+    (tmp_path / "the_helper_beside.py").touch()
+    config = PythonPolicy("the_policy_beside:act", takes_failed_picks=True)
+    before = list(sys.path)
+    first = config.digest(tmp_path)
+    path.write_text(FAILED + "# better\n")
+    assert config.digest(tmp_path) != first
+    # It travels to other machines with the scenario's files.
+    assert config.input_files(tmp_path) == [path]
+    assert config.modules() == ["the_policy_beside"]
+    system = config.make_system(dataclasses.replace(site, base=tmp_path))
+    assert sys.path == before
+    context = system.CreateDefaultContext()
+    system.GetInputPort("observation").FixValue(context, Value(observation()))
+    failed = (PlanarPose(0.1, 0.2, 0.3), PlanarPose(0.4, 0.5, 0.6))
+    system.GetInputPort("failed_picks").FixValue(context, Value(failed))
+    assert system.GetOutputPort("action").Eval(context).place == failed[1]
+    with pytest.raises(UserError, match="cannot import the_policy_elsewhere:act"):
+        PythonPolicy("the_policy_elsewhere:act").make_system(site)
+
+
+def test_the_policy_is_given_the_scenario_s_planner(
+    site: PolicySite, weights_file: Path, monkeypatch: pytest.MonkeyPatch
+):
+    seen = stored_observation("kitting_unseen")
+    deep = PickPlaceParameters(grasp_depth=0.030, max_grasp_depth=0.030)
+    site = dataclasses.replace(site, grid=seen.grid)
+    picks = [
+        action(ShapeMatching(), dataclasses.replace(site, planner=planner), seen).pick
+        for planner in (PickPlaceParameters(), deep)
+    ]
+    assert picks[0] != picks[1]
+    given: list[PickPlaceParameters] = []
+
+    def noted(planner: PickPlaceParameters, **arguments: Any) -> tuple[Stage, ...]:
+        given.append(planner)
+        return make_stages(planner, **arguments)
+
+    monkeypatch.setattr("kitting_drake.policies.stages.make_stages", noted)
+    Learned(str(weights_file)).make_system(dataclasses.replace(site, planner=deep))
+    assert given == [deep]
+
+
+@pytest.mark.parametrize("insertion", [True, False])
+def test_every_stage_that_asks_the_planner_asks_the_given_one(insertion: bool):
+    planner = PickPlaceParameters(grasp_depth=0.030)
+    stages = make_stages(planner, insertion=insertion, recover=True)
+    given = [stage.planner for stage in stages if hasattr(stage, "planner")]
+    assert len(given) == 2
+    assert all(item is planner for item in given)
 
 
 @pytest.mark.parametrize(

@@ -10,6 +10,8 @@ from pydrake.common.yaml import yaml_load
 
 from kitting_drake.common.paths import SCENARIOS
 from kitting_drake.scenario import Scenario, load_scenario
+from kitting_drake.scenario.description import describe
+from kitting_drake.scenario.drake_configs import struct_fields
 from kitting_drake.scenario.policies import Policy
 from kitting_drake.tasks import Task
 from systems.bounds import check_bounds
@@ -29,6 +31,20 @@ def reachable(kind: Any) -> set[type]:
     return set().union(*map(reachable, typing.get_args(kind)))
 
 
+def is_struct(value: Any) -> bool:
+    """Whether it is a config of Drake's."""
+    return struct_fields(type(value)) is not None
+
+
+def agrees(raw: Any, described: Any) -> bool:
+    """Whether YAML and a described value of a config of Drake's are the same, as far as given."""
+    if not isinstance(raw, dict):
+        return bool(raw == described)
+    # A rotation is written without the name of its only field.
+    inner = described if raw.keys() <= described.keys() else described["value"]
+    return all(agrees(value, inner[name]) for name, value in raw.items())
+
+
 def check_given(
     kind: Any, raw: Any, loaded: Any, default: Any, where: str, *, whole: bool = True
 ) -> set[type]:
@@ -46,7 +62,9 @@ def check_given(
     Returns:
         The dataclasses that were met.
     """
-    if isinstance(kind, types.UnionType) and dataclasses.is_dataclass(loaded):
+    if isinstance(kind, types.UnionType) and (
+        dataclasses.is_dataclass(loaded) or is_struct(loaded)
+    ):
         kind = type(loaded)
         assert raw.pop("_tag") == f"!{kind.__name__}", where
     if typing.get_origin(kind) is dict:
@@ -59,6 +77,12 @@ def check_given(
         pairs = enumerate(zip(raw, loaded, strict=True))
         below = [check_given(item_kind, r, v, None, f"{where}[{i}]") for i, (r, v) in pairs]
         return set().union(*below)
+    if struct_fields(kind) is not None:
+        default = kind() if type(default) is not kind else default
+        for name, value in raw.items():
+            assert agrees(value, describe(getattr(loaded, name))), f"{where}.{name}"
+            assert not agrees(value, describe(getattr(default, name))), f"{where}.{name}: default"
+        return set()
     if not dataclasses.is_dataclass(kind):
         assert raw == loaded, where
         assert loaded != default, f"{where} is the default"
@@ -76,8 +100,8 @@ def check_given(
 
 
 def test_defaults():
-    assert load_scenario(TEST_SCENARIOS) == Scenario()
-    assert load_scenario(TEST_SCENARIOS, "Defaults") == Scenario()
+    assert describe(load_scenario(TEST_SCENARIOS)) == describe(Scenario())
+    assert describe(load_scenario(TEST_SCENARIOS, "Defaults")) == describe(Scenario())
 
 
 def test_one_of_everything():

@@ -2,7 +2,8 @@ import dataclasses
 
 import pytest
 
-from kitting_drake.scenario.schema import LookAt, Pinhole, Scenario
+from kitting_drake.scenario import Scenario
+from kitting_drake.scenario.cameras import LookAt, Pinhole
 from kitting_drake.station.hidden_table import hidden_table_note
 from systems.pick_place_parameters import PickPlaceParameters
 

@@ -12,22 +12,21 @@ from kitting_drake.common.paths import MODELS, SCENARIOS
 from kitting_drake.common.rendering import can_render
 from kitting_drake.scenario.appearance import Appearance
 from kitting_drake.scenario.loader import load_scenario
-from kitting_drake.station import build_cell
 from kitting_drake.station.paint import lights_of
 from kitting_drake.station.variation import varied_model
+from tests.kitting_drake.rig import build_rig
 
 needs_renderer = pytest.mark.skipif(not can_render(), reason="images cannot be rendered here")
 
 
-def cell_of(text: str, seed: int = 2):
+def rig_of(text: str, seed: int = 2):
     scenario = load_scenario(SCENARIOS / "kitting_oracle.yaml", None, text)
-    return build_cell(scenario, seed=seed, base=SCENARIOS)
+    return build_rig(scenario, seed=seed, base=SCENARIOS)
 
 
 def observed(text: str, seed: int = 2) -> np.ndarray:
-    cell = cell_of(text, seed)
-    port = cell.diagram.GetOutputPort("observation")
-    return port.Eval(cell.diagram.CreateDefaultContext()).image
+    rig = rig_of(text, seed)
+    return rig.port("observation").image
 
 
 @needs_renderer
@@ -53,18 +52,15 @@ def test_drawn_colours_are_the_seeds():
 
 def test_a_pattern_that_names_nothing_is_told():
     with pytest.raises(UserError, match=r"appearance\.paints: no surface is called tabel/\*"):
-        cell_of('{appearance: {paints: {"tabel/*": !Drawn {}}}}')
+        rig_of('{appearance: {paints: {"tabel/*": !Drawn {}}}}')
     with pytest.raises(UserError, match=r"appearance\.sheen\.\* must be from 0 to 1, not 2"):
-        cell_of('{appearance: {sheen: {"*": 2.0}}}')
+        rig_of('{appearance: {sheen: {"*": 2.0}}}')
 
 
 @needs_renderer
 def test_sheen_makes_holes_on_what_has_it():
-    plain = cell_of("{}").diagram
-    port = plain.GetOutputPort("observation")
-    whole = port.Eval(plain.CreateDefaultContext())
-    shiny = cell_of('{appearance: {sheen: {"objects/*": 0.9}}}').diagram
-    holed = shiny.GetOutputPort("observation").Eval(shiny.CreateDefaultContext())
+    whole = rig_of("{}").port("observation")
+    holed = rig_of('{appearance: {sheen: {"objects/*": 0.9}}}').port("observation")
     lost = whole.valid & ~holed.valid
     tools = (whole.height > 0.004) & (whole.height < 0.04)
     assert lost[tools].mean() > 5 * lost[whole.height < 0.001].mean()
@@ -82,18 +78,18 @@ def test_drawn_lights_are_the_seeds_and_point_down():
 
 def test_mass_varies_with_the_seed_within_its_range():
     def masses(text: str, seed: int) -> np.ndarray:
-        cell = cell_of(text, seed)
+        rig = rig_of(text, seed)
         return (
-            np.array([cell.plant.get_body(item.body).default_mass() for item in cell.objects]) / 1.0
+            np.array([rig.plant.get_body(item.body).default_mass() for item in rig.objects]) / 1.0
         )
 
     plain = {seed: masses("{}", seed) for seed in (1, 2)}
-    varied = {seed: masses("{plant: {mass_variation: 0.3}}", seed) for seed in (1, 2)}
+    varied = {seed: masses("{variation: {mass: 0.3}}", seed) for seed in (1, 2)}
     for seed in plain:
         factors = varied[seed] / plain[seed]
         assert ((factors > 0.7) & (factors < 1.3) & (factors != 1)).all()
         assert len(set(factors.round(9))) == len(factors)
-    np.testing.assert_array_equal(masses("{plant: {mass_variation: 0.3}}", 1), varied[1])
+    np.testing.assert_array_equal(masses("{variation: {mass: 0.3}}", 1), varied[1])
 
 
 def test_a_models_friction_is_scaled_and_its_meshes_are_found(tmp_path: Path):

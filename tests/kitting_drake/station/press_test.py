@@ -1,4 +1,4 @@
-"""An action that presses, in the physics of the cell."""
+"""An action that presses, in the physics of the station."""
 
 import sys
 import types
@@ -10,11 +10,11 @@ from pydrake.systems.framework import Context, EventStatus
 
 from kitting_drake.scenario import Scenario
 from kitting_drake.scenario.policies import PythonPolicy
-from kitting_drake.station import build_cell
 from kitting_drake.tasks import ArrangedKitting
 from kitting_drake.tasks.kitting.tool_poses import TablePose
 from systems.pick_place_parameters import PickPlaceParameters
 from systems.signals import PickPlaceAction, PlanarPose
+from tests.kitting_drake.rig import build_rig
 
 
 @pytest.mark.parametrize("force", [30.0, 60.0])
@@ -29,16 +29,15 @@ def test_it_presses_as_hard_as_it_is_told(monkeypatch: pytest.MonkeyPatch, force
         planner=PickPlaceParameters(press_force=force, max_actions=1),
         cameras={"front": Scenario().cameras["front"]},
     )
-    cell = build_cell(scenario, seed=0, base=Path())
+    rig = build_rig(scenario, seed=0, base=Path())
     peak = 0.0
 
     def watch(root: Context) -> EventStatus:
         nonlocal peak
-        context = cell.planner.GetMyContextFromRoot(root)
-        peak = max(peak, cell.planner.GetInputPort("hand_contact_force").Eval(context)[2])
+        peak = max(peak, rig.port("wrist_force", root)[2])
         return EventStatus.DidNothing()
 
-    simulator = Simulator(cell.diagram)
+    simulator = Simulator(rig.diagram)
     simulator.set_monitor(watch)
     simulator.AdvanceTo(3.0)
     assert force < peak < force + 8

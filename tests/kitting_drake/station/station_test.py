@@ -4,11 +4,11 @@ import shutil
 import weakref
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from pydrake.common.value import Value
 from pydrake.multibody.math import SpatialVelocity
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import Context, EventStatus
@@ -19,6 +19,7 @@ from kitting_drake.policies.learned_policy import LearnedPolicy
 from kitting_drake.policies.networks.device import preferred_type
 from kitting_drake.policies.networks.weights import load_networks
 from kitting_drake.scenario import Scenario, load_scenario
+from kitting_drake.scenario.cameras import Pinhole
 from kitting_drake.scenario.policies import (
     Learned,
     Oracle,
@@ -27,87 +28,78 @@ from kitting_drake.scenario.policies import (
     QuantizedOracle,
     ShapeMatching,
 )
-from kitting_drake.scenario.schema import Pinhole, Sleep
-from kitting_drake.station import Cell, build_cell
+from kitting_drake.scenario.schema import Sleep
+from kitting_drake.station import build_station, make_policy
 from kitting_drake.tasks import Kitting
 from kitting_drake.tasks.ravens.palletizing_boxes import PalletizingBoxes
 from kitting_drake.tasks.task import TABLE
 from systems.hand_geometry import JOINT_LIMITS
-from systems.heightmap_projector import HeightmapProjector
 from systems.placement import Placement
 from systems.sensor_noise import SensorNoiseParameters
-from systems.signals import Observation, PickPlaceAction
+from systems.signals import Observation
+from tests.kitting_drake.rig import Rig, build_rig
 
 BASE = Path(__file__).parent
 BLIND = Scenario(cameras={})
 TWINS = Scenario(task=Kitting(tools=["flat_screwdriver", "flat_screwdriver"]), cameras={})
 
 
-def build(scenario: Scenario = BLIND) -> Cell:
-    return build_cell(scenario, seed=0, base=BASE)
+def build(scenario: Scenario = BLIND) -> Rig:
+    return build_rig(scenario, base=BASE)
 
 
 @pytest.fixture(scope="module")
-def cell() -> Cell:
-    """All memory is in the Context: one cell does for all."""
+def rig() -> Rig:
+    """All memory is in the Context: one station does for all."""
     return build()
 
 
-def advance(
-    cell: Cell, seconds: float, look: Callable[[Context], None] = lambda _: None
-) -> Context:
+def advance(rig: Rig, seconds: float, look: Callable[[Context], None] = lambda _: None) -> Context:
     """Simulates, objects that rest falling asleep; `look` is called after every step."""
-    simulator = Simulator(cell.diagram)
 
     def monitor(root: Context) -> EventStatus:
-        cell.apply_sleep(root)
         look(root)
         return EventStatus.DidNothing()
 
-    simulator.set_monitor(monitor)
+    simulator = rig.station.make_simulator(rig.diagram, monitor=monitor)
     simulator.AdvanceTo(seconds)
     return simulator.get_context()
 
 
-def port(cell: Cell, name: str, root: Context | None = None) -> Any:
-    """What an exported output port says, at the beginning if nothing else is asked."""
-    root = cell.diagram.CreateDefaultContext() if root is None else root
-    return cell.diagram.GetOutputPort(name).Eval(root)
+def locked(rig: Rig, root: Context) -> list[bool]:
+    context = rig.plant.GetMyContextFromRoot(root)
+    return [rig.plant.get_body(item.body).is_locked(context) for item in rig.objects]
 
 
-def locked(cell: Cell, root: Context) -> list[bool]:
-    context = cell.plant.GetMyContextFromRoot(root)
-    return [cell.plant.get_body(item.body).is_locked(context) for item in cell.objects]
-
-
-def test_default_context_is_the_scene(cell: Cell):
-    root = cell.diagram.CreateDefaultContext()
-    for X_WB, item in zip(cell.object_poses(root), cell.scene.objects, strict=True):
+def test_default_context_is_the_scene(rig: Rig):
+    root = rig.diagram.CreateDefaultContext()
+    for X_WB, item in zip(rig.station.object_poses(root), rig.scene.objects, strict=True):
         assert X_WB.IsNearlyEqualTo(item.X_WB, 1e-12)
-    assert [item.name for item in cell.objects] == [item.name for item in cell.scene.objects]
-    context = cell.plant.GetMyContextFromRoot(root)
-    kit = cell.plant.GetBodyByName("kit").EvalPoseInWorld(context)
-    assert kit.IsNearlyEqualTo(cell.scene.fixtures[0].X_WF, 1e-12)
+    assert [item.name for item in rig.objects] == [item.name for item in rig.scene.objects]
+    context = rig.plant.GetMyContextFromRoot(root)
+    kit = rig.plant.GetBodyByName("kit").EvalPoseInWorld(context)
+    assert kit.IsNearlyEqualTo(rig.scene.fixtures[0].X_WF, 1e-12)
     # The hand is where the planner wants it, at rest.
-    hand = cell.plant.GetModelInstanceByName("franka_hand")
+    hand = rig.plant.GetModelInstanceByName("franka_hand")
     home = Scenario().planner.home
     np.testing.assert_allclose(
-        cell.plant.GetPositionsAndVelocities(context, hand), [*home, 0.04, 0.04, *np.zeros(6)]
+        rig.plant.GetPositionsAndVelocities(context, hand),
+        [*home, 0.04, 0.04, *np.zeros(6)],
     )
 
 
-def test_the_hand_reaches_as_far_as_scenarios_are_told(cell: Cell):
+def test_the_hand_reaches_as_far_as_scenarios_are_told(rig: Rig):
     for name, limits in JOINT_LIMITS.items():
-        joint = cell.plant.GetJointByName(name)
+        joint = rig.plant.GetJointByName(name)
         found = (*joint.position_lower_limits(), *joint.position_upper_limits())
         assert found == pytest.approx(limits)
 
 
-def test_the_table_is_where_tasks_have_it(cell: Cell):
-    (geometry,) = cell.plant.GetCollisionGeometriesForBody(cell.plant.GetBodyByName("table"))
-    inspector = cell.scene_graph.model_inspector()
-    X_WTable = cell.plant.GetBodyByName("table").EvalPoseInWorld(
-        cell.plant.GetMyContextFromRoot(cell.diagram.CreateDefaultContext())
+def test_the_table_is_where_tasks_have_it(rig: Rig):
+    (geometry,) = rig.plant.GetCollisionGeometriesForBody(rig.plant.GetBodyByName("table"))
+    inspector = rig.station.scene_graph.model_inspector()
+    X_WTable = rig.plant.GetBodyByName("table").EvalPoseInWorld(
+        rig.plant.GetMyContextFromRoot(rig.diagram.CreateDefaultContext())
     )
     middle = (X_WTable @ inspector.GetPoseInFrame(geometry)).translation()
     half_sizes = inspector.GetShape(geometry).size() / 2
@@ -116,13 +108,13 @@ def test_the_table_is_where_tasks_have_it(cell: Cell):
     assert middle[2] + half_sizes[2] == pytest.approx(0.0)
 
 
-def test_nothing_touches_at_the_beginning_but_objects_the_table(cell: Cell):
-    context = cell.plant.GetMyContextFromRoot(cell.diagram.CreateDefaultContext())
-    results = cell.plant.get_contact_results_output_port().Eval(context)
+def test_nothing_touches_at_the_beginning_but_objects_the_table(rig: Rig):
+    context = rig.plant.GetMyContextFromRoot(rig.diagram.CreateDefaultContext())
+    results = rig.plant.get_contact_results_output_port().Eval(context)
     assert results.num_point_pair_contacts() == 0
-    inspector = cell.scene_graph.model_inspector()
+    inspector = rig.station.scene_graph.model_inspector()
     table = {
-        str(i) for i in cell.plant.GetCollisionGeometriesForBody(cell.plant.GetBodyByName("table"))
+        str(i) for i in rig.plant.GetCollisionGeometriesForBody(rig.plant.GetBodyByName("table"))
     }
     for i in range(results.num_hydroelastic_contacts()):
         surface = results.hydroelastic_contact_info(i).contact_surface()
@@ -138,35 +130,59 @@ def test_exported_ports(
         request.getfixturevalue("rendering")
     else:
         monkeypatch.setattr("kitting_drake.station.station.can_render", lambda: False)
-    diagram = build(Scenario()).diagram
-    errors = ["add_s", "position_error", "angle_error", "height_error"]
-    sizes = {**dict.fromkeys(["success", *errors], 4), "reward": 1, "mode": 1, "counts": 3}
-    names = [diagram.get_output_port(i).get_name() for i in range(diagram.num_output_ports())]
-    observation = ["observation"] if can_render else []
-    assert sorted(names) == sorted(["action", "placements", *sizes, *observation])
-    assert diagram.num_input_ports() == 0
-    context = diagram.CreateDefaultContext()
+    station = build_station(Scenario())
+    of_objects = ["success", "add_s", "position_error", "angle_error", "height_error", "at_rest"]
+    sizes = {**dict.fromkeys(of_objects, 4), "kept_goals": 4, "reward": 1, "mode": 1, "counts": 3}
+    sizes |= {"robot_state": 12, "wrist_force": 6, "commanded": 12, "commanded_opening": 2}
+    sizes["asks"] = 1
+    abstract = ["placements", "failed_picks", "accepted_action", "body_poses", "contact_results"]
+    seen = ["observation", "observation_heights"]
+    images = ("color_image", "depth_image", "camera_pose")
+    seen += [f"{image}_{camera}" for camera in Scenario().cameras for image in images]
+    names = [station.get_output_port(i).get_name() for i in range(station.num_output_ports())]
+    expected = [*sizes, *abstract, "query_object", *(seen if can_render else [])]
+    assert sorted(names) == sorted(expected)
+    assert [station.get_input_port(i).get_name() for i in range(1)] == ["action"]
+    assert station.num_input_ports() == 1
+    context = station.CreateDefaultContext()
     for name, size in sizes.items():
-        assert diagram.GetOutputPort(name).Eval(context).shape == (size,)
-    assert isinstance(diagram.GetOutputPort("action").Eval(context), PickPlaceAction)
-    placements = diagram.GetOutputPort("placements").Eval(context)
+        assert station.GetOutputPort(name).Eval(context).shape == (size,)
+    placements = station.GetOutputPort("placements").Eval(context)
     assert [type(item) for item in placements] == [Placement] * 4
 
 
-def test_the_oracle_begins_with_the_first_goal(cell: Cell):
-    action = port(cell, "action")
-    (grasp,) = cell.scene.objects[0].grasps
-    expected = cell.scene.objects[0].X_WB @ np.array([grasp.x, grasp.y, 0.0])
+def test_an_action_can_be_given_without_a_policy(rig: Rig):
+    """As the Gymnasium environments do: the input port is fixed."""
+    station, action = build_station(BLIND), rig.port("action")
+    simulator = station.make_simulator()
+    root = simulator.get_mutable_context()
+    station.GetInputPort("action").FixValue(root, Value(action))
+    simulator.AdvanceTo(1.0)
+    assert station.counts(root) == (1, 0, 0)
+    accepted = station.accepted_action(root)
+    assert (accepted.pick.x, accepted.place.y) == (action.pick.x, action.place.y)
+    assert station.at_rest(root).sum() >= 3
+
+
+def test_a_simulator_of_the_station_alone_is_refused_where_it_is_part_of_more(rig: Rig):
+    with pytest.raises(ValueError, match="outermost Diagram"):
+        rig.station.make_simulator()
+
+
+def test_the_oracle_begins_with_the_first_goal(rig: Rig):
+    action = rig.port("action")
+    (grasp,) = rig.scene.objects[0].grasps
+    expected = rig.scene.objects[0].X_WB @ np.array([grasp.x, grasp.y, 0.0])
     np.testing.assert_allclose([action.pick.x, action.pick.y], expected[:2], atol=1e-12)
     # It knows the heights, which nobody sees here.
     assert action.heights.pick_top == pytest.approx(grasp.surface_height)
     assert action.heights.place_rim == pytest.approx(Kitting().kit.height)
 
 
-def test_a_quantized_oracle_says_pixels_and_bins(cell: Cell):
-    exact = port(cell, "action")
-    rounded = port(
-        build(dataclasses.replace(BLIND, policy=QuantizedOracle(orientations=36))), "action"
+def test_a_quantized_oracle_says_pixels_and_bins(rig: Rig):
+    exact = rig.port("action")
+    rounded = build(dataclasses.replace(BLIND, policy=QuantizedOracle(orientations=36))).port(
+        "action"
     )
     grid = BLIND.heightmap.grid()
     pixel = grid.to_pixel((rounded.pick.x, rounded.pick.y))
@@ -175,108 +191,101 @@ def test_a_quantized_oracle_says_pixels_and_bins(cell: Cell):
     assert bins == pytest.approx(round(np.rad2deg(exact.pick.theta) / 10))
 
 
-def test_scores_are_of_where_objects_are(cell: Cell):
-    root = cell.diagram.CreateDefaultContext()
-    assert port(cell, "reward", root) == [0.0]
-    context = cell.plant.GetMyMutableContextFromRoot(root)
-    for item, goal in list(zip(cell.objects, cell.scene.goals, strict=True))[:3]:
-        cell.plant.SetFreeBodyPose(context, cell.plant.get_body(item.body), goal.poses[0])
-    assert port(cell, "success", root).tolist() == [1.0, 1.0, 1.0, 0.0]
-    assert port(cell, "reward", root) == pytest.approx([0.75])
-    assert [item.success for item in cell.placements(root)] == [True] * 3 + [False]
+def test_scores_are_of_where_objects_are(rig: Rig):
+    root = rig.diagram.CreateDefaultContext()
+    assert rig.port("reward", root) == [0.0]
+    context = rig.plant.GetMyMutableContextFromRoot(root)
+    for item, goal in list(zip(rig.objects, rig.scene.goals, strict=True))[:3]:
+        rig.plant.SetFreeBodyPose(context, rig.plant.get_body(item.body), goal.poses[0])
+    assert rig.port("success", root).tolist() == [1.0, 1.0, 1.0, 0.0]
+    assert rig.port("reward", root) == pytest.approx([0.75])
+    assert [item.success for item in rig.station.placements(root)] == [True] * 3 + [False]
 
 
-def test_what_lies_still_goes_to_sleep(cell: Cell):
+def test_what_lies_still_goes_to_sleep(rig: Rig):
     asleep: list[list[bool]] = []
     at_rest: list[list[bool]] = []
 
     def look(root: Context) -> None:
-        asleep.append(locked(cell, root))
-        at_rest.append(cell.at_rest(root).tolist())
+        asleep.append(locked(rig, root))
+        at_rest.append(rig.station.at_rest(root).tolist())
 
-    root = advance(cell, 0.6, look)
+    root = advance(rig, 0.6, look)
     assert asleep == at_rest
     assert asleep[0] == [False] * 4
     assert asleep[-1] == [True] * 4
     # The contact of a sleeping object with table and kit is not computed.
-    results = cell.plant.get_contact_results_output_port().Eval(
-        cell.plant.GetMyContextFromRoot(root)
-    )
+    results = rig.plant.get_contact_results_output_port().Eval(rig.plant.GetMyContextFromRoot(root))
     assert results.num_hydroelastic_contacts() == 0
 
 
-def test_a_sleeping_stack_costs_nothing_and_wakes_together():
-    cell = build(Scenario(task=PalletizingBoxes(layers=2), cameras={}))
+def test_a_sleeping_stack_costs_nothing_and_wakes_together(monkeypatch: pytest.MonkeyPatch):
+    rig = build(Scenario(task=PalletizingBoxes(layers=2), cameras={}))
 
     def contacts(root: Context) -> int:
-        context = cell.plant.GetMyContextFromRoot(root)
-        port = cell.plant.get_contact_results_output_port()
+        context = rig.plant.GetMyContextFromRoot(root)
+        port = rig.plant.get_contact_results_output_port()
         return port.Eval(context).num_hydroelastic_contacts()
 
     counts: list[int] = []
-    root = advance(cell, 0.6, lambda root: counts.append(contacts(root)))
+    root = advance(rig, 0.6, lambda root: counts.append(contacts(root)))
     assert max(counts) == 12
     assert counts[-1] == 0
-    assert all(locked(cell, root))
+    assert all(locked(rig, root))
     # One that wakes touches those that still sleep: the highest box is the last.
-    top = len(cell.objects) - 1
-    detector = cell.rest_detector.GetMyMutableContextFromRoot(root)
-    detector.get_mutable_discrete_state().get_mutable_vector(2).SetAtIndex(top, 0.0)
-    cell.apply_sleep(root)
-    assert locked(cell, root) == [True] * top + [False]
-    Simulator(cell.diagram, root).AdvanceTo(root.get_time() + 0.01)
+    top = len(rig.objects) - 1
+    at_rest = rig.station.at_rest(root)
+    at_rest[top] = False
+    monkeypatch.setattr(rig.station, "at_rest", lambda _: at_rest)
+    rig.station.apply_sleep(root)
+    assert locked(rig, root) == [True] * top + [False]
+    Simulator(rig.diagram, root).AdvanceTo(root.get_time() + 0.01)
     assert contacts(root) == 1
 
 
-def test_what_is_flung_out_of_the_cell_comes_to_rest(cell: Cell):
+def test_what_is_flung_out_of_the_cell_comes_to_rest(rig: Rig):
     """A free body that spins on and on overflows its quaternion in two seconds."""
-    simulator = Simulator(cell.diagram)
+    simulator = rig.station.make_simulator(rig.diagram)
     root = simulator.get_mutable_context()
-    context = cell.plant.GetMyMutableContextFromRoot(root)
+    context = rig.plant.GetMyMutableContextFromRoot(root)
     # The oracle is busy with another meanwhile.
-    flung = cell.plant.get_body(cell.objects[-1].body)
+    flung = rig.plant.get_body(rig.objects[-1].body)
     velocity = SpatialVelocity([0, 0, 4000.0], [300.0, 200.0, 300.0])
-    cell.plant.SetFreeBodySpatialVelocity(context, flung, velocity)
-
-    def monitor(root: Context) -> EventStatus:
-        cell.apply_sleep(root)
-        return EventStatus.DidNothing()
-
-    simulator.set_monitor(monitor)
+    rig.plant.SetFreeBodySpatialVelocity(context, flung, velocity)
     simulator.AdvanceTo(2.5)
-    assert np.isfinite(cell.plant.GetPositions(context)).all()
-    assert locked(cell, root)[-1]
-    assert not port(cell, "placements", root)[-1].success
+    assert np.isfinite(rig.plant.GetPositions(context)).all()
+    assert locked(rig, root)[-1]
+    assert not rig.port("placements", root)[-1].success
 
 
 def test_sleep_can_be_switched_off():
-    cell = build(dataclasses.replace(TWINS, sleep=Sleep(enabled=False)))
+    rig = build(dataclasses.replace(TWINS, sleep=Sleep(enabled=False)))
     asleep: list[list[bool]] = []
-    root = advance(cell, 0.6, lambda root: asleep.append(locked(cell, root)))
+    root = advance(rig, 0.6, lambda root: asleep.append(locked(rig, root)))
     assert len(asleep) > 70
     assert not np.any(asleep)
-    assert cell.at_rest(root).all()  # The rest detector says so nevertheless.
+    assert rig.station.at_rest(root).all()  # The rest detector says so nevertheless.
 
 
 def test_two_runs_of_a_seed_are_equal_to_the_bit():
     """To the middle of the first grasp, with objects gone to sleep on the way."""
 
     def final_state() -> NDArray[np.float64]:
-        cell = build(TWINS)
-        root = advance(cell, 3.0)
-        assert port(cell, "counts", root)[0] == 1
-        context = cell.plant.GetMyContextFromRoot(root)
-        return cell.plant.get_state_output_port().Eval(context).copy()
+        rig = build(TWINS)
+        root = advance(rig, 3.0)
+        assert rig.port("counts", root)[0] == 1
+        context = rig.plant.GetMyContextFromRoot(root)
+        return rig.plant.get_state_output_port().Eval(context).copy()
 
     np.testing.assert_array_equal(final_state(), final_state())
 
 
 def test_twins_are_two_bodies_of_one_model():
-    cell = build(TWINS)
-    one, other = (cell.plant.get_body(item.body) for item in cell.objects)
+    rig = build(TWINS)
+    one, other = (rig.plant.get_body(item.body) for item in rig.objects)
     assert one.index() != other.index()
     assert one.model_instance() != other.model_instance()
-    here, there = cell.object_poses(cell.diagram.CreateDefaultContext())
+    here, there = rig.station.object_poses(rig.diagram.CreateDefaultContext())
     assert np.linalg.norm(here.translation() - there.translation()) > 0.02
 
 
@@ -290,60 +299,53 @@ SMALL = {
 @pytest.mark.usefixtures("rendering")
 def test_a_learned_policy_acts_upon_what_is_seen(weights_file: Path):
     told: list[Observation] = []
-    cell = build_cell(
+    rig = build_rig(
         Scenario(policy=Learned(weights=weights_file.name, orientations=36), cameras=SMALL),
         seed=0,
         base=weights_file.parent,
         observer=lambda observation, _: told.append(observation),
     )
-    context = cell.diagram.CreateDefaultContext()
-    observation = port(cell, "observation", context)
+    context = rig.diagram.CreateDefaultContext()
+    observation = rig.port("observation", context)
     assert observation.height.any()
     assert not told
-    found = port(cell, "action", context)
+    found = rig.port("action", context)
     policy = LearnedPolicy(load_networks(weights_file, preferred_type()), orientations=36)
     assert found == policy(observation)
     (seen,) = told
     np.testing.assert_array_equal(seen.image, observation.image)
     # Nothing has changed: it is not asked again.
-    assert port(cell, "action", context) == found
+    assert rig.port("action", context) == found
     assert len(told) == 1
 
 
 @pytest.mark.parametrize(
     ("policy", "sight"),
     [
-        (Oracle(), "heights"),
-        (ShapeMatching(), "heights"),
-        (Learned(), "heights"),
+        (ShapeMatching(), "observation_heights"),
+        (Learned(), "observation_heights"),
         (Learned(weights=str(MODELS / "policies" / "kitting_seen.safetensors")), "observation"),
         (PythonPolicy(function="systems.signals:PickPlaceAction"), "observation"),
     ],
 )
 @pytest.mark.usefixtures("rendering")
-def test_colours_are_rendered_only_for_who_sees_them(policy: PolicyConfig, sight: str):
-    cell = build(Scenario(policy=policy, cameras=SMALL))
-    (projector,) = (
-        system for system in cell.diagram.GetSystems() if isinstance(system, HeightmapProjector)
-    )
-    lookers = [cell.planner.GetInputPort("observation")]
-    looks = cell.diagram.GetSubsystemByName("policy")
-    if looks.HasInputPort("observation"):
-        lookers.append(looks.GetInputPort("observation"))
-    for looker in lookers:
-        assert cell.diagram.AreConnected(projector.GetOutputPort(sight), looker)
+def test_colours_are_rendered_only_for_a_policy_that_sees_them(policy: PolicyConfig, sight: str):
+    station = build_station(Scenario(policy=policy, cameras=SMALL))
+    system = make_policy(station)
+    looks = [system.get_input_port(i).get_name() for i in range(system.num_input_ports())]
+    assert [name for name in looks if name.startswith("observation")] == [sight]
 
 
 @pytest.mark.usefixtures("rendering")
 def test_who_watches_is_shown_colours():
     told: list[Observation] = []
-    cell = build_cell(
+    rig = build_rig(
         Scenario(policy=Learned(), cameras=SMALL),
         seed=0,
         base=BASE,
         observer=lambda observation, _: told.append(observation),
     )
-    port(cell, "action")
+    rig.port("action")
     assert told[0].rgb.any()
 
 
@@ -360,12 +362,11 @@ def test_a_policy_that_looks_needs_cameras_and_rendering(monkeypatch: pytest.Mon
 @pytest.mark.usefixtures("rendering")
 def test_one_of_everything_builds_and_steps(name: str):
     scenario = load_scenario(BASE.parent / "scenario" / "test_scenarios.yaml", name)
-    cell = build(scenario)
-    assert cell.diagram.HasOutputPort("observation")
-    assert cell.plant.time_step() == scenario.plant.time_step
-    assert cell.sleep == scenario.sleep.enabled
-    root = advance(cell, 0.1)
-    observation = port(cell, "observation", root)
+    rig = build(scenario)
+    assert rig.station.has_cameras
+    assert rig.plant.time_step() == scenario.plant.time_step
+    root = advance(rig, 0.1)
+    observation = rig.port("observation", root)
     assert observation.grid == scenario.heightmap.grid()
     assert observation.height.any()
 
@@ -410,9 +411,9 @@ def with_tool(folder: Path) -> Scenario:
 
 
 def test_a_tool_of_ones_own(own_tool: Path):
-    cell = build(with_tool(own_tool))
-    body = cell.plant.get_body(cell.objects[0].body)
-    assert len(cell.plant.GetCollisionGeometriesForBody(body)) == 6
+    rig = build(with_tool(own_tool))
+    body = rig.plant.get_body(rig.objects[0].body)
+    assert len(rig.plant.GetCollisionGeometriesForBody(body)) == 6
 
 
 @pytest.mark.parametrize("spoilt", ["collision_0.obj", "flat_screwdriver.sdf"])
@@ -439,10 +440,11 @@ def test_a_mesh_that_is_none_is_the_users_to_repair(own_tool: Path):
 def test_a_cell_that_nobody_uses_leaves_the_memory(policy: PolicyConfig):
     """A loop that builds cell after cell does not grow."""
     scenario = Scenario(policy=policy, sensor_noise=SensorNoiseParameters(depth_std=0.001))
-    cell = build(scenario)
-    simulator = Simulator(cell.diagram)
+    rig = build(scenario)
+    simulator = rig.station.make_simulator(rig.diagram)
     simulator.AdvanceTo(0.01)
-    diagram = weakref.ref(cell.diagram)
-    del cell, simulator
+    diagram, station = weakref.ref(rig.diagram), weakref.ref(rig.station)
+    del rig, simulator
     gc.collect()
     assert diagram() is None
+    assert station() is None

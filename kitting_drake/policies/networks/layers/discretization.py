@@ -7,15 +7,13 @@ discretized at any N that the band limit allows, and the maximum of the series n
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from kitting_drake.policies.networks.layers.fibres import fourier_basis
-
-if TYPE_CHECKING:
-    from torch import Tensor
 
 
 def discretization_matrix(
@@ -68,8 +66,5 @@ def discretize(
     Returns:
         (..., N / quotient): the function at the angles 2 pi i / N.
     """
-    # `onnx_runner` uses the matrix where there is no torch.
-    import torch
-
     matrix = discretization_matrix(orientations, frequencies, quotient=quotient)
     return coefficients @ torch.from_numpy(matrix).to(coefficients).T

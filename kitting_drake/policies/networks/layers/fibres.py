@@ -97,7 +97,7 @@ class Irreps:
         return columns * math.sqrt(2 / self.size)
 
     def analysis(self) -> NDArray[np.float64]:
-        return np.linalg.pinv(self.synthesis())
+        return np.asarray(np.linalg.pinv(self.synthesis()), dtype=float)
 
     def invariant(self) -> NDArray[np.float64]:
         if not self.samples:

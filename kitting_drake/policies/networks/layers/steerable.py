@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import functools
 import math
-import warnings
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -203,11 +202,8 @@ def kernel_basis(in_fibre: Fibre, out_fibre: Fibre, size: int) -> Tensor:
     Returns:
         (D, out channels, in channels, size, size), float64.
     """
-    # escnn warns of an optional package that planar groups never use.
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        from escnn import gspaces
-        from escnn import nn as enn
+    # Shipped weights carry their kernels: whoever only decides needs no escnn.
+    from kitting_drake.policies.networks.layers.planar_escnn import enn, gspaces
 
     orders = {fibre.order for fibre in (in_fibre, out_fibre) if isinstance(fibre, Regular)}
     irreps = [fibre for fibre in (in_fibre, out_fibre) if isinstance(fibre, Irreps)]

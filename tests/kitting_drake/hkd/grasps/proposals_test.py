@@ -8,6 +8,7 @@ from kitting_drake.hkd.grasps.proposals import WIDEST, propose_grasps
 from kitting_drake.hkd.tools.meshes import vertices_and_faces
 from kitting_drake.hkd.tools.tool import load_tool
 from systems.grasp import Grasp
+from systems.pick_place_parameters import PickPlaceParameters
 
 
 def bar(length: float, width: float, height: float) -> Manifold:
@@ -29,6 +30,17 @@ def test_a_bar_is_gripped_across_at_its_centre_of_mass():
     assert best.surface_height == pytest.approx(0.012, abs=1e-9)
     assert best.contact == 1.0 and best.overhang == pytest.approx(0, abs=1e-9)
     assert best.cost == pytest.approx(sum(best.penalties.values()))
+
+
+def test_pads_that_reach_deeper_are_kept_from_what_is_wide_below():
+    """A bar on a broad foot: only shallow pads pass above the foot."""
+    solid = bar(160, 70, 8) + bar(160, 18, 24)
+    assert propose_grasps(triangles(solid), np.zeros(3))[0].width == pytest.approx(0.018, abs=1e-6)
+    deep = PickPlaceParameters(grasp_depth=0.020)
+    assert propose_grasps(triangles(solid), np.zeros(3), deep) == []
+    # Nor are they brought to where they would touch the table.
+    high = PickPlaceParameters(floor_clearance=0.030)
+    assert propose_grasps(triangles(bar(160, 18, 12)), np.zeros(3), high) == []
 
 
 @pytest.mark.parametrize("turn_deg", [-70.0, 33.0, 90.0])

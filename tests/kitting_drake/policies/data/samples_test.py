@@ -8,7 +8,7 @@ from kitting_drake.policies.data.demonstrations import Demonstration
 from kitting_drake.policies.data.recorded import DemonstrationStep, FinalObservation, record
 from kitting_drake.policies.data.samples import (
     HeightsOnly,
-    Scene,
+    ObservedScene,
     final_observations,
     labelled_images,
     normalisation,
@@ -36,12 +36,12 @@ def demonstration(seed: int, steps: int) -> Demonstration:
 
 
 @pytest.fixture
-def observed() -> list[Scene]:
+def observed() -> list[ObservedScene]:
     items = [demonstration(10, 3), demonstration(20, 1)]
     return scenes(items, GRID, later_picks_possible=True)
 
 
-def test_what_was_picked_later_might_have_been_picked_at_once(observed: list[Scene]):
+def test_what_was_picked_later_might_have_been_picked_at_once(observed: list[ObservedScene]):
     assert [len(scene.targets) for scene in observed] == [3, 2, 1, 1]
     for index, scene in enumerate(observed[:3]):
         for i, target in enumerate(scene.targets, start=index):
@@ -69,13 +69,13 @@ def test_final_observations_are_those_of_episodes_that_the_expert_ended():
     assert final.height[0, 0] == 0.5
 
 
-def test_as_in_the_paper_there_is_one_sample_for_each_observation(observed: list[Scene]):
+def test_as_in_the_paper_there_is_one_sample_for_each_observation(observed: list[ObservedScene]):
     samples = labelled_images(observed, taken_only=True)
     assert [tuple(np.rint(sample.pick)) for sample in samples] == [(0, 0), (1, 2), (2, 4), (0, 0)]
     assert all(sample.other_picks.shape == (0, 2) for sample in samples)
 
 
-def test_a_sample_for_each_possible_action_knows_of_the_others(observed: list[Scene]):
+def test_a_sample_for_each_possible_action_knows_of_the_others(observed: list[ObservedScene]):
     samples = labelled_images(observed, taken_only=False)
     assert len(samples) == 3 + 2 + 1 + 1
     second = samples[1]
@@ -86,7 +86,7 @@ def test_a_sample_for_each_possible_action_knows_of_the_others(observed: list[Sc
     assert samples[-1].other_thetas.shape == (0,)
 
 
-def test_inputs_are_normalised_over_all_observations(observed: list[Scene]):
+def test_inputs_are_normalised_over_all_observations(observed: list[ObservedScene]):
     found = normalisation(observed)
     levels = np.array([0.10, 0.11, 0.12, 0.20])
     assert found["height_mean"] == pytest.approx(levels.mean(), rel=1e-5)
@@ -100,7 +100,7 @@ def test_inputs_are_normalised_over_all_observations(observed: list[Scene]):
 def test_constant_inputs_are_not_divided_by_zero():
     grid = PixelGrid(rows=5, cols=5)
     blank = record(Observation(np.zeros((4, 5, 5), np.float32), grid))
-    found = normalisation([Scene(blank, (), grid)])
+    found = normalisation([ObservedScene(blank, (), grid)])
     assert (found["colour_mean"], found["height_mean"]) == (0, 0)
     assert math.isfinite(1 / found["colour_std"])
     assert math.isfinite(1 / found["height_std"])
@@ -124,7 +124,9 @@ def test_networks_without_colours_learn_from_what_they_will_be_shown():
     np.testing.assert_array_equal(shown[3], expected)
     assert not shown[:3].any()
     action = PickPlaceAction(PlanarPose(*GRID.to_world((6, 6)), 0.0), PlanarPose())
-    (sample,) = labelled_images([Scene(HeightsOnly(recorded), (action,), GRID)], taken_only=True)
+    (sample,) = labelled_images(
+        [ObservedScene(HeightsOnly(recorded), (action,), GRID)], taken_only=True
+    )
     np.testing.assert_array_equal(sample.image, shown)
 
 
@@ -134,6 +136,6 @@ def test_in_a_black_image_nothing_is_unseen():
     black = with_a_hole()
     black[:3] = 0.0
     assert samples.observed(black, GRID).valid.all()
-    assert Scene(
+    assert ObservedScene(
         HeightsOnly(FinalObservation.of(Observation(black, GRID))), (), GRID
     ).observation.valid.all()

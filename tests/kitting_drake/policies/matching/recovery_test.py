@@ -5,6 +5,7 @@ import pytest
 
 from kitting_drake.policies.matching.recovery import recovery_action
 from kitting_drake.policies.matching.segmentation import segment
+from systems.pick_place_parameters import PickPlaceParameters
 from systems.signals import Observation, PixelGrid
 
 GRID = PixelGrid()
@@ -25,7 +26,7 @@ def observed(rise: float = 0.0) -> Observation:
 
 
 def mending(observation: Observation, tried=()):
-    return recovery_action(observation, segment(observation), tried)
+    return recovery_action(observation, segment(observation), PickPlaceParameters(), tried)
 
 
 def is_on_object(action) -> bool:

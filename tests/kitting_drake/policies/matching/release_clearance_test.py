@@ -11,6 +11,8 @@ from kitting_drake.policies.learned_policy import LearnedPolicy
 from kitting_drake.policies.matching.release_clearance import blocked_at_place
 from kitting_drake.policies.networks.architecture import PLACE_CROP, NetworkConfig
 from kitting_drake.policies.networks.factored import AnglePrediction, Networks, PickPrediction
+from kitting_drake.policies.stages import ReleaseRoom, SubPixel, make_stages
+from systems.pick_place_parameters import PickPlaceParameters
 from systems.signals import Observation, PixelGrid
 
 GRID = PixelGrid(x_min=0.3, y_min=-0.2, resolution=0.004, rows=97, cols=129, z_min=0.0, z_max=0.3)
@@ -20,6 +22,7 @@ PAD = 0.005
 """The height of what cubes are put on."""
 SPACING = 0.052
 """Between the middles of neighbours: less than the fingers need."""
+PLANNER = PickPlaceParameters()
 
 
 def heights(heading: float | None, lifted: float = 0.0) -> NDArray[np.float32]:
@@ -44,8 +47,15 @@ def heights(heading: float | None, lifted: float = 0.0) -> NDArray[np.float32]:
     return found
 
 
-def blocked(height: NDArray[np.float32], theta: float, rotation: float) -> float:
-    return blocked_at_place(height, GRID.resolution, PICK * 1.0, theta, rotation, PLACE * 1.0)
+def blocked(
+    height: NDArray[np.float32],
+    theta: float,
+    rotation: float,
+    planner: PickPlaceParameters = PLANNER,
+) -> float:
+    return blocked_at_place(
+        height, GRID.resolution, PICK * 1.0, theta, rotation, PLACE * 1.0, planner
+    )
 
 
 @pytest.mark.parametrize("heading", [0.0, 0.5, 2.0])
@@ -60,11 +70,23 @@ def test_fingers_have_room_across_a_row_and_none_along_it(heading: float, lifted
         assert blocked(found, math.pi / 2, heading + half_turn) > 0.1
 
 
+def test_the_planner_says_how_far_the_jaws_draw_back_and_how_low_they_go():
+    along = heights(0.0), 0.0, math.pi / 2
+    # What they would stand in is farther away than the fingertips reach.
+    assert blocked(*along, PickPlaceParameters(release_clearance=0.001)) < blocked(*along) - 0.05
+    # Gripped near its top, the cube lets the fingers stay above low neighbours.
+    low = heights(0.0)
+    low[low > CUBE + PAD / 2] = PAD + 0.024
+    deep = PickPlaceParameters(grasp_depth=0.035, max_grasp_depth=0.035)
+    assert blocked(low, 0.0, math.pi / 2) == 0.0
+    assert blocked(low, 0.0, math.pi / 2, deep) > 0.1
+
+
 def test_nothing_is_in_the_way_on_a_bare_table_nor_at_the_image_s_edge():
     found = heights(None)
     assert blocked(found, 0.3, 1.0) == 0.0
     corner = np.array([0.0, GRID.cols - 1.0])
-    assert blocked_at_place(found, GRID.resolution, corner, 0.0, 0.0, corner) == 0.0
+    assert blocked_at_place(found, GRID.resolution, corner, 0.0, 0.0, corner, PLANNER) == 0.0
 
 
 class Cubes(Networks):
@@ -102,7 +124,9 @@ def test_of_rotations_that_are_as_good_the_one_with_room_is_taken(heading: float
     image = np.zeros((4, *GRID.shape), np.float32)
     image[3] = heights(heading)
     seen = Observation(image, GRID)
-    policy = LearnedPolicy(Cubes(), orientations=72, continuous=continuous, clear_jaws=True)
+    room = ReleaseRoom(PLANNER)
+    stages = [SubPixel(), room] if continuous else [room]
+    policy = LearnedPolicy(Cubes(), orientations=72, stages=stages)
     found = policy.decide(seen)
     np.testing.assert_allclose(found.place_pixel, PLACE, atol=0.5)
     jaws = found.action.place.theta
@@ -123,7 +147,7 @@ def test_what_is_not_as_good_is_not_taken():
 
     image = np.zeros((4, *GRID.shape), np.float32)
     image[3] = heights(math.pi / 2)
-    policy = LearnedPolicy(Corner(), orientations=72, clear_jaws=True)
+    policy = LearnedPolicy(Corner(), orientations=72, stages=make_stages(PLANNER, insertion=False))
     assert abs(policy.decide(Observation(image, GRID)).action.place.theta) < math.radians(3)
 
 

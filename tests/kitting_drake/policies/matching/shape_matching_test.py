@@ -17,11 +17,15 @@ from kitting_drake.policies.matching.refinement import refine_grasp, refine_plac
 from kitting_drake.policies.matching.segmentation import segment
 from kitting_drake.policies.matching.shape_matching import ShapeMatchingPolicy, certain_fits, match
 from kitting_drake.policies.networks.weights import load_networks
+from kitting_drake.policies.stages import make_stages
 from kitting_drake.scenario.loader import load_scenario
-from kitting_drake.station import build_cell
+from systems.pick_place_parameters import PickPlaceParameters
 from systems.signals import Observation, PixelGrid, PlanarPose, fill_unseen
+from tests.kitting_drake.rig import build_rig
 
 pytestmark = pytest.mark.skipif(not can_render(), reason="images cannot be rendered here")
+PLANNER = PickPlaceParameters()
+FITTING = make_stages(PLANNER, insertion=True)
 
 
 @pytest.fixture(scope="module", params=[None, "colour:severe,depth_noise,depth_holes"])
@@ -30,9 +34,9 @@ def seen(request):
     scenario = load_scenario(
         SCENARIOS / "kitting_seen.yaml", None, "{policy: !Oracle {}}", request.param
     )
-    cell = build_cell(scenario, seed=4, base=SCENARIOS)
-    context = cell.diagram.CreateDefaultContext()
-    return cell.diagram.GetOutputPort("observation").Eval(context), cell.scene
+    rig = build_rig(scenario, seed=4, base=SCENARIOS)
+    context = rig.diagram.CreateDefaultContext()
+    return rig.port("observation", context), rig.scene
 
 
 def true_places(scene):
@@ -69,7 +73,7 @@ def test_it_finds_kit_tools_and_recesses(seen):
 
 def test_its_action_brings_a_tool_to_its_place(seen):
     observation, scene = seen
-    action = ShapeMatchingPolicy()(observation)
+    action = ShapeMatchingPolicy(PLANNER)(observation)
     assert not action.stop
     distance, angle = errors_of(action, scene)
     assert distance < 0.003
@@ -80,7 +84,7 @@ def test_where_a_grasp_failed_another_is_tried(seen):
     observation, _ = seen
     tried = []
     for _ in range(3):
-        action = ShapeMatchingPolicy()(observation, tried)
+        action = ShapeMatchingPolicy(PLANNER)(observation, tried)
         assert not action.stop
         for pick in tried:
             assert math.dist((pick.x, pick.y), (action.pick.x, action.pick.y)) > 0.0099
@@ -90,7 +94,7 @@ def test_where_a_grasp_failed_another_is_tried(seen):
 def test_what_must_be_taken_out_waits_for_all_that_fits(seen):
     observation, _ = seen
     segmentation = segment(observation)
-    policy = ShapeMatchingPolicy(recover=True)
+    policy = ShapeMatchingPolicy(PLANNER, recover=True)
     # Something that stands 40 mm out of the fixture, where there is no recess.
     top = float(np.median(observation.height[segmentation.fixture]))
     rows, cols = np.nonzero(segmentation.fixture)
@@ -118,8 +122,8 @@ def test_it_stops_where_nothing_is_left(seen):
     for region in segment(observation).objects:
         image[:, np.pad(region.mask, 2)[2:-2, 2:-2]] = image[:, :5, :5].mean(axis=(1, 2))[:, None]
     cleared = dataclasses.replace(observation, image=image)
-    assert ShapeMatchingPolicy()(cleared).stop
-    assert ShapeMatchingPolicy()(Observation()).stop
+    assert ShapeMatchingPolicy(PLANNER)(cleared).stop
+    assert ShapeMatchingPolicy(PLANNER)(Observation()).stop
 
 
 @pytest.mark.parametrize("seen", [None], indirect=True)
@@ -135,7 +139,7 @@ def test_what_certainly_fits_is_picked_though_the_networks_see_nothing(seen):
         return dataclasses.replace(found, position=position, log_odds=-99.0)
 
     networks.predict_pick = blind
-    action = LearnedPolicy(networks, fit_outlines=True)(observation)
+    action = LearnedPolicy(networks, stages=FITTING)(observation)
     assert not action.stop
     assert certain_fits(segment(observation), observation.grid.resolution)[
         pixel_of(observation, action)
@@ -148,13 +152,13 @@ def test_what_certainly_fits_is_picked_though_the_networks_see_nothing(seen):
         for region in segment(observation).objects
         for pixel in np.argwhere(region.mask)[::3]
     ]
-    assert LearnedPolicy(networks, fit_outlines=True)(observation, everywhere).stop
+    assert LearnedPolicy(networks, stages=FITTING)(observation, everywhere).stop
 
 
 @pytest.mark.parametrize("turn", [0.0, math.pi])
 def test_a_place_that_is_nearly_right_or_reversed_is_put_right(seen, turn: float):
     observation, scene = seen
-    grid = observation.grid
+    grid, segmentation = observation.grid, segment(observation)
     # The second is a screwdriver, the recess of whose shaft is lost in noise.
     for lies, belongs in true_places(scene)[: 1 if turn and not observation.valid.all() else 2]:
         pick, place = grid.to_pixel(lies[:2]), grid.to_pixel(belongs[:2])
@@ -163,13 +167,11 @@ def test_a_place_that_is_nearly_right_or_reversed_is_put_right(seen, turn: float
         if turn:
             # What a network takes for the place then: the recess the wrong way round.
             recess = min(
-                segment(observation).recesses,
+                segmentation.recesses,
                 key=lambda item: np.linalg.norm(item.pixels - place, axis=1).min(),
             )
             off = 2 * recess.pixels.mean(axis=0) - off
-        found = refine_place(
-            segment(observation), pick, rotation + turn + 0.05, off, grid.resolution
-        )
+        found = refine_place(segmentation, pick, rotation + turn + 0.05, off, grid.resolution)
         assert found is not None
         assert np.linalg.norm(found.place - place) * grid.resolution < 0.003
         assert abs(math.remainder(found.rotation - rotation, math.tau)) < math.radians(2)
@@ -178,12 +180,12 @@ def test_a_place_that_is_nearly_right_or_reversed_is_put_right(seen, turn: float
 def test_a_place_in_a_recess_that_fits_far_worse_than_another_moves_there():
     """A precision screwdriver, thin enough to lie in a hammer's cavity, and placed there."""
     scenario = load_scenario(SCENARIOS / "kitting_unseen.yaml", None, "{policy: !Oracle {}}")
-    cell = build_cell(scenario, seed=1216, base=SCENARIOS)
-    context = cell.diagram.CreateDefaultContext()
-    observation = cell.diagram.GetOutputPort("observation").Eval(context)
+    rig = build_rig(scenario, seed=1216, base=SCENARIOS)
+    context = rig.diagram.CreateDefaultContext()
+    observation = rig.port("observation", context)
     grid, segmentation = observation.grid, segment(observation)
-    names = [item.name for item in cell.scene.objects]
-    places = true_places(cell.scene)
+    names = [item.name for item in rig.scene.objects]
+    places = true_places(rig.scene)
     lies, belongs = places[names.index("precision_screwdriver")]
     pick, place = grid.to_pixel(lies[:2]), grid.to_pixel(belongs[:2])
     rotation = belongs[2] - lies[2]
@@ -201,34 +203,30 @@ def test_a_place_in_a_recess_that_fits_far_worse_than_another_moves_there():
 
 def test_a_grasp_with_no_room_for_the_jaws_moves_to_where_there_is(seen):
     observation, scene = seen
-    grid = observation.grid
+    grid, segmentation = observation.grid, segment(observation)
+
+    def refined(pick, theta: float, failed=None):
+        return refine_grasp(segmentation, pick, theta, grid.resolution, PLANNER, failed)
+
     for index, (lies, _) in enumerate(true_places(scene)):
         grasp = scene.objects[index].grasps[0]
         pick = grid.to_pixel(rotation_matrix(lies[2]) @ (grasp.x, grasp.y) + lies[:2])
         theta = lies[2] + grasp.theta
-        near = refine_grasp(segment(observation), pick, theta, grid.resolution)
+        near = refined(pick, theta)
         if near is not None:
             assert np.linalg.norm(near.pick - pick) * grid.resolution < 0.04
         # Along the handle instead of across it, the jaws would close on nothing.
-        along = refine_grasp(segment(observation), pick, theta + math.pi / 2, grid.resolution)
+        along = refined(pick, theta + math.pi / 2)
         assert along is not None
         assert abs(math.remainder(along.theta - theta, math.pi)) < math.radians(40)
         # Not where a grasp failed before; and where all failed, nowhere.
-        other = refine_grasp(
-            segment(observation), pick, theta + math.pi / 2, grid.resolution, along.pick[None]
-        )
+        other = refined(pick, theta + math.pi / 2, along.pick[None])
         if other is not None:
             assert np.linalg.norm(other.pick - along.pick) * grid.resolution > 0.0099
         everywhere = np.argwhere(np.ones(grid.shape))[::2]
-        assert (
-            refine_grasp(
-                segment(observation), pick, theta + math.pi / 2, grid.resolution, everywhere
-            )
-            is None
-        )
-    assert (
-        refine_grasp(segment(Observation()), np.array([80.0, 160.0]), 0.0, grid.resolution) is None
-    )
+        assert refined(pick, theta + math.pi / 2, everywhere) is None
+    segmentation = segment(Observation())
+    assert refined(np.array([80.0, 160.0]), 0.0) is None
 
 
 def test_a_place_without_a_recess_stays(seen):
@@ -273,13 +271,13 @@ def kitted(request) -> Observation:
         "{policy: !Oracle {}}",
         "distractors",
     )
-    cell = build_cell(scenario, seed=request.param, base=SCENARIOS)
-    context = cell.diagram.CreateDefaultContext()
-    plant_context = cell.plant.GetMyMutableContextFromRoot(context)
-    for goal in cell.scene.goals:
-        body = cell.plant.get_body(cell.objects[goal.objects[0]].body)
-        cell.plant.SetFreeBodyPose(plant_context, body, goal.poses[0])
-    return cell.diagram.GetOutputPort("observation").Eval(context)
+    rig = build_rig(scenario, seed=request.param, base=SCENARIOS)
+    context = rig.diagram.CreateDefaultContext()
+    plant_context = rig.plant.GetMyMutableContextFromRoot(context)
+    for goal in rig.scene.goals:
+        body = rig.plant.get_body(rig.objects[goal.objects[0]].body)
+        rig.plant.SetFreeBodyPose(plant_context, body, goal.poses[0])
+    return rig.port("observation", context)
 
 
 def test_boxes_fit_nothing_that_tools_leave_of_their_cavities(kitted: Observation):
@@ -287,7 +285,9 @@ def test_boxes_fit_nothing_that_tools_leave_of_their_cavities(kitted: Observatio
     segmentation = segment(kitted)
     assert segmentation.recesses
     assert len(segmentation.objects) == 4
-    policy = LearnedPolicy(load_networks(GENERALIST), fit_outlines=True, recover=True)
+    policy = LearnedPolicy(
+        load_networks(GENERALIST), stages=make_stages(PLANNER, insertion=True, recover=True)
+    )
     assert policy(kitted).stop
 
 

@@ -2,12 +2,12 @@ import itertools
 
 import pytest
 import torch
-from escnn import nn as enn
 from torch import Tensor, nn
 
 from kitting_drake.policies.networks.architecture import NetworkConfig
 from kitting_drake.policies.networks.escnn_reference import as_escnn
 from kitting_drake.policies.networks.factored import Networks, SO2Networks
+from kitting_drake.policies.networks.layers.planar_escnn import enn
 from kitting_drake.policies.networks.layers.steerable import SteerableConv2d
 from kitting_drake.policies.networks.methods import make_networks
 

@@ -9,23 +9,20 @@ import torch
 
 from kitting_drake.common.paths import GENERALIST, MODELS
 from kitting_drake.common.seeds import TEST_SEEDS
-from kitting_drake.policies.data.recorded import Recorded
 from kitting_drake.policies.learned_policy import LearnedPolicy
 from kitting_drake.policies.networks.architecture import PICK_CROP, NetworkConfig
 from kitting_drake.policies.networks.factored import SO2Networks
 from kitting_drake.policies.networks.methods import make_networks
 from kitting_drake.policies.networks.weights import load_networks, read_weights_file
-from systems.signals import Observation, PixelGrid
+from systems.signals import Observation
 from tests.kitting_drake.policies.equivariance import relative_error, rotate_image, smooth_image
+from tests.kitting_drake.policies.scenes import stored_observation
 
 SHIPPED = sorted((MODELS / "policies").glob("*.safetensors"))
 TAUGHT = [path for path in SHIPPED if path.stem != "generalist"]
 """Those that learned from demonstrations."""
-DATA = Path(__file__).parents[1] / "observations"
-"""One rendered observation for each of them (seeds 103 and 105, at rest, four tools on the table):
-`rgb` (3, rows, cols), 8 bits, and `height_tenth_mm` (rows, cols), in tenths of a millimetre."""
-
 OBSERVED = {"generalist": "kitting_unseen"}
+"""A rendered observation for each of them (seeds 103 and 105, at rest, four tools on the table)."""
 
 GOLDEN = {
     "generalist": ((59.179, 219.931), 40.516, (69.985, 124.046), -146.184),
@@ -63,12 +60,6 @@ def test_no_test_seed_was_learned_from(path: Path):
     assert not learned.intersection(TEST_SEEDS)
     assert file.card["validation"]["median_rotation_deg"] < 0.5
     assert file.card["validation"]["false_stops"] == file.card["validation"]["missed_stops"] == 0
-
-
-def stored_observation(name: str) -> Observation:
-    stored = np.load(DATA / f"{name}.npz")
-    recorded = Recorded(stored["rgb"], stored["height_tenth_mm"].astype(np.float32) * 1e-4)
-    return Observation(recorded.image, PixelGrid())
 
 
 def test_stops_when_all_tools_are_in_the_kit():

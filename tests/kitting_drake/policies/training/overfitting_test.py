@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from kitting_drake.policies.data.images import LabelledImage, move
 from kitting_drake.policies.data.recorded import FinalObservation
-from kitting_drake.policies.learned_policy import LearnedPolicy
+from kitting_drake.policies.learned_policy import DEFAULT_STAGES, LearnedPolicy
 from kitting_drake.policies.networks.factored import Networks
 from kitting_drake.policies.networks.methods import make_networks
 from kitting_drake.policies.training import training_step as training
@@ -33,7 +33,9 @@ def prediction_errors(
     networks: Networks, sample: LabelledImage, *, continuous: bool = False
 ) -> list[float]:
     """Errors of the pick in pixels and bins, then of the place."""
-    policy = LearnedPolicy(networks, orientations=ORIENTATIONS, continuous=continuous)
+    policy = LearnedPolicy(
+        networks, orientations=ORIENTATIONS, stages=DEFAULT_STAGES if continuous else ()
+    )
     decision = policy.decide(Observation(sample.image, GRID))
     action = decision.action
     bins = ORIENTATIONS / math.tau

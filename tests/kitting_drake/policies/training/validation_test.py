@@ -6,7 +6,7 @@ import pytest
 
 from kitting_drake.policies.data.images import Image, make_action, rotation_matrix
 from kitting_drake.policies.data.recorded import FinalObservation, record
-from kitting_drake.policies.data.samples import Scene
+from kitting_drake.policies.data.samples import ObservedScene
 from kitting_drake.policies.learned_policy import Decision
 from kitting_drake.policies.networks.architecture import NetworkConfig
 from kitting_drake.policies.networks.methods import make_networks
@@ -24,7 +24,7 @@ GRID = PixelGrid(resolution=0.002, rows=60, cols=80)
 IMAGE: Image = np.zeros((4, *GRID.shape), np.float32)
 SEEN = Observation(IMAGE, GRID)
 PICK, PLACE, THETA, ROTATION = np.array([20.0, 30.0]), np.array([40.0, 60.0]), 1.2, 2.9
-SCENE = Scene(
+SCENE = ObservedScene(
     record(SEEN),
     (
         make_action(SEEN, np.array([50.0, 70.0]), THETA, PLACE, ROTATION),

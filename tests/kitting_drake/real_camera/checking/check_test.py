@@ -23,6 +23,7 @@ from kitting_drake.real_camera.checking.meaning import (
 )
 from kitting_drake.real_camera.frames import Frame
 from kitting_drake.scenario.schema import Scenario
+from systems.pick_place_parameters import PickPlaceParameters
 from systems.sensor_noise import SensorNoiseParameters, noisy_depth
 from tests.kitting_drake.real_camera.frames import calibration_of, cast, render_table
 
@@ -100,6 +101,8 @@ def test_a_camera_that_is_too_high_is_found(table: dict[str, Frame]):
     check = check_cameras(noisy(table), moved("front", shift=(0, 0, 0.003)))
     # The hand stops 1.5 mm above where the table is believed to be.
     assert "may go 1.5 mm into the table" in _meaning(check, "height bias")
+    lines = findings(check, PickPlaceParameters(floor_clearance=0.0025))
+    assert any("may go 0.5 mm into the table" in line.meaning for line in lines)
     low = check_cameras(table, moved("front", shift=(0, 0, -0.003)))
     assert "into the table" not in _meaning(low, "height bias")
     assert check.cameras["front"].table.bias == pytest.approx(0.003, rel=0.2)

@@ -1,12 +1,9 @@
-from pathlib import Path
-
 import pytest
 from rich.console import Console
 
-from kitting_drake.episode import run_episode
 from kitting_drake.reproduction.benchmarks.simulation import PhaseStopwatch, simulation_tables
 from kitting_drake.scenario.schema import Scenario
-from kitting_drake.station import build_cell
+from tests.kitting_drake.rig import build_rig
 
 
 def test_phases_add_up_to_their_episodes():
@@ -14,17 +11,9 @@ def test_phases_add_up_to_their_episodes():
     stopwatch = PhaseStopwatch()
     simulated = wall = 0.0
     for seed in range(2):
-        cell = build_cell(scenario, seed=seed, base=Path())
+        rig = build_rig(scenario, seed=seed)
         stopwatch.start()
-        result = run_episode(
-            cell,
-            task=scenario.task,
-            scenario="mine",
-            policy="oracle",
-            seed=seed,
-            time_limit=scenario.time_limit,
-            observers=[stopwatch.observe],
-        )
+        result = rig.run(stopwatch.observe)
         simulated += result.sim_seconds
         wall += result.wall_seconds
     # It ends in the middle of a phase, which counts too.

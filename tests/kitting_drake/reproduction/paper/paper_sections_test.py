@@ -1,17 +1,19 @@
 """The paper's part of the page of results, of summaries made for it."""
 
-import json
 import math
+from collections.abc import Iterable
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from kitting_drake.common.errors import UserError
 from kitting_drake.common.paths import SCENARIOS
 from kitting_drake.evaluation.summary import summarise
-from kitting_drake.reproduction.page.runs import described
-from kitting_drake.reproduction.paper.cell_results import read_results
+from kitting_drake.reproduction.page.runs import Run, described
+from kitting_drake.reproduction.paper.cell_results import cell_results
 from kitting_drake.reproduction.paper.cells import PRESET, TASKS, Cell, Training
+from kitting_drake.reproduction.paper.learning_rates import RATES, Rates, read_rates
 from kitting_drake.reproduction.paper.paper_figures import draw_figure_6, draw_table_1
 from kitting_drake.reproduction.paper.paper_sections import has_figure, has_table_1, paper_sections
 from kitting_drake.reproduction.paper.paper_tables import paper_cells
@@ -21,8 +23,8 @@ from tests.kitting_drake.evaluation.episodes import ADD_S, CHOSEN, make_episode
 CELLS = {cell.name: cell for cell in paper_cells()}
 
 
-def write(folder: Path, name: str, errors_mm: list[float]) -> None:
-    """The summary of a cell whose episodes are all alike."""
+def make_run(name: str, errors_mm: list[float]) -> Run:
+    """The run of a cell whose episodes are all alike."""
     cell: Cell = CELLS[name]
     task = TASKS[cell.task]
     scenario = load_scenario(SCENARIOS / task.file, task.tested, cell.scenario_text("w"))
@@ -50,18 +52,24 @@ def write(folder: Path, name: str, errors_mm: list[float]) -> None:
     summary |= {"resolved_scenario": described(scenario), "policy_details": details}
     if isinstance(cell.policy, str):
         summary["policy_digest"] = scenario.policy.digest(SCENARIOS)
-    (folder / f"{name}.json").write_text(json.dumps(summary))
+    return Run(name, summary)
 
 
-@pytest.fixture
-def folder(tmp_path: Path) -> Path:
-    write(tmp_path, "unseen_so2_180_100", [1.0, 1.0, 1.0, 9.0])
-    write(tmp_path, "unseen_so2_180_100_ours", [1.0, 1.0, 1.0, 1.0])
-    write(tmp_path, "unseen_equivariant_transporter_180_100", [1.0, 1.0, 9.0, 9.0])
-    write(tmp_path, "unseen_quantized_oracle_180", [1.0, 1.0, 1.0, 1.0])
-    write(tmp_path, "stack_block_pyramid_so2_36_10", [1.0, 9.0])
-    write(tmp_path, "fresh_shape_matching", [1.0, 1.0, 1.0, 1.0])
-    return tmp_path
+def sections(runs: Iterable[Run], rates: Rates | None = None) -> str:
+    results, _ = cell_results(list(runs), rates or {})
+    return "\n".join(paper_sections(results, rates or {}))
+
+
+@pytest.fixture(scope="module")
+def runs() -> tuple[Run, ...]:
+    return (
+        make_run("unseen_so2_180_100", [1.0, 1.0, 1.0, 9.0]),
+        make_run("unseen_so2_180_100_ours", [1.0, 1.0, 1.0, 1.0]),
+        make_run("unseen_equivariant_transporter_180_100", [1.0, 1.0, 9.0, 9.0]),
+        make_run("unseen_quantized_oracle_180", [1.0, 1.0, 1.0, 1.0]),
+        make_run("stack_block_pyramid_so2_36_10", [1.0, 9.0]),
+        make_run("fresh_shape_matching", [1.0, 1.0, 1.0, 1.0]),
+    )
 
 
 def rows(text: str) -> dict[tuple[str, ...], list[str]]:
@@ -71,8 +79,8 @@ def rows(text: str) -> dict[tuple[str, ...], list[str]]:
     return {tuple(row[:2]): row[2:] for row in cells}
 
 
-def test_the_tables_hold_the_cells_and_say_what_is_missing(folder: Path):
-    text = "\n".join(paper_sections(read_results(folder), {}, "results"))
+def test_the_tables_hold_the_cells_and_say_what_is_missing(runs: tuple[Run, ...]):
+    text = sections(runs)
     found = rows(text)
     assert found["SO(2)-equivariant (ours)", "100"] == ["-"] * 3 + ["75.0 (70.5 to 79.0) / 75.0"]
     assert found["Transporter", "100"] == ["-", "", "", ""]
@@ -82,72 +90,91 @@ def test_the_tables_hold_the_cells_and_say_what_is_missing(folder: Path):
     assert found["as in the paper", "75.0 (70.5 to 79.0) / 75.0"] == ["-"]
     assert found["with all extensions", "100.0 (99.0 to 100.0) / 100.0"] == ["-"]
     assert found["without outline fitting", "-"] == [""]
-    assert "results/paper/unseen_so2_180_100.json" in text
-    assert "misplaced 100" in text
+    every = text.split("### Every cell")[1]
+    assert {row[0] for row in rows(every)} >= {run.name for run in runs}
+    assert "misplaced 100" in every
     pyramid = [line for line in text.splitlines() if " 36 |" in line and " 10 |" in line]
     assert any("50.0 (43.1 to 56.9) / 84.5 |" in line for line in pyramid)
     assert found["shape matching", "100.0 (99.0 to 100.0)"][1] == "100.0 (99.0 to 100.0)"
     assert found["generalist", "-"] == ["-", "-"]
 
 
-def test_the_mean_over_n_is_compared_once_all_of_it_is_there(folder: Path):
+def test_prose_on_a_cell_is_there_with_the_cell(runs: tuple[Run, ...]):
+    told = {
+        "unseen_so2_180_10": "Two trainings of ours from the same seed",
+        "unseen_transporter_36_100": "putting a tool into the cavity of another",
+        "palletizing_boxes_so2_180_1": "After one demonstration of palletizing",
+        "palletizing_boxes_transporter_36_100": "On palletizing the Transporter does better",
+        "place_red_in_green_so2_180_1": "After one demonstration of place red in green",
+        "stack_block_pyramid_so2_36_10_ours": "ours comes out below the paper on the pyramid",
+    }
+    rates, without = {"unseen_transporter": {"0.001": 1.0}}, sections(runs)
+    everything = sections([*runs, *(make_run(name, [1.0, 9.0]) for name in told)], rates)
+    for words in told.values():
+        assert words in everything
+        assert words not in without
+    # No placeholder is left.
+    assert not set("{}$") & set(everything)
+    assert "<!--" not in everything
+
+
+def test_the_mean_over_n_is_compared_once_all_of_it_is_there(runs: tuple[Run, ...]):
+    more = list(runs)
+    label = ("unseen, 100 demonstrations, mean over N", "Equivariant Transporter")
     for n in (36, 72, 120):
-        write(folder, f"unseen_so2_{n}_100", [1.0, 1.0, 9.0, 9.0])
-        label = ("unseen, 100 demonstrations, mean over N", "Equivariant Transporter")
-        assert label not in rows("\n".join(paper_sections(read_results(folder), {}, "results")))
-        write(folder, f"unseen_equivariant_transporter_{n}_100", [1.0, 1.0, 1.0, 1.0])
-    found = rows("\n".join(paper_sections(read_results(folder), {}, "results")))
+        more.append(make_run(f"unseen_so2_{n}_100", [1.0, 1.0, 9.0, 9.0]))
+        assert label not in rows(sections(more))
+        more.append(make_run(f"unseen_equivariant_transporter_{n}_100", [1.0, 1.0, 1.0, 1.0]))
     # -50 three times and +25 once.
-    assert found[label] == ["-31.2 (-31.2 to -31.2)"] * 2
+    assert rows(sections(more))[label] == ["-31.2 (-31.2 to -31.2)"] * 2
 
 
-def test_trainings_are_compared_once_there_are_two(folder: Path):
-    assert "Variation between trainings" not in "\n".join(
-        paper_sections(read_results(folder), {}, "results")
-    )
-    write(folder, "unseen_so2_180_100_seed2", [1.0, 1.0, 1.0, 1.0])
-    found = rows("\n".join(paper_sections(read_results(folder), {}, "results")))
+def test_trainings_are_compared_once_there_are_two(runs: tuple[Run, ...]):
+    assert "Variation between trainings" not in sections(runs)
+    more = [*runs, make_run("unseen_so2_180_100_seed2", [1.0, 1.0, 1.0, 1.0])]
+    found = rows(sections(more))
     ours = found["SO(2)-equivariant (ours)", "unseen"]
     # 75 and 100.
     assert ours == ["75.0 / 75.0", "-", "100.0 / 100.0", "87.5 ± 17.7 / 87.5 ± 17.7"]
     assert ("Equivariant Transporter", "unseen") not in found
-    write(folder, "unseen_equivariant_transporter_180_100_seed2", [1.0, 1.0, 1.0, 9.0])
-    found = rows("\n".join(paper_sections(read_results(folder), {}, "results")))
+    theirs = "unseen_equivariant_transporter_180_100_seed2"
+    more.append(make_run(theirs, [1.0, 1.0, 1.0, 9.0]))
     label = ("unseen, N = 180, mean over 2 trainings", "Equivariant Transporter")
-    assert found[label] == ["+25.0 (+25.0 to +25.0)"] * 2
+    assert rows(sections(more))[label] == ["+25.0 (+25.0 to +25.0)"] * 2
 
 
-def test_a_longer_training_is_compared_with_the_same_cell_in_the_usual_steps(tmp_path: Path):
+def test_a_longer_training_is_compared_with_the_same_cell_in_the_usual_steps():
     ours = "stack_block_pyramid_so2_36_100"
-    write(tmp_path, ours, [9.0, 9.0])
-    write(tmp_path, f"{ours}_ours", [1.0, 9.0])
-    write(tmp_path, f"{ours}_3_times_the_steps_ours", [1.0, 1.0])
-    text = "\n".join(paper_sections(read_results(tmp_path), {}, "results"))
+    text = sections(
+        [
+            make_run(ours, [9.0, 9.0]),
+            make_run(f"{ours}_ours", [1.0, 9.0]),
+            make_run(f"{ours}_3_times_the_steps_ours", [1.0, 1.0]),
+        ]
+    )
     name = f"{ours}_3_times_the_steps_ours", "in the usual number of steps"
     assert rows(text)[name][0] == "+50.0 (+50.0 to +50.0)"
     assert "| 100, 3 times the steps | 100.0" in text
 
 
-def test_an_interval_over_tools_is_given_only_where_tools_are_drawn(folder: Path):
-    for name in ("seen_so2_180_100", "unseen_so2_180_100"):
-        write(folder, name, [1.0, 1.0, 1.0, 1.0])
-        path = folder / f"{name}.json"
-        summary = json.loads(path.read_text())
+def test_an_interval_over_tools_is_given_only_where_tools_are_drawn():
+    pair = [make_run(f"{task}_so2_180_100", [1.0, 1.0, 1.0, 1.0]) for task in ("seen", "unseen")]
+    for run in pair:
         # Every tool fails once, and so tells something of others.
-        summary["outcomes"][0]["objects"] = dict.fromkeys(summary["outcomes"][0]["objects"], 0)
-        path.write_text(json.dumps(summary))
-    text = "\n".join(paper_sections(read_results(folder), {}, "results"))
-    cells = {row.split("]")[0]: row.split(" | ") for row in text.splitlines() if "/paper/" in row}
-    assert cells["| [seen_so2_180_100"][9].strip() == "-"
-    assert " to " in cells["| [unseen_so2_180_100"][9]
+        first = run.summary["outcomes"][0]
+        first["objects"] = dict.fromkeys(first["objects"], 0)
+    every = sections(pair).split("### Every cell")[1]
+    cells = {row[0]: more for row, more in rows(every).items()}
+    assert cells["seen_so2_180_100"][7] == "-"
+    assert " to " in cells["unseen_so2_180_100"][7]
 
 
-def test_the_learning_rates_that_were_tried_are_told(folder: Path):
+def test_the_learning_rates_that_were_tried_are_told(runs: tuple[Run, ...]):
     rates = {
         "unseen_transporter": {"0.001": 4.0, "0.0003": 2.5, "0.01": math.inf},
         "stack_block_pyramid_transporter": {"0.001": 9.25, "0.0003": 12.0},
     }
-    text = "\n".join(paper_sections(read_results(folder), rates, "results"))
+    text = sections(runs, rates)
     assert (
         "- the Transporter, unseen: 0.0003 of 0.001 (4.00 mm), 0.0003 (2.50 mm), 0.01 (diverged)"
         in text
@@ -158,60 +185,59 @@ def test_the_learning_rates_that_were_tried_are_told(folder: Path):
     )
 
 
-def test_a_file_that_is_not_what_its_name_says_is_refused(folder: Path):
-    path = folder / "unseen_so2_180_100.json"
-    good = json.loads(path.read_text())
-    summary = json.loads(path.read_text())
-    summary["resolved_scenario"]["cameras"] = {}
-    path.write_text(json.dumps(summary))
-    with pytest.raises(UserError, match=r"unseen_so2_180_100\.json is not that of its cell: camer"):
-        read_results(folder)
-    path.rename(folder / "mine.json")
-    with pytest.raises(UserError, match=r"mine\.json is of no cell"):
-        read_results(folder)
-    (folder / "mine.json").unlink()
-    for content in ("[]", '{"unseen_equivariant_transporter": {}}'):
-        (folder / "learning_rates.json").write_text(content)
-        with pytest.raises(UserError, match=r"learning_rates\.json is damaged"):
-            read_results(folder)
+def test_a_run_that_is_not_what_its_name_says_is_refused(runs: tuple[Run, ...]):
+    good = runs[0]
+
+    def spoiled(**fields: Any) -> list[Run]:
+        return [Run(good.name, {**good.summary, **fields})]
+
+    scenario = {**good.summary["resolved_scenario"], "cameras": {}}
+    said = r"run 'unseen_so2_180_100' is not that of the cell of this name \(camer"
+    with pytest.raises(UserError, match=said):
+        cell_results(spoiled(resolved_scenario=scenario), {})
+    with pytest.raises(UserError, match=r"its outcomes are no list"):
+        cell_results(spoiled(outcomes=3), {})
+    for fields in ({"outcomes": None}, {"seeds": None}):
+        with pytest.raises(UserError, match=r"run 'unseen_so2_180_100' is no"):
+            cell_results(spoiled(**fields), {})
     rates = {"unseen_equivariant_transporter": {"0.001": 4.0, "0.0003": 2.5}}
-    (folder / "learning_rates.json").write_text(json.dumps(rates))
     with pytest.raises(UserError, match=r"learning_rate is 0\.001, not 0\.0003"):
-        read_results(folder)
-    (folder / "learning_rates.json").unlink()
-    for field in ("outcomes", "versions"):
-        path.write_text(json.dumps({**good, field: 3}))
-        with pytest.raises(UserError, match=r"is no summary of evaluate: .*must be"):
-            read_results(folder)
-    path.write_text("{}")
-    with pytest.raises(UserError, match="lacks 'task': it must be a summary"):
-        read_results(folder)
+        cell_results(runs, rates)
+    other = Run("mine", good.summary)
+    assert cell_results([other], {}) == ([], [other])
 
 
-def test_no_results_no_sections(tmp_path: Path):
-    assert read_results(tmp_path / "none") == []
-    assert paper_sections([], {}, "results") == []
+def test_learning_rates_that_are_damaged_are_told(tmp_path: Path):
+    assert read_rates(tmp_path) == {}
+    for content in ("[]", '{"unseen_equivariant_transporter": {}}', "{"):
+        (tmp_path / RATES).write_text(content)
+        with pytest.raises(UserError, match=r"learning_rates\.json is damaged"):
+            read_rates(tmp_path)
 
 
-def test_the_figure_is_drawn_from_what_there_is(folder: Path):
-    found = read_results(folder)
+def test_no_results_no_sections():
+    assert paper_sections([], {}) == []
+
+
+def test_the_figure_is_drawn_from_what_there_is(runs: tuple[Run, ...]):
+    found, _ = cell_results(runs, {})
     assert has_figure("unseen", found)
     assert not has_figure("seen", found)
-    assert "results_unseen.png" in "\n".join(paper_sections(found, {}, "results"))
-    results = {result.cell.name: result for result in read_results(folder)}
+    assert "results_unseen.png" in sections(runs)
+    results = {result.cell.name: result for result in found}
     drawn = draw_figure_6("unseen", results)
     assert drawn.startswith(b"\x89PNG")
     assert drawn != draw_figure_6("seen", results)
 
 
-def test_table_1_is_drawn_from_what_there_is(folder: Path):
-    found = read_results(folder)
+def test_table_1_is_drawn_from_what_there_is(runs: tuple[Run, ...]):
+    found, _ = cell_results(runs, {})
     assert has_table_1(found)
-    assert "results_ravens.png" in "\n".join(paper_sections(found, {}, "results"))
+    assert "results_ravens.png" in sections(runs)
     results = {result.cell.name: result for result in found}
     drawn = draw_table_1(results)
     assert drawn.startswith(b"\x89PNG")
     del results["stack_block_pyramid_so2_36_10"]
     assert drawn != draw_table_1(results)
     assert not has_table_1(results.values())
-    assert "results_ravens.png" not in "\n".join(paper_sections(list(results.values()), {}, "r"))
+    assert "results_ravens.png" not in "\n".join(paper_sections(list(results.values()), {}))

@@ -1,11 +1,12 @@
 """The queue of the paper's experiments, with commands that only pretend."""
 
+import copy
 import dataclasses
 import itertools
 import json
+import signal
 import subprocess
 import sys
-import threading
 import time
 from pathlib import Path
 
@@ -16,7 +17,9 @@ from kitting_drake import benchmark
 from kitting_drake.common.errors import DIVERGED, UserError
 from kitting_drake.common.files import alone_in
 from kitting_drake.common.paths import SCENARIOS
+from kitting_drake.reproduction.page.run_table import Summary, add_run, read_summaries
 from kitting_drake.reproduction.page.runs import described
+from kitting_drake.reproduction.paper.cell_results import check_cell
 from kitting_drake.reproduction.paper.cells import (
     LEARNING_RATES,
     PRESET,
@@ -27,10 +30,9 @@ from kitting_drake.reproduction.paper.cells import (
 )
 from kitting_drake.reproduction.paper.learning_rates import RATES
 from kitting_drake.reproduction.paper.paper_tables import paper_cells
-from kitting_drake.reproduction.paper.queue import Failed, Queue, run_paper
+from kitting_drake.reproduction.paper.queue import Failed, Queue
 from kitting_drake.scenario.loader import load_scenario
 
-PAPER_RESULTS = SCENARIOS.parent / "docs" / "results" / "paper"
 ORACLE = Cell("unseen", "!QuantizedOracle {orientations: 180}", 180, "quantized_oracle")
 OURS = Cell("unseen", Training("unseen", "so2", 180, 10), 36, end_at_success=True)
 THEIRS = Cell("unseen", Training("unseen", "transporter", 36, 10), 36)
@@ -49,17 +51,11 @@ class Pretending(Queue):
         self.why = "it broke"
         self.collected: dict[str, int] = {}
         """How many demonstrations were asked for, by folder."""
-        self.slow = ""
-        self.together: threading.Barrier | None = None
-        """Where trainings wait for each other."""
-        self._has_evaluated = threading.Event()
 
     def _command(self, verb: str, *arguments, folder: Path) -> None:
         self.calls.append(f"{verb} {folder.name}")
         if folder.name in self.broken:
             raise Failed(self.why)
-        if folder.name == self.slow:
-            self._has_evaluated.wait(10.0)
         folder.mkdir(parents=True, exist_ok=True)
         words = list(map(str, arguments))
         flags = dict(itertools.pairwise(words))
@@ -67,8 +63,6 @@ class Pretending(Queue):
             self.collected[folder.name] = int(flags["--demos"])
             (folder / "demonstrations.h5").touch()
         elif verb == "train":
-            if self.together:
-                self.together.wait(10.0)
             rate = float(flags["--learning-rate"])
             summary = {"best": {"cost_mm": 1.0 if rate == LEARNING_RATES[1] else 2.0}}
             summary |= {key: int(flags[f"--{key}"]) for key in COUNTED}
@@ -80,7 +74,6 @@ class Pretending(Queue):
             (folder / "summary.json").write_text(json.dumps(summary))
             (folder / "policy.safetensors").touch()
         else:
-            self._has_evaluated.set()
             (folder / "summary.json").write_text(json.dumps(self.summary(words, flags)))
 
     def summary(self, words: list[str], flags: dict[str, str]) -> dict:
@@ -113,6 +106,7 @@ class Pretending(Queue):
             "seeds": list(range(first, first + count)),
             "policy_details": details,
             "policy_digest": None,
+            "outcomes": [],
             "strict_success_rate": 1.0,
             "success_rate": 1.0,
         }
@@ -133,6 +127,7 @@ def test_cells_have_names_of_their_own_and_scenarios_that_load():
         scenario = load_scenario(SCENARIOS / task.file, task.tested, text)
         assert (scenario.planner.search.steps > 0) == cell.search
         assert scenario.end_at_success == cell.end_at_success
+    for task in TASKS.values():
         load_scenario(SCENARIOS / task.file, task.demonstrated, "{policy: !Oracle {}}")
 
 
@@ -152,7 +147,7 @@ def test_it_chooses_a_learning_rate_and_does_nothing_twice(queue: Pretending):
     rates = json.loads((queue.results / RATES).read_text())
     costs = {f"{rate:g}": 1.0 if rate == best else 2.0 for rate in LEARNING_RATES}
     assert rates == {"unseen_transporter": costs}
-    written = (queue.results / f"{OURS.name}.json").read_text()
+    written = json.dumps(read_summaries(queue.results)[OURS.name])
     assert str(queue.folder) not in written
     assert "trainings/unseen_so2_180_10" in written
 
@@ -196,7 +191,7 @@ def test_a_baseline_may_have_a_rate_of_its_own(queue: Pretending):
     cell = dataclasses.replace(THEIRS, policy=steadier)
     assert queue.run([cell]) == {}
     assert f"train {steadier.name}_lr{LEARNING_RATES[0]:g}" in queue.calls
-    summary = json.loads((queue.results / f"{cell.name}.json").read_text())
+    summary = read_summaries(queue.results)[cell.name]
     assert cell.departure(summary, rates) is None
     assert THEIRS.departure(summary, rates).startswith("learning_rate is 0.001, not 0.0003")
 
@@ -229,21 +224,10 @@ def test_more_patience_is_another_training(queue: Pretending):
     )
     assert patient.policy.steps == 3 * THEIRS.policy.steps
     assert queue.run([patient]) == {}
-    summary = json.loads((queue.results / f"{patient.name}.json").read_text())
+    summary = read_summaries(queue.results)[patient.name]
     assert patient.departure(summary) is None
     at_once = dataclasses.replace(patient, policy=dataclasses.replace(patient.policy, times=1))
     assert at_once.departure(summary).startswith("steps is")
-
-
-def test_what_is_trained_does_not_wait_behind_what_is_not(queue: Pretending):
-    queue.train(OURS.policy)
-    other = dataclasses.replace(OURS, policy=Training("unseen", "so2", 180, 100))
-    queue.slow = f"{other.policy.name}_lr{LEARNING_RATES[0]:g}"
-    assert queue.run([other, OURS]) == {}
-    assert [call for call in queue.calls if call.startswith("evaluate")] == [
-        f"evaluate {OURS.name}",
-        f"evaluate {other.name}",
-    ]
 
 
 def test_networks_at_another_learning_rate_do_not_count_as_trained(queue: Pretending):
@@ -259,27 +243,6 @@ def test_networks_at_another_learning_rate_do_not_count_as_trained(queue: Preten
     ]
 
 
-def test_trainings_side_by_side_collect_once(tmp_path: Path):
-    (tmp_path / "results").mkdir()
-    queue = Pretending(tmp_path, tmp_path / "results", Console(quiet=True), trainings=2)
-    queue.together = threading.Barrier(2)
-    other = dataclasses.replace(OURS, policy=Training("unseen", "so2", 180, 100))
-    assert queue.run([OURS, other]) == {}
-    assert [call for call in queue.calls if call.startswith("collect")] == [
-        "collect unseen",
-        "collect unseen_validation",
-    ]
-
-
-def test_learning_rates_are_tried_side_by_side(tmp_path: Path):
-    (tmp_path / "results").mkdir()
-    queue = Pretending(tmp_path, tmp_path / "results", Console(quiet=True), trainings=3)
-    queue.together = threading.Barrier(3, action=lambda: setattr(queue, "together", None))
-    assert queue.run([THEIRS]) == {}
-    tried = {f"train {reference(THEIRS.policy).name}_lr{rate:g}" for rate in LEARNING_RATES}
-    assert set(queue.calls[2:5]) == tried
-
-
 def test_a_run_collects_as_many_demonstrations_as_its_cells_need(queue: Pretending):
     assert queue.run([OURS]) == {}
     assert queue.collected == {"unseen": 10, "unseen_validation": TASKS["unseen"].validation}
@@ -292,9 +255,7 @@ def test_a_run_collects_as_many_demonstrations_as_its_cells_need(queue: Pretendi
 def test_what_fails_keeps_nothing_else_up(queue: Pretending):
     queue.broken = {f"{reference(THEIRS.policy).name}_lr{LEARNING_RATES[2]:g}"}
     assert queue.run([THEIRS, OURS, ORACLE]) == {THEIRS.name: "it broke"}
-    assert queue.is_done(ORACLE)
-    assert queue.is_done(OURS)
-    assert not queue.is_done(THEIRS)
+    assert queue.pending([THEIRS, OURS, ORACLE]) == [THEIRS]
     queue.broken = set()
     queue.calls.clear()
     assert queue.run([THEIRS, OURS, ORACLE]) == {}
@@ -323,6 +284,14 @@ def test_demonstrations_that_are_there_are_looked_at_once(queue: Pretending):
     assert again.calls == ["collect unseen"]
 
 
+@pytest.fixture(scope="module")
+def summaries(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Summary]:
+    """Those of two cells that were filled."""
+    folder = tmp_path_factory.mktemp("queue")
+    Pretending(folder / "work", folder, Console(quiet=True)).run([OURS, ORACLE])
+    return read_summaries(folder)
+
+
 @pytest.mark.parametrize(
     ("change", "said"),
     [
@@ -339,35 +308,34 @@ def test_demonstrations_that_are_there_are_looked_at_once(queue: Pretending):
         (lambda s: s["seeds"].pop(), "seeds are not 3000 to 3099"),
     ],
 )
-def test_a_summary_of_something_else_is_refused(queue: Pretending, change, said: str):
-    queue.run([OURS])
-    path = queue.results / f"{OURS.name}.json"
-    summary = json.loads(path.read_text())
-    assert OURS.departure(summary) is None
+def test_a_summary_of_something_else_is_refused(
+    summaries: dict[str, Summary], change, said: str, queue: Pretending
+):
+    summary = copy.deepcopy(summaries[OURS.name])
+    check_cell(OURS, summary, {})
     change(summary)
-    path.write_text(json.dumps(summary))
-    with pytest.raises(UserError, match="delete it") as caught:
-        queue.is_done(OURS)
+    add_run(queue.results, OURS.name, summary)
+    with pytest.raises(UserError, match=r"give it another name, or remove it") as caught:
+        queue.run([OURS])
     assert said in str(caught.value)
+    assert queue.calls == []
 
 
-def test_a_policy_of_its_own_is_checked_too(queue: Pretending):
-    queue.run([ORACLE])
-    path = queue.results / f"{ORACLE.name}.json"
-    path.write_text(path.read_text().replace('"orientations": 180', '"orientations": 72'))
+def test_a_policy_of_its_own_is_checked_too(summaries: dict[str, Summary]):
+    summary = copy.deepcopy(summaries[ORACLE.name])
+    check_cell(ORACLE, summary, {})
+    summary["resolved_scenario"]["policy"]["orientations"] = 72
     with pytest.raises(
         UserError, match=r"its policy is not !QuantizedOracle \{orientations: 180\}"
     ):
-        queue.is_done(ORACLE)
-    path.write_text("[]")
+        check_cell(ORACLE, summary, {})
     with pytest.raises(UserError, match="is no summary of evaluate"):
-        queue.is_done(ORACLE)
+        check_cell(ORACLE, {}, {})
 
 
 def test_shipped_policies_must_have_the_weights_that_come_with_the_package():
     cell = next(cell for cell in paper_cells() if cell.name == "fresh_generalist")
-    path = PAPER_RESULTS / "fresh_generalist.json"
-    summary = json.loads(path.read_text())
+    summary = read_summaries(SCENARIOS.parent / "docs" / "results")[cell.name]
     assert cell.departure(summary) is None
     summary["policy_digest"] = "sha256 of others"
     assert cell.departure(summary) == "its weights are not those that come with the package"
@@ -380,25 +348,19 @@ def test_what_an_earlier_version_trained_is_not_taken_for_what_is_asked(queue: P
     assert failure == f"{path.parent}: its steps is 7, not {OURS.policy.steps}: delete it"
 
 
-def test_commands_take_the_folders_that_they_are_given(tmp_path: Path):
-    """They refuse one that holds anything of something else."""
-    queue = Queue(tmp_path / "out", tmp_path / "results", Console(quiet=True))
-    folder = tmp_path / "out" / "evaluations" / "short"
-    text = "{policy: !Oracle {}, time_limit: 0.1}"
-    arguments = (SCENARIOS / "kitting_oracle.yaml", "--scenario_text", text, "--episodes", 1)
-    queue._command("evaluate", *arguments, "--workers", 1, folder=folder)
-    assert (folder / "summary.json").exists()
-
-
-def test_a_command_that_fails_is_told_by_its_last_line(tmp_path: Path):
-    """The real one: the scenario of this task does not exist."""
-    (tmp_path / "results").mkdir()
-    cell = dataclasses.replace(ORACLE, policy="!Nobody {}")
+def test_a_command_that_fails_is_told_by_its_last_line_and_not_tried_again(tmp_path: Path):
+    """The real one, of a verb that there is not."""
     queue = Queue(tmp_path / "work", tmp_path / "results", Console(quiet=True))
-    failures = run_paper(queue, [cell])
-    assert list(failures) == [cell.name]
-    assert failures[cell.name].startswith("evaluate failed with exit code 2: error: ")
-    assert "!Nobody" in failures[cell.name]
+    folder = tmp_path / "work" / "trainings" / "one"
+    said = r"nothing failed with exit code 1: .*No module named kitting_drake\.nothing"
+    with pytest.raises(Failed, match=said):
+        queue._command("nothing", folder=folder)
+    log = folder.with_name("one.log")
+    assert "No module" in log.read_text()
+    log.unlink()
+    with pytest.raises(Failed, match=said):
+        queue._command("nothing", folder=folder)
+    assert not log.exists()
 
 
 def test_cells_are_chosen_by_patterns_in_their_order(tmp_path: Path, monkeypatch, capsys):
@@ -433,17 +395,21 @@ def test_what_failed_is_told_by_the_exit_code(
 
 
 def test_who_ends_it_ends_what_it_began(tmp_path: Path):
-    command = [sys.executable, "-m", "kitting_drake.benchmark", "paper", "--quiet"]
+    """The real commands, which take the folders that they are given."""
+    command = [sys.executable, "-m", "kitting_drake.benchmark", "paper"]
     command += ["--cells", "unseen_quantized_oracle_180", "--results", str(tmp_path / "results")]
     work = tmp_path / "work"
-    queue = subprocess.Popen([*command, "--output", str(work)], text=True)
+    command += ["--output", str(work)]
+    queue = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
     folder = work / "paper" / "evaluations" / "unseen_quantized_oracle_180"
     deadline = time.monotonic() + 120
-    while not (folder / ".lock").exists():
+    while not (folder / "scenario.json").exists():
         assert time.monotonic() < deadline
         assert queue.poll() is None
         time.sleep(0.2)
     queue.terminate()
-    assert queue.wait(timeout=60) != 0
+    output, _ = queue.communicate(timeout=60)
+    assert queue.returncode == 128 + signal.SIGTERM
+    assert "the same command goes on from there" in " ".join(output.split())
     with alone_in(folder):
         pass

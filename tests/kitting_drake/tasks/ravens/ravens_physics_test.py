@@ -1,15 +1,12 @@
 """The expert at the tasks of Ravens, in physics."""
 
-from pathlib import Path
-
 import pytest
 
-from kitting_drake.episode import run_episode
 from kitting_drake.scenario.schema import Scenario
-from kitting_drake.station import build_cell
 from kitting_drake.tasks import BlockInsertion, StackBlockPyramid
 from kitting_drake.tasks.task import TaskConfig
 from systems.pick_place_parameters import PickPlaceParameters
+from tests.kitting_drake.rig import build_rig
 
 pytestmark = pytest.mark.slow
 
@@ -17,8 +14,7 @@ pytestmark = pytest.mark.slow
 @pytest.mark.parametrize(("task", "share"), [(BlockInsertion(), 1.0), (StackBlockPyramid(), 1 / 6)])
 def test_the_first_pick_and_place(task: TaskConfig, share: float):
     scenario = Scenario(task=task, cameras={}, planner=PickPlaceParameters(max_actions=1))
-    cell = build_cell(scenario, seed=0, base=Path())
-    result = run_episode(cell, task=task, scenario="test", policy="oracle", seed=0, time_limit=30.0)
+    result = build_rig(scenario).run(seconds=30.0)
     assert result.failure is None
     assert not result.timed_out
     assert [record.outcome for record in result.actions_taken] == ["placed"]

@@ -12,7 +12,6 @@ from pydrake.systems.analysis import Simulator
 
 from kitting_drake.common.errors import UserError
 from kitting_drake.scenario.schema import Scenario
-from kitting_drake.station import Cell, build_cell
 from kitting_drake.tasks import (
     AlignBoxCorner,
     BlockInsertion,
@@ -25,6 +24,7 @@ from systems.grasp import Grasp
 from systems.oracle_policy import gripper_pose
 from systems.pick_place_parameters import PickPlaceParameters
 from systems.signals import PixelGrid
+from tests.kitting_drake.rig import Rig, build_rig
 
 TASKS = [AlignBoxCorner, BlockInsertion, PlaceRedInGreen, StackBlockPyramid, PalletizingBoxes]
 SEEDS = range(2)
@@ -37,8 +37,8 @@ def make_scene(task: TaskConfig, seed: int) -> Scene:
 
 
 @functools.cache
-def shared_cell(kind: type[TaskConfig], seed: int) -> Cell:
-    return build_cell(Scenario(task=kind(), cameras={}), seed=seed, base=Path())
+def shared_cell(kind: type[TaskConfig], seed: int) -> Rig:
+    return build_rig(Scenario(task=kind(), cameras={}), seed=seed, base=Path())
 
 
 class Posed:
@@ -49,10 +49,14 @@ class Posed:
     """
 
     def __init__(self, kind: type[TaskConfig], seed: int) -> None:
-        cell = shared_cell(kind, seed)
-        self.scene, self._plant, self._bodies = cell.scene, cell.plant, cell.objects
-        self._root = cell.diagram.CreateDefaultContext()
-        self._context = cell.plant.GetMyMutableContextFromRoot(self._root)
+        rig = shared_cell(kind, seed)
+        self.scene, self._plant, self._bodies = (
+            rig.scene,
+            rig.plant,
+            rig.objects,
+        )
+        self._root = rig.diagram.CreateDefaultContext()
+        self._context = rig.plant.GetMyMutableContextFromRoot(self._root)
         self.poses = [item.X_WB for item in self.scene.objects]
         for index, X_WB in enumerate(self.poses):
             self.put(index, X_WB)
@@ -162,12 +166,12 @@ def test_goals_are_free_of_each_other_and_of_the_hand(kind: type[TaskConfig], se
 @each_task
 def test_objects_come_to_rest_at_once(kind: type[TaskConfig]):
     """Light and stiff boxes must not chatter on the table: what rests costs nothing."""
-    cell = shared_cell(kind, 1)
-    simulator = Simulator(cell.diagram)
+    rig = shared_cell(kind, 1)
+    simulator = Simulator(rig.diagram)
     simulator.AdvanceTo(0.4)
-    assert cell.at_rest(simulator.get_context()).all()
+    assert rig.station.at_rest(simulator.get_context()).all()
     for X_WB, item in zip(
-        cell.object_poses(simulator.get_context()), cell.scene.objects, strict=True
+        rig.station.object_poses(simulator.get_context()), rig.scene.objects, strict=True
     ):
         assert X_WB.IsNearlyEqualTo(item.X_WB, 3e-4)
 

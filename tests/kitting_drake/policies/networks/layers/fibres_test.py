@@ -1,10 +1,9 @@
 import numpy as np
 import pytest
-from escnn import gspaces
-from escnn import nn as enn
 from numpy.typing import NDArray
 
 from kitting_drake.policies.networks.layers.fibres import Fibre, Irreps, Regular, Scalar
+from kitting_drake.policies.networks.layers.planar_escnn import enn, gspaces
 
 BAND_3 = Irreps((0, 1, 2, 3), samples=8)
 FIBRES = [

@@ -2,12 +2,11 @@ import numpy as np
 import pytest
 import torch
 import torch.nn.functional as F
-from escnn import gspaces
-from escnn import nn as enn
 from scipy.linalg import block_diag
 from torch import Tensor
 
 from kitting_drake.policies.networks.layers.fibres import Fibre, Irreps, Regular, Scalar
+from kitting_drake.policies.networks.layers.planar_escnn import enn, gspaces
 from kitting_drake.policies.networks.layers.steerable import (
     BandLimit,
     BlurPool,

@@ -1,0 +1,183 @@
+"""The speed of the paper's networks as this package runs them, relative to plain escnn."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from kitting_drake.policies.data.samples import ObservedScene, labelled_images
+from kitting_drake.policies.learned_policy import LearnedPolicy
+from kitting_drake.policies.networks.architecture import NetworkConfig
+from kitting_drake.policies.networks.escnn_reference import EscnnAngleNet, EscnnUNet, as_escnn
+from kitting_drake.policies.networks.factored import Networks, SO2Networks
+from kitting_drake.policies.networks.methods import make_networks
+from kitting_drake.policies.training.training_step import Trainer
+from kitting_drake.reproduction.network_speed.convolutions import Convolutions
+from kitting_drake.reproduction.network_speed.plan import SpeedSetup, times_of, type_name
+from kitting_drake.reproduction.network_speed.timing import Timing, count_operations
+
+MEASURES = ("training_step", "alpha_training_step", "decision", "alpha_inference")
+"""The operations that are timed for each way to run the same networks."""
+
+
+def measure_folding(setup: SpeedSetup) -> dict[str, Any]:
+    """Times the paper's networks built of escnn's modules, and as this package runs them.
+
+    Their weights are the same, and so is what they compute, up to rounding.
+
+    Returns:
+        By way of running them, `rungs`: the time of each of `MEASURES`; `speed_up`: how many times
+        faster than plain escnn in float32 each of them is; `convolution_share`: for ours, the share
+        of the time of a training step and of a decision that its convolutions alone take, by plain
+        torch on tensors of the same shapes and type; `alpha_difference`: the difference of alpha's
+        output from plain escnn's, relative to its standard deviation; and `alpha_operations` of one
+        inference.
+    """
+    ways = _ways(setup)
+    exported = {name: pair[1] for name, pair in ways.items()}
+    timings = _time_ways(setup, ways)
+    baseline = next(iter(ways))
+    with torch.inference_mode():
+        outputs = {
+            name: networks.predict_pick(setup.image, networks.config.orientations).position
+            for name, networks in exported.items()
+        }
+    exact = outputs[baseline]
+    return {
+        "rungs": {
+            name: {measure: times_of(timings[measure][name]) for measure in MEASURES}
+            for name in ways
+        },
+        "speed_up": {
+            name: {
+                measure: timings[measure][baseline].seconds / timings[measure][name].seconds
+                for measure in MEASURES
+            }
+            for name in ways
+        },
+        "convolution_share": {
+            name: {
+                "training_step": _convolution_share(_training(pair[0], setup.scene), setup, True),
+                "decision": _convolution_share(_deciding(pair[1], setup), setup, False),
+            }
+            for name, pair in ways.items()
+            if name.startswith("ours")
+        },
+        "alpha_difference": {
+            name: float((output - exact).std() / exact.std()) for name, output in outputs.items()
+        },
+        "alpha_operations": {
+            # Those of autocast cannot be counted, but they are the same.
+            name: count_operations(inferring(*_alpha(exported[f"{name}_float32"], setup)))
+            for name in ("escnn", "ours")
+        },
+    }
+
+
+def _ways(setup: SpeedSetup) -> dict[str, tuple[Networks, Networks]]:
+    """The same networks in each way to run them: one for training, and one for inference."""
+    ours = make_networks(NetworkConfig("so2", setup.plan.preset))
+    assert isinstance(ours, SO2Networks)
+    types = [type_ for type_ in (torch.float32, torch.bfloat16) if type_ in setup.peak]
+    ways: dict[str, tuple[Networks, Networks]] = {}
+    escnn = as_escnn(ours)
+    for type_ in types:
+        trained = _with_autocast(escnn, type_)
+        # In evaluation mode escnn keeps the kernels that it has expanded.
+        exported = copy.deepcopy(trained).eval().requires_grad_(False)
+        ways[f"escnn_{type_name(type_)}"] = (trained, exported)
+    for type_ in types:
+        ways[f"ours_{type_name(type_)}"] = (computing_in(ours, type_), setup.export(ours, type_))
+    for pair in ways.values():
+        for networks in pair:
+            networks.to(setup.device)
+    return ways
+
+
+def _with_autocast(escnn: Networks, type_: torch.dtype) -> Networks:
+    """A copy that computes in a type by torch's automatic mixed precision."""
+    escnn = copy.deepcopy(escnn)
+    for network in escnn.children():
+        if isinstance(network, EscnnUNet | EscnnAngleNet):
+            network.autocast = None if type_ == torch.float32 else type_
+    return escnn
+
+
+def _time_ways(
+    setup: SpeedSetup, ways: dict[str, tuple[Networks, Networks]]
+) -> dict[str, dict[str, Timing]]:
+    """Each of `MEASURES` for each way to run the networks."""
+    trained = {name: pair[0] for name, pair in ways.items()}
+    exported = {name: pair[1] for name, pair in ways.items()}
+    return {
+        "training_step": setup.time_each(
+            {name: _training(networks, setup.scene) for name, networks in trained.items()},
+            training=True,
+        ),
+        "alpha_training_step": setup.time_each(
+            {name: stepping(*_alpha(networks, setup)) for name, networks in trained.items()},
+            training=True,
+        ),
+        "decision": setup.time_each(
+            {name: _deciding(networks, setup) for name, networks in exported.items()}
+        ),
+        "alpha_inference": setup.time_each(
+            {name: inferring(*_alpha(networks, setup)) for name, networks in exported.items()}
+        ),
+    }
+
+
+def _convolution_share(function: Callable[[], object], setup: SpeedSetup, training: bool) -> float:
+    """The share of a function's time that its convolutions take when they are computed alone."""
+    convolutions = Convolutions.of(function)
+    # In alternation with the function, so that other load on the machine affects both alike.
+    functions: dict[Any, Callable[[], object]] = {"all": function}
+    functions |= convolutions.alone(setup.device)
+    timings = setup.time_each(functions, training=training)
+    return convolutions.seconds(timings) / timings["all"].seconds
+
+
+def _alpha(networks: Networks, setup: SpeedSetup) -> tuple[nn.Module, Tensor]:
+    """The network alpha, and its input."""
+    return networks.get_submodule("alpha"), setup.inputs(networks)["alpha"]
+
+
+def computing_in(networks: Networks, type_: torch.dtype) -> Networks:
+    """A copy that computes in another type, to be trained."""
+    networks = copy.deepcopy(networks)
+    networks.compute_type = type_
+    return networks
+
+
+def _training(networks: Networks, scene: ObservedScene) -> Callable[[], object]:
+    """Training steps of all four networks, augmentation and losses included: the same ones,
+    whatever the networks."""
+    trainer = Trainer(networks, seed=0, curvature=True)
+    samples = labelled_images([scene], taken_only=False)
+    return lambda: trainer.step(samples)
+
+
+def stepping(network: nn.Module, features: Tensor) -> Callable[[], object]:
+    """A training step of one network: forwards, backwards, Adam."""
+    optimiser = torch.optim.Adam(network.parameters(), lr=1e-6)
+
+    def step() -> None:
+        optimiser.zero_grad(set_to_none=True)
+        network(features).square().mean().backward()
+        optimiser.step()
+
+    return step
+
+
+def inferring(network: nn.Module, features: Tensor) -> Callable[[], object]:
+    """An inference of one network."""
+    return lambda: network(features)
+
+
+def _deciding(networks: Networks, setup: SpeedSetup) -> Callable[[], object]:
+    policy = LearnedPolicy(networks, orientations=networks.config.orientations)
+    return lambda: policy.decide(setup.observe())

@@ -1,0 +1,27 @@
+"""The prose of the page of results, which stands in `results_prose.md`."""
+
+import re
+from functools import cache
+from pathlib import Path
+
+_PART = re.compile(r"<!-- part: (\w+) -->\n")
+
+
+def prose(part: str, **values: object) -> str:
+    """A part of the prose, with a line end.
+
+    Args:
+        part: its name.
+        values: what stands in the place of `{name}`.
+
+    Raises:
+        KeyError: there is no such part, or a value is missing.
+    """
+    return _parts()[part].format(**values) + "\n"
+
+
+@cache
+def _parts() -> dict[str, str]:
+    text = Path(__file__).with_name("results_prose.md").read_text()
+    _, *found = _PART.split(text)
+    return {name: part.strip() for name, part in zip(found[::2], found[1::2], strict=True)}

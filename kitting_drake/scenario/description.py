@@ -1,0 +1,30 @@
+"""Scenarios as plain values: for JSON, and to compare them."""
+
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from kitting_drake.scenario.drake_configs import struct_fields
+from kitting_drake.scenario.schema import Scenario
+
+
+def describe(value: Any) -> Any:
+    """A scenario, or a part of it, as JSON holds it: defaults included; variants have a `_tag`."""
+    if dataclasses.is_dataclass(value):
+        fields = {
+            item.name: describe(getattr(value, item.name)) for item in dataclasses.fields(value)
+        }
+        return fields if isinstance(value, Scenario) else {"_tag": _tag(value), **fields}
+    if (names := struct_fields(type(value))) is not None:
+        return {"_tag": _tag(value), **{name: describe(getattr(value, name)) for name in names}}
+    if isinstance(value, dict):
+        return {key: describe(item) for key, item in value.items()}
+    if isinstance(value, list | tuple | np.ndarray):
+        return [describe(item) for item in value]
+    return str(value) if isinstance(value, Path) else value
+
+
+def _tag(value: Any) -> str:
+    return f"!{type(value).__name__}"

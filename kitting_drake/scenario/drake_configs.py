@@ -1,0 +1,30 @@
+"""Drake's own configs as fields of a scenario."""
+
+import copyreg
+from typing import Any
+
+from pydrake.common.yaml import yaml_dump_typed, yaml_load_typed
+from pydrake.geometry import MeshcatParams
+from pydrake.multibody.plant import MultibodyPlantConfig
+from pydrake.systems.sensors import CameraConfig
+
+DRAKE_CONFIGS = (CameraConfig, MeshcatParams, MultibodyPlantConfig)
+
+
+def struct_fields(schema: Any) -> dict[str, Any] | None:
+    """The fields of a struct of Drake's, by name, with their types; None for any other type."""
+    fields = getattr(schema, "__fields__", None)
+    return None if fields is None else {item.name: item.type for item in fields}
+
+
+def _load(schema: type, text: str) -> Any:
+    return yaml_load_typed(schema=schema, data=text)
+
+
+def _reduce(config: Any) -> tuple[Any, ...]:
+    return _load, (type(config), yaml_dump_typed(config))
+
+
+# They do not pickle by themselves, and scenarios go to worker processes.
+for _config in DRAKE_CONFIGS:
+    copyreg.pickle(_config, _reduce)

@@ -1,0 +1,87 @@
+"""The planner and the controller of the hand, and the loop through the plant."""
+
+import numpy as np
+from pydrake.multibody.plant import MultibodyPlant
+from pydrake.systems.framework import DiagramBuilder
+
+from kitting_drake.scenario.schema import Scenario
+from kitting_drake.tasks.task import Scene
+from systems.heightmap_projector import HeightmapProjector
+from systems.pick_place_planner import PickPlacePlanner
+from systems.trajectory_controller import TrajectoryController
+
+_EXPORTED = {
+    "failed_picks": "failed_picks",
+    "accepted_action": "accepted_action",
+    "asks": "asks",
+    "mode": "mode",
+    "counts": "counts",
+    "desired_motion": "commanded",
+    "desired_opening": "commanded_opening",
+}
+"""The planner's output ports, and what the station calls them."""
+
+
+def add_control(
+    builder: DiagramBuilder,
+    scenario: Scenario,
+    scene: Scene,
+    plant: MultibodyPlant,
+    projector: HeightmapProjector | None,
+) -> PickPlacePlanner:
+    """Adds both, closes the loop, and exports the planner's ports, `robot_state`, `wrist_force`.
+
+    Args:
+        builder: of the station.
+        scenario: whose planner and controller they are.
+        scene: says how many actions there are, and whether objects are inserted.
+        plant: finalized; it has the hand.
+        projector: what the planner reads heights off; None: each action must bring its own.
+    """
+    hand = plant.GetModelInstanceByName("franka_hand")
+    planner = builder.AddNamedSystem(
+        "planner",
+        PickPlacePlanner(
+            parameters=scenario.planner,
+            max_actions=scene.max_actions,
+            insertion=any(goal.rim_height is not None for goal in scene.goals),
+        ),
+    )
+    controller = builder.AddNamedSystem("controller", _make_controller(scenario, plant))
+    state = plant.get_state_output_port(hand)
+    force = plant.get_generalized_contact_forces_output_port(hand)
+    builder.ExportInput(planner.GetInputPort("action"), "action")
+    if projector is not None:
+        builder.Connect(projector.GetOutputPort("heights"), planner.GetInputPort("observation"))
+    builder.Connect(state, planner.GetInputPort("hand_state"))
+    builder.Connect(force, planner.GetInputPort("hand_contact_force"))
+    builder.Connect(state, controller.GetInputPort("hand_state"))
+    for port in ("desired_motion", "desired_opening", "closing_force"):
+        builder.Connect(planner.GetOutputPort(port), controller.GetInputPort(port))
+    builder.Connect(controller.get_output_port(), plant.get_actuation_input_port(hand))
+    for port, name in _EXPORTED.items():
+        builder.ExportOutput(planner.GetOutputPort(port), name)
+    builder.ExportOutput(state, "robot_state")
+    builder.ExportOutput(force, "wrist_force")
+    return planner
+
+
+def _make_controller(scenario: Scenario, plant: MultibodyPlant) -> TrajectoryController:
+    config = scenario.controller
+    context = plant.CreateDefaultContext()
+    hand = plant.GetModelInstanceByName("franka_hand")
+    joints = [plant.GetJointByName(name) for name in ("x", "y", "z", "yaw")]
+    indices = [joint.velocity_start() for joint in joints]
+    inertia = plant.CalcMassMatrix(context).diagonal()[indices]
+    gravity = plant.CalcGravityGeneralizedForces(context)
+    assert plant.num_actuated_dofs(hand) == 6
+    return TrajectoryController(
+        inertia=inertia,
+        weight=-float(gravity[indices[2]]),
+        stiffness=np.array(config.stiffness),
+        damping=np.array(config.damping),
+        force_limit=np.array(config.force_limit),
+        finger_stiffness=config.finger_stiffness,
+        finger_damping=config.finger_damping,
+        finger_force_limit=config.finger_force_limit,
+    )

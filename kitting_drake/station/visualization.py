@@ -1,0 +1,112 @@
+"""Visualization: Meshcat, films, and drawings of a Diagram."""
+
+import shutil
+import subprocess
+from pathlib import Path
+
+from pydrake.geometry import (
+    ColorRenderCamera,
+    DepthRange,
+    DepthRenderCamera,
+    Meshcat,
+    MeshcatParams,
+    MeshcatVisualizer,
+    MeshcatVisualizerParams,
+    Role,
+)
+from pydrake.systems.framework import Diagram, DiagramBuilder
+from pydrake.systems.sensors import RgbdSensor
+from pydrake.visualization import VideoWriter
+
+from kitting_drake.common.errors import UserError
+from kitting_drake.common.files import write_atomically
+from kitting_drake.common.rendering import X_WOVERVIEW, add_film_renderer, picture_camera
+from kitting_drake.station.station import KittingStation
+
+MESHCAT_PERIOD = 1 / 32
+
+
+def start_meshcat(parameters: MeshcatParams) -> Meshcat:
+    """Starts Meshcat, looking at the table.
+
+    Args:
+        parameters: of a scenario.
+
+    Raises:
+        UserError: there is no free port.
+    """
+    try:
+        meshcat = Meshcat(parameters)
+    except RuntimeError as error:
+        raise UserError(
+            "Meshcat finds no free port from 7000 to 7099: close viewers, or give --no-meshcat"
+        ) from error
+    meshcat.SetProperty("/Background", "top_color", [0.93, 0.95, 0.97])
+    meshcat.SetProperty("/Background", "bottom_color", [0.80, 0.83, 0.86])
+    meshcat.SetProperty("/Grid", "visible", False)
+    meshcat.SetProperty("/Axes", "visible", False)
+    meshcat.SetCameraPose(camera_in_world=[1.02, -0.48, 0.62], target_in_world=[0.45, -0.02, 0.08])
+    return meshcat
+
+
+def add_meshcat(builder: DiagramBuilder, station: KittingStation, meshcat: Meshcat) -> None:
+    """Shows the station in Meshcat, 32 times a second of simulated time."""
+    parameters = MeshcatVisualizerParams(role=Role.kIllustration)
+    parameters.publish_period = MESHCAT_PERIOD
+    MeshcatVisualizer.AddToBuilder(
+        builder, station.GetOutputPort("query_object"), meshcat, parameters
+    )
+
+
+def add_video(builder: DiagramBuilder, station: KittingStation, path: Path) -> VideoWriter:
+    """Adds a camera that sees the whole station, and the writer of its film.
+
+    Args:
+        builder: holds the station; no context of it was made yet.
+        station: what to film.
+        path: a .gif or .webp file, written by the writer's `Save()`.
+
+    Raises:
+        MachineError: images cannot be rendered here.
+    """
+    core = picture_camera(add_film_renderer(station.scene_graph), width=640, height=400)
+    sensor = builder.AddNamedSystem(
+        "film_camera",
+        RgbdSensor(
+            parent_id=station.scene_graph.world_frame_id(),
+            X_PB=X_WOVERVIEW,
+            color_camera=ColorRenderCamera(core),
+            depth_camera=DepthRenderCamera(core, DepthRange(0.05, 10.0)),
+        ),
+    )
+    builder.Connect(station.GetOutputPort("query_object"), sensor.query_object_input_port())
+    writer = builder.AddNamedSystem("video_writer", VideoWriter(filename=str(path), fps=16.0))
+    writer.ConnectRgbdSensor(builder=builder, sensor=sensor)
+    return writer
+
+
+def draw_diagram(diagram: Diagram, path: Path) -> None:
+    """Draws a Diagram with Graphviz.
+
+    Raises:
+        UserError: an ending other than .svg, .png, .pdf and .dot, or Graphviz is not there or
+            cannot write it.
+    """
+    source = diagram.GetGraphvizString(max_depth=2)
+    if path.suffix == ".dot":
+        write_atomically(path, source)
+        return
+    if path.suffix not in (".svg", ".png", ".pdf"):
+        raise UserError(f"--graphviz writes .svg, .png, .pdf and .dot files, not '{path}'")
+    if shutil.which("dot") is None:
+        raise UserError(
+            "--graphviz needs the program dot: install it (Debian and Ubuntu: apt-get install "
+            "graphviz), or write the source to a .dot file"
+        )
+    drawn = subprocess.run(
+        ["dot", f"-T{path.suffix[1:]}"], input=source.encode(), capture_output=True
+    )
+    if drawn.returncode:
+        reason = drawn.stderr.decode(errors="replace").strip().splitlines()[-1:]
+        raise UserError(f"--graphviz: dot cannot write {path}: {' '.join(reason)}")
+    write_atomically(path, drawn.stdout)

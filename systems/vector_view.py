@@ -1,0 +1,72 @@
+"""Named, typed fields of a state vector: `pydrake`'s `namedview` for type checkers."""
+
+from __future__ import annotations
+
+from typing import overload
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+
+class Scalar:
+    """A field of one element."""
+
+    size = 1
+
+    def __init__(self) -> None:
+        self.index = 0
+
+    @overload
+    def __get__(self, view: None, owner: type) -> Scalar: ...
+    @overload
+    def __get__(self, view: VectorView, owner: type) -> float: ...
+    def __get__(self, view: VectorView | None, owner: type) -> Scalar | float:
+        return self if view is None else float(view.vector[self.index])
+
+    def __set__(self, view: VectorView, value: float) -> None:
+        view.vector[self.index] = value
+
+
+class Array:
+    """A field of several elements, read as a view that may be written."""
+
+    def __init__(self, size: int) -> None:
+        self.index, self.size = 0, size
+
+    @overload
+    def __get__(self, view: None, owner: type) -> Array: ...
+    @overload
+    def __get__(self, view: VectorView, owner: type) -> NDArray[np.float64]: ...
+    def __get__(self, view: VectorView | None, owner: type) -> Array | NDArray[np.float64]:
+        return self if view is None else view.vector[self.index : self.index + self.size]
+
+    def __set__(self, view: VectorView, value: ArrayLike) -> None:
+        view.vector[self.index : self.index + self.size] = value
+
+
+class VectorView:
+    """A view on a vector of numbers; a subclass lists its fields, in the order of the elements.
+
+    class HandState(VectorView):
+        position = Array(4)
+        opening = Scalar()
+
+    HandState(context.get_discrete_state(0).get_mutable_value()).opening = 0.08
+    """
+
+    size = 0
+    """How many elements the vector has."""
+
+    def __init_subclass__(cls) -> None:
+        cls.size = 0
+        for field in vars(cls).values():
+            if isinstance(field, Scalar | Array):
+                field.index = cls.size
+                cls.size += field.size
+
+    def __init__(self, vector: NDArray[np.float64]) -> None:
+        """
+        Args:
+            vector: (size,) the elements; writing a field writes them.
+        """
+        self.vector = vector

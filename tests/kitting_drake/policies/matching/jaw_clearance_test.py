@@ -1,0 +1,60 @@
+"""Grasps that the heights of o_t leave room for, by what the planner does."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from kitting_drake.policies.matching.jaw_clearance import jaw_grasps, tip_height
+from kitting_drake.policies.matching.segmentation import segment
+from systems.motion_heights import motion_heights
+from systems.pick_place_parameters import PickPlaceParameters
+from systems.signals import Observation, PixelGrid, SurfaceHeights
+
+GRID = PixelGrid()
+HIGH, LOW = 0.040, 0.024
+
+
+def beside(distance: float) -> Observation:
+    """A bar, 20 mm wide, and a lower one on either side of it that is so far from its middle."""
+    image = np.zeros((4, *GRID.shape), np.float32)
+    row, half, away = 80, round(0.010 / GRID.resolution), round(distance / GRID.resolution)
+    image[3, row - half : row + half, 100:140] = HIGH
+    for side in (-1, 1):
+        low = sorted((row + side * away, row + side * (away + 6)))
+        image[3, low[0] : low[1], 100:140] = LOW
+    return Observation(image, GRID, np.ones(GRID.shape, bool))
+
+
+def grasps_across(planner: PickPlaceParameters) -> int:
+    """The grasps of the high bar near its middle, fingers between the bars."""
+    seen = beside(0.035)
+    segmentation = segment(seen)
+    bar = max(segmentation.objects, key=lambda region: region.height)
+    found = jaw_grasps(segmentation, bar, GRID.resolution, planner)
+    return sum(110 < grasp.pixel[1] < 130 for grasp in found)
+
+
+def test_the_jaws_have_room_above_what_is_lower_than_they_go():
+    assert grasps_across(PickPlaceParameters(grasp_depth=0.012, max_grasp_depth=0.012)) > 0
+    assert grasps_across(PickPlaceParameters(grasp_depth=0.030, max_grasp_depth=0.030)) == 0
+
+
+def test_jaws_that_open_less_stay_clear_of_what_is_beside():
+    deep = PickPlaceParameters(grasp_depth=0.030, max_grasp_depth=0.030)
+    assert grasps_across(dataclasses.replace(deep, open_width=0.032)) > 0
+
+
+@pytest.mark.parametrize(
+    "planner",
+    [
+        PickPlaceParameters(),
+        PickPlaceParameters(grasp_depth=0.03, max_grasp_depth=0.01),
+        PickPlaceParameters(grasp_depth_share=0.9, max_grasp_depth=0.05, floor_clearance=0.01),
+    ],
+)
+@pytest.mark.parametrize("top", [0.012, 0.024, 0.045])
+def test_the_fingertips_go_where_the_planner_brings_them(planner: PickPlaceParameters, top: float):
+    expected = motion_heights(SurfaceHeights(pick_top=top), planner).grasp
+    # But for a margin above what the object stands on.
+    assert tip_height(np.array(top), 0.0, planner) == pytest.approx(max(expected, 0.003))
