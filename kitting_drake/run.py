@@ -40,7 +40,10 @@ def main() -> int:
         help="also draw the Diagram: .svg, .png or .pdf, or .dot for its source",
     )
     parser.add_argument(
-        "--picture", type=Path, metavar="FILE.png", help="also render the station as the episode ends"
+        "--picture",
+        type=Path,
+        metavar="FILE.png",
+        help="also render the station as the episode ends",
     )
     parser.add_argument(
         "--video", type=Path, metavar="FILE.gif", help="also film the episode (.gif or .webp)"

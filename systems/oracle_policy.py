@@ -31,10 +31,6 @@ _NEAR_GOAL = 0.03
 """An object displaced by less is at its goal, though it may not fill it, in metres."""
 _SAME_HEIGHT = 0.005
 """Objects whose heights differ by less are picked in the order given, in metres."""
-_TIP_DEPTH = 0.010
-"""How far below an object's top the fingertips are taken to reach, in metres."""
-_RELEASE = 0.006
-"""How far each jaw draws back to let go, in metres."""
 
 
 def gripper_pose(X_WB: RigidTransform, grasp: PlanarPose | Grasp) -> PlanarPose:
@@ -108,6 +104,8 @@ class OraclePolicy(LeafSystem):
         goals: Sequence[Goal],
         success: SuccessPredicate,
         quantizer: ActionQuantizer | None = None,
+        tip_depth: float = 0.010,
+        release_clearance: float = 0.006,
         brings_heights: bool = True,
     ) -> None:
         """
@@ -117,6 +115,8 @@ class OraclePolicy(LeafSystem):
             goals: what is to be brought about, in the order in which to do it.
             success: when a goal is filled.
             quantizer: of the actions; exact when None.
+            tip_depth: how far below an object's top the fingertips reach, in m.
+            release_clearance: how far each jaw draws back to let go, in m.
             brings_heights: whether actions have their heights; else the planner reads them off o_t.
 
         Raises:
@@ -131,6 +131,7 @@ class OraclePolicy(LeafSystem):
         self._objects, self._goals, self._success = tuple(objects), tuple(goals), success
         self._grasps = tuple(tuple(choices) for choices in grasps)
         self._quantizer, self._brings_heights = quantizer, brings_heights
+        self._tip_depth, self._release_clearance = tip_depth, release_clearance
         self._body_poses = self.DeclareAbstractInputPort("body_poses", Value([RigidTransform()]))
         self._kept_goals = self.DeclareVectorInputPort("kept_goals", len(goals))
         self.DeclareAbstractOutputPort(
@@ -227,18 +228,19 @@ class OraclePolicy(LeafSystem):
 
         def obstruction(grasp: Grasp) -> int:
             place = self._arrival(poses[item], X_WGoal, goal)
+            tip, half = grasp.surface_height - self._tip_depth, grasp.width / 2
             return sum(
-                _count_within_fingers(others, gripper_pose(X_WB, grasp), tip, reach)
-                for X_WB, tip, reach in (
+                _count_within_fingers(others, gripper_pose(X_WB, grasp), height, reach)
+                for X_WB, height, reach in (
                     (
                         poses[item],
-                        poses[item].translation()[2] + grasp.surface_height - _TIP_DEPTH,
-                        (grasp.width / 2, MAX_OPENING / 2 + FINGERTIP_DEPTH),
+                        poses[item].translation()[2] + tip,
+                        (half, MAX_OPENING / 2 + FINGERTIP_DEPTH),
                     ),
                     (
                         place,
-                        X_WGoal.translation()[2] + grasp.surface_height - _TIP_DEPTH,
-                        (grasp.width / 2, grasp.width / 2 + _RELEASE + FINGERTIP_DEPTH),
+                        X_WGoal.translation()[2] + tip,
+                        (half, half + self._release_clearance + FINGERTIP_DEPTH),
                     ),
                 )
             )

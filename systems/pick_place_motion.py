@@ -14,7 +14,7 @@ from systems.hand_motion import (
     time_to_reach,
 )
 from systems.pick_place_parameters import Mode, PickPlaceParameters
-from systems.vector_view import Array, Scalar, VectorView
+from systems.vector_view import Array, Number, VectorView
 
 X, Y, Z, YAW = range(4)
 """The axes of the hand in `PlannerState.start` and its like."""
@@ -24,9 +24,9 @@ class PlannerState(VectorView):
     """The planner's state vector, in SI units: the present mode and its motion, what was read off
     o_t, and what the hand felt."""
 
-    mode = Scalar()
-    start_time = Scalar()
-    duration = Scalar()
+    mode = Number()
+    start_time = Number()
+    duration = Number()
     start = Array(4)
     """x, y, z and yaw where the present motion begins ..."""
     goal = Array(4)
@@ -35,33 +35,33 @@ class PlannerState(VectorView):
     """The velocities with which it begins."""
     delays = Array(3)
     """When each of the motion's `PARTS` begins, after `start_time`."""
-    start_opening = Scalar()
-    goal_opening = Scalar()
-    start_force = Scalar()
-    goal_force = Scalar()
-    force_start_time = Scalar()
+    start_opening = Number()
+    goal_opening = Number()
+    start_force = Number()
+    goal_force = Number()
+    force_start_time = Number()
     pick = Array(3)
     """x, y and yaw of the hand at the pick, and at the place."""
     place = Array(3)
-    grasp_z = Scalar()
-    travel_z = Scalar()
-    clear_z = Scalar()
-    pick_top_z = Scalar()
-    pick_hover_z = Scalar()
-    place_hover_z = Scalar()
-    table_z = Scalar()
-    support_z = Scalar()
-    rim_z = Scalar()
-    hold_z = Scalar()
+    grasp_z = Number()
+    travel_z = Number()
+    clear_z = Number()
+    pick_top_z = Number()
+    pick_hover_z = Number()
+    place_hover_z = Number()
+    table_z = Number()
+    support_z = Number()
+    rim_z = Number()
+    hold_z = Number()
     """Of the hand as it gripped, and as it touched the rim of a cavity."""
-    touch_z = Scalar()
-    search_step = Scalar()
-    payload = Scalar()
+    touch_z = Number()
+    search_step = Number()
+    payload = Number()
     """The vertical force of what is carried, in N."""
-    actions = Scalar()
-    missed = Scalar()
-    dropped = Scalar()
-    press = Scalar()
+    actions = Number()
+    missed = Number()
+    dropped = Number()
+    press = Number()
     """1 if the action presses, else 0."""
 
 

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 
-class Scalar:
+class Number:
     """A field of one element."""
 
     size = 1
@@ -17,10 +17,10 @@ class Scalar:
         self.index = 0
 
     @overload
-    def __get__(self, view: None, owner: type) -> Scalar: ...
+    def __get__(self, view: None, owner: type) -> Number: ...
     @overload
     def __get__(self, view: VectorView, owner: type) -> float: ...
-    def __get__(self, view: VectorView | None, owner: type) -> Scalar | float:
+    def __get__(self, view: VectorView | None, owner: type) -> Number | float:
         return self if view is None else float(view.vector[self.index])
 
     def __set__(self, view: VectorView, value: float) -> None:
@@ -49,7 +49,7 @@ class VectorView:
 
     class HandState(VectorView):
         position = Array(4)
-        opening = Scalar()
+        opening = Number()
 
     HandState(context.get_discrete_state(0).get_mutable_value()).opening = 0.08
     """
@@ -60,7 +60,7 @@ class VectorView:
     def __init_subclass__(cls) -> None:
         cls.size = 0
         for field in vars(cls).values():
-            if isinstance(field, Scalar | Array):
+            if isinstance(field, Number | Array):
                 field.index = cls.size
                 cls.size += field.size
 

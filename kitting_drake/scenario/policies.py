@@ -45,7 +45,7 @@ _TOLD = (
 
 @dataclass(frozen=True)
 class PolicySite:
-    """The cell as far as it is built when the policy is made."""
+    """What a policy is told of the station that it plugs into."""
 
     scene: Scene
     objects: tuple[PlacedObject, ...]
@@ -336,6 +336,8 @@ def _make_oracle(site: PolicySite, quantizer: ActionQuantizer | None) -> OracleP
         goals=site.scene.goals,
         success=site.scene.success,
         quantizer=quantizer,
+        tip_depth=site.planner.grasp_depth,
+        release_clearance=site.planner.release_clearance,
         brings_heights=not site.has_cameras,
     )
 

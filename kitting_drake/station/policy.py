@@ -27,6 +27,7 @@ def make_policy(station: KittingStation, observer: DecisionObserver | None = Non
             base=station.base,
             observer=observer,
             may_stop=not scenario.end_at_success,
+            planner=scenario.planner,
             has_cameras=station.has_cameras,
         )
     )

@@ -30,14 +30,14 @@ from kitting_drake.policies.networks.layers.steerable import (
     MixedPrecision,
     SteerableConv2d,
 )
-from kitting_drake.policies.networks.unet import STRIDE, UNet
-from kitting_drake.policies.training.losses import (
+from kitting_drake.policies.networks.losses import (
     angle_loss,
     log_odds,
     place_loss,
     position_loss,
     presence_loss,
 )
+from kitting_drake.policies.networks.unet import STRIDE, UNet
 
 _JITTER = 2
 """Crops of a training step are centred up to this many pixels beside the label, as are those of a

@@ -36,13 +36,13 @@ from kitting_drake.policies.networks.layers.correlation import (
     window_around,
 )
 from kitting_drake.policies.networks.layers.steerable import Convolution, SteerableConv2d
-from kitting_drake.policies.networks.resnet import ResNet
-from kitting_drake.policies.training.losses import (
+from kitting_drake.policies.networks.losses import (
     interpolate_label,
     joint_loss,
     log_odds,
     presence_loss,
 )
+from kitting_drake.policies.networks.resnet import ResNet
 
 _NEAR = math.radians(10)
 """Rotations up to this far from a label are easily confused with it: they are a stratum of their

@@ -25,7 +25,6 @@ from kitting_drake.common.files import (
     write_json,
 )
 from kitting_drake.policies.data.images import LabelledImage
-from kitting_drake.policies.data.samples import normalisation
 from kitting_drake.policies.data.training_data import TrainingData, evenly_chosen
 from kitting_drake.policies.learned_policy import LearnedPolicy
 from kitting_drake.policies.networks.architecture import NetworkConfig
@@ -33,6 +32,7 @@ from kitting_drake.policies.networks.device import preferred_type
 from kitting_drake.policies.networks.factored import Networks
 from kitting_drake.policies.networks.methods import make_networks
 from kitting_drake.policies.networks.weights import load_trainable, save_weights
+from kitting_drake.policies.training.normalisation import normalisation
 from kitting_drake.policies.training.training_step import Trainer
 from kitting_drake.policies.training.validation import mean_loss, validate
 

@@ -23,6 +23,7 @@ from kitting_drake.policies.matching.shape_matching import ShapeMatchingPolicy
 from kitting_drake.scenario.choosing import find_scenario
 from kitting_drake.scenario.policies import PythonPolicy
 from systems.heightmap_projector import HeightmapProjector
+from systems.pick_place_parameters import PickPlaceParameters
 from systems.signals import Observation, PickPlaceAction, PixelGrid, PlanarPose
 
 pytestmark = pytest.mark.usefixtures("rendering")
@@ -89,7 +90,7 @@ class Recorder:
 
     def __init__(self) -> None:
         self.actions: list[PickPlaceAction] = []
-        self._policy = ShapeMatchingPolicy()
+        self._policy = ShapeMatchingPolicy(PickPlaceParameters())
 
     def __call__(self, observation: Observation) -> PickPlaceAction:
         self.actions.append(self._policy(observation))

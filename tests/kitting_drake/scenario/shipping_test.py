@@ -24,6 +24,7 @@ import importlib, pickle, sys
 from pathlib import Path
 import kitting_drake, systems
 from kitting_drake.common.errors import UserError
+from kitting_drake.common.own_modules import modules_beside
 from kitting_drake.common.paths import MODELS
 from kitting_drake.common.provenance import commit
 
@@ -38,7 +39,8 @@ for path in (*chosen.scenario.policy.input_files(chosen.base),
     assert path.resolve().is_relative_to(here), path
     assert path.is_file(), path
 for module in chosen.scenario.policy.modules():
-    assert Path(importlib.import_module(module).__file__).is_relative_to(here), module
+    with modules_beside(chosen.base):
+        assert Path(importlib.import_module(module).__file__).is_relative_to(here), module
 print(chosen.name, chosen.path)
 """
 
@@ -121,22 +123,30 @@ def test_absolute_paths_are_made_relative(folder: Path, tmp_path: Path):
 
 
 @pytest.mark.parametrize(
-    ("name", "module"),
+    ("name", "module", "place"),
     [
-        ("policy_of_mine.py", "policy_of_mine"),
-        ("policy_of_mine/__init__.py", "policy_of_mine"),
-        ("policies_of_mine/policy.py", "policies_of_mine.policy"),
+        ("policy_of_mine.py", "policy_of_mine", "where_i_run"),
+        ("policy_of_mine/__init__.py", "policy_of_mine", "where_i_run"),
+        ("policies_of_mine/policy.py", "policies_of_mine.policy", "where_i_run"),
+        ("policies_of_mine/policy.py", "policies_of_mine.policy", "beside_the_scenario"),
     ],
 )
 def test_a_policy_of_ones_own_travels_along(
-    name: str, module: str, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    name: str,
+    module: str,
+    place: str,
+    folder: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ):
-    source = tmp_path / "where_i_run" / name
+    source = tmp_path / place / name
     source.parent.mkdir(parents=True)
     source.write_text("def act(observation): ...\n")
     monkeypatch.syspath_prepend(tmp_path / "where_i_run")
     scenario = Scenario(policy=PythonPolicy(f"{module}:act"))
-    chosen = ChosenScenario(scenario, tmp_path / "mine.yaml", "mine", None)
+    yaml = tmp_path / "beside_the_scenario" / "mine.yaml"
+    yaml.parent.mkdir(exist_ok=True)
+    chosen = ChosenScenario(scenario, yaml, "mine", None)
     on_a_node(pack(chosen, folder), tmp_path / "node")
 
 

@@ -11,9 +11,9 @@ from kitting_drake.policies.data.samples import (
     ObservedScene,
     final_observations,
     labelled_images,
-    normalisation,
     scenes,
 )
+from kitting_drake.policies.training.normalisation import normalisation
 from systems.signals import Observation, PickPlaceAction, PixelGrid, PlanarPose
 
 GRID = PixelGrid(x_min=0.3, y_min=-0.2, resolution=0.01, rows=20, cols=30)

@@ -13,7 +13,7 @@ from kitting_drake.policies.data.images import LabelledImage, crop
 from kitting_drake.policies.networks import factored as networks_module
 from kitting_drake.policies.networks.architecture import PICK_CROP
 from kitting_drake.policies.networks.factored import FactoredNetworks
-from kitting_drake.policies.training.losses import NOTHING_LOGIT
+from kitting_drake.policies.networks.losses import NOTHING_LOGIT
 from tests.kitting_drake.policies.scenes import ORIENTATIONS, SIDE, config, scene
 
 BINS = ORIENTATIONS // 2

@@ -11,6 +11,12 @@ from kitting_drake.policies.data.images import Image, LabelledImage, rotation_ma
 from kitting_drake.policies.networks import transporter as transporter_module
 from kitting_drake.policies.networks.architecture import PLACE_CROP, PRESETS, NetworkConfig
 from kitting_drake.policies.networks.layers.correlation import KERNEL, cross_correlation, lift
+from kitting_drake.policies.networks.losses import (
+    interpolate_label,
+    joint_loss,
+    log_odds,
+    presence_loss,
+)
 from kitting_drake.policies.networks.methods import make_networks
 from kitting_drake.policies.networks.resnet import PlainLayer, ResNet
 from kitting_drake.policies.networks.transporter import (
@@ -22,12 +28,6 @@ from kitting_drake.policies.networks.transporter import (
     rotated_crops,
 )
 from kitting_drake.policies.networks.weights import load_networks, save_weights
-from kitting_drake.policies.training.losses import (
-    interpolate_label,
-    joint_loss,
-    log_odds,
-    presence_loss,
-)
 from kitting_drake.policies.training.training_step import Trainer
 
 N = 8

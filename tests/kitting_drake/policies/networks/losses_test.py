@@ -14,7 +14,7 @@ from kitting_drake.policies.networks.layers.correlation import (
     lift,
     rotation_angles,
 )
-from kitting_drake.policies.training.losses import (
+from kitting_drake.policies.networks.losses import (
     NOTHING_LOGIT,
     angle_loss,
     cross_entropy,

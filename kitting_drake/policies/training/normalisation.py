@@ -1,0 +1,41 @@
+"""How the inputs of networks are normalised: by the mean and spread of what they learn from."""
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kitting_drake.policies.data.samples import ObservedScene
+from kitting_drake.policies.networks.architecture import NetworkConfig
+
+
+def normalisation(observed: list[ObservedScene]) -> dict[str, float]:
+    """The fields of a `NetworkConfig` by which inputs are normalised."""
+    # One image in memory at a time.
+    images = (scene.recorded.image for scene in observed)
+    moments = np.array([[_moments(image[:3]), _moments(image[3])] for image in images])
+    default = NetworkConfig()
+    (colour, colour_std), (height, height_std) = map(_mean_and_std, moments.transpose(1, 2, 0))
+    return {
+        "colour_mean": colour,
+        "colour_std": colour_std or default.colour_std,
+        "height_mean": height,
+        "height_std": height_std or default.height_std,
+    }
+
+
+def _moments(values: NDArray[np.float32]) -> tuple[float, float]:
+    """The means of some values and of their squares."""
+    return float(values.mean(dtype=float)), float(np.square(values, dtype=float).mean())
+
+
+def _mean_and_std(moments: NDArray[np.float64]) -> tuple[float, float]:
+    """Mean and standard deviation from what `_moments` returns for equal shares of all values.
+
+    Args:
+        moments: (2, n).
+    """
+    mean, square = moments.mean(axis=1)
+    variance = float(square) - float(mean) ** 2
+    # Where all values are alike, the difference is a rounding error.
+    return float(mean), math.sqrt(variance) if variance > 1e-12 else 0.0
