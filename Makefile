@@ -44,6 +44,6 @@ $(READY): requirements.txt
 	  echo "$(PYTHON) -m venv --clear $(VENV)"; $(PYTHON) -m venv --clear $(VENV); \
 	fi
 	$(PIP) install --no-deps -r requirements.txt
-	$(PIP) install $(TORCH)
+	$(PIP) install --no-warn-conflicts $(TORCH)
 	@$(BIN)/python -c 'import pathlib, sysconfig; pathlib.Path(sysconfig.get_path("purelib"), "kitting_drake.pth").write_text(str(pathlib.Path.cwd()) + "\n")'
 	@touch $@
