@@ -204,10 +204,10 @@ def test_seeds_come_to_an_end(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
 
 
 def test_one_seed_without_a_scene_keeps_no_other_up(monkeypatch: pytest.MonkeyPatch):
-    def build(_: ChosenScenario, *, seed: int) -> int:
+    def build(_: ChosenScenario, *, seed: int) -> tuple[None, int]:
         if seed < 2:
             raise UserError(f"no room with {seed}")
-        return seed
+        return None, seed
 
     monkeypatch.setattr(chosen_module, "build_chosen", build)
     assert chosen_module.build_any_chosen(CHOSEN, range(9)) == 2

@@ -68,15 +68,23 @@ def shipped() -> list[Any]:
 
 @pytest.mark.parametrize(("path", "name"), shipped())
 def test_shipped_scenarios_run(
-    path: Path, name: str, verb: Verb, tmp_path: Path, request: pytest.FixtureRequest
+    path: Path,
+    name: str,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+    request: pytest.FixtureRequest,
 ):
+    """In this process, which has loaded all that it takes."""
     scenario = load_scenario(path, name)
     if scenario.policy.needs_observation:
         request.getfixturevalue("rendering")
     flags = ("--scenario_text", "{time_limit: 1.0}", "--no-meshcat", "--output", tmp_path / "out")
-    diagram = tmp_path / "cell.dot"
-    done = verb("run", path, "--scenario_name", name, "--seed", 3, *flags, "--graphviz", diagram)
-    assert done.returncode == 0, done.stderr
+    diagram = tmp_path / "kitting.dot"
+    command = ["run", path, "--scenario_name", name, "--seed", 3, *flags, "--graphviz", diagram]
+    monkeypatch.setattr(sys, "argv", list(map(str, command)))
+    assert running.main() == 0
+    shown = capsys.readouterr().out
     left = {"results.json", *(["decisions"] if isinstance(scenario.policy, Learned) else [])}
     assert {item.name for item in (tmp_path / "out").iterdir()} == left
     results = json.loads((tmp_path / "out" / "results.json").read_text())
@@ -94,7 +102,7 @@ def test_shipped_scenarios_run(
     assert [item["name"] for item in results["objects"]] == [item.name for item in counted]
     for item in results["objects"]:
         assert item.keys() >= OBJECT_KEYS
-        assert item["name"] in done.stdout  # In the table.
+        assert item["name"] in shown  # In the table.
         assert item["success"] or item["cause"] in scenario.task.causes
     assert diagram.read_text().startswith("digraph")
     for system in ("plant", "policy", "planner", "controller", "monitor"):

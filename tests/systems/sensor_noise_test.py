@@ -255,7 +255,7 @@ def test_errors_of_poses_have_streams_of_their_own(
     """Scenes are drawn from [seed] and [seed, k] with a k of a few, the rest of a cell from greater
     ones. numpy pads with zeros: [seed, 15, 0] is [seed, 15]."""
     shift = error(7).translation()
-    shift /= np.linalg.norm(shift)
+    shift = shift / np.linalg.norm(shift)
     others = [[stream, number] for stream in range(20) for number in range(3)]
     for stream in others:
         direction = np.random.default_rng([7, *stream]).standard_normal(3)

@@ -72,6 +72,7 @@ def test_a_file_beside_ones_script_replaces_no_environment(
     gymnasium.make("kitting_drake/KittingUnseen-v0").close()
 
 
+@pytest.mark.slow
 def test_gymnasiums_own_checks_pass(small: Path):
     # Rendering is checked below: theirs makes many pictures.
     check_env(make(small, cameras=True).unwrapped, skip_render_check=True)
@@ -222,13 +223,13 @@ def test_values_say_the_same_as_actions():
 def test_a_seed_is_drawn_where_none_is_given(small: Path):
     environment = make(small)
     _, first = environment.reset(seed=5)
-    drawn = [environment.reset()[1]["seed"] for _ in range(2)]
+    drawn = environment.reset()[1]["seed"]
     environment.reset(seed=5)
     assert first["seed"] == 5
-    assert [environment.reset()[1]["seed"] for _ in range(2)] == drawn
-    assert len({5, *drawn}) == 3
+    assert environment.reset()[1]["seed"] == drawn != 5
 
 
+@pytest.mark.slow
 def test_many_at_once(small: Path):
     make(small).reset(seed=0)
     environments = gymnasium.make_vec(
