@@ -4,7 +4,7 @@ from pydrake.multibody.plant import AddMultibodyPlantSceneGraph
 from pydrake.systems.framework import DiagramBuilder
 
 from kitting_drake.common.paths import SCENARIOS
-from kitting_drake.scenario.schema import Plant
+from kitting_drake.scenario.schema import Variation
 from kitting_drake.station.plant import add_models
 from kitting_drake.tasks import StackBlockPyramid
 from kitting_drake.tasks.task import Scene
@@ -24,7 +24,7 @@ def scene() -> Scene:
 def mass_factors(scene: Scene, seed: int, spread: float = SPREAD) -> np.ndarray:
     """By how much the masses of a scene's objects, which are all alike, are scaled."""
     plant, _ = AddMultibodyPlantSceneGraph(DiagramBuilder(), time_step=0.01)
-    objects, _ = add_models(plant, scene, Plant(mass_variation=spread), seed)
+    objects, _ = add_models(plant, scene, Variation(mass=spread), seed)
     masses = [plant.get_body(item.body).default_mass() for item in objects]
     return np.array(masses) / 0.01
 
