@@ -59,6 +59,7 @@ def measured(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     return benchmark_networks(plan, Console(quiet=True))
 
 
+@pytest.mark.slow
 def test_describes_the_machine(measured: dict[str, Any]):
     machine = measured["machine"]
     assert set(machine) == {
@@ -76,6 +77,7 @@ def test_describes_the_machine(measured: dict[str, Any]):
     assert json.loads(json.dumps(measured)) == measured
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["pick_angle", "decision"])
 def test_a_row_for_each_method_and_count(name: str, measured: dict[str, Any]):
     cells = [(row["method"], row["orientations"]) for row in measured[name]]
@@ -89,6 +91,7 @@ def test_a_row_for_each_method_and_count(name: str, measured: dict[str, Any]):
         assert row["operations"] > 0
 
 
+@pytest.mark.slow
 def test_only_the_equivariant_transporter_grows(measured: dict[str, Any]):
     growth = {row["method"]: row for row in measured["pick_angle_growth"]}
     assert growth["so2"]["from"] == 26
@@ -102,6 +105,7 @@ def test_only_the_equivariant_transporter_grows(measured: dict[str, Any]):
     assert growth["transporter"]["operations"] == pytest.approx(30 / 26, rel=0.1)
 
 
+@pytest.mark.slow
 def test_a_decision_is_the_sum_of_its_parts(measured: dict[str, Any]):
     for row in measured["decision"]:
         parts = dict(row["parts"])
@@ -113,6 +117,7 @@ def test_a_decision_is_the_sum_of_its_parts(measured: dict[str, Any]):
         assert all(seconds > 0 for seconds in parts.values())
 
 
+@pytest.mark.slow
 def test_the_transporter_encodes_every_rotated_crop(measured: dict[str, Any]):
     few, many = (row for row in measured["decision"] if row["method"] == "transporter")
     angle = {
@@ -127,6 +132,7 @@ def test_the_transporter_encodes_every_rotated_crop(measured: dict[str, Any]):
     assert placing[0] - 26 * crop == pytest.approx(placing[1] - 30 * crop)
 
 
+@pytest.mark.slow
 def test_folding_computes_the_same(measured: dict[str, Any]):
     folding = measured["folding"]
     types = ["float32"] + ["bfloat16"] * (preferred_type() == torch.bfloat16)
@@ -146,6 +152,7 @@ def test_folding_computes_the_same(measured: dict[str, Any]):
     assert 1 < operations["ours"] / operations["escnn"] < (8 / 7) ** 2
 
 
+@pytest.mark.slow
 def test_shares_of_the_peak(measured: dict[str, Any]):
     rows = {(row["network"], row["type"], row["mode"]): row for row in measured["share_of_peak"]}
     for name in ("alpha", "beta", "phi", "psi"):
@@ -157,6 +164,7 @@ def test_shares_of_the_peak(measured: dict[str, Any]):
         assert infer["share"] == pytest.approx(infer["operations"] / infer["seconds"] / peak)
 
 
+@pytest.mark.slow
 def test_levels_hold_all_layers(measured: dict[str, Any]):
     levels, layers = measured["alpha_levels"]["levels"], measured["alpha_levels"]["layers"]
     blocks = [f"down {i}" for i in range(1, 6)] + [f"up {i}" for i in range(1, 5)]
@@ -169,6 +177,7 @@ def test_levels_hold_all_layers(measured: dict[str, Any]):
         assert row["convolution_s"] > 0
 
 
+@pytest.mark.slow
 def test_draws_and_prints_what_was_measured(measured: dict[str, Any], tmp_path: Path):
     measured = copy.deepcopy(measured)
     for row in measured["pick_angle"] + measured["decision"]:
@@ -182,6 +191,7 @@ def test_draws_and_prints_what_was_measured(measured: dict[str, Any], tmp_path: 
     assert console.export_text().count("not run: ~99 s") == 4
 
 
+@pytest.mark.slow
 def test_the_page_of_results_tells_what_the_angle_costs(measured: dict[str, Any], tmp_path: Path):
     assert read_efficiency(tmp_path) is None
     path = tmp_path / EFFICIENCY
