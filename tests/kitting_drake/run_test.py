@@ -57,10 +57,19 @@ OBJECT_KEYS = {
 }
 
 
+MORE_OF_THE_SAME = ("SevenTools", "TwelveTools", "FreshToolsets", "OwnToolsets", "Training")
+"""Endings of the names of scenarios that run what others of their file run."""
+
+
 def shipped() -> list[Any]:
     """Every scenario of every file under scenarios/."""
     return [
-        pytest.param(path, key.value, id=f"{path.stem}:{key.value}")
+        pytest.param(
+            path,
+            key.value,
+            id=f"{path.stem}:{key.value}",
+            marks=[pytest.mark.slow] if key.value.endswith(MORE_OF_THE_SAME) else [],
+        )
         for path in sorted(SCENARIOS.glob("*.yaml"))
         for key, _ in yaml.compose(path.read_text(), Loader=yaml.SafeLoader).value
     ]
