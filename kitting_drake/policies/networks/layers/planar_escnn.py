@@ -1,7 +1,7 @@
 """escnn for groups of the plane: every import of escnn in this project goes through here.
 
 escnn imports one function of lie_learn, and calls it for SO(3) alone. lie_learn 0.0.2 does not load
-with numpy 2 and has no wheel for Python 3.13: see the issues QUVA-Lab/escnn#80 and
+with numpy 2 and has no wheel for Python 3.13: see the requests QUVA-Lab/escnn#80 and
 AMLab-Amsterdam/lie_learn#30. A module with a function that refuses stands in for it here.
 """
 
