@@ -1,5 +1,6 @@
 """`python -m kitting_drake.run SCENARIO.yaml`: one episode, shown live; leaves a replay."""
 
+import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -28,27 +29,7 @@ REPLAY = "replay.html"
 
 def main() -> int:
     """Parses the command line and runs the episode; returns the exit code."""
-    parser = scenario_parser("run", "Run an episode, watch it in Meshcat, keep a replay.")
-    parser.add_argument("--seed", type=seed_type, help="of the scene (default: the scenario's)")
-    parser.add_argument(
-        "--no-meshcat", action="store_true", help="show nothing, and leave no replay.html"
-    )
-    parser.add_argument(
-        "--graphviz",
-        type=Path,
-        metavar="FILE",
-        help="also draw the Diagram: .svg, .png or .pdf, or .dot for its source",
-    )
-    parser.add_argument(
-        "--picture",
-        type=Path,
-        metavar="FILE.png",
-        help="also render the station as the episode ends",
-    )
-    parser.add_argument(
-        "--video", type=Path, metavar="FILE.gif", help="also film the episode (.gif or .webp)"
-    )
-    arguments = parser.parse_args()
+    arguments = _parser().parse_args()
     chosen = choose_scenario(arguments)
     scenario = chosen.scenario
     seed = scenario.random_seed if arguments.seed is None else arguments.seed
@@ -107,6 +88,30 @@ def main() -> int:
     if result.failure:
         return FAILED
     return INTERRUPTED if result.interrupted else 0
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = scenario_parser("run", "Run an episode, watch it in Meshcat, keep a replay.")
+    parser.add_argument("--seed", type=seed_type, help="of the scene (default: the scenario's)")
+    parser.add_argument(
+        "--no-meshcat", action="store_true", help="show nothing, and leave no replay.html"
+    )
+    parser.add_argument(
+        "--graphviz",
+        type=Path,
+        metavar="FILE",
+        help="also draw the Diagram: .svg, .png or .pdf, or .dot for its source",
+    )
+    parser.add_argument(
+        "--picture",
+        type=Path,
+        metavar="FILE.png",
+        help="also render the station as the episode ends",
+    )
+    parser.add_argument(
+        "--video", type=Path, metavar="FILE.gif", help="also film the episode (.gif or .webp)"
+    )
+    return parser
 
 
 def _save_decisions(folder: Path, decisions: "list[tuple[Observation, Decision]]") -> None:
