@@ -16,6 +16,7 @@ from systems.action_quantizer import ActionQuantizer
 from systems.grasp import Grasp
 from systems.hand_geometry import FINGER_LENGTH, FINGERTIP_DEPTH, MAX_OPENING
 from systems.placement import (
+    GONE,
     Goal,
     PlacedObject,
     Placement,
@@ -81,11 +82,11 @@ class OraclePolicy(LeafSystem):
 
     The law. The next goal is the first, in the order given, that is not filled and whose
     prerequisites are, where those that are kept count as filled; goals whose object is already
-    there, though not as it should be, come last. Of the objects that may fill it and fill no other,
-    the highest is taken, as nothing lies on it; of several as high, the one assigned to the goal by
-    `evaluate_placements`. Of the goal's poses it takes the free one that rotates the object least,
-    and of the object's grasps the first at which the fingers are clear of other objects at the pick
-    and at the place.
+    there, though not as it should be, come last. Of the objects in the cell that may fill it and fill
+    no other, the highest is taken, as nothing lies on it; of several as high, the one assigned to
+    the goal by `evaluate_placements`. Of the goal's poses it takes the free one that rotates the
+    object least, and of the object's grasps the first at which the fingers are clear of other
+    objects at the pick and at the place.
 
     With a quantizer it answers the best action that a policy of the paper can choose: the pick is
     the annotated grasp, rounded; the place is where the gripper, *holding the object as the rounded
@@ -106,6 +107,7 @@ class OraclePolicy(LeafSystem):
         quantizer: ActionQuantizer | None = None,
         tip_depth: float = 0.010,
         release_clearance: float = 0.006,
+        open_width: float = MAX_OPENING,
         brings_heights: bool = True,
     ) -> None:
         """
@@ -117,6 +119,7 @@ class OraclePolicy(LeafSystem):
             quantizer: of the actions; exact when None.
             tip_depth: how far below an object's top the fingertips reach, in m.
             release_clearance: how far each jaw draws back to let go, in m.
+            open_width: between the jaws before a grasp, in m.
             brings_heights: whether actions have their heights; else the planner reads them off o_t.
 
         Raises:
@@ -132,6 +135,7 @@ class OraclePolicy(LeafSystem):
         self._grasps = tuple(tuple(choices) for choices in grasps)
         self._quantizer, self._brings_heights = quantizer, brings_heights
         self._tip_depth, self._release_clearance = tip_depth, release_clearance
+        self._open_width = open_width
         self._body_poses = self.DeclareAbstractInputPort("body_poses", Value([RigidTransform()]))
         self._kept_goals = self.DeclareVectorInputPort("kept_goals", len(goals))
         self.DeclareAbstractOutputPort(
@@ -171,7 +175,7 @@ class OraclePolicy(LeafSystem):
             item = self._choose_object(index, poses, placements)
             if item is not None:
                 X_WGoal = self._choose_pose(goal, item, poses)
-                grasp = self._choose_grasp(item, X_WGoal, goal, poses)
+                grasp = self._choose_grasp(item, X_WGoal, poses)
                 return _Plan(item, grasp, X_WGoal, goal)
         return None
 
@@ -188,7 +192,8 @@ class OraclePolicy(LeafSystem):
         free = [
             index
             for index in self._goals[goal].objects
-            if not placements[index].success or placements[index].goal == goal
+            if (not placements[index].success or placements[index].goal == goal)
+            and np.linalg.norm(poses[index].translation()) < GONE
         ]
         if not free:
             return None
@@ -212,7 +217,7 @@ class OraclePolicy(LeafSystem):
         )
 
     def _choose_grasp(
-        self, item: int, X_WGoal: RigidTransform, goal: Goal, poses: list[RigidTransform]
+        self, item: int, X_WGoal: RigidTransform, poses: list[RigidTransform]
     ) -> Grasp:
         grasps = self._grasps[item]
         if len(grasps) == 1:
@@ -227,7 +232,6 @@ class OraclePolicy(LeafSystem):
         )
 
         def obstruction(grasp: Grasp) -> int:
-            place = self._arrival(poses[item], X_WGoal, goal)
             tip, half = grasp.surface_height - self._tip_depth, grasp.width / 2
             return sum(
                 _count_within_fingers(others, gripper_pose(X_WB, grasp), height, reach)
@@ -235,10 +239,10 @@ class OraclePolicy(LeafSystem):
                     (
                         poses[item],
                         poses[item].translation()[2] + tip,
-                        (half, MAX_OPENING / 2 + FINGERTIP_DEPTH),
+                        (half, self._open_width / 2 + FINGERTIP_DEPTH),
                     ),
                     (
-                        place,
+                        X_WGoal,
                         X_WGoal.translation()[2] + tip,
                         (half, half + self._release_clearance + FINGERTIP_DEPTH),
                     ),
@@ -246,13 +250,6 @@ class OraclePolicy(LeafSystem):
             )
 
         return min(grasps, key=obstruction)
-
-    @staticmethod
-    def _arrival(X_WB: RigidTransform, X_WGoal: RigidTransform, goal: Goal) -> RigidTransform:
-        """Where an object now at X_WB is brought to."""
-        if not goal.any_heading:
-            return X_WGoal
-        return RigidTransform(X_WB.rotation(), X_WGoal.translation())
 
     def _action(self, plan: _Plan, poses: list[RigidTransform]) -> PickPlaceAction:
         X_WB = poses[plan.index]
@@ -262,7 +259,7 @@ class OraclePolicy(LeafSystem):
         if quantizer is not None:
             pick = PlanarPose(*quantizer.position(pick.x, pick.y), quantizer.angle(pick.theta))
             held = grasp_taken(X_WB, pick)
-        place = gripper_pose(self._arrival(X_WB, plan.X_WGoal, plan.goal), held)
+        place = gripper_pose(plan.X_WGoal, held)
         theta = wrap_to_pi(pick.theta)
         rotation = wrap_to_pi(place.theta - pick.theta)
         if quantizer is not None:

@@ -28,6 +28,9 @@ STRICT_ANGLE = math.radians(20.0)
 ALL = 1 - 1e-9
 """A share or a reward above this is all of it."""
 
+GONE = 10.0
+"""An object this far from the world's origin has left the cell, or is yet to appear, in metres."""
+
 _FAR = 0.5
 """Beyond this an object is no nearer to one goal than to another, in metres."""
 _NEAR = 0.05

@@ -10,6 +10,8 @@ from pydrake.math import RigidTransform
 from pydrake.multibody.tree import BodyIndex
 from pydrake.systems.framework import Context, DiscreteValues, EventStatus, LeafSystem
 
+from systems.placement import GONE
+
 
 @dataclass(frozen=True)
 class Box:
@@ -70,10 +72,6 @@ def _gaps(
     return np.maximum(along_i.max(axis=2), along_j.max(axis=2))
 
 
-_GONE = 10.0
-"""An object this far from the world's origin, in m, has left the cell for good."""
-
-
 class RestDetector(LeafSystem):
     """Says which objects may be frozen without changing what happens.
 
@@ -92,11 +90,10 @@ class RestDetector(LeafSystem):
     pose, and nothing that is not at rest, mover or object, is within `wake_distance` of it:
     distances of the oriented boxes of their pieces, never more than the true ones. It is no longer
     at rest as soon as something comes that near. Displacements are compared, not velocities: an
-    object that trembles in place, as on a step too long for its stiffness, goes nowhere. What was
-    flung out of the cell, 10 m or more from the world's origin, is at rest at once and for good: a
-    free body that spins on and on would overflow its quaternion in the end. The memory
-    (discrete state) is the pose that each object has stayed near, since when, in s, and whether it
-    is at rest.
+    object that trembles in place, as on a step too long for its stiffness, goes nowhere. What is
+    out of the cell, `GONE` or more from the world's origin, is at rest at once: a free body that
+    spins on and on would overflow its quaternion in the end. The memory (discrete state) is the
+    pose that each object has stayed near, since when, in s, and whether it is at rest.
     """
 
     def __init__(
@@ -160,8 +157,8 @@ class RestDetector(LeafSystem):
         still_for[:] = np.where(stayed, still_for + self._period, 0.0)
         resting = stayed & (still_for >= self._time_to_sleep - self._period / 2)
         self._wake(X, resting)
-        # So written that it holds for what is no number, too.
-        resting |= ~(np.square(X[:n, :, 3]).sum(axis=1) < _GONE**2)
+        # Also true for NaN.
+        resting |= ~(np.square(X[:n, :, 3]).sum(axis=1) < GONE**2)
         discrete_state.get_mutable_value(self._at_rest)[:] = resting
         return EventStatus.Succeeded()
 

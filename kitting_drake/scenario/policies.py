@@ -174,6 +174,9 @@ class Learned(PolicyConfig):
     # for as good, take the one where the fingers have room when they let go.
     fit_outlines: bool = True
 
+    # Do not pick again within 10 mm of where a grasp failed. The paper has no such memory.
+    avoid_failed_picks: bool = True
+
     # Mend what an action left undone, as o_t shows it: press down what protrudes; pick what fits
     # into a recess before anything else; at last take out what could not be pressed down, and try
     # again. It takes actions: see the task's `tries`.
@@ -204,7 +207,11 @@ class Learned(PolicyConfig):
             )
         # An observer is shown colours, whatever the networks see.
         heights_only = not loaded.colour and site.observer is None
-        return PickPlacePolicy(policy=loaded.function, heights_only=heights_only)
+        function = loaded.function
+        return PickPlacePolicy(
+            policy=function if self.avoid_failed_picks else _OfObservationAlone(function),
+            heights_only=heights_only,
+        )
 
     def details(self, base: Path) -> dict[str, Any]:
         from kitting_drake.policies.networks.device import preferred_type
@@ -218,6 +225,7 @@ class Learned(PolicyConfig):
             "continuous": self.continuous,
             "fit_outlines": self.continuous and self.fit_outlines,
             "recover": self.recover,
+            "avoid_failed_picks": self.avoid_failed_picks,
             "trained_orientations": file.config.orientations,
             "compute_type": str(preferred_type()).removeprefix("torch."),
             **{key: file.card.get(key) for key in _TOLD},
@@ -237,6 +245,12 @@ class Learned(PolicyConfig):
         from kitting_drake.policies.networks.weights import card_seeds, read_weights_file
 
         return card_seeds(read_weights_file(self._path(base)).card)
+
+    def validate(self) -> None:
+        if self.recover and not self.avoid_failed_picks:
+            raise ValueError(
+                "policy.recover needs policy.avoid_failed_picks: what failed is mended"
+            )
 
     def _path(self, base: Path) -> Path:
         return base / self.weights if self.weights else GENERALIST
@@ -338,6 +352,7 @@ def _make_oracle(site: PolicySite, quantizer: ActionQuantizer | None) -> OracleP
         quantizer=quantizer,
         tip_depth=site.planner.grasp_depth,
         release_clearance=site.planner.release_clearance,
+        open_width=site.planner.open_width,
         brings_heights=not site.has_cameras,
     )
 

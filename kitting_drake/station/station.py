@@ -21,7 +21,8 @@ from kitting_drake.station.plant import add_models, add_plant, bounded_body, set
 from kitting_drake.station.sensing import add_cameras
 from kitting_drake.tasks.task import Scene
 from systems.pick_place_parameters import Mode
-from systems.placement import PlacedObject, Placement
+from systems.placement import GONE, PlacedObject, Placement
+from systems.object_feeder import ObjectFeeder
 from systems.placement_monitor import PlacementMonitor
 from systems.rest_detector import RestDetector
 from systems.signals import Observation, PickPlaceAction
@@ -84,7 +85,8 @@ class KittingStation(Diagram):
     All memory is in the Context. Ports compute only on demand: images are rendered when something
     asks for an observation.
 
-    Simulate it by `make_simulator`, which lets objects at rest sleep: they cost nothing then.
+    Simulate it by `make_simulator`: objects at rest sleep there, and cost nothing; and objects that
+    arrive during the episode do so.
     """
 
     def __init__(self, scenario: Scenario, *, seed: int, base: Path) -> None:
@@ -115,7 +117,10 @@ class KittingStation(Diagram):
         """Whether there is the port `observation`."""
         planner = add_control(builder, scenario, self.scene, self.plant, projector)
         self._add_score_and_rest(builder)
-        builder.Connect(planner.GetOutputPort("mode"), self._monitor.GetInputPort("mode"))
+        self._feeder = self._add_feeder(builder)
+        for system in (self._monitor, self._feeder):
+            if system is not None:
+                builder.Connect(planner.GetOutputPort("mode"), system.GetInputPort("mode"))
         for name in ("body_poses", "contact_results"):
             builder.ExportOutput(self.plant.GetOutputPort(name), name)
         builder.ExportOutput(self.scene_graph.get_query_output_port(), "query_object")
@@ -146,6 +151,24 @@ class KittingStation(Diagram):
             for index in range(system.num_output_ports()):
                 port = system.get_output_port(index)
                 builder.ExportOutput(port, port.get_name())
+
+    def _add_feeder(self, builder: DiagramBuilder) -> ObjectFeeder | None:
+        """Adds what lets objects appear, if any do."""
+        arrivals = self.scene.arrivals
+        if arrivals is None:
+            return None
+        there = [i for i in range(len(self.objects)) if i not in arrivals.objects]
+        feeder = ObjectFeeder(
+            waiting=[
+                (self.objects[i].body, self.scene.objects[i].X_WB.translation())
+                for i in arrivals.objects
+            ],
+            others=[self.objects[i].body for i in there],
+            area=arrivals.area,
+        )
+        builder.AddNamedSystem("feeder", feeder)
+        builder.Connect(self.plant.get_body_poses_output_port(), feeder.GetInputPort("body_poses"))
+        return feeder
 
     # What its ports say, for callers that hold the context of a Diagram that it is part of.
 
@@ -203,12 +226,13 @@ class KittingStation(Diagram):
     def make_simulator(
         self, diagram: Diagram | None = None, *, monitor: Monitor | None = None
     ) -> Simulator:
-        """A Simulator in which objects at rest sleep (see `RestDetector`), if the scenario says so.
+        """A Simulator in which objects appear (see `ObjectFeeder`), and those at rest sleep (see
+        `RestDetector`) if the scenario says so.
 
         Args:
             diagram: the outermost Diagram that this station is part of; None: the station alone.
-            monitor: called after each step, once what rests has been put to sleep. (Drake's
-                `set_monitor` would replace the one that does that.)
+            monitor: called after each step and all this. (Drake's `set_monitor` would replace the
+                one that does it.)
 
         Raises:
             ValueError: no `diagram`, though the station is part of one.
@@ -218,23 +242,44 @@ class KittingStation(Diagram):
         simulator = Simulator(self if diagram is None else diagram)
 
         def step(root_context: Context) -> EventStatus:
-            self.apply_sleep(root_context)
+            self._let_appear(root_context)
+            self._apply_sleep(root_context)
             return EventStatus.DidNothing() if monitor is None else monitor(root_context)
 
         simulator.set_monitor(step)
         return simulator
 
-    def apply_sleep(self, root_context: Context) -> None:
+    # No LeafSystem may touch another's part of a context, hence these two for the simulator's
+    # monitor.
+
+    def _let_appear(self, root_context: Context) -> None:
+        """Moves the object that is to appear now, if one is, to where it appears. It wakes there."""
+        if self._feeder is None:
+            return
+        port = self._feeder.get_output_port()
+        index = int(port.Eval(self._feeder.GetMyContextFromRoot(root_context))[0])
+        if index < 0:
+            return
+        assert self.scene.arrivals is not None
+        body = self._bodies[self.scene.arrivals.objects[index]]
+        plant_context = self.plant.GetMyMutableContextFromRoot(root_context)
+        self.plant.SetFreeBodyPose(plant_context, body, self.scene.arrivals.poses[index])
+
+    def _apply_sleep(self, root_context: Context) -> None:
         """Freezes the objects that are at rest and thaws the others.
 
         A frozen object's joint is locked, and its contact with table, fixtures and other frozen
-        objects is not computed; what comes near it still collides with it. No LeafSystem may touch
-        another's part of a context, hence a function for the simulator's monitor.
+        objects is not computed; what comes near it still collides with it. Where the scenario has
+        no sleep, only what is yet to appear is frozen.
         """
+        may_sleep = self.at_rest(root_context)
         if not self.scenario.sleep.enabled:
-            return
+            if self.scene.arrivals is None:
+                return
+            positions = [X_WB.translation() for X_WB in self.object_poses(root_context)]
+            may_sleep = may_sleep & (np.linalg.norm(positions, axis=1) > GONE)
         plant_context = self.plant.GetMyMutableContextFromRoot(root_context)
-        bodies, at_rest = self._bodies, self.at_rest(root_context).tolist()
+        bodies, at_rest = self._bodies, may_sleep.tolist()
         changed = [
             (body, resting)
             for body, resting in zip(bodies, at_rest, strict=True)

@@ -91,24 +91,29 @@ def box_object(
     colour: Colour,
     X_WB: RigidTransform,
     *,
+    grasps: tuple[Grasp, ...] | None = None,
     mass: float = 0.1,
     friction: float = 1.0,
 ) -> SceneObject:
-    """A box that can be picked; sizes in metres, mass in kg."""
+    """A box that can be picked; sizes in metres, mass in kg; grasps: None for those of its
+    middle."""
     return SceneObject(
         name=name,
         category=category,
         model=box_model(size, colour, mass=mass, friction=friction),
         X_WB=X_WB,
         p_BPoints=box_points(size),
-        grasps=box_grasps(size),
+        grasps=box_grasps(size) if grasps is None else grasps,
         symmetry=box_symmetry(size),
     )
 
 
-def cube_object(name: str, colour: Colour, X_WB: RigidTransform) -> SceneObject:
+def cube_object(
+    name: str, colour: Colour, X_WB: RigidTransform, grasps: tuple[Grasp, ...]
+) -> SceneObject:
     """One of the small cubes of Ravens."""
-    return box_object(name, "cube", (CUBE_SIDE,) * 3, colour, X_WB, mass=CUBE_MASS)
+    size = (CUBE_SIDE,) * 3
+    return box_object(name, "cube", size, colour, X_WB, grasps=grasps, mass=CUBE_MASS)
 
 
 def box_model(
@@ -166,17 +171,54 @@ def box_grasps(size: tuple[float, float, float]) -> tuple[Grasp, ...]:
     return tuple(grasp for grasp in grasps if grasp.width <= _MAX_WIDTH)
 
 
+def grasp_along(size: tuple[float, float, float], axis: str, offset: float) -> Grasp:
+    """The grasp of a box on its centre line along an axis, across which the jaws close.
+
+    Args:
+        size: of the box, in metres.
+        axis: `x` or `y`.
+        offset: from the middle along the axis, in metres.
+    """
+    x, y, z = size
+    if axis == "x":
+        return Grasp(x=offset, y=0.0, theta=0.0, width=y, surface_height=z)
+    return Grasp(x=0.0, y=offset, theta=math.pi / 2, width=x, surface_height=z)
+
+
+def random_grasp(
+    size: tuple[float, float, float], offset: float, rng: np.random.Generator
+) -> Grasp:
+    """A grasp of a box on either of its centre lines, within a distance of its middle."""
+    axis = "x" if rng.random() < 0.5 else "y"
+    return grasp_along(size, axis, float(rng.uniform(-offset, offset)))
+
+
 def box_symmetry(size: tuple[float, float, float]) -> int:
     """The rotational symmetry of a box about its vertical axis."""
     return 4 if math.isclose(size[0], size[1]) else 2
 
 
-def box_footprint(size: tuple[float, float, float]) -> Footprint:
-    """The footprint of a box, and of the open hand that grasps it."""
-    return Footprint((rectangle(size[0], size[1]),), box_grasps(size))
+def box_footprint(size: tuple[float, float, float], offset: float = 0.0) -> Footprint:
+    """The footprint of a box, and of the open hand that grasps it.
+
+    Args:
+        size: of the box, in metres.
+        offset: how far from the middle along each axis the hand may grasp it, in metres.
+    """
+    return Footprint((rectangle(size[0], size[1]),), outermost_grasps(size, offset))
 
 
-CUBE_FOOTPRINT = box_footprint((CUBE_SIDE,) * 3)
+def outermost_grasps(size: tuple[float, float, float], offset: float) -> tuple[Grasp, ...]:
+    """The grasps of a box farthest from its middle, to leave room for all between; see
+    `box_footprint`."""
+    return tuple(
+        grasp_along(size, axis, distance) for axis in ("x", "y") for distance in (-offset, offset)
+    )
+
+
+CUBE_GRASP_OFFSET = 0.01
+"""The demonstrator takes hold of a cube within this distance of its middle, in metres."""
+CUBE_FOOTPRINT = box_footprint((CUBE_SIDE,) * 3, CUBE_GRASP_OFFSET)
 
 
 def random_brown(rng: np.random.Generator) -> Colour:

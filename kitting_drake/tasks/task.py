@@ -19,6 +19,7 @@ from systems.grasp import Grasp
 from systems.placement import Goal, Placement, SuccessPredicate
 from systems.signals import PixelGrid, PlanarPose
 
+NEVER_APPEARED = "never appeared"
 NEVER_PICKED = "never picked"
 MISSED_GRASP = "missed grasp"
 SLIPPED = "slipped"
@@ -60,6 +61,30 @@ class Fixture:
 
 
 @dataclass(frozen=True)
+class Arrivals:
+    """Objects that appear one at a time during an episode; until then they are out of the cell.
+
+    The next one appears while the hand retreats or observes, as soon as no object's origin lies
+    over `area`.
+    """
+
+    objects: tuple[int, ...]
+    """Indices into the scene's objects, in the order in which they appear."""
+    poses: tuple[RigidTransform, ...]
+    """X_WB of each as it appears, at rest in the air."""
+    area: tuple[tuple[float, float], tuple[float, float]]
+    """Lower and upper (x, y) corner in the world, in metres."""
+
+    def __post_init__(self) -> None:
+        assert len(self.objects) == len(self.poses)
+
+
+def waiting_pose(index: int) -> RigidTransform:
+    """X_WB of an object that has yet to appear: out of the cell, and of the cameras' sight."""
+    return RigidTransform([-20.0 - index, 0.0, -20.0])
+
+
+@dataclass(frozen=True)
 class Scene:
     """The beginning of one episode, and what is to be brought about."""
 
@@ -70,6 +95,8 @@ class Scene:
     success: SuccessPredicate
     max_actions: int
     """After so many actions the episode is over."""
+    arrivals: Arrivals | None = None
+    """Objects that are not there at the beginning; None: all are."""
 
     def __post_init__(self) -> None:
         names = [item.name for item in self.objects] + [item.name for item in self.fixtures]

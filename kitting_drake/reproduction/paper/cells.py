@@ -190,6 +190,8 @@ class Cell:
     """Whether the episode ends by itself once all is done, as in the paper."""
     recover: bool = False
     """Whether what went wrong is mended, and each object allows two actions."""
+    avoid_failed_picks: bool = False
+    """Whether no pick is tried again where a grasp failed; not in the paper."""
 
     @property
     def name(self) -> str:
@@ -229,6 +231,7 @@ class Cell:
                 "continuous": str(self.continuous).lower(),
                 "fit_outlines": str(self.fit_outlines).lower(),
                 "recover": str(self.recover).lower(),
+                "avoid_failed_picks": str(self.avoid_failed_picks).lower(),
             }
             policy = f"!Learned {{{', '.join(f'{key}: {value}' for key, value in fields.items())}}}"
         parts = [f"policy: {policy}"]
@@ -258,9 +261,10 @@ class Cell:
                 return f"its policy is not {self.policy}"
             same = summary["policy_digest"] == _loaded(self).policy.digest(SCENARIOS)
             return None if same else "its weights are not those that come with the package"
-        # Those of an earlier version have no such thing.
-        found = {"angle_only": False, **summary["policy_details"]}
         details = self._details(self.policy)
+        # Runs that do not say so avoided failed picks: the page tells what that can have changed.
+        earlier = {"angle_only": False, "avoid_failed_picks": self.avoid_failed_picks}
+        found = earlier | summary["policy_details"]
         key = rates_key(reference(self.policy))
         if rates and "learning_rate" not in details and key in rates:
             details["learning_rate"] = float(best_rate(rates[key]))
@@ -285,6 +289,7 @@ class Cell:
             "continuous": self.continuous,
             "fit_outlines": self.fit_outlines,
             "recover": self.recover,
+            "avoid_failed_picks": self.avoid_failed_picks,
         }
         if training.learning_rate is not None:
             wanted["learning_rate"] = training.learning_rate

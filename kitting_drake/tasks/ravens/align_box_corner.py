@@ -8,9 +8,15 @@ import numpy as np
 from pydrake.math import RigidTransform, RollPitchYaw
 
 from kitting_drake.common.paths import MODELS
-from kitting_drake.tasks.boxes import box_footprint, box_grasps, box_object, random_brown
+from kitting_drake.tasks.boxes import (
+    box_footprint,
+    box_object,
+    outermost_grasps,
+    random_brown,
+    random_grasp,
+)
 from kitting_drake.tasks.footprints import Footprint, draw_poses, rectangle
-from kitting_drake.tasks.ravens.ravens_task import PoseTask
+from kitting_drake.tasks.ravens.ravens_task import PoseTask, grasp_rng
 from kitting_drake.tasks.task import Fixture, Scene
 from systems.bounds import bounded
 from systems.grasp import Grasp
@@ -19,6 +25,8 @@ from systems.signals import PixelGrid
 
 _ARM_LENGTH, _ARM_WIDTH = 0.055, 0.005
 """The size of each arm of the marker, in metres."""
+_GRASP_OFFSET = 0.01
+"""The demonstrator takes hold of the box within this distance of its middle, in metres."""
 
 
 @dataclass
@@ -38,13 +46,14 @@ class AlignBoxCorner(PoseTask):
         size = (round(length, 4), round(width, 4), round(height, 4))
         colour = random_brown(shape_rng)
         X_WMarker, X_WBox = draw_poses(
-            [_marker_footprint(size), box_footprint(size)],
+            [_marker_footprint(size), box_footprint(size, _GRASP_OFFSET)],
             grid=grid,
             rng=np.random.default_rng(seed),
         )
         poses = tuple(X_WMarker @ X_MarkerBox for X_MarkerBox in corner_poses(size))
+        grasps = (random_grasp(size, _GRASP_OFFSET, grasp_rng(seed)),)
         return Scene(
-            objects=(box_object("box", "box", size, colour, X_WBox),),
+            objects=(box_object("box", "box", size, colour, X_WBox, grasps=grasps),),
             fixtures=(Fixture("marker", MODELS / "ravens" / "corner_marker.sdf", X_WMarker),),
             goals=(Goal(name="corner in marker", objects=(0,), poses=poses, reward=1.0),),
             success=self.success,
@@ -77,8 +86,14 @@ def _marker_footprint(size: tuple[float, float, float]) -> Footprint:
         x, y, _ = X_MarkerBox.translation()
         yaw = RollPitchYaw(X_MarkerBox.rotation()).yaw_angle()
         grasps += [
-            Grasp(x, y, yaw + grasp.theta, grasp.width, grasp.surface_height)
-            for grasp in box_grasps(size)
+            Grasp(
+                x + math.cos(yaw) * grasp.x - math.sin(yaw) * grasp.y,
+                y + math.sin(yaw) * grasp.x + math.cos(yaw) * grasp.y,
+                yaw + grasp.theta,
+                grasp.width,
+                grasp.surface_height,
+            )
+            for grasp in outermost_grasps(size, _GRASP_OFFSET)
         ]
     square = rectangle(side + _ARM_WIDTH, side + _ARM_WIDTH, x=middle, y=middle)
     return Footprint((square,), tuple(grasps))

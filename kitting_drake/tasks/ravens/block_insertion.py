@@ -9,7 +9,7 @@ import numpy as np
 from kitting_drake.common.paths import MODELS
 from kitting_drake.tasks.boxes import box_points
 from kitting_drake.tasks.footprints import Footprint, draw_poses, rectangle
-from kitting_drake.tasks.ravens.ravens_task import PoseTask
+from kitting_drake.tasks.ravens.ravens_task import PoseTask, grasp_rng
 from kitting_drake.tasks.task import Fixture, Scene, SceneObject
 from systems.grasp import Grasp
 from systems.placement import Goal
@@ -19,11 +19,17 @@ _ARMS = (((0.08, 0.03, 0.04), (0.025, 0.0)), ((0.03, 0.05, 0.04), (0.0, 0.04)))
 """Size and middle of the two boxes of the block, in metres: see `models/ravens/l_block.sdf`."""
 _HEIGHT = 0.04
 _WALL_HEIGHT = 0.02
-_GRASPS = (
-    Grasp(x=0.035, y=0.0, theta=0.0, width=0.03, surface_height=_HEIGHT),
-    Grasp(x=0.0, y=0.035, theta=math.pi / 2, width=0.03, surface_height=_HEIGHT),
-)
-"""On either arm, as near to the centre of mass as leaves the fingers room in the corner."""
+_ALONG_ARM = (0.035, 0.055)
+"""How far from the corner the demonstrator takes hold of an arm, in metres."""
+
+
+def _grasp(along_x: bool, distance: float) -> Grasp:
+    if along_x:
+        return Grasp(x=distance, y=0.0, theta=0.0, width=0.03, surface_height=_HEIGHT)
+    return Grasp(x=0.0, y=distance, theta=math.pi / 2, width=0.03, surface_height=_HEIGHT)
+
+
+_GRASPS = tuple(_grasp(along_x, distance) for along_x in (True, False) for distance in _ALONG_ARM)
 
 _BLOCK = Footprint(tuple(rectangle(*size[:2], x=x, y=y) for size, (x, y) in _ARMS), _GRASPS)
 _FIXTURE = Footprint(
@@ -34,19 +40,21 @@ _FIXTURE = Footprint(
 
 @dataclass
 class BlockInsertion(PoseTask):
-    """An L-shaped block is put into a fixture."""
+    """An L-shaped block is put into a fixture. The demonstrator grips it by either arm."""
 
     def make_scene(self, *, grid: PixelGrid, seed: int, base: Path) -> Scene:
         X_WFixture, X_WBlock = draw_poses(
             [_FIXTURE, _BLOCK], grid=grid, rng=np.random.default_rng(seed)
         )
+        rng = grasp_rng(seed)
+        grasp = _grasp(rng.random() < 0.5, float(rng.uniform(*_ALONG_ARM)))
         block = SceneObject(
             name="block",
             category="block",
             model=MODELS / "ravens" / "l_block.sdf",
             X_WB=X_WBlock,
             p_BPoints=_surface_points(),
-            grasps=_GRASPS,
+            grasps=(grasp,),
         )
         goal = Goal(
             name="block in fixture",

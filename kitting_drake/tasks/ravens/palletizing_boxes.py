@@ -1,6 +1,7 @@
-"""palletizing-boxes: boxes are moved from one stack to another, on a pallet."""
+"""palletizing-boxes: boxes that come one at a time are stacked on a pallet."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -10,32 +11,40 @@ from pydrake.math import RigidTransform, RollPitchYaw
 
 from kitting_drake.common.errors import UserError
 from kitting_drake.common.paths import MODELS
-from kitting_drake.tasks.boxes import box_object, random_brown
-from kitting_drake.tasks.ravens.ravens_task import RavensTask
-from kitting_drake.tasks.task import Fixture, Scene
+from kitting_drake.tasks.boxes import box_object, grasp_along, random_brown
+from kitting_drake.tasks.ravens.ravens_task import RavensTask, grasp_rng
+from kitting_drake.tasks.task import (
+    NEVER_APPEARED,
+    ActionRecord,
+    Arrivals,
+    Fixture,
+    Scene,
+    waiting_pose,
+)
 from systems.bounds import bounded
-from systems.placement import Goal, InZone
+from systems.placement import GONE, Goal, InZone, Placement
 from systems.signals import PixelGrid
 
 _BOX = (0.085, 0.04, 0.04)
 _X_WPALLET = RigidTransform([0.5, 0.25, 0.0])
 _PALLET_HEIGHT = 0.04
-_P_WSTACK = (0.5, -0.25)
-"""Where the boxes are stacked to begin with."""
+_P_WSOURCE = (0.5, -0.25)
+"""Where the boxes appear ..."""
+_DROP = 0.08
+"""... with their bottoms at this height, in metres; the first one lies there already."""
+_SOURCE_AREA = ((-5.0, -0.5), (5.0, 0.0))
+"""The next one appears when no box lies here: lower and upper (x, y) in the world, in metres."""
+_GRASP_OFFSET = 0.025
+"""The demonstrator takes hold of a box within this distance of its middle, along its longer side,
+in metres."""
 _ZONE = (0.30, 0.25, 0.30)
 """The room on the pallet, and the pallet's own, that counts."""
 
 _END_GAP = 0.01
 """Between the ends of two boxes in a line."""
 _TARGET_PITCH = 0.076
-"""From box to box across the jaws, on the pallet: a box, 6 mm of release and a finger, 26.3 mm
-deep, leave 3.7 mm to the next box."""
-_SOURCE_PITCH = 0.096
-"""The same where the boxes are taken from: half a box, half the open jaws and a finger leave
-9.7 mm, of which disarray may take 7."""
-_DISARRAY = 0.002
-_DISARRAY_ANGLE = math.radians(2.0)
-"""The boxes to be moved are off their places in the stack by at most so much."""
+"""From box to box across the jaws, on the pallet, so that three lines take up 190 mm; a finger is
+26.3 mm deep, and has room between two boxes."""
 
 _POINT_SPACING = 0.02
 """The spacing of the points by which the reward measures the share of a box in the zone, in m."""
@@ -43,49 +52,79 @@ _POINT_SPACING = 0.02
 
 @dataclass
 class PalletizingBoxes(RavensTask):
-    """Boxes are moved from one stack to another, on a pallet."""
+    """Boxes that come one at a time are stacked on a pallet.
+
+    The demonstrator fills one layer after the other, each in an order drawn anew.
+    """
+
+    causes = (NEVER_APPEARED, *RavensTask.causes)
 
     # Layers of six boxes.
     layers: int = bounded(3, 1, 4)
 
     def make_scene(self, *, grid: PixelGrid, seed: int, base: Path) -> Scene:
-        rng = np.random.default_rng(seed)
+        rng, grasps = np.random.default_rng(seed), grasp_rng(seed)
         count = 6 * self.layers
-        yaw = float(rng.uniform(-math.pi, math.pi))
-        X_WStack = RigidTransform(RollPitchYaw(0, 0, yaw), [*_P_WSTACK, 0])
-        X_WBoxes = [
-            X_WStack @ X_StackBox @ _disarray(rng)
-            for level in range(self.layers)
-            for X_StackBox in layer_poses(level, _SOURCE_PITCH)
+        X_WArrivals = [
+            RigidTransform(RollPitchYaw(0, 0, yaw), [*_P_WSOURCE, 0.0 if first else _DROP])
+            for first, yaw in zip(
+                [True] + [False] * (count - 1), rng.uniform(-math.pi, math.pi, count), strict=True
+            )
         ]
         boxes = tuple(
-            box_object(f"box_{number}", "box", _BOX, random_brown(rng), X_WBox)
-            for number, X_WBox in enumerate(X_WBoxes, start=1)
+            box_object(
+                f"box_{number}",
+                "box",
+                _BOX,
+                random_brown(rng),
+                X_WArrival if number == 1 else waiting_pose(number),
+                grasps=(grasp_along(_BOX, "x", float(offset)),),
+            )
+            for number, (X_WArrival, offset) in enumerate(
+                zip(X_WArrivals, grasps.uniform(-_GRASP_OFFSET, _GRASP_OFFSET, count), strict=True),
+                start=1,
+            )
         )
         X_WDeck = _X_WPALLET @ RigidTransform([0, 0, _PALLET_HEIGHT])
         # Every layer is across the one below, which ties the columns together.
         X_WGoals = [
-            X_WDeck @ X_DeckBox
+            X_WDeck @ layer[place]
             for level in range(self.layers)
-            for X_DeckBox in layer_poses(level, _TARGET_PITCH, across=level % 2 == 1)
+            for layer in [layer_poses(level, _TARGET_PITCH, across=level % 2 == 1)]
+            for place in rng.permutation(len(layer))
         ]
-        _check_workspace(grid, boxes[0].p_BPoints, X_WBoxes + X_WGoals)
+        _check_workspace(grid, boxes[0].p_BPoints, X_WArrivals + X_WGoals)
         return Scene(
             objects=boxes,
             fixtures=(Fixture("pallet", MODELS / "ravens" / "pallet.sdf", _X_WPALLET),),
-            # In this order the lower boxes come first; any order counts, as in Ravens.
+            # Any order counts, as in Ravens.
             goals=tuple(
                 Goal(
                     name=f"place {number} on the pallet",
                     objects=tuple(range(count)),
-                    poses=(X_WGoal, X_WGoal @ _half_turn()),
+                    poses=(X_WGoal,),
                     reward=1 / count,
                 )
                 for number, X_WGoal in enumerate(X_WGoals, start=1)
             ),
             success=InZone(_X_WPALLET, _ZONE, volume_points(_BOX)),
             max_actions=5 * count // 3,
+            arrivals=Arrivals(tuple(range(1, count)), tuple(X_WArrivals[1:]), _SOURCE_AREA),
         )
+
+    def find_cause(
+        self,
+        scene: Scene,
+        index: int,
+        X_WB: Sequence[RigidTransform],
+        placement: Placement,
+        records: Sequence[ActionRecord],
+    ) -> str:
+        # What has fallen off the table was picked, or has been where it could be.
+        waits = X_WB[index].IsNearlyEqualTo(scene.objects[index].X_WB, 1.0)
+        if waits and np.linalg.norm(X_WB[index].translation()) > GONE:
+            return NEVER_APPEARED
+        return super().find_cause(scene, index, X_WB, placement, records)
 
 
 def layer_poses(level: int, pitch: float, *, across: bool = False) -> list[RigidTransform]:
@@ -116,22 +155,12 @@ def volume_points(size: tuple[float, float, float]) -> NDArray[np.float64]:
     return np.column_stack([x.ravel(), y.ravel(), z.ravel() + size[2] / 2])
 
 
-def _disarray(rng: np.random.Generator) -> RigidTransform:
-    x, y = rng.uniform(-_DISARRAY, _DISARRAY, 2)
-    yaw = rng.uniform(-_DISARRAY_ANGLE, _DISARRAY_ANGLE)
-    return RigidTransform(RollPitchYaw(0, 0, yaw), [x, y, 0])
-
-
-def _half_turn() -> RigidTransform:
-    return RigidTransform(RollPitchYaw(0, 0, math.pi), [0, 0, 0])
-
-
 def _check_workspace(
     grid: PixelGrid, p_BPoints: NDArray[np.float64], poses: list[RigidTransform]
 ) -> None:
     for X_WB in poses:
         if not grid.contains(X_WB.multiply(p_BPoints.T)[:2].T).all():
             raise UserError(
-                "heightmap: the workspace does not hold the stack of boxes and the pallet, which "
+                "heightmap: the workspace does not hold the boxes to be stacked and the pallet, which "
                 "are around (0.5, -0.25) and (0.5, 0.25) m"
             )

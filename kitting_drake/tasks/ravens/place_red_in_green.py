@@ -7,9 +7,17 @@ import numpy as np
 from pydrake.math import RigidTransform
 
 from kitting_drake.policies.data.learning import Learning
-from kitting_drake.tasks.boxes import COLOURS, CUBE_FOOTPRINT, coloured, cube_object
+from kitting_drake.tasks.boxes import (
+    COLOURS,
+    CUBE_FOOTPRINT,
+    CUBE_GRASP_OFFSET,
+    CUBE_SIDE,
+    coloured,
+    cube_object,
+    random_grasp,
+)
 from kitting_drake.tasks.footprints import Footprint, disc, draw_poses
-from kitting_drake.tasks.ravens.ravens_task import RavensTask
+from kitting_drake.tasks.ravens.ravens_task import RavensTask, grasp_rng
 from kitting_drake.tasks.task import Fixture, Scene, SceneObject
 from systems.bounds import bounded
 from systems.placement import Goal, PoseWithin
@@ -23,7 +31,11 @@ _BOWL_FLOOR = 0.004
 
 @dataclass
 class PlaceRedInGreen(RavensTask):
-    """Red cubes are put into green bowls."""
+    """Red cubes are put into green bowls.
+
+    The demonstrator takes hold of a cube on either of its centre lines, and gives it the heading of
+    the bowl, which nothing shows.
+    """
 
     # Colours say what is to be done, and what else lies there has them too.
     not_perturbed = ("colour", "distractors")
@@ -59,7 +71,7 @@ class PlaceRedInGreen(RavensTask):
             X_WBowl @ RigidTransform([0, 0, _BOWL_FLOOR]) for X_WBowl in X_WBowls[:bowl_count]
         )
         return Scene(
-            objects=_cubes(cube_colours, X_WCubes),
+            objects=_cubes(cube_colours, X_WCubes, grasp_rng(seed)),
             fixtures=tuple(
                 Fixture(f"bowl_{number}_{name}", coloured("bowl.sdf", COLOURS[name]), X_WBowl)
                 for number, (name, X_WBowl) in enumerate(
@@ -81,9 +93,16 @@ class PlaceRedInGreen(RavensTask):
         )
 
 
-def _cubes(colours: list[str], X_WCubes: list[RigidTransform]) -> tuple[SceneObject, ...]:
+def _cubes(
+    colours: list[str], X_WCubes: list[RigidTransform], rng: np.random.Generator
+) -> tuple[SceneObject, ...]:
     return tuple(
-        cube_object(f"cube_{number}_{name}", COLOURS[name], X_WCube)
+        cube_object(
+            f"cube_{number}_{name}",
+            COLOURS[name],
+            X_WCube,
+            (random_grasp((CUBE_SIDE,) * 3, CUBE_GRASP_OFFSET, rng),),
+        )
         for number, (name, X_WCube) in enumerate(zip(colours, X_WCubes, strict=True), start=1)
     )
 

@@ -5,6 +5,7 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import numpy as np
 from pydrake.math import RigidTransform
 
 from kitting_drake.policies.data.learning import Learning
@@ -15,8 +16,17 @@ from systems.placement import Placement, PoseWithin
 TOPPLED = "toppled"
 PREREQUISITE_MISSING = "prerequisite missing"
 
+_GRASP_STREAM = 2
+"""Stream of the seed: the demonstrator's grasps change nothing else that is drawn."""
+
 _UPRIGHT = math.cos(math.radians(20.0))
 """The cosine of the tilt beyond which an object has toppled."""
+
+
+def grasp_rng(seed: int) -> np.random.Generator:
+    """Where the demonstrator takes hold of an object is drawn from this, as in the gripper version
+    of Ravens: off its middle, so that the pick tells which way the jaws close."""
+    return np.random.default_rng([seed, _GRASP_STREAM])
 
 
 @dataclass

@@ -5,12 +5,19 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from pydrake.math import RigidTransform, RollPitchYaw
+from pydrake.math import RigidTransform
 
 from kitting_drake.common.paths import MODELS
-from kitting_drake.tasks.boxes import COLOURS, CUBE_FOOTPRINT, CUBE_SIDE, cube_object
+from kitting_drake.tasks.boxes import (
+    COLOURS,
+    CUBE_FOOTPRINT,
+    CUBE_GRASP_OFFSET,
+    CUBE_SIDE,
+    cube_object,
+    grasp_along,
+)
 from kitting_drake.tasks.footprints import Footprint, draw_poses, rectangle
-from kitting_drake.tasks.ravens.ravens_task import PoseTask
+from kitting_drake.tasks.ravens.ravens_task import PoseTask, grasp_rng
 from kitting_drake.tasks.task import Fixture, Scene
 from systems.grasp import Grasp
 from systems.placement import Goal
@@ -24,14 +31,22 @@ _BASE_SIZE = (0.05, 0.15, 0.005)
 
 _BASE = Footprint(
     (rectangle(*_BASE_SIZE[:2]),),
-    tuple(Grasp(0.0, y, math.pi / 2, CUBE_SIDE, CUBE_SIDE) for y in (-_PITCH, 0.0, _PITCH)),
+    tuple(
+        Grasp(0.0, y + offset, math.pi / 2, CUBE_SIDE, CUBE_SIDE)
+        for y in (-_PITCH, 0.0, _PITCH)
+        for offset in (-CUBE_GRASP_OFFSET, CUBE_GRASP_OFFSET)
+    ),
     tall=True,
 )
 
 
 @dataclass
 class StackBlockPyramid(PoseTask):
-    """Six cubes are stacked to a pyramid."""
+    """Six cubes are stacked to a pyramid.
+
+    The demonstrator takes hold of a cube on its centre line along y and puts it down with the
+    heading of the base, so that the jaws open across the row.
+    """
 
     # The colour of a cube says where it belongs.
     not_perturbed = ("colour",)
@@ -41,10 +56,16 @@ class StackBlockPyramid(PoseTask):
         X_WBase, *X_WCubes = draw_poses(
             [_BASE] + [CUBE_FOOTPRINT] * len(names), grid=grid, rng=np.random.default_rng(seed)
         )
+        offsets = grasp_rng(seed).uniform(-CUBE_GRASP_OFFSET, CUBE_GRASP_OFFSET, len(names))
         return Scene(
             objects=tuple(
-                cube_object(f"{name}_cube", COLOURS[name], X_WCube)
-                for name, X_WCube in zip(names, X_WCubes, strict=True)
+                cube_object(
+                    f"{name}_cube",
+                    COLOURS[name],
+                    X_WCube,
+                    (grasp_along((CUBE_SIDE,) * 3, "y", float(offset)),),
+                )
+                for name, X_WCube, offset in zip(names, X_WCubes, offsets, strict=True)
             ),
             fixtures=(Fixture("base", MODELS / "ravens" / "pyramid_base.sdf", X_WBase),),
             goals=_goals(X_WBase),
@@ -70,10 +91,7 @@ def _goals(X_WBase: RigidTransform) -> tuple[Goal, ...]:
                 Goal(
                     name=f"row {level + 1}, place {place + 1}",
                     objects=cubes,
-                    poses=tuple(
-                        X_WBase @ RigidTransform(RollPitchYaw(0, 0, turn * math.pi / 2), [0, y, z])
-                        for turn in range(4)
-                    ),
+                    poses=(X_WBase @ RigidTransform([0, y, z]),),
                     reward=1 / 6,
                     after=below,
                 )
