@@ -47,7 +47,7 @@ class ObjectFeeder(LeafSystem):
     ) -> None:
         """
         Args:
-            waiting: the bodies that appear, in their order, and where each waits: (3,) in the world.
+            waiting: the bodies that appear, in their order, and p_WB (3,) where each waits.
             others: the bodies that are there from the beginning.
             area: lower and upper (x, y) corner in the world, in metres.
         """

@@ -82,9 +82,9 @@ class OraclePolicy(LeafSystem):
 
     The law. The next goal is the first, in the order given, that is not filled and whose
     prerequisites are, where those that are kept count as filled; goals whose object is already
-    there, though not as it should be, come last. Of the objects in the cell that may fill it and fill
-    no other, the highest is taken, as nothing lies on it; of several as high, the one assigned to
-    the goal by `evaluate_placements`. Of the goal's poses it takes the free one that rotates the
+    there, though not as it should be, come last. Of the objects in the cell that may fill it and
+    fill no other, the highest is taken, as nothing lies on it; of several as high, the one assigned
+    to the goal by `evaluate_placements`. Of the goal's poses it takes the free one that rotates the
     object least, and of the object's grasps the first at which the fingers are clear of other
     objects at the pick and at the place.
 

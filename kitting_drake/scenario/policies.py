@@ -248,9 +248,7 @@ class Learned(PolicyConfig):
 
     def validate(self) -> None:
         if self.recover and not self.avoid_failed_picks:
-            raise ValueError(
-                "policy.recover needs policy.avoid_failed_picks: what failed is mended"
-            )
+            raise ValueError("policy.recover needs policy.avoid_failed_picks: true")
 
     def _path(self, base: Path) -> Path:
         return base / self.weights if self.weights else GENERALIST

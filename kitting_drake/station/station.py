@@ -20,9 +20,9 @@ from kitting_drake.station.paint import paint_surfaces
 from kitting_drake.station.plant import add_models, add_plant, bounded_body, set_initial_poses
 from kitting_drake.station.sensing import add_cameras
 from kitting_drake.tasks.task import Scene
+from systems.object_feeder import ObjectFeeder
 from systems.pick_place_parameters import Mode
 from systems.placement import GONE, PlacedObject, Placement
-from systems.object_feeder import ObjectFeeder
 from systems.placement_monitor import PlacementMonitor
 from systems.rest_detector import RestDetector
 from systems.signals import Observation, PickPlaceAction
@@ -253,7 +253,7 @@ class KittingStation(Diagram):
     # monitor.
 
     def _let_appear(self, root_context: Context) -> None:
-        """Moves the object that is to appear now, if one is, to where it appears. It wakes there."""
+        """Moves the object that is to appear now, if any, to where it appears; it wakes there."""
         if self._feeder is None:
             return
         port = self._feeder.get_output_port()

@@ -161,6 +161,6 @@ def _check_workspace(
     for X_WB in poses:
         if not grid.contains(X_WB.multiply(p_BPoints.T)[:2].T).all():
             raise UserError(
-                "heightmap: the workspace does not hold the boxes to be stacked and the pallet, which "
-                "are around (0.5, -0.25) and (0.5, 0.25) m"
+                "heightmap: the workspace must hold the place where boxes appear and the pallet, "
+                "around (0.5, -0.25) and (0.5, 0.25) m"
             )

@@ -17,7 +17,14 @@ from kitting_drake.tasks import (
 )
 from kitting_drake.tasks.ravens.palletizing_boxes import volume_points
 from kitting_drake.tasks.ravens.ravens_task import PREREQUISITE_MISSING, TOPPLED
-from kitting_drake.tasks.task import MISPLACED, NEVER_PICKED, ActionRecord, Scene, TaskConfig
+from kitting_drake.tasks.task import (
+    MISPLACED,
+    NEVER_APPEARED,
+    NEVER_PICKED,
+    ActionRecord,
+    Scene,
+    TaskConfig,
+)
 from systems.placement import PlacedObject, Placement, evaluate_placements, total_reward
 from systems.signals import PixelGrid, PlanarPose
 
@@ -137,6 +144,16 @@ def test_boxes_count_by_what_of_them_is_on_the_pallet():
     assert reward(scene, [moved(over_the_edge, x=0.05), *start[1:]]) == 0
     # Nothing counts above 0.30 m.
     assert reward(scene, [moved(places[0], z=0.30), *start[1:]]) == 0
+
+
+def test_a_box_that_did_not_come_was_not_left():
+    task = PalletizingBoxes()
+    scene = make_scene(task)
+    poses = initial_poses(scene)
+    measured = placements(scene, poses)
+    causes = [task.find_cause(scene, index, poses, measured[index], []) for index in (0, 1)]
+    assert causes == [NEVER_PICKED, NEVER_APPEARED]
+    assert set(causes) <= set(task.causes)
 
 
 def test_boxes_are_filled_with_points_20_mm_apart():
