@@ -8,10 +8,12 @@ from pathlib import Path
 from typing import Any
 
 from kitting_drake.common.errors import UserError
+from kitting_drake.common.paths import SCENARIOS
 from kitting_drake.evaluation.summary import ERRORS
 from kitting_drake.policies.data.static_scenes import STATIC
 from kitting_drake.reproduction.page.run_table import TABLE, Summary, read_summaries
 from kitting_drake.scenario.choosing import ChosenScenario
+from kitting_drake.scenario.loader import load_scenario
 from kitting_drake.scenario.schema import Scenario
 from kitting_drake.tasks import PAPER_TASKS, RAVENS_TASKS
 
@@ -124,11 +126,9 @@ class Run:
             expected = described(Scenario(task=task))
             if found["task"]["_tag"] == expected["task"]["_tag"]:
                 return _differences(_without(found), _without(expected))
-        for other in RAVENS_TASKS:
-            expected = described(Scenario(task=other))
+        for expected in _ravens_scenarios():
             if found["task"]["_tag"] == expected["task"]["_tag"]:
-                # The longest of them has a limit of its own.
-                return _differences(_without(found, "time_limit"), _without(expected, "time_limit"))
+                return _differences(_without(found), _without(expected))
         expected = _defaults()
         return _differences(_without(found, "task"), _without(expected, "task"))
 
@@ -177,6 +177,12 @@ def _translated(plant: Any) -> dict[str, Any]:
         "variation": defaults["variation"]
         | {key: plant.get(f"{key}_variation", 0.0) for key in ("friction", "mass")},
     }
+
+
+@cache
+def _ravens_scenarios() -> list[dict[str, Any]]:
+    names = [type(task).__name__ for task in RAVENS_TASKS]
+    return [described(load_scenario(SCENARIOS / "ravens.yaml", name)) for name in names]
 
 
 @cache

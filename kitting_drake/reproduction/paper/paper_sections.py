@@ -52,6 +52,9 @@ _VARIANTS = {
 }
 """Endings of the names of cells, by what their rows are called."""
 
+EARLIER_MARK = " e"
+"""Behind a figure of table I: run on an earlier version of the task."""
+
 _TOLD = ("trained_orientations", "steps", "learning_rate", "training_seed", "compute_type")
 """The details of a policy that are columns of "Every cell"."""
 
@@ -202,7 +205,9 @@ def _table_1(results: Mapping[str, Result]) -> list[str]:
         found = results.get(name)
         if found is None:
             return f"- / {paper:g}"
-        return f"{rate_text(found.summary['success_rate'], found.summary['ci95'])} / {paper:g}"
+        mark = EARLIER_MARK if found.cell.is_earlier(found.summary) else ""
+        rate = rate_text(found.summary["success_rate"], found.summary["ci95"])
+        return f"{rate}{mark} / {paper:g}"
 
     rows, beyond = [], []
     for (name, n), by_task in TABLE_1.items():
