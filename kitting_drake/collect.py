@@ -31,6 +31,7 @@ from kitting_drake.common.rendering import require_rendering
 from kitting_drake.common.seeds import DEMONSTRATION_SEEDS, seeds_from
 from kitting_drake.episode import EpisodeResult, ModeChange
 from kitting_drake.episode.chosen import build_any_chosen, build_chosen, run_chosen
+from kitting_drake.episode.episode_log import add_log_flag, log_of_many, log_of_seed
 from kitting_drake.policies.data.demonstrations import (
     Demonstration,
     Origin,
@@ -84,7 +85,9 @@ def main() -> int:
         help="also write them as a LeRobotDataset v3.0, to the folder lerobot in --output; those "
         "collected before, without collecting",
     )
+    add_log_flag(parser)
     arguments = parser.parse_args()
+    log = log_of_many(arguments.log, arguments.ray)
     chosen = _by_oracle(choose_scenario(arguments))
     folder = require_folder(output_folder(arguments, f"{chosen.name}-demonstrations"))
     console = Console(quiet=arguments.quiet)
@@ -117,7 +120,7 @@ def main() -> int:
             with open_workers(arguments, chosen) as (workers, sent):
                 collection.collect(
                     arguments.demos,
-                    lambda seed: workers.run(_demonstrate, sent, seed),
+                    lambda seed: workers.run(_demonstrate, sent, seed, log),
                     workers=workers,
                     console=console,
                 )
@@ -355,7 +358,7 @@ def _reject_dead(seed: int, dead: ProcessCrashed) -> Rejection:
     return Rejection(seed, 0.0, f"its process ended with exit code {dead.exit_code}")
 
 
-def _demonstrate(chosen: ChosenScenario, seed: int) -> Demonstration | Rejection:
+def _demonstrate(chosen: ChosenScenario, seed: int, log: Path | None) -> Demonstration | Rejection:
     # A station is built without cameras where nothing can be rendered.
     require_rendering()
     try:
@@ -366,7 +369,8 @@ def _demonstrate(chosen: ChosenScenario, seed: int) -> Demonstration | Rejection
         return Rejection(seed, 0.0, str(error))
     learning = chosen.scenario.task.learning
     recorder = DemonstrationRecorder(station, later_picks_possible=learning.later_picks_possible)
-    result = run_chosen(chosen, diagram, station, observers=[recorder.observe])
+    file = None if log is None else log_of_seed(log, seed)
+    result = run_chosen(chosen, diagram, station, observers=[recorder.observe], log=file)
     return recorder.demonstration(result)
 
 

@@ -31,6 +31,7 @@ from kitting_drake.common.provenance import commit, versions
 from kitting_drake.common.seeds import ALL_SEEDS
 from kitting_drake.episode import EpisodeResult
 from kitting_drake.episode.chosen import build_any_chosen, build_chosen, run_chosen
+from kitting_drake.episode.episode_log import add_log_flag, log_of_many, log_of_seed
 from kitting_drake.evaluation.summary import Episode, summarise
 from kitting_drake.evaluation.summary_figure import draw_summary
 from kitting_drake.evaluation.terminal import summary_notes, summary_table
@@ -53,7 +54,9 @@ def main() -> int:
     parser.add_argument("--episodes", type=count_type, default=100, help="how many (100)")
     add_workers_flags(parser)
     parser.add_argument("--seed", type=seed_type, help="of the first (default: the scenario's)")
+    add_log_flag(parser)
     arguments = parser.parse_args()
+    log = log_of_many(arguments.log, arguments.ray)
     chosen = choose_scenario(arguments)
     first = chosen.scenario.random_seed if arguments.seed is None else arguments.seed
     seeds = range(first, first + arguments.episodes)
@@ -77,7 +80,7 @@ def main() -> int:
                 chosen,
                 seeds,
                 folder,
-                lambda seed: run_in_worker(workers, sent, seed),
+                lambda seed: run_in_worker(workers, sent, seed, log),
                 workers=workers,
                 console=console,
             )
@@ -197,7 +200,9 @@ def _identity(chosen: ChosenScenario) -> dict[str, Any]:
     }
 
 
-def run_in_worker(workers: Workers, chosen: ChosenScenario, seed: int) -> Episode:
+def run_in_worker(
+    workers: Workers, chosen: ChosenScenario, seed: int, log: Path | None = None
+) -> Episode:
     """Runs one episode in another process and waits for it.
 
     A process that dies leaves a failed episode with its reason; one that something else killed is
@@ -207,14 +212,15 @@ def run_in_worker(workers: Workers, chosen: ChosenScenario, seed: int) -> Episod
         workers: where.
         chosen: the scenario as they find it.
         seed: the episode's.
+        log: the file of which each seed has its own; see `log_of_seed`.
 
     Raises:
         UserError: the process was killed twice.
     """
     start = time.perf_counter()
-    outcome = workers.run(_work, chosen, seed)
+    outcome = workers.run(_work, chosen, seed, log)
     if isinstance(outcome, ProcessCrashed) and outcome.was_killed:
-        outcome = workers.run(_work, chosen, seed)
+        outcome = workers.run(_work, chosen, seed, log)
         if isinstance(outcome, ProcessCrashed) and outcome.was_killed:
             raise outcome.killed_twice(seed)
     if isinstance(outcome, ProcessCrashed):
@@ -224,7 +230,7 @@ def run_in_worker(workers: Workers, chosen: ChosenScenario, seed: int) -> Episod
     return outcome
 
 
-def _work(chosen: ChosenScenario, seed: int) -> Episode | str:
+def _work(chosen: ChosenScenario, seed: int, log: Path | None) -> Episode | str:
     """An episode, or why there is none of this seed."""
     try:
         diagram, station = build_chosen(chosen, seed=seed)
@@ -232,7 +238,9 @@ def _work(chosen: ChosenScenario, seed: int) -> Episode | str:
         raise
     except UserError as error:
         return str(error)
-    return run_chosen(chosen, diagram, station).as_dict() | {"commit": _commit_of_process()}
+    file = None if log is None else log_of_seed(log, seed)
+    result = run_chosen(chosen, diagram, station, log=file)
+    return result.as_dict() | {"commit": _commit_of_process()}
 
 
 @functools.cache

@@ -12,6 +12,7 @@ from kitting_drake.common.errors import UserError
 from kitting_drake.common.files import require_folder, write_atomically, write_json
 from kitting_drake.common.rendering import add_picture_renderer, render_picture, save_png
 from kitting_drake.episode.chosen import run_chosen
+from kitting_drake.episode.episode_log import add_log_flag, check_log
 from kitting_drake.evaluation.episode_progress import EpisodeProgress
 from kitting_drake.evaluation.terminal import print_episode
 from kitting_drake.scenario.choosing import choose_scenario, output_folder, scenario_parser
@@ -38,6 +39,8 @@ def main() -> int:
         console.print(f"note: {note}", highlight=False, markup=False)
     folder = require_folder(output_folder(arguments, chosen.name))
     _check_files(arguments.picture, arguments.video, folder / REPLAY)
+    if arguments.log is not None:
+        check_log(arguments.log)
 
     decisions: list[tuple[Observation, Decision]] = []
     meshcat = None if arguments.no_meshcat else start_meshcat(scenario.meshcat)
@@ -69,6 +72,7 @@ def main() -> int:
             station,
             realtime_rate=scenario.target_realtime_rate,
             observers=[progress.observe],
+            log=arguments.log,
         )
     write_json(folder / "results.json", result.as_dict())
     # Remove stale files.
@@ -108,6 +112,7 @@ def _parser() -> argparse.ArgumentParser:
         metavar="FILE.png",
         help="also render the station as the episode ends",
     )
+    add_log_flag(parser)
     parser.add_argument(
         "--video", type=Path, metavar="FILE.gif", help="also film the episode (.gif or .webp)"
     )

@@ -10,6 +10,7 @@ EXTRAS = {
     "fabrication": ("ezdxf>=1.4", "svgelements>=1.9.6"),
     "gym": ("gymnasium>=1.0",),
     "lerobot": ("pyarrow>=21",),
+    "log": ("mcap-ros2-support>=0.5",),
     "mujoco": ("mujoco>=3.2,<4",),
     "onnx": ("onnx>=1.17", "onnxruntime>=1.20"),
 }

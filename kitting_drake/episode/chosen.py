@@ -2,11 +2,13 @@
 
 import itertools
 from collections.abc import Iterable, Sequence
+from pathlib import Path
 
 from pydrake.systems.framework import Diagram
 
 from kitting_drake.common.errors import MachineError, UserError
 from kitting_drake.episode.episode import EpisodeResult, run_episode
+from kitting_drake.episode.episode_log import EpisodeLog
 from kitting_drake.episode.events import EpisodeObserver
 from kitting_drake.scenario.choosing import ChosenScenario
 from kitting_drake.station import KittingStation, build_station, with_policy
@@ -53,13 +55,20 @@ def run_chosen(
     *,
     realtime_rate: float = 0.0,
     observers: Sequence[EpisodeObserver] = (),
+    log: Path | None = None,
 ) -> EpisodeResult:
-    """`run_episode` for a scenario of the command line, in a Diagram fresh from `build_chosen`."""
-    return run_episode(
+    """`run_episode` for a scenario of the command line, in a Diagram fresh from `build_chosen`; a
+    log goes to a file, if one is named."""
+    episode_log = None if log is None else EpisodeLog(station)
+    result = run_episode(
         diagram,
         station,
         scenario=chosen.name,
         policy=chosen.policy,
         realtime_rate=realtime_rate,
         observers=observers,
+        log=episode_log,
     )
+    if episode_log is not None and log is not None:
+        episode_log.save(log)
+    return result

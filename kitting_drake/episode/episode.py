@@ -10,6 +10,7 @@ from typing import Any
 from pydrake.systems.framework import Context, Diagram, EventStatus
 
 from kitting_drake.episode.action_log import ActionLog
+from kitting_drake.episode.episode_log import EpisodeLog
 from kitting_drake.episode.events import EpisodeObserver, ModeChange
 from kitting_drake.station import KittingStation
 from kitting_drake.tasks.task import ActionRecord
@@ -86,6 +87,7 @@ def run_episode(
     policy: str,
     realtime_rate: float = 0.0,
     observers: Sequence[EpisodeObserver] = (),
+    log: EpisodeLog | None = None,
 ) -> EpisodeResult:
     """Runs an episode until the planner is done and the objects rest, or the time is up.
 
@@ -99,6 +101,7 @@ def run_episode(
         policy: its name, for the result.
         realtime_rate: 1 for real time, 0 for as fast as possible.
         observers: told of every event.
+        log: takes down every step.
     """
     episode = Episode(
         diagram,
@@ -107,6 +110,7 @@ def run_episode(
         policy=policy,
         realtime_rate=realtime_rate,
         observers=observers,
+        log=log,
     )
     episode.advance()
     return episode.result()
@@ -124,6 +128,7 @@ class Episode:
         policy: str,
         realtime_rate: float = 0.0,
         observers: Sequence[EpisodeObserver] = (),
+        log: EpisodeLog | None = None,
         pauses: bool = False,
     ) -> None:
         """
@@ -135,12 +140,14 @@ class Episode:
             policy: see there.
             realtime_rate: see there.
             observers: see there.
+            log: see there.
             pauses: whether `advance` returns each time the planner asks for an action.
         """
         self._station = station
         self._names = {"scenario": scenario, "policy": policy, "seed": station.seed}
         self._log = ActionLog(station)
-        self._monitor = _Monitor(station, [self._log.observe, *observers], pauses=pauses)
+        told = [self._log.observe, *observers]
+        self._monitor = _Monitor(station, told, log, pauses=pauses)
         self._simulator = station.make_simulator(diagram, monitor=self._monitor.step)
         self._simulator.set_target_realtime_rate(realtime_rate)
         self._failure: str | None = None
@@ -270,9 +277,15 @@ class _Monitor:
     """Called after every step: tells of events, knows when to halt."""
 
     def __init__(
-        self, station: KittingStation, observers: Sequence[EpisodeObserver], *, pauses: bool
+        self,
+        station: KittingStation,
+        observers: Sequence[EpisodeObserver],
+        log: EpisodeLog | None,
+        *,
+        pauses: bool,
     ) -> None:
         self._station = station
+        self._log = log
         self._pauses = pauses
         self._end_at_success = station.scenario.end_at_success and not pauses
         self.is_paused = False
@@ -285,6 +298,8 @@ class _Monitor:
         """The callback of the simulator."""
         station = self._station
         self.tell(root_context)
+        if self._log is not None:
+            self._log.sample(root_context)
         if self._pauses or self._end_at_success:
             asks = station.asks(root_context)
             if asks and self._end_at_success and station.reward(root_context) > ALL:

@@ -29,7 +29,7 @@ def add_control(
     plant: MultibodyPlant,
     projector: HeightmapProjector | None,
 ) -> PickPlacePlanner:
-    """Adds both, closes the loop, and exports the planner's ports, `robot_state`, `wrist_force`.
+    """Adds both, closes the loop, and exports the planner's ports, and what robot and wrist say.
 
     Args:
         builder: of the station.
@@ -61,6 +61,7 @@ def add_control(
     builder.Connect(controller.get_output_port(), plant.get_actuation_input_port(hand))
     for port, name in _EXPORTED.items():
         builder.ExportOutput(planner.GetOutputPort(port), name)
+    builder.ExportOutput(controller.get_output_port(), "actuation")
     builder.ExportOutput(state, "robot_state")
     builder.ExportOutput(force, "wrist_force")
     return planner

@@ -49,6 +49,7 @@ class KittingStation(Diagram):
         - counts
         - robot_state
         - wrist_force
+        - actuation
         - commanded
         - commanded_opening
         - body_poses
@@ -74,6 +75,7 @@ class KittingStation(Diagram):
     - `failed_picks`, `accepted_action`, `asks`, `mode`, `counts`: the `PickPlacePlanner`'s.
     - `robot_state` (12): positions, then velocities of x, y, z, yaw and both fingers; m, rad, s.
     - `wrist_force` (6): contact forces on x, y, z (N), about z (N m), and on each finger (N).
+    - `actuation` (6): what drives x, y, z (N), yaw (N m) and each finger (N).
     - `commanded` (12): q_d, v_d, a_d of x, y, z and yaw. `commanded_opening` (2): the opening
       between the pads in m, and its rate.
     - `body_poses`, `contact_results`: the plant's. `query_object`: the scene graph's.

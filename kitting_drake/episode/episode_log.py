@@ -1,0 +1,201 @@
+"""What a robot's log holds: joints, commands, forces, observations and actions of an episode, by
+time; written as NumPy's `.npz`, or as MCAP for Foxglove and rerun."""
+
+from __future__ import annotations
+
+import argparse
+import io
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pydrake.systems.framework import Context
+
+from kitting_drake.common.errors import UserError
+from kitting_drake.common.extras import import_extra
+from kitting_drake.common.files import write_atomically
+from kitting_drake.episode.mcap_messages import definition, mcap_messages
+from kitting_drake.station import KittingStation
+from systems.pick_place_parameters import Mode
+
+ENDINGS = (".npz", ".mcap")
+JOINTS = ("x", "y", "z", "yaw")
+"""The joints of the floating hand, as the log names them."""
+
+_SAMPLED = ("time", "state", "torque", "wrist", "commanded", "opening", "mode")
+
+Arrays = dict[str, NDArray[Any]]
+
+
+def add_log_flag(parser: argparse.ArgumentParser) -> None:
+    """Adds `--log`."""
+    parser.add_argument(
+        "--log",
+        type=Path,
+        metavar="FILE.npz",
+        help="also log joints, forces, o_t and actions (.npz, or .mcap for Foxglove and rerun)",
+    )
+
+
+def check_log(path: Path) -> None:
+    """Checks that a log can be written to a file, before the episode.
+
+    Raises:
+        UserError: the file's name has another ending, or is a folder's.
+        MachineError: the package that writes it is not installed.
+    """
+    if path.suffix not in ENDINGS:
+        raise UserError(f"--log writes {' and '.join(ENDINGS)} files, not '{path}'")
+    if path.is_dir():
+        raise UserError(f"{path} is a folder")
+    if path.suffix == ".mcap":
+        _mcap_package()
+
+
+def log_of_many(path: Path | None, cluster: str | None) -> Path | None:
+    """The file of `--log` where there are many episodes; see `log_of_seed`.
+
+    Args:
+        path: of `--log`, if it was given.
+        cluster: of `--ray`, if it was given.
+
+    Raises:
+        UserError: as `check_log`; or episodes run on other machines.
+        MachineError: as `check_log`.
+    """
+    if path is None:
+        return None
+    check_log(path)
+    if cluster is not None:
+        raise UserError("--log writes files of this machine: leave --ray out")
+    return path.resolve()
+
+
+def log_of_seed(path: Path, seed: int) -> Path:
+    """The file of one of many episodes: `runs/log.npz` becomes `runs/log_00000007.npz`."""
+    return path.with_name(f"{path.stem}_{seed:08d}{path.suffix}")
+
+
+class EpisodeLog:
+    """Takes down an episode, once every step of the plant."""
+
+    def __init__(self, station: KittingStation) -> None:
+        """
+        Args:
+            station: the episode's.
+        """
+        self._station = station
+        self._samples: dict[str, list[NDArray[np.float64]]] = {name: [] for name in _SAMPLED}
+        self._poses: list[NDArray[np.float64]] = []
+        self._actions: list[tuple[float, NDArray[np.float64], NDArray[np.float64], bool]] = []
+        self._heights: list[NDArray[np.float32]] = []
+        self._seen: NDArray[np.float32] | None = None
+
+    def sample(self, root_context: Context) -> None:
+        """Takes down the present step; to be called after each, and in their order."""
+        station = self._station
+        context = station.GetMyContextFromRoot(root_context)
+
+        def port(name: str) -> Any:
+            return station.GetOutputPort(name).Eval(context)
+
+        for key, value in (
+            ("time", np.array(root_context.get_time())),
+            ("state", port("robot_state")),
+            ("torque", port("actuation")),
+            ("wrist", port("wrist_force")),
+            ("commanded", port("commanded")),
+            ("opening", port("commanded_opening")),
+            ("mode", port("mode")[0]),
+        ):
+            self._samples[key].append(np.array(value))
+        self._poses.append(
+            np.array([X_WB.GetAsMatrix34() for X_WB in station.object_poses(root_context)])
+        )
+        if int(port("counts")[0]) > len(self._actions):
+            action = port("accepted_action")
+            poses = (action.pick.as_array(), action.place.as_array())
+            self._actions.append((root_context.get_time(), *poses, action.press))
+            if self._seen is not None:
+                self._heights.append(self._seen)
+        if station.has_cameras and port("asks")[0]:
+            # What the policy is about to be shown: Drake computes it once for both.
+            self._seen = port("observation_heights").height.astype(np.float32)
+
+    def arrays(self) -> Arrays:
+        """The log, n samples and k actions; SI units, radians, the world's frame.
+
+        Returns:
+            `time` (n); `joint_position`, `joint_velocity`, `joint_torque` (n, 4), of x, y, z and
+            yaw; `finger_position` (n, 2), `finger_force` (n, 2), what drives each; `wrist_force`
+            (n, 6), contact on x, y, z, about z, and on each finger; `commanded_position`,
+            `commanded_velocity`, `commanded_acceleration` (n, 4); `commanded_opening` (n, 2), and
+            its rate; `mode` (n), a `Mode`; `object_poses` (n, objects, 3, 4), X_WB. For each
+            action: `action_time` (k), when it was begun; `pick`, `place` (k, 3), x, y, theta;
+            `press` (k); `observation_height` (k, rows, cols), o_t as the policy saw it, not there
+            where nothing sees. `joint_names`, `mode_names` and `object_names` are texts.
+        """
+        found = {key: np.array(values) for key, values in self._samples.items()}
+        state, torque, commanded = found["state"], found["torque"], found["commanded"]
+        times = np.array([action[0] for action in self._actions])
+        picks = np.array([action[1] for action in self._actions]).reshape(-1, 3)
+        places = np.array([action[2] for action in self._actions]).reshape(-1, 3)
+        arrays: Arrays = {
+            "time": found["time"],
+            "joint_position": state[:, :4],
+            "joint_velocity": state[:, 6:10],
+            "joint_torque": torque[:, :4],
+            "finger_position": state[:, 4:6],
+            "finger_force": torque[:, 4:],
+            "wrist_force": found["wrist"],
+            "commanded_position": commanded[:, :4],
+            "commanded_velocity": commanded[:, 4:8],
+            "commanded_acceleration": commanded[:, 8:],
+            "commanded_opening": found["opening"],
+            "mode": found["mode"].astype(np.int8),
+            "object_poses": np.array(self._poses),
+            "action_time": times,
+            "pick": picks,
+            "place": places,
+            "press": np.array([action[3] for action in self._actions], bool),
+            "joint_names": np.array(JOINTS),
+            "mode_names": np.array([mode.name for mode in Mode]),
+            "object_names": np.array([item.name for item in self._station.objects]),
+        }
+        if len(self._heights) == len(times) > 0:
+            arrays["observation_height"] = np.array(self._heights)
+        return arrays
+
+    def save(self, path: Path) -> None:
+        """Writes the log to a `.npz` or `.mcap` file, atomically.
+
+        Raises:
+            MachineError: it cannot be written, or the package that writes it is not installed.
+        """
+        buffer = io.BytesIO()
+        if path.suffix == ".npz":
+            np.savez_compressed(buffer, allow_pickle=False, **self.arrays())
+        else:
+            _write_mcap(buffer, self.arrays())
+        write_atomically(path, buffer.getvalue())
+
+
+def _write_mcap(buffer: io.BytesIO, arrays: Arrays) -> None:
+    writer = _mcap_package().writer.Writer(buffer)
+    schemas = {}
+    for message in mcap_messages(arrays):
+        if message.kind not in schemas:
+            schemas[message.kind] = writer.register_msgdef(message.kind, definition(message.kind))
+        writer.write_message(
+            message.topic,
+            schemas[message.kind],
+            message.content,
+            log_time=round(1e9 * message.time),
+        )
+    writer.finish()
+
+
+def _mcap_package() -> ModuleType:
+    return import_extra("mcap_ros2", "writer", purpose="--log FILE.mcap", extra="log")
