@@ -27,7 +27,7 @@ from kitting_drake.common.processes import (
     counting_bar,
     side_by_side,
 )
-from kitting_drake.common.provenance import commit, versions
+from kitting_drake.common.provenance import commit, uncommitted_note, versions
 from kitting_drake.common.seeds import ALL_SEEDS
 from kitting_drake.episode import EpisodeResult
 from kitting_drake.episode.chosen import build_any_chosen, build_chosen, run_chosen
@@ -66,7 +66,7 @@ def main() -> int:
         )
     folder = require_folder(output_folder(arguments, f"{chosen.name}-evaluation"))
     console = Console(quiet=arguments.quiet)
-    if note := hidden_table_note(chosen.scenario):
+    for note in filter(None, (uncommitted_note(), hidden_table_note(chosen.scenario))):
         console.print(f"note: {note}", highlight=False, markup=False)
 
     known = chosen.scenario.policy.training_seeds(chosen.base).intersection(seeds)

@@ -2,9 +2,9 @@
 docs/robustness.md, from the runs in docs/results/.
 
 `--add` puts a run of `evaluate` among them, `--remove` takes one out. A run that has the name of a
-cell of `benchmark paper` fills that cell. Beside the runs lie `learning_rates.json` of `benchmark
-paper` and `networks.json`, a copy of the file of `benchmark networks`. Nothing in the tables comes
-from anywhere else, but the paper's own figures.
+cell of `benchmark paper` fills that cell; it must be of a tree without uncommitted changes. Beside
+the runs lie `learning_rates.json` of `benchmark paper` and `networks.json`, a copy of the file of
+`benchmark networks`. Nothing in the tables comes from anywhere else, but the paper's own figures.
 """
 
 import argparse
@@ -21,7 +21,7 @@ from kitting_drake.reproduction.page.results_page import results_page
 from kitting_drake.reproduction.page.robustness import robustness_table, with_figures
 from kitting_drake.reproduction.page.run_table import add_run, remove_runs
 from kitting_drake.reproduction.page.runs import read_evaluation, read_runs
-from kitting_drake.reproduction.paper.cell_results import Result, cell_results, check_cell
+from kitting_drake.reproduction.paper.cell_results import Result, cell_results, check_new_cell
 from kitting_drake.reproduction.paper.efficiency import read_efficiency
 from kitting_drake.reproduction.paper.learning_rates import read_rates
 from kitting_drake.reproduction.paper.paper_figures import draw_figure_6, draw_table_1
@@ -40,13 +40,19 @@ def main() -> int:
         summary = read_evaluation(Path(path))
         for cell in paper_cells():
             if cell.name == name:
-                check_cell(cell, summary, rates)
+                check_new_cell(cell, summary, rates)
         add_run(folder, name, summary)
     runs = read_runs(folder)
-    answers, others = cell_results(runs, rates)
+    divided = cell_results(runs, rates)
+    answers, others = divided.results, divided.others
     efficiency = read_efficiency(folder)
     link = os.path.relpath(folder, output.parent)
-    page = results_page(others, link, paper_sections(answers, rates, efficiency))
+    page = results_page(
+        others,
+        link,
+        paper_sections(answers, rates, efficiency, divided.to_run_again),
+        divided.set_aside,
+    )
     write_atomically(output, page)
     _draw(answers, efficiency, output.parent)
     robustness = output.with_name("robustness.md")

@@ -10,6 +10,7 @@ from rich.console import Console
 from kitting_drake.common.command_line import FAILED, INTERRUPTED, run_command, seed_type
 from kitting_drake.common.errors import UserError
 from kitting_drake.common.files import require_folder, write_atomically, write_json
+from kitting_drake.common.provenance import commit, uncommitted_note
 from kitting_drake.common.rendering import add_picture_renderer, render_picture, save_png
 from kitting_drake.episode.chosen import run_chosen
 from kitting_drake.episode.episode_log import add_log_flag, check_log
@@ -35,7 +36,7 @@ def main() -> int:
     scenario = chosen.scenario
     seed = scenario.random_seed if arguments.seed is None else arguments.seed
     console = Console(quiet=arguments.quiet)
-    if note := hidden_table_note(chosen.scenario):
+    for note in filter(None, (uncommitted_note(), hidden_table_note(chosen.scenario))):
         console.print(f"note: {note}", highlight=False, markup=False)
     folder = require_folder(output_folder(arguments, chosen.name))
     _check_files(arguments.picture, arguments.video, folder / REPLAY)
@@ -74,7 +75,7 @@ def main() -> int:
             observers=[progress.observe],
             log=arguments.log,
         )
-    write_json(folder / "results.json", result.as_dict())
+    write_json(folder / "results.json", result.as_dict() | {"commit": commit()})
     # Remove stale files.
     (folder / REPLAY).unlink(missing_ok=True)
     _save_decisions(folder / "decisions", decisions)

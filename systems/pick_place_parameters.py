@@ -89,7 +89,7 @@ class PickPlaceParameters:
     contact_threshold: float = bounded(4.0, 0.5, 100.0)
 
     # Highest linear speed (m/s) and acceleration (m/s^2) in free space, in the plane and along z
-    # each: both together stay within the 1.7 m/s and 13 m/s^2 of a Franka arm.
+    # each. An arm's joints may not be able to follow: nothing here knows of joints.
     linear_speed: float = bounded(1.2, 0.01, 1.2)
     linear_acceleration: float = bounded(8.0, 0.1, 9.0)
 

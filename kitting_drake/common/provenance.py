@@ -17,6 +17,10 @@ COMMIT_VARIABLE = "KITTING_DRAKE_COMMIT"
 """The environment variable that names the commit of copied sources, which have no history."""
 
 
+_UNCOMMITTED = "+"
+"""Stands behind a commit whose tree had uncommitted changes."""
+
+
 def versions() -> dict[str, str]:
     """The versions of this package and of its foundations; Drake's only where it is installed."""
     found = {"kitting_drake": kitting_drake.__version__}
@@ -40,7 +44,34 @@ def commit() -> str | None:
         changed = _git(root, "status", "--porcelain", "--untracked-files=no")
     except (OSError, subprocess.CalledProcessError):
         return None
-    return head + ("+" if changed else "")
+    return head + (_UNCOMMITTED if changed else "")
+
+
+def is_reproducible(commits: str | None) -> bool:
+    """Whether code can be checked out again.
+
+    Args:
+        commits: what `commit` gives, or several of them with commas between; None or nothing is
+            code that nobody knows.
+    """
+    return commits is not None and commits != "" and _UNCOMMITTED not in commits
+
+
+def short_commits(commits: str | None) -> str:
+    """The first eight digits of each commit, with its mark; `-` where there is none."""
+    found = (commits or "-").split(", ")
+    return ", ".join(item[:8] + _UNCOMMITTED * item.endswith(_UNCOMMITTED) for item in found)
+
+
+def uncommitted_note() -> str | None:
+    """A sentence for people where the tree has uncommitted changes; else None."""
+    now = commit()
+    if now is None or is_reproducible(now):
+        return None
+    return (
+        "the tree has uncommitted changes, so nobody can run this again from its commit, and "
+        "`results` does not take it for a cell of the paper's tables"
+    )
 
 
 def source_digest(*names: str) -> str:

@@ -32,6 +32,9 @@ AMBIGUITIES = {
 """Why a success may not be strict: an error that the task's own measure forgives, and the magnitude
 beyond which it counts. The angle is modulo the symmetry that the object declares."""
 
+_FAILED_GRASPS = ("missed", "dropped")
+"""The outcomes of an action whose grasp was missed or lost."""
+
 ERRORS = ("add_s_mm", "position_error_mm", "angle_error_deg", "height_error_mm")
 """The errors of an object where it ended."""
 
@@ -105,6 +108,7 @@ def summarise(
         ],
         "actions": sum(episode["actions"] for episode in episodes),
         "needless_actions": sum(needless_actions(episode) for episode in episodes),
+        "actions_after_failed_grasps": sum(map(actions_after_failed_grasp, episodes)),
         "missed_grasps": sum(episode["missed_grasps"] for episode in episodes),
         "dropped_objects": sum(episode["dropped_objects"] for episode in episodes),
         "moving_at_end": sum(len(episode["moving_at_end"]) for episode in episodes),
@@ -133,6 +137,14 @@ def needless_actions(episode: Episode) -> int:
         # It failed, and does not tell.
         return 0
     return sum(action["object"] not in useful for action in episode["actions_taken"])
+
+
+def actions_after_failed_grasp(episode: Episode) -> int:
+    """The actions that were decided after a grasp of the same episode was missed or lost: a policy
+    that remembers where grasps failed may have decided them otherwise."""
+    outcomes = [action["outcome"] for action in episode["actions_taken"]]
+    failed = [index for index, outcome in enumerate(outcomes) if outcome in _FAILED_GRASPS]
+    return len(outcomes) - 1 - failed[0] if failed else 0
 
 
 def counted_objects(episodes: Sequence[Episode]) -> list[list[Entry]]:

@@ -45,6 +45,8 @@ OURS = {
     "demonstrations": 100,
     "steps": 1234,
 }
+CLEAN = {"commit": "0123456789"}
+"""Not that of the tree of this test, which may have uncommitted changes."""
 SEEN, UNSEEN = PAPER_TASKS
 OWN = SCENARIOS.parent / "docs" / "results"
 """The results of this tree."""
@@ -61,7 +63,8 @@ def write(
     """Adds a run of episodes that are all alike, some fields of its summary replaced."""
     episodes = [make_episode(seed, errors_mm) for seed in seeds]
     chosen = replace(CHOSEN, scenario=scenario)
-    add_run(folder, name, summarise(episodes, chosen, ADD_S, wall_seconds_total=1.0) | fields)
+    summary = summarise(episodes, chosen, ADD_S, wall_seconds_total=1.0)
+    add_run(folder, name, summary | CLEAN | fields)
 
 
 @pytest.fixture
@@ -73,7 +76,7 @@ def folder(tmp_path: Path) -> Path:
     protruding = make_object("block", 2.0, height_error_mm=3.0)
     episodes = [make_result(seed, [*objects, protruding]).as_dict() for seed in range(100, 110)]
     learned = summarise(episodes, CHOSEN, ADD_S, wall_seconds_total=1.0)
-    add_run(tmp_path, "ours", learned | {"policy_details": OURS})
+    add_run(tmp_path, "ours", learned | CLEAN | {"policy_details": OURS})
     return tmp_path
 
 
@@ -304,6 +307,38 @@ def test_a_run_is_added_and_removed(folder: Path, monkeypatch: pytest.MonkeyPatc
         command(monkeypatch, folder, "--remove", "mine")
 
 
+def test_a_run_that_nobody_can_run_again_is_in_no_table(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+):
+    spoil(folder, "ours", commit="0123456789abcdef, 9876543210fedcba+")
+    text = command(monkeypatch, folder, "--quiet")
+    assert ("SO(2)-equivariant (ours)", "small", "100") not in successes(text, SEEN)
+    assert [row[0] for row in tables(text)["Runs"][0][1:]] == ["quantized"]
+    ((_, row),) = tables(text)["Not reproducible"]
+    assert (row[0], row[-1]) == ("ours", "0123456789abcdef<br>9876543210fedcba+")
+
+
+def test_no_cell_is_filled_by_what_nobody_can_run_again(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+):
+    name = "unseen_so2_180_100"
+    good = read_summaries(OWN)[name]
+    evaluated = folder / "evaluated"
+    evaluated.mkdir()
+    for fields, said in (
+        ({"commit": "f00d+"}, r"of commit f00d\+, with uncommitted changes; commit the changes"),
+        ({"commit": None}, "its episodes are of an unknown commit"),
+        ({"policy_digest": None}, "lacks policy_digest, the digest of its weights"),
+    ):
+        (evaluated / "summary.json").write_text(json.dumps(good | fields))
+        with pytest.raises(UserError, match=said):
+            command(monkeypatch, folder, "--add", name, str(evaluated))
+        assert name not in read_summaries(folder)
+    (evaluated / "summary.json").write_text(json.dumps(good))
+    command(monkeypatch, folder, "--add", name, str(evaluated), "--quiet")
+    assert read_summaries(folder)[name]["policy_digest"] == good["policy_digest"]
+
+
 @pytest.fixture(scope="module")
 def own_runs() -> list[Run]:
     return read_runs(OWN)
@@ -314,8 +349,10 @@ def test_the_runs_of_this_tree_are_what_they_say(own_runs: list[Run]):
     for run in own_runs:
         rates = [item["success_rate"] for item in run.summary.get("outcomes", ())]
         assert not rates or np.mean(rates) == pytest.approx(run.summary["success_rate"])
-    cells, others = cell_results(own_runs, read_rates(OWN))
-    assert len(cells) == len(paper_cells())
+    cells, others, set_aside = cell_results(own_runs, read_rates(OWN))
+    names = {result.cell.name for result in cells} | {run.name for run in set_aside}
+    assert names >= {cell.name for cell in paper_cells()}
+    assert all("+" in run.summary["commit"] for run in set_aside)
     assert len([run for run in others if run.paper_task]) == 6
     known = [run for run in others if run.name.startswith("robust_friction")]
     assert {item for run in known for item in run.departures} == {
@@ -327,8 +364,10 @@ def test_the_runs_of_this_tree_are_what_they_say(own_runs: list[Run]):
 @pytest.mark.slow
 def test_the_pages_of_this_tree_are_made_of_its_runs(own_runs: list[Run]):
     rates = read_rates(OWN)
-    cells, others = cell_results(own_runs, rates)
-    sections = paper_sections(cells, rates, read_efficiency(OWN))
-    assert results_page(others, "results", sections) == (OWN.parent / "results.md").read_text()
+    divided = cell_results(own_runs, rates)
+    cells, others, set_aside = divided
+    sections = paper_sections(cells, rates, read_efficiency(OWN), divided.to_run_again)
+    page = results_page(others, "results", sections, set_aside)
+    assert page == (OWN.parent / "results.md").read_text()
     robustness = (OWN.parent / "robustness.md").read_text()
     assert with_figures(robustness, robustness_table(others)) == robustness

@@ -612,7 +612,7 @@ def test_motion_is_smooth_and_within_the_limits_of_its_mode(answer: PickPlaceAct
             assert speed <= speeds[mode] * 1.0001, mode
             assert acceleration <= accelerations[mode] * 1.0001, mode
             fastest[mode] = max(fastest.get(mode, 0.0), speed)
-        # A Franka arm's own limits.
+        # Both limits together.
         assert np.linalg.norm(v[:3]) <= 1.7
         assert np.linalg.norm(a[:3]) <= 13.0
         assert abs(v[3]) <= p.yaw_speed * 1.0001

@@ -5,9 +5,11 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from kitting_drake.common.provenance import short_commits
 from kitting_drake.evaluation.summary import ACTION_ERRORS, AMBIGUITIES, ERRORS
 from kitting_drake.evaluation.terminal import number
 from kitting_drake.reproduction.page.markdown import markdown_table, rate_text
+from kitting_drake.reproduction.page.pooled import pooled_section
 from kitting_drake.reproduction.page.prose import prose
 from kitting_drake.reproduction.page.ravens_table import in_ravens_table, ravens_section
 from kitting_drake.reproduction.page.runs import LEARNED, METHODS, Run
@@ -34,13 +36,19 @@ PAPER = {
 }
 
 
-def results_page(runs: Sequence[Run], link: str, paper: Sequence[str] = ()) -> str:
+def results_page(
+    runs: Sequence[Run],
+    link: str,
+    paper: Sequence[str] = (),
+    set_aside: Sequence[Run] = (),
+) -> str:
     """The whole page, in Markdown.
 
     Args:
         runs: from `read_runs`; there may be none of a task, or none at all.
         link: the folder of the table of runs, from the page's own.
         paper: the sections of `kitting_drake.reproduction.paper.paper_sections`.
+        set_aside: the runs that nobody can run again, which are in no other table.
     """
     sections = [prose("how_to_read", link=link), *paper]
     if runs:
@@ -48,10 +56,15 @@ def results_page(runs: Sequence[Run], link: str, paper: Sequence[str] = ()) -> s
     for task in PAPER_TASKS:
         if of_task := [run for run in runs if run.paper_task == task]:
             sections += _task_sections(task, of_task)
+    sections += pooled_section(runs)
     sections += ravens_section(runs)
     others = [run for run in runs if run.paper_task is None and not in_ravens_table(run)]
     if others:
         sections += ["## Other runs\n", _others_table(others)]
+    if set_aside:
+        sections += [prose("not_reproducible", count=len(set_aside)), _aside_table(set_aside)]
+    if runs or set_aside:
+        sections.append(_mishaps([*runs, *set_aside], link))
     sections.append("## Runs\n")
     sections.append(_runs_table(runs) if runs else "There are none yet.\n")
     return "\n".join(sections)
@@ -204,6 +217,31 @@ def _others_table(runs: list[Run]) -> str:
     return markdown_table([*headings, "episodes", "seeds"], rows, left_columns=5)
 
 
+def _mishaps(runs: Sequence[Run], link: str) -> str:
+    failed, timed_out, episodes = (
+        sum(run.summary[key] for run in runs)
+        for key in ("failed_episodes", "timed_out_episodes", "episodes")
+    )
+    return prose("mishaps", link=link, failed=failed, timed_out=timed_out, episodes=episodes)
+
+
+def _aside_table(runs: Sequence[Run]) -> str:
+    rows = [
+        [run.name, _strict(run.summary), _own(run.summary), _weights(run), *_commits(run)]
+        for run in runs
+    ]
+    return markdown_table(["name", "strict, %", "success, %", "weights", "commit"], rows)
+
+
+def _commits(run: Run) -> list[str]:
+    return ["<br>".join((run.summary["commit"] or "-").split(", "))]
+
+
+def _weights(run: Run) -> str:
+    """The first digits of the digest of its weights."""
+    return (run.summary.get("policy_digest") or "-").removeprefix("sha256 ")[:8]
+
+
 def _runs_table(runs: Sequence[Run]) -> str:
     rows = [
         [
@@ -214,8 +252,11 @@ def _runs_table(runs: Sequence[Run]) -> str:
             str(run.summary["episodes"]),
             run.seeds,
             f"{run.summary['wall_seconds'] / 3600:.1f}",
+            _weights(run),
+            short_commits(run.summary["commit"]),
         ]
         for run in runs
     ]
     headings = ["name", "task", "run", "training steps", "episodes", "seeds", "hours, summed"]
+    headings += ["weights", "commit"]
     return markdown_table(headings, rows, left_columns=3)

@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 from kitting_drake.common.errors import UserError
+from kitting_drake.common.provenance import is_reproducible
 from kitting_drake.reproduction.page.markdown import rate_text
 from kitting_drake.reproduction.page.run_table import Summary
-from kitting_drake.reproduction.page.runs import Run
+from kitting_drake.reproduction.page.runs import LEARNED, Run
 from kitting_drake.reproduction.paper.cells import Cell
 from kitting_drake.reproduction.paper.learning_rates import Rates
 from kitting_drake.reproduction.paper.paper_tables import paper_cells
+
+MISSING, TO_RUN_AGAIN = "-", "- ‡"
+"""What stands for a cell that was not run, and for one whose run nobody can repeat."""
 
 
 @dataclass(frozen=True)
@@ -30,15 +34,28 @@ class Result:
         return f"{strict} / {100 * self.summary['success_rate']:.1f}"
 
 
-def cell_results(runs: Sequence[Run], rates: Rates) -> tuple[list[Result], list[Run]]:
+class Divided(NamedTuple):
+    """What `cell_results` divides runs into."""
+
+    results: list[Result]
+    """Of the cells, in their order."""
+    others: list[Run]
+    """The other runs, in the order in which they were given."""
+    set_aside: list[Run]
+    """Runs, of cells or not, whose code nobody can check out again: no table may use them."""
+
+    @property
+    def to_run_again(self) -> frozenset[str]:
+        """The names of the runs set aside."""
+        return frozenset(run.name for run in self.set_aside)
+
+
+def cell_results(runs: Sequence[Run], rates: Rates) -> Divided:
     """Divides runs into those of cells and others: a run that is named as a cell must be it.
 
     Args:
         runs: of `read_runs`.
         rates: of `read_rates`.
-
-    Returns:
-        The results in the order of the cells, and the other runs in theirs.
 
     Raises:
         UserError: a run is not what its name says.
@@ -47,8 +64,16 @@ def cell_results(runs: Sequence[Run], rates: Rates) -> tuple[list[Result], list[
     cells = {cell.name: cell for cell in paper_cells() if cell.name in found}
     for name, cell in cells.items():
         check_cell(cell, found[name], rates)
-    results = [Result(cell, found[name]) for name, cell in cells.items()]
-    return results, [run for run in runs if run.name not in cells]
+    set_aside = [run for run in runs if not is_reproducible(run.summary["commit"])]
+    away = {run.name for run in set_aside}
+    results = [Result(cell, found[name]) for name, cell in cells.items() if name not in away]
+    others = [run for run in runs if run.name not in cells.keys() | away]
+    return Divided(results, others, set_aside)
+
+
+def absent_text(name: str, to_run_again: Collection[str]) -> str:
+    """What a table shows for a cell without a result."""
+    return TO_RUN_AGAIN if name in to_run_again else MISSING
 
 
 def check_cell(cell: Cell, summary: Summary, rates: Rates) -> None:
@@ -68,3 +93,21 @@ def check_cell(cell: Cell, summary: Summary, rates: Rates) -> None:
             f"run '{cell.name}' is not that of the cell of this name ({departure}): give it "
             "another name, or remove it (results --remove)"
         )
+
+
+def check_new_cell(cell: Cell, summary: Summary, rates: Rates) -> None:
+    """Checks that a summary may fill a cell from now on.
+
+    Raises:
+        UserError: it is not of the cell, or cannot be run again from what it tells.
+    """
+    check_cell(cell, summary, rates)
+    commits = summary["commit"]
+    if not is_reproducible(commits):
+        raise UserError(
+            f"run '{cell.name}' cannot fill the cell of this name: its episodes are of "
+            f"{f'commit {commits}, with uncommitted changes' if commits else 'an unknown commit'}; "
+            "commit the changes and evaluate into a fresh folder"
+        )
+    if summary["policy_details"].get("method") in LEARNED and not summary["policy_digest"]:
+        raise UserError(f"run '{cell.name}' lacks policy_digest, the digest of its weights")

@@ -4,16 +4,17 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from typing import Any
 
+from kitting_drake.common.provenance import short_commits
 from kitting_drake.reproduction.page.markdown import markdown_table, rate_text
 from kitting_drake.reproduction.page.paired import STRICT, over_tools
 from kitting_drake.reproduction.page.prose import prose
 from kitting_drake.reproduction.page.ravens_table import PAPER as TABLE_1
 from kitting_drake.reproduction.page.results_page import PAPER
 from kitting_drake.reproduction.page.runs import LEARNED, METHODS
-from kitting_drake.reproduction.paper.cell_results import Result
+from kitting_drake.reproduction.paper.cell_results import Result, absent_text
 from kitting_drake.reproduction.paper.cells import (
     LEARNING_RATES,
     ORIENTATIONS,
@@ -22,8 +23,14 @@ from kitting_drake.reproduction.paper.cells import (
     Training,
     rates_key,
 )
+from kitting_drake.reproduction.paper.departures import departures
 from kitting_drake.reproduction.paper.differences import differences
 from kitting_drake.reproduction.paper.efficiency import efficiency_section
+from kitting_drake.reproduction.paper.failed_grasps import (
+    changeable,
+    failed_grasps,
+    is_as_in_the_paper,
+)
 from kitting_drake.reproduction.paper.learning_rates import Rates, best_rate
 from kitting_drake.reproduction.paper.paper_tables import (
     BEYOND_OF_TABLE_1,
@@ -63,6 +70,7 @@ def paper_sections(
     results: Sequence[Result],
     rates: Rates,
     efficiency: Mapping[str, Any] | None = None,
+    to_run_again: Collection[str] = (),
 ) -> list[str]:
     """The sections of the page; none without results.
 
@@ -70,6 +78,7 @@ def paper_sections(
         results: of `cell_results`.
         rates: what each learning rate of each baseline came to on validation scenes.
         efficiency: what `benchmark networks` measured, if it was.
+        to_run_again: the names of the cells whose runs are set aside.
     """
     if not results:
         return []
@@ -79,25 +88,23 @@ def paper_sections(
             "as_in_the_paper",
             preset=PRESET,
             rates=_rates_text(rates).strip(),
-            state=_state_text(results).strip(),
-        )
+            state=_state_text(results, to_run_again).strip(),
+        ),
+        departures(by_name),
     ]
     for task, heading in _HEADINGS.items():
         sections.append(f"### {heading}\n")
         if has_figure(task, results):
             sections.append(f"![Figure 6 of {task} tools](results_{task}.png)\n")
-        sections.append(_figure_table(task, by_name))
-        if task == "unseen" and "unseen_so2_180_10" in by_name:
-            sections.append(prose("ten_demonstrations"))
-        if task == "unseen" and "unseen_transporter_36_100" in by_name:
-            sections.append(prose("transporter"))
-    sections += trainings(by_name)
+        sections.append(_figure_table(task, by_name, to_run_again))
+    sections += trainings(by_name, to_run_again)
     if efficiency is not None:
         sections.append(efficiency_section(efficiency))
-    sections += _beyond_the_paper(by_name)
-    sections += _table_1(by_name)
-    sections += _fresh_tools(by_name)
+    sections += _beyond_the_paper(by_name, to_run_again)
+    sections += _table_1(by_name, to_run_again)
+    sections += _fresh_tools(by_name, to_run_again)
     sections += differences(by_name)
+    sections += failed_grasps(results)
     sections += ["### Every cell\n", _every_cell(results)]
     return sections
 
@@ -117,13 +124,16 @@ def has_table_1(results: Iterable[Result]) -> bool:
     return any(TASKS[result.cell.task].table == "I" for result in results)
 
 
-def _state_text(results: Sequence[Result]) -> str:
+def _state_text(results: Sequence[Result], to_run_again: Collection[str]) -> str:
     """How many of the cells have been run, and what that took."""
-    count = len(paper_cells())
+    cells = paper_cells()
+    count, again = len(cells), sum(cell.name in to_run_again for cell in cells)
     hours = f"{sum(result.summary['wall_seconds'] for result in results) / 3600:.0f}"
     if len(results) == count:
         return prose("cells_complete", all=count, hours=hours)
-    return prose("cells_missing", done=len(results), all=count, hours=hours)
+    missing = count - len(results) - again
+    part = "cells_missing" if missing else "cells_to_run_again"
+    return prose(part, done=len(results), all=count, hours=hours, again=again, missing=missing)
 
 
 def _rates_text(rates: Rates) -> str:
@@ -153,9 +163,9 @@ def _baselines() -> list[Training]:
     return [Training(task, method, 36, 100) for method in LEARNED[1:] for task in tasks]
 
 
-def _figure_table(task: str, results: Mapping[str, Result]) -> str:
+def _figure_table(task: str, results: Mapping[str, Result], again: Collection[str]) -> str:
     def text(name: str) -> str:
-        return results[name].text if name in results else "-"
+        return results[name].text if name in results else absent_text(name, again)
 
     rows = []
     for method in LEARNED:
@@ -174,14 +184,14 @@ def _figure_table(task: str, results: Mapping[str, Result]) -> str:
     return markdown_table(["method", "demonstrations", *(f"N = {n}" for n in COLUMNS)], rows)
 
 
-def _beyond_the_paper(results: Mapping[str, Result]) -> list[str]:
+def _beyond_the_paper(results: Mapping[str, Result], again: Collection[str]) -> list[str]:
     names = {label: f"so2_180_100{ending}" for label, ending in _VARIANTS.items()}
     beyond = list(names.values())[1:]
     if not any(f"{task}_{name}" in results for task in _HEADINGS for name in beyond):
         return []
 
     def text(name: str) -> str:
-        return results[name].text if name in results else "-"
+        return results[name].text if name in results else absent_text(name, again)
 
     steps = TASKS["unseen"].steps
     rows = [
@@ -196,7 +206,7 @@ def _beyond_the_paper(results: Mapping[str, Result]) -> list[str]:
     ]
 
 
-def _table_1(results: Mapping[str, Result]) -> list[str]:
+def _table_1(results: Mapping[str, Result], again: Collection[str]) -> list[str]:
     if not has_table_1(results.values()):
         return []
     tasks = [task.name for task in TASKS.values() if task.table == "I"]
@@ -204,7 +214,7 @@ def _table_1(results: Mapping[str, Result]) -> list[str]:
     def text(name: str, paper: float) -> str:
         found = results.get(name)
         if found is None:
-            return f"- / {paper:g}"
+            return f"{absent_text(name, again)} / {paper:g}"
         mark = EARLIER_MARK if found.cell.is_earlier(found.summary) else ""
         rate = rate_text(found.summary["success_rate"], found.summary["ci95"])
         return f"{rate}{mark} / {paper:g}"
@@ -232,12 +242,7 @@ def _table_1(results: Mapping[str, Result]) -> list[str]:
     ]
     if any(name.startswith("palletizing_boxes") for name in results):
         sections.append(prose("palletizing"))
-    if "palletizing_boxes_so2_180_1" in results:
-        sections.append(prose("palletizing_once"))
-    if "palletizing_boxes_transporter_36_100" in results:
-        sections.append(prose("palletizing_transporter"))
-    if "place_red_in_green_so2_180_1" in results:
-        sections.append(prose("red_in_green"))
+    sections += _toppled_boxes(results)
     if any(
         f"{task}_so2" in name and name.endswith("_ours")
         for name in results
@@ -248,12 +253,33 @@ def _table_1(results: Mapping[str, Result]) -> list[str]:
     return sections
 
 
-def _fresh_tools(results: Mapping[str, Result]) -> list[str]:
+def _toppled_boxes(results: Mapping[str, Result]) -> list[str]:
+    """What went wrong on palletizing after one demonstration, of the cells that are there."""
+    rows = []
+    for name, n in TABLE_1:
+        method = next(key for key, label in METHODS.items() if label == name)
+        result = results.get(f"palletizing_boxes_{method}_{n}_1")
+        if result is not None:
+            summary = result.summary
+            boxes = sum(row["objects"] for row in summary["categories"].values())
+            missed = f"{summary['missed_grasps']} of {summary['actions']}"
+            toppled = f"{summary['causes'].get('toppled', 0)} of {boxes}"
+            rows.append([name, str(n), missed, toppled])
+    if not rows:
+        return []
+    headings = ["method", "N", "actions that grasp nothing", "boxes that topple"]
+    return [prose("palletizing_once"), markdown_table(headings, rows)]
+
+
+def _fresh_tools(results: Mapping[str, Result], again: Collection[str]) -> list[str]:
     found = {label: results.get(f"fresh_{label}") for label in SHIPPED}
     if not any(found.values()):
         return []
     rows = [
-        [label.replace("_", " "), *(_both(result) if result else ["-", "-", "-"])]
+        [
+            label.replace("_", " "),
+            *(_both(result) if result else [absent_text(f"fresh_{label}", again), "-", "-"]),
+        ]
         for label, result in found.items()
     ]
     return [
@@ -293,7 +319,9 @@ def _every_cell(results: Sequence[Result]) -> str:
                 _causes(summary),
                 (summary["policy_digest"] or "-").removeprefix("sha256 ")[:8],
                 summary["versions"]["drake"],
-                ", ".join(item[:8] for item in (summary["commit"] or "").split(", ")),
+                short_commits(summary["commit"]),
+                changeable(summary).text if is_as_in_the_paper(result) else "",
+                _jaws(result),
             ]
         )
     headings = [
@@ -306,8 +334,17 @@ def _every_cell(results: Sequence[Result]) -> str:
         "episodes",
     ]
     headings += ["seeds", "strict, %", "over tools", "paper's, %", "causes"]
-    headings += ["weights", "Drake", "commit"]
+    headings += ["weights", "Drake", "commit", "after a failed grasp", "jaws"]
     return prose("every_cell") + "\n" + markdown_table(headings, rows)
+
+
+def _jaws(result: Result) -> str:
+    """On a Ravens task, how far each jaw draws back to release, and how far apart they come down,
+    in mm."""
+    if TASKS[result.cell.task].table != "I":
+        return ""
+    planner = result.summary["resolved_scenario"]["planner"]
+    return " / ".join(f"{1e3 * planner[key]:g}" for key in ("release_clearance", "open_width"))
 
 
 def _causes(summary: Mapping[str, Any]) -> str:

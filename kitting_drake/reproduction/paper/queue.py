@@ -19,11 +19,12 @@ from typing import Any
 
 from rich.console import Console
 
-from kitting_drake.common.errors import DIVERGED
+from kitting_drake.common.errors import DIVERGED, UserError
 from kitting_drake.common.files import require_folder
 from kitting_drake.common.paths import SCENARIOS
-from kitting_drake.reproduction.page.run_table import add_run, read_summaries
-from kitting_drake.reproduction.paper.cell_results import check_cell
+from kitting_drake.common.provenance import is_reproducible, uncommitted_note
+from kitting_drake.reproduction.page.run_table import add_run, read_summaries, remove_runs
+from kitting_drake.reproduction.paper.cell_results import check_cell, check_new_cell
 from kitting_drake.reproduction.paper.cells import (
     LEARNING_RATES,
     PRESET,
@@ -72,6 +73,8 @@ class Queue:
         Raises:
             UserError: a result is not that of its cell.
         """
+        if note := uncommitted_note():
+            self._say(f"note: {note}")
         pending = self.pending(cells)
         self._say(f"{len(cells) - len(pending)} of {len(cells)} cells are done")
         for cell in pending:
@@ -89,7 +92,7 @@ class Queue:
         return failures
 
     def pending(self, cells: Sequence[Cell]) -> list[Cell]:
-        """The cells that the table has no run of.
+        """The cells that the table has no run of, or none that can be run again.
 
         Raises:
             UserError: the table is damaged, or a run there is not that of its cell.
@@ -98,7 +101,8 @@ class Queue:
         for cell in cells:
             if cell.name in done:
                 check_cell(cell, done[cell.name], rates)
-        return [cell for cell in cells if cell.name not in done]
+        kept = {name for name, run in done.items() if is_reproducible(run.get("commit"))}
+        return [cell for cell in cells if cell.name not in kept]
 
     def collect(self, task: Task, *, validation: bool) -> Path:
         """The file of a task's demonstrations, as many as this run needs, or of those to validate
@@ -213,9 +217,13 @@ class Queue:
             name = str(weights.resolve().relative_to(self.folder.resolve()))
             text = text.replace(json.dumps(str(weights.resolve())), json.dumps(name))
         summary = json.loads(text)
-        departure = cell.departure(summary, read_rates(self.results))
-        if departure is not None:
-            raise Failed(f"what was evaluated is not the cell: {departure}")
+        try:
+            check_new_cell(cell, summary, read_rates(self.results))
+        except UserError as error:
+            raise Failed(f"{error} ({folder})") from error
+        earlier = read_summaries(self.results).get(cell.name)
+        if earlier is not None and not is_reproducible(earlier.get("commit")):
+            remove_runs(self.results, [cell.name])
         add_run(self.results, cell.name, summary)
         rate = 100 * summary["strict_success_rate"]
         self._say(f"{cell.name}: {rate:.1f} % strict, {100 * summary['success_rate']:.1f} %")

@@ -2,26 +2,34 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from statistics import mean, stdev
 
 from kitting_drake.reproduction.page.markdown import markdown_table
 from kitting_drake.reproduction.page.paired import OWN, STRICT
 from kitting_drake.reproduction.page.prose import prose
 from kitting_drake.reproduction.page.runs import LEARNED, METHODS
-from kitting_drake.reproduction.paper.cell_results import Result
+from kitting_drake.reproduction.paper.cell_results import Result, absent_text
 from kitting_drake.reproduction.paper.paper_tables import FIGURE_6, HEADLINE_SEEDS, headline
 
 
-def trainings(results: Mapping[str, Result]) -> list[str]:
-    """The section; empty where nothing has been trained from a second seed."""
+def trainings(results: Mapping[str, Result], to_run_again: Collection[str] = ()) -> list[str]:
+    """The section; empty where nothing has been trained from a second seed.
+
+    Args:
+        results: by the names of their cells.
+        to_run_again: the names of the cells whose runs are set aside.
+    """
     rows = []
     for task in FIGURE_6:
         for method in LEARNED[:2]:
-            found = [results.get(headline(task, method, seed).name) for seed in HEADLINE_SEEDS]
-            there = [result for result in found if result is not None]
+            names = [headline(task, method, seed).name for seed in HEADLINE_SEEDS]
+            there = [results[name] for name in names if name in results]
             if len(there) > 1:
-                cells = ["-" if result is None else _rates([result]) for result in found]
+                cells = [
+                    _rates([results[name]]) if name in results else absent_text(name, to_run_again)
+                    for name in names
+                ]
                 rows.append([METHODS[method], task, *cells, _rates(there)])
     if not rows:
         return []

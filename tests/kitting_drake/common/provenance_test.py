@@ -5,7 +5,14 @@ from pathlib import Path
 import pytest
 
 import kitting_drake
-from kitting_drake.common.provenance import COMMIT_VARIABLE, commit, versions
+from kitting_drake.common.provenance import (
+    COMMIT_VARIABLE,
+    commit,
+    is_reproducible,
+    short_commits,
+    uncommitted_note,
+    versions,
+)
 
 
 def git(folder: Path, *arguments: str) -> str:
@@ -35,6 +42,28 @@ def test_the_commit_and_whether_it_is_all(checkout: Path):
     assert commit() == head
     (checkout / "kitting_drake" / "__init__.py").write_text("changed = True\n")
     assert commit() == f"{head}+"
+
+
+def test_uncommitted_changes_are_told(checkout: Path, monkeypatch: pytest.MonkeyPatch):
+    assert uncommitted_note() is None
+    (checkout / "kitting_drake" / "__init__.py").write_text("changed = True\n")
+    assert uncommitted_note().startswith("the tree has uncommitted changes, so nobody can run")
+    monkeypatch.setenv("PATH", str(checkout))
+    assert uncommitted_note() is None
+
+
+@pytest.mark.parametrize(
+    ("commits", "known", "short"),
+    [
+        ("0123456789", True, "01234567"),
+        ("0123456789+", False, "01234567+"),
+        ("0123456789, abcdefghij+", False, "01234567, abcdefgh+"),
+        (None, False, "-"),
+    ],
+)
+def test_the_mark_of_uncommitted_changes_is_kept(commits: str | None, known: bool, short: str):
+    assert is_reproducible(commits) == known
+    assert short_commits(commits) == short
 
 
 def test_an_installed_package_has_no_commit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

@@ -43,6 +43,7 @@ KEYS = {
     "versions",
     "commit",
     "success_description",
+    "actions_after_failed_grasps",
     "missed_grasps",
     "dropped_objects",
     "point_contact_pairs",

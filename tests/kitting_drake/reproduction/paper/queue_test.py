@@ -32,6 +32,7 @@ from kitting_drake.reproduction.paper.learning_rates import RATES
 from kitting_drake.reproduction.paper.paper_tables import paper_cells
 from kitting_drake.reproduction.paper.queue import Failed, Queue
 from kitting_drake.scenario.loader import load_scenario
+from kitting_drake.scenario.policies import QuantizedOracle
 
 ORACLE = Cell("unseen", "!QuantizedOracle {orientations: 180}", 180, "quantized_oracle")
 OURS = Cell("unseen", Training("unseen", "so2", 180, 10), 36, end_at_success=True)
@@ -49,6 +50,7 @@ class Pretending(Queue):
         self.calls: list[str] = []
         self.broken: set[str] = set()
         self.why = "it broke"
+        self.commit = "c0ffee"
         self.collected: dict[str, int] = {}
         """How many demonstrations were asked for, by folder."""
 
@@ -105,7 +107,8 @@ class Pretending(Queue):
             "resolved_scenario": described(scenario),
             "seeds": list(range(first, first + count)),
             "policy_details": details,
-            "policy_digest": None,
+            "policy_digest": None if isinstance(policy, QuantizedOracle) else "sha256 f00d",
+            "commit": self.commit,
             "outcomes": [],
             "strict_success_rate": 1.0,
             "success_rate": 1.0,
@@ -154,6 +157,21 @@ def test_it_chooses_a_learning_rate_and_does_nothing_twice(queue: Pretending):
     queue.calls.clear()
     assert queue.run(cells) == {}
     assert queue.calls == []
+
+
+def test_a_cell_that_nobody_can_run_again_is_run_again(
+    queue: Pretending, summaries: dict[str, Summary]
+):
+    add_run(queue.results, ORACLE.name, summaries[ORACLE.name] | {"commit": "c0ffee+"})
+    assert queue.pending([ORACLE]) == [ORACLE]
+    queue.commit = "f00d, c0ffee+"
+    (failure,) = queue.run([ORACLE]).values()
+    assert "its episodes are of commit f00d, c0ffee+, with uncommitted changes" in failure
+    assert read_summaries(queue.results)[ORACLE.name]["commit"] == "c0ffee+"
+    queue.commit = "f00d"
+    assert queue.run([ORACLE]) == {}
+    assert read_summaries(queue.results)[ORACLE.name]["commit"] == "f00d"
+    assert queue.pending([ORACLE]) == []
 
 
 def test_learning_rates_that_are_known_are_not_tried_again(queue: Pretending):

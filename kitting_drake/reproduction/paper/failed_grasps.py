@@ -1,0 +1,117 @@
+"""How many actions a policy's memory of failed grasps can have changed.
+
+The policies do not pick within 10 mm of where a grasp of the same episode failed, unless they are
+told to forget (`avoid_failed_picks`). The paper has no such memory. It can change nothing but the
+actions after the first failed grasp of an episode. Newer summaries count these actions; of older
+ones there are bounds.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from kitting_drake.reproduction.page.markdown import markdown_table
+from kitting_drake.reproduction.page.prose import prose
+from kitting_drake.reproduction.page.runs import LEARNED, METHODS
+from kitting_drake.reproduction.paper.cell_results import Result
+from kitting_drake.reproduction.paper.cells import TASKS, Training
+
+_MOST_ACTIONS = {
+    "!AlignBoxCorner": 3,
+    "!BlockInsertion": 3,
+    "!PlaceRedInGreen": 10,
+    "!PalletizingBoxes": 30,
+    "!StackBlockPyramid": 12,
+}
+"""The most actions of an episode in the runs that do not count those after a failed grasp; on any
+other task it is one an object."""
+
+
+@dataclass(frozen=True)
+class Changeable:
+    """The actions that the memory can have changed, of all actions."""
+
+    at_least: int
+    at_most: int
+    actions: int
+
+    def __add__(self, other: Changeable) -> Changeable:
+        return Changeable(
+            self.at_least + other.at_least,
+            self.at_most + other.at_most,
+            self.actions + other.actions,
+        )
+
+    @property
+    def text(self) -> str:
+        """For a person."""
+        if self.at_least == self.at_most:
+            return f"{self.at_most} of {self.actions}"
+        return f"{self.at_least} to {self.at_most} of {self.actions}"
+
+
+def changeable(summary: Mapping[str, Any]) -> Changeable:
+    """The actions that were decided after a failed grasp of their episode.
+
+    The bounds where a summary does not count them, with F failed grasps in E episodes: at most
+    min(F, E) episodes have one, and all failed grasps but the first of each come after one. The
+    most come after one if these are the episodes in which the fewest objects were placed, as each
+    placed object took an action of its own, and if each of them began with a failed grasp.
+
+    Args:
+        summary: of `evaluate`, of a learned policy. If it does not count its actions, the most that
+            the task allows stand for them.
+    """
+    episodes = [item["objects"] for item in summary["outcomes"]]
+    tag = summary["resolved_scenario"]["task"]["_tag"]
+    most = [_MOST_ACTIONS.get(tag, len(objects)) for objects in episodes]
+    actions = summary.get("actions", sum(most))
+    if not summary["policy_details"].get("avoid_failed_picks", True):
+        return Changeable(0, 0, actions)
+    counted = summary.get("actions_after_failed_grasps")
+    if counted is not None:
+        return Changeable(counted, counted, actions)
+    failed = summary["missed_grasps"] + summary["dropped_objects"]
+    if not failed:
+        return Changeable(0, 0, actions)
+    with_failure = min(failed, len(episodes))
+    placed = sorted(max(1, sum(end > 0 for end in objects.values())) for objects in episodes)
+    at_most = min(
+        actions - sum(placed[with_failure:]) - with_failure,
+        sum(sorted(most)[-with_failure:]) - with_failure,
+    )
+    return Changeable(failed - with_failure, at_most, actions)
+
+
+def failed_grasps(results: Sequence[Result]) -> list[str]:
+    """The section: the sums over the cells of each task and method that are as in the paper."""
+    sums: dict[tuple[str, str], list[Changeable]] = {}
+    for result in results:
+        if is_as_in_the_paper(result):
+            assert isinstance(result.cell.policy, Training)
+            key = (result.cell.task, result.cell.policy.method)
+            sums.setdefault(key, []).append(changeable(result.summary))
+    if not sums:
+        return []
+    rows = []
+    for task in TASKS:
+        found = {method: sums[task, method] for method in LEARNED if (task, method) in sums}
+        for method, cells in found.items():
+            total = sum(cells[1:], cells[0])
+            unchanged = sum(not cell.at_most for cell in cells)
+            share = f"{100 * total.at_most / total.actions:.0f} %"
+            rows.append([task, METHODS[method], str(len(cells)), str(unchanged), total.text, share])
+    headings = ["task", "method", "cells", "nothing failed", "after a failed grasp", "at most"]
+    return [
+        "### The memory of failed grasps\n",
+        prose("failed_grasps"),
+        markdown_table(headings, rows, left_columns=2),
+    ]
+
+
+def is_as_in_the_paper(result: Result) -> bool:
+    """Whether a result is of a learned policy, and its actions are as in the paper."""
+    cell = result.cell
+    return isinstance(cell.policy, Training) and cell.end_at_success and not cell.continuous

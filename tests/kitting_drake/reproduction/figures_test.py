@@ -1,0 +1,304 @@
+"""The figures in README.md, docs/robustness.md and docs/results.md are those of the result files.
+
+They are computed here from the outcomes of the episodes, by none of the code that writes the pages.
+"""
+
+import csv
+import json
+import math
+import re
+from fnmatch import filter as matching
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from kitting_drake.common.provenance import is_reproducible
+from kitting_drake.reproduction.page.run_table import Summary, read_summaries
+
+TREE = Path(__file__).parents[3]
+RESULTS = TREE / "docs" / "results"
+METHODS = {
+    "SO(2)-equivariant (ours)": "so2",
+    "Equivariant Transporter": "equivariant_transporter",
+    "Transporter": "transporter",
+}
+POLICIES = ("so2_small_180_100", "generalist", "shape_matching")
+"""As the names of runs have them, in the order of the columns on robustness."""
+STRICT, OWN = 2, 1
+"""The least outcome of an object that counts."""
+
+
+@pytest.fixture(scope="module")
+def runs() -> dict[str, Summary]:
+    """Those whose code can be checked out."""
+    found = read_summaries(RESULTS)
+    return {name: run for name, run in found.items() if is_reproducible(run["commit"])}
+
+
+@pytest.fixture(scope="module")
+def readme() -> str:
+    return (TREE / "README.md").read_text()
+
+
+def rows(page: str, *sections: str) -> list[list[str]]:
+    """The cells of all tables of a section, or of a whole page, line by line."""
+    for section in sections:
+        page = page.split(section, 1)[1]
+    lines = page.split("\n#", 1)[0].splitlines() if sections else page.splitlines()
+    tables = [line.strip("|").split("|") for line in lines if line.startswith("|")]
+    return [[cell.strip() for cell in line] for line in tables]
+
+
+def one_line(text: str) -> str:
+    return " ".join(text.split())
+
+
+def half_up(value: float) -> int:
+    return math.floor(value + 0.5 + 1e-9)
+
+
+def counts(found: list[Summary], least: int = STRICT) -> tuple[int, int]:
+    """How many objects of some runs were a success, and how many there were."""
+    ends = [end for run in found for item in run["outcomes"] for end in item["objects"].values()]
+    return sum(end >= least for end in ends), len(ends)
+
+
+def wilson(good: int, objects: int) -> tuple[float, float]:
+    """The 95 % interval of a share."""
+    z, share = 1.959963984540054, good / objects
+    middle = share + z**2 / (2 * objects)
+    half = z * math.sqrt(share * (1 - share) / objects + z**2 / (4 * objects**2))
+    return tuple((middle + sign * half) / (1 + z**2 / objects) for sign in (-1, 1))
+
+
+def share(found: list[Summary], least: int = STRICT) -> str:
+    """The share of objects and its interval, as README.md has it."""
+    good, objects = counts(found, least)
+    low, high = wilson(good, objects)
+    return short(f"{100 * good / objects:.1f} ({100 * low:.1f} to {100 * high:.1f})")
+
+
+def short(text: str) -> str:
+    """As README.md has it: a whole 100 without decimals."""
+    return text.replace("100.0", "100")
+
+
+def reward(run: Summary) -> str:
+    """The mean reward and the interval of the run."""
+    rate = np.mean([item["success_rate"] for item in run["outcomes"]])
+    low, high = run["ci95"]
+    return f"{100 * rate:.1f} ({100 * low:.1f} to {100 * high:.1f})"
+
+
+def percent(runs: dict[str, Summary], name: str) -> int:
+    return half_up(100 * float(np.mean([item["success_rate"] for item in runs[name]["outcomes"]])))
+
+
+def test_the_shipped_policies_in_the_readme(runs: dict[str, Summary], readme: str):
+    found = {row[0]: row[1:] for row in rows(readme, "## Results") if len(row) == 4}
+    generalist, shipped, matching = (
+        next(cells for label, cells in found.items() if label.startswith(start))
+        for start in ("the generalist", "shipped", "`!ShapeMatching")
+    )
+    perturbed = [
+        [run for name, run in runs.items() if re.fullmatch(rf"robust_all_{policy}_\d+", name)]
+        for policy in POLICIES
+    ]
+    unseen = [
+        ["unseen_so2_small_180_100_outlines_2600", "unseen_so2_small_180_100_outlines_3525"],
+        ["unseen_generalist_2600", "unseen_generalist_3525"],
+        ["unseen_shape_matching_2600"],
+    ]
+    fresh = ["fresh_of_100_demonstrations", "fresh_generalist", "fresh_shape_matching"]
+    for cells, names, name, more in zip(
+        (shipped, generalist, matching), unseen, fresh, perturbed, strict=True
+    ):
+        assert cells == [share([runs[n] for n in names]), share([runs[name]]), share(more)]
+        digests = {run["policy_digest"] for run in (*(runs[n] for n in names), runs[name], *more)}
+        assert len(digests) == 1
+    for name in ("real_scans_generalist", "real_scans_shape_matching"):
+        assert counts([runs[name]]) == (160, 160)
+    assert "each kit 160 of 160 [laser scans]" in one_line(readme)
+
+
+def test_the_papers_experiments_in_the_readme(runs: dict[str, Summary], readme: str):
+    found = {row[0]: row[1:3] for row in rows(readme, "## Results") if row[0].count(", N = ")}
+
+    def text(name: str, least: int | None) -> str:
+        if name not in runs:
+            return "-"
+        return short(reward(runs[name])) if least is None else share([runs[name]], least)
+
+    for task, label in (("seen", "seen toolset"), ("unseen", "unseen toolsets")):
+        ours = f"{task}_so2_180_100"
+        expected = [text(ours, OWN), text(f"{ours}_ours", OWN)]
+        assert found[f"{label}, N = 180"] == expected
+    for n in (36, 180):
+        ours = f"stack_block_pyramid_so2_{n}_100"
+        expected = [text(ours, None), text(f"{ours}_ours", None)]
+        assert found[f"stack block pyramid, N = {n}"] == expected
+        palletizing = text(f"palletizing_boxes_so2_{n}_100", None)
+        assert found[f"palletizing boxes, N = {n}"] == [palletizing.split(" ")[0], ""]
+        for task in ("block_insertion", "place_red_in_green", "align_box_corner"):
+            assert percent(runs, f"{task}_so2_{n}_100") == 100
+    label = "block insertion, place red in green, align box corner, N = 36 and 180"
+    assert found[label] == ["100 each", ""]
+
+
+def test_the_sentences_of_the_readme(runs: dict[str, Summary], readme: str):
+    text = one_line(readme)
+    behind = {}
+    for task in ("unseen", "seen"):
+        rates = [
+            np.mean(
+                [counts([runs[f"{task}_{method}_{n}_100"]])[0] / 400 for n in (36, 72, 120, 180)]
+            )
+            for method in ("so2", "equivariant_transporter")
+        ]
+        behind[task] = 100 * (rates[1] - rates[0])
+    assert (
+        f"on the unseen toolsets ({behind['unseen']:.1f} points ahead, strict) and "
+        f"{-behind['seen']:.1f} points behind on the seen one"
+    ) in text
+    red, boxes = (
+        [percent(runs, f"{task}_so2_{n}_1") for n in (36, 180)]
+        for task in ("place_red_in_green", "palletizing_boxes")
+    )
+    assert f"place red in green ({red[0]} and {red[1]} %)" in text
+    assert f"palletizing boxes ({boxes[0]} and {boxes[1]} %)" in text
+    boxes = [percent(runs, f"palletizing_boxes_transporter_36_{n}") for n in (10, 100)]
+    assert f"boxes ({boxes[0]} and {boxes[1]} %, in the paper 100 and 100)" in text
+    rows_of = json.loads((RESULTS / "networks.json").read_text())["pick_angle"]
+    seconds = {
+        (row["method"], row["preset"], row["orientations"]): row["seconds"] for row in rows_of
+    }
+    factors = [
+        seconds["equivariant_transporter", preset, 180] / seconds["so2", preset, 180]
+        for preset in ("small", "paper")
+    ]
+    assert f"a factor of {factors[0]:.0f} (`small`) to {factors[1]:.0f} (`paper`)" in text
+
+
+def robust_share(runs: dict[str, Summary], pattern: str, counted: bool) -> str:
+    found = [run for name, run in runs.items() if re.fullmatch(pattern, name)]
+    if not found:
+        return "-"
+    good, objects = counts(found)
+    low, high = wilson(good, objects)
+    text = f"{100 * good / objects:.1f} ({100 * low:.0f} to {100 * high:.0f})"
+    return f"{text}, {objects}" if counted else text
+
+
+def test_the_tables_on_robustness(runs: dict[str, Summary]):
+    page = (TREE / "docs" / "robustness.md").read_text()
+    part = page.split("<!-- figures -->")[1].split("<!-- end of figures -->")[0]
+    common, others, needless, pooled = (
+        rows(table)[1:] for table in part.split("| perturbation")[1:]
+    )
+    for table, seeds, counted in (
+        (common, "2870", False),
+        (others, "2870", True),
+        (pooled, r"\d+", True),
+    ):
+        for label, *cells in table:
+            axis, _, level = label.split(",")[0].strip("`").partition(":")
+            kind = "none" if axis == "as it is" else axis
+            kind += "" if level in ("", "moderate") else f"_{level}"
+            kind += "_frames" if label.endswith("frames") else ""
+            for policy, cell in zip(POLICIES, cells, strict=False):
+                expected = robust_share(runs, f"robust_{kind}_{policy}_{seeds}", counted)
+                assert cell == expected, (label, policy)
+    for label, *cells in needless:
+        kind = label.strip("`").split(":")[0]
+        for policy, cell in zip(POLICIES, cells, strict=True):
+            run = runs[f"robust_{kind}_{policy}_2870"]
+            known = "needless_actions" in run
+            assert cell == (f"{run['needless_actions']} of {run['actions']}" if known else "-")
+
+
+def test_the_sentences_on_robustness(runs: dict[str, Summary]):
+    text = one_line((TREE / "docs" / "robustness.md").read_text())
+
+    def kitted(name: str) -> str:
+        good, objects = counts([runs[name]])
+        return f"{good} of {objects}"
+
+    assert f"kitted {kitted('colours_and_lights_generalist')} unseen tools" in text
+    meshes = runs["real_tools_shape_matching"]
+    objects = sum(row["objects"] for row in meshes["categories"].values())
+    assert f"generalist {kitted('real_tools_generalist')}, from seed 2960; shape matching " in text
+    assert f"{round(objects * meshes['strict_success_rate'])} of {objects}, from seed 1600" in text
+    assert f"shape matching {kitted('real_scans_shape_matching')}, and" in text
+    assert f"and {kitted('real_scans_generalist')} the networks of the generalist" in text
+    assert f"kitted {counts([runs['real_scans_oracle']])[0]}. These" in text
+    lost = [runs[f"robust_all_generalist_{seed}"] for seed in (2870, 2900, 3500)]
+    good, objects = counts(lost)
+    assert (objects - good, objects) == (16, 300)
+    assert "sixteen tools of three hundred: ten the wrong way round" in text
+    causes: dict[str, int] = {
+        name: sum(run["causes"].get(name, 0) for run in lost) for name in lost[0]["causes"]
+    }
+    assert {name: count for name, count in causes.items() if count} == {
+        "misplaced": 4,
+        "reversed": 3,
+        "insertion blocked": 1,
+    }
+    assert sum(run["ambiguous"]["reversed"] for run in lost) == 7
+    seconds: list[Any] = [
+        runs[f"robust_{kind}_{policy}_2870"]["sim_seconds"] / 25
+        for kind in ("none", "depth_noise", "all")
+        for policy in POLICIES[1:]
+    ]
+    a, b, *more = (f"{value:.1f}" for value in seconds)
+    assert a == b
+    assert (
+        f"{a} s of simulated time each as it is, {more[0]} and {more[1]} s under depth noise, "
+        f"{more[2]} and {more[3]} s with everything at once"
+    ) in text
+
+
+def test_figure_6_and_table_1_of_the_results(runs: dict[str, Summary]):
+    page = (TREE / "docs" / "results.md").read_text()
+    kept = read_summaries(RESULTS).keys()
+
+    def check(cell: str, name: str, expected: Any) -> None:
+        found = cell.split(" / ")[0] if name not in runs else cell
+        assert found == (expected() if name in runs else "- ‡" if name in kept else "-"), name
+
+    for task in ("Seen toolset", "Unseen toolsets"):
+        for row in rows(page, "## As in the paper", f"### {task}")[2:]:
+            if row[0] not in METHODS:
+                continue
+            for n, cell in zip((36, 72, 120, 180), row[2:], strict=True):
+                name = f"{task.split()[0].lower()}_{METHODS[row[0]]}_{n}_{row[1]}"
+                if cell:
+                    check(cell, name, lambda name=name: f"{strict(runs[name])} / {own(runs[name])}")
+    heading, _, *table = rows(page, "### The five Ravens tasks, table I")
+    for row in table:
+        if row[0] in METHODS and len(row) == len(heading):
+            for task, cell in zip(heading[3:], row[3:], strict=True):
+                name = f"{task}_{METHODS[row[0]]}_{row[1]}_{row[2]}"
+                check(cell.split(" / ")[0], name, lambda name=name: reward(runs[name]))
+
+
+def strict(run: Summary) -> str:
+    good, objects = counts([run])
+    low, high = wilson(good, objects)
+    return f"{100 * good / objects:.1f} ({100 * low:.1f} to {100 * high:.1f})"
+
+
+def own(run: Summary) -> str:
+    good, objects = counts([run], OWN)
+    return f"{100 * good / objects:.1f}"
+
+
+def test_the_mishaps_name_runs_that_there_are():
+    names = read_summaries(RESULTS).keys()
+    with (RESULTS / "mishaps.csv").open(newline="") as file:
+        listed = list(csv.DictReader(file))
+    assert all(all(row.values()) for row in listed)
+    for row in listed:
+        for pattern in row["runs"].split():
+            assert "_" not in pattern or matching(names, pattern), pattern
