@@ -19,21 +19,16 @@ _OF_THE_CELL = (
     ("rim of a cavity", "not given", "a lead-in bevel of 1 mm"),
     ("friction of a kit", "not given", "0.3"),
     ("scenes", "not given", "drawn until the open hand is free at every annotated grasp"),
-    ("release on a Ravens task", "the jaws open by 5 mm in all", "each draws back 6 mm; `6 / ...`"),
+    ("release, where table I has an `e`", "the jaws open by 5 mm in all", "each draws back 6 mm"),
+    ("open jaws, place red in green with an `e`", "50 mm apart", "80 mm apart, as everywhere"),
     (
-        "open jaws, place red in green and pyramid",
-        "50 mm apart",
-        "80 mm apart, as everywhere; `... / 80`",
-    ),
-    (
-        "the demonstrator's picks on a Ravens task",
+        "the demonstrator's picks, where table I has an `e`",
         "off the middle along one axis",
-        "at the middle, and a cube may be put down in any of four headings; `6 / 80`",
+        "at the middle",
     ),
-    ("palletizing", "boxes come one at a time", "they stand in a stack at the beginning; `6 / 80`"),
 )
 """What departs, as in the paper and the original Ravens tasks, and here. Nothing of it has been
-measured. What stands in quotes is the column `jaws` of the cells that it holds for."""
+measured."""
 
 _OF_LEARNING = (
     ("label", "one-hot", "shared among neighbouring pixels and orientations"),

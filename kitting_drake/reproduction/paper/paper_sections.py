@@ -321,7 +321,6 @@ def _every_cell(results: Sequence[Result]) -> str:
                 summary["versions"]["drake"],
                 short_commits(summary["commit"]),
                 changeable(summary).text if is_as_in_the_paper(result) else "",
-                _jaws(result),
             ]
         )
     headings = [
@@ -334,17 +333,8 @@ def _every_cell(results: Sequence[Result]) -> str:
         "episodes",
     ]
     headings += ["seeds", "strict, %", "over tools", "paper's, %", "causes"]
-    headings += ["weights", "Drake", "commit", "after a failed grasp", "jaws"]
+    headings += ["weights", "Drake", "commit", "after a failed grasp"]
     return prose("every_cell") + "\n" + markdown_table(headings, rows)
-
-
-def _jaws(result: Result) -> str:
-    """On a Ravens task, how far each jaw draws back to release, and how far apart they come down,
-    in mm."""
-    if TASKS[result.cell.task].table != "I":
-        return ""
-    planner = result.summary["resolved_scenario"]["planner"]
-    return " / ".join(f"{1e3 * planner[key]:g}" for key in ("release_clearance", "open_width"))
 
 
 def _causes(summary: Mapping[str, Any]) -> str:
