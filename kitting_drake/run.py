@@ -36,12 +36,12 @@ def main() -> int:
     scenario = chosen.scenario
     seed = scenario.random_seed if arguments.seed is None else arguments.seed
     console = Console(quiet=arguments.quiet)
-    for note in filter(None, (uncommitted_note(), hidden_table_note(chosen.scenario))):
-        console.print(f"note: {note}", highlight=False, markup=False)
     folder = require_folder(output_folder(arguments, chosen.name))
     _check_files(arguments.picture, arguments.video, folder / REPLAY)
     if arguments.log is not None:
         check_log(arguments.log)
+    for note in filter(None, (uncommitted_note(), hidden_table_note(chosen.scenario))):
+        console.print(f"note: {note}", highlight=False, markup=False)
 
     decisions: list[tuple[Observation, Decision]] = []
     meshcat = None if arguments.no_meshcat else start_meshcat(scenario.meshcat)

@@ -249,7 +249,7 @@ def _table_1(results: Mapping[str, Result], again: Collection[str]) -> list[str]
         for task in BEYOND_OF_TABLE_1
     ):
         table = markdown_table([*headings, *BEYOND_OF_TABLE_1], beyond)
-        sections += [prose("pyramid"), table, prose("pyramid_seen")]
+        sections += [prose("pyramid"), table]
     return sections
 
 

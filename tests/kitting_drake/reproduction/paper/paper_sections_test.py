@@ -106,7 +106,7 @@ def test_prose_on_a_cell_is_there_with_the_cell(runs: tuple[Run, ...]):
     told = {
         "palletizing_boxes_so2_180_1": "After one demonstration of palletizing",
         "palletizing_boxes_transporter_36_100": "Every method learns palletizing in 3000 steps",
-        "stack_block_pyramid_so2_36_10_ours": "ours comes out below the paper on the pyramid",
+        "stack_block_pyramid_so2_36_10_ours": "The pyramid with two extensions",
     }
     rates, without = {"unseen_transporter": {"0.001": 1.0}}, sections(runs)
     everything = sections([*runs, *(make_run(name, [1.0, 9.0]) for name in told)], rates)
