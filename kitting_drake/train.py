@@ -89,6 +89,7 @@ def _settings(
         method=arguments.method,
         preset=arguments.preset,
         orientations=arguments.orientations,
+        rotations=arguments.rotations,
         steps=arguments.steps,
         learning_rate=arguments.learning_rate,
         decay=arguments.decay,
@@ -179,6 +180,8 @@ def _parse() -> argparse.Namespace:
         parser.error("--angle-only needs --from: the weights of all other networks")
     if arguments.angle_only and arguments.method == "transporter":
         parser.error("--angle-only: a transporter has no network for angles alone")
+    if arguments.rotations and arguments.method != "transporter":
+        parser.error("--rotations is for --method transporter: the other methods rotate no images")
     if arguments.weights and (arguments.demos or not arguments.export):
         parser.error("--weights is for --export without --demos")
     for flag, given in (
@@ -249,6 +252,13 @@ def _add_settings(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--method", choices=METHODS, default="so2")
     parser.add_argument("--preset", choices=PRESETS, default="small", help="size of the networks")
     parser.add_argument("--orientations", type=count_type, default=180, metavar="N")
+    parser.add_argument(
+        "--rotations",
+        type=count_type,
+        metavar="N",
+        help="of a transporter: the rotations that a step computes for each loss, at most all "
+        "(default: those of the label and four more, which is the fewest)",
+    )
     parser.add_argument("--steps", type=count_type, default=10_000, help="(10000)")
     parser.add_argument("--learning-rate", type=_rate_type, default=1e-4, help="Adam's (1e-4)")
     parser.add_argument(

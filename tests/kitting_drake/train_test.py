@@ -211,6 +211,23 @@ def test_the_angle_network_alone_needs_the_others(
     assert sentence in capsys.readouterr().err
 
 
+def test_a_transporter_computes_as_many_rotations_as_asked_for(
+    demos: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    both = ("--method", "transporter", "--orientations", 8, "--steps", 1)
+    train(demos, tmp_path / "few", *both)
+    train(demos, tmp_path / "all", *both, "--rotations", 8)
+    few, all_ = (tmp_path / name / "policy.safetensors" for name in ("few", "all"))
+    assert read_weights_file(few).card["rotations"] is None
+    assert read_weights_file(all_).card["rotations"] == 8
+    assert log(few.parent)[-1] != log(all_.parent)[-1]
+    with pytest.MonkeyPatch.context() as patch, pytest.raises(SystemExit) as left:
+        patch.setattr(sys, "argv", ["train", *words(demos, tmp_path, "--rotations", 8)])
+        training.main()
+    assert left.value.code == 2
+    assert "--rotations is for --method transporter" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(
     ("learning", "flags", "taken_only", "rigid", "reflection"),
     [

@@ -68,6 +68,8 @@ class Settings:
     method: str
     preset: str
     orientations: int
+    rotations: int | None
+    """See `Networks.rotations`."""
     steps: int
     learning_rate: float
     decay: bool
@@ -155,6 +157,7 @@ class TrainingRun:
         networks = _begun(settings, learned, start)
         networks.to(settings.device)
         networks.compute_type = preferred_type()
+        networks.rotations = settings.rotations
         self.trainer = Trainer(
             networks,
             seed=settings.seed,
