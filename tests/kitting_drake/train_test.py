@@ -194,6 +194,25 @@ def test_the_angle_network_alone_is_trained_at_another_n(demos: Path, tmp_path: 
     assert set(log(path.parent)[-1]) == {"step", "pick_angle"}
 
 
+def test_the_angle_network_alone_may_be_of_another_size(
+    demos: Path, tmp_path: Path, refused: Callable[..., str]
+):
+    both = ("--method", "equivariant_transporter", "--orientations", 6)
+    train(demos, tmp_path / "first", *both, "--preset", "small", "--steps", 1)
+    first = tmp_path / "first" / "policy.safetensors"
+    angle = ("--steps", 1, "--angle-only", "--from", first)
+    train(demos, tmp_path / "angle", *both, *angle, "--preset", "matched")
+    path = tmp_path / "angle" / first.name
+    assert read_weights_file(path).config.preset == "matched"
+    old, new = (load_networks(file).state_dict() for file in (first, path))
+    for name in old:
+        if name.startswith("beta."):
+            assert old[name].numel() < new[name].numel()
+        else:
+            torch.testing.assert_close(new[name], old[name], atol=1e-5, rtol=1e-4)
+    assert "has preset small: give --preset small" in refused(demos, tmp_path, *both, *angle)
+
+
 @pytest.mark.parametrize(
     ("flags", "sentence"),
     [

@@ -145,6 +145,11 @@ class NetworkConfig:
         """The number of input channels: red, green, blue and height, or height alone."""
         return 4 if self.colour else 1
 
+    def has_unets_of(self, preset: str) -> bool:
+        """Whether the U-nets alpha, phi and psi are those of a preset, whatever its beta."""
+        own, other = PRESETS[self.preset], PRESETS[preset]
+        return (own.unet, own.samples) == (other.unet, other.samples)
+
     def as_dict(self) -> dict[str, Any]:
         """The fields, as JSON takes them."""
         return dataclasses.asdict(self)

@@ -119,7 +119,7 @@ class TransporterNetworks(Networks):
         thetas = (sample.pick_theta, *sample.other_thetas)
         angles = [interpolate_label(theta % math.pi / step, bins, cyclic=True) for theta in thetas]
         labels = {bin_ for angle in angles for bin_, _ in angle}
-        drawn = draw_bins(labels, bins, step, random, self.rotations)
+        drawn = draw_bins(labels, bins, step, random, self._pick_rotations)
         picks = [(float(row), float(col)) for row, col in (sample.pick, *sample.other_picks)]
 
         def loss() -> Tensor:
@@ -137,8 +137,13 @@ class TransporterNetworks(Networks):
     def stop_loss(self, image: Image, random: np.random.Generator) -> Tensor:
         bins = self.config.orientations // 2
         step = math.tau / self.config.orientations
-        drawn = draw_bins(set(), bins, step, random, self.rotations)
+        drawn = draw_bins(set(), bins, step, random, self._pick_rotations)
         return presence_loss(log_odds(self._drawn_scores(image, drawn), bins), present=False)
+
+    @property
+    def _pick_rotations(self) -> int | None:
+        """Half of `rotations`, as a gripper has half as many angles."""
+        return None if self.rotations is None else self.rotations // 2
 
     def _drawn_scores(self, image: Image, drawn: dict[int, float]) -> Tensor:
         """(n, rows, cols): the logits at the angles that `draw_bins` drew, weighted accordingly."""

@@ -102,7 +102,9 @@ def _begun(settings: Settings, learned: TrainingData, start: Path | None) -> Net
     torch.manual_seed(settings.seed)
     try:
         if start is not None:
-            return load_trainable(start, settings.orientations if settings.angle_only else None)
+            if settings.angle_only:
+                return load_trainable(start, settings.orientations, settings.preset)
+            return load_trainable(start)
         config = NetworkConfig(
             method=settings.method,
             preset=settings.preset,
