@@ -34,6 +34,7 @@ from kitting_drake.reproduction.paper.paper_tables import (
     SHIPPED,
     paper_cells,
 )
+from kitting_drake.reproduction.paper.parameters import parameters_section
 from kitting_drake.reproduction.paper.trainings import trainings
 
 COLUMNS = tuple(sorted(ORIENTATIONS))
@@ -91,6 +92,7 @@ def paper_sections(
     sections += trainings(by_name)
     if efficiency is not None:
         sections.append(efficiency_section(efficiency))
+        sections.append(parameters_section())
     sections += _beyond_the_paper(by_name)
     sections += _table_1(by_name)
     sections += _fresh_tools(by_name)
