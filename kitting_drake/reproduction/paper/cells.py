@@ -127,13 +127,19 @@ class Training:
     """Whether only the pick-angle network is trained; all else is that of `base`."""
     times: int = 1
     """How many times the steps that every method gets as in the paper."""
+    preset: str = PRESET
+    """The size of its networks."""
+    rotations: int | None = None
+    """How many rotations a step of the Transporter computes; None: a few. See `Networks`."""
 
     @property
     def base(self) -> Training | None:
         """The training whose networks this one has but for the pick angle's."""
         if not self.angle_only:
             return None
-        return dataclasses.replace(self, orientations=ORIENTATIONS[0], angle_only=False)
+        return dataclasses.replace(
+            self, orientations=ORIENTATIONS[0], angle_only=False, preset=PRESET
+        )
 
     @property
     def steps(self) -> int:
@@ -154,6 +160,10 @@ class Training:
             kind += "_angle_only"
         if self.times > 1:
             kind += f"_{self.times}_times_the_steps"
+        if self.preset != PRESET:
+            kind += f"_{self.preset}"
+        if self.rotations is not None:
+            kind += f"_{self.rotations}_rotations"
         return (
             f"{self.task}_{self.method}_{self.orientations}_{self.demonstrations}{kind}"
             f"_seed{self.seed}"
@@ -259,7 +269,7 @@ class Cell:
             same = summary["policy_digest"] == _loaded(self).policy.digest(SCENARIOS)
             return None if same else "its weights are not those that come with the package"
         # Those of an earlier version have no such thing.
-        found = {"angle_only": False, **summary["policy_details"]}
+        found = {"angle_only": False, "rotations": None, **summary["policy_details"]}
         details = self._details(self.policy)
         key = rates_key(reference(self.policy))
         if rates and "learning_rate" not in details and key in rates:
@@ -274,7 +284,8 @@ class Cell:
         wanted: dict[str, Any] = {
             "method": training.method,
             "scenario": f"{Path(learned_at.file).stem}:{learned_at.demonstrated}",
-            "preset": PRESET,
+            "preset": training.preset,
+            "rotations": training.rotations,
             "orientations": self.orientations,
             "trained_orientations": training.orientations,
             "demonstrations": training.demonstrations,
