@@ -126,7 +126,8 @@ def _ablation() -> list[Cell]:
     """All extensions beyond the paper, and the same without one of them at a time."""
 
     def ours(task: str, label: str, **changes: Any) -> Cell:
-        training = {key: changes.pop(key) for key in ("taken_only", "rigid") if key in changes}
+        kept = ("taken_only", "rigid")
+        training: dict[str, Any] = {key: changes.pop(key) for key in kept if key in changes}
         networks = Training(
             task, "so2", 180, 100, **{"taken_only": False, "rigid": False} | training
         )
