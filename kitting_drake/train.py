@@ -89,6 +89,7 @@ def _settings(
         method=arguments.method,
         preset=arguments.preset,
         orientations=arguments.orientations,
+        rotations=arguments.rotations,
         steps=arguments.steps,
         learning_rate=arguments.learning_rate,
         decay=arguments.decay,
@@ -123,8 +124,10 @@ def _checked_start(
             f"{arguments.start} learned from the seed {min(shared)}, which is one to validate by: "
             "give others by --validation"
         )
-    # The angle network alone depends on N, and is then a fresh one.
-    fixed = ("method", "preset") if arguments.angle_only else ("method", "preset", "orientations")
+    fixed = ["method", "preset", "orientations"]
+    if arguments.angle_only:
+        # The angle network is then a fresh one: it alone depends on N, and may be of another size.
+        fixed = ["method"] if config.has_unets_of(arguments.preset) else ["method", "preset"]
     for flag in fixed:
         given, found = getattr(arguments, flag), getattr(config, flag)
         if given != found:
@@ -179,6 +182,8 @@ def _parse() -> argparse.Namespace:
         parser.error("--angle-only needs --from: the weights of all other networks")
     if arguments.angle_only and arguments.method == "transporter":
         parser.error("--angle-only: a transporter has no network for angles alone")
+    if arguments.rotations and arguments.method != "transporter":
+        parser.error("--rotations is for --method transporter: the other methods rotate no images")
     if arguments.weights and (arguments.demos or not arguments.export):
         parser.error("--weights is for --export without --demos")
     for flag, given in (
@@ -244,11 +249,18 @@ def _add_settings(parser: argparse.ArgumentParser) -> None:
         "--angle-only",
         action="store_true",
         help="train the pick-angle network alone, from fresh weights; all else is that of --from, "
-        "which may have been trained at another N",
+        "which may have been trained at another N, or be of a preset of the same U-nets",
     )
     parser.add_argument("--method", choices=METHODS, default="so2")
     parser.add_argument("--preset", choices=PRESETS, default="small", help="size of the networks")
     parser.add_argument("--orientations", type=count_type, default=180, metavar="N")
+    parser.add_argument(
+        "--rotations",
+        type=count_type,
+        metavar="N",
+        help="of a transporter: of how many rotations of the crop, and half as many of the scene, "
+        "a step learns, at most all (default: those of the label and four more, the fewest)",
+    )
     parser.add_argument("--steps", type=count_type, default=10_000, help="(10000)")
     parser.add_argument("--learning-rate", type=_rate_type, default=1e-4, help="Adam's (1e-4)")
     parser.add_argument(

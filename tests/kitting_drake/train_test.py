@@ -194,6 +194,25 @@ def test_the_angle_network_alone_is_trained_at_another_n(demos: Path, tmp_path: 
     assert set(log(path.parent)[-1]) == {"step", "pick_angle"}
 
 
+def test_the_angle_network_alone_may_be_of_another_size(
+    demos: Path, tmp_path: Path, refused: Callable[..., str]
+):
+    both = ("--method", "equivariant_transporter", "--orientations", 6)
+    train(demos, tmp_path / "first", *both, "--preset", "small", "--steps", 1)
+    first = tmp_path / "first" / "policy.safetensors"
+    angle = ("--steps", 1, "--angle-only", "--from", first)
+    train(demos, tmp_path / "angle", *both, *angle, "--preset", "matched")
+    path = tmp_path / "angle" / first.name
+    assert read_weights_file(path).config.preset == "matched"
+    old, new = (load_networks(file).state_dict() for file in (first, path))
+    for name in old:
+        if name.startswith("beta."):
+            assert old[name].numel() < new[name].numel()
+        else:
+            torch.testing.assert_close(new[name], old[name], atol=1e-5, rtol=1e-4)
+    assert "has preset small: give --preset small" in refused(demos, tmp_path, *both, *angle)
+
+
 @pytest.mark.parametrize(
     ("flags", "sentence"),
     [
@@ -209,6 +228,23 @@ def test_the_angle_network_alone_needs_the_others(
         training.main()
     assert left.value.code == 2
     assert sentence in capsys.readouterr().err
+
+
+def test_a_transporter_computes_as_many_rotations_as_asked_for(
+    demos: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    both = ("--method", "transporter", "--orientations", 8, "--steps", 1)
+    train(demos, tmp_path / "few", *both)
+    train(demos, tmp_path / "all", *both, "--rotations", 8)
+    few, all_ = (tmp_path / name / "policy.safetensors" for name in ("few", "all"))
+    assert read_weights_file(few).card["rotations"] is None
+    assert read_weights_file(all_).card["rotations"] == 8
+    assert log(few.parent)[-1] != log(all_.parent)[-1]
+    with pytest.MonkeyPatch.context() as patch, pytest.raises(SystemExit) as left:
+        patch.setattr(sys, "argv", ["train", *words(demos, tmp_path, "--rotations", 8)])
+        training.main()
+    assert left.value.code == 2
+    assert "--rotations is for --method transporter" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

@@ -94,6 +94,9 @@ class Networks(nn.Module):
         self.preset = PRESETS[config.preset]
         self.compute_type = torch.float32
         """The type of the networks' inputs, and with it the type that they compute in."""
+        self.rotations: int | None = None
+        """How many rotations of the crop a training step of the Transporter computes, and half as
+        many of the scene; None: a few (see `transporter.draw_bins`). Other methods rotate none."""
         self.stop_threshold: float | None = None
         """A policy stops where the log-odds are below it; None: it never stops. It is chosen for
         the weights (see `validation.validate`) and stored with them."""

@@ -48,10 +48,10 @@ _NEAR = math.radians(10)
 """Rotations up to this far from a label are easily confused with it: they are a stratum of their
 own (see `draw_bins`)."""
 _DRAWS = 2
-"""The number of rotations that a training step draws in each stratum. More make a step slower. In
-the one comparison that was made they taught no more: after 750 steps of the place networks alone on
-align-box-corner, at a learning rate of 3e-4, the cross-entropy over all rotations of validation
-scenes was 6.6 with 2, and 7.9 with 16 (the script is not kept)."""
+"""The number of rotations that a training step draws in each stratum, where nothing else is asked
+for. More make a step slower. In the one comparison that was made they taught no more: after 750
+steps of the place networks alone on align-box-corner, at a learning rate of 3e-4, the cross-entropy
+over all rotations of validation scenes was 6.6 with 2, and 7.9 with 16 (the script is not kept)."""
 _COARSE = 36
 """The most rotations of the crop that are all encoded at inference."""
 _CANDIDATES = 3
@@ -118,15 +118,16 @@ class TransporterNetworks(Networks):
         bins = self.config.orientations // 2
         thetas = (sample.pick_theta, *sample.other_thetas)
         angles = [interpolate_label(theta % math.pi / step, bins, cyclic=True) for theta in thetas]
-        drawn = draw_bins({bin_ for angle in angles for bin_, _ in angle}, bins, step, random)
+        labels = {bin_ for angle in angles for bin_, _ in angle}
+        drawn = draw_bins(labels, bins, step, random, self._pick_rotations)
         picks = [(float(row), float(col)) for row, col in (sample.pick, *sample.other_picks)]
 
         def loss() -> Tensor:
             logits = self._drawn_scores(sample.image, drawn)
-            labels = [
+            targets = [
                 (among(angle, drawn), pick) for angle, pick in zip(angles, picks, strict=True)
             ]
-            value = joint_loss(logits, *labels)
+            value = joint_loss(logits, *targets)
             if self.config.stop:
                 value = value + presence_loss(log_odds(logits, bins), present=True)
             return value
@@ -135,8 +136,14 @@ class TransporterNetworks(Networks):
 
     def stop_loss(self, image: Image, random: np.random.Generator) -> Tensor:
         bins = self.config.orientations // 2
-        drawn = draw_bins(set(), bins, math.tau / self.config.orientations, random)
+        step = math.tau / self.config.orientations
+        drawn = draw_bins(set(), bins, step, random, self._pick_rotations)
         return presence_loss(log_odds(self._drawn_scores(image, drawn), bins), present=False)
+
+    @property
+    def _pick_rotations(self) -> int | None:
+        """Half of `rotations`, as a gripper has half as many angles."""
+        return None if self.rotations is None else self.rotations // 2
 
     def _drawn_scores(self, image: Image, drawn: dict[int, float]) -> Tensor:
         """(n, rows, cols): the logits at the angles that `draw_bins` drew, weighted accordingly."""
@@ -197,9 +204,8 @@ class TransporterNetworks(Networks):
         step = math.tau / orientations
         row, col = sample.place_of(np.array(pixel, float))
         bins = interpolate_label(sample.rotation % math.tau / step, orientations, cyclic=True)
-        drawn = draw_bins(
-            {bin_ for bin_, _ in bins}, orientations, step, np.random.default_rng(seed)
-        )
+        labels, random = {bin_ for bin_, _ in bins}, np.random.default_rng(seed)
+        drawn = draw_bins(labels, orientations, step, random, self.rotations)
         kernels = self.encode_crops(sample.image, pixel, [bin_ * step for bin_ in drawn])
         logits = cross_correlation_fft(self.encode_scene(sample.image), kernels)
         stands = logits.new_tensor(list(drawn.values()))
@@ -226,7 +232,11 @@ def encodings_per_decision(orientations: int) -> int:
 
 
 def draw_bins(
-    labels: set[int], bins: int, step: float, random: np.random.Generator
+    labels: set[int],
+    bins: int,
+    step: float,
+    random: np.random.Generator,
+    rotations: int | None = None,
 ) -> dict[int, float]:
     """The rotations that a training step computes: sampled softmax in two strata.
 
@@ -235,6 +245,9 @@ def draw_bins(
         bins: how many there are, over half a rotation or a full one.
         step: between neighbours, in radians.
         random: draws the others.
+        rotations: how many there are to be, with those of the labels: half of the others near a
+            label, as far as there are so many. At most all; at least as many as with None, which
+            draws two in each stratum.
 
     Returns:
         The bins, each with what is added to its logits, in nats, so that those that were drawn
@@ -246,9 +259,15 @@ def draw_bins(
             continue
         apart = [abs(math.remainder((bin_ - label) * step, bins * step)) for label in labels]
         strata[min(apart, default=math.inf) > _NEAR].append(bin_)
+    wanted = [_DRAWS, _DRAWS]
+    if rotations is not None:
+        others = max(rotations - len(labels), sum(wanted))
+        near, far = map(len, strata)
+        wanted[0] = min(max(others // 2, others - far), near)
+        wanted[1] = others - wanted[0]
     drawn = dict.fromkeys(sorted(labels), 0.0)
-    for stratum in strata:
-        count = min(_DRAWS, len(stratum))
+    for stratum, most in zip(strata, wanted, strict=True):
+        count = min(most, len(stratum))
         for bin_ in random.choice(stratum, count, replace=False) if count else ():
             drawn[int(bin_)] = math.log(len(stratum) / count)
     return drawn

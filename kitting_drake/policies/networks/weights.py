@@ -167,7 +167,9 @@ def load_networks(path: Path, compute_type: torch.dtype = torch.float32) -> Netw
     return networks
 
 
-def load_trainable(path: Path, fresh_angle_at: int | None = None) -> Networks:
+def load_trainable(
+    path: Path, fresh_angle_at: int | None = None, preset: str | None = None
+) -> Networks:
     """Networks as they are trained, to go on from a file's weights.
 
     The optimisers' state is not in a file: training begins anew, from these weights.
@@ -177,6 +179,8 @@ def load_trainable(path: Path, fresh_angle_at: int | None = None) -> Networks:
         fresh_angle_at: N of the result, whose pick-angle network then has fresh weights: of the
             `FactoredNetworks` it is the only one in whose architecture N may be. None: the file's
             N, and all its weights.
+        preset: of the result, whose U-nets must be of the same size (`NetworkConfig.has_unets_of`).
+            None: the file's.
 
     Raises:
         UserError: as `load_networks`.
@@ -185,7 +189,9 @@ def load_trainable(path: Path, fresh_angle_at: int | None = None) -> Networks:
     plain = load_networks(path)
     config = plain.config
     if fresh_angle_at is not None:
-        config = dataclasses.replace(config, orientations=fresh_angle_at)
+        config = dataclasses.replace(
+            config, orientations=fresh_angle_at, preset=preset or config.preset
+        )
     networks = make_networks(config)
     networks.check_orientations(config.orientations)
     stored = dict(plain.named_modules())

@@ -68,6 +68,8 @@ class Settings:
     method: str
     preset: str
     orientations: int
+    rotations: int | None
+    """See `Networks.rotations`."""
     steps: int
     learning_rate: float
     decay: bool
@@ -100,7 +102,9 @@ def _begun(settings: Settings, learned: TrainingData, start: Path | None) -> Net
     torch.manual_seed(settings.seed)
     try:
         if start is not None:
-            return load_trainable(start, settings.orientations if settings.angle_only else None)
+            if settings.angle_only:
+                return load_trainable(start, settings.orientations, settings.preset)
+            return load_trainable(start)
         config = NetworkConfig(
             method=settings.method,
             preset=settings.preset,
@@ -155,6 +159,7 @@ class TrainingRun:
         networks = _begun(settings, learned, start)
         networks.to(settings.device)
         networks.compute_type = preferred_type()
+        networks.rotations = settings.rotations
         self.trainer = Trainer(
             networks,
             seed=settings.seed,

@@ -156,13 +156,19 @@ class Training:
     """Whether only the pick-angle network is trained; all else is that of `base`."""
     times: int = 1
     """How many times the steps that every method gets as in the paper."""
+    preset: str = PRESET
+    """The size of its networks."""
+    rotations: int | None = None
+    """How many rotations a step of the Transporter computes; None: a few. See `Networks`."""
 
     @property
     def base(self) -> Training | None:
         """The training whose networks this one has but for the pick angle's."""
         if not self.angle_only:
             return None
-        return dataclasses.replace(self, orientations=ORIENTATIONS[0], angle_only=False)
+        return dataclasses.replace(
+            self, orientations=ORIENTATIONS[0], angle_only=False, preset=PRESET
+        )
 
     @property
     def steps(self) -> int:
@@ -183,6 +189,10 @@ class Training:
             kind += "_angle_only"
         if self.times > 1:
             kind += f"_{self.times}_times_the_steps"
+        if self.preset != PRESET:
+            kind += f"_{self.preset}"
+        if self.rotations is not None:
+            kind += f"_{self.rotations}_rotations"
         return (
             f"{self.task}_{self.method}_{self.orientations}_{self.demonstrations}{kind}"
             f"_seed{self.seed}"
@@ -296,7 +306,7 @@ class Cell:
         details = self._details(self.policy)
         # Runs that do not say so avoided failed picks: the page tells what that can have changed.
         earlier = {"angle_only": False, "avoid_failed_picks": self.avoid_failed_picks}
-        found = earlier | summary["policy_details"]
+        found = earlier | {"rotations": None} | summary["policy_details"]
         key = rates_key(reference(self.policy))
         if rates and "learning_rate" not in details and key in rates:
             details["learning_rate"] = float(best_rate(rates[key]))
@@ -314,7 +324,8 @@ class Cell:
         wanted: dict[str, Any] = {
             "method": training.method,
             "scenario": f"{Path(learned_at.file).stem}:{learned_at.demonstrated}",
-            "preset": PRESET,
+            "preset": training.preset,
+            "rotations": training.rotations,
             "orientations": self.orientations,
             "trained_orientations": training.orientations,
             "demonstrations": training.demonstrations,

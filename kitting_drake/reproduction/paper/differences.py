@@ -20,6 +20,7 @@ from kitting_drake.reproduction.paper.cells import ORIENTATIONS, Cell, Training
 from kitting_drake.reproduction.paper.paper_tables import (
     AT_FASTER,
     DEMONSTRATIONS,
+    EVERY_CHANCE,
     FIGURE_6,
     HEADLINE_SEEDS,
     PATIENT,
@@ -94,6 +95,12 @@ def _rivals(cell: Cell) -> list[tuple[str, str]]:
         return [
             ("at its own learning rate", f"{cell.task}_so2_{tail}"),
             *((METHODS[other], f"{cell.task}_{other}_{tail}") for other in LEARNED[1:]),
+        ]
+    if cell.label == EVERY_CHANCE and isinstance(training, Training):
+        tail = f"{cell.orientations}_{training.demonstrations}"
+        return [
+            ("as in the paper", f"{cell.task}_{training.method}_{tail}"),
+            (METHODS[LEARNED[0]], f"{cell.task}_{LEARNED[0]}_{tail}"),
         ]
     if cell.label == "generalist":
         others = [label for label in SHIPPED if label != cell.label]

@@ -41,6 +41,7 @@ from kitting_drake.reproduction.paper.paper_tables import (
     SHIPPED,
     paper_cells,
 )
+from kitting_drake.reproduction.paper.parameters import parameters_section
 from kitting_drake.reproduction.paper.trainings import trainings
 
 COLUMNS = tuple(sorted(ORIENTATIONS))
@@ -100,6 +101,7 @@ def paper_sections(
     sections += trainings(by_name, to_run_again)
     if efficiency is not None:
         sections.append(efficiency_section(efficiency))
+        sections.append(parameters_section())
     sections += _beyond_the_paper(by_name, to_run_again)
     sections += _table_1(by_name, to_run_again)
     sections += _fresh_tools(by_name, to_run_again)

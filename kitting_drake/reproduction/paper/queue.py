@@ -27,7 +27,6 @@ from kitting_drake.reproduction.page.run_table import add_run, read_summaries, r
 from kitting_drake.reproduction.paper.cell_results import check_cell, check_new_cell
 from kitting_drake.reproduction.paper.cells import (
     LEARNING_RATES,
-    PRESET,
     TASKS,
     VALIDATE_EVERY,
     Cell,
@@ -41,6 +40,8 @@ from kitting_drake.reproduction.paper.learning_rates import best_rate, read_rate
 _PATIENCE = 60.0
 """How long a command may take to end itself, in s."""
 _FIRST_SEED, _FIRST_VALIDATION_SEED = 10000, 20000
+_BEFORE = {"angle_only": False}
+"""What the trainings of earlier versions were, of which their summaries say nothing."""
 
 
 class Failed(Exception):  # noqa: N818  A cell failed, not the queue.
@@ -156,8 +157,9 @@ class Queue:
             *("--validation", self.collect(task, validation=True)),
             *("--demonstrations", training.demonstrations),
             *("--method", training.method),
-            *("--preset", PRESET),
+            *("--preset", training.preset),
             *("--orientations", training.orientations),
+            *(() if training.rotations is None else ("--rotations", training.rotations)),
             *("--steps", training.steps),
             *("--learning-rate", rate),
             "--decay",
@@ -271,14 +273,15 @@ def _check_training(training: Training, folder: Path) -> None:
     summary = json.loads((folder / "summary.json").read_text())
     for key, wanted in (
         ("method", training.method),
-        ("preset", PRESET),
+        ("preset", training.preset),
         ("orientations", training.orientations),
+        ("rotations", training.rotations),
         ("demonstrations", training.demonstrations),
         ("steps", training.steps),
         ("seed", training.seed),
         ("angle_only", training.angle_only),
     ):
-        found = summary.get(key, False)
+        found = summary.get(key, _BEFORE.get(key))
         if found != wanted:
             raise Failed(f"{folder}: its {key} is {found}, not {wanted}: delete it")
 

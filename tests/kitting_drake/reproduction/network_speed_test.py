@@ -288,5 +288,5 @@ def test_counts():
 
 
 def test_an_unknown_preset_is_refused():
-    with pytest.raises(UserError, match="--preset must be one of paper, small, tiny, not 'huge'"):
+    with pytest.raises(UserError, match="--preset must be one of paper, small, matched, tiny, not 'huge'"):
         Plan(preset="huge")

@@ -8,7 +8,6 @@ import torch
 from torch import Tensor
 
 from kitting_drake.policies.data.images import Image, LabelledImage, rotation_matrix
-from kitting_drake.policies.networks import transporter as transporter_module
 from kitting_drake.policies.networks.architecture import PLACE_CROP, PRESETS, NetworkConfig
 from kitting_drake.policies.networks.layers.correlation import KERNEL, cross_correlation, lift
 from kitting_drake.policies.networks.losses import (
@@ -247,11 +246,38 @@ def test_drawn_bins_stand_for_all():
     assert sum(math.exp(weight) for weight in drawn.values()) == pytest.approx(90)
 
 
-def test_the_losses_are_those_of_the_whole_volumes_where_all_bins_are_drawn(
-    monkeypatch: pytest.MonkeyPatch,
-):
-    monkeypatch.setattr(transporter_module, "_DRAWS", N)
+@pytest.mark.parametrize(
+    ("labels", "rotations", "near", "far"),
+    [
+        # Two bins beside those of a label are near it at N = 36: the rest is elsewhere.
+        ({3, 4}, 9, 2, 5),
+        ({3, 4}, 18, 2, 14),
+        ({3, 4}, 36, 2, 32),
+        ({3, 4}, 99, 2, 32),
+        # Never fewer than without a number.
+        ({3, 4}, 1, 2, 2),
+        ({3}, 9, 2, 6),
+        (set(), 9, 0, 9),
+    ],
+)
+def test_as_many_bins_are_drawn_as_wanted(labels: set[int], rotations: int, near: int, far: int):
+    drawn = draw_bins(labels, 36, math.tau / 36, np.random.default_rng(0), rotations)
+    assert labels <= set(drawn)
+    others = set(drawn) - labels
+    assert len({bin_ for bin_ in others if {bin_ - 1, bin_ + 1} & labels}) == near
+    assert len(others) == near + far
+    assert sum(math.exp(weight) for weight in drawn.values()) == pytest.approx(36)
+
+
+def test_all_bins_are_drawn_even_where_most_are_near():
+    assert len(draw_bins({0, 40}, 90, math.tau / 180, np.random.default_rng(0), 90)) == 90
+    few = draw_bins({0, 1}, 8, math.tau / 180, np.random.default_rng(0), 8)
+    assert few == dict.fromkeys(range(8), 0.0)
+
+
+def test_the_losses_are_those_of_the_whole_volumes_where_all_bins_are_drawn():
     networks = transporter(dataclasses.replace(TINY, stop=True))
+    networks.rotations = N
     one = dataclasses.replace(sample(), other_picks=np.zeros((0, 2)), other_thetas=np.zeros(0))
     (name, pick_loss), _ = networks.losses(one, np.random.default_rng(0))
     assert name == networks.picking == "pick"

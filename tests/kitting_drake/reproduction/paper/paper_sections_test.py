@@ -12,7 +12,7 @@ from kitting_drake.common.paths import SCENARIOS
 from kitting_drake.evaluation.summary import summarise
 from kitting_drake.reproduction.page.runs import Run, described
 from kitting_drake.reproduction.paper.cell_results import cell_results
-from kitting_drake.reproduction.paper.cells import PRESET, TASKS, Cell, Training
+from kitting_drake.reproduction.paper.cells import TASKS, Cell, Training
 from kitting_drake.reproduction.paper.learning_rates import RATES, Rates, read_rates
 from kitting_drake.reproduction.paper.paper_figures import draw_figure_6, draw_table_1
 from kitting_drake.reproduction.paper.paper_sections import has_figure, has_table_1, paper_sections
@@ -35,7 +35,8 @@ def make_run(name: str, errors_mm: list[float]) -> Run:
         details |= {
             "method": cell.policy.method,
             "scenario": f"{Path(task.file).stem}:{task.demonstrated}",
-            "preset": PRESET,
+            "preset": cell.policy.preset,
+            "rotations": cell.policy.rotations,
             "trained_orientations": cell.policy.orientations,
             "angle_only": cell.policy.angle_only,
             "demonstrations": cell.policy.demonstrations,
@@ -155,6 +156,21 @@ def test_a_longer_training_is_compared_with_the_same_cell_in_the_usual_steps():
     name = f"{ours}_3_times_the_steps_ours", "in the usual number of steps"
     assert rows(text)[name][0] == "+50.0 (+50.0 to +50.0)"
     assert "| 100, 3 times the steps | 100.0" in text
+
+
+def test_a_baseline_with_every_chance_is_compared_with_itself_and_with_ours():
+    theirs = "unseen_transporter_36_100"
+    text = sections(
+        [
+            make_run("unseen_so2_36_100", [1.0, 1.0, 1.0, 1.0]),
+            make_run(theirs, [9.0, 9.0, 9.0, 9.0]),
+            make_run(f"{theirs}_every_chance", [1.0, 1.0, 9.0, 9.0]),
+        ]
+    )
+    found = rows(text)
+    name = f"{theirs}_every_chance"
+    assert found[name, "as in the paper"][0] == "+50.0 (+50.0 to +50.0)"
+    assert found[name, "SO(2)-equivariant (ours)"][0] == "-50.0 (-50.0 to -50.0)"
 
 
 def test_an_interval_over_tools_is_given_only_where_tools_are_drawn():

@@ -73,6 +73,8 @@ class Pretending(Queue):
                 summary["best"]["loss"] = 7.0 + (rate != LEARNING_RATES[0])
             summary |= {"method": flags["--method"], "preset": flags["--preset"]}
             summary["angle_only"] = "--angle-only" in words
+            if "--rotations" in flags:
+                summary["rotations"] = int(flags["--rotations"])
             (folder / "summary.json").write_text(json.dumps(summary))
             (folder / "policy.safetensors").touch()
         else:
@@ -86,15 +88,17 @@ class Pretending(Queue):
         if hasattr(policy, "weights"):
             trained_by = Path(policy.weights).with_name("summary.json")
             folder = trained_by.parent.name
+            trained_as = json.loads(trained_by.read_text())
             task, method, trained, demonstrations = folder.split("_")[:4]
             details |= {
                 "method": method,
                 "scenario": f"{Path(TASKS[task].file).stem}:{TASKS[task].demonstrated}",
-                "preset": PRESET,
+                "preset": trained_as["preset"],
+                "rotations": trained_as.get("rotations"),
                 "trained_orientations": int(trained),
                 "demonstrations": int(demonstrations),
                 "training_seed": 0,
-                "steps": json.loads(trained_by.read_text())["steps"],
+                "steps": trained_as["steps"],
                 "learning_rate": float(folder.rpartition("_lr")[2]),
                 "decay": True,
                 "continuous": policy.continuous,
@@ -246,6 +250,36 @@ def test_more_patience_is_another_training(queue: Pretending):
     assert patient.departure(summary) is None
     at_once = dataclasses.replace(patient, policy=dataclasses.replace(patient.policy, times=1))
     assert at_once.departure(summary).startswith("steps is")
+
+
+def test_a_baseline_with_every_chance_is_another_training(queue: Pretending):
+    cells = {cell.name: cell for cell in paper_cells()}
+    chance = cells["unseen_transporter_36_100_every_chance"]
+    assert chance.policy.name == (
+        "unseen_transporter_36_100_3_times_the_steps_matched_18_rotations_seed0"
+    )
+    costs = {f"{rate:g}": rate for rate in LEARNING_RATES}
+    known = {f"unseen_{method}": costs for method in ("transporter", "equivariant_transporter")}
+    (queue.results / RATES).write_text(json.dumps(known))
+    assert queue.run([chance]) == {}
+    summary = read_summaries(queue.results)[chance.name]
+    assert chance.departure(summary) is None
+    for change, said in (
+        ({"preset": PRESET}, "preset is matched, not small"),
+        ({"rotations": None}, "rotations is 18, not None"),
+    ):
+        other = dataclasses.replace(chance, policy=dataclasses.replace(chance.policy, **change))
+        assert other.policy.name != chance.policy.name
+        assert other.departure(summary) == said
+    # Only the angle network of the Equivariant Transporter is larger: its base is of figure 6.
+    theirs = cells["unseen_equivariant_transporter_36_100_every_chance"].policy
+    assert theirs.base == cells["unseen_equivariant_transporter_180_100"].policy
+    queue.calls.clear()
+    queue.train(theirs)
+    assert [call for call in queue.calls if call.startswith("train")] == [
+        f"train {theirs.base.name}_lr{min(LEARNING_RATES):g}",
+        f"train {theirs.name}_lr{min(LEARNING_RATES):g}",
+    ]
 
 
 def test_networks_at_another_learning_rate_do_not_count_as_trained(queue: Pretending):

@@ -1,0 +1,88 @@
+"""The parameters of every network, beside those of the original networks: a table of the page of
+results, counted from the networks themselves."""
+
+from __future__ import annotations
+
+from functools import cache
+
+from kitting_drake.reproduction.page.markdown import markdown_table
+from kitting_drake.reproduction.page.runs import LEARNED, METHODS
+
+ORIENTATIONS = 36
+"""N at which the networks are counted; only the Equivariant Transporter's depend on it."""
+PRESETS = ("small", "matched", "paper")
+COLUMNS = ("alpha", "beta", "phi", "psi")
+ORIGINAL = {"alpha": 4_537_185, "beta": 835_888, "phi": 4_537_185, "psi": 4_537_185}
+"""Ours, as the authors ran it."""
+
+_TEXT = f"""\
+#### Parameters of every network
+
+Trainable parameters at N = {ORIENTATIONS}, counted from the networks. The Transporter's one picking
+network, f_pick, stands under alpha. The last column is the share of the original's parameters.
+
+The preset `matched` is `small` with larger baselines: the Transporter keeps as large a share of the
+original's parameters as ours does, and the Equivariant Transporter's pick-angle network (beta) has
+as many as that of ours.
+
+The original figures of ours are those of the authors' code. For the Equivariant Transporter the
+paper gives 4.54 M for alpha, and the authors' pick-angle network has 0.90 M at N = {ORIENTATIONS};
+its phi and psi are the same U-net as alpha. The paper does not count the Transporter: its original
+is taken to be the preset `paper` here, with the published widths of ResNets of 43 layers. The
+shares of both baselines are of the preset `paper`.
+"""
+
+
+_ORIGINAL_TEXTS = {
+    "so2": [*(f"{ORIGINAL[name]:,}" for name in COLUMNS), f"{sum(ORIGINAL.values()):,}"],
+    "equivariant_transporter": ["4.54 M", "0.90 M", "4.54 M", "4.54 M", "14.5 M"],
+}
+"""The cells of a method's original networks, and of all of them together."""
+
+
+@cache
+def count_parameters(method: str, preset: str) -> dict[str, int]:
+    """The number of parameters of each network.
+
+    Args:
+        method: a key of `METHODS`.
+        preset: the size of the networks.
+
+    Returns:
+        By its name, of `COLUMNS`; the Transporter's f_pick is `alpha`, and it has no `beta`.
+    """
+    # Torch takes seconds to import.
+    from kitting_drake.policies.networks.architecture import NetworkConfig
+    from kitting_drake.policies.networks.methods import make_networks
+
+    networks = make_networks(NetworkConfig(method, preset, ORIENTATIONS))
+    counts = {
+        name: sum(weight.numel() for weight in network.parameters())
+        for name, network in networks.named_children()
+    }
+    return {name.replace("f_pick", "alpha"): count for name, count in counts.items()}
+
+
+def original_parameters(method: str) -> int:
+    """The number of parameters of all of a method's original networks."""
+    counts = ORIGINAL if method == "so2" else count_parameters(method, "paper")
+    return sum(counts.values())
+
+
+def parameters_section() -> str:
+    """The table with its text, in Markdown."""
+    rows = []
+    for method in LEARNED:
+        by_counts: dict[tuple[int | None, ...], list[str]] = {}
+        for preset in PRESETS:
+            found = count_parameters(method, preset)
+            by_counts.setdefault(tuple(found.get(name) for name in COLUMNS), []).append(preset)
+        for counts, presets in by_counts.items():
+            total = sum(count for count in counts if count is not None)
+            texts = ["-" if count is None else f"{count:,}" for count in counts]
+            share = f"1 / {original_parameters(method) / total:.1f}"
+            rows.append([METHODS[method], ", ".join(presets), *texts, f"{total:,}", share])
+        if method in _ORIGINAL_TEXTS:
+            rows.append([METHODS[method], "*original*", *_ORIGINAL_TEXTS[method], ""])
+    headings = ["method", "preset", *COLUMNS, "all", "of the original"]
+    return f"{_TEXT}\n{markdown_table(headings, rows, left_columns=2)}"

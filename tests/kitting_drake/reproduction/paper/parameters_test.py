@@ -1,0 +1,51 @@
+"""The table of parameters."""
+
+import pytest
+
+from kitting_drake.reproduction.paper.parameters import (
+    COLUMNS,
+    ORIGINAL,
+    count_parameters,
+    original_parameters,
+    parameters_section,
+)
+
+
+def share(method: str, preset: str) -> float:
+    """Of the original's parameters."""
+    return sum(count_parameters(method, preset).values()) / original_parameters(method)
+
+
+def test_at_the_size_of_the_paper_ours_are_as_large_as_the_authors():
+    found = count_parameters("so2", "paper")
+    assert found == pytest.approx(ORIGINAL, rel=1e-3)
+    # The paper: 4.54 M; the authors' angle network: 0.90 M at N = 36.
+    theirs = count_parameters("equivariant_transporter", "paper")
+    assert [round(theirs[name] / 1e6, 2) for name in COLUMNS] == [4.54, 0.90, 4.54, 4.54]
+
+
+def test_matched_baselines_keep_the_share_that_ours_keep():
+    assert count_parameters("so2", "matched") == count_parameters("so2", "small")
+    ours = share("so2", "small")
+    assert share("transporter", "small") < 0.4 * ours
+    assert share("transporter", "matched") == pytest.approx(ours, rel=0.02)
+    # Of the Equivariant Transporter only the angle network differs.
+    small, matched = (
+        count_parameters("equivariant_transporter", preset) for preset in ("small", "matched")
+    )
+    assert {name for name in COLUMNS if small[name] != matched[name]} == {"beta"}
+    assert matched["beta"] >= count_parameters("so2", "small")["beta"]
+
+
+def test_the_table_has_every_network():
+    lines = [line for line in parameters_section().splitlines() if line.startswith("| ")]
+    rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines]
+    by_name = {tuple(row[:2]): row[2:] for row in rows}
+    ours = by_name["SO(2)-equivariant (ours)", "small, matched"]
+    assert ours == ["159,281", "102,696", "159,299", "159,299", "580,575", "1 / 24.9"]
+    original = by_name["SO(2)-equivariant (ours)", "*original*"]
+    assert original == ["4,537,185", "835,888", "4,537,185", "4,537,185", "14,447,443", ""]
+    transporter = by_name["Transporter", "matched"]
+    assert transporter == ["398,171", "-", "398,227", "398,227", "1,194,625", "1 / 24.7"]
+    assert by_name["Transporter", "small"][-1] == "1 / 70.5"
+    assert by_name["Equivariant Transporter", "matched"][1] == "102,912"
