@@ -288,5 +288,6 @@ def test_counts():
 
 
 def test_an_unknown_preset_is_refused():
-    with pytest.raises(UserError, match="--preset must be one of paper, small, matched, tiny, not 'huge'"):
+    presets = "paper, small, matched, tiny"
+    with pytest.raises(UserError, match=f"--preset must be one of {presets}, not 'huge'"):
         Plan(preset="huge")

@@ -325,7 +325,7 @@ SPOILT = {
         "the stop_threshold of its card is 'low', not a number",
     ),
     "unknown method": (reconfigured(method="magic"), "method must be one of so2, "),
-    "unknown preset": (reconfigured(preset="vast"), "preset must be one of paper, small, matched, tiny"),
+    "unknown preset": (reconfigured(preset="vast"), "preset must be one of paper, small, "),
     "missing field": (
         reconfigured(colour_mean=None),
         "its config must have the fields angle_frequencies, ",
