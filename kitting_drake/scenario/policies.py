@@ -39,6 +39,7 @@ _TOLD = (
     "decay",
     "taken_only",
     "rigid",
+    "rotations",
 )
 """The fields of a network's training that are reported with its results."""
 

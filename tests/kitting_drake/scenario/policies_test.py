@@ -125,6 +125,7 @@ def test_results_say_what_a_policy_is(weights_file: Path):
         "decay": None,
         "taken_only": None,
         "rigid": None,
+        "rotations": None,
         "training_seed": None,
         "angle_only": False,
         "checkpoint_step": None,
