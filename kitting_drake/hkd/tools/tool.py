@@ -10,7 +10,6 @@ from functools import cached_property
 from pathlib import Path
 
 import numpy as np
-import trimesh
 import yaml
 from manifold3d import CrossSection, FillRule
 from numpy.typing import NDArray
@@ -83,6 +82,9 @@ class Tool:
 
     def surface_points(self, count: int, seed: int = 0) -> NDArray[np.float64]:
         """(count, 3) points of the surface, in T, in metres: by area, the same each time."""
+        # Import trimesh lazily.
+        import trimesh
+
         faces = np.arange(3 * len(self.triangles)).reshape(-1, 3)
         mesh = trimesh.Trimesh(self.triangles.reshape(-1, 3), faces, process=False)
         points, _ = trimesh.sample.sample_surface(mesh, count, seed=seed)
@@ -90,6 +92,9 @@ class Tool:
 
 
 def _read_triangles(path: Path) -> NDArray[np.float64]:
+    # Import trimesh lazily.
+    import trimesh
+
     try:
         triangles = np.asarray(trimesh.load_mesh(path, process=False).triangles, dtype=float)
     except (OSError, ValueError, TypeError, AttributeError, IndexError, KeyError) as error:
