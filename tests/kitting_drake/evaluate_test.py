@@ -283,8 +283,8 @@ def test_what_something_else_killed_is_given_a_second_chance(monkeypatch: pytest
         evaluation.run_in_worker(workers, CHOSEN, 7)
 
 
-def test_two_short_episodes_side_by_side(verb, tmp_path: Path):
-    done = verb(
+def test_two_short_episodes_side_by_side(verb_process, tmp_path: Path):
+    done = verb_process(
         "evaluate",
         "scenarios/kitting_oracle.yaml",
         *("--episodes", 2, "--workers", 2, "--output", tmp_path),
