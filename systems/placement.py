@@ -10,16 +10,17 @@ import math
 from collections.abc import Sequence, Set
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 from pydrake.math import RigidTransform, RollPitchYaw
 from pydrake.multibody.tree import BodyIndex
-from scipy.optimize import linear_sum_assignment
-from scipy.spatial import cKDTree
 
 from systems.signals import wrap_to_pi
+
+if TYPE_CHECKING:
+    from scipy.spatial import cKDTree
 
 STRICT_HEIGHT = 0.002
 """A strict success stands at most this far above or below its goal, in metres."""
@@ -69,6 +70,9 @@ class PlacedObject:
     @cached_property
     def tree(self) -> cKDTree:
         """A tree of the points."""
+        # Import SciPy lazily.
+        from scipy.spatial import cKDTree
+
         return cKDTree(self.p_BPoints)
 
 
@@ -223,6 +227,9 @@ def add_s(points: NDArray[np.float64], X_WGoal: RigidTransform, X_WActual: Rigid
         X_WGoal: the target pose.
         X_WActual: the pose reached.
     """
+    # Import SciPy lazily.
+    from scipy.spatial import cKDTree
+
     return _add_s(cKDTree(points), points, X_WGoal, X_WActual)
 
 
@@ -309,6 +316,9 @@ def _assign(
                 measured = _measure(objects[row], goal, column, pose_index, poses[row], success)
                 # A goal that is filled outweighs all displacements.
                 cost[row, column] -= _FAR * len(objects) * measured.share
+    # Import SciPy lazily.
+    from scipy.optimize import linear_sum_assignment
+
     return [
         (int(row), int(column), int(nearest[row, column]))
         for row, column in zip(*linear_sum_assignment(cost), strict=True)

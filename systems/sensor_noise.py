@@ -12,8 +12,6 @@ from pydrake.geometry import DepthRenderCamera
 from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.systems.framework import Context, LeafSystem
 from pydrake.systems.sensors import CameraInfo, ImageDepth32F, ImageLabel16I, ImageRgba8U
-from scipy import ndimage
-from scipy.special import ndtri
 
 from systems.bounds import bounded
 from systems.weak_calc import weak_calc
@@ -247,6 +245,9 @@ def noisy_depth(
     """
     seen = np.isfinite(depth) & (depth > 0)
     z = np.where(seen, depth, 1.0).astype(np.float32)
+    # Import SciPy lazily.
+    from scipy import ndimage
+
     hole = np.zeros(depth.shape, bool)
     if parameters.steepest_deg < 90:
         hole |= _incidence(z, seen, camera) < math.cos(math.radians(parameters.steepest_deg))
@@ -329,12 +330,18 @@ def _unit_field(
     values = random.standard_normal(shape, dtype=np.float32)
     if radius <= 0:
         return values
+    # Import SciPy lazily.
+    from scipy import ndimage
+
     smooth = ndimage.gaussian_filter(values, radius, mode="wrap", truncate=3.0)
     return smooth / max(float(smooth.std()), 1e-12)
 
 
 def _upper_quantile(share: NDArray[np.float32]) -> NDArray[np.float32]:
     """The value that a share of normally distributed values exceeds."""
+    # Import SciPy lazily.
+    from scipy.special import ndtri
+
     return ndtri(1 - np.clip(share, 1e-9, 1 - 1e-9)).astype(np.float32)
 
 

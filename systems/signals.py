@@ -10,7 +10,6 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy import ndimage
 
 
 @dataclass(frozen=True)
@@ -117,6 +116,9 @@ def fill_unseen(height: NDArray[np.float32], valid: NDArray[np.bool_]) -> NDArra
     """
     if valid.all() or not valid.any():
         return height
+    # Import SciPy lazily.
+    from scipy import ndimage
+
     filled = np.where(valid, height, np.inf).astype(np.float32)
     missing = ~valid
     for _ in range(max(height.shape)):

@@ -4,7 +4,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import ndimage
 
 from systems.signals import Observation, PlanarPose, SurfaceHeights, fill_unseen
 
@@ -128,6 +127,9 @@ def _level(height: NDArray[np.float32]) -> tuple[NDArray[np.float32], float, flo
 
 def _noise(height: NDArray[np.float32]) -> float:
     """The standard deviation of the noise of heights (rows, cols); 0 where there is none."""
+    # Import SciPy lazily.
+    from scipy import ndimage
+
     away = np.abs(height - ndimage.uniform_filter(height, _SMOOTHED, mode="nearest"))
     highest = ndimage.maximum_filter(height, _SMOOTHED, mode="nearest")
     flat = highest - ndimage.minimum_filter(height, _SMOOTHED, mode="nearest") < _FLAT

@@ -1,7 +1,10 @@
 """What all tests share."""
 
 import ctypes
+import importlib
 import importlib.metadata
+import logging
+import os
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
@@ -10,6 +13,9 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
+
+# Tests run side by side. Threads of torch's that find no idle processor take ten times as long.
+os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -37,9 +43,38 @@ def freed_diagrams() -> None:
         pytest.skip("Drake 1.51 keeps every Diagram")
 
 
+@pytest.fixture
+def verb(
+    monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> Iterator[Callable[..., subprocess.CompletedProcess[str]]]:
+    """Runs `python -m kitting_drake.VERB ARGUMENTS...` in this process, from the root of the tree.
+
+    For all that a verb prints, writes and returns: this process has loaded what it takes.
+    """
+
+    def run(name: str, *arguments: object) -> subprocess.CompletedProcess[str]:
+        from kitting_drake.common.command_line import run_command
+
+        package = f"kitting_drake.{name}"
+        main = importlib.import_module("kitting_drake.hkd.__main__" if name == "hkd" else package)
+        words = [package, *map(str, arguments)]
+        capfd.readouterr()
+        with monkeypatch.context() as patch, pytest.raises(SystemExit) as left:
+            patch.setattr(sys, "argv", words)
+            patch.chdir(ROOT)
+            run_command(main.main)
+        assert isinstance(left.value.code, int)
+        return subprocess.CompletedProcess(words, left.value.code, *capfd.readouterr())
+
+    # A command silences Drake.
+    level = logging.getLogger("drake").level
+    yield run
+    logging.getLogger("drake").setLevel(level)
+
+
 @pytest.fixture(scope="session")
-def verb() -> Callable[..., subprocess.CompletedProcess[str]]:
-    """Runs `python -m kitting_drake.VERB ARGUMENTS...` from the root of the tree."""
+def verb_process() -> Callable[..., subprocess.CompletedProcess[str]]:
+    """Runs `python -m kitting_drake.VERB ARGUMENTS...` from the root of the tree, as people do."""
 
     def run(name: str, *arguments: object) -> subprocess.CompletedProcess[str]:
         command = [sys.executable, "-m", f"kitting_drake.{name}", *map(str, arguments)]

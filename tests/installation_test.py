@@ -4,6 +4,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 ROOT = Path(__file__).resolve().parent.parent
 
 EQUIVARIANT = """
@@ -24,25 +26,23 @@ assert torch.allclose(straight[0], expected, atol=1e-5)
 """
 
 SOLID = """
-from kitting_drake.policies.networks.layers.planar_escnn import gspaces
-
 space = gspaces.rot3dOnR3(maximum_frequency=1)
 space.irrep(1)(space.fibergroup.element((0.1, 0.2, 0.3), "ZYZ"))
 """
 
 
-def python(program: str) -> subprocess.CompletedProcess[str]:
-    # In a process of its own, where nothing has imported escnn.
+@pytest.fixture(scope="module")
+def done() -> subprocess.CompletedProcess[str]:
+    """Both, one after the other, in a process of their own, where nothing has imported escnn."""
+    program = f"{EQUIVARIANT}\nprint('works')\n{SOLID}"
     command = [sys.executable, "-W", "error", "-c", program]
     return subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
 
 
-def test_escnn_works_as_it_was_installed():
-    done = python(EQUIVARIANT)
-    assert done.returncode == 0, done.stderr
+def test_escnn_works_as_it_was_installed(done: subprocess.CompletedProcess[str]):
+    assert done.stdout == "works\n", done.stderr
 
 
-def test_groups_of_space_are_refused_with_what_would_do():
-    done = python(SOLID)
+def test_groups_of_space_are_refused_with_what_would_do(done: subprocess.CompletedProcess[str]):
     assert done.returncode == 1
     assert "NotImplementedError: escnn needs the package lie_learn for SO(3)" in done.stderr

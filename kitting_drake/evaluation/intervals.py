@@ -2,19 +2,26 @@
 
 import math
 from collections.abc import Sequence
+from statistics import NormalDist
 
 import numpy as np
-from scipy import stats
 
-_CONFIDENCE = 0.95
+_UPPER = 0.975
+"""What lies below the upper end of an interval of 95 %; as much lies above its lower end."""
+_Z = NormalDist().inv_cdf(_UPPER)
 _ALIKE = 0.9
 """Where this share of scores is one and the same, the others do not tell how much scores vary."""
 
 
 def proportion_interval(successes: int, trials: int) -> list[float]:
     """Wilson's score interval of a proportion, as [low, high]."""
-    interval = stats.binomtest(successes, trials).proportion_ci(_CONFIDENCE, method="wilson")
-    return [float(interval.low), float(interval.high)]
+    share = successes / trials
+    scale = 1 + _Z**2 / trials
+    middle = (share + _Z**2 / (2 * trials)) / scale
+    reach = _Z / scale * math.sqrt((share * (1 - share) + _Z**2 / (4 * trials)) / trials)
+    low = 0.0 if successes == 0 else middle - reach
+    high = 1.0 if successes == trials else middle + reach
+    return [low, high]
 
 
 def mean_interval(scores: Sequence[float]) -> list[float]:
@@ -33,5 +40,9 @@ def mean_interval(scores: Sequence[float]) -> list[float]:
         low, _ = proportion_interval(math.floor(total), count)
         _, high = proportion_interval(math.ceil(total), count)
         return [low, high]
-    low, high = stats.t.interval(_CONFIDENCE, count - 1, loc=mean, scale=stats.sem(scores))
-    return [max(0.0, float(low)), min(1.0, float(high))]
+    # Import SciPy lazily.
+    from scipy.special import stdtrit
+
+    error = float(np.std(scores, ddof=1)) / math.sqrt(count)
+    reach = float(stdtrit(count - 1, _UPPER)) * error
+    return [max(0.0, mean - reach), min(1.0, mean + reach)]

@@ -10,12 +10,12 @@ from typing import TYPE_CHECKING
 
 from kitting_drake.common.errors import UserError
 from kitting_drake.common.paths import GENERALIST
-from kitting_drake.policies.matching.shape_matching import ShapeMatchingPolicy
 from systems.pick_place_parameters import PickPlaceParameters
 from systems.signals import Observation, PixelGrid
 
 if TYPE_CHECKING:
     from kitting_drake.policies.learned_policy import Decision, LearnedPolicy
+    from kitting_drake.policies.matching.shape_matching import ShapeMatchingPolicy
 
 
 @dataclass(frozen=True)
@@ -111,4 +111,7 @@ def make_shape_matching(
         planner: how the hand will pick and place.
         recover: mend what earlier actions left undone.
     """
+    # Import SciPy lazily.
+    from kitting_drake.policies.matching.shape_matching import ShapeMatchingPolicy
+
     return ShapeMatchingPolicy(planner, recover=recover)

@@ -3,6 +3,7 @@
 import shutil
 import subprocess
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from pydrake.geometry import (
     ColorRenderCamera,
@@ -16,12 +17,14 @@ from pydrake.geometry import (
 )
 from pydrake.systems.framework import Diagram, DiagramBuilder
 from pydrake.systems.sensors import RgbdSensor
-from pydrake.visualization import VideoWriter
 
 from kitting_drake.common.errors import UserError
 from kitting_drake.common.files import write_atomically
 from kitting_drake.common.rendering import X_WOVERVIEW, add_film_renderer, picture_camera
 from kitting_drake.station.station import KittingStation
+
+if TYPE_CHECKING:
+    from pydrake.visualization import VideoWriter
 
 MESHCAT_PERIOD = 1 / 32
 
@@ -58,7 +61,7 @@ def add_meshcat(builder: DiagramBuilder, station: KittingStation, meshcat: Meshc
     )
 
 
-def add_video(builder: DiagramBuilder, station: KittingStation, path: Path) -> VideoWriter:
+def add_video(builder: DiagramBuilder, station: KittingStation, path: Path) -> "VideoWriter":
     """Adds a camera that sees the whole station, and the writer of its film.
 
     Args:
@@ -69,6 +72,9 @@ def add_video(builder: DiagramBuilder, station: KittingStation, path: Path) -> V
     Raises:
         MachineError: images cannot be rendered here.
     """
+    # Import matplotlib lazily.
+    from pydrake.visualization import VideoWriter
+
     core = picture_camera(add_film_renderer(station.scene_graph), width=640, height=400)
     sensor = builder.AddNamedSystem(
         "film_camera",

@@ -334,12 +334,12 @@ OneTool:
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("rendering")
-def test_killed_again_and_again_it_collects_what_it_would_have(verb, tmp_path: Path):
+def test_killed_again_and_again_it_collects_what_it_would_have(verb_process, tmp_path: Path):
     scenario = tmp_path / "one_tool.yaml"
     scenario.write_text(ONE_TOOL)
     whole, killed = tmp_path / "whole", tmp_path / "killed"
     counts = ("--demos", 12, "--workers", 2)
-    done = verb("collect", scenario, *counts, "--output", whole)
+    done = verb_process("collect", scenario, *counts, "--output", whole)
     assert done.returncode == 0, done.stderr
     command = [sys.executable, "-m", "kitting_drake.collect", scenario, *counts]
     rng = random.Random(0)
@@ -351,7 +351,7 @@ def test_killed_again_and_again_it_collects_what_it_would_have(verb, tmp_path: P
             process.wait(rng.uniform(0.5, 9.0))
         os.kill(process.pid, signal.SIGKILL)
         process.wait()
-    done = verb("collect", scenario, *counts, "--output", killed)
+    done = verb_process("collect", scenario, *counts, "--output", killed)
     assert done.returncode == 0, done.stderr
     assert sorted(item.name for item in killed.glob("[!.]*")) == [
         "demonstrations.h5",

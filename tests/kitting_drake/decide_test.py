@@ -236,14 +236,17 @@ def test_a_block_that_cannot_lie_there_is_refused(
     assert re.match(message, refusal(*flags))
 
 
-def test_input_that_cannot_be_used_ends_with_one_sentence(bench: Path):
+def test_input_that_cannot_be_used_ends_with_one_sentence(
+    bench: Path, verb: Callable[..., subprocess.CompletedProcess[str]]
+):
+    arguments = [bench, "--camera", bench / "calibration.yaml", "--output", bench / "out"]
     (bench / "left_depth.npy").unlink()
     (bench / "out").mkdir()
     (bench / "out" / "action.json").write_text('{"policy": "generalist", "seconds": 0.3}')
     (bench / "out" / "check.json").write_text("{}")
-    assert command(bench, "--check").returncode == 2
+    assert verb("decide", *arguments, "--check").returncode == 2
     assert [path.name for path in (bench / "out").iterdir()] == ["action.json"]
-    done = command(bench, "--shape_matching")
+    done = verb("decide", *arguments, "--shape_matching")
     # What an earlier frame was answered is no answer to this one.
     assert not list((bench / "out").iterdir())
     assert done.returncode == 2

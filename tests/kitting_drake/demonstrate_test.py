@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import shutil
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
@@ -61,9 +62,9 @@ def pose(record: dict[str, float]) -> PlanarPose:
     return PlanarPose(record["x"], record["y"], record["yaw"])
 
 
-@pytest.fixture
-def folder(tmp_path: Path) -> Path:
-    """Two demonstrations: one that ends by stop, and one that does not; step 10 comes after 9."""
+@pytest.fixture(scope="module")
+def written(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    tmp_path = tmp_path_factory.mktemp("demonstrations")
     root = tmp_path / "my bench"
     write_step(root / "demo1" / "step9", 10, {**POSES, "object": "red", "category": "wrench"})
     write_step(root / "demo1" / "step10", 20, {"stop": False, **POSES})
@@ -71,7 +72,13 @@ def folder(tmp_path: Path) -> Path:
     write_step(root / "demo2" / "step1", 40, POSES)
     write_calibration(tmp_path / "calibration.yaml", BENCH)
     (root / "notes.txt").write_text("Stray files are no demonstrations.")
-    return root
+    return tmp_path
+
+
+@pytest.fixture
+def folder(written: Path, tmp_path: Path) -> Path:
+    """Two demonstrations: one that ends by stop, and one that does not; step 10 comes after 9."""
+    return shutil.copytree(written, tmp_path, dirs_exist_ok=True) / "my bench"
 
 
 @pytest.fixture

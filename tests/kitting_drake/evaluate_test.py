@@ -13,13 +13,11 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-import torch
 from rich.console import Console
 
 import kitting_drake.common.rendering as cameras
 import kitting_drake.episode.chosen as chosen_module
 import kitting_drake.evaluate as evaluation
-import kitting_drake.policies.networks.device as device
 from kitting_drake.common.errors import UserError
 from kitting_drake.common.files import alone_in
 from kitting_drake.common.paths import MODELS
@@ -116,6 +114,11 @@ def test_a_folder_of_another_scenario_is_refused(tmp_path: Path):
 def test_a_folder_of_other_weights_or_another_number_type_is_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
+    # Workers import this file: not all of them need torch.
+    import torch
+
+    import kitting_drake.policies.networks.device as device
+
     weights = tmp_path / "policy.safetensors"
     scenario = Scenario(policy=Learned(weights=weights.name))
     chosen = ChosenScenario(scenario, tmp_path / "mine.yaml", "mine", None)
@@ -283,8 +286,8 @@ def test_what_something_else_killed_is_given_a_second_chance(monkeypatch: pytest
         evaluation.run_in_worker(workers, CHOSEN, 7)
 
 
-def test_two_short_episodes_side_by_side(verb, tmp_path: Path):
-    done = verb(
+def test_two_short_episodes_side_by_side(verb_process, tmp_path: Path):
+    done = verb_process(
         "evaluate",
         "scenarios/kitting_oracle.yaml",
         *("--episodes", 2, "--workers", 2, "--output", tmp_path),

@@ -17,7 +17,6 @@ from pydrake.systems.primitives import ConstantVectorSource
 from safetensors.torch import save_file
 
 from kitting_drake import run as running
-from kitting_drake.common.command_line import run_command
 from kitting_drake.common.errors import UserError
 from kitting_drake.common.paths import SCENARIOS
 from kitting_drake.scenario import load_scenario
@@ -80,20 +79,17 @@ def test_shipped_scenarios_run(
     path: Path,
     name: str,
     tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
+    verb: Verb,
     request: pytest.FixtureRequest,
 ):
-    """In this process, which has loaded all that it takes."""
     scenario = load_scenario(path, name)
     if scenario.policy.needs_observation:
         request.getfixturevalue("rendering")
     flags = ("--scenario_text", "{time_limit: 1.0}", "--no-meshcat", "--output", tmp_path / "out")
     diagram = tmp_path / "kitting.dot"
-    command = ["run", path, "--scenario_name", name, "--seed", 3, *flags, "--graphviz", diagram]
-    monkeypatch.setattr(sys, "argv", list(map(str, command)))
-    assert running.main() == 0
-    shown = capsys.readouterr().out
+    done = verb("run", path, "--scenario_name", name, "--seed", 3, *flags, "--graphviz", diagram)
+    assert done.returncode == 0
+    shown = done.stdout
     left = {"results.json", *(["decisions"] if isinstance(scenario.policy, Learned) else [])}
     assert {item.name for item in (tmp_path / "out").iterdir()} == left
     results = json.loads((tmp_path / "out" / "results.json").read_text())
@@ -208,8 +204,10 @@ def test_a_diagram_that_graphviz_cannot_write_is_told(tmp_path: Path, monkeypatc
         running.draw_diagram(builder.Build(), Path("cell.pdf"))
 
 
-def test_a_scenario_is_found_by_its_name_and_not_by_another_path(verb: Verb, tmp_path: Path):
-    done = verb("run", "no/such/kitting_oracle.yaml", "--no-meshcat", "--output", tmp_path)
+def test_a_scenario_is_found_by_its_name_and_not_by_another_path(
+    verb_process: Verb, tmp_path: Path
+):
+    done = verb_process("run", "no/such/kitting_oracle.yaml", "--no-meshcat", "--output", tmp_path)
     assert done.returncode == 2
     assert "cannot read the scenario no/such/kitting_oracle.yaml" in done.stderr
 
@@ -278,8 +276,7 @@ def test_weights_that_cannot_be_used(
     learned: Path,
     content: str | None,
     sentence: str,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
+    verb: Verb,
 ):
     weights = learned.with_name("policy.safetensors")
     if content == "text":
@@ -287,13 +284,7 @@ def test_weights_that_cannot_be_used(
     elif content == "foreign":
         save_file({"weight": torch.zeros(3)}, weights)
     out = learned.with_name("out")
-    monkeypatch.setattr(
-        sys, "argv", ["run", str(learned), "--no-meshcat", "--output", str(out), "--quiet"]
-    )
-    with pytest.raises(SystemExit) as left:
-        run_command(running.main)
-    assert left.value.code == 2
-    told = capsys.readouterr()
-    assert told.out == ""
-    assert told.err == f"error: {learned}: {sentence.format(weights=weights)}\n"
+    done = verb("run", learned, "--no-meshcat", "--output", out, "--quiet")
+    assert (done.returncode, done.stdout) == (2, "")
+    assert done.stderr == f"error: {learned}: {sentence.format(weights=weights)}\n"
     assert not list(out.iterdir())

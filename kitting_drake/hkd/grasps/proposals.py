@@ -191,11 +191,14 @@ def _reach(points: Array, level: NDArray[np.int64], levels: Array, theta: float)
     u_min = u.min() - _FINGER_COLUMNS * _BIN
     columns = int((u.max() - u_min) / _BIN) + _FINGER_COLUMNS + 2
     bins = ((u - u_min) / _BIN).astype(int)
-    left = np.full((columns, len(levels)), -np.inf)
-    right = np.full((columns, len(levels)), np.inf)
-    np.maximum.at(left, (bins, level), v)
-    np.minimum.at(right, (bins, level), v)
-    return _Reach(u_min, left, right)
+    # NumPy is faster with one index than with two.
+    cells = bins * len(levels) + level
+    left = np.full(columns * len(levels), -np.inf)
+    right = np.full(columns * len(levels), np.inf)
+    np.maximum.at(left, cells, v)
+    np.minimum.at(right, cells, v)
+    shape = columns, len(levels)
+    return _Reach(u_min, left.reshape(shape), right.reshape(shape))
 
 
 def _search(

@@ -15,7 +15,6 @@ from dataclasses import dataclass
 import numpy as np
 from manifold3d import CrossSection, JoinType
 from numpy.typing import NDArray
-from scipy import fft
 
 CELL = 0.0015
 """Side of the raster's cells, in metres."""
@@ -202,6 +201,9 @@ class _Part:
 
 
 def _transform(mask: Mask) -> Spectrum:
+    # Import SciPy lazily.
+    from scipy import fft
+
     return fft.rfft2(mask.astype(np.float32))
 
 
@@ -252,6 +254,9 @@ def _fill_strip(
         For each list the part and the (row, column) of its corner; None if they do not fit, or
         surely cost more than the limit.
     """
+    # Import SciPy lazily.
+    from scipy import fft
+
     # Keep-outs may reach out of the strip. On a canvas that is joined at its edges, that is to say
     # under a discrete Fourier transform, they then reach into a margin on the other side.
     overhang = max(
@@ -293,6 +298,9 @@ def _lowest_place(
     rows, columns = strip[0] - part.size[0] + 1, strip[1] - part.size[1] + 1
     if rows <= 0 or columns <= 0:
         return None
+    # Import SciPy lazily.
+    from scipy import fft
+
     against_solid, against_keep_out = part.spectra(canvas)
     overlap = fft.irfft2(taken[0] * against_solid + taken[1] * against_keep_out, s=canvas)
     # Overlaps are whole numbers of cells.

@@ -4,7 +4,6 @@ from pathlib import Path
 
 import numpy as np
 from manifold3d import Manifold
-from scipy.spatial import ConvexHull
 
 
 def vertices_and_faces(solid: Manifold) -> tuple[np.ndarray, np.ndarray]:
@@ -75,6 +74,9 @@ def flat_obj(
 
 def write_convex_obj(path: Path, points: np.ndarray) -> None:
     """Writes the convex hull of points (n, 3) in mm."""
+    # Import SciPy lazily.
+    from scipy.spatial import ConvexHull
+
     hull = ConvexHull(points)
     # Qhull does not orient its facets: turn those that wind against their outward normal.
     a, b, c = (points[hull.simplices[:, k]] for k in range(3))

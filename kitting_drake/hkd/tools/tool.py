@@ -6,11 +6,10 @@ import math
 import os
 import re
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 from pathlib import Path
 
 import numpy as np
-import trimesh
 import yaml
 from manifold3d import CrossSection, FillRule
 from numpy.typing import NDArray
@@ -21,6 +20,10 @@ from systems.grasp import Grasp
 
 CATEGORIES = ("hammer", "pliers", "wrench", "screwdriver")
 """The four categories of the paper (section IV-B.1). A tool of one's own may be of any other."""
+
+
+# libyaml reads a hundred records in the time of ten.
+_Loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 
 
 @dataclass(frozen=True)
@@ -74,7 +77,9 @@ class Tool:
         Raises:
             UserError: a file that is not a mesh.
         """
-        return np.concatenate([triangles for _, triangles in self.parts])
+        triangles = np.concatenate([triangles for _, triangles in self.parts])
+        triangles.flags.writeable = False
+        return triangles
 
     @cached_property
     def footprint(self) -> CrossSection:
@@ -83,6 +88,9 @@ class Tool:
 
     def surface_points(self, count: int, seed: int = 0) -> NDArray[np.float64]:
         """(count, 3) points of the surface, in T, in metres: by area, the same each time."""
+        # Import trimesh lazily.
+        import trimesh
+
         faces = np.arange(3 * len(self.triangles)).reshape(-1, 3)
         mesh = trimesh.Trimesh(self.triangles.reshape(-1, 3), faces, process=False)
         points, _ = trimesh.sample.sample_surface(mesh, count, seed=seed)
@@ -90,12 +98,16 @@ class Tool:
 
 
 def _read_triangles(path: Path) -> NDArray[np.float64]:
+    # Import trimesh lazily.
+    import trimesh
+
     try:
         triangles = np.asarray(trimesh.load_mesh(path, process=False).triangles, dtype=float)
     except (OSError, ValueError, TypeError, AttributeError, IndexError, KeyError) as error:
         raise UserError(f"{path} is not a mesh that can be read: {error}") from error
     if not len(triangles) or not np.isfinite(triangles).all():
         raise UserError(f"{path} holds no triangles, or some without a place")
+    triangles.flags.writeable = False
     return triangles
 
 
@@ -132,7 +144,7 @@ def load_tool(name: str, base: Path | None = None) -> Tool:
         advice = f"did you mean '{close[0]}'?" if close else "'hkd list' shows those there are"
         raise UserError(f"there is no tool '{name}', nor a folder with a tool.yaml: {advice}")
     try:
-        record = yaml.safe_load(record_path.read_text())
+        record = yaml.load(record_path.read_text(), Loader=_Loader)
         tool = Tool(
             directory=directory,
             name=str(record["name"]),
@@ -170,6 +182,17 @@ def load_tool(name: str, base: Path | None = None) -> Tool:
         raise UserError(f"{record_path}: grasp has to be of finite numbers")
     if tool.symmetry < 1:
         raise UserError(f"{record_path}: symmetry is {tool.symmetry}, and has to be 1 or more")
+    return _shared(tool, tuple(path.stat().st_mtime_ns for path in tool.visual_meshes))
+
+
+@lru_cache(maxsize=32)
+def _shared(tool: Tool, changed: tuple[int, ...]) -> Tool:
+    """The same tool for all that are equal, whose meshes are then read once.
+
+    Args:
+        tool: a tool.
+        changed: when its meshes were written.
+    """
     return tool
 
 

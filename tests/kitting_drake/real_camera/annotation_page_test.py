@@ -3,6 +3,7 @@
 import http.client
 import io
 import json
+import shutil
 import socket
 import struct
 import threading
@@ -30,12 +31,18 @@ from systems.signals import PlanarPose
 from tests.kitting_drake.demonstrate_test import BENCH, POSES, write_step
 
 
-@pytest.fixture
-def folder(tmp_path: Path) -> Path:
-    """A demonstration of two steps without actions."""
+@pytest.fixture(scope="module")
+def written(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("steps")
     for number, shade in (("1", 30), ("2", 90)):
-        write_step(tmp_path / "bench" / "demo" / f"step{number}", shade, None)
-    return tmp_path / "bench"
+        write_step(folder / "demo" / f"step{number}", shade, None)
+    return folder
+
+
+@pytest.fixture
+def folder(written: Path, tmp_path: Path) -> Path:
+    """A demonstration of two steps without actions."""
+    return Path(shutil.copytree(written, tmp_path / "bench"))
 
 
 @pytest.fixture

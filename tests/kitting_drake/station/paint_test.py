@@ -14,6 +14,7 @@ from kitting_drake.scenario.appearance import Appearance
 from kitting_drake.scenario.loader import load_scenario
 from kitting_drake.station.paint import lights_of
 from kitting_drake.station.variation import varied_model
+from systems.signals import Observation
 from tests.kitting_drake.rig import build_rig
 
 needs_renderer = pytest.mark.skipif(not can_render(), reason="images cannot be rendered here")
@@ -24,30 +25,33 @@ def rig_of(text: str, seed: int = 2):
     return build_rig(scenario, seed=seed, base=SCENARIOS)
 
 
-def observed(text: str, seed: int = 2) -> np.ndarray:
-    rig = rig_of(text, seed)
-    return rig.port("observation").image
+def observed(text: str) -> Observation:
+    return rig_of(text).port("observation")
+
+
+@pytest.fixture(scope="module")
+def plain() -> Observation:
+    """As nothing is painted."""
+    return observed("{}")
 
 
 @needs_renderer
-def test_colours_are_painted_and_heights_stay():
-    plain = observed("{}")
-    red = observed('{appearance: {paints: {"*": !Fixed {rgb: [1.0, 0.0, 0.0]}}}}')
-    np.testing.assert_array_equal(red[3], plain[3])
+def test_colours_are_painted_and_heights_stay(plain: Observation):
+    red = observed('{appearance: {paints: {"*": !Fixed {rgb: [1.0, 0.0, 0.0]}}}}').image
+    np.testing.assert_array_equal(red[3], plain.height)
     assert red[1:3].max() == 0
     assert red[0].max() > 0.5
 
 
 @needs_renderer
-def test_drawn_colours_are_the_seeds():
+def test_drawn_colours_are_the_seeds(plain: Observation):
     text = '{appearance: {paints: {"table/*": !Drawn {}, "fixtures/*": !Drawn {shared: true}}}}'
-    one = observed(text)
-    np.testing.assert_array_equal(one, observed(text))
-    plain = observed("{}")
-    changed = (one[:3] != plain[:3]).any(axis=0)
+    one = observed(text).image
+    np.testing.assert_array_equal(one, observed(text).image)
+    changed = (one[:3] != plain.rgb).any(axis=0)
     # The tools stay as they are.
     assert 0.8 < changed.mean() < 1.0
-    np.testing.assert_array_equal(one[3], plain[3])
+    np.testing.assert_array_equal(one[3], plain.height)
 
 
 def test_a_pattern_that_names_nothing_is_told():
@@ -58,12 +62,11 @@ def test_a_pattern_that_names_nothing_is_told():
 
 
 @needs_renderer
-def test_sheen_makes_holes_on_what_has_it():
-    whole = rig_of("{}").port("observation")
-    holed = rig_of('{appearance: {sheen: {"objects/*": 0.9}}}').port("observation")
-    lost = whole.valid & ~holed.valid
-    tools = (whole.height > 0.004) & (whole.height < 0.04)
-    assert lost[tools].mean() > 5 * lost[whole.height < 0.001].mean()
+def test_sheen_makes_holes_on_what_has_it(plain: Observation):
+    holed = observed('{appearance: {sheen: {"objects/*": 0.9}}}')
+    lost = plain.valid & ~holed.valid
+    tools = (plain.height > 0.004) & (plain.height < 0.04)
+    assert lost[tools].mean() > 5 * lost[plain.height < 0.001].mean()
 
 
 def test_drawn_lights_are_the_seeds_and_point_down():

@@ -134,8 +134,8 @@ def test_every_format_is_read(suffix: str, tmp_path: Path):
     ("suffix", "units_per_mm", "turned"),
     [
         ("obj", 1 / 25.4, True),
-        ("glb", 0.001, False),
         ("obj", 37.0, True),
+        pytest.param("glb", 0.001, False, marks=pytest.mark.slow),
         pytest.param("stl", 1.0, False, marks=pytest.mark.slow),
         pytest.param("ply", 0.001, True, marks=pytest.mark.slow),
         pytest.param("stl", 0.1, True, marks=pytest.mark.slow),
@@ -466,7 +466,11 @@ def test_a_broken_file_makes_a_whole_tool_or_none(seed: int, tmp_path: Path):
 @pytest.mark.skipif(not REAL.is_dir(), reason=f"no real meshes in {REAL}")
 @pytest.mark.parametrize(
     "name",
-    ["hammer/cc0_claw_hammer", "pliers/cc0_pliers", "wrench/zeyuli_wrench"],
+    [
+        "pliers/cc0_pliers",
+        pytest.param("hammer/cc0_claw_hammer", marks=pytest.mark.slow),
+        pytest.param("wrench/zeyuli_wrench", marks=pytest.mark.slow),
+    ],
 )
 def test_real_tools(name: str, tmp_path: Path):
     report = bring(REAL / f"{name}.obj", tmp_path / "tools", category=name.split("/")[0])

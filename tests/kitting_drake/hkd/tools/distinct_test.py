@@ -1,5 +1,6 @@
 """The tools of the dataset differ in shape, whatever their size."""
 
+import functools
 import itertools
 
 import numpy as np
@@ -12,6 +13,16 @@ from kitting_drake.hkd.tools.tool import CATEGORIES, Tool, load_tool, tool_names
 _REFERENCE_LENGTH = 0.175
 
 
+@functools.lru_cache(maxsize=64)
+def scaled_points(tool: Tool, number: int, seed: int) -> np.ndarray:
+    return tool.surface_points(number, seed) * (_REFERENCE_LENGTH / tool.length)
+
+
+@functools.lru_cache(maxsize=32)
+def dense_tree(tool: Tool, number: int) -> cKDTree:
+    return cKDTree(scaled_points(tool, number, 1))
+
+
 def mean_surface_distance(
     tool_a: Tool, tool_b: Tool, count: int = 4000, dense: int = 100_000
 ) -> float:
@@ -21,11 +32,8 @@ def mean_surface_distance(
     surface, of the distance to the nearest of `dense` points on the other, averaged over both ways.
     """
 
-    def points(tool: Tool, number: int, seed: int) -> np.ndarray:
-        return tool.surface_points(number, seed) * (_REFERENCE_LENGTH / tool.length)
-
     def one_way(source: Tool, target: Tool) -> float:
-        distance, _ = cKDTree(points(target, dense, 1)).query(points(source, count, 0))
+        distance, _ = dense_tree(target, dense).query(scaled_points(source, count, 0))
         return float(np.mean(distance))
 
     return 0.5 * (one_way(tool_a, tool_b) + one_way(tool_b, tool_a))

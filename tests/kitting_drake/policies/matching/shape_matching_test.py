@@ -262,7 +262,7 @@ def test_it_needs_no_torch():
     assert PixelGrid() == Observation().grid
 
 
-@pytest.fixture(scope="module", params=[7402, 7417])
+@pytest.fixture(scope="module", params=[7402, pytest.param(7417, marks=pytest.mark.slow)])
 def kitted(request) -> Observation:
     """A kit with all of its tools, and four boxes on the table."""
     scenario = load_scenario(

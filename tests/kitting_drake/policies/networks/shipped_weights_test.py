@@ -19,6 +19,10 @@ from tests.kitting_drake.policies.equivariance import relative_error, rotate_ima
 from tests.kitting_drake.policies.scenes import stored_observation
 
 SHIPPED = sorted((MODELS / "policies").glob("*.safetensors"))
+ONE_OF_THEM = [
+    pytest.param(path, id=path.stem, marks=[] if path.stem == "generalist" else [pytest.mark.slow])
+    for path in SHIPPED
+]
 TAUGHT = [path for path in SHIPPED if path.stem != "generalist"]
 """Those that learned from demonstrations."""
 OBSERVED = {"generalist": "kitting_unseen"}
@@ -90,7 +94,7 @@ def test_decides_as_when_it_was_shipped(path: Path):
     assert abs(math.remainder(math.degrees(difference) - rotation, 360)) < 1
 
 
-@pytest.mark.parametrize("path", SHIPPED, ids=lambda path: path.stem)
+@pytest.mark.parametrize("path", ONE_OF_THEM)
 @torch.inference_mode()
 def test_training_keeps_them_equivariant(path: Path):
     trained = load_networks(path)
@@ -111,7 +115,7 @@ def test_training_keeps_them_equivariant(path: Path):
         assert max(errors) < 0.3
 
 
-@pytest.mark.parametrize("path", SHIPPED, ids=lambda path: path.stem)
+@pytest.mark.parametrize("path", ONE_OF_THEM)
 @torch.inference_mode()
 def test_training_makes_pick_angles_more_equivariant(path: Path):
     trained = load_networks(path)

@@ -37,7 +37,9 @@ def test_all_draws_are_those_of_the_seed():
     assert_same(one, same)
 
 
-@pytest.mark.parametrize(("decay", "stop"), [(False, False), (True, True)])
+@pytest.mark.parametrize(
+    ("decay", "stop"), [pytest.param(False, False, marks=pytest.mark.slow), (True, True)]
+)
 def test_a_resumed_run_continues_bit_by_bit(
     decay: bool, stop: bool, monkeypatch: pytest.MonkeyPatch
 ):
