@@ -247,6 +247,7 @@ def test_nothing_but_failures_leaves_with_a_failure(
         return fake_run(seed) | {"failure": failures[seed]}
 
     monkeypatch.setattr(evaluation, "run_in_worker", run)
+    monkeypatch.setattr(evaluation, "draw_summary", lambda *_: None)
     flags = ["--episodes", "2", "--workers", "1", "--output", str(tmp_path / "out")]
     monkeypatch.setattr(sys, "argv", ["evaluate", str(scenario), *flags])
     assert evaluation.main() == code
@@ -265,6 +266,7 @@ def test_seeds_that_the_policy_has_learned_from_are_told(
     # Nobody waits for networks that decide nothing.
     scene = types.SimpleNamespace(scene=types.SimpleNamespace(success=AddS()))
     monkeypatch.setattr(evaluation, "build_any_chosen", lambda *_: scene)
+    monkeypatch.setattr(evaluation, "draw_summary", lambda *_: None)
     flags = ["--seed", "10001", "--episodes", "3", "--workers", "1"]
     monkeypatch.setattr(
         sys, "argv", ["evaluate", str(scenario), *flags, "--output", str(tmp_path / "out")]

@@ -28,7 +28,10 @@ PLANNER = PickPlaceParameters()
 FITTING = make_stages(PLANNER, insertion=True)
 
 
-@pytest.fixture(scope="module", params=[None, "colour:severe,depth_noise,depth_holes"])
+@pytest.fixture(
+    scope="module",
+    params=[pytest.param(None, marks=pytest.mark.slow), "colour:severe,depth_noise,depth_holes"],
+)
 def seen(request):
     """An observation of four tools beside their kit, and the truth."""
     scenario = load_scenario(
@@ -150,7 +153,7 @@ def test_what_certainly_fits_is_picked_though_the_networks_see_nothing(seen):
     everywhere = [
         PlanarPose(*grid.to_world(pixel), 0.0)
         for region in segment(observation).objects
-        for pixel in np.argwhere(region.mask)[::3]
+        for pixel in np.argwhere(region.mask)[::7]
     ]
     assert LearnedPolicy(networks, stages=FITTING)(observation, everywhere).stop
 
