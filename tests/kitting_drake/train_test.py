@@ -244,7 +244,9 @@ def test_the_task_says_what_training_may_assume(
     assert "false_stops" not in file.card["validation"]
 
 
-@pytest.mark.parametrize(("losses", "best"), [((1.0, 2.0), 3), ((2.0, 1.0), 4)])
+@pytest.mark.parametrize(
+    ("losses", "best"), [pytest.param((2.0, 1.0), 4, marks=pytest.mark.slow), ((1.0, 2.0), 3)]
+)
 def test_where_many_answers_are_right_the_losses_choose(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, losses: tuple[float, float], best: int
 ):

@@ -33,9 +33,8 @@ def run(
     return build_rig(scenario, base=base or Path()).run(seconds=time_limit)
 
 
-@pytest.mark.parametrize(
-    "name", ["kitting_seen", pytest.param("kitting_unseen", marks=pytest.mark.slow)]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["kitting_seen", "kitting_unseen"])
 @pytest.mark.usefixtures("rendering")
 def test_a_shipped_policy_kits_nearly_all(name: str):
     """As they stand, from a seed that no policy has learned from."""
