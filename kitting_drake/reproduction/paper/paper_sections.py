@@ -41,7 +41,7 @@ from kitting_drake.reproduction.paper.paper_tables import (
     SHIPPED,
     paper_cells,
 )
-from kitting_drake.reproduction.paper.parameters import parameters_section
+from kitting_drake.reproduction.paper.parameter_table import parameters_section
 from kitting_drake.reproduction.paper.trainings import trainings
 
 COLUMNS = tuple(sorted(ORIENTATIONS))
