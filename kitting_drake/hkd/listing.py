@@ -20,7 +20,7 @@ def chosen_entries(entries: list[ToolEntry], names: list[str]) -> list[ToolEntry
     """The named entries in the catalogue's order, or all entries if no name is given.
 
     Raises:
-        CatalogueError: the catalogue does not have a name.
+        CatalogueError: a name is not in the catalogue.
     """
     known = {entry.name for entry in entries}
     for name in names:
@@ -34,10 +34,10 @@ def chosen_entries(entries: list[ToolEntry], names: list[str]) -> list[ToolEntry
 def chosen_with_own(
     entries: list[ToolEntry], names: list[str]
 ) -> tuple[list[ToolEntry], list[str]]:
-    """The named entries and the user's own named tools; all of both if no name is given.
+    """The named entries and the user's named tools; all of both if no name is given.
 
     Raises:
-        CatalogueError: no tool has a name.
+        CatalogueError: a name is unknown.
     """
     own = [name for name in user_tool_names() if not names or name in names]
     known = [name for name in names if name not in own]
@@ -54,7 +54,7 @@ def print_tools(models: Path, entries: list[ToolEntry], names: list[str], consol
         console: widened to the table's width.
 
     Raises:
-        CatalogueError: no tool has a name, or a tool has not been generated.
+        CatalogueError: a name is unknown, or a tool has not been generated.
     """
     chosen, own = chosen_with_own(entries, names)
     records = [_record(models, entry.name) for entry in chosen]

@@ -26,8 +26,8 @@ _FARTHEST = 0.03
 """The largest distance of a label from its cavity, in metres."""
 _PLAINLY = 1.5
 """A label is at least this many times as far from other cavities as from its own."""
-# Costs, as a distance: letters higher by h may be 6 h further away, text read from the side costs
-# 6 mm, and a tenth of the distance from the cavity's middle is added.
+# Terms of a label's cost, in metres: minus 6 times the letters' height, 6 mm for text read from the
+# side, and a tenth of the distance from the cavity's middle.
 _DISTANCE_FOR_HEIGHT, _FROM_THE_SIDE, _OFF_THE_MIDDLE = 6.0, 0.006, 0.1
 _FONT_SIZE = 100.0
 

@@ -8,7 +8,7 @@ from manifold3d import Manifold, OpType
 
 from kitting_drake.common.errors import UserError
 from kitting_drake.hkd.families.hammer_heads import HeadEnd, build_head
-from kitting_drake.hkd.families.hammer_shafts import PROUD_MM, Shaft, build_shaft
+from kitting_drake.hkd.families.hammer_shafts import PROUD_MM, Shaft, build_shaft, octagon_corners
 from kitting_drake.hkd.tools.solids import (
     Part,
     Shape,
@@ -122,18 +122,7 @@ def _assembled(p: HammerParameters) -> list[Part]:
 
 def _octagon(width: float, thickness: float) -> np.ndarray:
     """An octagonal section (n, 2) of a handle with softened corners."""
-    y, z, cut = width / 2, thickness / 2, 0.27 * thickness
-    corners = [
-        (-y + cut, -z),
-        (y - cut, -z),
-        (y, -z + cut),
-        (y, z - cut),
-        (y - cut, z),
-        (-y + cut, z),
-        (-y, z - cut),
-        (-y, -z + cut),
-    ]
-    return fillet(corners, 0.35 * cut, 3)
+    return fillet(octagon_corners(width, thickness), 0.35 * (0.27 * thickness), 3)
 
 
 def _handle(p: HammerParameters) -> tuple[Shape, Shape]:

@@ -50,6 +50,15 @@ def _section(width: float, thickness: float, roundness: float, segments: int) ->
     return rounded_rectangle(width, thickness, 0.5 * roundness * thickness, segments)
 
 
+def octagon_corners(width: float, thickness: float) -> list[tuple[float, float]]:
+    """The corners of a rectangle about the origin with cut corners."""
+    y, z, cut = width / 2, thickness / 2, 0.27 * thickness
+    return [
+        (-y + cut, -z), (y - cut, -z), (y, -z + cut), (y, z - cut),
+        (y - cut, z), (-y + cut, z), (-y, z - cut), (-y, -z + cut),
+    ]  # fmt: skip
+
+
 def build_shaft(s: Shaft, top: float) -> list[Part]:
     """The parts of a handle whose upper end is at x = `top`."""
     neck = [
@@ -135,12 +144,7 @@ def _loft(s: Shaft, top: float, stations: list[tuple[float, float, float]]) -> S
         result = []
         for u, width, thickness in stations:
             if s.octagonal:
-                cut = 0.27 * thickness
-                y, z = width / 2, thickness / 2
-                corners = [
-                    (-y + cut, -z), (y - cut, -z), (y, -z + cut), (y, z - cut),
-                    (y - cut, z), (-y + cut, z), (-y, z - cut), (-y, -z + cut),
-                ]  # fmt: skip
+                corners, cut = octagon_corners(width, thickness), 0.27 * thickness
                 soft = fillet(corners, 0.35 * cut, 3) if segments > 1 else np.array(corners)
             else:
                 soft = _section(width, thickness, s.roundness, segments)

@@ -107,7 +107,7 @@ def _notches(part: CrossSection) -> list[Array]:
 
 
 def _grown(seed: int, cells: list[CrossSection], outer: CrossSection) -> set[int]:
-    """Grows a hull within `outer` from a seed by the least added area; the cells that it holds."""
+    """Grows a hull within `outer` from a seed by the least added area; returns its cells."""
     hull, members, candidates = cells[seed].hull(), {seed}, set(range(len(cells))) - {seed}
     while True:
         trials = []

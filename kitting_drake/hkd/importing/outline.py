@@ -139,7 +139,7 @@ def _svg_curves(path: Path) -> list[Curve]:
 
 
 def _settle_size(root: ElementTree.Element) -> tuple[float, float]:
-    """Completes the root's width and height; returns the viewBox's size in pixels for neither.
+    """Completes the root's size; returns the viewBox's size in pixels, for a root without one.
 
     If the root has only one of them, it gets the other by the viewBox's aspect ratio.
     """

@@ -96,7 +96,7 @@ def read_mesh(path: Path) -> tuple[Array, Faces]:
 
 
 def make_solid(vertices: Array, faces: Faces) -> tuple[Manifold, list[str]]:
-    """Makes one solid of a mesh whose longest side is `NOMINAL_MM`; also notes on the repairs.
+    """The solid of a mesh whose longest side is `NOMINAL_MM`, and notes on its repairs.
 
     Raises:
         UserError: the mesh encloses no volume, or consists of several things.

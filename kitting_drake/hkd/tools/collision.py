@@ -79,7 +79,7 @@ def thinned(
 
 
 def _farthest(points: np.ndarray, chosen: list[int], tolerance: float) -> list[int]:
-    """Adds the farthest point to `chosen` until the hull is within tolerance; sorted indices."""
+    """Adds farthest points to `chosen` until the hull is within tolerance; sorts the indices."""
     dimension = points.shape[1]
     directions = np.array(np.meshgrid(*[[-1.0, 0.0, 1.0]] * dimension)).reshape(dimension, -1).T
     chosen = list(dict.fromkeys([*chosen, *np.argmax(points @ directions.T, axis=0)]))

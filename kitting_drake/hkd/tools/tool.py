@@ -53,7 +53,7 @@ class Tool:
     """The order of the rotational symmetry about T's z: 1 for none, 2 for a reversible tool whose
     half turn in its cavity is the same placement."""
     scale: float = 1.0
-    """The scale that the files of the visual meshes are loaded with."""
+    """The factor by which the visual meshes' files are scaled."""
 
     @property
     def sdf(self) -> Path:

@@ -11,7 +11,7 @@ SPLITS = (*PAPER_SPLITS, "fresh")
 """All splits. The seeds depend on their order, so append new ones. The ten `fresh` tools are not
 the paper's: they are reserved for a final test, and nothing is trained or tuned with them."""
 TOOLSET_COUNT = 100
-"""The number of toolsets of a split that has as many combinations."""
+"""The number of toolsets of a split, unless it has fewer combinations."""
 TOOLSETS_SEED = 2024
 """The seed of the random draw."""
 
