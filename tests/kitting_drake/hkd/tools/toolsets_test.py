@@ -50,7 +50,7 @@ def test_the_papers_toolsets_do_not_change(split: str, digest: str):
 
 def test_no_scenario_names_a_fresh_tool():
     fresh = [name for pool in tool_pools("fresh").values() for name in pool]
-    for path in SCENARIOS.glob("*.yaml"):
+    for path in SCENARIOS.rglob("*.yaml"):
         assert not [name for name in fresh if name in path.read_text()], path
 
 
