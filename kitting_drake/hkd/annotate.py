@@ -76,8 +76,8 @@ def save_grasp(tool: Tool, grasp: Grasp, models: Path = MODELS) -> None:
     """
     if grasp.width > WIDEST:
         raise UserError(
-            f"the tool is {1e3 * grasp.width:.0f} mm wide there, and the jaws take "
-            f"{1e3 * WIDEST:.0f} mm"
+            f"the tool is {1e3 * grasp.width:.0f} mm wide there, but the jaws take only "
+            f"{1e3 * WIDEST:.0f} mm: grasp it where it is narrower"
         )
     if tool.directory.parent != models / "tools":
         record_path = tool.directory / "tool.yaml"

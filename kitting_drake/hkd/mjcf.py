@@ -155,7 +155,7 @@ def _child(element: ElementTree.Element, path: str) -> ElementTree.Element:
     """The element at a path; raises ValueError if it is missing."""
     child = element.find(path)
     if child is None:
-        raise ValueError(f"there is no {path}")
+        raise ValueError(f"{path} is missing")
     return child
 
 
@@ -170,7 +170,7 @@ def _name(element: ElementTree.Element) -> str:
 def _text(element: ElementTree.Element, path: str) -> str:
     text = element.findtext(path)
     if not text:
-        raise ValueError(f"there is no {path}")
+        raise ValueError(f"{path} is missing")
     return text
 
 

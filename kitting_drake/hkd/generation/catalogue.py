@@ -60,6 +60,7 @@ def load_catalogue(path: Path) -> list[ToolEntry]:
                 f"{', '.join(CATEGORIES)}"
             )
     names = [e.name for e in entries]
-    if len(set(names)) != len(names):
-        raise CatalogueError(f"{path}: two tools share a name")
+    for name in set(names):
+        if names.count(name) > 1:
+            raise CatalogueError(f"{path}: two tools are called {name!r}; rename one")
     return entries

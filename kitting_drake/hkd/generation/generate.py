@@ -149,7 +149,7 @@ def _write_tool(entry: ToolEntry, directory: Path) -> Report:
     outline = closed(whole.project(), CAVITY_CLEARANCE_MM)
     hulls = _collision_hulls(parts, R_TD, p_T, outline, entry.grasp)
     box = np.array(whole.bounding_box()).reshape(2, 3)
-    grip = _measure_grasp(entry.grasp, whole)
+    grip = _measure_grasp(entry, whole)
 
     center = R_TD @ center + 1e-3 * p_T
     inertia = R_TD @ inertia @ R_TD.T
@@ -176,7 +176,7 @@ def _write_tool(entry: ToolEntry, directory: Path) -> Report:
         inside_mm=furthest(outline, closed(projection(hulls), CAVITY_CLEARANCE_MM)),
         bottom_error_mm=points[:, 2].min() - box[0, 2],
         top_error_mm=points[:, 2].max() - box[1, 2],
-        grip_error_mm=_measure_grasp(entry.grasp, solid_hulls).width - grip.width,
+        grip_error_mm=_measure_grasp(entry, solid_hulls).width - grip.width,
         grip_flatness_mm=grip.flatness,
         finger_overhang_mm=grip.overhang,
         tilt_deg=float(np.degrees(np.arccos(min(1.0, R_TD[2, 2])))),
@@ -260,12 +260,14 @@ class _GripReport:
     top: float
 
 
-def _measure_grasp(grasp: GraspEntry, solid: Manifold) -> _GripReport:
-    """Measures a grasp on a tool at rest in its frame T.
+def _measure_grasp(entry: ToolEntry, solid: Manifold) -> _GripReport:
+    """Measures the annotated grasp on a tool at rest in its frame T.
 
     Raises:
         CatalogueError: the jaws cannot hold the tool there.
     """
+    grasp = entry.grasp
+    named = f"tool {entry.name}: the grasp at ({grasp.x_mm}, {grasp.y_mm}) mm"
     vertices, faces = meshes.vertices_and_faces(solid)
     triangles = vertices[faces]
     theta = np.radians(grasp.theta_deg)
@@ -275,21 +277,18 @@ def _measure_grasp(grasp: GraspEntry, solid: Manifold) -> _GripReport:
         x, y = (grasp.x_mm, grasp.y_mm) + offset * along
         found = find_grip(triangles, x, y, theta, length)
         if found is None:
-            raise CatalogueError(f"there is nothing to grasp at ({x:.2f}, {y:.2f}) mm")
+            raise CatalogueError(f"{named} holds nothing at ({x:.2f}, {y:.2f}) mm")
         return found
 
     pad, finger = grip(0.0, PAD_LENGTH_MM), grip(0.0, FINGER_LENGTH_MM)
     slices = [grip(offset, 0.5) for offset in np.linspace(-0.5, 0.5, 7) * (PAD_LENGTH_MM - 0.5)]
     if not 8.0 <= pad.width <= 35.0:
-        raise CatalogueError(
-            f"the grasp at ({grasp.x_mm}, {grasp.y_mm}) mm is {pad.width:.1f} mm wide; it must be "
-            "8 to 35 mm"
-        )
+        raise CatalogueError(f"{named} is {pad.width:.1f} mm wide; it must be 8 to 35 mm")
     if abs(pad.middle) > GRIP_CENTRING_MM:
         # Closing jaws would shift the tool, and it would be placed with the same offset.
         raise CatalogueError(
-            f"the grasp at ({grasp.x_mm}, {grasp.y_mm}) mm is not centred between the gripped "
-            f"faces: it is off by {pad.middle:+.2f} mm along the jaws"
+            f"{named} is not centred between the gripped faces: move it by "
+            f"{pad.middle:+.2f} mm along the jaws"
         )
     return _GripReport(
         width=pad.width,

@@ -66,7 +66,8 @@ def read_outline(path: Path) -> CrossSection:
         raise UserError(f"there is no file {path}: give a drawing (SVG, DXF)") from error
     if size > _MOST_BYTES:
         raise UserError(
-            f"{path} has {size / 1e6:.0f} MB; an outline may have {_MOST_BYTES / 1e6:.0f} MB"
+            f"{path} has {size / 1e6:.0f} MB, more than the limit of {_MOST_BYTES / 1e6:.0f} MB: "
+            "simplify the drawing first"
         )
     read = _svg_curves if path.suffix.lower() == ".svg" else _dxf_curves
     curves = [curve for curve in read(path) if len(curve) > 1 and np.isfinite(curve).all()]
