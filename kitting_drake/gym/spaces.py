@@ -12,7 +12,9 @@ from systems.signals import Observation, PickPlaceAction, PixelGrid, PlanarPose
 
 ACTION = ("pick_x", "pick_y", "pick_theta", "place_x", "place_y", "place_theta", "stop")
 """The entries of an action: the gripper's poses in the world, in metres and radians, and whether to
-stop instead, which it is above 0.5."""
+stop instead: it is 0 to 1, and above `STOP` the episode ends."""
+STOP = 0.95
+"""A random agent seldom stops."""
 _ANGLES = [2, 5]
 
 
@@ -86,7 +88,7 @@ def as_action(values: ArrayLike, grid: PixelGrid) -> PickPlaceAction:
     # An angle has no edge: any is the same as one within pi of zero.
     held[_ANGLES] = array[_ANGLES]
     pick, place = PlanarPose(*held[:3].tolist()), PlanarPose(*held[3:6].tolist())
-    return PickPlaceAction(pick, place, stop=bool(array[6] > 0.5))
+    return PickPlaceAction(pick, place, stop=bool(array[6] > STOP))
 
 
 def as_values(action: PickPlaceAction) -> NDArray[np.float64]:
