@@ -43,8 +43,8 @@ class LoadedPolicy:
         learned, given = self.resolution, grid.resolution
         if learned is not None and not math.isclose(given, learned, rel_tol=1e-6):
             raise UserError(
-                f"{field} is {given:g} m, but the policy in {self.path.name} was trained with "
-                f"pixels of {learned:g} m"
+                f"{field} is {given:g} m, but the policy in {self.path.name} "
+                f"learned from pixels of {learned:g} m"
             )
 
 
