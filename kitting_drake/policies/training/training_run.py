@@ -288,7 +288,7 @@ class TrainingRun:
                 state[key] for key in ("best", "seconds", "recent")
             )
         except _DAMAGED as error:
-            raise UserError(f"{path} cannot be taken up again: delete {self.folder}") from error
+            raise UserError(f"cannot resume from {path}: delete {self.folder}") from error
         kept = [line for line in read_lines(self._log) if line["step"] <= self.trainer.step_count]
         write_atomically(self._log, "".join(json.dumps(line) + "\n" for line in kept))
 

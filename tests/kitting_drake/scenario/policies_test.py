@@ -90,7 +90,7 @@ def test_what_cannot_be_had_is_named(site: PolicySite, weights_file: Path, tmp_p
     gone = f"cannot read the weights {tmp_path}/gone.safetensors: there is no such file"
     assert refusal(weights="gone.safetensors") == gone
     save_file({"weight": torch.zeros(3)}, tmp_path / "other.safetensors")
-    assert "other.safetensors is a safetensors file, but no policy" in refusal(
+    assert "other.safetensors is a safetensors file, but not a policy" in refusal(
         weights="other.safetensors"
     )
     assert refusal(weights=str(weights_file), orientations=24).startswith(
