@@ -44,7 +44,7 @@ class LoadedPolicy:
         if learned is not None and not math.isclose(given, learned, rel_tol=1e-6):
             raise UserError(
                 f"{field} is {given:g} m, but the policy in {self.path.name} "
-                f"learned from pixels of {learned:g} m"
+                f"learned from pixels of {learned:g} m: use that size, or train another policy"
             )
 
 

@@ -19,7 +19,7 @@ _COLOUR_ENDINGS = (".png", ".jpg", ".jpeg")
 _DEPTH_ENDINGS = (".npy", ".png")
 _SIXTEEN_BIT = ("I;16", "I;16B", "I")
 _DAMAGED = (OSError, SyntaxError)
-"""What Pillow raises for a damaged file; SyntaxError for a PNG with a broken chunk."""
+"""Pillow's exceptions for a damaged file; SyntaxError is for a PNG with a broken chunk."""
 
 
 @dataclass(frozen=True)

@@ -147,7 +147,7 @@ def check_replaceable(path: Path, folder: Path) -> None:
     try:
         origin = read_demonstrations(path).origin
     except UserError as error:
-        raise UserError(f"{path} exists, and is no file of demonstrations: delete it") from error
+        raise UserError(f"{path} exists and is not a file of demonstrations: delete it") from error
     if (origin.scenario_name, origin.scenario.get("task")) != (folder.resolve().name, TASK):
         raise UserError(f"{path} holds demonstrations of {origin.scenario_name}: delete it")
 

@@ -127,7 +127,7 @@ def test_only_demonstrations_of_the_same_bench_are_replaced(
 ):
     path = folder.parent / "mine.h5"
     path.write_text("before")
-    with pytest.raises(UserError, match=r"mine\.h5 exists, and is no file of demonstrations"):
+    with pytest.raises(UserError, match=r"mine\.h5 exists"):
         command("--output", path)
     assert path.read_text() == "before"
     path.unlink()

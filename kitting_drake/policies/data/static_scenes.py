@@ -46,7 +46,7 @@ _TEMPERATURE = 0.6
 _HEIGHT_SHIFT = 0.002
 """The standard deviation of a sample's common height shift, in metres."""
 _DRAWS = 64
-"""The number of samples per scene, with different grasps."""
+"""The number of samples per scene, each with its own random grasps."""
 
 
 @dataclass(frozen=True)

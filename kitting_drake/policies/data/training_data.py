@@ -198,7 +198,7 @@ def read_training_data(path: Path) -> TrainingData:
     else:
         demonstrations: Demonstrations = read_demonstrations(path)
         origin = demonstrations.origin
-        # Networks learn from heights above the table, but `z_min` may lie below it.
+        # A scenario's grid may start below the table; a bench's starts at the table.
         z_min = (origin.scenario.get("heightmap") or {}).get("z_min", 0.0)
         if z_min != 0:
             raise UserError(

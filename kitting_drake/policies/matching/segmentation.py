@@ -139,7 +139,7 @@ def _noise_of(
 ) -> float:
     """The standard deviation of the noise of the table or the fixture's top, whichever is larger.
 
-    The grid flattens the table where heights fall below its range.
+    The table's noise can be underestimated, because heights below the grid are clipped.
     """
     return max(_noise(relief), _noise((height - _plane_heights(top, height.shape))[fixture]))
 

@@ -138,7 +138,7 @@ class Networks(nn.Module):
 
         Returns:
             (n, channels, rows, cols): normalised, in `compute_type`, on `device`. Zero padding
-            below and on the right, before normalisation, extends the sides to what a U-net takes.
+            below and on the right, before normalisation, extends the sides to sizes of a U-net.
         """
         config = self.config
         rows, cols = images.shape[2:]

@@ -245,7 +245,7 @@ def draw_bins(
         step: between neighbours, in radians.
         random: draws the other bins.
         rotations: the number of bins to return, including the labels. Half of the drawn bins are
-            near a label where there are enough. None, the least, draws two per stratum.
+            near a label, if there are enough. None draws two per stratum, the minimum.
 
     Returns:
         A dict from bins to log weights in nats. Adding these to the logits makes the drawn bins

@@ -258,7 +258,7 @@ def _json(path: Path, metadata: dict[str, str], key: str) -> dict[str, Any]:
     try:
         value = json.loads(metadata[key])
     except (KeyError, ValueError) as error:
-        raise UserError(f"{path}: its {key} is not valid JSON") from error
+        raise UserError(f"{path}: its {key} is missing or not valid JSON") from error
     if not isinstance(value, dict):
         raise UserError(f"{path}: its {key} must be a JSON object")
     return value

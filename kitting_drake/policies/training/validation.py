@@ -15,7 +15,7 @@ from kitting_drake.policies.learned_policy import Decision, LearnedPolicy
 from kitting_drake.policies.networks.factored import Networks
 
 ERRORS = ("pick_mm", "pick_deg", "place_mm", "rotation_deg", "displacement_mm")
-"""The names of what `prediction_errors` returns."""
+"""The names of the errors in `prediction_errors`."""
 
 _ARM = 50.0
 """The mean distance of a tool's points from its grasp, in mm; converts angles to displacements."""

@@ -128,7 +128,7 @@ class _Adversary:
         self.seated: set[int] = set()
         """The objects that were kitted when an action began."""
         self.touched: set[int] = set()
-        """Those of them that an action then picked."""
+        """The kitted objects that an action then picked."""
 
     def observe(self, event: ModeChange) -> None:
         if event.is_last:

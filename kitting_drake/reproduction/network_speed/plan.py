@@ -52,7 +52,7 @@ class Plan:
     """The side of the matrices whose product measures the peak; four times that on an accelerator.
     """
     budget: float = 60.0
-    """The time for each number, in seconds; whatever would take longer is skipped."""
+    """The time for each number, in seconds; measurements that would take longer are skipped."""
     demonstrations: Path | None = None
     """The file with the observation; None for a synthetic one."""
 

@@ -19,7 +19,7 @@ from torch.utils.flop_counter import flop_registry
 Name = TypeVar("Name")
 
 _WARM_UPS = 2
-"""The number of uncounted runs, in which kernels are chosen and memory is allocated."""
+"""The largest number of uncounted runs, in which kernels are chosen and memory is allocated."""
 _PEAK_RUNS = 15
 """The number of runs; the fastest gives the peak."""
 

@@ -169,7 +169,7 @@ def _check_seeds(found: Mapping[Key, Sequence[Run]]) -> None:
         if twice is not None:
             files = " and ".join(run.name for run in runs if twice in run.summary["seeds"])
             raise UserError(
-                f"{files} are both of {_COLUMNS[method]}, {label}, seed {twice}: delete one"
+                f"{files} both hold seed {twice} of {_COLUMNS[method]}, {label}: delete one"
             )
 
 

@@ -157,7 +157,7 @@ def _read_table(path: Path) -> dict[str, Summary]:
     try:
         content = path.read_bytes().decode() if path.exists() else ""
         if content and not content.endswith("\n"):
-            raise ValueError("its last line has no end")
+            raise ValueError("its last line is incomplete")
         for row in csv.DictReader(io.StringIO(content, newline=""), strict=True):
             name = row.pop(_NAME)
             # Surplus cells are under the key None; missing cells have the value None.

@@ -165,7 +165,7 @@ def _without(scenario: dict[str, Any], *more: str) -> dict[str, Any]:
 
 
 def _translated(plant: Any) -> dict[str, Any]:
-    """The new fields of what older runs have in `plant`; empty for newer runs."""
+    """The current fields for an older run's `plant`; empty for newer runs."""
     if not isinstance(plant, dict) or "contact_approximation" not in plant:
         return {}
     defaults = _defaults()

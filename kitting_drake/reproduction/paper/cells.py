@@ -96,8 +96,8 @@ TASKS = {
             )
             # Palletizing has eighteen decisions per episode, so few episodes suffice for
             # validation. Its many equally good places take more steps to learn.
-            # On the pyramid and align-box-corner the learning rate of figure 6 was too low for a
-            # baseline, so these tasks choose their own. Palletizing takes that of the pyramid.
+            # On the pyramid and align-box-corner a baseline underperforms at the learning rate of
+            # figure 6, so these tasks choose their own. Palletizing takes that of the pyramid.
             for name, scenario, episodes, steps, validation, rates_from, earlier in (
                 ("block_insertion", "BlockInsertion", 100, 1000, 24, "unseen", _EARLIER_RELEASE),
                 (

@@ -51,8 +51,8 @@ def differences(results: Mapping[str, Result]) -> list[str]:
 
 
 def _means(results: Mapping[str, Result]) -> list[list[str]]:
-    """The rows of mean differences between ours and the Equivariant Transporter: over N of figure
-    6, if all of its cells exist, and over the trainings that exist of both."""
+    """The mean differences between SO(2) and the Equivariant Transporter: over N of figure 6 if all
+    of its cells exist, and over the trainings that both have."""
     rows = []
     ours, theirs = LEARNED[:2]
     for task in FIGURE_6:

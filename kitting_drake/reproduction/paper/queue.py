@@ -281,7 +281,7 @@ def _check_training(training: Training, folder: Path) -> None:
     ):
         found = summary.get(key, _BEFORE.get(key))
         if found != wanted:
-            raise Failed(f"{folder}: its {key} is {found}, not {wanted}: delete it")
+            raise Failed(f"{folder}: {key} is {found}, not {wanted}: delete it")
 
 
 def _end(process: subprocess.Popen[str]) -> None:

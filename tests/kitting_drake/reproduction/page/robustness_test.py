@@ -103,7 +103,7 @@ def test_other_runs_are_ignored():
 
 
 def test_a_seed_in_two_runs_is_an_error():
-    with pytest.raises(UserError, match="shape matching, `all:moderate`, seed 2880: delete one"):
+    with pytest.raises(UserError, match="seed 2880 of shape matching, `all:moderate`"):
         robustness_table([run("all", 0.9), run("all", 0.9, seeds=range(2880, 2881))])
 
 
