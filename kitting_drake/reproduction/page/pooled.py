@@ -1,4 +1,4 @@
-"""The shipped policies on the unseen toolsets as these are by default, all runs together."""
+"""The section on the shipped policies on the default unseen toolsets, over all runs together."""
 
 from collections import Counter
 from collections.abc import Sequence
@@ -19,16 +19,15 @@ _, _UNSEEN = PAPER_TASKS
 
 
 def pooled_section(runs: Sequence[Run]) -> list[str]:
-    """The section; nothing without such a run.
+    """The section; empty without such runs.
 
-    The rule: every run of the task by a shipped policy as it is by default, with weights of the
-    digest of the shipped file. No seed counts twice.
+    It pools every run of the task by a shipped policy with default options and shipped weights.
 
     Args:
-        runs: all that can be run again.
+        runs: all runs that can be repeated.
 
     Raises:
-        UserError: two runs of a policy have a seed in common.
+        UserError: two runs of a policy share a seed.
     """
     rows = []
     for label, policy in shipped_policies().items():
@@ -67,8 +66,7 @@ def shipped_policies() -> dict[str, Policy]:
 
 
 def _is_of(run: Run, policy: Policy) -> bool:
-    """Whether the policy, its weights and its options are those of a run; a run may lack options
-    that are younger than it."""
+    """Whether a run has the policy's weights and options. Older runs may lack newer options."""
     found: dict[str, Any] = run.summary["resolved_scenario"]["policy"]
     expected: dict[str, Any] = described(Scenario(policy=policy))["policy"]
     return run.summary.get("policy_digest") == policy.digest(SCENARIOS / "paper") and all(
@@ -81,4 +79,4 @@ def _check_seeds(label: str, runs: Sequence[Run]) -> None:
     twice = min((seed for seed, count in counts.items() if count > 1), default=None)
     if twice is not None:
         files = " and ".join(run.name for run in runs if twice in run.summary["seeds"])
-        raise UserError(f"{files} are both of {label}, seed {twice}: remove one")
+        raise UserError(f"{files} both hold seed {twice} of {label}: remove one")

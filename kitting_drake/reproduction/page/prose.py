@@ -1,4 +1,4 @@
-"""The prose of the page of results, which stands in `results_prose.md`."""
+"""Reads the prose of the page of results from `results_prose.md`."""
 
 import re
 from functools import cache
@@ -8,14 +8,14 @@ _PART = re.compile(r"<!-- part: (\w+) -->\n")
 
 
 def prose(part: str, **values: object) -> str:
-    """A part of the prose, with a line end.
+    """A part of the prose, with a final newline.
 
     Args:
         part: its name.
-        values: what stands in the place of `{name}`.
+        values: the values for the placeholders `{name}`.
 
     Raises:
-        KeyError: there is no such part, or a value is missing.
+        KeyError: the part does not exist, or a value is missing.
     """
     return _parts()[part].format(**values) + "\n"
 

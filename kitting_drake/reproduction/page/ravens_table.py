@@ -1,4 +1,4 @@
-"""The five Ravens tasks: what the paper gives (table I), and our runs of them by default."""
+"""The five Ravens tasks: the paper's numbers (table I) and our runs with default settings."""
 
 from collections import defaultdict
 from collections.abc import Sequence
@@ -44,17 +44,17 @@ PAPER: dict[tuple[str, int], tuple[tuple[float, float, float], ...]] = {
 
 
 def in_ravens_table(run: Run) -> bool:
-    """Whether a run is of one of the tasks as it is by default, and its actions are refined."""
+    """Whether a run is of an unmodified Ravens task, with refined actions."""
     if run.summary["task"] not in TASKS or run.departures:
         return False
     return run.method not in LEARNED or bool(run.detail("continuous"))
 
 
 def ravens_section(runs: Sequence[Run]) -> list[str]:
-    """The section of the five tasks; nothing without a run of them.
+    """The section on the five tasks; empty without runs of them.
 
     Args:
-        runs: all; those of which `in_ravens_table` says no are left out.
+        runs: all runs; those without `in_ravens_table` are ignored.
     """
     cells: dict[tuple[str, int | None, int | None], dict[str, list[str]]] = defaultdict(
         lambda: defaultdict(list)
@@ -73,7 +73,7 @@ def ravens_section(runs: Sequence[Run]) -> list[str]:
     rows = []
     for (method, orientations, count), found in sorted(cells.items(), key=str):
         name = METHODS.get(method, method)
-        # All are told: to choose would be flattering.
+        # Show all runs, because a selection would be biased.
         values = ["<br>".join(found[task]) if task in found else "-" for task in TASKS]
         rows.append([name, str(orientations or ""), str(count or ""), *values])
     headings = ["method", "N", "demonstrations", *TASKS]

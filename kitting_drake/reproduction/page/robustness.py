@@ -1,4 +1,4 @@
-"""The table of what each perturbation costs each policy: a part of `docs/robustness.md`."""
+"""The table of `docs/robustness.md`: the effect of each perturbation on each policy."""
 
 from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
@@ -25,33 +25,31 @@ _COLUMNS = {
     "shape_matching": "shape matching",
 }
 _COMPARED = ("generalist, minus as it is", "generalist, minus shape matching")
-"""In points, on the seeds that both ran."""
+"""The paired differences, in points, on the seeds that both ran."""
 _TRIES = 2
 _FRAMES = 5
-"""So many images are averaged in further rows."""
+"""The number of averaged images in additional rows."""
 _SEEDS = range(2870, 2895)
-"""Those on which every policy meets every perturbation; nobody had looked at them before
-their first run."""
+"""The seeds of every cell, unseen before their first run."""
 _FEWEST = 12
-"""At other levels than moderate at least so many of them, the first ones."""
+"""The other levels need at least this many of them, from the first on."""
 
 Key = tuple[str, str]
 """A row of the table and a method."""
 
 
 def robustness_table(runs: Sequence[Run]) -> str:
-    """Strict success on unseen toolsets, with two tries a tool and policies that recover.
+    """Strict success on unseen toolsets, with two tries per tool and recovering policies.
 
-    Of the first table all runs are of the same seeds, of the second, of the other levels, of the
-    first ones of these; a third one, of what was run on further seeds too, takes all of them
-    together: choosing among them would be flattering.
+    The first table is of `_SEEDS`. The second, of the other levels, is of the first of them. The
+    third pools all seeds of the cells that were run on further ones, because a selection would be
+    biased.
 
     Args:
-        runs: all; those that are none of these, or of other weights than the shipped ones, are left
-            out.
+        runs: all runs; those of other scenarios or weights are ignored.
 
     Raises:
-        UserError: of two runs of one cell some seeds are the same.
+        UserError: two runs of a cell share a seed.
     """
     expected, shipped = _expected(), _shipped()
     found: dict[Key, list[Run]] = defaultdict(list)
@@ -99,10 +97,12 @@ def robustness_table(runs: Sequence[Run]) -> str:
 
 
 def _table(found: Mapping[Key, Sequence[Run]], labels: Sequence[str], counted: bool = False) -> str:
-    """One row for each perturbation that was run.
+    """A table with one row for each perturbation that was run.
 
     Args:
-        counted: tells the number of objects.
+        found: the runs of each cell.
+        labels: of the rows.
+        counted: whether to show the number of objects.
     """
 
     def share(key: Key) -> str:
@@ -114,7 +114,7 @@ def _table(found: Mapping[Key, Sequence[Run]], labels: Sequence[str], counted: b
         return f"{text}, {objects}" if counted else text
 
     def outcomes(key: Key) -> dict[str, Any]:
-        # Older summaries tell of no episode.
+        # Older summaries have no outcomes.
         return {
             "outcomes": [
                 item for run in found.get(key, ()) for item in run.summary.get("outcomes", ())
@@ -141,11 +141,11 @@ def _table(found: Mapping[Key, Sequence[Run]], labels: Sequence[str], counted: b
 
 
 def _needless_table(found: Mapping[Key, Sequence[Run]], labels: Sequence[str]) -> str:
-    """One row for each perturbation that lays other things on the table; empty without runs."""
+    """One row for each perturbation with distractors; empty without runs."""
 
     def share(key: Key) -> str:
         summaries = [run.summary for run in found.get(key, ())]
-        # Older ones do not tell.
+        # Older summaries lack this field.
         if not summaries or not all("needless_actions" in item for item in summaries):
             return "-"
         needless, every = (
@@ -169,12 +169,12 @@ def _check_seeds(found: Mapping[Key, Sequence[Run]]) -> None:
         if twice is not None:
             files = " and ".join(run.name for run in runs if twice in run.summary["seeds"])
             raise UserError(
-                f"{files} are both of {_COLUMNS[method]}, {label}, seed {twice}: delete one"
+                f"{files} both hold seed {twice} of {_COLUMNS[method]}, {label}: delete one"
             )
 
 
 def _common(run: Run, label: str) -> bool:
-    """Whether its seeds are those that all are run on."""
+    """Whether a run is on the common seeds."""
     seeds = list(run.summary["seeds"])
     if _is_other_level(label):
         return len(seeds) >= _FEWEST and seeds == list(_SEEDS)[: len(seeds)]
@@ -186,7 +186,7 @@ def _is_other_level(label: str) -> bool:
 
 
 def _strict(run: Run) -> tuple[int, int]:
-    """How many objects were a strict success, and how many there were."""
+    """The number of strictly successful objects, and of all objects."""
     objects = sum(category["objects"] for category in run.summary["categories"].values())
     return round(run.summary["strict_success_rate"] * objects), objects
 
@@ -195,7 +195,7 @@ def with_figures(page: str, figures: str) -> str:
     """A page with the text between its two marks replaced.
 
     Raises:
-        UserError: it lacks the marks.
+        UserError: the page lacks the marks.
     """
     head, begin, rest = page.partition(_BEGIN)
     _, end, tail = rest.partition(_END)
@@ -205,13 +205,13 @@ def with_figures(page: str, figures: str) -> str:
 
 
 def _shipped() -> dict[str, str | None]:
-    """The digests of the weights that come with the package, by method."""
+    """The digests of the shipped weights, by method."""
     policies = {"generalist": Learned(weights=""), "so2": load_scenario(_UNSEEN).policy}
     return {method: policy.digest(SCENARIOS / "paper") for method, policy in policies.items()}
 
 
 def _expected() -> dict[str, dict[str, Any]]:
-    """The scenario of each row, as JSON holds it."""
+    """The scenario of each row, as JSON values."""
     path, task = _UNSEEN, f"task: {{tries: {_TRIES}}}"
     one, more = f"{{{task}}}", f"{{{task}, sensor_noise: {{frames: {_FRAMES}}}}}"
     rows: dict[str, tuple[str, str | None]] = {_AS_IT_IS: (one, None)}

@@ -1,4 +1,4 @@
-"""The runs that the page of results is made of, and how they depart from the paper's tasks."""
+"""The runs on the page of results, and how their scenarios differ from the paper's tasks."""
 
 import json
 from collections.abc import Mapping
@@ -26,13 +26,13 @@ METHODS = {
     "quantized_oracle": "oracle, quantized",
     "oracle": "oracle, exact",
 }
-"""Names of methods for people; any other is called as it calls itself."""
+"""The displayed names of methods; others are displayed by their own names."""
 
 LEARNED = ("so2", "equivariant_transporter", "transporter")
 """The methods that the paper compares."""
 
 _NOT_THE_TASK = ("policy", "random_seed", "target_realtime_rate", "meshcat")
-"""The fields of a scenario in which runs of one task may differ."""
+"""The scenario fields in which runs of one task may differ."""
 
 _ADDED: dict[str, Any] = {
     "task.distractors": 0,
@@ -43,10 +43,10 @@ _ADDED: dict[str, Any] = {
     "sensor_noise.frames": 1,
     "end_at_success": False,
 }
-"""Fields that older runs lack, with what those did."""
+"""Fields that older runs lack, with the values that these runs used."""
 
 _ADDED_WHOLE = ("sensor_noise", "appearance")
-"""The same, where it is what a scenario does by default."""
+"""Whole sections that older runs lack; these runs used the defaults."""
 
 _HAND = (
     "planner.firm_grasp_force",
@@ -57,11 +57,11 @@ _HAND = (
     "planner.search.speed",
 )
 _EARLIER_HAND = "an earlier hand"
-"""How it is told that these fields are lacking: it did not grip what is heavy more firmly, nor
-press, nor search in a spiral, and took what is thinner than 3 mm for not gripped."""
+"""The displayed name of runs without these fields. That hand did not grip heavy objects more
+firmly, press, or search in a spiral, and took objects thinner than 3 mm for missed grasps."""
 
 _MOST_SHOWN = 4
-"""So many differences of one run are listed; more are counted."""
+"""The number of listed differences of a run; more are only counted."""
 
 
 _KINDS: dict[str, Any] = {
@@ -72,7 +72,7 @@ _KINDS: dict[str, Any] = {
     **dict.fromkeys(("success_rate", "strict_success_rate", "wall_seconds"), int | float),
     "episodes": int,
 }
-"""The fields of a summary, and what each is."""
+"""The fields of a summary and their types."""
 
 
 @dataclass(frozen=True)
@@ -83,7 +83,7 @@ class Run:
     summary: Summary
 
     def detail(self, key: str) -> Any:
-        """An entry of the policy's details; None if it has no such entry."""
+        """An entry of the policy's details; None if it is missing."""
         return self.summary["policy_details"].get(key)
 
     @property
@@ -95,14 +95,14 @@ class Run:
 
     @property
     def seeds(self) -> str:
-        """The first and the last seed, for a person."""
+        """The first and the last seed, as text."""
         seeds = self.summary["seeds"]
         first, last = min(seeds), max(seeds)
         return f"{first} to {last}" if last - first + 1 == len(seeds) else f"{first} .. {last}"
 
     @property
     def label(self) -> str:
-        """The policy and the parameters that the paper varies, for a person."""
+        """The policy and the parameters that the paper varies, as text."""
         parts = [METHODS.get(self.method, self.method)]
         for key, text in (
             ("orientations", "N = {}"),
@@ -118,9 +118,11 @@ class Run:
 
     @cached_property
     def departures(self) -> list[str]:
-        """Where its scenario differs, but for the policy, from that of the paper's task of its
-        kind, or from the Ravens task; or, if the paper has none, from the default one, but for the
-        task."""
+        """The differences of its scenario from the paper's or Ravens task of its kind.
+
+        The policy is ignored. For other tasks, the differences from the default scenario, ignoring
+        the task too.
+        """
         found = self.summary["resolved_scenario"]
         for task in PAPER_TASKS.values():
             expected = described(Scenario(task=task))
@@ -134,27 +136,26 @@ class Run:
 
     @property
     def paper_task(self) -> str | None:
-        """The title of the paper's task that it is a run of, where nothing but the policy differs
-        from it."""
+        """The title of the paper's task if the scenario differs in nothing but the policy."""
         task = self.summary["task"]
         return task if task in PAPER_TASKS and not self.departures else None
 
     @property
     def departures_text(self) -> str:
-        """The departures in a few words."""
+        """The departures as short text."""
         shown = "; ".join(f"`{item}`" for item in self.departures[:_MOST_SHOWN])
         more = len(self.departures) - _MOST_SHOWN
         return f"{shown}; and {more} more" if more > 0 else shown
 
 
 def described(scenario: Scenario) -> dict[str, Any]:
-    """The scenario as JSON holds it."""
+    """The scenario as JSON values."""
     fields = ChosenScenario(scenario, Path(), "", None).described
     return json.loads(json.dumps(fields, default=str))
 
 
 def scenario_differences(found: dict[str, Any], expected: dict[str, Any]) -> list[str]:
-    """The fields, policy aside, in which two scenarios differ, as `described` has them."""
+    """The fields in which two scenarios (see `described`) differ, apart from the policy."""
     return _differences(_without(found), _without(expected))
 
 
@@ -164,7 +165,7 @@ def _without(scenario: dict[str, Any], *more: str) -> dict[str, Any]:
 
 
 def _translated(plant: Any) -> dict[str, Any]:
-    """What older runs have in `plant`, in the fields that it is in since; else nothing."""
+    """The current fields for an older run's `plant`; empty for newer runs."""
     if not isinstance(plant, dict) or "contact_approximation" not in plant:
         return {}
     defaults = _defaults()
@@ -196,7 +197,7 @@ def _added() -> dict[str, Any]:
 
 
 def _differences(found: Any, expected: Any, path: str = "") -> list[str]:
-    """The fields, by their paths, in which JSON values differ, with what was found there."""
+    """The differences of JSON values, by field path, with the found values."""
     if found == expected:
         return []
     if not isinstance(found, Mapping) or not isinstance(expected, Mapping):
@@ -219,10 +220,10 @@ def _differences(found: Any, expected: Any, path: str = "") -> list[str]:
 
 
 def read_runs(folder: Path) -> list[Run]:
-    """All runs of the table in a folder, in the order of their names; there may be none.
+    """All runs in a folder's table, sorted by name; the table may be empty.
 
     Raises:
-        UserError: there is no table, its files are damaged, or a run is not one of `evaluate`.
+        UserError: there is no table, a file is damaged, or a run is not from `evaluate`.
     """
     if not (folder / TABLE).exists():
         raise UserError(
@@ -235,13 +236,13 @@ def read_runs(folder: Path) -> list[Run]:
 
 
 def read_evaluation(path: Path) -> Summary:
-    """The summary that `evaluate` left.
+    """The summary that `evaluate` wrote.
 
     Args:
-        path: its file, or the folder with its `summary.json`.
+        path: the file, or the folder with its `summary.json`.
 
     Raises:
-        UserError: it cannot be read, or is not one.
+        UserError: it is unreadable or not a summary.
     """
     path = path / "summary.json" if path.is_dir() else path
     try:
@@ -253,14 +254,14 @@ def read_evaluation(path: Path) -> Summary:
 
 
 def check_summary(summary: Any, where: str) -> None:
-    """Checks that a summary has the fields of `evaluate`, and that each is of its kind.
+    """Checks that a summary has the fields of `evaluate` with their types.
 
     Args:
-        summary: the content of a file, or of a row.
-        where: it is from, for the error.
+        summary: the content of a file or a row.
+        where: the beginning of an error.
 
     Raises:
-        UserError: it has not; names the field.
+        UserError: a field is missing or has a wrong type; names the field.
     """
     must = "it must be a summary.json of evaluate"
     for key, kind in _KINDS.items():

@@ -1,4 +1,4 @@
-"""The section of the page of results on how much one training differs from another."""
+"""The section on the variation between trainings."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from kitting_drake.reproduction.paper.paper_tables import FIGURE_6, HEADLINE_SEE
 
 
 def trainings(results: Mapping[str, Result], to_run_again: Collection[str] = ()) -> list[str]:
-    """The section; empty where nothing has been trained from a second seed.
+    """The section; empty without trainings from a second seed.
 
     Args:
-        results: by the names of their cells.
-        to_run_again: the names of the cells whose runs are set aside.
+        results: by cell name.
+        to_run_again: the names of cells whose runs are set aside.
     """
     rows = []
     for task in FIGURE_6:
@@ -42,7 +42,7 @@ def trainings(results: Mapping[str, Result], to_run_again: Collection[str] = ())
 
 
 def _rates(results: Sequence[Result]) -> str:
-    """The mean of both rates, and its standard deviation where there are several."""
+    """The mean of both rates, with its standard deviation if there are several results."""
     texts = []
     for rate in (STRICT, OWN):
         percents = [100 * result.summary[rate] for result in results]
