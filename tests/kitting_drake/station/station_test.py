@@ -382,7 +382,7 @@ def test_one_of_everything_builds_and_steps(name: str):
 )
 @pytest.mark.usefixtures("rendering")
 def test_invalid_scenarios_raise(text: str, sentence: str):
-    scenario = load_scenario(SCENARIOS / "kitting_seen.yaml", text=text)
+    scenario = load_scenario(SCENARIOS / "paper/kitting_seen.yaml", text=text)
     with pytest.raises(UserError, match=sentence):
         build(scenario)
 
