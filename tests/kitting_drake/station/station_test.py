@@ -221,6 +221,8 @@ def test_objects_at_rest_fall_asleep(rig: Rig):
 
 def test_a_sleeping_stack_has_no_contacts_until_it_wakes(monkeypatch: pytest.MonkeyPatch):
     rig = build(Scenario(task=PalletizingBoxes(layers=2), cameras={}))
+    for item, goal in zip(rig.objects, rig.scene.goals, strict=True):
+        rig.plant.SetDefaultFloatingBaseBodyPose(rig.plant.get_body(item.body), goal.poses[0])
 
     def contacts(root: Context) -> int:
         context = rig.plant.GetMyContextFromRoot(root)
@@ -229,7 +231,7 @@ def test_a_sleeping_stack_has_no_contacts_until_it_wakes(monkeypatch: pytest.Mon
 
     counts: list[int] = []
     root = advance(rig, 0.6, lambda root: counts.append(contacts(root)))
-    assert max(counts) == 12
+    assert max(counts) > 12
     assert counts[-1] == 0
     assert all(locked(rig, root))
     # The highest box, the last one, wakes and touches those that sleep.
@@ -240,7 +242,7 @@ def test_a_sleeping_stack_has_no_contacts_until_it_wakes(monkeypatch: pytest.Mon
     rig.station._apply_sleep(root)
     assert locked(rig, root) == [True] * top + [False]
     Simulator(rig.diagram, root).AdvanceTo(root.get_time() + 0.01)
-    assert contacts(root) == 1
+    assert 0 < contacts(root) < max(counts)
 
 
 def test_an_object_that_leaves_the_cell_comes_to_rest(rig: Rig):
