@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Grasp:
-    """A planar grasp in the body frame B of an object that lies upright."""
+    """A planar grasp in the body frame B of an object in its nominal resting pose."""
 
     x: float
     """Coordinates of the point midway between the pads, in B, in metres. Likewise `y`."""

@@ -30,8 +30,8 @@ _SMOOTHED = 9
 _FLAT = 0.012
 """Squares with a larger range of heights contain edges and are not flat, in metres."""
 _NOISY_RIM_SHARE, _NOISY_RIM_BIAS = 90.0, 1.0
-"""About two thirds of the pixels around a place belong to its rim. This percentile of all lies so
-many standard deviations above the median of the rim's."""
+"""Percentile of the heights around a place that estimates its rim's height, and its bias in
+standard deviations. About two thirds of these pixels belong to the rim."""
 _NOISY_FLOOR_SHARE, _NOISY_FLOOR_BIAS = 25.0, -0.67
 """Percentile of the heights at a place that estimates its floor's height, and its bias in standard
 deviations."""

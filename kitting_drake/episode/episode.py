@@ -133,14 +133,10 @@ class Episode:
     ) -> None:
         """
         Args:
-            diagram: as for `run_episode`; with `pauses`, it may be the station alone.
-            station: as for `run_episode`.
-            scenario: as for `run_episode`.
-            policy: as for `run_episode`.
-            realtime_rate: as for `run_episode`.
-            observers: as for `run_episode`.
-            log: as for `run_episode`.
+            diagram: may be the station alone if the episode pauses.
             pauses: whether `advance` returns each time the planner needs an action.
+
+        The other arguments are those of `run_episode`.
         """
         self._station = station
         self._names = {"scenario": scenario, "policy": policy, "seed": station.seed}

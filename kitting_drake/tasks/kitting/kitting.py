@@ -254,7 +254,7 @@ class ArrangedKitting(_KittingTask):
 
     @staticmethod
     def _check_workspace(scene: Scene, grid: PixelGrid) -> None:
-        """Raises UserError if a pick or place is outside the workspace: o_t has no heights there."""
+        """Raises UserError if a pick or place is outside the workspace, where o_t is unknown."""
         things = {f"task.tools.{item.name}": item.X_WB for item in scene.objects}
         for goal in scene.goals:
             name = scene.objects[goal.objects[0]].name
@@ -262,8 +262,9 @@ class ArrangedKitting(_KittingTask):
         for name, X_WThing in things.items():
             if not grid.contains(X_WThing.translation()[:2]):
                 raise UserError(
-                    f"{name} is not in the workspace (heightmap), x from {grid.x_min:g} to "
-                    f"{grid.x_max:g} m and y from {grid.y_min:g} to {grid.y_max:g} m"
+                    f"{name} is not in the workspace: choose x from {grid.x_min:g} to "
+                    f"{grid.x_max:g} m and y from {grid.y_min:g} to {grid.y_max:g} m, or enlarge "
+                    "heightmap"
                 )
 
     def input_files(self, base: Path) -> list[Path]:
