@@ -378,4 +378,4 @@ def _check_count(count: int) -> None:
     if not count:
         raise ValueError("task.tools is empty: name at least one tool")
     if count > _MOST_TOOLS:
-        raise ValueError(f"task.tools has {count} tools: name at most {_MOST_TOOLS}")
+        raise ValueError(f"task.tools has {count} tools: a kit holds up to {_MOST_TOOLS}")
