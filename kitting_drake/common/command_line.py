@@ -71,6 +71,8 @@ def run_command(main: Callable[[], int]) -> None:
     """Runs a command and exits with its code; prints a UserError as one line."""
     # Hide Drake's messages about ports and frame names.
     logging.getLogger("drake").setLevel(logging.WARNING)
+    # Like Ctrl-C, SIGTERM raises KeyboardInterrupt, so that files and processes are cleaned up.
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         code = main()
     except UserError as error:

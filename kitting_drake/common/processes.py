@@ -1,9 +1,11 @@
 """Runs functions in fresh processes, in parallel, so that a crash affects no other."""
 
+import contextlib
 import multiprocessing
 import os
 import signal
 import threading
+import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass
@@ -24,6 +26,8 @@ _THREADS = "OMP_NUM_THREADS"
 _MOST_CALLS = 10
 """A process is replaced after so many calls: Drake 1.51 never frees Diagrams, about 50 MB for each
 episode."""
+_PATIENCE = 3.0
+"""Time for a stopped process to remove partial files, in s."""
 _MOST_AT_WORK = 1000
 """Limit on parallel calls. Each occupies a thread of this process."""
 
@@ -58,7 +62,12 @@ class Subprocess:
         context = multiprocessing.get_context("spawn")
         self._connection, theirs = context.Pipe()
         self._process = context.Process(target=_serve, args=(theirs,), daemon=True)
-        self._process.start()
+        # The process inherits the mask, which blocks Ctrl-C even while it starts.
+        before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+        try:
+            self._process.start()
+        finally:
+            signal.pthread_sigmask(signal.SIG_SETMASK, before)
         theirs.close()
         self.calls = 0
         """Number of calls so far."""
@@ -124,7 +133,7 @@ class Workers(Protocol):
         """
 
     def stop(self) -> None:
-        """Kills all running calls and accepts no more.
+        """Ends all running calls and accepts no more.
 
         `run` then returns a `ProcessCrashed`.
         """
@@ -191,7 +200,12 @@ class LocalWorkers:
 
     def stop(self) -> None:
         self._stopped = True
-        for process in multiprocessing.active_children():
+        processes = multiprocessing.active_children()
+        for process in processes:
+            process.terminate()
+        deadline = time.monotonic() + _PATIENCE
+        for process in processes:
+            process.join(max(deadline - time.monotonic(), 0.0))
             process.kill()
 
 
@@ -240,19 +254,28 @@ def counting_bar(console: Console, label: str) -> Progress:
 
 
 def _serve(connection: Connection) -> None:
-    # The parent handles Ctrl-C.
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_end_with_parent, daemon=True).start()
-    while True:
-        try:
+    terminated = False
+
+    def terminate(*_: object) -> None:
+        nonlocal terminated
+        terminated = True
+        raise KeyboardInterrupt
+
+    # Unwind the stack, so that partial files are removed.
+    signal.signal(signal.SIGTERM, terminate)
+    with contextlib.suppress(EOFError, KeyboardInterrupt):
+        while not terminated:
             function, arguments = connection.recv()
-        except EOFError:
-            return
-        try:
-            answer = function(*arguments)
-        except MachineError as error:
-            answer = error
-        connection.send(answer)
+            try:
+                answer = function(*arguments)
+            except MachineError as error:
+                answer = error
+            connection.send(answer)
+    if terminated:
+        # The exit code must show the signal.
+        signal.signal(signal.SIGTERM, signal.SIG_DFL)
+        os.kill(os.getpid(), signal.SIGTERM)
 
 
 def _end_with_parent() -> None:
