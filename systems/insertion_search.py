@@ -71,5 +71,5 @@ class InsertionSearch:
         return rim > table + _LEAST_RIM and bottom > rim - self.rim_margin
 
     def has_slipped_in(self, z: float, touched_at: float) -> bool:
-        """Whether the hand, at height z, sank below its contact height; in metres."""
+        """Whether the hand at height z has sunk below its contact height, both in metres."""
         return z < touched_at - self.press / 2

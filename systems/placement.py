@@ -74,7 +74,7 @@ class PlacedObject:
 
 @dataclass(frozen=True)
 class Goal:
-    """One of some objects in one of some poses."""
+    """A goal: place any of some objects in any of some poses."""
 
     name: str
     objects: tuple[int, ...]

@@ -179,7 +179,7 @@ def save_png(pixels: NDArray[np.uint8], path: Path) -> None:
     """Writes an image (height, width, 3) to a PNG file, atomically.
 
     Raises:
-        UserError: writing fails.
+        MachineError: writing fails.
     """
     buffer = io.BytesIO()
     Image.fromarray(pixels).save(buffer, "PNG")

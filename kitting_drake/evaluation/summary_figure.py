@@ -77,7 +77,7 @@ def draw_summary(summary: dict[str, Any], episodes: Sequence[Episode], path: Pat
         path: a .png file.
 
     Raises:
-        UserError: writing fails.
+        MachineError: writing fails.
     """
     # Import matplotlib lazily.
     import matplotlib

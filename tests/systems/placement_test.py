@@ -59,9 +59,9 @@ def test_add_s_takes_the_nearest_point_not_the_same_point():
 def test_add_s_measures_from_the_goal_to_the_actual_pose():
     """Asymmetric shapes give two directed distances; equation 9 starts from the goal."""
     points = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [3.0, 0.0, 0.0]])
-    moved = RigidTransform([3.0, 0.0, 0.0])  # Goal 0, 1, 3; actual 3, 4, 6.
+    moved = RigidTransform([3.0, 0.0, 0.0])  # Goal points at x = 0, 1, 3; actual at 3, 4, 6.
     assert add_s(points, RigidTransform(), moved) == pytest.approx((3 + 2 + 0) / 3)
-    back = RigidTransform([-3.0, 0.0, 0.0])  # Goal 0, 1, 3; actual -3, -2, 0.
+    back = RigidTransform([-3.0, 0.0, 0.0])  # Goal points at x = 0, 1, 3; actual at -3, -2, 0.
     assert add_s(points, RigidTransform(), back) == pytest.approx((0 + 1 + 3) / 3)
 
 

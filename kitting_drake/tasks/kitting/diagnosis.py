@@ -45,7 +45,7 @@ def find_cause(
 
     - `never picked`: no action on it was completed.
     - `missed grasp`: no grasp of it held.
-    - `reversed`: at its cavity, but rotated by half a turn or on the wrong side.
+    - `reversed`: at its cavity, but rotated by 180 degrees or on the wrong side.
     - `insertion blocked`: over its cavity, but protruding or displaced.
     - `slipped`: lost on the way, or left outside the kit by a correct action.
     - `wrong cavity`: over another tool's cavity.

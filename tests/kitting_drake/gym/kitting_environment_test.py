@@ -140,7 +140,7 @@ def test_an_episode_equals_that_of_evaluate(small: Path, monkeypatch: pytest.Mon
 
 
 def test_each_step_renders_one_observation(small: Path, monkeypatch: pytest.MonkeyPatch):
-    """Rendering dominates the cost of a step over that of an action in `evaluate`."""
+    """More renderings would make a step costlier than an action in `evaluate`."""
     count = []
     render = HeightmapProjector._CalcObservation
 

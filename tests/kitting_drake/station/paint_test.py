@@ -104,7 +104,7 @@ def test_a_models_friction_is_scaled_and_its_meshes_are_found(tmp_path: Path):
     assert "<mass>0.1805997838</mass>" in tool
     assert "mu_static>0.25<" in tool
     assert f"file://{MODELS / 'tools' / 'claw_hammer' / 'steel.obj'}" in tool
-    # Folder names may contain such characters; Drake decodes nothing.
+    # Folder names may contain such characters, and Drake does not decode URIs.
     folder = tmp_path / "ä b#c%20d"
     shutil.copytree(MODELS / "tools" / "claw_hammer", folder)
     plant, _ = AddMultibodyPlantSceneGraph(DiagramBuilder(), time_step=0.01)

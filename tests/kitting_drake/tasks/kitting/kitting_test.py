@@ -179,7 +179,7 @@ def test_tools_scaled_too_wide_for_the_jaws_raise(tmp_path: Path):
     shutil.copytree(MODELS / "tools" / "stubby_screwdriver", folder)
     tool = load_tool(str(folder))
     record = yaml.safe_load((folder / "tool.yaml").read_text())
-    # At a length of 0.2 m it is as wide as the jaws open.
+    # At a length of 0.2 m its grasp is as wide as the open jaws.
     record["grasp"]["width"] = 0.08 * tool.length / 0.2
     (folder / "tool.yaml").write_text(yaml.safe_dump(record))
     draw(0, ToolsetKitting(pool=[str(folder)], tool_length=[0.15, 0.19]))
