@@ -21,6 +21,7 @@ torch.optim.Adam([torch.zeros(1, requires_grad=True)])
 """
 
 
+@pytest.mark.slow
 def test_an_optimizer_can_be_made_after_rendering():
     """As in training on a Gymnasium environment: PyTorch's Triton and Mesa each bring an LLVM."""
     result = subprocess.run(

@@ -156,6 +156,7 @@ def test_each_step_renders_one_observation(small: Path, monkeypatch: pytest.Monk
     assert len(count) == 3
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("freed_diagrams")
 def test_earlier_scenes_are_garbage_collected(small: Path):
     environment = make(small, render_mode="rgb_array")

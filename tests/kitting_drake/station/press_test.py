@@ -17,7 +17,7 @@ from systems.signals import PickPlaceAction, PlanarPose
 from tests.kitting_drake.rig import build_rig
 
 
-@pytest.mark.parametrize("force", [30.0, 60.0])
+@pytest.mark.parametrize("force", [pytest.param(30.0, marks=pytest.mark.slow), 60.0])
 @pytest.mark.usefixtures("rendering")
 def test_a_press_reaches_the_press_force(monkeypatch: pytest.MonkeyPatch, force: float):
     """Includes the impact at `lower_speed` and the delay of one planner period."""

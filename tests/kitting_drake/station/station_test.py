@@ -430,7 +430,11 @@ def test_an_invalid_mesh_raises_user_error(own_tool: Path):
 
 
 @pytest.mark.parametrize(
-    "policy", [Oracle(), PythonPolicy(function="systems.signals:PickPlaceAction")]
+    "policy",
+    [
+        pytest.param(Oracle(), marks=pytest.mark.slow),
+        PythonPolicy(function="systems.signals:PickPlaceAction"),
+    ],
 )
 @pytest.mark.usefixtures("rendering", "freed_diagrams")
 def test_unused_stations_are_garbage_collected(policy: PolicyConfig):

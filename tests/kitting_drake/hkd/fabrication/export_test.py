@@ -284,7 +284,7 @@ def test_a_block_of_a_given_size(tmp_path: Path):
     assert scene.goals[0].rim_height == pytest.approx(0.030)
 
 
-@pytest.mark.parametrize("clearance", [0.1, 0.2])
+@pytest.mark.parametrize("clearance", [0.1, pytest.param(0.2, marks=pytest.mark.slow)])
 def test_a_small_clearance_is_kept(clearance: float, tmp_path: Path):
     design = export_kit(KitRequest(("claw_hammer",), tmp_path / "kit", clearance_mm=clearance))
     kit = design.kit

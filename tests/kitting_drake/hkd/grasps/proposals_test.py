@@ -43,7 +43,9 @@ def test_pads_that_reach_deeper_are_kept_from_what_is_wide_below():
     assert propose_grasps(triangles(bar(160, 18, 12)), np.zeros(3), high) == []
 
 
-@pytest.mark.parametrize("turn_deg", [-70.0, 33.0, 90.0])
+@pytest.mark.parametrize(
+    "turn_deg", [-70.0, *(pytest.param(turn, marks=pytest.mark.slow) for turn in (33.0, 90.0))]
+)
 def test_the_grasp_turns_with_the_bar(turn_deg: float):
     solid = bar(160, 18, 12).rotate((0, 0, turn_deg)).translate((7, -4, 0))
     best = propose_grasps(triangles(solid), np.array([0.007, -0.004]))[0]
@@ -105,7 +107,13 @@ def test_nothing_has_no_grasp():
 
 
 @pytest.mark.parametrize(
-    "name", ["claw_hammer", "combination_wrench", "flat_screwdriver", "slip_joint_pliers"]
+    "name",
+    [
+        "claw_hammer",
+        "slip_joint_pliers",
+        pytest.param("combination_wrench", marks=pytest.mark.slow),
+        pytest.param("flat_screwdriver", marks=pytest.mark.slow),
+    ],
 )
 def test_the_best_grasp_is_near_the_annotated_one(name: str):
     tool = load_tool(name)

@@ -2,6 +2,7 @@ import numpy as np
 import pytest
 from manifold3d import CrossSection, Manifold, OpType
 
+from kitting_drake.hkd.importing import convex_decomposition
 from kitting_drake.hkd.importing.convex_decomposition import MOST_HULLS, decompose
 from kitting_drake.hkd.tools.collision import furthest, projection
 from systems.grasp import Grasp
@@ -53,7 +54,10 @@ def test_the_bottom_stays_flat_and_nothing_is_below_it():
     assert furthest(solid.project().hull(), bottom) < 0.4
 
 
-def test_an_outline_of_too_many_corners_is_told():
+def test_an_outline_of_too_many_corners_is_told(monkeypatch: pytest.MonkeyPatch):
+    # The last tolerances of all are what it ends with.
+    last = convex_decomposition.OUTLINE_TOLERANCES_MM[-1:]
+    monkeypatch.setattr(convex_decomposition, "OUTLINE_TOLERANCES_MM", last)
     # A comb whose gaps are too broad to be bridged.
     teeth = [
         Manifold.cube((4, 30, 10)).translate((11.5 * index - 94.0, -40, 0)) for index in range(17)

@@ -306,9 +306,9 @@ TWELVE = [*SEVEN, "pipe_wrench", "soft_face_mallet", "s_wrench", "torx_screwdriv
         (["claw_hammer"], {"length": 0.15}),
         (["claw_hammer", "claw_hammer"], {}),
         (NAMES, {"minimum_wall": 0.025}),
-        (SEVEN, {}),
+        pytest.param(SEVEN, {}, marks=pytest.mark.slow),
         (SEVEN, {"nested_wall": 0.012, "lead_in": 0.0}),
-        (TWELVE, {}),
+        pytest.param(TWELVE, {}, marks=pytest.mark.slow),
         (["t_handle_screwdriver"] * 12, {}),
     ],
 )

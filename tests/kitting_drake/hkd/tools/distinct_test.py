@@ -44,7 +44,17 @@ def test_a_tool_is_no_distance_from_itself():
     assert mean_surface_distance(tool, tool) < 0.0005
 
 
-@pytest.mark.parametrize("name", [n for n in tool_names() if load_tool(n).split == "fresh"])
+ONE_OF_EACH = ("geologists_pick", "fencing_pliers", "basin_wrench", "cabinet_screwdriver")
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(name, marks=[] if name in ONE_OF_EACH else [pytest.mark.slow])
+        for name in tool_names()
+        if load_tool(name).split == "fresh"
+    ],
+)
 def test_a_fresh_tool_is_like_none_of_its_category(name: str):
     tool = load_tool(name)
     others = [load_tool(other) for other in tool_names() if other != name]
