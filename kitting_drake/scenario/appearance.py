@@ -1,6 +1,6 @@
-"""The part of a scenario that says how things look: colours, sheen and lights.
+"""The appearance of a scenario: colours, sheen and lights.
 
-Annotations are evaluated here: Drake's YAML loader reads the types of fields, not their texts.
+Drake's YAML loader needs evaluated annotations, hence no `from __future__ import annotations`.
 """
 
 import dataclasses as dc
@@ -12,7 +12,7 @@ from systems.bounds import bounded
 class Fixed:
     """A colour."""
 
-    # Red, green and blue.
+    # Red, green and blue, 0 to 1.
     rgb: list[float] = bounded([0.5, 0.5, 0.5], 0.0, 1.0)
 
 
@@ -20,10 +20,10 @@ class Fixed:
 class Drawn:
     """A colour drawn from the seed."""
 
-    # One colour for all surfaces that are named; else each gets its own.
+    # True: all surfaces that match the pattern get the same colour. False: each gets its own.
     shared: bool = False
 
-    # How far each channel may be from the model's own colour; null: any colour.
+    # Largest deviation of each channel from the model's own colour. null: any colour.
     spread: float | None = bounded(None, 0.0, 1.0)
 
 
@@ -32,37 +32,43 @@ Paint = Fixed | Drawn
 
 @dc.dataclass
 class Light:
-    """A light as far away as the sun."""
+    """A directional light."""
 
-    # Where it shines to, in the world, and how bright it is; 1 lights a surface fully.
+    # Direction of its rays in the world.
     direction: list[float] = bounded([0.0, 0.0, -1.0], -1.0, 1.0)
+
+    # Brightness; a light of 1 lights a surface fully.
     intensity: float = bounded(1.0, 0.0, 10.0)
+
+    # Red, green and blue, 0 to 1.
     rgb: list[float] = bounded([1.0, 1.0, 1.0], 0.0, 1.0)
 
 
 @dc.dataclass
 class Appearance:
-    """How things look. By default as their models say, lit from each camera."""
+    """Colours, sheen and lights. By default the models' own colours, lit from each camera."""
 
-    # Paint by surface: a pattern (* is anything) of table/PART, fixtures/NAME/PART and
-    # objects/NAME/PART, with the names of visuals in the SDFormat models. Later ones win.
+    # Paints by pattern. A pattern matches surfaces named table/PART, fixtures/NAME/PART or
+    # objects/NAME/PART; PART is a visual of the SDFormat model, and * matches any text. For
+    # example, "fixtures/kit/*" paints the kit: its parts are block and cavities. If several
+    # patterns match a surface, the last one wins.
     paints: dict[str, Paint] = dc.field(default_factory=dict)
 
-    # The share of a surface that gives a depth camera no depth, 0 to 1, by the same patterns.
+    # Share of a surface's pixels without depth, 0 to 1, by the same patterns.
     sheen: dict[str, float] = dc.field(default_factory=dict)
 
-    # The lights; none: each camera lights what it sees.
+    # If empty, a light at each camera.
     lights: list[Light] = dc.field(default_factory=list)
 
-    # Draw the lights from the seed instead: one to three, by so much brighter or darker than full
-    # light at most.
+    # If given, the seed draws one to three lights instead. Their total brightness deviates from
+    # full light by at most this share.
     drawn_lights: float | None = bounded(None, 0.0, 1.0)
 
     def validate(self) -> None:
-        """Checks what neither types nor ranges say.
+        """Checks the constraints that types and ranges cannot express.
 
         Raises:
-            ValueError: one sentence that begins with the path of a field, `appearance.x`.
+            ValueError: a sentence that begins with the path of a field, `appearance.x`.
         """
         for pattern, share in self.sheen.items():
             if not 0.0 <= share <= 1.0:

@@ -1,6 +1,6 @@
-"""Cameras: their descriptions in a scenario, and Drake's cameras made of them.
+"""The variants of a scenario's cameras, and their conversion to Drake's cameras.
 
-Annotations are evaluated here: Drake's YAML loader reads the types of fields, not their texts.
+Drake's YAML loader needs evaluated annotations, hence no `from __future__ import annotations`.
 """
 
 import copy
@@ -17,14 +17,14 @@ from systems.bounds import bounded
 
 _ANGLE = (-360.0, 360.0)
 _NEAR, _FAR = 0.01, 10.0
-"""The depths that `Pinhole` and `LookAt` can see, in metres."""
+"""Depth range of `Pinhole` and `LookAt`, in metres."""
 
 
 @dc.dataclass
 class Pinhole:
     """An RGB-D camera placed by roll, pitch and yaw: a short form of Drake's `CameraConfig`.
 
-    Its z axis looks, its x axis points right.
+    z points along the viewing direction, x to the right in the image, y down.
     """
 
     # Position in the world, in m.
@@ -46,9 +46,9 @@ class Pinhole:
 
 @dc.dataclass
 class LookAt:
-    """An RGB-D camera that looks at a point, upright: a short form of Drake's `CameraConfig`."""
+    """An upright RGB-D camera aimed at a point: a short form of Drake's `CameraConfig`."""
 
-    # Position, and the point in the middle of the image, in the world, in m.
+    # Positions of the camera and of the point in the middle of the image, in the world, in m.
     position: list[float] = bounded([1.0, 0.0, 0.75], -10.0, 10.0)
     target: list[float] = bounded([0.5, 0.0, 0.0], -10.0, 10.0)
 
@@ -62,13 +62,13 @@ class LookAt:
         return _camera_config(self, Transform(look_at(self.position, self.target)))
 
     def validate(self) -> None:
-        """Checks what ranges do not say.
+        """Checks that the camera does not look straight up or down, where upright is undefined.
 
         Raises:
-            ValueError: one sentence that continues the name of the camera.
+            ValueError: the rest of a sentence whose subject is the camera's name.
         """
         if self.position[:2] == self.target[:2]:
-            raise ValueError("looks straight down, where upright means nothing: use !Pinhole")
+            raise ValueError("looks straight up or down: use !Pinhole, as upright is undefined")
 
 
 Camera: TypeAlias = Pinhole | LookAt | CameraConfig
@@ -97,14 +97,14 @@ def _config(camera: Camera) -> CameraConfig:
 
 
 _UNUSED = ("renderer_name", "renderer_class", "fps", "capture_offset", "output_delay", "lcm_bus")
-"""Fields of a CameraConfig that mean nothing here: images are rendered when they are asked for."""
+"""Fields of a CameraConfig without effect, as images are rendered on demand."""
 
 
 def check_camera(camera: Camera) -> None:
-    """Checks what neither types nor ranges say.
+    """Checks the constraints that types and ranges cannot express.
 
     Raises:
-        ValueError: one sentence that continues the name of the camera.
+        ValueError: the rest of a sentence whose subject is the camera's name.
     """
     if isinstance(camera, LookAt):
         camera.validate()
@@ -113,30 +113,30 @@ def check_camera(camera: Camera) -> None:
     plain = CameraConfig()
     for name in _UNUSED:
         if getattr(camera, name) != getattr(plain, name):
-            raise ValueError(f"gives {name}, which has no effect here: leave it out")
+            raise ValueError(f"has the field {name}, which has no effect here: remove it")
     if camera.X_PB.base_frame not in (None, "", "world"):
-        raise ValueError("must be fixed to the world: leave X_PB.base_frame out")
+        raise ValueError("must be fixed to the world: remove X_PB.base_frame")
     try:
         camera.MakeCameras()
         X_BC, X_BD = (X.GetDeterministicValue() for X in (camera.X_BC, camera.X_BD))
         camera.X_PB.GetDeterministicValue()
     except RuntimeError as error:
-        raise ValueError(f"cannot be used: {str(error).splitlines()[0]}") from error
+        raise ValueError(f"is invalid: {str(error).splitlines()[0]}") from error
     if not X_BC.IsNearlyEqualTo(X_BD, 1e-9):
-        raise ValueError("must see colour and depth from the same point: X_BC and X_BD differ")
+        raise ValueError("must have the same pose for colour and depth: X_BC and X_BD differ")
 
 
 def camera_pose(camera: Camera) -> RigidTransform:
-    """X_WB of a camera: z looks, x points right in the image, y down."""
+    """X_WB of a camera; z is the viewing direction, x points right in the image, y down."""
     return RigidTransform(_config(camera).X_PB.GetDeterministicValue())
 
 
 def depth_camera(camera: Camera, renderer: str) -> DepthRenderCamera:
-    """Drake's description of a camera; colour and depth are seen from the same point.
+    """Drake's description of a camera; its colour camera has the same pose.
 
     Args:
         camera: of a scenario.
-        renderer: the name of the engine that it renders by.
+        renderer: the name of its render engine.
     """
     config = copy.deepcopy(_config(camera))
     config.renderer_name = renderer

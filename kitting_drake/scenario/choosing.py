@@ -1,4 +1,4 @@
-"""The command line of every command on a scenario."""
+"""The command-line flags shared by all commands that take a scenario."""
 
 import argparse
 import contextlib
@@ -16,7 +16,7 @@ from kitting_drake.scenario.schema import Scenario
 
 
 def scenario_parser(command: str, description: str) -> argparse.ArgumentParser:
-    """A parser with the flags that every command on a scenario takes."""
+    """A parser with the flags of every command that takes a scenario."""
     parser = argparse.ArgumentParser(
         prog=f"python -m kitting_drake.{command}", description=description
     )
@@ -25,51 +25,53 @@ def scenario_parser(command: str, description: str) -> argparse.ArgumentParser:
         "--output",
         type=Path,
         metavar="DIR",
-        help="where all files go (default: output/ and the scenario's name)",
+        help="folder for all files (default: a subfolder of output/ named after the scenario)",
     )
     parser.add_argument("--quiet", action="store_true", help="print nothing but errors")
     return parser
 
 
 def add_scenario_flags(parser: argparse.ArgumentParser) -> None:
-    """Adds the flags that say which scenario."""
+    """Adds the flags that select a scenario."""
     parser.add_argument("scenario", type=Path, metavar="SCENARIO.yaml", help="the scenario's file")
     parser.add_argument(
-        "--scenario_name", metavar="NAME", help="which scenario of the file (default: the first)"
+        "--scenario_name",
+        metavar="NAME",
+        help="which scenario in the file (default: the first)",
     )
     parser.add_argument(
-        "--scenario_text", metavar="YAML", help="fields merged over the scenario's own"
+        "--scenario_text", metavar="YAML", help="fields to merge over those of the scenario"
     )
     parser.add_argument(
         "--perturb",
         metavar="NAME[:LEVEL],...",
-        help=f"make the world less perfect: {', '.join(NAMES)}; {', '.join(LEVELS)} (moderate)",
+        help=f"add imperfections: {', '.join(NAMES)}; levels: {', '.join(LEVELS)} (moderate)",
     )
 
 
 @dataclasses.dataclass(frozen=True)
 class ChosenScenario:
-    """A scenario as the command line names it."""
+    """A scenario with the command-line arguments that selected it."""
 
     scenario: Scenario
     path: Path
     name: str
-    """The name of its file, without the ending, and of the scenario in it if one was given."""
+    """The file's name without its suffix, then `:NAME` if a scenario was named."""
     text: str | None
-    """The YAML that was merged over it."""
+    """The YAML merged over it."""
     perturbed: str | None = None
-    """The perturbations that it has, as `--perturb` names them."""
+    """Its perturbations, in the syntax of `--perturb`."""
     moved_to: Path | None = None
-    """Where relative paths in the scenario start, if not in the folder of its file."""
+    """The folder of relative paths in the scenario, if not that of its file."""
 
     @property
     def base(self) -> Path:
-        """Where relative paths in the scenario start."""
+        """The folder of relative paths in the scenario."""
         return (self.moved_to or self.path.resolve().parent).resolve()
 
     @contextlib.contextmanager
     def named_in_errors(self) -> Iterator[None]:
-        """Puts the file's name before the text of any UserError that is raised within."""
+        """Prefixes any UserError raised within by the name of the scenario's file."""
         try:
             yield
         except UserError as error:
@@ -77,20 +79,20 @@ class ChosenScenario:
 
     @property
     def policy(self) -> str:
-        """The policy's name for results."""
+        """The policy's name in results."""
         return self.scenario.policy.name
 
     @property
     def described(self) -> dict[str, Any]:
-        """The whole scenario, defaults included, as JSON holds it; variants have a `_tag`."""
+        """The whole scenario with its defaults, as JSON values; variants have a `_tag`."""
         return describe(self.scenario)
 
 
 def choose_scenario(arguments: argparse.Namespace) -> ChosenScenario:
-    """Loads what `scenario_parser`'s flags say.
+    """Loads the scenario that the flags of `scenario_parser` select.
 
     Raises:
-        UserError: it cannot be used.
+        UserError: as `load_scenario`.
     """
     return find_scenario(
         arguments.scenario,
@@ -106,10 +108,10 @@ def find_scenario(
     """Loads a scenario as the command line does; the arguments are those of `load_scenario`.
 
     Raises:
-        UserError: it cannot be used.
+        UserError: as `load_scenario`.
     """
     if not path.exists() and not path.is_absolute() and ".." not in path.parts:
-        # An installed wheel carries its scenarios; `scenarios/x.yaml` means them anywhere.
+        # In any folder, `scenarios/x.yaml` finds the scenarios of an installed wheel.
         inside = path.relative_to(SCENARIOS.name) if path.parts[0] == SCENARIOS.name else path
         path = SCENARIOS / inside if (SCENARIOS / inside).is_file() else path
     scenario = load_scenario(path, name, text, perturb)
@@ -118,5 +120,5 @@ def find_scenario(
 
 
 def output_folder(arguments: argparse.Namespace, name: str) -> Path:
-    """The folder that `--output` names, or the command's own."""
+    """The folder given by `--output`; by default `output/NAME`."""
     return arguments.output or Path("output") / name.replace(":", "-")

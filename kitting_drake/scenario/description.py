@@ -1,4 +1,4 @@
-"""Scenarios as plain values: for JSON, and to compare them."""
+"""Converts scenarios to JSON values, for files and comparisons."""
 
 import dataclasses
 from pathlib import Path
@@ -11,7 +11,7 @@ from kitting_drake.scenario.yaml_input.drake_configs import struct_fields
 
 
 def describe(value: Any) -> Any:
-    """A scenario, or a part of it, as JSON holds it: defaults included; variants have a `_tag`."""
+    """A scenario or a part of it as JSON values, with defaults; variants have a `_tag`."""
     if dataclasses.is_dataclass(value):
         fields = {
             item.name: describe(getattr(value, item.name))

@@ -1,4 +1,4 @@
-"""Reads scenarios from YAML; a mistake is told by its file and field."""
+"""Reads scenarios from YAML. Errors name the file and the field."""
 
 import dataclasses as dc
 import typing
@@ -22,8 +22,8 @@ from systems.hand_geometry import JOINT_LIMITS
 _APPROXIMATIONS = ("lagged", "similar", "sap")
 
 _PLAINLY_BELOW = 0.02
-"""A grid that begins so far below the table, in m, is not taken for one that is off (see
-`systems.surface_heights`)."""
+"""Least distance of a negative heightmap.z_min below the table, in m. A smaller distance could be a
+calibration error of the cameras (see `systems.surface_heights`)."""
 
 
 def load_scenario(
@@ -32,14 +32,15 @@ def load_scenario(
     """Reads a scenario.
 
     Args:
-        path: the YAML file: a mapping from names to scenarios.
-        name: which one; the first when None.
-        text: YAML merged over it: mappings field by field, all else replaced; a tag that is not
-            given is that of what is merged over. A camera that is null is removed.
-        perturb: perturbations (see `scenario.perturbations`), merged over it before `text`.
+        path: a YAML file that maps names to scenarios.
+        name: of the scenario; None for the first.
+        text: YAML to merge over the scenario. Mappings merge field by field; other values are
+            replaced. A mapping without a tag keeps the variant that it is merged over. A camera
+            set to null is removed.
+        perturb: perturbations (see `scenario.perturbations`), merged before `text`.
 
     Raises:
-        UserError: the file cannot be used; names the file and the field.
+        UserError: the file cannot be read, or a field is invalid.
     """
     try:
         content = path.read_text()
@@ -47,12 +48,12 @@ def load_scenario(
         reason = getattr(error, "strerror", None) or "it is not a text file"
         raise UserError(f"cannot read the scenario {path}: {reason}") from error
     root = parse(content, str(path))
-    # By YAML's custom such names hold parts that others refer to.
+    # By convention, such names hold YAML anchors.
     names = [name for name in root if not name.startswith(("x-", "."))]
     fields = {item.name for item in dc.fields(Scenario)}
     if names and not set(names) - fields:
         raise UserError(
-            f"{path}: '{names[0]}' is a field, not a scenario: put the fields under a name of yours"
+            f"{path}: '{names[0]}' is a field, not a scenario: put the fields under a name"
         )
     if name is None:
         if not names:
@@ -64,7 +65,7 @@ def load_scenario(
     scenario = _load(root[name], Scenario(), f"{path}: {name}", base)
     if perturb is not None:
         overlay = perturbation(perturb, scenario)
-        # Of paints the later one wins, and a name that is given again would keep its place.
+        # The last paint wins, but merging over an existing pattern would keep its position.
         kept = {
             name: paint
             for name, paint in scenario.appearance.paints.items()
@@ -80,11 +81,10 @@ def load_scenario(
 
 
 def _onto(raw: dict, defaults: Scenario) -> tuple[dict, Scenario]:
-    """Makes ready what is merged over a scenario.
+    """Prepares YAML and defaults for merging.
 
-    Drake reads a mapping without a tag as the first variant of its union; here it is of the variant
-    that it is merged over. And where a tag brings another variant, nothing of its default mappings
-    is to remain beside what is given.
+    Drake reads an untagged mapping as the union's first variant. This adds the tag of the current
+    variant. If a tag selects another variant, the mappings given replace its default mappings.
     """
     tagged = dict(raw)
     for name in ("task", "policy"):
@@ -108,8 +108,10 @@ def _onto(raw: dict, defaults: Scenario) -> tuple[dict, Scenario]:
 
 
 def _without_mappings(given: dict, current: Task) -> Task:
-    """The task to merge `given` over: of another variant than `current`, its defaults, but for the
-    mappings that are given."""
+    """The task to merge `given` over.
+
+    If `given` selects another variant, this is that variant's default with emptied mappings.
+    """
     for variant in typing.get_args(Task):
         if variant is PythonTask:
             continue
@@ -125,12 +127,12 @@ def _without_mappings(given: dict, current: Task) -> Task:
 
 
 def _of_variant(given: object, current: object) -> object:
-    """A mapping with the tag of a variant, if it has none of its own."""
+    """Adds the current variant's tag to an untagged mapping."""
     return {"_tag": f"!{type(current).__name__}", **given} if isinstance(given, dict) else given
 
 
 def _of_variants(given: object, current: Mapping[str, object]) -> object:
-    """The same for each of a mapping's values that there is already."""
+    """Applies `_of_variant` to each value whose name is in `current`."""
     if not isinstance(given, dict):
         return given
     return {
@@ -146,11 +148,10 @@ def _load(
 
     Args:
         raw: the mapping, as `parse` returns it.
-        defaults: what it does not give.
-        where: what to call it in errors.
+        defaults: the values of absent fields.
+        where: its name in errors.
         base: the folder of the scenario's file.
-        merged: whether mappings of names (cameras, tools) are added to the default ones; else they
-            replace them.
+        merged: whether mappings by name (cameras, tools) extend the default ones or replace them.
     """
     try:
         raw = {} if raw is None else raw
@@ -176,7 +177,7 @@ def _load(
 
 
 def _check_meaning(scenario: Scenario) -> None:
-    """Checks what neither types nor ranges say."""
+    """Checks the constraints that types and ranges cannot express."""
     approximation = scenario.plant.discrete_contact_approximation
     if approximation not in _APPROXIMATIONS:
         raise ValueError(
@@ -191,17 +192,17 @@ def _check_meaning(scenario: Scenario) -> None:
     if abs(steps - round(steps)) > 1e-9 or steps < 1:
         raise ValueError(
             "plant.time_step must divide 1/64 s, the planner's period, "
-            f"not be {scenario.plant.time_step:g}"
+            f"but is {scenario.plant.time_step:g}"
         )
     if scenario.heightmap.z_min > 0:
         raise ValueError(
-            f"heightmap.z_min is {scenario.heightmap.z_min:g}: the table, at 0, must be seen, as "
-            "the hand goes by its height"
+            f"heightmap.z_min is {scenario.heightmap.z_min:g}: use 0 or less, as the hand needs "
+            "the height of the table, which is at 0"
         )
     if -_PLAINLY_BELOW < scenario.heightmap.z_min < 0:
         raise ValueError(
-            f"heightmap.z_min is {scenario.heightmap.z_min:g}: so little below the table it would "
-            f"pass for an error of calibration: use 0, or -{_PLAINLY_BELOW:g} and less"
+            f"heightmap.z_min is {scenario.heightmap.z_min:g}, too close to the table to tell "
+            f"from a calibration error: use 0, or -{_PLAINLY_BELOW:g} or less"
         )
     if scenario.heightmap.z_max <= scenario.heightmap.z_min:
         raise ValueError("heightmap.z_max must be above heightmap.z_min")
@@ -216,24 +217,25 @@ def _check_meaning(scenario: Scenario) -> None:
     for index, (axis, (low, high)) in enumerate(JOINT_LIMITS.items()):
         if not low <= planner.home[index] <= high:
             raise ValueError(
-                f"planner.home[{index}] is {planner.home[index]:g}, beyond the hand's {axis}, "
-                f"{low:g} to {high:g}"
+                f"planner.home[{index}] is {planner.home[index]:g}, but the hand's {axis} must be "
+                f"between {low:g} and {high:g}"
             )
     lowest = scenario.heightmap.z_max + planner.travel_clearance
     if planner.home[2] < lowest:
         raise ValueError(
-            f"planner.home[2] is {planner.home[2]:g}: the hand would sweep across the table below "
-            f"what may stand there (heightmap.z_max + planner.travel_clearance: {lowest:g})"
+            f"planner.home[2] is {planner.home[2]:g}, and the hand could hit objects: use at "
+            f"least {lowest:g} (heightmap.z_max + planner.travel_clearance)"
         )
     if planner.grasp_depth > planner.max_grasp_depth:
-        raise ValueError("planner.grasp_depth is more than planner.max_grasp_depth")
+        raise ValueError("planner.grasp_depth must be at most planner.max_grasp_depth")
+    limit = scenario.controller.finger_force_limit
     for name in ("grasp_force", "firm_grasp_force"):
         force = getattr(planner, name)
-        if force > scenario.controller.finger_force_limit:
+        if force > limit:
             raise ValueError(
-                f"planner.{name} is {force:g} N, more than the fingers can press "
-                f"(controller.finger_force_limit: {scenario.controller.finger_force_limit:g} N)"
+                f"planner.{name} is {force:g} N, but must be at most {limit:g} N "
+                "(controller.finger_force_limit)"
             )
     scenario.policy.validate()
     if scenario.policy.needs_observation and not scenario.cameras:
-        raise ValueError("cameras is empty: this policy needs at least one to see by")
+        raise ValueError("cameras is empty: this policy needs at least one camera")

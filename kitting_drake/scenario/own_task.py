@@ -1,4 +1,4 @@
-"""Loads `task: !PythonTask`: its fields are those of the class that it names."""
+"""Loads `task: !PythonTask`, whose fields are those of a user's class."""
 
 import dataclasses
 from pathlib import Path
@@ -17,7 +17,7 @@ _CLASS = "class"
 
 
 def is_own_task(raw: Any, current: Task) -> bool:
-    """Whether a scenario's `task:` is a `!PythonTask`, or is merged over one."""
+    """Whether a scenario's `task:` is a `!PythonTask` or merges over one."""
     if not isinstance(raw, dict):
         return False
     tag = raw.get("_tag")
@@ -25,16 +25,16 @@ def is_own_task(raw: Any, current: Task) -> bool:
 
 
 def load_own_task(raw: dict[str, Any], current: Task, base: Path) -> PythonTask:
-    """The task.
+    """Loads a `!PythonTask`.
 
     Args:
-        raw: the mapping in YAML, as `yaml_load` returns it.
-        current: the task to merge it over, if that is of the same class.
+        raw: the mapping `task:` of the scenario, parsed.
+        current: the task to merge over if it has the same class; otherwise ignored.
         base: the folder of the scenario's file.
 
     Raises:
-        ValueError: one sentence that begins with the path of a field.
-        RuntimeError: Drake's own complaint.
+        ValueError: a field is invalid; the message begins with its path.
+        RuntimeError: Drake's YAML loader rejects the mapping.
     """
     fields = {key: value for key, value in raw.items() if key not in ("_tag", _CLASS)}
     reference = raw.get(_CLASS, current.reference if isinstance(current, PythonTask) else None)
@@ -56,4 +56,4 @@ def _default(kind: type[TaskConfig]) -> TaskConfig:
     try:
         return kind()
     except TypeError as error:
-        raise ValueError(f"task.class: every field needs a default ({error})") from error
+        raise ValueError(f"task.class: its fields all need defaults ({error})") from error

@@ -1,6 +1,6 @@
-"""Named overlays of scenario fields that make the world less perfect: the flag `--perturb`.
+"""Named sets of imperfections for the flag `--perturb`, as overlays of scenario fields.
 
-Nothing here could not be written in YAML; what is drawn, is drawn from the episode's seed.
+A scenario's YAML can give the same fields. All random draws depend on the episode's seed alone.
 """
 
 import dataclasses as dc
@@ -16,7 +16,7 @@ _OVERLAYS: dict[str, tuple[dict[str, Any], ...]] = {
     "colour": (
         {"appearance": {"paints": {"*": {**_DRAWN, "spread": 0.15}}}},
         {"appearance": {"paints": {"*": _DRAWN}}},
-        # What stands is of one colour, insides and outsides.
+        # All surfaces of the fixtures share one colour, so that cavities do not stand out.
         {"appearance": {"paints": {"*": _DRAWN, "fixtures/*": {**_DRAWN, "shared": True}}}},
     ),
     "light": (
@@ -55,29 +55,29 @@ _OVERLAYS: dict[str, tuple[dict[str, Any], ...]] = {
     "distractors": tuple({"task": {"distractors": count}} for count in (2, 4, 8)),
 }
 _WORSE_IF_LESS = ("steepest_deg",)
-"""These numbers are worse where they are less; all others are worse where they are greater."""
+"""Fields whose lower values are less perfect. For all others, higher values are."""
 
 NAMES = (*_OVERLAYS, "all")
 
 
 def perturbation(text: str, scenario: Scenario) -> dict[str, Any]:
-    """The overlay that `--perturb` names, as a mapping of fields; tags are under `_tag`.
+    """The overlay for the value of `--perturb`: a mapping of fields, with tags under `_tag`.
 
     Args:
-        text: `NAME[:LEVEL]`, several separated by commas; without a level it is `moderate`. `all`
-            is all that applies to the scenario's task.
-        scenario: what it will be laid over.
+        text: `NAME[:LEVEL],...`. The default level is `moderate`. `all` means all perturbations
+            that apply to the scenario's task.
+        scenario: to be perturbed.
 
     Raises:
-        UserError: there is no such name or level, one is given twice, or it does not apply to the
-            scenario's task.
+        UserError: a name or level is unknown, a name is given twice, or a perturbation does not
+            apply to the scenario's task.
     """
     levels: dict[str, str] = {}
     for item in text.split(","):
         name, colon, level = item.strip().partition(":")
         level = level if colon else "moderate"
         if name not in NAMES:
-            raise UserError(f"--perturb: there is no '{name}': use {', '.join(NAMES)}")
+            raise UserError(f"--perturb: unknown name '{name}': use one of {', '.join(NAMES)}")
         if level not in LEVELS:
             raise UserError(f"--perturb: {name} has no level '{level}': use {', '.join(LEVELS)}")
         if name in levels:
@@ -98,7 +98,7 @@ def perturbation(text: str, scenario: Scenario) -> dict[str, Any]:
 
 
 def _applies(name: str, scenario: Scenario) -> bool:
-    """Whether the task has what a perturbation changes, and stays the same task with it."""
+    """Whether the task has the fields of a perturbation and permits it."""
     if name in scenario.task.not_perturbed:
         return False
     fields = {item.name for item in dc.fields(scenario.task)}
@@ -106,7 +106,7 @@ def _applies(name: str, scenario: Scenario) -> bool:
 
 
 def _keep_worse(overlay: dict[str, Any], found: object) -> None:
-    """Lets the world become no more perfect than it is: of two numbers the worse one stays."""
+    """Keeps the scenario's number wherever it is less perfect than the overlay's."""
     for name, value in overlay.items():
         given = getattr(found, name)
         if isinstance(value, dict) and dc.is_dataclass(given):

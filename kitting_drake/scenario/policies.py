@@ -1,6 +1,6 @@
-"""The variants of a scenario's `policy:`; each knows how to make its LeafSystem.
+"""The variants of a scenario's `policy:`. Each one makes its LeafSystem.
 
-Annotations are evaluated here: Drake's YAML loader reads the types of fields, not their texts.
+Drake's YAML loader needs evaluated annotations, hence no `from __future__ import annotations`.
 """
 
 import hashlib
@@ -28,8 +28,7 @@ if TYPE_CHECKING:
     from kitting_drake.policies.learned_policy import Decision
 
 DecisionObserver = Callable[[Observation, "Decision"], None]
-"""Told of every decision of a learned policy."""
-
+"""Called with every decision of a learned policy."""
 
 _TOLD = (
     "scenario",
@@ -41,12 +40,12 @@ _TOLD = (
     "rigid",
     "rotations",
 )
-"""The fields of a network's training that are reported with its results."""
+"""Fields of a weights file's card that are reported with the results."""
 
 
 @dataclass(frozen=True)
 class PolicySite:
-    """What a policy is told of the station that it plugs into."""
+    """The properties of the station that a policy needs to make its system."""
 
     scene: Scene
     objects: tuple[PlacedObject, ...]
@@ -54,79 +53,79 @@ class PolicySite:
     grid: PixelGrid
     """The pixel grid of the observations."""
     base: Path
-    """Where relative paths in the scenario start."""
+    """The folder of relative paths in the scenario."""
     observer: DecisionObserver | None = None
     may_stop: bool = True
-    """False where the episode ends by itself once all is done."""
+    """False if the episode ends as soon as every goal is met (`end_at_success`)."""
     planner: PickPlaceParameters = field(default_factory=PickPlaceParameters)
-    """How the hand will pick and place."""
+    """The parameters of the hand's motion."""
     has_cameras: bool = True
-    """Whether there is an o_t: else the oracle tells the planner how high things are."""
+    """Whether the station provides o_t. Without it, the oracle outputs heights for the planner."""
 
 
 class PolicyConfig:
-    """The interface of a policy; each variant of the scenario's `policy:` derives from it."""
+    """Base class of the variants of a scenario's `policy:`."""
 
     needs_observation: bool = True
-    """Whether it sees by cameras, which are then needed."""
+    """Whether it needs cameras."""
 
     @property
     def name(self) -> str:
-        """The policy's name for results."""
+        """The policy's name in results."""
         return "".join(f"_{c.lower()}" if c.isupper() else c for c in type(self).__name__)[1:]
 
     def make_system(self, site: PolicySite) -> LeafSystem:
-        """The system. Its input ports are named after the station's output ports that they are
-        connected to (see `station.KittingStation`); it has the output port `action`.
+        """Makes the system, with the output port `action`. Each input port has the name of the
+        station's output port that it connects to (see `station.KittingStation`).
 
         Raises:
-            UserError: it cannot be made.
+            UserError: a field or a file is invalid for this station.
         """
         raise NotImplementedError
 
     def details(self, base: Path) -> dict[str, Any]:
-        """The details that distinguish policies of a kind, for results.
+        """Details of the policy for results, as JSON values.
 
         Raises:
-            UserError: its files cannot be read.
+            UserError: a file cannot be read.
         """
         return {}
 
     def digest(self, base: Path) -> str | None:
-        """A digest of the content of the policy's files; None if it has none.
+        """A digest of the contents of the policy's files; None without files.
 
         Raises:
-            UserError: they cannot be read.
+            UserError: a file cannot be read.
         """
         return None
 
     def input_files(self, base: Path) -> list[Path]:
-        """The files that it reads, beside those of the project; not its modules."""
+        """The user's files that the policy reads, without its modules."""
         return []
 
     def modules(self) -> list[str]:
-        """The modules that it imports, beside those of the project and of what that requires."""
+        """The user's modules that the policy imports."""
         return []
 
     def training_seeds(self, base: Path) -> set[int]:
-        """The seeds of the demonstrations that it was trained, or chosen, with.
+        """The seeds of the demonstrations used in its training or validation.
 
         Raises:
-            UserError: its files cannot be read.
+            UserError: a file cannot be read.
         """
         return set()
 
     def validate(self) -> None:
-        """Checks what neither types nor ranges say.
+        """Checks the constraints that types and ranges cannot express.
 
         Raises:
-            ValueError: one sentence that begins with the path of a field, `policy.x`.
+            ValueError: a sentence that begins with the path of a field, `policy.x`.
         """
 
 
 @dataclass
 class Oracle(PolicyConfig):
-    """Ground truth and annotated grasps (section IV-B.4 of the paper)."""
+    """An expert that knows all poses and uses annotated grasps (section IV-B.4 of the paper)."""
 
     needs_observation = False
 
@@ -139,11 +138,14 @@ class Oracle(PolicyConfig):
 
 @dataclass
 class QuantizedOracle(PolicyConfig):
-    """The oracle, rounded to the actions of a network: the ceiling of the paper's policy."""
+    """The oracle with its actions rounded to those of a network.
+
+    It is an upper bound for the paper's policy.
+    """
 
     needs_observation = False
 
-    # N: picks and rotations are among 2 pi i / N; positions are pixel centres of the heightmap.
+    # N: angles are rounded to multiples of 2 pi / N, positions to pixel centres of the heightmap.
     orientations: int = bounded(180, 2, 3600)
 
     def make_system(self, site: PolicySite) -> LeafSystem:
@@ -157,37 +159,39 @@ class QuantizedOracle(PolicyConfig):
 class Learned(PolicyConfig):
     """Networks trained by `train`."""
 
-    # Their file, as `train` writes it; relative to the scenario's folder. Empty: the project's
-    # own generalist.
+    # The weights file that `train` wrote, relative to the scenario's folder. Empty: the generalist
+    # in models/policies/.
     weights: str = ""
 
-    # N: picks and rotations are among 2 pi i / N. The paper's own method takes any N.
+    # N: angles of picks and rotations are multiples of 2 pi / N. The SO(2) method takes any N.
     orientations: int = bounded(180, 2, 3600)
 
-    # Refine actions to sub-pixel and sub-bin accuracy (the paper does not) instead of choosing
-    # among pixel centres and the N orientations.
+    # True: refine actions between pixel centres and between the N orientations. False: as in the
+    # paper, actions are pixel centres and one of the N orientations.
     continuous: bool = True
 
-    # With `continuous`, by the geometry of o_t (the paper does none of these): refine the place by
-    # fitting the outline of the object to that of the recess, where the two agree, and the grasp by
-    # the room that there is for the jaws; and, unless `recover`, do not stop while an object
-    # certainly fits into a recess. Where nothing is inserted: of rotations that the networks hold
-    # for as good, take the one where the fingers have room when they let go.
+    # Refine actions by the geometry of o_t. Needs `continuous`; the paper does none of this.
+    # - The place: fit the object's outline to that of the recess, if the two agree.
+    # - The pick: move the grasp to where the jaws have clearance.
+    # - Stopping: continue while an object clearly fits into a recess. With `recover`, recovery
+    #   decides instead.
+    # - In tasks without insertion: among rotations that score equally well, choose one with
+    #   clearance for the opening fingers.
     fit_outlines: bool = True
 
-    # Do not pick again within 10 mm of where a grasp failed. The paper has no such memory.
+    # Do not pick again within 10 mm of a failed grasp. The paper has no such memory.
     avoid_failed_picks: bool = True
 
-    # Mend what an action left undone, as o_t shows it: press down what protrudes; pick what fits
-    # into a recess before anything else; at last take out what could not be pressed down, and try
-    # again. It takes actions: see the task's `tries`.
+    # Recover from failed insertions that o_t shows. Press down protruding objects; first pick
+    # objects that fit into a recess; finally take out objects that do not go down, and retry.
+    # Recovery needs extra actions: see the task's `tries`.
     recover: bool = False
 
     def make_system(self, site: PolicySite) -> LeafSystem:
-        # Outlines and recesses mean something only where objects are inserted.
+        # Outlines and recesses matter only for insertion.
         insertion = any(goal.rim_height is not None for goal in site.scene.goals)
         if self.recover and not insertion:
-            raise UserError("policy.recover mends insertions, and in this task nothing is inserted")
+            raise UserError("policy.recover must be false, as this task has no insertions")
         loaded = load_learned_policy(
             self._path(site.base),
             site.planner,
@@ -203,10 +207,10 @@ class Learned(PolicyConfig):
         loaded.check_grid(site.grid, "heightmap.resolution")
         if site.grid.z_min != 0:
             raise UserError(
-                f"heightmap.z_min is {site.grid.z_min:g}, and the policy of {loaded.path.name} "
-                "learned from heights above the table: use 0"
+                f"heightmap.z_min is {site.grid.z_min:g}, but the policy {loaded.path.name} needs "
+                "0, as in its training"
             )
-        # An observer is shown colours, whatever the networks see.
+        # An observer gets colours even if the networks use heights alone.
         heights_only = not loaded.colour and site.observer is None
         function = loaded.function
         return PickPlacePolicy(
@@ -232,7 +236,7 @@ class Learned(PolicyConfig):
             **{key: file.card.get(key) for key in _TOLD},
             "training_seed": file.card.get("seed"),
             "angle_only": file.card.get("angle_only", False),
-            # The step of the checkpoint that was kept, of `steps`.
+            # The step of the chosen checkpoint.
             "checkpoint_step": (file.card.get("validation") or {}).get("step"),
         }
 
@@ -257,9 +261,12 @@ class Learned(PolicyConfig):
 
 @dataclass
 class ShapeMatching(PolicyConfig):
-    """Training-free: outlines of the loose objects, seen by height, fitted to those of recesses."""
+    """A training-free policy that fits the outlines of loose objects to those of recesses.
 
-    # Mend what an action left undone, as for !Learned.
+    It uses heights alone.
+    """
+
+    # Recover from failed insertions, as !Learned does.
     recover: bool = False
 
     def make_system(self, site: PolicySite) -> LeafSystem:
@@ -274,24 +281,23 @@ class ShapeMatching(PolicyConfig):
 class PythonPolicy(PolicyConfig):
     """Your own function from `Observation` to `PickPlaceAction` (see systems/signals.py).
 
-    Results tell policies apart by the sources of the function's package, or of its module if that
-    is in none. What else it reads (weights, other modules) is not told: give another --output when
-    that has changed.
+    `evaluate` compares the sources of the function's package, or of its module, with those of
+    earlier episodes. It does not check other files that the function reads, such as weights. Use
+    another --output after changing them.
     """
 
-    # `module:function`, called with one Observation; the module is importable from where you run,
-    # or lies beside the scenario's file.
+    # `module:function`, called with an Observation. The module must be importable, or lie beside
+    # the scenario's file.
     function: str = ""
 
-    # Call it with a second argument: the poses (`PlanarPose`) at which grasps failed before, the
-    # latest last.
+    # Pass a second argument: the poses (`PlanarPose`) of failed grasps, oldest first.
     takes_failed_picks: bool = False
 
     def make_system(self, site: PolicySite) -> LeafSystem:
         try:
             function = import_own(self.function, site.base)
         except (Exception, SystemExit) as error:
-            # A person's own module may raise anything.
+            # A user's module may raise anything.
             reason = f"{type(error).__name__}: {error}"
             raise UserError(f"policy.function: cannot import {self.function}: {reason}") from error
         if not callable(function):
@@ -325,7 +331,7 @@ class PythonPolicy(PolicyConfig):
 
 @dataclass(frozen=True)
 class _OfObservationAlone:
-    """A function of an observation alone, as a policy that may be given failed picks too."""
+    """Wraps a function of an observation; ignores the failed picks."""
 
     function: Callable[[Observation], PickPlaceAction]
 

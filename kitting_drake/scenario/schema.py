@@ -1,10 +1,12 @@
-"""The YAML schema of a scenario, in the manner of Drake's hardware_sim.
+"""The YAML schema of a scenario, modelled on Drake's hardware_sim.
 
-A file holds one or more scenarios, each under its name. Every field has a default, so that
-`Defaults: {}` is a scenario. Where a field is a union, a tag chooses: `policy: !Oracle {}`. Where
-Drake has a config of its own, that is the field.
+A file maps names to scenarios. Every field has a default: `Defaults: {}` is a valid scenario. A tag
+selects the variant of a union: `policy: !Oracle {}`. Some fields are Drake's own configs.
 
-Units are SI; angles that a person writes are in degrees, and the field says so.
+Units are SI. Names of fields in degrees end in `_deg`.
+
+The table's top is the plane z = 0 of the world. No field changes it; see `models/table/table.sdf`.
+The fingers' geometry is in `models/franka_hand/`, its dimensions in `systems/hand_geometry.py`.
 """
 
 import dataclasses as dc
@@ -24,19 +26,23 @@ from systems.signals import PixelGrid
 
 @dc.dataclass
 class Heightmap:
-    """The orthographic observation o_t. What a task draws lies within it, and on the table."""
+    """The orthographic observation o_t and the workspace.
 
-    # Lower corner of the workspace in the world, in m.
+    Tasks draw poses on the part of the table that lies within it.
+    """
+
+    # Lower (x, y) corner of the workspace in the world, in m.
     x_min: float = bounded(0.25, -10.0, 10.0)
     y_min: float = bounded(-0.5, -10.0, 10.0)
 
-    # Side of a pixel, in m, and pixels along x and y.
+    # Side of a pixel, in m. Numbers of pixels along x (rows) and y (cols).
     resolution: float = bounded(0.003125, 1e-4, 0.1)
     rows: int = bounded(160, 1, 4096)
     cols: int = bounded(320, 1, 4096)
 
-    # Heights are counted from z_min, in m: what is below reads as z_min, and what is above z_max is
-    # not seen. Learned policies need 0, the table's; where something is lower, take -0.02 or less.
+    # Range of heights in the world, in m. Lower points read as z_min; points above z_max are
+    # ignored. Learned policies need z_min = 0, the height of the table. If your scene has points
+    # below the table, use z_min = -0.02 or lower.
     z_min: float = bounded(0.0, -1.0, 10.0)
     z_max: float = bounded(0.28, -1.0, 10.0)
 
@@ -47,15 +53,16 @@ class Heightmap:
 
 @dc.dataclass
 class Controller:
-    """Gains of the TrajectoryController; for x, y, z (N/m, N s/m) and yaw (N m/rad, N m s/rad)."""
+    """Gains and force limits of the TrajectoryController."""
 
+    # For x, y, z (N/m, N s/m) and yaw (N m/rad, N m s/rad).
     stiffness: list[float] = bounded([10000.0, 10000.0, 10000.0, 120.0], 0.0, 1e6)
     damping: list[float] = bounded([320.0, 320.0, 320.0, 4.2], 0.0, 1e5)
 
-    # Force limits of the axes, in N and N m.
+    # For x, y, z (N) and yaw (N m).
     force_limit: list[float] = bounded([150.0, 150.0, 150.0, 12.0], 1e-3, 1e4)
 
-    # Of each finger: N/m, N s/m, N.
+    # For each finger: N/m, N s/m, N.
     finger_stiffness: float = bounded(800.0, 1.0, 1e5)
     finger_damping: float = bounded(16.0, 0.0, 1e4)
     finger_force_limit: float = bounded(140.0, 1.0, 140.0)
@@ -63,56 +70,57 @@ class Controller:
 
 @dc.dataclass
 class Variation:
-    """How far the models are from what their files say. The hand's is not."""
+    """Random variation of all models but the hand."""
 
-    # Each model's friction coefficients, and its mass, are multiplied by factors drawn from the
-    # seed: between 1 minus and 1 plus these.
+    # The seed draws a factor for each model's friction coefficients, and one for its mass, between
+    # 1 - value and 1 + value.
     friction: float = bounded(0.0, 0.0, 0.9)
     mass: float = bounded(0.0, 0.0, 0.9)
 
 
 @dc.dataclass
 class Sleep:
-    """An object at rest, out of reach of anything that moves, is frozen and costs nothing."""
+    """Objects at rest are frozen, to save computing time, until something comes near."""
 
     enabled: bool = True
 
-    # An object is at rest when it has stayed this near (m, rad) to one pose ...
+    # An object falls asleep when it stays within these tolerances (m, rad) of one pose for
+    # `time_to_sleep`.
     position_tolerance: float = bounded(0.0005, 0.0, 0.01)
     angle_tolerance: float = bounded(0.02, 0.0, 1.0)
 
-    # ... for this long, in s.
+    # In s.
     time_to_sleep: float = bounded(0.25, 0.0, 10.0)
 
-    # It wakes when the hand, or an object that is awake, comes this near, in m.
+    # It wakes when the hand or an awake object comes within this distance, in m.
     wake_distance: float = bounded(0.006, 0.001, 1.0)
 
 
 @dc.dataclass
 class Scenario:
-    """Everything about an episode but its seed."""
+    """A scenario. Together with a seed it determines an episode."""
 
-    # The seed when none is given on the command line.
+    # The seed if the command line gives none.
     random_seed: int = bounded(0, 0, 2**32 - 1)
 
-    # The episode ends after this much simulated time whatever happens, in s.
+    # Longest simulated time of an episode, in s.
     time_limit: float = bounded(180.0, 0.1, 1e6)
 
-    # It ends as soon as every goal is met, and learned policies are not asked whether they stop, as
-    # in the Ravens benchmark and the paper. Otherwise whoever decides must see that all is done.
+    # True: end the episode as soon as every goal is met, as in Ravens and the paper. Learned
+    # policies then never decide to stop. False: the policy must detect that it is done.
     end_at_success: bool = False
 
-    # 1 is real time, 0 as fast as the machine allows.
+    # 1: real time. 0: as fast as possible.
     target_realtime_rate: float = bounded(0.0, 0.0, 100.0)
 
-    # What stands on the table, and what is to be done with it; see kitting_drake/tasks/.
+    # The objects on the table and their goals: see kitting_drake/tasks/.
     task: Task = dc.field(default_factory=Kitting)
 
-    # Who decides: !Oracle, !QuantizedOracle, !Learned, !ShapeMatching or !PythonPolicy.
+    # !Oracle, !QuantizedOracle, !Learned, !ShapeMatching or !PythonPolicy: see policies.py.
     policy: Policy = dc.field(default_factory=Oracle)
 
-    # The RGB-D cameras by name: !Pinhole, !LookAt, or Drake's own !CameraConfig. These three are
-    # those of Ravens.
+    # The RGB-D cameras by name: !Pinhole, !LookAt, or Drake's !CameraConfig. See cameras.py. The
+    # default cameras are those of Ravens.
     cameras: dict[str, Camera] = dc.field(
         default_factory=lambda: {
             "front": Pinhole(position=[1.0, 0.0, 0.75], rpy_deg=[45.0, 180.0, -90.0]),
@@ -121,21 +129,23 @@ class Scenario:
         }
     )
 
-    # What the cameras and their calibration add to a perfect image.
+    # Noise of the images and errors of the calibration.
     sensor_noise: SensorNoiseParameters = dc.field(default_factory=SensorNoiseParameters)
 
-    # Colours, sheen and lights.
+    # Colours, sheen and lights: see appearance.py. For a red kit:
+    # appearance: {paints: {"fixtures/kit/*": !Fixed {rgb: [0.8, 0.1, 0.1]}}}
     appearance: Appearance = dc.field(default_factory=Appearance)
 
-    # What the policy sees.
+    # The policy's observation.
     heightmap: Heightmap = dc.field(default_factory=Heightmap)
 
-    # How the hand moves.
+    # The motion of the hand, and its control.
     planner: PickPlaceParameters = dc.field(default_factory=PickPlaceParameters)
     controller: Controller = dc.field(default_factory=Controller)
 
-    # The physics: Drake's MultibodyPlantConfig. The step divides every other period; contact is
-    # strictly hydroelastic: a pair that cannot be is an error, not a point contact in disguise.
+    # The physics: Drake's MultibodyPlantConfig. The time step must divide 1/64 s. Contact is
+    # strictly hydroelastic: a contact between geometries without hydroelastic properties is an
+    # error.
     plant: MultibodyPlantConfig = dc.field(
         default_factory=lambda: MultibodyPlantConfig(
             time_step=1 / 128,
@@ -146,7 +156,8 @@ class Scenario:
     variation: Variation = dc.field(default_factory=Variation)
     sleep: Sleep = dc.field(default_factory=Sleep)
 
-    # Live viewing: Drake's MeshcatParams. Drake's own default host is every interface.
+    # Visualization: Drake's MeshcatParams. The page is served to this machine only; host: "*"
+    # serves it to all.
     meshcat: MeshcatParams = dc.field(
         default_factory=lambda: MeshcatParams(host="localhost", show_stats_plot=False)
     )

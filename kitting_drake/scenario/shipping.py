@@ -1,4 +1,4 @@
-"""A scenario and all that it takes to run it, as a Ray cluster's `runtime_env` carries it."""
+"""Packs a scenario and its files as the `runtime_env` of a Ray cluster."""
 
 import dataclasses
 import importlib.util
@@ -18,7 +18,7 @@ from kitting_drake.scenario.choosing import ChosenScenario
 _PACKAGES = ("kitting_drake", "systems")
 
 _FILES = Path("files")
-"""In the folder: links to the scenario's files, each at its path on this machine."""
+"""Subfolder with links to the scenario's files, by their absolute paths on this machine."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -26,24 +26,24 @@ class Shipment:
     """The result of `pack`."""
 
     chosen: ChosenScenario
-    """The scenario for a process that runs in the folder's copy."""
+    """The scenario with its paths relative to the packed folder."""
     runtime_env: dict[str, Any]
-    """Ray's: the folder to run in, a person's own modules, and environment variables."""
+    """Ray's working folder, the user's modules, and environment variables."""
 
 
 def pack(chosen: ChosenScenario, folder: Path) -> Shipment:
-    """Gathers what another machine needs to run a scenario, as links; Ray copies what they name.
+    """Packs the files that another machine needs to run a scenario.
 
-    It is this checkout's or wheel's packages and models, the files that task and policy read
-    (weights, tools of one's own), and the modules or packages of a `!PythonPolicy` and of a
-    `!PythonTask`. Other packages have to be installed there.
+    They are the packages and models of this project, the files that task and policy read (weights,
+    a user's tools), and the modules of a `!PythonPolicy` or `!PythonTask`. Other packages must be
+    installed on the other machine. The folder holds links, whose targets Ray copies.
 
     Args:
-        chosen: the scenario; it can be built here.
-        folder: an empty folder for the links; the command needs it until Ray has connected.
+        chosen: a scenario that can be built here.
+        folder: an empty folder for the links. Keep it until Ray has connected.
 
     Raises:
-        UserError: a file cannot be found, or a link cannot be made.
+        UserError: a file does not exist, or a link cannot be made.
     """
     scenario, base = chosen.scenario, chosen.base
     root = Path(kitting_drake.__file__).resolve().parents[1]
@@ -60,7 +60,7 @@ def pack(chosen: ChosenScenario, folder: Path) -> Shipment:
             link = folder / _copy(path)
             link.parent.mkdir(parents=True, exist_ok=True)
             link.symlink_to(path)
-        # A path that begins with `..` needs the folder, empty or not.
+        # A relative path that begins with `..` needs this folder to exist.
         (folder / _copy(base)).mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise UserError(f"cannot pack {error.filename}: {error.strerror}") from error
@@ -78,19 +78,19 @@ def pack(chosen: ChosenScenario, folder: Path) -> Shipment:
         "excludes": ["__pycache__"],
         "env_vars": environment,
     }
-    # Ray fails on an empty list.
+    # Ray rejects an empty list.
     if modules := _own_modules([*scenario.policy.modules(), *scenario.task.modules()]):
         runtime_env["py_modules"] = [str(path) for path in modules]
     return Shipment(moved, runtime_env)
 
 
 def _copy(path: Path) -> Path:
-    """Where the link to a file or folder is."""
+    """The path of the link to a file or folder, relative to the packed folder."""
     return _FILES / path.relative_to(path.anchor)
 
 
 def _own_modules(modules: Iterable[str]) -> list[Path]:
-    """The files, or the packages' folders, of modules that are neither ours nor installed."""
+    """Files or package folders of modules that are neither installed nor part of this project."""
     found: list[Path] = []
     for name in sorted({module.partition(".")[0] for module in modules} - set(_PACKAGES)):
         spec = importlib.util.find_spec(name)
@@ -98,16 +98,16 @@ def _own_modules(modules: Iterable[str]) -> list[Path]:
             continue
         # A package without an `__init__.py` may have several folders.
         places = [Path(place) for place in spec.submodule_search_locations or [spec.origin or ""]]
-        # Installed packages have to be installed on the node, too.
+        # Installed packages must be installed on the node too.
         installed = sysconfig.get_path("purelib")
         found += [path for path in places if path.exists() and not path.is_relative_to(installed)]
     return found
 
 
 def _relative(value: Any, base: Path, places: set[Path]) -> Any:
-    """A value with every text that names one of `places` made relative to `base`.
+    """Copies a value with every path to one of `places` made relative to `base`.
 
-    An absolute path is another one on the node, and symbolic links are not kept there.
+    Absolute paths differ on the node, and Ray resolves symbolic links.
     """
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         fields = {

@@ -1,4 +1,4 @@
-"""The workers that a command line asks for: processes of this machine, or those of a cluster."""
+"""Opens the workers that the command line asks for: local processes or a Ray cluster."""
 
 import argparse
 import contextlib
@@ -15,16 +15,16 @@ from kitting_drake.scenario.shipping import pack
 
 
 def add_workers_flags(parser: argparse.ArgumentParser) -> None:
-    """Adds the flags that say where to run; one excludes the other."""
+    """Adds the mutually exclusive flags `--workers` and `--ray`."""
     flags = parser.add_mutually_exclusive_group()
-    # No default: argparse would not see the conflict when it is given as a value.
+    # No default: argparse misses the conflict if the value given equals the default.
     flags.add_argument(
-        "--workers", type=count_type, help=f"how many side by side ({os.cpu_count()})"
+        "--workers", type=count_type, help=f"number of parallel processes ({os.cpu_count()})"
     )
     flags.add_argument(
         "--ray",
         metavar="ADDRESS",
-        help="run on the Ray cluster at HOST:PORT; auto: that of this machine",
+        help="run on the Ray cluster at HOST:PORT; auto: a cluster on this machine",
     )
 
 
@@ -32,16 +32,16 @@ def add_workers_flags(parser: argparse.ArgumentParser) -> None:
 def open_workers(
     arguments: argparse.Namespace, chosen: ChosenScenario
 ) -> Iterator[tuple[Workers, ChosenScenario]]:
-    """Makes ready the workers that `add_workers_flags`'s flags say.
+    """Opens the workers that the flags of `add_workers_flags` select.
 
     Yields:
-        The workers, and the scenario with its paths as the workers find them.
+        The workers, and the scenario with paths that are valid for the workers.
 
     Raises:
-        UserError: there is no such cluster, or it cannot take the work.
+        UserError: the cluster cannot be reached or cannot run the work.
     """
     if arguments.ray is None:
-        # What a person's own function remembers must not travel from episode to episode.
+        # A user's function may keep state, which must not carry over between episodes.
         scenario = chosen.scenario
         reuse = not (scenario.policy.modules() or scenario.task.modules())
         with LocalWorkers(arguments.workers or os.cpu_count() or 1, reuse=reuse) as local:

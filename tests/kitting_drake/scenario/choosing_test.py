@@ -27,7 +27,7 @@ def write(folder: Path, text: str) -> Path:
     return path
 
 
-def test_a_chosen_scenario_describes_all_of_itself(tmp_path: Path):
+def test_described_holds_every_field(tmp_path: Path):
     path = write(tmp_path, "A: {time_limit: 2.0}\nB: {task: !ToolsetKitting {split: train}}\n")
     text = "{policy: !Learned {weights: w}, cameras: {top: !LookAt {width: 99}}}"
     chosen = choose_scenario(parse(path, "--scenario_name", "B", "--scenario_text", text))
@@ -48,7 +48,7 @@ def test_a_chosen_scenario_describes_all_of_itself(tmp_path: Path):
     assert described["cameras"]["top"]["_tag"] == "!LookAt"
     assert described["cameras"]["front"]["_tag"] == "!Pinhole"
     assert described["planner"]["search"]["amplitude"] == 0.12
-    # Nothing is left out, and it is what JSON makes of it.
+    # It is complete, and JSON preserves it.
     assert described.keys() == {item.name for item in dataclasses.fields(Scenario)}
     assert described["planner"].keys() - {"_tag"} == {
         item.name for item in dataclasses.fields(chosen.scenario.planner)
@@ -56,8 +56,8 @@ def test_a_chosen_scenario_describes_all_of_itself(tmp_path: Path):
     assert json.loads(json.dumps(described)) == described
 
 
-def test_what_differs_is_described_differently():
-    """By this two folders of results are told apart."""
+def test_different_scenarios_have_different_descriptions():
+    """Commands use this to detect a folder of another scenario."""
     one, other = (
         ChosenScenario(scenario, Path("a.yaml"), "a", None).described
         for scenario in (Scenario(), Scenario(time_limit=2.0))
@@ -76,7 +76,7 @@ def test_shipped_scenarios_are_found_from_anywhere(tmp_path: Path, monkeypatch: 
         assert choose_scenario(parse(path)).path == SCENARIOS / "paper" / "kitting_seen.yaml"
 
 
-def test_files_go_where_one_says_or_into_a_folder_of_the_scenario():
+def test_output_folder():
     assert output_folder(parse("a.yaml", "--output", "here"), "a:B") == Path("here")
     assert output_folder(parse("a.yaml"), "a:B") == Path("output/a-B")
 
@@ -88,7 +88,7 @@ def test_files_go_where_one_says_or_into_a_folder_of_the_scenario():
         ("A: {task: !Kitting {tools: [spoon]}}", "mine.yaml: task.tools: there is no tool 'spoon'"),
     ],
 )
-def test_bad_input_is_told_in_one_sentence(
+def test_invalid_input_prints_one_line(
     tmp_path: Path,
     verb: Callable[..., subprocess.CompletedProcess[str]],
     text: str,

@@ -20,7 +20,7 @@ def write(folder: Path, text: str) -> Path:
     return path
 
 
-def test_the_first_scenario_is_the_default_and_others_go_by_name(tmp_path: Path):
+def test_selects_the_first_scenario_or_the_named_one(tmp_path: Path):
     path = write(tmp_path, "B: {time_limit: 2.0}\nA: {time_limit: 3.0}\n")
     assert load_scenario(path).time_limit == 2.0
     assert load_scenario(path, "A").time_limit == 3.0
@@ -61,7 +61,7 @@ def test_text_removes_and_replaces_cameras(tmp_path: Path):
         "top": Pinhole(),
         "side": LookAt(height=77),
     }
-    # Its fields are of the new kind alone.
+    # Another variant keeps no fields of the old one.
     text = "cameras: {front: !Pinhole {height: 88}}"
     assert load_scenario(path, text=text).cameras["front"] == Pinhole(height=88)
 
@@ -83,8 +83,8 @@ A:
     assert scenario.task == Kitting(tools=["flat_screwdriver"])
 
 
-def test_text_keeps_the_order_that_it_is_written_in(tmp_path: Path):
-    """The oracle takes tools in their order, and of paints the later one wins."""
+def test_text_keeps_the_order_of_mappings(tmp_path: Path):
+    """The oracle picks tools in this order, and the last paint wins."""
     path = write(tmp_path, "A: {}")
     text = """
 task: !ArrangedKitting {tools: {slip_joint_pliers: {x: 0.3, y: 0.3}, claw_hammer: {x: 0.6, y: 0.3}}}
@@ -122,12 +122,12 @@ def test_text_can_choose_another_variant(tmp_path: Path):
     assert list(merged.task.tools) == ["flat_screwdriver"]
 
 
-def test_arranged_tools_are_those_of_the_file(tmp_path: Path):
+def test_arranged_tools_replace_the_default_ones(tmp_path: Path):
     path = write(tmp_path, "A: {task: !ArrangedKitting {tools: {flat_screwdriver: {x: 0.4}}}}")
     assert list(load_scenario(path).task.tools) == ["flat_screwdriver"]
 
 
-def test_cameras_are_those_of_the_file(tmp_path: Path):
+def test_cameras_replace_the_default_ones(tmp_path: Path):
     path = write(tmp_path, "A: {cameras: {top: !Pinhole {}}}")
     assert list(load_scenario(path).cameras) == ["top"]
 
@@ -150,25 +150,25 @@ BAD = {
         "A: {task: !ArrangedKitting {spacing: 0.01}}",
         ["task.spacing", "unknown field"],
     ),
-    "what a variant has, but as no field": (
+    "attribute of a variant that is not a field": (
         "A: {policy: !Oracle {needs_observation: true}}",
         ["policy.needs_observation is an unknown field"],
     ),
-    "hand sweeping": ("A: {planner: {home: [0.3, 0, 0.2, 0]}}", ["planner.home[2]", "0.295"]),
-    "hand beyond its joints": ("A: {planner: {home: [2, 0, 0.4, 0]}}", ["planner.home[0]", "1.5"]),
-    "deeper than the deepest": (
+    "home too low": ("A: {planner: {home: [0.3, 0, 0.2, 0]}}", ["planner.home[2]", "0.295"]),
+    "home out of reach": ("A: {planner: {home: [2, 0, 0.4, 0]}}", ["planner.home[0]", "1.5"]),
+    "grasp depth above its maximum": (
         "A: {planner: {grasp_depth: 0.03}}",
-        ["planner.grasp_depth is more than planner.max_grasp_depth"],
+        ["planner.grasp_depth", "planner.max_grasp_depth"],
     ),
-    "a tag where there are no variants": ("A: {planner: !Foo {}}", ["A: planner has the tag !Foo"]),
-    "a tag of a scenario": ("A: !Foo {}", ["the scenario has the tag !Foo"]),
-    "more force than there is": (
+    "tag of a field without variants": ("A: {planner: !Foo {}}", ["A: planner has the tag !Foo"]),
+    "tag of a scenario": ("A: !Foo {}", ["the scenario has the tag !Foo"]),
+    "grasp force above the limit": (
         "A: {controller: {finger_force_limit: 20.0}}",
-        ["planner.grasp_force is 30 N", "controller.finger_force_limit: 20 N"],
+        ["planner.grasp_force is 30 N", "20 N", "finger_force_limit"],
     ),
-    "more force for what is heavy than there is": (
+    "firm grasp force above the limit": (
         "A: {controller: {finger_force_limit: 50.0}}",
-        ["planner.firm_grasp_force is 70 N", "controller.finger_force_limit: 50 N"],
+        ["planner.firm_grasp_force is 70 N", "50 N", "finger_force_limit"],
     ),
     "unknown tag": ("A: {policy: !Orcle {}}", ["policy", "!Orcle", "!Oracle"]),
     "tag without a value": ("A: {policy: !Oracle }", ["mine.yaml"]),
@@ -178,8 +178,8 @@ BAD = {
     "text for a number": ("A: {time_limit: soon}", ["time_limit", "number", "'soon'"]),
     "quoted number": ("A: {time_limit: '3'}", ["time_limit", "number"]),
     "fraction for a whole number": ("A: {random_seed: 1.5}", ["random_seed", "whole"]),
-    "truth for a number": ("A: {random_seed: true}", ["random_seed", "whole"]),
-    "number for truth": ("A: {sleep: {enabled: 1}}", ["sleep.enabled", "true or false"]),
+    "boolean for a number": ("A: {random_seed: true}", ["random_seed", "whole"]),
+    "number for a boolean": ("A: {sleep: {enabled: 1}}", ["sleep.enabled", "true or false"]),
     "text for a list": ("A: {task: !Kitting {tools: hammer}}", ["task.tools", "list"]),
     "number in a list of texts": ("A: {task: !Kitting {tools: [1]}}", ["task.tools[0]", "text"]),
     "list for a mapping": ("A: {cameras: [1]}", ["cameras", "mapping"]),
@@ -225,16 +225,16 @@ BAD = {
         "A: {policy: !Learned {weights: w, orientations: 4000}}",
         ["policy.orientations", "3600"],
     ),
-    "blind": (
+    "no cameras": (
         "A: {policy: !Learned {weights: w}, cameras: {}}",
-        ["cameras is empty: this policy needs at least one"],
+        ["cameras is empty"],
     ),
     "no function": ("A: {policy: !PythonPolicy {function: mine}}", ["policy.function", "mine"]),
 }
 
 
 @pytest.mark.parametrize("case", BAD)
-def test_bad_input_is_named(tmp_path: Path, case: str):
+def test_errors_name_file_and_field(tmp_path: Path, case: str):
     text, words = BAD[case]
     with pytest.raises(UserError) as caught:
         load_scenario(write(tmp_path, text))
@@ -255,7 +255,7 @@ def test_bad_input_is_named(tmp_path: Path, case: str):
         pytest.param("A: {? {b: 1} : 1}", id="mapping for a field"),
     ],
 )
-def test_odd_but_parsable_files_are_the_users_to_mend(tmp_path: Path, text: str):
+def test_odd_but_parsable_files_are_refused(tmp_path: Path, text: str):
     with pytest.raises(UserError, match=r"mine\.yaml"):
         load_scenario(write(tmp_path, text))
 
@@ -270,12 +270,12 @@ def test_files_that_cannot_be_read(tmp_path: Path):
         load_scenario(tmp_path / "binary.yaml")
 
 
-def test_an_unknown_name_is_told_with_the_known_ones():
-    with pytest.raises(UserError, match="no scenario 'Default': use one of Defaults, OneOf"):
+def test_an_unknown_scenario_is_refused_with_the_known_names():
+    with pytest.raises(UserError, match=r"no scenario 'Default'.*Defaults, OneOf"):
         load_scenario(TEST_SCENARIOS, "Default")
 
 
-def test_bad_text_is_told_apart_from_a_bad_file():
+def test_errors_in_scenario_text_name_the_flag():
     with pytest.raises(UserError, match=r"^--scenario_text: planner\.hom is an unknown field"):
         load_scenario(TEST_SCENARIOS, text="{planner: {hom: 1}}")
     with pytest.raises(UserError, match=r"^--scenario_text.* is not YAML"):
@@ -288,14 +288,12 @@ def test_bad_text_is_told_apart_from_a_bad_file():
         load_scenario(TEST_SCENARIOS, text="{task: {_tag: 5}}")
 
 
-def test_a_range_holds_for_file_and_text_together(tmp_path: Path):
-    """Each is right by itself: it is the sum that cannot be."""
+def test_the_merged_scenario_is_validated(tmp_path: Path):
+    """File and text are valid alone, but not together."""
     path = write(tmp_path, "A: {heightmap: {z_min: -0.1}}")
-    with pytest.raises(UserError, match=r"--scenario_text: heightmap\.z_max must be above"):
+    with pytest.raises(UserError, match=r"--scenario_text: heightmap\.z_max"):
         load_scenario(path, text="{heightmap: {z_max: -0.2}}")
-    with pytest.raises(
-        UserError, match=r"heightmap\.z_min is 0\.02: the table, at 0, must be seen"
-    ):
+    with pytest.raises(UserError, match=r"heightmap\.z_min is 0\.02"):
         load_scenario(path, text="{heightmap: {z_min: 0.02}}")
-    with pytest.raises(UserError, match=r"z_min is -0\.005: so little below the table it would"):
+    with pytest.raises(UserError, match=r"heightmap\.z_min is -0\.005"):
         load_scenario(path, text="{heightmap: {z_min: -0.005}}")

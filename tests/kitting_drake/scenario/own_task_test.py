@@ -47,7 +47,7 @@ def load(folder: Path, fields: str, text: str | None = None) -> PythonTask:
     return task
 
 
-def test_its_fields_are_those_of_the_class(folder: Path):
+def test_fields_of_the_class_can_be_given(folder: Path):
     task = load(folder, "class: 'boxes_of_mine:SmallBoxes', rounds: 5, box_sides: [0.03, 0.04]")
     assert (task.config.rounds, task.config.box_sides) == (5, [0.03, 0.04])
     scene = task.make_scene(grid=PixelGrid(), seed=3, base=folder)
@@ -60,14 +60,14 @@ def test_its_fields_are_those_of_the_class(folder: Path):
     assert str(folder) not in described
 
 
-def test_text_is_merged_over_it(folder: Path):
+def test_text_merges_over_the_fields(folder: Path):
     fields = "class: 'boxes_of_mine:SmallBoxes', rounds: 5"
     task = load(folder, fields, text="{task: {box_height: [0.04, 0.05], names: {b: 2.0}}}")
     assert (task.config.rounds, task.config.box_height) == (5, [0.04, 0.05])
     assert task.config.names == {"a": 1.0, "b": 2.0}
 
 
-def test_it_travels_to_another_process(folder: Path, monkeypatch: pytest.MonkeyPatch):
+def test_it_can_be_unpickled_in_another_process(folder: Path, monkeypatch: pytest.MonkeyPatch):
     task = load(folder, "class: 'boxes_of_mine:SmallBoxes', rounds: 7")
     sent = pickle.dumps(task)
     monkeypatch.delitem(sys.modules, "boxes_of_mine")
@@ -86,6 +86,6 @@ def test_it_travels_to_another_process(folder: Path, monkeypatch: pytest.MonkeyP
         ("class: 'boxes_of_mine:SmallBoxes', box_sides: [0.06, 0.04]", "task.box_sides"),
     ],
 )
-def test_what_cannot_be_used_is_refused_by_its_field(folder: Path, fields: str, said: str):
+def test_errors_name_the_field(folder: Path, fields: str, said: str):
     with pytest.raises(UserError, match=said):
         load(folder, fields)

@@ -38,7 +38,7 @@ GRID = PixelGrid(rows=33, cols=49)
 
 @pytest.fixture(scope="module")
 def site() -> PolicySite:
-    """A cell in which no policy has a body to look at."""
+    """A site without plant bodies."""
     scene = ArrangedKitting().make_scene(grid=PixelGrid(), seed=0, base=Path())
     return PolicySite(scene=scene, objects=(), grid=GRID, base=Path())
 
@@ -48,10 +48,10 @@ def observation() -> Observation:
 
 
 def action(config: PolicyConfig, site: PolicySite, seen: Observation) -> PickPlaceAction:
-    """What a policy's system makes of an observation."""
+    """The action of a policy's system for an observation."""
     system = config.make_system(site)
     context = system.CreateDefaultContext()
-    # A policy that looks at heights alone says so by its port.
+    # A policy that uses heights alone has another port.
     heights = system.HasInputPort("observation_heights")
     name = "observation_heights" if heights else "observation"
     system.GetInputPort(name).FixValue(context, Value(seen))
@@ -60,7 +60,7 @@ def action(config: PolicyConfig, site: PolicySite, seen: Observation) -> PickPla
 
 @pytest.mark.parametrize("continuous", [True, False])
 @pytest.mark.parametrize("orientations", [36, 180])
-def test_a_learned_policy_as_the_scenario_says(
+def test_learned_makes_the_configured_policy(
     site: PolicySite, weights_file: Path, orientations: int, continuous: bool
 ):
     told: list[Decision] = []
@@ -70,14 +70,16 @@ def test_a_learned_policy_as_the_scenario_says(
     config = Learned(weights_file.name, orientations=orientations, continuous=continuous)
     found = action(config, site, observation())
     networks = load_networks(weights_file, preferred_type())
-    # Quantized actions are those of the networks alone.
+    # Without `continuous`, no stage refines the networks' actions.
     stages = make_stages(site.planner, insertion=True) if continuous else [StopRule()]
     policy = LearnedPolicy(networks, orientations=orientations, stages=stages)
     assert found == policy(observation())
     assert [decision.action for decision in told] == [found]
 
 
-def test_what_cannot_be_had_is_named(site: PolicySite, weights_file: Path, tmp_path: Path):
+def test_invalid_weights_and_fields_are_refused(
+    site: PolicySite, weights_file: Path, tmp_path: Path
+):
     site = dataclasses.replace(site, base=tmp_path)
 
     def refusal(grid: PixelGrid = GRID, **fields: object) -> str:
@@ -103,7 +105,7 @@ def test_what_cannot_be_had_is_named(site: PolicySite, weights_file: Path, tmp_p
     assert "heightmap.resolution is 0.00625 m" in refusal(coarse, weights=str(weights_file))
 
 
-def test_results_say_what_a_policy_is(weights_file: Path):
+def test_details_and_digests_for_results(weights_file: Path):
     config = Learned(weights_file.name, orientations=36, continuous=False)
     base = weights_file.parent
     assert config.name == "learned"
@@ -131,7 +133,7 @@ def test_results_say_what_a_policy_is(weights_file: Path):
     }
     assert Learned(weights="").details(base)["checkpoint_step"] == 4800
     assert config.training_seeds(base) == {10_000, 10_001, 10_002}
-    # Seeds of static scenes are none of episodes.
+    # Seeds of static scenes are not seeds of episodes.
     assert Learned(weights="").training_seeds(base) == set()
     assert config.digest(base) == f"sha256 {hashlib.sha256(weights_file.read_bytes()).hexdigest()}"
     with pytest.raises(UserError, match=r"gone\.safetensors"):
@@ -151,13 +153,15 @@ def act(observation):
 """
 
 
-def test_a_function_of_ones_own(site: PolicySite, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_a_users_function_and_its_digest(
+    site: PolicySite, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
     path = tmp_path / "a_policy_of_mine.py"
     path.write_text(STOP)
     monkeypatch.syspath_prepend(tmp_path)
     config = PythonPolicy("a_policy_of_mine:act")
     assert action(config, site, observation()) == PickPlaceAction(stop=True)
-    # Results tell one version of it from another.
+    # The digest changes with the source.
     first = config.digest(tmp_path)
     path.write_text(STOP + "\n# better\n")
     assert config.digest(tmp_path) != first
@@ -165,7 +169,7 @@ def test_a_function_of_ones_own(site: PolicySite, tmp_path: Path, monkeypatch: p
     assert config.digest(tmp_path) == first
     with pytest.raises(UserError, match="there is no file of the module time"):
         PythonPolicy("time:sleep").digest(tmp_path)
-    # What its package holds beside it makes it another one, too.
+    # The digest also covers the other modules of its package.
     package = tmp_path / "a_package_of_mine"
     package.mkdir()
     (package / "__init__.py").touch()
@@ -195,7 +199,7 @@ def test_a_module_beside_the_scenario_is_found(site: PolicySite, tmp_path: Path)
     first = config.digest(tmp_path)
     path.write_text(FAILED + "# better\n")
     assert config.digest(tmp_path) != first
-    # It travels to other machines with the scenario's files.
+    # `--ray` ships it with the scenario's files.
     assert config.input_files(tmp_path) == [path]
     assert config.modules() == ["the_policy_beside"]
     system = config.make_system(dataclasses.replace(site, base=tmp_path))
@@ -209,7 +213,7 @@ def test_a_module_beside_the_scenario_is_found(site: PolicySite, tmp_path: Path)
         PythonPolicy("the_policy_elsewhere:act").make_system(site)
 
 
-def test_the_policy_is_given_the_scenario_s_planner(
+def test_the_policy_uses_the_scenarios_planner(
     site: PolicySite, weights_file: Path, monkeypatch: pytest.MonkeyPatch
 ):
     seen = stored_observation("kitting_unseen")
@@ -232,9 +236,7 @@ def test_the_policy_is_given_the_scenario_s_planner(
 
 
 @pytest.mark.parametrize("avoids", [True, False])
-def test_failed_picks_are_avoided_unless_as_in_the_paper(
-    site: PolicySite, weights_file: Path, avoids: bool
-):
+def test_avoid_failed_picks(site: PolicySite, weights_file: Path, avoids: bool):
     seen = stored_observation("kitting_unseen")
     site = dataclasses.replace(site, grid=seen.grid)
     config = Learned(str(weights_file), continuous=False, avoid_failed_picks=avoids)
@@ -251,7 +253,7 @@ def test_failed_picks_are_avoided_unless_as_in_the_paper(
 
 
 @pytest.mark.parametrize("insertion", [True, False])
-def test_every_stage_that_asks_the_planner_asks_the_given_one(insertion: bool):
+def test_every_stage_with_a_planner_uses_the_given_one(insertion: bool):
     planner = PickPlaceParameters(grasp_depth=0.030)
     stages = make_stages(planner, insertion=insertion, recover=True)
     given = [stage.planner for stage in stages if hasattr(stage, "planner")]
@@ -267,7 +269,7 @@ def test_every_stage_that_asks_the_planner_asks_the_given_one(insertion: bool):
         ("stub_policy:number", "policy.function: stub_policy:number is not a function"),
     ],
 )
-def test_a_function_that_cannot_be_had_is_named(
+def test_invalid_functions_are_refused(
     site: PolicySite, function: str, message: str, monkeypatch: pytest.MonkeyPatch
 ):
     monkeypatch.setitem(sys.modules, "stub_policy", types.SimpleNamespace(number=3))
@@ -275,7 +277,7 @@ def test_a_function_that_cannot_be_had_is_named(
         PythonPolicy(function).make_system(site)
 
 
-def test_who_uses_no_network_does_not_wait_for_torch():
+def test_run_imports_torch_lazily():
     program = "import sys, kitting_drake.run; print('torch' in sys.modules)"
     done = subprocess.run([sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True)
     assert done.stdout == "False\n", done.stderr

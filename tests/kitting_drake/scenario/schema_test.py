@@ -23,12 +23,12 @@ ONE_OF_EVERYTHING = [
 
 
 APART = {Learned: {"avoid_failed_picks"}}
-"""Fields that cannot be given beside the others: `policies_test` gives them."""
+"""Fields that exclude others. `policies_test` covers them."""
 
 
 def reachable(kind: Any) -> set[type]:
-    """The dataclasses that a value of a type of the schema may hold."""
-    if kind is PythonTask:  # `own_task_test` gives it: its fields are those of another class.
+    """The dataclasses that a value of a type of the schema may contain."""
+    if kind is PythonTask:  # Covered by `own_task_test`.
         return set()
     if dataclasses.is_dataclass(kind):
         hints = typing.get_type_hints(kind)
@@ -38,15 +38,15 @@ def reachable(kind: Any) -> set[type]:
 
 
 def is_struct(value: Any) -> bool:
-    """Whether it is a config of Drake's."""
+    """Whether it is one of Drake's configs."""
     return struct_fields(type(value)) is not None
 
 
 def agrees(raw: Any, described: Any) -> bool:
-    """Whether YAML and a described value of a config of Drake's are the same, as far as given."""
+    """Whether the fields given in YAML equal those of a described Drake config."""
     if not isinstance(raw, dict):
         return bool(raw == described)
-    # A rotation is written without the name of its only field.
+    # YAML omits the name of a rotation's only field.
     inner = described if raw.keys() <= described.keys() else described["value"]
     return all(agrees(value, inner[name]) for name, value in raw.items())
 
@@ -54,19 +54,20 @@ def agrees(raw: Any, described: Any) -> bool:
 def check_given(
     kind: Any, raw: Any, loaded: Any, default: Any, where: str, *, whole: bool = True
 ) -> set[type]:
-    """Checks that every value of YAML arrives where it belongs, and is not what would be there
-    anyway: else a field that is not read would pass.
+    """Checks that every YAML value was loaded, and that none equals its default.
+
+    A value equal to its default would not show that the field was read.
 
     Args:
         kind: the type in the schema.
         raw: the YAML, untyped.
         loaded: the value.
-        default: what it would be if nothing were given; None where it would not be at all.
+        default: the value without YAML; None if there is none.
         where: the path, for messages.
         whole: whether every field of a dataclass must be given.
 
     Returns:
-        The dataclasses that were met.
+        The dataclasses found.
     """
     if isinstance(kind, types.UnionType) and (
         dataclasses.is_dataclass(loaded) or is_struct(loaded)
@@ -116,14 +117,14 @@ def test_one_of_everything():
     seen: set[type] = set()
     for name in ONE_OF_EVERYTHING:
         loaded = load_scenario(TEST_SCENARIOS, name)
-        # The first has all fields of a scenario; the others what cannot stand beside them.
+        # The first gives all fields of a scenario; the others cover what excludes these.
         whole = name == "OneOfEverything"
         seen |= check_given(Scenario, root[name], loaded, Scenario(), name, whole=whole)
     assert seen >= reachable(Scenario) - reachable(Task) - reachable(Policy)
 
 
 def test_every_variant_of_task_and_policy_is_in_some_scenario():
-    """Shipped ones are smoke-run, those of tests are built: nothing is there that nobody tries."""
+    """Other tests run the shipped scenarios and build those of the tests."""
     seen = set()
     for path in (TEST_SCENARIOS, *SCENARIOS.rglob("*.yaml")):
         for key, _ in yaml.compose(path.read_text(), Loader=yaml.SafeLoader).value:

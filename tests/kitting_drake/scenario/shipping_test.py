@@ -46,7 +46,7 @@ print(chosen.name, chosen.path)
 
 
 def on_a_node(shipment: Shipment, node: Path) -> str:
-    """What a process finds where Ray put the copies of a shipment's folder and modules."""
+    """Copies a shipment as Ray does, checks it in another process, and returns what that prints."""
     env = shipment.runtime_env
     ignored = shutil.ignore_patterns(*env["excludes"])
     shutil.copytree(env["working_dir"], node, ignore=ignored)
@@ -69,13 +69,13 @@ def on_a_node(shipment: Shipment, node: Path) -> str:
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    """An empty one, for links."""
+    """An empty folder for links."""
     folder = tmp_path / "links"
     folder.mkdir()
     return folder
 
 
-def test_all_that_a_scenario_names_is_found_there(
+def test_packs_all_files_of_a_scenario(
     folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     own, mine, elsewhere = tmp_path / "tools", tmp_path / "mine", tmp_path / "elsewhere"
@@ -96,13 +96,13 @@ def test_all_that_a_scenario_names_is_found_there(
     )
     shipment = pack(chosen, folder)
     found = on_a_node(shipment, tmp_path / "node")
-    # Messages name the file as here.
+    # Messages on the node name the original file.
     assert found.splitlines() == [str(commit()), f"mine {mine / 'mine.yaml'}"]
     shipped = {path.name for path in folder.iterdir()}
     assert shipped == {"kitting_drake", "systems", "models", "files"}
-    # Ray fails on an empty list.
+    # Ray rejects an empty list.
     assert "py_modules" not in shipment.runtime_env
-    # What the user is working with is as it was.
+    # The original scenario is unchanged.
     assert chosen.scenario.task.tools == tools
     assert chosen.base == mine
 
@@ -131,7 +131,7 @@ def test_absolute_paths_are_made_relative(folder: Path, tmp_path: Path):
         ("policies_of_mine/policy.py", "policies_of_mine.policy", "beside_the_scenario"),
     ],
 )
-def test_a_policy_of_ones_own_travels_along(
+def test_packs_the_users_policy(
     name: str,
     module: str,
     place: str,
@@ -150,7 +150,7 @@ def test_a_policy_of_ones_own_travels_along(
     on_a_node(pack(chosen, folder), tmp_path / "node")
 
 
-def test_a_file_that_is_gone_is_named(folder: Path, tmp_path: Path):
+def test_a_missing_file_is_refused(folder: Path, tmp_path: Path):
     chosen = ChosenScenario(
         Scenario(policy=Learned("gone.safetensors")), tmp_path / "mine.yaml", "mine", None
     )

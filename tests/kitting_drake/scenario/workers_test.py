@@ -19,9 +19,7 @@ def parse(*flags: str) -> argparse.Namespace:
 
 
 @pytest.mark.parametrize(("flags", "count"), [(("--workers", "3"), 3), ((), 7)])
-def test_processes_of_this_machine(
-    flags: tuple[str, ...], count: int, monkeypatch: pytest.MonkeyPatch
-):
+def test_local_workers(flags: tuple[str, ...], count: int, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr("os.cpu_count", lambda: 7)
     chosen = ChosenScenario(Scenario(), Path("mine.yaml"), "mine", None)
     with open_workers(parse(*flags), chosen) as (workers, sent):
@@ -33,7 +31,7 @@ def test_processes_of_this_machine(
 @pytest.mark.parametrize(
     ("policy", "processes"), [(Oracle(), 1), (PythonPolicy(function="mine:policy"), 2)]
 )
-def test_what_ones_own_function_remembers_stays_in_its_episode(policy, processes: int):
+def test_user_functions_get_a_new_process_per_episode(policy, processes: int):
     scenario = dataclasses.replace(Scenario(), policy=policy)
     chosen = ChosenScenario(scenario, Path("mine.yaml"), "mine", None)
     with open_workers(parse("--workers", "1"), chosen) as (workers, _):
@@ -41,7 +39,7 @@ def test_what_ones_own_function_remembers_stays_in_its_episode(policy, processes
 
 
 @pytest.mark.parametrize("count", range(1, 5))
-def test_a_cluster_takes_no_number_of_workers(count: int, capsys: pytest.CaptureFixture[str]):
+def test_workers_and_ray_exclude_each_other(count: int, capsys: pytest.CaptureFixture[str]):
     with pytest.raises(SystemExit):
         parse("--ray", "auto", "--workers", str(count))
     assert "argument --workers: not allowed with argument --ray" in capsys.readouterr().err
