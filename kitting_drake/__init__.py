@@ -10,7 +10,7 @@ __version__ = "0.1.0"
 def _end_quietly(
     kind: type[BaseException], error: BaseException, traceback: TracebackType | None
 ) -> None:
-    """Shows no traceback for Ctrl-C."""
+    """Suppresses the traceback of Ctrl-C."""
     if not issubclass(kind, KeyboardInterrupt):
         sys.__excepthook__(kind, error, traceback)
 
@@ -19,5 +19,5 @@ if any(
     flag == "-m" and module.startswith("kitting_drake")
     for flag, module in itertools.pairwise(sys.orig_argv)
 ):
-    # A command: Ctrl-C may come while it still imports.
+    # Ctrl-C may arrive while a command still imports modules.
     sys.excepthook = _end_quietly

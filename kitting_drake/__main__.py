@@ -1,4 +1,4 @@
-"""`kitting-drake VERB ...`, and `python -m kitting_drake VERB ...`: the verbs under one command."""
+"""The command `kitting-drake VERB ...`, or `python -m kitting_drake VERB ...`."""
 
 import importlib
 import sys
@@ -6,22 +6,22 @@ import sys
 from kitting_drake import __version__
 
 VERBS = {
-    "run": "one episode, watched in Meshcat; keeps a replay",
-    "evaluate": "many seeds side by side, and their summary",
-    "collect": "demonstrations of the oracle, in one file",
-    "draw_scenes": "static scenes of random tools, to learn from without physics",
-    "train": "networks from demonstrations or static scenes",
-    "decide": "a real camera's frame to one pick and place",
-    "demonstrate": "frames and actions of a bench as demonstrations",
-    "hkd": "tools and kits: list, sheet, build, import, annotate, kit",
-    "results": "the pages of results, from the table of runs",
-    "benchmark": "run times, recovery, MuJoCo, the paper's cells",
+    "run": "run one episode, show it in Meshcat, save a replay",
+    "evaluate": "run many seeds in parallel and summarise them",
+    "collect": "collect demonstrations of the oracle in one file",
+    "draw_scenes": "draw static scenes of random tools, to train without physics",
+    "train": "train networks from demonstrations or static scenes",
+    "decide": "decide one pick and place from a real camera's frames",
+    "demonstrate": "convert frames and actions of a real bench to demonstrations",
+    "hkd": "manage tools and kits: list, sheet, build, import, annotate, kit",
+    "results": "write the pages of results from the table of runs",
+    "benchmark": "measure run times, recovery, agreement with MuJoCo, the paper's tables",
 }
-"""What each verb does."""
+"""The help text of each verb."""
 
 
 def main() -> None:
-    """Runs the verb that the command line names, or lists them, and exits."""
+    """Runs the verb given on the command line, or lists the verbs, and exits."""
     arguments = sys.argv[1:]
     if arguments[:1] == ["--version"]:
         print(f"kitting_drake {__version__}")
@@ -32,7 +32,7 @@ def main() -> None:
     verb = arguments[0].replace("-", "_")
     if verb not in VERBS:
         print(
-            f"error: there is no verb '{arguments[0]}': use one of {', '.join(VERBS)}",
+            f"error: unknown verb '{arguments[0]}': use one of {', '.join(VERBS)}",
             file=sys.stderr,
         )
         sys.exit(2)
@@ -50,7 +50,7 @@ def main() -> None:
 def _listing() -> str:
     width = max(map(len, VERBS))
     lines = [f"  {verb:<{width}}  {text}" for verb, text in VERBS.items()]
-    tail = "kitting-drake VERB --help tells the rest."
+    tail = "See kitting-drake VERB --help for its options."
     return "\n".join(["usage: kitting-drake VERB ...", "", *lines, "", tail])
 
 

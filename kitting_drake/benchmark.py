@@ -1,4 +1,7 @@
-"""`python -m kitting_drake.benchmark simulation | networks | kits | recovery | mujoco | paper`."""
+"""`python -m kitting_drake.benchmark NAME`: measures, prints tables and saves them.
+
+NAME is simulation, networks, kits, recovery, mujoco or paper.
+"""
 
 import argparse
 import os
@@ -14,7 +17,7 @@ from kitting_drake.scenario.choosing import add_scenario_flags, choose_scenario
 
 
 def main() -> int:
-    """Parses the command line and measures; returns the exit code."""
+    """Parses the command line and runs the benchmark; returns the exit code."""
     arguments = _parser().parse_args()
     console = Console(quiet=arguments.quiet)
     folder = require_folder(arguments.output)
@@ -36,70 +39,81 @@ def main() -> int:
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
-        prog="python -m kitting_drake.benchmark", description="Measure; print and keep tables."
+        prog="python -m kitting_drake.benchmark",
+        description="Run a benchmark; print and save its tables.",
     )
     benchmarks = parser.add_subparsers(dest="benchmark", required=True)
-    simulation = benchmarks.add_parser("simulation", help="phases of an episode, start-up, images")
-    simulation.add_argument("--episodes", type=count_type, default=3, help="how many to run (3)")
-    simulation.add_argument("--seed", type=seed_type, default=0, help="of the first (0)")
+    simulation = benchmarks.add_parser(
+        "simulation", help="times of an episode's phases, start-up and images"
+    )
+    simulation.add_argument("--episodes", type=count_type, default=3, help="number of episodes (3)")
+    simulation.add_argument(
+        "--seed", type=seed_type, default=0, help="seed of the first episode (0)"
+    )
     networks = benchmarks.add_parser(
-        "networks", help="parameters and time of the policies' networks, and how fast they could be"
+        "networks",
+        help="sizes and run times of the networks, and lower bounds of the times",
     )
     networks.add_argument("--preset", default="small", help="size of the networks (small)")
     networks.add_argument(
         "--demos",
         type=Path,
         metavar="FILE.h5",
-        help="demonstrations, of whose first observation to decide (default: one is drawn)",
+        help="demonstrations whose first observation is the input (default: a drawn scene)",
     )
     networks.add_argument(
-        "--repeats", type=count_type, default=9, help="runs of which the median is taken (9)"
+        "--repeats", type=count_type, default=9, help="number of runs; the median is reported (9)"
     )
     kits = benchmarks.add_parser(
         "kits", help="building time, clearance and size of the dataset's kits"
     )
-    kits.add_argument("--kits", type=count_type, help="how many of each split (default: all)")
-    recovery = benchmarks.add_parser(
-        "recovery", help="what a policy makes of actions that go wrong"
-    )
+    kits.add_argument("--kits", type=count_type, help="number of kits of each split (default: all)")
+    recovery = benchmarks.add_parser("recovery", help="a policy's recovery from failed actions")
     add_scenario_flags(recovery)
-    recovery.add_argument("--episodes", type=count_type, default=10, help="of each kind (10)")
-    recovery.add_argument("--seed", type=seed_type, default=0, help="of the first (0)")
-    opinion = benchmarks.add_parser(
-        "mujoco", help="whether tools come to rest in MuJoCo where they do here"
+    recovery.add_argument(
+        "--episodes", type=count_type, default=10, help="episodes per failure (10)"
     )
-    opinion.add_argument("--placements", type=count_type, default=50, help="how many (50)")
-    opinion.add_argument("--seed", type=seed_type, default=0, help="of the first (0)")
+    recovery.add_argument("--seed", type=seed_type, default=0, help="seed of the first episode (0)")
+    opinion = benchmarks.add_parser(
+        "mujoco", help="compare the resting poses of placed tools in Drake and MuJoCo"
+    )
     opinion.add_argument(
-        "--orientations", type=count_type, help="round the oracle's actions to so many (no)"
+        "--placements", type=count_type, default=50, help="number of placements (50)"
+    )
+    opinion.add_argument("--seed", type=seed_type, default=0, help="seed of the first episode (0)")
+    opinion.add_argument(
+        "--orientations",
+        type=count_type,
+        metavar="N",
+        help="round the oracle's actions to N orientations",
     )
     paper = benchmarks.add_parser(
-        "paper", help="collect, train and evaluate the cells of the paper's tables; it takes days"
+        "paper", help="collect, train and evaluate for the cells of the paper's tables; takes days"
     )
     paper.add_argument(
         "--cells",
         nargs="+",
         default=["*"],
         metavar="PATTERN",
-        help="only those of such names, in this order (*: all, the most telling first)",
+        help="names of the cells, in this order (*: all, the most informative first)",
     )
     paper.add_argument(
         "--results",
         type=Path,
         metavar="DIR",
         default=Path("docs/results"),
-        help="where the table is that finished cells are added to (docs/results)",
+        help="folder of the table of runs, which finished cells are added to (docs/results)",
     )
-    paper.add_argument("--workers", type=count_type, default=1, help="episodes side by side (1)")
+    paper.add_argument("--workers", type=count_type, default=1, help="parallel episodes (1)")
     for benchmark in (simulation, networks, kits, recovery, opinion, paper):
         benchmark.add_argument(
-            "--output", type=Path, default=Path("output/benchmark"), help="where the files go"
+            "--output", type=Path, default=Path("output/benchmark"), help="folder for the files"
         )
         benchmark.add_argument("--quiet", action="store_true", help="print nothing but errors")
     return parser
 
 
-# Each imports what it measures: nobody waits for what the others need.
+# Each benchmark imports its own modules lazily.
 
 
 def _simulation(arguments: argparse.Namespace, console: Console, folder: Path) -> list[Table]:
@@ -131,7 +145,7 @@ def _networks(arguments: argparse.Namespace, console: Console, folder: Path) -> 
     plan = Plan(preset=arguments.preset, repeats=arguments.repeats, demonstrations=arguments.demos)
     measured: dict[str, Any] = benchmark_networks(plan, console)
     write_json(folder / "networks.json", measured)
-    # Not before the figures are safe.
+    # Import matplotlib only after the results are saved.
     from kitting_drake.reproduction.network_speed.speed_figure import draw_networks
 
     draw_networks(measured, folder / "networks.png")
@@ -166,7 +180,7 @@ def _mujoco(arguments: argparse.Namespace, console: Console, folder: Path) -> li
 
 
 def _paper(arguments: argparse.Namespace, console: Console, folder: Path) -> int:
-    """Fills the paper's cells; returns the exit code."""
+    """Runs the experiments of the paper's cells; returns the exit code."""
     from kitting_drake.reproduction.paper.paper_tables import choose_cells
     from kitting_drake.reproduction.paper.queue import Queue, run_paper
 
@@ -182,7 +196,7 @@ def _paper(arguments: argparse.Namespace, console: Console, folder: Path) -> int
 
 
 def _use_one_core() -> None:
-    """Uses one core, as the tables claim; children inherit it."""
+    """Restricts this process and its children to one core, as the tables state."""
     os.sched_setaffinity(0, {max(os.sched_getaffinity(0))})
 
 

@@ -1,4 +1,4 @@
-"""`python -m kitting_drake.collect SCENARIO.yaml`: the oracle's demonstrations, in one file."""
+"""`python -m kitting_drake.collect SCENARIO.yaml`: collects demonstrations of the oracle."""
 
 import contextlib
 import dataclasses
@@ -59,31 +59,33 @@ from kitting_drake.station.hidden_table import hidden_table_note
 from systems.signals import Observation, PickPlaceAction
 
 LEAST_SCORE = 0.99
-"""A demonstration that scores less is rejected."""
+"""Demonstrations with a lower success rate are rejected."""
 
 _MOST_REJECTED = 20
-"""So many seeds rejected in a row mean that the oracle cannot do it."""
+"""After this many rejected seeds in a row, collecting fails."""
 
 Demonstrate = Callable[[int], Demonstration | Rejection | ProcessCrashed]
-"""Demonstrates a seed; called in a thread."""
+"""Makes the demonstration of a seed. Called in threads."""
 
 
 def main() -> int:
     """Parses the command line and collects; returns the exit code."""
     parser = scenario_parser("collect", "Collect demonstrations of the oracle.")
-    parser.add_argument("--demos", type=count_type, default=100, help="how many (100)")
+    parser.add_argument(
+        "--demos", type=count_type, default=100, help="number of demonstrations (100)"
+    )
     add_workers_flags(parser)
     parser.add_argument(
         "--seed",
         type=seed_type,
         default=DEMONSTRATION_SEEDS.start,
-        help=f"of the first ({DEMONSTRATION_SEEDS.start})",
+        help=f"seed of the first episode ({DEMONSTRATION_SEEDS.start})",
     )
     parser.add_argument(
         "--export",
         choices=("lerobot",),
-        help="also write them as a LeRobotDataset v3.0, to the folder lerobot in --output; those "
-        "collected before, without collecting",
+        help="also write them as a LeRobotDataset v3.0, to the folder lerobot in --output; if all "
+        "demonstrations exist, only export",
     )
     add_log_flag(parser)
     arguments = parser.parse_args()
@@ -95,9 +97,9 @@ def main() -> int:
         console.print(f"note: {note}", highlight=False, markup=False)
     start = time.perf_counter()
     with alone_in(folder):
-        # What cannot be built at all is told at once, and claims no folder.
+        # Fail early, before claiming the folder.
         if not chosen.scenario.cameras:
-            raise UserError(f"{chosen.path}: cameras is empty: demonstrations need at least one")
+            raise UserError(f"{chosen.path}: cameras is empty: collect needs at least one")
         require_rendering()
         build_any_chosen(chosen, seeds_from(arguments.seed))
         exported = folder / "lerobot" if arguments.export else None
@@ -106,7 +108,7 @@ def main() -> int:
         identity = {
             **chosen.described,
             "versions": versions(),
-            # Tools of a person's own may have been imported or annotated anew.
+            # A user's tools may change by another import or annotation.
             "task_digest": files_digest(chosen.scenario.task.input_files(chosen.base)),
         }
         claim_folder(folder, "scenario.json", identity, of="scenario, tools or version")
@@ -137,21 +139,21 @@ def main() -> int:
 
 
 class Collection:
-    """A folder of demonstrations: those of the first seeds that are not rejected.
+    """A folder with the demonstrations of the first seeds that are not rejected.
 
-    Which these are depends neither on the workers nor on when it was stopped and went on. Until all
-    are there, `parts` holds a file for each; then they become `demonstrations.h5`, the parts go.
+    The result is independent of the number of workers and of interruptions. Unfinished collections
+    keep a file per seed in `parts`; the end merges them into `demonstrations.h5`.
     """
 
     def __init__(self, folder: Path, origin: Origin) -> None:
-        """Finds what is there.
+        """Reads the files of earlier runs.
 
         Args:
-            folder: where the files are.
+            folder: of the files.
             origin: of the demonstrations.
 
         Raises:
-            UserError: what is there is of another origin, or damaged.
+            UserError: a file has another origin or is damaged.
         """
         self.path = folder / "demonstrations.h5"
         self._parts = folder / "parts"
@@ -159,9 +161,9 @@ class Collection:
         self._accepted: dict[int, Path] = {}
         self._rejected: dict[int, Rejection] = {}
         self.assembled = 0
-        """How many demonstrations are in the one file."""
+        """The number of demonstrations in `demonstrations.h5`."""
         for path in self._parts.glob(".*"):
-            # Was being written when the process was killed.
+            # Left by a killed process.
             path.unlink()
         for path in self._parts.glob("seed_*"):
             try:
@@ -171,7 +173,7 @@ class Collection:
                     rejection = Rejection(**json.loads(path.read_text()))
                     self._rejected[rejection.seed] = rejection
             except (OSError, ValueError, TypeError) as error:
-                raise UserError(f"{path} makes no sense here: delete it") from error
+                raise UserError(f"{path} is damaged: delete it") from error
         if self.path.exists():
             self._find_assembled()
 
@@ -180,11 +182,11 @@ class Collection:
         found = contents.origin
         if json.dumps(found.scenario) != json.dumps(self._origin.scenario):
             raise UserError(
-                f"{self.path} is of another scenario: give another --output, or delete it"
+                f"{self.path} belongs to another scenario: give another --output, or delete it"
             )
         if found.versions != self._origin.versions:
             raise UserError(
-                f"{self.path} is by other versions ({_listed(found.versions)}), these are "
+                f"{self.path} was written by {_listed(found.versions)}, but this is "
                 f"{_listed(self._origin.versions)}: give another --output, or delete it"
             )
         if found.first_seed != self._origin.first_seed:
@@ -195,25 +197,24 @@ class Collection:
         self.assembled = len(contents.seeds)
         self._accepted |= dict.fromkeys(contents.seeds, self.path)
         self._rejected |= {item.seed: item for item in contents.rejected}
-        # The parts of what is there whole: it was stopped before they were gone.
+        # A process killed after merging leaves its parts.
         self._remove_parts([*contents.seeds, *(item.seed for item in contents.rejected)])
 
     def collect(
         self, count: int, demonstrate: Demonstrate, *, workers: Workers, console: Console
     ) -> None:
-        """Makes the demonstrations that are missing, and the one file of them all.
+        """Makes the missing demonstrations and merges all into `demonstrations.h5`.
 
-        A process that dies is given a second chance: something else may have killed it, and which
-        seeds are rejected must not hang on that.
+        If a process dies, its seed is tried once more, as a process may be killed from outside.
 
         Args:
-            count: how many there shall be.
-            demonstrate: makes one; called in threads.
-            workers: say how many at a time.
+            count: the number of demonstrations wanted.
+            demonstrate: makes a demonstration; called in threads.
+            workers: determine the number of parallel calls.
             console: for the progress bar.
 
         Raises:
-            UserError: the seeds come to an end, too many in a row are rejected, or a process is
+            UserError: no seeds are left, too many seeds in a row are rejected, or a process is
                 killed twice.
         """
         seeds = seeds_from(self._origin.first_seed)
@@ -263,16 +264,16 @@ class Collection:
             for ending in (".h5", ".json"):
                 (self._parts / f"seed_{seed:08d}{ending}").unlink(missing_ok=True)
         with contextlib.suppress(OSError):
-            # Not empty when more had been asked for before.
+            # An earlier run may have asked for more demonstrations.
             self._parts.rmdir()
 
     def summary(self) -> str:
-        """The contents of the one file, for people."""
+        """A sentence about the contents of `demonstrations.h5`."""
         contents = read_contents(self.path)
         megabytes = self.path.stat().st_size / 1e6
         several = ""
         if len(contents.commits) > 1:
-            several = f"; they are of several commits: {', '.join(c[:8] for c in contents.commits)}"
+            several = f"; made by several commits: {', '.join(c[:8] for c in contents.commits)}"
         return (
             f"{self.path} ({megabytes:.1f} MB) holds {_number(contents.seeds, 'demonstration')}, "
             f"{_number(contents.rejected, 'seed')} rejected{several}"
@@ -294,23 +295,23 @@ def next_seed(
     rejected: Container[int],
     working: Container[int],
 ) -> int | None:
-    """Which seed to try next, so that the first that are not rejected are those that are made.
+    """The seed to try next, to get demonstrations of the first seeds that are not rejected.
 
     Args:
-        seeds: all that may be tried, in their order.
-        count: how many demonstrations there shall be.
-        accepted: seeds that gave one.
-        rejected: seeds that did not.
-        working: seeds being tried.
+        seeds: the permitted seeds, in order.
+        count: the number of demonstrations wanted.
+        accepted: seeds with a demonstration.
+        rejected: seeds without one.
+        working: seeds in progress.
 
     Returns:
-        A seed; None when there are enough, provided that those being tried are not rejected.
+        A seed; None if there are enough, provided that the seeds in progress succeed.
 
     Raises:
-        UserError: there is none left, or too many in a row were rejected.
+        UserError: no seed is left, or too many seeds in a row were rejected.
     """
     none_left = UserError(
-        f"the seeds from {seeds[0]} end at {seeds[-1]}: ask for fewer --demos, or another --seed"
+        f"only seeds {seeds[0]} to {seeds[-1]} are available: give fewer --demos or another --seed"
     )
     if count > len(seeds):
         raise none_left
@@ -323,8 +324,8 @@ def next_seed(
             if in_a_row == _MOST_REJECTED:
                 first = seed - _MOST_REJECTED + 1
                 raise UserError(
-                    f"the oracle failed with {_MOST_REJECTED} seeds in a row, {first} to "
-                    f"{seed}: see why by python -m kitting_drake.run with --seed {seed}"
+                    f"the oracle failed on {_MOST_REJECTED} seeds in a row, {first} to {seed}: to "
+                    f"find the cause, run python -m kitting_drake.run with --seed {seed}"
                 )
         elif seed in accepted or seed in working:
             hoped_for += 1
@@ -359,7 +360,7 @@ def _reject_dead(seed: int, dead: ProcessCrashed) -> Rejection:
 
 
 def _demonstrate(chosen: ChosenScenario, seed: int, log: Path | None) -> Demonstration | Rejection:
-    # A station is built without cameras where nothing can be rendered.
+    # Without rendering, the station would have no cameras.
     require_rendering()
     try:
         diagram, station = build_chosen(chosen, seed=seed)
@@ -375,14 +376,14 @@ def _demonstrate(chosen: ChosenScenario, seed: int, log: Path | None) -> Demonst
 
 
 class DemonstrationRecorder:
-    """Takes down what the expert saw and did: an `EpisodeObserver`."""
+    """Records the observations and actions of an episode, as an `EpisodeObserver`."""
 
     def __init__(self, station: KittingStation, *, later_picks_possible: bool = False) -> None:
         """
         Args:
             station: with cameras and the oracle.
-            later_picks_possible: see `Learning`. What took two actions, as it may where there are
-                several tries, did not lie yet where it was picked later, and spoils those labels.
+            later_picks_possible: see `Learning`. Episodes with two actions on one object are then
+                rejected: the first action moves the object, so its later pick is a wrong label.
         """
         self._station = station
         self._later_picks_possible = later_picks_possible
@@ -390,7 +391,7 @@ class DemonstrationRecorder:
         self._final: FinalObservation | None = None
 
     def observe(self, event: ModeChange) -> None:
-        """Takes down what the planner acts upon."""
+        """Records the observation and the action at the start of each action, and at a stop."""
         if event.is_last or not (event.is_action_start or event.is_stop):
             return
         observation = self._station.observation(event.root_context)
@@ -401,22 +402,22 @@ class DemonstrationRecorder:
             self._actions.append((observation, action))
 
     def demonstration(self, result: EpisodeResult) -> Demonstration | Rejection:
-        """The demonstration of the episode, now that it is over, without actions that failed."""
+        """The demonstration of a finished episode, without failed actions; or its rejection."""
         if result.failure or result.success_rate < LEAST_SCORE:
             reason = result.failure or f"the reward was {result.success_rate:.0%}"
             return Rejection(result.seed, result.success_rate, reason)
         taken = Counter(item.object for item in result.actions_taken)
         again = next((name for name, times in taken.items() if times > 1), None)
         if self._later_picks_possible and again is not None:
-            return Rejection(result.seed, result.success_rate, f"{again} took a second action")
+            return Rejection(result.seed, result.success_rate, f"{again} needed a second action")
         steps = tuple(
             DemonstrationStep.of(observation, action, name=item.object, category=item.category)
             for (observation, action), item in zip(self._actions, result.actions_taken, strict=True)
             if item.outcome == "placed"
         )
         if not steps:
-            return Rejection(result.seed, result.success_rate, "there was nothing to do")
-        # All goals are filled: whether the expert was asked again or not, nothing is left to do.
+            return Rejection(result.seed, result.success_rate, "no action was needed")
+        # All goals are met, so the final observation shows a finished task.
         return Demonstration(result.seed, result.success_rate, steps, self._final, commit())
 
 

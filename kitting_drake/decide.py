@@ -1,6 +1,7 @@
-"""`python -m kitting_drake.decide FRAME... --camera CALIBRATION.yaml`: one look, one action.
+"""`python -m kitting_drake.decide FRAME... --camera CALIBRATION.yaml`: decides one action.
 
-A real camera's frames become one pick and place in the robot's frame; no Drake. See docs/bench.md.
+Computes a pick and place in the robot's frame from frames of real cameras, without Drake. See
+docs/bench.md.
 """
 
 import argparse
@@ -39,7 +40,7 @@ def main() -> int:
     console = Console(quiet=arguments.quiet)
     folder = require_folder(arguments.output)
     action, picture = folder / "action.json", folder / "decision.png"
-    # Should this fail, nobody must take the answer to an earlier frame for that to this one.
+    # Remove stale files: after a failure, nobody must use the action of an earlier frame.
     earlier = [folder / name for name in CHECK_FILES] if arguments.check else [action, picture]
     if not arguments.check:
         _check_decided(action)
@@ -74,7 +75,7 @@ def main() -> int:
 
 
 def _check_decided(action: Path) -> None:
-    """Raises UserError for an `action.json` that was not decided here: it is a demonstration's."""
+    """Raises UserError if `action.json` is not from this command, e.g. a demonstration's."""
     try:
         record = json.loads(action.read_text())
     except FileNotFoundError:
@@ -82,7 +83,7 @@ def _check_decided(action: Path) -> None:
     except (OSError, ValueError):
         record = None
     if not isinstance(record, dict) or not {"policy", "seconds"} <= set(record):
-        raise UserError(f"{action} was not decided here: give another --output")
+        raise UserError(f"{action} was not written by decide: give another --output")
 
 
 def _remove(path: Path) -> None:
@@ -102,7 +103,7 @@ def _parser() -> argparse.ArgumentParser:
         type=Path,
         nargs="+",
         metavar="FRAME",
-        help="a folder, or a colour image and a depth image for each camera",
+        help="a folder of frames, or a colour image and a depth image for each camera",
     )
     parser.add_argument(
         "--camera",
@@ -112,30 +113,45 @@ def _parser() -> argparse.ArgumentParser:
         help="intrinsics and poses of the cameras",
     )
     parser.add_argument(
-        "--output", type=Path, default=Path("output/decide"), metavar="DIR", help="where files go"
+        "--output", type=Path, default=Path("output/decide"), metavar="DIR", help="folder for files"
     )
     policy = parser.add_mutually_exclusive_group()
-    policy.add_argument("--weights", type=Path, metavar="FILE", help="networks (the generalist's)")
-    policy.add_argument("--shape_matching", action="store_true", help="decide by outlines alone")
-    parser.add_argument(
-        "--orientations", type=count_type, metavar="N", help="of the networks (180)"
+    policy.add_argument(
+        "--weights",
+        type=Path,
+        metavar="FILE",
+        help="weights of the networks (default: the generalist)",
+    )
+    policy.add_argument(
+        "--shape_matching", action="store_true", help="fit outlines instead of using networks"
     )
     parser.add_argument(
-        "--no_outlines", action="store_true", help="networks: refine nothing (no cavities)"
+        "--orientations",
+        type=count_type,
+        metavar="N",
+        help="number of orientations of the networks (180)",
     )
-    parser.add_argument("--recover", action="store_true", help="mend what is not seated")
     parser.add_argument(
-        "--table_height", type=float, metavar="Z", help="in the base frame, in m (the file's, or 0)"
+        "--no_outlines",
+        action="store_true",
+        help="networks: do not refine actions by outlines (for tasks without cavities)",
+    )
+    parser.add_argument("--recover", action="store_true", help="recover from failed insertions")
+    parser.add_argument(
+        "--table_height",
+        type=float,
+        metavar="Z",
+        help="height of the table in the base frame, in m (default: the calibration's, or 0)",
     )
     parser.add_argument(
-        "--check", action="store_true", help="check the cameras: the table in the frame is empty"
+        "--check", action="store_true", help="check the calibration by frames of the empty table"
     )
     parser.add_argument(
         "--kit_size_mm",
         type=float,
         nargs=3,
         metavar=("L", "W", "H"),
-        help="with --check: a block of this size lies on the table",
+        help="with --check: size of a block that lies on the table",
     )
     parser.add_argument(
         "--kit_pose",
@@ -155,7 +171,9 @@ def _policy(arguments: argparse.Namespace) -> BenchPolicy:
             ("--no_outlines", arguments.no_outlines),
         ):
             if given:
-                raise UserError(f"{flag} is for networks, and --shape_matching has none")
+                raise UserError(
+                    f"{flag} cannot be combined with --shape_matching: it is for networks"
+                )
         return ShapeMatching(recover=arguments.recover)
     return load_policy(
         arguments.weights,
@@ -180,11 +198,11 @@ def _block(arguments: argparse.Namespace, grid: PixelGrid) -> Block | None:
         raise UserError("--kit_pose takes three finite numbers: x and y in m, and yaw in rad")
     if pose is not None and not grid.contains(pose[:2]):
         raise UserError(
-            f"--kit_pose: ({pose[0]:g}, {pose[1]:g}) m is outside the workspace: it takes x and y "
-            "of the block's middle in m"
+            f"--kit_pose: ({pose[0]:g}, {pose[1]:g}) m is outside the workspace: give x and y of "
+            "the block's middle in m"
         )
     if pose is not None and abs(pose[2]) > math.tau:
-        raise UserError(f"--kit_pose: the yaw {pose[2]:g} is more than a rotation: it is in rad")
+        raise UserError(f"--kit_pose: the yaw {pose[2]:g} is more than a full turn: give it in rad")
     return Block((length, width, height), pose)
 
 

@@ -1,8 +1,7 @@
-"""`python -m kitting_drake.demonstrate FOLDER --camera CALIBRATION.yaml`: a bench's own
-demonstrations.
+"""`python -m kitting_drake.demonstrate FOLDER --camera CALIBRATION.yaml`: real demonstrations.
 
-A folder of frames and actions becomes a file that `train` takes; `--click` serves a page on which a
-person tells the actions. No Drake. See docs/bench.md.
+Converts a folder of frames and actions to a file for `train`, without Drake. `--click` serves a
+page on which a person enters the actions. See docs/bench.md.
 """
 
 import argparse
@@ -43,8 +42,8 @@ def main() -> int:
     with console.status("projecting frames"):
         found = convert(arguments.folder, calibration, learning, path)
     console.print(
-        f"{path} holds {found.demonstrations} demonstrations of {found.steps} steps in all; "
-        f"{found.finals} of them show in the end that nothing is left to do",
+        f"{path} holds {found.demonstrations} demonstrations with {found.steps} steps in all; "
+        f"{found.finals} of them end with a frame of the finished task",
         highlight=False,
         markup=False,
         soft_wrap=True,
@@ -55,22 +54,22 @@ def main() -> int:
 def _annotate(folder: Path, calibration: Calibration, port: int) -> None:
     steps = [step for steps in find_demonstrations(folder) for step in steps]
     with AnnotationServer(steps, calibration, port) as server:
-        # Without the address nobody finds the page: it is told even where all else is quiet.
-        print(f"annotate at {server.url}; Ctrl-C ends, and what was saved is kept", flush=True)
+        # Print the address even with --quiet.
+        print(f"annotate at {server.url}; Ctrl-C ends and keeps what was saved", flush=True)
         server.serve_forever()
 
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="python -m kitting_drake.demonstrate",
-        description="Make demonstrations for `train` of a real bench's frames and actions.",
+        description="Convert frames and actions of a real bench to demonstrations for `train`.",
     )
     parser.add_argument(
         "folder",
         type=Path,
         metavar="FOLDER",
-        help="holds a folder for each demonstration, and that a folder for each step: its frames, "
-        "and action.json",
+        help="holds a folder for each demonstration, with a folder for each step, with frames and "
+        "action.json",
     )
     parser.add_argument(
         "--camera",
@@ -83,29 +82,36 @@ def _parser() -> argparse.ArgumentParser:
         "--output",
         type=Path,
         metavar="DIR",
-        help="where demonstrations.h5 goes, or a FILE.h5 (output/FOLDER-demonstrations)",
+        help="folder for demonstrations.h5, or a FILE.h5 (output/FOLDER-demonstrations)",
     )
     parser.add_argument(
-        "--click", action="store_true", help="serve a page on which to click the actions"
+        "--click", action="store_true", help="serve a page for entering the actions"
     )
     parser.add_argument(
-        "--port", type=_port_type, default=0, metavar="N", help="of the page (any that is free)"
+        "--port",
+        type=_port_type,
+        default=0,
+        metavar="N",
+        help="port of the page (default: any free one)",
     )
     parser.add_argument(
         "--no_later_picks",
         action="store_true",
-        help="what was picked later could not have been picked at once: for stacking",
+        help="objects cannot be picked in any order, e.g. when stacking",
     )
     parser.add_argument(
         "--no_curvature",
         action="store_true",
-        help="objects come in one shape only: do not bend them to learn more",
+        help="do not bend objects for augmentation: their shapes are fixed",
     )
     parser.add_argument(
-        "--no_reflection", action="store_true", help="mirror images of objects never occur"
+        "--no_reflection", action="store_true", help="do not mirror images for augmentation"
     )
     parser.add_argument(
-        "--table_height", type=float, metavar="Z", help="in the base frame, in m (the file's, or 0)"
+        "--table_height",
+        type=float,
+        metavar="Z",
+        help="height of the table in the base frame, in m (default: the calibration's, or 0)",
     )
     parser.add_argument("--quiet", action="store_true", help="print nothing but errors")
     return parser

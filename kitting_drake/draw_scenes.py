@@ -1,4 +1,4 @@
-"""`python -m kitting_drake.draw_scenes`: static scenes of random tools, to train a generalist."""
+"""`python -m kitting_drake.draw_scenes`: draws static scenes of random tools for training."""
 
 import argparse
 import contextlib
@@ -41,15 +41,15 @@ _DRAWN_BY = (
     "kitting_drake.policies.data.static_scenes",
     "systems",
 )
-"""The packages and modules that decide what a scene looks like, ..."""
+"""The packages and modules that determine the drawn scenes."""
 _CATALOGUE = MODELS / "tools" / "catalogue.yaml"
-"""... and the designs that its tools begin with."""
+"""The designs of tools that are varied."""
 _DRAWN = ".drawn"
-"""The ending of the file that says how many scenes of an unfinished batch are drawn."""
+"""Suffix of the file that counts the scenes of an unfinished batch."""
 _POLL = 0.5
-"""How often these files are read, in s."""
+"""Period of reading these files, in s."""
 _MOST_BATCHES = 10_000
-"""No batch has so few scenes that more than this would be needed."""
+"""Upper bound of the number of batches of a seed."""
 
 
 def main() -> int:
@@ -83,28 +83,28 @@ def _drawn_by() -> dict[str, str]:
 
 
 class _Parts:
-    """A file for each batch of scenes; they stay, so that more can be asked for later."""
+    """Files with a batch of scenes each. They are kept, so that later runs can add batches."""
 
     def __init__(self, folder: Path, seed: int, drawn_by: dict[str, str]) -> None:
-        """Finds what is there.
+        """Reads the files of earlier runs.
 
         Args:
             folder: of the files.
             seed: of all draws.
-            drawn_by: the versions that draw.
+            drawn_by: versions and digests of the code.
 
         Raises:
-            UserError: what is there is of another seed or version, or damaged.
+            UserError: a file has another seed or version, or is damaged.
         """
         self._folder, self._seed, self._drawn_by = require_folder(folder), seed, drawn_by
         self._counts = {}
         for path in folder.glob(f"*{_DRAWN}"):
-            # Of a process that was killed.
+            # Left by a killed process.
             path.unlink()
         for path in folder.glob("batch_*.h5"):
             number = path.stem.removeprefix("batch_")
             if not number.isdecimal() or path != self.path(int(number)):
-                raise UserError(f"{path} makes no sense here: delete it")
+                raise UserError(f"{path} has an unexpected name: delete it")
             self._counts[int(number)] = len(self._read(int(number)).scenes)
 
     def _read(self, batch: int) -> StaticScenes:
@@ -112,12 +112,10 @@ class _Parts:
         try:
             found = read_static_scenes(path)
         except UserError as error:
-            raise UserError(f"{error}: delete it, and it is drawn again") from error
+            raise UserError(f"{error}: delete it to draw it again") from error
         mine = (self._seed_of(batch), self._drawn_by, PixelGrid())
         if (found.first_seed, found.versions, found.grid) != mine:
-            raise UserError(
-                f"{path} is of another seed or version: delete it, and it is drawn again"
-            )
+            raise UserError(f"{path} has another seed or version: delete it to draw it again")
         return found
 
     def _seed_of(self, batch: int) -> int:
@@ -127,14 +125,14 @@ class _Parts:
         return self._folder / f"batch_{batch:06d}.h5"
 
     def draw(self, count: int, workers: LocalWorkers, console: Console) -> None:
-        """Draws batches until those without a gap before them hold so many scenes."""
+        """Draws batches until the batches before the first missing one hold `count` scenes."""
         begun = set(self._counts)
 
         def next_batch() -> int | None:
             if self._gapless() >= count:
                 return None
             batch = next(i for i in range(_MOST_BATCHES) if i not in begun)
-            # With what is at work there may be enough before this one already.
+            # Earlier batches in progress may suffice.
             if sum(self._counts.values()) >= count and batch > max(self._counts):
                 return None
             begun.add(batch)
@@ -156,28 +154,28 @@ class _Parts:
             if isinstance(outcome, ProcessCrashed):
                 raise UserError(
                     f"the process of batch {batch} ended without a result "
-                    f"(exit code {outcome.exit_code}): the same command goes on there"
+                    f"(exit code {outcome.exit_code}): run the same command to resume"
                 )
             self._counts[batch] = outcome
 
     def _drawn(self) -> int:
-        """How many scenes there are, those of unfinished batches included."""
+        """The number of scenes, including those of unfinished batches."""
         unfinished = 0
         for path in self._folder.glob(f"*{_DRAWN}"):
-            # It may be gone, or empty, just now.
+            # Its process may just have removed or truncated it.
             with contextlib.suppress(OSError, ValueError):
                 unfinished += int(path.read_text())
         return sum(self._counts.values()) + unfinished
 
     def _gapless(self) -> int:
-        """How many scenes the batches without a gap before them hold."""
+        """The number of scenes in the batches before the first missing one."""
         batches = itertools.takewhile(self._counts.__contains__, itertools.count())
         return sum(self._counts[batch] for batch in batches)
 
     def assemble(self, count: int, path: Path) -> tuple[StaticScene, ...]:
-        """Writes the one file of the first so many scenes; returns them."""
+        """Writes the first `count` scenes to one file; returns them."""
         batches = [self._read(batch).scenes for batch in sorted(self._counts)]
-        # In a batch there may be room for no toolset.
+        # A batch is empty if no toolset fits.
         ends = sorted({*itertools.accumulate(len(scenes) for scenes in batches)} - {0})
         everything = tuple(itertools.chain.from_iterable(batches))
         content = StaticScenes(PixelGrid(), everything, self._seed, self._drawn_by, tuple(ends))
@@ -201,7 +199,7 @@ def _draw_part(path: Path, seed: int, drawn_by: dict[str, str]) -> int:
 
 @contextlib.contextmanager
 def _every(seconds: float, call: Callable[[], object]) -> Iterator[None]:
-    """Calls a function again and again, in a thread of its own."""
+    """Calls a function periodically in a thread."""
     ended = threading.Event()
 
     def repeat() -> None:
@@ -221,12 +219,12 @@ def _parse() -> argparse.Namespace:
     parser = argparse.ArgumentParser(
         prog="python -m kitting_drake.draw_scenes",
         description="Draw static scenes of random tools and kits, to train a generalist. "
-        "Run again, it goes on.",
+        "Run the same command again to resume.",
     )
-    parser.add_argument("--scenes", type=count_type, default=3000, help="how many (3000)")
-    parser.add_argument("--seed", type=seed_type, default=0, help="of all draws (0)")
+    parser.add_argument("--scenes", type=count_type, default=3000, help="number of scenes (3000)")
+    parser.add_argument("--seed", type=seed_type, default=0, help="seed of all draws (0)")
     parser.add_argument(
-        "--workers", type=count_type, help=f"how many side by side ({os.cpu_count()})"
+        "--workers", type=count_type, help=f"number of parallel processes ({os.cpu_count()})"
     )
     parser.add_argument("--output", type=Path, required=True, metavar="DIR")
     parser.add_argument("--quiet", action="store_true", help="print nothing but errors")

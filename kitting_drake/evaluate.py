@@ -1,4 +1,4 @@
-"""`python -m kitting_drake.evaluate SCENARIO.yaml`: many seeds side by side, and their summary."""
+"""`python -m kitting_drake.evaluate SCENARIO.yaml`: runs many seeds in parallel; summarises."""
 
 import functools
 import json
@@ -45,15 +45,19 @@ from kitting_drake.scenario.workers import add_workers_flags, open_workers
 from kitting_drake.station.hidden_table import hidden_table_note
 
 Run = Callable[[int], Episode]
-"""Runs the episode of a seed; called in a thread."""
+"""Runs the episode of a seed. Called in threads."""
 
 
 def main() -> int:
     """Parses the command line and evaluates; returns the exit code."""
-    parser = scenario_parser("evaluate", "Run episodes of many seeds and summarise them.")
-    parser.add_argument("--episodes", type=count_type, default=100, help="how many (100)")
+    parser = scenario_parser(
+        "evaluate", "Run episodes of many seeds in parallel and summarise them."
+    )
+    parser.add_argument("--episodes", type=count_type, default=100, help="number of episodes (100)")
     add_workers_flags(parser)
-    parser.add_argument("--seed", type=seed_type, help="of the first (default: the scenario's)")
+    parser.add_argument(
+        "--seed", type=seed_type, help="seed of the first episode (default: the scenario's)"
+    )
     add_log_flag(parser)
     arguments = parser.parse_args()
     log = log_of_many(arguments.log, arguments.ray)
@@ -61,9 +65,7 @@ def main() -> int:
     first = chosen.scenario.random_seed if arguments.seed is None else arguments.seed
     seeds = range(first, first + arguments.episodes)
     if seeds[-1] not in ALL_SEEDS:
-        raise UserError(
-            f"the seeds end at {ALL_SEEDS[-1]}: ask for fewer --episodes, or another --seed"
-        )
+        raise UserError(f"the largest seed is {ALL_SEEDS[-1]}: give a smaller --episodes or --seed")
     folder = require_folder(output_folder(arguments, f"{chosen.name}-evaluation"))
     console = Console(quiet=arguments.quiet)
     if note := hidden_table_note(chosen.scenario):
@@ -72,7 +74,7 @@ def main() -> int:
     known = chosen.scenario.policy.training_seeds(chosen.base).intersection(seeds)
     if known:
         console.print(f"note: the policy has learned from seeds {min(known)} to {max(known)}")
-    # What cannot be built at all is told at once, not once for each seed.
+    # Fail early if no seed can be built.
     success = build_any_chosen(chosen, seeds).scene.success
     if note := uncommitted_note():
         console.print(f"note: {note}", highlight=False, markup=False)
@@ -98,7 +100,7 @@ def main() -> int:
     failed = [episode for episode in episodes if episode["failure"]]
     if failed:
         console.print(
-            f"failed first: seed {failed[0]['seed']}: {failed[0]['failure']}",
+            f"first failure: seed {failed[0]['seed']}: {failed[0]['failure']}",
             highlight=False,
             markup=False,
         )
@@ -112,7 +114,7 @@ class Evaluation:
     episodes: list[Episode]
     """In the order of the seeds."""
     wall_seconds_total: float
-    """The time of all calls that worked in the folder, in s."""
+    """The wall-clock time of all commands that ran episodes in the folder, in s."""
 
 
 def evaluate(
@@ -126,20 +128,20 @@ def evaluate(
 ) -> Evaluation:
     """Runs an episode for each seed.
 
-    Episodes already in `folder/episodes.jsonl` are not run again; one is written there as it ends,
-    with the commit of the code that ran it.
+    Skips the episodes in `folder/episodes.jsonl`. Appends each episode as it ends, with the commit
+    of the code that ran it.
 
     Args:
         chosen: the scenario.
         seeds: one episode each.
-        folder: where `episodes.jsonl` is; must not hold those of anything else.
-        run: runs one; called in threads.
-        workers: say how many run at a time.
+        folder: of `episodes.jsonl`.
+        run: runs an episode; called in threads.
+        workers: determine the number of parallel episodes.
         console: for the progress bar.
 
     Raises:
-        UserError: the folder holds the episodes of another scenario, or of the same with another
-            policy, other files or other versions; or a process was killed twice.
+        UserError: the folder holds episodes of another scenario, policy, version or other input
+            files, or a process was killed twice.
     """
     seeds = list(seeds)
     path = folder / "episodes.jsonl"
@@ -147,7 +149,7 @@ def evaluate(
     clock = _WallClock(folder / "wall_seconds.json")
     earlier = read_lines(path)
     if not all(isinstance(item, dict) and {"seed", "objects"} <= item.keys() for item in earlier):
-        raise UserError(f"{path} is damaged: it has a line that is no episode")
+        raise UserError(f"{path} is damaged: a line is not an episode")
     done = {episode["seed"]: episode for episode in earlier}
     pending = [seed for seed in seeds if seed not in done]
     queue = iter(pending)
@@ -155,7 +157,7 @@ def evaluate(
     with counting_bar(console, "episodes") as progress:
         task = progress.add_task("", total=len(seeds), completed=len(seeds) - len(pending))
         for episode in side_by_side(run, lambda: next(queue, None), workers=workers):
-            # A worker tells that of its own code, where it has a checkout.
+            # Workers with a checkout report their own commit.
             episode["commit"] = episode.get("commit") or now
             done[episode["seed"]] = episode
             append_line(path, episode)
@@ -165,10 +167,9 @@ def evaluate(
 
 
 class _WallClock:
-    """Measures the time of all calls that worked in a folder; a file keeps that of earlier ones.
+    """Measures the total time of all commands that ran in a folder, and saves it in a file.
 
-    When a call is killed, the time since its last episode ended is not counted: the work of that
-    time is lost too.
+    If a command is killed, the time since its last finished episode is not counted.
     """
 
     def __init__(self, path: Path) -> None:
@@ -182,21 +183,20 @@ class _WallClock:
                 raise UserError(f"{path} is damaged: delete it") from error
 
     def save(self) -> float:
-        """Writes the file; returns the time so far, in s."""
+        """Writes the file; returns the total time, in s."""
         total = self._earlier + time.perf_counter() - self._start
         write_json(self._path, {"wall_seconds_total": total})
         return total
 
 
 def _identity(chosen: ChosenScenario) -> dict[str, Any]:
-    """The identity of an evaluation: the whole scenario, digests of the files that it depends on,
-    and versions."""
+    """The identity of an evaluation: the scenario, versions and digests of its input files."""
     scenario = chosen.scenario
     return {
         **chosen.described,
         "versions": versions(),
         "policy_digest": scenario.policy.digest(chosen.base),
-        # Networks compute in what is faster on the machine: not the same to the last bit.
+        # The type depends on the machine, and results differ between types.
         "compute_type": scenario.policy.details(chosen.base).get("compute_type"),
         "task_digest": files_digest(scenario.task.input_files(chosen.base)),
     }
@@ -207,14 +207,14 @@ def run_in_worker(
 ) -> Episode:
     """Runs one episode in another process and waits for it.
 
-    A process that dies leaves a failed episode with its reason; one that something else killed is
-    given a second chance.
+    If the process dies, returns a failed episode with the reason. If it was killed from outside,
+    first tries once more.
 
     Args:
-        workers: where.
-        chosen: the scenario as they find it.
-        seed: the episode's.
-        log: the file of which each seed has its own; see `log_of_seed`.
+        workers: run the process.
+        chosen: the scenario, with paths that are valid for the workers.
+        seed: of the episode.
+        log: the log file without the seed; see `log_of_seed`.
 
     Raises:
         UserError: the process was killed twice.
@@ -233,7 +233,7 @@ def run_in_worker(
 
 
 def _work(chosen: ChosenScenario, seed: int, log: Path | None) -> Episode | str:
-    """An episode, or why there is none of this seed."""
+    """The episode, or the reason why its scene cannot be built."""
     try:
         diagram, station = build_chosen(chosen, seed=seed)
     except MachineError:
@@ -247,12 +247,12 @@ def _work(chosen: ChosenScenario, seed: int, log: Path | None) -> Episode | str:
 
 @functools.cache
 def _commit_of_process() -> str | None:
-    """The commit of the code that this process runs: as of its first episode."""
+    """The commit at this process's first episode, i.e. that of the loaded code."""
     return commit()
 
 
 def _lost_episode(chosen: ChosenScenario, seed: int, failure: str, seconds: float) -> Episode:
-    """The episode of which nothing is known but why it failed."""
+    """A failed episode of which only the reason is known."""
     return EpisodeResult(
         scenario=chosen.name,
         policy=chosen.policy,

@@ -1,10 +1,10 @@
-"""`python -m kitting_drake.results`: docs/results.md and its figures, and the table of
-docs/robustness.md, from the runs in docs/results/.
+"""`python -m kitting_drake.results`: writes the pages of results from the runs in docs/results/.
 
-`--add` puts a run of `evaluate` among them, `--remove` takes one out. A run that has the name of a
-cell of `benchmark paper` fills that cell; it must be of a tree without uncommitted changes. Beside
-the runs lie `learning_rates.json` of `benchmark paper` and `networks.json`, a copy of the file of
-`benchmark networks`. Nothing in the tables comes from anywhere else, but the paper's own figures.
+The pages are docs/results.md with its figures, and the table in docs/robustness.md. `--add` adds a
+run of `evaluate` to the runs, and `--remove` removes one. A run with the name of a cell of
+`benchmark paper` fills that cell; it needs a tree without uncommitted changes. The folder also
+holds `learning_rates.json` of `benchmark paper` and a copy of `networks.json` of
+`benchmark networks`. All numbers come from this folder, except the paper's own.
 """
 
 import argparse
@@ -67,21 +67,22 @@ def main() -> int:
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
-        prog="python -m kitting_drake.results", description="Tables of results, from files only."
+        prog="python -m kitting_drake.results",
+        description="Write the pages of results from the table of runs.",
     )
     parser.add_argument(
         "--results",
         type=Path,
         metavar="DIR",
         default=Path("docs/results"),
-        help="where runs.csv and episodes.jsonl.xz are (docs/results)",
+        help="folder of runs.csv and episodes.jsonl.xz (docs/results)",
     )
     parser.add_argument(
         "--output",
         type=Path,
         metavar="FILE.md",
         default=Path("docs/results.md"),
-        help="what to write (docs/results.md)",
+        help="page to write (docs/results.md)",
     )
     parser.add_argument(
         "--add",
@@ -89,7 +90,7 @@ def _parser() -> argparse.ArgumentParser:
         action="append",
         default=[],
         metavar=("NAME", "DIR"),
-        help="first add the run of which evaluate left the summary.json in a folder",
+        help="first add a run: its name, and the output folder of evaluate",
     )
     parser.add_argument(
         "--remove", action="append", metavar="NAME", help="first remove the run of this name"
@@ -99,14 +100,14 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _draw(answers: Sequence[Result], efficiency: dict[str, Any] | None, folder: Path) -> None:
-    """Draws figure 6 of the tasks that it compares methods on, what networks cost, and table I."""
+    """Draws figure 6, the networks' run times and table I, where results exist."""
     by_name = {answer.cell.name: answer for answer in answers}
     for task in ("seen", "unseen"):
         if has_figure(task, answers):
             path = folder / f"results_{task}.png"
             write_atomically(path, draw_figure_6(task, by_name))
     if answers and efficiency is not None:
-        # Imported here, as it imports torch.
+        # Import torch lazily.
         from kitting_drake.reproduction.network_speed.speed_figure import draw_networks
 
         draw_networks(efficiency, folder / "networks.png")

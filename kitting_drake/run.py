@@ -1,4 +1,4 @@
-"""`python -m kitting_drake.run SCENARIO.yaml`: one episode, shown live; leaves a replay."""
+"""`python -m kitting_drake.run SCENARIO.yaml`: runs an episode in Meshcat, saves a replay."""
 
 import argparse
 from pathlib import Path
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from kitting_drake.policies.learned_policy import Decision
 
 REPLAY = "replay.html"
-"""The file of an episode's recording, in the folder of its files."""
+"""The name of the file with the recording."""
 
 
 def main() -> int:
@@ -101,32 +101,34 @@ def main() -> int:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = scenario_parser("run", "Run an episode, watch it in Meshcat, keep a replay.")
-    parser.add_argument("--seed", type=seed_type, help="of the scene (default: the scenario's)")
+    parser = scenario_parser("run", "Run an episode, show it in Meshcat, save a replay.")
     parser.add_argument(
-        "--no-meshcat", action="store_true", help="show nothing, and leave no replay.html"
+        "--seed", type=seed_type, help="seed of the scene (default: the scenario's)"
+    )
+    parser.add_argument(
+        "--no-meshcat", action="store_true", help="no visualization and no replay.html"
     )
     parser.add_argument(
         "--graphviz",
         type=Path,
         metavar="FILE",
-        help="also draw the Diagram: .svg, .png or .pdf, or .dot for its source",
+        help="also draw the Diagram (.svg, .png, .pdf, or .dot for its source)",
     )
     parser.add_argument(
         "--picture",
         type=Path,
         metavar="FILE.png",
-        help="also render the station as the episode ends",
+        help="also render the station at the end of the episode",
     )
     add_log_flag(parser)
     parser.add_argument(
-        "--video", type=Path, metavar="FILE.gif", help="also film the episode (.gif or .webp)"
+        "--video", type=Path, metavar="FILE.gif", help="also record a video (.gif or .webp)"
     )
     return parser
 
 
 def _save_decisions(folder: Path, decisions: "list[tuple[Observation, Decision]]") -> None:
-    """A picture for each decision of a learned policy; those of an earlier run go."""
+    """Saves a picture of each decision of a learned policy; removes stale ones."""
     for path in folder.glob("decision_*.png"):
         path.unlink()
     if decisions:
@@ -144,7 +146,7 @@ def _check_files(picture: Path | None, video: Path | None, replay: Path) -> None
         raise UserError(f"--picture writes .png files, not '{picture}'")
     if video is not None and video.suffix not in (".gif", ".webp"):
         raise UserError(f"--video writes .gif and .webp files, not '{video}'")
-    # Told before the episode, not after it.
+    # Fail early.
     for path in (picture, video, replay):
         if path is not None and path.is_dir():
             raise UserError(f"{path} is a folder")

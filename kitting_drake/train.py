@@ -1,4 +1,4 @@
-"""`python -m kitting_drake.train --demos FILE`: trains networks from demonstrations; no Drake."""
+"""`python -m kitting_drake.train --demos FILE`: trains networks, without Drake."""
 
 import argparse
 import dataclasses
@@ -31,11 +31,11 @@ def main() -> int:
         _export(arguments, arguments.weights or arguments.output / WEIGHTS, console)
         return 0
     learned, held_out = _split(arguments.demos, arguments.demonstrations, arguments.validation)
-    _require_picks(learned, arguments.demos, "to learn from")
+    _require_picks(learned, arguments.demos, "for training")
     settings = _settings(arguments, learned, held_out)
     _check_validation(settings, held_out, arguments.validation or arguments.demos)
     if arguments.export:
-        # Not after hours.
+        # Fail early.
         from kitting_drake.policies.training.onnx_export import require_onnx
 
         require_onnx()
@@ -44,7 +44,7 @@ def main() -> int:
     )
     run = TrainingRun(settings, learned, held_out, folder, console, arguments.start)
     with alone_in(folder):
-        # Scenarios of one name may differ, and with them what the same seeds give.
+        # The same seeds give other data in a changed scenario of the same name.
         origins = [item.origin for item in (learned, held_out)]
         made_by = [item.made_by for item in (learned, held_out)]
         described = {**dataclasses.asdict(settings), "origins": origins, "made_by": made_by}
@@ -57,8 +57,8 @@ def main() -> int:
 
 
 def _export(arguments: argparse.Namespace, weights: Path, console: Console) -> None:
-    """Writes weights in another format, to the folder `onnx` beside them, or in --output."""
-    # Who exports nothing does not wait for it.
+    """Writes weights as ONNX to the folder `onnx` in --output, by default beside the weights."""
+    # Import ONNX lazily.
     from kitting_drake.policies.training.onnx_export import export_onnx
 
     folder = (arguments.output or weights.parent) / "onnx"
@@ -73,8 +73,8 @@ def _settings(
     assumed = learned.learning
     if arguments.taken_only and not learned.has_taken:
         raise UserError(
-            f"--taken-only is for demonstrations: the scenes in {arguments.demos} tell what could "
-            "be picked, not what was"
+            f"--taken-only needs demonstrations: {arguments.demos} holds static scenes, in which "
+            "no object was picked"
         )
     begun: NetworkConfig | None = None
     seeds: tuple[int, ...] = ()
@@ -94,7 +94,7 @@ def _settings(
         learning_rate=arguments.learning_rate,
         decay=arguments.decay,
         taken_only=arguments.taken_only or not assumed.later_picks_possible,
-        # The Transporter rotates whole images: it has no crop in which an object can be bent.
+        # The Transporter rotates whole images and has no crop to bend.
         rigid=arguments.rigid or not assumed.curvature or arguments.method == "transporter",
         reflection=assumed.reflection and not arguments.rigid,
         colour=learned.colour if begun is None else begun.colour,
@@ -113,54 +113,62 @@ def _settings(
 def _checked_start(
     arguments: argparse.Namespace, learned: TrainingData, held_out: TrainingData
 ) -> tuple[NetworkConfig, tuple[int, ...], dict[str, list[int]]]:
-    """The config of the weights to begin with, which must be those that the flags ask for, with
-    `card_seeds` and `learned_seeds`; they learned from none of those to validate by."""
+    """Checks the weights of --from against the flags and the data.
+
+    Returns:
+        Their config, `card_seeds` and `learned_seeds`.
+
+    Raises:
+        UserError: they do not match, or they learned from a seed of the validation data.
+    """
     file = read_weights_file(arguments.start)
     config = file.config
     before = learned_seeds(file.card)
     shared = set(before.get(held_out.scenario, ())) & set(held_out.seeds)
     if shared:
         raise UserError(
-            f"{arguments.start} learned from the seed {min(shared)}, which is one to validate by: "
+            f"{arguments.start} learned from seed {min(shared)}, which is in the validation data: "
             "give others by --validation"
         )
     fixed = ["method", "preset", "orientations"]
     if arguments.angle_only:
-        # The angle network is then a fresh one: it alone depends on N, and may be of another size.
+        # The new angle network may have another N and size.
         fixed = ["method"] if config.has_unets_of(arguments.preset) else ["method", "preset"]
     for flag in fixed:
         given, found = getattr(arguments, flag), getattr(config, flag)
         if given != found:
             raise UserError(f"{arguments.start} has {flag} {found}: give --{flag} {found}")
     if config.colour and not learned.colour:
-        raise UserError(f"{arguments.start} looks at colours, and {arguments.demos} has none")
+        raise UserError(f"{arguments.start} needs colours, but {arguments.demos} has none")
     resolution, found = learned.grid.resolution, file.card.get("resolution")
     if found is not None and not math.isclose(found, resolution, rel_tol=1e-6):
         raise UserError(
-            f"{arguments.start} learned from pixels of {found:g} m, and {arguments.demos} has "
+            f"{arguments.start} learned from pixels of {found:g} m, but {arguments.demos} has "
             f"pixels of {resolution:g} m"
         )
     return config, tuple(sorted(card_seeds(file.card))), before
 
 
 def _check_validation(settings: Settings, held_out: TrainingData, path: Path) -> None:
-    """Raises UserError where no checkpoint, or no threshold for stopping, can be chosen by it."""
+    """Raises UserError if the data cannot select a checkpoint or the threshold for stopping."""
     if settings.colour and not held_out.colour:
-        raise UserError(f"{path} has no colours, and the networks look at them: validate by others")
-    _require_picks(held_out, path, "to validate by")
+        raise UserError(
+            f"{path} has no colours, but the networks need them: give others by --validation"
+        )
+    _require_picks(held_out, path, "for validation")
     if settings.stop and not held_out.finals(1):
         raise UserError(
-            f"of the {held_out.count} {held_out.kind} in {path} to validate by, none ends with "
-            f"nothing left to pick: the policy would never stop: {held_out.made} more, or give "
-            "others by --validation"
+            f"none of the {held_out.count} {held_out.kind} in {path} for validation ends with "
+            "nothing left to pick, so the policy would never learn to stop: "
+            f"{held_out.made} more, or give others by --validation"
         )
 
 
 def _require_picks(data: TrainingData, path: Path, purpose: str) -> None:
-    """Raises UserError where there is nothing to pick in any observation."""
+    """Raises UserError if no observation has an object to pick."""
     if not data.scenes(1):
         raise UserError(
-            f"of the {data.count} {data.kind} in {path} {purpose}, none has anything to pick: "
+            f"none of the {data.count} {data.kind} in {path} {purpose} has an object to pick: "
             f"{data.made} more"
         )
 
@@ -173,115 +181,114 @@ def _parse() -> argparse.Namespace:
     parser = _parser()
     arguments = parser.parse_args()
     if arguments.demos is None and not arguments.export:
-        parser.error("--demos says what to learn from")
+        parser.error("--demos is required, unless --export is given")
     if arguments.demos is None and not (arguments.weights or arguments.output):
-        parser.error("--export needs --demos to train first, or --output or --weights to export")
+        parser.error("--export needs --demos, --weights or --output")
     if arguments.demos and arguments.export and arguments.method == "transporter":
         parser.error("--export onnx: a transporter cannot be exported")
     if arguments.angle_only and not arguments.start:
-        parser.error("--angle-only needs --from: the weights of all other networks")
+        parser.error("--angle-only needs --from for the weights of the other networks")
     if arguments.angle_only and arguments.method == "transporter":
-        parser.error("--angle-only: a transporter has no network for angles alone")
+        parser.error("--angle-only: a transporter has no separate angle network")
     if arguments.rotations and arguments.method != "transporter":
         parser.error("--rotations is for --method transporter: the other methods rotate no images")
     if arguments.weights and (arguments.demos or not arguments.export):
-        parser.error("--weights is for --export without --demos")
+        parser.error("--weights can only be given with --export and without --demos")
     for flag, given in (
         ("--from", arguments.start),
         ("--validation", arguments.validation),
         ("--demonstrations", arguments.demonstrations),
     ):
         if arguments.demos is None and given is not None:
-            parser.error(f"{flag} needs --demos: without it nothing is trained")
+            parser.error(f"{flag} needs --demos")
     return arguments
 
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="python -m kitting_drake.train",
-        description="Train a policy's networks from demonstrations. Run again, it resumes.",
+        description="Train a policy's networks. Run the same command again to resume.",
     )
     parser.add_argument(
         "--demos",
         type=Path,
         metavar="FILE.h5",
-        help="what to learn from: what collect or draw_scenes wrote",
+        help="training data: a file of collect, draw_scenes or demonstrate",
     )
     parser.add_argument(
         "--demonstrations",
         type=count_type,
         metavar="N",
-        help="learn from the first N (all, but for those to validate by)",
+        help="train on the first N (default: all but the validation data)",
     )
     parser.add_argument(
         "--validation",
         type=Path,
         metavar="FILE.h5",
-        help="demonstrations to choose a checkpoint by (default: those of --demos that come after "
-        "the ones learned from, a tenth as many; of static scenes, those of other tools)",
+        help="validation data, which select the checkpoint (default: of --demos, those after the "
+        "training data, a tenth as many; of static scenes, those with other tools)",
     )
     parser.add_argument(
         "--from",
         dest="start",
         type=Path,
         metavar="FILE.safetensors",
-        help="weights to begin with, such as models/policies/generalist.safetensors (default: "
-        "fresh ones)",
+        help="initial weights, such as models/policies/generalist.safetensors (default: random)",
     )
     _add_settings(parser)
-    parser.add_argument("--output", type=Path, metavar="DIR", help="where all files go")
+    parser.add_argument("--output", type=Path, metavar="DIR", help="folder for all files")
     parser.add_argument(
         "--export",
         choices=("onnx",),
-        help="also write the networks for other programs, to the folder onnx in --output; without "
-        "--demos those trained in --output before, or of --weights, without training",
+        help="also write the networks to the folder onnx in --output; without --demos, only export "
+        "the networks trained in --output or those of --weights",
     )
     parser.add_argument(
-        "--weights", type=Path, metavar="FILE", help="what to export, without --demos"
+        "--weights", type=Path, metavar="FILE", help="weights to export, without --demos"
     )
     parser.add_argument("--quiet", action="store_true", help="print nothing but errors")
     return parser
 
 
 def _add_settings(parser: argparse.ArgumentParser) -> None:
-    """Adds the flags of what is trained, and how."""
+    """Adds the flags of the training settings."""
     parser.add_argument(
         "--angle-only",
         action="store_true",
-        help="train the pick-angle network alone, from fresh weights; all else is that of --from, "
-        "which may have been trained at another N, or be of a preset of the same U-nets",
+        help="train only the pick-angle network, from random weights; take the others from --from, "
+        "which may have another N, or another preset with the same U-nets",
     )
     parser.add_argument("--method", choices=METHODS, default="so2")
     parser.add_argument("--preset", choices=PRESETS, default="small", help="size of the networks")
-    parser.add_argument("--orientations", type=count_type, default=180, metavar="N")
+    parser.add_argument("--orientations", type=count_type, default=180, metavar="N", help="(180)")
     parser.add_argument(
         "--rotations",
         type=count_type,
         metavar="N",
-        help="of a transporter: of how many rotations of the crop, and half as many of the scene, "
-        "a step learns, at most all (default: those of the label and four more, the fewest)",
+        help="transporter: number of rotations of the crop that a step trains on, and half as many "
+        "of the scene (default: the label's and four more, the minimum)",
     )
     parser.add_argument("--steps", type=count_type, default=10_000, help="(10000)")
     parser.add_argument("--learning-rate", type=_rate_type, default=1e-4, help="Adam's (1e-4)")
     parser.add_argument(
-        "--decay", action="store_true", help="let the learning rate fall to zero over the steps"
+        "--decay", action="store_true", help="decay the learning rate to zero over the steps"
     )
     parser.add_argument(
         "--taken-only",
         action="store_true",
-        help="as in the paper: label each observation with what was picked then, not also with "
-        "what was picked later (always so where the task does not allow it)",
+        help="as in the paper: label each observation with the next pick only, not with later "
+        "picks too (always on if the task does not permit later picks)",
     )
     parser.add_argument(
         "--rigid",
         action="store_true",
-        help="as in the paper: augment by motions of the whole scene only, not by curvature (never "
-        "with transporter) and reflection (neither where the task does not allow it)",
+        help="as in the paper: augment by rigid motions only, without curvature (never used with "
+        "transporter) and reflection (both are off if the task does not permit them)",
     )
     parser.add_argument(
         "--validate-every", type=count_type, default=500, metavar="STEPS", help="(500)"
     )
-    parser.add_argument("--seed", type=seed_type, default=0, help="of weights and draws (0)")
+    parser.add_argument("--seed", type=seed_type, default=0, help="seed of weights and draws (0)")
 
 
 def _rate_type(text: str) -> float:
@@ -297,10 +304,10 @@ def _rate_type(text: str) -> float:
 def _split(
     path: Path, count: int | None, validation: Path | None
 ) -> tuple[TrainingData, TrainingData]:
-    """The data to learn from, and those to validate by."""
+    """The training and the validation data."""
     everything = read_training_data(path)
     total = everything.count
-    # By default all are used.
+    # Use all by default.
     most_kept = total if count is None else max(1, count // 10)
     if count is None:
         count = total if validation else _most_unrelated(everything, total - max(1, total // 11))
@@ -314,9 +321,9 @@ def _split(
         kept = everything.part(first, first + most_kept)
         if not kept.count or not count:
             raise UserError(
-                f"of {total} in {path}, {count} {everything.kind} to learn from leave none to "
-                "validate by"
-                f"{'' if everything.has_taken else ' that show other tools'}: "
+                f"{path} holds {total} {everything.kind}: {count} for training leave none for "
+                "validation"
+                f"{'' if everything.has_taken else ' with other tools'}: "
                 f"{everything.made} more, or give --validation"
             )
         return learned, kept
@@ -324,7 +331,7 @@ def _split(
     shared = learned.shares_scenes(held_out)
     if shared is not None:
         raise UserError(
-            f"{validation} and {path} share the seed {shared}: validation needs other ones"
+            f"{validation} and {path} share seed {shared}: validation needs other seeds"
         )
     if held_out.grid != everything.grid:
         raise UserError(f"{validation} and {path} have different pixel grids")
@@ -332,8 +339,8 @@ def _split(
 
 
 def _most_unrelated(data: TrainingData, wanted: int) -> int:
-    """The most of them, up to what is wanted, that show nothing of what those after them show; all
-    that are wanted if there are none."""
+    """The largest number, up to `wanted`, of first scenes that share no tools with later ones; if
+    there is none, `wanted`."""
     return max((end for end in data.unrelated if end <= wanted), default=wanted)
 
 

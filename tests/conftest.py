@@ -1,4 +1,4 @@
-"""What all tests share."""
+"""Fixtures of all tests."""
 
 import ctypes
 import importlib
@@ -14,13 +14,13 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 
-# Tests run side by side. Threads of torch's that find no idle processor take ten times as long.
+# Tests run in parallel. With more threads than processors, torch is ten times slower.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 
 @pytest.fixture(scope="session", autouse=True)
 def cache_home(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
-    """A cache of this session's own: what an older version built there must not pass a test."""
+    """A fresh cache, so that no test uses files of an older version."""
     with pytest.MonkeyPatch.context() as patch:
         folder = tmp_path_factory.mktemp("cache")
         patch.setenv("XDG_CACHE_HOME", str(folder))
@@ -29,7 +29,7 @@ def cache_home(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
 
 @pytest.fixture(scope="session")
 def rendering() -> None:
-    """Skips where images cannot be rendered."""
+    """Skips the test if images cannot be rendered."""
     try:
         ctypes.CDLL("libEGL.so.1")
     except OSError:
@@ -38,7 +38,7 @@ def rendering() -> None:
 
 @pytest.fixture(scope="session")
 def freed_diagrams() -> None:
-    """Skips where Drake keeps every Diagram in memory, as 1.51 does."""
+    """Skips the test if Drake keeps every Diagram in memory, as 1.51 does."""
     if importlib.metadata.version("drake").startswith("1.51."):
         pytest.skip("Drake 1.51 keeps every Diagram")
 
@@ -49,7 +49,7 @@ def verb(
 ) -> Iterator[Callable[..., subprocess.CompletedProcess[str]]]:
     """Runs `python -m kitting_drake.VERB ARGUMENTS...` in this process, from the root of the tree.
 
-    For all that a verb prints, writes and returns: this process has loaded what it takes.
+    It is faster than another process. The result holds the exit code and the output.
     """
 
     def run(name: str, *arguments: object) -> subprocess.CompletedProcess[str]:
@@ -66,7 +66,7 @@ def verb(
         assert isinstance(left.value.code, int)
         return subprocess.CompletedProcess(words, left.value.code, *capfd.readouterr())
 
-    # A command silences Drake.
+    # Commands change the level of Drake's log.
     level = logging.getLogger("drake").level
     yield run
     logging.getLogger("drake").setLevel(level)
@@ -74,7 +74,7 @@ def verb(
 
 @pytest.fixture(scope="session")
 def verb_process() -> Callable[..., subprocess.CompletedProcess[str]]:
-    """Runs `python -m kitting_drake.VERB ARGUMENTS...` from the root of the tree, as people do."""
+    """Runs `python -m kitting_drake.VERB ARGUMENTS...` in a process, from the root of the tree."""
 
     def run(name: str, *arguments: object) -> subprocess.CompletedProcess[str]:
         command = [sys.executable, "-m", f"kitting_drake.{name}", *map(str, arguments)]

@@ -1,4 +1,4 @@
-"""What the set-up promises to the policies: torch and escnn, without lie_learn or a compiler."""
+"""escnn works without lie_learn and without a compiler."""
 
 import subprocess
 import sys
@@ -33,16 +33,16 @@ space.irrep(1)(space.fibergroup.element((0.1, 0.2, 0.3), "ZYZ"))
 
 @pytest.fixture(scope="module")
 def done() -> subprocess.CompletedProcess[str]:
-    """Both, one after the other, in a process of their own, where nothing has imported escnn."""
+    """Runs both programs in a new process, where escnn is not imported yet."""
     program = f"{EQUIVARIANT}\nprint('works')\n{SOLID}"
     command = [sys.executable, "-W", "error", "-c", program]
     return subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
 
 
-def test_escnn_works_as_it_was_installed(done: subprocess.CompletedProcess[str]):
+def test_equivariant_layers_of_the_plane_work(done: subprocess.CompletedProcess[str]):
     assert done.stdout == "works\n", done.stderr
 
 
-def test_groups_of_space_are_refused_with_what_would_do(done: subprocess.CompletedProcess[str]):
+def test_groups_of_space_name_the_missing_package(done: subprocess.CompletedProcess[str]):
     assert done.returncode == 1
     assert "NotImplementedError: escnn needs the package lie_learn for SO(3)" in done.stderr

@@ -1,4 +1,4 @@
-"""The rooms of the house: imports go one way, nothing goes in circles, and a name occurs once."""
+"""The structure of the packages: imports are layered and acyclic, and names are unique."""
 
 import ast
 import itertools
@@ -13,7 +13,7 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 
-# From top to bottom: a room imports only from itself and from those below it.
+# Rooms (packages) from top to bottom. A room may import only itself and lower rooms.
 ROOMS = (
     "verbs",
     "reproduction",
@@ -36,7 +36,7 @@ ANY_SIZE = {ROOT / "systems", ROOT / "tests" / "systems"}
 
 Module = str
 Imports = dict[Module, dict[Module, int]]
-"""The modules of the tree that each module imports, and the line where it does."""
+"""For each module, the imported modules of the tree and the lines of the imports."""
 
 
 class Tree:
@@ -51,7 +51,7 @@ class Tree:
         self.sources = {name: ast.parse(path.read_bytes()) for name, path in self.files.items()}
         self.imports: Imports = {}
         self.outside: dict[Module, set[str]] = {}
-        """The packages that each module imports from elsewhere."""
+        """The external packages that each module imports."""
         for name, source in self.sources.items():
             self.imports[name], self.outside[name] = {}, set()
             for imported, line in self._imported(name, source):
@@ -61,7 +61,7 @@ class Tree:
                     self.outside[name].add(imported.partition(".")[0])
 
     def _imported(self, name: Module, source: ast.Module) -> Iterator[tuple[Module, int]]:
-        """All imports of a file: those in functions and under TYPE_CHECKING, too."""
+        """All imports of a file, including those in functions and under TYPE_CHECKING."""
         is_package = self.files[name].name == "__init__.py"
         package = name.split(".") if is_package else name.split(".")[:-1]
         for node in ast.walk(source):
@@ -86,8 +86,8 @@ class Tree:
         return room if room in ROOMS and name != "kitting_drake.hkd.__main__" else "verbs"
 
     def folder(self, name: Module) -> str:
-        """The folder of a file. An `__init__.py` that gathers what a folder offers stands above
-        the folder's other files."""
+        """The folder of a module. An `__init__.py` counts as above the other files of its folder,
+        which it re-exports."""
         path = self.files[name]
         if self.room(name) == "verbs":
             return "verbs"
@@ -100,7 +100,7 @@ def _module(path: Path) -> Module:
 
 
 def circle(graph: Mapping[str, Iterable[str]]) -> list[str]:
-    """The nodes of one circle of a graph, or none."""
+    """The nodes of a cycle of a graph; empty if it is acyclic."""
     try:
         TopologicalSorter(graph).prepare()
     except CycleError as error:
@@ -128,12 +128,12 @@ def test_imports_go_down(tree: Tree):
     assert not climbing, "\n".join(climbing)
 
 
-def test_no_module_is_in_a_circle(tree: Tree):
+def test_modules_have_no_cyclic_imports(tree: Tree):
     found = circle(tree.imports)
     assert not found, " <- ".join(found)
 
 
-def test_no_folder_is_in_a_circle(tree: Tree):
+def test_folders_have_no_cyclic_imports(tree: Tree):
     graph: dict[str, dict[str, str]] = defaultdict(dict)
     for name, imported in tree.imports.items():
         for other in imported:
@@ -144,7 +144,7 @@ def test_no_folder_is_in_a_circle(tree: Tree):
     assert not found, "\n".join(steps)
 
 
-def test_systems_and_policies_import_nothing_that_is_not_theirs(tree: Tree):
+def test_forbidden_external_imports(tree: Tree):
     wrong = []
     for name, packages in tree.outside.items():
         barred: set[str] = set()
@@ -163,7 +163,7 @@ def test_the_real_camera_loads_without_drake(tree: Tree):
     assert done.returncode == 0, done.stderr
 
 
-def test_no_file_name_occurs_twice(tree: Tree):
+def test_file_names_are_unique(tree: Tree):
     count = Counter(path.name for path in tree.files.values())
     twice = [
         str(path.relative_to(ROOT))
@@ -173,7 +173,7 @@ def test_no_file_name_occurs_twice(tree: Tree):
     assert not twice, "\n".join(twice)
 
 
-def test_no_public_class_occurs_twice(tree: Tree):
+def test_public_class_names_are_unique(tree: Tree):
     places = defaultdict(list)
     for name, source in tree.sources.items():
         for node in source.body:

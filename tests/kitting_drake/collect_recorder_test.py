@@ -1,4 +1,4 @@
-"""What the oracle's demonstrations are made of: `kitting_drake.collect.DemonstrationRecorder`."""
+"""Tests of `kitting_drake.collect.DemonstrationRecorder`."""
 
 import dataclasses
 import itertools
@@ -30,7 +30,7 @@ SMALL = {
     for name, camera in Scenario().cameras.items()
     if isinstance(camera, Pinhole)
 }
-# The tools still sink onto the table: no two steps are the same.
+# The tools still settle on the table, so observations differ between steps.
 HASTY = PickPlaceParameters(observe_settle=0.02)
 
 
@@ -50,7 +50,7 @@ def assert_shows(step: DemonstrationStep, observation: Observation) -> None:
     np.testing.assert_array_equal(step.image, expected.image)
 
 
-def test_a_demonstration_is_what_was_acted_upon_and_what_was_left():
+def test_records_observations_actions_and_the_final_observation():
     rig = rig_of("combination_wrench", planner=HASTY)
     recorder = DemonstrationRecorder(rig.station)
     latched: list[tuple[PlanarPose, PlanarPose]] = []
@@ -66,7 +66,7 @@ def test_a_demonstration_is_what_was_acted_upon_and_what_was_left():
     (step,) = made.steps
     assert (step.object, step.category) == ("combination_wrench", "wrench")
     assert (step.pick, step.place) == latched[0]
-    # The wrench is seen at the pick, and where it was not seen at the end.
+    # The wrench is at the pick in the first observation, but not in the final one.
     assert made.final is not None
     row, col = np.round(Scenario().heightmap.grid().to_pixel([step.pick.x, step.pick.y]))
     here = np.s_[int(row) - 3 : int(row) + 4, int(col) - 3 : int(col) + 4]
@@ -74,7 +74,7 @@ def test_a_demonstration_is_what_was_acted_upon_and_what_was_left():
     assert made.final.height[here].max() < 0.003
 
 
-def test_what_is_taken_down_is_what_a_policy_has_seen(monkeypatch: pytest.MonkeyPatch):
+def test_records_the_policys_observation(monkeypatch: pytest.MonkeyPatch):
     action = PickPlaceAction(PlanarPose(0.35, 0.3, 0.1), PlanarPose(0.5, 0.0, 0.2))
     seen: list[Observation] = []
 
@@ -96,7 +96,7 @@ def test_what_is_taken_down_is_what_a_policy_has_seen(monkeypatch: pytest.Monkey
 
 
 def as_success(result: EpisodeResult, *outcomes: str) -> EpisodeResult:
-    """The result of an episode that ended well, with such actions on one object after another."""
+    """A successful episode with the given actions."""
     actions = [
         ActionRecord(
             f"object_{number}", "any", outcome, PlanarPose(), PlanarPose(), None, None, None, None
@@ -106,8 +106,8 @@ def as_success(result: EpisodeResult, *outcomes: str) -> EpisodeResult:
     return dataclasses.replace(result, success_rate=1.0, failure=None, actions_taken=actions)
 
 
-def test_only_what_was_placed_is_a_step():
-    """Told of actions on two tools that do not move, of which the first fails twice."""
+def test_failed_actions_are_omitted():
+    """Two tools do not move, and the first action on one fails twice."""
     rig = rig_of("claw_hammer", "flat_screwdriver")
     recorder = DemonstrationRecorder(rig.station)
     root: Context = rig.diagram.CreateDefaultContext()
@@ -147,12 +147,12 @@ def test_only_what_was_placed_is_a_step():
     assert (made.steps[0].image != made.steps[1].image).any()
     assert made.final is not None
     np.testing.assert_array_equal(made.final.height, left.height)
-    # One that scores less than all, or failed, is none.
+    # Failures and episodes without full success are rejected.
     less = dataclasses.replace(result, success_rate=0.5)
     assert recorder.demonstration(less) == Rejection(3, 0.5, "the reward was 50%")
     failed = dataclasses.replace(result, success_rate=0.0, failure="the solver", actions_taken=[])
     assert recorder.demonstration(failed) == Rejection(3, 0.0, "the solver")
-    # What was picked again lay elsewhere before, which matters where later picks are labels.
+    # A second action on an object is rejected where later picks are labels.
     first, *others, last = result.actions_taken
     twice = [first, *others, dataclasses.replace(last, object=first.object)]
     again = dataclasses.replace(result, actions_taken=twice)

@@ -38,7 +38,7 @@ BAD = {11, 14, 15}
 
 
 class Oracle:
-    """Demonstrates at once, or is killed; knows which seeds it was asked for."""
+    """Demonstrates immediately, or is killed; records the seeds of its calls."""
 
     def __init__(self, killed_after: int = 1000) -> None:
         self.asked: list[int] = []
@@ -48,7 +48,7 @@ class Oracle:
         if len(self.asked) == self._killed_after:
             raise KeyboardInterrupt
         self.asked.append(seed)
-        # Later seeds end before earlier ones.
+        # Some seeds end before earlier ones.
         time.sleep(0.02 * (seed % 3 == 1))
         if seed in BAD:
             return Rejection(seed, 0.5, f"{seed} is bad")
@@ -65,7 +65,7 @@ def collect(folder: Path, count: int, oracle: Oracle | None = None, workers: int
 
 
 def content(folder: Path) -> dict[str, object]:
-    """All that a demonstrations file holds, by name."""
+    """The whole content of a demonstrations file by name."""
     found: dict[str, object] = {}
 
     def note(name: str, item: h5py.Group | h5py.Dataset) -> None:
@@ -81,7 +81,7 @@ def content(folder: Path) -> dict[str, object]:
     return found
 
 
-def test_the_seeds_for_tests_and_for_learning_are_not_the_same():
+def test_ranges_of_seeds_are_disjoint():
     kinds = (TEST_SEEDS, DEMONSTRATION_SEEDS, VALIDATION_SEEDS)
     assert len({seed for seeds in kinds for seed in seeds}) == 30_000
     assert seeds_from(10_003) == range(10_003, 20_000)
@@ -94,9 +94,9 @@ def test_the_seeds_for_tests_and_for_learning_are_not_the_same():
         ([], [], [], 10),
         ([], [], [10, 11], 12),
         ([10], [], [11, 12], None),
-        # One of those at work was rejected.
+        # A seed in progress was rejected.
         ([10], [11], [12], 13),
-        # A hole that a killed run has left.
+        # A killed run left a gap.
         ([10, 12], [], [], 11),
         ([10, 12, 13], [], [], 11),
         ([10, 12, 13], [], [11], None),
@@ -107,22 +107,22 @@ def test_the_next_seed(accepted, rejected, working, expected):
     assert next_seed(range(10, 20), 3, accepted, rejected, working) == expected
 
 
-def test_seeds_come_to_an_end():
-    with pytest.raises(UserError, match="the seeds from 10 end at 12: ask for fewer"):
+def test_too_few_seeds_are_refused():
+    with pytest.raises(UserError, match="only seeds 10 to 12"):
         next_seed(range(10, 13), 4, [], [], [])
-    with pytest.raises(UserError, match="the seeds from 10 end at 12"):
+    with pytest.raises(UserError, match="only seeds 10 to 12"):
         next_seed(range(10, 13), 3, [10, 12], [11], [])
     assert next_seed(range(10, 13), 3, [10, 11, 12], [], []) is None
 
 
-def test_an_oracle_that_always_fails_is_told_of():
-    with pytest.raises(UserError, match="failed with 20 seeds in a row, 11 to 30"):
+def test_an_oracle_that_always_fails_ends_collecting():
+    with pytest.raises(UserError, match="failed on 20 seeds in a row, 11 to 30"):
         next_seed(range(10, 99), 3, [10], range(11, 31), [])
     assert next_seed(range(10, 99), 3, [10], range(11, 30), []) == 30
 
 
 @pytest.mark.parametrize("workers", [1, 3])
-def test_the_first_seeds_that_are_not_rejected(tmp_path: Path, workers: int):
+def test_collects_the_first_seeds_that_are_not_rejected(tmp_path: Path, workers: int):
     collect(tmp_path, 4, workers=workers)
     assert [item.name for item in tmp_path.iterdir()] == ["demonstrations.h5"]
     read = read_demonstrations(tmp_path / "demonstrations.h5")
@@ -135,13 +135,13 @@ def test_the_first_seeds_that_are_not_rejected(tmp_path: Path, workers: int):
 
 @pytest.mark.parametrize("workers", [1, 3])
 @pytest.mark.parametrize("after", range(1, 7))
-def test_goes_on_where_it_was_stopped(tmp_path: Path, after: int, workers: int):
+def test_resumes_a_stopped_run(tmp_path: Path, after: int, workers: int):
     collect(tmp_path / "whole", 4)
     with pytest.raises(KeyboardInterrupt):
         collect(tmp_path / "stopped", 4, Oracle(killed_after=after), workers)
     parts = tmp_path / "stopped" / "parts"
     kept = {int(path.stem.removeprefix("seed_")) for path in parts.glob("seed_*")}
-    # Killed while files were being written.
+    # Simulate a kill while files are being written.
     for name in (".seed_00000099.h5.scratch", ".seed_00000099.json.x1"):
         parts.mkdir(parents=True, exist_ok=True)
         (parts / name).write_text("half")
@@ -151,7 +151,7 @@ def test_goes_on_where_it_was_stopped(tmp_path: Path, after: int, workers: int):
     assert not parts.exists()
 
 
-def test_killed_before_the_parts_were_gone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_removes_parts_left_by_a_killed_process(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     collect(tmp_path / "whole", 4)
     with monkeypatch.context() as patch:
         patch.setattr(Collection, "_remove_parts", lambda *_: None)
@@ -163,14 +163,14 @@ def test_killed_before_the_parts_were_gone(tmp_path: Path, monkeypatch: pytest.M
     assert content(tmp_path) == content(tmp_path / "whole")
 
 
-def test_more_are_added_to_those_there(tmp_path: Path):
+def test_adds_demonstrations_to_a_finished_run(tmp_path: Path):
     collect(tmp_path / "whole", 5)
     collect(tmp_path / "extended", 2)
     assert collect(tmp_path / "extended", 5).asked == [13, 14, 15, 16, 17]
     assert content(tmp_path / "extended") == content(tmp_path / "whole")
 
 
-def test_fewer_after_a_stop_lose_nothing(tmp_path: Path):
+def test_fewer_demonstrations_after_a_stop_keep_the_parts(tmp_path: Path):
     collect(tmp_path / "whole", 2)
     with pytest.raises(KeyboardInterrupt):
         collect(tmp_path / "stopped", 9, Oracle(killed_after=6))
@@ -179,8 +179,8 @@ def test_fewer_after_a_stop_lose_nothing(tmp_path: Path):
     assert collect(tmp_path / "stopped", 4).asked == [16]
 
 
-def test_rejections_of_another_stretch_of_seeds_are_not_told(tmp_path: Path):
-    """A run was stopped, and another begun in its folder further on."""
+def test_rejections_of_other_seeds_are_ignored(tmp_path: Path):
+    """A stopped run left them in the folder."""
     (tmp_path / "parts").mkdir()
     rejected = {"seed": 3, "score": 0.0, "reason": "of another run"}
     (tmp_path / "parts" / "seed_00000003.json").write_text(json.dumps(rejected))
@@ -197,7 +197,7 @@ def test_a_file_of_another_origin_is_refused(tmp_path: Path):
 
 
 class Mortal(Oracle):
-    """Dies on the way to seed 12, so many times."""
+    """Dies at seed 12, `deaths` times."""
 
     def __init__(self, deaths: int, exit_code: int) -> None:
         super().__init__()
@@ -210,20 +210,20 @@ class Mortal(Oracle):
 
 
 @pytest.mark.parametrize("exit_code", [1, -signal.SIGKILL])
-def test_a_process_that_dies_is_given_a_second_chance(tmp_path: Path, exit_code: int):
+def test_a_process_that_dies_is_retried_once(tmp_path: Path, exit_code: int):
     collect(tmp_path / "whole", 2)
     assert collect(tmp_path, 2, Mortal(1, exit_code)).asked == [10, 11, 12, 12]
     assert content(tmp_path) == content(tmp_path / "whole")
 
 
-def test_a_seed_that_takes_its_process_down_is_rejected(tmp_path: Path):
+def test_a_seed_that_crashes_twice_is_rejected(tmp_path: Path):
     collect(tmp_path, 2, Mortal(2, -signal.SIGSEGV))
     rejected = read_demonstrations(tmp_path / "demonstrations.h5").rejected
     assert rejected[-1] == Rejection(12, 0.0, "its process ended with exit code -11")
 
 
-def test_what_is_killed_from_outside_is_not_rejected(tmp_path: Path):
-    with pytest.raises(UserError, match="seed 12 was killed twice, perhaps for want of memory"):
+def test_a_seed_killed_from_outside_is_not_rejected(tmp_path: Path):
+    with pytest.raises(UserError, match="seed 12 was killed twice"):
         collect(tmp_path, 2, Mortal(2, -signal.SIGKILL))
     assert collect(tmp_path, 2).asked == [12]
 
@@ -232,7 +232,7 @@ def arguments(folder: Path, *more: object) -> list[str]:
     return ["collect", "scenarios/kitting_oracle.yaml", "--output", str(folder), *map(str, more)]
 
 
-def test_without_rendering_one_sentence(
+def test_without_rendering_prints_one_line(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
     monkeypatch.chdir(ROOT)
@@ -245,25 +245,25 @@ def test_without_rendering_one_sentence(
     assert line.startswith("error: rendering needs the system library libEGL")
 
 
-def test_without_cameras_one_sentence(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_a_scenario_without_cameras_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.chdir(ROOT)
     scenario = tmp_path / "blind.yaml"
     scenario.write_text("Blind: {cameras: {}}\n")
     monkeypatch.setattr(sys, "argv", ["collect", str(scenario), "--output", str(tmp_path / "out")])
     with pytest.raises(UserError, match=r"blind\.yaml: cameras is empty"):
         collecting.main()
-    # It can be corrected and collected into the same folder.
+    # The corrected scenario can use the same folder.
     assert not (tmp_path / "out" / "scenario.json").exists()
 
 
-def test_two_do_not_collect_into_one_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_a_folder_in_use_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.chdir(ROOT)
     monkeypatch.setattr(sys, "argv", arguments(tmp_path))
     with alone_in(tmp_path), pytest.raises(UserError, match="another process is at work"):
         collecting.main()
 
 
-def test_what_is_finished_is_left_alone(
+def test_a_finished_collection_is_not_repeated(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
     monkeypatch.chdir(ROOT)
@@ -282,10 +282,10 @@ def test_what_is_finished_is_left_alone(
     monkeypatch.setattr(sys, "argv", [*arguments(tmp_path), "--scenario_text", "{time_limit: 2}"])
     with pytest.raises(UserError, match="another scenario"):
         collecting.main()
-    monkeypatch.setattr(collecting, "files_digest", lambda _: "of a tool annotated anew")
+    monkeypatch.setattr(collecting, "files_digest", lambda _: "another digest")
     monkeypatch.setattr(sys, "argv", arguments(tmp_path, "--demos", 3, "--seed", 10))
     with pytest.raises(
-        UserError, match=r"another scenario, tools or version \(task_digest is of a"
+        UserError, match=r"another scenario, tools or version \(task_digest is another"
     ):
         collecting.main()
 
@@ -295,7 +295,7 @@ def test_demonstrations_are_exported(
 ):
     pytest.importorskip("pyarrow", exc_type=ImportError)
     monkeypatch.chdir(ROOT)
-    # That of the scenario.
+    # Use the scenario's grid.
     monkeypatch.setattr(sys.modules[__name__], "GRID", PixelGrid())
     monkeypatch.setattr(collecting, "require_rendering", lambda: None)
     monkeypatch.setattr(collecting, "build_any_chosen", lambda *_, **__: None)
@@ -308,14 +308,14 @@ def test_demonstrations_are_exported(
 
     main(1)
     assert not (tmp_path / "lerobot").exists()
-    # Those that are there, without collecting; and again, which changes nothing.
+    # Exports existing demonstrations without collecting; repeating it changes nothing.
     told = main(1, "--export", "lerobot")
     assert told.startswith("nothing to collect: ")
     assert told.endswith(f"as a LeRobotDataset: {tmp_path / 'lerobot'}/\n")
     before = (tmp_path / "lerobot").stat()
     main(1, "--export", "lerobot")
     assert (tmp_path / "lerobot").stat() == before
-    # An export of other demonstrations is in the way: told before any are collected.
+    # An export of other demonstrations is refused before collecting.
     with pytest.raises(UserError, match="lerobot exists"):
         main(2, "--export", "lerobot")
     assert len(read_demonstrations(tmp_path / "demonstrations.h5").demonstrations) == 1
@@ -334,7 +334,7 @@ OneTool:
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("rendering")
-def test_killed_again_and_again_it_collects_what_it_would_have(verb_process, tmp_path: Path):
+def test_a_repeatedly_killed_run_collects_the_same_file(verb_process, tmp_path: Path):
     scenario = tmp_path / "one_tool.yaml"
     scenario.write_text(ONE_TOOL)
     whole, killed = tmp_path / "whole", tmp_path / "killed"

@@ -1,4 +1,4 @@
-"""Processes that are killed, and a made-up policy."""
+"""Fixtures: killing processes, and untrained weights."""
 
 import os
 import random
@@ -13,7 +13,7 @@ import pytest
 
 @pytest.fixture(scope="session")
 def kill_at_random() -> Callable[..., None]:
-    """Kills a process at a random moment: after a file of its own has changed so many times."""
+    """Kills a process at a random moment after `changes` changes of a file."""
 
     def kill(process: subprocess.Popen, file: Path, rng: random.Random, *, changes: int) -> None:
         def size() -> int:
@@ -22,10 +22,10 @@ def kill_at_random() -> Callable[..., None]:
         for _ in range(changes):
             before = size()
             while size() == before:
-                assert process.poll() is None, "it was to be killed before its end"
+                assert process.poll() is None, "it ended before the kill"
                 time.sleep(0.01)
         time.sleep(rng.uniform(0, 0.5))
-        assert process.poll() is None, "it was to be killed before its end"
+        assert process.poll() is None, "it ended before the kill"
         os.kill(process.pid, signal.SIGKILL)
         process.wait()
 
@@ -34,8 +34,8 @@ def kill_at_random() -> Callable[..., None]:
 
 @pytest.fixture(scope="session")
 def weights_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A policy that has learned nothing: the smallest networks, as they are before training."""
-    # Who tests no network does not wait for torch.
+    """Weights of the smallest networks before training."""
+    # Import torch lazily.
     import torch
 
     from kitting_drake.policies.networks.architecture import NetworkConfig

@@ -1,4 +1,4 @@
-"""From files of frames to an action: that of the rig, and without Drake."""
+"""Decisions on frames from files equal those in the cell, and need no Drake."""
 
 import dataclasses
 import io
@@ -50,7 +50,7 @@ def rendered(seed: int, policy: str) -> Rendered:
 
 
 def check_against_cell(seed: int, folder: Path) -> None:
-    """The generalist's decision on files is the cell's: on .npy to the last bit."""
+    """Checks the generalist's decision on files; on .npy it must be bit-identical."""
     found = rendered(seed, '!Learned {weights: ""}')
     write_calibration(folder / "calibration.yaml", found.calibration)
     calibration = read_calibration(folder / "calibration.yaml")
@@ -61,7 +61,7 @@ def check_against_cell(seed: int, folder: Path) -> None:
     np.testing.assert_array_equal(decision.observation.valid, found.observation.valid)
     assert decision.action == found.action
     assert 0 <= decision.choice.confidence <= 1
-    # In steps of a millimetre the grasp may be another, but the same tool comes to the same place.
+    # Depth rounded to millimetres may change the grasp, but not the tool and its place.
     stepped = read_frames([write_frames(folder / "png", found.frames, "png")], calibration)
     other = decide(stepped, calibration, policy).action
     assert (difference(other, decision.action) < (10.0, 1.0, 0.7)).all()
@@ -73,8 +73,8 @@ def scene(rendering: None) -> Rendered:
 
 
 @pytest.mark.parametrize("high", [0.008, 0.04])
-def test_what_stands_out_is_mended_when_the_cell_mends_it(high: float, scene: Rendered):
-    """A little: pressed down at once. By more: taken out when nothing else is left that fits."""
+def test_recovers_when_the_cell_does(high: float, scene: Rendered):
+    """A slightly protruding tool is pressed; one that protrudes more is taken out at the end."""
     seen = scene.observation
     fixture = segment(seen).fixture
     rows, cols = np.nonzero(fixture)
@@ -93,18 +93,18 @@ def test_what_stands_out_is_mended_when_the_cell_mends_it(high: float, scene: Re
 
 @pytest.mark.usefixtures("rendering")
 @pytest.mark.parametrize("seed", [1503])
-def test_frames_as_files_are_decided_on_as_in_the_cell(seed: int, tmp_path: Path):
+def test_decisions_on_files_equal_those_in_the_cell(seed: int, tmp_path: Path):
     check_against_cell(seed, tmp_path)
 
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("rendering")
 @pytest.mark.parametrize("seed", range(1500, 1520))
-def test_twenty_scenes_are_decided_on_as_in_the_cell(seed: int, tmp_path: Path):
+def test_decisions_on_twenty_scenes_equal_those_in_the_cell(seed: int, tmp_path: Path):
     check_against_cell(seed, tmp_path)
 
 
-def test_shape_matching_decides_as_in_the_cell_too(scene: Rendered):
+def test_shape_matching_equals_that_in_the_cell(scene: Rendered):
     decision = decide(scene.frames, scene.calibration, ShapeMatching())
     assert decision.action == scene.action
     record = decision.as_dict()
@@ -114,14 +114,14 @@ def test_shape_matching_decides_as_in_the_cell_too(scene: Rendered):
     assert heights == sorted(heights)
     place = record["place"]
     assert place["lowest_z"] <= place["z"] < place["hover_z"]
-    # Where a grasp failed it is not tried again.
+    # A failed grasp is not repeated.
     second = decide(scene.frames, scene.calibration, ShapeMatching(), [decision.action.pick])
     assert difference(second.action, decision.action)[0] > 9
     with Image.open(io.BytesIO(decision.draw())) as picture:
         assert picture.format == "PNG"
 
 
-def test_a_table_that_is_higher_raises_the_action_by_as_much(scene: Rendered):
+def test_a_higher_table_raises_the_action(scene: Rendered):
     """The same scene in a base frame whose origin is 0.3 m below the table."""
     calibration = scene.calibration
     raised = dataclasses.replace(
@@ -141,7 +141,7 @@ def test_a_table_that_is_higher_raises_the_action_by_as_much(scene: Rendered):
     assert high["pick"]["x"] == pytest.approx(low["pick"]["x"], abs=1e-4)
 
 
-# The command, where there is no Drake.
+# The command without Drake.
 
 _NO_DRAKE = """
 import runpy, sys
@@ -169,7 +169,7 @@ def bench(written: Path, tmp_path: Path) -> Path:
 
 @pytest.fixture
 def refusal(bench: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., str]:
-    """Why `decide` refuses; in this process."""
+    """Runs `decide` in this process, which must fail; returns its error."""
 
     def run(*flags: object) -> str:
         arguments = [bench, "--camera", bench / "calibration.yaml", "--output", bench / "out"]
@@ -182,7 +182,7 @@ def refusal(bench: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., str]:
 
 
 def command(bench: Path, *flags: object) -> subprocess.CompletedProcess[str]:
-    """`decide` in a process that has no Drake."""
+    """Runs `decide` in a process without Drake."""
     arguments = [bench, "--camera", bench / "calibration.yaml", "--output", bench / "out", *flags]
     return subprocess.run(
         [sys.executable, "-c", _NO_DRAKE, *map(str, arguments)],
@@ -193,7 +193,7 @@ def command(bench: Path, *flags: object) -> subprocess.CompletedProcess[str]:
     )
 
 
-def test_the_command_needs_neither_drake_nor_torch_to_match_shapes(bench: Path):
+def test_shape_matching_needs_neither_drake_nor_torch(bench: Path):
     done = command(bench, "--shape_matching")
     assert (done.returncode, done.stderr.strip()) == (0, "False"), done.stderr
     record = json.loads((bench / "out" / "action.json").read_text())
@@ -202,7 +202,7 @@ def test_the_command_needs_neither_drake_nor_torch_to_match_shapes(bench: Path):
     assert (bench / "out" / "decision.png").stat().st_size > 10_000
 
 
-def test_the_command_decides_by_networks_without_drake(bench: Path, weights_file: Path):
+def test_networks_need_no_drake(bench: Path, weights_file: Path):
     done = command(bench, "--weights", weights_file, "--orientations", 36)
     assert (done.returncode, done.stderr.strip()) == (0, "True"), done.stderr
     record = json.loads((bench / "out" / "action.json").read_text())
@@ -210,7 +210,7 @@ def test_the_command_decides_by_networks_without_drake(bench: Path, weights_file
     assert 0 <= record["confidence"] <= 1
 
 
-def test_the_command_checks_cameras_without_drake(bench: Path):
+def test_the_check_needs_no_drake(bench: Path):
     done = command(bench, "--check", "--kit_size_mm", 200, 150, 50)
     assert (done.returncode, done.stderr.strip()) == (0, "False"), done.stderr
     record = json.loads((bench / "out" / "check.json").read_text())
@@ -229,14 +229,12 @@ def test_the_command_checks_cameras_without_drake(bench: Path):
         ((0.5, 0, 90), "--kit_pose: the yaw 90 is more than a rotation"),
     ],
 )
-def test_a_block_that_cannot_lie_there_is_refused(
-    pose: tuple, message: str, refusal: Callable[..., str]
-):
+def test_an_invalid_block_is_refused(pose: tuple, message: str, refusal: Callable[..., str]):
     flags = ("--check", "--kit_size_mm", 200, 150, 50, "--kit_pose", *pose)
     assert re.match(message, refusal(*flags))
 
 
-def test_input_that_cannot_be_used_ends_with_one_sentence(
+def test_invalid_input_prints_one_line(
     bench: Path, verb: Callable[..., subprocess.CompletedProcess[str]]
 ):
     arguments = [bench, "--camera", bench / "calibration.yaml", "--output", bench / "out"]
@@ -247,7 +245,7 @@ def test_input_that_cannot_be_used_ends_with_one_sentence(
     assert verb("decide", *arguments, "--check").returncode == 2
     assert [path.name for path in (bench / "out").iterdir()] == ["action.json"]
     done = verb("decide", *arguments, "--shape_matching")
-    # What an earlier frame was answered is no answer to this one.
+    # The action of an earlier frame is removed.
     assert not list((bench / "out").iterdir())
     assert done.returncode == 2
     assert done.stderr.startswith("error: camera left: ")
@@ -255,7 +253,7 @@ def test_input_that_cannot_be_used_ends_with_one_sentence(
     assert "Traceback" not in done.stderr
 
 
-def test_the_action_of_a_demonstration_is_not_lost(bench: Path, refusal: Callable[..., str]):
+def test_does_not_overwrite_the_action_of_a_demonstration(bench: Path, refusal: Callable[..., str]):
     (bench / "out").mkdir()
     kept = bench / "out" / "action.json"
     for text in ('{"pick": {}, "place": {}, "object": "hammer"}', "{", "[]"):
@@ -266,12 +264,12 @@ def test_the_action_of_a_demonstration_is_not_lost(bench: Path, refusal: Callabl
 
 
 @pytest.mark.parametrize("flags", [("--orientations", 36), ("--no_outlines",)])
-def test_flags_of_networks_are_not_ignored(refusal: Callable[..., str], flags: tuple):
+def test_flags_of_networks_exclude_shape_matching(refusal: Callable[..., str], flags: tuple):
     sentence = refusal("--shape_matching", *flags)
     assert sentence == f"{flags[0]} is for networks, and --shape_matching has none"
 
 
-# What may be wrong with frames.
+# Invalid frames.
 
 
 def spoil(change: Callable[[np.ndarray], np.ndarray]) -> Callable[[Path], None]:
@@ -310,7 +308,7 @@ def broken_header(folder: Path) -> None:
 
 
 def broken_chunk(folder: Path) -> None:
-    """Of the kind that a faulty disk makes: what follows the first data is no chunk."""
+    """A PNG whose second chunk is damaged, as by a faulty disk."""
     path = folder / "front_color.png"
     image = np.random.default_rng(0).integers(0, 255, (480, 640, 3), np.uint8)
     Image.fromarray(image).save(path)
@@ -337,24 +335,22 @@ def broken_chunk(folder: Path) -> None:
         (archive, r"is an archive of arrays \(.npz\)"),
     ],
 )
-def test_frames_that_cannot_be_are_refused(
-    bench: Path, change: Callable[[Path], None], message: str
-):
+def test_invalid_frames_are_refused(bench: Path, change: Callable[[Path], None], message: str):
     change(bench)
     with pytest.raises(UserError, match=message) as raised:
         decide(read_frames([bench], TRUE), TRUE, ShapeMatching())
     assert "\n" not in str(raised.value)
 
 
-def test_a_frame_of_ones_own_has_the_shape_of_an_image():
-    """Drake and others have a last axis of one channel."""
+def test_a_frame_with_a_channel_axis_is_refused():
+    """Depth images of Drake have a last axis of one channel."""
     frames = cast(TRUE)
     frames["left"] = Frame(frames["left"].color, frames["left"].depth[..., None])
     with pytest.raises(UserError, match=r"must be \(height, width\), not \(480, 640, 1\)"):
         decide(frames, TRUE, ShapeMatching())
 
 
-def test_steps_of_more_than_16_bits_are_not_wrapped(tmp_path: Path):
+def test_depths_of_32_bits_do_not_overflow(tmp_path: Path):
     front = Calibration((dataclasses.replace(TRUE.cameras[0], depth_scale=1e-5),), TRUE.grid)
     frames = cast(front)
     write_frames(tmp_path, frames)
@@ -373,7 +369,7 @@ def test_steps_of_more_than_16_bits_are_not_wrapped(tmp_path: Path):
         ({}, {"rows": 1, "cols": 1}, "the workspace is too small for camera"),
     ],
 )
-def test_what_leaves_nothing_to_see_is_told(
+def test_frames_without_usable_depth_are_refused(
     camera: dict[str, float], grid: dict[str, int], message: str
 ):
     cameras = (dataclasses.replace(TRUE.cameras[0], **camera), *TRUE.cameras[1:])
@@ -382,8 +378,8 @@ def test_what_leaves_nothing_to_see_is_told(
         decide(cast(TRUE), blind, ShapeMatching())
 
 
-def test_missing_depths_are_unseen_and_no_error():
-    """Zero and NaN are what cameras say where light did not come back."""
+def test_missing_depths_are_unseen_pixels():
+    """Cameras mark missing depth as zero or NaN."""
     front = Calibration(TRUE.cameras[:1], TRUE.grid)
     frames = cast(front, BLOCK)
     depth = frames["front"].depth.copy()
@@ -393,7 +389,7 @@ def test_missing_depths_are_unseen_and_no_error():
     assert 500 < (whole.observation.valid & ~seen.observation.valid).sum() < 12000
 
 
-def test_nobody_stops_where_little_is_seen():
+def test_a_mostly_unseen_table_is_refused():
     front = Calibration(TRUE.cameras[:1], TRUE.grid)
     color, depth = (getattr(cast(front)["front"], name).copy() for name in ("color", "depth"))
     assert decide({"front": Frame(color, depth)}, front, ShapeMatching()).action.stop
@@ -402,14 +398,14 @@ def test_nobody_stops_where_little_is_seen():
         decide({"front": Frame(color, depth)}, front, ShapeMatching())
 
 
-def test_a_near_camera_may_see_little_but_a_kit():
+def test_a_near_camera_that_sees_mostly_a_kit_is_accepted():
     down = dataclasses.replace(
         TRUE.cameras[0],
         X_BC=np.array([[0.0, -1, 0, 0.5], [-1, 0, 0, 0], [0, 0, -1, 0.3], [0, 0, 0, 1]]),
     )
     near = Calibration((down,), TRUE.grid)
     frames = cast(near, Block((0.24, 0.22, 0.05), (0.5, 0.0, 0.0)))
-    # The kit hides some of the table.
+    # The kit occludes part of the table.
     assert decide(frames, near, ShapeMatching()).seen > 0.8
 
 
@@ -438,7 +434,7 @@ ASIDE = FRONT + np.outer([0, 1, 0, 0], [0, 0, 0, 3.0])
         (FRONT - np.outer([0, 0, 1, 0], [0, 0, 0, 1.0]), "below the table"),
     ],
 )
-def test_a_camera_that_looks_elsewhere_is_told_where(pose: np.ndarray, message: str):
+def test_a_camera_with_a_wrong_pose_is_refused(pose: np.ndarray, message: str):
     with pytest.raises(UserError, match=f"camera front sees no.*{message}"):
         decide(cast(TRUE), turned("front", pose), ShapeMatching())
 
@@ -456,7 +452,7 @@ def test_frames_may_be_pairs_of_files(bench: Path):
         read_frames([bench / "nowhere"], TRUE)
 
 
-def test_networks_are_asked_only_about_pixels_of_their_size(weights_file: Path):
+def test_networks_need_their_own_pixel_size(weights_file: Path):
     coarse = dataclasses.replace(TRUE, grid=dataclasses.replace(TRUE.grid, resolution=0.004))
     policy = load_policy(weights_file, orientations=36)
     with pytest.raises(UserError, match=r"workspace\.resolution is 0.004 m"):

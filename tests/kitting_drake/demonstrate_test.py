@@ -1,4 +1,4 @@
-"""Frames and actions of a bench become demonstrations that networks learn from."""
+"""Converts frames and actions of a real bench to demonstrations."""
 
 import dataclasses
 import json
@@ -47,7 +47,7 @@ POSES = {
 
 
 def write_step(folder: Path, shade: int, record: dict | None) -> None:
-    """A block on the table, of a colour of its own, and what was done."""
+    """A step: frames of a coloured block on the table, and its action."""
     block = Block((0.15, 0.08, 0.04), (0.45, -0.2, 0.01 * shade))
     frames = {
         name: Frame(np.full_like(frame.color, shade), frame.depth)
@@ -77,13 +77,13 @@ def written(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def folder(written: Path, tmp_path: Path) -> Path:
-    """Two demonstrations: one that ends by stop, and one that does not; step 10 comes after 9."""
+    """Two demonstrations, with and without a stop at the end. One has more than nine steps."""
     return shutil.copytree(written, tmp_path, dirs_exist_ok=True) / "my bench"
 
 
 @pytest.fixture
 def command(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., int]:
-    """`demonstrate` on the folder."""
+    """Runs `demonstrate` on the folder."""
 
     def run(*flags: object) -> int:
         arguments = [folder, "--camera", folder.parent / "calibration.yaml", "--quiet", *flags]
@@ -98,7 +98,7 @@ def by_name(found: Demonstrations) -> Iterator[tuple[str, object]]:
         yield ("demo1" if item.final else "demo2"), item
 
 
-def test_the_file_holds_what_decide_sees_and_what_was_done(
+def test_the_file_holds_observations_of_decide_and_actions(
     folder: Path, command: Callable[..., int]
 ):
     assert command("--output", folder.parent / "out") == 0
@@ -114,7 +114,7 @@ def test_the_file_holds_what_decide_sees_and_what_was_done(
         frames = read_frames([folder / name], calibration)
         seen = decide(frames, calibration, ShapeMatching()).observation
         np.testing.assert_array_equal(step.image[3], seen.height)
-        # The file has colours in 8 bits.
+        # The file stores colours in 8 bits.
         np.testing.assert_allclose(step.image[:3], seen.rgb, atol=0.5 / 255 + 1e-6)
         if name != "demo1/step11":
             assert (step.pick, step.place) == (pose(POSES["pick"]), pose(POSES["place"]))
@@ -122,9 +122,7 @@ def test_the_file_holds_what_decide_sees_and_what_was_done(
     assert [step.category for step in items["demo1"].steps] == ["wrench", ""]
 
 
-def test_only_demonstrations_of_the_same_bench_are_replaced(
-    folder: Path, command: Callable[..., int]
-):
+def test_files_of_other_origin_are_not_replaced(folder: Path, command: Callable[..., int]):
     path = folder.parent / "mine.h5"
     path.write_text("before")
     with pytest.raises(UserError, match=r"mine\.h5 exists"):
@@ -146,8 +144,8 @@ def test_train_takes_the_file(folder: Path, command, monkeypatch: pytest.MonkeyP
     assert (output / "policy.safetensors").is_file()
 
 
-def test_what_is_learned_from_twice_is_known_again(folder: Path):
-    """A seed stands for the frames: in any file, and whatever else is in it."""
+def test_seeds_identify_frames(folder: Path):
+    """The same frames get the same seed in any file."""
     first, second = folder.parent / "first.h5", folder.parent / "second.h5"
     convert(folder, BENCH, KITTING, first)
     (folder / "demo2").rename(folder / "again")
@@ -168,7 +166,7 @@ finally:
 
 
 def test_the_command_needs_neither_drake_nor_torch(folder: Path):
-    """And what cannot be used ends with one sentence, and leaves what was there."""
+    """Invalid input prints one line and keeps the existing file."""
     output = folder.parent / "out"
     words = [folder, "--camera", folder.parent / "calibration.yaml", "--output", output]
 
@@ -187,7 +185,7 @@ def test_the_command_needs_neither_drake_nor_torch(folder: Path):
     assert len(read_demonstrations(output / "demonstrations.h5").demonstrations) == 2
 
 
-# What may be wrong.
+# Invalid input.
 
 
 def action(step: str, content: object) -> Callable[[Path], None]:
@@ -248,10 +246,10 @@ def only_stop(folder: Path) -> None:
         (only_stop, "demo3 holds no steps but the last"),
     ],
 )
-def test_what_cannot_be_learned_from_is_refused(
+def test_invalid_demonstrations_are_refused(
     folder: Path, spoil: Callable[[Path], None], message: str
 ):
-    """With one sentence, and what was there before stays."""
+    """The error is one line, and the existing file is kept."""
     spoil(folder)
     path = folder.parent / "out" / "mine.h5"
     path.parent.mkdir()
@@ -270,10 +268,10 @@ def test_folders_without_demonstrations_are_refused(tmp_path: Path):
         find_demonstrations(tmp_path)
 
 
-def test_calibrations_are_told_apart_by_what_they_say(tmp_path: Path):
+def test_calibrations_are_compared_by_value(tmp_path: Path):
     write_calibration(tmp_path / "same.yaml", BENCH)
     assert calibration_digest(read_calibration(tmp_path / "same.yaml")) == calibration_digest(BENCH)
-    # As the same rotation in another layout comes out.
+    # Another layout of the same rotation differs by rounding.
     other = with_poses(BENCH, {camera.name: camera.X_BC - 1e-15 for camera in BENCH.cameras})
     assert calibration_digest(other) == calibration_digest(BENCH)
     moved = with_poses(BENCH, {camera.name: camera.X_BC + 1e-5 for camera in BENCH.cameras})

@@ -30,7 +30,7 @@ def run(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> int:
 
 
 class AtOnce:
-    """A worker that writes twenty scenes of its seed at once."""
+    """A worker that immediately writes twenty scenes of its seed."""
 
     def capacity(self) -> int:
         return 1
@@ -44,7 +44,7 @@ class AtOnce:
     def stop(self) -> None: ...
 
 
-def test_a_batch_that_is_missing_is_drawn_again_and_seeds_share_nothing(tmp_path: Path):
+def test_draws_missing_batches_and_other_seeds_differ(tmp_path: Path):
     console = Console(quiet=True)
     parts = draw_scenes._Parts(tmp_path, 0, OURS)
     parts.draw(40, AtOnce(), console)
@@ -60,24 +60,24 @@ def test_a_batch_that_is_missing_is_drawn_again_and_seeds_share_nothing(tmp_path
     assert (one.height != two.height).any()
 
 
-def test_the_one_file_tells_which_scenes_share_their_tools(tmp_path: Path):
+def test_assembles_scenes_with_the_ends_of_batches(tmp_path: Path):
     parts = draw_scenes._Parts(tmp_path / "parts", 0, OURS)
     parts.draw(50, AtOnce(), Console(quiet=True))
     parts.assemble(50, tmp_path / "scenes.h5")
     assert read_static_scenes(tmp_path / "scenes.h5").batch_ends == (20, 40, 50)
 
 
-def test_batches_of_another_seed_or_version_are_not_mixed(tmp_path: Path):
+def test_batches_of_another_seed_or_version_are_refused(tmp_path: Path):
     draw_scenes._Parts(tmp_path, 0, OURS).draw(20, AtOnce(), Console(quiet=True))
     for seed, drawn_by in [(1, OURS), (0, {"kitting_drake": "0.2"})]:
-        with pytest.raises(UserError, match=r"batch_000000\.h5 is of another seed or version"):
+        with pytest.raises(UserError, match=r"batch_000000\.h5 has another seed or version"):
             draw_scenes._Parts(tmp_path, seed, drawn_by)
     path = tmp_path / "batch_000000.h5"
     path.write_bytes(path.read_bytes()[:1000])
-    with pytest.raises(UserError, match=r"cannot read .*: delete it, and it is drawn again"):
+    with pytest.raises(UserError, match=r"cannot read .*: delete it"):
         draw_scenes._Parts(tmp_path, 0, OURS)
     path.rename(tmp_path / "batch_000000 (1).h5")
-    with pytest.raises(UserError, match="makes no sense here: delete it"):
+    with pytest.raises(UserError, match="has an unexpected name"):
         draw_scenes._Parts(tmp_path, 0, OURS)
 
 
@@ -96,7 +96,7 @@ def test_a_folder_of_another_seed_or_version_is_refused(tmp_path: Path, monkeypa
         assert json.loads(settings.read_text()) == claimed | other
 
 
-def test_what_is_drawn_by_includes_cameras_encoding_and_designs(tmp_path: Path, monkeypatch):
+def test_digests_cover_cameras_encoding_and_designs(tmp_path: Path, monkeypatch):
     before = draw_scenes._drawn_by()
     catalogue = tmp_path / "catalogue.yaml"
     catalogue.write_text("tools: {}\n")
@@ -107,7 +107,7 @@ def test_what_is_drawn_by_includes_cameras_encoding_and_designs(tmp_path: Path, 
         assert source_digest(*others) != before["code"]
 
 
-def test_a_batch_in_which_no_toolset_has_room_is_kept(tmp_path: Path):
+def test_an_empty_batch_is_kept(tmp_path: Path):
     parts = draw_scenes._Parts(tmp_path, 0, OURS)
     write_static_scenes(parts.path(0), StaticScenes(GRID, (), 0, OURS))
     assert read_static_scenes(parts.path(0)).scenes == ()
@@ -117,7 +117,7 @@ def test_a_batch_in_which_no_toolset_has_room_is_kept(tmp_path: Path):
 
 
 @pytest.mark.slow
-def test_it_draws_and_goes_on_and_repeats_itself(tmp_path: Path, monkeypatch):
+def test_drawing_resumes_and_repeats(tmp_path: Path, monkeypatch):
     one, other = tmp_path / "one", tmp_path / "other"
     flags = ("--seed", "3", "--workers", "2", "--quiet", "--output")
     assert run(monkeypatch, "--scenes", "5", *flags, str(one)) == 0

@@ -20,7 +20,7 @@ pytestmark = pytest.mark.slow
 
 ROOT = Path(__file__).resolve().parents[2]
 
-# Two tools that no node has: one beside the scenario, one that was imported.
+# Two tools that must be shipped: one beside the scenario, one imported.
 SCENARIO = """
 Mine:
   time_limit: {time_limit}
@@ -31,7 +31,7 @@ Mine:
 
 @pytest.fixture
 def cluster() -> Iterator[Any]:
-    """A head node and no other yet, with one CPU."""
+    """A head node with one CPU."""
     utils = pytest.importorskip("ray.cluster_utils", reason="Ray is not installed")
     cluster = utils.Cluster(
         initialize_head=True, head_node_args={"num_cpus": 1, "include_dashboard": False}
@@ -42,7 +42,7 @@ def cluster() -> Iterator[Any]:
 
 @pytest.fixture
 def start(tmp_path: Path) -> Callable[..., subprocess.Popen[bytes]]:
-    """Starts a command on a scenario; it knows where the imported tools are."""
+    """Starts a command on a scenario, with the folder of imported tools set."""
     for place in (tmp_path / "imported" / "mine", tmp_path / "beside"):
         shutil.copytree(MODELS / "tools" / "combination_wrench", place)
 
@@ -61,7 +61,7 @@ def scenario_file(folder: Path, *, time_limit: float, tools: str) -> Path:
 
 
 def kill_node(cluster: Any, node: Any, process: subprocess.Popen[bytes], when: Callable) -> None:
-    """Kills a node at a random moment after something has come true."""
+    """Kills a node at a random moment after a condition is met."""
     while not when():
         assert process.poll() is None, "the node was to be killed before the end"
         time.sleep(0.05)
@@ -70,7 +70,7 @@ def kill_node(cluster: Any, node: Any, process: subprocess.Popen[bytes], when: C
     cluster.remove_node(node, allow_graceful=False)
 
 
-def test_a_node_is_killed_and_the_episodes_are_the_same(
+def test_episodes_are_independent_of_a_killed_node(
     cluster: Any, start: Callable[..., subprocess.Popen[bytes]], tmp_path: Path
 ):
     scenario = scenario_file(tmp_path, time_limit=1.0, tools="beside, mine")
@@ -97,7 +97,7 @@ def test_a_node_is_killed_and_the_episodes_are_the_same(
 
 
 @pytest.mark.usefixtures("rendering")
-def test_a_node_is_killed_and_the_demonstrations_are_the_same(
+def test_demonstrations_are_independent_of_a_killed_node(
     cluster: Any, start: Callable[..., subprocess.Popen[bytes]], tmp_path: Path
 ):
     scenario = scenario_file(tmp_path, time_limit=60.0, tools="mine")

@@ -45,7 +45,7 @@ OURS = {
     "steps": 1234,
 }
 CLEAN = {"commit": "0123456789"}
-"""Not that of the tree of this test, which may have uncommitted changes."""
+"""A clean commit: the tree of this test may have uncommitted changes."""
 SEEN, UNSEEN = PAPER_TASKS
 OWN = SCENARIOS.parent / "docs" / "results"
 """The results of this tree."""
@@ -59,7 +59,7 @@ def write(
     seeds: range = range(5),
     **fields: Any,
 ) -> None:
-    """Adds a run of episodes that are all alike, some fields of its summary replaced."""
+    """Adds a run of equal episodes, with some fields of its summary replaced."""
     episodes = [make_episode(seed, errors_mm) for seed in seeds]
     chosen = replace(CHOSEN, scenario=scenario)
     summary = summarise(episodes, chosen, ADD_S, wall_seconds_total=1.0)
@@ -68,7 +68,7 @@ def write(
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    """Two runs: of the oracle quantized to N = 36, and of a network."""
+    """Two runs: the oracle quantized to N = 36, and a network."""
     quantized = Scenario(policy=QuantizedOracle(orientations=36))
     write(tmp_path, "quantized", quantized, [1.0, 9.0, 1.0, 1.0])
     objects = [make_object(name, 1.0) for name in ("cup", "bolt", "ring")]
@@ -91,7 +91,7 @@ def page(folder: Path) -> str:
 
 
 def tables(page: str) -> dict[str, list[list[list[str]]]]:
-    """The cells of every table, without its rule, by the heading that it is under."""
+    """The cells of all tables by heading, without the rules."""
     found: dict[str, list[list[list[str]]]] = {}
     heading, before = "", ""
     for line in page.splitlines():
@@ -107,7 +107,7 @@ def tables(page: str) -> dict[str, list[list[list[str]]]]:
 
 
 def successes(page: str, task: str) -> dict[tuple[str, ...], list[str]]:
-    """A task's rates by method, preset and demonstrations."""
+    """Success rates of a task by method, preset and number of demonstrations."""
     (heading,) = (name for name in tables(page) if name.endswith(f"(`{task}`)"))
     (table,) = tables(page)[heading]
     assert table[0][3:] == [f"N = {n}" for n in (36, 72, 120, 180)]
@@ -129,7 +129,7 @@ def test_success_by_method_and_orientations_strict_first(folder: Path):
     assert UNSEEN not in page(folder)
 
 
-def test_a_policy_of_ones_own_has_one_figure_for_all(folder: Path):
+def test_a_users_policy_has_one_row(folder: Path):
     own = Scenario(policy=PythonPolicy(function="json:loads"))
     write(folder, "own", own, [1.0, 1.0])
     own_row = successes(page(folder), SEEN)["python_policy", "", ""]
@@ -146,7 +146,7 @@ DENSE = Scenario(task=ToolsetKitting(split="test"), heightmap=Heightmap(resoluti
         (Scenario(random_seed=7, target_realtime_rate=1.0), SEEN, ""),
         (Scenario(task=ToolsetKitting(split="test")), UNSEEN, ""),
         (EASY, None, "`task.success_threshold: 0.01`"),
-        # Its task has the paper's title: not that alone makes it the paper's.
+        # The title of a task alone is not enough.
         (DENSE, None, "`heightmap.resolution: 0.002`"),
         (Scenario(task=ToolsetKitting(split="train")), None, '`task.split: "train"`'),
         (Scenario(task=ToolsetKitting(split="fresh")), None, '`task.split: "fresh"`'),
@@ -172,7 +172,7 @@ def test_a_run_is_the_papers_only_if_nothing_but_the_policy_differs(
 
 
 def test_a_field_that_a_run_did_not_have_is_a_difference(tmp_path: Path):
-    """A task that has since become harder is not the same task."""
+    """A task with another default is another task."""
     write(tmp_path, "run", Scenario(task=ToolsetKitting()), [1.0])
     found = read_summaries(tmp_path)["run"]["resolved_scenario"]
     del found["task"]["random_lengths"]
@@ -203,7 +203,9 @@ def test_the_most_tested_network_and_all_causes(folder: Path):
 @pytest.mark.parametrize(
     ("continuous", "trained", "marks"), [(True, 180, " \\*"), (False, 36, " †")]
 )
-def test_marks_tell_how_a_run_departs(folder: Path, continuous: bool, trained: int, marks: str):
+def test_marks_show_differences_from_the_paper(
+    folder: Path, continuous: bool, trained: int, marks: str
+):
     details = OURS | {"continuous": continuous, "trained_orientations": trained}
     spoil(folder, "ours", policy_details=details)
     assert f"100.0 (91.2 to 100.0), 10{marks} |" in page(folder)
@@ -216,7 +218,7 @@ def test_every_run_is_listed(folder: Path):
     assert files[1][3:6] == ["1234", "10", "100 to 109"]
 
 
-def test_runs_that_differ_only_in_training_are_all_told(folder: Path):
+def test_runs_that_differ_only_in_training_have_own_rows(folder: Path):
     add_run(folder, "ours_again", read_summaries(folder)["ours"] | {"strict_success_rate": 0.5})
     cell = successes(page(folder), SEEN)["SO(2)-equivariant (ours)", "small", "100"][-1]
     first, second = cell.split("<br>")
@@ -237,7 +239,7 @@ def test_without_runs_there_is_a_page(tmp_path: Path):
         read_runs(tmp_path)
 
 
-def test_runs_that_cannot_be_used_are_named(folder: Path, tmp_path: Path):
+def test_errors_name_the_invalid_run(folder: Path, tmp_path: Path):
     for details, words in (
         ("so2", "'policy_details' is 'so2': it must be"),
         ({"method": "so2", "orientations": 36}, "policy_details.demonstrations must be a whole"),
@@ -270,7 +272,7 @@ def test_runs_that_cannot_be_used_are_named(folder: Path, tmp_path: Path):
 
 
 def command(monkeypatch: pytest.MonkeyPatch, folder: Path, *words: str) -> str:
-    """Runs the verb, and gives the page that it writes."""
+    """Runs the verb; returns the page that it writes."""
     output = folder / "docs" / "results.md"
     arguments = ["results", "--results", str(folder), "--output", str(output), *words]
     monkeypatch.setattr(sys, "argv", arguments)
@@ -293,7 +295,7 @@ def test_a_run_is_added_and_removed(folder: Path, monkeypatch: pytest.MonkeyPatc
     (files,) = tables(text)["Runs"]
     assert [row[0] for row in files[1:]] == ["mine", "ours", "quantized"]
     assert read_summaries(folder)["mine"] == summary
-    # Adding it again changes nothing; another run does not replace it.
+    # Adding it again changes nothing. Another run of the same name is refused.
     command(monkeypatch, folder, "--add", "mine", str(evaluated), "--quiet")
     (evaluated / "summary.json").write_text(json.dumps(summary | {"outcomes": []}))
     with pytest.raises(UserError, match="has another run 'mine': give another name"):
@@ -306,7 +308,7 @@ def test_a_run_is_added_and_removed(folder: Path, monkeypatch: pytest.MonkeyPatc
         command(monkeypatch, folder, "--remove", "mine")
 
 
-def test_a_run_that_nobody_can_run_again_is_in_no_table(
+def test_a_run_that_cannot_be_repeated_is_in_no_table(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ):
     spoil(folder, "ours", commit="0123456789abcdef, 9876543210fedcba+")
@@ -317,9 +319,7 @@ def test_a_run_that_nobody_can_run_again_is_in_no_table(
     assert (row[0], row[-1]) == ("ours", "0123456789abcdef<br>9876543210fedcba+")
 
 
-def test_no_cell_is_filled_by_what_nobody_can_run_again(
-    folder: Path, monkeypatch: pytest.MonkeyPatch
-):
+def test_a_run_that_cannot_be_repeated_fills_no_cell(folder: Path, monkeypatch: pytest.MonkeyPatch):
     name = "unseen_so2_180_100"
     good = read_summaries(OWN)[name]
     evaluated = folder / "evaluated"
@@ -343,8 +343,8 @@ def own_runs() -> list[Run]:
     return read_runs(OWN)
 
 
-def test_the_runs_of_this_tree_are_what_they_say(own_runs: list[Run]):
-    """However the fields of a scenario are called since."""
+def test_own_runs_match_their_names(own_runs: list[Run]):
+    """Renamed fields of a scenario do not matter."""
     for run in own_runs:
         rates = [item["success_rate"] for item in run.summary.get("outcomes", ())]
         assert not rates or np.mean(rates) == pytest.approx(run.summary["success_rate"])
@@ -360,7 +360,7 @@ def test_the_runs_of_this_tree_are_what_they_say(own_runs: list[Run]):
 
 
 @pytest.mark.slow
-def test_the_pages_of_this_tree_are_made_of_its_runs(own_runs: list[Run]):
+def test_own_pages_are_up_to_date(own_runs: list[Run]):
     rates = read_rates(OWN)
     divided = cell_results(own_runs, rates)
     cells, others, set_aside = divided

@@ -19,7 +19,7 @@ from systems.placement import PlacedObject
 @dataclass(frozen=True)
 class Rig:
     diagram: Diagram
-    """The outermost one."""
+    """The root diagram."""
     station: KittingStation
 
     @property
@@ -35,7 +35,7 @@ class Rig:
         return self.station.objects
 
     def port(self, name: str, root: Context | None = None) -> Any:
-        """What a port of the station says, at the beginning if nothing else is asked."""
+        """The value of a port of the station, by default in the initial context."""
         root = self.diagram.CreateDefaultContext() if root is None else root
         context = self.station.GetMyContextFromRoot(root)
         if name == "action":
@@ -45,7 +45,7 @@ class Rig:
     def run(
         self, *observers: EpisodeObserver, seconds: float | None = None, name: str = "test"
     ) -> EpisodeResult:
-        """An episode, of so many simulated seconds at most."""
+        """Runs an episode, of at most `seconds` of simulated time."""
         if seconds is not None:
             scenario = dataclasses.replace(self.station.scenario, time_limit=seconds)
             self.station.scenario = scenario

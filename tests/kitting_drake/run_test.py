@@ -25,7 +25,7 @@ from kitting_drake.scenario.policies import Learned
 ROOT = Path(__file__).resolve().parents[2]
 Verb = Callable[..., subprocess.CompletedProcess[str]]
 
-# Fixed by the design: other programs read them.
+# Other programs read these keys.
 KEYS = {
     "scenario",
     "policy",
@@ -61,7 +61,7 @@ MORE_OF_THE_SAME = (
     *("KittingSeenToolset", "TwoTools", "BlockInsertion", "PlaceRedInGreen", "StackBlockPyramid"),
     "PalletizingBoxes",
 )
-"""Endings of the names of scenarios that run much of what others run."""
+"""Suffixes of the names of scenarios that resemble others; these tests are slow."""
 
 
 def shipped() -> list[Any]:
@@ -144,8 +144,8 @@ run_command(run.main)
 """
 
 
-def test_ctrl_c_leaves_whole_files(tmp_path: Path):
-    """The signal comes at a known moment of the episode: no waiting, no guessing."""
+def test_ctrl_c_leaves_complete_files(tmp_path: Path):
+    """The signal comes at a fixed moment of the episode, so that the test is deterministic."""
     command = [sys.executable, "-c", INTERRUPTED_RUN, "scenarios/kitting_oracle.yaml"]
     command += ["--output", str(tmp_path)]
     done = subprocess.run(
@@ -154,7 +154,7 @@ def test_ctrl_c_leaves_whole_files(tmp_path: Path):
         capture_output=True,
         text=True,
         timeout=300,
-        # A shell's background jobs, and all that they start, are born deaf to Ctrl-C.
+        # Background jobs of a shell ignore Ctrl-C by default.
         preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
     )
     assert done.returncode == 130, done.stderr
@@ -180,7 +180,7 @@ def test_ctrl_c_leaves_whole_files(tmp_path: Path):
         (["--video", "/proc/none/film.gif"], "cannot write into /proc/none"),
     ],
 )
-def test_flags_that_cannot_be_used(verb: Verb, tmp_path: Path, flags: list[str], words: str):
+def test_invalid_flags_are_refused(verb: Verb, tmp_path: Path, flags: list[str], words: str):
     done = verb(
         "run", "scenarios/kitting_oracle.yaml", "--no-meshcat", "--output", tmp_path, *flags
     )
@@ -190,14 +190,14 @@ def test_flags_that_cannot_be_used(verb: Verb, tmp_path: Path, flags: list[str],
     assert not list(tmp_path.iterdir())
 
 
-def test_a_folder_in_the_replay_s_place_is_told_before_the_episode(verb: Verb, tmp_path: Path):
+def test_a_folder_named_like_the_replay_is_refused_early(verb: Verb, tmp_path: Path):
     (tmp_path / "replay.html").mkdir()
     done = verb("run", "scenarios/kitting_oracle.yaml", "--no-meshcat", "--output", tmp_path)
     assert (done.returncode, done.stdout) == (2, "")
     assert "replay.html is a folder" in done.stderr
 
 
-def test_a_diagram_that_graphviz_cannot_write_is_told(tmp_path: Path, monkeypatch):
+def test_errors_of_graphviz_are_reported(tmp_path: Path, monkeypatch):
     broken = tmp_path / "dot"
     broken.write_text("#!/bin/sh\necho 'Format: pdf not recognized' >&2\nexit 1\n")
     broken.chmod(0o755)
@@ -208,15 +208,13 @@ def test_a_diagram_that_graphviz_cannot_write_is_told(tmp_path: Path, monkeypatc
         running.draw_diagram(builder.Build(), Path("cell.pdf"))
 
 
-def test_a_scenario_is_found_by_its_name_and_not_by_another_path(
-    verb_process: Verb, tmp_path: Path
-):
+def test_a_wrong_path_does_not_find_a_shipped_scenario(verb_process: Verb, tmp_path: Path):
     done = verb_process("run", "no/such/kitting_oracle.yaml", "--no-meshcat", "--output", tmp_path)
     assert done.returncode == 2
     assert "cannot read the scenario no/such/kitting_oracle.yaml" in done.stderr
 
 
-def test_a_policy_that_raises_leaves_its_reason_and_a_failure(verb: Verb, tmp_path: Path):
+def test_a_policy_that_raises_is_a_failure(verb: Verb, tmp_path: Path):
     scenario = tmp_path / "mine.yaml"
     scenario.write_text('Mine: {policy: !PythonPolicy {function: "math:sqrt"}}\n')
     (tmp_path / "out").mkdir()
@@ -242,14 +240,14 @@ Mine:
 
 @pytest.fixture
 def learned(tmp_path: Path) -> Path:
-    """A scenario's file, beside which its weights should be."""
+    """A scenario file that expects weights beside it."""
     path = tmp_path / "mine.yaml"
     path.write_text(LEARNED)
     return path
 
 
 @pytest.mark.usefixtures("rendering")
-def test_every_decision_of_a_learned_policy_leaves_a_picture(
+def test_saves_a_picture_of_each_decision(
     verb: Verb, learned: Path, weights_file: Path, tmp_path: Path
 ):
     shutil.copy(weights_file, tmp_path)
@@ -263,7 +261,7 @@ def test_every_decision_of_a_learned_policy_leaves_a_picture(
     assert (out / "decisions" / "decision_01.png").read_bytes().startswith(b"\x89PNG")
     results = json.loads((out / "results.json").read_text())
     assert (results["policy"], results["failure"]) == ("learned", None)
-    # It timed out in its first action.
+    # The episode ends during the first action.
     assert results["actions"] == 1
 
 
@@ -276,7 +274,7 @@ def test_every_decision_of_a_learned_policy_leaves_a_picture(
     ],
 )
 @pytest.mark.usefixtures("rendering")
-def test_weights_that_cannot_be_used(
+def test_invalid_weights_are_refused(
     learned: Path,
     content: str | None,
     sentence: str,

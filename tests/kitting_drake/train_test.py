@@ -102,7 +102,7 @@ def trained(demos: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def folder(trained: Path, tmp_path: Path) -> Path:
-    """A copy of it, to be changed."""
+    """A copy of the finished run's folder."""
     return Path(shutil.copytree(trained, tmp_path / "run"))
 
 
@@ -110,7 +110,7 @@ def log(folder: Path) -> list[dict[str, Any]]:
     return [json.loads(line) for line in (folder / "log.jsonl").read_text().splitlines()]
 
 
-def test_leaves_a_policy_and_its_origin(trained: Path):
+def test_writes_weights_and_their_card(trained: Path):
     assert sorted(path.name for path in trained.iterdir()) == [
         ".lock",
         "checkpoint.pt",
@@ -123,11 +123,11 @@ def test_leaves_a_policy_and_its_origin(trained: Path):
     file = read_weights_file(trained / "policy.safetensors")
     assert (file.config.method, file.config.preset) == ("so2", "tiny")
     assert file.card["scenario"] == "mine"
-    # A tenth is held out, and one at least.
+    # A tenth is held out, but at least one.
     assert file.card["demonstrations"] == 3
     assert file.card["demonstration_seeds"] == [10, 11, 12]
     assert file.card["validation_seeds"] == [13]
-    # In the first of two observations either object may be picked.
+    # In the first observation, both objects are valid picks.
     assert file.card["samples"] == 3 * 3
     assert file.card["final_observations"] == 3
     assert not (file.card["taken_only"] or file.card["rigid"])
@@ -145,7 +145,7 @@ def test_leaves_a_policy_and_its_origin(trained: Path):
     assert summary["wall_seconds"] > 0
 
 
-def test_begins_with_the_weights_of_a_file(
+def test_from_starts_with_given_weights(
     trained: Path, demos: Path, tmp_path: Path, refused: Callable[..., str]
 ):
     start = trained / "policy.safetensors"
@@ -172,7 +172,7 @@ def test_begins_with_the_weights_of_a_file(
 
 
 @pytest.mark.parametrize("method", ["so2", "equivariant_transporter"])
-def test_the_angle_network_alone_is_trained_at_another_n(demos: Path, tmp_path: Path, method: str):
+def test_angle_only_with_another_n(demos: Path, tmp_path: Path, method: str):
     both = ("--method", method, "--steps", 1)
     train(demos, tmp_path / "first", *both, "--orientations", 36)
     first = tmp_path / "first" / "policy.safetensors"
@@ -194,9 +194,7 @@ def test_the_angle_network_alone_is_trained_at_another_n(demos: Path, tmp_path: 
     assert set(log(path.parent)[-1]) == {"step", "pick_angle"}
 
 
-def test_the_angle_network_alone_may_be_of_another_size(
-    demos: Path, tmp_path: Path, refused: Callable[..., str]
-):
+def test_angle_only_with_another_preset(demos: Path, tmp_path: Path, refused: Callable[..., str]):
     both = ("--method", "equivariant_transporter", "--orientations", 6)
     train(demos, tmp_path / "first", *both, "--preset", "small", "--steps", 1)
     first = tmp_path / "first" / "policy.safetensors"
@@ -217,10 +215,10 @@ def test_the_angle_network_alone_may_be_of_another_size(
     ("flags", "sentence"),
     [
         ((), "--angle-only needs --from"),
-        (("--method", "transporter", "--from", "x"), "a transporter has no network for angles"),
+        (("--method", "transporter", "--from", "x"), "a transporter has no separate angle network"),
     ],
 )
-def test_the_angle_network_alone_needs_the_others(
+def test_angle_only_refuses_invalid_flags(
     demos: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], flags: tuple, sentence: str
 ):
     with pytest.MonkeyPatch.context() as patch, pytest.raises(SystemExit) as left:
@@ -230,7 +228,7 @@ def test_the_angle_network_alone_needs_the_others(
     assert sentence in capsys.readouterr().err
 
 
-def test_a_transporter_computes_as_many_rotations_as_asked_for(
+def test_rotations_of_a_transporter(
     demos: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
     both = ("--method", "transporter", "--orientations", 8, "--steps", 1)
@@ -258,7 +256,7 @@ def test_a_transporter_computes_as_many_rotations_as_asked_for(
         (LEARNING, ("--taken-only", "--rigid"), True, True, False),
     ],
 )
-def test_the_task_says_what_training_may_assume(
+def test_the_task_determines_labels_and_augmentation(
     learning: Learning,
     flags: tuple[str, ...],
     taken_only: bool,
@@ -274,7 +272,7 @@ def test_the_task_says_what_training_may_assume(
     found = (file.card["taken_only"], file.card["rigid"], file.card["reflection"])
     assert found == (taken_only, rigid, reflection)
     assert file.card["samples"] == (2 if taken_only else 3)
-    # Without final observations nobody learns to stop.
+    # Without final observations there is no stop network.
     assert not file.config.stop
     assert file.card["stop_threshold"] is None
     assert "false_stops" not in file.card["validation"]
@@ -283,7 +281,7 @@ def test_the_task_says_what_training_may_assume(
 @pytest.mark.parametrize(
     ("losses", "best"), [pytest.param((2.0, 1.0), 4, marks=pytest.mark.slow), ((1.0, 2.0), 3)]
 )
-def test_where_many_answers_are_right_the_losses_choose(
+def test_losses_select_the_checkpoint_of_multimodal_tasks(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, losses: tuple[float, float], best: int
 ):
     origin = dataclasses.replace(ORIGIN, learning=Learning(many_answers=True))
@@ -321,11 +319,11 @@ def test_the_curves(trained: Path):
         assert points == logged
 
 
-def test_a_finished_run_has_nothing_to_do(
+def test_a_finished_run_is_not_repeated(
     demos: Path, folder: Path, capsys: pytest.CaptureFixture[str]
 ):
     before = {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
-    # As if killed between the last checkpoint and the summary.
+    # Simulate a kill between the last checkpoint and the summary.
     (folder / "summary.json").unlink()
     train(demos, folder)
     assert capsys.readouterr().out.startswith("all steps are done\n")
@@ -351,7 +349,7 @@ def assert_same_outcome(folder: Path, other: Path) -> None:
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_whoever_ends_it_loses_no_step(
+def test_signals_save_the_last_step(
     number: signal.Signals,
     demos: Path,
     trained: Path,
@@ -367,7 +365,7 @@ def test_whoever_ends_it_loses_no_step(
             os.kill(os.getpid(), number)
         return step(self, *arguments)
 
-    # A shell that starts the tests in the background has them ignore Ctrl-C.
+    # Background jobs of a shell ignore Ctrl-C by default.
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     try:
         with monkeypatch.context() as patch:
@@ -376,7 +374,7 @@ def test_whoever_ends_it_loses_no_step(
                 train(demos, tmp_path)
     finally:
         signal.signal(signal.SIGINT, before)
-    assert "stopped after step 3: the same command goes on there" in capsys.readouterr().out
+    assert "stopped after step 3" in capsys.readouterr().out
     state = torch.load(tmp_path / "checkpoint.pt", weights_only=True)
     assert state["trainer"]["step_count"] == 3
     train(demos, tmp_path)
@@ -398,7 +396,7 @@ def test_a_stopped_run_resumes_as_if_it_had_not_been_stopped(
         patch.setattr(Trainer, "step", step_or_stop)
         with pytest.raises(KeyboardInterrupt):
             train(demos, tmp_path)
-    # As if killed while a line was being written.
+    # Simulate a kill while a line is being written.
     with (tmp_path / "log.jsonl").open("a") as file:
         file.write('{"step": 9, "pla')
     train(demos, tmp_path)
@@ -406,9 +404,7 @@ def test_a_stopped_run_resumes_as_if_it_had_not_been_stopped(
 
 
 @pytest.mark.parametrize("flag", ["--from", "--validation", "--demonstrations"])
-def test_what_is_for_training_is_not_ignored_in_an_export(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], flag: str
-):
+def test_training_flags_need_demos(tmp_path: Path, capsys: pytest.CaptureFixture[str], flag: str):
     arguments = ["train", "--export", "onnx", "--output", str(tmp_path), flag, "3"]
     with pytest.MonkeyPatch.context() as patch, pytest.raises(SystemExit) as left:
         patch.setattr(sys, "argv", arguments)
@@ -417,7 +413,7 @@ def test_what_is_for_training_is_not_ignored_in_an_export(
     assert f"{flag} needs --demos" in capsys.readouterr().err
 
 
-def test_demonstrations_of_another_task_may_have_the_same_seeds(demos: Path, tmp_path: Path):
+def test_validation_by_the_same_seeds_of_another_task(demos: Path, tmp_path: Path):
     origin = dataclasses.replace(ORIGIN, scenario={"task": {"_tag": "!StackBlockPyramid"}})
     validation = write(tmp_path / "validation.h5", range(10, 12), origin)
     train(demos, tmp_path / "run", "--validation", validation, "--steps", 1)
@@ -444,14 +440,14 @@ def test_trains_where_drake_is_not_installed(demos: Path, tmp_path: Path, method
     assert (tmp_path / "policy.safetensors").exists()
 
 
-# Input that cannot be used.
+# Invalid input.
 
 
 @pytest.fixture
 def refused(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> Callable[..., str]:
-    """The one sentence with which a run is refused."""
+    """Runs `train`, which must fail; returns the line that it prints."""
 
     def run(*arguments: Any) -> str:
         monkeypatch.setattr(sys, "argv", ["train", *words(*arguments)])
@@ -469,7 +465,7 @@ def refused(
     ("flags", "sentence"),
     [
         (("--demonstrations", 5), "demonstrations.h5 holds 4 demonstrations, not 5: collect more"),
-        (("--demonstrations", 4), "4 demonstrations to learn from leave none to validate by: "),
+        (("--demonstrations", 4), "4 for training leave none for validation"),
         (("--orientations", 24), "--orientations 24: 24 orientations alias"),
         (("--orientations", 37), "--orientations 37: orientations must be an even number, not 37"),
         (("--validation", "gone.h5"), "there is no file gone.h5"),
@@ -479,27 +475,26 @@ def test_refuses(
     demos: Path, tmp_path: Path, refused: Callable[..., str], flags: tuple, sentence: str
 ):
     assert sentence in refused(demos, tmp_path, *flags)
-    # The folder can still be used for another run.
+    # A refused run leaves the folder unclaimed.
     assert not list(tmp_path.iterdir())
 
 
 VALIDATIONS = {
-    "overlapping": (range(13, 15), ORIGIN, "share the seed 13: validation needs other ones"),
-    # Neither a time limit nor the number of tries changes what stands where, nor does a field that
-    # an older file lacks.
+    "overlapping": (range(13, 15), ORIGIN, "share seed 13"),
+    # Time limit, tries and fields that older files lack do not affect the scenes.
     "the same tables": (
         range(13, 15),
         dataclasses.replace(
             ORIGIN,
             scenario={"time_limit": 2.0, "task": {"_tag": "!Kitting", "tries": 2, "new": 0}},
         ),
-        "share the seed 13: validation needs other ones",
+        "share seed 13",
     ),
-    # Nor do the boxes that --perturb lays beside them.
+    # Distractors do not affect the tools.
     "the same tables with boxes": (
         range(13, 15),
         dataclasses.replace(ORIGIN, scenario={"task": {"_tag": "!Kitting", "distractors": 4}}),
-        "share the seed 13: validation needs other ones",
+        "share seed 13",
     ),
     "another grid": (
         [20],
@@ -519,17 +514,17 @@ def test_unsuitable_validation_demonstrations_are_refused(
     assert sentence in refused(demos, tmp_path / "run", "--validation", path)
 
 
-def test_a_policy_that_would_never_stop_is_not_trained(
+def test_validation_data_without_final_observations_are_refused(
     demos: Path, tmp_path: Path, refused: Callable[..., str]
 ):
     path = tmp_path / "validation.h5"
     write_demonstrations(path, ORIGIN, [demonstration(20, final=False)])
     told = refused(demos, tmp_path / "run", "--validation", path)
-    assert "none ends with nothing left to pick: the policy would never stop" in told
+    assert "nothing left to pick" in told
 
 
 def static_scenes(path: Path, *counts: int, batch: int = 1) -> Path:
-    """A file of scenes with so many actions each, in batches of so many."""
+    """Writes scenes with the given numbers of actions, in batches of `batch`."""
     scenes = [StaticScene(np.zeros(GRID.shape, np.uint16), np.zeros((n, 8))) for n in counts]
     ends = (*range(batch, len(scenes), batch), len(scenes))
     write_static_scenes(path, StaticScenes(GRID, tuple(scenes), batch_ends=ends))
@@ -539,47 +534,43 @@ def static_scenes(path: Path, *counts: int, batch: int = 1) -> Path:
 @pytest.mark.parametrize(
     ("batch", "count", "expected"),
     [
-        # Neither side has scenes of a batch that the other has.
+        # Training and validation share no batch.
         (8, None, (16, 4)),
         (8, 9, (9, 1)),
         (1, None, (19, 1)),
-        # Of the scenes after the batch of the last that is learned from, a tenth as many.
+        # Validation starts at the next batch and has a tenth as many scenes.
         (5, 13, (13, 1)),
     ],
 )
-def test_static_scenes_are_validated_by_other_tools(
+def test_validation_scenes_have_other_tools(
     tmp_path: Path, batch: int, count: int | None, expected: tuple[int, int]
 ):
     path = static_scenes(tmp_path / "scenes.h5", *range(1, 21), batch=batch)
     learned, kept = training._split(path, count, None)
     assert (learned.count, kept.count) == expected
-    # The scenes are known by how many actions they have.
+    # The number of actions identifies a scene.
     last, first = (len(data.items.scenes[i].actions) - 1 for data, i in ((learned, -1), (kept, 0)))
     assert last // batch < first // batch
 
 
-def test_static_scenes_of_one_batch_are_not_validated_by_themselves(
-    tmp_path: Path, refused: Callable[..., str]
-):
+def test_scenes_of_one_batch_cannot_be_split(tmp_path: Path, refused: Callable[..., str]):
     path = static_scenes(tmp_path / "scenes.h5", *range(1, 21), batch=20)
     told = refused(path, tmp_path / "run")
-    assert "19 scenes to learn from leave none to validate by that show other tools" in told
+    assert "leave none for validation with other tools" in told
 
 
-def test_where_there_is_nothing_to_pick_nothing_is_learned(
-    tmp_path: Path, refused: Callable[..., str]
-):
+def test_data_without_picks_are_refused(tmp_path: Path, refused: Callable[..., str]):
     path = static_scenes(tmp_path / "scenes.h5", 1, 1, 0)
     told = refused(path, tmp_path / "run", "--demonstrations", 2)
-    assert "to validate by, none has anything to pick: draw more" in told
+    assert "for validation has an object to pick: draw more" in told
     path = static_scenes(tmp_path / "none.h5", 0, 0, 1)
     told = refused(path, tmp_path / "run", "--demonstrations", 2)
-    assert "to learn from, none has anything to pick: draw more" in told
+    assert "for training has an object to pick: draw more" in told
 
 
-def test_static_scenes_do_not_tell_what_was_picked(tmp_path: Path, refused: Callable[..., str]):
+def test_taken_only_refuses_static_scenes(tmp_path: Path, refused: Callable[..., str]):
     path = static_scenes(tmp_path / "scenes.h5", *[1, 0] * 11)
-    assert "--taken-only is for demonstrations" in refused(path, tmp_path / "run", "--taken-only")
+    assert "--taken-only needs demonstrations" in refused(path, tmp_path / "run", "--taken-only")
 
 
 @pytest.mark.parametrize(
@@ -592,7 +583,7 @@ def test_static_scenes_do_not_tell_what_was_picked(tmp_path: Path, refused: Call
         ("first", np.array([0, 2, 1, 2])),
     ],
 )
-def test_static_scenes_that_make_no_sense_are_refused(
+def test_damaged_static_scenes_are_refused(
     tmp_path: Path, refused: Callable[..., str], name: str, values: np.ndarray
 ):
     path = static_scenes(tmp_path / "scenes.h5", 1, 1, 0)
@@ -603,7 +594,7 @@ def test_static_scenes_that_make_no_sense_are_refused(
     assert f"cannot read {path}: " in told
 
 
-def test_networks_that_see_colours_are_not_validated_without(
+def test_validation_data_without_colours_are_refused(
     demos: Path, tmp_path: Path, refused: Callable[..., str]
 ):
     path = tmp_path / "scenes.h5"
@@ -612,7 +603,7 @@ def test_networks_that_see_colours_are_not_validated_without(
     assert "scenes.h5 has no colours" in refused(demos, tmp_path / "run", "--validation", path)
 
 
-def test_what_cannot_be_exported_is_not_trained_first(
+def test_export_of_a_transporter_is_refused_before_training(
     demos: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys
 ):
     flags = words(demos, tmp_path, "--export", "onnx", "--method", "transporter")
@@ -639,7 +630,7 @@ def test_a_folder_of_another_run_is_refused(
 @pytest.mark.parametrize(
     "other", [{"scenario": {"time_limit": 2.0}}, {"versions": {"kitting_drake": "0.0.1"}}]
 )
-def test_the_same_seeds_of_another_scenario_or_version_are_another_run(
+def test_another_scenario_or_version_is_another_run(
     folder: Path, tmp_path: Path, refused: Callable[..., str], other: dict[str, Any]
 ):
     origin = dataclasses.replace(ORIGIN, **other)
@@ -647,10 +638,8 @@ def test_the_same_seeds_of_another_scenario_or_version_are_another_run(
     assert f"{folder} holds the files of another training run" in refused(others, folder)
 
 
-def test_the_same_seeds_with_other_images_are_another_run(
-    folder: Path, tmp_path: Path, refused: Callable[..., str]
-):
-    """As those that were collected again by other code."""
+def test_other_images_are_another_run(folder: Path, tmp_path: Path, refused: Callable[..., str]):
+    """Other code may collect other images from the same seeds."""
     path = tmp_path / "others.h5"
     changed = demonstration(10)
     brighter = dataclasses.replace(changed.steps[0], height=changed.steps[0].height + 0.001)
@@ -659,7 +648,7 @@ def test_the_same_seeds_with_other_images_are_another_run(
     assert f"{folder} holds the files of another training run" in refused(path, folder)
 
 
-def test_two_do_not_train_in_one_folder(demos: Path, folder: Path, refused: Callable[..., str]):
+def test_a_folder_in_use_is_refused(demos: Path, folder: Path, refused: Callable[..., str]):
     with alone_in(folder):
         assert f"another process is at work in {folder}" in refused(demos, folder)
 
@@ -683,16 +672,14 @@ def test_a_damaged_checkpoint_is_refused(
     assert f"delete {folder}" in refused(demos, folder)
 
 
-def test_a_loss_that_is_no_number_ends_the_run(
-    demos: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-):
+def test_a_nan_loss_ends_the_run(demos: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(Trainer, "step", lambda *_: {"place": float("nan")})
     with pytest.raises(UserError, match="no longer a number at step 0: lower --learning-rate"):
         train(demos, tmp_path)
     assert not (tmp_path / "checkpoint.pt").exists()
 
 
-# Checkpoints are a second apart, and no displacement is so large that others are equal to it.
+# Slow validation to a second, and do not clip displacements.
 KILLABLE = """
 from kitting_drake import train
 from kitting_drake.policies.training import training_run, validation
@@ -704,7 +691,7 @@ train.run_command(train.main)
 
 
 @pytest.mark.slow
-def test_a_run_that_is_killed_again_and_again_ends_as_if_it_had_not_been(
+def test_a_repeatedly_killed_run_gives_the_same_weights(
     demos: Path, tmp_path: Path, kill_at_random: Callable[..., None]
 ):
     whole, killed = tmp_path / "whole", tmp_path / "killed"
@@ -722,11 +709,11 @@ def test_a_run_that_is_killed_again_and_again_ends_as_if_it_had_not_been(
     assert taken_up > 10
     assert start(killed).wait() == 0
     assert_same_outcome(killed, whole)
-    # The best checkpoint is not simply the first one.
+    # The best checkpoint is not the first one.
     assert json.loads((whole / "summary.json").read_text())["best"]["step"] > 20
 
 
-def test_static_scenes_of_one_seed_are_told_apart_by_what_they_show(tmp_path: Path):
+def test_shared_static_scenes_are_detected_by_content(tmp_path: Path):
     found = []
     for height in (0, 0, 7):
         scene = StaticScene(np.full(GRID.shape, height, np.uint16), np.zeros((1, 8)))

@@ -221,7 +221,7 @@ class TrainingRun:
                     self.seconds = time.perf_counter() - start
                     self._save()
                 if interrupted() and not last:
-                    progress.print(f"stopped after step {step}: the same command goes on there")
+                    progress.print(f"stopped after step {step}: run the same command to resume")
                     raise KeyboardInterrupt
         self._summarise()
 
