@@ -1,12 +1,12 @@
-# `make run` kits; `make test` tests. Both first make .venv/, once.
+# `make run` runs a scenario, `make test` the tests. Both create .venv/ if it is missing.
 
-# The newest comes first. Drake for Python 3.11 is an older one, with which episodes take longer.
+# Python 3.11 comes last: its newest Drake is older, and episodes take longer.
 SUPPORTED := import ensurepip, sys, venv; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 14))
 PYTHON ?= $(shell for python in python3.14 python3.13 python3.12 python3 python3.11; do \
   $$python -c '$(SUPPORTED)' 2>/dev/null && echo $$python && break; done)
-# What pip installs PyTorch from. On Linux that is a build for CUDA, of 4.6 GB with all that it needs. Where
-# there is no such GPU, PyTorch's build for CPUs does with 0.7 GB: make TORCH='torch==2.13.0 --index-url URL',
-# with the URL that pytorch.org/get-started/locally shows for CPU.
+# Arguments of pip for PyTorch. On Linux the default is the CUDA build, which takes 4.6 GB with its dependencies.
+# The build for CPUs takes 0.7 GB: make TORCH='torch==2.13.0 --index-url URL', with the URL that
+# pytorch.org/get-started/locally shows for CPU.
 TORCH ?= torch==2.13.0
 VENV := .venv
 BIN := $(VENV)/bin
@@ -34,12 +34,12 @@ clean:
 
 PIP := $(BIN)/python -m pip --quiet --disable-pip-version-check
 
-# An environment that is there is kept, with its PyTorch; `make clean` removes it. The .pth file makes the
-# checkout importable from anywhere.
+# Keeps an existing environment and its PyTorch; `make clean` removes it. The .pth file makes the checkout
+# importable from any folder.
 $(READY): requirements.txt
 	@if ! { $(PIP) --version && $(BIN)/python -c '$(SUPPORTED)'; } >/dev/null 2>&1; then \
 	  if test -z "$(PYTHON)" || ! $(PYTHON) -c '$(SUPPORTED)' 2>/dev/null; then \
-	    echo "error: Python 3.11 to 3.14 is needed, with its venv module (Debian and Ubuntu: apt-get install python3-venv): say 'make PYTHON=/path/to/python3.13'" >&2; exit 2; \
+	    echo "error: no Python 3.11 to 3.14 with the venv module found (Debian and Ubuntu: apt-get install python3-venv): run 'make PYTHON=/path/to/python3.13'" >&2; exit 2; \
 	  fi; \
 	  echo "$(PYTHON) -m venv --clear $(VENV)"; $(PYTHON) -m venv --clear $(VENV); \
 	fi

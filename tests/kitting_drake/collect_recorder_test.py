@@ -107,7 +107,7 @@ def as_success(result: EpisodeResult, *outcomes: str) -> EpisodeResult:
 
 
 def test_failed_actions_are_omitted():
-    """Two tools do not move, and the first action on one fails twice."""
+    """Simulates four actions, of which the first two fail."""
     rig = rig_of("claw_hammer", "flat_screwdriver")
     recorder = DemonstrationRecorder(rig.station)
     root: Context = rig.diagram.CreateDefaultContext()
@@ -158,6 +158,6 @@ def test_failed_actions_are_omitted():
     again = dataclasses.replace(result, actions_taken=twice)
     assert isinstance(recorder.demonstration(again), Demonstration)
     labelling = DemonstrationRecorder(rig.station, later_picks_possible=True)
-    assert labelling.demonstration(again) == Rejection(3, 1.0, "object_0 took a second action")
+    assert labelling.demonstration(again) == Rejection(3, 1.0, "object_0 needed a second action")
     aside = as_success(nothing, "missed", "missed", "missed", "missed")
-    assert recorder.demonstration(aside) == Rejection(3, 1.0, "there was nothing to do")
+    assert recorder.demonstration(aside) == Rejection(3, 1.0, "no action was needed")

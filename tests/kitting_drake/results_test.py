@@ -343,7 +343,7 @@ def own_runs() -> list[Run]:
     return read_runs(OWN)
 
 
-def test_own_runs_match_their_names(own_runs: list[Run]):
+def test_own_runs_are_consistent(own_runs: list[Run]):
     """Renamed fields of a scenario do not matter."""
     for run in own_runs:
         rates = [item["success_rate"] for item in run.summary.get("outcomes", ())]
