@@ -269,7 +269,7 @@ def test_a_finished_collection_is_not_repeated(
     monkeypatch.chdir(ROOT)
     monkeypatch.setattr(collecting, "require_rendering", lambda: None)
     monkeypatch.setattr(collecting, "build_any_chosen", lambda *_, **__: None)
-    monkeypatch.setattr(LocalWorkers, "run", lambda _, __, ___, seed: Oracle()(seed))
+    monkeypatch.setattr(LocalWorkers, "run", lambda _, __, ___, seed, ____: Oracle()(seed))
     monkeypatch.setattr(sys, "argv", arguments(tmp_path, "--demos", 3, "--seed", 10))
     assert collecting.main() == 0
     assert "holds 3 demonstrations, 1 seed rejected; " in capsys.readouterr().out
@@ -299,7 +299,7 @@ def test_demonstrations_are_exported(
     monkeypatch.setattr(sys.modules[__name__], "GRID", PixelGrid())
     monkeypatch.setattr(collecting, "require_rendering", lambda: None)
     monkeypatch.setattr(collecting, "build_any_chosen", lambda *_, **__: None)
-    monkeypatch.setattr(LocalWorkers, "run", lambda _, __, ___, seed: Oracle()(seed))
+    monkeypatch.setattr(LocalWorkers, "run", lambda _, __, ___, seed, ____: Oracle()(seed))
 
     def main(demos: int, *more: str) -> str:
         monkeypatch.setattr(sys, "argv", arguments(tmp_path, "--demos", demos, "--seed", 10, *more))

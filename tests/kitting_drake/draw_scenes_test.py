@@ -86,9 +86,9 @@ def test_a_folder_of_another_seed_or_version_is_refused(tmp_path: Path, monkeypa
     ours = draw_scenes._drawn_by()
     claimed = {"seed": 0, **ours}
     for other, message in [
-        ({"seed": 7}, "seed is 0, there 7"),
-        ({"code": "1"}, f"{ours['code']}, there 1"),
-        ({"catalogue": "2"}, f"{ours['catalogue']}, there 2"),
+        ({"seed": 7}, "seed is 0, but 7 there"),
+        ({"code": "1"}, f"{ours['code']}, but 1 there"),
+        ({"catalogue": "2"}, f"{ours['catalogue']}, but 2 there"),
     ]:
         settings.write_text(json.dumps(claimed | other))
         with pytest.raises(UserError, match=message):

@@ -178,7 +178,7 @@ def test_a_folder_in_use_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPa
         evaluation.main()
 
 
-def die(chosen: ChosenScenario, seed: int) -> None:
+def die(chosen: ChosenScenario, seed: int, log: Path | None) -> None:
     os.kill(os.getpid(), signal.SIGSEGV)
 
 
@@ -220,9 +220,9 @@ def test_evaluates_if_any_seed_can_be_built(monkeypatch: pytest.MonkeyPatch):
         chosen_module.build_any_chosen(CHOSEN, range(2))
 
 
-def without_rendering(chosen: ChosenScenario, seed: int) -> Any:
+def without_rendering(chosen: ChosenScenario, seed: int, log: Path | None) -> Any:
     cameras.can_render = lambda: False
-    return evaluation._work(chosen, seed)
+    return evaluation._work(chosen, seed, log)
 
 
 def test_missing_rendering_is_not_a_failed_episode(monkeypatch: pytest.MonkeyPatch):
@@ -245,7 +245,7 @@ def test_exit_code_when_all_episodes_fail(
     scenario = tmp_path / "mine.yaml"
     scenario.write_text("Mine: {}\n")
 
-    def run(_: Workers, __: ChosenScenario, seed: int) -> Episode:
+    def run(_: Workers, __: ChosenScenario, seed: int, log: Path | None) -> Episode:
         return fake_run(seed) | {"failure": failures[seed]}
 
     monkeypatch.setattr(evaluation, "run_in_worker", run)
@@ -264,7 +264,7 @@ def test_notes_seeds_of_the_training_data(
 ):
     scenario = tmp_path / "mine.yaml"
     scenario.write_text(f"Mine: {{policy: !Learned {{weights: {weights_file}}}}}\n")
-    monkeypatch.setattr(evaluation, "run_in_worker", lambda _, __, seed: fake_run(seed))
+    monkeypatch.setattr(evaluation, "run_in_worker", lambda _, __, seed, ___: fake_run(seed))
     # Skip loading the networks.
     scene = types.SimpleNamespace(scene=types.SimpleNamespace(success=AddS()))
     monkeypatch.setattr(evaluation, "build_any_chosen", lambda *_: scene)

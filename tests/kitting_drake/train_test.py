@@ -159,7 +159,7 @@ def test_from_starts_with_given_weights(
     assert card_seeds(card) == {10, 11, 12, 13}
     assert list(card["start_learned"].values()) == [[10, 11, 12]]
     fewer = refused(demos, tmp_path / "no", "--from", start, "--demonstrations", 2)
-    assert "learned from the seed 12, which is one to validate by" in fewer
+    assert "learned from seed 12, which is in the validation data" in fewer
     assert "give --orientations 180" in refused(
         demos, tmp_path / "no", "--from", start, "--orientations", 36
     )
@@ -679,7 +679,7 @@ def test_a_nan_loss_ends_the_run(demos: Path, tmp_path: Path, monkeypatch: pytes
     assert not (tmp_path / "checkpoint.pt").exists()
 
 
-# Slow validation to a second, and do not clip displacements.
+# Save checkpoints often, and do not clip displacements, so that they differ.
 KILLABLE = """
 from kitting_drake import train
 from kitting_drake.policies.training import training_run, validation
