@@ -51,7 +51,7 @@ def pooled_section(runs: Sequence[Run]) -> list[str]:
     if not rows:
         return []
     return [
-        "### The shipped policies on unseen toolsets\n",
+        "### Unseen toolsets, all runs of the shipped policies\n",
         prose("pooled"),
         markdown_table(["policy", "seeds", "objects", "strict, %", "paper's, %"], rows, 2),
     ]

@@ -73,13 +73,13 @@ def ravens_section(runs: Sequence[Run]) -> list[str]:
     rows = []
     for (method, orientations, count), found in sorted(cells.items(), key=str):
         name = METHODS.get(method, method)
-        # All are told: to choose would be flattering.
+        # Lists all of them: a choice would be flattering.
         values = ["<br>".join(found[task]) if task in found else "-" for task in TASKS]
         rows.append([name, str(orientations or ""), str(count or ""), *values])
     headings = ["method", "N", "demonstrations", *TASKS]
     return [
-        "### The five Ravens tasks\n",
-        "With sub-pixel and sub-bin refinement. The mean reward in percent, its 95 % interval and "
-        "the\nnumber of episodes.\n",
+        "### The five Ravens tasks, by default\n",
+        "With sub-pixel and sub-bin refinement. A cell has the mean reward in percent, its 95 % "
+        "interval\nand the number of episodes.\n",
         markdown_table(headings, rows),
     ]
