@@ -28,12 +28,11 @@ _COMPARED = ("generalist, minus as it is", "generalist, minus shape matching")
 """In points, on the seeds that both ran."""
 _TRIES = 2
 _FRAMES = 5
-"""So many images are averaged in further rows."""
+"""The number of images that are averaged in further rows."""
 _SEEDS = range(2870, 2895)
-"""Those on which every policy meets every perturbation; nobody had looked at them before
-their first run."""
+"""Those on which every policy meets every perturbation; unseen before their first run."""
 _FEWEST = 12
-"""At other levels than moderate at least so many of them, the first ones."""
+"""The least number of these seeds, from the first, at levels other than moderate."""
 
 Key = tuple[str, str]
 """A row of the table and a method."""
@@ -75,7 +74,7 @@ def robustness_table(runs: Sequence[Run]) -> str:
     parts = []
     if common:
         parts.append(
-            f"{len(_SEEDS)} episodes from seed {_SEEDS[0]}, the same in every cell:\n\n"
+            f"{len(_SEEDS)} episodes from seed {_SEEDS[0]} in every cell:\n\n"
             + _table(common, [label for label in expected if not _is_other_level(label)])
         )
     if any(_is_other_level(label) for label, _ in common):
@@ -87,12 +86,12 @@ def robustness_table(runs: Sequence[Run]) -> str:
     needless = _needless_table(common, list(expected))
     if needless:
         parts.append(
-            "Of these runs, the actions on boxes and whatever else has no cavity, and of how many. "
-            "No rate of success\ntells of them:\n\n" + needless
+            "Actions in these runs on objects that have no cavity, such as boxes, of all actions. "
+            "Success rates do not\ninclude them:\n\n" + needless
         )
     if further:
         parts.append(
-            "All seeds together, where there are more, with the number of objects:\n\n"
+            "All seeds together, where more were run, with the number of objects:\n\n"
             + _table(found, [label for label in expected if label in further], counted=True)
         )
     return "\n".join(parts) or "No runs yet.\n"
