@@ -20,7 +20,7 @@ def markdown_table(
         left_columns: how many columns, from the first, are aligned left; the others are aligned
             right.
     """
-    # A rule of fewer than three characters is none to some readers.
+    # Some readers require rules of at least three characters.
     widths = [max(3, *map(len, column)) for column in zip(headings, *rows, strict=True)]
     rule = [
         "-" * width if index < left_columns else "-" * (width - 1) + ":"

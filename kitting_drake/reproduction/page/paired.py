@@ -1,7 +1,7 @@
 """Two runs of the same seeds compared, and intervals of a rate for tools in general.
 
-Both intervals are a bootstrap's, which knows of nothing that it has not seen: where few episodes
-differ, or few tools fail, they are too narrow.
+Both intervals are bootstrap intervals. They are too narrow where few episodes differ or few tools
+fail.
 """
 
 from collections import defaultdict
@@ -16,7 +16,7 @@ _RESAMPLES = 10_000
 _TAILS = (2.5, 97.5)
 """Percentiles of a 95 % interval."""
 _FEWEST_TOOLS = 3
-"""With fewer tools that ever fail, drawing tools tells nothing of others."""
+"""With fewer tools that ever fail, a bootstrap over tools is not informative."""
 
 STRICT, OWN = "strict_success_rate", "success_rate"
 """The two rates of an episode: the strict one, and by the task's own measure."""

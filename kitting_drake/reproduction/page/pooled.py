@@ -1,4 +1,4 @@
-"""The shipped policies on the unseen toolsets as these are by default, all runs together."""
+"""The shipped policies on the unseen toolsets with the default scenario, all runs pooled."""
 
 from collections import Counter
 from collections.abc import Sequence
@@ -19,13 +19,13 @@ _, _UNSEEN = PAPER_TASKS
 
 
 def pooled_section(runs: Sequence[Run]) -> list[str]:
-    """The section; nothing without such a run.
+    """The section; empty without such a run.
 
-    The rule: every run of the task by a shipped policy as it is by default, with weights of the
-    digest of the shipped file. No seed counts twice.
+    It pools every run of the task by a shipped policy with its default options and the digest of
+    the shipped weights. No seed counts twice.
 
     Args:
-        runs: all that can be run again.
+        runs: all reproducible runs that fill no cell.
 
     Raises:
         UserError: two runs of a policy have a seed in common.
@@ -67,8 +67,8 @@ def shipped_policies() -> dict[str, Policy]:
 
 
 def _is_of(run: Run, policy: Policy) -> bool:
-    """Whether the policy, its weights and its options are those of a run; a run may lack options
-    that are younger than it."""
+    """Whether a run is of this policy, with its weights and options. Older runs may lack newer
+    options."""
     found: dict[str, Any] = run.summary["resolved_scenario"]["policy"]
     expected: dict[str, Any] = described(Scenario(policy=policy))["policy"]
     return run.summary.get("policy_digest") == policy.digest(SCENARIOS) and all(

@@ -90,7 +90,7 @@ def _success_table(runs: list[Run], paper: _Paper) -> str:
 
     def row(method: str, preset: str | None = None, count: int | None = None) -> list[str]:
         named = [METHODS.get(method, method), preset or "", str(count or "")]
-        # What has no N, as the exact oracle, has one figure for all.
+        # Methods without N, such as the exact oracle, have one figure for all.
         any_n = cells.get((method, preset, count, None), [])
         return named + [
             _cell(cells.get((method, preset, count, n), []) + any_n) for n in orientations
@@ -116,7 +116,7 @@ def _with_others(usual: Iterable[int], found: Iterable[int | None]) -> list[int]
 
 
 def _cell(runs: list[Run]) -> str:
-    # Runs that differ in nothing but their training are all told: choosing would be flattering.
+    # List all runs that differ only in their training: a choice would be flattering.
     return (
         "<br>".join(
             f"{_strict(run.summary)} / {_own(run.summary)}, {run.summary['episodes']}{_marks(run)}"
@@ -143,7 +143,7 @@ def _own(summary: dict[str, Any]) -> str:
 
 
 def _most_tested_run(runs: list[Run]) -> list[str]:
-    """Tables by category of the network that was tested most; if there is none, of another run."""
+    """Tables by category of the most tested network, or of the most tested run if there is none."""
     learned = [run for run in runs if run.method in LEARNED]
     # Not the best: of few episodes, that is the luckiest.
     most = max(learned or runs, key=lambda run: (run.summary["episodes"], run.name))

@@ -44,7 +44,7 @@ PAPER: dict[tuple[str, int], tuple[tuple[float, float, float], ...]] = {
 
 
 def in_ravens_table(run: Run) -> bool:
-    """Whether a run is of one of the tasks as it is by default, and its actions are refined."""
+    """Whether a run is of one of the default tasks, with refined actions."""
     if run.summary["task"] not in TASKS or run.departures:
         return False
     return run.method not in LEARNED or bool(run.detail("continuous"))
@@ -54,7 +54,7 @@ def ravens_section(runs: Sequence[Run]) -> list[str]:
     """The section of the five tasks; nothing without a run of them.
 
     Args:
-        runs: all; those of which `in_ravens_table` says no are left out.
+        runs: all runs; those that are not `in_ravens_table` are ignored.
     """
     cells: dict[tuple[str, int | None, int | None], dict[str, list[str]]] = defaultdict(
         lambda: defaultdict(list)

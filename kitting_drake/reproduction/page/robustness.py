@@ -41,16 +41,16 @@ Key = tuple[str, str]
 def robustness_table(runs: Sequence[Run]) -> str:
     """Strict success on unseen toolsets, with two tries a tool and policies that recover.
 
-    Of the first table all runs are of the same seeds, of the second, of the other levels, of the
-    first ones of these; a third one, of what was run on further seeds too, takes all of them
-    together: choosing among them would be flattering.
+    All runs of the first table use the same seeds. The second table has the other levels, on the
+    first of these seeds. The last table pools all seeds of cells that ran on further ones: a choice
+    among them would be flattering.
 
     Args:
-        runs: all; those that are none of these, or of other weights than the shipped ones, are left
-            out.
+        runs: all runs. Runs of other scenarios or with other weights than the shipped ones are
+            ignored.
 
     Raises:
-        UserError: of two runs of one cell some seeds are the same.
+        UserError: two runs of one cell share seeds.
     """
     expected, shipped = _expected(), _shipped()
     found: dict[Key, list[Run]] = defaultdict(list)
@@ -101,7 +101,7 @@ def _table(found: Mapping[Key, Sequence[Run]], labels: Sequence[str], counted: b
     """One row for each perturbation that was run.
 
     Args:
-        counted: tells the number of objects.
+        counted: whether cells have the number of objects.
     """
 
     def share(key: Key) -> str:
@@ -113,7 +113,7 @@ def _table(found: Mapping[Key, Sequence[Run]], labels: Sequence[str], counted: b
         return f"{text}, {objects}" if counted else text
 
     def outcomes(key: Key) -> dict[str, Any]:
-        # Older summaries tell of no episode.
+        # Older summaries lack outcomes.
         return {
             "outcomes": [
                 item for run in found.get(key, ()) for item in run.summary.get("outcomes", ())
@@ -144,7 +144,7 @@ def _needless_table(found: Mapping[Key, Sequence[Run]], labels: Sequence[str]) -
 
     def share(key: Key) -> str:
         summaries = [run.summary for run in found.get(key, ())]
-        # Older ones do not tell.
+        # Older summaries lack the count.
         if not summaries or not all("needless_actions" in item for item in summaries):
             return "-"
         needless, every = (
@@ -173,7 +173,7 @@ def _check_seeds(found: Mapping[Key, Sequence[Run]]) -> None:
 
 
 def _common(run: Run, label: str) -> bool:
-    """Whether its seeds are those that all are run on."""
+    """Whether a run has the seeds that all cells share."""
     seeds = list(run.summary["seeds"])
     if _is_other_level(label):
         return len(seeds) >= _FEWEST and seeds == list(_SEEDS)[: len(seeds)]

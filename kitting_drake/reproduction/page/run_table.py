@@ -1,10 +1,9 @@
-"""The files that the page of results is made of: a table with a row a run, and a compressed file.
+"""The files behind the pages of results: a table with a row a run, and a compressed file.
 
-`runs.csv` holds what a row can hold of the `summary.json` of `evaluate`: its own fields, and those
-of the dictionaries in it, named `versions.drake`. An empty cell is a field that the run lacks.
+`runs.csv` holds the short fields of the `summary.json` of `evaluate`, and those of dictionaries in
+it under names such as `versions.drake`. An empty cell is a field that the run lacks.
 `episodes.jsonl.xz` has a line a run with the rest: `outcomes` (a success rate an episode, and how
-each object ended), `categories` and `resolved_scenario`. Both together give back every summary as
-it was.
+each object ended), `categories` and `resolved_scenario`. Both together restore every summary.
 """
 
 import csv
@@ -93,7 +92,7 @@ def _write(folder: Path, rows: Mapping[str, Summary], lines: Mapping[str, Summar
     writer = csv.DictWriter(table, [_NAME, *_columns(flat.values())], lineterminator="\n")
     writer.writeheader()
     writer.writerows({_NAME: name, **row} for name, row in flat.items())
-    # The table last: a run without a row can be told, and added again.
+    # Write the table last: a run without a row can be detected, and added again.
     write_atomically(folder / EPISODES, lzma.compress(text.encode()))
     write_atomically(folder / TABLE, table.getvalue())
 

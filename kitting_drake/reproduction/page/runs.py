@@ -1,4 +1,4 @@
-"""The runs that the page of results is made of, and how they depart from the paper's tasks."""
+"""The runs behind the pages of results, and how they depart from the paper's tasks."""
 
 import json
 from collections.abc import Mapping
@@ -21,12 +21,12 @@ METHODS = {
     "so2": "SO(2)-equivariant (ours)",
     "equivariant_transporter": "Equivariant Transporter",
     "transporter": "Transporter",
-    "generalist": "generalist, of static scenes",
-    "shape_matching": "shape matching, of nothing",
+    "generalist": "generalist",
+    "shape_matching": "shape matching",
     "quantized_oracle": "oracle, quantized",
     "oracle": "oracle, exact",
 }
-"""Names of methods for people; any other is called as it calls itself."""
+"""Names of methods for people. Other methods keep their own names."""
 
 LEARNED = ("so2", "equivariant_transporter", "transporter")
 """The methods that the paper compares."""
@@ -43,10 +43,10 @@ _ADDED: dict[str, Any] = {
     "sensor_noise.frames": 1,
     "end_at_success": False,
 }
-"""Fields that older runs lack, with what those did."""
+"""Fields that older runs lack, with the values that those used."""
 
 _ADDED_WHOLE = ("sensor_noise", "appearance")
-"""The same, where it is what a scenario does by default."""
+"""Fields that older runs lack, and that have the scenario's defaults."""
 
 _HAND = (
     "planner.firm_grasp_force",
@@ -57,11 +57,11 @@ _HAND = (
     "planner.search.speed",
 )
 _EARLIER_HAND = "an earlier hand"
-"""How it is told that these fields are lacking: it did not grip what is heavy more firmly, nor
-press, nor search in a spiral, and took what is thinner than 3 mm for not gripped."""
+"""The label of runs that lack these fields. That hand did not grip heavy objects more firmly, press
+or search in a spiral, and a grasp under 3 mm of width counted as failed."""
 
 _MOST_SHOWN = 4
-"""So many differences of one run are listed; more are counted."""
+"""The most differences of one run that are listed; further ones are counted."""
 
 
 _KINDS: dict[str, Any] = {
@@ -118,9 +118,8 @@ class Run:
 
     @cached_property
     def departures(self) -> list[str]:
-        """Where its scenario differs, but for the policy, from that of the paper's task of its
-        kind, or from the Ravens task; or, if the paper has none, from the default one, but for the
-        task."""
+        """The fields in which its scenario differs, policy aside, from the paper's task or the
+        Ravens task of its kind. For other tasks: from the default scenario, task aside."""
         found = self.summary["resolved_scenario"]
         for task in PAPER_TASKS.values():
             expected = described(Scenario(task=task))
@@ -134,8 +133,8 @@ class Run:
 
     @property
     def paper_task(self) -> str | None:
-        """The title of the paper's task that it is a run of, where nothing but the policy differs
-        from it."""
+        """The title of the paper's task, if the run differs from that in nothing but the
+        policy."""
         task = self.summary["task"]
         return task if task in PAPER_TASKS and not self.departures else None
 
@@ -148,7 +147,7 @@ class Run:
 
 
 def described(scenario: Scenario) -> dict[str, Any]:
-    """The scenario as JSON holds it."""
+    """The scenario as JSON data."""
     fields = ChosenScenario(scenario, Path(), "", None).described
     return json.loads(json.dumps(fields, default=str))
 
@@ -164,7 +163,7 @@ def _without(scenario: dict[str, Any], *more: str) -> dict[str, Any]:
 
 
 def _translated(plant: Any) -> dict[str, Any]:
-    """What older runs have in `plant`, in the fields that it is in since; else nothing."""
+    """The fields of an older run's `plant`, under their present names."""
     if not isinstance(plant, dict) or "contact_approximation" not in plant:
         return {}
     defaults = _defaults()
@@ -196,7 +195,7 @@ def _added() -> dict[str, Any]:
 
 
 def _differences(found: Any, expected: Any, path: str = "") -> list[str]:
-    """The fields, by their paths, in which JSON values differ, with what was found there."""
+    """The paths at which JSON values differ, with the values found there."""
     if found == expected:
         return []
     if not isinstance(found, Mapping) or not isinstance(expected, Mapping):
@@ -257,10 +256,10 @@ def check_summary(summary: Any, where: str) -> None:
 
     Args:
         summary: the content of a file, or of a row.
-        where: it is from, for the error.
+        where: its origin, for the error.
 
     Raises:
-        UserError: it has not; names the field.
+        UserError: a field is missing or of another kind.
     """
     must = "it must be a summary.json of evaluate"
     for key, kind in _KINDS.items():

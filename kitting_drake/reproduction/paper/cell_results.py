@@ -17,7 +17,7 @@ from kitting_drake.reproduction.paper.learning_rates import Rates
 from kitting_drake.reproduction.paper.paper_tables import paper_cells
 
 MISSING, TO_RUN_AGAIN = "-", "- ‡"
-"""What stands for a cell that was not run, and for one whose run nobody can repeat."""
+"""Texts of a cell that was not run, and of one whose run is not reproducible."""
 
 
 @dataclass(frozen=True)
@@ -35,14 +35,14 @@ class Result:
 
 
 class Divided(NamedTuple):
-    """What `cell_results` divides runs into."""
+    """The groups into which `cell_results` divides runs."""
 
     results: list[Result]
     """Of the cells, in their order."""
     others: list[Run]
     """The other runs, in the order in which they were given."""
     set_aside: list[Run]
-    """Runs, of cells or not, whose code nobody can check out again: no table may use them."""
+    """Runs from trees with uncommitted changes, of cells or not. No table may use them."""
 
     @property
     def to_run_again(self) -> frozenset[str]:

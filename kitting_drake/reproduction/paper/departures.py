@@ -1,4 +1,4 @@
-"""How the cells "as in the paper" depart from it all the same, and what each departure changes."""
+"""How the cells "as in the paper" depart from it, and the effect of each departure."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ _NOT_MEASURED = (
 
 
 def departures(results: Mapping[str, Result]) -> str:
-    """The two tables, and what stands above them.
+    """The section, with its two tables.
 
     Args:
         results: by the names of their cells.

@@ -1,5 +1,4 @@
-"""The section of the page of results on how much better one method is than another on the same
-seeds."""
+"""The section of the protocol on how much better one method is than another on the same seeds."""
 
 from __future__ import annotations
 

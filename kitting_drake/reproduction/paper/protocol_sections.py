@@ -112,7 +112,7 @@ def _beyond_the_paper(results: Mapping[str, Result], again: Collection[str]) -> 
 
     steps = TASKS["unseen"].steps
     rows = [
-        # Without one thing at a time, only the unseen toolsets tell a difference.
+        # The ablation was run on the unseen toolsets only.
         [label, text(f"unseen_{name}"), "" if "minus" in name else text(f"seen_{name}")]
         for label, name in names.items()
     ]
@@ -158,7 +158,7 @@ def _pyramid(results: Mapping[str, Result], again: Collection[str]) -> list[str]
 
 
 def _toppled_boxes(results: Mapping[str, Result]) -> list[str]:
-    """What went wrong on palletizing after one demonstration, of the cells that are there."""
+    """Failures on palletizing after one demonstration, of the cells that were run."""
     rows = []
     for method, n, _ in rows_of_table_1():
         result = results.get(f"palletizing_boxes_{method}_{n}_1")
@@ -211,6 +211,6 @@ def _every_cell(results: Sequence[Result]) -> str:
 
 
 def _causes(summary: Mapping[str, Any]) -> str:
-    """Why objects were no success, or no strict one, and how many."""
+    """Causes of failures and of successes that are not strict, with their counts."""
     counts = {**summary["causes"], **summary["ambiguous"]}
     return ", ".join(f"{name} {count}" for name, count in counts.items() if count) or "-"

@@ -1,4 +1,4 @@
-"""The section of the page of results on how much one training differs from another."""
+"""The section of the protocol on the variation between trainings."""
 
 from __future__ import annotations
 
