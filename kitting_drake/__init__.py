@@ -1,3 +1,23 @@
 """Robotic kitting in Drake: the station, the tasks, the dataset and the policies."""
 
+import itertools
+import sys
+from types import TracebackType
+
 __version__ = "0.1.0"
+
+
+def _end_quietly(
+    kind: type[BaseException], error: BaseException, traceback: TracebackType | None
+) -> None:
+    """Shows no traceback for Ctrl-C."""
+    if not issubclass(kind, KeyboardInterrupt):
+        sys.__excepthook__(kind, error, traceback)
+
+
+if any(
+    flag == "-m" and module.startswith("kitting_drake")
+    for flag, module in itertools.pairwise(sys.orig_argv)
+):
+    # A command: Ctrl-C may come while it still imports.
+    sys.excepthook = _end_quietly

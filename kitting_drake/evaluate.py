@@ -66,7 +66,7 @@ def main() -> int:
         )
     folder = require_folder(output_folder(arguments, f"{chosen.name}-evaluation"))
     console = Console(quiet=arguments.quiet)
-    for note in filter(None, (uncommitted_note(), hidden_table_note(chosen.scenario))):
+    if note := hidden_table_note(chosen.scenario):
         console.print(f"note: {note}", highlight=False, markup=False)
 
     known = chosen.scenario.policy.training_seeds(chosen.base).intersection(seeds)
@@ -74,6 +74,8 @@ def main() -> int:
         console.print(f"note: the policy has learned from seeds {min(known)} to {max(known)}")
     # What cannot be built at all is told at once, not once for each seed.
     success = build_any_chosen(chosen, seeds).scene.success
+    if note := uncommitted_note():
+        console.print(f"note: {note}", highlight=False, markup=False)
     with alone_in(folder):
         with open_workers(arguments, chosen) as (workers, sent):
             evaluation = evaluate(

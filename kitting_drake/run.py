@@ -10,7 +10,7 @@ from rich.console import Console
 from kitting_drake.common.command_line import FAILED, INTERRUPTED, run_command, seed_type
 from kitting_drake.common.errors import UserError
 from kitting_drake.common.files import require_folder, write_atomically, write_json
-from kitting_drake.common.provenance import commit, uncommitted_note
+from kitting_drake.common.provenance import commit
 from kitting_drake.common.rendering import add_picture_renderer, render_picture, save_png
 from kitting_drake.episode.chosen import run_chosen
 from kitting_drake.episode.episode_log import add_log_flag, check_log
@@ -40,7 +40,7 @@ def main() -> int:
     _check_files(arguments.picture, arguments.video, folder / REPLAY)
     if arguments.log is not None:
         check_log(arguments.log)
-    for note in filter(None, (uncommitted_note(), hidden_table_note(chosen.scenario))):
+    if note := hidden_table_note(chosen.scenario):
         console.print(f"note: {note}", highlight=False, markup=False)
 
     decisions: list[tuple[Observation, Decision]] = []

@@ -71,6 +71,8 @@ def run_command(main: Callable[[], int]) -> None:
     """Runs a command and exits with its code; prints a user's error as one sentence."""
     # Drake announces ports and frame names; a command says itself what a person needs to know.
     logging.getLogger("drake").setLevel(logging.WARNING)
+    # SIGTERM ends a command as Ctrl-C does: with its files and its processes in order.
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         code = main()
     except UserError as error:

@@ -1,9 +1,11 @@
 """Work in fresh processes, several side by side: what takes it down takes no other with it."""
 
+import contextlib
 import multiprocessing
 import os
 import signal
 import threading
+import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass
@@ -24,6 +26,8 @@ _THREADS = "OMP_NUM_THREADS"
 _MOST_CALLS = 10
 """A process is ended after so many calls: Drake 1.51 keeps every Diagram, so that each episode
 leaves some fifty megabytes behind."""
+_PATIENCE = 3.0
+"""How long a process that is stopped may take to remove what it was writing, in s."""
 _MOST_AT_WORK = 1000
 """Each occupies a thread here, wherever it is at work."""
 
@@ -58,7 +62,12 @@ class Subprocess:
         context = multiprocessing.get_context("spawn")
         self._connection, theirs = context.Pipe()
         self._process = context.Process(target=_serve, args=(theirs,), daemon=True)
-        self._process.start()
+        # The process inherits the mask: Ctrl-C is not for it, even while it starts.
+        before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+        try:
+            self._process.start()
+        finally:
+            signal.pthread_sigmask(signal.SIG_SETMASK, before)
         theirs.close()
         self.calls = 0
         """How many it has been given."""
@@ -191,7 +200,12 @@ class LocalWorkers:
 
     def stop(self) -> None:
         self._stopped = True
-        for process in multiprocessing.active_children():
+        processes = multiprocessing.active_children()
+        for process in processes:
+            process.terminate()
+        deadline = time.monotonic() + _PATIENCE
+        for process in processes:
+            process.join(max(deadline - time.monotonic(), 0.0))
             process.kill()
 
 
@@ -240,19 +254,28 @@ def counting_bar(console: Console, label: str) -> Progress:
 
 
 def _serve(connection: Connection) -> None:
-    # Ctrl-C is the parent's to handle.
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_end_with_parent, daemon=True).start()
-    while True:
-        try:
+    terminated = False
+
+    def terminate(*_: object) -> None:
+        nonlocal terminated
+        terminated = True
+        raise KeyboardInterrupt
+
+    # What is being written is removed on the way out.
+    signal.signal(signal.SIGTERM, terminate)
+    with contextlib.suppress(EOFError, KeyboardInterrupt):
+        while not terminated:
             function, arguments = connection.recv()
-        except EOFError:
-            return
-        try:
-            answer = function(*arguments)
-        except MachineError as error:
-            answer = error
-        connection.send(answer)
+            try:
+                answer = function(*arguments)
+            except MachineError as error:
+                answer = error
+            connection.send(answer)
+    if terminated:
+        # The exit code tells what ended it.
+        signal.signal(signal.SIGTERM, signal.SIG_DFL)
+        os.kill(os.getpid(), signal.SIGTERM)
 
 
 def _end_with_parent() -> None:

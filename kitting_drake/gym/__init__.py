@@ -9,8 +9,8 @@ import gymnasium
 from kitting_drake.common import paths
 
 SCENARIOS = {
-    "KittingSeen": ("kitting_seen.yaml", "KittingSeenToolset"),
-    "KittingUnseen": ("kitting_unseen.yaml", "KittingUnseenToolsets"),
+    "KittingSeen": ("paper/kitting_seen.yaml", "KittingSeenToolset"),
+    "KittingUnseen": ("paper/kitting_unseen.yaml", "KittingUnseenToolsets"),
     "AlignBoxCorner": ("ravens.yaml", "AlignBoxCorner"),
     "BlockInsertion": ("ravens.yaml", "BlockInsertion"),
     "PlaceRedInGreen": ("ravens.yaml", "PlaceRedInGreen"),

@@ -108,10 +108,10 @@ def find_scenario(
     Raises:
         UserError: it cannot be used.
     """
-    by_name = path.parent in (Path(), Path(SCENARIOS.name))
-    if by_name and not path.exists() and (SCENARIOS / path.name).is_file():
+    if not path.exists() and not path.is_absolute() and ".." not in path.parts:
         # An installed wheel carries its scenarios; `scenarios/x.yaml` means them anywhere.
-        path = SCENARIOS / path.name
+        inside = path.relative_to(SCENARIOS.name) if path.parts[0] == SCENARIOS.name else path
+        path = SCENARIOS / inside if (SCENARIOS / inside).is_file() else path
     scenario = load_scenario(path, name, text, perturb)
     label = path.stem if name is None else f"{path.stem}:{name}"
     return ChosenScenario(scenario, path, label, text, perturb)

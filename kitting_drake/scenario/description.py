@@ -14,7 +14,9 @@ def describe(value: Any) -> Any:
     """A scenario, or a part of it, as JSON holds it: defaults included; variants have a `_tag`."""
     if dataclasses.is_dataclass(value):
         fields = {
-            item.name: describe(getattr(value, item.name)) for item in dataclasses.fields(value)
+            item.name: describe(getattr(value, item.name))
+            for item in dataclasses.fields(value)
+            if item.metadata.get("described", True)
         }
         return fields if isinstance(value, Scenario) else {"_tag": _tag(value), **fields}
     if (names := struct_fields(type(value))) is not None:

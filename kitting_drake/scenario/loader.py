@@ -6,15 +6,16 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import yaml
-from pydrake.common.yaml import yaml_load, yaml_load_typed
+from pydrake.common.yaml import yaml_load_typed
 
 from kitting_drake.common.errors import UserError
 from kitting_drake.scenario.cameras import check_camera
+from kitting_drake.scenario.own_task import is_own_task, load_own_task
 from kitting_drake.scenario.perturbations import perturbation
 from kitting_drake.scenario.schema import Scenario
 from kitting_drake.scenario.yaml_check import check_yaml
-from kitting_drake.tasks import Task
+from kitting_drake.scenario.yaml_text import dumped, parse
+from kitting_drake.tasks import PythonTask, Task
 from systems.bounds import check_bounds
 from systems.hand_geometry import JOINT_LIMITS
 
@@ -34,7 +35,7 @@ def load_scenario(
         path: the YAML file: a mapping from names to scenarios.
         name: which one; the first when None.
         text: YAML merged over it: mappings field by field, all else replaced; a tag that is not
-            given is that of what is merged over.
+            given is that of what is merged over. A camera that is null is removed.
         perturb: perturbations (see `scenario.perturbations`), merged over it before `text`.
 
     Raises:
@@ -45,8 +46,9 @@ def load_scenario(
     except (OSError, UnicodeDecodeError) as error:
         reason = getattr(error, "strerror", None) or "it is not a text file"
         raise UserError(f"cannot read the scenario {path}: {reason}") from error
-    root = _parse(content, str(path))
-    names = list(root)
+    root = parse(content, str(path))
+    # By YAML's custom such names hold parts that others refer to.
+    names = [name for name in root if not name.startswith(("x-", "."))]
     fields = {item.name for item in dc.fields(Scenario)}
     if names and not set(names) - fields:
         raise UserError(
@@ -58,7 +60,8 @@ def load_scenario(
         name = names[0]
     if name not in root:
         raise UserError(f"{path} has no scenario '{name}': use one of {', '.join(names)}")
-    scenario = _load(root[name], content, name, Scenario(), f"{path}: {name}")
+    base = path.resolve().parent
+    scenario = _load(root[name], Scenario(), f"{path}: {name}", base)
     if perturb is not None:
         overlay = perturbation(perturb, scenario)
         # Of paints the later one wins, and a name that is given again would keep its place.
@@ -69,55 +72,11 @@ def load_scenario(
         }
         scenario = dc.replace(scenario, appearance=dc.replace(scenario.appearance, paints=kept))
         raw, defaults = _onto(overlay, scenario)
-        scenario = _load(raw, _dumped(raw), None, defaults, "--perturb")
+        scenario = _load(raw, defaults, "--perturb", base, merged=True)
     if text is not None:
-        raw, defaults = _onto(_parse(text, "--scenario_text"), scenario)
-        scenario = _load(raw, _dumped(raw), None, defaults, "--scenario_text")
+        raw, defaults = _onto(parse(text, "--scenario_text"), scenario)
+        scenario = _load(raw, defaults, "--scenario_text", base, merged=True)
     return scenario
-
-
-class _Dumper(yaml.SafeDumper):
-    """Writes what Drake's `yaml_load` reads: the tag of a mapping is under `_tag`."""
-
-
-def _represent_tagged(dumper: yaml.SafeDumper, data: dict[str, Any]) -> yaml.Node:
-    tag = data.get("_tag", "tag:yaml.org,2002:map")
-    return dumper.represent_mapping(tag, {k: v for k, v in data.items() if k != "_tag"})
-
-
-_Dumper.add_representer(dict, _represent_tagged)
-
-
-def _dumped(raw: dict) -> str:
-    """The YAML of a mapping. Drake's `yaml_dump` would sort it: but of paints the later one wins,
-    and tools are taken in their order."""
-    return yaml.dump(raw, Dumper=_Dumper, sort_keys=False)
-
-
-def _parse(content: str, where: str) -> dict:
-    try:
-        # A Python mapping swallows a field that is given twice.
-        node = yaml.compose(content, Loader=yaml.SafeLoader)
-        _check_names(node)
-        # It would be dropped without a word.
-        if isinstance(node, yaml.MappingNode) and node.tag != "tag:yaml.org,2002:map":
-            raise ValueError(f"the tag {node.tag} at the beginning means nothing there")
-        # Drake takes an empty text for no text at all.
-        root = yaml_load(data=content) if content.strip() else None
-    except yaml.YAMLError as error:
-        mark = getattr(error, "problem_mark", None)
-        line = f", line {mark.line + 1}" if mark else ""
-        problem = getattr(error, "problem", None) or "it cannot be parsed"
-        raise UserError(f"{where}{line} is not YAML: {problem}") from error
-    except ValueError as error:
-        raise UserError(f"{where}: {error}") from error
-    except RecursionError as error:
-        raise UserError(f"{where} is not YAML that ends: it contains itself") from error
-    if root is None:
-        return {}
-    if not isinstance(root, dict):
-        raise UserError(f"{where} must be a mapping of names, not a {type(root).__name__}")
-    return root
 
 
 def _onto(raw: dict, defaults: Scenario) -> tuple[dict, Scenario]:
@@ -134,8 +93,13 @@ def _onto(raw: dict, defaults: Scenario) -> tuple[dict, Scenario]:
     task = tagged.get("task")
     if isinstance(task, dict):
         defaults = dc.replace(defaults, task=_without_mappings(task, defaults.task))
-    if "cameras" in raw:
-        tagged["cameras"] = _of_variants(raw["cameras"], defaults.cameras)
+    cameras = raw.get("cameras")
+    if isinstance(cameras, dict):
+        kept = {name: camera for name, camera in cameras.items() if camera is not None}
+        removed = cameras.keys() - kept.keys()
+        left = {name: item for name, item in defaults.cameras.items() if name not in removed}
+        defaults = dc.replace(defaults, cameras=left)
+        tagged["cameras"] = _of_variants(kept, left)
     appearance = raw.get("appearance")
     if isinstance(appearance, dict) and "paints" in appearance:
         paints = _of_variants(appearance["paints"], defaults.appearance.paints)
@@ -147,6 +111,8 @@ def _without_mappings(given: dict, current: Task) -> Task:
     """The task to merge `given` over: of another variant than `current`, its defaults, but for the
     mappings that are given."""
     for variant in typing.get_args(Task):
+        if variant is PythonTask:
+            continue
         if given["_tag"] == f"!{variant.__name__}" and not isinstance(current, variant):
             fresh = variant()
             emptied: dict[str, Any] = {
@@ -173,37 +139,33 @@ def _of_variants(given: object, current: Mapping[str, object]) -> object:
     }
 
 
-def _check_names(node: yaml.Node | None) -> None:
-    if isinstance(node, yaml.MappingNode):
-        seen = set()
-        for key, value in node.value:
-            line = key.start_mark.line + 1
-            if key.tag != "tag:yaml.org,2002:str":
-                raise ValueError(f"the name on line {line} must be a text")
-            if key.value == "_tag":
-                raise ValueError(f"'_tag' on line {line} is no field: write !Name before the value")
-            if key.value in seen:
-                raise ValueError(f"'{key.value}' is given twice (again on line {line})")
-            seen.add(key.value)
-            _check_names(value)
-    elif isinstance(node, yaml.SequenceNode):
-        for item in node.value:
-            _check_names(item)
+def _load(
+    raw: Any, defaults: Scenario, where: str, base: Path, *, merged: bool = False
+) -> Scenario:
+    """Loads a mapping over defaults.
 
-
-def _load(raw: object, content: str, name: str | None, defaults: Scenario, where: str) -> Scenario:
+    Args:
+        raw: the mapping, as `parse` returns it.
+        defaults: what it does not give.
+        where: what to call it in errors.
+        base: the folder of the scenario's file.
+        merged: whether mappings of names (cameras, tools) are added to the default ones; else they
+            replace them.
+    """
     try:
-        check_yaml(Scenario, raw if raw is not None else {}, "")
-        if raw is None or raw == {}:
-            scenario = defaults
-        else:
+        raw = {} if raw is None else raw
+        if isinstance(raw, dict) and is_own_task(raw.get("task"), defaults.task):
+            own = load_own_task(raw["task"], defaults.task, base)
+            defaults = dc.replace(defaults, task=own)
+            raw = {key: value for key, value in raw.items() if key != "task"}
+        check_yaml(Scenario, raw, "")
+        scenario = defaults
+        if raw:
             scenario = yaml_load_typed(
                 schema=Scenario,
-                data=content,
-                child_name=name,
+                data=dumped(raw),
                 defaults=defaults,
-                # A file's cameras and tools replace the default ones; --scenario_text adds.
-                retain_map_defaults=name is None,
+                retain_map_defaults=merged,
             )
         check_bounds(scenario)
         _check_meaning(scenario)

@@ -35,8 +35,8 @@ def pack(chosen: ChosenScenario, folder: Path) -> Shipment:
     """Gathers what another machine needs to run a scenario, as links; Ray copies what they name.
 
     It is this checkout's or wheel's packages and models, the files that task and policy read
-    (weights, tools of one's own), and the module or package of a `!PythonPolicy`. Other packages
-    have to be installed there.
+    (weights, tools of one's own), and the modules or packages of a `!PythonPolicy` and of a
+    `!PythonTask`. Other packages have to be installed there.
 
     Args:
         chosen: the scenario; it can be built here.
@@ -79,7 +79,7 @@ def pack(chosen: ChosenScenario, folder: Path) -> Shipment:
         "env_vars": environment,
     }
     # Ray fails on an empty list.
-    if modules := _own_modules(scenario.policy.modules()):
+    if modules := _own_modules([*scenario.policy.modules(), *scenario.task.modules()]):
         runtime_env["py_modules"] = [str(path) for path in modules]
     return Shipment(moved, runtime_env)
 

@@ -42,7 +42,8 @@ def open_workers(
     """
     if arguments.ray is None:
         # What a person's own function remembers must not travel from episode to episode.
-        reuse = not chosen.scenario.policy.modules()
+        scenario = chosen.scenario
+        reuse = not (scenario.policy.modules() or scenario.task.modules())
         with LocalWorkers(arguments.workers or os.cpu_count() or 1, reuse=reuse) as local:
             yield local, chosen
         return

@@ -1,6 +1,7 @@
 """Tasks: what stands on the table, what is to be brought about, and when it is success."""
 
 from kitting_drake.tasks.kitting.kitting import ArrangedKitting, Kitting, ToolsetKitting
+from kitting_drake.tasks.python_task import PythonTask
 from kitting_drake.tasks.ravens.align_box_corner import AlignBoxCorner
 from kitting_drake.tasks.ravens.block_insertion import BlockInsertion
 from kitting_drake.tasks.ravens.palletizing_boxes import PalletizingBoxes
@@ -16,6 +17,7 @@ Task = (
     | PlaceRedInGreen
     | StackBlockPyramid
     | PalletizingBoxes
+    | PythonTask
 )
 """The variants of a scenario's `task:`; the first is the default."""
 

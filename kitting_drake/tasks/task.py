@@ -178,6 +178,10 @@ class TaskConfig:
         """
         return []
 
+    def modules(self) -> list[str]:
+        """Modules of a person's own that it is made of."""
+        return []
+
     def validate(self) -> None:
         """Checks what neither types nor ranges say.
 

@@ -69,7 +69,7 @@ def shipped() -> list[Any]:
             id=f"{path.stem}:{key.value}",
             marks=[pytest.mark.slow] if key.value.endswith(MORE_OF_THE_SAME) else [],
         )
-        for path in sorted(SCENARIOS.glob("*.yaml"))
+        for path in sorted(SCENARIOS.rglob("*.yaml"))
         for key, _ in yaml.compose(path.read_text(), Loader=yaml.SafeLoader).value
     ]
 

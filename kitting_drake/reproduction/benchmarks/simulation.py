@@ -26,7 +26,7 @@ from kitting_drake.scenario.schema import Scenario
 from kitting_drake.station import build_station, with_policy
 
 _SCENARIO = SCENARIOS / "kitting_oracle.yaml"
-_LEARNED = SCENARIOS / "kitting_seen.yaml"
+_LEARNED = SCENARIOS / "paper/kitting_seen.yaml"
 
 
 def benchmark_simulation(episodes: int, seed: int, console: Console) -> dict[str, Any]:

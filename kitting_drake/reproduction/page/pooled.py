@@ -61,7 +61,7 @@ def shipped_policies() -> dict[str, Policy]:
     """The policies that need no training, by their names in tables."""
     return {
         "generalist": Learned(weights=""),
-        "of 100 demonstrations": load_scenario(SCENARIOS / "kitting_unseen.yaml").policy,
+        "of 100 demonstrations": load_scenario(SCENARIOS / "paper/kitting_unseen.yaml").policy,
         "shape matching": ShapeMatching(),
     }
 
@@ -71,7 +71,7 @@ def _is_of(run: Run, policy: Policy) -> bool:
     options."""
     found: dict[str, Any] = run.summary["resolved_scenario"]["policy"]
     expected: dict[str, Any] = described(Scenario(policy=policy))["policy"]
-    return run.summary.get("policy_digest") == policy.digest(SCENARIOS) and all(
+    return run.summary.get("policy_digest") == policy.digest(SCENARIOS / "paper") and all(
         found.get(key, value) == value for key, value in expected.items() if key != "weights"
     )
 

@@ -16,7 +16,7 @@ from kitting_drake.scenario.loader import load_scenario
 from kitting_drake.scenario.perturbations import LEVELS, NAMES
 from kitting_drake.scenario.policies import Learned
 
-_UNSEEN = SCENARIOS / "kitting_unseen.yaml"
+_UNSEEN = SCENARIOS / "paper/kitting_unseen.yaml"
 _BEGIN, _END = "<!-- figures -->\n", "<!-- end of figures -->\n"
 _AS_IT_IS = "as it is"
 _COLUMNS = {
@@ -206,7 +206,7 @@ def with_figures(page: str, figures: str) -> str:
 def _shipped() -> dict[str, str | None]:
     """The digests of the weights that come with the package, by method."""
     policies = {"generalist": Learned(weights=""), "so2": load_scenario(_UNSEEN).policy}
-    return {method: policy.digest(SCENARIOS) for method, policy in policies.items()}
+    return {method: policy.digest(SCENARIOS / "paper") for method, policy in policies.items()}
 
 
 def _expected() -> dict[str, dict[str, Any]]:

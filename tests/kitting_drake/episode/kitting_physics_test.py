@@ -34,7 +34,14 @@ def run(
 
 
 @pytest.mark.parametrize(
-    "name", ["kitting_seen", pytest.param("kitting_unseen", marks=pytest.mark.slow)]
+    "name",
+    [
+        "kitting_seen",
+        *(
+            pytest.param(name, marks=pytest.mark.slow)
+            for name in ("kitting_unseen", "paper/kitting_seen", "paper/kitting_unseen")
+        ),
+    ],
 )
 @pytest.mark.usefixtures("rendering")
 def test_a_shipped_policy_kits_nearly_all(name: str):

@@ -40,6 +40,7 @@ def test_a_chosen_scenario_describes_all_of_itself(tmp_path: Path):
         "continuous": True,
         "fit_outlines": True,
         "recover": False,
+        "avoid_failed_picks": True,
     }
     task = described["task"]
     assert (task["_tag"], task["split"], task["spacing"]) == ("!ToolsetKitting", "train", 0.008)
@@ -71,6 +72,8 @@ def test_shipped_scenarios_are_found_from_anywhere(tmp_path: Path, monkeypatch: 
         chosen = choose_scenario(parse(path))
         assert chosen.path == SCENARIOS / "kitting_oracle.yaml"
         assert chosen.name == "kitting_oracle"
+    for path in ("paper/kitting_seen.yaml", "scenarios/paper/kitting_seen.yaml"):
+        assert choose_scenario(parse(path)).path == SCENARIOS / "paper" / "kitting_seen.yaml"
 
 
 def test_files_go_where_one_says_or_into_a_folder_of_the_scenario():

@@ -54,6 +54,35 @@ planner: {home: [0.4, 0.0, 0.5, 0.0], search: {amplitude: 0.0}}
     assert merged.time_limit == 9.0
 
 
+def test_text_removes_and_replaces_cameras(tmp_path: Path):
+    path = write(tmp_path, "A: {cameras: {front: !LookAt {width: 100}, top: !Pinhole {}}}")
+    text = "cameras: {front: null, side: !LookAt {height: 77}}"
+    assert load_scenario(path, text=text).cameras == {
+        "top": Pinhole(),
+        "side": LookAt(height=77),
+    }
+    # Its fields are of the new kind alone.
+    text = "cameras: {front: !Pinhole {height: 88}}"
+    assert load_scenario(path, text=text).cameras["front"] == Pinhole(height=88)
+
+
+def test_anchors_and_merge_keys_are_resolved(tmp_path: Path):
+    path = write(
+        tmp_path,
+        """
+x-common: &slow {lower_speed: 0.05, linear_speed: 0.5}
+.tools: &tools [flat_screwdriver]
+A:
+  task: !Kitting {tools: *tools}
+  planner: {<<: *slow, linear_speed: 0.7}
+""",
+    )
+    scenario = load_scenario(path)
+    assert scenario.planner.lower_speed == 0.05
+    assert scenario.planner.linear_speed == 0.7
+    assert scenario.task == Kitting(tools=["flat_screwdriver"])
+
+
 def test_text_keeps_the_order_that_it_is_written_in(tmp_path: Path):
     """The oracle takes tools in their order, and of paints the later one wins."""
     path = write(tmp_path, "A: {}")

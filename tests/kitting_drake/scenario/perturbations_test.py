@@ -11,7 +11,7 @@ from kitting_drake.scenario.perturbations import LEVELS, NAMES, perturbation
 from kitting_drake.scenario.schema import Scenario
 from kitting_drake.tasks import Kitting
 
-KITTING = SCENARIOS / "kitting_unseen.yaml"
+KITTING = SCENARIOS / "paper/kitting_unseen.yaml"
 
 
 @pytest.mark.parametrize("name", NAMES)

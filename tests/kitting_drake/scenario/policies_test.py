@@ -116,6 +116,7 @@ def test_results_say_what_a_policy_is(weights_file: Path):
         "continuous": False,
         "fit_outlines": False,
         "recover": False,
+        "avoid_failed_picks": True,
         "trained_orientations": 72,
         "compute_type": str(preferred_type()).removeprefix("torch."),
         "scenario": "mine",
@@ -230,6 +231,25 @@ def test_the_policy_is_given_the_scenario_s_planner(
     monkeypatch.setattr("kitting_drake.policies.stages.make_stages", noted)
     Learned(str(weights_file)).make_system(dataclasses.replace(site, planner=deep))
     assert given == [deep]
+
+
+@pytest.mark.parametrize("avoids", [True, False])
+def test_failed_picks_are_avoided_unless_as_in_the_paper(
+    site: PolicySite, weights_file: Path, avoids: bool
+):
+    seen = stored_observation("kitting_unseen")
+    site = dataclasses.replace(site, grid=seen.grid)
+    config = Learned(str(weights_file), continuous=False, avoid_failed_picks=avoids)
+    system = config.make_system(site)
+    context = system.CreateDefaultContext()
+    port = "observation" if system.HasInputPort("observation") else "observation_heights"
+    system.GetInputPort(port).FixValue(context, Value(seen))
+    first = system.GetOutputPort("action").Eval(context).pick
+    system.GetInputPort("failed_picks").FixValue(context, Value((first,)))
+    second = system.GetOutputPort("action").Eval(context).pick
+    assert (second != first) == avoids
+    with pytest.raises(ValueError, match=r"policy\.recover"):
+        Learned(recover=True, avoid_failed_picks=False).validate()
 
 
 @pytest.mark.parametrize("insertion", [True, False])

@@ -388,7 +388,7 @@ def test_one_of_everything_builds_and_steps(name: str):
 )
 @pytest.mark.usefixtures("rendering")
 def test_what_would_go_wrong_is_not_built(text: str, sentence: str):
-    scenario = load_scenario(SCENARIOS / "kitting_seen.yaml", text=text)
+    scenario = load_scenario(SCENARIOS / "paper/kitting_seen.yaml", text=text)
     with pytest.raises(UserError, match=sentence):
         build(scenario)
 

@@ -50,7 +50,7 @@ def test_toolsets_of_the_paper_never_change(split: str, digest: str):
 
 def test_fresh_tools_are_in_no_scenario_but_by_their_split():
     fresh = [name for pool in tool_pools("fresh").values() for name in pool]
-    for path in SCENARIOS.glob("*.yaml"):
+    for path in SCENARIOS.rglob("*.yaml"):
         assert not [name for name in fresh if name in path.read_text()], path
 
 

@@ -32,7 +32,7 @@ FITTING = make_stages(PLANNER, insertion=True)
 def seen(request):
     """An observation of four tools beside their kit, and the truth."""
     scenario = load_scenario(
-        SCENARIOS / "kitting_seen.yaml", None, "{policy: !Oracle {}}", request.param
+        SCENARIOS / "paper/kitting_seen.yaml", None, "{policy: !Oracle {}}", request.param
     )
     rig = build_rig(scenario, seed=4, base=SCENARIOS)
     context = rig.diagram.CreateDefaultContext()
@@ -179,7 +179,7 @@ def test_a_place_that_is_nearly_right_or_reversed_is_put_right(seen, turn: float
 
 def test_a_place_in_a_recess_that_fits_far_worse_than_another_moves_there():
     """A precision screwdriver, thin enough to lie in a hammer's cavity, and placed there."""
-    scenario = load_scenario(SCENARIOS / "kitting_unseen.yaml", None, "{policy: !Oracle {}}")
+    scenario = load_scenario(SCENARIOS / "paper/kitting_unseen.yaml", None, "{policy: !Oracle {}}")
     rig = build_rig(scenario, seed=1216, base=SCENARIOS)
     context = rig.diagram.CreateDefaultContext()
     observation = rig.port("observation", context)
@@ -266,7 +266,7 @@ def test_it_needs_no_torch():
 def kitted(request) -> Observation:
     """A kit with all of its tools, and four boxes on the table."""
     scenario = load_scenario(
-        SCENARIOS / "kitting_unseen.yaml",
+        SCENARIOS / "paper/kitting_unseen.yaml",
         "KittingUnseenToolsetsTraining",
         "{policy: !Oracle {}}",
         "distractors",

@@ -10,7 +10,7 @@ from kitting_drake.reproduction.page.pooled import pooled_section, shipped_polic
 from kitting_drake.reproduction.page.runs import Run, described
 from kitting_drake.scenario.loader import load_scenario
 
-UNSEEN = SCENARIOS / "kitting_unseen.yaml"
+UNSEEN = SCENARIOS / "paper/kitting_unseen.yaml"
 GENERALIST = shipped_policies()["generalist"].digest(SCENARIOS)
 
 

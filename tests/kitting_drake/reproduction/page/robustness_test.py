@@ -11,7 +11,7 @@ from kitting_drake.reproduction.page.runs import Run, described
 from kitting_drake.scenario.loader import load_scenario
 from kitting_drake.scenario.policies import Learned
 
-UNSEEN = SCENARIOS / "kitting_unseen.yaml"
+UNSEEN = SCENARIOS / "paper/kitting_unseen.yaml"
 
 
 SAME = range(2870, 2895)

@@ -60,7 +60,7 @@ def make_run(name: str, errors_mm: list[float]) -> Run:
     # Not that of the tree of this test, which may have uncommitted changes.
     summary["commit"] = "0123456789"
     if isinstance(cell.policy, str):
-        summary["policy_digest"] = scenario.policy.digest(SCENARIOS)
+        summary["policy_digest"] = scenario.policy.digest(SCENARIOS / "paper")
     return Run(name, summary)
 
 

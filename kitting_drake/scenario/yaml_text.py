@@ -1,0 +1,87 @@
+"""Parses YAML with errors that a person understands, and writes what Drake reads."""
+
+from typing import Any
+
+import yaml
+from pydrake.common.yaml import yaml_load
+
+from kitting_drake.common.errors import UserError
+
+_TEXT, _MERGE = "tag:yaml.org,2002:str", "tag:yaml.org,2002:merge"
+
+
+class _Dumper(yaml.SafeDumper):
+    """Writes what Drake's `yaml_load` reads: the tag of a mapping is under `_tag`."""
+
+    def ignore_aliases(self, data: Any) -> bool:
+        """Writes the same mapping again, not a reference to it."""
+        return True
+
+
+def _represent_tagged(dumper: yaml.SafeDumper, data: dict[str, Any]) -> yaml.Node:
+    tag = data.get("_tag", "tag:yaml.org,2002:map")
+    return dumper.represent_mapping(tag, {k: v for k, v in data.items() if k != "_tag"})
+
+
+_Dumper.add_representer(dict, _represent_tagged)
+
+
+def dumped(raw: dict) -> str:
+    """The YAML of a mapping, in its order: of paints the later one wins. Drake's `yaml_dump` sorts
+    it."""
+    return yaml.dump(raw, Dumper=_Dumper, sort_keys=False)
+
+
+def parse(content: str, where: str) -> dict:
+    """The mapping that a text holds; anchors, aliases and merge keys (`<<`) are resolved.
+
+    Args:
+        content: the text.
+        where: what to call it in errors.
+
+    Raises:
+        UserError: it is not YAML, or not a mapping of names.
+    """
+    try:
+        # A Python mapping swallows a field that is given twice.
+        node = yaml.compose(content, Loader=yaml.SafeLoader)
+        _check_names(node)
+        # It would be dropped without a word.
+        if isinstance(node, yaml.MappingNode) and node.tag != "tag:yaml.org,2002:map":
+            raise ValueError(f"the tag {node.tag} at the beginning means nothing there")
+        # Drake takes an empty text for no text at all.
+        root = yaml_load(data=content) if content.strip() else None
+    except yaml.YAMLError as error:
+        mark = getattr(error, "problem_mark", None)
+        line = f", line {mark.line + 1}" if mark else ""
+        problem = getattr(error, "problem", None) or "it cannot be parsed"
+        raise UserError(f"{where}{line} is not YAML: {problem}") from error
+    except ValueError as error:
+        raise UserError(f"{where}: {error}") from error
+    except RecursionError as error:
+        raise UserError(f"{where} is not YAML that ends: it contains itself") from error
+    if root is None:
+        return {}
+    if not isinstance(root, dict):
+        raise UserError(f"{where} must be a mapping of names, not a {type(root).__name__}")
+    return root
+
+
+def _check_names(node: yaml.Node | None) -> None:
+    if isinstance(node, yaml.MappingNode):
+        seen = set()
+        for key, value in node.value:
+            line = key.start_mark.line + 1
+            _check_names(value)
+            if key.tag == _MERGE:
+                continue
+            if key.tag != _TEXT:
+                raise ValueError(f"the name on line {line} must be a text")
+            if key.value == "_tag":
+                raise ValueError(f"'_tag' on line {line} is no field: write !Name before the value")
+            if key.value in seen:
+                raise ValueError(f"'{key.value}' is given twice (again on line {line})")
+            seen.add(key.value)
+    elif isinstance(node, yaml.SequenceNode):
+        for item in node.value:
+            _check_names(item)
