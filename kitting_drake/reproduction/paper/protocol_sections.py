@@ -5,10 +5,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Mapping, Sequence
+from statistics import mean, stdev
 from typing import Any
 
 from kitting_drake.common.provenance import short_commits
 from kitting_drake.reproduction.page.markdown import markdown_table
+from kitting_drake.reproduction.page.paired import OWN, STRICT
 from kitting_drake.reproduction.page.prose import prose
 from kitting_drake.reproduction.page.runs import LEARNED, METHODS
 from kitting_drake.reproduction.paper.cell_results import Result, absent_text
@@ -28,11 +30,12 @@ from kitting_drake.reproduction.paper.paper_sections import (
 from kitting_drake.reproduction.paper.paper_tables import (
     BEYOND_OF_TABLE_1,
     FIGURE_6,
+    HEADLINE_SEEDS,
     PATIENCE,
     PATIENT,
     RAVENS_DEMONSTRATIONS,
+    headline,
 )
-from kitting_drake.reproduction.paper.trainings import trainings
 
 _VARIANTS = {
     "as in the paper": "",
@@ -64,7 +67,7 @@ def protocol_sections(
         return []
     by_name = {result.cell.name: result for result in results}
     sections = [prose("cells", rates=_rates_text(rates).strip())]
-    sections += trainings(by_name, to_run_again)
+    sections += _trainings(by_name, to_run_again)
     sections += _beyond_the_paper(by_name, to_run_again)
     sections += _palletizing(by_name)
     sections += _pyramid(by_name, to_run_again)
@@ -99,6 +102,39 @@ def _baselines() -> list[Training]:
     """The trainings of `reference`: of each baseline on each task that chooses its rate."""
     tasks = dict.fromkeys(task.rates_from for task in TASKS.values())
     return [Training(task, method, 36, 100) for method in LEARNED[1:] for task in tasks]
+
+
+def _trainings(results: Mapping[str, Result], again: Collection[str]) -> list[str]:
+    """The variation between trainings; empty unless there is a second one."""
+    rows = []
+    for task in FIGURE_6:
+        for method in LEARNED[:2]:
+            names = [headline(task, method, seed).name for seed in HEADLINE_SEEDS]
+            there = [results[name] for name in names if name in results]
+            if len(there) > 1:
+                cells = [
+                    _mean_rates([results[name]]) if name in results else absent_text(name, again)
+                    for name in names
+                ]
+                rows.append([METHODS[method], task, *cells, _mean_rates(there)])
+    if not rows:
+        return []
+    headings = ["method", "toolsets", *(f"seed {seed}" for seed in HEADLINE_SEEDS), "mean"]
+    return [
+        "### Variation between trainings\n",
+        prose("trainings"),
+        markdown_table(headings, rows, left_columns=2),
+    ]
+
+
+def _mean_rates(results: Sequence[Result]) -> str:
+    """The mean of both rates, and its standard deviation where there are several."""
+    texts = []
+    for rate in (STRICT, OWN):
+        percents = [100 * result.summary[rate] for result in results]
+        spread = f" ± {stdev(percents):.1f}" if len(percents) > 1 else ""
+        texts.append(f"{mean(percents):.1f}{spread}")
+    return " / ".join(texts)
 
 
 def _beyond_the_paper(results: Mapping[str, Result], again: Collection[str]) -> list[str]:
