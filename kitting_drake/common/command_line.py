@@ -6,6 +6,7 @@ import logging
 import signal
 import sys
 from collections.abc import Callable, Iterator
+from types import FrameType
 
 from kitting_drake.common.errors import UserError
 from kitting_drake.common.seeds import ALL_SEEDS
@@ -67,12 +68,28 @@ def interrupts_wait() -> Iterator[Callable[[], bool]]:
             signal.signal(number, handler)
 
 
+def _interrupt(number: int, frame: FrameType | None) -> None:
+    """Raises KeyboardInterrupt, a little later if trimesh is being imported: its optional imports
+    catch everything."""
+    while frame is not None:
+        module = str(frame.f_globals.get("__name__", ""))
+        if module.partition(".")[0] == "trimesh" and frame.f_code.co_name == "<module>":
+            signal.setitimer(signal.ITIMER_REAL, 0.1)
+            return
+        frame = frame.f_back
+    raise KeyboardInterrupt
+
+
 def run_command(main: Callable[[], int]) -> None:
     """Runs a command and exits with its code; prints a user's error as one sentence."""
     # Drake announces ports and frame names; a command says itself what a person needs to know.
     logging.getLogger("drake").setLevel(logging.WARNING)
     # SIGTERM ends a command as Ctrl-C does: with its files and its processes in order.
-    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    signals = [signal.SIGTERM, signal.SIGALRM]
+    if signal.getsignal(signal.SIGINT) != signal.SIG_IGN:
+        signals.append(signal.SIGINT)
+    for number in signals:
+        signal.signal(number, _interrupt)
     try:
         code = main()
     except UserError as error:

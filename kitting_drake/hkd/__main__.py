@@ -1,4 +1,4 @@
-"""The dataset: tools and kits, `python -m kitting_drake.hkd COMMAND`."""
+"""Tools and kits of the Hand-tool Kitting Dataset: `python -m kitting_drake.hkd COMMAND`."""
 
 import argparse
 import shlex
@@ -25,7 +25,7 @@ def list_tools(args: argparse.Namespace, entries: list[ToolEntry]) -> None:
 
 
 def generate(args: argparse.Namespace, entries: list[ToolEntry]) -> None:
-    """Regenerates models and prints how true their collision hulls are."""
+    """Regenerates models and prints how closely their collision hulls match the visual shape."""
     table = Table(caption="outline, top, grip: collision hulls against the visual shape, mm")
     table.add_column("name", no_wrap=True)
     for heading in ("triangles", "hulls", "outline", "top", "grip", "tilt, deg"):
@@ -42,14 +42,14 @@ def generate(args: argparse.Namespace, entries: list[ToolEntry]) -> None:
 
 def sheet(args: argparse.Namespace, entries: list[ToolEntry]) -> None:
     """Renders the contact sheet."""
-    # Imported here: Drake is slow to load, and only this verb needs it.
+    # Drake is slow to import, and only this verb needs it.
     from kitting_drake.hkd.kits.kit import make_kit
     from kitting_drake.hkd.kits.parameters import KitParameters
     from kitting_drake.hkd.sheet import kit_subject, tool_subject, write_sheet
 
     if args.kits:
         if args.names:
-            raise UserError(f"--kits draws kits, not '{args.names[0]}': leave one of the two out")
+            raise UserError(f"--kits draws kits, not '{args.names[0]}': leave out one of the two")
         chosen = toolsets(args.split)[: args.kits]
         kits = [make_kit([load_tool(name) for name in names], KitParameters()) for names in chosen]
         subjects = [kit_subject(f"{args.split} {i:03d}", kit) for i, kit in enumerate(kits)]
@@ -61,7 +61,7 @@ def sheet(args: argparse.Namespace, entries: list[ToolEntry]) -> None:
 
 
 def build(args: argparse.Namespace, entries: list[ToolEntry]) -> None:
-    """Writes the paper's dataset, tools and kits, to a folder that other simulators can load."""
+    """Writes the paper's tools and kits to a folder that other simulators can load."""
     from kitting_drake.hkd.dataset import build_dataset
 
     with Progress(console=Console(stderr=True), transient=True, disable=args.quiet) as progress:
@@ -77,14 +77,14 @@ def build(args: argparse.Namespace, entries: list[ToolEntry]) -> None:
 
 
 def annotate(args: argparse.Namespace, entries: list[ToolEntry]) -> None:
-    """Opens a page to look at a tool, move a gripper over it, and save its grasp."""
+    """Opens a page that shows a tool, moves a gripper over it and saves its grasp."""
     from kitting_drake.hkd.annotate import annotate as annotate_tool
 
     annotate_tool(args.name, Console())
 
 
 def import_mesh(args: argparse.Namespace, entries: list[ToolEntry]) -> None:
-    """Makes a tool of a mesh (STL, OBJ, PLY, GLB) or of an outline (SVG, DXF)."""
+    """Makes a tool from a mesh (STL, OBJ, PLY, GLB) or an outline (SVG, DXF)."""
     from kitting_drake.hkd.importing.importer import ImportRequest, import_tool
 
     console = Console(quiet=args.quiet, highlight=False, markup=False)
@@ -135,8 +135,8 @@ def kit(args: argparse.Namespace, entries: list[ToolEntry]) -> None:
 
 
 def _check_scenario(path: Path, console: Console) -> None:
-    """Says how to run a kit's scenario, or that the simulated table is too small for it."""
-    # Imported here: the other verbs do not need it, and it is slow to load.
+    """Prints how to run a kit's scenario, or that the simulated table is too small for it."""
+    # The loader is slow to import, and the other verbs do not need it.
     from kitting_drake.scenario.loader import load_scenario
     from systems.signals import PixelGrid
 
@@ -145,8 +145,8 @@ def _check_scenario(path: Path, console: Console) -> None:
         scenario.task.make_scene(grid=PixelGrid(), seed=0, base=path.parent)
     except UserError:
         console.print(
-            "  the simulated table has no room for this block and its tools: `run` takes a smaller "
-            "one or fewer tools",
+            "  the simulated table has no room for this block and its tools: make a smaller block "
+            "or use fewer tools to `run` it",
             soft_wrap=True,
         )
     else:
@@ -156,13 +156,13 @@ def _check_scenario(path: Path, console: Console) -> None:
 
 
 def main() -> int:
-    """Runs one verb; returns the exit status."""
+    """Runs one verb and returns the exit status."""
     parser = argparse.ArgumentParser(prog="python -m kitting_drake.hkd", description=__doc__)
     verbs = parser.add_subparsers(dest="verb", required=True)
     for name, function in (("list", list_tools), ("generate", generate), ("sheet", sheet)):
         verb = verbs.add_parser(name, help=function.__doc__)
         verb.add_argument(
-            "names", nargs="*", metavar="NAME", help="tools; all of them if none is named"
+            "names", nargs="*", metavar="NAME", help="names of tools (default: all tools)"
         )
         verb.set_defaults(function=function)
         if name != "sheet":
@@ -173,17 +173,19 @@ def main() -> int:
             verb.add_argument("--quiet", action="store_true", help="print nothing")
         if name == "sheet":
             verb.add_argument("--output", type=Path, required=True, help="the PNG to write")
-            verb.add_argument("--kits", type=count_type, help="draw as many kits instead of tools")
             verb.add_argument(
-                "--split", choices=SPLITS, default="train", help="which kits (default: train)"
+                "--kits", type=count_type, help="draw this many kits instead of tools"
+            )
+            verb.add_argument(
+                "--split", choices=SPLITS, default="train", help="the kits' split (default: train)"
             )
     builder = verbs.add_parser("build", help=build.__doc__)
-    builder.add_argument("--output", type=Path, required=True, help="the folder to make")
+    builder.add_argument("--output", type=Path, required=True, help="the folder to write")
     builder.add_argument(
         "--format",
         choices=("sdf", "mjcf"),
         default="sdf",
-        help="mjcf: also MuJoCo's models, beside the SDFormat ones",
+        help="mjcf: also write MuJoCo models beside the SDFormat ones",
     )
     builder.add_argument("--quiet", action="store_true", help="print nothing")
     builder.set_defaults(function=build)
@@ -199,49 +201,48 @@ def main() -> int:
 
 
 def _describe_import(importer: argparse.ArgumentParser) -> None:
-    importer.add_argument("mesh", type=Path, metavar="FILE", help="the mesh's or the outline's")
+    importer.add_argument("mesh", type=Path, metavar="FILE", help="a mesh or an outline")
     importer.add_argument(
         "--category",
         required=True,
-        help=f"of the tool: {', '.join(CATEGORIES)}, or a name of your own",
+        help=f"the tool's category: {', '.join(CATEGORIES)}, or a name of your own",
     )
-    importer.add_argument("--name", help="of the tool (default: the file's)")
+    importer.add_argument("--name", help="the tool's name (default: the file's)")
     importer.add_argument(
         "--output",
         type=Path,
         metavar="DIR",
-        help="the folder of tools to add it to (default: $KITTING_DRAKE_TOOLS, or one's own)",
+        help="the folder of tools to add it to (default: $KITTING_DRAKE_TOOLS or the user's own)",
     )
     importer.add_argument(
         "--length_mm",
         type=float,
-        help="to scale it to (default: an outline's own; a mesh's, if 150 to 200, or 180)",
+        help="scale to this length (default: an outline's own; a mesh's if 150 to 200, else 180)",
     )
-    importer.add_argument("--height_mm", type=float, help="how high to extrude an outline")
+    importer.add_argument("--height_mm", type=float, help="the height of an extruded outline")
     importer.add_argument(
-        "--density", type=float, metavar="KG_M3", help="of it all (default: the category's)"
+        "--density",
+        type=float,
+        metavar="KG_M3",
+        help="the density of the whole tool (default: the category's)",
     )
     importer.add_argument("--quiet", action="store_true", help="print nothing but errors")
     importer.set_defaults(function=import_mesh)
 
 
 def _describe_kit(maker: argparse.ArgumentParser) -> None:
-    maker.add_argument(
-        "tools", nargs="+", metavar="TOOL", help="names, or folders of imported tools"
-    )
+    maker.add_argument("tools", nargs="+", metavar="TOOL", help="names or folders of tools")
     maker.add_argument("--output", type=Path, required=True, metavar="DIR", help="the kit's folder")
     maker.add_argument(
         "--clearance_mm", type=float, help="between a tool and its cavity's wall (default: 2)"
     )
-    maker.add_argument(
-        "--wall_mm", type=float, help="between cavities, and around them (default: 6)"
-    )
+    maker.add_argument("--wall_mm", type=float, help="between and around the cavities (default: 6)")
     maker.add_argument(
         "--block_mm",
         type=float,
         nargs=3,
         metavar=("LENGTH", "WIDTH", "HEIGHT"),
-        help="the block (default: as small as can be, 50 high)",
+        help="the block's size (default: as small as possible, 50 high)",
     )
     maker.add_argument("--notches", action="store_true", help="add finger notches")
     maker.add_argument("--labels", action="store_true", help="engrave the tools' names")

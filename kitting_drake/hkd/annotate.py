@@ -34,16 +34,16 @@ _HAND_MESHES = MODELS / "franka_hand" / "meshes"
 
 
 def measure_grasp(tool: Tool, x: float, y: float, theta: float) -> Grasp | None:
-    """The grasp that results when the jaws close at a place over a tool.
+    """The grasp that results when the jaws close at a given pose.
 
     Args:
         tool: at rest in its frame T.
         x: of the middle of the pads in T, in metres.
-        y: the same; only its part along the pads counts, as closing jaws centre the tool.
+        y: as x. Only its component along the pads counts, because closing jaws centre the tool.
         theta: the rotation of the hand about T's z, in radians.
 
     Returns:
-        The grasp centred between the gripped faces; None where there is nothing between the pads.
+        The grasp, centred between the gripped faces; None if nothing is between the pads.
     """
     grip = find_grip(tool.triangles, x, y, theta, PAD_LENGTH)
     if grip is None:
@@ -60,10 +60,10 @@ def measure_grasp(tool: Tool, x: float, y: float, theta: float) -> Grasp | None:
 
 
 def save_grasp(tool: Tool, grasp: Grasp, models: Path = MODELS) -> None:
-    """Makes a grasp the tool's annotated one.
+    """Saves a grasp as the tool's annotated one.
 
-    For a tool of the catalogue the grasp goes there, and the tool is generated again; for any other
-    it goes into the tool's record.
+    A tool of the catalogue gets it in the catalogue and is generated again. Any other tool gets it
+    in its record.
 
     Args:
         tool: the tool.
@@ -71,19 +71,19 @@ def save_grasp(tool: Tool, grasp: Grasp, models: Path = MODELS) -> None:
         models: the folder with the catalogue in `tools/`.
 
     Raises:
-        UserError: the jaws do not open so far, or the catalogue cannot have it; then nothing has
-            changed.
+        UserError: the jaws do not open wide enough, or the generator rejects the grasp. Nothing is
+            changed then.
     """
     if grasp.width > WIDEST:
         raise UserError(
-            f"the tool is {1e3 * grasp.width:.0f} mm wide there, and the jaws take "
-            f"{1e3 * WIDEST:.0f} mm"
+            f"the tool is {1e3 * grasp.width:.0f} mm wide there, but the jaws take only "
+            f"{1e3 * WIDEST:.0f} mm: grasp it where it is narrower"
         )
     if tool.directory.parent != models / "tools":
         record_path = tool.directory / "tool.yaml"
         record = yaml.safe_load(record_path.read_text())
         record["grasp"] = {key: round(value, 6) for key, value in dataclasses.asdict(grasp).items()}
-        # Importing again is not to undo it.
+        # A repeated import keeps an annotated grasp.
         record["annotated"] = True
         write_atomically(record_path, yaml.safe_dump(record, sort_keys=False))
         return
@@ -99,7 +99,7 @@ def save_grasp(tool: Tool, grasp: Grasp, models: Path = MODELS) -> None:
 
 
 def with_grasp(catalogue: str, name: str, grasp: Grasp) -> str:
-    """The text of the catalogue with another grasp for one tool, all else and all comments kept.
+    """The catalogue's text with one tool's grasp replaced; comments and all else are kept.
 
     Raises:
         UserError: the catalogue has no such tool.
@@ -118,17 +118,17 @@ def with_grasp(catalogue: str, name: str, grasp: Grasp) -> str:
 
 
 class AnnotationPage:
-    """The page: the tool, the hand over it, sliders, buttons.
+    """The page with the tool, the hand over it, sliders and buttons.
 
-    Sliders move the hand; "take proposal" sets them to the proposal of the first slider.
+    The sliders move the hand. "take proposal" moves it to the proposal that the first slider picks.
     """
 
     def __init__(self, tool: Tool, proposals: list[GraspProposal], meshcat: Meshcat) -> None:
         """
         Args:
-            tool: to annotate.
-            proposals: the best first.
-            meshcat: whose page it is.
+            tool: the tool to annotate.
+            proposals: best first.
+            meshcat: serves the page.
         """
         self._tool = tool
         self._proposals = proposals
@@ -150,18 +150,18 @@ class AnnotationPage:
 
     @property
     def grasp(self) -> Grasp | None:
-        """The sliders' grasp, centred between the gripped faces; None where nothing is gripped."""
+        """The grasp at the sliders' pose; None if nothing is between the pads."""
         x, y, theta_deg = (
             self._meshcat.GetSliderValue(name) for name in ("x, mm", "y, mm", "rotation, deg")
         )
         return measure_grasp(self._tool, 1e-3 * x, 1e-3 * y, math.radians(theta_deg))
 
     def clicks(self, button: str) -> int:
-        """How often a button was clicked."""
+        """The number of clicks on a button."""
         return int(self._meshcat.GetButtonClicks(button))
 
     def refresh(self) -> None:
-        """Takes a proposal if that was asked for, and draws the hand where the sliders say."""
+        """Takes a proposal if the button was clicked, and draws the hand at the sliders' pose."""
         if self._proposals and self.clicks("take proposal") != self._taken:
             self._taken = self.clicks("take proposal")
             chosen = self._proposals[round(self._meshcat.GetSliderValue("proposal")) - 1]
@@ -187,7 +187,7 @@ class AnnotationPage:
         for path, rgba in zip(tool.visual_meshes, _colours(tool), strict=True):
             meshcat.SetObject(f"tool/{path.stem}", Mesh(path), rgba)
         for rank, proposal in enumerate(self._proposals):
-            # From green, the best, to red.
+            # Green is the best, red the worst.
             share = rank / max(len(self._proposals) - 1, 1)
             path_name = f"proposals/{rank + 1}"
             meshcat.SetObject(path_name, Sphere(0.002), Rgba(share, 1 - share, 0.1))
@@ -217,7 +217,7 @@ class AnnotationPage:
 
 
 def _colours(tool: Tool) -> list[Rgba]:
-    """The colour of each visual mesh, as the model has it."""
+    """The colour of each visual mesh in the SDFormat model."""
     text = tool.sdf.read_text()
     colours = []
     for path in tool.visual_meshes:
@@ -227,7 +227,7 @@ def _colours(tool: Tool) -> list[Rgba]:
 
 
 def proposal_table(tool: Tool, proposals: list[GraspProposal]) -> Table:
-    """The proposals, ranked, and the grasp that is annotated now."""
+    """The ranked proposals and the tool's annotated grasp."""
     table = Table(title=f"grasps of {tool.name}, best first", title_justify="left")
     for heading in (
         "rank",
@@ -262,19 +262,19 @@ def annotate(name: str, console: Console) -> None:
     """Serves the page on localhost until "done" is clicked or Ctrl-C is pressed.
 
     Raises:
-        UserError: no such tool, or no port for the page.
+        UserError: the tool does not exist, or no port is free.
     """
     tool = load_tool(name)
     path = tool.directory / "tool.yaml"
     com = yaml.safe_load(path.read_text()).get("center_of_mass")
     if not isinstance(com, list) or len(com) != 3:
-        raise UserError(f"{path} has no center_of_mass, three numbers: import the tool again")
+        raise UserError(f"{path}: center_of_mass must be three numbers; import the tool again")
     proposals = propose_grasps(tool.triangles, np.array(com, dtype=float))
     console.print(proposal_table(tool, proposals))
     try:
         meshcat = Meshcat(MeshcatParams(host="localhost", show_stats_plot=False))
     except RuntimeError as error:
-        raise UserError("Meshcat finds no free port from 7000 to 7099: close viewers") from error
+        raise UserError("Meshcat found no free port from 7000 to 7099: close viewers") from error
     page = AnnotationPage(tool, proposals, meshcat)
     console.print(
         f"annotate at {meshcat.web_url()}: open the controls, move, save", highlight=False

@@ -1,4 +1,4 @@
-"""`hkd build`: the whole dataset as files that another simulator can load, with a manifest."""
+"""`hkd build`: the whole dataset with a manifest, for other simulators."""
 
 import hashlib
 import os
@@ -24,19 +24,19 @@ def build_dataset(
 ) -> dict[str, Any]:
     """Writes the paper's tools and kits as SDFormat with their meshes, and `manifest.json`.
 
-    The folder appears atomically. Tools are in `tools/NAME/`, kits in `kits/SPLIT_000/`;
-    meshes are named relatively, so that any part may be moved.
+    The folder appears atomically. Tools are in `tools/NAME/`, kits in `kits/SPLIT_000/`. Models
+    name their meshes relatively, so each model's folder can be moved.
 
     Args:
-        folder: where to; must not exist, or be empty.
-        progress: called with how many kits are done and how many there are.
+        folder: the folder to write; must be empty or not exist.
+        progress: called with the number of kits written and the number of all kits.
         mjcf: whether to write MuJoCo's `NAME.xml` and `kit.xml` beside each SDFormat model.
 
     Returns:
         The manifest.
 
     Raises:
-        UserError: the folder holds something, or cannot be written.
+        UserError: the folder is not empty or cannot be written.
     """
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise UserError(f"{folder} is not empty: give another --output, or delete it")
@@ -115,7 +115,7 @@ def _kit_entry(name: str, split: str, kit: Kit, root: Path) -> dict[str, Any]:
         "split": split,
         **_models(folder / kit.sdf.name, root),
         "size": list(kit.size),
-        # The pose of each seated tool's frame in the kit's: yaw is about the kit's z.
+        # The pose of each seated tool's frame in the kit's frame; yaw is about the kit's z.
         "tools": [
             {"name": tool.name, "position": [pose.x, pose.y, pose.z], "yaw": pose.yaw}
             for tool, pose in zip(kit.tools, kit.layout.poses, strict=True)
@@ -125,7 +125,7 @@ def _kit_entry(name: str, split: str, kit: Kit, root: Path) -> dict[str, Any]:
 
 
 def _models(sdf: Path, root: Path) -> dict[str, str]:
-    """The paths of a model in each format that there is."""
+    """The paths of a model in each format written."""
     paths = {"sdf": sdf, "mjcf": sdf.with_suffix(".xml")}
     return {key: path.relative_to(root).as_posix() for key, path in paths.items() if path.exists()}
 

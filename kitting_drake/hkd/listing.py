@@ -1,4 +1,4 @@
-"""`hkd list`: a table of the tools that there are."""
+"""`hkd list`: a table of the available tools."""
 
 from pathlib import Path
 from typing import Any
@@ -13,14 +13,14 @@ from kitting_drake.hkd.generation.catalogue import CatalogueError, ToolEntry
 from kitting_drake.hkd.tools.tool import load_tool, user_tool_names, user_tools
 
 _LIST_WIDTH = 1000
-"""Columns of a terminal on which nothing is cut."""
+"""Columns of a terminal that cuts no cell."""
 
 
 def chosen_entries(entries: list[ToolEntry], names: list[str]) -> list[ToolEntry]:
-    """The entries named, in the catalogue's order; all of them if none is named.
+    """The named entries in the catalogue's order, or all entries if no name is given.
 
     Raises:
-        CatalogueError: a name that the catalogue does not have.
+        CatalogueError: a name is not in the catalogue.
     """
     known = {entry.name for entry in entries}
     for name in names:
@@ -34,10 +34,10 @@ def chosen_entries(entries: list[ToolEntry], names: list[str]) -> list[ToolEntry
 def chosen_with_own(
     entries: list[ToolEntry], names: list[str]
 ) -> tuple[list[ToolEntry], list[str]]:
-    """The entries named and the user's own tools named; where no name is given, all of both.
+    """The named entries and the user's named tools; all of both if no name is given.
 
     Raises:
-        CatalogueError: a name that is neither.
+        CatalogueError: a name is unknown.
     """
     own = [name for name in user_tool_names() if not names or name in names]
     known = [name for name in names if name not in own]
@@ -45,16 +45,16 @@ def chosen_with_own(
 
 
 def print_tools(models: Path, entries: list[ToolEntry], names: list[str], console: Console) -> None:
-    """Prints a table of generated tools and of the user's own; a broken one of those is named.
+    """Prints a table of generated tools and the user's own, then a line for each broken tool.
 
     Args:
         models: the folder with `tools/`.
-        entries: of the catalogue.
-        names: of the tools; all of them if there are none.
-        console: to print on; it becomes as wide as the table.
+        entries: the catalogue's.
+        names: the tools to print; all of them if empty.
+        console: widened to the table's width.
 
     Raises:
-        CatalogueError: a name that no tool has, or a tool that was not generated yet.
+        CatalogueError: a name is unknown, or a tool has not been generated.
     """
     chosen, own = chosen_with_own(entries, names)
     records = [_record(models, entry.name) for entry in chosen]
@@ -67,7 +67,7 @@ def print_tools(models: Path, entries: list[ToolEntry], names: list[str], consol
             continue
         records.append(yaml.safe_load((user_tools() / name / "tool.yaml").read_text()))
     table = _table(records)
-    # Names are what the other commands take: they are never cut.
+    # Users copy names into other commands, so never truncate them.
     wide = console.options.update(width=_LIST_WIDTH)
     console.width = max(console.width, Measurement.get(console, wide, table).maximum)
     console.print(table)
@@ -90,7 +90,7 @@ def _table(records: list[dict[str, Any]]) -> Table:
         table.add_column(heading, no_wrap=True)
     for heading in ("size, mm", "mass, g", "grasp, mm"):
         table.add_column(heading, justify="right", no_wrap=True)
-    # Most tools have none, and a terminal is narrow.
+    # Show the symmetry only where a tool has one, to keep the table narrow.
     symmetric = any(record.get("symmetry", 1) != 1 for record in records)
     if symmetric:
         table.add_column("symmetry", justify="right", no_wrap=True)

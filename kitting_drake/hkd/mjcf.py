@@ -1,8 +1,8 @@
-"""MuJoCo's MJCF of tools and kits, from their SDFormat models.
+"""MuJoCo models (MJCF) of tools and kits, converted from their SDFormat models.
 
-MuJoCo takes the convex hull of every mesh that collides. A tool's collision meshes are convex; a
-kit's block is cut into upright convex prisms, exactly but for the bevel around the rims, which is
-one step of half its width and all of its depth.
+MuJoCo replaces every collision mesh by its convex hull. A tool's collision meshes are convex. A
+kit's block is cut into upright convex prisms. They are exact except for the bevel around the rims,
+which becomes one step of half its width and its whole depth.
 """
 
 from __future__ import annotations
@@ -22,30 +22,29 @@ from kitting_drake.common.errors import UserError
 
 _DRAKE = "{http://drake.mit.edu}"
 _TORSION, _ROLLING = 0.002, 0.0001
-"""MuJoCo's own friction of spinning and rolling, in m; Drake has none."""
+"""MuJoCo's default torsional and rolling friction in m; Drake models neither."""
 _LEVEL = 1e-5
-"""Heights of a block that differ by less are one, in m."""
+"""Heights of a block that differ by less count as equal, in m."""
 _TOLERANCE = 5e-5
-"""How far outlines may be simplified, in m."""
+"""The simplification tolerance of outlines, in m."""
 _SLIVER = 1e-9
-"""Smaller areas are no part of a block, in m^2."""
+"""Smaller triangles are dropped, in m^2."""
 
 
 def tool_mjcf(sdf: Path) -> str:
-    """A tool's model: one free body, named as the model, whose frame is the tool frame T.
+    """The MJCF of a tool: one free body with the model's name, in the tool frame T.
 
     Args:
-        sdf: its SDFormat model, of one link; the result names the same meshes, relatively where the
-            SDFormat does.
+        sdf: the SDFormat model, of one link. The result uses the same mesh paths.
 
     Raises:
-        UserError: the file is missing, or is not the model of a tool.
+        UserError: the file is missing or is not a tool's model.
     """
     try:
         model = _child(ElementTree.parse(sdf).getroot(), "model")
         return _tool(_name(model), _child(model, "link"))
     except (OSError, ElementTree.ParseError, ValueError) as error:
-        raise UserError(f"{sdf} is no model of a tool: {error}") from error
+        raise UserError(f"{sdf} is not the model of a tool: {error}") from error
 
 
 def _tool(name: str, link: ElementTree.Element) -> str:
@@ -76,13 +75,13 @@ def _tool(name: str, link: ElementTree.Element) -> str:
 
 
 def kit_mjcf(sdf: Path) -> str:
-    """A kit's model: one body `kit` that does not move, whose frame is the kit frame K.
+    """The MJCF of a kit: one fixed body `kit`, in the kit frame K.
 
     Args:
-        sdf: its SDFormat model; `kit.obj` and the visual meshes are beside it.
+        sdf: the SDFormat model; `kit.obj` and the visual meshes lie beside it.
 
     Raises:
-        UserError: the model or its block is missing, or is not that of a kit.
+        UserError: the model or its block is missing, or the file is not a kit's model.
     """
     try:
         link = _child(ElementTree.parse(sdf).getroot(), "model/link")
@@ -95,7 +94,7 @@ def kit_mjcf(sdf: Path) -> str:
             assets.append(f'<mesh name="{name}" file={file}/>')
             geoms.append(_geom(name, f'rgba="{colour}" contype="0" conaffinity="0" group="2"'))
     except (OSError, ElementTree.ParseError, ValueError) as error:
-        raise UserError(f"{sdf} is no model of a kit: {error}") from error
+        raise UserError(f"{sdf} is not the model of a kit: {error}") from error
     for number, prism in enumerate(block_prisms(mesh.vertices, mesh.faces)):
         points = " ".join(f"{value:.6g}" for value in prism.ravel())
         assets.append(f'<mesh name="kit_part_{number}" vertex="{points}"/>')
@@ -107,14 +106,14 @@ def kit_mjcf(sdf: Path) -> str:
 def block_prisms(
     vertices: NDArray[np.float64], faces: NDArray[np.int64]
 ) -> list[NDArray[np.float64]]:
-    """A block of upright walls as convex upright prisms, which may overlap.
+    """Splits a block with upright walls into upright convex prisms, which may overlap.
 
     Args:
-        vertices: (n, 3), in m.
-        faces: (m, 3), of a watertight mesh.
+        vertices: (n, 3) in m.
+        faces: (m, 3) of a watertight mesh.
 
     Returns:
-        (k, 3) the corners of each, in m.
+        The corners (k, 3) of each prism, in m.
     """
     solid = Manifold(Mesh(vertices.astype(np.float32), faces.astype(np.uint32)))
     levels = [float(vertices[:, 2].min())]
@@ -126,7 +125,7 @@ def block_prisms(
         for low, high in itertools.pairwise(levels)
     ]
     prisms: list[NDArray[np.float64]] = []
-    # From the top: what is new in a layer reaches from there to the bottom.
+    # From the top: each layer's new area becomes prisms down to the bottom.
     above = CrossSection()
     for layer, top in zip(reversed(layers), reversed(levels[1:]), strict=True):
         prisms += [_prism(part, levels[0], top) for part in _convex_parts(layer - above)]
@@ -135,7 +134,7 @@ def block_prisms(
 
 
 def _convex_parts(region: CrossSection) -> list[NDArray[np.float64]]:
-    """(3 or more, 2) the corners of convex polygons that make up a region."""
+    """The corners (3, 2) of triangles that cover a region."""
     loops = [np.asarray(loop) for loop in region.to_polygons()]
     if not loops:
         return []
@@ -153,15 +152,15 @@ def _prism(polygon: NDArray[np.float64], bottom: float, top: float) -> NDArray[n
 
 
 def _child(element: ElementTree.Element, path: str) -> ElementTree.Element:
-    """The element at a path. Raises ValueError if it is missing."""
+    """The element at a path; raises ValueError if it is missing."""
     child = element.find(path)
     if child is None:
-        raise ValueError(f"there is no {path}")
+        raise ValueError(f"{path} is missing")
     return child
 
 
 def _name(element: ElementTree.Element) -> str:
-    """The attribute `name`. Raises ValueError if it is missing."""
+    """The attribute `name`; raises ValueError if it is missing."""
     name = element.get("name")
     if not name:
         raise ValueError(f"a {element.tag} has no name")
@@ -171,7 +170,7 @@ def _name(element: ElementTree.Element) -> str:
 def _text(element: ElementTree.Element, path: str) -> str:
     text = element.findtext(path)
     if not text:
-        raise ValueError(f"there is no {path}")
+        raise ValueError(f"{path} is missing")
     return text
 
 

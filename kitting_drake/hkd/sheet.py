@@ -32,7 +32,7 @@ from kitting_drake.hkd.kits.parameters import KitParameters
 from kitting_drake.hkd.tools.tool import Tool
 
 _BACKGROUND = (0.97, 0.97, 0.96)
-# A key light that throws the shadows, and a fill from the camera, whose shadows cannot be seen.
+# A key light that casts the shadows, and a fill light from the camera, whose shadows are hidden.
 _LIGHTS = [
     LightParameter(
         type="directional",
@@ -54,10 +54,10 @@ _LIGHTS = [
 def camera_pose(
     target: np.ndarray, azimuth_deg: float, elevation_deg: float, distance: float
 ) -> RigidTransform:
-    """X_WC of a camera that looks at `target` (m) from the given side; optical axis +z, y down."""
+    """X_WC of a camera that looks at `target` (m) from the given side: +z forward, y down."""
     a, e = np.radians([azimuth_deg, elevation_deg])
     toward = np.array([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)])
-    # Right stays level; it is defined even for a view straight down.
+    # The camera's right is level, and defined even when looking straight down.
     right = np.array([-np.sin(a), np.cos(a), 0.0])
     R_WC = RotationMatrix(np.column_stack([right, np.cross(-toward, right), -toward]))
     return RigidTransform(R_WC, target + distance * toward)
@@ -69,7 +69,7 @@ class Subject:
 
     title: str
     models: Sequence[tuple[Path, RigidTransform]]
-    """SDFormat files of one link each, and the poses of their frames."""
+    """SDFormat files of one link each, and the poses of these links."""
     target: tuple[float, float, float]
     """The point that the camera looks at, in metres."""
     size: float
@@ -80,13 +80,13 @@ class Subject:
 def tool_subject(tool: Tool) -> Subject:
     """A tool at rest on the table."""
     title = tool.name.replace("_", " ")
-    # A larger tool than those of the dataset is seen from further away.
+    # A tool larger than the dataset's is seen from further away.
     size = 0.208 * max(1.0, tool.length / 0.2, tool.width / 0.13)
     return Subject(title, [(tool.sdf, RigidTransform())], (0.0, 0.0, 0.006), size)
 
 
 def kit_subject(title: str, kit: Kit) -> Subject:
-    """A kit on the table, its tools seated but for the last, whose cavity is seen."""
+    """A kit on the table with all tools seated but the last, to show one empty cavity."""
     seated = [
         (tool.sdf, RigidTransform(RollPitchYaw(0, 0, pose.yaw), [pose.x, pose.y, pose.z]))
         for tool, pose in zip(kit.tools[:-1], kit.layout.poses[:-1], strict=True)
@@ -101,7 +101,7 @@ def kit_subject(title: str, kit: Kit) -> Subject:
 def render_subject(
     subject: Subject, *, azimuth_deg: float = -62.0, width: int = 900, height: int = 600
 ) -> np.ndarray:
-    """An image (height, width, 3) of something on a pale table."""
+    """Renders a subject on a pale table to an image (height, width, 3)."""
     builder = DiagramBuilder()
     plant, scene_graph = AddMultibodyPlantSceneGraph(builder, 0.0)
     scene_graph.AddRenderer(
@@ -125,7 +125,7 @@ def render_subject(
     diagram = builder.Build()
     context = diagram.CreateDefaultContext()
 
-    # From far away, as with a long lens, so that what is parallel looks so.
+    # A distant camera keeps parallel edges nearly parallel.
     distance = 3.46 * subject.size
     field_of_view = 2 * np.arctan(subject.size / distance / 2 * height / width)
     pose = camera_pose(np.array(subject.target), azimuth_deg, subject.elevation_deg, distance)
@@ -155,10 +155,10 @@ def write_sheet(subjects: Sequence[Subject], output: Path) -> None:
     """Writes one picture of all the subjects with their titles.
 
     Raises:
-        UserError: images cannot be rendered here, or the picture cannot be written.
+        UserError: rendering is not available, or the picture cannot be written.
     """
     require_rendering()
-    # Imported here: drawing is the only use, and the other verbs should not wait for it.
+    # matplotlib is slow to import, and the other verbs do not need it.
     import matplotlib
 
     matplotlib.use("Agg")

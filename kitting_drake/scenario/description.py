@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from kitting_drake.scenario.drake_configs import struct_fields
 from kitting_drake.scenario.schema import Scenario
+from kitting_drake.scenario.yaml_input.drake_configs import struct_fields
 
 
 def describe(value: Any) -> Any:

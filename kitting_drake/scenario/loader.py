@@ -13,8 +13,8 @@ from kitting_drake.scenario.cameras import check_camera
 from kitting_drake.scenario.own_task import is_own_task, load_own_task
 from kitting_drake.scenario.perturbations import perturbation
 from kitting_drake.scenario.schema import Scenario
-from kitting_drake.scenario.yaml_check import check_yaml
-from kitting_drake.scenario.yaml_text import dumped, parse
+from kitting_drake.scenario.yaml_input.yaml_check import check_yaml
+from kitting_drake.scenario.yaml_input.yaml_text import dumped, parse
 from kitting_drake.tasks import PythonTask, Task
 from systems.bounds import check_bounds
 from systems.hand_geometry import JOINT_LIMITS

@@ -6,8 +6,8 @@ from typing import Any
 
 from pydrake.common.yaml import yaml_load_typed
 
-from kitting_drake.scenario.yaml_check import check_yaml
-from kitting_drake.scenario.yaml_text import dumped
+from kitting_drake.scenario.yaml_input.yaml_check import check_yaml
+from kitting_drake.scenario.yaml_input.yaml_text import dumped
 from kitting_drake.tasks import Task
 from kitting_drake.tasks.python_task import PythonTask, import_task
 from kitting_drake.tasks.task import TaskConfig

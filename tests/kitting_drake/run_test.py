@@ -56,8 +56,12 @@ OBJECT_KEYS = {
 }
 
 
-MORE_OF_THE_SAME = ("SevenTools", "TwelveTools", "FreshToolsets", "OwnToolsets", "Training")
-"""Endings of the names of scenarios that run what others of their file run."""
+MORE_OF_THE_SAME = (
+    *("SevenTools", "TwelveTools", "FreshToolsets", "OwnToolsets", "Training"),
+    *("KittingSeenToolset", "TwoTools", "BlockInsertion", "PlaceRedInGreen", "StackBlockPyramid"),
+    "PalletizingBoxes",
+)
+"""Endings of the names of scenarios that run much of what others run."""
 
 
 def shipped() -> list[Any]:

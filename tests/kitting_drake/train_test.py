@@ -280,7 +280,9 @@ def test_the_task_says_what_training_may_assume(
     assert "false_stops" not in file.card["validation"]
 
 
-@pytest.mark.parametrize(("losses", "best"), [((1.0, 2.0), 3), ((2.0, 1.0), 4)])
+@pytest.mark.parametrize(
+    ("losses", "best"), [pytest.param((2.0, 1.0), 4, marks=pytest.mark.slow), ((1.0, 2.0), 3)]
+)
 def test_where_many_answers_are_right_the_losses_choose(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, losses: tuple[float, float], best: int
 ):
@@ -381,7 +383,7 @@ def test_whoever_ends_it_loses_no_step(
     assert_same_outcome(tmp_path, trained)
 
 
-@pytest.mark.parametrize("stop", [1, 3])
+@pytest.mark.parametrize("stop", [pytest.param(1, marks=pytest.mark.slow), 3])
 def test_a_stopped_run_resumes_as_if_it_had_not_been_stopped(
     demos: Path, trained: Path, tmp_path: Path, stop: int, monkeypatch: pytest.MonkeyPatch
 ):
@@ -432,8 +434,10 @@ run_command(main)
 """
 
 
-def test_trains_where_drake_is_not_installed(demos: Path, tmp_path: Path):
-    command = [sys.executable, "-c", NO_DRAKE, *words(demos, tmp_path, "--steps", 1, "--quiet")]
+@pytest.mark.parametrize("method", ["transporter", pytest.param("so2", marks=pytest.mark.slow)])
+def test_trains_where_drake_is_not_installed(demos: Path, tmp_path: Path, method: str):
+    flags = words(demos, tmp_path, "--method", method, "--steps", 1, "--quiet")
+    command = [sys.executable, "-c", NO_DRAKE, *flags]
     done = subprocess.run(command, cwd=ROOT, env=ONE_THREAD, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     assert done.stdout == ""

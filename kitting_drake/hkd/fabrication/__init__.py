@@ -1,1 +1,1 @@
-"""Kits to print and to cut: solids, drawings and all else that `hkd kit` writes."""
+"""Kits for printing and cutting: the files that `hkd kit` writes."""

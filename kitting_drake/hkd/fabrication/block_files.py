@@ -1,4 +1,4 @@
-"""A kit block as STL and as 3MF, in millimetres, for slicers."""
+"""A kit's block as STL and 3MF in millimetres, for slicers."""
 
 import io
 import zipfile
@@ -12,7 +12,7 @@ Triangles = tuple[NDArray[np.float64], NDArray[np.int64]]
 """Vertices (n, 3) in millimetres, and faces (m, 3)."""
 
 _STAMP = (1980, 1, 1, 0, 0, 0)
-"""The time in the archive's entries: the same kit makes the same file."""
+"""A fixed time for the archive's entries, so that equal kits give equal files."""
 
 _CONTENT_TYPES = """<?xml version="1.0" encoding="UTF-8"?>
 <Types xmlns="http://schemas.openxmlformats.org/package/2006/content-types">
@@ -57,9 +57,9 @@ def stl_bytes(surface: Triangles) -> bytes:
 
 
 def threemf_bytes(surface: Triangles, title: str) -> bytes:
-    """A 3MF archive of one object, by the core specification 1.3.
+    """A 3MF archive of one object, after the core specification 1.3.
 
-    trimesh writes 3MF too, but needs lxml for it, and gives it no unit.
+    trimesh's own 3MF export needs lxml and writes no unit.
     """
     vertices, faces = surface
     corners = "\n".join(

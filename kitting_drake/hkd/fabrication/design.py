@@ -1,7 +1,4 @@
-"""The cuts of a kit's block that is to be printed or milled: more than is simulated.
-
-To the cavities, which are those of the simulated kit, come finger notches and engraved labels.
-"""
+"""The design of a kit's block to print or mill: the simulated kit with notches and labels."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -19,23 +16,23 @@ from kitting_drake.hkd.kits.layout import kit_cavities
 from kitting_drake.hkd.kits.parameters import KitParameters
 
 _ABOVE = 0.01
-"""How far cutters reach out of the block, in metres."""
+"""The distance by which cutters stick out of the block, in metres."""
 _FINEST = 2e-6
-"""Details of the solid are no smaller than this, in metres."""
+"""The size of the smallest detail that the solid keeps, in metres."""
 _DIGITS = 4
 """Decimals of coordinates in files, in millimetres."""
 
 
 @dataclass(frozen=True)
 class Design:
-    """A kit block as it is made."""
+    """A kit block with everything that is cut from it."""
 
     kit: Kit
     cavities: tuple[Cavity, ...]
     recesses: tuple[Recess, ...]
-    """All that is cut from above: the cavities first, in the tools' order."""
+    """All recesses: first the cavities, in the tools' order."""
     notes: tuple[str, ...]
-    """A sentence on each notch or label that had no room."""
+    """A sentence on each notch or label that found no room."""
 
     @property
     def size_mm(self) -> tuple[float, float, float]:
@@ -44,12 +41,12 @@ class Design:
         return length, width, height
 
     def depth_mm(self, recess: Recess) -> float:
-        """How deep a recess is below the block's top, to a hundredth."""
+        """The depth of a recess below the block's top, rounded to 0.01 mm."""
         return round(1e3 * (self.kit.parameters.height - recess.floor), 2)
 
 
 def design_kit(kit: Kit, *, notches: bool = False, labels: bool = False) -> Design:
-    """The block of a kit, with notches and labels where they are wanted and there is room."""
+    """Designs the block of a kit, with notches and labels on request where they fit."""
     cavities = tuple(kit_cavities(kit.tools, kit.parameters, kit.layout.poses))
     recesses = [
         Recess("cavity", tool.name, cavity.outline, cavity.floor)
@@ -65,10 +62,10 @@ def design_kit(kit: Kit, *, notches: bool = False, labels: bool = False) -> Desi
 
 
 def solid(design: Design) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """The block's surface in the frame of the files: see `in_block`.
+    """The block's surface in the frame of the files; see `in_block`.
 
     Returns:
-        Vertices (n, 3) in millimetres, and triangles (m, 3): watertight, wound outward.
+        Vertices (n, 3) in millimetres and triangles (m, 3), watertight and wound outward.
     """
     parameters = design.kit.parameters
     block = build_block(design.cavities, parameters)
@@ -76,7 +73,7 @@ def solid(design: Design) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
         if recess.kind != "cavity":
             depth = parameters.height - recess.floor + _ABOVE
             block -= Manifold.extrude(recess.outline, depth).translate((0, 0, recess.floor))
-    # Points that files cannot tell apart must not be two: what is that small goes first.
+    # Remove details that rounding to the files' digits would collapse.
     mesh = block.simplify(_FINEST).to_mesh64()
     corners = 1e3 * np.asarray(mesh.vert_properties, dtype=float)[:, :3]
     corners[:, :2] = in_block(corners[:, :2] / 1e3, parameters)
@@ -87,21 +84,21 @@ def solid(design: Design) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
 
 
 def in_block(points: NDArray[np.float64], parameters: KitParameters) -> NDArray[np.float64]:
-    """Points (n, 2) of the kit frame, in metres, as they are in files, in millimetres.
+    """Converts points (n, 2) from the kit frame in metres to the frame of the files in mm.
 
-    There the origin is the lower left corner of the block's bottom, because many slicers and
-    mills take no negative coordinates.
+    The files' origin is the lower left corner of the block's bottom, because many slicers and
+    mills reject negative coordinates.
     """
     return np.round(1e3 * (points + np.array([parameters.length, parameters.width]) / 2), _DIGITS)
 
 
 def loops_mm(outline: CrossSection, parameters: KitParameters) -> list[NDArray[np.float64]]:
-    """The closed loops (n, 2), in mm, of an outline in the kit frame; see `in_block`."""
+    """The closed loops (n, 2) of an outline of the kit frame, converted by `in_block` to mm."""
     return [in_block(np.asarray(loop), parameters) for loop in outline.to_polygons()]
 
 
 def layers(design: Design) -> dict[tuple[str, float], list[Recess]]:
-    """The recesses by kind and by depth in mm, in the order in which they are drawn."""
+    """The recesses by kind and depth in mm, in drawing order."""
     groups: dict[tuple[str, float], list[Recess]] = {}
     for recess in design.recesses:
         groups.setdefault((recess.kind, design.depth_mm(recess)), []).append(recess)

@@ -1,7 +1,7 @@
-"""The outlines of all that is cut from a kit block: DXF and SVG in true millimetres.
+"""The outlines of a block's recesses as DXF and SVG, in true millimetres.
 
-A layer, or group, holds what is of one kind and of one depth below the block's top. Cavities are
-drawn as their walls are; the bevel around their rims is in the solids only.
+Each layer or group holds the recesses of one kind and one depth below the block's top. Cavities
+are drawn along their walls; only the solids have the bevel around the rims.
 """
 
 import io
@@ -14,7 +14,7 @@ from kitting_drake.common.extras import import_extra
 from kitting_drake.hkd.fabrication.design import Design, layers, loops_mm
 
 _NAMES = {"cavity": "CAVITIES", "notch": "NOTCHES", "label": "LABELS"}
-# AutoCAD's colour indices: cavities in cyan and on, what is shallow apart.
+# AutoCAD's colour indices: cavities cycle through cool ones, notches and labels are warm.
 _BLOCK_COLOUR, _CAVITY_COLOURS, _NOTCH_COLOUR, _LABEL_COLOUR = 7, (4, 3, 6, 2, 150, 80), 30, 1
 _STROKES = {"cavity": "#0b5fa5", "notch": "#d9480f", "label": "#2b8a3e"}
 
@@ -25,7 +25,7 @@ def layer_name(kind: str, depth: float) -> str:
 
 
 def dxf_text(design: Design) -> str:
-    """A DXF of release 2010: closed polylines, a layer per depth, and the block on layer BLOCK.
+    """A DXF of release 2010: closed polylines on one layer per depth, and the block on BLOCK.
 
     Raises:
         UserError: ezdxf is not installed.
@@ -57,7 +57,7 @@ def dxf_text(design: Design) -> str:
 
 
 def svg_text(design: Design) -> str:
-    """An SVG whose user unit is a millimetre: a group per depth, a path per recess."""
+    """An SVG with 1 mm user units: a group per depth, a path per recess."""
     length, width, height = design.size_mm
     lines = [
         '<?xml version="1.0" encoding="UTF-8"?>',
@@ -89,6 +89,6 @@ def _block(design: Design) -> NDArray[np.float64]:
 
 
 def _path(loop: NDArray[np.float64], width: float) -> str:
-    """A closed path; y points down in an SVG."""
+    """A closed path, flipped because y points down in SVG."""
     points = " L ".join(f"{x:.4f} {width - y:.4f}" for x, y in loop)
     return f"M {points} Z"

@@ -1,4 +1,4 @@
-"""`hkd kit`: all the files of a kit of any tools, in one folder that appears atomically."""
+"""`hkd kit`: writes all files of a kit into one folder, which appears atomically."""
 
 import dataclasses
 import json
@@ -26,7 +26,7 @@ from kitting_drake.hkd.kits.parameters import KitParameters
 from kitting_drake.hkd.tools.tool import Tool, load_tool, tool_names
 
 RECORD = "kit.json"
-"""The file that marks a folder as one of these."""
+"""The file that marks a folder as a kit's."""
 
 _SCENARIO = """\
 # Written by `hkd kit`: the tools and the kit of this folder, for `python -m kitting_drake.run`.
@@ -49,17 +49,17 @@ class KitRequest:
     clearance_mm: float | None = None
     wall_mm: float | None = None
     block_mm: tuple[float, float, float] | None = None
-    """Length, width and height; as small as can be, and of the template's height, if None."""
+    """Length, width and height. None: as small as possible, with the template's height."""
     notches: bool = False
     labels: bool = False
 
 
 def export_kit(request: KitRequest) -> Design:
-    """Writes the folder of a kit; one that this function wrote before is replaced.
+    """Writes the folder of a kit, and replaces a folder that this function wrote before.
 
     Raises:
-        UserError: the tools make no such kit, or the folder holds other files or cannot be written;
-            then nothing was changed.
+        UserError: the kit cannot be made, or the folder holds other files or cannot be written.
+            Nothing is changed then.
     """
     if not 1 <= len(request.tools) <= MOST_TOOLS:
         raise UserError(f"a kit holds 1 to {MOST_TOOLS} tools, not {len(request.tools)}")
@@ -88,10 +88,10 @@ def export_kit(request: KitRequest) -> Design:
 
 
 def _parameters(request: KitRequest) -> KitParameters:
-    """The template of the kit.
+    """The parameters of the requested kit.
 
     Raises:
-        UserError: a length out of range.
+        UserError: a length is out of range.
     """
     parameters = KitParameters(always_nested=True)
     for flag, value, low, high in (
@@ -102,7 +102,7 @@ def _parameters(request: KitRequest) -> KitParameters:
             raise UserError(f"{flag} {value:g} is out of range: give {low:g} to {high:g}")
     if request.clearance_mm is not None:
         parameters.clearance = round(1e-3 * request.clearance_mm, 7)
-        # Straight edges that stray inward would take a small clearance away.
+        # The outline's simplification must not use up a small clearance.
         finest = max(parameters.clearance / 20, 1e-6)
         parameters.tolerance = min(parameters.tolerance, finest)
     if request.wall_mm is not None:
@@ -124,7 +124,7 @@ def _parameters(request: KitRequest) -> KitParameters:
 
 
 def _check_replaceable(folder: Path) -> None:
-    """Raises UserError for a place that holds anything but a kit's files."""
+    """Raises UserError unless the folder is missing or holds only a kit's files."""
     if not folder.exists():
         return
     advice = "give another --output, or delete it"
@@ -140,7 +140,7 @@ def _check_replaceable(folder: Path) -> None:
     foreign = sorted(present - own)
     if foreign or not present:
         what = foreign[0] if foreign else "an empty folder"
-        raise UserError(f"{folder} holds {what}, which is no file of a kit: {advice}")
+        raise UserError(f"{folder} holds {what}, which is not a kit's file: {advice}")
 
 
 def _write(folder: Path, design: Design, parameters: KitParameters) -> None:
@@ -167,13 +167,13 @@ def _check_closed(stl: bytes) -> None:
     mesh = trimesh.load_mesh(trimesh.util.wrap_as_stream(stl), file_type="stl")
     if not (mesh.is_watertight and mesh.is_winding_consistent):
         raise UserError(
-            "the block with these cavities is no closed solid: try another --clearance_mm or "
-            "--wall_mm by a tenth of a millimetre"
+            "the block with these cavities is not watertight: change --clearance_mm or --wall_mm "
+            "by a tenth of a millimetre"
         )
 
 
 def _bring_tools(tools: Sequence[Tool], folder: Path) -> list[str]:
-    """Copies tools of one's own into `tools/`; returns the names of all for the scenario."""
+    """Copies the user's tools into `tools/` and returns the scenario's name of every tool."""
     names: dict[Path, str] = {}
     for tool in tools:
         if tool.directory in names:

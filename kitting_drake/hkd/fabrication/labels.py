@@ -1,4 +1,4 @@
-"""Engraved labels: the name of each tool on the block beside its cavity, or on its floor."""
+"""Engraved labels: each tool's name beside its cavity, or on the cavity's floor."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -14,33 +14,32 @@ from kitting_drake.hkd.kits.kit import Kit
 from kitting_drake.hkd.kits.nesting import rasterized
 
 DEPTH = 0.0006
-"""How deep letters are engraved, in metres."""
+"""The depth of the engraving, in metres."""
 CAP_HEIGHTS = (0.007, 0.006, 0.005, 0.004)
-"""The heights of capital letters that are tried, in metres."""
+"""Heights of capital letters to try, in metres."""
 
 _MARGIN, _EDGE = 0.0014, 0.004
-"""The least distance of letters from recesses, and from the block's edge, in metres."""
+"""The least distance of letters from recesses and from the block's edge, in metres."""
 _CELL = 0.0007
-"""The side of the cells in which places are looked for, in metres."""
+"""The side of a raster cell, in metres."""
 _FARTHEST = 0.03
-"""A label is no further than this from its cavity, in metres."""
+"""The largest distance of a label from its cavity, in metres."""
 _PLAINLY = 1.5
-"""How many times as far from other cavities as from its own a label is at least."""
-# A label may be this much further away for each unit that its letters are higher; and one that is
-# read from the side has to be nearer than one that is read from the front.
-# It is rather beside its cavity's middle than beside its end.
+"""A label is at least this many times as far from other cavities as from its own."""
+# Terms of a label's cost, in metres: minus 6 times the letters' height, 6 mm for text read from the
+# side, and a tenth of the distance from the cavity's middle.
 _DISTANCE_FOR_HEIGHT, _FROM_THE_SIDE, _OFF_THE_MIDDLE = 6.0, 0.006, 0.1
 _FONT_SIZE = 100.0
 
 
 @dataclass(frozen=True)
 class _Lettering:
-    """A text of a given height, its lower left corner at the origin; in metres."""
+    """A text of one height with its lower left corner at the origin, in metres."""
 
     outline: CrossSection
     cap_height: float
     rotated: bool
-    """Whether it is read from the side."""
+    """Whether it is turned by 90 degrees."""
 
     @property
     def size(self) -> tuple[float, float]:
@@ -51,10 +50,10 @@ class _Lettering:
 
 @dataclass(frozen=True)
 class _Raster:
-    """Where labels may be on a block: masks (rows along y, columns along x)."""
+    """The grid of masks over the block: rows along y, columns along x."""
 
     start: NDArray[np.float64]
-    """(x, y) of the corner, in metres."""
+    """(x, y) of the lower left corner, in metres."""
     counts: tuple[int, int]
 
     def mask(self, outline: CrossSection) -> NDArray[np.bool_]:
@@ -67,15 +66,15 @@ class _Raster:
 def engrave_labels(
     kit: Kit, cavities: Sequence[Cavity], taken: Sequence[Recess]
 ) -> tuple[list[Recess], list[str]]:
-    """A label for each tool of a kit.
+    """Places a label for each tool of a kit.
 
     Args:
-        kit: whose tools have the names.
-        cavities: of the tools, in their order.
-        taken: recesses from which labels keep their distance: notches.
+        kit: the kit; its tools' names are engraved.
+        cavities: the tools', in their order.
+        taken: the recesses cut so far; labels keep their distance from them.
 
     Returns:
-        The labels, and a sentence for each tool for which there is room for none.
+        The labels, and a sentence for each tool whose label does not fit.
     """
     parameters = kit.parameters
     sides = np.array([parameters.length, parameters.width])
@@ -106,15 +105,15 @@ def engrave_labels(
             continue
         floor = cavity.outline.offset(-_MARGIN, JoinType.Round) - notched
         inside = raster.mask(floor)
-        # In a cavity the best place is the one furthest from its wall.
+        # Inside a cavity prefer the place furthest from the wall.
         depth = ndimage.distance_transform_edt(inside) * _CELL
         bottom = _placed(choices, inside, raster, depth.max() - depth)
         if bottom is not None:
             labels.append(Recess("label", tool.name, bottom, cavity.floor - DEPTH))
         else:
             notes.append(
-                f"there is no room for a label of '{tool.name}': give it a shorter name, or the "
-                "block thicker walls"
+                f"there is no room for a label of '{tool.name}': use a shorter name or thicker "
+                "walls"
             )
     return labels, notes
 
@@ -125,7 +124,7 @@ def _distance(mask: NDArray[np.bool_]) -> NDArray[np.float64]:
 
 
 def _from_middle(mask: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """The distance of each cell from the middle of a mask's bounding box, in metres."""
+    """The distance of each cell from the centre of a mask's bounding box, in metres."""
     rows, columns = np.nonzero(mask)
     row, column = (rows.min() + rows.max()) / 2, (columns.min() + columns.max()) / 2
     y, x = np.indices(mask.shape)
@@ -138,13 +137,13 @@ def _placed(
     raster: _Raster,
     costs: NDArray[np.float64],
 ) -> CrossSection | None:
-    """The best choice of a text where all of its rectangle is free; None if there is none.
+    """The cheapest placement of a text whose bounding box is free, or None.
 
     Args:
-        choices: of one text.
-        free: the cells that it may cover.
+        choices: the same text at several sizes and rotations.
+        free: the cells that the text may cover.
         raster: of the cells.
-        costs: of the text's middle by where it is, in metres; infinite where it may not be.
+        costs: the cost in metres of each position of the text's middle; infinite where forbidden.
     """
     blocked = np.pad(np.cumsum(np.cumsum(~free, axis=0), axis=1), ((1, 0), (1, 0)))
     best, lowest = None, np.inf
@@ -174,12 +173,12 @@ def _placed(
 
 
 def _letterings(text: str) -> list[_Lettering]:
-    """A text at all the heights that are tried, to be read from the front and from the side."""
-    # Imported here: it takes a while, and only labels need it.
+    """A text at all heights to try, upright and turned by 90 degrees."""
+    # matplotlib is slow to import, and only labels need it.
     from matplotlib.font_manager import FontProperties
     from matplotlib.textpath import TextPath
 
-    # Strokes have to be wide enough for a nozzle of 0.4 mm.
+    # Bold strokes are wide enough for a 0.4 mm nozzle.
     font = FontProperties(family="DejaVu Sans", weight="bold")
 
     def glyphs(letters: str) -> CrossSection:

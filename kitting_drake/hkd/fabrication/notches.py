@@ -1,4 +1,4 @@
-"""Finger notches: half-round recesses beside a tool, where a hand takes it out of its cavity."""
+"""Finger notches: half-round recesses beside a tool, to lift it out of its cavity by hand."""
 
 import itertools
 import math
@@ -13,34 +13,34 @@ from kitting_drake.hkd.kits.block import ARC_SEGMENTS, Cavity
 from kitting_drake.hkd.kits.kit import Kit
 
 RADII = (0.012, 0.010, 0.008)
-"""The radii that are tried, in metres: for a wide finger first, for a narrow one last."""
+"""Radii to try in metres, widest first."""
 DEEPEST = 0.020
-"""A notch is as deep as its cavity, but no deeper than a finger reaches, in metres."""
+"""The largest depth of a notch in metres: the reach of a finger."""
 
 _WALL = 0.003
-"""The least wall between a notch and all else, in metres; less where the kit's walls are less."""
+"""The least wall around a notch in metres, unless the kit's own walls are thinner."""
 _SLIDES = tuple(sign * step for step in np.arange(0.0, 0.041, 0.004) for sign in (1, -1))
-"""How far along the tool from its grasp a notch may be, in metres."""
+"""Distances of a notch from the grasp along the tool to try, in metres."""
 _SHARES = (0.85, 1.15)
-"""The area of a notch beside its cavity, as a share of half a disc's."""
+"""The allowed area of a notch outside its cavity, as a share of a half disc's."""
 _FINS = 1.6
-"""How much more than right corners may be thin between a notch and its cavity, as a share."""
+"""The allowed area of thin fins beside a notch, as a multiple of that of two right corners."""
 _OVERLAP = 0.001
-"""How far a notch reaches into its cavity, in metres, so that no skin is left between them."""
+"""The overlap of a notch with its cavity in metres; it leaves no skin between them."""
 
 
 def cut_notches(
     kit: Kit, cavities: Sequence[Cavity], taken: Sequence[Recess]
 ) -> tuple[list[Recess], list[str]]:
-    """Notches for all tools of a kit, on both sides of the tool where there is room.
+    """Cuts notches for each tool of a kit, on both sides of the tool where they fit.
 
     Args:
-        kit: whose tools are to be taken out.
-        cavities: of the tools, in their order.
-        taken: other recesses beside the cavities; notches keep their distance from them.
+        kit: the kit.
+        cavities: the tools', in their order.
+        taken: the recesses cut so far; notches keep their distance from them.
 
     Returns:
-        The notches, and a sentence for each tool beside which there is room for none.
+        The notches, and a sentence for each tool beside which no notch fits.
     """
     parameters = kit.parameters
     wall = min(_WALL, max(parameters.minimum_wall, parameters.nested_wall))
@@ -58,8 +58,8 @@ def cut_notches(
         notches += [Recess("notch", tool.name, outline, floor) for outline in outlines]
         if not outlines:
             notes.append(
-                f"there is no room for a finger notch beside '{tool.name}': a thicker --wall_mm or "
-                "a larger block gives some"
+                f"there is no room for a finger notch beside '{tool.name}': use a larger "
+                "--wall_mm or a larger block"
             )
     return notches, notes
 
@@ -67,9 +67,9 @@ def cut_notches(
 def _best_pair(
     kit: Kit, index: int, cavity: Cavity, free: CrossSection, wall: float
 ) -> list[CrossSection]:
-    """The outlines of a tool's notches: two rather than one, wide rather than near the grasp."""
+    """The outlines of a tool's notches, preferring two to one, wide to narrow, near to far."""
     single: list[CrossSection] = []
-    # The first pair is the best there is: wide notches are tried first, and of them near ones.
+    # The order of the search is the order of preference, so the first pair is the best.
     for radius, slide in itertools.product(RADII, _SLIDES):
         outlines = []
         for centre, outward in _beside(kit, index, cavity, slide):
@@ -85,14 +85,14 @@ def _best_pair(
 
 
 def _is_wall_between(one: CrossSection, other: CrossSection, cavity: Cavity, wall: float) -> bool:
-    """Whether what stands between two notches of a cavity is no thinner than a wall."""
+    """Whether two notches of a cavity have at least a wall's thickness between them."""
     return ((_grown(one, wall) ^ other) - cavity.outline).area() < 1e-9
 
 
 def _beside(
     kit: Kit, index: int, cavity: Cavity, slide: float
 ) -> Iterator[tuple[NDArray[np.float64], NDArray[np.float64]]]:
-    """Points (2) of a cavity's wall on both sides of a grasp, and directions (2) out of it."""
+    """Points (2) on the cavity's wall on both sides of the grasp, and outward directions (2)."""
     grasp, pose = kit.tools[index].grasp, kit.layout.poses[index]
     c, s = math.cos(pose.yaw), math.sin(pose.yaw)
     along_angle = pose.yaw + grasp.theta
@@ -101,7 +101,7 @@ def _beside(
     held = np.array([pose.x + c * grasp.x - s * grasp.y, pose.y + s * grasp.x + c * grasp.y])
     start = held + slide * along
     crossings = _crossings(cavity.outline, start, across)
-    # A line that misses the tool, or runs beside it, has no wall on one of its sides.
+    # A line that misses or only touches the cavity has no wall on one side.
     if len(crossings) and crossings.min() < 0 < crossings.max():
         yield start + crossings.max() * across, across
         yield start + crossings.min() * across, -across
@@ -110,7 +110,7 @@ def _beside(
 def _crossings(
     outline: CrossSection, start: NDArray[np.float64], direction: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Where a line crosses an outline: distances (n) from `start`, in metres."""
+    """The signed distances (n) from `start` at which a line crosses an outline, in metres."""
     normal = np.array([-direction[1], direction[0]])
     found = [np.empty(0)]
     for loop in outline.to_polygons():
@@ -125,7 +125,7 @@ def _crossings(
 def _half_disc(
     centre: NDArray[np.float64], outward: NDArray[np.float64], radius: float
 ) -> CrossSection:
-    """A disc about a point of the wall without what might reach through to the other wall."""
+    """A disc about a point on the wall, cut off towards the opposite wall."""
     disc = CrossSection.circle(radius, ARC_SEGMENTS)
     kept = CrossSection.square((1.5 * radius, 2 * radius)).translate((-0.5 * radius, -radius))
     angle = math.degrees(math.atan2(outward[1], outward[0]))
@@ -133,12 +133,12 @@ def _half_disc(
 
 
 def _notch(cavity: Cavity, disc: CrossSection, radius: float, wall: float) -> CrossSection | None:
-    """The outline of a notch; None where it is not half round or leaves a thin fin."""
+    """The outline of a notch, or None if it is not half round or leaves a thin fin."""
     beside = disc - cavity.outline
     share = beside.area() / (math.pi * radius**2 / 2)
     if len(beside.decompose()) != 1 or not _SHARES[0] <= share <= _SHARES[1]:
         return None
-    # A closing fills what is thin: a little of two right corners with the wall, more of fins.
+    # A morphological closing fills thin parts: a little at two right corners, more at fins.
     x_min, y_min, x_max, y_max = disc.bounds()
     near = CrossSection.square((x_max - x_min + 4 * wall, y_max - y_min + 4 * wall)).translate(
         (x_min - 2 * wall, y_min - 2 * wall)

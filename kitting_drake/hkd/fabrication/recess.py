@@ -1,4 +1,4 @@
-"""An area of a kit's block that is cut away from above."""
+"""A recess cut into a kit's block from above."""
 
 from dataclasses import dataclass
 
@@ -12,7 +12,7 @@ class Recess:
     kind: str
     """`cavity`, `notch` or `label`."""
     tool: str
-    """The name of the tool that it belongs to."""
+    """The tool's name."""
     outline: CrossSection
     floor: float
-    """Its height above the block's bottom."""
+    """The height of the floor above the block's bottom."""

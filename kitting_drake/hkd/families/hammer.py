@@ -1,4 +1,4 @@
-"""Hammers: a forged head on a wooden handle. They lie on the side, the face toward +y."""
+"""Hammers: a forged head on a wooden handle. They lie on their side with the face toward +y."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -8,7 +8,7 @@ from manifold3d import Manifold, OpType
 
 from kitting_drake.common.errors import UserError
 from kitting_drake.hkd.families.hammer_heads import HeadEnd, build_head
-from kitting_drake.hkd.families.hammer_shafts import PROUD_MM, Shaft, build_shaft
+from kitting_drake.hkd.families.hammer_shafts import PROUD_MM, Shaft, build_shaft, octagon_corners
 from kitting_drake.hkd.tools.solids import (
     Part,
     Shape,
@@ -22,29 +22,30 @@ from kitting_drake.hkd.tools.solids import (
 
 @dataclass
 class HammerParameters:
-    """A claw hammer, handle along x, its eye at the origin. Lengths in mm."""
+    """A claw hammer with the handle along x and the eye at the origin. Lengths in mm."""
 
     # From the top of the eye to the end of the handle.
     length_mm: float = 330.0
-    # The head: from the eye's middle to the striking face, and the thickness of its cheeks along z.
+    # From the eye's middle to the striking face.
     face_reach_mm: float = 56.0
+    # The thickness of the cheeks along z.
     head_thickness_mm: float = 30.0
-    # Height of the cheeks along x, and their length along the head (y).
+    # The cheeks' height along x and length along y.
     cheek_height_mm: float = 32.0
     cheek_length_mm: float = 32.0
-    # Diameters of the striking face and of the neck behind it; bevel about the face.
+    # Diameters of the striking face and of the neck behind it; the bevel around the face.
     face_diameter_mm: float = 29.0
     neck_diameter_mm: float = 22.0
     face_bevel_mm: float = 2.0
-    # The claw: radius of its curve, the angle that it turns through, thickness at the tip, the
-    # width of its tips along z, and the widest gap of its split.
+    # The claw: the radius and angle of its curve, the thickness and width (along z) of its tips,
+    # and the widest gap of its split.
     claw_radius_mm: float = 66.0
     claw_angle_deg: float = 60.0
     claw_tip_mm: float = 3.5
     claw_width_mm: float = 31.0
     claw_gap_mm: float = 11.0
-    # The handle's widths along y at the eye, at the grip's swell and at its thinnest (the throat);
-    # its thickness along z is this share of the width.
+    # The handle's widths along y at the eye, at the throat (its thinnest point) and at the grip's
+    # swell; its thickness along z as a share of the width.
     eye_width_mm: float = 25.0
     throat_width_mm: float = 23.0
     swell_width_mm: float = 34.0
@@ -54,13 +55,12 @@ class HammerParameters:
     face_material: str = "polished_steel"
     handle_material: str = "hickory"
     grip_material: str = "painted_wood"
-    # Any other kind of hammer: its two ends and its shaft, which replace the bell, the claw and the
-    # handle above; their fields stand in hammer_heads.py and hammer_shafts.py. Mappings are taken
-    # for the values of their fields. All three or none.
+    # Any other kind of hammer has two ends and a shaft, which replace the bell, the claw and the
+    # handle above; see hammer_heads.py and hammer_shafts.py. A mapping gives the fields' values.
     front: HeadEnd | dict[str, Any] | None = None
     back: HeadEnd | dict[str, Any] | None = None
     shaft: Shaft | dict[str, Any] | None = None
-    # Corners of the cheeks' sections: 0 square, 1 round.
+    # Corners of the cheeks' sections: 0 is square, 1 is round.
     cheek_roundness: float = 0.3
 
 
@@ -72,10 +72,14 @@ def _typed(kind: type, value: Any, field: str) -> Any:
 
 
 def build_hammer(p: HammerParameters) -> list[Part]:
-    """The parts of a hammer, in mm in the design frame."""
+    """The parts of a hammer, in mm in the design frame.
+
+    Raises:
+        UserError: a mapping has an unknown field.
+    """
     if p.front or p.back or p.shaft:
         return _assembled(p)
-    # The wedge spreads the handle in the eye; its end stands a hair proud, so that it can be seen.
+    # The wedge spreads the handle in the eye, and protrudes a little to be visible.
     wedge = Manifold.cube((12.0, 0.5 * p.eye_width_mm, 2.2), True)
     wedge = wedge.translate((p.cheek_height_mm / 2 + PROUD_MM - 5.8, 0.0, 0.0))
     wood, dipped = _handle(p)
@@ -96,7 +100,7 @@ def build_hammer(p: HammerParameters) -> list[Part]:
 
 
 def _assembled(p: HammerParameters) -> list[Part]:
-    """A hammer of two chosen ends and a chosen shaft."""
+    """A hammer with given ends and a given shaft."""
     shaft: Shaft = _typed(Shaft, p.shaft or {}, "shaft")
     top = p.cheek_height_mm / 2 + PROUD_MM
     parts = build_shaft(shaft, top)
@@ -117,28 +121,17 @@ def _assembled(p: HammerParameters) -> list[Part]:
 
 
 def _octagon(width: float, thickness: float) -> np.ndarray:
-    """A handle's section: flat on all four sides, its corners cut and softened; (8 arcs, 2)."""
-    y, z, cut = width / 2, thickness / 2, 0.27 * thickness
-    corners = [
-        (-y + cut, -z),
-        (y - cut, -z),
-        (y, -z + cut),
-        (y, z - cut),
-        (y - cut, z),
-        (-y + cut, z),
-        (-y, z - cut),
-        (-y, -z + cut),
-    ]
-    return fillet(corners, 0.35 * cut, 3)
+    """An octagonal section (n, 2) of a handle with softened corners."""
+    return fillet(octagon_corners(width, thickness), 0.35 * (0.27 * thickness), 3)
 
 
 def _handle(p: HammerParameters) -> tuple[Shape, Shape]:
-    """The handle from the eye to the throat in bare wood, and its dipped grip with the swell."""
+    """The bare handle from the eye to the throat, and the dipped grip with the swell."""
     top = p.cheek_height_mm / 2 + PROUD_MM
     end = top - p.length_mm
     eye, throat, swell = p.eye_width_mm, p.throat_width_mm, p.swell_width_mm
-    # Distance from the end as a share of the length; width. The straight stretch behind the head is
-    # where a gripper holds it: its flanks are parallel there.
+    # (distance from the end as a share of the length, width). The flanks are parallel behind the
+    # head, where a gripper holds the handle.
     bare = [
         (1.0, 0.86 * eye),
         (0.995, 0.9 * eye),
@@ -175,12 +168,12 @@ def _handle(p: HammerParameters) -> tuple[Shape, Shape]:
 
 
 def _across_y(profile: np.ndarray, y: float) -> np.ndarray:
-    """A section of a loft along y: the profile's axes become x and z."""
+    """A section of a loft along y, with the profile's axes along x and z."""
     return np.column_stack([-profile[:, 0], np.full(len(profile), y), profile[:, 1]])
 
 
 def _cheeks(p: HammerParameters) -> Shape:
-    """The block about the eye, drawn in toward poll and claw."""
+    """The block around the eye, narrowed toward poll and claw."""
     half, height, thickness = p.cheek_length_mm / 2, p.cheek_height_mm, p.head_thickness_mm
     sections = [(-1.0, 0.8), (-0.72, 1.0), (0.72, 1.0), (1.0, 0.8)]
     return loft(
@@ -224,13 +217,13 @@ def _poll(p: HammerParameters) -> tuple[Shape, Shape]:
 
 
 def _claw(p: HammerParameters) -> Shape:
-    """The claw: a tapering band bent toward the handle, split from its tips."""
+    """A tapered band that bends toward the handle, split at its tips."""
     start = 0.3 * p.cheek_length_mm
     root = 0.84 * p.cheek_height_mm
     turn = np.radians(p.claw_angle_deg)
     sections = []
     for t in np.linspace(0.0, 1.0, 13):
-        # The outer edge follows the circle; the thickness grows inward from it.
+        # The outer edge follows the circle, and the thickness extends inward.
         angle = -np.pi / 2 - t * turn
         thickness = p.claw_tip_mm + (root - p.claw_tip_mm) * (1 - t) ** 1.15
         width = p.head_thickness_mm * 0.8 + (p.claw_width_mm - 0.8 * p.head_thickness_mm) * min(
@@ -250,7 +243,7 @@ def _claw(p: HammerParameters) -> Shape:
 
 
 def _split(p: HammerParameters, start: float) -> Manifold:
-    """The V between the tines, seen along x: a wedge that narrows to a round root."""
+    """The V between the tines, seen along x, which narrows to a round root."""
     reach = start + p.claw_radius_mm
     root = start + 0.32 * p.claw_radius_mm
     outline = fillet(

@@ -1,7 +1,7 @@
-"""Heads of hammers: a block about the eye, and an end toward either side.
+"""Heads of hammers: a block around the eye with an end on either side.
 
-An end is built toward +y, which is the side of the striking face; the other one is flipped.
-The head's axis is y; a section's height is along x, its thickness along z.
+The head's axis is y; a section's height is along x and its thickness along z. Ends are built toward
++y, the side of the striking face, and the other end is flipped.
 """
 
 from collections.abc import Callable, Sequence
@@ -21,7 +21,7 @@ from kitting_drake.hkd.tools.solids import (
     rounded_rectangle,
 )
 
-# How far the hulls of a full-size head or shaft may stand out of it, in the outline and in height.
+# Tolerances of the hulls of a full-size head or shaft, for the outline and for heights, in mm.
 OUTLINE_MM, HEIGHT_MM = 0.4, 1.2
 
 
@@ -31,29 +31,29 @@ class HeadEnd:
 
     # bell, plain, ball, wedge, point, claw or capped.
     kind: str = "bell"
-    # From the eye's middle to the end of it.
+    # From the eye's middle to the end.
     reach_mm: float = 56.0
-    # Its size at the end along x (the diameter of a face), and along z; as along x if zero.
+    # The size at the end along x (the diameter of a face), and along z (0: as along x).
     size_mm: float = 29.0
     thickness_mm: float = 0.0
-    # Size of the neck behind a bell or a ball, or of the root of a claw, wedge or point.
+    # The size of the neck behind a bell or a ball, or of the root of a claw, wedge or point.
     neck_mm: float = 22.0
-    # Corners of a section: 1 for round, 0 for square, `octagonal` to cut them off flat.
+    # Corners of a section: 1 is round, 0 is square; `octagonal` makes them flat.
     roundness: float = 1.0
     octagonal: bool = False
-    # How far the tip comes down toward the handle, and the power of the curve that it follows.
+    # The drop of the tip toward the handle, and the power of the curve that it follows.
     drop_mm: float = 0.0
     curve: float = 2.0
-    # Gap of a split between two tines at its tips; none if zero.
+    # The gap between two tines at their tips; 0 for no split.
     gap_mm: float = 0.0
-    # Whether the striking face is milled to a waffle.
+    # Whether the striking face has a milled waffle pattern.
     milled: bool = False
-    # Key of solids.MATERIALS for the outermost few millimetres (a face, a plastic cap).
+    # Key of solids.MATERIALS for the outermost few millimetres (a face or a plastic cap).
     tip_material: str = "polished_steel"
 
 
 class Section(NamedTuple):
-    """A section of a head: where along y, its height along x, thickness along z, place along x."""
+    """A section of a head: position along y, height along x, thickness along z, offset along x."""
 
     y: float
     height: float
@@ -63,7 +63,7 @@ class Section(NamedTuple):
 
 
 def head_loft(stations: Sequence[Section], octagonal: bool = False) -> Shape:
-    """A skin through stations; its hulls have fewer corners and the same shadows on the planes."""
+    """A skin through stations; its hulls have fewer corners but nearly the same projections."""
 
     def sections(segments: int) -> list[np.ndarray]:
         rings = []
@@ -91,7 +91,7 @@ def build_head(
     back: HeadEnd,
     material: str,
 ) -> list[Part]:
-    """The parts of a head whose eye is at the origin: tips first, then the steel."""
+    """The parts of a head with its eye at the origin: tips first, then the steel."""
     half = cheek_length / 2
     cheeks = head_loft(
         [
@@ -110,7 +110,7 @@ def build_head(
     for name, end, flipped in (("front", front, False), ("back", back, True)):
         body, tip = ENDS[end.kind](end, *root)
         if flipped:
-            # The same end on the other side, so that up stays up along x.
+            # Flip about x, so that the handle's direction stays.
             body, tip = body.flipped(), tip.flipped() if tip else None
         steel.append(body)
         if tip:
@@ -138,7 +138,7 @@ def _bell(e: HeadEnd, height: float, thickness: float, start: float) -> tuple[Sh
 
 
 def _face(e: HeadEnd, start: float) -> Shape:
-    """The last millimetres of a striking end; the crown is left out of its hulls."""
+    """The last millimetres of a striking end; its hulls omit the crown."""
     size, deep, end = e.size_mm, e.thickness_mm or e.size_mm, e.reach_mm
     rim = [
         Section(start, size, deep, e.roundness),
@@ -157,7 +157,7 @@ def _face(e: HeadEnd, start: float) -> Shape:
 
 
 def _plain(e: HeadEnd, height: float, thickness: float, start: float) -> tuple[Shape, Shape]:
-    """A block of one section from the cheeks to the face, as on a sledge."""
+    """A block of constant section from the cheeks to the face, as on a sledge."""
     size, deep, r = e.size_mm, e.thickness_mm or e.size_mm, e.roundness
     body = head_loft(
         [
@@ -171,7 +171,7 @@ def _plain(e: HeadEnd, height: float, thickness: float, start: float) -> tuple[S
 
 
 def _capped(e: HeadEnd, height: float, thickness: float, start: float) -> tuple[Shape, Shape]:
-    """A steel socket with a soft cap screwed in; the cap is a third of the reach."""
+    """A steel socket and a soft cap, which is 44 % of the end's length."""
     size, deep = e.size_mm, e.thickness_mm or e.size_mm
     seam = e.reach_mm - 0.44 * (e.reach_mm - start)
     neck = e.neck_mm
@@ -196,7 +196,7 @@ def _capped(e: HeadEnd, height: float, thickness: float, start: float) -> tuple[
 
 
 def _ball(e: HeadEnd, height: float, thickness: float, start: float) -> tuple[Shape, Shape]:
-    """A neck and a ball."""
+    """A ball on a neck."""
     radius, neck = e.size_mm / 2, e.neck_mm
     center = e.reach_mm - radius
     join = np.arcsin(0.8 * neck / e.size_mm)
@@ -211,7 +211,7 @@ def _ball(e: HeadEnd, height: float, thickness: float, start: float) -> tuple[Sh
     ball = head_loft(
         [Section(center - radius * np.cos(a), *[e.size_mm * np.sin(a)] * 2) for a in angles]
     )
-    # Every other ring is enough to touch.
+    # Fewer rings suffice for collision.
     keep = head_loft(
         [
             Section(center - radius * np.cos(a), *[e.size_mm * np.sin(a)] * 2)
@@ -263,7 +263,7 @@ def _point(e: HeadEnd, height: float, thickness: float, start: float) -> tuple[S
 
 
 def _claw(e: HeadEnd, height: float, thickness: float, start: float) -> tuple[Shape, None]:
-    """A band that tapers to a split edge and bends toward the handle, its upper edge one curve."""
+    """A tapered band with a split edge that bends toward the handle, with a smooth upper edge."""
     root, wide = min(height, e.neck_mm), e.thickness_mm or thickness
     top = root / 2
 
@@ -281,7 +281,7 @@ def _claw(e: HeadEnd, height: float, thickness: float, start: float) -> tuple[Sh
             rings.append(across_path(profile, center, float(along)))
         return rings
 
-    # Chords of the inner edge lie half within it and half without.
+    # The chords of the concave inner edge lie partly outside it, so inset them.
     inset = min(0.4, 0.1 * e.size_mm)
     hulls = runs(sections(17, 1, inset), OUTLINE_MM + inset, HEIGHT_MM)
     solid = loft(sections(13, 4)).solid

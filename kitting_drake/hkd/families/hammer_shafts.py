@@ -1,4 +1,4 @@
-"""Handles of hammers: a shaft through the eye and a grip, along x toward the handle's end."""
+"""Handles of hammers: a shaft through the eye and a grip, along x."""
 
 from dataclasses import dataclass
 
@@ -9,7 +9,7 @@ from kitting_drake.hkd.families.hammer_heads import HEIGHT_MM, OUTLINE_MM
 from kitting_drake.hkd.tools.collision import runs
 from kitting_drake.hkd.tools.solids import Part, Shape, across_x, fillet, loft, rounded_rectangle
 
-# How far the handle's end stands out of the eye.
+# How far the handle protrudes from the top of the eye.
 PROUD_MM = 1.4
 
 
@@ -17,28 +17,28 @@ PROUD_MM = 1.4
 class Shaft:
     """A handle. Lengths in mm of the full-size tool."""
 
-    # Plain (wood and its like), ribbed (a rubber sleeve), rings (stacked leather).
+    # plain (for instance wood), ribbed (a rubber sleeve) or rings (stacked leather).
     kind: str = "plain"
     length_mm: float = 320.0
-    # Width along y of the straight stretch behind the head, of the throat where the grip begins,
-    # of the grip's swell and of its end; thickness along z as a share of the width.
+    # Widths along y of the straight part behind the head, of the throat where the grip begins, of
+    # the grip's swell and of its end; thicknesses along z as shares of the widths.
     neck_width_mm: float = 25.0
     throat_width_mm: float = 23.0
     swell_width_mm: float = 32.0
     end_width_mm: float = 34.0
     flatness: float = 0.76
     grip_flatness: float = 0.76
-    # Share of the length at which the grip begins, and at which its swell is.
+    # Where the grip begins and where its swell is, as shares of the length.
     neck_share: float = 0.5
     swell_share: float = 0.72
-    # Corners: 0 for square, 1 for round; cut off flat where octagonal.
+    # Corners of a section: 0 is square, 1 is round; `octagonal` makes them flat.
     roundness: float = 0.55
     octagonal: bool = False
     # How far the middle line bows toward the face, and the end back from there.
     bow_mm: float = 0.0
-    # Grooves of the grip.
+    # The number of grooves in the grip.
     ribs: int = 7
-    # A hollow along the broad sides of a one-piece steel neck.
+    # Whether the broad sides of a one-piece steel neck have hollows.
     fullered: bool = False
     # Keys of solids.MATERIALS.
     material: str = "hickory"
@@ -50,8 +50,17 @@ def _section(width: float, thickness: float, roundness: float, segments: int) ->
     return rounded_rectangle(width, thickness, 0.5 * roundness * thickness, segments)
 
 
+def octagon_corners(width: float, thickness: float) -> list[tuple[float, float]]:
+    """The corners of a rectangle about the origin with cut corners."""
+    y, z, cut = width / 2, thickness / 2, 0.27 * thickness
+    return [
+        (-y + cut, -z), (y - cut, -z), (y, -z + cut), (y, z - cut),
+        (y - cut, z), (-y + cut, z), (-y, z - cut), (-y, -z + cut),
+    ]  # fmt: skip
+
+
 def build_shaft(s: Shaft, top: float) -> list[Part]:
-    """The parts of a handle; `top` is where along x it ends above the head."""
+    """The parts of a handle whose upper end is at x = `top`."""
     neck = [
         (0.0, 0.9 * s.neck_width_mm),
         (0.004, s.neck_width_mm),
@@ -70,13 +79,13 @@ def build_shaft(s: Shaft, top: float) -> list[Part]:
     parts = [Part("shaft", s.material, bare.solid, bare.hulls)]
     if s.kind == "plain":
         return [*parts, Part("grip", s.grip_material, sleeve.solid, sleeve.hulls)]
-    # The grip's hulls are those of its crests: grooves are too narrow for anything to enter.
+    # The grip's hulls ignore the grooves, which are too narrow for anything to enter.
     first, last = grip[2][0], grip[-5][0]
     edges = np.linspace(first, last, 2 * s.ribs + 2)
     grooved = sleeve.solid
     rings = None
     for a, b in zip(edges[1::2], edges[2::2], strict=False):
-        # A groove is narrow enough to be no part of a cavity.
+        # A groove must be narrow enough that cavities bridge it.
         middle, half = 0.5 * (a + b), min(0.3 * (b - a), 1.3 / s.length_mm)
         a, b = middle - half, middle + half
         widths = np.interp([a, b], [u for u, _ in grip], [w for _, w in grip])
@@ -94,7 +103,7 @@ def build_shaft(s: Shaft, top: float) -> list[Part]:
         grooved = grooved - (band - core)
         rings = core if rings is None else rings + core
     if s.kind == "rings" and rings is not None:
-        # Dark washers between the leather ones.
+        # Dark washers fill the grooves between the leather rings.
         return [
             *parts,
             Part("washers", s.accent_material, rings),
@@ -104,7 +113,7 @@ def build_shaft(s: Shaft, top: float) -> list[Part]:
 
 
 def _grip_stations(s: Shaft) -> list[tuple[float, float]]:
-    """Share of the length and width along the grip."""
+    """The (share of the handle's length, width) pairs along the grip."""
     a, swell, end = s.neck_share, s.swell_width_mm, s.end_width_mm
 
     def at(t: float) -> float:
@@ -135,12 +144,7 @@ def _loft(s: Shaft, top: float, stations: list[tuple[float, float, float]]) -> S
         result = []
         for u, width, thickness in stations:
             if s.octagonal:
-                cut = 0.27 * thickness
-                y, z = width / 2, thickness / 2
-                corners = [
-                    (-y + cut, -z), (y - cut, -z), (y, -z + cut), (y, z - cut),
-                    (y - cut, z), (-y + cut, z), (-y, z - cut), (-y, -z + cut),
-                ]  # fmt: skip
+                corners, cut = octagon_corners(width, thickness), 0.27 * thickness
                 soft = fillet(corners, 0.35 * cut, 3) if segments > 1 else np.array(corners)
             else:
                 soft = _section(width, thickness, s.roundness, segments)
@@ -152,13 +156,13 @@ def _loft(s: Shaft, top: float, stations: list[tuple[float, float, float]]) -> S
 
 
 def _bow(s: Shaft, u: float) -> float:
-    """How far the middle line stands toward the face at a share of the length."""
+    """The offset of the middle line toward the face at a share of the length."""
     t = max(0.0, (u - 0.36) / 0.64)
     return s.bow_mm * (np.sin(np.pi * min(1.0, 1.25 * t)) * 1.0 - 1.2 * max(0.0, t - 0.55))
 
 
 def _hollows(s: Shaft, top: float) -> Manifold:
-    """Hollows along the broad sides, between head and grip."""
+    """Hollows along the broad sides between head and grip."""
     start, end = 0.13 * s.length_mm, (s.neck_share - 0.015) * s.length_mm
     thickness = s.flatness * s.neck_width_mm
     half = 0.24 * s.neck_width_mm

@@ -1,4 +1,4 @@
-"""Pliers: two crossed levers on a rivet. They lie flat, the jaws toward +x."""
+"""Pliers: two crossed levers on a rivet. They lie flat with the jaws toward +x."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -27,25 +27,24 @@ from kitting_drake.hkd.tools.solids import (
 
 @dataclass
 class PliersParameters:
-    """Slip-joint pliers, their rivet at the origin, the jaws a little open. Lengths in mm."""
+    """Slip-joint pliers with slightly open jaws and the rivet at the origin. Lengths in mm."""
 
     # From the rivet to the tip of the jaws, and to the end of the handles.
     jaw_length_mm: float = 46.0
     handle_length_mm: float = 138.0
     # Thickness of joint and jaws.
     thickness_mm: float = 12.0
-    # Width across the parallel flanks of the joint, and how far they run behind and before the
-    # rivet.
+    # Width across the parallel flanks of the joint; their lengths behind and in front of the rivet.
     joint_width_mm: float = 30.0
     joint_back_mm: float = 29.0
     joint_front_mm: float = 8.0
-    # Width of both closed jaws at the tip; how far they stand open there.
+    # Width across both closed jaws at the tip, and the opening there.
     tip_width_mm: float = 15.0
     tip_gap_mm: float = 3.4
     # Depth and pitch of the serrations of the jaws.
     tooth_depth_mm: float = 1.0
     tooth_pitch_mm: float = 2.4
-    # Distance between the middles of the two handles where they are widest.
+    # Distance between the middle lines of the handles where they are furthest apart.
     handle_spread_mm: float = 43.0
     # Width of a steel handle, and width, thickness and length of its grip.
     handle_width_mm: float = 9.5
@@ -59,9 +58,9 @@ class PliersParameters:
     steel_material: str = "steel"
     rivet_material: str = "polished_steel"
     grip_material: str = "red_grip"
-    # Any other kind of pliers: jaws and levers, or a pair of locking pliers, in place of the fields
-    # above; their fields stand in pliers_jaws.py, pliers_levers.py and pliers_locking.py. Mappings
-    # are taken for the values of their fields.
+    # Any other kind of pliers has jaws and levers, or is a pair of locking pliers; these replace
+    # the fields above. See pliers_jaws.py, pliers_levers.py and pliers_locking.py. A mapping gives
+    # the fields' values.
     jaws: Jaws | dict[str, Any] | None = None
     levers: Levers | dict[str, Any] | None = None
     locking: Locking | dict[str, Any] | None = None
@@ -75,14 +74,18 @@ def _typed(kind: type, value: Any, field: str) -> Any:
 
 
 def build_pliers(p: PliersParameters) -> list[Part]:
-    """The parts of a pair of pliers, in mm in the design frame."""
+    """The parts of a pair of pliers, in mm in the design frame.
+
+    Raises:
+        UserError: a mapping has an unknown field.
+    """
     if p.locking is not None:
         return build_locking(_typed(Locking, p.locking, "locking"))
     if p.jaws is not None or p.levers is not None:
         levers = _typed(Levers, p.levers or {}, "levers")
         return build_levers(levers, _typed(Jaws, p.jaws or {}, "jaws"))
     upper = _lever(p)
-    # The second lever is the first, flipped.
+    # The second lever is a flipped copy.
     lower = upper.flipped()
     grip = _grip(p)
     other_grip = grip.flipped()
@@ -97,10 +100,10 @@ def build_pliers(p: PliersParameters) -> list[Part]:
 
 
 def _handle_path(p: PliersParameters, count: int) -> np.ndarray:
-    """The middle of the upper lever's handle (y < 0), from the joint to its end; (count, 2)."""
+    """The middle line (count, 2) of the upper lever's handle (y < 0), from the joint to its end."""
     inner = p.joint_width_mm / 2 - p.handle_width_mm / 2
     outer = p.handle_spread_mm / 2
-    # Along the joint's flank first, then a bow outward; the ends come back a little.
+    # Along the joint's flank, then outward; the ends come back a little.
     shares = np.array([0.0, 0.10, 0.42, 0.72, 1.0])
     ys = np.array([inner, inner + 0.2, inner + 0.72 * (outer - inner), outer, outer - 0.8])
     t = np.linspace(0.0, 1.0, count)
@@ -110,7 +113,7 @@ def _handle_path(p: PliersParameters, count: int) -> np.ndarray:
 
 
 def _lever(p: PliersParameters) -> Shape:
-    """One lever: jaw at positive y, upper half of the lap joint, handle at negative y."""
+    """One lever: jaw at y > 0, upper half of the lap joint, handle at y < 0."""
     half, z = p.joint_width_mm / 2, p.thickness_mm / 2
     jaw = plate(_jaw_profile(p), -z, z, p.bevel_mm)
     path = _handle_path(p, 25)
@@ -118,7 +121,7 @@ def _lever(p: PliersParameters) -> Shape:
     # The grip hides the rest of the handle.
     bare = path[path[:, 0] > p.grip_length_mm - p.handle_length_mm - 6.0]
     neck = plate(ribbon(bare, np.full(len(bare), p.handle_width_mm)), -z, z, p.bevel_mm)
-    # The lap's outline: flanks parallel over a finger's width, corners drawn in before and behind.
+    # The lap's flanks are parallel over a finger's width; its corners are rounded.
     front, back = p.joint_front_mm, p.joint_back_mm
     lap_outline = fillet(
         [
@@ -134,7 +137,7 @@ def _lever(p: PliersParameters) -> Shape:
         [1, 5, 4, 4, 5, 12, 3, 3],
     )
     lap = plate(lap_outline, 0.0, z, p.bevel_mm)
-    # Where the other lever's lap is, this one gives way, with play for the two to turn.
+    # Make room for the other lever's lap, with some play to turn.
     room = CrossSection([lap_outline]).mirror((0, 1)).offset(0.25, circular_segments=SEGMENTS)
     room = room.extrude(z + 1).translate((0, 0, -z - 1))
     return Shape(
@@ -146,12 +149,12 @@ def _lever(p: PliersParameters) -> Shape:
 
 
 def _jaw_profile(p: PliersParameters) -> np.ndarray:
-    """The upper jaw: convex back, and a biting edge with fine teeth, a pipe grip and a throat."""
+    """The upper jaw: a convex back, and an edge with fine teeth, a pipe grip and a throat."""
     length, half, tip = p.jaw_length_mm, p.joint_width_mm / 2, p.tip_width_mm / 2
     start = p.joint_front_mm
 
     def gap(x: float) -> float:
-        """Half the opening: the jaws have rotated about the rivet."""
+        """Half the opening at x; the jaws turn about the rivet."""
         return 0.5 * p.tip_gap_mm * x / length
 
     back = [
@@ -175,19 +178,19 @@ def _jaw_profile(p: PliersParameters) -> np.ndarray:
         depth = 0.38 * radius * np.sin(angle) + (p.tooth_depth_mm if i % 2 else 0.0)
         bite.append((middle + radius * np.cos(angle), gap(middle) + depth))
     bite += [(pipe_start - 2.0, gap(pipe_start)), (start - 6.0, 0.2)]
-    # Listed clockwise from the joint over the back to the tip and home along the bite.
+    # The points run clockwise over the back to the tip and return along the bite.
     return np.array([*back, *bite])[::-1].copy()
 
 
 def _grip(p: PliersParameters) -> Shape:
-    """The dipped sleeve of the upper lever: rounded, flared to a thumb stop, closed at the end."""
+    """The dipped sleeve of the upper lever: rounded, with a thumb stop and a closed end."""
     path = _handle_path(p, 60)
-    # Let the sleeve overrun the steel, so that it closes the handle's end.
+    # Extend the sleeve beyond the steel to close the handle's end.
     path = np.vstack([path, path[-1] + (path[-1] - path[-2]) * [[1.0], [1.6]]])
     tangent = np.gradient(path, axis=0)
     run = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=1))])
     start = run[-1] - p.grip_length_mm
-    # Share of the sleeve, width, thickness, both as shares of the grip's.
+    # (share of the sleeve's length, width, thickness), the latter as shares of the grip's.
     stations = [
         (0.0, 0.80, 0.82),
         (0.012, 1.02, 0.92),
@@ -221,7 +224,7 @@ def _grip(p: PliersParameters) -> Shape:
 
 
 def _rivet(p: PliersParameters) -> Shape:
-    """The rivet: flush below, a low chamfered head above."""
+    """The rivet: flush below, with a low chamfered head above."""
     radius, z = p.rivet_diameter_mm / 2, p.thickness_mm / 2
 
     def disc(r: float, height: float) -> np.ndarray:

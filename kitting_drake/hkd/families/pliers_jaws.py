@@ -1,6 +1,6 @@
-"""Outlines of the upper jaw of pliers, by kind; the lower one is its mirror image.
+"""Outlines of the upper jaw of pliers, by kind; the lower jaw is its mirror image.
 
-An outline is listed from the joint over the back to the tip and home along the bite: clockwise.
+The points run clockwise from the joint over the back to the tip and return along the bite.
 """
 
 from collections.abc import Callable
@@ -15,22 +15,22 @@ Line = list[tuple[float, float]]
 
 @dataclass
 class Jaws:
-    """A pair of jaws. Lengths in mm of the full-size tool, the rivet at the origin."""
+    """A pair of jaws. Lengths in mm of the full-size tool with the rivet at the origin."""
 
-    # One of OUTLINES; and that of the lower jaw, where it is another.
+    # A key of OUTLINES, and that of the lower jaw (empty: the same).
     kind: str = "combination"
     lower_kind: str = ""
     length_mm: float = 46.0
-    # Width of both closed jaws at the tip, and how far they stand open there.
+    # Width across both closed jaws at the tip, and the opening there.
     tip_width_mm: float = 15.0
     gap_mm: float = 3.0
-    # Thickness at the tip; that of the joint if zero.
+    # Thickness at the tip (0: the joint's).
     tip_thickness_mm: float = 0.0
     # Depth and pitch of the serrations.
     tooth_mm: float = 0.9
     pitch_mm: float = 2.2
-    # Both jaws are rotated by this about where they leave the joint, and bend further by this
-    # toward the tip.
+    # Both jaws turn by `turn_deg` where they leave the joint, and bend by `bend_deg` more toward
+    # the tip.
     turn_deg: float = 0.0
     bend_deg: float = 0.0
 
@@ -38,8 +38,8 @@ class Jaws:
 def upper_jaw(j: Jaws, start: float, half: float, kind: str = "") -> np.ndarray:
     """The outline (n, 2) of the upper jaw, counter-clockwise.
 
-    `start` is where the joint's flanks end along x, `half` half their distance; `kind` is one of
-    OUTLINES, the jaws' own if empty.
+    The joint's flanks end at x = `start` and y = +-`half`. `kind` is a key of OUTLINES, and the
+    jaws' own if empty.
     """
     back, bite = OUTLINES[kind or j.kind](j, start, half)
     root = [(start - 6.0, 0.0), (start - 6.0, half - 0.3)]
@@ -47,10 +47,10 @@ def upper_jaw(j: Jaws, start: float, half: float, kind: str = "") -> np.ndarray:
 
 
 def bent(j: Jaws, outline: np.ndarray, start: float) -> np.ndarray:
-    """An outline rotated about the joint, and bent along a circle from there."""
+    """An outline turned at the joint and bent along an arc from there."""
     if not j.turn_deg and not j.bend_deg:
         return outline
-    # Straight edges bend too.
+    # Subdivide the edges, because straight edges bend too.
     count = np.ceil(np.linalg.norm(np.roll(outline, -1, axis=0) - outline, axis=1) / 2.0)
     outline = np.vstack(
         [
@@ -59,7 +59,7 @@ def bent(j: Jaws, outline: np.ndarray, start: float) -> np.ndarray:
         ]
     )
     t = np.clip((outline[:, 0] - start) / (j.length_mm - start), 0.0, 1.2)
-    # Beyond the joint the middle line turns more and more.
+    # The turn sets in gradually at the joint.
     ease = np.clip((outline[:, 0] - start + 5.0) / 5.0, 0.0, 1.0)
     line = np.linspace(0.0, 1.2, 241)
     heading = np.radians(j.turn_deg + j.bend_deg * np.clip((line - 0.25) / 0.5, 0.0, 1.0))
@@ -75,12 +75,12 @@ def bent(j: Jaws, outline: np.ndarray, start: float) -> np.ndarray:
 
 
 def _opening(j: Jaws) -> Callable[[float], float]:
-    """Half the opening along x: the jaws have rotated about the rivet."""
+    """Half the opening along x; the jaws turn about the rivet."""
     return lambda x: 0.5 * j.gap_mm * max(0.0, x) / j.length_mm
 
 
 def _teeth(j: Jaws, high: float, low: float) -> Line:
-    """Serrations from `high` down to `low` along x."""
+    """Serrations from x = `high` down to `low`."""
     gap, bite = _opening(j), []
     for i in range(int((high - low) / j.pitch_mm)):
         x = high - i * j.pitch_mm
@@ -89,7 +89,7 @@ def _teeth(j: Jaws, high: float, low: float) -> Line:
 
 
 def _hollow(j: Jaws, high: float, low: float, depth: float, teeth: bool) -> Line:
-    """An arched hollow between two places along x, serrated or not."""
+    """An arched hollow between x = `low` and `high`, serrated or smooth."""
     gap = _opening(j)
     middle, radius = 0.5 * (low + high), 0.5 * (high - low)
     return [
@@ -102,14 +102,14 @@ def _hollow(j: Jaws, high: float, low: float, depth: float, teeth: bool) -> Line
 
 
 def _rounded(line: Line, radii: list[float], j: Jaws) -> Line:
-    """A back with its corners rounded; the first and the last point stay."""
+    """A back with its corners rounded except at its two ends."""
     end = (j.length_mm, _opening(j)(j.length_mm) + 0.3)
     soft = fillet([*line, end, (line[0][0], 0.0)], [0.0, *radii, 0.0, 0.0])
     return [(float(x), float(y)) for x, y in soft[:-1]]
 
 
 def _combination(j: Jaws, start: float, half: float) -> tuple[Line, Line]:
-    """Flat serrated tip, a pipe grip and a side cutter."""
+    """A flat serrated tip, a pipe grip and a side cutter."""
     length, tip = j.length_mm, j.tip_width_mm / 2
     back = [
         (start, half),
@@ -133,7 +133,7 @@ def _linesman(j: Jaws, start: float, half: float) -> tuple[Line, Line]:
 
 
 def _needle(j: Jaws, start: float, half: float) -> tuple[Line, Line]:
-    """A long slender nose, straight from a shoulder to its tip."""
+    """A long slender nose, straight from the shoulder to the tip."""
     length, tip = j.length_mm, j.tip_width_mm / 2
     shoulder = start + 0.16 * (length - start)
     back = [(start, half), (shoulder, 0.60 * half + 0.40 * tip), (length, tip - 0.2)]
@@ -143,7 +143,7 @@ def _needle(j: Jaws, start: float, half: float) -> tuple[Line, Line]:
 
 
 def _flat(j: Jaws, start: float, half: float) -> tuple[Line, Line]:
-    """Smooth jaws of one taper to a square tip."""
+    """Smooth jaws with a constant taper to a square tip."""
     length, tip, gap = j.length_mm, j.tip_width_mm / 2, _opening(j)
     back = [(start, half), (start + 5.0, 0.9 * half), (length, tip)]
     bite = [(length - 0.5, gap(length)), (start + 2.0, gap(start)), (start, 0.3)]
@@ -151,7 +151,7 @@ def _flat(j: Jaws, start: float, half: float) -> tuple[Line, Line]:
 
 
 def _round(j: Jaws, start: float, half: float) -> tuple[Line, Line]:
-    """Two cones that stand apart."""
+    """Two cones with a gap between them."""
     length, tip, gap = j.length_mm, j.tip_width_mm / 2, _opening(j)
     open_tip = gap(length)
     back = [(start, half), (start + 8.0, 0.82 * half), (length - 0.6, open_tip + tip)]
@@ -167,7 +167,7 @@ def _round(j: Jaws, start: float, half: float) -> tuple[Line, Line]:
 
 
 def _diagonal(j: Jaws, start: float, half: float) -> tuple[Line, Line]:
-    """A short round head whose edges meet all along, with a hollow at the joint."""
+    """A short round head with a cutting edge along its whole length and a hollow at the joint."""
     length, tip = j.length_mm, j.tip_width_mm / 2
     back = [
         (start, half),
@@ -199,7 +199,7 @@ def _circlip(j: Jaws, start: float, half: float) -> tuple[Line, Line]:
 
 
 def _nipper(j: Jaws, start: float, half: float) -> tuple[Line, Line]:
-    """Pincers: the jaws arch apart and meet in a broad edge across the tool."""
+    """Pincers: jaws that arch apart and meet in a broad edge across the tool."""
     length, wide = j.length_mm, j.tip_width_mm / 2
     span = length - start
     back = [
@@ -233,7 +233,7 @@ def _snips(j: Jaws, start: float, half: float) -> tuple[Line, Line]:
 
 
 def _stripper(j: Jaws, start: float, half: float) -> tuple[Line, Line]:
-    """Blades with a row of round holes that grow toward the joint, and a gripping nose."""
+    """Blades with a row of round holes that grow toward the joint, and a serrated nose."""
     length, tip = j.length_mm, j.tip_width_mm / 2
     back = [(start, half), (start + 6.0, 0.92 * half), (length - 4.0, tip + 0.5), (length, tip - 2)]
     bite = _teeth(j, length - 1.0, length - 10.0)
@@ -265,7 +265,7 @@ def _pump(j: Jaws, start: float, half: float) -> tuple[Line, Line]:
 
 
 def _poll(j: Jaws, start: float, half: float) -> tuple[Line, Line]:
-    """The jaw of fencing pliers that is a hammer: a square poll stands out sideways at the tip."""
+    """The hammer jaw of fencing pliers: a square poll that sticks out sideways at the tip."""
     length, out = j.length_mm, j.tip_width_mm / 2
     back = [
         (start, half),
@@ -279,7 +279,7 @@ def _poll(j: Jaws, start: float, half: float) -> tuple[Line, Line]:
 
 
 def _pick(j: Jaws, start: float, half: float) -> tuple[Line, Line]:
-    """The jaw across from it: a curved point that draws staples stands out sideways."""
+    """The opposite jaw of fencing pliers: a curved point for staples sticks out sideways."""
     length, out = j.length_mm, j.tip_width_mm / 2
     back = [
         (start, half),
@@ -294,7 +294,7 @@ def _pick(j: Jaws, start: float, half: float) -> tuple[Line, Line]:
 
 
 def _staple_bite(j: Jaws, start: float) -> Line:
-    """Serrated at the tip, with a round hole for wire and a cutter behind it."""
+    """A serrated tip with a round hole for wire and a cutter behind it."""
     length = j.length_mm
     bite = _teeth(j, length - 1.0, 0.66 * length)
     bite += _hollow(j, 0.62 * length, 0.46 * length, 2.4, False)

@@ -1,4 +1,4 @@
-"""Pliers of any jaws: two crossed levers, a joint with parallel flanks, sleeves on the handles."""
+"""Pliers with any jaws: two crossed levers, a joint with parallel flanks, sleeved handles."""
 
 import itertools
 from collections.abc import Sequence
@@ -23,33 +23,34 @@ from kitting_drake.hkd.tools.solids import (
     without_holes,
 )
 
-# How far the hulls of full-size pliers may stand out of them, in the outline and in height; and
-# how far within the outline those of a sleeve lie, so that chords may cut its hollow side.
+# Tolerances of the hulls of full-size pliers for the outline and for heights. The hulls of a sleeve
+# are inset, because chords stick out of its concave side.
 _OUTLINE_MM, _HEIGHT_MM, _INSET_MM = 0.22, 1.0, 0.08
 
 
 @dataclass
 class Levers:
-    """Joint and handles. Lengths in mm of the full-size tool, the rivet at the origin."""
+    """Joint and handles. Lengths in mm of the full-size tool with the rivet at the origin."""
 
     thickness_mm: float = 12.0
-    # Width across the parallel flanks of the joint; how far they run behind and before the rivet.
+    # Width across the parallel flanks of the joint; lengths of the joint behind and in front of the
+    # rivet.
     joint_width_mm: float = 28.0
     joint_back_mm: float = 22.0
-    # How far behind the rivet the handles run on in line with the flanks.
+    # How far behind the rivet the handles continue in line with the flanks.
     parallel_mm: float = 44.0
     joint_front_mm: float = 9.0
     # From the rivet to the end of the handles.
     handle_length_mm: float = 130.0
-    # Distance between the middles of the handles at the shoulder and at the ends, and the share of
-    # a handle's length where the shoulder is.
+    # Distances between the middle lines of the handles at the shoulder and at the ends; position of
+    # the shoulder as a share of a handle's length.
     spread_mm: float = 42.0
     end_spread_mm: float = 44.0
     shoulder_share: float = 0.4
     # Radius of the bend at the shoulder.
     bend_radius_mm: float = 28.0
     handle_width_mm: float = 9.0
-    # A sleeve: width and thickness, and its length; no sleeve if zero. A guard is a flare at its
+    # Width, thickness and length of a sleeve (length 0: no sleeve); a guard is a flare at its
     # front.
     grip_width_mm: float = 13.0
     grip_thickness_mm: float = 13.0
@@ -57,7 +58,7 @@ class Levers:
     guard: bool = False
     rivet_diameter_mm: float = 12.0
     bevel_mm: float = 0.8
-    # Number of curved grooves in the joint (tongue and groove), and a return spring's leaf.
+    # The number of curved grooves in the joint (tongue and groove), and a leaf spring.
     grooves: int = 0
     spring: bool = False
     # Keys of solids.MATERIALS.
@@ -71,7 +72,7 @@ def build_levers(v: Levers, j: Jaws) -> list[Part]:
     upper, lower = _lever(v, j, True), _lever(v, j, False)
     steel = Part("steel", v.steel_material, upper + lower, _steel_hulls(v, j))
     rivet = _rivet(v)
-    # Its head touches nothing where sleeves stand higher.
+    # The rivet's head touches nothing where the sleeves are higher.
     hidden = v.grip_length_mm and v.grip_thickness_mm > v.thickness_mm + 2.6
     parts = [Part("rivet", v.rivet_material, rivet.solid, [] if hidden else rivet.hulls), steel]
     if v.grip_length_mm:
@@ -84,7 +85,7 @@ def build_levers(v: Levers, j: Jaws) -> list[Part]:
 
 
 def handle_path(v: Levers) -> np.ndarray:
-    """The middle of the handle at y < 0, from within the joint to its end; (n, 2)."""
+    """The middle line (n, 2) of the handle at y < 0, from inside the joint to its end."""
     start = (-0.45 * v.joint_back_mm, -0.5 * (v.joint_width_mm - v.handle_width_mm))
     shoulder_x = -v.parallel_mm - v.shoulder_share * (v.handle_length_mm - v.parallel_mm)
     corners = [
@@ -93,20 +94,20 @@ def handle_path(v: Levers) -> np.ndarray:
         (shoulder_x, -v.spread_mm / 2),
         (-v.handle_length_mm, -v.end_spread_mm / 2),
     ]
-    # The closing edge of the polygon runs far off, so that the two ends stay sharp.
+    # Close the polygon far away, so that the line's two ends are not rounded.
     far = [(-v.handle_length_mm, -400.0), (start[0], -400.0)]
     return fillet([*corners, *far], [0, 8.0, v.bend_radius_mm, 0, 0, 0], 6)[:-2]
 
 
 def _even(path: np.ndarray, step: float) -> np.ndarray:
-    """A path resampled at about even steps."""
+    """A path resampled at roughly equal steps."""
     run = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=1))])
     s = np.linspace(0.0, run[-1], max(2, int(run[-1] / step)))
     return np.column_stack([np.interp(s, run, path[:, k]) for k in (0, 1)])
 
 
 def _band(v: Levers, bare_only: bool) -> np.ndarray:
-    """The outline of the steel handle at y < 0; of its bare stretch only, or whole."""
+    """The outline of the steel handle at y < 0, the whole or only the part outside the sleeve."""
     path = _even(handle_path(v), 4.0)
     if bare_only and v.grip_length_mm:
         path = path[path[:, 0] > v.grip_length_mm - v.handle_length_mm - 9.0]
@@ -137,7 +138,7 @@ def _lap_outline(v: Levers) -> np.ndarray:
 
 
 def _jaw_outlines(v: Levers, j: Jaws) -> tuple[np.ndarray, np.ndarray]:
-    """The outlines of the upper and the lower jaw, rotated and bent as they are."""
+    """The outlines of the upper and lower jaw, turned and bent."""
     outline = upper_jaw(j, v.joint_front_mm, v.joint_width_mm / 2)
     other = upper_jaw(j, v.joint_front_mm, v.joint_width_mm / 2, j.lower_kind)
     mirrored = (other * np.array([1.0, -1.0]))[::-1]
@@ -146,7 +147,7 @@ def _jaw_outlines(v: Levers, j: Jaws) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _tapered(solid: Manifold, v: Levers, j: Jaws) -> Manifold:
-    """Jaws that get thinner toward the tip, above and below alike."""
+    """Thins jaws toward the tip, symmetrically from above and below."""
     if not j.tip_thickness_mm:
         return solid
     thick, thin = v.thickness_mm / 2, j.tip_thickness_mm / 2
@@ -159,7 +160,7 @@ def _tapered(solid: Manifold, v: Levers, j: Jaws) -> Manifold:
 
 
 def _lever(v: Levers, j: Jaws, upper: bool) -> Manifold:
-    """One lever: a jaw, its half of the lap joint and, on the other side, its handle."""
+    """One lever: a jaw, its half of the lap joint and its handle on the other side."""
     z = v.thickness_mm / 2
     outline = _jaw_outlines(v, j)[0 if upper else 1]
     jaw = _tapered(plate(outline, -z, z, v.bevel_mm).solid, v, j)
@@ -167,7 +168,7 @@ def _lever(v: Levers, j: Jaws, upper: bool) -> Manifold:
         jaw -= _edge_bevel(v, j)
     band = plate(_band(v, True), -z, z, v.bevel_mm).solid
     if v.grip_length_mm:
-        # The tang within the sleeve.
+        # The tang inside the sleeve.
         tang = plate(_band(v, False), -0.45 * z, 0.45 * z, 0.3).solid
         band += tang
     lap = plate(_lap_outline(v), 0.0, z, v.bevel_mm).solid
@@ -182,7 +183,7 @@ def _lever(v: Levers, j: Jaws, upper: bool) -> Manifold:
 
 
 def _groove(v: Levers, radius: float) -> Manifold:
-    """A curved channel in the top of the joint, about a point before the rivet."""
+    """A curved channel in the top of the joint, about a point in front of the rivet."""
     ring = CrossSection([circle(radius + 1.1)]) - CrossSection([circle(radius - 1.1)])
     shape = ring.translate((v.joint_front_mm + 4.0, 0.35 * v.joint_width_mm))
     window = CrossSection([_lap_outline(v)]).offset(-2.0, JoinType.Miter)
@@ -190,12 +191,12 @@ def _groove(v: Levers, radius: float) -> Manifold:
 
 
 def _edge_bevel(v: Levers, j: Jaws) -> Manifold:
-    """A V along the closed edges, above and below: what makes them cutters."""
+    """The V-shaped bevel of cutting edges, above and below."""
     length, z = j.length_mm, v.thickness_mm / 2
     wide = {"diagonal": 0.30 * v.joint_width_mm, "snips": 4.0, "nipper": 5.0}[j.kind]
     start = v.joint_front_mm + (8.0 if j.kind != "nipper" else 0.0)
     if j.kind == "nipper":
-        # Its edge runs across the tool: bevel the front.
+        # Its edge is across the tool: bevel the front.
         flat = [(length - 5.0, z + 0.1), (length + 5.0, z + 0.1), (length + 5.0, -0.2 * z)]
         rings = [np.array([(x, y, h) for x, h in flat]) for y in (-40.0, 40.0)]
     else:
@@ -208,7 +209,7 @@ def _edge_bevel(v: Levers, j: Jaws) -> Manifold:
 
 
 def _steel_hulls(v: Levers, j: Jaws) -> list[np.ndarray]:
-    """Few convex prisms for all the steel, its small gaps filled."""
+    """Few convex prisms that fill the steel and its small gaps."""
     z = v.thickness_mm / 2
     band, lap = _band(v, True), _lap_outline(v)
     outlines = [
@@ -235,11 +236,10 @@ def slab_hulls(
     flanks: Sequence[tuple[float, float, float]] = (),
     tolerance: float = 0.24,
 ) -> list[np.ndarray]:
-    """Few convex prisms for a plate, bevelled below where its rim is; holes and gaps are filled.
+    """Few convex prisms for a plate with a bevelled lower rim; holes and gaps are filled.
 
-    The profile is cut across x into bands, each as long as the hulls of all its pieces stay within
-    the tolerance (mm), and true to the flanks that jaws grip, each given as two bounds along x and
-    the height along y.
+    The profile is cut across x into bands as long as possible: the hulls of a band's pieces stay
+    within the tolerance (mm). At the gripped flanks (x start, x end, y) they stay within 0.05 mm.
     """
 
     def grown(p: CrossSection, d: float) -> CrossSection:
@@ -286,7 +286,7 @@ def slab_hulls(
 
 
 def _sleeve(v: Levers) -> Shape:
-    """The dipped sleeve of the handle at y < 0: rounded, closed at the end."""
+    """The dipped sleeve of the handle at y < 0: rounded, with a closed end."""
     path = _even(handle_path(v), 2.0)
     path = np.vstack([path, path[-1] + (path[-1] - path[-2]) * [[1.0], [1.6]]])
     run = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=1))])
@@ -317,7 +317,7 @@ def _sleeve(v: Levers) -> Shape:
 
 
 def _rivet(v: Levers) -> Shape:
-    """The rivet: flush below, a low chamfered head above with a dimple."""
+    """The rivet: flush below, with a low chamfered head and a dimple above."""
     radius, z = v.rivet_diameter_mm / 2, v.thickness_mm / 2
 
     def disc(r: float, height: float, segments: int) -> np.ndarray:
@@ -332,7 +332,7 @@ def _rivet(v: Levers) -> Shape:
 
 
 def _leaf(v: Levers) -> np.ndarray:
-    """The outline of a bowed leaf spring between the handles, just behind the joint."""
+    """The outline of a bowed leaf spring between the handles, behind the joint."""
     ends = 0.5 * (v.joint_width_mm - v.handle_width_mm)
     t = np.linspace(-1.0, 1.0, 21)
     x = -v.joint_back_mm - 2.0 - 9.0 * (1 - t**2)

@@ -21,19 +21,19 @@ from kitting_drake.hkd.tools.solids import (
 
 @dataclass
 class Locking:
-    """Locking pliers. Lengths in mm of the full-size tool, the jaw's pivot near the origin."""
+    """Locking pliers with the jaw's pivot near the origin. Lengths in mm of the full-size tool."""
 
-    # From the pivot to the tip of the jaws and to the end of the body, without the screw.
+    # From the pivot to the tip of the jaws, and to the end of the body without the screw.
     jaw_length_mm: float = 46.0
     body_length_mm: float = 150.0
-    # Thickness of the channel, of the jaws, and width across the parallel flanks behind the pivot.
+    # Thickness of the channel and of the jaws; width across the parallel flanks behind the pivot.
     thickness_mm: float = 15.0
     jaw_thickness_mm: float = 11.0
     flank_width_mm: float = 38.0
-    # Depth of the body's channel, and of the handle below it, as seen from above.
+    # Depths of the body's channel and of the handle, seen from above.
     body_depth_mm: float = 15.0
     handle_depth_mm: float = 12.0
-    # How far the handle stands from the body at its end.
+    # Distance of the handle's outer edge from the body's at the end.
     spread_mm: float = 52.0
     screw_diameter_mm: float = 13.0
     body_material: str = "polished_steel"
@@ -136,7 +136,7 @@ def build_locking(k: Locking) -> list[Part]:
         )
     ]
 
-    # One slab for all that is flat, thick as the body.
+    # The hulls are one slab for all flat parts, as thick as the body.
     def together(*names: str) -> CrossSection:
         profiles = [
             CrossSection([outlines[name]]) + CrossSection([outlines[name][::-1]]) for name in names
@@ -158,7 +158,7 @@ def build_locking(k: Locking) -> list[Part]:
 
 
 def _jaw(back: list[tuple[float, float]], tip: float, gap: float, half: float) -> np.ndarray:
-    """A curved jaw with coarse teeth; clockwise over its back."""
+    """The outline of a curved jaw with coarse teeth, clockwise over its back."""
     soft = fillet([*back, (tip, gap / 2), (back[0][0], 0.0)], [4, 14, 8, 2, 0, 0])
     bite = []
     for i, x in enumerate(np.linspace(tip - 0.5, 14.0, 17)):

@@ -1,6 +1,6 @@
-"""The handles of screwdrivers: stations along the length, and the sections that pass through them.
+"""Handles of screwdrivers: lofts through sections at stations along the length.
 
-Every section is flat below and on both sides: so a handle does not roll, and jaws can hold it.
+Every section is flat below and on both sides, so that a handle does not roll and can be gripped.
 """
 
 import itertools
@@ -15,11 +15,11 @@ from kitting_drake.hkd.tools.solids import Shape, across_x, fillet, loft, rounde
 class HandleSection(NamedTuple):
     """A section of a handle."""
 
-    # Share of the handle's length, 0 at the butt, 1 at the front.
+    # Position as a share of the handle's length: 0 at the butt, 1 at the front.
     place: float
-    # Share of the handle's width and height.
+    # Size as a share of the handle's width and height.
     size: float
-    # Share of the depth of the flutes.
+    # Share of the flutes' depth.
     flute: float = 0.0
 
 
@@ -28,14 +28,14 @@ class Zone(NamedTuple):
 
     material: str
     stations: Sequence[HandleSection]
-    # Whether it is straight but for rings too fine to touch.
+    # Whether its only detail is fine rings, which the hulls can ignore.
     knurled: bool = False
 
 
 class Style(NamedTuple):
-    """The look of a handle."""
+    """The style of a handle."""
 
-    # Takes width, height and depth of the flutes; gives the profile (n, 2), always of the same n.
+    # From width, height and flute depth to the profile (n, 2), always with the same n.
     section: Callable[[float, float, float], np.ndarray]
     zones: Sequence[Zone]
 
@@ -43,7 +43,7 @@ class Style(NamedTuple):
 def _pressed(
     profile: np.ndarray, flutes: int, depth: float, phase: float, sharpness: float
 ) -> np.ndarray:
-    """A profile with `flutes` grooves pressed toward its middle; the first at angle `phase`."""
+    """A profile with `flutes` grooves pressed in, the first at angle `phase`."""
     angle = np.arctan2(profile[:, 1], profile[:, 0])
     press = depth * np.clip(np.cos(flutes * (angle - phase)), 0.0, 1.0) ** sharpness
     reach = np.linalg.norm(profile, axis=1)
@@ -51,7 +51,7 @@ def _pressed(
 
 
 def _resampled(profile: np.ndarray, count: int) -> np.ndarray:
-    """Points (count, 2) on a profile at equal angles from its middle."""
+    """The points (count, 2) of a profile at equal angles about the origin."""
     closed = np.vstack([profile, profile[:1]])
     fine = np.vstack([a + t * (b - a) for a, b in itertools.pairwise(closed) for t in _FINE])
     angle = np.arctan2(fine[:, 1], fine[:, 0])
@@ -66,13 +66,13 @@ _FINE = np.linspace(0.0, 1.0, 24, endpoint=False)
 
 
 def _square(width: float, height: float, flute: float) -> np.ndarray:
-    """A square with well rounded corners and a flute along each."""
+    """A square with large round corners and a flute along each."""
     profile = rounded_rectangle(width, height, 0.3 * min(width, height), 3)
     return _pressed(profile, 4, flute, np.pi / 4, 2)
 
 
 def _octagon(width: float, height: float, flute: float) -> np.ndarray:
-    """Eight flats, the facets of turned and planed wood."""
+    """An octagon, as of planed wood."""
     y, z = width / 2, height / 2
     a, b = 0.42 * y, 0.42 * z
     corners = [(-a, -z), (a, -z), (y, -b), (y, b), (a, z), (-a, z), (-y, b), (-y, -b)]
@@ -80,14 +80,14 @@ def _octagon(width: float, height: float, flute: float) -> np.ndarray:
 
 
 def _ribbed(width: float, height: float, flute: float) -> np.ndarray:
-    """Eight ribs with round flutes between them, the ribs below and beside cut flat."""
+    """Eight ribs with round flutes between them; the lower and side ribs are flat."""
     y, z = width / 2, height / 2
     profile = _resampled(rounded_rectangle(width, height, 0.7 * min(y, z), 8), 64)
     return _pressed(profile, 8, flute, np.pi / 8, 1)
 
 
 def _three_lobed(width: float, height: float, flute: float) -> np.ndarray:
-    """A triangle with broad round corners, one side below, the lower corners cut upright."""
+    """A triangle with large round corners, one side down and the lower corners cut upright."""
     y, z = width / 2, height / 2
     corners = [
         (-0.62 * y, -z),
@@ -103,14 +103,14 @@ def _three_lobed(width: float, height: float, flute: float) -> np.ndarray:
 
 
 def _oval(width: float, height: float, flute: float) -> np.ndarray:
-    """Broader than high, round above and below but for narrow flats."""
+    """An oval with narrow flats above, below and at the sides."""
     y, z = width / 2, height / 2
     return rounded_rectangle(width, height, 0.75 * min(y, z), 3)
 
 
 S = HandleSection
 STYLES: dict[str, Style] = {
-    # Soft sides on a hard core: a waist for the fingertips, a guard before it.
+    # Soft sides on a hard core, with a waist for the fingertips and a guard in front of it.
     "two_tone": Style(
         _square,
         [
@@ -123,7 +123,7 @@ STYLES: dict[str, Style] = {
             Zone("grip", [S(0.94, 1.0), S(0.975, 1.0), S(1.0, 0.7)]),
         ],
     ),
-    # Clear plastic with ribs all along, a smooth bulb at the butt.
+    # Clear plastic with ribs and a smooth bulb at the butt.
     "ribbed": Style(
         _ribbed,
         [
@@ -141,7 +141,7 @@ STYLES: dict[str, Style] = {
             Zone("accent", [S(0.98, 1.0), S(1.0, 0.7)]),
         ],
     ),
-    # Planed wood, a swell in the palm, held by a ferrule.
+    # Planed wood with a swell for the palm and a ferrule.
     "wood": Style(
         _octagon,
         [
@@ -150,7 +150,7 @@ STYLES: dict[str, Style] = {
             Zone("metal", [S(0.92, 0.64), S(0.985, 0.56), S(1.0, 0.5)]),
         ],
     ),
-    # The cabinet maker's oval bulb, waisted toward a ferrule.
+    # A cabinet maker's oval bulb, narrowed toward a ferrule.
     "cabinet": Style(
         _oval,
         [
@@ -160,7 +160,7 @@ STYLES: dict[str, Style] = {
             Zone("metal", [S(0.88, 0.47), S(0.98, 0.45), S(1.0, 0.4)]),
         ],
     ),
-    # Wood through which the blade is forged, its end a steel cap to strike.
+    # Wood with a through blade that ends in a steel striking cap.
     "striking": Style(
         _octagon,
         [
@@ -169,7 +169,7 @@ STYLES: dict[str, Style] = {
             Zone("metal", [S(0.88, 0.96), S(0.98, 0.96), S(1.0, 0.86)]),
         ],
     ),
-    # A body whose blade turns a little at every blow of a hammer: a cap to strike, and rings.
+    # An impact driver, whose blade turns a little at each hammer blow: a striking cap, and rings.
     "impact": Style(
         _octagon,
         [
@@ -181,7 +181,7 @@ STYLES: dict[str, Style] = {
             Zone("metal", [S(0.91, 0.70), S(0.98, 0.70), S(1.0, 0.6)]),
         ],
     ),
-    # Insulated: a guard at the front keeps the hand from what is live.
+    # Insulated, with a guard at the front that keeps the hand off live parts.
     "insulated": Style(
         _oval,
         [
@@ -190,7 +190,7 @@ STYLES: dict[str, Style] = {
             Zone("accent", [S(0.84, 0.80), S(0.88, 1.0), S(0.93, 1.0), S(0.96, 0.7), S(1.0, 0.5)]),
         ],
     ),
-    # A bar that is square all along.
+    # A square bar.
     "square": Style(
         _square,
         [
@@ -199,7 +199,7 @@ STYLES: dict[str, Style] = {
             Zone("metal", [S(0.91, 0.66), S(0.98, 0.66), S(1.0, 0.56)]),
         ],
     ),
-    # A fat pear for the palm.
+    # A thick pear for the palm.
     "bulb": Style(
         _square,
         [
@@ -218,7 +218,7 @@ STYLES: dict[str, Style] = {
             ),
         ],
     ),
-    # Slim metal, knurled where the fingers turn it, with a cap that spins against the palm.
+    # Slim metal, knurled for the fingers, with a spinning cap for the palm.
     "precision": Style(
         _octagon,
         [
@@ -240,10 +240,10 @@ del S
 def handle(
     style: str, length: float, width: float, height: float, flute: float
 ) -> list[tuple[str, Shape]]:
-    """The zones of a handle as (material, shape), its front at x = 0; lengths in mm.
+    """The zones of a handle as (material, shape), with its front at x = 0. Lengths in mm.
 
     Raises:
-        ValueError: there is no such style.
+        ValueError: the style is not known.
     """
     if style not in STYLES:
         raise ValueError(f"no handle is called {style!r}, only {', '.join(STYLES)}")

@@ -1,4 +1,4 @@
-"""The blades of screwdrivers other than the flat: shaft and tip in one, along x."""
+"""Blades of screwdrivers other than flat ones: shaft and tip in one, along x."""
 
 from collections.abc import Callable
 
@@ -21,7 +21,7 @@ def _round_blade(
 
 
 def _phillips(start: float, end: float, diameter: float, length: float, width: float) -> Shape:
-    """A cone with a blunt point, and four grooves that leave a cross."""
+    """A cone with a blunt point and four grooves that leave a cross."""
     cone = 0.9 * diameter
     blade = _round_blade(
         start,
@@ -35,7 +35,7 @@ def _phillips(start: float, end: float, diameter: float, length: float, width: f
         ],
     )
     solid = blade.solid
-    # Each groove is a square prism on its edge that rises toward the shaft.
+    # Each groove is a triangular prism on its edge that rises toward the shaft.
     root, deep = 0.5 * diameter, 0.15 * diameter
     for quarter in range(4):
         sections = []
@@ -51,7 +51,7 @@ def _phillips(start: float, end: float, diameter: float, length: float, width: f
 
 
 def _prismatic(outline: CrossSection) -> Callable[[float, float, float, float, float], Shape]:
-    """A tip with a constant section, of unit width, on a round shaft that tapers to it."""
+    """A tip of constant section, given for width 1, on a round shaft that tapers to it."""
 
     def build(start: float, end: float, diameter: float, length: float, width: float) -> Shape:
         tip = outline.scale((width, width))
@@ -64,7 +64,7 @@ def _prismatic(outline: CrossSection) -> Callable[[float, float, float, float, f
             [(0.2 * length, diameter), (0.0, min(reach, diameter))],
         )
         prism = tip.extrude(length, 0, 0.0, (1.0, 1.0)).rotate((0.0, 90.0, 0.0))
-        # The prism is rotated: its top looks to -z.
+        # The rotation turned the section's x to -z; do the same to the hull.
         hull = CrossSection.hull_points(points).to_polygons()[0][:, ::-1] * (1.0, -1.0)
         ends = np.vstack([across_x(hull, end - length), across_x(hull, end)])
         return Shape(blade.solid + prism.translate((end - length, 0.0, 0.0)), [*blade.hulls, ends])
@@ -80,7 +80,7 @@ def _star() -> CrossSection:
 
 
 def _socket(start: float, end: float, diameter: float, length: float, width: float) -> Shape:
-    """The socket of a nut driver: a thick tube with a hexagonal mouth, of outer width `width`."""
+    """The socket of a nut driver: a thick tube of outer width `width` with a hexagonal mouth."""
     blade = _round_blade(
         start,
         end,
@@ -104,4 +104,4 @@ TIPS: dict[str, Callable[[float, float, float, float, float], Shape]] = {
     "hex": _prismatic(CrossSection([circle(1.0 / np.sqrt(3), segments=6)]).rotate(30.0)),
     "socket": _socket,
 }
-"""Each takes where the shaft starts and ends, its diameter, and length and width of the tip."""
+"""Functions of the shaft's start, end and diameter, and the tip's length and width."""

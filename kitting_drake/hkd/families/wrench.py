@@ -10,36 +10,36 @@ from manifold3d import CrossSection, Manifold
 from kitting_drake.hkd.families.wrench_heads import Head, head_shape
 from kitting_drake.hkd.tools.solids import Part, Shape, blend, circle, fillet, plate, ribbon
 
-# Where an S-shaped shank bends, as a share of the way from its middle to a head.
+# The position of the bends of an S-shaped shank, as a share of the way from its middle to a head.
 _BEND = 0.56
 
 
 @dataclass
 class WrenchParameters:
-    """A wrench, one head toward +x, the other toward -x: a combination wrench. Lengths in mm."""
+    """A combination wrench with its heads toward +x and -x. Lengths in mm."""
 
     # From the centre of one head to the centre of the other.
     center_distance_mm: float = 172.0
-    # The heads toward +x and -x; a mapping of Head's fields stands for a Head.
+    # The heads toward +x and -x; a mapping gives the fields of a Head.
     front: Head = field(
         default_factory=lambda: Head("open", diameter_mm=38.0, thickness_mm=8.8, angle_deg=15.0)
     )
     back: Head = field(
         default_factory=lambda: Head("box", diameter_mm=28.0, thickness_mm=11.0, points=12)
     )
-    # Width of the shank at the front and at the back, its thickness, and the radius that blends it
-    # into the heads.
+    # Widths of the shank at the front and back, its thickness, and the radius of its blend into the
+    # heads.
     shank_width_front_mm: float = 16.0
     shank_width_back_mm: float = 15.0
     shank_thickness_mm: float = 7.8
     blend_radius_mm: float = 16.0
-    # How far an S-shaped shank swings to either side.
+    # The offset of an S-shaped shank to either side.
     swing_mm: float = 0.0
-    # Depth of the recessed panel on each broad side of the shank, below zero the height of a raised
-    # one; and the share of the shank's width that it takes.
+    # The depth of the recessed panel on each broad side of the shank (negative: the height of a
+    # raised panel), and its width as a share of the shank's.
     panel_depth_mm: float = 0.9
     panel_share: float = 0.58
-    # Bevel of all outer edges; of the shank's, where they differ.
+    # The bevel of all outer edges; that of the shank's, if different.
     bevel_mm: float = 0.9
     shank_bevel_mm: float | None = None
     # A key of solids.MATERIALS.
@@ -61,7 +61,7 @@ def build_wrench(p: WrenchParameters) -> list[Part]:
     for head, side in ((p.front, 1), (p.back, -1)):
         if head.neck_mm and not p.swing_mm:
             shank += _shoulders(p, head, side)
-    # Blend shank and heads as one outline, so that the forging flows; the heads then stand on it.
+    # Blend shank and heads as one outline; thicker heads are added below.
     outline = blend(front.profile + shank + back.profile, p.blend_radius_mm)
     outline = outline - front.cut - back.cut
     bevel = p.bevel_mm if p.shank_bevel_mm is None else p.shank_bevel_mm
@@ -77,7 +77,7 @@ def build_wrench(p: WrenchParameters) -> list[Part]:
         if p.panel_depth_mm > 0:
             solid -= _panel(p, side)
         elif p.panel_depth_mm < 0:
-            # It is lower than the heads, so that nothing touches it.
+            # The raised panel is lower than the heads, so it needs no hulls.
             solid += _panel(p, side)
     return [*front.inserts, *back.inserts, Part("wrench", p.material, solid, hulls)]
 
@@ -85,7 +85,7 @@ def build_wrench(p: WrenchParameters) -> list[Part]:
 def _slab(
     profile: CrossSection, thickness: float, bevel: float, cells: Sequence[CrossSection]
 ) -> Shape:
-    # Corners sharper than the bevel is wide would fold it over.
+    # Round corners that are sharper than the bevel, which would fold over them.
     profile = blend(profile, 0.3, 1.4 * bevel)
     return plate(profile, -thickness / 2, thickness / 2, bevel, cells)
 
@@ -97,23 +97,23 @@ def _half_width(p: WrenchParameters, x: float) -> float:
 
 
 def _shoulders(p: WrenchParameters, head: Head, side: int) -> CrossSection:
-    """The convex taper from a head, on the side +1 or -1, down to the shank."""
+    """The convex taper from the head at side +1 or -1 to the shank."""
     x = side * (p.center_distance_mm / 2 - head.neck_mm)
     half = _half_width(p, x)
-    # They run into the side of a box, but behind the jaws of an open end.
+    # The taper starts at the side of a box, but behind the jaws of an open end.
     radius = (0.37 if head.kind in ("open", "flare_nut") else 0.49) * head.diameter_mm
     disc = circle(radius, (side * p.center_distance_mm / 2, 0.0), 64)
     return CrossSection.hull_points(np.vstack([disc, [(x, -half), (x, half)]]))
 
 
 def _shank_cells(p: WrenchParameters) -> list[CrossSection]:
-    """The profiles that cut the shank into convex parts; none unless both its ends are simple.
+    """Regions that cut the shank into convex parts; empty unless both heads are simple.
 
-    The shank within a thicker head is left to the head.
+    The part of the shank inside a thicker head is left to the head.
     """
     half, far = p.center_distance_mm / 2, 100.0
     if p.swing_mm:
-        # The blend of the bends, a little of it, goes to the ends: jaws grip the middle.
+        # The bends belong to the end cells, because jaws grip the middle one.
         bend = _BEND * half - 0.7
         return [_rectangle(-bend, bend), *_swung_ends(p, bend)]
     joints: list[float] = []
@@ -131,12 +131,12 @@ def _shank_cells(p: WrenchParameters) -> list[CrossSection]:
 
 
 def _rectangle(x_low: float, x_high: float) -> CrossSection:
-    """All between two x."""
+    """The strip between two values of x."""
     return CrossSection.square((x_high - x_low, 200.0)).translate((x_low, -100.0))
 
 
 def _swung_ends(p: WrenchParameters, bend: float) -> list[CrossSection]:
-    """The profiles that cut off the ends of an S-shaped shank, at its bends and at its heads."""
+    """The cells of the two ends of an S-shaped shank, between a bend and a head each."""
     half = p.center_distance_mm / 2
     cells = []
     for head, side in ((p.front, 1), (p.back, -1)):
@@ -154,7 +154,7 @@ def _between(x_a: float, x_b: float) -> CrossSection:
 
 
 def _shank(p: WrenchParameters) -> np.ndarray:
-    """The outline of the shank alone, from the centre of one head to that of the other."""
+    """The outline of the shank alone, between the centres of the heads."""
     x_front, x_back = p.center_distance_mm / 2, -p.center_distance_mm / 2
     if p.swing_mm:
         path = _swung(p)
@@ -170,17 +170,17 @@ def _shank(p: WrenchParameters) -> np.ndarray:
 
 
 def _swung(p: WrenchParameters) -> np.ndarray:
-    """The middle line (n, 2) of an S-shaped shank: its middle is straight, for a gripper."""
+    """The middle line (n, 2) of an S-shaped shank; its middle is straight, for a gripper."""
     half = p.center_distance_mm / 2
     corners = [(-half, 0.0), (-_BEND * half, p.swing_mm), (_BEND * half, -p.swing_mm), (half, 0.0)]
-    # Closed far below, so that only the two bends are rounded.
+    # Close the loop far below, so that only the two bends are rounded.
     loop = [*corners, (half, -4 * half), (-half, -4 * half)]
     line = fillet(loop, [0.0, 0.1 * half, 0.1 * half, 0.0, 0.0, 0.0], 8)
     return line[:-2]
 
 
 def _panel(p: WrenchParameters, side: int) -> Manifold:
-    """The panel of one broad side of the shank, to subtract or add; side is +1 or -1."""
+    """The panel to subtract from or add to one broad side (+1 or -1) of the shank."""
     start = -p.center_distance_mm / 2 + 0.85 * p.back.diameter_mm
     end = p.center_distance_mm / 2 - 0.85 * p.front.diameter_mm
     half_start = 0.5 * p.panel_share * p.shank_width_back_mm
@@ -196,7 +196,7 @@ def _panel(p: WrenchParameters, side: int) -> Manifold:
             0.95 * half_start,
         )
     top = p.shank_thickness_mm / 2
-    # Its own bevel slopes the panel's walls, as a forging die leaves them.
+    # The bevel gives the panel sloped walls, as forging dies do.
     if p.panel_depth_mm > 0:
         panel = plate(outline, top - p.panel_depth_mm, top + 4.0, 0.6).solid
     else:

@@ -1,4 +1,4 @@
-"""The heads of wrenches: what stands at either end of a shank, and fits a nut, a pipe or a ring."""
+"""Heads of wrenches: the ends of a shank."""
 
 from dataclasses import dataclass, field
 
@@ -22,45 +22,45 @@ class Head:
     """One end of a wrench. Lengths in mm."""
 
     # open, box, ratchet (a box with a geared ring), flare_nut (a box with a gap for the pipe),
-    # adjustable, pipe, hook (of a hook spanner), tail (a round end with a hole to hang it by),
-    # spike (a taper to line up holes with) or bar (a handle, or a block to strike, across the end).
+    # adjustable, pipe, hook (of a hook spanner), tail (a round end with a hole), spike (a taper to
+    # align holes) or bar (a handle or striking block across the end).
     kind: str = "open"
-    # Size of the hexagon that it turns, across flats. For adjustable and pipe, how far the jaws
-    # stand open; for a tail, the diameter of the hole; for a hook, the length of its nose; for a
-    # spike, its length; for a bar, its depth along the shank.
+    # The hexagon's size across flats. For adjustable and pipe, the opening of the jaws; for a tail,
+    # the diameter of the hole; for a hook, the length of its nose; for a spike, its length; for a
+    # bar, its depth along the shank.
     size_mm: float = 17.0
-    # Diameter of the head; for adjustable and pipe, the width across it; for a spike, that of its
-    # foot; for a bar, its length.
+    # The head's diameter. For adjustable and pipe, the width across it; for a spike, the diameter
+    # of its foot; for a bar, its length.
     diameter_mm: float = 38.0
     thickness_mm: float = 8.8
     # Angle of the head's axis to the shank, in degrees.
     angle_deg: float = 0.0
-    # Points of a closed socket, 6 or 12.
+    # The number of points of a closed socket, 6 or 12.
     points: int = 12
-    # How far from the head's centre straight shoulders run down to the shank; 0 for none, when the
-    # blend alone joins the two.
+    # The distance from the head's centre at which straight shoulders meet the shank; 0: no
+    # shoulders, only the blend.
     neck_mm: float = 0.0
 
 
 @dataclass
 class HeadShape:
-    """A head in its place at the end of the shank, seen from above, and what is set into it."""
+    """A placed head, seen from above, with its inserts."""
 
-    # Forged in one with the shank; its edges are blended into it.
+    # The forged outline, which is blended with the shank's.
     profile: CrossSection
-    # Taken out of head and shank after blending: the slot of an open end, the hole of a box.
+    # The area cut out after blending: the slot of an open end or the hole of a box.
     cut: CrossSection
-    # Parts that take their room from the forging: jaws, screws, rings.
+    # Separate parts that replace forged material: jaws, screws and rings.
     inserts: list[Part] = field(default_factory=list)
-    # The profiles that cut the head into convex parts, for collision; triangles if empty.
+    # Regions that cut the head into convex parts for collision; empty: triangles are used.
     cells: list[CrossSection] = field(default_factory=list)
 
 
 def head_shape(head: Head, x: float, heading_deg: float, bevel_mm: float) -> HeadShape:
-    """The head at (x, 0), its axis rotated by `heading_deg` (and its own angle) from +x.
+    """The head at (x, 0), with its axis turned by `heading_deg` plus its own angle from +x.
 
     Raises:
-        ValueError: there is no such kind of head.
+        ValueError: the kind of head is not known.
     """
     if head.kind not in _KINDS:
         raise ValueError(f"no wrench head is called {head.kind!r}, only {', '.join(_KINDS)}")
@@ -76,7 +76,7 @@ def _put(profile: CrossSection, x: float, turn_deg: float) -> CrossSection:
 
 
 def _set(part: Part, x: float, turn_deg: float) -> Part:
-    """A part built about the origin, its axis along +x, moved to its head."""
+    """Moves a part built about the origin, with its axis along +x, to its head."""
     c, s = np.cos(np.radians(turn_deg)), np.sin(np.radians(turn_deg))
     R = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
     solid = part.solid.rotate((0.0, 0.0, turn_deg)).translate((x, 0.0, 0.0))
@@ -94,9 +94,9 @@ def _flat_part(
 
 
 def _open(head: Head, x: float, turn_deg: float, bevel: float) -> HeadShape:
-    """A disc with the two jaws drawn forward.
+    """A disc with two jaws in front.
 
-    The slot has parallel flanks, a floor of two facets of the hexagon, and slightly opened lips.
+    The slot has parallel flanks, a floor of two facets of the hexagon, and slightly flared lips.
     """
     radius = head.diameter_mm / 2
     cheek = (0.82 if head.neck_mm else 0.9) * radius
@@ -113,7 +113,7 @@ def _open(head: Head, x: float, turn_deg: float, bevel: float) -> HeadShape:
     )
     disc = CrossSection([circle(radius, segments=64)]) + CrossSection([jaws])
     half, depth = head.size_mm / 2, 0.42 * radius
-    # Heads with straight shoulders are straight all over: convex pieces fill them well.
+    # Heads with straight shoulders have straight outlines, which convex pieces fill well.
     apex, corner = (0.12 * half, 0.12 * half) if head.neck_mm else (2.0 * half, 0.35 * half)
     slot = fillet(
         [
@@ -127,7 +127,7 @@ def _open(head: Head, x: float, turn_deg: float, bevel: float) -> HeadShape:
         ],
         [apex, corner, 1.0, 0.0, 0.0, 1.0, corner],
     )
-    # Two jaws, and either half of what is behind the floor.
+    # The two jaws and the two halves behind the floor.
     far, floor = 2.0 * radius, -depth + 0.2 * half
     cells = [
         _rectangle(floor, far, half, far),
@@ -146,7 +146,7 @@ def _open(head: Head, x: float, turn_deg: float, bevel: float) -> HeadShape:
 
 
 def _socket(head: Head) -> CrossSection:
-    """A closed hole: one hexagon for 6 points, two of them for 12."""
+    """A closed hole: a hexagon for 6 points, two hexagons for 12."""
     hexagon = CrossSection([circle(head.size_mm / np.sqrt(3), segments=6)])
     return hexagon if head.points == 6 else hexagon + hexagon.rotate(30)
 
@@ -157,11 +157,11 @@ def _box(head: Head, x: float, turn_deg: float, bevel: float) -> HeadShape:
 
 
 def _ratchet(head: Head, x: float, turn_deg: float, bevel: float) -> HeadShape:
-    """A round housing with a dark geared ring in it, and the lever that reverses it on top."""
+    """A round housing with a dark geared ring, and a reversing lever on top."""
     shape = _box(head, x, turn_deg, bevel)
     top, outer = head.thickness_mm / 2, head.diameter_mm / 2 - bevel
     radius = 0.68 * head.size_mm + 0.8
-    # The ring is a little deeper than the housing that it turns in.
+    # The ring is recessed in the housing.
     bore = CrossSection([circle(radius)])
     ring = plate(CrossSection([circle(radius + 0.02)]) - _socket(head), -top + 0.6, top - 0.6, 0.4)
     shape.cut = bore.translate((x, 0.0))
@@ -184,14 +184,14 @@ def _ratchet(head: Head, x: float, turn_deg: float, bevel: float) -> HeadShape:
 
 
 def _flare_nut(head: Head, x: float, turn_deg: float, bevel: float) -> HeadShape:
-    """A 6-point box with a gap, narrower than the nut, that lets the pipe through."""
+    """A 6-point box with a gap for the pipe, narrower than the nut."""
     radius, half_gap = head.diameter_mm / 2, 0.36 * head.size_mm
     disc = CrossSection([circle(radius, segments=48)])
     gap = [(0.0, -half_gap), (1.4 * radius, -half_gap), (1.4 * radius, half_gap), (0.0, half_gap)]
     cut = CrossSection([circle(head.size_mm / np.sqrt(3), segments=6)]) + CrossSection(
         [np.array(gap)]
     )
-    # The wall on either side of the gap, and on each of the four other sides of the hexagon.
+    # One cell for each sixth of the ring.
     cells = []
     for i in range(6):
         start, end = np.radians([60.0 * i, 60.0 * i + 60.0])
@@ -205,7 +205,7 @@ def _flare_nut(head: Head, x: float, turn_deg: float, bevel: float) -> HeadShape
 
 
 def _tail(head: Head, x: float, turn_deg: float, bevel: float) -> HeadShape:
-    """A round end with a hole to hang the wrench by."""
+    """A round end with a hole to hang up the wrench."""
     disc = CrossSection([circle(head.diameter_mm / 2, (x, 0.0), 32)])
     return HeadShape(disc, CrossSection([circle(head.size_mm / 2, (x, 0.0), 32)]))
 
@@ -214,7 +214,7 @@ def _tail(head: Head, x: float, turn_deg: float, bevel: float) -> HeadShape:
 
 
 def _knurled(radius: float, length: float, ridges: int) -> Part:
-    """A screw along x about the origin, with ridges around it."""
+    """A ridged screw along x about the origin."""
     ring = circle(radius, segments=20)
     stations = np.linspace(-length / 2, length / 2, 2 * ridges + 1)
     sections = [
@@ -224,9 +224,9 @@ def _knurled(radius: float, length: float, ridges: int) -> Part:
 
 
 def _adjustable(head: Head, x: float, turn_deg: float, bevel: float) -> HeadShape:
-    """A fixed jaw forged with the head, a sliding jaw, and the knurled screw that moves it.
+    """A forged fixed jaw, a sliding jaw, and the knurled screw that moves it.
 
-    Drawn about the foot of the jaws, which point to +x; the fixed jaw is on the side of +y.
+    Drawn about the foot of the jaws, which point to +x; the fixed jaw is at +y.
     """
     s, gap = head.diameter_mm / 42.0, head.size_mm
     body = s * fillet(
@@ -284,9 +284,9 @@ def _adjustable(head: Head, x: float, turn_deg: float, bevel: float) -> HeadShap
 
 
 def _pipe(head: Head, x: float, turn_deg: float, bevel: float) -> HeadShape:
-    """A toothed heel jaw, and the hook jaw that a knurled nut draws through the housing.
+    """A toothed heel jaw, and a hook jaw in a housing with a knurled nut.
 
-    Drawn about the middle of the heel jaw's face, which looks to +x.
+    Drawn about the middle of the heel jaw's face, which faces +x.
     """
     s, gap = head.diameter_mm / 34.0, head.size_mm
     body = s * fillet(
@@ -349,9 +349,9 @@ def _pipe(head: Head, x: float, turn_deg: float, bevel: float) -> HeadShape:
 
 
 def _hook(head: Head, x: float, turn_deg: float, bevel: float) -> HeadShape:
-    """A third of a ring that ends in a nose, which points at the ring's middle.
+    """A third of a ring that ends in a nose pointing at the ring's centre.
 
-    The ring leaves the shank along its axis and bends to the side of +y.
+    The ring leaves the shank along its axis and bends to +y.
     """
     radius = head.diameter_mm / 2
     angles = np.radians(np.linspace(-96.0, 40.0, 25))

@@ -1,1 +1,1 @@
-"""Tools made from their catalogue entries, or drawn at random."""
+"""Generates tools from catalogue entries or at random."""

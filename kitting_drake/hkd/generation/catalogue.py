@@ -1,4 +1,4 @@
-"""The catalogue: what makes up each generated tool, `models/tools/catalogue.yaml`."""
+"""The catalogue of the generated tools, `models/tools/catalogue.yaml`."""
 
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -11,12 +11,12 @@ from kitting_drake.hkd.tools.tool import CATEGORIES
 
 
 class CatalogueError(UserError):
-    """A catalogue entry that cannot be used; the message names entry and field."""
+    """An invalid catalogue entry; the message names the entry and the field."""
 
 
 @dataclass
 class GraspEntry:
-    """A grasp annotated by hand in frame T: the jaws close along +y rotated by theta about +z."""
+    """An annotated grasp in frame T: the jaws close along +y rotated by theta about +z."""
 
     x_mm: float = 0.0
     y_mm: float = 0.0
@@ -30,15 +30,15 @@ class ToolEntry:
     name: str
     category: str
     split: str
-    # The design is scaled to this length.
+    # The length to scale the design to.
     length_mm: float
     grasp: GraspEntry
-    # Departures from the defaults of the category's parameters.
+    # Overrides of the category's default parameters.
     parameters: dict[str, Any] = field(default_factory=dict)
 
 
 def load_catalogue(path: Path) -> list[ToolEntry]:
-    """Reads `catalogue.yaml`; raises CatalogueError for an entry that cannot be used."""
+    """Reads `catalogue.yaml`; raises CatalogueError for an invalid entry."""
     try:
         data = yaml.safe_load(path.read_text())
     except OSError as error:
@@ -46,7 +46,7 @@ def load_catalogue(path: Path) -> list[ToolEntry]:
     except yaml.YAMLError as error:
         raise CatalogueError(f"{path}: {' '.join(str(error).split())}") from error
     if not isinstance(data, dict) or not isinstance(data.get("tools"), list):
-        raise CatalogueError(f"{path}: it has to hold a list named `tools`")
+        raise CatalogueError(f"{path}: it must hold a list named `tools`")
     entries: list[ToolEntry] = []
     for item in data["tools"]:
         name = item.get("name", f"number {len(entries) + 1}")
@@ -56,10 +56,11 @@ def load_catalogue(path: Path) -> list[ToolEntry]:
             raise CatalogueError(f"{path}: tool {name}: {error}") from error
         if entries[-1].category not in CATEGORIES:
             raise CatalogueError(
-                f"{path}: tool {name}: category {entries[-1].category!r} is none of "
+                f"{path}: tool {name}: category {entries[-1].category!r} is not one of "
                 f"{', '.join(CATEGORIES)}"
             )
     names = [e.name for e in entries]
-    if len(set(names)) != len(names):
-        raise CatalogueError(f"{path}: two tools share a name")
+    for name in set(names):
+        if names.count(name) > 1:
+            raise CatalogueError(f"{path}: two tools are called {name!r}; rename one")
     return entries

@@ -1,8 +1,6 @@
-"""Makes the model of a hand tool from its catalogue entry: meshes, SDFormat and `tool.yaml`.
+"""Generates the model of a tool from its catalogue entry: meshes, SDFormat and `tool.yaml`.
 
-The tool frame T: z up, the table is the plane z = 0 when the tool rests on it, x along the length
-with the working end toward +x, the origin in the middle of the visual bounding box's footprint.
-Solids are handled in mm and written in metres.
+`Tool` defines the tool frame T. Solids are handled in mm and written in metres.
 """
 
 import dataclasses
@@ -36,20 +34,19 @@ from kitting_drake.hkd.tools.stable_pose import stable_poses
 from kitting_drake.hkd.tools.symmetry import symmetry_order
 from systems.hand_geometry import FINGER_LENGTH, PAD_LENGTH
 
-# The cavities of a kit stand this far off a tool's outline: what is narrower than twice this is no
-# part of a cavity, so collision hulls may bridge it.
+# The clearance of a kit's cavities. Collision hulls may bridge notches narrower than twice this,
+# because cavities do too.
 CAVITY_CLEARANCE_MM = 2.0
-# How far joining two collision hulls may move the outline, and thinning their vertices.
+# Tolerances of the outline for merging collision hulls, and for thinning their vertices.
 MERGE_TOLERANCE_MM = 0.25
 VERTEX_TOLERANCE_MM = 0.2
-# The same for the faces that the jaws grip.
+# The tolerance for merging at the gripped faces.
 GRIP_TOLERANCE_MM = 0.06
-# How far off the middle of those faces a grasp may be annotated.
+# The largest distance of an annotated grasp from the middle of the gripped faces.
 GRIP_CENTRING_MM = 0.2
-# Edges sharper than this are drawn as edges.
+# Edges sharper than this are shaded as edges.
 CREASE_ANGLE_DEG = 35.0
-# Along the tool, what is gripped by the pads and passed by the fingers; a little longer than they
-# are, as the hand may stand a little beside the grasp.
+# The lengths of the pads and fingers along the tool, with a margin for a hand off its grasp.
 PAD_LENGTH_MM = round(1e3 * PAD_LENGTH + 0.4, 3)
 FINGER_LENGTH_MM = round(1e3 * FINGER_LENGTH + 1.2, 3)
 
@@ -68,23 +65,23 @@ class Report:
     description: dict[str, Any]
     triangles: int
     collision_hulls: int
-    # The furthest that the collision outline is outside and inside the visual outline.
+    # The largest distance of the collision outline outside and inside the visual outline.
     outside_mm: float
     inside_mm: float
-    # Collision less visual: lowest point, highest point, gripped width.
+    # Collision minus visual: lowest point, highest point and gripped width.
     bottom_error_mm: float
     top_error_mm: float
     grip_error_mm: float
-    # How much the gripped faces' distance varies along the pads, and how far anything beside them
-    # stands out where the fingers pass.
+    # The variation of the gripped faces along the pads, and how far the tool sticks out past them
+    # at the fingers.
     grip_flatness_mm: float
     finger_overhang_mm: float
-    # Tilt of the stable pose from the design's.
+    # The tilt of the stable pose from the design's.
     tilt_deg: float
 
 
 def build_parts(entry: ToolEntry) -> list[Part]:
-    """The tool's parts in the design frame, scaled to its length and free of overlaps; mm."""
+    """The tool's parts in the design frame in mm, scaled to its length and without overlaps."""
     parameters_type, build = DESIGNS[entry.category]
     known = {f.name for f in dataclasses.fields(parameters_type)}
     if unknown := sorted(set(entry.parameters) - known):
@@ -113,10 +110,10 @@ def homogeneous(parts: list[Part]) -> list[Body]:
 
 
 def rest_rotation(points: np.ndarray, center_of_mass: np.ndarray) -> np.ndarray:
-    """The rotation R_TD (3, 3) to the stable pose of a body that is nearest to its design pose.
+    """R_TD (3, 3): the rotation to the stable pose nearest to the design pose.
 
     Args:
-        points: (n, 3) whose convex hull is the body's, in the design frame D.
+        points: (n, 3) in the design frame D; their convex hull is the body's.
         center_of_mass: (3,) in D.
     """
     poses = stable_poses(points, center_of_mass)
@@ -125,11 +122,11 @@ def rest_rotation(points: np.ndarray, center_of_mass: np.ndarray) -> np.ndarray:
 
 
 def generate_tool(entry: ToolEntry, directory: Path) -> Report:
-    """Writes the model of one tool to `directory`, replacing what is there.
+    """Writes a tool's model to `directory` atomically, replacing an older one.
 
     Raises:
-        CatalogueError: the entry makes no tool that can be used.
-        MachineError: it cannot be written. In both cases what is there remains.
+        CatalogueError: the entry does not make a usable tool.
+        MachineError: the model cannot be written. In both cases the older one remains.
     """
     try:
         directory.parent.mkdir(parents=True, exist_ok=True)
@@ -147,12 +144,12 @@ def _write_tool(entry: ToolEntry, directory: Path) -> Report:
     """Writes the model of one tool into an empty folder; see `generate_tool`."""
     parts = build_parts(entry)
     mass, center, inertia = mass_properties(homogeneous(parts))
-    # Hulls are merged in the stable pose: outline and heights are those of that pose.
+    # Merge the hulls in the stable pose, whose outline and heights matter.
     R_TD, p_T, whole = _tool_frame(entry, parts, center)
     outline = closed(whole.project(), CAVITY_CLEARANCE_MM)
     hulls = _collision_hulls(parts, R_TD, p_T, outline, entry.grasp)
     box = np.array(whole.bounding_box()).reshape(2, 3)
-    grip = _measure_grasp(entry.grasp, whole)
+    grip = _measure_grasp(entry, whole)
 
     center = R_TD @ center + 1e-3 * p_T
     inertia = R_TD @ inertia @ R_TD.T
@@ -179,7 +176,7 @@ def _write_tool(entry: ToolEntry, directory: Path) -> Report:
         inside_mm=furthest(outline, closed(projection(hulls), CAVITY_CLEARANCE_MM)),
         bottom_error_mm=points[:, 2].min() - box[0, 2],
         top_error_mm=points[:, 2].max() - box[1, 2],
-        grip_error_mm=_measure_grasp(entry.grasp, solid_hulls).width - grip.width,
+        grip_error_mm=_measure_grasp(entry, solid_hulls).width - grip.width,
         grip_flatness_mm=grip.flatness,
         finger_overhang_mm=grip.overhang,
         tilt_deg=float(np.degrees(np.arccos(min(1.0, R_TD[2, 2])))),
@@ -192,9 +189,9 @@ def _tool_frame(
     """R_TD, p_T (mm), and the union of the parts (mm) in the tool frame T.
 
     Args:
-        entry: of the tool.
-        parts: of the tool in the design frame D.
-        center: of mass, (3,) in D, in metres.
+        entry: the tool's.
+        parts: in the design frame D.
+        center: (3,) the centre of mass in D, in metres.
 
     Raises:
         CatalogueError: the parts do not touch.
@@ -213,7 +210,7 @@ def _tool_frame(
 def _collision_hulls(
     parts: list[Part], R_TD: np.ndarray, p_T: np.ndarray, outline: CrossSection, grasp: GraspEntry
 ) -> list[np.ndarray]:
-    """The collision hulls (n, 3), few, in T in mm, in an order that depends on nothing else."""
+    """The collision hulls (n, 3) in T in mm, in a deterministic order."""
     hulls = [h @ R_TD.T + p_T for part in parts for h in part.hulls]
     covering = cover(hulls, outline, _allowed(outline, grasp), MERGE_TOLERANCE_MM)
     return sorted(
@@ -223,7 +220,7 @@ def _collision_hulls(
 
 
 def _allowed(outline: CrossSection, grasp: GraspEntry) -> CrossSection:
-    """The region of the collision hulls: a little more than the outline, but not at the grip."""
+    """The region that collision hulls may cover: the outline and a margin, small at the grip."""
 
     def grown(distance: float) -> CrossSection:
         return outline.offset(distance, JoinType.Round, circular_segments=96)
@@ -240,7 +237,7 @@ def _moved(solid: Manifold, R: np.ndarray, p: np.ndarray) -> Manifold:
 def _write_visuals(
     parts: list[Part], R_TD: np.ndarray, p_T: np.ndarray, directory: Path
 ) -> tuple[list[tuple[str, str]], int]:
-    """One OBJ per material; returns (file, material) pairs and the number of triangles."""
+    """Writes one OBJ per material; returns (file, material) pairs and the number of triangles."""
     visuals, triangles = [], 0
     for material in sorted({part.material for part in parts}):
         solids = [part.solid for part in parts if part.material == material]
@@ -255,20 +252,22 @@ class _GripReport:
     """Measurements of a grasp; lengths in mm."""
 
     width: float
-    # How much the gripped faces vary along the pads.
+    # The variation of the gripped faces along the pads.
     flatness: float
-    # How far anything beside the pads stands out where the fingers pass.
+    # How far the tool sticks out past the gripped faces at the fingers.
     overhang: float
-    # Height of the tool's top there.
+    # The height of the tool's top at the grasp.
     top: float
 
 
-def _measure_grasp(grasp: GraspEntry, solid: Manifold) -> _GripReport:
-    """Measures a grasp on a tool at rest in its frame T.
+def _measure_grasp(entry: ToolEntry, solid: Manifold) -> _GripReport:
+    """Measures the annotated grasp on a tool at rest in its frame T.
 
     Raises:
         CatalogueError: the jaws cannot hold the tool there.
     """
+    grasp = entry.grasp
+    named = f"tool {entry.name}: the grasp at ({grasp.x_mm}, {grasp.y_mm}) mm"
     vertices, faces = meshes.vertices_and_faces(solid)
     triangles = vertices[faces]
     theta = np.radians(grasp.theta_deg)
@@ -278,21 +277,18 @@ def _measure_grasp(grasp: GraspEntry, solid: Manifold) -> _GripReport:
         x, y = (grasp.x_mm, grasp.y_mm) + offset * along
         found = find_grip(triangles, x, y, theta, length)
         if found is None:
-            raise CatalogueError(f"there is nothing to grasp at ({x:.2f}, {y:.2f}) mm")
+            raise CatalogueError(f"{named} holds nothing at ({x:.2f}, {y:.2f}) mm")
         return found
 
     pad, finger = grip(0.0, PAD_LENGTH_MM), grip(0.0, FINGER_LENGTH_MM)
     slices = [grip(offset, 0.5) for offset in np.linspace(-0.5, 0.5, 7) * (PAD_LENGTH_MM - 0.5)]
     if not 8.0 <= pad.width <= 35.0:
-        raise CatalogueError(
-            f"the grasp at ({grasp.x_mm}, {grasp.y_mm}) mm holds {pad.width:.1f} mm; "
-            "it has to be 8 to 35 mm"
-        )
+        raise CatalogueError(f"{named} is {pad.width:.1f} mm wide; it must be 8 to 35 mm")
     if abs(pad.middle) > GRIP_CENTRING_MM:
-        # The jaws would draw the tool over as they close, and put it down as much beside its place.
+        # Closing jaws would shift the tool, and it would be placed with the same offset.
         raise CatalogueError(
-            f"the grasp at ({grasp.x_mm}, {grasp.y_mm}) mm is not centred between the faces that "
-            f"it grips, but {pad.middle:+.2f} mm off along the jaws"
+            f"{named} is not centred between the gripped faces: move it by "
+            f"{pad.middle:+.2f} mm along the jaws"
         )
     return _GripReport(
         width=pad.width,

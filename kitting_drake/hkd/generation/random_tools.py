@@ -1,8 +1,8 @@
-"""Tools drawn at random, to learn from: shapes that no catalogue has.
+"""Random tools for training: shapes that are not in the catalogue.
 
-Most are designs of the training split with every proportion drawn anew; some are composed of plain
-solids, as mallets, keys, scrapers and chisels are. Then the whole is stretched, splayed, bent and
-mirrored. They are shapes only: with meshes and grasps, but without collision geometry or files.
+Most are designs of the training split with random proportions. The others are composed of simple
+solids, like mallets, keys, scrapers and chisels. All are randomly stretched, splayed, bent and
+mirrored. They have surfaces and grasps, but no collision geometry and no files.
 """
 
 import copy
@@ -35,17 +35,17 @@ Array = NDArray[np.float64]
 _LENGTHS = (0.11, 0.23)
 """The range of the tools' lengths, in metres."""
 _HIGHEST = 0.046
-"""Higher tools do not fit into a kit's block, in metres."""
+"""The largest height that fits into a kit's block, in metres."""
 _COMPOSED = 0.25
-"""The share of tools that are composed of plain solids."""
+"""The share of tools composed of simple solids."""
 _JITTER = 0.22
-"""Each length and angle of a design is multiplied by up to 1 plus or minus this."""
+"""The logarithm of the largest factor on each length and angle of a design."""
 _REFINED = 6.0
-"""Triangles have edges of at most this before they are bent, in mm."""
+"""The longest edge of triangles before the warp, in mm."""
 _SIMPLIFIED = 0.08
-"""The surface may then move by this, in mm."""
+"""The tolerance of the simplification after the warp, in mm."""
 _POOR_GRASP = 3.0
-"""Grasps that cost more than this are no grasps to learn from; see `GraspProposal.cost`."""
+"""Grasps that cost more are not used; see `GraspProposal.cost`."""
 _ATTEMPTS = 40
 
 
@@ -54,9 +54,9 @@ class RandomTool(Tool):
     """A tool without files."""
 
     surface: Array = field(default_factory=lambda: np.zeros((0, 3, 3)), repr=False)
-    """(n, 3, 3) its triangles in T, in metres."""
+    """(n, 3, 3) the triangles in T, in metres."""
     grasps: tuple[GraspProposal, ...] = ()
-    """Grasps that would hold it, the best first."""
+    """Possible grasps, best first."""
 
     @property
     def triangles(self) -> Array:
@@ -64,25 +64,25 @@ class RandomTool(Tool):
 
 
 def draw_tool(entries: Sequence[ToolEntry], rng: np.random.Generator, name: str) -> RandomTool:
-    """A random tool that rests on the table and that the hand can hold.
+    """Draws a random tool that rests on the table and that the hand can hold.
 
     Args:
-        entries: designs to depart from.
+        entries: the designs to vary.
         rng: for all draws.
         name: of the tool.
 
     Raises:
-        UserError: many attempts made none.
+        UserError: no attempt gave a usable tool.
     """
     for _ in range(_ATTEMPTS):
         try:
             tool = _attempt(entries, rng, name)
         except (UserError, QhullError, ValueError, ZeroDivisionError, IndexError, TypeError):
-            # Proportions that contradict each other make no solid: the next draw may.
+            # Contradictory proportions make no solid; try again.
             continue
         if tool is not None:
             return tool
-    raise UserError(f"{_ATTEMPTS} attempts drew no tool that can be used")
+    raise UserError(f"none of {_ATTEMPTS} attempts drew a usable random tool")
 
 
 def _attempt(
@@ -135,7 +135,7 @@ def _attempt(
 
 
 def _varied(entry: ToolEntry, rng: np.random.Generator) -> ToolEntry:
-    """The design with its proportions drawn anew; those that it leaves at their defaults too."""
+    """The design with random proportions, including those at their default values."""
     defaults = DESIGNS[entry.category][0]()
     parameters = {
         key: value for key, value in vars(defaults).items() if isinstance(value, float)
@@ -160,17 +160,17 @@ def _jittered(key: str, value: Any, rng: np.random.Generator, spread: float) -> 
 
 @dataclass(frozen=True)
 class _Warp:
-    """A map of points (n, 3) in mm: stretched and splayed across the tool's axis, then bent."""
+    """A map of points (n, 3) in mm: stretch and splay across the tool's axis x, then bend."""
 
     low: float
-    """The lower end of the tool along its axis, x."""
+    """The tool's lower end along x."""
     length: float
     stretch: Array
-    """(2,): along y and z."""
+    """(2,) factors along y and z."""
     splay: float
-    """By how much wider, as a share, the forward end gets than the middle."""
+    """The relative widening of the forward end against the middle."""
     bend: Array
-    """(2,): coefficients of the square and the cube of x, in half lengths."""
+    """(2,) coefficients of the square and the cube of x in half lengths, from the middle."""
 
     @classmethod
     def draw(cls, solid: Manifold, rng: np.random.Generator) -> "_Warp":
@@ -197,7 +197,7 @@ def _centroid(solid: Manifold) -> Array:
 
 
 def _composed(rng: np.random.Generator) -> Manifold:
-    """A shaft along x with one to four solids at its ends and along it, in mm, lying flat."""
+    """A shaft along x with one to four solids at its ends or along it, in mm, lying flat."""
     length = 180.0
     width, height = rng.uniform(6, 30), rng.uniform(5, 28)
     solid = _bar(length, width, height, rng)
@@ -234,7 +234,7 @@ def _composed(rng: np.random.Generator) -> Manifold:
 
 
 def _bar(length: float, width: float, height: float, rng: np.random.Generator) -> Manifold:
-    """A bar along x with a rectangular, rounded or elliptic section, perhaps tapered."""
+    """A bar along x with a rectangular, rounded or elliptic section that may taper."""
     kind = rng.integers(3)
     if kind == 0:
         section = CrossSection.square((width, height), True)
@@ -247,5 +247,5 @@ def _bar(length: float, width: float, height: float, rng: np.random.Generator) -
         section = CrossSection.circle(0.5, 32).scale((width, height))
     top = (rng.uniform(0.5, 1.0), rng.uniform(0.7, 1.0))
     bar = section.extrude(length, scale_top=top).translate((0, 0, -length / 2))
-    # The section stood in the xy plane: its width goes along y, its height along z.
+    # Turn the extrusion from z to x, with the section's width along y and its height along z.
     return bar.rotate((0, 90, 0)).rotate((90, 0, 0))

@@ -1,1 +1,1 @@
-"""Grasps: proposed and annotated."""
+"""Grasps: measured and proposed from a tool's surface."""

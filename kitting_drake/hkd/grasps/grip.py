@@ -1,7 +1,7 @@
 """The grip: the faces between which the jaws hold a tool from above.
 
-The pads close on whatever reaches furthest between them. So a grip is the extent, across the jaws,
-of the part of the surface between two planes: those through the ends of the pads.
+The pads close on the surface that reaches furthest between them. So a grip is the extent, along the
+closing direction, of the surface between the two planes through the pads' ends.
 """
 
 from dataclasses import dataclass
@@ -14,37 +14,37 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Grip:
-    """The extent of a surface between the jaws, in the unit of its triangles."""
+    """The extent of the surface between the jaws, in the unit of the triangles."""
 
     low: float
-    """The least coordinate along the closing direction, from where the hand is."""
+    """The least coordinate along the closing direction, measured from (x, y) of `find_grip`."""
     high: float
     top: float
     """The greatest height."""
 
     @property
     def width(self) -> float:
-        """The distance of the faces that are gripped."""
+        """The distance between the gripped faces."""
         return self.high - self.low
 
     @property
     def middle(self) -> float:
-        """The coordinate along the closing direction halfway between those faces."""
+        """The coordinate halfway between the gripped faces."""
         return (self.low + self.high) / 2
 
 
 def find_grip(triangles: Array, x: float, y: float, theta: float, length: float) -> Grip | None:
-    """The grip of pads of a length along the tool, wherever they stand across it.
+    """The grip of pads of a given length, independent of their position across the tool.
 
     Args:
-        triangles: (n, 3, 3) of the surface of a tool in its frame T.
+        triangles: (n, 3, 3) the surface of a tool in its frame T.
         x: of the middle of the pads in T.
         y: the same.
         theta: the rotation of the hand about T's z, in radians; at zero the jaws close along y.
-        length: of the pads, across the closing direction.
+        length: of the pads, perpendicular to the closing direction.
 
     Returns:
-        The grip, or None where there is nothing between the pads.
+        The grip, or None if nothing is between the pads.
     """
     along, across = jaw_axes(theta)
     points = _points_between(triangles - (x, y, 0.0), np.append(along, 0.0), length / 2)
@@ -55,13 +55,13 @@ def find_grip(triangles: Array, x: float, y: float, theta: float, length: float)
 
 
 def jaw_axes(theta: float) -> tuple[Array, Array]:
-    """The directions (2,) along the pads and across them, in which the jaws close, in T."""
+    """The unit vectors (2,) in T along the pads and along the closing direction."""
     along = np.array([np.cos(theta), np.sin(theta)])
     return along, np.array([-along[1], along[0]])
 
 
 def _points_between(triangles: Array, normal: Array, distance: float) -> Array:
-    """The corners (m, 3) of what is left of triangles (n, 3, 3) between two parallel planes."""
+    """The corners (m, 3) of triangles (n, 3, 3) clipped to |normal . p| <= distance."""
     starts, ends = triangles.reshape(-1, 3), np.roll(triangles, -1, axis=1).reshape(-1, 3)
     start_heights, end_heights = starts @ normal, ends @ normal
     found = [starts[np.abs(start_heights) <= distance]]

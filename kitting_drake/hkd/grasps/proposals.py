@@ -1,9 +1,9 @@
 """Grasp proposals computed from a tool's surface (section IV-B.3 of the paper).
 
-The jaws of a hand that comes from above close on whatever stands out furthest between them. So for
-a rotation theta of the hand and a place u along its pads, all that matters of the tool is how far
-it reaches to either side, at each height. The tool's horizontal slices give that, and the place of
-the grasp along the closing direction follows, because a grasp is centred between its faces.
+The jaws of a hand that comes from above close on the surface that stands out furthest between them.
+So for a rotation theta of the hand and a position u along its pads, only the tool's extent to
+either side at each height matters. Horizontal slices of the tool give these extents. The position
+along the closing direction follows, because a grasp is centred between the gripped faces.
 """
 
 from dataclasses import dataclass, field, replace
@@ -18,60 +18,59 @@ from systems.pick_place_parameters import PickPlaceParameters
 
 Array = NDArray[np.float64]
 
-# Lengths in m, as everywhere here.
+# Lengths are in m.
 PLANNER = PickPlaceParameters()
-"""How the hand picks and places by default: tools are annotated, and kits laid out, for this."""
+"""The default planner, for which tools are annotated and kits laid out."""
 GRASP_DEPTH = PLANNER.grasp_depth
-"""How far the pads reach below the tool's top."""
+"""The depth of the pads below the tool's top."""
 FLOOR_CLEARANCE = PLANNER.floor_clearance
-"""The pads are never lower than this above the table."""
+"""The least height of the pads above the table."""
 WIDEST = MAX_OPENING - 0.015
-"""The greatest width that the jaws take, with a margin on either side."""
+"""The largest width to grasp, which leaves a margin on either side."""
 NARROWEST = 0.003
-"""The least width that is worth a grasp."""
+"""The smallest width to grasp."""
 RELEASE_REACH = PLANNER.release_clearance + FINGERTIP_DEPTH
-"""How far the fingertips reach beyond the gripped faces as they let go."""
+"""The reach of the fingertips beyond the gripped faces when they release."""
 
-# Surface that stands back by less than this touches a pad.
+# Surface that stands back by less than this touches a pad, in the fine and the coarse search.
 _TOUCH = 0.0003
-# The same while the hand is rotated in coarse steps.
 _COARSE_TOUCH = 0.0008
-# The hand's upper fingers stand this much further out than its pads.
+# The hand's upper fingers are set back from its pads by this much.
 _FINGER_RECESS = 0.003
-# Steeper than this, faces that narrow upward slip down out of the pads.
+# Faces that narrow upward at more than this angle slip out of the pads.
 _STEEPEST = np.radians(28.0)
-# The least share of the pads' length that touches on both sides at once.
+# The least share of the pads' length that touches on both sides.
 _LEAST_CONTACT = 0.15
-# From the middle of a tool in its kit to where a neighbour begins.
+# The distance from the middle of a tool in its kit to a neighbour.
 _LANE = 0.040
 
 _BIN, _STEP = 0.0005, 0.001
 _COARSE_DEG, _FINE_DEG = 5.0, 0.5
 _MOST_PROPOSALS = 12
-# Proposals nearer than this to a better one are left out.
+# Proposals this close to a better one are dropped.
 _DISTINCT, _DISTINCT_ANGLE = 0.012, np.radians(20.0)
 
 
 @dataclass(frozen=True)
 class GraspProposal(Grasp):
-    """A grasp in frame T with the figures that speak for and against it."""
+    """A grasp in frame T with the measures that rank it."""
 
     offset: float
-    """Distance of the centre of mass from the grasp, seen from above, in metres."""
+    """The horizontal distance between the centre of mass and the grasp, in metres."""
     contact: float
-    """Share of the pads' length, 0 to 1, along which both of them touch."""
+    """The share of the pads' length, 0 to 1, along which both touch."""
     depth: float
-    """Share of the pads' reach below the tool's top, 0 to 1, over which both of them touch."""
+    """The share of the pads' depth below the tool's top, 0 to 1, over which both touch."""
     slope: float
-    """How far the gripped faces lean where the pads' lower edges bear on them, in radians."""
+    """The inward lean of the gripped faces at the pads' lower edges, in radians."""
     overhang: float
-    """How far the tool stands out past the gripped faces beside the pads, in metres."""
+    """The distance that the tool stands out past the gripped faces at the fingers, in metres."""
     penalties: dict[str, float] = field(default_factory=dict)
-    """The parts of the cost, by cause."""
+    """The terms of the cost by cause."""
 
     @property
     def cost(self) -> float:
-        """The sum of the penalties, by which proposals are ranked; above 3 is poor."""
+        """The sum of the penalties, which ranks proposals; above 3 is poor."""
         return sum(self.penalties.values())
 
     @property
@@ -83,13 +82,12 @@ class GraspProposal(Grasp):
 def propose_grasps(
     triangles: Array, center_of_mass: Array, planner: PickPlaceParameters = PLANNER
 ) -> list[GraspProposal]:
-    """Grasps from above, the best first; empty if the hand can hold the tool nowhere.
+    """Grasps from above, best first; empty if the hand cannot hold the tool.
 
     Args:
-        triangles: (n, 3, 3) of the surface in frame T, in metres, the table at z = 0.
+        triangles: (n, 3, 3) the surface in frame T, in metres, with the table at z = 0.
         center_of_mass: (2,) or (3,) in T, in metres.
-        planner: how deep the pads reach, how far they stay above the table, and how far the jaws
-            draw back to let go.
+        planner: gives the pads' depth, their clearance to the table, and the release clearance.
     """
     height = float(triangles[:, :, 2].max())
     if not height > planner.floor_clearance:
@@ -100,7 +98,7 @@ def propose_grasps(
         return []
     com = np.asarray(center_of_mass, dtype=float)[:2]
 
-    # A rotation by pi swaps the jaws, which are alike.
+    # A rotation by pi swaps the two jaws, which are alike.
     found: list[GraspProposal] = []
     for theta in np.radians(np.arange(-90.0, 90.0, _COARSE_DEG)):
         found += _search(points, level, levels, com, float(theta), _COARSE_TOUCH, planner)
@@ -113,7 +111,7 @@ def propose_grasps(
             near += _search(points, level, levels, com, float(theta), _TOUCH, planner, place)
         if near:
             result.append(min(near, key=lambda p: p.cost))
-    # Heights from the slices are as coarse as their levels.
+    # The slices know heights only to their spacing.
     result = [replace(p, surface_height=_top(triangles, p)) for p in result]
     return sorted(result, key=lambda p: p.cost)
 
@@ -129,7 +127,7 @@ def _levels(height: float) -> Array:
 
 
 def _slices(triangles: Array, levels: Array) -> tuple[Array, NDArray[np.int64]]:
-    """Points (n, 2) on the outlines of the horizontal slices, and the level of each."""
+    """Points (n, 2) on the outlines of the horizontal slices, and each point's level."""
     all_points, all_levels = [np.empty((0, 2))], [np.empty(0, dtype=np.int64)]
     low, high = triangles[:, :, 2].min(axis=1), triangles[:, :, 2].max(axis=1)
     for index, z in enumerate(levels):
@@ -151,17 +149,17 @@ def _slices(triangles: Array, levels: Array) -> tuple[Array, NDArray[np.int64]]:
 
 @dataclass(frozen=True)
 class _Reach:
-    """How far a tool reaches to either side along the hand, at each height.
+    """The extents of a tool to either side at each height, in the hand's coordinates.
 
-    Coordinates are those of the hand at one rotation: u along the pads, v across them.
+    At one rotation of the hand, u is along the pads and v across them.
     """
 
     u_min: float
-    """The u at which the columns begin; each is `_BIN` long."""
+    """The u of the first column; each column is `_BIN` long."""
     left: Array
-    """(columns, levels) the greatest v; -inf where there is nothing."""
+    """(columns, levels) the greatest v; -inf where empty."""
     right: Array
-    """(columns, levels) the least v; inf where there is nothing."""
+    """(columns, levels) the least v; inf where empty."""
 
 
 @dataclass(frozen=True)
@@ -177,10 +175,10 @@ class _Hold:
     slope: float
     overhang: float
     twist: float
-    """The distance along the pads between where the one and where the other touches, on average."""
+    """The distance along the pads between the two pads' mean points of contact."""
 
 
-# To either side of a common edge of columns.
+# Columns to either side of the middle.
 _PAD_COLUMNS = round(PAD_LENGTH / 2 / _BIN)
 _FINGER_COLUMNS = round(FINGER_LENGTH / 2 / _BIN)
 
@@ -191,7 +189,7 @@ def _reach(points: Array, level: NDArray[np.int64], levels: Array, theta: float)
     u_min = u.min() - _FINGER_COLUMNS * _BIN
     columns = int((u.max() - u_min) / _BIN) + _FINGER_COLUMNS + 2
     bins = ((u - u_min) / _BIN).astype(int)
-    # NumPy is faster with one index than with two.
+    # NumPy's `at` is faster with one index than with two.
     cells = bins * len(levels) + level
     left = np.full(columns * len(levels), -np.inf)
     right = np.full(columns * len(levels), np.inf)
@@ -211,7 +209,7 @@ def _search(
     planner: PickPlaceParameters,
     near: Array | None = None,
 ) -> list[GraspProposal]:
-    """The acceptable grasps at one rotation of the hand: along all of the tool, or about `near`.
+    """The acceptable grasps at one rotation of the hand, along the whole tool or close to `near`.
 
     Surface that stands back by less than `touch` counts as touched.
     """
@@ -234,7 +232,7 @@ def _search(
 def _proposal(
     hold: _Hold, u: float, theta: float, com: Array, planner: PickPlaceParameters
 ) -> GraspProposal:
-    """The proposal that a hold makes where the pads' middle is at `u`, with its penalties."""
+    """The proposal of a hold with the pads' middle at `u`, with its penalties."""
     along, across = jaw_axes(theta)
     x, y = u * along + hold.middle * across
     lever = abs(u - float(com @ along))
@@ -276,14 +274,14 @@ def _hold(
 ) -> _Hold | None:
     """The hold of two pads with their middle at a column; None if they cannot hold the tool.
 
-    `find_grip` tells the extent of all that is between the pads; this, how they touch it.
+    `find_grip` measures only the extent between the pads; this also measures their contact.
 
     Args:
         reach: of the tool.
-        centre: the column at whose lower edge the middle of the pads is.
+        centre: the column whose lower edge is at the middle of the pads.
         levels: the heights of the slices.
         touch: surface that stands back by less than this counts as touched.
-        planner: how deep the pads reach, and how far they stay above the table.
+        planner: gives the pads' depth and their clearance to the table.
     """
     fingers = slice(centre - _FINGER_COLUMNS, centre + _FINGER_COLUMNS)
     finger_left, finger_right = reach.left[fingers], reach.right[fingers]
@@ -303,7 +301,7 @@ def _hold(
     width = furthest_left - furthest_right
     if not NARROWEST <= width <= WIDEST:
         return None
-    # Fingers pass outside the tool from its top down to the pads' ends.
+    # The fingers pass the tool from its top down to the pads' ends.
     passed = levels >= bottom
     overhang = max(
         finger_left[:, passed].max() - furthest_left,
@@ -333,7 +331,7 @@ def _hold(
 
 
 def _lean(profile: Array, step: float) -> float:
-    """How a face leans inward where a pad's lower edge bears on it, from its reach by level."""
+    """The inward lean of a face, in radians, at a pad's lower edge, from its reach by level."""
     above = min(2, len(profile) - 1)
     if above == 0 or profile.argmax() > 0 or not np.isfinite(profile[above]):
         return 0.0

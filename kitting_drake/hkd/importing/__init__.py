@@ -1,1 +1,1 @@
-"""Importing: tools from meshes of any origin."""
+"""Importing: tools from meshes and outlines."""

@@ -1,4 +1,4 @@
-"""Few convex polygons that cover an outline, give or take a tolerance. Lengths in mm."""
+"""Covers an outline, within a tolerance, with few convex polygons. Lengths in mm."""
 
 import numpy as np
 from manifold3d import CrossSection, OpType
@@ -6,30 +6,30 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-# Area (mm^2) below which a difference of outlines is rounding.
+# Area (mm^2) below which outlines count as equal.
 _AREA = 0.02
-# Cuts are tried through this many corners, at this many angles.
+# Cuts to try: through this many corners, at this many angles.
 _CORNERS, _ANGLES = 6, 8
 _FAR = 1e3
-# Cells smaller than this are not cut again, and none where there are so many.
+# Cells smaller than this are not cut again; nor is any cell once there are this many.
 _SMALLEST_MM, _MOST_CELLS = 1.0, 150
-# How far, in steps, each edge of a polygon is pushed out in the end.
+# Steps in which the edges of the final polygons are moved outward.
 _PUSHES_MM = (0.8, 0.4, 0.2, 0.1)
 
 
 def convex_cover(
     inner: CrossSection, outer: CrossSection, outline: CrossSection
 ) -> list[CrossSection]:
-    """Convex polygons that together cover `inner` and stay within `outer`.
+    """Convex polygons that cover `inner` and stay within `outer`. Deterministic.
 
-    The inner region is cut until the hull of every cell is within the outer one; hulls are grown
-    from the cells, and the largest are kept. Between the two regions they follow the outline as
-    far as they can. The same input always gives the same polygons.
+    The inner region is cut into cells whose hulls are within the outer one. Hulls are grown from
+    the cells, and those that cover most are selected. Between the two regions the polygons follow
+    `outline` as closely as they can.
 
     Args:
-        inner: what has to be covered; without holes.
-        outer: what may be covered; it contains `inner`.
-        outline: what should be; between the two.
+        inner: the region to cover, without holes.
+        outer: the allowed region; it contains `inner`.
+        outline: the preferred region, between the two.
     """
     cells = _cells(inner, outer)
     grown = [_grown(seed, cells, outer) for seed in range(len(cells))]
@@ -53,7 +53,7 @@ def _fits(profile: CrossSection, outer: CrossSection) -> bool:
 
 
 def _cells(inner: CrossSection, outer: CrossSection) -> list[CrossSection]:
-    """Parts of `inner` whose hulls are within `outer`."""
+    """Cuts `inner` into parts whose hulls are within `outer`."""
     done: list[CrossSection] = []
     waiting = inner.decompose()
     while waiting:
@@ -73,7 +73,7 @@ def _corners(profile: CrossSection) -> Array:
 
 
 def _best_cut(part: CrossSection, outer: CrossSection) -> list[CrossSection]:
-    """The pieces of a part, by the cut that leaves the least of their hulls outside `outer`."""
+    """Cuts a part where the hulls of its pieces have the least area outside `outer`."""
     best, least = [part.hull()], np.inf
     for point in _notches(part):
         for angle in np.arange(_ANGLES) * 180.0 / _ANGLES:
@@ -88,7 +88,7 @@ def _best_cut(part: CrossSection, outer: CrossSection) -> list[CrossSection]:
 
 
 def _notches(part: CrossSection) -> list[Array]:
-    """The middle of a part, and the corners, apart from one another, deepest in its hull."""
+    """The centre of a part, and separate corners of it that lie deepest inside its hull."""
     corners = _corners(part)
     hull = _corners(part.hull())
     edges = np.roll(hull, -1, axis=0) - hull
@@ -96,7 +96,7 @@ def _notches(part: CrossSection) -> list[Array]:
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     depth = ((hull * normals).sum(axis=1) - corners @ normals.T).min(axis=1)
     spacing = 0.1 * np.ptp(corners, axis=0).max()
-    # The middle comes first: of equal cuts, halving leaves the fewest cells of an arc.
+    # The centre comes first, because halving an arc gives the fewest cells among equal cuts.
     chosen = [0.5 * (corners.min(axis=0) + corners.max(axis=0))]
     for index in np.argsort(-depth, kind="stable"):
         if all(np.linalg.norm(corners[index] - other) > spacing for other in chosen[1:]):
@@ -107,7 +107,7 @@ def _notches(part: CrossSection) -> list[Array]:
 
 
 def _grown(seed: int, cells: list[CrossSection], outer: CrossSection) -> set[int]:
-    """The cells that one hull within `outer` can hold: the seed, then what adds the least area."""
+    """Grows a hull within `outer` from a seed by the least added area; returns its cells."""
     hull, members, candidates = cells[seed].hull(), {seed}, set(range(len(cells))) - {seed}
     while True:
         trials = []
@@ -115,7 +115,7 @@ def _grown(seed: int, cells: list[CrossSection], outer: CrossSection) -> set[int
             joined = _hull([hull, cells[i]])
             trials.append((joined.area() - hull.area() - (cells[i] - hull).area(), i, joined))
         for _, i, joined in sorted(trials, key=lambda trial: trial[:2]):
-            # A hull that does not fit now never will: it only grows.
+            # The hull only grows, so a cell that does not fit here never will.
             candidates.discard(i)
             if _fits(joined, outer):
                 hull = joined
@@ -126,7 +126,7 @@ def _grown(seed: int, cells: list[CrossSection], outer: CrossSection) -> set[int
 
 
 def _pushed(polygon: CrossSection, outline: CrossSection, outer: CrossSection) -> CrossSection:
-    """The polygon with its edges moved out where that brings it nearer to the outline."""
+    """Moves edges of a polygon outward where that makes it match the outline better."""
     corners = _corners(polygon.simplify(0.05))
     edges = np.roll(corners, -1, axis=0) - corners
     normals = np.column_stack([edges[:, 1], -edges[:, 0]])
@@ -134,7 +134,7 @@ def _pushed(polygon: CrossSection, outline: CrossSection, outer: CrossSection) -
     offsets = (corners * normals).sum(axis=1)
 
     def score(candidate: CrossSection) -> float:
-        """The area of the outline that it covers, less what it covers beside."""
+        """The area inside the outline minus the area outside it."""
         return float(2 * (candidate ^ outline).area() - candidate.area())
 
     best, best_score = polygon, score(polygon)
@@ -149,7 +149,7 @@ def _pushed(polygon: CrossSection, outline: CrossSection, outer: CrossSection) -
 
 
 def _between(normals: Array, offsets: Array) -> CrossSection:
-    """The region of all points p with normals @ p <= offsets, of edges in order."""
+    """The region of points p with normals @ p <= offsets."""
     result = CrossSection.square((_FAR, _FAR), True)
     for (x, y), offset in zip(normals, offsets, strict=True):
         half = CrossSection.square((_FAR, 2 * _FAR)).translate((offset, -_FAR))
@@ -158,7 +158,7 @@ def _between(normals: Array, offsets: Array) -> CrossSection:
 
 
 def _needed(polygons: list[CrossSection], inner: CrossSection) -> list[CrossSection]:
-    """The polygons without those, the smallest first, that the others make superfluous."""
+    """Drops polygons, smallest first, that the others make superfluous."""
     kept = list(polygons)
     for polygon in sorted(polygons, key=CrossSection.area):
         rest = [other for other in kept if other is not polygon]

@@ -1,9 +1,9 @@
-"""Approximate convex decomposition of a solid of any shape, for collision.
+"""Approximate convex decomposition of any solid for collision. Lengths in mm.
 
-Hydroelastic contact costs time by the hull and by the facet, so there is a budget of both. First
-come the hulls that the outline seen from above needs (`convex_cover`), which decides whether the
-tool enters its cavity; what is left of the budget is spent on heights. Every hull is that of some
-of the solid's own points, so the tool rests on a table as the solid does. Lengths in mm.
+Hydroelastic contact costs time per hull and per facet, so both have a budget. The first hulls cover
+the outline seen from above (`convex_cover`), because it decides whether the tool enters its cavity.
+The rest of the budget refines the heights. Every hull has only points of the solid, so the tool
+rests on a table as the solid does.
 """
 
 from dataclasses import dataclass
@@ -19,39 +19,39 @@ from kitting_drake.hkd.tools.solids import SEGMENTS
 from systems.grasp import Grasp
 
 MOST_HULLS = 16
-"""The number of hulls that a tool gets; only an outline that needs more, at the last of
-`OUTLINE_TOLERANCES_MM`, gets more."""
+"""The number of hulls of a tool, unless its outline needs more at the last of
+`OUTLINE_TOLERANCES_MM`."""
 OUTLINE_TOLERANCES_MM = ((0.26, 0.12), (0.30, 0.2), (0.4, 0.2), (0.6, 0.3), (0.9, 0.3))
-"""How far hulls may be off the outline, and off the faces that the jaws grip, before their vertices
-are thinned; each pair is tried if the one before needs too many hulls."""
+"""Tolerances of the hulls for the outline and for the gripped faces, before vertices are thinned.
+Each pair is tried if the one before needs too many hulls."""
 ADDED_SHARE = 0.05
-"""How much of a tool's volume one hull may add to it, above and below."""
-# A hull has at most so many vertices, if that moves no vertex by more than the last of the
-# tolerances; the outline's is its own.
+"""The share of the tool's volume that one hull may add above and below the tool."""
+# Vertices are thinned at the first tolerance that leaves this many, or at the last one. The outline
+# has its own tolerance.
 _MOST_VERTICES = 20
 _VERTEX_TOLERANCES_MM = (0.2, 0.3, 0.45, 0.6)
 _OUTLINE_VERTEX_TOLERANCE_MM = 0.08
-# Notches narrower than twice this are no part of a cavity: they may be bridged.
+# Hulls may bridge notches narrower than twice this, because cavities do too.
 _NOTCH_MM = 2.0
 _SMALLEST_VOLUME = 0.5
 
 
 @dataclass(frozen=True)
 class Decomposition:
-    """Convex hulls that together stand for a solid."""
+    """Convex hulls that approximate a solid."""
 
     hulls: list[np.ndarray]
-    """Arrays (n, 3) of their vertices, in mm."""
+    """The vertices (n, 3) of each hull, in mm."""
     outline_deviation_mm: float
-    """The furthest that their outline, seen from above, is from the solid's; 5 mm at most."""
+    """The largest distance between their outline from above and the solid's, capped at 5 mm."""
 
 
 def decompose(solid: Manifold, grasp: Grasp) -> Decomposition:
-    """Few convex hulls of few facets that together fill a tool.
+    """Decomposes a tool into few convex hulls with few facets.
 
     Args:
         solid: the tool at rest in its frame T, in mm.
-        grasp: where the jaws grip it, in T.
+        grasp: the annotated grasp in T.
     """
     solid = solid.simplify(0.03)
     outline = closed(solid.project().simplify(0.02), _NOTCH_MM).simplify(0.02)
@@ -70,7 +70,7 @@ def decompose(solid: Manifold, grasp: Grasp) -> Decomposition:
         try:
             hulls.append(_thinned(np.asarray(part.hull().to_mesh64().vert_properties)[:, :3]))
         except QhullError:
-            # A sliver that has no volume on the grid of vertices.
+            # The part has no volume once its vertices are on the grid.
             continue
     hulls.sort(key=lambda hull: tuple(np.round(hull.mean(axis=0), 3)))
     return Decomposition(hulls, _deviation(hulls, outline))
@@ -93,7 +93,7 @@ def _within(solid: Manifold, polygon: CrossSection) -> Manifold:
 
 
 def _split_by_height(parts: list[Manifold]) -> list[Manifold]:
-    """The parts, those whose hulls add most above and below cut in two, while hulls are left."""
+    """Cuts the parts whose hulls add the most volume in two, as the budget of hulls allows."""
     parts = [part for part in parts if part.volume() >= _SMALLEST_VOLUME]
     most = ADDED_SHARE * sum(part.volume() for part in parts)
     added = [_added_volume(part) for part in parts]
@@ -120,7 +120,7 @@ def _thinned(points: np.ndarray) -> np.ndarray:
 
 
 def _halves(part: Manifold) -> tuple[Manifold, Manifold]:
-    """The part cut in two by the plane that leaves the least that is not solid in the hulls."""
+    """Cuts a part by an axis-aligned plane such that the halves' hulls have the least volume."""
     low, high = np.array(part.bounding_box()).reshape(2, 3)
     size = high - low
     vertices = np.asarray(part.to_mesh64().vert_properties)[:, :3]
@@ -132,7 +132,7 @@ def _halves(part: Manifold) -> tuple[Manifold, Manifold]:
             normal = np.eye(3)[axis]
             halves = part.split_by_plane(tuple(normal), low[axis] + share * size[axis])
             volume = sum(half.hull().volume() for half in halves)
-            # Among equal cuts the middle one, which leaves the smallest parts.
+            # Prefer the middle of equal cuts, which leaves the smallest parts.
             volume *= 1.0 + 0.02 * abs(share - 0.5)
             if volume < best_volume:
                 best, best_volume = halves, volume
@@ -141,12 +141,12 @@ def _halves(part: Manifold) -> tuple[Manifold, Manifold]:
 
 
 def _steps(shares: np.ndarray) -> list[float]:
-    """Places, from 0 to 1, of planes with many vertices: of a shoulder, or of a jaw's end."""
+    """Positions, 0 to 1, of planes with many vertices, such as a shoulder or a jaw's end."""
     within = shares[(shares > 0.08) & (shares < 0.92)]
     values, counts = np.unique(np.round(within, 3), return_counts=True)
     order = np.argsort(-counts, kind="stable")[:3]
     many = max(4, len(shares) // 50)
-    # The middle of the vertices themselves, not the rounded place.
+    # The median of the vertices' exact positions, not the rounded one.
     return [
         float(np.median(within[np.abs(within - values[i]) <= 6e-4]))
         for i in order

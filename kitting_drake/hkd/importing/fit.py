@@ -1,4 +1,4 @@
-"""How long an imported tool is made, and whether the hand and a kit can take it then."""
+"""Scales an imported tool to a length at which the hand can hold it and a kit can take it."""
 
 from pathlib import Path
 
@@ -15,23 +15,23 @@ from kitting_drake.hkd.tools.mass import mass_properties
 from kitting_drake.hkd.tools.tool import Tool
 
 SCALED_LENGTHS_MM = (180.0, 170.0, 160.0, 150.0)
-"""A tool is scaled to the first of these at which the hand can hold it and a kit take it."""
+"""Lengths to try; the tool gets the first at which it can be held and kitted."""
 KEPT_LENGTHS_MM = (150.0, 200.0)
-"""A tool of such a length keeps it: those of the dataset's tools."""
+"""Tools in this range of lengths, that of the dataset, are not scaled."""
 POSSIBLE_LENGTHS_MM = (50.0, 600.0)
-"""How long hand tools are, by which a file's unit is guessed."""
+"""The range of lengths of hand tools, for guessing a file's unit."""
 THINNEST_MM, HIGHEST_MM = 4.0, 45.0
 
 _UNITS = {"mm": 1.0, "m": 1000.0, "cm": 10.0, "inches": 25.4}
 _CREASE_ANGLE_DEG = 35.0
-# How far decimating may move a surface; each is tried if the one before leaves more triangles.
+# Decimation tolerances to try until a mesh has few enough triangles.
 _DECIMATION_TOLERANCES_MM, _ENOUGH_TRIANGLES = (0.01, 0.02, 0.04), 10_000
 
 
 def guess_unit(length: float) -> str | None:
-    """The unit in which a hand tool of this length was measured, or None if in nothing usual.
+    """The unit in which a hand tool has this length: mm, m, cm or inches; None if in none of them.
 
-    Inches and centimetres overlap; a length below 12 is taken for inches, above for centimetres.
+    Inches and centimetres overlap: a length of at most 12 is taken as inches, above as centimetres.
     """
     shortest, longest = POSSIBLE_LENGTHS_MM
     for unit, low, high in (
@@ -46,13 +46,12 @@ def guess_unit(length: float) -> str | None:
 
 
 def material_of(category: str) -> str:
-    """The material of which an imported tool of a category seems to be: a key of `MATERIALS` of
-    `hkd.tools.solids`."""
+    """The material to draw an imported tool with: a key of `hkd.tools.solids.MATERIALS`."""
     return "polished_steel" if category == "wrench" else "steel"
 
 
 def lengths_to_try(length: float, wanted_mm: float | None) -> tuple[list[float], str]:
-    """The lengths (mm) to try, the first that will do; and why, for the user."""
+    """The lengths (mm) to try in order, and a phrase for the user that explains them."""
     unit = guess_unit(length)
     if unit is None:
         assumed, real = f"unit unknown ({length:.4g} long)", 0.0
@@ -60,7 +59,7 @@ def lengths_to_try(length: float, wanted_mm: float | None) -> tuple[list[float],
         real = length * _UNITS[unit]
         assumed = f"taken to be in {unit}: {real:.0f} mm long"
     if wanted_mm is not None:
-        return [wanted_mm], f"{assumed}, scaled as asked"
+        return [wanted_mm], f"{assumed}, scaled as requested"
     if KEPT_LENGTHS_MM[0] <= real <= KEPT_LENGTHS_MM[1]:
         return [real], f"{assumed}, kept"
     return list(SCALED_LENGTHS_MM), f"{assumed}, scaled"
@@ -75,10 +74,10 @@ def fit(
     directory: Path,
     density: float | None = None,
 ) -> tuple[Tool, Manifold]:
-    """The tool, with its visual mesh written, at the first length at which it can be used.
+    """Makes a tool at the first of `lengths` (mm) that works, and writes its visual mesh.
 
     Raises:
-        UserError: no length makes a usable tool; says what was wrong with the first one.
+        UserError: no length works; the message is that of the first one.
     """
     refusal: UserError | None = None
     for length in lengths:
@@ -99,7 +98,7 @@ def fit(
 
 
 def _decimated(solid: Manifold) -> Manifold:
-    """The solid without triangles that hardly show; a very fine one is made a little coarser."""
+    """Removes triangles that hardly show, and coarsens a very fine mesh."""
     simple = solid
     for tolerance in _DECIMATION_TOLERANCES_MM:
         simple = solid.simplify(tolerance)
@@ -112,23 +111,23 @@ def _check_size(solid: Manifold) -> None:
     length, _, height = size(solid)
     if height < THINNEST_MM:
         raise UserError(
-            f"at {length:.0f} mm length it is {height:.1f} mm thick, and the hand needs "
-            f"{THINNEST_MM:.0f} mm to hold"
+            f"at a length of {length:.0f} mm it is {height:.1f} mm thick (the hand needs "
+            f"{THINNEST_MM:.0f} mm)"
         )
     if height > HIGHEST_MM:
         raise UserError(
-            f"at {length:.0f} mm length it is {height:.0f} mm high at rest, and a kit takes "
-            f"{HIGHEST_MM:.0f} mm"
+            f"at a length of {length:.0f} mm it is {height:.0f} mm high at rest (a kit takes "
+            f"{HIGHEST_MM:.0f} mm)"
         )
 
 
 def _tool(
     category: str, name: str, solid: Manifold, directory: Path, density: float | None
 ) -> Tool:
-    """A tool with its visual mesh written and its best grasp.
+    """Writes the visual mesh of a solid and finds its best grasp.
 
     Raises:
-        UserError: it cannot be grasped.
+        UserError: the hand cannot hold it.
     """
     length, width, height = (round(1e-3 * float(extent), 6) for extent in size(solid))
     visual = directory / f"{material_of(category)}.obj"
@@ -139,8 +138,8 @@ def _tool(
     proposals = propose_grasps(triangles, com)
     if not proposals:
         raise UserError(
-            f"at {1e3 * length:.0f} mm length the hand, whose jaws take {1e3 * WIDEST:.0f} mm, "
-            "finds no place to hold it from above"
+            f"at a length of {1e3 * length:.0f} mm the hand cannot hold it from above (the jaws "
+            f"take {1e3 * WIDEST:.0f} mm)"
         )
     return Tool(
         directory=directory,

@@ -1,10 +1,10 @@
-"""`hkd import`: from anyone's mesh, or outline, to a tool that scenarios can name.
+"""`hkd import`: makes a tool from a mesh or an outline.
 
-The mesh is read and repaired (`repair`), or extruded from an outline (`outline`), brought into the
-tool frame in a stable pose (`stable_pose`), scaled, given the best grasp (`fit`), its mass, and a
-convex decomposition for collision (`convex_decomposition`), and laid as it comes to rest
-(`resting_pose`). All of that happens in a process of its own, which may fail or hang as it likes:
-the tool's folder appears atomically. Solids are handled in mm and written in metres.
+The mesh is read and repaired (`repair`) or extruded from an outline (`outline`). It is brought into
+the tool frame in a stable pose (`tool_frame`), scaled, and given a grasp (`fit`), a mass
+(`materials`) and collision hulls (`convex_decomposition`). Finally a simulation checks how it comes
+to rest (`resting_pose`). All this happens in a child process, which may crash or hang, and the
+tool's folder appears atomically. Solids are handled in mm and written in metres.
 """
 
 import contextlib
@@ -58,37 +58,39 @@ from kitting_drake.hkd.tools.symmetry import symmetry_order
 from kitting_drake.hkd.tools.tool import check_category, load_tool, tool_names, user_tools
 
 TIME_LIMIT = 55.0
-"""Seconds of processor time after which the geometry is given up."""
+"""Seconds of processor time after which the import is aborted."""
 _MOST_WAITING = 10.0
-"""It is given up too after so many times that limit by the clock: the machine may be busy."""
+"""The limit in wall-clock time, as a multiple of the time limit, because the machine may be busy.
+"""
 _MAKING = ".making-"
-"""The names of the folders in which tools are made begin with this."""
+"""The prefix of the folders of unfinished tools."""
 _MOST_MEMORY = 12 * 2**30
-# A tool is laid anew where it comes to rest by more than this, in degrees, at most so often.
+# A tool that comes to rest tilted by more than this, in degrees, is laid again that way, at most
+# this many times.
 _SAME_POSE_DEG, _LAYINGS = 2.0, 3
-# A tool that falls over when its table tilts by this, in degrees, falls over at a touch.
+# A tool that tips over when the table tilts by this, in degrees, is not stable.
 _TIPS_DEG = 10.0
-# Collision hulls that are further off the outline than this are worth a note.
+# A larger deviation of the collision hulls from the outline is reported.
 _TRUE_OUTLINE_MM = 0.35
 _FRONTS = {"hammer": "its head", "screwdriver": "its blade"}
 
 
 @dataclass(frozen=True)
 class ImportRequest:
-    """A mesh to import, and the tool that it is to become."""
+    """A file to import, and the properties of its tool."""
 
     mesh: Path
     category: str
     name: str | None = None
-    """The tool's name; that of the file if None."""
+    """The tool's name; by default the file's."""
     length_mm: float | None = None
-    """The length to scale it to; see `fit.lengths_to_try` for None."""
+    """The length to scale to; see `fit.lengths_to_try` for None."""
     density: float | None = None
     """The mean density in kg/m^3; see `materials` for None."""
     output: Path | None = None
-    """The folder of tools to write into; `user_tools` if None."""
+    """The folder of tools to write to; by default `user_tools`."""
     height_mm: float | None = None
-    """How high to extrude it, if it is an outline."""
+    """The height of an extruded outline; only for outlines."""
 
 
 @dataclass(frozen=True)
@@ -99,21 +101,20 @@ class ImportReport:
     record: dict[str, Any]
     """The tool's record, as in `tool.yaml`."""
     notes: list[str]
-    """The assumptions and repairs that were made, a phrase each."""
+    """The assumptions and repairs, one phrase each."""
     collision_hulls: int
-    """The number of convex hulls of its collision geometry."""
+    """The number of collision hulls."""
 
 
 def import_tool(request: ImportRequest, time_limit: float | None = TIME_LIMIT) -> ImportReport:
-    """Makes a tool's folder from a mesh.
+    """Makes a tool's folder from a mesh or an outline.
 
     Args:
-        request: what to import.
-        time_limit: in seconds of processor time, for the process that does it; None does it in this
-            process.
+        request: the file to import.
+        time_limit: seconds of processor time of the child process; None runs in this process.
 
     Raises:
-        UserError: it cannot be saved, and nothing was written.
+        UserError: the tool cannot be made; nothing was written then.
     """
     check_category(request.category)
     name = _checked_name(request)
@@ -154,9 +155,9 @@ def import_tool(request: ImportRequest, time_limit: float | None = TIME_LIMIT) -
 
 
 def _remove_abandoned(folder: Path) -> None:
-    """Removes what imports that were killed have left."""
+    """Removes unfinished folders of killed imports."""
     for path in folder.glob(f"{_MAKING}*"):
-        # Another import may have removed it by now.
+        # Another import may remove the folder at the same time.
         with contextlib.suppress(FileNotFoundError):
             if time.time() - path.stat().st_mtime > 2 * _MOST_WAITING * TIME_LIMIT:
                 shutil.rmtree(path, ignore_errors=True)
@@ -164,43 +165,46 @@ def _remove_abandoned(folder: Path) -> None:
 
 def _check_height(request: ImportRequest) -> None:
     if is_outline(request.mesh) and request.height_mm is None:
-        raise UserError(f"{request.mesh} is an outline: give --height_mm, how high the tool is")
+        raise UserError(f"{request.mesh} is an outline: give its height by --height_mm")
     if not is_outline(request.mesh) and request.height_mm is not None:
-        raise UserError(f"--height_mm is for outlines (SVG, DXF), and {request.mesh} is none")
+        raise UserError(f"--height_mm is for outlines (SVG, DXF), and {request.mesh} is a mesh")
 
 
 def _checked_name(request: ImportRequest) -> str:
     if request.name is None:
         name = re.sub(r"[^a-z0-9]+", "_", request.mesh.stem.lower()).strip("_")[:60]
         if not name:
-            raise UserError(f"{request.mesh} has no small letter or digit in its name: give --name")
+            raise UserError(f"{request.mesh} has no letter or digit in its name: give --name")
     else:
         name = request.name
     if not re.fullmatch(r"[a-z0-9][a-z0-9_]{0,63}", name):
-        raise UserError(f"--name '{name}' has to be small letters, digits and underscores")
+        raise UserError(f"--name '{name}' must be small letters, digits and underscores")
     if name in tool_names():
         raise UserError(f"'{name}' is the name of one of the project's own tools: give --name")
     return name
 
 
 def _check_replaceable(folder: Path, request: ImportRequest) -> str | None:
-    """Checks that what a folder holds may be replaced; returns a note if it is of other content.
+    """Checks that a folder may be replaced; returns a note if the file's content has changed.
 
     Raises:
-        UserError: it is no imported tool, or of a file of another name, or it has a person's work.
+        UserError: the folder is not an imported tool, comes from a file of another name, or has an
+            annotated grasp.
     """
     try:
         record = yaml.safe_load((folder / "tool.yaml").read_text())
         file, digest = record["imported"]["file"], record["imported"]["sha256"]
         annotated = record.get("annotated")
     except (OSError, yaml.YAMLError, KeyError, TypeError, UnicodeDecodeError) as error:
-        raise UserError(f"{folder} exists and is no imported tool: give another --name") from error
+        raise UserError(
+            f"{folder} exists and is not an imported tool: give another --name"
+        ) from error
     if annotated:
         raise UserError(f"{folder} has a grasp that you saved: give another --name, or delete it")
     if file != request.mesh.name:
         raise UserError(f"{folder} is the tool of {file}: give another --name, or delete it")
     if request.mesh.is_file() and digest != _digest(request.mesh):
-        return f"replaces the tool of another {file}"
+        return f"replaces the tool of an older {file}"
     return None
 
 
@@ -212,9 +216,9 @@ Prepared = tuple[dict[str, Any], list[str], int]
 
 
 def _prepare_aside(request: ImportRequest, name: str, made: Path, time_limit: float) -> Prepared:
-    """`prepare_tool` in a process that is ended after `time_limit` of processor time."""
+    """Runs `prepare_tool` in a process that is killed after `time_limit` of processor time."""
     too_long = UserError(
-        f"{request.mesh} was not worked out in {time_limit:.0f} s: decimate the mesh first"
+        f"{request.mesh} took more than {time_limit:.0f} s to process: decimate the mesh first"
     )
     context = multiprocessing.get_context("spawn")
     ours, theirs = context.Pipe(duplex=False)
@@ -230,7 +234,7 @@ def _prepare_aside(request: ImportRequest, name: str, made: Path, time_limit: fl
         process.join()
         if process.exitcode == -signal.SIGXCPU:
             raise too_long from end
-        raise UserError(f"{request.mesh} is too broken a mesh to be worked out") from end
+        raise UserError(f"{request.mesh} cannot be processed: repair the mesh first") from end
     finally:
         process.kill()
         process.join()
@@ -244,7 +248,7 @@ def _child(
     pipe: Connection, request: ImportRequest, name: str, made: Path, time_limit: float
 ) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    # Libraries talk: what there is to say goes through the pipe.
+    # Discard what libraries print; results go through the pipe.
     nowhere = os.open(os.devnull, os.O_WRONLY)
     os.dup2(nowhere, 1)
     os.dup2(nowhere, 2)
@@ -266,10 +270,10 @@ def prepare_tool(request: ImportRequest, name: str, directory: Path) -> Prepared
     """Writes a tool's files into an empty folder.
 
     Returns:
-        Its record, the assumptions and repairs that were made, and the number of collision hulls.
+        Its record, the assumptions and repairs, and the number of collision hulls.
 
     Raises:
-        UserError: it cannot be saved.
+        UserError: the tool cannot be made.
     """
     try:
         return _prepare(request, name, directory)
@@ -278,13 +282,13 @@ def prepare_tool(request: ImportRequest, name: str, directory: Path) -> Prepared
         path = str(request.mesh)
         raise UserError(text if path in text else f"{path}: {text}") from error
     except MemoryError as error:
-        raise UserError(f"{request.mesh} needs more memory than there is") from error
+        raise UserError(f"{request.mesh} needs more memory than is available") from error
     except OSError as error:
         raise UserError(f"cannot write {name}: {error.strerror}") from error
     except Exception as error:
-        # Whatever geometry fails on: a broken mesh is the user's to repair, not a fault to trace.
+        # Geometry libraries fail in many ways on broken meshes, which are the user's to repair.
         raise UserError(
-            f"{request.mesh} is too broken a mesh to be worked out ({type(error).__name__})"
+            f"{request.mesh} cannot be processed ({type(error).__name__}): repair the mesh first"
         ) from error
 
 
@@ -293,20 +297,20 @@ def _prepare(request: ImportRequest, name: str, directory: Path) -> Prepared:
     low, high = vertices.min(axis=0), vertices.max(axis=0)
     longest = float((high - low).max())
     if not longest > 1e-12:
-        raise UserError("all of the mesh is one point")
+        raise UserError("the mesh has no extent")
     nominal = NOMINAL_MM / longest
     solid, notes = make_solid((vertices - (low + high) / 2) * nominal, faces)
     drawn = is_outline(request.mesh)
-    # An outline shows the tool as it lies, seen from above.
+    # An outline shows the tool at rest, from above.
     solid = (facing_forward if drawn else to_tool_frame)(solid, request.category)
     length = size(solid)[0] / nominal
     if drawn:
         if tipping_deg(solid) < _TIPS_DEG:
             raise UserError(
-                f"{request.height_mm:g} mm high, it falls over: draw it as it lies, from above"
+                f"{request.height_mm:g} mm high, it falls over: draw it from above, as it lies"
             )
         lengths = [length]
-        assumed = f"an outline, {length:.0f} mm long and made {request.height_mm:g} mm high"
+        assumed = f"an outline, {length:.0f} mm long and extruded to {request.height_mm:g} mm"
     else:
         lengths, assumed = lengths_to_try(length, request.length_mm)
     notes = [assumed, *notes]
@@ -321,15 +325,15 @@ def _prepare(request: ImportRequest, name: str, directory: Path) -> Prepared:
             return prepared
         solid = fitted.transform(np.column_stack([tilt, np.zeros(3)]))
         lengths = [request.length_mm or size(solid)[0]]
-        laid = [f"laid as it comes to rest, which is {angle:.0f} degrees tilted"]
-    # It rolls wherever it is laid: then it is laid as low as it can be.
+        laid = [f"laid in its resting pose, which is tilted by {angle:.0f} degrees"]
+    # No pose is at rest: use the one with the lowest centre of mass.
     _empty(directory)
     notes.append("it rolls on a table")
     return _write(request, name, directory, first, wanted, notes)[0]
 
 
 def _surface(request: ImportRequest) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices (n, 3) and triangles (m, 3) of a mesh, in its own units, or of an outline in mm."""
+    """Vertices (n, 3) and triangles (m, 3): of a mesh in its units, or of an outline in mm."""
     if not is_outline(request.mesh):
         return read_mesh(request.mesh)
     assert request.height_mm is not None
@@ -350,7 +354,7 @@ def _write(
     lengths: list[float],
     notes: list[str],
 ) -> tuple[Prepared, Manifold]:
-    """Writes the files of a solid (mm) that lies in the tool frame; returns it as it was fitted."""
+    """Writes the files of a solid (mm) in the tool frame; also returns the solid as scaled."""
     notes = list(notes)
     category, density = request.category, request.density
     tool, solid = fit(category, name, solid, lengths, notes, directory, density)
@@ -361,7 +365,7 @@ def _write(
     vertices, faces = meshes.vertices_and_faces(solid)
     collision = decompose(solid, tool.grasp)
     if not collision.hulls:
-        raise UserError("the mesh encloses too little volume to be touched")
+        raise UserError("the mesh encloses too little volume for collision hulls")
     if collision.outline_deviation_mm > _TRUE_OUTLINE_MM:
         notes.append(
             f"its {len(collision.hulls)} collision hulls are up to "
@@ -409,5 +413,5 @@ def _write(
 
 
 def _safe(text: str) -> str:
-    """Text that may stand in an XML comment."""
+    """Text that is safe in an XML comment."""
     return re.sub(r"[^\w. ]|-", "_", text, flags=re.ASCII)

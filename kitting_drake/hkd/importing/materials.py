@@ -1,7 +1,7 @@
-"""How the mass of an imported tool is distributed.
+"""The mass distribution of an imported tool.
 
-A mesh tells a tool's shape, not what it is made of. But no hammer balances at the middle of its
-handle: its head is steel, and so is a screwdriver's blade, while their handles are light.
+A mesh has no materials. But the head of a hammer and the blade of a screwdriver are of steel and
+their handles are light, so their centre of mass is not the centroid.
 """
 
 import numpy as np
@@ -14,39 +14,39 @@ from kitting_drake.hkd.tools.mass import Body
 _STEEL, _HANDLE = 7850.0, 1200.0
 
 DENSITIES = {"pliers": 6000.0, "wrench": _STEEL}
-"""The mean density of a tool of a category, with its grips, in kg/m^3."""
+"""The mean density of a category's tools with their grips, in kg/m^3."""
 OTHER_DENSITY = 3000.0
-"""The same for a tool of any other category."""
+"""The mean density of a tool of any other category, in kg/m^3."""
 
 _SLICES = 60
 _END = 0.3
-"""Share of the length that is an end."""
+"""The share of the length that counts as an end."""
 _STEP_WIDTH = 1.5
-"""By how much wider than the shaft a head or a handle is, at least."""
+"""The least ratio of a head's or handle's width to the shaft's."""
 
 
 def bodies_of(solid: Manifold, category: str, density: float | None = None) -> list[Body]:
-    """A tool in its frame T as one or two homogeneous bodies.
+    """Splits a tool in its frame T into one or two homogeneous bodies.
 
-    The head of a hammer and the blade of a screwdriver, where they stand out or draw in clearly,
-    are of steel, what is behind them is a handle.
+    The head of a hammer or the blade of a screwdriver is of steel and the rest is a handle, if
+    their widths differ clearly.
 
     Args:
-        solid: in mm, its working end toward +x.
+        solid: in mm, with the working end toward +x.
         category: of the tool.
-        density: of it all, in kg/m^3; None: that of the category.
+        density: of the whole tool, in kg/m^3; by default that of the category.
     """
     if density is None and category in ("hammer", "screwdriver"):
         border = _border(solid, category)
         if border is not None:
-            # The plane's normal is that of the first of the two, the working end.
+            # The first half is the one toward the normal: the working end.
             front, back = solid.split_by_plane((1.0, 0.0, 0.0), border)
             return [(front, _STEEL), (back, _HANDLE)]
     return [(solid, density or DENSITIES.get(category, OTHER_DENSITY))]
 
 
 def _border(solid: Manifold, category: str) -> float | None:
-    """The x at which the head or the blade begins; None if nothing tells."""
+    """The x at which the head or the blade begins; None if the widths do not show it."""
     x, widths = _widths(solid)
     ends = max(1, round(_END * len(x)))
     if category == "hammer":
@@ -62,7 +62,7 @@ def _border(solid: Manifold, category: str) -> float | None:
 
 
 def _widths(solid: Manifold) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Places along x, and how wide the solid is there along y."""
+    """Positions along x, and the solid's width along y at each."""
     vertices, _ = meshes.vertices_and_faces(solid.refine_to_length(2.0))
     low, high = vertices[:, 0].min(), vertices[:, 0].max()
     edges = np.linspace(low, high, _SLICES + 1)

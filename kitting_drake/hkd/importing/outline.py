@@ -1,4 +1,4 @@
-"""Outlines of tools, drawn in SVG or DXF: read in true millimetres, and extruded to solids."""
+"""Reads outlines of tools from SVG or DXF in true millimetres, and extrudes them to solids."""
 
 import io
 import math
@@ -19,14 +19,14 @@ from kitting_drake.hkd.importing.tool_frame import long_direction_deg
 
 OUTLINE_FORMATS = (".svg", ".dxf")
 LENGTHS_MM = (20.0, 250.0)
-"""How long an imported outline may be."""
+"""The range of lengths of an imported outline."""
 
 _MM_PER_PIXEL = 25.4 / 96
-"""CSS has 96 pixels to an inch, and so has an SVG without units."""
+"""CSS, and an SVG without units, has 96 pixels per inch."""
 _JOIN_MM = 0.1
-"""Ends of curves that are no further apart than this are joined."""
+"""The largest gap between ends of curves that are joined."""
 _FLAT_MM = 0.01
-"""Curves are drawn with straight edges that stray at most about this far."""
+"""The approximate tolerance of the polylines that replace curves."""
 _STEP_MM = 0.25
 _MOST_STEPS = 400
 _MOST_BYTES = 20_000_000
@@ -35,55 +35,59 @@ _NUMBER_UNIT = re.compile(r"([0-9.eE+-]+)\s*([a-z]*)")
 _UNITS = ("", "mm", "cm", "in", "pt", "pc", "px")
 _NOT_DRAWN = ("symbol", "mask", "marker", "clipPath", "pattern")
 _NOTES = ("DIMENSION", "ARC_DIMENSION", "LARGE_RADIAL_DIMENSION", "LEADER", "MULTILEADER")
-"""Entities of DXF that tell of a drawing, and whose lines are no outline."""
+"""DXF entities that annotate a drawing, so their lines do not belong to an outline."""
 
 Curve = NDArray[np.float64]
 """The points (n, 2) of a curve, in mm, y up."""
 
 
 def is_outline(path: Path) -> bool:
-    """Whether a file is a drawing, by its name."""
+    """Whether a file's suffix is that of a drawing."""
     return path.suffix.lower() in OUTLINE_FORMATS
 
 
 def read_outline(path: Path) -> CrossSection:
-    """The area that a drawing's closed curves enclose, in mm: the largest, less those inside it.
+    """The area inside a drawing's largest closed curve and outside its other curves, in mm.
 
-    An SVG is measured by its width, height and viewBox, a DXF by its $INSUNITS: without those, in
-    pixels of 1/96 inch and in millimetres. Lines, arcs and open polylines whose ends meet are
-    joined.
+    The scale of an SVG follows from its width, height and viewBox, or else is 96 pixels per inch.
+    That of a DXF follows from $INSUNITS, or else is in mm. Lines, arcs and open polylines are
+    joined where their ends meet.
 
     Args:
         path: of the drawing.
 
     Raises:
-        UserError: no such file, not a drawing, an open curve, or not the outline of one tool.
+        UserError: the file is missing or not a drawing, a curve is open, or the drawing is not the
+            outline of one tool.
     """
     try:
         size = path.stat().st_size
     except (OSError, ValueError) as error:
         raise UserError(f"there is no file {path}: give a drawing (SVG, DXF)") from error
     if size > _MOST_BYTES:
-        raise UserError(f"{path} has {size / 1e6:.0f} MB, and an outline takes far less")
+        raise UserError(
+            f"{path} has {size / 1e6:.0f} MB, more than the limit of {_MOST_BYTES / 1e6:.0f} MB: "
+            "simplify the drawing first"
+        )
     read = _svg_curves if path.suffix.lower() == ".svg" else _dxf_curves
     curves = [curve for curve in read(path) if len(curve) > 1 and np.isfinite(curve).all()]
     if not curves:
-        raise UserError(f"{path} holds no curves: text and pictures have to be made paths first")
+        raise UserError(f"{path} has no curves: convert text and pictures to paths first")
     return _enclosed(_joined(curves, path), path)
 
 
 def laid_along_x(
     outline: CrossSection, length_mm: float | None = None, name: str = "the outline"
 ) -> CrossSection:
-    """An outline turned so that its length is along x.
+    """Rotates an outline so that its length is along x, and scales it on request.
 
     Args:
         outline: in mm.
-        length_mm: to scale its extent along x to; its own if None.
-        name: what to call it.
+        length_mm: the length to scale to; None keeps the scale.
+        name: the outline's name in messages.
 
     Raises:
-        UserError: no length was given, and by its units it is no hand tool's.
+        UserError: `length_mm` is None and the outline's length is not in `LENGTHS_MM`.
     """
     x_min, y_min, x_max, y_max = outline.bounds()
     nominal = NOMINAL_MM / max(x_max - x_min, y_max - y_min)
@@ -95,8 +99,8 @@ def laid_along_x(
     low, high = LENGTHS_MM
     if not low <= length <= high:
         raise UserError(
-            f"{name} is {length:.4g} mm long by its own units, and {low:g} to {high:g} mm are "
-            "taken: give --length_mm, or set the drawing's units"
+            f"{name} is {length:.4g} mm long by its own units; the range is {low:g} to {high:g} "
+            "mm: give --length_mm, or set the drawing's units"
         )
     return outline
 
@@ -113,7 +117,7 @@ def _svg_curves(path: Path) -> list[Curve]:
     try:
         root = ElementTree.parse(path).getroot()
         if root.tag.rsplit("}", 1)[-1] != "svg":
-            raise ValueError("the root is no svg element")
+            raise ValueError("the root is not an svg element")
         width, height = _settle_size(root)
         _keep_from_drawing(root)
         text = io.StringIO(ElementTree.tostring(root, encoding="unicode"))
@@ -123,22 +127,22 @@ def _svg_curves(path: Path) -> list[Curve]:
         curves = [
             _MM_PER_PIXEL * np.array(points) * (1, -1)
             for shape in shapes
-            # Else a rectangle or ellipse would lose a transform that turns, skews or mirrors it.
+            # Convert to a path, because svgelements drops rotations of rectangles and ellipses.
             for part in abs(svgelements.Path(shape)).as_subpaths()
             if (points := _sampled(svgelements.Path(part), _MM_PER_PIXEL))
         ]
     except (MemoryError, UserError):
         raise
     except Exception as error:
-        # Readers fail on broken files in as many ways as there are.
+        # The reader fails in many ways on broken files.
         raise UserError(f"{path} cannot be read as SVG") from error
     return curves
 
 
 def _settle_size(root: ElementTree.Element) -> tuple[float, float]:
-    """The size of a drawing whose root does not say it, in pixels: that of its viewBox.
+    """Completes the root's size; returns the viewBox's size in pixels, for a root without one.
 
-    Where the root says one side alone, it gets the other one, in proportion to its viewBox.
+    If the root has only one of them, it gets the other by the viewBox's aspect ratio.
     """
     box = root.get("viewBox", "0 0 1000 1000").replace(",", " ").split()
     sides = {"width": float(box[2]), "height": float(box[3])}
@@ -148,7 +152,7 @@ def _settle_size(root: ElementTree.Element) -> tuple[float, float]:
             del root.attrib[name]
     given = [name for name in sides if name in root.attrib]
     for name in given:
-        # svgelements takes what it cannot read for pixels: `200 mm`, for one.
+        # Normalize lengths, because svgelements reads `200 mm` as pixels.
         root.set(name, "".join(_length(root.attrib[name], name)))
     if len(given) == 1 and "viewBox" in root.attrib:
         (known,) = given
@@ -159,10 +163,10 @@ def _settle_size(root: ElementTree.Element) -> tuple[float, float]:
 
 
 def _length(text: str, name: str) -> tuple[str, str]:
-    """The number and the unit of a length, which may be none.
+    """The number and the unit (or "") of a length.
 
     Raises:
-        UserError: it is no length in a unit that we know.
+        UserError: the text is not a length in a known unit.
     """
     match = _NUMBER_UNIT.fullmatch(text.strip().lower())
     if match is None or match[2] not in _UNITS:
@@ -172,7 +176,7 @@ def _length(text: str, name: str) -> tuple[str, str]:
 
 
 def _keep_from_drawing(root: ElementTree.Element) -> None:
-    """Moves what is drawn only where it is referred to among the definitions."""
+    """Moves elements that are drawn only by reference into the definitions."""
     space = root.tag.rpartition("svg")[0]
     definitions = ElementTree.Element(f"{space}defs")
     for parent in list(root.iter()):
@@ -186,7 +190,7 @@ def _keep_from_drawing(root: ElementTree.Element) -> None:
 
 
 def _sampled(path: Iterable, mm: float) -> list[tuple[float, float]]:
-    """Points of a subpath of svgelements, in its units, each of which is `mm` long."""
+    """Points of a subpath of svgelements, in its units; one unit is `mm` mm."""
     points: list[tuple[float, float]] = []
     for segment in path:
         if segment.end is None:
@@ -229,7 +233,7 @@ def _dxf_curves(path: Path) -> list[Curve]:
             try:
                 curve = ezdxf.path.make_path(entity)
             except TypeError:
-                # Text and the like are no curves.
+                # Not a curve, for instance text.
                 continue
             for part in curve.sub_paths():
                 points = [(mm * p.x, mm * p.y) for p in part.flattening(_FLAT_MM / mm)]
@@ -242,12 +246,12 @@ def _dxf_curves(path: Path) -> list[Curve]:
 
 
 def _joined(curves: list[Curve], path: Path) -> list[Curve]:
-    """Closed curves, made of all of these by joining ends that meet.
+    """Joins curves whose ends meet into closed curves.
 
     Raises:
-        UserError: one stays open.
+        UserError: a curve stays open.
     """
-    # A lone point, as some programs leave behind, is no curve.
+    # Drop the single points that some programs leave behind.
     curves = [curve for curve in curves if np.ptp(curve, axis=0).max() > _JOIN_MM]
     loops = [curve for curve in curves if _is_closed(curve)]
     chains = [curve for curve in curves if not _is_closed(curve)]
@@ -264,8 +268,8 @@ def _joined(curves: list[Curve], path: Path) -> list[Curve]:
         if not _is_closed(chain):
             gap = float(np.linalg.norm(chain[-1] - chain[0]))
             raise UserError(
-                f"{path} has an open curve, whose ends are {gap:.2f} mm apart: close it, or delete "
-                "what is no outline"
+                f"{path} has an open curve with a gap of {gap:.2f} mm: close it, or delete what "
+                "does not belong to the outline"
             )
         loops.append(chain)
     return loops
@@ -276,25 +280,25 @@ def _is_closed(curve: Curve) -> bool:
 
 
 def _enclosed(loops: list[Curve], path: Path) -> CrossSection:
-    """The area inside the largest of closed curves and outside the others.
+    """The area inside the largest closed curve and outside the others.
 
     Raises:
-        UserError: a curve is not inside the largest, or that encloses nothing, or several things.
+        UserError: the largest curve encloses no area or crosses itself, or another is not inside
+            it.
     """
     areas = [CrossSection([loop], FillRule.EvenOdd) for loop in loops]
     areas.sort(key=lambda area: -area.area())
     if not areas or areas[0].area() < _LEAST_AREA_MM2:
-        raise UserError(f"{path} holds no closed curve that encloses anything")
+        raise UserError(f"{path} has no closed curve that encloses an area")
     outer, *holes = areas
     if len(outer.decompose()) > 1:
         raise UserError(f"{path}: its outline crosses itself")
     for hole in holes:
         if (hole - outer).area() > 0.01 * hole.area():
             raise UserError(
-                f"{path} has a curve that is not inside the largest one: draw the outline of one "
-                "tool alone"
+                f"{path} has a curve outside the largest one: draw the outline of one tool only"
             )
-    # The same curve drawn twice, as a fill and as a stroke, is no hole.
+    # The same curve drawn twice, as fill and stroke, is not a hole.
     for hole in holes:
         if hole.area() < 0.999 * areas[0].area():
             outer -= hole

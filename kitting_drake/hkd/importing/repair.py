@@ -1,9 +1,8 @@
-"""Anyone's mesh, read and made one solid: what `hkd import` begins with.
+"""Reads any mesh and makes it one solid, the first step of `hkd import`.
 
-A mesh that is sound is taken as it is. One that is not is split into connected components, each
-repaired alone (winding, then holes, then pymeshfix) and all united, less sealed hollows; where that
-loses any of the shape that can be seen, the surface is wrapped instead: filled as voxels, and
-traced.
+A watertight mesh is used as it is. Any other is split into connected components. Each is repaired
+alone (winding, then holes, then pymeshfix), and all are united, minus sealed hollows. If that loses
+visible parts, the surface is wrapped instead: filled as voxels and traced.
 """
 
 from pathlib import Path
@@ -21,25 +20,25 @@ from kitting_drake.common.errors import UserError
 FORMATS = (".stl", ".obj", ".ply", ".glb", ".gltf")
 MOST_BYTES = 200_000_000
 MOST_TRIANGLES = 2_000_000
-# Solids are repaired at this size, whatever the file's units: tolerances below are for it.
+# Solids are repaired at this size in any unit; the tolerances below are for it.
 NOMINAL_MM = 180.0
 
-# Vertices on the same point of this grid are one.
+# Vertices in the same cell of this grid are merged.
 _MERGE_MM = 1e-3
-# Bodies further apart than this are no one tool; what is smaller than this share is dirt.
+# Bodies further apart than this are separate things; a thing below this share of volume is dirt.
 _GAP_MM, _DIRT = 1.5, 0.02
-# A repaired mesh may lose this share of any of its projections on the three planes.
+# The share of any of its three projections that a repaired mesh may lose.
 _LOST = 0.03
-# Projections are compared in pixels of this size.
+# The size of a pixel of the compared projections.
 _PIXEL_MM = 0.5
-# A note says how much of the surface was added to close it, if that is more than this share. It is
-# measured at so many points; those further from the given surface than this, in mm, were added.
+# A larger share of added surface is reported. It is sampled at this many points, and those further
+# than this (mm) from the given surface count as added.
 _TELLING, _AWAY_MM, _PROBES = 0.03, 1.5, 20_000
 _MOST_COMPONENTS = 3000
 _VOXEL_MM = 0.75
-# A hollow has less than this share outside the body that it is in.
+# The largest share of a hollow's volume outside its body.
 _OUTSIDE = 0.01
-# Less than this share of a box is no solid but a skin.
+# A mesh that fills less than this share of its bounding box encloses no volume.
 _HOLLOW = 0.002
 
 Array = NDArray[np.float64]
@@ -47,10 +46,10 @@ Faces = NDArray[np.int64]
 
 
 def read_mesh(path: Path) -> tuple[Array, Faces]:
-    """Vertices (n, 3), in the file's own units, and triangles (m, 3) of all that a file shows.
+    """The vertices (n, 3), in the file's units, and triangles (m, 3) of all visible meshes.
 
     Raises:
-        UserError: no such file, too big, or not a mesh.
+        UserError: the file is missing, too large or not a mesh.
     """
     kinds = ", ".join(suffix[1:].upper() for suffix in FORMATS)
     try:
@@ -58,18 +57,15 @@ def read_mesh(path: Path) -> tuple[Array, Faces]:
     except (OSError, ValueError) as error:
         raise UserError(f"there is no file {path}: give a mesh ({kinds})") from error
     if not path.is_file():
-        raise UserError(f"{path} is a folder or no common file: give a mesh ({kinds})")
+        raise UserError(f"{path} is a folder or special file: give a mesh ({kinds})")
     if path.suffix.lower() not in FORMATS:
-        raise UserError(
-            f"{path} is none of the kinds of mesh that can be read ({kinds}), nor an outline "
-            "(SVG, DXF)"
-        )
+        raise UserError(f"{path} is neither a supported mesh ({kinds}) nor an outline (SVG, DXF)")
     if size == 0:
         raise UserError(f"{path} is empty")
     if size > MOST_BYTES:
         raise UserError(
-            f"{path} has {size / 1e6:.0f} MB, and {MOST_BYTES / 1e6:.0f} MB is the most that is "
-            "read: decimate the mesh first"
+            f"{path} has {size / 1e6:.0f} MB, more than the limit of {MOST_BYTES / 1e6:.0f} MB: "
+            "decimate the mesh first"
         )
     options = {"skip_materials": True} if path.suffix.lower() == ".obj" else {}
     try:
@@ -79,14 +75,14 @@ def read_mesh(path: Path) -> tuple[Array, Faces]:
     except MemoryError:
         raise
     except Exception as error:
-        # Readers fail on broken files in as many ways as there are.
+        # The readers fail in many ways on broken files.
         raise UserError(f"{path} cannot be read as {path.suffix[1:].upper()}") from error
     if len(faces) == 0 or vertices.ndim != 2 or faces.ndim != 2 or faces.shape[1] != 3:
-        raise UserError(f"{path} holds no triangles: is the file whole?")
+        raise UserError(f"{path} has no triangles: check that the file is complete")
     if len(faces) > MOST_TRIANGLES:
         raise UserError(
-            f"{path} has {len(faces)} triangles, and {MOST_TRIANGLES} is the most that is taken: "
-            "decimate the mesh first"
+            f"{path} has {len(faces)} triangles, more than the limit of {MOST_TRIANGLES}: decimate "
+            "the mesh first"
         )
     whole = ((faces >= 0) & (faces < len(vertices))).all(axis=1)
     faces = faces[whole]
@@ -94,16 +90,16 @@ def read_mesh(path: Path) -> tuple[Array, Faces]:
         good = np.isfinite(vertices).all(axis=1) & (np.abs(vertices) < 1e30).all(axis=1)
     faces = faces[good[faces].all(axis=1)]
     if len(faces) == 0:
-        raise UserError(f"{path} holds no triangle whose corners are all numbers")
+        raise UserError(f"{path} has no triangle with finite corners")
     used, faces = np.unique(faces, return_inverse=True)
     return vertices[used], faces.reshape(-1, 3)
 
 
 def make_solid(vertices: Array, faces: Faces) -> tuple[Manifold, list[str]]:
-    """One solid of a mesh whose longest side is `NOMINAL_MM`, and what had to be done for it.
+    """The solid of a mesh whose longest side is `NOMINAL_MM`, and notes on its repairs.
 
     Raises:
-        UserError: it encloses no volume, or is several things.
+        UserError: the mesh encloses no volume, or consists of several things.
     """
     vertices, faces = _merged(vertices, faces)
     if len(faces) < 4:
@@ -140,8 +136,8 @@ def make_solid(vertices: Array, faces: Faces) -> tuple[Manifold, list[str]]:
         added = _added(triangles, solid)
         if added > _TELLING:
             notes.append(
-                f"{100 * added:.0f} % of its surface was not there: see by `hkd sheet` whether the "
-                "file is whole"
+                f"{100 * added:.0f} % of its surface was missing: check by `hkd sheet` that the "
+                "file is complete"
             )
     if solid.is_empty() or solid.volume() < _HOLLOW * _box_volume(solid):
         raise UserError("the mesh encloses no volume")
@@ -157,14 +153,14 @@ def make_solid(vertices: Array, faces: Faces) -> tuple[Manifold, list[str]]:
 def _told_apart(
     outward: list[Manifold], inward: list[Manifold]
 ) -> tuple[list[Manifold], list[Manifold]]:
-    """The bodies, and the sealed hollows inside them, of what surfaces bound.
+    """Separates bodies from the sealed hollows inside them.
 
-    A hollow's surface is wound the other way than that of the body which it is in. A surface that
-    is not inside another bounds a body, however it is wound.
+    A hollow's surface is wound opposite to that of the body around it. A surface that is not inside
+    another bounds a body, whatever its winding.
 
     Args:
-        outward: what is inside surfaces whose normals point out of it.
-        inward: what is inside those whose normals point into it.
+        outward: the solids inside surfaces with outward normals.
+        inward: the solids inside surfaces with inward normals.
     """
     if inward and max((s.volume() for s in outward), default=0.0) < max(s.volume() for s in inward):
         outward, inward = inward, outward
@@ -176,7 +172,7 @@ def _told_apart(
 
 
 def _volume(triangles: Array) -> float:
-    """The volume inside triangles (n, 3, 3), negative where their normals point inward."""
+    """The signed volume inside triangles (n, 3, 3): negative for inward normals."""
     a, b, c = np.moveaxis(triangles - triangles.mean(axis=(0, 1)), 1, 0)
     return float((a * np.cross(b, c)).sum() / 6)
 
@@ -192,7 +188,7 @@ def _merged(vertices: Array, faces: Faces) -> tuple[Array, Faces]:
 
 
 def _as_manifold(vertices: Array, faces: Faces) -> Manifold | None:
-    """The solid that a surface bounds, or None where it bounds none."""
+    """The solid inside a surface, or None if the surface does not bound one."""
     if len(faces) < 4 or not _is_closed(faces):
         return None
     used, index = np.unique(faces, return_inverse=True)
@@ -206,7 +202,7 @@ def _as_manifold(vertices: Array, faces: Faces) -> Manifold | None:
 
 
 def _is_closed(faces: Faces) -> bool:
-    """Whether every edge is run along once in either direction: manifold3d may crash else."""
+    """Whether each edge occurs once in each direction; otherwise manifold3d may crash."""
     edges = np.vstack([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
     keys = edges[:, 0] * (faces.max() + 1) + edges[:, 1]
     opposite = edges[:, 1] * (faces.max() + 1) + edges[:, 0]
@@ -233,7 +229,7 @@ def _repaired(vertices: Array, faces: Faces) -> Manifold | None:
         fixer.fill_small_boundaries(0, False)
         solid = _fixed(fixer)
         if solid is None:
-            # Slow, and what it removes beside, surfaces through one another, does no harm here.
+            # Slow; it also removes surfaces that cross each other, which does no harm here.
             fixer.clean(10, 3)
             solid = _fixed(fixer)
     except RuntimeError:
@@ -247,7 +243,7 @@ def _fixed(fixer: pymeshfix.PyTMesh) -> Manifold | None:
 
 
 def _loses(triangles: Array, solid: Manifold) -> bool:
-    """Whether a solid lacks part of what can be seen of triangles from any of three sides."""
+    """Whether a solid lacks visible parts of the triangles in any of three projections."""
     if solid.is_empty():
         return True
     mesh = solid.to_mesh64()
@@ -263,17 +259,17 @@ def _loses(triangles: Array, solid: Manifold) -> bool:
         seen, kept = (np.zeros(shape[axes], dtype=bool) for _ in range(2))
         seen[tuple(pixels[:, axes].T)] = True
         kept[tuple(my_pixels[:, axes].T)] = True
-        # A pixel at the rim may be hit in one and missed in the other.
+        # Tolerate one pixel at the rim, which sampling may miss.
         lost = (seen & ~ndimage.binary_dilation(kept, around)).sum()
         gained = (kept & ~ndimage.binary_dilation(seen, around)).sum()
-        # Filled holes in walls may show: gains count only if large.
+        # Filled holes gain area, so only large gains count.
         if lost > _LOST * seen.sum() or gained > 5 * _LOST * seen.sum():
             return True
     return False
 
 
 def _added(triangles: Array, solid: Manifold) -> float:
-    """The share of a solid's surface that is away from all triangles that it was made of."""
+    """The share of a solid's surface that is far from all triangles."""
     if solid.is_empty():
         return 0.0
     mesh = solid.to_mesh64()
@@ -289,7 +285,7 @@ def _added(triangles: Array, solid: Manifold) -> float:
 
 
 def _sampled(triangles: Array, step: float) -> Array:
-    """Points (n, 3) of a surface, so many that hardly a square of a side of `step` has none."""
+    """Points (n, 3) of a surface, dense enough to hit almost every square of side `step`."""
     corners = triangles.reshape(-1, 3)
     mesh = trimesh.Trimesh(corners, np.arange(len(corners)).reshape(-1, 3), process=False)
     count = int(min(4e6, 12 * mesh.area / step**2)) + 1
@@ -298,7 +294,7 @@ def _sampled(triangles: Array, step: float) -> Array:
 
 
 def _wrapped(triangles: Array) -> Manifold:
-    """The solid inside a surface with gaps of up to some voxels, within about half a voxel."""
+    """The solid inside a surface with gaps of a few voxels, accurate to about half a voxel."""
     corners = triangles.reshape(-1, 3)
     margin = 5 * _VOXEL_MM
     low = corners.min(axis=0) - margin
@@ -313,18 +309,18 @@ def _wrapped(triangles: Array) -> Manifold:
     if filled.sum() < 1.05 * surface:
         return Manifold()
     distance = ndimage.distance_transform_edt(filled) - ndimage.distance_transform_edt(~filled)
-    # The skin's voxels reach half of one beyond it.
+    # The voxels of the surface extend half a voxel beyond it.
     field = ndimage.gaussian_filter(distance, 0.7) - 0.5
     inside = np.argwhere(field > -3)
     first, last = inside.min(axis=0), inside.max(axis=0)
-    # A memoryview, because one number of an array at a time is slow to get.
+    # Single numbers are faster to read from a memoryview than from an array.
     values = np.ascontiguousarray(field).reshape(-1).data
     last_x, last_y, last_z = (int(extent) - 2 for extent in shape)
     low_x, low_y, low_z = map(float, low)
     row, plane = int(shape[2]), int(shape[1] * shape[2])
 
     def depth(x: float, y: float, z: float) -> float:
-        """The field at a point, linear between voxels."""
+        """The field at a point, interpolated linearly."""
         i, j, k = (x - low_x) / _VOXEL_MM, (y - low_y) / _VOXEL_MM, (z - low_z) / _VOXEL_MM
         a, b, c = (
             min(max(int(i), 0), last_x),
@@ -351,10 +347,10 @@ def _box_volume(solid: Manifold) -> float:
 
 
 def _one_thing(solid: Manifold, notes: list[str]) -> Manifold:
-    """The solid without the dirt around it.
+    """Removes the dirt around the solid.
 
     Raises:
-        UserError: it is several things that stand apart.
+        UserError: it consists of several separate things.
     """
     bodies = sorted(solid.decompose(), key=lambda body: -body.volume())
     if len(bodies) <= 1:
@@ -370,8 +366,8 @@ def _one_thing(solid: Manifold, notes: list[str]) -> Manifold:
     main = int(np.argmax(volumes))
     if volumes[main] < (1 - _DIRT) * whole:
         raise UserError(
-            f"the mesh holds {len(groups)} things that stand apart: import each from its own file"
+            f"the mesh holds {len(groups)} separate things: import each from its own file"
         )
     if len(groups) > 1 or crumbs:
-        notes.append("left out the dirt around it")
+        notes.append("removed loose dirt")
     return Manifold.batch_boolean(groups[main], OpType.Add)

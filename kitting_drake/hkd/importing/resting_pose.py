@@ -1,8 +1,7 @@
-"""The pose in which an imported tool comes to rest, as the physics has it.
+"""The pose in which an imported tool comes to rest in simulation.
 
-A stable pose of a rigid solid may be one that a tool does not keep: a screwdriver balanced on its
-handle tips at a touch. So the tool is dropped by a little onto a table, and where it ends otherwise
-than it was laid, that is how it lies.
+Geometry alone finds stable poses that a tool does not keep: a screwdriver balanced on its handle
+tips at a touch. So the tool is dropped from a small height onto a table.
 """
 
 from pathlib import Path
@@ -26,19 +25,18 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
 
 _DROP = 0.002
-"""In metres."""
+"""The height of the drop, in metres."""
 _SETTLE = 2.0
-"""Time in which a tool comes to rest, in seconds."""
+"""The simulated time, in seconds."""
 _STEP = 1 / 128
 _FRICTION = 0.5
 
 
 def resting_tilt(sdf: Path) -> NDArray[np.float64]:
-    """R (3, 3): how a tool that is dropped in its frame's pose has tilted when it has come to rest;
-    its rotation about z is left out.
+    """R (3, 3): the tilt of a dropped tool at rest, without the rotation about z.
 
     Args:
-        sdf: SDFormat of the tool, one link whose frame lies on the table.
+        sdf: SDFormat of the tool, of one link whose frame has the table at z = 0.
     """
     builder = DiagramBuilder()
     config = MultibodyPlantConfig(time_step=_STEP, contact_model="hydroelastic")

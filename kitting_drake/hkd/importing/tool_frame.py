@@ -1,4 +1,4 @@
-"""The tool frame of a solid: in a stable pose, along x, the working end toward +x."""
+"""Moves a solid into the tool frame: in a stable pose, along x, working end toward +x."""
 
 import numpy as np
 import trimesh
@@ -12,24 +12,23 @@ from kitting_drake.hkd.tools.stable_pose import StablePose, stable_poses
 
 Array = NDArray[np.float64]
 
-# Poses whose centre of mass is this little higher than the lowest are as good; of those the one
-# with the broadest support is taken, to this step. For a solid some 180 mm long.
+# Stable poses whose centres of mass are this close to the lowest count as equal. The one with the
+# broadest support, rounded to this step, is chosen. Both are for a solid about 180 mm long.
 _EQUAL_HEIGHT_MM, _MARGIN_STEP_MM = 0.3, 0.5
-# How far the length may run off the axis of least inertia, and what counts as one direction.
+# The largest angle between the length and the axis of least inertia, and the spread of a vote.
 _SIDEWAYS_DEG, _LIKE_DEG = 25.0, 6.0
 _END = 0.3
-"""Share of the length that is an end."""
+"""The share of the length that counts as an end."""
 
 
 def to_tool_frame(solid: Manifold, category: str) -> Manifold:
-    """The solid (mm) moved into the frame T of a tool of that category; see `Tool`.
+    """Moves a solid (mm) into the frame T of a tool of that category; see `Tool`.
 
-    The pose is the stable one with the lowest centre of mass. The working end is the
-    wider one of a hammer, the narrower one of pliers and of a screwdriver, and the one nearer the
-    centre of mass of a wrench.
+    The pose is the stable one with the lowest centre of mass. The working end is the wider end of a
+    hammer, the end nearer the centre of mass of a wrench, and the narrower end of any other tool.
 
     Raises:
-        UserError: it is flat, or has no stable pose.
+        UserError: the solid is flat or has no stable pose.
     """
     vertices, faces = meshes.vertices_and_faces(solid)
     com = trimesh.triangles.mass_properties(vertices[faces])["center_mass"]
@@ -40,17 +39,18 @@ def to_tool_frame(solid: Manifold, category: str) -> Manifold:
 
 
 def facing_forward(solid: Manifold, category: str) -> Manifold:
-    """A solid (mm) that lies along x in its pose at rest, moved into the frame T: turned by half a
-    turn about z where its working end (see `to_tool_frame`) is not at +x."""
+    """Moves a solid (mm) at rest along x into the frame T, with its working end at +x.
+
+    See `to_tool_frame` for the working end."""
     if not _works_at_plus_x(solid, category):
         solid = solid.rotate((0.0, 0.0, 180.0))
     return centred(solid)
 
 
 def tipping_deg(solid: Manifold) -> float:
-    """By how many degrees the table has to tilt until a solid (mm), as it lies, falls over.
+    """The tilt of the table, in degrees, at which a solid (mm) at rest tips over.
 
-    It is 0 where it does not stay as it lies at all.
+    It is 0 if the solid is not in a stable pose.
     """
     vertices, faces = meshes.vertices_and_faces(solid)
     com = trimesh.triangles.mass_properties(vertices[faces])["center_mass"]
@@ -59,23 +59,23 @@ def tipping_deg(solid: Manifold) -> float:
 
 
 def centred(solid: Manifold) -> Manifold:
-    """The solid moved to the origin of the frame T: centred in its bounding box, on the table."""
+    """The solid moved to T's origin: centred in its bounding box, and on the table."""
     low, high = np.array(solid.bounding_box()).reshape(2, 3)
     middle = (low + high) / 2
     return solid.translate((-middle[0], -middle[1], -low[2]))
 
 
 def size(solid: Manifold) -> Array:
-    """Extents (3,) of the bounding box."""
+    """The extents (3,) of the bounding box."""
     low, high = np.array(solid.bounding_box()).reshape(2, 3)
     return high - low
 
 
 def _lowest_pose(vertices: Array, com: Array) -> StablePose:
-    """The stable pose with the lowest centre of mass; of equals, that with the broadest support.
+    """The stable pose with the lowest centre of mass; of equal ones, that with broadest support.
 
     Raises:
-        UserError: there is none.
+        UserError: there is no stable pose.
     """
     try:
         poses = stable_poses(vertices, com)
@@ -85,7 +85,7 @@ def _lowest_pose(vertices: Array, com: Array) -> StablePose:
         raise UserError("the mesh has no stable pose")
     lowest = min(pose.height for pose in poses)
     good = [pose for pose in poses if pose.height < lowest + _EQUAL_HEIGHT_MM]
-    # Among equals again, the one nearest to the pose in the file.
+    # Of poses that are still equal, take the nearest to the pose in the file.
     return max(
         good,
         key=lambda pose: (round(pose.margin / _MARGIN_STEP_MM), -round(float(pose.normal[2]), 3)),
@@ -93,15 +93,15 @@ def _lowest_pose(vertices: Array, com: Array) -> StablePose:
 
 
 def long_direction_deg(outline: CrossSection) -> float:
-    """The direction along which most of an outline's edge runs, of those near its long axis.
+    """The direction of an outline's length: that of most of its edges, near its principal axis.
 
-    A handle's two edges decide it, not how far a head or a jaw stands out to one side.
+    So the two edges of a handle decide it, not a head or a jaw that sticks out to one side.
 
     Args:
-        outline: some 180 mm long.
+        outline: about 180 mm long.
 
     Returns:
-        Counter-clockwise from x, in degrees.
+        The angle from x, counter-clockwise, in degrees.
     """
     loops = outline.simplify(0.2).to_polygons()
     points = np.vstack([0.5 * (loop + np.roll(loop, -1, axis=0)) for loop in loops])
@@ -114,7 +114,7 @@ def long_direction_deg(outline: CrossSection) -> float:
     directions = axis + np.arange(-_SIDEWAYS_DEG, _SIDEWAYS_DEG, 0.25)
     apart = (directions[:, None] - angles + 90.0) % 180.0 - 90.0
     votes = np.exp(-0.5 * (apart / _LIKE_DEG) ** 2) @ lengths
-    # The middle of what agrees with the winner, which is finer than the steps.
+    # Average the edges that agree with the winner, which is finer than the steps.
     near = apart[int(np.argmax(votes))]
     weights = lengths * np.exp(-0.5 * (near / _LIKE_DEG) ** 2)
     return float(directions[int(np.argmax(votes))] - np.average(near, weights=weights))
@@ -133,7 +133,7 @@ def _works_at_plus_x(solid: Manifold, category: str) -> bool:
 
 
 def _width(outline: CrossSection, start: float, end: float) -> float:
-    """The mean width of the hull of what is between two places along x."""
+    """The mean width of the hull of an outline between two positions along x."""
     y_min, y_max = outline.bounds()[1], outline.bounds()[3]
     band = CrossSection.square((end - start, y_max - y_min)).translate((start, y_min))
     return float((outline ^ band).hull().area() / (end - start))

@@ -1,4 +1,4 @@
-"""The kit block: its solid, and the surface that the contact solver likes."""
+"""The kit block: its solid, and its surface meshed for the contact solver."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -10,16 +10,16 @@ from numpy.typing import NDArray
 from kitting_drake.hkd.kits.parameters import KitParameters
 
 ARC_SEGMENTS = 64
-"""How many straight edges a rounded outline has around a full circle."""
+"""The number of edges of a full circle in a rounded outline."""
 _CELL = 0.02
-"""The longest wall, and the side of the squares of the top, for the contact solver, in metres."""
+"""The largest piece of a wall or the top for the contact solver, in metres."""
 
 Triangles = tuple[NDArray[np.float64], NDArray[np.int64]]
 """Vertices (n, 3), in metres, and faces (m, 3)."""
 
 
 class _Surface:
-    """Triangles that grow ring by ring. Lengths in metres, normals out of the cavity's solid."""
+    """Collects triangles ring by ring; lengths in metres, normals out of the cavity."""
 
     def __init__(self) -> None:
         self._vertices: list[NDArray[np.float64]] = []
@@ -37,12 +37,12 @@ class _Surface:
         self._faces.append(faces)
 
     def add_ring(self, loops: list[NDArray[np.float64]], z: float) -> int:
-        """Adds the vertices of closed loops at a height; returns the index of the first."""
+        """Adds the vertices of closed loops at height z; returns the index of the first."""
         flat = np.concatenate(loops)
         return self.add_vertices(np.column_stack([flat, np.full(len(flat), z)]))
 
     def add_walls(self, loops: list[NDArray[np.float64]], lower: int, upper: int) -> None:
-        """Joins two rings of the same loops by upright walls."""
+        """Joins two rings of the same loops by vertical walls."""
         start = 0
         for loop in loops:
             here = start + np.arange(len(loop))
@@ -58,7 +58,7 @@ class _Surface:
         inner_loops: list[NDArray[np.float64]],
         inner: int,
     ) -> None:
-        """Joins a ring to a narrower and lower one: the flat band between the loops, let down."""
+        """Joins a ring to a narrower, lower one by the triangulated band between their loops."""
         band = np.asarray(triangulate(outer_loops + [loop[::-1] for loop in inner_loops]))
         starts = np.cumsum([0, *map(len, inner_loops[:-1])])
         inner_index = [
@@ -69,35 +69,36 @@ class _Surface:
         self.add_faces(np.concatenate([outer_index, *inner_index])[band][:, ::-1])
 
     def arrays(self) -> Triangles:
-        """All of them."""
+        """The vertices and faces added so far."""
         return np.concatenate(self._vertices), np.concatenate(self._faces)
 
 
 @dataclass(frozen=True)
 class Cavity:
-    """A bevelled pit in the kit frame, in metres."""
+    """A bevelled cavity in the kit frame, in metres."""
 
     outline: CrossSection
-    """The outline of the wall."""
+    """The outline of the walls."""
     floor: float
-    """Heights in the kit frame."""
+    """The height of the floor in the kit frame."""
     top: float
+    """The height of the rim in the kit frame."""
     lead_in: float
-    """Width and depth of the bevel around the rim; none at zero."""
+    """The width and depth of the bevel around the rim; zero for none."""
 
     @property
     def rim(self) -> CrossSection:
-        """The outline at the very top."""
+        """The outline at the top, outside the bevel."""
         if self.lead_in <= 0:
             return self.outline
         return self.outline.offset(self.lead_in, JoinType.Round, circular_segments=ARC_SEGMENTS)
 
     def add_sides(self, surface: _Surface, longest: float = np.inf) -> tuple[int, int]:
-        """Adds wall and bevel; returns the first vertices of the floor's ring and of the rim's.
+        """Adds walls and bevel; returns the first vertices of the floor's and the rim's rings.
 
         Args:
-            surface: grows.
-            longest: no edge of the outlines is to be longer, in metres.
+            surface: the surface to add to.
+            longest: the largest length of an outline's edge, in metres.
         """
         wall_loops = _subdivided(self.outline.to_polygons(), longest)
         rim_loops = _subdivided(self.rim.to_polygons(), longest)
@@ -126,7 +127,7 @@ class Cavity:
 
 
 def _subdivided(loops: list[NDArray[np.float64]], longest: float) -> list[NDArray[np.float64]]:
-    """The same closed loops with vertices added, so that no edge is longer."""
+    """Adds vertices to closed loops so that no edge is longer than `longest`."""
     result = []
     for loop in loops:
         edges = np.roll(loop, -1, axis=0) - loop
@@ -139,11 +140,11 @@ def _subdivided(loops: list[NDArray[np.float64]], longest: float) -> list[NDArra
 
 
 def build_block(cavities: Sequence[Cavity], parameters: KitParameters) -> Manifold:
-    """The kit block in the frame K, in metres: watertight, one body.
+    """The kit block in frame K, in metres: watertight and connected.
 
     Args:
-        cavities: to cut out.
-        parameters: whose length and width are the block's; see `KitLayout.parameters`.
+        cavities: the cavities to cut.
+        parameters: of the kit; their length and width are the block's.
     """
     size = (parameters.length, parameters.width, parameters.height)
     block = Manifold.cube(size, True).translate((0, 0, parameters.height / 2))
@@ -153,9 +154,9 @@ def build_block(cavities: Sequence[Cavity], parameters: KitParameters) -> Manifo
 
 
 def _add_floor(surface: _Surface, cavity: Cavity, cavities: Sequence[Cavity]) -> None:
-    """Adds the bounding rectangle of a cavity's floor, without what is in others as deep or deeper.
+    """Adds a cavity's floor as its bounding rectangle, minus other cavities at least as deep.
 
-    There it would be a shelf, or a second floor in the place of the first.
+    Inside those, the rectangle would be a shelf or a second floor.
     """
     x_min, y_min, x_max, y_max = cavity.outline.bounds()
     corners = np.array([(x_min, y_min), (x_max, y_min), (x_max, y_max), (x_min, y_max)])
@@ -174,15 +175,16 @@ def _add_floor(surface: _Surface, cavity: Cavity, cavities: Sequence[Cavity]) ->
 
 
 def contact_surfaces(cavities: Sequence[Cavity], parameters: KitParameters) -> dict[str, Triangles]:
-    """The block as the contact solver likes it: sides of the cavities, floors, top and outside.
+    """The block's surface meshed for the contact solver: sides, floors, top and outside.
 
-    The same walls, bevels and planes as the block's, cut otherwise. What costs is how many bounding
-    boxes of a few neighbouring triangles an object overlaps. A triangulation of floors and top by
-    their outlines has long slivers, whose boxes all overlap, and breaks every contact patch into as
-    many polygons; and a large triangle together with a small one has a large box. So a floor is one
-    rectangle that reaches into the solid, where nothing can touch it, but not into another cavity;
-    top and walls are cut into small pieces; and what is large is apart from what is small. The
-    underside is left out.
+    The geometry is that of the block, apart from the missing underside. The solver's cost grows
+    with the number of bounding boxes, each of a few neighbouring triangles, that an object
+    overlaps. A plain triangulation has long slivers with overlapping boxes, which also split
+    contact patches into many polygons. So:
+
+    - each floor is one rectangle that extends into the solid, where nothing can touch it;
+    - top and walls are cut into small pieces;
+    - large and small triangles are in separate meshes, because they would share large boxes.
     """
     sides, floors, top, outside = _Surface(), _Surface(), _Surface(), _Surface()
     room = CrossSection.square((parameters.length, parameters.width), True)
@@ -202,7 +204,7 @@ def contact_surfaces(cavities: Sequence[Cavity], parameters: KitParameters) -> d
     outside.add_walls(
         loops, outside.add_ring(loops, 0.0), outside.add_ring(loops, parameters.height)
     )
-    # What bounds the cavities from outside bounds the block from inside.
+    # The surfaces point out of the cavities; flip them to point out of the block.
     return {
         "sides": _reversed(sides),
         "floors": _reversed(floors),

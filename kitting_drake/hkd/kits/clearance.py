@@ -1,4 +1,4 @@
-"""Measures a kit as built: how much room a seated tool has in its cavity."""
+"""Measures the clearance of a seated tool in its cavity, on the built block."""
 
 from dataclasses import dataclass
 
@@ -11,12 +11,12 @@ from kitting_drake.hkd.kits.parameters import KitParameters
 from kitting_drake.hkd.tools.tool import Tool
 
 _STEP = 0.00025
-"""Distance of the points that are measured along a tool's outline, in metres."""
+"""The spacing of the measured points along a tool's outline, in metres."""
 
 
 @dataclass(frozen=True)
 class Clearance:
-    """Free space between the outline of a seated tool and the wall of its cavity, in metres."""
+    """The distance between a seated tool's outline and its cavity's wall, in metres."""
 
     median: float
     minimum: float
@@ -25,20 +25,20 @@ class Clearance:
 def measure_clearance(
     block: Manifold, tool: Tool, parameters: KitParameters, pose: CavityPose | None = None
 ) -> Clearance:
-    """The clearance of a tool in the block of a kit, all along the tool's outline.
+    """Measures the clearance along the whole outline of a seated tool.
 
-    The wall is taken from the block itself, cut halfway between floor and bevel; the outline from
-    the tool's visual mesh. Where the tool has notches that the cavity bridges, and its wall has no
-    counterpart, the distance is that to the nearest wall there is.
+    The wall is a slice of the block halfway between floor and bevel; the outline is that of the
+    tool's visual mesh. Each point of the outline has the distance to the nearest wall, also in
+    notches of the tool that the cavity bridges.
 
     Args:
-        block: of the kit, in its frame K.
-        tool: to seat.
+        block: the kit's, in frame K.
+        tool: the tool to seat.
         parameters: of the kit.
-        pose: of the seated tool; that in the slot of its category if None.
+        pose: of the seated tool; by default the slot of its category.
 
     Raises:
-        ValueError: the tool, so seated, is not inside a cavity.
+        ValueError: the seated tool is not inside a cavity.
     """
     pose = slot_pose(tool, parameters) if pose is None else pose
     level = (pose.z + parameters.height - parameters.lead_in) / 2
@@ -59,7 +59,7 @@ def _points_along(loop: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _distances(points: NDArray[np.float64], shape: CrossSection) -> NDArray[np.float64]:
-    """The distance (n) of points (n, 2) from the nearest edge of a shape."""
+    """The distance (n) of points (n, 2) to the nearest edge of a shape."""
     nearest = np.full(len(points), np.inf)
     for loop in shape.to_polygons():
         for start, end in zip(loop, np.roll(loop, -1, axis=0), strict=True):

@@ -1,10 +1,9 @@
 """Kits: a block with a conformal cavity for each tool (section IV-B.2 of the paper).
 
-The paper takes a depth image of the tool from above, fills what is beneath it, closes the result
-morphologically, grows it by 2 mm and subtracts it from the block; its authors then cut upward, so
-that the tool can get in. A depth image filled downward and cut upward is a prism over the tool's
-outline. So the outline is taken exactly, as polygons, and closed and grown exactly, by offsetting:
-the same cavity without the voxels, their steps, and the smoothing that has to hide them.
+The paper takes a depth image of the tool from above, fills it downward, closes it morphologically,
+grows it by 2 mm and subtracts it from the block. It then cuts the cavity open to the top. The
+result is a prism over the tool's outline. So this module closes and grows the exact outline by
+polygon offsetting, which needs no voxels and no smoothing.
 """
 
 import dataclasses
@@ -28,7 +27,7 @@ from kitting_drake.hkd.tools.tool import Tool
 _DIGITS = 7
 """The number of decimals of coordinates in files."""
 _FORMAT_VERSION = "9"
-"""Part of the cache key: changed whenever the same input makes another kit."""
+"""Part of the cache key. Change it when equal inputs give other kits."""
 
 
 @dataclass(frozen=True)
@@ -45,7 +44,7 @@ class Kit:
 
     @property
     def parameters(self) -> KitParameters:
-        """The template, with the length and the width that the block has."""
+        """The template, with the block's length and width."""
         return self.layout.parameters
 
     @property
@@ -54,18 +53,18 @@ class Kit:
         return self.parameters.length, self.parameters.width, self.parameters.height
 
     def goal(self, index: int) -> CavityPose:
-        """Where the frame T of tool `index` belongs in K."""
+        """The goal pose of tool `index`'s frame T in K."""
         return self.layout.poses[index]
 
 
 def make_kit(tools: Sequence[Tool], parameters: KitParameters) -> Kit:
-    """The kit for these tools, from the cache, or built and put there.
+    """Makes a kit for tools, or loads it from the cache.
 
-    The cache goes by content, so a changed tool or parameter makes another kit. A kit appears there
-    atomically, and two processes that build the same one do not disturb each other.
+    The cache key is the content of the tools and parameters. A kit appears in the cache atomically,
+    so processes may build the same one concurrently.
 
     Raises:
-        UserError: the tools make no kit (see `layout_kit`), or the cache cannot be written.
+        UserError: the tools do not fit (see `layout_kit`), or the cache cannot be written.
     """
     folder = cached_folder(
         cache_directory() / "kits" / _content_key(tools, parameters),
@@ -140,7 +139,7 @@ def _write(tools: Sequence[Tool], layout: KitLayout, directory: Path) -> None:
     cavities = kit_cavities(tools, parameters, layout.poses)
     block = build_block(cavities, parameters)
     mesh = block.to_mesh()
-    # Vertices that the file's digits cannot tell apart are one, or the surface would have seams.
+    # Merge vertices that round to the same digits, which would leave cracks in the surface.
     rounded = np.round(np.asarray(mesh.vert_properties, dtype=float)[:, :3], _DIGITS) + 0.0
     vertices, index = np.unique(rounded, axis=0, return_inverse=True)
     faces = index[np.asarray(mesh.tri_verts, dtype=int)]
@@ -149,7 +148,7 @@ def _write(tools: Sequence[Tool], layout: KitLayout, directory: Path) -> None:
     (directory / "kit.obj").write_text(flat_obj(vertices, faces, digits=_DIGITS))
     for name, surface in contact_surfaces(cavities, parameters).items():
         (directory / f"contact_{name}.obj").write_text(flat_obj(*surface, digits=_DIGITS))
-    # Two colours, as tool foam has: what is inside the block's faces is a cavity.
+    # Two colours, as in tool foam: faces off the block's bounding box belong to cavities.
     bounds = np.array(block.bounding_box()).reshape(2, 3)
     centres = vertices[faces].mean(axis=1)
     on_hull = np.isclose(centres[:, None], bounds[None], atol=1e-6).any(axis=(1, 2))

@@ -1,8 +1,8 @@
-"""Where the cavities of a kit are, and their outlines.
+"""The layout of a kit: the poses and outlines of its cavities.
 
-A toolset, one tool of each of the paper's categories at most, takes the slots of a template. Any
-other tools, tools that are too big for their slots, and all where `always_nested` says so, are
-nested: on a block of their own size, or on one of a given size.
+A toolset, with at most one tool of each of the paper's categories, takes the slots of a template.
+Tools are nested instead if they are other tools, are too large for their slots, or if
+`always_nested` is set. The block then has the smallest size found, or a given size.
 """
 
 import dataclasses
@@ -29,13 +29,13 @@ SLOTS = {
     "wrench": (0.0, -0.09),
     "screwdriver": (0.0, 0.09),
 }
-"""(x, y) of the frame T of the tool of each category in the kit frame, in metres."""
+"""(x, y) of each category's tool frame T in the kit frame, in metres."""
 
 MOST_TOOLS = 12
 """The largest number of tools in a kit."""
 
 _SIZE_STEP = 0.001
-"""Nested blocks have a length and a width that are multiples of this, in metres."""
+"""The length and width of a nested block are multiples of this, in metres."""
 
 
 @dataclass(frozen=True)
@@ -51,19 +51,19 @@ class CavityPose:
 
 @dataclass(frozen=True)
 class KitLayout:
-    """How large a kit block is, and where its cavities are."""
+    """The size of a kit's block and the poses of its tools."""
 
     parameters: KitParameters
-    """The template, with the length and the width that the block has."""
+    """The template, with the block's length and width."""
     poses: tuple[CavityPose, ...]
-    """The poses of the seated tools, in their order."""
+    """The poses of the seated tools, in the tools' order."""
 
 
 def slot_pose(tool: Tool, parameters: KitParameters) -> CavityPose:
-    """The pose of a tool in the slot of its category: its top is flush with the block's.
+    """The pose of a tool in its category's slot, with its top level with the block's.
 
     Raises:
-        KeyError: there is no slot for the tool's category.
+        KeyError: the tool's category has no slot.
     """
     x, y = SLOTS[tool.category]
     return CavityPose(x, y, parameters.height - tool.height)
@@ -72,15 +72,15 @@ def slot_pose(tool: Tool, parameters: KitParameters) -> CavityPose:
 def cavity_outline(outline: CrossSection, parameters: KitParameters) -> CrossSection:
     """The outline of a tool, closed and grown by the clearance.
 
-    A hole through the tool leaves no pillar standing in its cavity, thin and of no use.
+    Holes are filled, because they would leave thin pillars in the cavity.
     """
     closing, clearance = parameters.closing_radius, parameters.clearance
-    # Simplified first and last only: each time costs up to the tolerance.
+    # Simplify only first and last, because each time costs up to the tolerance.
     grown = outline.simplify(parameters.tolerance / 4).offset(
         closing + clearance, JoinType.Round, circular_segments=ARC_SEGMENTS
     )
     closed = grown.offset(-closing, JoinType.Round, circular_segments=ARC_SEGMENTS)
-    # Loops around holes run clockwise, and have negative areas.
+    # Loops around holes are clockwise and have negative areas.
     loops = [loop for loop in closed.to_polygons() if _signed_area(loop) > 0]
     return CrossSection(loops).simplify(parameters.tolerance)
 
@@ -91,20 +91,20 @@ def _signed_area(loop: NDArray[np.float64]) -> float:
 
 
 def layout_kit(tools: Sequence[Tool], parameters: KitParameters) -> KitLayout:
-    """Chooses the block's size and the poses of the tools: in their slots, or else nested.
+    """Chooses the block's size and the poses of the tools: in their slots if they fit, else nested.
 
     Raises:
-        UserError: there are no tools or too many, one is too high for the block, or no block is
-            large enough for them all.
+        UserError: there are no tools or too many, a tool is too high for the block, or the tools do
+            not fit on a block.
     """
     if not 1 <= len(tools) <= MOST_TOOLS:
         raise UserError(f"a kit holds 1 to {MOST_TOOLS} tools, not {len(tools)}")
     for tool in tools:
         if parameters.height - tool.height < parameters.minimum_wall - 1e-9:
             raise UserError(
-                f"'{tool.name}' is {1e3 * tool.height:.1f} mm high and leaves less than a wall of "
+                f"'{tool.name}' is {1e3 * tool.height:.1f} mm high and leaves less than "
                 f"{1e3 * parameters.minimum_wall:.1f} mm (kit.minimum_wall) below it in a block of "
-                f"{1e3 * parameters.height:.1f} mm: a higher block would do"
+                f"{1e3 * parameters.height:.1f} mm: use a higher block"
             )
     categories = [tool.category for tool in tools]
     unlike = len(set(categories)) == len(categories) and set(categories) <= set(SLOTS)
@@ -142,7 +142,7 @@ def _wall(parameters: KitParameters) -> float:
 
 
 def _block_sides(nesting: Nesting) -> tuple[float, float]:
-    """The sides, in metres, of the smallest block that takes a nesting."""
+    """The sides of the smallest block that holds a nesting, in metres."""
     length, width = (
         _SIZE_STEP * math.ceil(side / _SIZE_STEP) for side in (nesting.length, nesting.width)
     )
@@ -156,7 +156,7 @@ def _nested_on_least_block(
     if nesting is None:
         sides = " by ".join(f"{1e3 * side:.0f}" for side in LONGEST_SIDES)
         raise UserError(
-            f"{_quoted(tools)} do not fit into one kit: its block may be {sides} mm at most"
+            f"{_quoted(tools)} do not fit into one kit: its block can be at most {sides} mm"
         )
     return nesting
 
@@ -167,10 +167,10 @@ def _nested_on_given_block(
     nesting = nest_on(shapes, _wall(parameters), (parameters.length, parameters.width))
     if nesting is None:
         free = nest(shapes, _wall(parameters))
-        advice = "take fewer tools, or a thinner wall"
+        advice = "use fewer tools or thinner walls"
         if free is not None:
             sides = " by ".join(f"{1e3 * side:.0f}" for side in _block_sides(free))
-            advice = f"{sides} mm would do"
+            advice = f"use a block of {sides} mm"
         given = f"{1e3 * parameters.length:g} by {1e3 * parameters.width:g} mm"
         raise UserError(
             f"there is no room for {_quoted(tools)} on a block of {given} with walls of "
@@ -184,9 +184,9 @@ def _quoted(tools: Sequence[Tool]) -> str:
 
 
 def released_fingers(tool: Tool) -> CrossSection:
-    """The area under the fingers as they let go of a tool at its annotated grasp, in T, in metres.
+    """The area under the fingers as they release a tool at its annotated grasp, in T, in metres.
 
-    One rectangle for each finger, from the gripped face outward.
+    It is one rectangle for each finger, outward from the gripped face.
     """
     fingers = CrossSection()
     for side in (-1, 1):
@@ -201,12 +201,12 @@ def kit_cavities(
     """The cavity of each tool.
 
     Args:
-        tools: of the kit.
+        tools: the kit's.
         parameters: of the kit.
-        poses: of the seated tools; those of `layout_kit` if None.
+        poses: of the seated tools; by default those of `layout_kit`.
 
     Raises:
-        UserError: the tools make no kit; see `layout_kit`.
+        UserError: the tools do not fit; see `layout_kit`.
     """
     poses = layout_kit(tools, parameters).poses if poses is None else poses
     return [
@@ -221,14 +221,14 @@ def kit_cavities(
 
 
 def moved_outline(outline: CrossSection, pose: CavityPose) -> CrossSection:
-    """An outline in a tool's frame T as it is in the kit frame K when the tool is seated."""
+    """Moves an outline from a seated tool's frame T to the kit frame K."""
     if pose.yaw:
         outline = outline.rotate(math.degrees(pose.yaw))
     return outline.translate((pose.x, pose.y))
 
 
 def _has_walls(cavities: Sequence[Cavity], parameters: KitParameters) -> bool:
-    """Whether there is a wall between any two cavities, and around them in the block."""
+    """Whether all cavities have walls between them and to the block's sides."""
     half_wall = parameters.minimum_wall / 2
     grown = [
         cavity.rim.offset(half_wall, JoinType.Round, circular_segments=ARC_SEGMENTS)

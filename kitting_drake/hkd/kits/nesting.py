@@ -1,10 +1,10 @@
-"""Nesting: where shapes of any outline go on a rectangle that is as small as can be.
+"""Nesting: packs shapes of any outline on a rectangle as small as possible.
 
-Shapes are placed one by one, the largest first, in a strip of a given width, each where it raises
-the used height of the strip least; of several strip widths the best is kept. On a raster, all the
-translations of a shape are tried at once: it may not go where the correlation of its mask with the
-mask of what is taken is not zero, and a fast Fourier transform gives that for the whole strip. The
-masks are conservative, so what the raster allows keeps its distances in the continuum too.
+Shapes are placed one by one, largest first, in strips of several widths. Each goes where it raises
+the strip's used height least, and the best strip is kept. All translations of a shape are tested at
+once on a raster: a translation is free where the cross-correlation of the shape's mask with the
+mask of the placed shapes is zero. A fast Fourier transform computes it for the whole strip. The
+masks are conservative, so the exact outlines keep their distances too.
 """
 
 import itertools
@@ -17,24 +17,24 @@ from manifold3d import CrossSection, JoinType
 from numpy.typing import NDArray
 
 CELL = 0.0015
-"""Side of the raster's cells, in metres."""
+"""The side of a raster cell, in metres."""
 
 PREFERRED_SIDE = 0.42
-"""The longest side of a rectangle that is taken if there is any such, in metres."""
+"""The longest side of a rectangle, in metres, unless the shapes need a longer one."""
 
 LONGEST_SIDES = (0.48, 0.95)
-"""The longest sides of any rectangle, in metres: the workspace of 0.5 by 1 m, with a margin."""
+"""The largest sides of any rectangle, in metres: the workspace of 0.5 by 1 m with a margin."""
 
 _YAWS_DEG = (0, 90, 180, 270)
 _WIDTHS = (1.0, 0.9, 1.1, 0.8, 1.25, 1.45)
-"""Strip widths that are tried, as multiples of the side of a square of the expected area."""
+"""Strip widths to try, as multiples of the side of a square of the expected area."""
 _EXPECTED_USE = 0.60
-"""The share of the rectangle's area that outlines and their walls are expected to take."""
+"""The expected share of the rectangle's area under outlines and their walls."""
 _ELONGATION_COST = 0.10
-"""How much more area a square may have than a rectangle whose sides are as two to one."""
+"""The extra cost of a rectangle with sides of 2 to 1 over a square of the same area."""
 _ARC_SEGMENTS = 64
 _REACH = 1.02 * CELL / math.sqrt(2)
-"""The greatest distance of a point from the centre of its cell, with some for rounding."""
+"""The largest distance of a point from the centre of its cell, with a margin for rounding."""
 
 Mask = NDArray[np.bool_]
 Spectrum = NDArray[np.complexfloating]
@@ -45,14 +45,14 @@ class NestedShape:
     """A shape to place; lengths in metres."""
 
     outline: CrossSection
-    """It keeps its distance from all other outlines."""
+    """Keeps its distance from all other outlines."""
     keep_out: CrossSection
-    """It overlaps no other outline, though perhaps its own and other keep-outs."""
+    """Overlaps no other shape's outline; it may overlap keep-outs."""
 
 
 @dataclass(frozen=True)
 class NestedPose:
-    """The pose of a shape's frame: in metres from the rectangle's centre, and in degrees."""
+    """The pose of a shape's frame in metres from the rectangle's centre, and in degrees."""
 
     x: float
     y: float
@@ -62,25 +62,25 @@ class NestedPose:
 
 @dataclass(frozen=True)
 class Nesting:
-    """A rectangle, and where the shapes are on it."""
+    """A rectangle and the poses of the shapes on it."""
 
     length: float
     """Along x, in metres."""
     width: float
     """Along y."""
     poses: tuple[NestedPose, ...]
-    """The poses, in the order of the shapes."""
+    """The poses, in the shapes' order."""
 
 
 def nest(shapes: Sequence[NestedShape], wall: float) -> Nesting | None:
-    """Places shapes on the best rectangle that is found; None if none is large enough.
+    """Places shapes on the best rectangle found, or returns None if none is large enough.
 
-    The best is small and nearly square; one with a side over `PREFERRED_SIDE` is the last resort.
-    The same shapes always get the same poses.
+    The best rectangle is small and nearly square, and exceeds `PREFERRED_SIDE` only if it must. The
+    result is deterministic.
 
     Args:
         shapes: at least one.
-        wall: the least distance between two outlines, and to the rectangle's edge, in metres.
+        wall: the least distance between two outlines and to the rectangle's edge, in metres.
     """
     parts = [[_Part(shape, yaw, wall) for yaw in _YAWS_DEG] for shape in shapes]
     sizes = [int(rotated[0].walled.sum()) for rotated in parts]
@@ -107,7 +107,7 @@ def nest(shapes: Sequence[NestedShape], wall: float) -> Nesting | None:
 def nest_on(
     shapes: Sequence[NestedShape], wall: float, room: tuple[float, float]
 ) -> Nesting | None:
-    """Places shapes on a rectangle of a given size; None where no way to do so is found.
+    """Places shapes on a rectangle of a given size, or returns None if no placement is found.
 
     Args:
         shapes: at least one.
@@ -115,14 +115,14 @@ def nest_on(
         room: the rectangle's length along x and width along y, in metres.
 
     Returns:
-        The nesting in the middle of the rectangle, whose size it has.
+        The nesting, of the rectangle's size and centred in it.
     """
     parts = [[_Part(shape, yaw, wall) for yaw in _YAWS_DEG] for shape in shapes]
     sizes = [int(rotated[0].walled.sum()) for rotated in parts]
     extents = [max(rotated[0].size) for rotated in parts]
     largest_first = sorted(range(len(shapes)), key=lambda i: -sizes[i])
     longest_first = sorted(range(len(shapes)), key=lambda i: -extents[i])
-    # Masks are conservative: what does not fit on the raster by a cell or two may do so in truth.
+    # Masks are conservative: shapes that miss by a cell or two on the raster may still fit.
     for order, lengthwise, excess in itertools.product(
         (largest_first, longest_first), (True, False), (0, 1, 2)
     ):
@@ -139,7 +139,7 @@ def nest_on(
 
 
 def _on(nesting: Nesting, room: tuple[float, float], lengthwise: bool) -> Nesting | None:
-    """A nesting in the middle of a larger rectangle, rotated or not; None if it is too large."""
+    """A nesting centred in a larger rectangle, possibly turned by 90 degrees; None if too large."""
     length, width = room if lengthwise else room[::-1]
     if nesting.length > length + 1e-9 or nesting.width > width + 1e-9:
         return None
@@ -158,16 +158,15 @@ def _cost(length: float, width: float) -> float:
 
 
 class _Part:
-    """A rotated shape as masks (rows along y, columns along x).
+    """Masks of a rotated shape: rows along y, columns along x, all of one size.
 
-    All masks are of one size. The corner of the shape's outline with its wall is `inset` cells
-    (along y, along x) inside them.
+    The lower left corner of the outline with its wall is at cell `inset` (row, column).
     """
 
     def __init__(self, shape: NestedShape, yaw_deg: int, wall: float) -> None:
         self.yaw_deg = yaw_deg
-        # A point of an outline is in a cell of its `solid`. So where no such cell is in another's
-        # `walled`, outlines are further apart than the wall, and in no `keep_out`, clear of it.
+        # `solid` has every cell that the outline touches. If none of them is in another shape's
+        # `walled`, the outlines keep the wall; if none is in its `keep_out`, they stay clear of it.
         solid = _grown(shape.outline.rotate(yaw_deg), _REACH)
         walled = _grown(shape.outline.rotate(yaw_deg), wall + _REACH)
         keep_out = _grown(shape.keep_out.rotate(yaw_deg), _REACH)
@@ -185,7 +184,7 @@ class _Part:
         self._spectra: dict[tuple[int, int], tuple[Spectrum, Spectrum]] = {}
 
     def spectra(self, canvas: tuple[int, int]) -> tuple[Spectrum, Spectrum]:
-        """Conjugate transforms of what may not meet solids, and of what may not meet keep-outs."""
+        """Conjugate spectra of the masks to test against other shapes' solids and keep-outs."""
         if canvas not in self._spectra:
             self._spectra[canvas] = (
                 np.conj(_transform(self.on_canvas(self.walled | self.keep_out, canvas, (0, 0)))),
@@ -194,7 +193,7 @@ class _Part:
         return self._spectra[canvas]
 
     def on_canvas(self, mask: Mask, canvas: tuple[int, int], place: tuple[int, int]) -> Mask:
-        """One of the masks with its corner at a place on a canvas that is joined at its edges."""
+        """A mask on a cyclic canvas, with its `inset` corner at `place`."""
         result = np.zeros(canvas, dtype=bool)
         result[: mask.shape[0], : mask.shape[1]] = mask
         return np.roll(result, (place[0] - self.inset[0], place[1] - self.inset[1]), axis=(0, 1))
@@ -221,13 +220,13 @@ def rasterized(
     counts: tuple[int, int],
     cell: float = CELL,
 ) -> Mask:
-    """Which cells have their centres inside an outline.
+    """The mask of the cells whose centres are inside an outline.
 
     Args:
         outline: in metres; not empty.
-        start: (x, y) of the raster's corner, in metres.
-        counts: of the raster's cells along y and x.
-        cell: the side of one, in metres.
+        start: (x, y) of the raster's lower left corner, in metres.
+        counts: the numbers of cells along y and x.
+        cell: the side of a cell, in metres.
     """
     loops = outline.to_polygons()
     a = (np.concatenate(loops) - start) / cell - 0.5
@@ -236,7 +235,7 @@ def rasterized(
     row, edge = np.nonzero((a[:, 1] <= rows) != (b[:, 1] <= rows))
     (a_x, a_y), (b_x, b_y) = a[edge].T, b[edge].T
     crossing = a_x + (row - a_y) / (b_y - a_y) * (b_x - a_x)
-    # Inside is what is right of an odd number of crossings.
+    # A cell is inside if an odd number of crossings is left of it.
     flips = np.zeros((counts[0], counts[1] + 1), dtype=np.int64)
     np.add.at(flips, (row, np.clip(np.ceil(crossing), 0, counts[1]).astype(int)), 1)
     return np.cumsum(flips, axis=1)[:, :-1] % 2 == 1
@@ -248,17 +247,17 @@ _Placement = tuple[_Part, tuple[int, int]]
 def _fill_strip(
     parts: Sequence[Sequence[_Part]], order: Sequence[int], strip: tuple[int, int], limit: float
 ) -> list[_Placement] | None:
-    """Places one part of each list in a strip of (rows, columns), each as low as it can be.
+    """Places one part of each list in a strip of (rows, columns), each as low as possible.
 
     Returns:
-        For each list the part and the (row, column) of its corner; None if they do not fit, or
-        surely cost more than the limit.
+        The part and the (row, column) of its corner for each list. None if they do not fit or if
+        they would cost more than the limit.
     """
     # Import SciPy lazily.
     from scipy import fft
 
-    # Keep-outs may reach out of the strip. On a canvas that is joined at its edges, that is to say
-    # under a discrete Fourier transform, they then reach into a margin on the other side.
+    # Keep-outs may reach out of the strip. The canvas is cyclic, as the Fourier transform is, so
+    # they then wrap around into this margin.
     overhang = max(
         max(part.solid.shape[axis] - part.size[axis] for axis in (0, 1))
         for rotated in parts
@@ -294,7 +293,7 @@ def _lowest_place(
     strip: tuple[int, int],
     canvas: tuple[int, int],
 ) -> tuple[int, int] | None:
-    """The lowest (row, column) of a part's corner, and of those the leftmost; None for none."""
+    """The lowest, then leftmost, free (row, column) of a part's corner; None if there is none."""
     rows, columns = strip[0] - part.size[0] + 1, strip[1] - part.size[1] + 1
     if rows <= 0 or columns <= 0:
         return None
@@ -303,7 +302,7 @@ def _lowest_place(
 
     against_solid, against_keep_out = part.spectra(canvas)
     overlap = fft.irfft2(taken[0] * against_solid + taken[1] * against_keep_out, s=canvas)
-    # Overlaps are whole numbers of cells.
+    # An overlap is a whole number of cells.
     free = overlap[:rows, :columns] < 0.5
     first = int(np.argmax(free))
     row, column = divmod(first, columns)
@@ -313,7 +312,7 @@ def _lowest_place(
 def _tightened(
     shapes: Sequence[NestedShape], placements: Sequence[_Placement], wall: float
 ) -> Nesting:
-    """The nesting on the smallest rectangle about what was placed."""
+    """The nesting on the smallest rectangle around the placed shapes."""
     origins = [CELL * np.array([column, row]) - part.corner for part, (row, column) in placements]
     bounds = np.array(
         [

@@ -9,9 +9,8 @@ from systems.bounds import bounded
 class KitParameters:
     """The template of the kit block. Lengths in m."""
 
-    # The block's extents along x, y and z. The length and the width are those of a block with the
-    # slots of a toolset; where tools are nested instead, the block gets a size of its own, unless
-    # `fixed_size`.
+    # The block's extents along x, y and z. Length and width apply to a block with the slots of a
+    # toolset, and to a nested block if `fixed_size` is set.
     length: float = bounded(0.280, 0.05, 1.0)
     width: float = bounded(0.260, 0.05, 1.0)
     height: float = bounded(0.050, 0.01, 0.2)
@@ -25,17 +24,17 @@ class KitParameters:
     # Width and depth of the bevel around the rim, which leads a tool in.
     lead_in: float = bounded(0.001, 0.0, 0.005)
 
-    # Walls are drawn with straight edges that stray at most this far.
+    # The largest deviation of the straight edges from the exact walls.
     tolerance: float = bounded(0.0001, 1e-6, 0.001)
 
-    # The least thickness of block between two cavities, and below one.
+    # The least wall thickness between two cavities, and below a cavity.
     minimum_wall: float = bounded(0.002, 0.0, 0.05)
 
-    # The same between two nested cavities, and around them.
+    # The wall thickness between and around nested cavities.
     nested_wall: float = bounded(0.006, 0.001, 0.05)
 
-    # Whether tools are nested even where they could take the slots of a toolset.
+    # Nest the tools even where they fit the slots of a toolset.
     always_nested: bool = False
 
-    # Whether a nested block has the length and the width above; else it is as small as can be.
+    # Give a nested block the length and width above, instead of the smallest size found.
     fixed_size: bool = False

@@ -1,1 +1,1 @@
-"""Hand tools: their families, generation and records."""
+"""Hand tools: their records, solids, meshes and physical properties."""

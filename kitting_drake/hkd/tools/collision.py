@@ -1,9 +1,8 @@
-"""Convex decompositions with few hulls, of solids that are given as the union of many.
+"""Merges the convex hulls that fill a solid into few collision hulls.
 
-Lengths in mm; a hull is an array (n, 3) of points that stands for its convex hull. Two hulls may be
-replaced by the hull of both as long as nobody could tell by the projections: on xy, where the
-outline decides whether the tool enters its cavity, and on xz and yz, where the heights decide what
-it rests on.
+Lengths are in mm. A hull is an array (n, 3) of points and stands for their convex hull. Merging is
+limited by the projections of the result: the xy outline decides whether the tool fits its cavity,
+and the xz and yz heights decide how it rests.
 """
 
 import itertools
@@ -16,18 +15,18 @@ from scipy.spatial import ConvexHull
 
 from kitting_drake.hkd.tools.solids import SEGMENTS
 
-# Grid of the vertices of collision hulls.
+# The grid spacing of the vertices of collision hulls.
 GRID_MM = 0.05
 
 _XY, _XZ, _YZ = [0, 1], [0, 2], [1, 2]
-# Hulls are first joined where that changes next to nothing, which leaves few enough to search.
+# A first pass merges hulls that change by less than this, to leave fewer for the search.
 _EXACT_MM = 0.03
-# Area (mm^2) below which a difference of outlines is rounding.
+# Area (mm^2) below which outlines count as equal.
 _AREA = 1e-4
 
 
 def projection(hulls: Sequence[np.ndarray], plane: Sequence[int] = _XY) -> CrossSection:
-    """The projection of a union of convex hulls on a coordinate plane."""
+    """The projection of a union of convex hulls onto a coordinate plane."""
     return CrossSection.batch_boolean(
         [CrossSection.hull_points(np.ascontiguousarray(h[:, plane])) for h in hulls],
         manifold3d.OpType.Add,
@@ -35,7 +34,7 @@ def projection(hulls: Sequence[np.ndarray], plane: Sequence[int] = _XY) -> Cross
 
 
 def closed(profile: CrossSection, clearance: float) -> CrossSection:
-    """The profile as a cavity with this clearance sees it: holes and gaps under twice it filled."""
+    """The profile with its holes filled and its gaps under twice the clearance closed."""
 
     def outer(p: CrossSection) -> CrossSection:
         return CrossSection([loop for loop in p.to_polygons() if CrossSection([loop]).area() > 0])
@@ -45,7 +44,7 @@ def closed(profile: CrossSection, clearance: float) -> CrossSection:
 
 
 def furthest(inner: CrossSection, outer: CrossSection) -> float:
-    """The furthest that `inner` reaches out of `outer`, at most 5 mm, to 0.01 mm by bisection."""
+    """The largest distance of a point of `inner` from `outer`, capped at 5 mm, to 0.01 mm."""
     low, high = 0.0, 5.0
     while high - low > 0.01:
         middle = 0.5 * (low + high)
@@ -57,15 +56,15 @@ def furthest(inner: CrossSection, outer: CrossSection) -> float:
 def thinned(
     points: np.ndarray, tolerance: float, outline_tolerance: float | None = None
 ) -> np.ndarray:
-    """Vertices (m, 3) that span the hull of `points` to within about `tolerance` (mm).
+    """Selects vertices (m, 3) whose hull is within about `tolerance` of the hull of `points`.
 
-    The points on the table are chosen first, in the plane, so that a flat bottom stays flat. The
-    result is on a grid: facets that are almost coplanar become exactly so, or clearly not.
+    Points on the table are selected first, so that a flat bottom stays flat. The result is snapped
+    to a grid, which makes nearly coplanar facets exactly coplanar or clearly different.
 
     Args:
-        points: (n, 3).
+        points: (n, 3) in mm.
         tolerance: in mm.
-        outline_tolerance: that of the outline seen from above, if it has one of its own, in mm.
+        outline_tolerance: a tolerance for the outline from above, in mm; `tolerance` if None.
     """
     points = points[ConvexHull(points).vertices]
     touching = np.flatnonzero(points[:, 2] < 1e-3)
@@ -80,12 +79,12 @@ def thinned(
 
 
 def _farthest(points: np.ndarray, chosen: list[int], tolerance: float) -> list[int]:
-    """Indices of points whose hull, grown from `chosen` by the farthest, reaches all others."""
+    """Adds farthest points to `chosen` until the hull is within tolerance; sorts the indices."""
     dimension = points.shape[1]
     directions = np.array(np.meshgrid(*[[-1.0, 0.0, 1.0]] * dimension)).reshape(dimension, -1).T
     chosen = list(dict.fromkeys([*chosen, *np.argmax(points @ directions.T, axis=0)]))
     if len(chosen) <= dimension:
-        # A sliver, which has no hull to grow; it has few points anyhow.
+        # Too few extreme points to span a hull: keep all.
         return list(range(len(points)))
     while True:
         equations = ConvexHull(points[chosen], qhull_options="QJ Pp").equations
@@ -97,7 +96,7 @@ def _farthest(points: np.ndarray, chosen: list[int], tolerance: float) -> list[i
 
 
 class _Hull:
-    """A convex hull, the hulls it was made of, its volume and its box."""
+    """A convex hull, the hulls that it was merged from, its volume and its bounding box."""
 
     def __init__(self, points: np.ndarray, sources: list[np.ndarray] | None = None):
         hull = Manifold.hull_points(np.ascontiguousarray(points))
@@ -118,7 +117,7 @@ def _grown(profile: CrossSection, distance: float) -> CrossSection:
 
 
 def _fits(hull: _Hull, allowed: CrossSection, tolerance: float) -> bool:
-    """Whether a joined hull has the projections of its sources, within the tolerance."""
+    """Whether a merged hull stays in `allowed` on xy and keeps its sources' other projections."""
     if (projection([hull.points]) - allowed).area() > _AREA:
         return False
     return all(
@@ -131,7 +130,7 @@ def _fits(hull: _Hull, allowed: CrossSection, tolerance: float) -> bool:
 
 
 def _merged(hulls: list[_Hull], allowed: CrossSection, tolerance: float) -> list[_Hull]:
-    """Joins pairs, the one that adds the least volume first, until no pair fits."""
+    """Merges pairs in order of the least added volume until no pair fits."""
     alive = dict(enumerate(hulls))
 
     def options(a: int, b: int) -> list[tuple[float, int, int]]:
@@ -154,13 +153,12 @@ def _merged(hulls: list[_Hull], allowed: CrossSection, tolerance: float) -> list
 def cover(
     hulls: Sequence[np.ndarray], outline: CrossSection, allowed: CrossSection, tolerance: float
 ) -> list[np.ndarray]:
-    """Convex hulls, few and perhaps overlapping, that together fill what `hulls` fill.
+    """Covers `hulls` with few convex hulls, which may overlap. Deterministic.
 
-    Each hull is grown from one of `hulls` by whichever neighbour adds the least volume, as long
-    as its projection on xy stays within `allowed` and the others move by at most `tolerance` (mm);
-    of all that can be grown, the one that fills the most that is still open is taken, until nothing
-    is open. Hulls that hardly show in any projection are then left out. The same input always gives
-    the same hulls.
+    Every hull is a seed that grows by the neighbour that adds the least volume. Its xy projection
+    must stay within `allowed`, and the other projections may grow by at most `tolerance` (mm). Then
+    the grown hull that covers the most uncovered volume is selected until all of `hulls` are
+    covered. Finally, hulls that hardly change any projection are dropped.
     """
     merged = _merged([_Hull(h) for h in hulls], _grown(outline, _EXACT_MM), _EXACT_MM)
     grown = [_grow(seed, merged, allowed, tolerance) for seed in range(len(merged))]
@@ -170,7 +168,7 @@ def cover(
             round(sum(merged[i].volume for i in members & open_hulls), 3) for _, members in grown
         ]
         _, members = grown[int(np.argmax(gains))]
-        # Span only what is still open: what others fill need not be filled twice.
+        # Span only the uncovered members, since other hulls cover the rest.
         wanted = np.vstack([merged[i].points for i in sorted(members & open_hulls)])
         result.append(wanted)
         open_hulls -= members
@@ -180,10 +178,10 @@ def cover(
 def runs(
     sections: Sequence[np.ndarray], tolerance: float, height_tolerance: float
 ) -> list[np.ndarray]:
-    """The hulls along a loft through `sections`, (n, 3) each, few and long.
+    """Merges the sections (n, 3) of a loft into few long hulls.
 
-    Neighbours are joined as long as the projection on xy grows by at most `tolerance`, and the
-    others, which decide nothing beside a cavity's wall, by at most `height_tolerance` (both mm).
+    Neighbours are merged while the xy projection grows by at most `tolerance` and the other two,
+    which matter less for a cavity, by at most `height_tolerance` (both in mm).
     """
     pairs = [np.vstack(pair) for pair in itertools.pairwise(sections)]
     result, first = [], 0
@@ -209,7 +207,7 @@ def runs(
 
 
 def _pruned(hulls: list[np.ndarray], tolerance: float) -> list[np.ndarray]:
-    """Leaves out hulls, the smallest first, without which no projection shrinks by `tolerance`."""
+    """Drops hulls, smallest first, if no projection shrinks by more than `tolerance`."""
     wholes = [projection(hulls, plane) for plane in (_XY, _XZ, _YZ)]
     kept = list(hulls)
     for hull in sorted(hulls, key=lambda h: Manifold.hull_points(h).volume()):
@@ -225,7 +223,7 @@ def _pruned(hulls: list[np.ndarray], tolerance: float) -> list[np.ndarray]:
 def _grow(
     seed: int, hulls: list[_Hull], allowed: CrossSection, tolerance: float
 ) -> tuple[np.ndarray, set[int]]:
-    """The largest hull that grows from `seed`, and the indices of the hulls that it holds."""
+    """Grows the largest hull from `seed`; returns its points and the indices of its members."""
     current, members = hulls[seed], {seed}
     candidates = set(range(len(hulls))) - members
     while True:
@@ -234,7 +232,7 @@ def _grow(
             (current.joined(hulls[i]).volume - current.volume - hulls[i].volume, i) for i in near
         )
         for _, i in trials:
-            # A hull that does not fit now never will: the joined one only grows.
+            # The hull only grows, so a neighbour that does not fit here never will.
             candidates.discard(i)
             joined = current.joined(hulls[i])
             if _fits(joined, allowed, tolerance):

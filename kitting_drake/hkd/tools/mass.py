@@ -1,4 +1,4 @@
-"""Mass, centre of mass and inertia of rigid bodies that are made of homogeneous ones."""
+"""Mass properties of rigid bodies composed of homogeneous solids."""
 
 from collections.abc import Iterable
 
@@ -13,7 +13,7 @@ Body = tuple[Manifold, float]
 
 
 def mass_properties(bodies: Iterable[Body]) -> tuple[float, np.ndarray, np.ndarray]:
-    """Mass (kg), centre of mass (m) and rotational inertia about it (kg m^2, 3 by 3)."""
+    """Mass (kg), centre of mass (3,) in m, and inertia about it (3, 3) in kg m^2."""
     single = []
     for solid, density in bodies:
         vertices, faces = vertices_and_faces(solid)

@@ -1,4 +1,4 @@
-"""Solids as Wavefront OBJ: metres, fixed digits and order, so equal solids give equal files."""
+"""Writes solids as Wavefront OBJ in metres; equal solids give equal files."""
 
 from pathlib import Path
 
@@ -7,16 +7,16 @@ from manifold3d import Manifold
 
 
 def vertices_and_faces(solid: Manifold) -> tuple[np.ndarray, np.ndarray]:
-    """The vertices (n, 3) in the solid's own units and the faces (m, 3) of its surface."""
+    """The surface's vertices (n, 3), in the solid's units, and faces (m, 3)."""
     mesh = solid.to_mesh64()
     return np.asarray(mesh.vert_properties)[:, :3], np.asarray(mesh.tri_verts).astype(int)
 
 
 def corner_normals(vertices: np.ndarray, faces: np.ndarray, crease_angle_deg: float) -> np.ndarray:
-    """Normals (m, 3, 3) of the faces' corners, smooth across edges flatter than the crease angle.
+    """The normals (m, 3, 3) of the faces' corners, smooth across edges below the crease angle.
 
-    Each corner averages, by area, the faces about its vertex that lean less than that angle from
-    its own: broad flats then stay flat beside narrow bevels.
+    A corner's normal is the area-weighted mean over the faces at its vertex whose normals differ
+    from its own face's by less than that angle. So large flat faces stay flat beside narrow bevels.
     """
     a, b, c = (vertices[faces[:, k]] for k in range(3))
     weighted = np.cross(b - a, c - a)
@@ -34,10 +34,10 @@ def corner_normals(vertices: np.ndarray, faces: np.ndarray, crease_angle_deg: fl
 
 
 def write_smooth_obj(path: Path, solid: Manifold, crease_angle_deg: float) -> int:
-    """Writes a solid given in mm, with normals; returns its number of triangles."""
+    """Writes a solid given in mm, with smooth normals; returns its number of triangles."""
     vertices, faces = vertices_and_faces(solid)
     normals = corner_normals(vertices, faces, crease_angle_deg)
-    # Adding zero turns -0 into 0, so that no sign depends on rounding.
+    # Adding zero turns -0 into 0.
     texts = [f"vn {x:.4f} {y:.4f} {z:.4f}" for x, y, z in np.round(normals.reshape(-1, 3), 4) + 0.0]
     index = {text: i + 1 for i, text in enumerate(dict.fromkeys(texts))}
     lines = [*_vertex_lines(vertices), *index]
@@ -51,13 +51,13 @@ def write_smooth_obj(path: Path, solid: Manifold, crease_angle_deg: float) -> in
 def flat_obj(
     vertices: np.ndarray, faces: np.ndarray, *, digits: int, normal_digits: int | None = None
 ) -> str:
-    """The text of a mesh as it is, with a normal for each face where those have digits.
+    """The OBJ text of a mesh, with one normal per face on request.
 
     Args:
         vertices: (n, 3), in metres.
         faces: (m, 3).
-        digits: of the vertices, behind the point.
-        normal_digits: the same of the normals; None for a file without normals.
+        digits: decimals of the vertices.
+        normal_digits: decimals of the normals; None writes no normals.
     """
     lines = [f"v {x:.{digits}f} {y:.{digits}f} {z:.{digits}f}" for x, y, z in vertices]
     if normal_digits is None:
@@ -78,7 +78,7 @@ def write_convex_obj(path: Path, points: np.ndarray) -> None:
     from scipy.spatial import ConvexHull
 
     hull = ConvexHull(points)
-    # Qhull does not orient its facets: turn those that wind against their outward normal.
+    # Qhull does not orient its facets: flip those that wind against their outward normal.
     a, b, c = (points[hull.simplices[:, k]] for k in range(3))
     inward = np.sum(np.cross(b - a, c - a) * hull.equations[:, :3], axis=1) < 0
     faces = np.where(inward[:, None], hull.simplices[:, ::-1], hull.simplices)

@@ -1,7 +1,7 @@
-"""Tools of other lengths: section IV-B.2 of the paper scales the tools of a toolset at random.
+"""Scaled tools: section IV-B.2 of the paper scales the tools of a toolset at random.
 
-A tool scaled uniformly by s keeps its density, so its mass grows with s^3, its moments of inertia
-with s^5, and its lengths, its centre of mass among them, with s.
+A uniform scale s at constant density multiplies the mass by s^3, the moments of inertia by s^5 and
+all lengths by s.
 """
 
 import dataclasses
@@ -15,24 +15,24 @@ from kitting_drake.common.paths import cache_directory
 from kitting_drake.hkd.tools.tool import Tool
 
 _FORMAT_VERSION = "1"
-"""Part of the cache key: changed whenever the same input makes another file."""
+"""Part of the cache key. Change it when equal inputs give other files."""
 _SAME_LENGTH = 1e-9
 
 _DRAKE = "http://drake.mit.edu"
 
 
 def scaled_tool(tool: Tool, length: float) -> Tool:
-    """The tool, uniformly scaled to a length in metres; the tool itself if that is its length.
+    """The tool scaled uniformly to a length in metres; the same tool if it has that length.
 
-    The scaled tool has an SDFormat file of its own, in the cache, which loads the meshes of the
-    original with a scale. All else is that of the original, its name included.
+    The scaled tool has its own SDFormat file in the cache, which scales the original's meshes. Its
+    name and all else stay the original's.
 
     Raises:
-        UserError: the length is not positive, the tool's model cannot be scaled, or the cache
-            cannot be written.
+        UserError: the length is not positive, the model cannot be scaled, or the cache cannot be
+            written.
     """
     if not 0.0 < length < float("inf"):
-        raise UserError(f"the tool '{tool.name}' cannot be made {length:g} m long")
+        raise UserError(f"the tool '{tool.name}' cannot be scaled to a length of {length:g} m")
     if abs(length - tool.length) <= _SAME_LENGTH:
         return tool
     factor = length / tool.length
@@ -56,14 +56,14 @@ def scaled_tool(tool: Tool, length: float) -> Tool:
 
 
 def _scaled_model(tool: Tool, factor: float) -> Path:
-    """The folder in the cache with the SDFormat file of a scaled tool."""
+    """The cache folder with the SDFormat file of a scaled tool."""
     original = tool.sdf.read_bytes()
     key = f"{_FORMAT_VERSION} {tool.sdf.resolve()} {factor!r}".encode()
     name = hashlib.sha256(key + original).hexdigest()[:24]
     try:
         text = scaled_sdf(original.decode(), tool.sdf.resolve().parent, factor)
     except (ElementTree.ParseError, UnicodeDecodeError, ValueError) as error:
-        raise UserError(f"{tool.sdf} is not a model that can be scaled: {error}") from error
+        raise UserError(f"{tool.sdf} cannot be scaled: {error}") from error
     return cached_folder(
         cache_directory() / "tools" / name,
         [tool.sdf.name],
@@ -72,22 +72,22 @@ def _scaled_model(tool: Tool, factor: float) -> Path:
 
 
 def scaled_sdf(text: str, directory: Path, factor: float) -> str:
-    """The SDFormat text of a model of meshes, uniformly scaled.
+    """Scales the SDFormat text of a model of meshes uniformly.
 
     Args:
-        text: of the original.
-        directory: where the original's relative URIs start; the result's are absolute.
+        text: the original.
+        directory: the base of the original's relative URIs; the result's are absolute.
         factor: the scale.
 
     Raises:
-        ValueError: the model has geometry that is not a mesh, or text where a number belongs.
+        ValueError: the model has geometry other than meshes, or a number is malformed.
         xml.etree.ElementTree.ParseError: the text is not XML.
     """
     ElementTree.register_namespace("drake", _DRAKE)
     root = ElementTree.fromstring(text)
     for geometry in root.iter("geometry"):
         if [child.tag for child in geometry] != ["mesh"]:
-            raise ValueError("only geometry of one mesh each can be scaled")
+            raise ValueError("a geometry is not exactly one mesh")
     for mesh in root.iter("mesh"):
         uri = mesh.find("uri")
         if uri is None or not uri.text:

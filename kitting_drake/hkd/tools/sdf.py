@@ -7,10 +7,10 @@ import numpy as np
 
 from kitting_drake.hkd.tools.solids import MATERIALS
 
-# Contact, for every tool: Drake's hydroelastic modulus (Pa), dissipation (s/m), margin (m; 0 for
-# none) and friction. Drake 1.51 fails on the margin of finely faceted convex hulls, when it loads
-# or when they touch a mesh; the modulus is low enough that a flat bottom rests quietly without,
-# on steps of 1/128 s.
+# Contact parameters of every tool: Drake's hydroelastic modulus (Pa), dissipation (s/m), margin (m)
+# and friction. The margin is off, because Drake 1.51 fails on the margin of finely faceted convex
+# hulls when it loads them or they touch a mesh. At this modulus a flat bottom rests quietly without
+# one, at steps of 1/128 s.
 HYDROELASTIC_MODULUS = 2e6
 HUNT_CROSSLEY_DISSIPATION = 20.0
 HYDROELASTIC_MARGIN = 0.0
@@ -55,11 +55,17 @@ def tool_sdf(
     visuals: Sequence[tuple[str, str]],
     collisions: Sequence[str],
 ) -> str:
-    """A model with one free link named `tool`, whose frame is the tool frame T.
+    """The SDFormat of a tool: one free link named `tool`, whose frame is the tool frame T.
 
-    Mass in kg, centre of mass (3,) in m, inertia about it (3, 3) in kg m^2; visuals: pairs of OBJ
-    file and key of MATERIALS, collisions are OBJ files of convex hulls, all beside the SDFormat,
-    which names them relatively: a tool's folder may be copied and moved.
+    The OBJ files lie beside the SDFormat file, which names them relatively.
+
+    Args:
+        name: the model's.
+        mass: in kg.
+        center: (3,) the centre of mass in m.
+        inertia: (3, 3) about the centre of mass, in kg m^2.
+        visuals: pairs of OBJ file and key of MATERIALS.
+        collisions: OBJ files of convex hulls.
     """
     moments = "".join(
         f"<i{'xyz'[i]}{'xyz'[j]}>{inertia[i, j]:.9g}</i{'xyz'[i]}{'xyz'[j]}>"

@@ -1,9 +1,9 @@
 """Building blocks of the generated hand tools: parts, profiles, plates and lofts.
 
-Everything here is in millimetres and in the *design frame* of a tool: x along the length, working
-end toward +x, z up when the tool lies flat. A shape is built twice from the same numbers: once as
-an exact solid, which is seen and weighed, and once as many small convex point sets that fill it,
-which `collision.cover` later joins into the few convex collision hulls that a simulator wants.
+Lengths are in mm, in the *design frame* of a tool: x along its length with the working end toward
++x, and z up when the tool lies flat. Each shape is built twice from the same numbers: as an exact
+solid, for looks and mass, and as many small convex point sets that fill it. `collision.cover`
+merges the latter into few collision hulls.
 """
 
 import itertools
@@ -16,8 +16,7 @@ import numpy as np
 from manifold3d import CrossSection, JoinType, Manifold
 from numpy.typing import ArrayLike
 
-# Segments of a full circle. Given at every call: the library's own choice is meant for larger
-# units.
+# Segments of a full circle, given at every call because manifold3d's default suits larger units.
 SEGMENTS = 48
 
 
@@ -52,26 +51,26 @@ MATERIALS: dict[str, Material] = {
 class Part:
     """One homogeneous part of a tool, in mm in the design frame.
 
-    Parts may overlap: where they do, the part earlier in a tool's list keeps the volume.
+    Where parts overlap, the volume belongs to the part earlier in the tool's list.
     """
 
     name: str
     # A key of MATERIALS.
     material: str
     solid: Manifold
-    # Arrays of shape (n, 3): the convex hulls of these point sets fill the solid. A part that lies
-    # wholly inside the hulls of others has none.
+    # Point sets (n, 3) whose convex hulls fill the solid; empty for a part that lies inside the
+    # hulls of others.
     hulls: list[np.ndarray] = field(default_factory=list)
 
 
 class Shape(NamedTuple):
-    """A solid together with the convex point sets, each (n, 3), that fill it."""
+    """A solid and the convex point sets, each (n, 3), that fill it."""
 
     solid: Manifold
     hulls: list[np.ndarray]
 
     def flipped(self) -> "Shape":
-        """The shape rotated by half a turn about x."""
+        """The shape rotated by 180 degrees about x."""
         flip = np.array([1.0, -1.0, -1.0])
         return Shape(self.solid.rotate((180, 0, 0)), [h * flip for h in self.hulls])
 
@@ -82,7 +81,7 @@ class Shape(NamedTuple):
 def circle(
     radius: float, center: Sequence[float] = (0.0, 0.0), segments: int = SEGMENTS
 ) -> np.ndarray:
-    """A regular polygon inscribed in a circle, the first vertex toward +x."""
+    """A regular polygon inscribed in a circle, with its first vertex toward +x."""
     angles = 2 * np.pi * np.arange(segments) / segments
     return np.asarray(center) + radius * np.column_stack([np.cos(angles), np.sin(angles)])
 
@@ -92,7 +91,7 @@ def fillet(
 ) -> np.ndarray:
     """Replaces each corner of a closed polygon by an arc.
 
-    A radius too large for its edges is cut back to what fits; zero keeps the corner.
+    A radius too large for its edges is reduced; zero keeps the corner.
     """
     corners = np.asarray(points, dtype=float)
     corner_radii = np.broadcast_to(np.asarray(radii, dtype=float), len(corners))
@@ -108,7 +107,7 @@ def fillet(
         length_u, length_v = np.linalg.norm(u), np.linalg.norm(v)
         u, v = u / length_u, v / length_v
         half = 0.5 * np.arccos(np.clip(u @ v, -1.0, 1.0))
-        # Leave a little of each edge, so that neighbouring arcs never share a point.
+        # Leave a little of each edge, so that neighbouring arcs share no point.
         setback = min(radius / np.tan(half), 0.49 * length_u, 0.49 * length_v)
         if setback < 1e-6 or half > 0.5 * np.pi - 1e-3:
             result.append(corner)
@@ -127,14 +126,14 @@ def fillet(
 
 
 def rounded_rectangle(width: float, height: float, radius: float, segments: int = 4) -> np.ndarray:
-    """A rectangle about the origin with arcs for corners, 4 (segments + 1) vertices."""
+    """A rectangle about the origin with arcs as corners: 4 (segments + 1) vertices."""
     x, y = width / 2, height / 2
     radius = min(radius, 0.98 * min(x, y))
     return fillet([(-x, -y), (x, -y), (x, y), (-x, y)], radius, segments)
 
 
 def ribbon(path: np.ndarray, widths: np.ndarray) -> np.ndarray:
-    """The outline, (2n, 2), of a band of the given `widths` (n) about a `path` (n, 2)."""
+    """The outline (2n, 2) of a band of `widths` (n) along a `path` (n, 2)."""
     tangent = np.gradient(path, axis=0)
     normal = np.column_stack([-tangent[:, 1], tangent[:, 0]])
     normal *= 0.5 * np.asarray(widths)[:, None] / np.linalg.norm(normal, axis=1, keepdims=True)
@@ -142,7 +141,7 @@ def ribbon(path: np.ndarray, widths: np.ndarray) -> np.ndarray:
 
 
 def blend(profile: CrossSection, inner_radius: float, outer_radius: float = 0.0) -> CrossSection:
-    """Rounds the inward corners of a profile, and its outward ones, to the given radii."""
+    """Rounds a profile's concave and convex corners to the given radii."""
     for radius in (inner_radius, -outer_radius):
         profile = profile.offset(radius, JoinType.Round, circular_segments=SEGMENTS)
         profile = profile.offset(-radius, JoinType.Round, circular_segments=SEGMENTS)
@@ -159,7 +158,7 @@ def without_holes(profile: CrossSection) -> CrossSection:
 
 
 def _stitched(rings: np.ndarray, caps: tuple[np.ndarray, np.ndarray]) -> Manifold:
-    """Closes `rings` (m, n, 3) of equal loops with quads between them and the given end caps."""
+    """The solid of equal loops `rings` (m, n, 3), joined by quads and closed by end caps."""
     count, size = rings.shape[:2]
     i = np.arange(size)
     j = (i + 1) % size
@@ -177,10 +176,10 @@ def _stitched(rings: np.ndarray, caps: tuple[np.ndarray, np.ndarray]) -> Manifol
 
 
 def _closed_solid(vertices: np.ndarray, faces: np.ndarray) -> Manifold:
-    """The solid of a closed mesh, its faces turned outward as a whole."""
+    """The solid of a closed mesh, with all faces flipped if they point inward."""
     solid = Manifold(manifold3d.Mesh64(np.ascontiguousarray(vertices), faces.astype(np.uint64)))
     if solid.status() != manifold3d.Error.NoError:
-        raise ValueError(f"a shape does not close: {solid.status()}")
+        raise ValueError(f"the mesh is not manifold: {solid.status()}")
     return solid if solid.volume() > 0 else _closed_solid(vertices, faces[:, ::-1])
 
 
@@ -191,10 +190,10 @@ def plate(
     bevel: float = 0.8,
     cells: Sequence[CrossSection] = (),
 ) -> Shape:
-    """A plate between two heights, its lower and upper edges bevelled at 45 degrees.
+    """A plate between two heights with its outer edges bevelled at 45 degrees.
 
-    Holes are cut with plain edges, and do not appear in the hulls. There is a hull for the part of
-    the profile in each of the `cells`, or, if there are none, for each of many triangles.
+    Holes have plain edges and do not appear in the hulls. Each of `cells` gives one hull, of the
+    profile inside it; without cells, each triangle of a triangulation does.
     """
     if isinstance(profile, np.ndarray):
         profile = CrossSection([profile])
@@ -207,15 +206,16 @@ def plate(
 
 
 def _bevelled(profile: CrossSection, z_low: float, z_high: float, bevel: float) -> Manifold:
-    """The plate's solid. The inset outline may have other vertices, or loops, than the outline.
+    """The plate's solid.
 
-    A bevel is the strip between the two outlines, triangulated in the plane and then lifted.
+    The inset outline may have other vertices or loops than the outline. So a bevel is made by
+    triangulating the strip between the two in the plane and lifting it.
     """
     outer = profile.to_polygons()
     inner = profile.offset(-bevel, JoinType.Miter).to_polygons()
     rim, top = np.vstack(outer), np.vstack(inner)
     strip = manifold3d.triangulate([*outer, *(loop[::-1] for loop in inner)])
-    # In the strip the inner loops run backward: number their vertices as in the cap.
+    # The strip lists the inner loops backward: number their vertices as in the cap.
     numbers = np.arange(len(top))
     starts = np.cumsum([len(loop) for loop in inner])[:-1]
     backward = np.concatenate([n[::-1] for n in np.split(numbers, starts)])
@@ -247,11 +247,11 @@ def _plate_hulls(
     bevel: float,
     cells: Sequence[CrossSection],
 ) -> list[np.ndarray]:
-    """Prisms over cells or a triangulation of the profile that bevel its rim but not the cuts."""
+    """Prisms over the cells or triangles of the profile; only the profile's rim is bevelled."""
     coarse = profile.simplify(0.08)
     loops = coarse.to_polygons()
     points = np.vstack(loops)
-    # The top edge's bevel is left out: nothing slides over it, and every vertex costs contact time.
+    # The upper bevel is left out: nothing slides over it, and each vertex costs contact time.
     levels = [(z_low, bevel), (z_low + bevel, 0.0), (z_high, 0.0)]
     insets = {
         inset: coarse.offset(-inset, JoinType.Miter, circular_segments=SEGMENTS)
@@ -270,14 +270,14 @@ def _plate_hulls(
 
 
 def loft(sections: Sequence[np.ndarray]) -> Shape:
-    """A skin through cross-sections (n, 3), each star-shaped about its mean, with the same n."""
+    """A skin through cross-sections (n, 3) of equal n, each star-shaped about its mean."""
     rings = np.asarray(sections, dtype=float)
     caps = tuple(manifold3d.triangulate([_planar(ring)]) for ring in (rings[0], rings[-1]))
     return Shape(_stitched(rings, caps), [np.vstack(pair) for pair in itertools.pairwise(rings)])
 
 
 def _planar(ring: np.ndarray) -> np.ndarray:
-    """A flat ring (n, 3) in coordinates of its own plane, counter-clockwise."""
+    """A flat ring (n, 3) in coordinates of its own plane (n, 2), counter-clockwise."""
     centered = ring - ring.mean(axis=0)
     u = centered[0] / np.linalg.norm(centered[0])
     normal = np.sum(np.cross(centered, np.roll(centered, -1, axis=0)), axis=0)
@@ -286,12 +286,12 @@ def _planar(ring: np.ndarray) -> np.ndarray:
 
 
 def across_x(profile: np.ndarray, x: float, y: float = 0.0, z: float = 0.0) -> np.ndarray:
-    """A section (n, 3) of a loft along x: the profile's axes become y and z."""
+    """A section (n, 3) of a loft along x, with the profile's axes along y and z."""
     return np.column_stack([np.full(len(profile), x), profile[:, 0] + y, profile[:, 1] + z])
 
 
 def across_path(profile: np.ndarray, point: ArrayLike, angle: float) -> np.ndarray:
-    """A section (n, 3) of a loft in the xy plane, at `point`, heading at `angle` (rad) from +x."""
+    """A section (n, 3) of a loft in the xy plane at `point`, at `angle` (rad) from +x."""
     left = np.array([-np.sin(angle), np.cos(angle)])
     xy = np.asarray(point) + profile[:, :1] * left
     return np.column_stack([xy, profile[:, 1]])

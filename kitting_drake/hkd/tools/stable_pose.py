@@ -1,9 +1,9 @@
 """The stable poses of a rigid body on a table.
 
-A body rests on a facet of its convex hull if the centre of mass, seen along the facet's normal, is
-inside the facet. `trimesh.poses.compute_stable_poses` takes every triangle of the hull for a facet
-of its own and ranks the poses by their probability in a random toss; which of them is a tool's is a
-question of heights and of support instead, so this module merges coplanar triangles and tells both.
+A body rests on a facet of its convex hull if the centre of mass, projected along the facet's
+normal, lies inside the facet. `trimesh.poses.compute_stable_poses` treats every triangle as a facet
+and ranks poses by their probability in a random toss. This module merges coplanar triangles and
+returns the height of the centre of mass and the support margin instead.
 """
 
 from dataclasses import dataclass
@@ -14,26 +14,26 @@ from scipy.spatial import ConvexHull, QhullError
 
 Array = NDArray[np.float64]
 
-# Triangles of the hull whose normals differ by less are one facet.
+# Triangles of the hull whose normals differ by less belong to one facet.
 _COPLANAR = 1e-3
 
 
 @dataclass(frozen=True)
 class StablePose:
-    """A pose in which a body stays, in the body's frame B and in the unit of its points."""
+    """A stable pose of a body, in the body's frame B and in the unit of its points."""
 
     normal: Array
-    """(3,) the outward normal of the facet that is the support: down, when the body rests."""
+    """(3,) the outward normal of the supporting facet, which points down at rest."""
     height: float
     """The height of the centre of mass above the table."""
     margin: float
-    """The distance of the centre of mass, seen from above, from the rim of its support."""
+    """The distance of the centre of mass from the support's edge, seen from above."""
 
     def rotation(self, forward: Array) -> Array:
-        """R_TB (3, 3) that brings the normal to -z and a direction into the xz plane, to +x.
+        """R_TB (3, 3): turns the normal to -z and `forward` into the xz plane, toward +x.
 
         Args:
-            forward: (3,) the direction in B; not along the normal.
+            forward: (3,) a direction in B, not parallel to the normal.
         """
         z = -self.normal
         x = forward - (forward @ z) * z
@@ -42,14 +42,14 @@ class StablePose:
 
 
 def stable_poses(points: Array, center_of_mass: Array) -> list[StablePose]:
-    """The stable poses of a body, in no particular but always the same order.
+    """The stable poses of a body, in a deterministic order.
 
     Args:
-        points: (n, 3) whose convex hull is the body's, in its frame B.
+        points: (n, 3) in the body's frame B; their convex hull is the body's.
         center_of_mass: (3,) in B.
 
     Raises:
-        scipy.spatial.QhullError: the points have no hull with a volume.
+        scipy.spatial.QhullError: the hull of the points has no volume.
     """
     hull = ConvexHull(points)
     normals = hull.equations[:, :3]
@@ -63,7 +63,7 @@ def stable_poses(points: Array, center_of_mass: Array) -> list[StablePose]:
         margin = _support_margin(support, normals[members[0]], center_of_mass)
         if margin <= 0:
             continue
-        # Among nearly coplanar triangles, the one below the centre of mass bears the body.
+        # Of nearly coplanar triangles, take the normal of the one below the centre of mass.
         shares = [_least_share(hull, points, int(member), center_of_mass) for member in members]
         bearing = members[int(np.argmax(shares))]
         normal = normals[bearing]
@@ -73,9 +73,9 @@ def stable_poses(points: Array, center_of_mass: Array) -> list[StablePose]:
 
 
 def _support_margin(support: Array, normal: Array, center_of_mass: Array) -> float:
-    """The distance of the centre of mass from the rim of its support, seen along the normal.
+    """The distance of the centre of mass from the support's edge, seen along the normal.
 
-    It is negative outside the support, and -1 if that has no area.
+    It is negative outside the support, and -1 if the support has no area.
     """
     axes = np.linalg.svd(normal[None])[2][1:]
     try:

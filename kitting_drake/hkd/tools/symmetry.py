@@ -1,7 +1,7 @@
-"""Which rotations about z leave a tool as it was.
+"""Rotational symmetry of tools about z.
 
 A tool is symmetric if its rotated copy has nearly the same surface and nearly the same outline, and
-so fits the same cavity. Then the rotated tool in its cavity counts as the same placement.
+so fits the same cavity. The rotated tool in its cavity then counts as the same placement.
 """
 
 from collections.abc import Callable
@@ -18,13 +18,13 @@ from kitting_drake.hkd.tools.collision import furthest
 from kitting_drake.hkd.tools.tool import footprint
 
 MOST_SURFACE_DISTANCE_MM = 0.5
-"""The mean distance of a symmetric tool from its rotated copy is less than this."""
+"""The upper limit of the mean distance between a symmetric tool and its rotated copy."""
 
 MOST_OUTLINE_DEVIATION_MM = 2.0
-"""The largest distance of their outlines is less than this: the clearance of a cavity."""
+"""The upper limit of the largest distance between their outlines: a cavity's clearance."""
 
 ORDERS = (24, 12, 8, 6, 5, 4, 3, 2)
-"""The orders that are tried. The first one stands for what is round."""
+"""The orders to try, largest first; the first stands for round tools."""
 
 _SAMPLES, _DENSE_SAMPLES = 4000, 400_000
 
@@ -33,16 +33,16 @@ Shift = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Difference:
-    """How a tool differs from its rotated copy about the best centre."""
+    """The difference between a tool and its rotated copy, each at the best translation."""
 
     outline_deviation_mm: float
-    """The largest distance of a point of one outline from the other, 5 mm at most."""
+    """The largest distance of a point of one outline from the other, capped at 5 mm."""
     surface_distance_mm: float
-    """The symmetric mean distance of the surfaces; infinite where the outlines decide."""
+    """The symmetric mean distance of the surfaces; infinite if the outlines differ too much."""
 
     @property
     def is_symmetric(self) -> bool:
-        """Whether the two look and fit alike."""
+        """Whether the copy looks and fits like the tool."""
         return (
             self.outline_deviation_mm < MOST_OUTLINE_DEVIATION_MM
             and self.surface_distance_mm < MOST_SURFACE_DISTANCE_MM
@@ -50,15 +50,15 @@ class Difference:
 
 
 def symmetry_order(triangles: NDArray[np.float64]) -> int:
-    """The order of a tool's rotational symmetry about z, the largest of `ORDERS`; 1 for none.
+    """The order of a tool's rotational symmetry about z: the largest of `ORDERS`, or 1 for none.
 
     Args:
-        triangles: (n, 3, 3) of the surface in frame T, in metres.
+        triangles: (n, 3, 3) the surface in frame T, in metres.
     """
     outline = footprint(triangles).scale((1e3, 1e3))
     size = _size(outline)
     for order in ORDERS:
-        # Wherever the copy is moved: what has another size deviates by half of the difference.
+        # At any translation, the deviation is at least half of the difference in size.
         differs = np.abs(_size(outline.rotate(360.0 / order)) - size).max()
         alike = differs < 2 * MOST_OUTLINE_DEVIATION_MM
         if alike and measure_rotation(triangles, order).is_symmetric:
@@ -67,7 +67,7 @@ def symmetry_order(triangles: NDArray[np.float64]) -> int:
 
 
 def _size(outline: CrossSection) -> NDArray[np.float64]:
-    """(2): along x and y."""
+    """(2,) the extents along x and y."""
     bounds = np.array(outline.bounds())
     return bounds[2:] - bounds[:2]
 
@@ -77,14 +77,13 @@ def measure_rotation(
 ) -> Difference:
     """Compares a tool with its copy, rotated by 2 pi / order.
 
-    The copy is moved along x and y to where the area that only one of the outlines covers is least;
-    from there, once to where the outlines' deviation is least, and once to where the surfaces'
-    distance is.
+    The copy is first translated to minimize the area that only one of the outlines covers. From
+    there, two separate searches minimize the outlines' deviation and the surfaces' distance.
 
     Args:
-        triangles: (n, 3, 3) of the surface in frame T, in metres.
+        triangles: (n, 3, 3) the surface in frame T, in metres.
         order: of the symmetry; 2 is a half turn.
-        complete: whether the surfaces are compared where the outlines already differ too much.
+        complete: compare the surfaces even if the outlines differ too much.
     """
     outline = footprint(triangles).scale((1e3, 1e3))
     copy = outline.rotate(360.0 / order)
@@ -99,7 +98,7 @@ def measure_rotation(
 
     shift, _ = _minimum(uncommon_area, np.zeros(2), 2.0)
     outline_deviation = deviation(shift)
-    # Where it is twice too large here, no other shift makes up for it.
+    # A deviation of twice the limit is too large for another translation to make up.
     if complete or outline_deviation < 2 * MOST_OUTLINE_DEVIATION_MM:
         outline_deviation = _minimum(deviation, shift, 0.5)[1]
     if not complete and outline_deviation >= MOST_OUTLINE_DEVIATION_MM:
@@ -108,7 +107,7 @@ def measure_rotation(
 
 
 def _surface_distance(triangles: NDArray[np.float64], order: int, start: Shift) -> float:
-    """The mean distance of a surface and its rotated copy, moved from `start` to the best."""
+    """The mean distance of a surface and its rotated copy, minimized from the shift `start`."""
     faces = np.arange(3 * len(triangles)).reshape(-1, 3)
     mesh = trimesh.Trimesh(triangles.reshape(-1, 3), faces, process=False)
     points, _ = trimesh.sample.sample_surface(mesh, _SAMPLES, seed=0)
@@ -118,7 +117,7 @@ def _surface_distance(triangles: NDArray[np.float64], order: int, start: Shift) 
     c, s = np.cos(2 * np.pi / order), np.sin(2 * np.pi / order)
     R = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
 
-    # From the copy to the original and back; a half turn undoes itself.
+    # From the copy to the original and back; both are equal for a half turn.
     def mean_distance(shift: Shift) -> float:
         offset = np.append(shift, 0.0)
         there = tree.query(points @ R.T + offset)[0].mean()
@@ -129,7 +128,7 @@ def _surface_distance(triangles: NDArray[np.float64], order: int, start: Shift) 
 
 
 def _minimum(function: Callable[[Shift], float], start: Shift, step: float) -> tuple[Shift, float]:
-    """The shift near `start` at which a function is least, and its value there."""
+    """The shift near `start` that minimizes a function, and the minimum."""
     found = minimize(
         function,
         start,

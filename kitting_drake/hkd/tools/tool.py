@@ -1,4 +1,4 @@
-"""A tool as a scenario uses it: a folder with its SDFormat model, its meshes and its record."""
+"""Tools: folders with an SDFormat model, its meshes and a record."""
 
 import dataclasses
 import difflib
@@ -19,10 +19,10 @@ from kitting_drake.common.paths import MODELS
 from systems.grasp import Grasp
 
 CATEGORIES = ("hammer", "pliers", "wrench", "screwdriver")
-"""The four categories of the paper (section IV-B.1). A tool of one's own may be of any other."""
+"""The four categories of the paper (section IV-B.1). User tools may have others."""
 
 
-# libyaml reads a hundred records in the time of ten.
+# libyaml reads records ten times as fast.
 _Loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 
 
@@ -30,17 +30,17 @@ _Loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 class Tool:
     """One hand tool.
 
-    The tool frame T: z up in the tool's stable pose, the table is z = 0, x along the tool's
-    length with the working end at +x, the origin centred in the bounding box of its footprint.
+    The tool frame T: z up in the tool's stable pose with the table at z = 0, x along the tool's
+    length with the working end at +x, the origin centred in the footprint's bounding box.
     """
 
     directory: Path
     name: str
     category: str
-    """One of `CATEGORIES`, or a name of one's own: small letters, digits and underscores."""
+    """One of `CATEGORIES`, or another name of small letters, digits and underscores."""
     split: str
-    """`train` or `test` (section IV-B.1 of the paper), `fresh` (kept for a last test), or `user`
-    for a tool of one's own."""
+    """`train` or `test` (section IV-B.1 of the paper), `fresh` (reserved for a final test), or
+    `user` for a user's own tool."""
     length: float
     """Extents of the bounding box along x, y and z of T, in metres."""
     width: float
@@ -50,10 +50,10 @@ class Tool:
     grasp: Grasp
     visual_meshes: tuple[Path, ...]
     symmetry: int = 1
-    """The order of the rotational symmetry about T's z: 1 for none; 2 for a reversible tool, for
-    which a half turn in its cavity is the same placement."""
+    """The order of the rotational symmetry about T's z: 1 for none, 2 for a reversible tool whose
+    half turn in its cavity is the same placement."""
     scale: float = 1.0
-    """The scale of the visual meshes, whose files have the lengths of the tool as it was made."""
+    """The factor by which the visual meshes' files are scaled."""
 
     @property
     def sdf(self) -> Path:
@@ -62,10 +62,10 @@ class Tool:
 
     @cached_property
     def parts(self) -> tuple[tuple[str, NDArray[np.float64]], ...]:
-        """The material of each part, and the triangles (n, 3, 3) of its surface, in T, in metres.
+        """The material and the surface triangles (n, 3, 3) of each part, in T, in metres.
 
         Raises:
-            UserError: a file that is not a mesh.
+            UserError: a file is not a mesh.
         """
         read = [(path.stem, _read_triangles(path)) for path in self.visual_meshes]
         return tuple((name, t if self.scale == 1.0 else self.scale * t) for name, t in read)
@@ -75,7 +75,7 @@ class Tool:
         """(n, 3, 3) the triangles of the visual surface, in T, in metres.
 
         Raises:
-            UserError: a file that is not a mesh.
+            UserError: a file is not a mesh.
         """
         triangles = np.concatenate([triangles for _, triangles in self.parts])
         triangles.flags.writeable = False
@@ -83,11 +83,11 @@ class Tool:
 
     @cached_property
     def footprint(self) -> CrossSection:
-        """The outline from above, in T, in metres."""
+        """The outline seen from above, in T, in metres."""
         return footprint(self.triangles)
 
     def surface_points(self, count: int, seed: int = 0) -> NDArray[np.float64]:
-        """(count, 3) points of the surface, in T, in metres: by area, the same each time."""
+        """(count, 3) points spread over the surface by area, in T, in metres; deterministic."""
         # Import trimesh lazily.
         import trimesh
 
@@ -104,15 +104,15 @@ def _read_triangles(path: Path) -> NDArray[np.float64]:
     try:
         triangles = np.asarray(trimesh.load_mesh(path, process=False).triangles, dtype=float)
     except (OSError, ValueError, TypeError, AttributeError, IndexError, KeyError) as error:
-        raise UserError(f"{path} is not a mesh that can be read: {error}") from error
+        raise UserError(f"{path} is not a readable mesh: {error}") from error
     if not len(triangles) or not np.isfinite(triangles).all():
-        raise UserError(f"{path} holds no triangles, or some without a place")
+        raise UserError(f"{path} has no triangles, or vertices that are not finite")
     triangles.flags.writeable = False
     return triangles
 
 
 def footprint(triangles: NDArray[np.float64]) -> CrossSection:
-    """The union of triangles (n, 3, 3) seen along z, whether their mesh is closed or not."""
+    """The union of triangles (n, 3, 3) projected along z; the mesh may be open."""
     flat = np.array(triangles[:, :, :2], dtype=float)
     edge_1, edge_2 = flat[:, 1] - flat[:, 0], flat[:, 2] - flat[:, 0]
     area = edge_1[:, 0] * edge_2[:, 1] - edge_1[:, 1] * edge_2[:, 0]
@@ -121,15 +121,15 @@ def footprint(triangles: NDArray[np.float64]) -> CrossSection:
 
 
 def load_tool(name: str, base: Path | None = None) -> Tool:
-    """A tool by its name under `models/tools` or `user_tools`, or by the path of its folder.
+    """Loads a tool by its name under `models/tools` or `user_tools`, or by its folder's path.
 
     Args:
-        name: a name, or a path, absolute or relative to `base`. Where one name means several, the
-            project's own tool comes first, then the user's, then the path.
-        base: where relative paths start; the working directory when None.
+        name: a name, or a path, absolute or relative to `base`. The project's own tool of a name
+            has precedence over the user's, and both over a path.
+        base: the base of relative paths; the working directory if None.
 
     Raises:
-        UserError: no such tool, or a record or a mesh that is missing or broken.
+        UserError: the tool does not exist, or its record or a mesh is missing or broken.
     """
     if "\0" in name:
         raise UserError(f"there is no tool {name!r}")
@@ -141,7 +141,7 @@ def load_tool(name: str, base: Path | None = None) -> Tool:
     record_path = directory / "tool.yaml"
     if not record_path.is_file():
         close = difflib.get_close_matches(name, [*tool_names(), *user_tool_names()], n=1)
-        advice = f"did you mean '{close[0]}'?" if close else "'hkd list' shows those there are"
+        advice = f"did you mean '{close[0]}'?" if close else "`hkd list` lists all tools"
         raise UserError(f"there is no tool '{name}', nor a folder with a tool.yaml: {advice}")
     try:
         record = yaml.load(record_path.read_text(), Loader=_Loader)
@@ -177,41 +177,41 @@ def load_tool(name: str, base: Path | None = None) -> Tool:
     }
     for name, value in sizes.items():
         if not 0 < value < math.inf:
-            raise UserError(f"{record_path}: {name} is {value:g}, and has to be positive")
+            raise UserError(f"{record_path}: {name} is {value:g}; it must be positive")
     if not all(map(math.isfinite, dataclasses.astuple(tool.grasp))):
-        raise UserError(f"{record_path}: grasp has to be of finite numbers")
+        raise UserError(f"{record_path}: grasp must consist of finite numbers")
     if tool.symmetry < 1:
-        raise UserError(f"{record_path}: symmetry is {tool.symmetry}, and has to be 1 or more")
+        raise UserError(f"{record_path}: symmetry is {tool.symmetry}; it must be 1 or more")
     return _shared(tool, tuple(path.stat().st_mtime_ns for path in tool.visual_meshes))
 
 
 @lru_cache(maxsize=32)
 def _shared(tool: Tool, changed: tuple[int, ...]) -> Tool:
-    """The same tool for all that are equal, whose meshes are then read once.
+    """One shared instance of equal tools, so that their meshes are read once.
 
     Args:
         tool: a tool.
-        changed: when its meshes were written.
+        changed: the modification times of its meshes.
     """
     return tool
 
 
 def check_category(category: str) -> None:
-    """Raises UserError for what is no name of a category."""
+    """Raises UserError if a name is not valid for a category."""
     if not re.fullmatch(r"[a-z][a-z0-9_]{0,31}", category):
         raise UserError(
-            f"category '{category}' has to be a name of small letters, digits and underscores, "
-            f"as {', '.join(CATEGORIES)} are"
+            f"category '{category}' must be a name of small letters, digits and underscores, "
+            f"such as {', '.join(CATEGORIES)}"
         )
 
 
 def tool_names() -> list[str]:
-    """The names of the tools that come with the project."""
+    """The names of the project's tools."""
     return sorted(path.parent.name for path in (MODELS / "tools").glob("*/tool.yaml"))
 
 
 def user_tools() -> Path:
-    """The folder of the user's own tools: `$KITTING_DRAKE_TOOLS`, or one in `~/.local/share`."""
+    """The folder of the user's tools: `$KITTING_DRAKE_TOOLS`, or one in `~/.local/share`."""
     given = os.environ.get("KITTING_DRAKE_TOOLS")
     return (
         Path(given).absolute()
@@ -222,6 +222,6 @@ def user_tools() -> Path:
 
 def user_tool_names() -> list[str]:
     """The names of the tools in `user_tools`."""
-    # A folder that begins with a dot is one that is being made.
+    # Folders whose names begin with a dot are unfinished.
     records = user_tools().glob("[!.]*/tool.yaml")
     return sorted(path.parent.name for path in records)

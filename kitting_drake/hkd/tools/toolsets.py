@@ -1,4 +1,4 @@
-"""Toolsets: which four tools, one of each category, share a kit (section IV-B.2 of the paper)."""
+"""Toolsets: the four tools, one per category, that share a kit (section IV-B.2 of the paper)."""
 
 import numpy as np
 
@@ -6,15 +6,14 @@ from kitting_drake.common.errors import UserError
 from kitting_drake.hkd.tools.tool import CATEGORIES, load_tool, tool_names
 
 PAPER_SPLITS = ("train", "test")
-"""The splits of the paper's dataset (section IV-B.1): forty tools to train with, twenty to test."""
+"""The splits of the paper's dataset (section IV-B.1): forty tools to train, twenty to test."""
 SPLITS = (*PAPER_SPLITS, "fresh")
-"""All splits; draws depend on their order, so a new one comes last. The ten `fresh` tools are no
-part of the paper's dataset: they are kept for a last test, and nothing is trained or tuned with
-them."""
+"""All splits. The seeds depend on their order, so append new ones. The ten `fresh` tools are not
+the paper's: they are reserved for a final test, and nothing is trained or tuned with them."""
 TOOLSET_COUNT = 100
-"""Toolsets, and so kits, of each split that has so many combinations."""
+"""The number of toolsets of a split, unless it has fewer combinations."""
 TOOLSETS_SEED = 2024
-"""The seed of the drawing."""
+"""The seed of the random draw."""
 
 
 def tool_pools(split: str) -> dict[str, list[str]]:
@@ -28,9 +27,9 @@ def tool_pools(split: str) -> dict[str, list[str]]:
 
 
 def toolsets(split: str) -> list[tuple[str, ...]]:
-    """The split's toolsets, all different, always the same: names in the order of `CATEGORIES`.
+    """The split's toolsets: distinct and deterministic, each in the order of `CATEGORIES`.
 
-    There are `TOOLSET_COUNT`, or as many as there are combinations.
+    There are `TOOLSET_COUNT`, or all combinations if there are fewer.
 
     Raises:
         UserError: a category has no tool in the split.

@@ -1,4 +1,4 @@
-"""The shipped policies on the unseen toolsets with the default scenario, all runs pooled."""
+"""The shipped policies on the unseen toolsets of the paper, all runs pooled."""
 
 from collections import Counter
 from collections.abc import Sequence

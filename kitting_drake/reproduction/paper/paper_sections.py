@@ -21,13 +21,13 @@ from kitting_drake.reproduction.paper.cells import (
 )
 from kitting_drake.reproduction.paper.departures import departures
 from kitting_drake.reproduction.paper.efficiency import efficiency_section
-from kitting_drake.reproduction.paper.network_parameters import parameters_section
 from kitting_drake.reproduction.paper.paper_tables import (
     DEMONSTRATIONS,
     RAVENS_DEMONSTRATIONS,
     SHIPPED,
     paper_cells,
 )
+from kitting_drake.reproduction.paper.parameter_table import parameters_section
 
 COLUMNS = tuple(sorted(ORIENTATIONS))
 _HEADINGS = {"seen": "Seen toolset, figure 6(a)", "unseen": "Unseen toolsets, figure 6(b)"}

@@ -32,7 +32,7 @@ rate of their `reference`: at that rate, after ten demonstrations, the pick-angl
 exploded and never came down again. They take the second best."""
 MATCHED = "matched"
 """The preset in which the baselines are as large beside their originals as ours; see
-`paper.network_parameters`."""
+`paper.parameter_table`."""
 ROTATIONS = 18
 """Of how many of 36 rotations a step of the Transporter learns in `_every_chance`."""
 EVERY_CHANCE = "every_chance"

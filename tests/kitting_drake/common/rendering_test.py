@@ -21,6 +21,7 @@ torch.optim.Adam([torch.zeros(1, requires_grad=True)])
 """
 
 
+@pytest.mark.slow
 def test_an_optimizer_can_be_made_after_an_image_was_rendered():
     """As a person does who trains on a gymnasium environment: PyTorch's Triton and Mesa each bring
     an LLVM."""

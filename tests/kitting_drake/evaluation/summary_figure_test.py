@@ -27,7 +27,9 @@ NINE = [make_object(f"thing {number}", 0.5 + number) for number in range(9)]
         ([make_episode(seed, [1.0, 9.0, 500.0, 0.0]) for seed in range(3)], ADD_S, 4),
         # More than there are colours, and one that no goal was left for.
         ([make_result(0, [*NINE, make_object("spare", None)]).as_dict()], PoseWithin(), 9),
-        ([make_episode(0, [1.0], timed_out=True)], PoseWithin(), 1),
+        pytest.param(
+            [make_episode(0, [1.0], timed_out=True)], PoseWithin(), 1, marks=pytest.mark.slow
+        ),
         ([make_lost_episode(0)], ADD_S, 1),
     ],
 )

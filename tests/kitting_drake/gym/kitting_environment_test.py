@@ -158,6 +158,7 @@ def test_an_observation_is_rendered_once_an_action_and_once_at_the_end(
     assert len(count) == 3
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("freed_diagrams")
 def test_scene_after_scene_leaves_the_memory(small: Path):
     environment = make(small, render_mode="rgb_array")

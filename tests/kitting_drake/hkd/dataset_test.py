@@ -18,7 +18,7 @@ def few_kits(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.usefixtures("few_kits")
-def test_what_is_built_is_what_the_manifest_says(tmp_path: Path):
+def test_the_manifest_lists_all_files_with_checksums(tmp_path: Path):
     folder = tmp_path / "hkd"
     steps: list[tuple[int, int]] = []
     manifest = dataset.build_dataset(folder, lambda done, total: steps.append((done, total)))
@@ -38,7 +38,7 @@ def test_what_is_built_is_what_the_manifest_says(tmp_path: Path):
 
 
 @pytest.mark.usefixtures("few_kits")
-def test_parts_load_from_wherever_they_are_moved(tmp_path: Path):
+def test_models_load_after_the_folder_is_moved(tmp_path: Path):
     manifest = dataset.build_dataset(tmp_path / "built", lambda done, total: None)
     moved = (tmp_path / "built").rename(tmp_path / "moved")
     for entry in (manifest["tools"][0], manifest["kits"][0]):
@@ -48,14 +48,14 @@ def test_parts_load_from_wherever_they_are_moved(tmp_path: Path):
         assert scene_graph.model_inspector().num_geometries() > 1
 
 
-def test_a_folder_that_holds_something_is_left_alone(tmp_path: Path):
+def test_a_folder_with_files_is_rejected_and_kept(tmp_path: Path):
     (tmp_path / "mine.txt").write_text("mine")
     with pytest.raises(UserError, match="not empty"):
         dataset.build_dataset(tmp_path, lambda done, total: None)
     assert [path.name for path in tmp_path.iterdir()] == ["mine.txt"]
 
 
-def test_nothing_is_left_of_a_build_that_fails(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_a_failed_build_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     def fail(*_: object) -> None:
         raise OSError(28, "No space left on device")
 

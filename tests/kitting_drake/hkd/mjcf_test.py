@@ -1,4 +1,4 @@
-"""MuJoCo's models of tools and kits: what the SDFormat says, in MuJoCo's words."""
+"""MuJoCo models of tools and kits agree with their SDFormat models."""
 
 import xml.etree.ElementTree as ElementTree
 from pathlib import Path
@@ -35,7 +35,7 @@ def compiled(text: str, folder: Path) -> Any:
 
 
 @pytest.mark.parametrize("length", [None, 0.16])
-def test_a_tool_weighs_and_rubs_as_its_sdformat_says(length: float | None):
+def test_mass_inertia_and_friction_are_those_of_the_sdformat(length: float | None):
     tool: Tool = load_tool("claw_hammer")
     tool = tool if length is None else scaled_tool(tool, length)
     model = compiled(tool_mjcf(tool.sdf), tool.directory)
@@ -54,12 +54,12 @@ def test_a_tool_weighs_and_rubs_as_its_sdformat_says(length: float | None):
     assert np.allclose(model.geom_friction[collides, 0], 0.5)
 
 
-def test_a_kits_prisms_are_its_block(kit: Kit):
+def test_the_prisms_fill_the_block(kit: Kit):
     mesh = trimesh.load_mesh(kit.sdf.parent / "kit.obj")
     solid = Manifold()
     for prism in block_prisms(mesh.vertices, mesh.faces):
         solid += Manifold.hull_points(prism)
-    # But for the bevels, of which the step gives about as much as it takes.
+    # The steps that replace the bevels add about as much volume as they remove.
     assert solid.volume() == pytest.approx(mesh.volume, rel=1e-4)
     model = compiled(kit_mjcf(kit.sdf), kit.sdf.parent)
     assert model.nq == 0
@@ -85,9 +85,7 @@ def test_a_seated_tool_stays_in_its_cavity(kit: Kit):
     assert np.abs(data.qvel).max() < 0.02
 
 
-def test_the_dataset_has_them_where_they_are_asked_for(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-):
+def test_the_dataset_has_mjcf_on_request(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(dataset, "toolsets", lambda split: toolsets(split)[:1])
     manifest = dataset.build_dataset(tmp_path / "hkd", lambda done, total: None, mjcf=True)
     for entry in (manifest["tools"][0], manifest["kits"][0]):
@@ -96,16 +94,16 @@ def test_the_dataset_has_them_where_they_are_asked_for(
         compiled(path.read_text(), path.parent)
 
 
-def test_what_is_no_model_is_told(tmp_path: Path):
+def test_an_invalid_model_is_rejected(tmp_path: Path):
     path = tmp_path / "broken.sdf"
     for text, tools, kits in (
         ("", "no element found", "no element found"),
-        ("<sdf/>", "there is no model", "there is no model/link"),
-        ("<sdf><model><link/></model></sdf>", "a model has no name", "kit.obj"),
-        ("<sdf><model name='x'><link name='y'/></model></sdf>", "there is no inertial", "kit.obj"),
+        ("<sdf/>", "model", "model/link"),
+        ("<sdf><model><link/></model></sdf>", "name", "kit.obj"),
+        ("<sdf><model name='x'><link name='y'/></model></sdf>", "inertial", "kit.obj"),
     ):
         path.write_text(text)
-        with pytest.raises(UserError, match=f"is no model of a tool: {tools}"):
+        with pytest.raises(UserError, match=f"tool: .*{tools}"):
             tool_mjcf(path)
-        with pytest.raises(UserError, match=f"is no model of a kit: .*{kits}"):
+        with pytest.raises(UserError, match=f"kit: .*{kits}"):
             kit_mjcf(path)

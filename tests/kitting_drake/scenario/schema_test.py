@@ -11,8 +11,8 @@ from pydrake.common.yaml import yaml_load
 from kitting_drake.common.paths import SCENARIOS
 from kitting_drake.scenario import Scenario, load_scenario
 from kitting_drake.scenario.description import describe
-from kitting_drake.scenario.drake_configs import struct_fields
 from kitting_drake.scenario.policies import Learned, Policy
+from kitting_drake.scenario.yaml_input.drake_configs import struct_fields
 from kitting_drake.tasks import PythonTask, Task
 from systems.bounds import check_bounds
 

@@ -17,7 +17,7 @@ from systems.signals import PickPlaceAction, PlanarPose
 from tests.kitting_drake.rig import build_rig
 
 
-@pytest.mark.parametrize("force", [30.0, 60.0])
+@pytest.mark.parametrize("force", [pytest.param(30.0, marks=pytest.mark.slow), 60.0])
 @pytest.mark.usefixtures("rendering")
 def test_it_presses_as_hard_as_it_is_told(monkeypatch: pytest.MonkeyPatch, force: float):
     """Through an impact at `lower_speed`, and from one period of the planner to the next."""

@@ -434,7 +434,11 @@ def test_a_mesh_that_is_none_is_the_users_to_repair(own_tool: Path):
 
 
 @pytest.mark.parametrize(
-    "policy", [Oracle(), PythonPolicy(function="systems.signals:PickPlaceAction")]
+    "policy",
+    [
+        pytest.param(Oracle(), marks=pytest.mark.slow),
+        PythonPolicy(function="systems.signals:PickPlaceAction"),
+    ],
 )
 @pytest.mark.usefixtures("rendering", "freed_diagrams")
 def test_a_cell_that_nobody_uses_leaves_the_memory(policy: PolicyConfig):

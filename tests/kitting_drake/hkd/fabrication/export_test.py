@@ -51,7 +51,7 @@ def own_tool(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def bar(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The folder of a tool that is a rectangle, beside which a tight block has no room."""
+    """The folder of a rectangular tool, which leaves no room on a tight block."""
     folder = tmp_path_factory.mktemp("bar")
     (folder / "bar.svg").write_text(
         '<svg xmlns="http://www.w3.org/2000/svg" width="160mm" height="14mm" viewBox="0 0 160 14">'
@@ -63,7 +63,7 @@ def bar(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def plain(tmp_path_factory: pytest.TempPathFactory, own_tool: Path) -> Path:
-    """The folder of a kit with a tool of one's own, twice, and one of the project's."""
+    """The folder of a kit with a user tool, twice, and one of the project's tools."""
     folder = tmp_path_factory.mktemp("plain") / "kit"
     export_kit(KitRequest((str(own_tool), "claw_hammer", str(own_tool)), folder))
     return folder
@@ -92,7 +92,7 @@ def record(folder: Path) -> dict:
 
 
 def polylines(folder: Path, *kinds: str) -> list[tuple[float, NDArray]]:
-    """Depth and points (n, 2), in mm, of the DXF's closed polylines of some kinds."""
+    """Depth and points (n, 2), in mm, of the DXF's closed polylines of the given kinds."""
     document = ezdxf.readfile(folder / "cavities.dxf")
     assert document.header["$INSUNITS"] == 4
     found = []
@@ -105,7 +105,7 @@ def polylines(folder: Path, *kinds: str) -> list[tuple[float, NDArray]]:
 
 
 def points_along(segments: Iterable[NDArray], step: float) -> NDArray:
-    """Points (n, 2) on segments (2, 2), no further apart than a step."""
+    """Points (n, 2) on segments (2, 2), at most a step apart."""
     points = []
     for a, b in segments:
         count = max(2, int(np.ceil(np.linalg.norm(b - a) / step)) + 1)
@@ -118,13 +118,13 @@ def edges(loops: Iterable[NDArray]) -> list[NDArray]:
 
 
 def hausdorff(one: list[NDArray], other: list[NDArray]) -> float:
-    """The greatest distance of a point of either from the other, in mm."""
+    """The Hausdorff distance, in mm."""
     a, b = points_along(one, 0.02), points_along(other, 0.02)
     return float(max(cKDTree(a).query(b)[0].max(), cKDTree(b).query(a)[0].max()))
 
 
 def walls_of_block(folder: Path, z: float) -> list[NDArray]:
-    """The edges of the printed block's cavities where it is cut at a height, in mm."""
+    """The edges (mm) of the cavities in a horizontal slice of the printed block."""
     length, width, _ = record(folder)["block"]
     loops = [np.array(loop) for loop in solid(folder).slice(z).to_polygons()]
     outside = np.array([length, width])
@@ -132,10 +132,10 @@ def walls_of_block(folder: Path, z: float) -> list[NDArray]:
 
 
 def wall_distances(folder: Path) -> tuple[float, float]:
-    """How far the STL's walls are from the SDFormat's and from the DXF's outlines, in mm.
+    """The distances of the STL's walls from the SDFormat's and the DXF's, in mm.
 
-    The greatest Hausdorff distance of three cuts through each cavity: near its floor, half way up,
-    and beneath the bevel.
+    Each is the largest Hausdorff distance over three slices of each cavity: near its floor, at half
+    height, and below the bevel.
     """
     made = record(folder)
     length, width, height = made["block"]
@@ -147,7 +147,7 @@ def wall_distances(folder: Path) -> tuple[float, float]:
     floors = sorted({height - depth for depth, _ in outlines})
     for floor in floors:
         for z in (floor + 0.15, (floor + top) / 2, top - 0.15):
-            # Along another floor a cut may show that cavity or not.
+            # A slice along another cavity's floor is ambiguous.
             while min(abs(z - other) for other in floors) < 0.02:
                 z += 0.03
             walls = walls_of_block(folder, z)
@@ -159,14 +159,14 @@ def wall_distances(folder: Path) -> tuple[float, float]:
     return to_sdf, to_dxf
 
 
-def test_printed_walls_are_those_of_the_simulator_and_of_the_drawing(plain: Path):
+def test_the_printed_walls_match_simulation_and_drawing(plain: Path):
     assert stl(plain).is_watertight
     to_sdf, to_dxf = wall_distances(plain)
-    # Points are sampled every 0.02 mm: less than half of that cannot be told.
+    # Points are 0.02 mm apart, so a deviation below half of that is not resolved.
     assert max(to_sdf, to_dxf) < 0.015
 
 
-def test_every_file_is_the_same_block_in_millimetres(full: Path):
+def test_all_files_show_the_same_block_in_millimetres(full: Path):
     length, width, height = record(full)["block"]
     mesh = stl(full)
     assert mesh.is_watertight
@@ -200,11 +200,11 @@ def test_every_file_is_the_same_block_in_millimetres(full: Path):
     Image.open(io.BytesIO((full / "kit.png").read_bytes())).verify()
 
 
-def test_what_is_drawn_is_cut_and_nothing_else(full: Path):
+def test_the_solid_is_cut_exactly_as_drawn(full: Path):
     block, height = solid(full), record(full)["block"][2]
     drawn = polylines(full, "CAVITIES", "NOTCHES")
     assert {depth for depth, _ in polylines(full, "LABELS")} == {0.6}
-    # Below the letters and the bevels, and so down to the deepest floor.
+    # Slices from below the letters and bevels down to the deepest floor.
     for z in np.arange(1.5, max(depth for depth, _ in drawn), 4.3):
         open_there = CrossSection()
         for depth, points in drawn:
@@ -223,7 +223,7 @@ def xor(one: CrossSection, other: CrossSection) -> float:
     return (one - other).area() + (other - one).area()
 
 
-def test_notches_leave_walls_standing():
+def test_notches_keep_their_distance():
     kit = make_kit([load_tool(name) for name in FOUR], KitParameters(always_nested=True))
     design = design_kit(kit, notches=True)
     notches = [recess for recess in design.recesses if recess.kind == "notch"]
@@ -242,8 +242,8 @@ def test_notches_leave_walls_standing():
 
 @pytest.mark.parametrize("apart", [0.001, 0.004])
 @pytest.mark.parametrize("inside", [False, True])
-def test_a_wall_stands_between_the_notches_of_one_tool(apart: float, inside: bool):
-    """Around a corner of a tool they may come near; within its cavity there is nothing between."""
+def test_notches_of_one_tool_have_a_wall_between_them(apart: float, inside: bool):
+    """Notches around a corner of the tool need a wall; inside the cavity there is none anyway."""
     one = CrossSection.square((0.02, 0.02))
     other = one.translate((0.02 + apart, 0.0))
     side = 0.1 if inside else 0.01
@@ -251,18 +251,18 @@ def test_a_wall_stands_between_the_notches_of_one_tool(apart: float, inside: boo
     assert _is_wall_between(one, other, cavity, 0.003) == (inside or apart > 0.003)
 
 
-def test_a_notch_without_room_is_told_and_a_label_goes_to_the_floor(bar: Path, tmp_path: Path):
+def test_a_note_on_a_missing_notch_and_a_label_on_the_floor(bar: Path, tmp_path: Path):
     request = KitRequest((str(bar),), tmp_path, wall_mm=2.0, notches=True, labels=True)
     design = export_kit(request)
     assert len(design.notes) == 1
-    assert "no room for a finger notch beside 'bar'" in design.notes[0]
+    assert "notch" in design.notes[0] and "'bar'" in design.notes[0]
     assert record(tmp_path)["notes"] == list(design.notes)
     (label,) = (recess for recess in design.recesses if recess.kind == "label")
     assert label.floor == pytest.approx(design.cavities[0].floor - 0.0006)
     assert (label.outline - design.cavities[0].outline).is_empty()
 
 
-def test_the_scenario_has_the_printed_kit_wherever_the_folder_is(plain: Path, tmp_path: Path):
+def test_the_scenario_loads_the_printed_kit_after_moving_the_folder(plain: Path, tmp_path: Path):
     moved = tmp_path / "moved"
     shutil.copytree(plain, moved)
     scenario = load_scenario(moved / "scenario.yaml")
@@ -274,7 +274,7 @@ def test_the_scenario_has_the_printed_kit_wherever_the_folder_is(plain: Path, tm
         assert file.read_bytes() == (simulated / file.name).read_bytes()
 
 
-def test_a_block_of_a_given_size(tmp_path: Path):
+def test_a_block_of_given_size(tmp_path: Path):
     block = (230.0, 210.0, 30.0)
     export_kit(KitRequest(FOUR, tmp_path / "kit", block_mm=block, clearance_mm=1.0))
     assert record(tmp_path / "kit")["block"] == list(block)
@@ -284,7 +284,7 @@ def test_a_block_of_a_given_size(tmp_path: Path):
     assert scene.goals[0].rim_height == pytest.approx(0.030)
 
 
-@pytest.mark.parametrize("clearance", [0.1, 0.2])
+@pytest.mark.parametrize("clearance", [0.1, pytest.param(0.2, marks=pytest.mark.slow)])
 def test_a_small_clearance_is_kept(clearance: float, tmp_path: Path):
     design = export_kit(KitRequest(("claw_hammer",), tmp_path / "kit", clearance_mm=clearance))
     kit = design.kit
@@ -294,30 +294,30 @@ def test_a_small_clearance_is_kept(clearance: float, tmp_path: Path):
     assert (grown - design.cavities[0].outline).area() < 1e-10
 
 
-def test_what_is_left_below_a_tool_may_be_just_a_wall(bar: Path, tmp_path: Path):
+def test_the_floor_below_a_tool_may_be_as_thin_as_a_wall(bar: Path, tmp_path: Path):
     height = 1e3 * load_tool(str(bar)).height
     export_kit(KitRequest((str(bar),), tmp_path, block_mm=(300.0, 300.0, height + 2.0)))
 
 
 @pytest.mark.parametrize(
-    ("options", "sentence"),
+    ("options", "token"),
     [
-        ({"tools": ("no_such_tool",)}, "no tool 'no_such_tool'"),
-        ({"tools": FOUR * 4}, "holds 1 to 12 tools, not 16"),
-        ({"tools": FOUR, "block_mm": (120.0, 100.0, 50.0)}, "on a block of 120 by 100 mm"),
-        ({"tools": FOUR, "block_mm": (300.0, 300.0, 15.0)}, "in a block of 15.0 mm"),
-        ({"tools": FOUR, "block_mm": (300.0, 3e4, 50.0)}, "width of 30000 is out of range"),
-        ({"tools": FOUR, "clearance_mm": -1.0}, "--clearance_mm -1 is out of range"),
-        ({"tools": FOUR, "wall_mm": float("nan")}, "--wall_mm nan is out of range"),
+        ({"tools": ("no_such_tool",)}, "no_such_tool"),
+        ({"tools": FOUR * 4}, "not 16"),
+        ({"tools": FOUR, "block_mm": (120.0, 100.0, 50.0)}, "120 by 100 mm"),
+        ({"tools": FOUR, "block_mm": (300.0, 300.0, 15.0)}, "15.0 mm"),
+        ({"tools": FOUR, "block_mm": (300.0, 3e4, 50.0)}, "width of 30000"),
+        ({"tools": FOUR, "clearance_mm": -1.0}, "--clearance_mm -1"),
+        ({"tools": FOUR, "wall_mm": float("nan")}, "--wall_mm nan"),
     ],
 )
-def test_what_cannot_be_made_leaves_nothing(options: dict, sentence: str, tmp_path: Path):
-    with pytest.raises(UserError, match=re.escape(sentence)):
+def test_an_impossible_kit_leaves_nothing(options: dict, token: str, tmp_path: Path):
+    with pytest.raises(UserError, match=re.escape(token)):
         export_kit(KitRequest(output=tmp_path / "new" / "kit", **options))
     assert not any(tmp_path.iterdir())
 
 
-def test_a_kit_replaces_a_kit_and_nothing_else(plain: Path, tmp_path: Path):
+def test_a_kit_replaces_only_a_kit(plain: Path, tmp_path: Path):
     folder = tmp_path / "kit"
     shutil.copytree(plain, folder)
     export_kit(KitRequest(("claw_hammer",), folder))
@@ -325,12 +325,12 @@ def test_a_kit_replaces_a_kit_and_nothing_else(plain: Path, tmp_path: Path):
     assert not (folder / "tools").exists()
     assert [path.name for path in tmp_path.iterdir()] == ["kit"]
     (folder / "notes.txt").write_text("mine")
-    with pytest.raises(UserError, match=r"notes\.txt, which is no file of a kit"):
+    with pytest.raises(UserError, match=r"notes\.txt"):
         export_kit(KitRequest(("claw_hammer",), folder))
     assert (folder / "notes.txt").read_text() == "mine"
 
 
-def test_a_kit_that_cannot_be_moved_into_its_place_leaves_the_old_one(
+def test_a_kit_that_cannot_be_moved_into_place_keeps_the_old_one(
     plain: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     folder = tmp_path / "kit"
@@ -343,13 +343,13 @@ def test_a_kit_that_cannot_be_moved_into_its_place_leaves_the_old_one(
         rename(source, target)
 
     monkeypatch.setattr(os, "rename", refuse)
-    with pytest.raises(UserError, match=r"cannot write .*: Device or resource busy"):
+    with pytest.raises(UserError, match="Device or resource busy"):
         export_kit(KitRequest(("claw_hammer",), folder))
     assert len(record(folder)["tools"]) == 3
     assert [path.name for path in tmp_path.iterdir()] == ["kit"]
 
 
-def test_the_command_says_what_is_wrong(
+def test_the_command_suggests_a_tool_name(
     verb_process: Callable[..., subprocess.CompletedProcess[str]], tmp_path: Path
 ):
     done = verb_process("hkd", "kit", "claw_hamer", "--output", tmp_path / "kit")
@@ -359,7 +359,7 @@ def test_the_command_says_what_is_wrong(
 
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", range(5))
-def test_printed_walls_of_any_tools(seed: int, own_tool: Path, tmp_path: Path):
+def test_the_printed_walls_of_random_kits_match(seed: int, own_tool: Path, tmp_path: Path):
     rng = np.random.default_rng(seed)
     tools = [str(name) for name in rng.choice(tool_names(), rng.integers(2, 7))]
     for flags in (False, True):
@@ -370,7 +370,7 @@ def test_printed_walls_of_any_tools(seed: int, own_tool: Path, tmp_path: Path):
 
 
 @pytest.mark.slow
-def test_the_written_scenario_is_kitted(
+def test_the_written_scenario_succeeds(
     verb: Callable[..., subprocess.CompletedProcess[str]],
     rendering: None,
     plain: Path,

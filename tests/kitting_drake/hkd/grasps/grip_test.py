@@ -6,7 +6,7 @@ from kitting_drake.hkd.grasps.grip import find_grip
 
 
 def bar(angle_deg: float, y: float) -> np.ndarray:
-    """The triangles of a bar of 160 x 18 x 12 mm on the table, rotated and moved along y."""
+    """The triangles of a bar of 160 x 18 x 12 mm on the table, rotated, then moved along y."""
     mesh = trimesh.creation.box((0.16, 0.018, 0.012))
     mesh.apply_transform(trimesh.transformations.rotation_matrix(np.radians(angle_deg), (0, 0, 1)))
     mesh.apply_translation((0, y, 0.006))
@@ -20,14 +20,14 @@ def test_a_bar_between_the_jaws(angle_deg: float):
     assert (grip.width, grip.middle, grip.top) == pytest.approx((0.018, 0, 0.012), abs=1e-12)
 
 
-def test_the_middle_is_seen_from_the_hand():
+def test_coordinates_are_relative_to_the_hand():
     grip = find_grip(bar(0.0, 0.005), 0.01, 0.002, 0.0, 0.0176)
     assert grip is not None
     assert (grip.low, grip.high) == pytest.approx((-0.006, 0.012))
     assert grip.middle == pytest.approx(0.003)
 
 
-def test_only_what_is_between_the_ends_of_the_pads_counts():
+def test_only_the_surface_between_the_ends_of_the_pads_counts():
     # A bar across the jaws at 10 mm is beside pads that reach 8.8 mm.
     both = np.concatenate([bar(0.0, 0.0), bar(90.0, 0.0) + (0.019, 0, 0)])
     narrow, wide = (find_grip(both, 0.0, 0.0, 0.0, length) for length in (0.0176, 0.0224))
@@ -36,5 +36,5 @@ def test_only_what_is_between_the_ends_of_the_pads_counts():
     assert wide.width == pytest.approx(0.160)
 
 
-def test_there_is_nothing_beyond_the_end():
+def test_there_is_no_grip_beyond_the_end():
     assert find_grip(bar(0.0, 0.0), 0.1, 0.0, 0.0, 0.0176) is None

@@ -26,14 +26,12 @@ def grown(profile: CrossSection, distance: float) -> CrossSection:
         (CrossSection.circle(30.0, 100), 1),
         (angle_iron(), 2),
         (angle_iron().rotate(33.0), 3),
-        # A chord whose sagitta is both tolerances spans 12 degrees of the inner arc.
+        # A chord whose sagitta is the sum of both tolerances spans 12 degrees of the inner arc.
         (ring_sector(100.0, 10.0, 90.0), 11),
         (CrossSection.square((40, 40)) + CrossSection.square((10, 10)).translate((60, 0)), 2),
     ],
 )
-def test_few_polygons_cover_the_inner_and_stay_in_the_outer_region(
-    outline: CrossSection, most: int
-):
+def test_few_polygons_cover_the_inner_region_within_the_outer_one(outline: CrossSection, most: int):
     inner, outer = grown(outline, -0.25), grown(outline, 0.25)
     polygons = convex_cover(inner, outer, outline)
     assert len(polygons) <= most
@@ -43,7 +41,7 @@ def test_few_polygons_cover_the_inner_and_stay_in_the_outer_region(
     assert all(polygon.area() > 0.999 * polygon.hull().area() for polygon in polygons)
 
 
-def test_the_polygons_reach_out_to_the_outline():
+def test_the_polygons_follow_the_outline():
     outline = angle_iron()
     inner = grown(outline, -0.25)
     polygons = convex_cover(inner, grown(outline, 0.25), outline)

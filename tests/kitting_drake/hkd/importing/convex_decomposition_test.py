@@ -2,6 +2,7 @@ import numpy as np
 import pytest
 from manifold3d import CrossSection, Manifold, OpType
 
+from kitting_drake.hkd.importing import convex_decomposition
 from kitting_drake.hkd.importing.convex_decomposition import MOST_HULLS, decompose
 from kitting_drake.hkd.tools.collision import furthest, projection
 from systems.grasp import Grasp
@@ -14,21 +15,21 @@ def union(hulls: list[np.ndarray]) -> Manifold:
 
 
 def bent_handle() -> Manifold:
-    """An arc of 20 mm by 12 mm whose middle is at the grasp."""
+    """An arc 20 mm wide and 12 mm high whose middle is at the grasp."""
     ring = CrossSection.circle(160.0, 400) - CrossSection.circle(140.0, 400)
     arc = ring ^ CrossSection.square((140.0, 100.0), True).translate((0.0, 150.0))
     return arc.translate((-20.0, -150.0)).extrude(12.0)
 
 
 def stepped() -> Manifold:
-    """A straight bar whose half is three times as high as the other: one outline, two heights."""
+    """A straight bar with one half three times as high as the other."""
     return Manifold.cube((80, 20, 10)).translate((-80, -10, 0)) + Manifold.cube(
         (80, 20, 30)
     ).translate((0, -10, 0))
 
 
 @pytest.mark.parametrize("solid", [bent_handle(), stepped()])
-def test_the_outline_is_as_true_as_it_says(solid: Manifold):
+def test_the_reported_outline_deviation_is_true(solid: Manifold):
     found = decompose(solid, GRASP)
     outline, seen = solid.project(), projection(found.hulls)
     deviation = max(furthest(seen, outline), furthest(outline, seen))
@@ -38,14 +39,14 @@ def test_the_outline_is_as_true_as_it_says(solid: Manifold):
     assert all(len(hull) <= 40 for hull in found.hulls)
 
 
-def test_heights_get_hulls_of_their_own():
+def test_hulls_are_split_by_height():
     solid = stepped()
     together = union(decompose(solid, GRASP).hulls)
     assert (together - solid).volume() < 0.02 * solid.volume()
     assert (solid - together).volume() < 0.02 * solid.volume()
 
 
-def test_the_bottom_stays_flat_and_nothing_is_below_it():
+def test_the_bottom_is_flat_at_zero():
     solid = bent_handle()
     points = np.vstack(decompose(solid, GRASP).hulls)
     assert points[:, 2].min() == 0.0
@@ -53,8 +54,11 @@ def test_the_bottom_stays_flat_and_nothing_is_below_it():
     assert furthest(solid.project().hull(), bottom) < 0.4
 
 
-def test_an_outline_of_too_many_corners_is_told():
-    # A comb whose gaps are too broad to be bridged.
+def test_the_deviation_of_a_complex_outline_is_reported(monkeypatch: pytest.MonkeyPatch):
+    # Try the last tolerances only.
+    last = convex_decomposition.OUTLINE_TOLERANCES_MM[-1:]
+    monkeypatch.setattr(convex_decomposition, "OUTLINE_TOLERANCES_MM", last)
+    # A comb with gaps too wide to bridge.
     teeth = [
         Manifold.cube((4, 30, 10)).translate((11.5 * index - 94.0, -40, 0)) for index in range(17)
     ]

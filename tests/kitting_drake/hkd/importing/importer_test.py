@@ -31,7 +31,7 @@ REAL = Path(os.environ.get("KITTING_REAL_TOOLS", ROOT.parent / "shared" / "real_
 
 
 def mallet() -> trimesh.Trimesh:
-    """A handle and a head, 175 mm long in mm, flat below."""
+    """A handle and a head with a flat bottom, 175 mm long, in mm."""
     handle = Manifold.cube((170, 20, 12), True).translate((0, 0, -2))
     head = Manifold.cube((26, 50, 16), True).translate((77, 5, 0))
     vertices, faces = vertices_and_faces(handle + head)
@@ -44,13 +44,13 @@ def exported(mesh: trimesh.Trimesh, path: Path) -> Path:
 
 
 def bring(path: Path, folder: Path, **options: object) -> importer.ImportReport:
-    """Imports in this process."""
+    """Runs an import in this process."""
     request = ImportRequest(path, options.pop("category", "hammer"), output=folder, **options)
     return import_tool(request, time_limit=None)
 
 
 def solid_of(mesh: trimesh.Trimesh) -> tuple[Manifold, list[str]]:
-    """The solid of a mesh, as long as the importer makes it, and what had to be done for it."""
+    """The solid of a mesh, at the importer's size, and the notes on its repairs."""
     scale = NOMINAL_MM / mesh.extents.max()
     return make_solid(scale * (mesh.vertices - mesh.bounds.mean(axis=0)), mesh.faces)
 
@@ -61,16 +61,16 @@ def left_in(folder: Path) -> list[str]:
 
 @pytest.fixture(scope="module")
 def plain(tmp_path_factory: pytest.TempPathFactory) -> importer.ImportReport:
-    """The mallet as it is, in mm."""
+    """The mallet, imported without changes."""
     folder = tmp_path_factory.mktemp("plain")
     return bring(exported(mallet(), folder / "mallet.stl"), folder / "tools")
 
 
-def test_a_tool_is_as_its_mesh_is(plain: importer.ImportReport):
+def test_a_tool_has_the_shape_and_mass_of_its_mesh(plain: importer.ImportReport):
     tool = load_tool(str(plain.directory))
     assert (tool.name, tool.category, tool.split) == ("mallet", "hammer", "user")
     assert (tool.length, tool.width, tool.height) == pytest.approx((0.175, 0.050, 0.016), abs=1e-5)
-    # The head is the working end, and heavy.
+    # The head is the working end and made of steel.
     head = 1e-9 * 26 * 50 * 16
     handle = 1e-9 * mallet().volume - head
     assert tool.mass == pytest.approx(7850 * head + 1200 * handle, rel=0.05)
@@ -81,17 +81,17 @@ def test_a_tool_is_as_its_mesh_is(plain: importer.ImportReport):
     np.testing.assert_allclose((points.min(axis=0) + points.max(axis=0))[:2], 0, atol=1e-6)
 
 
-def test_a_category_of_ones_own(tmp_path: Path):
+def test_a_new_category(tmp_path: Path):
     mesh = exported(mallet(), tmp_path / "mallet.stl")
     tool = load_tool(str(bring(mesh, tmp_path / "tools", category="carvers_mallet").directory))
     assert tool.category == "carvers_mallet"
     assert tool.mass == pytest.approx(mallet().volume * 1e-9 * OTHER_DENSITY, rel=1e-4)
-    with pytest.raises(UserError, match="category 'Carver' has to be a name of small letters"):
+    with pytest.raises(UserError, match="category 'Carver'"):
         bring(mesh, tmp_path / "tools", category="Carver", name="other")
     assert left_in(tmp_path / "tools") == ["mallet"]
 
 
-def test_collision_hulls_are_few_convex_and_true(plain: importer.ImportReport):
+def test_collision_hulls_are_few_convex_and_accurate(plain: importer.ImportReport):
     pieces = [
         trimesh.load_mesh(path, process=False) for path in plain.directory.glob("collision_*.obj")
     ]
@@ -102,7 +102,7 @@ def test_collision_hulls_are_few_convex_and_true(plain: importer.ImportReport):
         OpType.Add,
     )
     tool = load_tool(str(plain.directory))
-    # A cavity, 2 mm off, sees no sharp notch.
+    # Cavities with a clearance of 2 mm bridge narrow notches.
     shadow = closed(together.project().scale((1e3, 1e3)), 2.0)
     outline = closed(tool.footprint.scale((1e3, 1e3)), 2.0)
     deviation = max(furthest(shadow, outline), furthest(outline, shadow))
@@ -110,7 +110,7 @@ def test_collision_hulls_are_few_convex_and_true(plain: importer.ImportReport):
     assert 1e3 * plain.record["imported"]["outline_deviation"] == pytest.approx(deviation, abs=0.1)
 
 
-def test_the_model_loads_where_it_is(plain: importer.ImportReport):
+def test_drake_loads_the_model(plain: importer.ImportReport):
     from pydrake.multibody.parsing import Parser
     from pydrake.multibody.plant import MultibodyPlant
 
@@ -141,7 +141,7 @@ def test_every_format_is_read(suffix: str, tmp_path: Path):
         pytest.param("stl", 0.1, True, marks=pytest.mark.slow),
     ],
 )
-def test_units_pose_and_format_do_not_matter(
+def test_unit_pose_and_format_do_not_matter(
     plain: importer.ImportReport, tmp_path: Path, suffix: str, units_per_mm: float, turned: bool
 ):
     mesh = mallet()
@@ -152,7 +152,7 @@ def test_units_pose_and_format_do_not_matter(
         mesh.apply_translation([900, -400, 100])
     mesh.apply_scale(units_per_mm)
     path = exported(mesh, tmp_path / f"mallet.{suffix}")
-    # A unit that nobody uses leaves the size open: then it is asked for.
+    # An unknown unit needs a length.
     length = 175.0 if units_per_mm == 37.0 else None
     report = bring(path, tmp_path / "tools", length_mm=length)
     for key in ("length", "width", "height"):
@@ -161,7 +161,7 @@ def test_units_pose_and_format_do_not_matter(
     mine, other = report.record["grasp"], plain.record["grasp"]
     for key in ("x", "width", "surface_height"):
         assert mine[key] == pytest.approx(other[key], abs=1.5e-3)
-    # It may lie on its other side.
+    # The tool may lie on its other side.
     assert abs(mine["y"]) == pytest.approx(abs(other["y"]), abs=5e-4)
 
 
@@ -169,11 +169,11 @@ def test_units_pose_and_format_do_not_matter(
     ("length", "unit"),
     [(180, "mm"), (0.18, "m"), (7.1, "inches"), (18, "cm"), (4000, None), (1e-5, None)],
 )
-def test_units_are_guessed(length: float, unit: str | None):
+def test_guess_unit(length: float, unit: str | None):
     assert guess_unit(length) == unit
 
 
-def test_a_long_tool_is_scaled_and_a_holed_one_repaired(tmp_path: Path):
+def test_a_long_open_mesh_is_scaled_and_repaired(tmp_path: Path):
     mesh = mallet()
     mesh.apply_scale(2.0)
     mesh.update_faces(np.arange(len(mesh.faces)) != 3)
@@ -183,16 +183,16 @@ def test_a_long_tool_is_scaled_and_a_holed_one_repaired(tmp_path: Path):
     assert any("repaired" in note for note in report.notes)
 
 
-def test_what_closing_a_hole_added_is_told():
-    """Half of a file is a mesh with a large hole, which closes to another shape."""
+def test_added_surface_is_reported():
+    """Half of a mesh has a large hole, so closing it changes the shape."""
     box = trimesh.creation.box((0.18, 0.02, 0.012)).subdivide().subdivide()
-    assert not any("was not there" in note for note in solid_of(box)[1])
+    assert not any("% of its surface" in note for note in solid_of(box)[1])
     box.update_faces(box.triangles_center[:, 2] < 0.0055)
-    assert any("% of its surface was not there" in note for note in solid_of(box)[1])
+    assert any("% of its surface" in note for note in solid_of(box)[1])
 
 
 def test_a_broad_tool_keeps_its_length(tmp_path: Path):
-    # Broader than the slot of a hammer: no tool beside it in the template would have room.
+    # The head is broader than the slot of a hammer, so the kit is nested.
     handle = Manifold.cube((180, 20, 14), True)
     head = Manifold.cube((30, 130, 14), True).translate((80, 0, 0))
     vertices, faces = vertices_and_faces(handle + head)
@@ -204,14 +204,14 @@ def test_a_broad_tool_keeps_its_length(tmp_path: Path):
     assert len(layout_kit(tools, KitParameters()).poses) == 3
 
 
-def test_a_tool_too_high_for_a_kit_is_made_shorter(tmp_path: Path):
+def test_a_tool_too_high_for_a_kit_is_scaled_down(tmp_path: Path):
     mesh = trimesh.creation.box((300, 76, 78))
     report = bring(exported(mesh, tmp_path / "beam.stl"), tmp_path / "tools")
     assert report.record["length"] == pytest.approx(0.170, abs=1e-5)
-    assert any("170 mm long, because at 180 mm" in note for note in report.notes)
+    assert any(note.startswith("made 170 mm long") for note in report.notes)
 
 
-def test_one_body_is_made_of_several_and_of_a_soup():
+def test_bodies_are_united_and_triangle_soup_is_wrapped():
     handle, head = trimesh.creation.box((170, 20, 12)), trimesh.creation.box((26, 50, 16))
     head.apply_translation((72, 0, 0))
     both = trimesh.util.concatenate([handle, head])
@@ -227,10 +227,10 @@ def test_one_body_is_made_of_several_and_of_a_soup():
 
 
 @pytest.mark.parametrize("inverted", [False, True])
-def test_a_sealed_hollow_weighs_nothing(inverted: bool):
+def test_a_sealed_hollow_has_no_mass(inverted: bool):
     outer, hollow = trimesh.creation.box((180, 30, 20)), trimesh.creation.box((170, 26, 16))
     hollow.invert()
-    # A rod that is in the hollow, without touching its wall.
+    # A loose rod inside the hollow.
     rod = trimesh.creation.box((20, 10, 8))
     mesh = trimesh.util.concatenate([outer, hollow, rod])
     if inverted:
@@ -243,7 +243,7 @@ def test_a_sealed_hollow_weighs_nothing(inverted: bool):
 def test_a_mesh_of_many_triangles_is_decimated(tmp_path: Path):
     mesh = mallet().subdivide_to_size(1.7)
     assert len(mesh.faces) > 11_000
-    # Bumps of a tenth of a millimetre, as a scan has.
+    # Bumps of a tenth of a millimetre, like scanner noise.
     waves = np.sin(mesh.vertices @ np.random.default_rng(0).normal(0, 1, (3, 3)))
     mesh.vertices = mesh.vertices + 0.05 * waves
     report = bring(exported(mesh, tmp_path / "scan.stl"), tmp_path / "tools", density=3000.0)
@@ -267,54 +267,54 @@ def sheet() -> trimesh.Trimesh:
 
 
 @pytest.mark.parametrize(
-    ("make", "sentence"),
+    ("make", "token"),
     [
-        (lambda: trimesh.creation.box((180, 20, 2)), "2.0 mm thick, and the hand needs 4 mm"),
-        (lambda: trimesh.creation.box((180, 80, 60)), "60 mm high at rest"),
-        (lambda: trimesh.creation.box((180, 150, 20)), "(mm wide|no place to hold)"),
-        (lambda: trimesh.creation.box((160, 150, 10)), "jaws take 65 mm, finds no place"),
-        (sheet, "encloses no volume"),
-        (apart, "2 things that stand apart"),
+        (lambda: trimesh.creation.box((180, 20, 2)), "2.0 mm thick"),
+        (lambda: trimesh.creation.box((180, 80, 60)), "60 mm high"),
+        (lambda: trimesh.creation.box((180, 150, 20)), "jaws"),
+        (lambda: trimesh.creation.box((160, 150, 10)), "65 mm"),
+        (sheet, "no volume"),
+        (apart, "2 separate things"),
     ],
 )
-def test_what_cannot_be_used_is_told(
-    make: Callable[[], trimesh.Trimesh], sentence: str, tmp_path: Path
+def test_an_unusable_mesh_is_rejected(
+    make: Callable[[], trimesh.Trimesh], token: str, tmp_path: Path
 ):
     path = exported(make(), tmp_path / "it.stl")
-    with pytest.raises(UserError, match=sentence) as refusal:
+    with pytest.raises(UserError, match=token) as refusal:
         bring(path, tmp_path / "tools")
     assert str(path) in str(refusal.value) and "\n" not in str(refusal.value)
     assert not (tmp_path / "tools").exists()
 
 
-def test_what_is_no_mesh_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    for name, content, sentence in (
-        ("empty.stl", b"", "is empty"),
-        ("notes.txt", b"hello", "none of the kinds"),
-        ("letter.stl", b"Dear Sir or Madam, " * 40, "(cannot be read as STL|holds no triangle)"),
-        ("points.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\n", "(cannot be read|holds no triangle)"),
-        ("nan.obj", b"v nan nan nan\nv nan 0 0\nv 0 nan 0\nf 1 2 3\n", "all numbers"),
+def test_an_invalid_file_is_rejected(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    for name, content, token in (
+        ("empty.stl", b"", "empty"),
+        ("notes.txt", b"hello", "neither"),
+        ("letter.stl", b"Dear Sir or Madam, " * 40, "(STL|no triangle)"),
+        ("points.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\n", "(OBJ|no triangle)"),
+        ("nan.obj", b"v nan nan nan\nv nan 0 0\nv 0 nan 0\nf 1 2 3\n", "finite"),
     ):
         (tmp_path / name).write_bytes(content)
-        with pytest.raises(UserError, match=sentence):
+        with pytest.raises(UserError, match=token):
             bring(tmp_path / name, tmp_path / "tools")
-    with pytest.raises(UserError, match="there is no file"):
+    with pytest.raises(UserError, match=r"missing\.stl"):
         bring(tmp_path / "missing.stl", tmp_path / "tools")
-    with pytest.raises(UserError, match="is a folder"):
+    with pytest.raises(UserError, match="folder"):
         bring(tmp_path, tmp_path / "tools")
     huge = tmp_path / "huge.stl"
     with huge.open("wb") as file:
         file.truncate(300_000_000)
-    with pytest.raises(UserError, match="300 MB, and 200 MB is the most"):
+    with pytest.raises(UserError, match="200 MB"):
         bring(huge, tmp_path / "tools")
     monkeypatch.setattr("kitting_drake.hkd.importing.repair.MOST_TRIANGLES", 20)
-    with pytest.raises(UserError, match="triangles, and 20 is the most"):
+    with pytest.raises(UserError, match="20"):
         bring(exported(mallet(), tmp_path / "mallet.stl"), tmp_path / "tools")
     assert not (tmp_path / "tools").exists()
 
 
 def quickly_made(plain: importer.ImportReport) -> Callable[..., importer.Prepared]:
-    """What stands in for the geometry where only names matter: the mallet, as long as is asked."""
+    """A fast stand-in for `prepare_tool`: the mallet with the requested name and length."""
 
     def prepare(request: ImportRequest, name: str, directory: Path) -> importer.Prepared:
         for path in plain.directory.iterdir():
@@ -336,34 +336,32 @@ def test_names(plain: importer.ImportReport, tmp_path: Path, monkeypatch: pytest
     assert user_tool_names() == []
     path = exported(mallet(), tmp_path / "Claw Hammer.stl")
     request = ImportRequest(path, "hammer")
-    with pytest.raises(UserError, match="'claw_hammer' is the name of one of the project's own"):
+    with pytest.raises(UserError, match="'claw_hammer'"):
         import_tool(request, time_limit=None)
-    with pytest.raises(UserError, match="small letters"):
+    with pytest.raises(UserError, match="--name"):
         bring(path, tmp_path / "own", name="../away")
     report = import_tool(ImportRequest(path, "hammer", name="mine"), time_limit=None)
     assert user_tool_names() == ["mine"]
     assert load_tool("mine").directory == report.directory == tmp_path / "own" / "mine"
-    # An import may be done again; what is none is not overwritten.
+    # A tool can be imported again, but other folders are not overwritten.
     again = bring(path, tmp_path / "own", name="mine", length_mm=160.0)
     assert load_tool("mine").length == pytest.approx(0.160) == again.record["length"]
-    # Another file of that name may be a newer one.
+    # Another file of the same name may be a newer version.
     newer = exported(mallet().apply_scale(1.05), path)
-    assert (
-        "replaces the tool of another Claw Hammer.stl"
-        in bring(newer, tmp_path / "own", name="mine").notes
-    )
-    with pytest.raises(UserError, match=r"mine is the tool of Claw Hammer\.stl: give another"):
+    notes = bring(newer, tmp_path / "own", name="mine").notes
+    assert any(note.endswith("Claw Hammer.stl") for note in notes)
+    with pytest.raises(UserError, match=r"Claw Hammer\.stl"):
         bring(exported(mallet(), tmp_path / "hammer.stl"), tmp_path / "own", name="mine")
-    with pytest.raises(UserError, match="no small letter or digit in its name: give --name"):
+    with pytest.raises(UserError, match="give --name"):
         bring(exported(mallet(), tmp_path / "\u6273\u624b.stl"), tmp_path / "own")
-    # A person's work is not undone by it.
+    # An import does not overwrite an annotated grasp.
     grasp = dataclasses.replace(load_tool("mine").grasp, x=0.011)
     save_grasp(load_tool("mine"), grasp)
-    with pytest.raises(UserError, match="has a grasp that you saved"):
+    with pytest.raises(UserError, match="grasp"):
         bring(path, tmp_path / "own", name="mine")
     assert load_tool("mine").grasp == grasp
     (tmp_path / "own" / "other").mkdir()
-    with pytest.raises(UserError, match="is no imported tool"):
+    with pytest.raises(UserError, match="other"):
         bring(path, tmp_path / "own", name="other")
     assert left_in(tmp_path / "own") == ["mine", "other"]
 
@@ -372,13 +370,13 @@ def test_names(plain: importer.ImportReport, tmp_path: Path, monkeypatch: pytest
     "options", [{"length_mm": float("nan")}, {"length_mm": -5.0}, {"density": 1e9}]
 )
 def test_numbers_out_of_range(options: dict, tmp_path: Path):
-    with pytest.raises(UserError, match="is out of range: give"):
+    with pytest.raises(UserError, match="out of range"):
         bring(exported(mallet(), tmp_path / "it.stl"), tmp_path / "tools", **options)
 
 
-def test_the_process_aside(tmp_path: Path):
+def test_the_child_process(tmp_path: Path):
     path = exported(mallet(), tmp_path / "mallet.stl")
-    with pytest.raises(UserError, match="was not worked out in 0 s"):
+    with pytest.raises(UserError, match="0 s"):
         import_tool(ImportRequest(path, "hammer", output=tmp_path / "tools"), time_limit=0.0)
     assert not (tmp_path / "tools").exists()
     report = import_tool(ImportRequest(path, "hammer", output=tmp_path / "tools"))
@@ -402,7 +400,7 @@ def sound_file(suffix: str) -> bytes:
 
 
 def corrupted(data: bytes, rng: np.random.Generator) -> bytes:
-    """A file with something wrong with it, of a kind that files in the wild have."""
+    """A file with a random defect of a kind that occurs in practice."""
     place = int(rng.integers(len(data)))
     size = int(rng.integers(1, 200))
     floats = [float("nan"), float("inf"), -1e38, 1e-45, 0.0, 1e6]
@@ -445,7 +443,7 @@ def corrupted(data: bytes, rng: np.random.Generator) -> bytes:
 @pytest.mark.parametrize(
     "seed", [*range(12), *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(12, 40))]
 )
-def test_a_broken_file_makes_a_whole_tool_or_none(seed: int, tmp_path: Path):
+def test_a_broken_file_makes_a_complete_tool_or_none(seed: int, tmp_path: Path):
     suffix = SUFFIXES[seed % len(SUFFIXES)]
     path = tmp_path / f"it.{suffix.split('.')[-1]}"
     path.write_bytes(corrupted(sound_file(suffix), np.random.default_rng(seed)))
@@ -460,7 +458,7 @@ def test_a_broken_file_makes_a_whole_tool_or_none(seed: int, tmp_path: Path):
         assert np.isfinite(tool.triangles).all() and tool.mass > 0
 
 
-# The real ones.
+# Real meshes.
 
 
 @pytest.mark.skipif(not REAL.is_dir(), reason=f"no real meshes in {REAL}")
@@ -482,17 +480,17 @@ def test_real_tools(name: str, tmp_path: Path):
     assert abs(tool.grasp.x - com[0]) < 0.045
 
 
-def test_a_balanced_tool_is_laid_as_it_comes_to_rest(tmp_path: Path):
-    """A thick handle holds a long shaft up, by less than a millimetre: it tips at a touch."""
+def test_an_unbalanced_tool_is_laid_in_its_resting_pose(tmp_path: Path):
+    """A thick handle just balances a long shaft above the table, so it tips at a touch."""
     handle = Manifold.cube((40, 30, 30), True).translate((-20, 0, 0))
     shaft = Manifold.cube((97, 12, 12), True).translate((48.5, 0, 0))
     whole = (handle + shaft).translate((-28.5, 0, 15)).scale((1.2, 1.2, 1.2))
     mesh = trimesh.Trimesh(*vertices_and_faces(whole), process=False)
     report = bring(exported(mesh, tmp_path / "d.stl"), tmp_path / "tools", category="screwdriver")
-    assert any("comes to rest" in note for note in report.notes)
+    assert any("resting pose" in note for note in report.notes)
     tilt = resting_tilt(report.directory / "d.sdf")
     assert np.degrees(np.arccos(tilt[2, 2])) < 2
     tool = load_tool(str(report.directory))
-    # The shaft's end is on the table now.
+    # The shaft's end is on the table.
     low = tool.triangles.reshape(-1, 3)
     assert low[low[:, 0] > 0.9 * low[:, 0].max()][:, 2].min() < 0.001

@@ -22,7 +22,7 @@ def drawing(folder: Path, content: str, size: str = 'width="200mm" height="80mm"
 
 
 def stadium(folder: Path, units: int, scale: float) -> Path:
-    """A slot of 160 by 20 mm with a hole of 8 mm, of lines and arcs in no order."""
+    """A slot of 160 by 20 mm with a hole of 8 mm, of lines and arcs in mixed order."""
     document = ezdxf.new(units=units)
     space = document.modelspace()
     space.add_line((0, 0), (140 * scale, 0))
@@ -60,8 +60,8 @@ def test_an_svg_is_measured_by_its_width(measures: str, mm: float, tmp_path: Pat
     assert size(drawing(tmp_path, BAR, measures)) == pytest.approx((160 * mm, 20 * mm), rel=1e-4)
 
 
-def test_a_unit_that_is_none_is_told(tmp_path: Path):
-    with pytest.raises(UserError, match="its width is '200um': give a number and one of mm, cm"):
+def test_an_unknown_unit_is_rejected(tmp_path: Path):
+    with pytest.raises(UserError, match=r"width .*'200um'"):
         read_outline(drawing(tmp_path, BAR, 'width="200um" height="80um"'))
 
 
@@ -75,7 +75,7 @@ def test_a_unit_that_is_none_is_told(tmp_path: Path):
         '<marker id="a"><path d="M0 0 L10 5"/></marker>',
     ],
 )
-def test_what_an_svg_does_not_draw_is_no_outline(unseen: str, tmp_path: Path):
+def test_hidden_svg_elements_do_not_count(unseen: str, tmp_path: Path):
     assert size(drawing(tmp_path, unseen + BAR)) == pytest.approx((160, 20), rel=1e-4)
 
 
@@ -85,7 +85,7 @@ def test_a_symbol_counts_where_it_is_used(tmp_path: Path):
 
 
 def test_y_points_up_and_transforms_count(tmp_path: Path):
-    # A triangle whose right angle is below, on the left, as it is seen.
+    # A triangle whose right angle is at the lower left.
     path = drawing(tmp_path, '<path transform="rotate(0) translate(10)" d="M0 70 h150 L0 20 z"/>')
     assert read_outline(path).bounds() == pytest.approx((10, -70, 160, -20), abs=1e-3)
 
@@ -93,14 +93,14 @@ def test_y_points_up_and_transforms_count(tmp_path: Path):
 @pytest.mark.parametrize(
     "transform", ["rotate(90 85 20)", "matrix(0 1 1 0 0 0)", "scale(-1 1) translate(-300)"]
 )
-def test_rectangles_and_ellipses_are_turned_and_mirrored(transform: str, tmp_path: Path):
+def test_rectangles_and_ellipses_keep_their_transforms(transform: str, tmp_path: Path):
     hole = '<ellipse cx="150" cy="20" rx="6" ry="3"/>'
     outline = read_outline(drawing(tmp_path, f'<g transform="{transform}">{BAR}{hole}</g>'))
     assert outline.area() == pytest.approx(160 * 20 - 18 * np.pi, rel=1e-3)
 
 
 @pytest.mark.parametrize(("units", "scale"), [(4, 1.0), (1, 1 / 25.4), (5, 0.1), (0, 1.0)])
-def test_a_dxf_is_measured_by_its_units_and_its_pieces_are_joined(
+def test_a_dxf_is_measured_by_its_units_and_its_curves_are_joined(
     units: int, scale: float, tmp_path: Path
 ):
     outline = read_outline(stadium(tmp_path, units, scale))
@@ -109,7 +109,7 @@ def test_a_dxf_is_measured_by_its_units_and_its_pieces_are_joined(
     assert outline.area() == pytest.approx(140 * 20 + np.pi * (10**2 - 4**2), rel=1e-3)
 
 
-def test_layers_that_are_off_and_dimensions_are_no_outline(tmp_path: Path):
+def test_hidden_layers_and_dimensions_do_not_count(tmp_path: Path):
     path = stadium(tmp_path, 4, 1.0)
     document = ezdxf.readfile(path)
     document.layers.add("frame").freeze()
@@ -137,26 +137,26 @@ def test_splines_and_blocks_are_read(tmp_path: Path):
 
 
 @pytest.mark.parametrize(
-    ("content", "sentence"),
+    ("content", "token"),
     [
-        ('<path d="M10 10 H170 V30 H10"/>', "open curve, whose ends are 20.00 mm apart"),
-        (BAR + '<rect y="50" width="150" height="20"/>', "not inside the largest one"),
-        ("<text>wrench</text>", "holds no curves"),
+        ('<path d="M10 10 H170 V30 H10"/>', "20.00 mm"),
+        (BAR + '<rect y="50" width="150" height="20"/>', "one tool"),
+        ("<text>wrench</text>", "no curves"),
         ('<path d="M0 0 L160 40 V0 L0 40 z"/>', "crosses itself"),
         ('<path d="M0 0 H160 z"/>', "encloses"),
-        ("<g>", "cannot be read as SVG"),
+        ("<g>", "SVG"),
     ],
 )
-def test_what_is_no_outline_is_told_in_a_sentence(content: str, sentence: str, tmp_path: Path):
-    with pytest.raises(UserError, match=sentence):
+def test_an_invalid_svg_is_rejected(content: str, token: str, tmp_path: Path):
+    with pytest.raises(UserError, match=token):
         read_outline(drawing(tmp_path, content))
 
 
-def test_what_is_no_dxf_is_told_in_a_sentence(tmp_path: Path):
+def test_an_invalid_dxf_is_rejected(tmp_path: Path):
     (tmp_path / "tool.dxf").write_text("no drawing")
-    with pytest.raises(UserError, match="cannot be read as DXF"):
+    with pytest.raises(UserError, match="DXF"):
         read_outline(tmp_path / "tool.dxf")
-    with pytest.raises(UserError, match="there is no file"):
+    with pytest.raises(UserError, match=r"none\.dxf"):
         read_outline(tmp_path / "none.dxf")
 
 
@@ -168,21 +168,21 @@ def bring(path: Path, **options: float) -> ImportReport:
 def test_an_outline_becomes_a_tool_of_its_size(tmp_path: Path):
     path = drawing(tmp_path, '<rect width="110" height="14"/><circle cx="8" cy="7" r="3"/>')
     tool = load_tool(str(bring(path, height_mm=12.0).directory))
-    # A mesh of 110 mm would be scaled; who draws an outline has measured the tool.
+    # A mesh of 110 mm would be scaled, but an outline has true measures.
     assert (tool.length, tool.width, tool.height) == pytest.approx((0.110, 0.014, 0.012), abs=2e-5)
     assert tool.footprint.area() == pytest.approx(1e-6 * (110 * 14 - 9 * np.pi), rel=1e-2)
 
 
-def test_an_outline_lies_as_it_is_drawn(tmp_path: Path):
+def test_an_outline_must_be_stable_as_drawn(tmp_path: Path):
     path = drawing(tmp_path, '<rect width="150" height="10"/>')
     tool = load_tool(str(bring(path, height_mm=20.0).directory))
     assert (tool.length, tool.width, tool.height) == pytest.approx((0.150, 0.010, 0.020), abs=2e-5)
     path = drawing(tmp_path, '<rect width="150" height="4"/>')
-    with pytest.raises(UserError, match="40 mm high, it falls over: draw"):
+    with pytest.raises(UserError, match="40 mm high"):
         bring(path, height_mm=40.0)
 
 
-def test_the_length_is_the_tools_however_the_drawing_is_turned(tmp_path: Path):
+def test_the_length_does_not_depend_on_the_drawings_rotation(tmp_path: Path):
     # Its bounding box is 123 mm wide.
     path = drawing(tmp_path, '<rect transform="rotate(45)" width="160" height="14"/>')
     x_min, y_min, x_max, y_max = laid_along_x(read_outline(path), None, "tool.svg").bounds()
@@ -190,16 +190,16 @@ def test_the_length_is_the_tools_however_the_drawing_is_turned(tmp_path: Path):
     tool = load_tool(str(bring(path, height_mm=12.0, length_mm=100.0).directory))
     expected = (0.100, 0.014 * 100 / 160, 0.012)
     assert (tool.length, tool.width, tool.height) == pytest.approx(expected, abs=5e-5)
-    with pytest.raises(UserError, match="9 mm long by its own units"):
+    with pytest.raises(UserError, match="9 mm"):
         bring(drawing(tmp_path, '<rect width="9" height="5"/>'), height_mm=12.0)
 
 
-def test_only_outlines_have_and_need_a_height(tmp_path: Path):
+def test_outlines_need_a_height_and_meshes_must_not_have_one(tmp_path: Path):
     path = drawing(tmp_path, BAR)
-    with pytest.raises(UserError, match="give --height_mm"):
+    with pytest.raises(UserError, match="--height_mm"):
         bring(path)
-    with pytest.raises(UserError, match="--height_mm 60 is out of range"):
+    with pytest.raises(UserError, match="--height_mm 60"):
         bring(path, height_mm=60.0)
-    with pytest.raises(UserError, match="--height_mm is for outlines"):
+    with pytest.raises(UserError, match="--height_mm"):
         bring(tmp_path / "tool.stl", height_mm=10.0)
     assert not (tmp_path / "tools").exists()

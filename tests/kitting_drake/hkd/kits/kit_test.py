@@ -36,7 +36,7 @@ def cavities(tools: list[Tool]) -> list[Cavity]:
 
 @pytest.fixture
 def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """An empty cache; the folder in which kits will be."""
+    """Sets an empty cache; returns its folder of kits."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     return tmp_path / "kitting_drake" / "kits"
 
@@ -49,7 +49,7 @@ def grown(outline: CrossSection, distance: float) -> CrossSection:
     return outline.offset(distance, JoinType.Round, circular_segments=128)
 
 
-def test_files_of_a_kit_are_watertight_and_one_body(tools: list[Tool], cache: Path):
+def test_the_files_of_a_kit_are_watertight_and_connected(tools: list[Tool], cache: Path):
     kit = make_kit(tools, PARAMETERS)
     block = trimesh.load_mesh(kit.sdf.parent / "kit.obj")
     assert block.is_watertight
@@ -57,7 +57,7 @@ def test_files_of_a_kit_are_watertight_and_one_body(tools: list[Tool], cache: Pa
     assert len(block.split()) == 1
 
 
-def test_block_is_watertight_and_one_body(cavities: list[Cavity]):
+def test_the_block_is_watertight_and_connected(cavities: list[Cavity]):
     block = build_block(cavities, PARAMETERS)
     assert block.status() == Error.NoError
     assert len(block.decompose()) == 1
@@ -66,11 +66,13 @@ def test_block_is_watertight_and_one_body(cavities: list[Cavity]):
     pits = sum(c.outline.area() * (c.top - c.floor) for c in cavities)
     bevels = sum(c.outline.to_polygons()[0].shape[0] > 0 for c in cavities)
     assert bevels == len(NAMES)
-    # Besides the pits the bevels are cut away: a triangle of 1 mm along about 2 m of rim.
+    # The bevels also remove volume: a triangle of 1 mm along about 2 m of rim.
     assert 0 < 0.28 * 0.26 * 0.05 - pits - block.volume() < 2e-6
 
 
-def test_every_cavity_is_a_pit_open_at_the_top(tools: list[Tool], cavities: list[Cavity]):
+def test_cavities_are_open_at_the_top_and_end_at_the_floor(
+    tools: list[Tool], cavities: list[Cavity]
+):
     block = build_block(cavities, PARAMETERS)
     for tool, cavity in zip(tools, cavities, strict=True):
         # The seated tool's top is flush with the block's.
@@ -81,14 +83,14 @@ def test_every_cavity_is_a_pit_open_at_the_top(tools: list[Tool], cavities: list
             assert inside == pytest.approx(0.0 if free else shadow.area(), abs=1e-8)
 
 
-def test_clearance_all_round(tools: list[Tool], cavities: list[Cavity]):
+def test_the_clearance_is_kept_all_around(tools: list[Tool], cavities: list[Cavity]):
     for tool, cavity in zip(tools, cavities, strict=True):
         outline = seated_outline(tool)
         assert (grown(outline, 0.0019) - cavity.outline).area() < 1e-9, tool.name
-        # Where the tool reaches farthest the closing does nothing: 2 mm are 2 mm.
+        # The closing does not affect the tool's extremes, so the clearance is exact there.
         box, tool_box = np.array(cavity.outline.bounds()), np.array(outline.bounds())
         np.testing.assert_allclose(np.abs(box - tool_box), 0.002, atol=1.5e-4)
-        # Half of the wall or more is as near as the clearance: it follows the tool.
+        # At least half of the wall follows the tool at the clearance.
         points = np.concatenate(cavity.outline.to_polygons())
         middle = (points + np.roll(points, 1, axis=0)) / 2
         length = np.linalg.norm(points - np.roll(points, 1, axis=0), axis=1)
@@ -109,7 +111,7 @@ def test_clearance_is_a_parameter(tools: list[Tool]):
 
 
 def contact_surface(cavities: list[Cavity], parameters: KitParameters) -> tuple[NDArray, NDArray]:
-    """All of its parts."""
+    """The vertices and faces of all parts together."""
     meshes = [
         trimesh.Trimesh(*part, process=False)
         for part in contact_surfaces(cavities, parameters).values()
@@ -119,7 +121,7 @@ def contact_surface(cavities: list[Cavity], parameters: KitParameters) -> tuple[
 
 
 @pytest.mark.parametrize("lead_in", [0.0, 0.001])
-def test_contact_surface_has_the_walls_of_the_block(tools: list[Tool], lead_in: float):
+def test_the_contact_surface_has_the_walls_of_the_block(tools: list[Tool], lead_in: float):
     parameters = KitParameters(lead_in=lead_in)
     cavities = kit_cavities(tools, parameters)
     mesh = build_block(cavities, parameters).to_mesh()
@@ -129,7 +131,7 @@ def test_contact_surface_has_the_walls_of_the_block(tools: list[Tool], lead_in: 
         assert np.isfinite(mesh_.face_normals).all()
 
     def facing(mesh_: trimesh.Trimesh, low: float, high: float) -> tuple[float, NDArray, NDArray]:
-        """Area, moment and flux of the faces whose normals rise so much."""
+        """Area, moment and flux of the faces whose normals have z between `low` and `high`."""
         chosen = (mesh_.face_normals[:, 2] > low) & (mesh_.face_normals[:, 2] < high)
         area, centre = mesh_.area_faces[chosen], mesh_.triangles_center[chosen]
         return area.sum(), area @ centre, (area * mesh_.face_normals[chosen].T) @ centre
@@ -137,7 +139,7 @@ def test_contact_surface_has_the_walls_of_the_block(tools: list[Tool], lead_in: 
     for low, high in ((-0.1, 0.1), (0.1, 0.9)):  # Walls; bevels.
         for one, other in zip(facing(block, low, high), facing(contact, low, high), strict=True):
             np.testing.assert_allclose(one, other, atol=2e-7)
-    # The floors are where the block has them, and face up.
+    # The floors are at the block's heights and face up.
     up = contact.triangles[contact.face_normals[:, 2] > 0.99]
     heights = np.unique(np.round(up[:, :, 2], 9))
     expected = [*(cavity.floor for cavity in cavities), parameters.height]
@@ -152,7 +154,7 @@ def test_contact_surface_has_the_walls_of_the_block(tools: list[Tool], lead_in: 
 @pytest.mark.parametrize(
     "names",
     [
-        # The bounding rectangles of cavities reach into each other.
+        # Kits whose cavities' bounding rectangles overlap.
         ["chipping_hammer", "tin_snips", "s_wrench", "precision_screwdriver"],
         ["rip_claw_hammer_fibreglass", "diagonal_cutters", "square_drive_screwdriver"],
         ["claw_hammer", "t_handle_screwdriver", "tin_snips", "pipe_wrench", "soft_face_mallet"] * 2,
@@ -176,7 +178,7 @@ def test_no_part_of_the_contact_surface_is_inside_a_cavity(names: list[str], lea
             return [(triangle ^ inner).area() for triangle in triangles]
 
         assert max(inside(heights > cavity.floor + 1e-6)) < 1e-12
-        # The floor is there once, and whole.
+        # The floor is complete and occurs once.
         floor = inside(np.abs(heights - cavity.floor) < 1e-9)
         assert sum(floor) == pytest.approx(inner.area(), rel=1e-6)
 
@@ -192,7 +194,7 @@ def test_a_kit_is_built_once(tools: list[Tool], cache: Path, monkeypatch: pytest
     with monkeypatch.context() as patch:
         patch.setattr(kit_module, "_write", fail)
         assert make_kit(tools, PARAMETERS).sdf == first.sdf
-    # The machine went down before the content was on the disk.
+    # A crash can leave empty files.
     path = first.sdf.with_name("contact_sides.obj")
     content = path.read_bytes()
     path.write_bytes(b"")
@@ -200,7 +202,7 @@ def test_a_kit_is_built_once(tools: list[Tool], cache: Path, monkeypatch: pytest
     assert path.read_bytes() == content
 
 
-def test_what_changes_a_kit_makes_another(tools: list[Tool], cache: Path):
+def test_every_parameter_and_tool_changes_the_kit(tools: list[Tool], cache: Path):
     folders = {make_kit(tools[:2], PARAMETERS).sdf.parent}
     for name, value in (("height", 0.055), ("clearance", 0.0025), ("lead_in", 0.0)):
         changed = dataclasses.replace(PARAMETERS, **{name: value})
@@ -223,14 +225,14 @@ def test_a_changed_mesh_makes_another_kit(tools: list[Tool], cache: Path, tmp_pa
     assert make_kit([copy], PARAMETERS).sdf != same
 
 
-def test_two_that_build_the_same_kit_at_once_both_get_it(
+def test_concurrent_builds_of_the_same_kit_both_succeed(
     tools: list[Tool], cache: Path, monkeypatch: pytest.MonkeyPatch
 ):
     write, both = kit_module._write, threading.Barrier(2)
 
     def write_together(*arguments: object) -> None:
         write(*arguments)  # type: ignore[arg-type]
-        both.wait(timeout=60)  # Neither has put its kit into place.
+        both.wait(timeout=60)  # Neither kit is in place yet.
 
     monkeypatch.setattr(kit_module, "_write", write_together)
     with ThreadPoolExecutor(2) as pool:
@@ -243,7 +245,7 @@ def test_two_that_build_the_same_kit_at_once_both_get_it(
 
 
 @pytest.mark.parametrize("error", [OSError(28, "No space left on device"), KeyboardInterrupt()])
-def test_nothing_half_written_stays(
+def test_a_failed_build_leaves_nothing(
     tools: list[Tool], cache: Path, monkeypatch: pytest.MonkeyPatch, error: BaseException
 ):
     with monkeypatch.context() as patch:
@@ -261,7 +263,7 @@ def test_nothing_half_written_stays(
     assert make_kit(tools[:1], PARAMETERS).sdf.is_file()
 
 
-def test_a_cache_that_cannot_be_written_is_the_users_to_mend(
+def test_an_unwritable_cache_is_a_user_error(
     tools: list[Tool], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     (tmp_path / "file").write_text("")
@@ -271,15 +273,15 @@ def test_a_cache_that_cannot_be_written_is_the_users_to_mend(
 
 
 @pytest.mark.parametrize(
-    ("names", "parameters", "message"),
+    ("names", "parameters", "token"),
     [
-        ([], {}, "a kit holds 1 to 12 tools, not 0"),
-        (["claw_hammer"] * 13, {}, "a kit holds 1 to 12 tools, not 13"),
-        (NAMES, {"height": 0.018}, "'claw_hammer' is 17.0 mm high and leaves less than"),
+        ([], {}, "not 0"),
+        (["claw_hammer"] * 13, {}, "not 13"),
+        (NAMES, {"height": 0.018}, "'claw_hammer' is 17.0 mm high"),
     ],
 )
-def test_tools_that_make_no_kit(names: list[str], parameters: dict[str, float], message: str):
-    with pytest.raises(UserError, match=message) as refusal:
+def test_an_impossible_kit_is_rejected(names: list[str], parameters: dict[str, float], token: str):
+    with pytest.raises(UserError, match=token) as refusal:
         make_kit([load_tool(name) for name in names], KitParameters(**parameters))
     assert "\n" not in str(refusal.value)
 
@@ -306,13 +308,13 @@ TWELVE = [*SEVEN, "pipe_wrench", "soft_face_mallet", "s_wrench", "torx_screwdriv
         (["claw_hammer"], {"length": 0.15}),
         (["claw_hammer", "claw_hammer"], {}),
         (NAMES, {"minimum_wall": 0.025}),
-        (SEVEN, {}),
+        pytest.param(SEVEN, {}, marks=pytest.mark.slow),
         (SEVEN, {"nested_wall": 0.012, "lead_in": 0.0}),
-        (TWELVE, {}),
+        pytest.param(TWELVE, {}, marks=pytest.mark.slow),
         (["t_handle_screwdriver"] * 12, {}),
     ],
 )
-def test_nested_cavities_keep_walls_and_room_for_the_fingers(
+def test_nested_cavities_have_walls_and_room_for_the_fingers(
     names: list[str], parameters: dict[str, float]
 ):
     template = KitParameters(**parameters)
@@ -323,7 +325,7 @@ def test_nested_cavities_keep_walls_and_room_for_the_fingers(
     rims, fingers = [], []
     for tool, pose in zip(tools, layout.poses, strict=True):
         assert pose.z == template.height - tool.height
-        # From the tool itself: no part of the code under test.
+        # Computed from the tool's outline, independently of the code under test.
         shape = tool.footprint.rotate(np.degrees(pose.yaw)).translate((pose.x, pose.y))
         rims.append(grown(shape, template.clearance + template.lead_in))
         turn = tool.grasp.theta + pose.yaw
@@ -347,7 +349,7 @@ def test_nested_cavities_keep_walls_and_room_for_the_fingers(
             if i != j:
                 assert (grown(rim, wall - 1e-4) ^ other).area() < 1e-9, (names[i], names[j])
                 assert (fingers[i] ^ other).area() < 1e-9, (names[i], names[j])
-    # The block is no larger than it has to be.
+    # The block is compact.
     bounds = np.array(CrossSection.batch_boolean(rims, OpType.Add).bounds())
     extents = bounds[2:] - bounds[:2]
     size = np.array([layout.parameters.length, layout.parameters.width])
@@ -364,7 +366,7 @@ def test_a_category_without_a_slot_is_nested(tools: list[Tool]):
     assert len(layout.poses) == 2
 
 
-def test_nested_kits_are_the_same_each_time_and_load(cache: Path):
+def test_nested_kits_are_deterministic_and_watertight(cache: Path):
     tools = [load_tool(name) for name in SEVEN]
     kit = make_kit(tools, PARAMETERS)
     assert kit.layout == layout_kit(tools, PARAMETERS) == make_kit(tools, PARAMETERS).layout
@@ -386,14 +388,14 @@ def test_a_scaled_tool_has_another_kit(tools: list[Tool], cache: Path):
     assert x_max - x_min == pytest.approx(0.16 + 0.004, abs=4e-4)
 
 
-def test_what_no_block_holds_is_told():
+def test_tools_that_fit_no_block_are_rejected():
     hammers = [scaled_tool(load_tool("claw_hammer"), 0.5)] * 5
-    with pytest.raises(UserError, match=r"^'claw_hammer', .* do not fit into one kit: its block"):
+    with pytest.raises(UserError, match=r"^'claw_hammer', "):
         layout_kit(hammers, KitParameters(height=0.1))
 
 
-def test_a_damaged_layout_is_told(tools: list[Tool], cache: Path):
+def test_a_damaged_layout_is_rejected(tools: list[Tool], cache: Path):
     kit = make_kit(tools[:1], PARAMETERS)
     (kit.sdf.parent / "layout.json").write_text("{")
-    with pytest.raises(UserError, match=r"layout\.json is damaged"):
+    with pytest.raises(UserError, match=r"layout\.json"):
         make_kit(tools[:1], PARAMETERS)

@@ -18,7 +18,7 @@ def tools() -> list[Tool]:
 
 @pytest.fixture(scope="module")
 def least(tools: list[Tool]) -> KitParameters:
-    """The smallest block that is found for the tools."""
+    """The smallest block found for the tools."""
     return layout_kit(tools, KitParameters(always_nested=True)).parameters
 
 
@@ -26,13 +26,13 @@ def on_block(length: float, width: float) -> KitParameters:
     return KitParameters(length=length, width=width, always_nested=True, fixed_size=True)
 
 
-def test_a_toolset_is_nested_where_that_is_wanted(least: KitParameters):
+def test_a_toolset_can_be_nested(least: KitParameters):
     slots = KitParameters()
     assert least.length * least.width < 0.8 * slots.length * slots.width
 
 
 @pytest.mark.parametrize("excess", [0.0, 0.004, 0.05])
-def test_a_block_of_a_given_size_has_its_walls(
+def test_a_block_of_given_size_keeps_its_walls(
     tools: list[Tool], least: KitParameters, excess: float
 ):
     for length, width in itertools.permutations((least.length + excess, least.width + excess)):
@@ -49,7 +49,7 @@ def test_a_block_of_a_given_size_has_its_walls(
             assert (grown ^ other.rim).area() < 1e-10
 
 
-def test_a_block_that_is_too_small_says_what_would_do(tools: list[Tool], least: KitParameters):
-    wanted = f"{1e3 * least.length:.0f} by {1e3 * least.width:.0f} mm would do"
-    with pytest.raises(UserError, match=rf"on a block of 150 by 200 mm .*: {wanted}$"):
+def test_the_error_for_a_small_block_suggests_a_size(tools: list[Tool], least: KitParameters):
+    wanted = f"{1e3 * least.length:.0f} by {1e3 * least.width:.0f} mm"
+    with pytest.raises(UserError, match=rf"150 by 200 mm .*: .*{wanted}$"):
         layout_kit(tools, on_block(0.15, 0.2))

@@ -16,13 +16,13 @@ from kitting_drake.hkd.tools.tool import Tool, load_tool
 
 @pytest.fixture
 def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """An empty cache; the folder in which scaled tools will be."""
+    """Sets an empty cache; returns its folder of scaled tools."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     return tmp_path / "kitting_drake" / "tools"
 
 
 def loaded(tool: Tool):
-    """The tool's body, and an inspector of its geometry."""
+    """The tool's body, and the shapes and properties of its collision geometry."""
     builder = DiagramBuilder()
     plant, scene_graph = AddMultibodyPlantSceneGraph(builder, 0.001)
     Parser(plant).AddModels(str(tool.sdf))
@@ -39,7 +39,7 @@ def loaded(tool: Tool):
 
 @pytest.mark.parametrize("name", ["claw_hammer", "stubby_screwdriver"])
 @pytest.mark.parametrize("length", [0.1551, 0.1937])
-def test_what_a_scaled_tool_weighs_and_measures(name: str, length: float, cache: Path):
+def test_lengths_mass_and_inertia_scale(name: str, length: float, cache: Path):
     tool = load_tool(name)
     scaled = scaled_tool(tool, length)
     s = length / tool.length
@@ -82,13 +82,13 @@ def hull_extents(shape: Convex) -> np.ndarray:
     return np.ptp(vertices, axis=0)
 
 
-def test_its_own_length_is_the_tool_itself(cache: Path):
+def test_a_tool_of_the_same_length_is_returned_unchanged(cache: Path):
     tool = load_tool("claw_hammer")
     assert scaled_tool(tool, tool.length + 5e-10) is tool
     assert not cache.exists()
 
 
-def test_scaling_twice_is_scaling_once(cache: Path):
+def test_scaling_twice_equals_scaling_once(cache: Path):
     tool = load_tool("claw_hammer")
     twice = scaled_tool(scaled_tool(tool, 0.15), 0.19)
     assert twice.scale == pytest.approx(0.19 / tool.length)
@@ -101,18 +101,18 @@ def test_scaling_twice_is_scaling_once(cache: Path):
 
 
 @pytest.mark.parametrize("length", [0.0, -0.1, float("nan"), float("inf")])
-def test_a_length_that_is_none_is_refused(length: float, cache: Path):
+def test_an_invalid_length_is_rejected(length: float, cache: Path):
     with pytest.raises(UserError, match="claw_hammer"):
         scaled_tool(load_tool("claw_hammer"), length)
 
 
-def test_other_geometry_than_meshes_is_refused():
+def test_geometry_other_than_meshes_is_rejected():
     text = "<sdf><geometry><box><size>1 1 1</size></box></geometry></sdf>"
     with pytest.raises(ValueError, match="mesh"):
         scaled_sdf(text, Path(), 2.0)
 
 
-def test_two_that_scale_the_same_tool_at_once_both_get_it(cache: Path):
+def test_concurrent_scalings_of_the_same_tool_all_succeed(cache: Path):
     tool, both = load_tool("claw_hammer"), threading.Barrier(4)
 
     def scale(_: int) -> Tool:

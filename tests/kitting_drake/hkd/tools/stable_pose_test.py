@@ -16,15 +16,15 @@ def test_a_box_rests_on_each_of_its_sides():
     assert (found[1, 0, 0].height, found[1, 0, 0].margin) == pytest.approx((90, 5))
 
 
-def test_an_off_centre_mass_topples():
+def test_a_box_with_an_off_centre_mass_has_fewer_poses():
     box = trimesh.creation.box((180, 20, 10))
-    # Over the rim of the sides at the ends and along the length, inside that of the other two.
+    # The centre of mass is beyond the support of four sides, and inside that of two.
     poses = stable_poses(np.asarray(box.vertices), np.array([0.0, 9.0, 6.0]))
     assert {tuple(np.round(pose.normal).astype(int)) for pose in poses} == {(0, 0, 1), (0, 0, -1)}
     assert all(pose.margin == pytest.approx(1) for pose in poses)
 
 
-def test_the_rotation_lays_the_body_down():
+def test_the_rotation_brings_the_support_down():
     rng = np.random.default_rng(0)
     body = trimesh.convex.convex_hull(rng.normal(size=(30, 3)))
     points, com = np.asarray(body.vertices), body.center_mass
@@ -36,7 +36,7 @@ def test_the_rotation_lays_the_body_down():
         assert np.linalg.det(R) == pytest.approx(1)
         turned = points @ R.T
         bottom = turned[:, 2].min()
-        # It stands on three corners, its centre of mass over them, at the height that was told.
+        # The body stands on three corners, with its centre of mass at the reported height.
         assert (turned[:, 2] < bottom + 1e-6).sum() >= 3
         assert (R @ com)[2] - bottom == pytest.approx(pose.height)
         assert pose.margin > 0
@@ -45,7 +45,7 @@ def test_the_rotation_lays_the_body_down():
         assert forward[1] == pytest.approx(0, abs=1e-12) and forward[0] > 0
 
 
-def test_they_are_those_of_trimesh():
+def test_the_poses_match_trimesh():
     body = trimesh.convex.convex_hull(np.random.default_rng(1).normal(size=(25, 3)))
     expected, _ = trimesh.poses.compute_stable_poses(body)
     poses = stable_poses(np.asarray(body.vertices), body.center_mass)
@@ -55,6 +55,6 @@ def test_they_are_those_of_trimesh():
     np.testing.assert_allclose(nearest, 0, atol=1e-6)
 
 
-def test_what_is_flat_has_none():
+def test_a_flat_body_is_rejected():
     with pytest.raises(QhullError):
         stable_poses(np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0]], float), np.zeros(3))

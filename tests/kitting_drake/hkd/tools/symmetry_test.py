@@ -30,9 +30,9 @@ def triangles(solid: Manifold) -> NDArray[np.float64]:
     ("solid", "order"),
     [
         (bar(), 2),
-        # Off the origin, the best centre is elsewhere.
+        # The best centre is not at the origin.
         (bar().translate((3, -1, 0)), 2),
-        # Point-symmetric without being a mirror image of itself.
+        # Point-symmetric but not mirror-symmetric.
         (
             bar()
             + block(20, 30, 10).translate((80, 5, 0))
@@ -45,27 +45,27 @@ def triangles(solid: Manifold) -> NDArray[np.float64]:
             + block(20, 30, 10).translate((-80, 5, 0)),
             1,
         ),
-        # Nobody sees a notch of half a millimetre; of five, everybody does.
+        # A notch of half a millimetre is below the limits; one of 5 mm is not.
         (bar() - block(1, 4, 30).translate((90, 0, 0)), 2),
         (bar() - block(10, 4, 30).translate((90, 0, 0)), 1),
         (prism(6, 60), 6),
         (prism(4, 60), 4),
         (prism(3, 60), 3),
         (prism(128, 60), 24),
-        # The same outline, but a hollow at one end.
+        # The same outline, but with a hollow at one end.
         (bar() - block(70, 18, 10).translate((50, 0, 5)), 1),
     ],
 )
-def test_the_order_of_shapes(solid: Manifold, order: int, monkeypatch: pytest.MonkeyPatch):
-    # Plain shapes need fewer points than tools do.
+def test_symmetry_order(solid: Manifold, order: int, monkeypatch: pytest.MonkeyPatch):
+    # Simple shapes need fewer points than tools.
     monkeypatch.setattr(symmetry, "_DENSE_SAMPLES", 50_000)
     assert symmetry_order(triangles(solid)) == order
 
 
-def test_what_is_measured():
+def test_measure_rotation():
     longer = bar() + block(10, 20, 10).translate((85, 5, 0))
     reversal = measure_rotation(triangles(longer), complete=True)
-    # The step of 5 mm is shared between the two ends.
+    # The step of 5 mm is shared between both ends.
     assert reversal.outline_deviation_mm == pytest.approx(2.5, abs=0.1)
     assert 0.1 < reversal.surface_distance_mm < 0.5
     assert not reversal.is_symmetric
@@ -74,6 +74,6 @@ def test_what_is_measured():
 @pytest.mark.parametrize(
     "name", ["double_box_end_wrench", "offset_screwdriver", "s_wrench", "claw_hammer"]
 )
-def test_tools_whose_ends_differ_are_not_reversible(name: str):
+def test_tools_with_different_ends_are_not_reversible(name: str):
     tool = load_tool(name)
     assert tool.symmetry == symmetry_order(tool.triangles) == 1

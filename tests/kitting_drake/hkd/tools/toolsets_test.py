@@ -15,14 +15,14 @@ from kitting_drake.hkd.tools.tool import CATEGORIES, load_tool
 from kitting_drake.hkd.tools.toolsets import SPLITS, TOOLSET_COUNT, tool_pools, toolsets
 
 
-def test_ten_tools_of_each_category_to_train_with_five_to_test_and_ten_fresh_ones():
+def test_the_splits_have_the_expected_numbers_of_tools():
     sizes = {split: [len(pool) for pool in tool_pools(split).values()] for split in SPLITS}
     assert sizes == {"train": [10] * 4, "test": [5] * 4, "fresh": [3, 2, 3, 2]}
 
 
 @pytest.mark.parametrize("split", SPLITS)
-def test_toolsets_are_a_hundred_different_ones_of_their_own_split(split: str):
-    """Or all that there are."""
+def test_toolsets_are_distinct_and_of_one_split(split: str):
+    """There are a hundred, or all combinations if there are fewer."""
     drawn = toolsets(split)
     combinations = math.prod(len(pool) for pool in tool_pools(split).values())
     assert len(set(drawn)) == len(drawn) == min(TOOLSET_COUNT, combinations)
@@ -30,7 +30,7 @@ def test_toolsets_are_a_hundred_different_ones_of_their_own_split(split: str):
         tools = [load_tool(name) for name in names]
         assert tuple(tool.category for tool in tools) == CATEGORIES
         assert {tool.split for tool in tools} == {split}
-    # Every tool has its turn.
+    # Every tool occurs.
     assert {name for names in drawn for name in names} == {
         name for pool in tool_pools(split).values() for name in pool
     }
@@ -43,24 +43,24 @@ def test_toolsets_are_a_hundred_different_ones_of_their_own_split(split: str):
         ("test", "3ac90885e97a9654d2a294cc3191c67c05f90d461d1d2434d8d1f3bb6f3c2320"),
     ],
 )
-def test_toolsets_of_the_paper_never_change(split: str, digest: str):
-    """Demonstrations, weights and results are of these: a split that is added moves none."""
+def test_the_papers_toolsets_do_not_change(split: str, digest: str):
+    """Demonstrations, weights and results depend on them."""
     assert hashlib.sha256(json.dumps(toolsets(split)).encode()).hexdigest() == digest
 
 
-def test_fresh_tools_are_in_no_scenario_but_by_their_split():
+def test_no_scenario_names_a_fresh_tool():
     fresh = [name for pool in tool_pools("fresh").values() for name in pool]
     for path in SCENARIOS.rglob("*.yaml"):
         assert not [name for name in fresh if name in path.read_text()], path
 
 
-def test_a_split_that_lacks_a_category_is_told(monkeypatch: pytest.MonkeyPatch):
+def test_a_split_without_a_category_is_rejected(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(toolsets_module, "tool_names", lambda: ["claw_hammer"])
-    with pytest.raises(UserError, match="no train toolsets"):
+    with pytest.raises(UserError, match="train"):
         toolsets("train")
 
 
-def test_clearance_is_what_the_kit_was_asked_for():
+def test_the_measured_clearance_is_the_requested_one():
     tools = [load_tool(name) for name in toolsets("test")[0]]
     for asked in (0.002, 0.003):
         parameters = KitParameters(clearance=asked)
@@ -71,9 +71,9 @@ def test_clearance_is_what_the_kit_was_asked_for():
             assert clearance.minimum > asked - 0.0003
 
 
-def test_a_tool_that_does_not_fit_has_no_clearance():
+def test_the_clearance_of_a_tool_that_does_not_fit_is_an_error():
     tools = [load_tool("claw_hammer")]
     parameters = KitParameters()
     block = build_block(kit_cavities([load_tool("soft_face_mallet")], parameters), parameters)
-    with pytest.raises(ValueError, match="does not fit"):
+    with pytest.raises(ValueError, match="claw_hammer"):
         measure_clearance(block, tools[0], parameters)

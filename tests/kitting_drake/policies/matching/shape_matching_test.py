@@ -28,7 +28,10 @@ PLANNER = PickPlaceParameters()
 FITTING = make_stages(PLANNER, insertion=True)
 
 
-@pytest.fixture(scope="module", params=[None, "colour:severe,depth_noise,depth_holes"])
+@pytest.fixture(
+    scope="module",
+    params=[pytest.param(None, marks=pytest.mark.slow), "colour:severe,depth_noise,depth_holes"],
+)
 def seen(request):
     """An observation of four tools beside their kit, and the truth."""
     scenario = load_scenario(

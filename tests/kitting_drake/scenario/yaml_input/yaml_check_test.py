@@ -4,7 +4,7 @@ from typing import Any
 
 import pytest
 
-from kitting_drake.scenario.yaml_check import check_yaml
+from kitting_drake.scenario.yaml_input.yaml_check import check_yaml
 
 
 @dataclasses.dataclass

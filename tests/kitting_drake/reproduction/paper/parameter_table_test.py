@@ -2,7 +2,7 @@
 
 import pytest
 
-from kitting_drake.reproduction.paper.network_parameters import (
+from kitting_drake.reproduction.paper.parameter_table import (
     COLUMNS,
     ORIGINAL,
     count_parameters,

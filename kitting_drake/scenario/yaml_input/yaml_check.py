@@ -12,7 +12,7 @@ import typing
 from pathlib import Path
 from typing import Any
 
-from kitting_drake.scenario.drake_configs import struct_fields
+from kitting_drake.scenario.yaml_input.drake_configs import struct_fields
 
 _NAMES = {float: "a number", int: "a whole number", bool: "true or false", str: "a text"}
 

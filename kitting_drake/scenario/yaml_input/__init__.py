@@ -1,0 +1,1 @@
+"""YAML: parsed, and checked against a schema of dataclasses."""
