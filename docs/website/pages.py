@@ -76,7 +76,7 @@ def on_files(files: Files, config) -> Files:
     systems = sorted(
         path.stem for path in (ROOT / "systems").glob("*.py") if "(LeafSystem)" in path.read_text()
     )
-    names = ["signals", *systems, "pick_place_parameters"]
+    names = [*systems, "signals", "pick_place_parameters"]
     pages["api/systems.md"] = _reference("Systems and signals", [f"systems.{s}" for s in names])
     for path, text in pages.items():
         files.append(File.generated(config, path, content=text))
@@ -100,20 +100,25 @@ def on_page_markdown(markdown: str, page, config, files: Files) -> str:
             there = files.get_file_from_path(inside)
         else:
             there = None
-            if (ROOT / path).is_dir():
-                path = f"{path}/README.md" if (ROOT / path / "README.md").exists() else path
-            if (ROOT / path).is_file():
+            if (ROOT / path / "README.md").is_file():
+                path = f"{path}/README.md"
+            if (ROOT / path).exists():
+                picture = before.startswith("!")
                 # A browser shows text as it is.
-                inside = f"{TREE}/{path}.txt"
+                inside = f"{TREE}/{path}" if picture else f"{TREE}/{path}.txt"
                 _linked[inside] = ROOT / path
-                up = "../" * source.count("/")
-                return f'<a href="{up}{inside}">{before[1:-2]}</a>'
+                inside = "../" * source.count("/") + inside
+                if picture:
+                    return f'<img alt="{before[2:-2]}" src="{inside}">'
+                return f'<a href="{inside}">{before[1:-2]}</a>'
         if there is None:
             LOG.warning("%s links to '%s', which is not there", place, target)
             return match[0]
         up = "../" * source.count("/")
         return f"{before}{up}{inside}{after}"
 
+    if source == "index.md":
+        markdown = re.sub(r'(src|href)="docs/', r'\1="', markdown)
     return _outside_code(markdown, lambda text: _LINK.sub(changed, text))
 
 
@@ -129,11 +134,14 @@ def on_page_content(html: str, page, config, files: Files) -> str:
 
 
 def on_post_build(config) -> None:
-    """Copies the linked files outside docs/."""
+    """Copies the linked files outside docs/; of a folder, the list of its files."""
     for name, path in _linked.items():
         copy = Path(config.site_dir, name)
         copy.parent.mkdir(parents=True, exist_ok=True)
-        shutil.copyfile(path, copy)
+        if path.is_dir():
+            copy.write_text("\n".join(sorted(item.name for item in path.iterdir())) + "\n")
+        else:
+            shutil.copyfile(path, copy)
 
 
 def _reference(title: str, modules: list[str]) -> str:
