@@ -55,7 +55,7 @@ def rows(table: str) -> dict[str, list[str]]:
 def test_each_run_goes_into_the_row_that_its_scenario_says():
     table = robustness_table([run(None, 1.0), run("mass:mild", 0.9), run("all", 0.5)])
     found = rows(table)
-    assert found["as it is"][2] == "100.0 (96 to 100)"
+    assert found["unperturbed"][2] == "100.0 (96 to 100)"
     assert found["`mass:mild`"][2] == "90.0 (83 to 94), 100"
     assert found["`all:moderate`"][2] == "50.0 (40 to 60)"
     assert "`mass:moderate`" not in found
@@ -68,7 +68,7 @@ def test_runs_of_other_seeds_are_pooled_in_a_table_of_their_own():
     first, second = table.split("All seeds together")
     assert rows(first)["`all:moderate`"][2] == "90.0 (83 to 94)"
     assert rows(second)["`all:moderate`"][2] == "70.0 (63 to 76), 200"
-    assert "as it is" not in rows(second)
+    assert "unperturbed" not in rows(second)
 
 
 def test_other_levels_are_of_the_first_seeds_and_tell_how_many():
@@ -92,7 +92,7 @@ def test_the_generalist_is_compared_on_the_seeds_that_both_ran():
         lost, ahead = rows(part)["`all:moderate`"][-2:]
         assert lost.startswith("-10.0 (")
         assert ahead.startswith("+40.0 (")
-    assert rows(table)["as it is"][-2:] == ["-", "-"]
+    assert rows(table)["unperturbed"][-2:] == ["-", "-"]
 
 
 def test_what_is_something_else_is_left_out():
