@@ -1,9 +1,12 @@
 """`python -m kitting_drake.draw_scenes`: static scenes of random tools, to train a generalist."""
 
 import argparse
+import contextlib
 import hashlib
 import itertools
 import os
+import threading
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 
 from rich.console import Console
@@ -41,6 +44,10 @@ _DRAWN_BY = (
 """The packages and modules that decide what a scene looks like, ..."""
 _CATALOGUE = MODELS / "tools" / "catalogue.yaml"
 """... and the designs that its tools begin with."""
+_DRAWN = ".drawn"
+"""The ending of the file that says how many scenes of an unfinished batch are drawn."""
+_POLL = 0.5
+"""How often these files are read, in s."""
 _MOST_BATCHES = 10_000
 """No batch has so few scenes that more than this would be needed."""
 
@@ -91,6 +98,9 @@ class _Parts:
         """
         self._folder, self._seed, self._drawn_by = require_folder(folder), seed, drawn_by
         self._counts = {}
+        for path in folder.glob(f"*{_DRAWN}"):
+            # Of a process that was killed.
+            path.unlink()
         for path in folder.glob("batch_*.h5"):
             number = path.stem.removeprefix("batch_")
             if not number.isdecimal() or path != self.path(int(number)):
@@ -136,14 +146,28 @@ class _Parts:
 
         with counting_bar(console, "scenes") as progress:
             task = progress.add_task("", total=count, completed=min(count, self._gapless()))
-            for batch, outcome in side_by_side(draw, next_batch, workers=workers):
-                if isinstance(outcome, ProcessCrashed):
-                    raise UserError(
-                        f"the process of batch {batch} ended without a result "
-                        f"(exit code {outcome.exit_code}): the same command goes on there"
-                    )
-                self._counts[batch] = outcome
-                progress.update(task, completed=min(count, self._gapless()))
+            with _every(_POLL, lambda: progress.update(task, completed=min(count, self._drawn()))):
+                outcomes = side_by_side(draw, next_batch, workers=workers)
+                self._count(outcomes)
+
+    def _count(self, outcomes: Iterable[tuple[int, int | ProcessCrashed]]) -> None:
+        """Counts the scenes of each batch as it ends."""
+        for batch, outcome in outcomes:
+            if isinstance(outcome, ProcessCrashed):
+                raise UserError(
+                    f"the process of batch {batch} ended without a result "
+                    f"(exit code {outcome.exit_code}): the same command goes on there"
+                )
+            self._counts[batch] = outcome
+
+    def _drawn(self) -> int:
+        """How many scenes there are, those of unfinished batches included."""
+        unfinished = 0
+        for path in self._folder.glob(f"*{_DRAWN}"):
+            # It may be gone, or empty, just now.
+            with contextlib.suppress(OSError, ValueError):
+                unfinished += int(path.read_text())
+        return sum(self._counts.values()) + unfinished
 
     def _gapless(self) -> int:
         """How many scenes the batches without a gap before them hold."""
@@ -163,9 +187,34 @@ class _Parts:
 
 
 def _draw_part(path: Path, seed: int, drawn_by: dict[str, str]) -> int:
-    scenes = tuple(draw_batch(seed))
-    write_static_scenes(path, StaticScenes(PixelGrid(), scenes, seed, drawn_by))
+    scenes: list[StaticScene] = []
+    counter = path.with_suffix(_DRAWN)
+    try:
+        for scene in draw_batch(seed):
+            scenes.append(scene)
+            counter.write_text(str(len(scenes)))
+    finally:
+        counter.unlink(missing_ok=True)
+    write_static_scenes(path, StaticScenes(PixelGrid(), tuple(scenes), seed, drawn_by))
     return len(scenes)
+
+
+@contextlib.contextmanager
+def _every(seconds: float, call: Callable[[], object]) -> Iterator[None]:
+    """Calls a function again and again, in a thread of its own."""
+    ended = threading.Event()
+
+    def repeat() -> None:
+        while not ended.wait(seconds):
+            call()
+
+    thread = threading.Thread(target=repeat, daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        ended.set()
+        thread.join()
 
 
 def _parse() -> argparse.Namespace:

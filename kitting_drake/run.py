@@ -75,7 +75,12 @@ def main() -> int:
             observers=[progress.observe],
             log=arguments.log,
         )
-    write_json(folder / "results.json", result.as_dict() | {"commit": commit()})
+    told = {
+        "policy_digest": scenario.policy.digest(chosen.base),
+        "policy_details": scenario.policy.details(chosen.base),
+        "commit": commit(),
+    }
+    write_json(folder / "results.json", result.as_dict() | told)
     # Remove stale files.
     (folder / REPLAY).unlink(missing_ok=True)
     _save_decisions(folder / "decisions", decisions)

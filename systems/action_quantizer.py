@@ -1,4 +1,4 @@
-"""The finite set of actions that a policy of the paper chooses from (section III-A)."""
+"""Rounding to the discrete actions of the paper's policies (section III-A)."""
 
 import math
 from dataclasses import dataclass
@@ -13,9 +13,9 @@ class ActionQuantizer:
     """Rounds positions to pixel centres and rotations to N orientations."""
 
     grid: PixelGrid
-    """Positions are centres of its pixels."""
+    """Positions are rounded to the centres of its pixels."""
     orientations: int
-    """N: angles are among 2 pi i / N."""
+    """N: angles are rounded to multiples of 2 pi / N."""
 
     def position(self, x: float, y: float) -> tuple[float, float]:
         """The nearest pixel centre, in metres."""

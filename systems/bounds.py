@@ -1,7 +1,7 @@
-"""Ranges of configuration numbers, declared beside their defaults and checked in one place.
+"""Ranges of configuration numbers, declared beside their defaults.
 
-The dataclasses that use them are also YAML schemas of Drake's `yaml_load_typed`, which takes
-neither frozen dataclasses nor postponed annotations.
+The dataclasses that use them are YAML schemas of Drake's `yaml_load_typed`, which supports neither
+frozen dataclasses nor postponed annotations.
 """
 
 import dataclasses
@@ -21,11 +21,11 @@ def bounded(default: Any, minimum: float = -math.inf, maximum: float = math.inf)
 
 
 def check_bounds(config: Any, where: str = "") -> None:
-    """Checks all numbers of a dataclass and of the dataclasses in it, in lists and in dicts.
+    """Checks all numbers of a dataclass, recursively through nested dataclasses, lists and dicts.
 
     Raises:
-        ValueError: the first number that is not finite or outside its range, or list of the wrong
-            length, named by its path.
+        ValueError: a number is not finite or out of its range, or a list has the wrong length. The
+            message names the path of the first such field.
     """
     if dataclasses.is_dataclass(config):
         for item in dataclasses.fields(config):

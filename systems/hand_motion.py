@@ -1,4 +1,4 @@
-"""Smooth, time-optimal motions of the hand in (x, y, z, yaw) within limits."""
+"""Smooth motions of the hand in (x, y, z, yaw), as fast as the limits allow."""
 
 import math
 from collections.abc import Iterator
@@ -10,15 +10,15 @@ from numpy.typing import NDArray
 from systems.signals import wrap_to_pi
 
 SMOOTHING = 1 / 16
-"""Time in which an acceleration builds up or falls away, in s."""
+"""Rise time of the acceleration, in s."""
 
 PARTS = ([0, 1], [2], [3])
-"""The parts of a motion that have a time course each, as axes: (x, y), z and yaw."""
+"""The axes that share a time course: (x, y), z and yaw."""
 
 
 @dataclass(frozen=True)
 class MotionLimits:
-    """The most that a motion may reach: m/s, m/s^2 (in the plane, and along z), rad/s, rad/s^2."""
+    """Limits of speed (m/s, rad/s) and acceleration (m/s^2, rad/s^2) of (x, y), z and yaw."""
 
     speed: float
     acceleration: float
@@ -26,7 +26,7 @@ class MotionLimits:
     yaw_acceleration: float
 
     def of_parts(self) -> tuple[tuple[float, float], ...]:
-        """Speed and acceleration of each of the `PARTS`."""
+        """(speed, acceleration) of each of the `PARTS`."""
         linear = (self.speed, self.acceleration)
         return (linear, linear, (self.yaw_speed, self.yaw_acceleration))
 
@@ -34,17 +34,17 @@ class MotionLimits:
 def travel(
     distance: float, speed: float, acceleration: float, elapsed: float
 ) -> tuple[float, float, float]:
-    """How far, how fast and at which acceleration one is, on the way from rest to rest.
+    """Position, velocity and acceleration at a time of a motion from rest to rest.
 
-    The velocity is a trapezoid (or a triangle, where the distance is too short to reach the speed),
-    averaged over the last `SMOOTHING` seconds, so that the acceleration is a trapezoid too. It is a
-    sum of truncated cubics, one for each of the eight corners of the acceleration.
+    The velocity is a trapezoid, or a triangle over short distances, averaged over the last
+    `SMOOTHING` seconds. The acceleration is therefore continuous. The position is a sum of
+    truncated cubics, one for each of the eight corners of the acceleration.
 
     Args:
-        distance: to go, not negative, in m or rad.
-        speed: the most, in units per s.
-        acceleration: the most, in units per s^2.
-        elapsed: since the start, in s; before it one is at rest at the start.
+        distance: not negative, in m or rad.
+        speed: the limit, in units per s.
+        acceleration: the limit, in units per s^2.
+        elapsed: time since the start, in s; before it, the motion is at rest at zero.
     """
     if elapsed <= 0 or distance <= 0:
         return 0.0, 0.0, 0.0
@@ -70,7 +70,7 @@ def travel(
 
 
 def travel_time(distance: float, speed: float, acceleration: float) -> float:
-    """How long `travel` takes, in s."""
+    """Duration of `travel`, in s."""
     if distance <= 0:
         return 0.0
     top = min(speed, math.sqrt(distance * acceleration))
@@ -78,7 +78,7 @@ def travel_time(distance: float, speed: float, acceleration: float) -> float:
 
 
 def time_to_reach(part: float, distance: float, speed: float, acceleration: float) -> float:
-    """When `travel` has gone a part of its distance, in s after its start."""
+    """Time after which `travel` has covered `part` of its distance, in s."""
     low, high = 0.0, travel_time(distance, speed, acceleration)
     if part >= distance:
         return high
@@ -93,14 +93,14 @@ def time_to_reach(part: float, distance: float, speed: float, acceleration: floa
 
 
 def braking_time(rate: NDArray[np.float64], limits: MotionLimits) -> float:
-    """The shortest time in which all parts of a motion come to rest, in s.
+    """The shortest time in which all axes can stop, in s.
 
-    The velocity falls along a cubic, unaccelerated at both ends: what moves goes on for half of
-    the way that it would have gone in this time.
+    The velocity follows a cubic with zero acceleration at both ends, so the stopping distance is
+    half of rate times braking time.
 
     Args:
         rate: (4) velocity: vx, vy, vz, vyaw.
-        limits: of acceleration.
+        limits: only the accelerations are used.
     """
     vx, vy, vz, vyaw = map(float, rate)
     return 1.5 * max(
@@ -118,23 +118,23 @@ def motion_at(
     delays: NDArray[np.float64],
     elapsed: float,
 ) -> NDArray[np.float64]:
-    """The motion from a start, at its rate, to rest at a goal.
+    """State at a time of the motion from a start with a given velocity to rest at a goal.
 
-    It brakes (see `braking_time`) from its rate, and each of its `PARTS` goes the rest of the way
-    to the goal by `travel`, from its delay on; both are added up.
+    The motion is the sum of two: braking from the start velocity (see `braking_time`), and for each
+    of the `PARTS` a `travel` over the remaining distance that begins after its delay.
 
     Args:
         start: (4) position.
         goal: (4) position.
         start_rate: (4) velocity at the start.
-        limits: which each part keeps.
-        delays: (3) when each part begins, in s after the start.
-        elapsed: since the start, in s.
+        limits: of each of the `PARTS`.
+        delays: (3) when the `travel` of each part begins, in s after the start.
+        elapsed: time since the start, in s.
 
     Returns:
         (12) position, velocity, acceleration.
     """
-    # Plain numbers: this runs at every step, and arrays of four cost more than they save.
+    # Plain floats: this runs at every step, and NumPy is slower for four elements.
     position, velocity, acceleration = start.tolist(), [0.0] * 4, [0.0] * 4
     braking = braking_time(start_rate, limits)
     if braking > 0:
@@ -160,7 +160,7 @@ def motion_duration(
     limits: MotionLimits,
     delays: NDArray[np.float64],
 ) -> float:
-    """How long `motion_at` takes to come to rest, in s."""
+    """Duration of `motion_at`, in s."""
     ends = [
         delay + travel_time(distance, *limit)
         for _, _, distance, limit, delay in _ways(start, goal, start_rate, limits, delays)
@@ -176,7 +176,7 @@ def _ways(
     limits: MotionLimits,
     delays: NDArray[np.float64],
 ) -> Iterator[tuple[list[int], list[float], float, tuple[float, float], float]]:
-    """For each part: its axes, the way from where braking ends, how far that is, limits, delay."""
+    """For each part: axes, displacement after braking, its length, limits, delay."""
     ways = (goal - start - start_rate * braking_time(start_rate, limits) / 2).tolist()
     for part, limit, delay in zip(PARTS, limits.of_parts(), delays.tolist(), strict=True):
         way = [ways[i] for i in part]
@@ -184,7 +184,7 @@ def _ways(
 
 
 def ramp(start: float, goal: float, rate: float, elapsed: float) -> tuple[float, float]:
-    """Value and rate of a ramp at constant speed that stops at its goal."""
+    """Value and rate of a ramp of constant rate that stops at its goal."""
     distance = goal - start
     travelled = rate * max(elapsed, 0.0)
     if travelled >= abs(distance):
@@ -195,15 +195,15 @@ def ramp(start: float, goal: float, rate: float, elapsed: float) -> tuple[float,
 def shortest_yaws(
     pick_yaw: float, place_yaw: float, present_yaw: float, limit: float
 ) -> tuple[float, float]:
-    """The equivalent yaws that the wrist reaches, within its limit, by rotating least.
+    """The equivalent pick and place yaws, within a limit, that rotate the wrist least.
 
-    The jaws are alike, so both yaws may be rotated by pi together, and either by 2 pi.
+    The jaws are symmetric: both yaws may be rotated by pi together, and each by 2 pi.
 
     Args:
         pick_yaw: in rad.
         place_yaw: in rad.
-        present_yaw: where the wrist is now, in rad.
-        limit: of the magnitude of both; pi at least, so that there is always an answer.
+        present_yaw: the wrist's present yaw, in rad.
+        limit: of the magnitude of both yaws, in rad; at least pi, so that a solution exists.
 
     Returns:
         (pick, place) in rad.
@@ -213,7 +213,7 @@ def shortest_yaws(
         for pick in _within(pick_yaw + half_turn, limit):
             for place in _within(place_yaw + half_turn, limit):
                 candidates.append((pick, place))
-    # Of equal ways, that which stays nearest to the middle.
+    # Ties: prefer yaws near the middle of the range.
     return min(
         candidates,
         key=lambda yaws: (

@@ -1,7 +1,7 @@
-"""The arithmetic of o_t: from the images of RGB-D cameras to the orthographic heightmap.
+"""Computes o_t, the orthographic heightmap, from the images of RGB-D cameras.
 
-No pydrake here: `HeightmapProjector` computes it in simulation, `kitting_drake.real_camera` on a
-robot's own frames, and both get the same bits from the same images, intrinsics and poses.
+This module does not need pydrake. `HeightmapProjector` uses it in simulation and
+`kitting_drake.real_camera` on recorded frames.
 """
 
 from __future__ import annotations
@@ -15,24 +15,24 @@ from numpy.typing import NDArray
 from systems.signals import Observation, PixelGrid
 
 SAME_SURFACE = 0.01
-"""Heights that differ by less than this, in metres, may belong to one surface."""
+"""Heights that differ by less than this belong to one surface, in metres."""
 
 
 class DepthRays(NamedTuple):
-    """A depth camera in the form that the projection needs.
+    """The rays of a depth camera's pixels.
 
-    The point that a pixel sees is `depth * (u, v, 1)` in the camera's optical frame D: x points
-    right in the image, y down, z forward.
+    A pixel sees the point `depth * (u, v, 1)` in the camera's optical frame D: x points right in
+    the image, y down, z forward.
     """
 
     u: NDArray[np.float32]
-    """(1, width), or (height, width) where lenses distort: x of each pixel's ray at depth 1."""
+    """(1, width), or (height, width) with lens distortion: x of each pixel's ray at depth 1."""
     v: NDArray[np.float32]
     """(height, 1), or (height, width): y of each pixel's ray at depth 1."""
     min_depth: float
-    """A depth below this is no point, in metres."""
+    """Smaller depths are invalid, in metres."""
     max_depth: float
-    """Nor is one beyond this, in metres."""
+    """Larger depths are invalid, in metres."""
 
     @staticmethod
     def from_pinhole(
@@ -48,7 +48,7 @@ class DepthRays(NamedTuple):
             size: (width, height) in pixels.
             focal: (fx, fy) in pixels.
             centre: (cx, cy) in pixels, where image pixel (u, v) covers [u, u+1) x [v, v+1). OpenCV,
-                ROS and RealSense count from the pixels' centres: their cx is less by a half.
+                ROS and RealSense measure from the centre of pixel (0, 0): add 0.5 to their cx, cy.
             depth_range: least and largest depth, in metres.
         """
         u = (np.arange(size[0]) + 0.5 - centre[0]) / focal[0]
@@ -67,22 +67,22 @@ class DepthRays(NamedTuple):
 
 
 class View(NamedTuple):
-    """The image of one camera, and the pose that it was taken from."""
+    """The images of one camera and the pose from which they were taken."""
 
     color: NDArray[np.uint8] | None
-    """(height, width, 3 or more): red, green, blue. None: black."""
+    """(height, width, 3 or more): red, green, blue. None reads as black."""
     depth: NDArray[np.float32]
-    """(height, width) along the optical axis, in metres; 0, infinity and NaN are no depth."""
+    """(height, width) along the optical axis, in metres; 0, infinity and NaN are invalid."""
     X_WD: NDArray[np.float64]
     """(4, 4) pose of the camera's optical frame in the world."""
     rays: DepthRays
 
 
 def project(views: Sequence[View], grid: PixelGrid) -> Observation:
-    """o_t, by the law that `HeightmapProjector` states.
+    """Computes o_t as `HeightmapProjector` documents.
 
     Args:
-        views: of the cameras, at least one.
+        views: one for each camera, at least one.
         grid: the pixels of the heightmap.
     """
     image, valid = _fuse(np.stack([_see(view, grid) for view in views]))
@@ -93,15 +93,15 @@ def project(views: Sequence[View], grid: PixelGrid) -> Observation:
 def _see(view: View, grid: PixelGrid) -> NDArray[np.float32]:
     """One camera's heightmap: (4, rows, cols) red, green, blue, height; height -1 where unseen.
 
-    `PixelGrid.to_pixel` is affine, as is the rigid transform: so they are applied once, to the
-    camera's centre and axes, and a pixel's grid coordinates are then linear in its depth.
+    The rigid transform and `PixelGrid.to_pixel` are affine. They are applied once, to the camera's
+    centre and axes; the grid coordinates of a pixel are then linear in its depth.
     """
     rays, depth = view.rays, view.depth
     p_WD = view.X_WD[:3, 3]
-    ends = view.X_WD[:3, :3].T + p_WD  # World points one metre along each axis of the camera.
+    ends = view.X_WD[:3, :3].T + p_WD  # World points one metre along each axis of D.
     origin = np.append(grid.to_pixel(p_WD[:2]), p_WD[2] - grid.z_min)
     axes = np.column_stack([grid.to_pixel(ends[:, :2]), ends[:, 2] - grid.z_min]) - origin
-    origin[:2] += 0.5  # So that truncation finds the pixel whose centre is nearest.
+    origin[:2] += 0.5  # Truncation then finds the nearest pixel centre.
 
     def coordinate(k: int) -> NDArray[np.float32]:
         a, b, c = (np.float32(value) for value in axes[:, k])
@@ -124,8 +124,8 @@ def _see(view: View, grid: PixelGrid) -> NDArray[np.float32]:
     row, col, z = (values.ravel()[point] for values in (row, col, z))
     cell = row.astype(np.int64) * grid.cols + col.astype(np.int64)
 
-    # The bits of a float32 >= +0 are in the order of its value: with the height's bits above the
-    # point's index in one integer, a single maximum finds the highest point and its colour.
+    # The bits of a float32 >= +0 sort like its value. With the height's bits above the point's
+    # index in one integer, a single maximum finds the highest point and its colour.
     z = np.maximum(z, 0) + np.float32(0)  # Adding 0 turns -0 into +0.
     key = (z.view(np.int32).astype(np.int64) << 32) | point
     highest = np.full(grid.rows * grid.cols, -1, np.int64)
@@ -142,7 +142,7 @@ def _see(view: View, grid: PixelGrid) -> NDArray[np.float32]:
 
 
 def _fuse(views: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-    """The Observation's image (4, rows, cols) of the cameras' (n, 4, rows, cols), and its mask."""
+    """The fused image (4, rows, cols) of the cameras' (n, 4, rows, cols), and its valid mask."""
     height = views[:, 3].max(axis=0)
     seen = height >= 0
     on_top = (views[:, 3] >= 0) & (views[:, 3] >= height - np.float32(SAME_SURFACE))
@@ -154,7 +154,7 @@ def _fuse(views: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.b
 
 
 def _bridge_gaps(image: NDArray[np.float32], seen: NDArray[np.bool_]) -> None:
-    """Fills, in place, single unseen pixels between two that belong together."""
+    """Fills, in place, single unseen pixels between two pixels of the same surface."""
     row, col = np.nonzero(~seen)
     padded_image = np.pad(image, ((0, 0), (1, 1), (1, 1)))
     padded_seen = np.pad(seen, 1)

@@ -1,4 +1,4 @@
-"""From the cameras' images to the orthographic heightmap that the policies look at."""
+"""Projects the cameras' images to the orthographic heightmap that policies observe."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -32,27 +32,25 @@ class HeightmapProjector(LeafSystem):
 
     There are three input ports for each camera. They take the outputs `color_image`,
     `depth_image_32f` and `body_pose_in_world` (X_WB) of an RgbdSensor. Each output port holds an
-    Observation, computed when it is asked for and kept until an input changes; the passing of time
-    alone does not make it stale. Its image is read-only, as every reader shares it. That of
-    `heights` is the same in black: for who looks at heights alone, no colour image is rendered.
+    Observation. It is computed on demand and cached until an input changes. Its image is read-only,
+    because all readers share it. The port `heights` has black colours, so that evaluating it does
+    not render colour images.
 
     The law, for a camera D with intrinsics (fx, fy, cx, cy) and fixed pose X_BD in the sensor body:
 
     - Image pixel (u, v) covers [u, u+1) x [v, v+1), so its ray passes through (u + 1/2, v + 1/2):
-      `p_WP = X_WB X_BD (depth * ((u + 1/2 - cx)/fx, (v + 1/2 - cy)/fy, 1))`. This is how Drake's
-      VTK engine renders, to a hundredth of a pixel. A depth outside the camera's DepthRange (0 and
-      infinity, Drake's too close and too far, among them) is no point, nor is NaN.
-    - Points off the grid or above `z_max` are dropped; one below `z_min` reads as height 0. Of a
-      camera's points in a grid pixel the highest wins, and brings its colour.
-    - Height is the largest over the cameras. Colour is the mean over the cameras that see this top
-      surface: one whose own highest point lies more than SAME_SURFACE (1 cm) below the fused height
-      sees something that the top hides from above, a side or the ground before it, and must not
-      tint it.
-    - A camera's samples can be farther apart than grid pixels and step over one. A pixel
-      that no camera saw, but whose two neighbours along x or along y were both seen, with heights
-      within SAME_SURFACE of each other, is such a gap and gets the mean of the two, or of the
-      higher pair. Nothing wider than one pixel is bridged: a shadow stays zero in all four
-      channels, and is not `valid`.
+      `p_WP = X_WB X_BD (depth * ((u + 1/2 - cx)/fx, (v + 1/2 - cy)/fy, 1))`. Drake's VTK engine
+      renders the same way, to a hundredth of a pixel. NaN and depths outside the camera's
+      DepthRange, such as Drake's too close (0) and too far (infinity), are ignored.
+    - Points off the grid or above `z_max` are dropped; points below `z_min` get height 0. In each
+      grid pixel, a camera's highest point determines height and colour.
+    - The fused height is the maximum over the cameras. The fused colour is the mean over the
+      cameras that see the top surface, i.e. whose height is within SAME_SURFACE (1 cm) of it. The
+      others see a side, or the ground in front.
+    - A camera's samples can be farther apart than grid pixels. An unseen pixel is interpolated if
+      both of its neighbours along x or along y are seen, with heights within SAME_SURFACE of each
+      other. It gets the mean of the two, or of the higher pair. Wider gaps (shadows) remain zero
+      in all four channels and are not `valid`.
 
     The colour camera must be registered with the depth camera: same intrinsics, same pose.
     """
@@ -60,14 +58,13 @@ class HeightmapProjector(LeafSystem):
     def __init__(
         self, *, cameras: Mapping[str, DepthRenderCamera], grid: PixelGrid | None = None
     ) -> None:
-        """Declares the ports.
-
+        """
         Args:
-            cameras: the depth camera of each sensor by name, as `RgbdSensor` takes it.
+            cameras: the depth camera of each sensor by name, as passed to `RgbdSensor`.
             grid: the pixels of the heightmap.
 
         Raises:
-            ValueError: if there is no camera.
+            ValueError: there is no camera.
         """
         super().__init__()
         if not cameras:

@@ -1,4 +1,4 @@
-"""Feeling for a cavity by force, when what is lowered stands on its rim."""
+"""Force-guided search for a cavity when the lowered object stands on its rim."""
 
 import math
 from dataclasses import dataclass
@@ -6,55 +6,52 @@ from dataclasses import dataclass
 from systems.bounds import bounded
 
 _YAWS = (0.5, -0.5, 1.0, -1.0, 0.0)
-"""The headings that the search tries one after another, in parts of its amplitude."""
+"""The yaw offsets that the search tries in this order, as fractions of its amplitude."""
 _GOLDEN = math.pi * (3 - math.sqrt(5))
 _SPIRAL = tuple(
     (math.sqrt(n / 16) * math.cos(n * _GOLDEN), math.sqrt(n / 16) * math.sin(n * _GOLDEN))
     for n in range(1, 17)
 )
-"""Then the positions, evenly spread over a disc from its middle outward, in parts of its radius."""
+"""The position offsets that follow, an even spiral from the middle, as fractions of the reach."""
 _LEAST_RIM = 0.004
-"""The rim of a cavity is at least this high above the table, in m; noise is less."""
+"""Least height of a cavity's rim above the table, in metres; above the noise of o_t."""
 _BACK = (0.0, 0.0)
-"""At last it is where it began."""
+"""The last offset returns to the start."""
 
 
 @dataclass
 class InsertionSearch:
-    """The hand presses lightly, rotates to and fro, then strays in a spiral, until the resistance
-    ends."""
+    """Parameters of the search: the hand presses lightly, rotates to and fro, then follows a
+    spiral, until the resistance ends."""
 
-    # How far the hand rotates to and fro, in rad: a tool that the closing jaws rotated a little
-    # slips into its cavity then. At zero it does not; with `reach` zero too there is no search: it
-    # is let go where it is.
+    # Amplitude of the yaw oscillation, in rad: undoes a small rotation of the tool by the closing
+    # jaws. Zero disables it; if `reach` is zero too, the object is released without a search.
     amplitude: float = bounded(0.12, 0.0, 0.5)
 
-    # How far from the place it strays, in m: about what calibration may be off. At zero it rotates
-    # only.
+    # Radius of the spiral, in m: about the calibration error. Zero disables the spiral.
     reach: float = bounded(0.004, 0.0, 0.02)
 
-    # Rotation speed, in rad/s: the free space around a tool is about 3 degrees wide, and is not to
-    # be missed.
+    # Rotation speed, in rad/s: slow enough not to miss a clearance of about 3 degrees.
     yaw_speed: float = bounded(0.3, 0.01, 2.5)
 
     # Speed along the spiral, in m/s.
     speed: float = bounded(0.03, 0.001, 0.5)
 
-    # While searching, the hand is commanded this far below where it was stopped, in m: its
-    # stiffness makes a light force of it.
+    # The hand is commanded this far below the contact height, in m. Its stiffness turns this into a
+    # light force.
     press: float = bounded(0.001, 0.0, 0.01)
 
-    # An object that touches something stands on the rim unless its bottom is this far below, in m.
+    # An object in contact stands on the rim unless its bottom is this far below the rim, in m.
     rim_margin: float = bounded(0.0007, 0.0, 0.01)
 
     @property
     def steps(self) -> int:
-        """How many headings and positions are tried before the object is let go."""
+        """How many offsets are tried before the object is released."""
         spiral = len(_SPIRAL) + 1 if self.reach > 0 else 0
         return (len(_YAWS) if self.amplitude > 0 else 0) + spiral
 
     def offset(self, step: int) -> tuple[float, float, float]:
-        """By how much the hand is off the place's x and y, in m, and yaw, in rad, at a step."""
+        """Offset from the place at a step: x, y in m and yaw in rad."""
         if self.amplitude > 0:
             if step < len(_YAWS):
                 return 0.0, 0.0, _YAWS[step] * self.amplitude
@@ -63,16 +60,16 @@ class InsertionSearch:
         return self.reach * x, self.reach * y, 0.0
 
     def is_on_rim(self, bottom: float, rim: float, table: float) -> bool:
-        """Whether an object with its bottom at a height stands on the rim of a cavity.
+        """Whether an object stands on the rim of a cavity.
 
         Args:
-            bottom: of the object, in metres.
-            rim: the highest around its place, in metres. What is no higher than the table has no
-                cavity: an object that is laid there has arrived.
-            table: of the table's top, in metres.
+            bottom: height of the object's bottom, in metres.
+            rim: highest surface around its place, in metres. If it is at table height, there is no
+                cavity.
+            table: height of the table, in metres.
         """
         return rim > table + _LEAST_RIM and bottom > rim - self.rim_margin
 
     def has_slipped_in(self, z: float, touched_at: float) -> bool:
-        """Whether the hand at a height has gone down from where it was stopped, in metres."""
+        """Whether the hand at height z has sunk below its contact height, both in metres."""
         return z < touched_at - self.press / 2

@@ -1,4 +1,4 @@
-"""The heights of one pick and place: from what o_t shows to where the fingertips go."""
+"""Fingertip heights of one pick and place, from the surface heights in o_t."""
 
 from __future__ import annotations
 
@@ -13,25 +13,26 @@ class MotionHeights:
     """Heights of the fingertips in the world, in metres."""
 
     grasp: float
-    """Where the jaws close."""
+    """Height at which the jaws close."""
     clear: float
-    """Empty jaws clear everything from here on."""
+    """Lowest height at which empty jaws clear everything."""
     travel: float
-    """The held object clears everything when the fingertips are here or higher."""
+    """Lowest height at which the held object clears everything."""
     pick_hover: float
-    """Down to here the hand may come fast over the pick."""
+    """Height above the pick down to which the hand moves fast."""
     place_hover: float
-    """The same over the place, with what is held."""
+    """The same above the place, with the held object."""
 
 
 def motion_heights(heights: SurfaceHeights, parameters: PickPlaceParameters) -> MotionHeights:
-    """The heights of a motion.
+    """Computes the heights of a motion.
 
-    The fingertips grip a share of the object's height below its top, within limits, and stay above
-    the table. What is held hangs below them by as much as they are above its support.
+    The fingertips grip below the object's top by a share of its height, within limits, and stay
+    above the table. The object's bottom hangs below the fingertips by their height above its
+    support.
 
     Args:
-        heights: of the surfaces, as `read_surface_heights` reads them off o_t.
+        heights: of the surfaces, as `read_surface_heights` returns them.
         parameters: of the motion primitive.
     """
     floor = heights.table + parameters.floor_clearance

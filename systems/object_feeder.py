@@ -1,4 +1,4 @@
-"""Says which object is to appear next, where objects come one at a time."""
+"""Chooses the next object to appear in tasks where objects come one at a time."""
 
 from collections.abc import Sequence
 
@@ -12,13 +12,13 @@ from pydrake.systems.framework import BasicVector, Context, LeafSystem
 from systems.pick_place_parameters import Mode
 
 _FREE_MODES = (Mode.RETREAT, Mode.OBSERVE)
-"""The modes in which nothing is in the hand."""
+"""The modes in which the hand is empty."""
 _STILL_THERE = 1.0
-"""An object waits while it is within this distance of where it waits, in metres."""
+"""An object within this distance of its waiting position is still waiting, in metres."""
 
 
 class ObjectFeeder(LeafSystem):
-    """Says which object is to appear, once the place where objects appear is clear.
+    """Chooses the object to appear next, when the area in which objects appear is clear.
 
     .. pydrake_system::
 
@@ -31,11 +31,10 @@ class ObjectFeeder(LeafSystem):
 
     - `body_poses` (abstract, list of RigidTransform by body index): the plant's port of that name.
     - `mode` (1): the planner's port of that name.
-    - `arriving` (1): the index, in the order given, of the object that is to appear now, or -1.
+    - `arriving` (1): the index in `waiting` of the object to appear now, or -1.
 
-    The law: while the hand retreats or observes, and no object's origin lies over `area`, the first
-    of the objects that is still where it waits is to appear. Stateless. A system cannot move
-    another's bodies: the station does.
+    The law: while the hand retreats or observes, and no object's origin is over `area`, the first
+    waiting object is to appear. The station then moves the body. Stateless.
     """
 
     def __init__(
@@ -47,8 +46,8 @@ class ObjectFeeder(LeafSystem):
     ) -> None:
         """
         Args:
-            waiting: the bodies that appear, in their order, and p_WB (3,) where each waits.
-            others: the bodies that are there from the beginning.
+            waiting: the bodies that appear, in order, and each one's waiting position p_WB (3,).
+            others: the bodies that are present from the beginning.
             area: lower and upper (x, y) corner in the world, in metres.
         """
         super().__init__()

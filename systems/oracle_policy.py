@@ -1,4 +1,4 @@
-"""The expert of section IV-B.4: knows where everything is and where it is best held."""
+"""The expert of section IV-B.4, which acts on ground-truth poses and annotated grasps."""
 
 from __future__ import annotations
 
@@ -29,22 +29,22 @@ from systems.signals import PickPlaceAction, PlanarPose, SurfaceHeights, wrap_to
 from systems.weak_calc import weak_calc
 
 _NEAR_GOAL = 0.03
-"""An object displaced by less is at its goal, though it may not fill it, in metres."""
+"""An object within this distance of its goal's pose is near it, in metres."""
 _SAME_HEIGHT = 0.005
-"""Objects whose heights differ by less are picked in the order given, in metres."""
+"""Objects within this height difference are equally high, in metres."""
 
 
 def gripper_pose(X_WB: RigidTransform, grasp: PlanarPose | Grasp) -> PlanarPose:
-    """The gripper pose in the world that holds an object at X_WB by its grasp."""
+    """The gripper pose in the world that holds an object at X_WB by a grasp."""
     yaw = heading(X_WB)
     x, y, _ = X_WB @ np.array([grasp.x, grasp.y, 0.0])
     return PlanarPose(x, y, yaw + grasp.theta)
 
 
 def grasp_taken(X_WB: RigidTransform, gripper: PlanarPose) -> PlanarPose:
-    """The grasp by which a gripper in the world holds an object that lies flat at X_WB.
+    """The grasp by which a gripper pose in the world holds an object that lies flat at X_WB.
 
-    The inverse of `gripper_pose`: what a pick off the annotated grasp holds the object by.
+    The inverse of `gripper_pose`.
     """
     yaw = heading(X_WB)
     dx, dy = np.array([gripper.x, gripper.y]) - X_WB.translation()[:2]
@@ -54,7 +54,7 @@ def grasp_taken(X_WB: RigidTransform, gripper: PlanarPose) -> PlanarPose:
 
 @dataclass(frozen=True)
 class _Plan:
-    """One object, the grasp to hold it by, and where it is to go."""
+    """An object, a grasp of it, and its goal pose."""
 
     index: int
     grasp: Grasp
@@ -63,7 +63,7 @@ class _Plan:
 
 
 class OraclePolicy(LeafSystem):
-    """Fills one goal after another, from the ground truth.
+    """Fills one goal after another, from ground truth.
 
     .. pydrake_system::
 
@@ -75,26 +75,26 @@ class OraclePolicy(LeafSystem):
         - action
 
     - `body_poses` (abstract, list of RigidTransform by body index): the plant's port of that name.
-    - `kept_goals` (one for each goal): the `PlacementMonitor`'s port of that name. Where it is not
-      connected, none is kept.
-    - `action` (abstract, `PickPlaceAction`): an object and a goal that it may fill; `stop` when
-      every goal is filled.
+    - `kept_goals` (one for each goal): the `PlacementMonitor`'s port of that name. If it is not
+      connected, no goal is kept.
+    - `action` (abstract, `PickPlaceAction`): moves an object to a goal; `stop` when every goal is
+      filled.
 
-    The law. The next goal is the first, in the order given, that is not filled and whose
-    prerequisites are, where those that are kept count as filled; goals whose object is already
-    there, though not as it should be, come last. Of the objects in the cell that may fill it and
-    fill no other, the highest is taken, as nothing lies on it; of several as high, the one assigned
-    to the goal by `evaluate_placements`. Of the goal's poses it takes the free one that rotates the
-    object least, and of the object's grasps the first at which the fingers are clear of other
-    objects at the pick and at the place.
+    The law chooses, in this order:
 
-    With a quantizer it answers the best action that a policy of the paper can choose: the pick is
-    the annotated grasp, rounded; the place is where the gripper, *holding the object as the rounded
-    pick does*, brings it to its goal, and its position and the object's rotation are rounded in
-    turn. That is how a place network is labelled whose crop is centred on the pick (section
-    III-C.2).
+    1. The goal: the first that is not filled and whose prerequisites are filled or kept. Goals
+       that already have a misplaced object come last.
+    2. The object: the highest one in the cell that may fill the goal and fills no other, since
+       nothing lies on it. Of equally high ones, the one that `evaluate_placements` assigned.
+    3. The goal pose: the free one that rotates the object least.
+    4. The grasp: the first that keeps the fingers clear of other objects at the pick and the place.
 
-    Stateless: an object whose grasp failed still lies where it lay, and is the answer again.
+    With a quantizer, the action is the best that a policy of the paper can choose. The pick is the
+    rounded annotated grasp. The place is where the gripper, holding the object as the *rounded*
+    pick does, brings it to its goal; then position and rotation are rounded. A place network whose
+    crop is centred on the pick needs these labels (section III-C.2).
+
+    Stateless: after a failed grasp, it returns the same object again.
     """
 
     def __init__(
@@ -113,17 +113,17 @@ class OraclePolicy(LeafSystem):
         """
         Args:
             objects: n of them.
-            grasps: n, the grasps of each, best first; empty for one that no goal takes.
-            goals: what is to be brought about, in the order in which to do it.
-            success: when a goal is filled.
-            quantizer: of the actions; exact when None.
+            grasps: n, the grasps of each object, best first; empty if no goal takes the object.
+            goals: in the order in which to fill them.
+            success: decides when a goal is filled.
+            quantizer: rounds the actions; None leaves them exact.
             tip_depth: how far below an object's top the fingertips reach, in m.
-            release_clearance: how far each jaw draws back to let go, in m.
-            open_width: between the jaws before a grasp, in m.
-            brings_heights: whether actions have their heights; else the planner reads them off o_t.
+            release_clearance: how far each jaw opens to release an object, in m.
+            open_width: opening of the jaws before a grasp, in m.
+            brings_heights: whether actions carry heights; else the planner reads them off o_t.
 
         Raises:
-            ValueError: no goals, or an object of a goal without a grasp.
+            ValueError: there are no goals, or an object of a goal has no grasp.
         """
         super().__init__()
         if not goals:
@@ -158,7 +158,7 @@ class OraclePolicy(LeafSystem):
     def _plan(
         self, poses: list[RigidTransform], placements: list[Placement], kept: frozenset[int]
     ) -> _Plan | None:
-        """The next thing to do; None when every goal is filled, or none can be."""
+        """The next move; None if every goal is filled, or no goal can be filled."""
         filled = kept | {item.goal for item in placements if item.success}
         failed_there = {
             item.goal
@@ -208,7 +208,7 @@ class OraclePolicy(LeafSystem):
         return min(free, key=lambda X: abs(wrap_to_pi(heading(X) - yaw)))
 
     def _is_taken(self, X_WGoal: RigidTransform, item: int, poses: list[RigidTransform]) -> bool:
-        """Whether another object's middle is where this one's would be."""
+        """Whether another object occupies this goal pose."""
         middle = X_WGoal @ self._objects[item].p_BMiddle
         return any(
             bool(np.linalg.norm(X_WB @ other.p_BMiddle - middle) < _NEAR_GOAL / 2)
@@ -292,13 +292,13 @@ class OraclePolicy(LeafSystem):
 def _count_within_fingers(
     points: NDArray[np.float64], gripper: PlanarPose, tip: float, reach: tuple[float, float]
 ) -> int:
-    """How many points (m, 3) are where the fingers are.
+    """How many points lie within the volume of the fingers.
 
     Args:
-        points: in the world, in metres.
-        gripper: where the gripper is.
+        points: (m, 3) in the world, in metres.
+        gripper: the gripper's pose.
         tip: world z of the fingertips, in metres.
-        reach: how near to, and how far from, its middle a finger reaches along the jaws, in metres.
+        reach: nearest and farthest extent of a finger from the gripper's middle, in metres.
     """
     cos, sin = math.cos(gripper.theta), math.sin(gripper.theta)
     dx, dy = points[:, 0] - gripper.x, points[:, 1] - gripper.y

@@ -1,5 +1,4 @@
-"""How the hand moves in each mode of the pick-and-place motion primitive: from where the commands
-stood as the mode began, to where it goes."""
+"""The hand's motion in each mode of the pick-and-place motion primitive."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,22 +16,21 @@ from systems.pick_place_parameters import Mode, PickPlaceParameters
 from systems.vector_view import Array, Number, VectorView
 
 X, Y, Z, YAW = range(4)
-"""The axes of the hand in `PlannerState.start` and its like."""
+"""Indices of the hand's axes in `PlannerState.start` and `goal`."""
 
 
 class PlannerState(VectorView):
-    """The planner's state vector, in SI units: the present mode and its motion, what was read off
-    o_t, and what the hand felt."""
+    """The planner's state vector, in SI units."""
 
     mode = Number()
     start_time = Number()
     duration = Number()
     start = Array(4)
-    """x, y, z and yaw where the present motion begins ..."""
+    """x, y, z and yaw at the start of the present motion."""
     goal = Array(4)
-    """... and ends."""
+    """x, y, z and yaw at its end."""
     start_rate = Array(4)
-    """The velocities with which it begins."""
+    """The velocities at its start."""
     delays = Array(3)
     """When each of the motion's `PARTS` begins, after `start_time`."""
     start_opening = Number()
@@ -41,7 +39,7 @@ class PlannerState(VectorView):
     goal_force = Number()
     force_start_time = Number()
     pick = Array(3)
-    """x, y and yaw of the hand at the pick, and at the place."""
+    """x, y and yaw of the hand at the pick. Likewise `place`."""
     place = Array(3)
     grasp_z = Number()
     travel_z = Number()
@@ -53,11 +51,11 @@ class PlannerState(VectorView):
     support_z = Number()
     rim_z = Number()
     hold_z = Number()
-    """Of the hand as it gripped, and as it touched the rim of a cavity."""
+    """Height of the hand when it gripped; `touch_z`: when the object touched a cavity's rim."""
     touch_z = Number()
     search_step = Number()
     payload = Number()
-    """The vertical force of what is carried, in N."""
+    """The vertical force of the payload, in N."""
     actions = Number()
     missed = Number()
     dropped = Number()
@@ -66,15 +64,15 @@ class PlannerState(VectorView):
 
 
 YAW_LIMIT = 3.4
-"""How far the wrist may rotate either way, in rad: just short of its joint limit."""
+"""Largest yaw of the wrist either way, in rad, just short of its joint limit."""
 _NEARLY_THERE = 0.02
-"""So near to where it goes, in m, the hand may sink below what the rest of the way has to clear."""
+"""Within this horizontal distance of its goal, in m, the hand may sink below the clear height."""
 _OVERSHOOT = 0.05
-"""How far above the travel height a lift aims, in m, as the hand crosses that without a stop."""
+"""How far above the travel height a lift aims, in m, so that the hand passes it without a stop."""
 
 
 class PickPlaceMotion:
-    """The motions, jaw openings and closing forces of all modes, as functions of the state."""
+    """Motions, jaw openings and closing forces of all modes, as functions of the state."""
 
     def __init__(self, parameters: PickPlaceParameters) -> None:
         """
@@ -101,14 +99,14 @@ class PickPlaceMotion:
         z: float | None = None,
         opening: float | None = None,
     ) -> None:
-        """Starts a mode from where the commands now stand.
+        """Starts a mode from the present commands.
 
         Args:
-            state: the planner's state, written.
+            state: the planner's state; modified.
             mode: the mode to begin.
-            time: now, in s.
-            z: hold the fingertips at this height from now on, in m.
-            opening: hold the jaws at this opening from now on, in m.
+            time: the present time, in s.
+            z: stop the fingertips at this height, in m.
+            opening: stop the jaws at this opening, in m.
         """
         now, rate, _ = np.split(self.motion_at(state, time), 3)
         now_opening, _ = self.opening_at(state, time)
@@ -121,7 +119,7 @@ class PickPlaceMotion:
         state.start_time = time
         state.start = now
         state.start_rate = rate
-        # Unless the mode says otherwise: come to rest.
+        # Default: brake to rest.
         state.goal = now + rate * braking_time(rate, self._limits_of(state)) / 2
         state.start_opening = state.goal_opening = now_opening
         self._set_goals(state, mode)
@@ -132,7 +130,7 @@ class PickPlaceMotion:
         self.set_times(state)
 
     def _set_goals(self, state: PlannerState, mode: Mode) -> None:
-        """Sets where a mode leads, where that is not where the hand comes to rest by itself."""
+        """Sets the goals of a mode, unless the hand only brakes to rest."""
         parameters = self._parameters
         if mode == Mode.APPROACH:
             state.goal = (*state.pick[:2], state.pick_hover_z, state.pick[2])
@@ -163,21 +161,21 @@ class PickPlaceMotion:
             state.goal[Z] = max(home_z, state.travel_z)
 
     def set_times(self, state: PlannerState) -> None:
-        """Sets when each part of the present mode's motion begins, and how long all of it takes."""
+        """Sets the delays and the duration of the present mode's motion."""
         mode = Mode(int(state.mode))
         limits = self._limits_of(state)
         rate = state.start_rate
         braking = braking_time(rate, limits)
-        # What moves comes to rest first.
+        # An axis that still moves brakes first.
         delays = np.array([braking * bool(rate[part].any()) for part in PARTS])
         ways = np.abs(state.goal - state.start - rate * braking / 2)
         across, height = float(np.linalg.norm(ways[:2])), float(ways[2])
         of_plane, of_height, _ = limits.of_parts()
         if mode == Mode.CARRY:
-            # The lift that it goes on from is all but done by half of the braking.
+            # After half of the braking time the preceding lift is almost complete.
             delays = np.maximum(delays, braking / 2)
         if mode in (Mode.APPROACH, Mode.CARRY):
-            # Sink when it is nearly there.
+            # Sink near the goal only.
             clear = state.clear_z if mode == Mode.APPROACH else state.travel_z
             nearly_there = delays[0] + time_to_reach(across - _NEARLY_THERE, across, *of_plane)
             sinks = height - (clear - state.goal[Z])
@@ -192,11 +190,11 @@ class PickPlaceMotion:
     def _limits_of(self, state: PlannerState) -> MotionLimits:
         """The limits of the present mode's motion."""
         mode = Mode(int(state.mode))
-        # In a period of a faster one the force would rise by more than is asked for.
+        # Faster than LOWER, the force would overshoot by too much within one period.
         return self._limits[Mode.LOWER if state.press and mode == Mode.DESCEND else mode]
 
     def set_force(self, state: PlannerState, time: float, force: float) -> None:
-        """Lets the closing force go to another value, from what it is now."""
+        """Ramps the closing force from its present value to another."""
         if force != state.goal_force:
             state.start_force = self.force_at(state, time)
             state.goal_force, state.force_start_time = force, time
@@ -232,7 +230,7 @@ class PickPlaceMotion:
         return float(state.start_force + fraction * (state.goal_force - state.start_force))
 
     def arrival(self, state: PlannerState) -> float:
-        """When the motion, the jaws and the force of the present mode have arrived, in s."""
+        """When motion, jaws and force of the present mode have all arrived, in s."""
         opening_time = abs(state.goal_opening - state.start_opening) / (
             2 * self._parameters.finger_speed
         )
@@ -240,6 +238,6 @@ class PickPlaceMotion:
         return float(max(moved, state.force_start_time + self._parameters.force_ramp))
 
     def brakes_above(self, state: PlannerState, time: float, height: float) -> bool:
-        """Whether the hand, braking from now on, would come to rest above a height."""
+        """Whether the hand would stop above a height if it began to brake now."""
         now, rate, _ = np.split(self.motion_at(state, time), 3)
         return bool(now[2] + rate[2] * braking_time(rate, self._limits[Mode.LIFT]) / 2 >= height)

@@ -1,4 +1,4 @@
-"""The pick-and-place motion primitive: a state machine that makes smooth, limited motions."""
+"""The pick-and-place motion primitive: a state machine with smooth, limited motions."""
 
 import dataclasses
 import math
@@ -25,16 +25,16 @@ from systems.surface_heights import read_surface_heights
 from systems.weak_calc import weak_calc
 
 _MOST_FAILED = 16
-"""So many failed picks are remembered."""
+"""How many failed picks are remembered."""
 
 
 @dataclasses.dataclass(frozen=True)
 class _Moment:
-    """What a step of the state machine looks at."""
+    """The inputs of one step of the state machine."""
 
     context: Context
     state: PlannerState
-    """The state to write."""
+    """The state, which the step modifies."""
     time: float
     hand: NDArray[np.float64]
     """The port `hand_state`."""
@@ -43,7 +43,7 @@ class _Moment:
 
 
 class PickPlacePlanner(LeafSystem):
-    """Carries out one pick and place after another.
+    """Executes one pick and place after another.
 
     .. pydrake_system::
 
@@ -64,41 +64,42 @@ class PickPlacePlanner(LeafSystem):
         - accepted_action
 
     - `hand_state` (12): positions then velocities of (x, y, z, yaw, left finger, right finger).
-    - `hand_contact_force` (6): contact as generalized force on the same coordinates, in N and N m:
-      what a force-torque sensor at the wrist and one in each finger would read. Up is positive.
-    - `action` (abstract, `PickPlaceAction`): evaluated only at the moment in which the planner,
-      at rest out of the cameras' sight, asks for it. Nothing upstream (policy, cameras) is computed
-      at other times.
-    - `observation` (abstract, `Observation`): o_t, evaluated together with the action, unless the
-      action brings its heights: those under the pick and around the place are read off it.
+    - `hand_contact_force` (6): contact as generalized force on the same coordinates, in N and N m,
+      as force-torque sensors at the wrist and in each finger would measure it. Up is positive.
+    - `action` (abstract, `PickPlaceAction`): evaluated only when the planner, at rest out of the
+      cameras' sight, needs an action. Policy and cameras are not evaluated at other times.
+    - `observation` (abstract, `Observation`): o_t, evaluated together with the action if the
+      action carries no heights. They are then read off o_t.
     - `desired_motion` (12): q_d, v_d, a_d of (x, y, z, yaw).
     - `desired_opening` (2): the opening between the pads in m, and its rate.
-    - `closing_force` (1): what each pad presses beyond that, in N.
+    - `closing_force` (1): additional force of each pad, in N.
     - `mode` (1): a `Mode`.
     - `counts` (3): actions begun, grasps missed, objects dropped.
-    - `failed_picks` (abstract, a tuple of `PlanarPose`): where a grasp was missed or lost, or an
-      object pressed down, the latest last, at most 16 of them: for a policy that is to try another.
-    - `asks` (1): 1 where the next update, due at the context's time, evaluates `action`; else 0.
-    - `accepted_action` (abstract, `PickPlaceAction`): the action begun last, its poses as the hand
-      goes there, without heights.
+    - `failed_picks` (abstract, a tuple of `PlanarPose`): the last 16 picks where a grasp was missed
+      or lost, or an object pressed down, latest last. A policy can use it to try another.
+    - `asks` (1): 1 if the next update, due at the context's time, evaluates `action`; else 0.
+    - `accepted_action` (abstract, `PickPlaceAction`): the last action begun, with the hand's actual
+      yaws and without heights.
 
-    Every motion is as short as the limits on speed and acceleration allow, and smooth (see
-    `systems.hand_motion`); where `CARRY` goes on from a `LIFT` that still accelerates, velocity is
-    continuous and acceleration is not. It is in the plane along a straight line, while height and
-    yaw have time courses of their own. What goes up clears the highest surface of o_t before it
-    travels, and what travels sinks when it is nearly there, to just above what o_t shows around its
-    goal (`APPROACH`, `CARRY`). From there two guarded motions, `DESCEND` and `LOWER`, stop dead
-    where the vertical contact force rises `contact_threshold` above the payload's weight, and hold
-    the height reached: no known height of table, kit or cavity tells them where to stop. Where
-    places are insertions, and the object comes to stand on the rim around its place, the hand feels
-    for the cavity (`SEARCH`) and lowers again once the resistance ends. A grasp is good if the pads
-    stand further apart than `minimum_width` and both feel at least half of the grasp force; when it
-    is not, or is lost on the way, the hand retreats and observes again, which counts as an action.
-    What turns out to be heavier than `heavy_load` is gripped more firmly as it is lifted. An action
-    that says `press` ends with `DESCEND`, with closed jaws, as slowly as `LOWER` and until
-    `press_force` is reached.
+    Motions are smooth and as short as the limits on speed and acceleration allow (see
+    `systems.hand_motion`). In the plane they are straight lines; height and yaw have their own time
+    courses. When `CARRY` continues from an unfinished `LIFT`, only the velocity is continuous.
 
-    All memory is discrete state: one vector, and the failed picks.
+    - `LIFT`, `RETREAT`: the hand rises above the highest surface of o_t before it travels.
+    - `APPROACH`, `CARRY`: near its goal, the hand sinks to just above the surfaces there.
+    - `DESCEND`, `LOWER`: guarded motions. They stop dead when the vertical contact force exceeds
+      the payload's weight by `contact_threshold`. The heights of table, kit and cavity need not be
+      known.
+    - `CHECK`: a grasp is good if the pads are further apart than `minimum_width` and both feel at
+      least half of the grasp force. If it is not, or is lost later, the hand retreats and observes
+      again. The attempt counts as an action.
+    - `LIFT`, `CARRY`: a load above `heavy_load` is gripped more firmly.
+    - `SEARCH`: in tasks that insert, if the object stands on the rim around its place, the hand
+      searches for the cavity. It lowers again once the resistance ends.
+    - An action with `press` ends with `DESCEND`, with closed jaws, at the speed of `LOWER`, until
+      `press_force` is reached.
+
+    State (discrete): one vector, and the failed picks.
     """
 
     def __init__(
@@ -111,10 +112,10 @@ class PickPlacePlanner(LeafSystem):
     ) -> None:
         """
         Args:
-            parameters: heights, speeds, thresholds; `max_actions` among them comes first.
-            max_actions: after so many actions it is done, unless the parameters say otherwise.
-            insertion: whether places are insertions, for which to search.
-            period: how often the state machine is updated, in s.
+            parameters: heights, speeds, thresholds.
+            max_actions: stop after so many actions, unless `parameters.max_actions` overrides it.
+            insertion: whether to search for a cavity when a place is blocked.
+            period: update period of the state machine, in s.
         """
         super().__init__()
         self._parameters = parameters
@@ -137,7 +138,7 @@ class PickPlacePlanner(LeafSystem):
         state_only = {self.discrete_state_ticket(self._state_index)}
         self.DeclareVectorOutputPort("mode", 1, self._calc_mode, state_only)
         self.DeclareVectorOutputPort("counts", 3, self._calc_counts, state_only)
-        # A row for each: x, y, theta. Those after the last are not numbers.
+        # Rows of x, y, theta; NaN after the last.
         self._failed_index = self.DeclareDiscreteState(np.full(3 * _MOST_FAILED, np.nan))
         self.DeclareAbstractOutputPort(
             "failed_picks",
@@ -257,7 +258,7 @@ class PickPlacePlanner(LeafSystem):
         self._motion.begin(state, Mode.APPROACH, time)
 
     def _has_settled(self, state: PlannerState, time: float) -> bool:
-        """Whether the hand has been at rest out of sight for long enough to observe."""
+        """Whether the hand has rested out of sight for long enough to observe."""
         return time >= self._motion.arrival(state) + self._parameters.observe_settle
 
     def _heights(self, context: Context, action: PickPlaceAction) -> SurfaceHeights:
@@ -265,7 +266,7 @@ class PickPlacePlanner(LeafSystem):
             return action.heights
         if not self._observation.HasValue(context):
             raise RuntimeError(
-                "the planner's port `observation` is not connected, and the action has no heights"
+                "the action has no heights: connect the planner's port `observation` to read them"
             )
         observation = self._observation.Eval(context)
         return read_surface_heights(observation, action.pick, action.place)
@@ -274,7 +275,7 @@ class PickPlacePlanner(LeafSystem):
         motion = motion_heights(heights, self._parameters)
         state.grasp_z, state.pick_top_z = motion.grasp, heights.pick_top
         state.table_z, state.support_z = heights.table, heights.support
-        # What stands a little below a doubtful rim may stand on it.
+        # An object slightly below an uncertain rim may stand on it.
         state.rim_z = heights.place_rim - heights.doubt
         state.clear_z, state.travel_z = motion.clear, motion.travel
         state.pick_hover_z, state.place_hover_z = motion.pick_hover, motion.place_hover
@@ -289,13 +290,13 @@ class PickPlacePlanner(LeafSystem):
         state, time, hand, contact = moment.state, moment.time, moment.hand, moment.contact
         if state.press:
             if contact[2] > self._parameters.press_force:
-                # Braking would press harder still.
+                # Stop dead: braking would press harder.
                 self._motion.begin(state, Mode.RETREAT, time, z=hand[2])
             elif time >= self._motion.arrival(state):
                 self._motion.begin(state, Mode.RETREAT, time)
         elif contact[2] > self._parameters.contact_threshold:
             self._motion.begin(state, Mode.CLOSE, time, z=hand[2])
-            # Back off a little: pressed fingertips would not close.
+            # Back off a little: the jaws cannot close while the fingertips press.
             state.goal[Z] += self._parameters.floor_clearance
             self._motion.set_times(state)
         elif time >= self._motion.arrival(state):
@@ -305,7 +306,7 @@ class PickPlacePlanner(LeafSystem):
         state, time, hand = moment.state, moment.time, moment.hand
         opening, rate = hand[4] + hand[5], hand[10] + hand[11]
         moving_for = time - state.start_time
-        # The command runs ahead of stalled jaws by what the fingers' spring makes of it.
+        # Stalled jaws lag behind the command by the deflection of the fingers' spring.
         commanded, _ = self._motion.opening_at(state, time)
         stalled = moving_for > 0.1 and abs(rate) < 2e-3 and commanded < opening - 1e-3
         if stalled or commanded <= 0.0:
@@ -317,7 +318,7 @@ class PickPlacePlanner(LeafSystem):
             return
         if self._is_held(hand, contact):
             state.hold_z = hand[2]
-            # Gripped higher than it was to be, the object reaches farther below the hand.
+            # Gripped higher than planned, the object hangs lower.
             higher = max(hand[2] - state.grasp_z, 0.0)
             state.travel_z += higher
             state.place_hover_z += higher
@@ -362,7 +363,7 @@ class PickPlacePlanner(LeafSystem):
             state.dropped += 1
             self._motion.begin(state, Mode.RETREAT, time)
         elif free and self._parameters.search.has_slipped_in(hand[2], state.touch_z):
-            # Given a height, it stops dead: here the object fits.
+            # The height makes it stop dead, where the object fits.
             self._motion.begin(state, Mode.LOWER, time, z=hand[2])
         elif time >= self._motion.arrival(state):
             state.search_step += 1
@@ -378,6 +379,6 @@ class PickPlacePlanner(LeafSystem):
         return left and search.is_on_rim(float(bottom), rim, table)
 
     def _is_held(self, hand: NDArray[np.float64], contact: NDArray[np.float64]) -> bool:
-        # Contact pushes the fingers apart: along their positive axes.
+        # Contact pushes the fingers apart, along their positive axes.
         pressed = contact[4:6].min() > self._parameters.grasp_force / 2
         return bool(pressed and hand[4] + hand[5] > self._parameters.minimum_width)

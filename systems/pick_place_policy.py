@@ -1,4 +1,4 @@
-"""Any function from an observation to an action, as a Drake system."""
+"""Wraps a policy function, from observation to action, as a Drake system."""
 
 from __future__ import annotations
 
@@ -15,22 +15,22 @@ from systems.weak_calc import weak_calc
 
 
 class PolicyFunction(Protocol):
-    """A policy: a function without memory."""
+    """A stateless policy function."""
 
     def __call__(
         self, observation: Observation, failed_picks: Sequence[PlanarPose] = (), /
     ) -> PickPlaceAction:
-        """The action for an observation.
+        """Returns the action for an observation.
 
         Args:
             observation: o_t.
-            failed_picks: where a grasp failed before, in the world, the latest last.
+            failed_picks: poses of failed grasps in the world, latest last.
         """
         ...
 
 
 class PolicyError(RuntimeError):
-    """A policy's own function failed; `__cause__` is what it raised."""
+    """A policy's function raised an exception, which is `__cause__`."""
 
 
 class PickPlacePolicy(LeafSystem):
@@ -45,24 +45,23 @@ class PickPlacePolicy(LeafSystem):
         output_ports:
         - action
 
-    - `observation` (abstract, `Observation`): o_t. A policy that looks at heights alone has
-      `observation_heights` instead: o_t, perhaps without colours.
-    - `failed_picks` (abstract, a tuple of `PlanarPose`): where a grasp failed before; none where
-      the port is not connected.
-    - `action` (abstract, `PickPlaceAction`): the policy's answer.
+    - `observation` (abstract, `Observation`): o_t. A policy that uses heights only has
+      `observation_heights` instead, whose colours may be missing.
+    - `failed_picks` (abstract, a tuple of `PlanarPose`): poses of failed grasps; empty if not
+      connected.
+    - `action` (abstract, `PickPlaceAction`): the policy's action.
 
-    The policy is called when the port is evaluated, once for each new input. It lives outside the
-    Context, which must stay cheap to copy, and must therefore not remember anything: what there is
-    to remember comes in by a port.
+    Evaluating the port calls the policy once for each new input. The policy must be stateless: the
+    Context does not hold it. Memory has to come in through a port.
     """
 
     def __init__(self, *, policy: PolicyFunction, heights_only: bool = False) -> None:
         """
         Args:
-            policy: what it raises ends the evaluation of the port as a `PolicyError`; an answer
-                that is not a `PickPlaceAction` does as a `TypeError`, and one whose poses are not
-                finite numbers as a `ValueError`.
-            heights_only: whether it looks at heights alone.
+            policy: evaluating the port raises a `PolicyError` if the policy raises, a `TypeError`
+                if it does not return a `PickPlaceAction` of numbers, and a `ValueError` if its
+                poses are not finite.
+            heights_only: whether the policy uses heights only.
         """
         super().__init__()
         self._policy = policy
@@ -86,33 +85,32 @@ class PickPlacePolicy(LeafSystem):
             raise PolicyError(f"the policy {self._policy!r} failed: {error}") from error
         if not isinstance(action, PickPlaceAction):
             raise TypeError(
-                f"the policy {self._policy!r} answered with {type(action).__name__}, "
-                "not a PickPlaceAction"
+                f"the policy {self._policy!r} must return a PickPlaceAction, not "
+                f"{type(action).__name__}"
             )
         output.set_value(self._checked(action))
 
     def _checked(self, action: PickPlaceAction) -> PickPlaceAction:
-        """The action with its poses in use as floats.
+        """The action, with its poses converted to floats.
 
         Raises:
-            TypeError: they are not numbers.
-            ValueError: they are not finite.
+            TypeError: a pose is not of numbers.
+            ValueError: a pose is not finite.
         """
         numbers: dict[str, Any] = {}
         for name, pose in action.poses.items():
             if not isinstance(pose, PlanarPose):
                 raise TypeError(
-                    f"the policy {self._policy!r} answered with a {name} that is no PlanarPose: "
-                    f"{pose!r}"
+                    f"the policy {self._policy!r} must return a PlanarPose as {name}, not {pose!r}"
                 )
             values = (pose.x, pose.y, pose.theta)
             if any(isinstance(value, str) for value in values):
                 raise TypeError(
-                    f"the policy {self._policy!r} answered with a {name} of text: {pose!r}"
+                    f"the policy {self._policy!r} must return numbers in {name}, not {pose!r}"
                 )
             numbers[name] = PlanarPose(*map(float, values))
             if not np.isfinite(numbers[name].as_array()).all():
                 raise ValueError(
-                    f"the policy {self._policy!r} answered with no finite numbers: {action}"
+                    f"the policy {self._policy!r} must return finite poses, not {action}"
                 )
         return dataclasses.replace(action, **numbers)

@@ -1,7 +1,5 @@
-"""Goals, how far objects are from them, and when that is success.
-
-No Drake system is in here: `PlacementMonitor` and `OraclePolicy` evaluate these laws.
-"""
+"""Goals, the errors of placements, and success predicates, for `PlacementMonitor` and
+`OraclePolicy`."""
 
 from __future__ import annotations
 
@@ -23,41 +21,39 @@ if TYPE_CHECKING:
     from scipy.spatial import cKDTree
 
 STRICT_HEIGHT = 0.002
-"""A strict success stands at most this far above or below its goal, in metres."""
+"""Largest height error of a strict success, in metres."""
 STRICT_ANGLE = math.radians(20.0)
-"""Its heading differs by at most this, modulo the object's symmetry, in radians."""
+"""Largest heading error of a strict success, modulo the object's symmetry, in radians."""
 ALL = 1 - 1e-9
-"""A share or a reward above this is all of it."""
+"""A share or a reward above this counts as 1."""
 
 GONE = 10.0
-"""An object this far from the world's origin has left the cell, or is yet to appear, in metres."""
+"""An object this far from the world's origin, in metres, has left the cell or not yet appeared."""
 
 _FAR = 0.5
-"""Beyond this an object is no nearer to one goal than to another, in metres."""
+"""Displacements are capped at this when objects are assigned to goals, in metres."""
 _NEAR = 0.05
-"""When objects are assigned, one that is farther from a goal is not held to fill it, in metres."""
+"""Only an object within this distance of a goal is tested for filling it, in metres."""
 _FREE_ANGLES = 24
-"""In how many headings an object of any heading is compared with its goal."""
+"""Number of headings compared for a goal of any heading."""
 
 
 @dataclass(frozen=True)
 class PlacedObject:
-    """An object as placements are scored."""
+    """An object whose placement is scored."""
 
     name: str
     body: BodyIndex
-    """The object's body B, whose frame points and goal poses refer to."""
+    """The object's body B; points and goal poses refer to its frame."""
     p_BPoints: NDArray[np.float64]
-    """(m, 3) points of the object's surface, in metres. Sample them by area: the score must not
-    depend on how finely a mesh is cut."""
+    """(m, 3) points sampled uniformly by area from the object's surface, in metres."""
     symmetry: int = 1
-    """Rotations about body z by 2 pi / symmetry that a person could not tell; 1 when there are
-    none. Declared with the object, not measured by ADD-S."""
+    """Order of the rotational symmetry about body z; 1 for none. Declared with the object."""
 
     @cached_property
     def p_BMiddle(self) -> NDArray[np.float64]:
-        """(3,) the middle of the points' bounding box, where positions are compared. It lies on the
-        axis of a round object; the origin of B need not, and would wander as the object rolls."""
+        """(3,) the middle of the points' bounding box, where positions are compared. Unlike the
+        origin of B, it lies on the axis of a round object and stays there as the object rolls."""
         return (self.p_BPoints.min(axis=0) + self.p_BPoints.max(axis=0)) / 2
 
     @cached_property
@@ -69,7 +65,7 @@ class PlacedObject:
 
     @cached_property
     def tree(self) -> cKDTree:
-        """A tree of the points."""
+        """A k-d tree of the points."""
         # Import SciPy lazily.
         from scipy.spatial import cKDTree
 
@@ -78,52 +74,51 @@ class PlacedObject:
 
 @dataclass(frozen=True)
 class Goal:
-    """Something to be brought about: one of some objects in one of some poses."""
+    """A goal: place any of some objects in any of some poses."""
 
     name: str
     objects: tuple[int, ...]
-    """Which objects may fill it, as indices into the scene's."""
+    """Objects that may fill the goal, as indices into the scene's."""
     poses: tuple[RigidTransform, ...]
-    """X_WGoal: any of these poses of the object's frame will do."""
+    """X_WGoal: poses of the object's frame, any of which fills the goal."""
     reward: float
-    """Share of the episode's score; those of all goals add up to 1."""
+    """Share of the episode's score; the goals' shares add up to 1."""
     after: tuple[int, ...] = ()
-    """The goals that must be filled before this one counts, as indices into the scene's."""
+    """Goals that must be filled before this one counts, as indices into the scene's."""
     any_heading: bool = False
-    """Whether the object's rotation about world z means nothing."""
+    """Whether the object's rotation about world z is ignored."""
     rim_height: float | None = None
-    """World z of the rim that the object is inserted below, in metres; None: it is put down."""
+    """World z of the rim of the cavity that the object goes into, in metres; None: no cavity."""
 
 
 @dataclass(frozen=True)
 class Placement:
-    """Where one object is, relative to the goal that it is nearest to filling."""
+    """The errors of one object with respect to the goal assigned to it."""
 
     goal: int | None = None
-    """Index of the goal; None for an object that no goal is left for."""
+    """Index of the goal; None if no goal is left for the object."""
     pose: int = 0
-    """Which of the goal's poses is the nearest."""
+    """Index of the nearest of the goal's poses."""
     add_s: float = math.inf
     """Equation 9 of the paper, in metres."""
     position_error: float = math.inf
-    """Horizontal distance of the middles (`PlacedObject.p_BMiddle`), in metres."""
+    """Horizontal distance between the middles (`PlacedObject.p_BMiddle`), in metres."""
     angle_error: float = math.inf
-    """Heading beyond the goal's, about world z and modulo the object's symmetry, in radians;
-    zero where any heading will do."""
+    """Heading error about world z, modulo the object's symmetry, in radians; zero if the goal
+    accepts any heading."""
     height_error: float = math.inf
-    """How far the middle is above the goal's, in metres."""
+    """Height of the middle above the goal's, in metres."""
     share: float = 0.0
-    """Share of the goal's reward, 0 to 1, by the success predicate; 0 while a goal that must come
-    before is not filled."""
+    """Earned share of the goal's reward, 0 to 1; 0 until the goal's prerequisites are filled."""
 
     @property
     def success(self) -> bool:
-        """Whether the object fills its goal by the task's own measure."""
+        """Whether the object fills its goal by the task's success predicate."""
         return self.share > ALL
 
     @property
     def strict_success(self) -> bool:
-        """Success that a person would sign: at its height and heading too."""
+        """Success with the right height and heading, too."""
         return (
             self.success
             and abs(self.height_error) <= STRICT_HEIGHT
@@ -132,18 +127,18 @@ class Placement:
 
 
 class SuccessPredicate(Protocol):
-    """When an object fills its goal."""
+    """Decides when an object fills its goal."""
 
     @property
     def description(self) -> str:
-        """In words, for people: what is asked for, with its threshold."""
+        """The criterion and its threshold, in words."""
         ...
 
     def share(self, placement: Placement, X_WB: RigidTransform) -> float:
-        """The share of the goal's reward, 0 to 1, that a placement earns by its pose alone.
+        """The share of the goal's reward, 0 to 1, that a pose earns.
 
         Args:
-            placement: the errors; its own `share` is not yet known.
+            placement: the errors; its own `share` is not set yet.
             X_WB: the object's pose.
         """
         ...
@@ -166,7 +161,7 @@ class AddS:
 
 @dataclass(frozen=True)
 class PoseWithin:
-    """Success as Ravens has it: a pose error below thresholds; heights are not compared."""
+    """Success as in Ravens: pose errors below thresholds; heights are not compared."""
 
     position: float = 0.01
     """Horizontal, in metres."""
@@ -184,10 +179,10 @@ class PoseWithin:
 
 @dataclass(frozen=True)
 class InZone:
-    """Success as Ravens has it for zones: the share of an object's volume that is in a box."""
+    """Success as in Ravens' zones: the share of an object's volume inside a box."""
 
     X_WZone: RigidTransform
-    """The zone stands on the origin of this frame."""
+    """The zone's frame, with its origin at the middle of the zone's bottom."""
     size: tuple[float, float, float]
     """Extents of the zone along the axes of its frame, in metres."""
     p_BVolume: NDArray[np.float64] = field(repr=False)
@@ -216,11 +211,10 @@ def add_s(points: NDArray[np.float64], X_WGoal: RigidTransform, X_WActual: Rigid
     """The average distance for symmetric objects, equation 9 of the paper, in metres.
 
     The mean, over the model's points at the goal pose, of the distance to the *nearest* model point
-    at the actual pose: a rotation that maps the *points* onto themselves costs nothing, one that
-    maps the surface onto itself costs no more than the distance between neighbouring points.
+    at the actual pose. A rotation that maps the points onto themselves costs nothing.
 
-    It forgives much: a flat object that protrudes from its goal by h scores about h / 2, and a
-    reversed one may score less than the paper's threshold. See `Placement.strict_success`.
+    The measure is lenient: a flat object that protrudes by h scores about h / 2, and a reversed one
+    may pass the paper's threshold. See `Placement.strict_success`.
 
     Args:
         points: (m, 3) model points in the body frame.
@@ -239,7 +233,7 @@ def _add_s(
     X_WGoal: RigidTransform,
     X_WActual: RigidTransform,
 ) -> float:
-    # Distances do not depend on the frame: queried in the actual body frame, one tree serves all.
+    # Query in the actual body frame, so that one tree serves all poses.
     X_ActualGoal = X_WActual.InvertAndCompose(X_WGoal)
     goal_points = points @ X_ActualGoal.rotation().matrix().T + X_ActualGoal.translation()
     return float(tree.query(goal_points)[0].mean())
@@ -252,24 +246,22 @@ def evaluate_placements(
     poses: Sequence[RigidTransform],
     kept: Set[int] = frozenset(),
 ) -> list[Placement]:
-    """Assigns objects to the goals that they may fill, and measures how far from them they are.
+    """Assigns objects to goals and measures their errors.
 
-    The assignment is the one that fills most goals, by objects within 5 cm of them, and of those
-    the one of least displacement in all (Hungarian method): the mean distance of the corners of an
-    object's bounding box from where they belong. By displacement alone each object of a row in
-    place may be assigned to its neighbour's goal, where one more lies along the row.
+    The assignment (Hungarian method) fills as many goals as possible with objects within 5 cm of
+    them, then minimizes the total `displacement`. Minimizing displacement alone could assign each
+    object of a correct row to its neighbour's goal, if one more object lies along the row.
 
     Args:
         objects: n of them.
-        goals: what is to be brought about.
-        success: when a goal is filled.
+        goals: of the task.
+        success: decides when a goal is filled.
         poses: n, X_WB of each object.
-        kept: goals that those after them need not wait for, however things stand
-            (`complete_stages`).
+        kept: goals that count as filled in the prerequisites of others (`complete_stages`).
 
     Returns:
-        One for each object, in their order. An object without a goal has no errors, nor has one
-        whose pose is no number, as after a simulation that diverged.
+        One for each object, in order. The errors are infinite for an object without a goal, or
+        whose pose is not finite because the simulation diverged.
     """
     placements = [Placement() for _ in objects]
     for index, goal_index, pose_index in _assign(objects, goals, success, poses):
@@ -297,7 +289,7 @@ def _assign(
     poses: Sequence[RigidTransform],
 ) -> list[tuple[int, int, int]]:
     """(object, goal, pose) of each pair."""
-    # Pairs that are not allowed cost more than all that are.
+    # A forbidden pair costs more than any assignment of allowed pairs.
     cost = np.full((len(objects), len(goals)), 10.0 * _FAR * max(len(objects), 1))
     nearest = np.zeros(cost.shape, int)
     known = [np.isfinite(pose.GetAsMatrix34()).all() for pose in poses]
@@ -314,7 +306,7 @@ def _assign(
             cost[row, column] = min(distances[pose_index], _FAR)
             if len(goal.objects) > 1 and distances[pose_index] < _NEAR:
                 measured = _measure(objects[row], goal, column, pose_index, poses[row], success)
-                # A goal that is filled outweighs all displacements.
+                # Filling a goal outweighs all displacements.
                 cost[row, column] -= _FAR * len(objects) * measured.share
     # Import SciPy lazily.
     from scipy.optimize import linear_sum_assignment
@@ -329,16 +321,15 @@ def _assign(
 def displacement(
     item: PlacedObject, X_WGoal: RigidTransform, X_WB: RigidTransform, *, any_heading: bool = False
 ) -> float:
-    """The mean distance of the corners of an object's bounding box from where they belong.
+    """The mean distance of the corners of an object's bounding box from their goal, in metres.
+
+    It is the smallest over the rotations of the object's symmetry.
 
     Args:
         item: the object.
-        X_WGoal: where it belongs; its symmetry makes other poses as good.
-        X_WB: where it is.
-        any_heading: whether all its headings are as good.
-
-    Returns:
-        In metres, for the best of the poses that are as good.
+        X_WGoal: its goal pose.
+        X_WB: its actual pose.
+        any_heading: whether the goal accepts any heading.
     """
     here = X_WB.multiply(item.p_BCorners.T)
     order = _FREE_ANGLES if any_heading else item.symmetry
@@ -385,15 +376,14 @@ def _measure(
 def complete_stages(
     goals: Sequence[Goal], placements: Sequence[Placement], kept: Set[int] = frozenset()
 ) -> frozenset[int]:
-    """The goals that others come `after`, once all of those have been filled together.
+    """The goals that are prerequisites of others and were once all filled together.
 
-    As in the Ravens benchmark they are filled for good: the reward is not lost when the objects are
-    moved later.
+    As in the Ravens benchmark, their reward is kept even if the objects move later.
 
     Args:
         goals: of the task.
-        placements: as things stand, evaluated with `kept`.
-        kept: those that were complete before.
+        placements: the present ones, evaluated with `kept`.
+        kept: goals that were complete before.
     """
     filled = kept | {item.goal for item in placements if item.success}
     return frozenset(kept).union(*(goal.after for goal in goals if filled >= {*goal.after}))
@@ -406,8 +396,8 @@ def total_reward(
 
     Args:
         goals: of the task.
-        placements: as things stand, evaluated with `kept`.
-        kept: goals that count as filled however things stand (`complete_stages`).
+        placements: the present ones, evaluated with `kept`.
+        kept: goals that always count as filled (`complete_stages`).
     """
     shares = {item.goal: item.share for item in placements if item.goal is not None}
     shares |= dict.fromkeys(kept, 1.0)
@@ -415,7 +405,7 @@ def total_reward(
 
 
 def strict_reward(goals: Sequence[Goal], placements: Sequence[Placement]) -> float:
-    """The episode's score if only strict successes counted, 0 to 1."""
+    """The episode's score if only strict successes count, 0 to 1."""
     return math.fsum(
         goals[item.goal].reward
         for item in placements

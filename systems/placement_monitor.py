@@ -1,4 +1,4 @@
-"""Scores placements: which goals are filled, ADD-S, and the errors that explain it."""
+"""Scores placements: filled goals, ADD-S and pose errors."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from systems.weak_calc import weak_calc
 
 
 class PlacementMonitor(LeafSystem):
-    """Compares where objects are with where they belong.
+    """Compares the objects' poses with their goals.
 
     .. pydrake_system::
 
@@ -48,18 +48,17 @@ class PlacementMonitor(LeafSystem):
         - kept_goals
 
     - `body_poses` (abstract, list of RigidTransform by body index): the plant's port of that name.
-    - `mode` (1): the planner's port of that name. Where it is not connected, no goal is kept.
+    - `mode` (1): the planner's port of that name. If it is not connected, no goal is kept.
     - `placements` (abstract, list of n `Placement`): one for each object, by the law of
-      `evaluate_placements`: each object is assigned to the goal that it is nearest to filling.
-    - `reward` (1): the sum of the goals' rewards, each by the share of it that is earned.
+      `evaluate_placements`.
+    - `reward` (1): the sum of the goals' rewards, each multiplied by its earned share.
     - `success` (n): 1 for an object that fills a goal.
-    - `add_s` (n): equation 9, metres; infinite for an object that no goal is left for.
+    - `add_s` (n): equation 9, metres; infinite for an object without a goal.
     - `position_error`, `angle_error`, `height_error` (n): see `Placement`; metres, radians.
-    - `kept_goals` (one for each goal): 1 for those of a stage that was complete when an action was
-      begun. They count as filled for good (`complete_stages`).
+    - `kept_goals` (one for each goal): 1 for goals of a stage that was complete when an action
+      began. They count as filled from then on (`complete_stages`).
 
-    The goals that are kept, and the mode that was seen last, are discrete state. Everything else is
-    pulled.
+    State (discrete): the kept goals, and the last mode. Ports compute only on demand.
     """
 
     def __init__(
@@ -74,11 +73,11 @@ class PlacementMonitor(LeafSystem):
         Args:
             objects: n of them.
             goals: at least one.
-            success: when a goal is filled.
-            period: how often it looks at the mode, in s: the planner's.
+            success: decides when a goal is filled.
+            period: period of reading the mode, in s; use the planner's.
 
         Raises:
-            ValueError: no goals, a goal of no object or pose, or an object without points.
+            ValueError: no goals, a goal without object or pose, or an object without points.
         """
         super().__init__()
         if not goals:
@@ -119,11 +118,11 @@ class PlacementMonitor(LeafSystem):
         return self._goals
 
     def placements(self, context: Context) -> list[Placement]:
-        """The port `placements` in the given context (its own)."""
+        """Evaluates the port `placements` in this system's context."""
         return self._placements.Eval(context)
 
     def reward(self, context: Context) -> float:
-        """The port `reward` in the given context (its own)."""
+        """Evaluates the port `reward` in this system's context."""
         return float(self._reward.Eval(context)[0])
 
     def _kept(self, context: Context) -> frozenset[int]:

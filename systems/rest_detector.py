@@ -1,4 +1,4 @@
-"""Tells which objects rest out of reach of everything that moves, so that they can sleep."""
+"""Detects objects that rest out of reach of everything that moves, so that they can sleep."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -19,7 +19,7 @@ class Box:
 
     X_BBox: RigidTransform
     half_size: NDArray[np.float64]
-    """(3,) half of its sides, in metres."""
+    """(3,) half of the side lengths, in metres."""
 
 
 @dataclass(frozen=True)
@@ -31,24 +31,24 @@ class BoundedBody:
 
 
 class _Boxes:
-    """Boxes as arrays: k of them, fixed in frames."""
+    """k boxes, as arrays."""
 
     def __init__(self, boxes: Sequence[Box]) -> None:
         self.poses = np.array([box.X_BBox.GetAsMatrix34() for box in boxes])
         self.halves = np.array([box.half_size for box in boxes], float)
 
     def posed(self, X: NDArray[np.float64]) -> tuple[NDArray, NDArray, NDArray]:
-        """Rotations (k, 3, 3), centres (k, 3) and half sizes, for one frame or one frame each.
+        """Rotations (k, 3, 3), centres (k, 3) and half sizes (k, 3) of the posed boxes.
 
         Args:
-            X: (3, 4) or (k, 3, 4), the pose of the frame.
+            X: pose of the frame, (3, 4), or of each box's own, (k, 3, 4).
         """
         rotations = X[..., :3] @ self.poses[:, :, :3]
         centres = np.einsum("...ij,...j->...i", X[..., :3], self.poses[:, :, 3]) + X[..., 3]
         return rotations, centres, self.halves
 
     def enclosing(self) -> Box:
-        """One box around all, along the axes of the frame."""
+        """The box around all boxes, aligned with the frame."""
         reach = np.einsum("kij,kj->ki", np.abs(self.poses[:, :, :3]), self.halves)
         lower = (self.poses[:, :, 3] - reach).min(axis=0)
         upper = (self.poses[:, :, 3] + reach).max(axis=0)
@@ -58,9 +58,9 @@ class _Boxes:
 def _gaps(
     first: Sequence[NDArray[np.float64]], second: Sequence[NDArray[np.float64]]
 ) -> NDArray[np.float64]:
-    """(a, b) lower bounds of the distances of a boxes from b others, in metres.
+    """(a, b) lower bounds of the distances between a boxes and b others, in metres.
 
-    The widest gap along the six face normals of a pair.
+    The bound is the widest gap along the six face normals of a pair.
     """
     (R_i, centres_i, halves_i), (R_j, centres_j, halves_j) = first, second
     apart = centres_i[:, None] - centres_j[None]
@@ -73,7 +73,7 @@ def _gaps(
 
 
 class RestDetector(LeafSystem):
-    """Says which objects may be frozen without changing what happens.
+    """Detects which objects may be frozen without changing the simulation's outcome.
 
     .. pydrake_system::
 
@@ -86,14 +86,20 @@ class RestDetector(LeafSystem):
     - `body_poses`: the plant's port of this name.
     - `at_rest` (n): 1 for an object that is at rest, else 0, in the order of `objects`.
 
-    An object comes to rest when for `time_to_sleep` it has stayed within both tolerances of one
-    pose, and nothing that is not at rest, mover or object, is within `wake_distance` of it:
-    distances of the oriented boxes of their pieces, never more than the true ones. It is no longer
-    at rest as soon as something comes that near. Displacements are compared, not velocities: an
-    object that trembles in place, as on a step too long for its stiffness, goes nowhere. What is
-    out of the cell, `GONE` or more from the world's origin, is at rest at once: a free body that
-    spins on and on would overflow its quaternion in the end. The memory (discrete state) is the
-    pose that each object has stayed near, since when, in s, and whether it is at rest.
+    An object comes to rest if two conditions hold:
+
+    - For `time_to_sleep` it has stayed within both tolerances of one pose. Displacements are
+      compared, not velocities, because an object may tremble in place if the time step is too long
+      for its stiffness.
+    - No mover, and no object that is awake, is within `wake_distance` of it. Distances are those
+      of the oriented boxes around the collision geometry, which are lower bounds.
+
+    It wakes when something comes within `wake_distance`. An object that left the cell, `GONE` or
+    more from the world's origin, rests at once: a body that spins forever would overflow its
+    quaternion.
+
+    State (discrete): for each object the pose that it stays near, for how long it has (s), and
+    whether it rests.
     """
 
     def __init__(
@@ -109,14 +115,14 @@ class RestDetector(LeafSystem):
     ) -> None:
         """
         Args:
-            objects: what may come to rest; n of them.
-            movers: what never does: the links of the hand.
-            position_tolerance: of the body origin, in m.
+            objects: n bodies that may come to rest.
+            movers: bodies that never rest: the links of the hand.
+            position_tolerance: of the body's origin, in m.
             angle_tolerance: in rad.
             time_to_sleep: in s.
-            wake_distance: in m. What moves faster than this in a period may touch an object before
-                it wakes: for that long the object stands as firm as a rock.
-            period: how often to look, in s.
+            wake_distance: in m. A body that moves farther than this within one period may hit a
+                sleeping object, which stays fixed until the next update.
+            period: of the updates, in s.
         """
         super().__init__()
         self._count = len(objects)
@@ -125,13 +131,13 @@ class RestDetector(LeafSystem):
         self._pieces = [_Boxes(item.boxes) for item in bodies]
         self._wholes = _Boxes([pieces.enclosing() for pieces in self._pieces])
         self._position_tolerance = position_tolerance
-        # A rotation by an angle a differs from none by 2 sqrt(2) sin(a / 2) in Frobenius norm.
+        # R(a) differs from the identity by 2 sqrt(2) sin(a / 2) in Frobenius norm.
         self._rotation_tolerance = 2 * np.sqrt(2) * np.sin(angle_tolerance / 2)
         self._time_to_sleep = time_to_sleep
         self._wake_distance = wake_distance
         self._period = period
         self._poses = self.DeclareAbstractInputPort("body_poses", Value([RigidTransform()]))
-        # Nothing is near infinity: the first look finds every object elsewhere.
+        # Infinity makes the first update set every anchor.
         self._anchors = self.DeclareDiscreteState(np.full(12 * self._count, np.inf))
         self._still_for = self.DeclareDiscreteState(self._count)
         self._at_rest = self.DeclareDiscreteState(self._count)
@@ -139,7 +145,7 @@ class RestDetector(LeafSystem):
         self.DeclareStateOutputPort("at_rest", self._at_rest)
 
     def at_rest(self, context: Context) -> NDArray[np.bool_]:
-        """(n,) which objects are at rest in the given context (its own)."""
+        """(n,) which objects are at rest, in this system's context."""
         return context.get_discrete_state(self._at_rest).value() > 0.5
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> EventStatus:
@@ -163,20 +169,19 @@ class RestDetector(LeafSystem):
         return EventStatus.Succeeded()
 
     def _wake(self, X: NDArray[np.float64], resting: NDArray[np.bool_]) -> None:
-        """Clears what rests, and has something near it that does not.
+        """Clears `resting` of objects that have something awake near them.
 
         Args:
-            X: (bodies, 3, 4) X_WB of each.
-            resting: (n,) written.
+            X: (bodies, 3, 4) X_WB of each body.
+            resting: (n,) modified.
         """
         if not resting.any():
             return
         rotations, centres, halves = boxes = self._wholes.posed(X)
         reach = (np.abs(rotations) @ halves[:, :, None])[:, :, 0]
         lower, upper = centres - reach, centres + reach + self._wake_distance
-        # An awake object wakes its neighbours, and they theirs. That wholes are near is cheap to
-        # see, along the axes of the world cheapest; whether pieces are is looked at where it
-        # matters.
+        # An awake object wakes its neighbours, which wake theirs. Cheap tests come first: boxes
+        # aligned with the world, then boxes around bodies, then boxes around their pieces.
         waking = np.append(~resting, np.ones(len(self._bodies) - self._count, bool))
         while waking.any():
             i, j = np.flatnonzero(resting), np.flatnonzero(waking)
@@ -191,6 +196,6 @@ class RestDetector(LeafSystem):
                     resting[i[a]], waking[i[a]] = False, True
 
     def _are_near(self, X: NDArray[np.float64], i: int, j: int) -> bool:
-        """Whether pieces of two bodies are within the wake distance of each other."""
+        """Whether pieces of two bodies are within `wake_distance` of each other."""
         gaps = _gaps(self._pieces[i].posed(X[i]), self._pieces[j].posed(X[j]))
         return bool(gaps.min() < self._wake_distance)

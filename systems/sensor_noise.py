@@ -1,4 +1,4 @@
-"""The errors of a real RGB-D camera: noise, holes, and a calibration that is off."""
+"""The errors of a real RGB-D camera: noise, holes and calibration errors."""
 
 import dataclasses as dc
 import math
@@ -17,61 +17,60 @@ from systems.bounds import bounded
 from systems.weak_calc import weak_calc
 
 SHEEN_LABELS = 20000
-"""A render label of this plus a percentage is that of a surface of so much sheen."""
+"""Render label SHEEN_LABELS + p marks a surface whose sheen turns p percent of it into holes."""
 
 _RIG_STREAM, _CAMERA_STREAM, _DEPTH_STREAM = 14, 15, 16
-"""Random streams of a seed; those below are of scenes and of what else a cell draws. None is zero,
-for numpy takes [seed, 2, 0] for [seed, 2]."""
+"""Random streams of a seed; smaller numbers belong to scenes and other draws. Avoid zero: NumPy
+treats [seed, 2, 0] like [seed, 2]."""
 _TIME_RESOLUTION = 1e-6
-"""Images that are farther apart than this, in seconds, have noise of their own."""
+"""Images farther apart in time than this, in seconds, have independent noise."""
 _HOLE_RADIUS = 3.0
-"""Standard deviation of the smooth field whose highest parts are holes, in pixels."""
+"""Smoothing radius of the field whose highest parts become holes, in pixels."""
 _EDGE = 0.015
-"""Neighbouring depths that differ by more than this are an edge, in metres."""
+"""A difference between neighbouring depths above this is an edge, in metres."""
 
 
 @dc.dataclass
 class SensorNoiseParameters:
-    """The imperfections of the RGB-D cameras and of their calibration. All zero: none."""
+    """Imperfections of the RGB-D cameras and their calibration. All zero: perfect."""
 
-    # Standard deviation of the depth at 1 m, in m; it grows with the square of the depth, as that
-    # of a stereo camera does.
+    # Standard deviation of the depth at 1 m, in m; grows with the square of the depth, as for a
+    # stereo camera.
     depth_std: float = bounded(0.0, 0.0, 0.1)
 
-    # Neighbouring pixels err alike: standard deviation of the smoothing kernel, in pixels.
+    # Correlation length of the depth noise: radius of the smoothing kernel, in pixels.
     correlation: float = bounded(1.5, 0.0, 20.0)
 
-    # Depths come in steps: their size at 1 m, in m; it grows with the square of the depth.
+    # Quantization step of the depth at 1 m, in m; grows with the square of the depth.
     depth_step: float = bounded(0.0, 0.0, 0.1)
 
-    # The share of pixels beside an edge whose depth lies anywhere between both sides.
+    # Share of the pixels beside an edge that get a depth between its two sides.
     flying_share: float = bounded(0.0, 0.0, 1.0)
 
-    # The share of all pixels that are holes, without depth; a hole is some pixels wide.
+    # Share of the pixels that are holes, i.e. without depth.
     hole_share: float = bounded(0.0, 0.0, 0.9)
 
-    # A surface seen at more than this angle from its normal gives no depth, in degrees.
+    # Surfaces seen at more than this angle from their normal give no depth, in degrees.
     steepest_deg: float = bounded(90.0, 1.0, 90.0)
 
-    # So many images of what stands still are taken where one is asked for, and the median of each
-    # pixel's depths is kept, as one does at a bench. Their time, 33 ms each, is not simulated.
+    # Number of images per observation; each pixel gets their median depth. The time to take them,
+    # 33 ms each, is not simulated.
     frames: int = bounded(1, 1, 100)
 
-    # Standard deviation of the gain of each colour channel, as a share.
+    # Standard deviation of the relative gain of each colour channel.
     white_balance_std: float = bounded(0.0, 0.0, 1.0)
 
-    # By how much the pose that is believed of each camera is off, in m and degrees; in a direction
-    # drawn for each.
+    # Error of each camera's calibrated pose, in m and degrees, in a random direction.
     camera_position_error: float = bounded(0.0, 0.0, 0.1)
     camera_angle_error_deg: float = bounded(0.0, 0.0, 20.0)
 
-    # By how much all of them are off together, about the middle of the workspace.
+    # Error common to all cameras, about the middle of the workspace, in m and degrees.
     rig_position_error: float = bounded(0.0, 0.0, 0.1)
     rig_angle_error_deg: float = bounded(0.0, 0.0, 20.0)
 
     @property
     def is_none(self) -> bool:
-        """Whether nothing is changed."""
+        """Whether all imperfections are off."""
         return not any(
             (
                 self.depth_std,
@@ -89,7 +88,7 @@ class SensorNoiseParameters:
 
 
 class SensorNoise(LeafSystem):
-    """Stands between an RgbdSensor and what reads it, and makes its images imperfect.
+    """Adds the errors of a real camera to the outputs of an RgbdSensor.
 
     .. pydrake_system::
 
@@ -104,24 +103,22 @@ class SensorNoise(LeafSystem):
         - depth_image_32f
         - body_pose_in_world
 
-    The outputs are what the sensor's are, so that it can take their place. The law:
+    The outputs have the sensor's names and types, to replace it in a diagram. The law:
 
     - Depth z gets noise of standard deviation `depth_std (z / 1 m)^2`, smoothed over `correlation`
-      pixels and scaled back, and is rounded to multiples of `depth_step (z / 1 m)^2`.
-    - Beside an edge (a step of more than 15 mm within a pixel) a share `flying_share` of the pixels
-      gets a depth anywhere between the two sides.
-    - Holes, with depth 0 (Drake's too close): blobs over `hole_share` of the image; what is seen at
-      more than `steepest_deg` from its normal, outlines too, where depth jumps; and, where
-      `label_image` is connected, blobs over a share of the surfaces with sheen: of a label of
-      SHEEN_LABELS + p, p percent.
-    - Of `frames` such images, each with draws of its own, the median of the depths is kept.
-    - Each colour channel is multiplied by a gain, normally distributed about one.
-    - `body_pose_in_world` is the pose that calibration *believes*: `X_Rig X_WB X_Camera`, with
-      errors of the given size in directions drawn once. The images show the world from the true
-      pose.
+      pixels at constant variance, and is rounded to multiples of `depth_step (z / 1 m)^2`.
+    - Beside an edge (a step of more than 15 mm between neighbours), a share `flying_share` of the
+      pixels gets a depth between the two sides.
+    - Holes get depth 0 (Drake's too close). They are: blobs over `hole_share` of the image; blobs
+      over p percent of surfaces labelled SHEEN_LABELS + p, if `label_image` is connected; and
+      pixels seen at more than `steepest_deg` from the normal, outlines included.
+    - The output depth is the median of `frames` such images with independent noise.
+    - Each colour channel is multiplied by a normally distributed gain of mean one.
+    - `body_pose_in_world` is the *calibrated* pose, `X_Rig X_WB X_Camera`. Its errors have the
+      given sizes, in directions drawn once. The images are those of the true pose.
 
-    All is drawn from the seed, the camera's number and the time, to the microsecond: what is pulled
-    again is the same again, and there is no state.
+    All draws depend on the seed, the camera's number and the time (to the microsecond) only.
+    Stateless: evaluating twice gives the same images.
     """
 
     def __init__(
@@ -139,9 +136,9 @@ class SensorNoise(LeafSystem):
             parameters: of the noise.
             camera: the sensor's depth camera.
             seed: of all draws.
-            number: of the camera; the error of the rig does not depend on it.
-            workspace_middle: (x, y) in the world about which the rig is rotated, in metres.
-            use_labels: declare the input port `label_image`.
+            number: of the camera; the rig's error does not depend on it.
+            workspace_middle: (x, y) in the world about which the rig's error rotates, in metres.
+            use_labels: whether to declare the input port `label_image`.
         """
         super().__init__()
         self._parameters = parameters
@@ -234,14 +231,14 @@ def noisy_depth(
     random: np.random.Generator,
     sheen: NDArray[np.float32] | None = None,
 ) -> NDArray[np.float32]:
-    """A depth image as an imperfect camera sees it; see `SensorNoise` for the law.
+    """Adds noise and holes to a depth image; see `SensorNoise` for the law.
 
     Args:
-        depth: (height, width), in metres; 0 and infinity are no depth.
+        depth: (height, width), in metres; 0 and infinity are invalid.
         parameters: of the noise.
         camera: its intrinsics.
         random: for all draws.
-        sheen: (height, width), the share of holes on each surface, if there is any sheen.
+        sheen: (height, width) share of holes on each surface; None for no sheen.
     """
     seen = np.isfinite(depth) & (depth > 0)
     z = np.where(seen, depth, 1.0).astype(np.float32)
@@ -253,7 +250,7 @@ def noisy_depth(
         hole |= _incidence(z, seen, camera) < math.cos(math.radians(parameters.steepest_deg))
     noisy = z
     if parameters.flying_share:
-        # Where there is no depth there is no other side for a pixel to fly to.
+        # A pixel without a valid neighbour has no other side to mix with.
         low, high = (
             np.where(seen, extreme(np.where(seen, z, none), 3), z)
             for extreme, none in (
@@ -285,34 +282,34 @@ def noisy_depth(
 def _incidence(
     z: NDArray[np.float32], seen: NDArray[np.bool_], camera: CameraInfo
 ) -> NDArray[np.float32]:
-    """(height, width): the cosine of the angle between each pixel's ray and the surface's normal;
-    not a number beside pixels without depth.
+    """(height, width) cosine of the angle between each pixel's ray and the surface's normal; NaN
+    beside pixels without depth.
 
     Args:
         z: (height, width), depths in metres.
-        seen: (height, width), where there is one.
+        seen: (height, width), where the depth is valid.
         camera: its intrinsics.
     """
-    # A pixel's middle is half a pixel from where it begins, as in `heightmap.py`.
+    # Pixel centres are at half-integers, as in `heightmap.py`.
     columns, rows = np.arange(z.shape[1]) + 0.5, np.arange(z.shape[0]) + 0.5
     x = ((columns - camera.center_x()) / camera.focal_x()).astype(np.float32)
     y = ((rows - camera.center_y()) / camera.focal_y()).astype(np.float32)[:, None]
     by_row, by_col = np.gradient(np.where(seen, z, np.float32(np.nan)))
     along_x, along_y = by_col * np.float32(camera.focal_x()), by_row * np.float32(camera.focal_y())
-    # Of the surface z (x, y, 1) the normal is (-dz/dx, -dz/dy, z + x dz/dx + y dz/dy), and its
-    # product with the ray (x, y, 1) is z.
+    # The surface z (x, y, 1) has the normal (-dz/dx, -dz/dy, z + x dz/dx + y dz/dy). Its product
+    # with the ray (x, y, 1) is z.
     normal = np.sqrt(along_x**2 + along_y**2 + (z + x * along_x + y * along_y) ** 2)
     return z / (normal * np.sqrt(x**2 + y**2 + 1))
 
 
 def median_depth(frames: Sequence[NDArray[np.float32]]) -> NDArray[np.float32]:
-    """The median over some images of each pixel's depth, in those that have one there.
+    """The median of each pixel's valid depths over some images.
 
     Args:
-        frames: (height, width) each, in metres; 0 and infinity are no depth.
+        frames: (height, width) each, in metres; 0 and infinity are invalid.
 
     Returns:
-        (height, width); where none has a depth, what the first one has.
+        (height, width); a pixel that is never valid keeps its value in the first image.
     """
     stack = np.stack(frames)
     stack[~(np.isfinite(stack) & (stack > 0))] = np.nan
@@ -326,7 +323,7 @@ def median_depth(frames: Sequence[NDArray[np.float32]]) -> NDArray[np.float32]:
 def _unit_field(
     random: np.random.Generator, shape: tuple[int, ...], radius: float
 ) -> NDArray[np.float32]:
-    """Normally distributed values of unit variance, smoothed over some pixels."""
+    """Normally distributed values of unit variance, smoothed by a Gaussian."""
     values = random.standard_normal(shape, dtype=np.float32)
     if radius <= 0:
         return values
@@ -338,7 +335,7 @@ def _unit_field(
 
 
 def _upper_quantile(share: NDArray[np.float32]) -> NDArray[np.float32]:
-    """The value that a share of normally distributed values exceeds."""
+    """The value that a share of standard normal values exceeds."""
     # Import SciPy lazily.
     from scipy.special import ndtri
 
@@ -346,7 +343,7 @@ def _upper_quantile(share: NDArray[np.float32]) -> NDArray[np.float32]:
 
 
 def _pose_error(random: np.random.Generator, distance: float, angle_deg: float) -> RigidTransform:
-    """A shift and a rotation of the given size, each in a random direction."""
+    """A translation and a rotation of the given sizes, in random directions."""
     shift, axis = random.standard_normal(3), random.standard_normal(3)
     axis /= np.linalg.norm(axis)
     half = math.radians(angle_deg) / 2

@@ -1,6 +1,6 @@
-"""The values that travel on the wires of the kitting cell.
+"""The values that flow between the systems of the kitting cell.
 
-Plain data: no pydrake here, so that policies can be trained where Drake is not installed.
+This module does not need pydrake, so that policies can be trained without Drake.
 """
 
 from __future__ import annotations
@@ -14,12 +14,12 @@ from numpy.typing import ArrayLike, NDArray
 
 @dataclass(frozen=True)
 class PixelGrid:
-    """The orthographic pixel grid over the workspace; nothing else converts pixels to metres.
+    """The orthographic pixel grid over the workspace. Only this class converts pixels to metres.
 
-    Row `i` runs along world +x and column `j` along world +y, so that an image shown with row 0 on
-    top is the workspace seen from above, not mirrored: a counter-clockwise turn about +z is a
-    counter-clockwise turn of the picture. Whole numbers are pixel *centres*: pixel (0, 0) covers
-    half a pixel around its centre at `x_min + resolution/2, y_min + resolution/2`.
+    Row `i` runs along world +x and column `j` along world +y. Shown with row 0 on top, an image is
+    the workspace seen from above, not mirrored: a counter-clockwise rotation about +z is a
+    counter-clockwise rotation of the picture. Whole numbers are pixel *centres*: that of pixel
+    (0, 0) is at `x_min + resolution/2, y_min + resolution/2`.
 
     The defaults are the workspace of Ravens and of the paper's simulation (section IV-B.4).
     """
@@ -35,15 +35,15 @@ class PixelGrid:
     cols: int = 320
     """Pixels along y."""
     z_min: float = 0.0
-    """Height that reads as zero, in metres above the world origin."""
+    """World height that reads as zero, in metres."""
     z_max: float = 0.28
-    """Points above this height are left out of the heightmap, in metres."""
+    """Points above this world height are dropped, in metres."""
 
     def __post_init__(self) -> None:
         if self.rows < 1 or self.cols < 1 or self.resolution <= 0:
-            raise ValueError("a pixel grid needs at least one pixel of positive size")
+            raise ValueError("rows, cols and resolution of a pixel grid must be positive")
         if self.z_max <= self.z_min:
-            raise ValueError("a pixel grid needs z_max above z_min")
+            raise ValueError("z_max of a pixel grid must be above z_min")
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -66,12 +66,12 @@ class PixelGrid:
         return offset / self.resolution - 0.5
 
     def to_world(self, pixel: ArrayLike) -> NDArray[np.float64]:
-        """World (x, y) in metres of continuous (row, col) coordinates (..., 2)."""
+        """World (x, y) in metres of continuous pixel coordinates (row, col), (..., 2)."""
         offset = (np.asarray(pixel, dtype=float) + 0.5) * self.resolution
         return offset + np.array([self.x_min, self.y_min])
 
     def contains(self, xy: ArrayLike) -> NDArray[np.bool_]:
-        """Which of the world points (..., 2) fall on the grid."""
+        """Whether each of the world points (..., 2) is on the grid."""
         row, col = np.moveaxis(self.to_pixel(xy), -1, 0)
         inside = (row >= -0.5) & (row < self.rows - 0.5) & (col >= -0.5) & (col < self.cols - 0.5)
         return np.asarray(inside)
@@ -83,11 +83,10 @@ class Observation:
 
     image: NDArray[np.float32] = field(default_factory=lambda: np.zeros((4, 160, 320), np.float32))
     """(4, rows, cols): red, green, blue in [0, 1], and height above `grid.z_min` in metres.
-    A pixel that no camera sees is zero in all four."""
+    Unseen pixels are zero in all four channels."""
     grid: PixelGrid = field(default_factory=PixelGrid)
     valid: NDArray[np.bool_] = None  # type: ignore[assignment]
-    """(rows, cols): the pixels that some camera sees. Where it is not given, those that are not
-    zero in all four."""
+    """(rows, cols): pixels seen by some camera. Default: the pixels with a non-zero channel."""
 
     def __post_init__(self) -> None:
         if self.valid is None:
@@ -105,14 +104,14 @@ class Observation:
 
 
 def fill_unseen(height: NDArray[np.float32], valid: NDArray[np.bool_]) -> NDArray[np.float32]:
-    """Heights with the pixels that no camera saw filled in from around them.
+    """Fills the heights of unseen pixels from their neighbours.
 
-    What is hidden is hidden by something higher: a hole takes the lowest of its neighbours, from
-    its border inwards.
+    A hidden surface is lower than what hides it, so a hole is filled with the lowest neighbour,
+    from its border inwards.
 
     Args:
         height: (rows, cols).
-        valid: (rows, cols), where it was seen.
+        valid: (rows, cols), where the height was seen.
     """
     if valid.all() or not valid.any():
         return height
@@ -134,7 +133,7 @@ def fill_unseen(height: NDArray[np.float32], valid: NDArray[np.bool_]) -> NDArra
 class PlanarPose:
     """A pose of the gripper in SE(2), pointing straight down.
 
-    Theta turns the hand about world +z, counter-clockwise; at zero the jaws close along world y.
+    Theta rotates the hand about world +z, counter-clockwise; at zero the jaws close along world y.
     """
 
     x: float = 0.0
@@ -151,51 +150,51 @@ class PlanarPose:
 
 @dataclass(frozen=True)
 class SurfaceHeights:
-    """The heights that a motion between pick and place must respect, in metres in the world.
+    """Heights of surfaces that limit the motion of a pick and place, in metres in the world.
 
     `systems.surface_heights.read_surface_heights` reads them off o_t, for every policy.
     """
 
     pick_top: float = 0.0
-    """The top of what lies under the pick."""
+    """The object's top at the pick."""
     support: float = 0.0
-    """The top of what that stands on."""
+    """The surface that the object stands on."""
     place_rim: float = 0.0
-    """The highest surface around the place: the rim of a cavity, if there is one."""
+    """The highest surface around the place, e.g. the rim of a cavity."""
     place_floor: float = 0.0
-    """The lowest surface at the place: on it an object there will stand."""
+    """The lowest surface at the place, on which the object will stand."""
     near_pick: float = 0.0
-    """The highest surface that open jaws over the pick are above."""
+    """The highest surface below the open jaws at the pick."""
     near_place: float = 0.0
-    """The highest surface that an object over its place is above."""
+    """The highest surface below the held object at the place."""
     highest: float = 0.0
-    """The highest surface of the workspace."""
+    """The highest surface in the workspace."""
     table: float = 0.0
-    """The table, below which nothing goes."""
+    """The table; nothing goes below it."""
     doubt: float = 0.0
-    """How far these heights may be off each other; zero where o_t has neither noise nor tilt."""
+    """Uncertainty of the differences of these heights; zero if o_t has neither noise nor tilt."""
 
 
 @dataclass(frozen=True)
 class PickPlaceAction:
-    """One pick and one place: a_pick and a_place of the paper (section III-A), both in SE(2).
+    """A pick and a place: a_pick and a_place of the paper (section III-A), both in SE(2).
 
-    The held object turns by `place.theta - pick.theta`. Turning both by pi is the same action, as
-    the jaws are alike.
+    The held object rotates by `place.theta - pick.theta`. Adding pi to both angles gives the same
+    action, because the jaws are symmetric.
     """
 
     pick: PlanarPose = field(default_factory=PlanarPose)
     place: PlanarPose = field(default_factory=PlanarPose)
     stop: bool = False
-    """True: there is nothing left to do, and the poses mean nothing."""
+    """True: the task is finished, and the poses are ignored."""
     press: bool = False
-    """True: push down at the pick with closed jaws, and nothing else; the place means nothing."""
+    """True: only push down at the pick with closed jaws; the place is ignored."""
     heights: SurfaceHeights | None = None
-    """None: the planner reads them off its own o_t."""
+    """None: the planner reads the heights off its own o_t."""
 
     @property
     def poses(self) -> dict[str, PlanarPose]:
-        """Those that mean something, by their names."""
+        """The poses in use, by name."""
         if self.stop:
             return {}
         return {"pick": self.pick} if self.press else {"pick": self.pick, "place": self.place}

@@ -1,4 +1,4 @@
-"""Reads off o_t the heights that a motion between pick and place must respect: the only place."""
+"""Reads off o_t the surface heights that limit the motion of a pick and place."""
 
 from typing import Any
 
@@ -8,64 +8,61 @@ from numpy.typing import NDArray
 from systems.signals import Observation, PlanarPose, SurfaceHeights, fill_unseen
 
 _PICK_REACH = 1
-"""How far around the pick pixel its top is looked for, in pixels."""
+"""Radius around the pick that is searched for the object's top, in pixels."""
 _RIM_REACH = 0.025
-"""How far around the place its rim is looked for, in metres."""
+"""Radius around the place that is searched for a rim, in metres."""
 _FLOOR_REACH = 2
-"""How far around the place pixel its floor is looked for, in pixels."""
+"""Radius around the place that is searched for its floor, in pixels."""
 _PICK_CLEARANCE_REACH = 0.07
-"""How far around the pick the open jaws must clear what is there, in metres."""
+"""Radius around the pick that the open jaws sweep, in metres."""
 _PLACE_CLEARANCE_REACH = 0.125
-"""How far around the place what is held must clear what is there, in metres."""
+"""Radius around the place that the held object sweeps, in metres."""
 _SUPPORT_REACH = 0.08
-"""How far around the pick what it stands on is looked for, in metres."""
+"""Radius around the pick that is searched for the object's support, in metres."""
 _SUPPORT_SHARE = 10.0
-"""The percentile of the heights around a pick that is taken for its support's."""
+"""Percentile of the heights around a pick that estimates the support's height."""
 _TABLE_SHARE = 5.0
-"""The percentile of all heights that is taken for the table's."""
+"""Percentile of all heights that estimates the table's height."""
 _CLEAN = 0.0003
-"""A standard deviation of less is no noise, in metres."""
+"""A smaller standard deviation counts as no noise, in metres."""
 _SMOOTHED = 9
-"""Noise is what departs from the mean over so many pixels, along rows and columns."""
+"""Noise is the deviation from the mean over a square of so many pixels."""
 _FLAT = 0.012
-"""Where the heights of these differ by more there are edges, which are no noise, in metres."""
+"""Squares with a larger range of heights contain edges and are not flat, in metres."""
 _NOISY_RIM_SHARE, _NOISY_RIM_BIAS = 90.0, 1.0
-"""Some two thirds of the pixels around a place are its rim: the percentile of all that is so many
-standard deviations above the middle of these."""
+"""Percentile of the heights around a place that estimates its rim's height, and its bias in
+standard deviations. About two thirds of these pixels belong to the rim."""
 _NOISY_FLOOR_SHARE, _NOISY_FLOOR_BIAS = 25.0, -0.67
-"""The percentile of the heights at a place that is taken for its floor's, and how many standard
-deviations it is above their middle."""
+"""Percentile of the heights at a place that estimates its floor's height, and its bias in standard
+deviations."""
 _TABLE_BAND = 0.008
-"""Pixels within this of the table's height belong to it, however it is tilted, in metres."""
+"""Pixels within this height difference may belong to the table, if tilted, in metres."""
 _LEAST_TABLE, _FITS = 500, 3
 _LEVEL = 0.0003
-"""A table that is nowhere off by more than this is level, in metres."""
+"""A table with smaller deviations counts as level, in metres."""
 _MOST_OFF = 0.008
-"""One that is off by more is where it is, in metres."""
+"""An offset above this is the table's true height and no calibration error, in metres."""
 _TILT_DOUBT, _MOST_DOUBT = 0.3, 0.0025
-"""Heights may be off by this share of what the table was, and by at most this, in metres."""
+"""Uncertainty after levelling: this share of the table's deviation, limited to this, in metres."""
 
 
 def read_surface_heights(
     observation: Observation, pick: PlanarPose, place: PlanarPose
 ) -> SurfaceHeights:
-    """The heights around a pick and a place, from o_t alone.
+    """The surface heights around a pick and a place, from o_t alone.
 
-    What no camera sees is taken to be as high as what is around it (`fill_unseen`).
-
-    The support of an object is the height that a tenth of the pixels around it do not exceed; so
-    an object in the middle of others is taken to stand on what they stand on.
-
-    Tops are the highest of some pixels, and the floor of a place is the lowest of those that are
-    seen. Where o_t is noisy that would be the noise: then they are medians and percentiles,
-    corrected by what these are off in such noise. The table is level and at the bottom of the grid:
-    that it is tilted or higher in o_t is an error of calibration, and is taken away. Neither is
-    done where there is nothing to correct.
+    - Unseen pixels are filled from their neighbours (`fill_unseen`).
+    - An object's support is a low percentile of the heights around it. An object in the middle of
+      others is thus assumed to stand on the same surface.
+    - Tops are maxima over a few pixels; the floor of a place is the minimum over the seen ones. If
+      o_t is noisy, they are medians and percentiles instead, corrected for their bias.
+    - The table is assumed to be level and at the bottom of the grid. A small tilt or offset in o_t
+      is a calibration error and is subtracted.
 
     Args:
         observation: o_t.
         pick: of the gripper, in the world.
-        place: of the gripper, in the world. One off the grid has heights of zero.
+        place: of the gripper, in the world. Off the grid, its heights are zero.
     """
     grid = observation.grid
     reach = {
@@ -85,7 +82,7 @@ def read_surface_heights(
     top = top[seen] if seen.any() else top
     support = _percentile(around_pick, _SUPPORT_SHARE)
     table = _percentile(height, _TABLE_SHARE)
-    # Where nothing is seen of it, the floor is the table's.
+    # If no pixel of the floor is seen, assume the table's height.
     seen = _around(observation.valid, at_place, _FLOOR_REACH)
     floor = _around(height, at_place, _FLOOR_REACH)[seen] if seen.any() else np.zeros(1, np.float32)
     if noise:
@@ -114,8 +111,8 @@ def _percentile(values: NDArray[np.float32], share: float) -> float:
 
 
 def _level(height: NDArray[np.float32]) -> tuple[NDArray[np.float32], float, float]:
-    """Heights (rows, cols) above the table as it is, the standard deviation of their noise, and
-    what they may still be off; the same heights and zeros where there is nothing to correct."""
+    """Heights (rows, cols) above the levelled table, standard deviation of their noise, and their
+    remaining uncertainty."""
     noise = _noise(height)
     table = _table(height, noise)
     largest = float(np.abs(table).max())
@@ -126,14 +123,14 @@ def _level(height: NDArray[np.float32]) -> tuple[NDArray[np.float32], float, flo
 
 
 def _noise(height: NDArray[np.float32]) -> float:
-    """The standard deviation of the noise of heights (rows, cols); 0 where there is none."""
+    """The standard deviation of the noise of heights (rows, cols); 0 if there is none."""
     # Import SciPy lazily.
     from scipy import ndimage
 
     away = np.abs(height - ndimage.uniform_filter(height, _SMOOTHED, mode="nearest"))
     highest = ndimage.maximum_filter(height, _SMOOTHED, mode="nearest")
     flat = highest - ndimage.minimum_filter(height, _SMOOTHED, mode="nearest") < _FLAT
-    # Of flat places alone the calmest would be taken: they tell only whether there is noise.
+    # Flat squares are a biased sample (the calmest), so they only decide whether there is noise.
     if flat.sum() >= _LEAST_TABLE and 1.4826 * np.median(away[flat]) < _CLEAN:
         return 0.0
     noise = 1.4826 * float(np.median(away))
@@ -141,7 +138,7 @@ def _noise(height: NDArray[np.float32]) -> float:
 
 
 def _table(height: NDArray[np.float32], noise: float) -> NDArray[np.float64]:
-    """(rows, cols): the plane of the table, as o_t shows it; zero if it shows none near zero."""
+    """(rows, cols) the table's plane in o_t; zero if no table is found near zero."""
     start = np.percentile(height, _TABLE_SHARE) + noise
     rows, cols = (axis - axis.mean() for axis in np.indices(height.shape, np.float64))
     tilt = np.zeros(height.shape)
@@ -154,12 +151,12 @@ def _table(height: NDArray[np.float32], noise: float) -> NDArray[np.float64]:
         tilt = rows * plane[0] + cols * plane[1]
         near = np.abs(height - tilt - plane[2]) < _TABLE_BAND / 2 + 2 * noise
     level = float(np.median((height - tilt)[near])) if near.any() else 0.0
-    # A grid that begins well below the table is no error of calibration.
+    # A large offset is no calibration error: the grid begins below the table.
     return tilt + level if level < _MOST_OFF else tilt
 
 
 def _around(values: NDArray[Any], pixel: NDArray[np.float64], reach: int) -> NDArray[Any]:
-    """The values (rows, cols) within `reach` pixels, along both, of a position (row, col)."""
+    """The values (rows, cols) in a square of `reach` pixels around a position (row, col)."""
     row, col = np.rint(pixel).astype(int)
     rows = slice(max(row - reach, 0), max(row + reach + 1, 0))
     cols = slice(max(col - reach, 0), max(col + reach + 1, 0))

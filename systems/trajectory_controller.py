@@ -1,4 +1,4 @@
-"""Drives the Franka hand along a desired motion: feedback, feed-forward, gravity, force limits."""
+"""Controls the Franka hand along a desired motion."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ FINGERS = 2
 
 
 class TrajectoryController(LeafSystem):
-    r"""Turns a desired hand motion and jaw opening into generalized forces.
+    r"""Computes generalized forces from a desired hand motion and jaw opening.
 
     .. pydrake_system::
 
@@ -29,22 +29,22 @@ class TrajectoryController(LeafSystem):
       m, rad, m/s, rad/s: the state of the hand's model instance.
     - `desired_motion` (12): q_d, v_d, a_d of (x, y, z, yaw).
     - `desired_opening` (2): opening w_d between the pads in m, and its rate in m/s.
-    - `closing_force` (1): f, how hard each pad shall press *in addition to* what holding the
-      opening takes, in N; zero when left open.
+    - `closing_force` (1): f, the force of each pad *in addition to* the force that holds the
+      opening, in N; zero if not connected.
     - `actuation` (6): forces on the four axes and the two fingers, in N and N m.
 
-    The law of the axes is computed-torque control of a body whose axes do not couple,
+    The axes follow computed-torque control of a body with decoupled axes,
 
         u = clip(M a_d + g + k_p (q_d - q) + k_d (v_d - v), -u_max, u_max),
 
-    with M the effective inertia of each axis and g the hand's own weight on z. What the hand
-    carries is unknown to it and shows as a sag of payload weight / k_p.
+    with M the effective inertia of each axis and g the hand's own weight on z. The payload is
+    unknown and causes a sag of payload weight / k_p.
 
     The fingers (q_L, q_R; opening w = q_L + q_R, closed at zero) follow
 
         u_finger = clip(k_w (w_d - w)/2 + d_w (w_d' - w')/2 - f, -f_max, f_max)
 
-    each, the centring of the pair being left to the plant's mimic constraint.
+    each. The plant's mimic constraint centres the pair.
 
     Stateless.
     """
@@ -74,7 +74,7 @@ class TrajectoryController(LeafSystem):
             finger_force_limit: f_max of each finger, in N.
 
         Raises:
-            ValueError: an array of the wrong size, or a limit that is not positive.
+            ValueError: an array has the wrong size, or a limit is not positive.
         """
         super().__init__()
         for name, value in {
@@ -87,7 +87,7 @@ class TrajectoryController(LeafSystem):
                 raise ValueError(f"{name} must hold {HAND_AXES} numbers, not {np.shape(value)}")
         if np.any(np.asarray(force_limit) <= 0) or finger_force_limit <= 0:
             raise ValueError("force limits must be positive")
-        # Of each axis: inertia, weight, stiffness, damping and limit of the force.
+        # For each axis: inertia, weight, stiffness, damping, force limit.
         self._axes = [
             tuple(map(float, axis))
             for axis in zip(
@@ -105,7 +105,7 @@ class TrajectoryController(LeafSystem):
         self.DeclareVectorOutputPort("actuation", HAND_AXES + FINGERS, self._calc_actuation)
 
     def _calc_actuation(self, context: Context, output: BasicVector) -> None:
-        # Plain numbers: this runs at every step, and arrays of four cost more than they save.
+        # Plain floats: this runs at every step, and NumPy is slower for four elements.
         state = self._hand_state.Eval(context).tolist()
         desired = self._desired_motion.Eval(context).tolist()
         forces = []

@@ -1,4 +1,4 @@
-"""Named, typed fields of a state vector: `pydrake`'s `namedview` for type checkers."""
+"""Named, typed fields of a state vector, like pydrake's `namedview` but for type checkers."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class Number:
 
 
 class Array:
-    """A field of several elements, read as a view that may be written."""
+    """A field of several elements; reading it returns a writable view."""
 
     def __init__(self, size: int) -> None:
         self.index, self.size = 0, size
@@ -45,7 +45,7 @@ class Array:
 
 
 class VectorView:
-    """A view on a vector of numbers; a subclass lists its fields, in the order of the elements.
+    """A view of a vector. A subclass declares its fields in the order of the elements:
 
     class HandState(VectorView):
         position = Array(4)
@@ -55,7 +55,7 @@ class VectorView:
     """
 
     size = 0
-    """How many elements the vector has."""
+    """Number of elements of the vector."""
 
     def __init_subclass__(cls) -> None:
         cls.size = 0
@@ -67,6 +67,6 @@ class VectorView:
     def __init__(self, vector: NDArray[np.float64]) -> None:
         """
         Args:
-            vector: (size,) the elements; writing a field writes them.
+            vector: (size,) the elements; writing a field modifies them.
         """
         self.vector = vector

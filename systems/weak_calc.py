@@ -9,11 +9,11 @@ from pydrake.systems.framework import Context
 
 
 def weak_calc(method: Callable[..., None], *first: Any) -> Callable[[Context, AbstractValue], None]:
-    """The `calc` of an abstract output port, from a method of the system that declares it.
+    """Returns the `calc` callback of an abstract output port, with a weak reference to its system.
 
-    Drake holds the callback of an abstract output port where Python's garbage collector does not
-    see it: one that holds its system, as a bound method does, keeps it in memory for good, and with
-    it the Diagram, its plant and its render engines. (Drake 1.51 keeps them in any case.)
+    Python's garbage collector cannot see the callbacks that Drake holds. A bound method would
+    therefore keep its system alive forever, and with it the Diagram, plant and render engines.
+    (Drake 1.51 keeps them alive in any case.)
 
     Args:
         method: a bound method that takes `first`, a Context and the output's value.
@@ -23,7 +23,7 @@ def weak_calc(method: Callable[..., None], *first: Any) -> Callable[[Context, Ab
 
     def calc(context: Context, output: AbstractValue) -> None:
         bound = reference()
-        assert bound is not None, "a system is there as long as its ports are"
+        assert bound is not None, "the system outlives its ports"
         bound(*first, context, output)
 
     return calc

@@ -1,1 +1,1 @@
-"""Shared by the whole application: files, processes, errors, paths, command lines."""
+"""Shared code: files, processes, errors, paths, command lines."""

@@ -1,4 +1,4 @@
-"""Folders of files that can be made again: they appear atomically, and the oldest are removed."""
+"""A cache of folders that can be recreated. They appear atomically; the oldest are removed."""
 
 import contextlib
 import os
@@ -11,29 +11,29 @@ from pathlib import Path
 from kitting_drake.common.errors import MachineError
 
 KEPT_ENTRIES = 1000
-"""The number of folders that `prune` leaves."""
+"""Number of folders that `prune` keeps."""
 
 YOUNGEST_REMOVED = 3600.0
-"""The age in seconds below which `prune` removes nothing: a running process may need it."""
+"""`prune` removes no folder younger than this, in seconds: a running process may need it."""
 
 _SCRATCH = ".making-"
 
 
 def cached_folder(final: Path, files: Sequence[str], write: Callable[[Path], object]) -> Path:
-    """A folder from the cache, made there if it is missing or damaged.
+    """Returns a folder of the cache, after creating it if it is missing or damaged.
 
-    The folder appears atomically, and two processes that make the same one do not disturb each
-    other. Every use renews its modification time, by which `prune` chooses what to keep.
+    The folder appears atomically, so several processes may create it at once. Every use renews its
+    modification time, by which `prune` chooses.
 
     Args:
-        final: the folder. Its name has to identify its content.
-        files: the names of the files that it holds.
-        write: writes them into an empty folder.
+        final: the folder. Its name must identify its content.
+        files: the names of the files in it.
+        write: writes the files into an empty folder.
 
     Raises:
-        MachineError: the cache cannot be written.
+        MachineError: the cache is not writable.
     """
-    # Renewed before it is looked at, so that it is not removed in between.
+    # Renew it first, so that another process does not remove it in between.
     with contextlib.suppress(OSError):
         os.utime(final)
     if _is_complete(final, files):
@@ -45,11 +45,11 @@ def cached_folder(final: Path, files: Sequence[str], write: Callable[[Path], obj
             scratch.mkdir()
             write(scratch)
             if final.exists() and not _is_complete(final, files):
-                # A machine that lost power may have left names without content.
+                # After a power failure files may be empty.
                 os.rename(final, Path(folder) / "damaged")
             os.rename(scratch, final)
     except OSError as error:
-        # Another process may have been quicker: its folder is the same.
+        # Another process may have created the same folder meanwhile.
         if not _is_complete(final, files):
             raise MachineError(f"cannot write to {final.parent}: {error.strerror}") from error
     prune(final.parent)
@@ -62,14 +62,14 @@ def _is_complete(folder: Path, files: Sequence[str]) -> bool:
 
 
 def prune(parent: Path) -> None:
-    """Removes the folders in `parent` that were used longest ago.
+    """Removes the least recently used folders in `parent`.
 
-    The newest `KEPT_ENTRIES` stay, and so does everything younger than `YOUNGEST_REMOVED`. Scratch
-    folders of processes that were killed are removed at the same age.
+    It keeps the newest `KEPT_ENTRIES` and all younger than `YOUNGEST_REMOVED`. Scratch folders of
+    killed processes are removed at the same age.
     """
     entries: list[tuple[float, Path]] = []
     for path in parent.iterdir():
-        # Another process may remove it meanwhile.
+        # Another process may remove the folder meanwhile.
         with contextlib.suppress(OSError):
             entries.append((path.stat().st_mtime, path))
     scratch = [path for _, path in entries if path.name.startswith(_SCRATCH)]
@@ -78,7 +78,7 @@ def prune(parent: Path) -> None:
     for path in [*(path for _, path in kept[KEPT_ENTRIES:]), *scratch]:
         with contextlib.suppress(OSError):
             if time.time() - path.stat().st_mtime > YOUNGEST_REMOVED:
-                # Moved away first, so that nobody finds half of it.
+                # Move it away first, so that no process finds it half deleted.
                 with tempfile.TemporaryDirectory(dir=parent, prefix=_SCRATCH) as folder:
                     os.rename(path, Path(folder) / "removed")
                     shutil.rmtree(Path(folder) / "removed", ignore_errors=True)

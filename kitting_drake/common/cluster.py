@@ -1,4 +1,4 @@
-"""A Ray cluster as `Workers`. Ray is needed here alone, and only when it is asked for."""
+"""`Workers` on a Ray cluster. Only this module needs Ray."""
 
 import importlib
 import logging
@@ -22,31 +22,31 @@ from kitting_drake.common.provenance import versions
 _Result = TypeVar("_Result")
 
 _RETRIES = 5
-"""How often a call is begun again when its node, or its worker there, dies."""
+"""How often a call is retried if its node or worker dies."""
 
 _PATIENCE = 5.0
-"""How long to wait for an answer from the cluster's address, in s."""
+"""Timeout for connecting to the cluster's address, in s."""
 
 
 @dataclass(frozen=True)
 class _Unfit:
-    """The answer of a node that cannot do the work."""
+    """The result of a call on a node that lacks something."""
 
     reason: str
 
 
 class RayWorkers:
-    """The CPUs of a Ray cluster, as `Workers`; to be used in a `with`.
+    """The CPUs of a Ray cluster, as `Workers`. Use it in a `with` statement.
 
-    A call occupies one CPU. There it runs in a fresh process, as it would here; when its node
-    dies, it runs again on another. Results come back to this process, which alone writes files.
+    A call occupies one CPU and runs in a fresh process. If its node dies, it is retried on another.
+    Only this process writes files.
     """
 
     def __init__(self, address: str, runtime_env: dict[str, Any]) -> None:
         """
         Args:
             address: `auto`, `HOST:PORT` or `ray://HOST:PORT`.
-            runtime_env: Ray's, of the processes there; in its `working_dir` is this package.
+            runtime_env: Ray's environment of the workers; its `working_dir` contains this package.
         """
         self._address = address
         self._runtime_env = runtime_env
@@ -59,9 +59,9 @@ class RayWorkers:
         """Connects to the cluster.
 
         Raises:
-            UserError: Ray is not installed, there is no such cluster, or it refuses the files.
+            UserError: Ray is not installed, there is no such cluster, or it rejects the files.
         """
-        # When a node dies, Ray prints why; without this, pages of that node's log, too.
+        # Ray explains a dead node once; this hides pages of the node's own log.
         os.environ.setdefault("RAY_DEDUP_LOGS_SKIP_REGEX", "Raylet is terminated")
         self._ray = import_extra("ray", purpose="--ray", extra="cluster")
         address = _find_cluster(self._address)
@@ -103,7 +103,7 @@ class RayWorkers:
             last_line = str(error).strip().splitlines()[-1]
             raise UserError(f"a node of the cluster cannot work: {last_line}") from error
         except exceptions.RayError:
-            # Its nodes died again and again, or it was cancelled.
+            # All retries failed, or the call was cancelled.
             return ProcessCrashed(-signal.SIGKILL)
         finally:
             with self._lock:
@@ -123,10 +123,10 @@ class RayWorkers:
 
 
 def _find_cluster(address: str) -> str:
-    """The address of a cluster that answers. Where none does, Ray itself would try for minutes.
+    """The address of a running cluster. This fails fast, whereas Ray itself retries for minutes.
 
     Raises:
-        UserError: nothing answers at the address, or this machine has no cluster.
+        UserError: nothing listens at the address, or no cluster runs on this machine.
     """
     found = address
     if address == "auto":
@@ -135,7 +135,7 @@ def _find_cluster(address: str) -> str:
             found = services.get_ray_address_from_environment("auto", None)
         except ConnectionError as error:
             raise UserError(
-                "--ray auto: there is no cluster on this machine: start one as docs/cluster.md says"
+                "--ray auto: there is no cluster on this machine: start one, see docs/cluster.md"
             ) from error
     host, _, port = found.removeprefix("ray://").rpartition(":")
     if not host or not port.isdecimal():
@@ -145,41 +145,40 @@ def _find_cluster(address: str) -> str:
     except (OSError, OverflowError) as error:
         reason = getattr(error, "strerror", None) or error
         raise UserError(
-            f"--ray {address}: there is no cluster at {host}:{port} ({reason}): start one as "
-            "docs/cluster.md says"
+            f"--ray {address}: there is no cluster at {host}:{port} ({reason}): start one, see "
+            "docs/cluster.md"
         ) from error
     return found
 
 
 def _name(function: Callable[..., object]) -> tuple[str, str]:
-    """The module and the name by which another process imports a function."""
+    """The module and name by which another process can import a function."""
     module = function.__module__
     if module == "__main__":
-        # Started by `python -m`: elsewhere it is not the main module.
+        # `python -m` names the module __main__, but only in this process.
         module = sys.modules["__main__"].__spec__.name  # type: ignore[union-attr]
     return module, function.__qualname__
 
 
 def _serve(versions_wanted: dict[str, str], call: bytes) -> bytes | ProcessCrashed:
-    """Runs a call in a worker of a node. It reads neither the call nor the result, and so imports
-    nothing that is not needed to pass them on."""
+    """Runs a call on a node. Passes call and result on as bytes, so that it needs few imports."""
     return run_in_subprocess(_answer, versions_wanted, call)
 
 
 def _answer(versions_wanted: dict[str, str], call: bytes) -> bytes:
-    """Runs a call in the fresh process of a node: a pickled result, or `_Unfit`."""
+    """Runs a call in a fresh process on a node; returns the pickled result, or an `_Unfit`."""
     node = platform.node()
     try:
         found = versions()
         if found != versions_wanted:
-            # A package that is not installed has no version.
+            # A missing package has no version.
             names = (*versions_wanted, *found)
             name = next(key for key in names if found.get(key) != versions_wanted.get(key))
             there, here = (which.get(name, "none") for which in (found, versions_wanted))
             return pickle.dumps(
                 _Unfit(
-                    f"the node {node} has {name} {there}, this machine {here}: install the same "
-                    "there"
+                    f"the node {node} has {name} {there}, but this machine has {here}: install "
+                    "the same version there"
                 )
             )
         module, function, arguments = pickle.loads(call)
@@ -189,6 +188,6 @@ def _answer(versions_wanted: dict[str, str], call: bytes) -> bytes:
         return pickle.dumps(_Unfit(f"the node {node} cannot work: {error}"))
     except ImportError as error:
         return pickle.dumps(
-            _Unfit(f"the node {node} cannot import what it needs: {error}: install it there")
+            _Unfit(f"the node {node} cannot import a module: {error}: install it there")
         )
     return pickle.dumps(answer)

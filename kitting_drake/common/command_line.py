@@ -1,4 +1,4 @@
-"""The parts of a command line that all commands share; no pydrake here."""
+"""Command-line code that all commands share. It does not need pydrake."""
 
 import argparse
 import contextlib
@@ -12,14 +12,14 @@ from kitting_drake.common.errors import UserError
 from kitting_drake.common.seeds import ALL_SEEDS
 
 FAILED = 1
-"""Exit code when a simulation or a policy failed, and nothing else can be blamed."""
+"""Exit code if a simulation or a policy failed."""
 
 INTERRUPTED = 130
-"""Exit code after Ctrl-C, as shells have it."""
+"""Exit code after Ctrl-C, as in shells."""
 
 
 def seed_type(text: str) -> int:
-    """A seed given on the command line."""
+    """Parses a seed."""
     try:
         seed = int(text)
     except ValueError:
@@ -31,7 +31,7 @@ def seed_type(text: str) -> int:
 
 
 def count_type(text: str) -> int:
-    """A count given on the command line: 1 or more."""
+    """Parses a count of at least 1."""
     try:
         count = int(text)
     except ValueError:
@@ -43,10 +43,10 @@ def count_type(text: str) -> int:
 
 @contextlib.contextmanager
 def interrupts_wait() -> Iterator[Callable[[], bool]]:
-    """Lets Ctrl-C, and being told to end (SIGTERM), wait for a good moment; a second does not wait.
+    """Defers the first Ctrl-C or SIGTERM until the caller is ready; the second one interrupts.
 
     Yields:
-        Whether there was one: who asks goes on to raise KeyboardInterrupt.
+        A function that says whether a signal came. The caller then raises KeyboardInterrupt.
     """
     came = False
 
@@ -58,7 +58,7 @@ def interrupts_wait() -> Iterator[Callable[[], bool]]:
 
     before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
     for number, handler in before.items():
-        # Ctrl-C is ignored in jobs that a shell starts in the background.
+        # A shell's background jobs ignore Ctrl-C.
         if handler != signal.SIG_IGN:
             signal.signal(number, note)
     try:
@@ -69,8 +69,8 @@ def interrupts_wait() -> Iterator[Callable[[], bool]]:
 
 
 def _interrupt(number: int, frame: FrameType | None) -> None:
-    """Raises KeyboardInterrupt, a little later if trimesh is being imported: its optional imports
-    catch everything."""
+    """Raises KeyboardInterrupt, but not while trimesh is imported, whose optional imports catch it:
+    then a timer tries again."""
     while frame is not None:
         module = str(frame.f_globals.get("__name__", ""))
         if module.partition(".")[0] == "trimesh" and frame.f_code.co_name == "<module>":
@@ -81,10 +81,10 @@ def _interrupt(number: int, frame: FrameType | None) -> None:
 
 
 def run_command(main: Callable[[], int]) -> None:
-    """Runs a command and exits with its code; prints a user's error as one sentence."""
-    # Drake announces ports and frame names; a command says itself what a person needs to know.
+    """Runs a command and exits with its code; prints a UserError as one line."""
+    # Hide Drake's messages about ports and frame names.
     logging.getLogger("drake").setLevel(logging.WARNING)
-    # SIGTERM ends a command as Ctrl-C does: with its files and its processes in order.
+    # Like Ctrl-C, SIGTERM raises KeyboardInterrupt, so that files and processes are cleaned up.
     signals = [signal.SIGTERM, signal.SIGALRM]
     if signal.getsignal(signal.SIGINT) != signal.SIG_IGN:
         signals.append(signal.SIGINT)

@@ -1,16 +1,15 @@
-"""Errors that are the user's to mend."""
+"""Errors that a user can fix."""
 
 DIVERGED = "a loss is no longer a number"
-"""The words of the error with which a training ends that diverges."""
+"""Message of the error that ends a diverged training."""
 
 
 class UserError(ValueError):
-    """Input that cannot be used. Its text is one sentence: what is wrong, where, what would do.
+    """Invalid input. The message is one sentence: what is wrong, where, and what to do.
 
-    Commands print it and leave with exit code 2.
+    Commands print it and exit with code 2.
     """
 
 
 class MachineError(UserError):
-    """The same where it is this machine that lacks something, such as a library or room on its
-    disk: the input may be fine elsewhere."""
+    """This machine lacks something, e.g. a library or disk space. The input may work elsewhere."""

@@ -1,4 +1,4 @@
-"""Packages that only some commands need, and that are installed as extras of the project."""
+"""Optional packages, which are extras of the project."""
 
 import importlib
 from types import ModuleType
@@ -18,16 +18,16 @@ EXTRAS = {
 
 
 def import_extra(package: str, *modules: str, purpose: str, extra: str) -> ModuleType:
-    """A package that may be missing, with some of its modules imported.
+    """Imports a package that may be missing.
 
     Args:
         package: its name.
-        modules: to import too, by their names inside the package.
-        purpose: what needs it, for a person.
-        extra: the project's extra that brings it.
+        modules: submodules to import, too.
+        purpose: the command or option that needs it, for the error message.
+        extra: the project's extra that contains it.
 
     Raises:
-        MachineError: it is not installed; says by what command it would be.
+        MachineError: it is not installed; the message has the command that installs it.
     """
     try:
         found = importlib.import_module(package)

@@ -1,4 +1,4 @@
-"""Files written atomically, in folders of one thing and one process."""
+"""Atomic files, and output folders that belong to one run and one process."""
 
 import contextlib
 import fcntl
@@ -14,10 +14,10 @@ from kitting_drake.common.errors import MachineError, UserError
 
 
 def write_atomically(path: Path, content: str | bytes) -> None:
-    """Writes a file beside its place and moves it there, making its folder if need be.
+    """Writes a file atomically and creates its folder if needed.
 
     Raises:
-        MachineError: the place cannot be written to.
+        MachineError: writing fails.
     """
     data = content.encode() if isinstance(content, str) else content
     try:
@@ -36,15 +36,15 @@ def write_atomically(path: Path, content: str | bytes) -> None:
 
 
 def write_json(path: Path, value: Any) -> None:
-    """Writes JSON for people to read; see `write_atomically`."""
+    """Writes indented JSON with `write_atomically`."""
     write_atomically(path, json.dumps(value, indent=2) + "\n")
 
 
 def require_folder(path: Path) -> Path:
-    """Makes a folder for a run's files, before the run.
+    """Creates a folder for a run's output, and checks before the run that it is writable.
 
     Raises:
-        MachineError: it cannot be made, or written to.
+        MachineError: creating or writing fails.
     """
     try:
         path.mkdir(parents=True, exist_ok=True)
@@ -55,10 +55,10 @@ def require_folder(path: Path) -> Path:
 
 
 def replace_folder(folder: Path, made: Path, aside: Path) -> None:
-    """Moves a folder that was made beside its place there, and what was there aside; or neither.
+    """Moves `made` to `folder`, and the previous `folder` to `aside`. If it fails, neither moves.
 
     Raises:
-        OSError: it cannot be moved.
+        OSError: moving fails.
     """
     there = folder.exists()
     if there:
@@ -72,40 +72,42 @@ def replace_folder(folder: Path, made: Path, aside: Path) -> None:
 
 
 def files_digest(paths: Iterable[Path]) -> str:
-    """A digest of the content of files, in their order."""
+    """A digest of the files' contents, in order."""
     digest = hashlib.sha256()
     for path in paths:
-        # Of fixed length each, so that no two sequences of files have the same.
+        # Digests have a fixed length, so file boundaries matter.
         digest.update(hashlib.sha256(path.read_bytes()).digest())
     return f"sha256 {digest.hexdigest()}"
 
 
 def claim_folder(folder: Path, name: str, described: Any, *, of: str) -> None:
-    """Marks a folder, by a JSON file in it, as that of one thing's files.
+    """Marks a folder with a JSON file as the output of one run.
 
     Args:
-        folder: whose.
-        name: of the file.
-        described: what tells the thing from others; anything that JSON takes.
-        of: what such a thing is called.
+        folder: the folder.
+        name: of the JSON file.
+        described: the run's description, serializable as JSON.
+        of: what a run is called in error messages.
 
     Raises:
-        UserError: it holds those of another.
+        UserError: the folder contains other files, or those of a different run.
     """
     path = folder / name
     described = json.loads(json.dumps(described, default=str))
     if not path.exists():
         others = sorted(item.name for item in folder.iterdir() if not item.name.startswith("."))
         if others:
-            raise UserError(f"{folder} holds {others[0]} of something else: give another --output")
-    if path.exists():
+            raise UserError(
+                f"{folder} holds other files, such as {others[0]}: give another --output"
+            )
+    else:
         try:
             found = json.loads(path.read_text())
         except (OSError, ValueError) as error:
-            raise UserError(f"{path} is damaged: give another --output, or delete {folder}") from (
-                error
-            )
-        # Of tools or paints the order counts too.
+            raise UserError(
+                f"{path} is damaged: give another --output, or delete {folder}"
+            ) from error
+        # The order of tools or paints counts, too.
         if json.dumps(found) != json.dumps(described):
             raise UserError(
                 f"{folder} holds the files of another {of}"
@@ -115,33 +117,33 @@ def claim_folder(folder: Path, name: str, described: Any, *, of: str) -> None:
 
 
 def _first_difference(found: Any, described: Any) -> str:
-    """Where two descriptions differ, for a person; nothing if that cannot be said in few words."""
+    """The first difference of two descriptions as text; empty if it is not short."""
     if not isinstance(found, dict) or not isinstance(described, dict):
         return ""
     for key in (*described, *found):
         if key not in found:
-            return f" (there is no {key} there)"
+            return f" (it has no {key})"
         if key not in described:
-            return f" (there is a {key} there)"
+            return f" (it has a {key})"
         old, new = found[key], described[key]
         if old != new:
             if isinstance(old, dict) and isinstance(new, dict):
                 return _first_difference(old, new)
             simple = all(isinstance(value, str | float | int | None) for value in (old, new))
-            return f" ({key} is {new}, there {old})" if simple else f" ({key} differs)"
+            return f" ({key} is {new}, but {old} there)" if simple else f" ({key} differs)"
     for key, new in described.items():
         if json.dumps(found[key]) != json.dumps(new):
             return _first_difference(found[key], new) or f" ({key} differs)"
-    return f" ({', '.join(described)} were in the order {', '.join(found)})"
+    return f" ({', '.join(described)} are there in the order {', '.join(found)})"
 
 
 @contextlib.contextmanager
 def alone_in(folder: Path) -> Iterator[None]:
-    """Keeps a second process out of a folder while one is at work there.
+    """Locks a folder against other processes.
 
     Raises:
-        MachineError: the folder cannot be written to.
-        UserError: there is one already.
+        MachineError: the folder is not writable.
+        UserError: another process has locked it.
     """
     path = folder / ".lock"
     try:
@@ -161,10 +163,10 @@ def alone_in(folder: Path) -> Iterator[None]:
 
 
 def append_line(path: Path, item: Any) -> None:
-    """Adds an object to a file of JSON lines, and sees to it that it is on the disk.
+    """Appends an object to a JSON Lines file and syncs it to disk.
 
     Raises:
-        MachineError: it cannot be written; `read_lines` cuts off what was.
+        MachineError: writing fails; `read_lines` removes a partial line.
     """
     try:
         with path.open("a") as file:
@@ -176,9 +178,9 @@ def append_line(path: Path, item: Any) -> None:
 
 
 def read_lines(path: Path) -> list[Any]:
-    """The objects of a file of JSON lines; none if there is no file.
+    """The objects of a JSON Lines file; empty if the file does not exist.
 
-    A last line without an end, which was being written when the process was killed, is cut off.
+    An incomplete last line, left by a killed process, is removed from the file.
 
     Raises:
         UserError: another line is damaged.

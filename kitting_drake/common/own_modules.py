@@ -1,4 +1,4 @@
-"""A person's own modules, which a scenario names: found where Python finds modules, or beside the
+"""Imports the user's modules that a scenario names: from Python's path, or from the folder of the
 scenario's YAML file."""
 
 import contextlib
@@ -14,9 +14,9 @@ from kitting_drake.common.provenance import source_digest
 
 @contextlib.contextmanager
 def modules_beside(base: Path) -> Iterator[None]:
-    """Lets Python find modules in a folder too, after all other places.
+    """Appends a folder to Python's module path.
 
-    As everywhere in Python, of two modules of one name the first that is imported stays.
+    As usual in Python, the first imported module of a name stays.
 
     Args:
         base: the folder of the scenario's file.
@@ -50,30 +50,30 @@ def import_own(reference: str, base: Path) -> Any:
 
 
 def own_digest(module: str, base: Path) -> str:
-    """A digest of the sources of a module's whole package, or of itself where it is in none.
+    """A digest of the sources of a module's package, or of the module if it is in no package.
 
     Args:
         module: its name.
         base: the folder of the scenario's file.
 
     Raises:
-        ImportError: it cannot be imported.
-        LookupError: it has no file.
+        ImportError: the module cannot be imported.
+        LookupError: the module has no file.
         OSError: its sources cannot be read.
     """
     with modules_beside(base):
         spec = importlib.util.find_spec(module)
         if spec is None or not spec.has_location:
             raise LookupError(f"there is no file of the module {module}")
-        # What it imports from its own package makes it another one too.
+        # The module may import the rest of its package.
         package = module.partition(".")[0]
         top = importlib.util.find_spec(package)
         return source_digest(package if top is not None and top.has_location else module)
 
 
 def files_beside(module: str, base: Path) -> list[Path]:
-    """The files of a module, or of its whole package, that lie beside the scenario's file; empty
-    where it lies elsewhere.
+    """The files of a module, or of its package, in the folder of the scenario's file; empty if it
+    is elsewhere.
 
     Args:
         module: its name.

@@ -1,4 +1,4 @@
-"""Where the project's files are, in a checkout or in an installed wheel, and its cache."""
+"""Paths of the project's files, in a checkout or an installed wheel, and of its cache."""
 
 import os
 from pathlib import Path
@@ -6,21 +6,21 @@ from pathlib import Path
 
 def _data_root() -> Path:
     package = Path(__file__).resolve().parent.parent
-    # A wheel carries models/ and scenarios/ inside the package; a checkout has them beside it.
+    # A wheel contains models/ and scenarios/ in the package; a checkout has them beside it.
     return package if (package / "models").is_dir() else package.parent
 
 
 MODELS = _data_root() / "models"
-"""Hand, table and tools; also the folder of the ROS package `kitting_models`."""
+"""Models of hand, table and tools; also the folder of the ROS package `kitting_models`."""
 
 GENERALIST = MODELS / "policies" / "generalist.safetensors"
-"""The weights of the policy for anybody's tools, trained on static scenes."""
+"""Weights of the policy for arbitrary tools, trained on static scenes."""
 
 SCENARIOS = _data_root() / "scenarios"
-"""The scenarios that come with the project."""
+"""The project's scenarios."""
 
 
 def cache_directory() -> Path:
-    """The folder for what can be made again: `$XDG_CACHE_HOME/kitting_drake`, or in `~/.cache`."""
+    """The cache folder: `$XDG_CACHE_HOME/kitting_drake`, by default in `~/.cache`."""
     base = os.environ.get("XDG_CACHE_HOME")
     return (Path(base) if base else Path.home() / ".cache") / "kitting_drake"

@@ -1,4 +1,4 @@
-"""Work in fresh processes, several side by side: what takes it down takes no other with it."""
+"""Runs functions in fresh processes, in parallel, so that a crash affects no other."""
 
 import contextlib
 import multiprocessing
@@ -24,12 +24,12 @@ _Result = TypeVar("_Result")
 _THREADS = "OMP_NUM_THREADS"
 
 _MOST_CALLS = 10
-"""A process is ended after so many calls: Drake 1.51 keeps every Diagram, so that each episode
-leaves some fifty megabytes behind."""
+"""A process is replaced after so many calls: Drake 1.51 never frees Diagrams, about 50 MB for each
+episode."""
 _PATIENCE = 3.0
-"""How long a process that is stopped may take to remove what it was writing, in s."""
+"""Time for a stopped process to remove partial files, in s."""
 _MOST_AT_WORK = 1000
-"""Each occupies a thread here, wherever it is at work."""
+"""Limit on parallel calls. Each occupies a thread of this process."""
 
 
 @dataclass(frozen=True)
@@ -37,32 +37,32 @@ class ProcessCrashed:
     """A process that ended without a result."""
 
     exit_code: int | None
-    """Negative: the signal that killed it."""
+    """Negative: the signal that killed the process."""
 
     @property
     def was_killed(self) -> bool:
-        """Whether something else killed it, for want of memory perhaps: not its own doing."""
+        """Whether it was killed from outside, e.g. for lack of memory."""
         return self.exit_code in (-signal.SIGKILL, -signal.SIGTERM)
 
     def killed_twice(self, seed: int) -> UserError:
-        """The error to raise when a second chance did not help."""
+        """The error to raise if the retry was killed, too."""
         return UserError(
-            f"the process of seed {seed} was killed twice, perhaps for want of memory: "
-            "give fewer --workers, or nodes fewer CPUs, and it goes on where it was"
+            f"the process of seed {seed} was killed twice, perhaps for want of memory: run the "
+            "command again with fewer --workers, or fewer CPUs per node, to resume"
         )
 
 
 class Subprocess:
-    """A process that answers calls, one after another.
+    """A process that executes calls one after another.
 
-    Ctrl-C is not for it, and it ends when this process does.
+    It ignores Ctrl-C and ends with its parent.
     """
 
     def __init__(self) -> None:
         context = multiprocessing.get_context("spawn")
         self._connection, theirs = context.Pipe()
         self._process = context.Process(target=_serve, args=(theirs,), daemon=True)
-        # The process inherits the mask: Ctrl-C is not for it, even while it starts.
+        # The process inherits the mask, which blocks Ctrl-C even while it starts.
         before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
         try:
             self._process.start()
@@ -70,30 +70,30 @@ class Subprocess:
             signal.pthread_sigmask(signal.SIG_SETMASK, before)
         theirs.close()
         self.calls = 0
-        """How many it has been given."""
+        """Number of calls so far."""
 
     def call(
         self, function: Callable[..., _Result], *arguments: object
     ) -> _Result | ProcessCrashed:
-        """Calls a function there, and waits for it.
+        """Calls a function in the process and waits for it.
 
         Args:
-            function: importable by name, as its arguments and its result travel pickled. What it
-                raises ends the process, but for a `MachineError`.
-            arguments: its arguments.
+            function: importable by name; arguments and result must be picklable. Exceptions end the
+                process, except for `MachineError`.
+            arguments: of the function.
 
         Returns:
-            The function's result, or how the process ended if it returned none.
+            The function's result, or how the process ended without one.
 
         Raises:
-            MachineError: the function raised it.
+            MachineError: raised by the function.
         """
         self.calls += 1
         try:
             self._connection.send((function, arguments))
             answer = self._connection.recv()
         except (EOFError, OSError):
-            # OSError: it died in the middle of its answer.
+            # OSError: the process died while sending its result.
             self._process.join()
             return ProcessCrashed(self._process.exitcode)
         if isinstance(answer, MachineError):
@@ -101,7 +101,7 @@ class Subprocess:
         return answer
 
     def end(self) -> None:
-        """Ends it, once it has answered."""
+        """Ends the process, after its present call."""
         self._connection.close()
         self._process.join()
 
@@ -109,7 +109,7 @@ class Subprocess:
 def run_in_subprocess(
     function: Callable[..., _Result], *arguments: object
 ) -> _Result | ProcessCrashed:
-    """Calls a function in a fresh process, and waits for it; as `Subprocess.call` does."""
+    """Calls a function in a fresh process, like `Subprocess.call`."""
     process = Subprocess()
     try:
         return process.call(function, *arguments)
@@ -118,39 +118,39 @@ def run_in_subprocess(
 
 
 class Workers(Protocol):
-    """A place where functions run in other processes: this machine, or a cluster."""
+    """Runs functions in other processes, on this machine or on a cluster."""
 
     def capacity(self) -> int:
-        """How many processes it has room for now; at least 1."""
+        """The number of calls that can run at present; at least 1."""
 
     def run(self, function: Callable[..., _Result], *arguments: object) -> _Result | ProcessCrashed:
-        """Calls a function as `Subprocess.call` does; may be called in many threads at once.
+        """Calls a function like `Subprocess.call`. Thread-safe.
 
-        What ran in the process before must not matter to the function.
+        Processes may be reused, so the function must not depend on earlier calls.
 
         Raises:
-            UserError: the place is not fit for it, or the function raised a `MachineError`.
+            UserError: a worker lacks something, or the function raised a `MachineError`.
         """
 
     def stop(self) -> None:
-        """Kills what is at work, and lets nothing begin any more: nobody waits for what it finds.
+        """Ends all running calls and accepts no more.
 
-        `run` returns a `ProcessCrashed` that was killed.
+        `run` then returns a `ProcessCrashed`.
         """
 
 
 class LocalWorkers:
-    """This machine, as `Workers`.
+    """This machine, as `Workers`. Use it in a `with` statement.
 
-    Inside its `with`, several processes use one thread each, and a process answers several calls,
-    as to start one and import everything takes seconds.
+    If there are several processes, each uses one thread. Processes are reused, because starting
+    one and importing everything takes seconds.
     """
 
     def __init__(self, count: int, *, reuse: bool = True) -> None:
         """
         Args:
-            count: how many processes at a time.
-            reuse: whether a process answers several calls; else each has a fresh one.
+            count: number of parallel processes.
+            reuse: whether a process executes several calls; else each call gets a fresh one.
         """
         self._count = count
         self._reuse = reuse
@@ -164,7 +164,7 @@ class LocalWorkers:
             self._most_calls = _MOST_CALLS
         self._threads_before = os.environ.get(_THREADS)
         if self._count > 1:
-            # For the processes to come: this one has long read the variable.
+            # Affects only the processes started from here.
             os.environ[_THREADS] = "1"
         return self
 
@@ -212,21 +212,21 @@ class LocalWorkers:
 def side_by_side(
     function: Callable[[_Item], _Result], draw: Callable[[], _Item | None], *, workers: Workers
 ) -> Iterator[_Result]:
-    """Calls a function with one item after another, in threads; results come as they end.
+    """Calls a function for each item, in threads; yields results as they complete.
 
-    When it ends early, by Ctrl-C say, the workers are stopped.
+    If the iteration ends early, e.g. by Ctrl-C, the workers are stopped.
 
     Args:
-        function: called in a thread: lets `workers` do the work.
-        draw: the next item; asked when there is room, in the caller's thread. None: none now, ask
-            again after the next result; it is over when none is at work.
-        workers: say how many threads.
+        function: called in a thread; it delegates the work to `workers`.
+        draw: returns the next item, called in the caller's thread. None: there is none at present;
+            it is called again after the next result. The iteration ends if no call is running.
+        workers: determines the number of threads.
     """
     with ThreadPoolExecutor(_MOST_AT_WORK) as pool:
         working: set[Future[_Result]] = set()
         try:
             while True:
-                # Machines may have come, or gone.
+                # A cluster's capacity may change.
                 most = min(workers.capacity(), _MOST_AT_WORK)
                 while len(working) < most and (item := draw()) is not None:
                     working.add(pool.submit(function, item))
@@ -241,7 +241,7 @@ def side_by_side(
 
 
 def counting_bar(console: Console, label: str) -> Progress:
-    """A progress bar for things that are counted; invisible where there is no terminal."""
+    """A progress bar with a count; invisible without a terminal."""
     return Progress(
         TextColumn(label),
         BarColumn(),
@@ -262,7 +262,7 @@ def _serve(connection: Connection) -> None:
         terminated = True
         raise KeyboardInterrupt
 
-    # What is being written is removed on the way out.
+    # Unwind the stack, so that partial files are removed.
     signal.signal(signal.SIGTERM, terminate)
     with contextlib.suppress(EOFError, KeyboardInterrupt):
         while not terminated:
@@ -273,7 +273,7 @@ def _serve(connection: Connection) -> None:
                 answer = error
             connection.send(answer)
     if terminated:
-        # The exit code tells what ended it.
+        # The exit code must show the signal.
         signal.signal(signal.SIGTERM, signal.SIG_DFL)
         os.kill(os.getpid(), signal.SIGTERM)
 

@@ -1,4 +1,4 @@
-"""The provenance of results beside the scenario: versions, and the commit."""
+"""Versions and commit of the code that made a result."""
 
 import contextlib
 import hashlib
@@ -14,15 +14,15 @@ import numpy as np
 import kitting_drake
 
 COMMIT_VARIABLE = "KITTING_DRAKE_COMMIT"
-"""The environment variable that names the commit of copied sources, which have no history."""
+"""Environment variable with the commit of copied sources, which have no history."""
 
 
 _UNCOMMITTED = "+"
-"""Stands behind a commit whose tree had uncommitted changes."""
+"""Suffix of a commit whose tree had uncommitted changes."""
 
 
 def versions() -> dict[str, str]:
-    """The versions of this package and of its foundations; Drake's only where it is installed."""
+    """The versions of this package and its main dependencies; Drake's only if it is installed."""
     found = {"kitting_drake": kitting_drake.__version__}
     with contextlib.suppress(importlib.metadata.PackageNotFoundError):
         found["drake"] = importlib.metadata.version("drake")
@@ -30,9 +30,9 @@ def versions() -> dict[str, str]:
 
 
 def commit() -> str | None:
-    """The checkout's commit, with `+` behind it if tracked files were changed since.
+    """The checkout's commit, with suffix `+` if tracked files have changed.
 
-    On a node of a cluster, `COMMIT_VARIABLE` says it. None for an installed package.
+    On a cluster's node, the value of `COMMIT_VARIABLE`. None for an installed package.
     """
     if given := os.environ.get(COMMIT_VARIABLE):
         return given
@@ -48,44 +48,43 @@ def commit() -> str | None:
 
 
 def is_reproducible(commits: str | None) -> bool:
-    """Whether code can be checked out again.
+    """Whether the code can be checked out again.
 
     Args:
-        commits: what `commit` gives, or several of them with commas between; None or nothing is
-            code that nobody knows.
+        commits: a result of `commit`, or several separated by commas; None or empty is unknown
+            code.
     """
     return commits is not None and commits != "" and _UNCOMMITTED not in commits
 
 
 def short_commits(commits: str | None) -> str:
-    """The first eight digits of each commit, with its mark; `-` where there is none."""
+    """The first eight digits of each commit, with its suffix; `-` if there is none."""
     found = (commits or "-").split(", ")
     return ", ".join(item[:8] + _UNCOMMITTED * item.endswith(_UNCOMMITTED) for item in found)
 
 
 def uncommitted_note() -> str | None:
-    """A sentence for people where the tree has uncommitted changes; else None."""
+    """A warning if the tree has uncommitted changes; else None."""
     now = commit()
     if now is None or is_reproducible(now):
         return None
     return (
-        "the tree has uncommitted changes, so nobody can run this again from its commit, and "
-        "`results` does not take it for a cell of the paper's tables"
+        "the tree has uncommitted changes: this run cannot be repeated from its commit, and "
+        "`results` will not accept it for the paper's tables"
     )
 
 
 def source_digest(*names: str) -> str:
-    """A digest of the Python sources of some packages or modules: another one may do something
-    else.
+    """A digest of the Python sources of packages and modules.
 
     Args:
-        names: of packages, with all that they hold, and of modules.
+        names: of packages, including their submodules, and of modules.
     """
     digest = hashlib.sha256()
     for name in names:
         spec = importlib.util.find_spec(name)
         if spec is None or spec.origin is None:
-            raise ImportError(f"there is no package and no module {name}")
+            raise ImportError(f"there is no package or module {name}")
         root = Path(spec.origin).parent
         is_package = spec.submodule_search_locations is not None
         for path in sorted(root.rglob("*.py")) if is_package else [Path(spec.origin)]:

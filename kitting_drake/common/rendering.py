@@ -1,4 +1,4 @@
-"""Rendering without a display: engines, pictures for people, and PNG files."""
+"""Rendering without a display: render engines, pictures and PNG files."""
 
 import contextlib
 import ctypes
@@ -29,11 +29,11 @@ from kitting_drake.common.errors import MachineError
 from kitting_drake.common.files import write_atomically
 
 _rendering_process: int | None = None
-"""The process in which engines were made; a fork inherits it."""
+"""The process that made engines; a forked child inherits the value."""
 
 
 def can_render() -> bool:
-    """Whether the system library that rendering needs is there."""
+    """Whether the system library for rendering is installed."""
     try:
         ctypes.CDLL("libEGL.so.1")
     except OSError:
@@ -42,11 +42,11 @@ def can_render() -> bool:
 
 
 def require_rendering() -> None:
-    """Makes sure that images can be rendered here; to be called before an engine is made.
+    """Checks that this process can render. Call it before making an engine.
 
     Raises:
         MachineError: the system library is missing, or the process was forked from one that has
-            rendered; says what would do.
+            rendered.
     """
     global _rendering_process
     if not can_render():
@@ -56,36 +56,36 @@ def require_rendering() -> None:
         )
     if _rendering_process not in (None, os.getpid()):
         raise MachineError(
-            "this process was forked from one that has rendered, which OpenGL does not survive: "
-            "start it by spawn, as in multiprocessing.get_context('spawn')"
+            "this process was forked from one that has rendered, which breaks OpenGL: use "
+            "multiprocessing.get_context('spawn')"
         )
     _rendering_process = os.getpid()
     _load_triton()
 
 
 def _load_triton() -> None:
-    """Loads Triton, which PyTorch imports with its first optimizer where it is built for CUDA.
+    """Loads Triton before Mesa, if PyTorch is built for CUDA.
 
-    It brings an LLVM of its own. Where Mesa's was loaded before, as by rendering without a graphics
-    card, that import ends in a segmentation fault; in this order both work.
+    Both bring an LLVM. PyTorch imports Triton with the first optimizer; after Mesa's LLVM (software
+    rendering) this import crashes, but the reverse order works.
     """
     package = importlib.util.find_spec("triton")
     for folder in (package and package.submodule_search_locations) or ():
         for library in Path(folder, "_C").glob("libtriton*.so"):
-            # One that does not load cannot be imported later either.
+            # If loading fails, PyTorch cannot import it either.
             with contextlib.suppress(OSError):
                 ctypes.CDLL(str(library))
 
 
 def add_observation_renderer(scene_graph: SceneGraph, lights: Sequence[LightParameter] = ()) -> str:
-    """Adds the engine that the policy sees by, plain and quick; returns its name.
+    """Adds the plain and fast engine of the policy's cameras; returns its name.
 
     Args:
-        scene_graph: to add it to.
-        lights: none: one at each camera.
+        scene_graph: to which to add it.
+        lights: if empty, a light at each camera.
 
     Raises:
-        MachineError: images cannot be rendered here.
+        MachineError: this machine cannot render.
     """
     require_rendering()
     parameters = RenderEngineVtkParams(lights=list(lights))
@@ -94,22 +94,22 @@ def add_observation_renderer(scene_graph: SceneGraph, lights: Sequence[LightPara
 
 
 def add_picture_renderer(scene_graph: SceneGraph) -> str:
-    """Adds the engine that pictures are made with; returns its name.
+    """Adds the engine for still pictures, with soft light from three sides and ambient occlusion;
+    returns its name.
 
-    Soft light from three sides, and ambient occlusion, which tells what stands on what. To be added
-    before a context is made: one that comes later is not told where things are.
+    Add it before a context is made: engines added later do not receive poses.
 
     Raises:
-        MachineError: images cannot be rendered here.
+        MachineError: this machine cannot render.
     """
     return _add_studio(scene_graph, "picture", SsaoParameter(radius=0.08))
 
 
 def add_film_renderer(scene_graph: SceneGraph) -> str:
-    """Adds the engine that films are made with, lit as pictures are, but quick; returns its name.
+    """Adds the fast engine for videos, lit like pictures; returns its name.
 
     Raises:
-        MachineError: images cannot be rendered here.
+        MachineError: this machine cannot render.
     """
     return _add_studio(scene_graph, "film", None)
 
@@ -138,7 +138,7 @@ def _light(direction: list[float], intensity: float) -> LightParameter:
 def look_at(position: Sequence[float], target: Sequence[float]) -> RigidTransform:
     """X_WC of an upright camera at `position` that looks at `target`, both in the world in metres.
 
-    z looks, x points right in the image, y down. The two must not lie above one another.
+    Camera axes: x right in the image, y down, z forward. The view must not be vertical.
     """
     z = np.subtract(target, position)
     x = np.cross(z, [0.0, 0.0, 1.0])
@@ -147,13 +147,13 @@ def look_at(position: Sequence[float], target: Sequence[float]) -> RigidTransfor
 
 
 X_WOVERVIEW = look_at([1.62, -0.95, 1.13], [0.48, -0.02, 0.06])
-"""From where pictures and films show the whole cell."""
+"""Camera pose for pictures and videos of the whole cell."""
 
 
 def picture_camera(
     renderer: str, *, width: int = 1280, height: int = 800, fov_y: float = 0.42
 ) -> RenderCameraCore:
-    """A camera for people's eyes: size in pixels, vertical field of view in radians."""
+    """A camera for pictures; size in pixels, vertical field of view in radians."""
     return RenderCameraCore(
         renderer,
         CameraInfo(width=width, height=height, fov_y=fov_y),
@@ -165,7 +165,7 @@ def picture_camera(
 def render_picture(
     scene_graph: SceneGraph, context: Context, X_WC: RigidTransform = X_WOVERVIEW
 ) -> NDArray[np.uint8]:
-    """(800, 1280, 3) what a scene graph's own, connected context shows from a camera's place.
+    """(800, 1280, 3) picture of a scene graph in its context, from a camera pose.
 
     The scene graph needs the engine of `add_picture_renderer`.
     """
@@ -179,7 +179,7 @@ def save_png(pixels: NDArray[np.uint8], path: Path) -> None:
     """Writes an image (height, width, 3) to a PNG file, atomically.
 
     Raises:
-        UserError: the file cannot be written.
+        MachineError: writing fails.
     """
     buffer = io.BytesIO()
     Image.fromarray(pixels).save(buffer, "PNG")

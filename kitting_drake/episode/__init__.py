@@ -1,4 +1,4 @@
-"""One episode: running it, recording its actions, scoring it."""
+"""Runs one episode, records its actions and scores it."""
 
 from kitting_drake.episode.episode import Episode, EpisodeResult, run_episode
 from kitting_drake.episode.events import EpisodeObserver, ModeChange

@@ -1,6 +1,6 @@
-"""The action log: what a policy did, and how far that was from what the expert would have done.
+"""Records a policy's actions and their errors with respect to the expert's.
 
-Everything here is decided from true poses: a policy sees none of it.
+It uses true poses, which policies cannot see.
 """
 
 import dataclasses
@@ -18,11 +18,11 @@ from systems.placement import Goal, PlacedObject, displacement, heading
 from systems.signals import PlanarPose, wrap_to_pi
 
 _LIFTED = 0.010
-"""An object that rose by this while the hand went up is in the hand, in m."""
+"""Least rise of an object that counts as lifted, in m."""
 
 
 def nearest_object(station: KittingStation, poses: list[RigidTransform], pick: PlanarPose) -> int:
-    """The index of the object whose surface, seen from above, comes nearest to a pick.
+    """The index of the object whose surface is nearest to a pick, seen from above.
 
     Args:
         station: the episode's.
@@ -37,7 +37,7 @@ def nearest_object(station: KittingStation, poses: list[RigidTransform], pick: P
 
 
 class ActionLog:
-    """Takes down the actions of an episode: an `EpisodeObserver`."""
+    """Records the actions of an episode. Its `observe` is an `EpisodeObserver`."""
 
     def __init__(self, station: KittingStation) -> None:
         """
@@ -49,7 +49,7 @@ class ActionLog:
         self.records: list[ActionRecord] = []
 
     def observe(self, event: ModeChange) -> None:
-        """Takes down what an event means."""
+        """Updates the records for an event."""
         if event.is_last:
             return
         if event.is_action_start:
@@ -84,7 +84,7 @@ class ActionLog:
             self.records[-1] = self._record(int(np.argmax(rises)), last.pick, last.place)
 
     def _record(self, index: int, pick: PlanarPose, place: PlanarPose) -> ActionRecord:
-        """The record of an action on the given object, still unfinished."""
+        """A new record, with outcome "unfinished", of an action on the given object."""
         scene_object, item = self._station.scene.objects[index], self._station.objects[index]
         record = ActionRecord(
             object=scene_object.name,
@@ -101,7 +101,7 @@ class ActionLog:
         best = [gripper_pose(X_WB, grasp) for grasp in scene_object.grasps]
         if best:
             nearest = min(best, key=lambda pose: math.hypot(pick.x - pose.x, pick.y - pose.y))
-            # Of several grasps at one point, the one that is nearest in angle counts.
+            # Of several grasps at the nearest point, take the one nearest in angle.
             here = [p for p in best if math.hypot(p.x - nearest.x, p.y - nearest.y) < 1e-6]
             angle = min(abs(wrap_to_pi(2 * (pick.theta - p.theta))) / 2 for p in here)
             distance = math.hypot(pick.x - nearest.x, pick.y - nearest.y)
@@ -130,9 +130,9 @@ class ActionLog:
 def _place_errors(
     item: PlacedObject, goal: Goal, X_WGoal: RigidTransform, arrival: RigidTransform
 ) -> tuple[float, float, float]:
-    """Displacement in all, distance of the middles (m) and angle (rad) of an object from a goal.
+    """Total displacement (m), distance of the middles (m) and angle (rad) of an object from a goal.
 
-    Where it arrives is known in the plane only: heights are not compared.
+    Only the planar arrival pose is known, so heights are not compared.
     """
     flat = RigidTransform(
         X_WGoal.rotation(), [*X_WGoal.translation()[:2], arrival.translation()[2]]
@@ -149,7 +149,7 @@ def _place_errors(
 
 
 def _arrival(X_WB: RigidTransform, pick: PlanarPose, place: PlanarPose) -> RigidTransform:
-    """Where an object at X_WB comes to lie that moves with the gripper from pick to place."""
+    """The pose of an object at X_WB after moving rigidly with the gripper from pick to place."""
     return _pose(place) @ _pose(pick).inverse() @ X_WB
 
 

@@ -1,4 +1,4 @@
-"""The station and the episode of a scenario that a command line names."""
+"""Builds and runs the scenario chosen on a command line."""
 
 import itertools
 from collections.abc import Iterable, Sequence
@@ -14,14 +14,14 @@ from kitting_drake.scenario.choosing import ChosenScenario
 from kitting_drake.station import KittingStation, build_station, with_policy
 
 _TRIED = 5
-"""How many seeds tell whether a scenario can be built at all."""
+"""Number of seeds to try before a scenario counts as invalid."""
 
 
 def build_chosen(chosen: ChosenScenario, *, seed: int) -> tuple[Diagram, KittingStation]:
-    """The station of a scenario of the command line, and the Diagram of it and its policy.
+    """Builds a Diagram of the chosen scenario's station and policy; returns it and the station.
 
     Raises:
-        UserError: as `build_station` and `make_policy`, with the file's name.
+        UserError: as `build_station` and `make_policy`; the message names the scenario's file.
     """
     with chosen.named_in_errors():
         station = build_station(chosen.scenario, seed, chosen.base)
@@ -29,13 +29,13 @@ def build_chosen(chosen: ChosenScenario, *, seed: int) -> tuple[Diagram, Kitting
 
 
 def build_any_chosen(chosen: ChosenScenario, seeds: Iterable[int]) -> KittingStation:
-    """The station of the first of a few seeds with which it can be built.
+    """Builds the station with the first of a few seeds for which this succeeds.
 
-    What a scene draws may not fit with some seeds: that is then the failure of that seed alone.
+    A random scene may be invalid for some seeds; only their episodes then fail.
 
     Raises:
-        MachineError: it cannot be built on this machine.
-        UserError: it can be built with none of the first seeds; that of the first of all.
+        MachineError: this machine cannot build it.
+        UserError: it fails with each of the first seeds; the error is that of the first.
     """
     errors = []
     for seed in itertools.islice(seeds, _TRIED):
@@ -57,8 +57,8 @@ def run_chosen(
     observers: Sequence[EpisodeObserver] = (),
     log: Path | None = None,
 ) -> EpisodeResult:
-    """`run_episode` for a scenario of the command line, in a Diagram fresh from `build_chosen`; a
-    log goes to a file, if one is named."""
+    """Calls `run_episode` with a Diagram fresh from `build_chosen`; writes a log if `log` names a
+    file."""
     episode_log = None if log is None else EpisodeLog(station)
     result = run_episode(
         diagram,

@@ -1,4 +1,4 @@
-"""One episode from its first to its last step, and its result."""
+"""Runs one episode and computes its result."""
 
 import dataclasses
 import logging
@@ -19,63 +19,63 @@ from systems.pick_place_policy import PolicyError
 from systems.placement import ALL, Placement, strict_reward
 
 _LAST_WAIT = 2.0
-"""How long the objects may take to come to rest after the last action, in s."""
+"""Time limit for objects to come to rest after the last action, in s."""
 
 
 @dataclasses.dataclass
 class ObjectResult:
-    """How one object ended. The names are keys of `results.json`."""
+    """The final state of one object. The field names are keys of `results.json`."""
 
     name: str
     category: str
     add_s_mm: float | None
-    """None, as the other errors, for an object that no goal was left for."""
+    """None, like the other errors, if no goal was left for the object."""
     success: bool
-    """By the task's own measure; for kitting the paper's, ADD-S below the threshold."""
+    """By the task's success predicate; in kitting the paper's, ADD-S below the threshold."""
     strict_success: bool
-    """That, and at its height and heading: see `systems.placement.Placement`."""
+    """Success with the right height and heading: `systems.placement.Placement.strict_success`."""
     position_error_mm: float | None
     angle_error_deg: float | None
-    """Modulo the symmetry that the object declares."""
+    """Modulo the object's declared symmetry."""
     height_error_mm: float | None
     cause: str | None
-    """Why it is no success, one of the task's `causes`; None when it is one."""
+    """Why the object failed, one of the task's `causes`; None for a success."""
 
 
 @dataclasses.dataclass
 class EpisodeResult:
-    """The result of an episode. The names are keys of `results.json`."""
+    """The result of an episode. The field names are keys of `results.json`."""
 
     scenario: str
     policy: str
     seed: int
     objects: list[ObjectResult]
-    """Those that a goal takes."""
+    """The objects that some goal takes."""
     success_rate: float
-    """The task's reward, 0 to 1: for kitting the share of the tools that are kitted; 0 when the
-    episode failed or timed out."""
+    """The task's reward, 0 to 1 (in kitting the share of kitted tools); 0 if the episode failed or
+    timed out."""
     strict_success_rate: float
-    """The same, counting strict successes alone."""
+    """The same, counting only strict successes."""
     actions: int
     missed_grasps: int
     dropped_objects: int
     actions_taken: list[ActionRecord]
-    """The policy's actions, and what came of each."""
+    """The policy's actions and their outcomes."""
     sim_seconds: float
     wall_seconds: float
     point_contact_pairs: int
-    """The most pairs in point contact whenever the hand began something else."""
+    """The largest number of pairs in point contact at any mode change."""
     moving_at_end: list[str]
-    """The objects that had not come to rest when the episode ended."""
+    """The objects that had not come to rest at the end."""
     failure: str | None
-    """Why the simulation could not go on, if it could not."""
+    """The error that ended the episode, if any."""
     timed_out: bool
-    """Whether the time limit ended it."""
+    """Whether the time limit ended the episode."""
     interrupted: bool
-    """Whether a person ended it."""
+    """Whether Ctrl-C ended the episode."""
 
     def as_dict(self) -> dict[str, Any]:
-        """For JSON."""
+        """As plain values for JSON."""
         return dataclasses.asdict(self)
 
 
@@ -89,19 +89,19 @@ def run_episode(
     observers: Sequence[EpisodeObserver] = (),
     log: EpisodeLog | None = None,
 ) -> EpisodeResult:
-    """Runs an episode until the planner is done and the objects rest, or the time is up.
+    """Runs an episode until the planner is done and the objects rest, or until the time limit.
 
-    An error of the simulation (the contact solver not converging, say) or of the policy, and
-    Ctrl-C, end the episode, not the program: the result tells of it, and of what was reached.
+    An error of the policy or the simulation (e.g. the contact solver does not converge) and Ctrl-C
+    end the episode, not the program. The result then has `failure` or `interrupted` set.
 
     Args:
-        diagram: the outermost Diagram, with the station and a policy connected to it.
-        station: fresh from `build_station`; its scenario sets the time limit and the like.
+        diagram: the outermost Diagram, with the station and a connected policy.
+        station: fresh from `build_station`; its scenario sets, e.g., the time limit.
         scenario: its name, for the result.
         policy: its name, for the result.
         realtime_rate: 1 for real time, 0 for as fast as possible.
-        observers: told of every event.
-        log: takes down every step.
+        observers: called with every event.
+        log: samples every step.
     """
     episode = Episode(
         diagram,
@@ -117,7 +117,7 @@ def run_episode(
 
 
 class Episode:
-    """An episode under way: `run_episode` in parts, for callers that choose each action."""
+    """`run_episode` in parts, for callers that choose each action."""
 
     def __init__(
         self,
@@ -133,15 +133,10 @@ class Episode:
     ) -> None:
         """
         Args:
-            diagram: as for `run_episode`, and so are the others but for the last; where it pauses,
-                it may be the station alone.
-            station: see there.
-            scenario: see there.
-            policy: see there.
-            realtime_rate: see there.
-            observers: see there.
-            log: see there.
-            pauses: whether `advance` returns each time the planner asks for an action.
+            diagram: may be the station alone if the episode pauses.
+            pauses: whether `advance` returns each time the planner needs an action.
+
+        The other arguments are those of `run_episode`.
         """
         self._station = station
         self._names = {"scenario": scenario, "policy": policy, "seed": station.seed}
@@ -162,13 +157,13 @@ class Episode:
 
     @property
     def failure(self) -> str | None:
-        """Why the simulation could not go on, if it could not."""
+        """The error that ended the episode, if any."""
         return self._failure
 
     def advance(self) -> None:
-        """Goes on to the end of the episode, or, where it pauses, to when the planner asks.
+        """Advances to the end of the episode or, with `pauses`, until the planner needs an action.
 
-        At a pause the action must be given before the next call.
+        After a pause, set the action before the next call.
 
         Raises:
             RuntimeError: the episode is over.
@@ -192,8 +187,8 @@ class Episode:
             self._failure = " ".join(f"{type(reason).__name__}: {reason}".split())
             self.is_over = True
             if reason is not error or not isinstance(error, RuntimeError):
-                # Drake raises RuntimeErrors, whose text says enough. An own policy may raise
-                # anything, and its author wants to know where.
+                # The text of Drake's RuntimeErrors suffices. A policy's exception may be of any
+                # type, so its author needs the traceback.
                 seed = self._names["seed"]
                 logging.getLogger(__name__).exception("the episode of seed %d failed", seed)
         self._wall_seconds += time.perf_counter() - start
@@ -201,7 +196,7 @@ class Episode:
             self._monitor.tell(self.context, is_last=True)
 
     def result(self) -> EpisodeResult:
-        """How it ended; before its end, how it stands now."""
+        """The result; before the end, a preliminary one."""
         station, context, records = self._station, self.context, self._log.records
         placements, scene = station.placements(context), station.scene
         counts = station.counts(context)
@@ -234,12 +229,12 @@ def object_results(
     placements: Sequence[Placement],
     records: Sequence[ActionRecord] = (),
 ) -> list[ObjectResult]:
-    """How every object that a goal takes stands now, in the scene's order.
+    """The results of all objects that some goal takes, in the scene's order.
 
     Args:
         station: the episode's.
         root_context: of the outermost Diagram.
-        placements: of the scene's objects, in its order.
+        placements: of the scene's objects, in order.
         records: the actions so far.
     """
     scene, task = station.scene, station.scenario.task
@@ -274,7 +269,7 @@ def _object_result(
 
 
 class _Monitor:
-    """Called after every step: tells of events, knows when to halt."""
+    """The simulator's monitor: notifies observers and decides when to stop."""
 
     def __init__(
         self,
@@ -295,7 +290,7 @@ class _Monitor:
         self.done_since: float | None = None
 
     def step(self, root_context: Context) -> EventStatus:
-        """The callback of the simulator."""
+        """Called after every step."""
         station = self._station
         self.tell(root_context)
         if self._log is not None:
@@ -304,10 +299,10 @@ class _Monitor:
             asks = station.asks(root_context)
             if asks and self._end_at_success and station.reward(root_context) > ALL:
                 self.done_since = root_context.get_time()
-                return EventStatus.ReachedTermination(station, "every goal is met")
+                return EventStatus.ReachedTermination(station, "every goal is filled")
             self.is_paused = asks and self._pauses
             if self.is_paused:
-                return EventStatus.ReachedTermination(station, "the planner asks")
+                return EventStatus.ReachedTermination(station, "the planner needs an action")
         if self._mode != Mode.DONE:
             return EventStatus.DidNothing()
         now = root_context.get_time()
@@ -318,7 +313,7 @@ class _Monitor:
         return EventStatus.DidNothing()
 
     def tell(self, root_context: Context, *, is_last: bool = False) -> None:
-        """Tells the observers, if the mode has changed or the episode is over."""
+        """Notifies the observers if the mode has changed or the episode is over."""
         previous, self._mode = self._mode, self._station.mode(root_context)
         if is_last or self._mode != previous:
             pairs = self._station.point_contact_pairs(root_context)

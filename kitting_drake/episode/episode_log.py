@@ -1,5 +1,5 @@
-"""What a robot's log holds: joints, commands, forces, observations and actions of an episode, by
-time; written as NumPy's `.npz`, or as MCAP for Foxglove and rerun."""
+"""Logs joints, commands, forces, observations and actions of an episode, as NumPy's `.npz` or as
+MCAP for Foxglove and rerun."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from systems.pick_place_parameters import Mode
 
 ENDINGS = (".npz", ".mcap")
 JOINTS = ("x", "y", "z", "yaw")
-"""The joints of the floating hand, as the log names them."""
+"""The log's names of the floating hand's joints."""
 
 _SAMPLED = ("time", "state", "torque", "wrist", "commanded", "opening", "mode")
 
@@ -40,46 +40,46 @@ def add_log_flag(parser: argparse.ArgumentParser) -> None:
 
 
 def check_log(path: Path) -> None:
-    """Checks that a log can be written to a file, before the episode.
+    """Checks, before the episode, that a log can be written to a file.
 
     Raises:
-        UserError: the file's name has another ending, or is a folder's.
-        MachineError: the package that writes it is not installed.
+        UserError: the file's suffix is not supported, or it is a folder.
+        MachineError: a required package is not installed.
     """
     if path.suffix not in ENDINGS:
         raise UserError(f"--log writes {' and '.join(ENDINGS)} files, not '{path}'")
     if path.is_dir():
-        raise UserError(f"{path} is a folder")
+        raise UserError(f"--log: {path} is a folder; name a file")
     if path.suffix == ".mcap":
         _mcap_package()
 
 
 def log_of_many(path: Path | None, cluster: str | None) -> Path | None:
-    """The file of `--log` where there are many episodes; see `log_of_seed`.
+    """Checks and returns the file of `--log` for a command that runs many episodes.
 
     Args:
-        path: of `--log`, if it was given.
-        cluster: of `--ray`, if it was given.
+        path: of `--log`, if given; see `log_of_seed`.
+        cluster: of `--ray`, if given.
 
     Raises:
-        UserError: as `check_log`; or episodes run on other machines.
+        UserError: as `check_log`, or both options are given.
         MachineError: as `check_log`.
     """
     if path is None:
         return None
     check_log(path)
     if cluster is not None:
-        raise UserError("--log writes files of this machine: leave --ray out")
+        raise UserError("--log cannot write files from other machines: leave out --ray")
     return path.resolve()
 
 
 def log_of_seed(path: Path, seed: int) -> Path:
-    """The file of one of many episodes: `runs/log.npz` becomes `runs/log_00000007.npz`."""
+    """The log file of one of many episodes: `runs/log.npz` becomes `runs/log_00000007.npz`."""
     return path.with_name(f"{path.stem}_{seed:08d}{path.suffix}")
 
 
 class EpisodeLog:
-    """Takes down an episode, once every step of the plant."""
+    """Logs an episode, with one sample per step of the plant."""
 
     def __init__(self, station: KittingStation) -> None:
         """
@@ -94,7 +94,7 @@ class EpisodeLog:
         self._seen: NDArray[np.float32] | None = None
 
     def sample(self, root_context: Context) -> None:
-        """Takes down the present step; to be called after each, and in their order."""
+        """Appends a sample. Call it after each step, in order."""
         station = self._station
         context = station.GetMyContextFromRoot(root_context)
 
@@ -121,21 +121,21 @@ class EpisodeLog:
             if self._seen is not None:
                 self._heights.append(self._seen)
         if station.has_cameras and port("asks")[0]:
-            # What the policy is about to be shown: Drake computes it once for both.
+            # The policy's observation; Drake's cache avoids a second rendering.
             self._seen = port("observation_heights").height.astype(np.float32)
 
     def arrays(self) -> Arrays:
-        """The log, n samples and k actions; SI units, radians, the world's frame.
+        """The log, with n samples and k actions; SI units, radians, world frame.
 
         Returns:
-            `time` (n); `joint_position`, `joint_velocity`, `joint_torque` (n, 4), of x, y, z and
-            yaw; `finger_position` (n, 2), `finger_force` (n, 2), what drives each; `wrist_force`
+            `time` (n); `joint_position`, `joint_velocity`, `joint_torque` (n, 4) of x, y, z, yaw;
+            `finger_position`, `finger_force` (n, 2), the force being the actuation; `wrist_force`
             (n, 6), contact on x, y, z, about z, and on each finger; `commanded_position`,
-            `commanded_velocity`, `commanded_acceleration` (n, 4); `commanded_opening` (n, 2), and
-            its rate; `mode` (n), a `Mode`; `object_poses` (n, objects, 3, 4), X_WB. For each
-            action: `action_time` (k), when it was begun; `pick`, `place` (k, 3), x, y, theta;
-            `press` (k); `observation_height` (k, rows, cols), o_t as the policy saw it, not there
-            where nothing sees. `joint_names`, `mode_names` and `object_names` are texts.
+            `commanded_velocity`, `commanded_acceleration` (n, 4); `commanded_opening` (n, 2), value
+            and rate; `mode` (n), a `Mode`; `object_poses` (n, objects, 3, 4), X_WB. For each
+            action: `action_time` (k), its start; `pick`, `place` (k, 3), x, y, theta; `press` (k);
+            `observation_height` (k, rows, cols), the policy's o_t, missing without cameras. Texts:
+            `joint_names`, `mode_names`, `object_names`.
         """
         found = {key: np.array(values) for key, values in self._samples.items()}
         state, torque, commanded = found["state"], found["torque"], found["commanded"]
@@ -172,7 +172,7 @@ class EpisodeLog:
         """Writes the log to a `.npz` or `.mcap` file, atomically.
 
         Raises:
-            MachineError: it cannot be written, or the package that writes it is not installed.
+            MachineError: writing fails, or a required package is not installed.
         """
         buffer = io.BytesIO()
         if path.suffix == ".npz":

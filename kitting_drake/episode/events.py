@@ -1,4 +1,4 @@
-"""The stream of events of an episode, which whoever watches it is told of."""
+"""The events of an episode."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -10,30 +10,29 @@ from systems.pick_place_parameters import Mode
 
 @dataclass(frozen=True)
 class ModeChange:
-    """The planner has gone from one mode to another; or, at its end, the episode is over.
+    """The planner changed its mode or, as the last event, the episode ended.
 
-    The plant has stepped, the planner has decided on that, and this is told one step of time later:
-    nothing has moved since, but ports that depend on time, such as the noise of cameras, are
-    evaluated anew.
+    Observers are called one time step after the change. Nothing has moved since the planner's
+    update, but ports that depend on time, such as those with camera noise, are evaluated anew.
     """
 
     previous: Mode
     mode: Mode
     root_context: Context
-    """The context of the outermost Diagram; not to be changed, nor kept beyond the last event."""
+    """The context of the outermost Diagram. Do not modify it or keep it beyond the last event."""
     is_last: bool = False
-    """Whether the episode is over; the modes are equal then."""
+    """Whether the episode ended; `previous` and `mode` are then equal."""
 
     @property
     def is_action_start(self) -> bool:
-        """Whether a policy's action has just been accepted."""
+        """Whether the planner has just accepted an action."""
         return self.previous == Mode.OBSERVE and self.mode == Mode.APPROACH
 
     @property
     def is_stop(self) -> bool:
-        """Whether the planner is done: the policy said stop, or the actions are spent."""
+        """Whether the planner is done: the policy returned `stop`, or no actions are left."""
         return self.previous == Mode.OBSERVE and self.mode == Mode.DONE
 
 
 EpisodeObserver = Callable[[ModeChange], None]
-"""Told of every event, in order."""
+"""Called with every event, in order."""

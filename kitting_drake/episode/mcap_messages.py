@@ -1,4 +1,4 @@
-"""A log as messages of ROS 2, which Foxglove, rerun and PlotJuggler read."""
+"""Converts a log to ROS 2 messages, which Foxglove, rerun and PlotJuggler read."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from pydrake.math import RotationMatrix
 
 _PERIOD = 1 / 32
-"""How often poses are written, in s; joints and forces are at every step."""
+"""Period of poses, in s. Joints and forces are written at every step."""
 
 _RULE = "=" * 80
 _PARTS = {
@@ -29,7 +29,7 @@ _PARTS = {
         "std_msgs/Header header\nstring child_frame_id\ngeometry_msgs/Transform transform"
     ),
 }
-"""The definitions of the messages that others are made of."""
+"""Definitions of the message types used by others."""
 
 _DEFINITIONS = {
     "sensor_msgs/msg/JointState": (
@@ -55,12 +55,12 @@ class Message:
     kind: str
     """A key of `_DEFINITIONS`."""
     time: float
-    """In s."""
+    """In seconds."""
     content: dict[str, Any]
 
 
 def definition(kind: str) -> str:
-    """The text that defines a kind of message, with the parts that it is made of."""
+    """The schema text of a message type, including the types that it uses."""
     texts, pending = [_DEFINITIONS[kind]], [_DEFINITIONS[kind]]
     used: list[str] = []
     while pending:
@@ -75,13 +75,13 @@ def definition(kind: str) -> str:
 
 
 def mcap_messages(arrays: Mapping[str, NDArray[Any]]) -> Iterator[Message]:
-    """The messages of a log, in the order of their times.
+    """The messages of a log, ordered by time.
 
     - `/joint_states`, `/joint_commands`: `JointState` of x, y, z, yaw. `/gripper`: of the fingers.
     - `/wrist_wrench`: `WrenchStamped`, the contact forces on the hand.
-    - `/mode`: `String`, the planner's mode, where it changes.
-    - `/tf`: `TFMessage`, the hand and the objects in the frame `world`, 32 times a second.
-    - `/pick`, `/place`: `PoseStamped`, as an action begins.
+    - `/mode`: `String`, the planner's mode when it changes.
+    - `/tf`: `TFMessage`, hand and objects in the frame `world`, 32 times a second.
+    - `/pick`, `/place`: `PoseStamped` at the start of each action.
     - `/observation_height`: `Image` of 32-bit floats, o_t in metres.
 
     Args:

@@ -1,4 +1,4 @@
-"""A strip of frames: what the cameras saw before each action of an episode, and what came of it."""
+"""Draws a strip of frames: o_t before each action of an episode, and the action's outcome."""
 
 import io
 from collections.abc import Sequence
@@ -19,29 +19,29 @@ _PICK, _PLACE = "#e4572e", "#1b998b"
 
 @dataclass(frozen=True)
 class StripFrame:
-    """One observation, and the action that follows it."""
+    """One observation and the action that follows it."""
 
     colours: NDArray[np.float32]
     """(rows, cols, 3), in [0, 1]."""
     pick: NDArray[np.float64] | None
-    """(row, col); None where there is no action."""
+    """(row, col); None if no action follows."""
     place: NDArray[np.float64] | None
-    """The same."""
+    """(row, col); None if no action follows."""
 
 
 class ActionStrip:
-    """An `EpisodeObserver` that keeps what was seen before each action, and at the end."""
+    """Records o_t before each action and at the end. Its `observe` is an `EpisodeObserver`."""
 
     def __init__(self, station: KittingStation) -> None:
         """
         Args:
-            station: the episode's; it has cameras.
+            station: the episode's, with cameras.
         """
         self._station = station
         self.frames: list[StripFrame] = []
 
     def observe(self, event: ModeChange) -> None:
-        """Keeps what an event shows."""
+        """Records a frame if the event needs one."""
         if not (event.is_action_start or event.is_stop):
             return
         seen = self._station.observation(event.root_context)
@@ -59,10 +59,10 @@ def _pixel(observation: Observation, pose: PlanarPose) -> NDArray[np.float64]:
 
 
 def draw_strips(rows: Sequence[tuple[str, Sequence[StripFrame], Sequence[str]]]) -> bytes:
-    """Several strips, one below the other.
+    """Draws several strips, one below the other.
 
     Args:
-        rows: of each its title, its frames, and what came of each action.
+        rows: for each strip its title, its frames and the outcome of each action.
 
     Returns:
         A PNG.

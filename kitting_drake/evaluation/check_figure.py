@@ -1,4 +1,4 @@
-"""A picture of a check of cameras: how high each sees the table."""
+"""A figure of the heights at which each camera sees the table."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ from systems.signals import PixelGrid
 
 
 def draw_heights(heights: Mapping[str, NDArray[np.float32]], grid: PixelGrid) -> bytes:
-    """Heights above the table, seen from above, by each camera and by all.
+    """Draws heights above the table, seen from above, for each camera and all together.
 
     Args:
-        heights: (rows, cols) in metres, by the camera's name, and by all as ''; NaN where unseen.
+        heights: (rows, cols) in metres, by camera name, and '' for all; NaN where unseen.
         grid: the pixels.
 
     Returns:
         A PNG.
     """
     values = np.concatenate([item[np.isfinite(item)] for item in heights.values()])
-    # What stands on the table is not what this is about.
+    # Ignore objects on the table.
     flat = np.abs(values[np.abs(values) < 0.02])
     reach = max(1.0, 1e3 * float(np.percentile(flat, 98))) if flat.size else 1.0
     down = (len(heights) + 1) // 2
@@ -54,7 +54,7 @@ def draw_heights(heights: Mapping[str, NDArray[np.float32]], grid: PixelGrid) ->
 
 
 def _without_gaps(height: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Heights in which pixels between a camera's samples, which look like holes, are filled in."""
+    """Fills pixels between a camera's samples, which would look like holes."""
     seen = np.isfinite(height)
     share = ndimage.uniform_filter(seen.astype(np.float32), 3)
     mean = ndimage.uniform_filter(np.where(seen, height, 0).astype(np.float32), 3)

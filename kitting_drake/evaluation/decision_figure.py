@@ -1,4 +1,4 @@
-"""A picture of a learned policy's decision: the observation, and the maps behind the action."""
+"""A figure of a learned policy's decision: the observation and the maps behind the action."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ _PICK, _PLACE = "#e4572e", "#1b998b"
 
 
 def draw_decision(observation: Observation, decision: Decision) -> bytes:
-    """The observation with both gripper poses, and the three maps.
+    """Draws the observation with both gripper poses, and the three maps.
 
-    Where the policy stops, the maps are of what it would have done, and no gripper is drawn.
+    If the policy stops, no gripper is drawn, and the maps are those of the rejected action.
 
     Returns:
         A PNG.
@@ -49,7 +49,7 @@ def draw_decision(observation: Observation, decision: Decision) -> bytes:
 
 
 def draw_action(observation: Observation, action: PickPlaceAction) -> bytes:
-    """The observation with both gripper poses, for a decision that has no maps.
+    """Draws the observation with both gripper poses, for a decision without maps.
 
     Returns:
         A PNG.
@@ -82,7 +82,7 @@ def _draw_observation(colour: Axes, height: Axes, observation: Observation) -> N
 
 
 def _title(decision: Decision) -> str:
-    """Whether the policy stops, and how sure it is; nothing if its networks cannot tell."""
+    """The kind of action and its confidence; empty if the networks give no confidence."""
     said = "stop" if decision.stop else "pick and place"
     if decision.log_odds is None:
         return said if decision.stop else ""
@@ -93,7 +93,7 @@ def _draw_maps(
     pick_axes: Axes, place_axes: Axes, decision: Decision, colours: NDArray[np.floating]
 ) -> None:
     grey = np.repeat(colours.mean(axis=2, keepdims=True), 3, axis=2)
-    # A probability of a thousandth of the largest still shows.
+    # Show probabilities down to a thousandth of the largest.
     log_pick = np.log10(np.maximum(decision.pick_map, 1e-12) / decision.pick_map.max())
     for axes, title, depth, cmap, pixel in (
         (
@@ -142,7 +142,7 @@ def _show(axes: Axes, title: str) -> None:
 
 
 def _draw_grippers(axes: Axes, grid: PixelGrid, action: PickPlaceAction) -> None:
-    """The gripper at pick and at place, and an arrow from one to the other."""
+    """Draws the gripper at pick and place, and an arrow between them."""
     reach = _JAWS / grid.resolution
     pick, place = (grid.to_pixel((pose.x, pose.y)) for pose in (action.pick, action.place))
     _draw_gripper(axes, pick, action.pick.theta, reach, _PICK)
@@ -166,7 +166,7 @@ def _draw_grippers(axes: Axes, grid: PixelGrid, action: PickPlaceAction) -> None
 def _draw_gripper(
     axes: Axes, pixel: NDArray[np.float64], theta: float, reach: float, colour: str
 ) -> None:
-    """A line between the jaws and the two pads; at theta zero they close along the cols."""
+    """Draws a line between the jaws, and the two pads; at theta zero they close along the cols."""
     closing = np.array([-math.sin(theta), math.cos(theta)])
     pad = np.array([math.cos(theta), math.sin(theta)])
     ends = np.stack([pixel - reach * closing, pixel + reach * closing])

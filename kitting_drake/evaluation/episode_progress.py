@@ -10,7 +10,7 @@ from systems.pick_place_parameters import Mode
 
 
 class EpisodeProgress:
-    """A progress bar of an episode, one step for each action: an `EpisodeObserver`."""
+    """A progress bar with a step for each action. Its `observe` is an `EpisodeObserver`."""
 
     def __init__(self, console: Console, station: KittingStation) -> None:
         self._station = station
@@ -34,7 +34,7 @@ class EpisodeProgress:
         self._progress.stop()
 
     def observe(self, event: ModeChange) -> None:
-        """Shows what the planner is doing now."""
+        """Shows the planner's present mode."""
         self.last_context = event.root_context
         actions, _, _ = self._station.counts(event.root_context)
         finished = actions - (event.mode not in (Mode.OBSERVE, Mode.DONE))

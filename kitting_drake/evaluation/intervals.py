@@ -7,10 +7,10 @@ from statistics import NormalDist
 import numpy as np
 
 _UPPER = 0.975
-"""What lies below the upper end of an interval of 95 %; as much lies above its lower end."""
+"""Quantile of the upper end of a two-sided 95 % interval."""
 _Z = NormalDist().inv_cdf(_UPPER)
 _ALIKE = 0.9
-"""Where this share of scores is one and the same, the others do not tell how much scores vary."""
+"""If this share of the scores is equal, their sample variance is unreliable."""
 
 
 def proportion_interval(successes: int, trials: int) -> list[float]:
@@ -25,11 +25,11 @@ def proportion_interval(successes: int, trials: int) -> list[float]:
 
 
 def mean_interval(scores: Sequence[float]) -> list[float]:
-    """An interval of the mean of scores between 0 and 1, as [low, high].
+    """A 95 % interval of the mean of scores between 0 and 1, as [low, high].
 
-    It is Student's; of scores that are all 0 or 1 it is Wilson's. Scores nearly all of which are
-    alike do not tell how much they vary. Their interval is Wilson's too, as if each were a number
-    of successes in one trial: no scores of that mean vary more.
+    It is Student's interval. For scores that are all 0 or 1, or nearly all equal, it is Wilson's,
+    with the sum of the scores as number of successes. This is conservative: scores of 0 and 1 have
+    the largest variance for a given mean.
     """
     count, mean = len(scores), float(np.mean(scores))
     values, counts = np.unique(np.round(scores, 9), return_counts=True)

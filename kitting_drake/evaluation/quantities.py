@@ -1,4 +1,4 @@
-"""Counts and times as text, with three digits and a prefix, and tables of them."""
+"""Formats counts and times with three digits and a prefix, and tables of them."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from rich.table import Table
 
 
 def seconds_text(seconds: float | None) -> str:
-    """A time with three digits, in s or ms."""
+    """Formats a time with three digits, in s or ms."""
     if seconds is None:
         return "-"
     if seconds >= 100:
@@ -15,7 +15,7 @@ def seconds_text(seconds: float | None) -> str:
 
 
 def count_text(count: float) -> str:
-    """A count with three digits and a prefix: k, M, G or T."""
+    """Formats a count with three digits and the prefix k, M, G or T."""
     for power, letter in ((1e12, "T"), (1e9, "G"), (1e6, "M"), (1e3, "k")):
         if count >= power:
             return f"{count / power:.3g} {letter}"
@@ -23,12 +23,12 @@ def count_text(count: float) -> str:
 
 
 def ratio_text(ratio: float | None) -> str:
-    """A ratio with two decimals; a dash where there is none."""
+    """Formats a ratio with two decimals; a dash for None."""
     return "-" if ratio is None else f"{ratio:.2f}"
 
 
 def numbers_table(title: str, *headings: str) -> Table:
-    """A table for the terminal whose first column holds words, and the others numbers."""
+    """A table for the terminal; the first column holds text, the others numbers."""
     table = Table(title=title, title_justify="left")
     for index, heading in enumerate(headings):
         table.add_column(heading, justify="right" if index else "left", no_wrap=not index)

@@ -1,4 +1,4 @@
-"""`summary.json`: many episodes in numbers."""
+"""Summarises many episodes as `summary.json`."""
 
 import math
 from collections import Counter
@@ -13,30 +13,30 @@ from kitting_drake.scenario.choosing import ChosenScenario
 from systems.placement import STRICT_ANGLE, STRICT_HEIGHT, AddS, SuccessPredicate
 
 Episode = dict[str, Any]
-"""A line of `episodes.jsonl`: what `EpisodeResult.as_dict` gives."""
+"""A line of `episodes.jsonl`: the result of `EpisodeResult.as_dict`."""
 
 Entry = dict[str, Any]
 """An object or an action of an episode."""
 
 FAILED = "failed episode"
 TIMED_OUT = "timed out"
-"""The cause of all objects of an episode that failed, or whose time was up."""
+"""The cause of all objects of an episode that timed out."""
 
 UNKNOWN = "unknown"
-"""The category of the object of an episode that failed, when no episode tells what it held."""
+"""The category of the object of a failed episode if no other episode has objects."""
 
 AMBIGUITIES = {
     "protruding": ("height_error_mm", 1e3 * STRICT_HEIGHT),
     "reversed": ("angle_error_deg", math.degrees(STRICT_ANGLE)),
 }
-"""Why a success may not be strict: an error that the task's own measure forgives, and the magnitude
-beyond which it counts. The angle is modulo the symmetry that the object declares."""
+"""Reasons why a success is not strict: an error that the task's success predicate tolerates, and
+its limit. The angle is modulo the object's declared symmetry."""
 
 _FAILED_GRASPS = ("missed", "dropped")
 """The outcomes of an action whose grasp was missed or lost."""
 
 ERRORS = ("add_s_mm", "position_error_mm", "angle_error_deg", "height_error_mm")
-"""The errors of an object where it ended."""
+"""The errors of an object's final pose."""
 
 ACTION_ERRORS = (
     "pick_position_error_mm",
@@ -54,26 +54,23 @@ def summarise(
     *,
     wall_seconds_total: float,
 ) -> dict[str, Any]:
-    """The content of `summary.json`.
+    """Computes the content of `summary.json`.
 
-    Rates are means of the episodes' rewards; an episode that failed or timed out counts 0. Where
-    reward is the share of the objects that are successes, and the task says that each is one by
-    itself, the interval is Wilson's over the objects, as if each were drawn anew. Where it is
-    anything else (partial rewards, weights, cubes that stand on one another), it is one over the
-    episodes (see `mean_interval`); `ci95_method` says which.
-
-    `outcomes` has for each episode its seed, both rates, and for each object, by its name, 2: a
-    strict success, 1: a success, 0: none. Two runs of the same seeds are compared by them.
-
-    Errors are those of all objects, and all actions, of the episodes that came to an end, missed
-    ones included; an object that no goal was left for is in no statistic.
+    - Rates are means of the episodes' rewards; failed and timed-out episodes count 0.
+    - Intervals are Wilson's over objects if the reward is the share of successful objects and the
+      task declares its objects independent. Otherwise (partial rewards, weights, stacks) they are
+      over episodes, see `mean_interval`. `ci95_method` names the method.
+    - `outcomes` holds for each episode its seed, both rates, and for each object 2 (strict
+      success), 1 (success) or 0. It allows paired comparisons of runs with the same seeds.
+    - Errors include all objects and actions of completed episodes, failures too. Objects for which
+      no goal was left are excluded.
 
     Args:
         episodes: at least one.
-        chosen: what was run.
-        success: the predicate of the scenario's scenes.
-        wall_seconds_total: how long all calls took that ran the episodes, in s; `wall_seconds` adds
-            up the episodes' own.
+        chosen: the scenario.
+        success: the success predicate of its scenes.
+        wall_seconds_total: total duration of the calls that ran the episodes, in s. In contrast,
+            `wall_seconds` is the sum of the episodes' durations.
     """
     objects_of = counted_objects(episodes)
     objects = [item for items in objects_of for item in items]
@@ -123,36 +120,36 @@ def summarise(
 
 
 def _commits(episodes: Sequence[Episode]) -> str | None:
-    """The commit of the code that ran the episodes; several if an evaluation was taken up by
-    other code. Older episodes do not tell."""
+    """The commits of the code that ran the episodes: several if other code resumed the evaluation.
+    Defaults to the present one for episodes without a commit."""
     found = dict.fromkeys(str(episode["commit"]) for episode in episodes if episode.get("commit"))
     return ", ".join(found) or commit()
 
 
 def needless_actions(episode: Episode) -> int:
-    """The actions on objects that no goal was left for: no success rate tells of them, and they may
-    do harm."""
+    """The number of actions on objects for which no goal was left. Success rates do not show them,
+    but they may do harm."""
     useful = {item["name"] for item in episode["objects"] if item["add_s_mm"] is not None}
     if not useful:
-        # It failed, and does not tell.
+        # A failed episode may lack its objects.
         return 0
     return sum(action["object"] not in useful for action in episode["actions_taken"])
 
 
 def actions_after_failed_grasp(episode: Episode) -> int:
-    """The actions that were decided after a grasp of the same episode was missed or lost: a policy
-    that remembers where grasps failed may have decided them otherwise."""
+    """The number of actions after the first missed or lost grasp of the episode. A policy with a
+    memory of failed grasps may decide them differently."""
     outcomes = [action["outcome"] for action in episode["actions_taken"]]
     failed = [index for index, outcome in enumerate(outcomes) if outcome in _FAILED_GRASPS]
     return len(outcomes) - 1 - failed[0] if failed else 0
 
 
 def counted_objects(episodes: Sequence[Episode]) -> list[list[Entry]]:
-    """The objects of each episode that its reward is about: those that a goal was left for.
+    """The objects of each episode that count, i.e. for which a goal was left.
 
-    In an episode that failed or timed out none is a success, and none has errors. If its process
-    was lost and with it the names of its objects, it held as many of each category as any other
-    episode held at most.
+    In a failed or timed-out episode no object is a success or has errors. If its process was lost
+    together with the objects' names, it gets for each category the largest number of objects in any
+    other episode.
     """
     found = [
         [item for item in episode["objects"] if item["add_s_mm"] is not None]
@@ -169,7 +166,7 @@ def counted_objects(episodes: Sequence[Episode]) -> list[list[Entry]]:
 
 
 def _outcome(episode: Episode, objects: list[Entry]) -> dict[str, Any]:
-    """One of the `outcomes`; an object whose name is lost with its process is in none."""
+    """An element of `outcomes`, without objects whose names were lost."""
     return {key: episode[key] for key in ("seed", "success_rate", "strict_success_rate")} | {
         "objects": {
             item["name"]: int(item["success"]) + int(item["strict_success"])
@@ -241,7 +238,7 @@ def _rates(
 def _summarise_category(
     objects: list[Entry], actions: list[Entry], causes: Sequence[str]
 ) -> dict[str, Any]:
-    """The summary of the objects of one category; its rates are shares of them."""
+    """The summary of the objects of one category; rates are shares of the objects."""
     successes, strict_successes = (
         sum(item[key] for item in objects) for key in ("success", "strict_success")
     )
@@ -269,14 +266,14 @@ def _statistics(
 
 
 def find_ambiguities(item: Mapping[str, Any]) -> list[str]:
-    """Why an object that is a success is no strict one: some of `AMBIGUITIES`."""
+    """The `AMBIGUITIES` because of which a success is not strict."""
     if not item["success"] or item["strict_success"]:
         return []
     return [name for name, (key, limit) in AMBIGUITIES.items() if abs(item[key]) > limit]
 
 
 def _describe(items: list[Entry], key: str) -> dict[str, float | None]:
-    """Median, 95th percentile and maximum of the magnitudes that there are."""
+    """Median, 95th percentile and maximum of the magnitudes, without None."""
     values = [abs(item[key]) for item in items if item[key] is not None]
     if not values:
         return {"median": None, "p95": None, "max": None}

@@ -1,4 +1,4 @@
-"""The picture beside `summary.json`: how well objects were placed, and why some were not."""
+"""The figure beside `summary.json`: placement errors and causes of failure."""
 
 import io
 import itertools
@@ -13,10 +13,10 @@ from kitting_drake.common.files import write_atomically
 from kitting_drake.evaluation.summary import Entry, Episode, counted_actions, counted_objects
 
 _COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#8c6d1f")
-"""Seven that all eyes tell apart on white (after Okabe and Ito)."""
+"""Seven colours that are distinguishable with colour blindness (after Okabe and Ito)."""
 _LINES = ("-", "-.", ":")
 _HATCHES = ("", "////", "....")
-"""The marks that tell categories apart once the colours are used up."""
+"""Hatches that distinguish categories when the colours are used up."""
 
 _STYLE = {
     "font.size": 9.5,
@@ -33,12 +33,12 @@ _STYLE = {
 
 _LENGTHS = (0.1, 300.0)
 _ANGLES = (0.02, 180.0)
-"""The ranges of the axes, in mm and degrees; values beyond them are drawn at their ends."""
+"""Ranges of the axes, in mm and degrees; values outside are drawn at their ends."""
 
 
 @dataclass(frozen=True)
 class _Look:
-    """The marks of a category."""
+    """The style of a category."""
 
     colour: str
     line: str
@@ -47,7 +47,7 @@ class _Look:
 
 @dataclass(frozen=True)
 class _Panel:
-    """The distributions of one error."""
+    """The distribution of one error."""
 
     title: str
     unit: str
@@ -66,21 +66,20 @@ _PANELS = (
 def draw_summary(summary: dict[str, Any], episodes: Sequence[Episode], path: Path) -> None:
     """Draws the distributions behind a summary.
 
-    Three panels show, for each category, the share of its objects that ended within x of their
-    goals: by ADD-S, where the curve meets the task's threshold, if it has one, at the success rate;
-    by position and by angle, beside where the policy's actions would have brought them had nothing
-    slipped. Objects of episodes that failed or timed out are within no x. The fourth panel counts
-    the causes.
+    Three panels show, for each category, the share of objects with an error of at most x: ADD-S
+    (with the task's threshold, if any), position and angle. Position and angle also show the errors
+    of the policy's actions, i.e. without slip. Objects of failed or timed-out episodes count as
+    errors beyond all x. The fourth panel counts the causes.
 
     Args:
-        summary: of `summarise`.
+        summary: the result of `summarise`.
         episodes: all of them.
         path: a .png file.
 
     Raises:
-        UserError: the file cannot be written.
+        MachineError: writing fails.
     """
-    # Imported here: the other commands should not wait for it.
+    # Import matplotlib lazily.
     import matplotlib
 
     matplotlib.use("Agg")
@@ -108,7 +107,7 @@ def draw_summary(summary: dict[str, Any], episodes: Sequence[Episode], path: Pat
 
 
 def _looks() -> Iterable[_Look]:
-    """More than anybody has categories, all different; then the same again."""
+    """Distinct styles for 21 categories, then the same again."""
     return itertools.cycle(
         _Look(colour, line, hatch)
         for line, hatch in zip(_LINES, _HATCHES, strict=True)
@@ -153,7 +152,7 @@ def _draw_shares(
     look: _Look,
     label: str,
 ) -> None:
-    """Draws which share of the errors has a magnitude of at most x; None is beyond all x."""
+    """Draws the share of errors with a magnitude of at most x; None counts as infinite."""
     known = [error for error in errors if error is not None]
     ordered = np.sort(np.clip(np.abs(known), *limits))
     shares = np.arange(len(known) + 1) / max(len(errors), 1)
@@ -175,7 +174,7 @@ def _draw_shares(
 
 
 def _draw_causes(axis: Any, summary: dict[str, Any], looks: dict[str, _Look]) -> None:
-    """Draws a bar for each cause, in sections for the categories."""
+    """Draws a bar for each cause, divided by category."""
     causes = list(summary["causes"])
     ends = np.zeros(len(causes))
     for name, category in summary["categories"].items():

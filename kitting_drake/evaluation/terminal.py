@@ -1,4 +1,4 @@
-"""Tables for the terminal: of one episode, and of the summary of many."""
+"""Tables for the terminal: of one episode, and of a summary."""
 
 import dataclasses
 from typing import Any
@@ -15,7 +15,7 @@ _ERROR_HEADINGS = ("ADD-S mm", "position mm", "angle deg", "height mm")
 
 
 def episode_table(result: EpisodeResult) -> Table:
-    """A row for each object that a goal takes."""
+    """A table with a row for each object that some goal takes."""
     table = Table(
         title=escape(f"{result.scenario}, seed {result.seed}"),
         title_justify="left",
@@ -47,7 +47,7 @@ def _verdict(item: ObjectResult) -> str:
 
 
 def print_episode(console: Console, result: EpisodeResult) -> None:
-    """The table of an episode and its summary."""
+    """Prints the table of an episode and its summary."""
     console.print(episode_table(result))
     rate = result.sim_seconds / result.wall_seconds if result.wall_seconds else 0.0
     console.print(
@@ -80,15 +80,15 @@ def print_episode(console: Console, result: EpisodeResult) -> None:
             "done; the episode scores 0"
         )
     if result.interrupted:
-        console.print("[yellow]interrupted:[/] the result is of the episode so far")
+        console.print("[yellow]interrupted:[/] the result covers the episode so far")
 
 
 def summary_table(summary: dict[str, Any]) -> Table:
-    """The summary of many episodes: a row for each category. Columns count objects."""
+    """The table of a summary, with a row for each category. Columns count objects."""
     table = Table(title=_summary_title(summary), title_justify="left")
     table.add_column("category", no_wrap=True)
     for heading in ("strict", "success", "ADD-S mm", "95 %", *_ERROR_HEADINGS[1:]):
-        # In a narrow terminal headings break between words, not within them.
+        # In a narrow terminal, break headings between words only.
         table.add_column(heading, justify="right", min_width=max(map(len, heading.split())))
     categories = summary["categories"]
     rows = [(name, row, _counts(row)) for name, row in categories.items()]
@@ -129,7 +129,7 @@ def _counts(category: dict[str, Any]) -> tuple[int, int, int]:
 
 
 def summary_notes(summary: dict[str, Any]) -> str:
-    """The lines below the table: causes, ambiguous successes, and how good the actions were."""
+    """The lines below the table: causes, ambiguous successes, and errors of the actions."""
     causes = [f"{count} {cause}" for cause, count in summary["causes"].items() if count]
     ambiguous = [f"{count} {name}" for name, count in summary["ambiguous"].items() if count]
     pick_position, pick_angle, place_position, place_angle = (
@@ -152,5 +152,5 @@ def summary_notes(summary: dict[str, Any]) -> str:
 
 
 def number(value: float | None, form: str = ".2f") -> str:
-    """A number for a table; a dash where there is none."""
+    """Formats a number for a table; a dash for None."""
     return "-" if value is None else format(value, form)

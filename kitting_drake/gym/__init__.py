@@ -1,7 +1,7 @@
-"""The cell as Gymnasium environments; importing this registers them: see docs/gym.md.
+"""The cell as Gymnasium environments, registered on import; see docs/gym.md.
 
-Gymnasium imports it for `gymnasium.make("kitting_drake.gym:kitting_drake/KittingUnseen-v0")`. It
-looks for no entry points of installed packages any more, from its version 1.0 on.
+`gymnasium.make("kitting_drake.gym:kitting_drake/KittingUnseen-v0")` imports this module. Gymnasium
+1.0 and later ignore the entry points of installed packages.
 """
 
 import gymnasium
@@ -17,7 +17,8 @@ SCENARIOS = {
     "StackBlockPyramid": ("ravens.yaml", "StackBlockPyramid"),
     "PalletizingBoxes": ("ravens.yaml", "PalletizingBoxes"),
 }
-"""The file and the scenario in it of each environment but `Scenario`, which is told them."""
+"""The file and the scenario of each environment, except for `Scenario`, which gets them by
+argument."""
 
 
 def _register_environments() -> None:
@@ -26,9 +27,9 @@ def _register_environments() -> None:
         file, scenario = SCENARIOS.get(name, (None, None))
         gymnasium.register(
             f"kitting_drake/{name}-v0",
-            # Drake is slow to load: it is, once an environment is made.
+            # A string, so that Drake, which loads slowly, is imported only with an environment.
             entry_point="kitting_drake.gym.environment:KittingEnvironment",
-            # By its path: a file of that name in the working directory is another.
+            # By path, as the working directory may contain a file of the same name.
             kwargs={}
             if file is None
             else {"scenario": str(paths.SCENARIOS / file), "scenario_name": scenario},

@@ -33,19 +33,19 @@ from systems.surface_heights import read_surface_heights
 
 
 class KittingEnvironment(gymnasium.Env[dict[str, Any], NDArray[Any]]):
-    """A scenario's station, with an agent in the place of its policy.
+    """A scenario's station. The agent replaces the scenario's policy.
 
-    - Observation and action: see `gym.spaces`. An observation is what a policy would see, taken as
-      the hand waits out of the cameras' sight for the next action.
-    - Reward: the increase of the task's reward; the rewards of an episode add up to the
-      `success_rate` of `results.json`. As there, an episode whose time is up, or whose simulation
-      fails, has none: its last step takes away what was earned.
-    - Terminated: the agent said stop, or every goal is filled. Truncated: the actions or the time
-      are spent, or the simulation failed, and `info["failure"]` says why.
-    - `info`: the keys of `results.json` as they stand, but for `wall_seconds`, which is never twice
-      the same; and `failed_picks`: where a grasp failed before, a tuple of (x, y, theta).
-    - `reset(seed=N)` makes the scene of seed N of `evaluate` and `run`; without a seed the next is
-      drawn. `info["seed"]` tells it.
+    - Observation and action: see `gym.spaces`. The observation is o_t at the time when a policy
+      would be called, while the hand waits out of the cameras' sight.
+    - Reward: the increase of the task's reward, so that the return equals `success_rate` in
+      `results.json`. It too is 0 if the episode times out or fails: the last step then subtracts
+      the reward earned before.
+    - Terminated: the agent stopped, or every goal is filled. Truncated: no actions or no time are
+      left, or the simulation failed (`info["failure"]`).
+    - `info`: the present values of the keys of `results.json`, without `wall_seconds`, which would
+      not be reproducible; and `failed_picks`, (x, y, theta) of each failed grasp.
+    - `reset(seed=N)` makes the scene of seed N, as in `evaluate` and `run`; without a seed, a
+      random one. `info["seed"]` holds it.
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 1}  # noqa: RUF012  Gymnasium's own way.
@@ -62,22 +62,22 @@ class KittingEnvironment(gymnasium.Env[dict[str, Any], NDArray[Any]]):
     ) -> None:
         """
         Args:
-            scenario: its file, or the name of one of the project's; its policy means nothing here.
-            scenario_name: which of the file; the first when None.
+            scenario: a scenario file, or the name of one of the project's; its policy is ignored.
+            scenario_name: a scenario in the file; None: the first.
             scenario_text: YAML merged over it.
-            perturb: perturbations, as `--perturb` takes them.
-            cameras: whether observations hold the images of each camera too.
+            perturb: perturbations, as for `--perturb`.
+            cameras: whether observations contain the cameras' images, too.
             render_mode: `rgb_array` for `render`, or None.
 
         Raises:
-            UserError: the scenario cannot be used.
-            ValueError: a render mode that there is not.
+            UserError: the scenario is invalid.
+            ValueError: the render mode does not exist.
         """
         if render_mode not in (None, *self.metadata["render_modes"]):
             raise ValueError(f"render_mode must be rgb_array or None, not {render_mode!r}")
         found = find_scenario(Path(scenario), scenario_name, scenario_text, perturb)
         if not found.scenario.cameras:
-            raise UserError(f"{found.path}: cameras is empty: an agent needs at least one")
+            raise UserError(f"{found.path}: cameras is empty: an agent needs at least one camera")
         self._chosen = found
         self.render_mode = render_mode
         self.grid = found.scenario.heightmap.grid()
@@ -91,20 +91,20 @@ class KittingEnvironment(gymnasium.Env[dict[str, Any], NDArray[Any]]):
 
     @property
     def scenario(self) -> Scenario:
-        """The scenario; its cameras tell where images are from, its policy means nothing here."""
+        """The scenario; its policy is ignored."""
         return self._chosen.scenario
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, Any], dict[str, Any]]:
-        """A new scene: see Gymnasium and the class.
+        """Makes a new scene; see Gymnasium and the class.
 
         Raises:
-            ValueError: a seed that is none.
+            ValueError: the seed is invalid.
             UserError: the scene cannot be made, or the episode ends before its first action.
         """
         if seed is not None and not 0 <= seed < ALL_SEEDS.stop:
-            raise ValueError(f"a seed is a whole number from 0 to {ALL_SEEDS[-1]}, not {seed}")
+            raise ValueError(f"seed must be an integer from 0 to {ALL_SEEDS[-1]}, not {seed}")
         super().reset(seed=seed)
         chosen_seed = int(self.np_random.integers(ALL_SEEDS.stop)) if seed is None else int(seed)
         self.close()
@@ -115,21 +115,21 @@ class KittingEnvironment(gymnasium.Env[dict[str, Any], NDArray[Any]]):
         self._earned = 0.0
         self._advance(self._episode)
         if self._episode.is_over:
-            why = self._episode.failure or "planner.max_actions allows none"
+            why = self._episode.failure or "planner.max_actions is 0"
             if self._episode.timed_out:
-                why = f"the time limit of {self.scenario.time_limit:g} s came first"
+                why = f"time_limit is {self.scenario.time_limit:g} s"
             raise UserError(
-                f"{self._chosen.path}: with seed {chosen_seed} the episode was over before the "
-                f"first action: {why}"
+                f"{self._chosen.path}: with seed {chosen_seed} the episode ended before the first "
+                f"action: {why}"
             )
         return self._observe(), self._info(self._episode.result())
 
     def _build(self, seed: int) -> KittingStation:
-        """The station, which has cameras.
+        """Builds a station with cameras.
 
         Raises:
             UserError: the scene cannot be made.
-            MachineError: images cannot be rendered here.
+            MachineError: this machine cannot render.
         """
         require_rendering()
         with self._chosen.named_in_errors():
@@ -139,24 +139,24 @@ class KittingEnvironment(gymnasium.Env[dict[str, Any], NDArray[Any]]):
         return station
 
     def step(self, action: ArrayLike) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
-        """One pick and place, or the end: see Gymnasium and the class.
+        """Executes one pick and place, or stops; see Gymnasium and the class.
 
         Args:
-            action: (7,): `gym.spaces.ACTION`. A position off the workspace is moved to its edge.
+            action: (7,): `gym.spaces.ACTION`. Positions are clipped to the workspace.
 
         Raises:
-            ValueError: not seven finite numbers.
-            gymnasium.error.ResetNeeded: there is no episode, or it is over.
+            ValueError: the action is not seven finite numbers.
+            gymnasium.error.ResetNeeded: no episode has begun, or it is over.
         """
         if self._episode is None or self._episode.is_over:
-            raise gymnasium.error.ResetNeeded("call reset() first: there is no episode under way")
+            raise gymnasium.error.ResetNeeded("no episode is running: call reset() first")
         episode = self._episode
         given = as_action(action, self.grid)
         self._give(episode, self._with_heights(given))
         result = episode.result()
         is_done = result.success_rate > ALL
         if is_done and not episode.is_over:
-            # As a policy would that sees that nothing is left to do.
+            # Like a policy that sees a finished task.
             self._give(episode, PickPlaceAction(stop=True))
             result = episode.result()
             is_done = result.success_rate > ALL
@@ -167,7 +167,7 @@ class KittingEnvironment(gymnasium.Env[dict[str, Any], NDArray[Any]]):
         return self._observe(), reward, terminated, truncated, self._info(result)
 
     def render(self) -> NDArray[np.uint8] | None:
-        """(800, 1280, 3): the whole cell as it stands now; None without a render mode.
+        """(800, 1280, 3) picture of the whole cell now; None without a render mode.
 
         Raises:
             gymnasium.error.ResetNeeded: there is no scene yet.
@@ -175,16 +175,15 @@ class KittingEnvironment(gymnasium.Env[dict[str, Any], NDArray[Any]]):
         if self.render_mode is None:
             return None
         if self._station is None or self._episode is None:
-            raise gymnasium.error.ResetNeeded("call reset() first: there is nothing to render")
+            raise gymnasium.error.ResetNeeded("there is no scene to render: call reset() first")
         scene_graph = self._station.scene_graph
         context = scene_graph.GetMyContextFromRoot(self._episode.context)
         return render_picture(scene_graph, context)
 
     def close(self) -> None:
-        """Lets go of the simulation. Drake 1.51, of Python 3.11, keeps some 35 MB of it all the
-        same."""
+        """Frees the simulation. With Python 3.11, Drake 1.51 leaks about 35 MB nevertheless."""
         self._station = self._episode = None
-        # A Diagram and its systems refer to each other: without this they stay for a while.
+        # A Diagram and its systems form reference cycles.
         gc.collect()
 
     def _give(self, episode: Episode, action: PickPlaceAction) -> None:
@@ -202,12 +201,12 @@ class KittingEnvironment(gymnasium.Env[dict[str, Any], NDArray[Any]]):
         return self._eval("observation")
 
     def _eval(self, port: str) -> Any:
-        """The value of one of the station's output ports."""
+        """The value of an output port of the station."""
         assert self._station is not None and self._episode is not None
         return self._station.GetOutputPort(port).Eval(self._episode.context)
 
     def _with_heights(self, action: PickPlaceAction) -> PickPlaceAction:
-        """The action with the heights that it has to respect, off the o_t that the agent saw."""
+        """The action with heights, read off the agent's o_t."""
         heights = read_surface_heights(self._observation(), action.pick, action.place)
         return dataclasses.replace(action, heights=heights)
 
@@ -218,7 +217,7 @@ class KittingEnvironment(gymnasium.Env[dict[str, Any], NDArray[Any]]):
         return arrays
 
     def _images(self, camera: str) -> dict[str, NDArray[Any]]:
-        """The images that o_t was projected from, with the scenario's noise."""
+        """The images from which o_t was projected, with the scenario's noise."""
         colour, depth = (self._eval(f"{kind}_image_{camera}").data for kind in ("color", "depth"))
         return {"colour": np.array(colour[:, :, :3]), "depth": np.array(depth[:, :, 0])}
 

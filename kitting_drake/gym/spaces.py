@@ -1,4 +1,4 @@
-"""Observations and actions of an agent: Gymnasium's spaces, to and from the systems' signals."""
+"""Gymnasium spaces of observations and actions, and their conversion to the systems' signals."""
 
 import math
 from typing import Any
@@ -11,21 +11,24 @@ from kitting_drake.scenario.schema import Scenario
 from systems.signals import Observation, PickPlaceAction, PixelGrid, PlanarPose
 
 ACTION = ("pick_x", "pick_y", "pick_theta", "place_x", "place_y", "place_theta", "stop")
-"""The entries of an action: the gripper's poses in the world, in metres and radians, and whether to
-stop instead, which it is above 0.5."""
+"""The entries of an action: the gripper's poses in the world, in metres and radians, and `stop`, 0
+to 1: above `STOP` the episode ends."""
+STOP = 0.95
+"""A random agent seldom stops."""
 _ANGLES = [2, 5]
 
 
 def action_space(grid: PixelGrid) -> spaces.Box:
-    """(7,) float64: `ACTION`; positions are within the workspace, angles within pi of zero."""
+    """(7,) float64: `ACTION`, with positions in the workspace and angles in [-pi, pi]."""
     low, high = (grid.x_min, grid.y_min, -math.pi), (grid.x_max, grid.y_max, math.pi)
     return spaces.Box(np.array([*low, *low, 0.0]), np.array([*high, *high, 1.0]), dtype=np.float64)
 
 
 def observation_space(scenario: Scenario, *, cameras: bool) -> spaces.Dict:
     """`colour` (rows, cols, 3), `height` (rows, cols) in metres above `grid.z_min` and `valid`
-    (rows, cols), as in `Observation`; with cameras also `cameras`: `colour` (height, width, 3) and
-    `depth` (height, width) in metres, infinite where too far and 0 where too near, of each."""
+    (rows, cols), as in `Observation`. With `cameras`, also the images of each camera under that
+    key: `colour` (height, width, 3) and `depth` (height, width) in metres, infinity where too far
+    and 0 where too near."""
     grid = scenario.heightmap.grid()
     depth_range = grid.z_max - grid.z_min
     parts: dict[str, spaces.Space[Any]] = {
@@ -48,7 +51,7 @@ def observation_space(scenario: Scenario, *, cameras: bool) -> spaces.Dict:
 
 
 def as_arrays(observation: Observation) -> dict[str, NDArray[Any]]:
-    """o_t as the environments tell it: colours are rounded to 8 bits."""
+    """o_t as arrays, with colours rounded to 8 bits."""
     colour = np.rint(255 * np.moveaxis(observation.rgb, 0, -1)).astype(np.uint8)
     return {
         "colour": colour,
@@ -58,7 +61,7 @@ def as_arrays(observation: Observation) -> dict[str, NDArray[Any]]:
 
 
 def as_observation(arrays: dict[str, Any], grid: PixelGrid) -> Observation:
-    """o_t as policies take it: the inverse of `as_arrays`.
+    """The inverse of `as_arrays`, for policies.
 
     Args:
         arrays: an environment's observation.
@@ -70,31 +73,31 @@ def as_observation(arrays: dict[str, Any], grid: PixelGrid) -> Observation:
 
 
 def as_action(values: ArrayLike, grid: PixelGrid) -> PickPlaceAction:
-    """The action that an agent says; positions off the workspace are moved to its edge.
+    """The action of seven numbers; positions are clipped to the workspace.
 
     Raises:
-        ValueError: not seven numbers, or one that is not finite.
+        ValueError: the shape is not (7,), or a number is not finite.
     """
     array = np.asarray(values, dtype=np.float64)
     if array.shape != (len(ACTION),):
-        raise ValueError(f"an action is {len(ACTION)} numbers, not of the shape {array.shape}")
+        raise ValueError(f"an action must have the shape ({len(ACTION)},), not {array.shape}")
     for name, value in zip(ACTION, array, strict=True):
         if not math.isfinite(value):
             raise ValueError(f"{name} of an action must be a finite number, not {value}")
     space = action_space(grid)
     held = np.clip(array, space.low, space.high)
-    # An angle has no edge: any is the same as one within pi of zero.
+    # Angles need no clipping: they are equivalent modulo 2 pi.
     held[_ANGLES] = array[_ANGLES]
     pick, place = PlanarPose(*held[:3].tolist()), PlanarPose(*held[3:6].tolist())
-    return PickPlaceAction(pick, place, stop=bool(array[6] > 0.5))
+    return PickPlaceAction(pick, place, stop=bool(array[6] > STOP))
 
 
 def as_values(action: PickPlaceAction) -> NDArray[np.float64]:
-    """(7,) the action of a policy as an agent says it.
+    """(7,) the inverse of `as_action`, for a policy's action.
 
     Raises:
-        ValueError: it presses, which environments have no word for.
+        ValueError: the action presses, which environments do not support.
     """
     if action.press:
-        raise ValueError("an environment's actions cannot press: use a policy that does not")
+        raise ValueError("environments do not support actions that press: use another policy")
     return np.array([*action.pick.as_array(), *action.place.as_array(), float(action.stop)])

@@ -57,7 +57,8 @@ def sheet(args: argparse.Namespace, entries: list[ToolEntry]) -> None:
         shown, own = chosen_with_own(entries, args.names)
         names = [*(entry.name for entry in shown), *own]
         subjects = [tool_subject(load_tool(name)) for name in names]
-    write_sheet(subjects, args.output)
+    with Progress(console=Console(stderr=True, quiet=args.quiet), transient=True) as progress:
+        write_sheet(progress.track(subjects, description="drawing"), len(subjects), args.output)
 
 
 def build(args: argparse.Namespace, entries: list[ToolEntry]) -> None:
@@ -169,7 +170,7 @@ def main() -> int:
             verb.add_argument(
                 "--models", type=Path, default=MODELS, help="the folder with package.xml and tools/"
             )
-        if name == "generate":
+        if name != "list":
             verb.add_argument("--quiet", action="store_true", help="print nothing")
         if name == "sheet":
             verb.add_argument("--output", type=Path, required=True, help="the PNG to write")

@@ -1,7 +1,7 @@
 """Contact sheets of tools and kits, rendered without a display by Drake's VTK engine."""
 
 import io
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -151,8 +151,13 @@ def _add_table(scene_graph: SceneGraph) -> None:
     scene_graph.RegisterAnchoredGeometry(source, table)
 
 
-def write_sheet(subjects: Sequence[Subject], output: Path) -> None:
+def write_sheet(subjects: Iterable[Subject], count: int, output: Path) -> None:
     """Writes one picture of all the subjects with their titles.
+
+    Args:
+        subjects: what to draw.
+        count: how many they are.
+        output: the PNG file.
 
     Raises:
         UserError: rendering is not available, or the picture cannot be written.
@@ -164,8 +169,8 @@ def write_sheet(subjects: Sequence[Subject], output: Path) -> None:
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
-    columns = min(len(subjects), 2 if len(subjects) <= 4 else 6)
-    rows = -(-len(subjects) // columns)
+    columns = min(count, 2 if count <= 4 else 6)
+    rows = -(-count // columns)
     figure, axes = plt.subplots(
         rows, columns, figsize=(4.5 * columns, 3.3 * rows), squeeze=False, facecolor=_BACKGROUND
     )
@@ -176,6 +181,6 @@ def write_sheet(subjects: Sequence[Subject], output: Path) -> None:
         axis.set_title(subject.title, fontsize=13, color="0.15")
     figure.tight_layout()
     picture = io.BytesIO()
-    figure.savefig(picture, format="png", dpi=130 if len(subjects) <= 12 else 60)
+    figure.savefig(picture, format="png", dpi=130 if count <= 12 else 60)
     plt.close(figure)
     write_atomically(output, picture.getvalue())

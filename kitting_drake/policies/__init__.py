@@ -1,1 +1,1 @@
-"""Policies: their demonstrations, networks and losses. There is no pydrake here."""
+"""Policies: their demonstrations, networks and losses. Nothing here imports pydrake."""

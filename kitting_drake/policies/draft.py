@@ -1,4 +1,4 @@
-"""A decision in the making: what the networks propose, and what later stages have made of it."""
+"""A decision while it is made: the networks' proposal, which the stages then refine."""
 
 from __future__ import annotations
 
@@ -37,8 +37,10 @@ _NEVER = -math.inf
 
 
 def network_input(networks: Networks, observation: Observation) -> Image:
-    """(4, rows, cols): what the networks are shown; where they see heights alone, what no camera
-    saw is filled in."""
+    """The networks' input: (4, rows, cols).
+
+    Networks that see heights alone get unseen pixels filled in.
+    """
     if networks.config.colour:
         return observation.image
     filled = fill_unseen(observation.height, observation.valid)
@@ -46,7 +48,7 @@ def network_input(networks: Networks, observation: Observation) -> Image:
 
 
 class Look:
-    """One observation, and what is read off it once."""
+    """One observation with everything that is computed from it once."""
 
     def __init__(
         self,
@@ -60,7 +62,7 @@ class Look:
             networks: for inference.
             orientations: N.
             observation: o_t.
-            failed_picks: where grasps failed before.
+            failed_picks: poses at which a grasp failed before.
         """
         self.networks = networks
         self.orientations = orientations
@@ -71,22 +73,22 @@ class Look:
 
     @property
     def resolution(self) -> float:
-        """The side of a pixel, in metres."""
+        """The side of a pixel in metres."""
         return self.observation.grid.resolution
 
     @cached_property
     def segmentation(self) -> Segmentation:
-        """The regions of o_t, by height."""
+        """The segmentation of o_t by height."""
         return segment(self.observation)
 
     @cached_property
     def failed_pixels(self) -> Array:
-        """(n, 2): the (row, col) of where grasps failed."""
+        """(n, 2): the (row, col) of each failed pick."""
         places = np.array([(pick.x, pick.y) for pick in self.failed_picks]).reshape(-1, 2)
         return self.observation.grid.to_pixel(places)
 
     def first_logits(self) -> Tensor:
-        """(rows, cols): the logits of the pick; none is chosen where a grasp failed before."""
+        """(rows, cols): the logits of the pick, -inf near failed picks."""
         logits = self.picking.position
         if not self.failed_picks:
             return logits
@@ -94,62 +96,66 @@ class Look:
 
 
 class Stage(Protocol):
-    """One stage of a decision; it keeps nothing from one decision to the next."""
+    """One stage of a decision. It keeps no state between decisions."""
 
     def refine(self, draft: Draft) -> Draft:
-        """The draft with this stage's change, or the draft as it was."""
+        """The refined draft, or the same draft where the stage does not apply."""
         ...
 
 
 @dataclass(frozen=True)
 class Draft:
-    """An action in pixels, and what it was read from."""
+    """An action in pixels, and the predictions behind it."""
 
     look: Look
     stages: tuple[Stage, ...]
-    """The stages that it has passed."""
+    """The stages applied so far."""
     logits: Tensor
-    """(rows, cols): of the pick, -inf where it must not be."""
+    """(rows, cols): the logits of the pick, -inf where it is excluded."""
     pixel: tuple[int, int]
-    """(row, col) of the largest logit: the networks see the crops around it."""
+    """(row, col) of the largest logit. The networks see the crops around it."""
     angles: AnglePrediction
-    """The pick's angle there."""
+    """The predicted pick angle at `pixel`."""
     placing: PlacePrediction
-    """Where the networks bring what is at that pixel."""
+    """The predicted placements of the object at `pixel`."""
     pick: Array
     """(row, col)."""
     theta: float
-    """Of the gripper at the pick, in radians."""
+    """The gripper's angle at the pick, in radians."""
     rotation: float
-    """Of the object on its way, in radians."""
+    """The object's rotation from pick to place, in radians."""
     goal: Array
-    """(row, col) where the networks bring the pixel."""
+    """The predicted (row, col) of the place for `pixel`."""
     continuous: bool = False
     """Whether positions and angles are refined beyond pixels and bins."""
     fitted: Array | None = None
-    """(row, col) of the place, where the outlines of object and recess say it."""
+    """(row, col) of the place by the outlines of object and recess; None where they do not fit."""
     belongs: bool = False
-    """Whether the outlines say that the object belongs where it is to be placed."""
+    """Whether the outlines show that the object belongs at this place."""
     stop: bool = False
     """Whether there is nothing left to pick."""
     mending: PickPlaceAction | None = None
-    """What is done instead, to mend an earlier action."""
+    """An action that mends an earlier one and replaces this draft."""
 
     @property
     def place(self) -> Array:
-        """(row, col) where the pick is brought: the predicted motion of the pixel applies to the
-        refined pick too."""
+        """(row, col) of the place for the pick.
+
+        Without a fitted place, the motion predicted for `pixel` is applied to the refined pick.
+        """
         if self.fitted is not None:
             return self.fitted
         return self.goal + rotation_matrix(self.rotation) @ (self.pick - np.array(self.pixel))
 
     def placement(self, candidate: Candidate) -> tuple[float, Array]:
-        """The rotation, in radians, and the goal (row, col) of a candidate of the networks."""
+        """The rotation in radians and the goal (row, col) of one of the networks' candidates."""
         return best_placement(candidate, self.look.orientations, self.continuous)
 
     def among(self, mask: Mask) -> Draft | None:
-        """The draft, after the same stages, of the best pick within a mask (rows, cols) instead;
-        None where the mask leaves no pixel to pick."""
+        """The draft of the best pick within a mask (rows, cols), after the same stages.
+
+        None where the mask leaves no pixel to pick.
+        """
         left = _without(self.logits, ~mask)
         if not bool((left > _NEVER).any()):
             return None
@@ -160,9 +166,9 @@ def make_draft(look: Look, logits: Tensor, stages: Sequence[Stage]) -> Draft:
     """The networks' best action, passed through all stages.
 
     Args:
-        look: what is looked at.
+        look: the observation.
         logits: (rows, cols), of the pick.
-        stages: in their order.
+        stages: in the order in which they are applied.
     """
     row, col = divmod(int(logits.argmax()), logits.shape[1])
     angles = look.picking.angle((row, col))
@@ -186,7 +192,7 @@ def make_draft(look: Look, logits: Tensor, stages: Sequence[Stage]) -> Draft:
 
 
 def near_failed(grid: PixelGrid, failed_picks: Sequence[PlanarPose]) -> Mask:
-    """(rows, cols): the pixels that are too near to a failed pick to try again."""
+    """(rows, cols): the pixels within `RETRY_DISTANCE` of a failed pick."""
     rows, cols = np.indices(grid.shape)
     world = grid.to_world(np.stack([rows, cols], axis=-1))
     near = np.zeros(grid.shape, bool)
@@ -198,7 +204,7 @@ def near_failed(grid: PixelGrid, failed_picks: Sequence[PlanarPose]) -> Mask:
 def expected_position(logits: Tensor, pixel: tuple[int, int]) -> Array:
     """Sub-pixel refinement: the mean position under the softmax over a pixel and its neighbours.
 
-    Networks that are trained with interpolated labels (see `losses`) predict this mean.
+    Networks trained with interpolated labels (see `losses`) predict this mean.
 
     Args:
         logits: (rows, cols).
@@ -213,7 +219,7 @@ def expected_position(logits: Tensor, pixel: tuple[int, int]) -> Array:
 def best_placement(
     candidate: Candidate, orientations: int, continuous: bool
 ) -> tuple[float, Array]:
-    """A candidate's rotation in radians and its position (row, col), quantized or refined."""
+    """A candidate's rotation in radians and position (row, col), refined if `continuous`."""
     _, rotation, row, col = candidate.best()
     found = np.array([rotation, row, col], float)
     if continuous:
@@ -224,7 +230,7 @@ def best_placement(
 
 
 def _without(logits: Tensor, mask: Mask) -> Tensor:
-    """Logits by which no pixel of a mask is chosen."""
+    """The logits, -inf within the mask."""
     return logits.masked_fill(torch.from_numpy(mask).to(logits.device), _NEVER)
 
 

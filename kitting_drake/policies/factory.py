@@ -1,4 +1,4 @@
-"""The one place where policies are made, for the simulated cell and for real cameras; no Drake."""
+"""Makes the policies, for the simulated cell and for real cameras. Does not import Drake."""
 
 from __future__ import annotations
 
@@ -20,31 +20,31 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class LoadedPolicy:
-    """A learned policy, and what its weights file says of it."""
+    """A learned policy and the metadata of its weights file."""
 
     function: LearnedPolicy
     path: Path
     """The weights file."""
     resolution: float | None
-    """The side of the pixels that it learned from, in metres, if its file tells."""
+    """The side of the pixels in training, in metres; None if the file does not give it."""
     colour: bool
-    """Whether it sees colours; else heights alone."""
+    """Whether it sees colours; otherwise heights alone."""
 
     def check_grid(self, grid: PixelGrid, field: str) -> None:
-        """Makes sure that the pixels are of the size that it learned from.
+        """Checks that the pixels have the size that the policy was trained with.
 
         Args:
             grid: of the observations.
-            field: what the caller calls the grid's resolution.
+            field: the caller's name of the grid's resolution, for the error.
 
         Raises:
-            UserError: they are not.
+            UserError: the sizes differ.
         """
         learned, given = self.resolution, grid.resolution
         if learned is not None and not math.isclose(given, learned, rel_tol=1e-6):
             raise UserError(
-                f"{field} is {given:g} m, and the policy of {self.path.name} learned from pixels "
-                f"of {learned:g} m"
+                f"{field} is {given:g} m, but the policy in {self.path.name} "
+                f"learned from pixels of {learned:g} m: use that size, or train another policy"
             )
 
 
@@ -64,11 +64,11 @@ def load_learned_policy(
     """A policy of trained networks.
 
     Args:
-        weights: a file that `train` wrote; None: the generalist's.
+        weights: a file that `train` wrote; None for the generalist.
         planner: how the hand will pick and place.
-        insertion: whether objects are put into recesses.
+        insertion: whether objects are inserted into recesses.
         orientations: N.
-        orientations_field: what the caller calls them, for errors.
+        orientations_field: the caller's name of `orientations`, for errors.
         continuous: see `make_stages`.
         fit_outlines: see `make_stages`.
         recover: see `make_stages`.
@@ -76,7 +76,7 @@ def load_learned_policy(
         watch: called with each observation and decision.
 
     Raises:
-        UserError: the file cannot be used, or not at so many orientations.
+        UserError: the file is unusable, or the networks do not support N orientations.
     """
     # Import torch only where networks are used.
     from kitting_drake.policies.learned_policy import LearnedPolicy
@@ -109,7 +109,7 @@ def make_shape_matching(
 
     Args:
         planner: how the hand will pick and place.
-        recover: mend what earlier actions left undone.
+        recover: mend failed insertions.
     """
     # Import SciPy lazily.
     from kitting_drake.policies.matching.shape_matching import ShapeMatchingPolicy

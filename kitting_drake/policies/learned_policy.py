@@ -20,24 +20,24 @@ from systems.signals import Observation, PickPlaceAction, PlanarPose
 
 @dataclass(frozen=True)
 class Decision:
-    """An action, and the distributions that it was read from."""
+    """An action and the distributions behind it."""
 
     action: PickPlaceAction
-    """Where it says stop, its poses and all that follows are what the policy would have done."""
+    """With `stop` set, it still holds the action that the policy would have taken otherwise."""
     pick_map: NDArray[np.float32]
     """(rows, cols): p(u, v), the picking module's probabilities."""
     angle_curve: NDArray[np.float32]
     """(n,): p(theta | u, v) at the angles pi i / n."""
     place_map: NDArray[np.float32]
-    """(rows, cols): the best score over all rotations, in nats below the best of all; coarse."""
+    """(rows, cols): the best score over all rotations relative to the maximum, in nats; coarse."""
     pick_pixel: NDArray[np.float64]
     """(row, col)."""
     place_pixel: NDArray[np.float64]
     """(row, col)."""
     log_odds: float | None = None
-    """That there is something to pick; None where the networks cannot tell."""
+    """The log-odds that there is something to pick; None if the networks do not predict it."""
     belongs: bool = False
-    """Whether the outlines say that the object belongs where it is to be placed."""
+    """Whether the outlines show that the object belongs at its place."""
 
     @property
     def stop(self) -> bool:
@@ -46,11 +46,11 @@ class Decision:
 
 
 DEFAULT_STAGES: tuple[Stage, ...] = (SubPixel(), StopRule())
-"""The stages of a policy that knows nothing of its task."""
+"""The stages of a policy that knows nothing about its task."""
 
 
 class LearnedPolicy:
-    """Networks and the stages that refine what they propose; it has no memory."""
+    """Networks and the stages that refine their proposal. It has no memory."""
 
     def __init__(
         self,
@@ -62,14 +62,14 @@ class LearnedPolicy:
     ) -> None:
         """
         Args:
-            networks: for inference; their `stop_threshold` says when a `StopRule` stops.
+            networks: for inference. `StopRule` uses their `stop_threshold`.
             orientations: N.
-            stages: each refines what the one before it made of the networks' action; none: the
-                paper's own policy, whose actions are pixels and bins. See `make_stages`.
+            stages: applied in order (see `make_stages`). With no stages this is the paper's
+                policy, whose actions are pixels and bins.
             watch: called with each observation and decision.
 
         Raises:
-            ValueError: the networks cannot predict at N orientations.
+            ValueError: the networks do not support N orientations.
         """
         networks.check_orientations(orientations)
         self._networks = networks
@@ -84,14 +84,14 @@ class LearnedPolicy:
 
         Args:
             observation: o_t.
-            failed_picks: where a grasp failed before: there it is not tried again.
+            failed_picks: poses at which a grasp failed before; it avoids them.
         """
         return self.act(observation, failed_picks)[0]
 
     def act(
         self, observation: Observation, failed_picks: Sequence[PlanarPose] = ()
     ) -> tuple[PickPlaceAction, Decision | None]:
-        """The action, and the decision that it is; None where it mends something instead.
+        """The action and its decision; the decision is None for an action that mends another.
 
         The arguments are those of `__call__`.
         """
@@ -104,13 +104,15 @@ class LearnedPolicy:
         return PickPlaceAction(stop=True) if decision.stop else decision.action, decision
 
     def decide(self, observation: Observation, failed_picks: Sequence[PlanarPose] = ()) -> Decision:
-        """The action of the networks, and the distributions that it was read from; see `__call__`,
-        which may mend something instead."""
+        """The networks' action and the distributions behind it; it never mends an earlier action.
+
+        The arguments are those of `__call__`.
+        """
         return _decision(self._draft(observation, failed_picks))
 
     @torch.inference_mode()
     def log_odds(self, observation: Observation) -> float | None:
-        """The log-odds that there is something to pick; None where the networks cannot tell."""
+        """The log-odds that there is something to pick; None if the networks do not predict it."""
         image = network_input(self._networks, observation)
         return self._networks.predict_pick(image, self._orientations).log_odds
 

@@ -1,7 +1,7 @@
-"""The stages of a decision after the networks' own. None of them is in the paper, which quantizes
-every action and never stops.
+"""The stages that refine the networks' decision.
 
-Each takes a `Draft` and returns it refined; a policy is its networks and a list of these.
+Each takes a `Draft` and returns it refined. The paper has none of them: it quantizes every action
+and never stops.
 """
 
 from __future__ import annotations
@@ -20,12 +20,14 @@ from kitting_drake.policies.matching.shape_matching import belonging, certain_fi
 from systems.pick_place_parameters import PickPlaceParameters
 
 _AS_GOOD = 2.0
-"""A rotation whose score is less by at most this is as good, in nats, ..."""
+"""Rotations within this of the best score count as equally good, in nats, ..."""
 _SAME_PLACE = 4.0
-"""... where the places are at most this far apart, in pixels."""
+"""... if their places are at most this far apart, in pixels."""
 _SOMETHING_FITS, _NOTHING_FITS = -1.0, 2.0
-"""By how much the threshold for stopping moves with what the outlines say, in nats. With everything
-kitted and other things about, networks and outlines each err at times, and seldom both."""
+"""The shift of the stop threshold when the outlines show a fitting object, or none, in nats.
+
+Networks and outlines both err among distractors, but seldom at the same time.
+"""
 
 
 def make_stages(
@@ -37,15 +39,15 @@ def make_stages(
     recover: bool = False,
     may_stop: bool = True,
 ) -> tuple[Stage, ...]:
-    """The stages of a policy's decisions, as `!Learned` of a scenario names them.
+    """The stages of a policy's decisions. The arguments are the fields of `!Learned` in a scenario.
 
     Args:
         planner: how the hand will pick and place.
-        insertion: whether objects are put into recesses: outlines mean something only there.
+        insertion: whether objects are inserted into recesses. Outlines are used only then.
         continuous: refine actions beyond pixels and bins.
-        fit_outlines: with `continuous`, refine them by the geometry of o_t too.
-        recover: mend what earlier actions left undone.
-        may_stop: whether to stop where there is nothing left to pick.
+        fit_outlines: with `continuous`, also refine them by the geometry of o_t.
+        recover: mend failed insertions.
+        may_stop: stop when there is nothing left to pick.
     """
     outlines = insertion and continuous and fit_outlines
     stages: list[Stage] = []
@@ -68,7 +70,7 @@ def make_stages(
 
 @dataclass(frozen=True)
 class SubPixel:
-    """Positions between pixels and angles between bins."""
+    """Refines positions to sub-pixels and angles to sub-bins."""
 
     def refine(self, draft: Draft) -> Draft:
         refined = draft.angles.refined
@@ -84,7 +86,7 @@ class SubPixel:
 
 @dataclass(frozen=True)
 class JawRoom:
-    """A grasp for which o_t leaves the jaws no room moves to where it does (`refine_grasp`)."""
+    """Moves a grasp that leaves the jaws no room to one that does (`refine_grasp`)."""
 
     planner: PickPlaceParameters
 
@@ -105,7 +107,7 @@ class JawRoom:
 
 @dataclass(frozen=True)
 class OutlinePlace:
-    """The place by the outlines of object and recess, where they agree (`refine_place`)."""
+    """Fits the place to the outlines of object and recess where they agree (`refine_place`)."""
 
     def refine(self, draft: Draft) -> Draft:
         look = draft.look
@@ -121,8 +123,10 @@ class OutlinePlace:
 
 @dataclass(frozen=True)
 class ReleaseRoom:
-    """Of rotations that score equally well, as a cube has four, the one in which the fingers have
-    most room when they let go (`blocked_at_place`)."""
+    """Chooses the rotation that leaves the fingers most room at release (`blocked_at_place`).
+
+    It chooses only among rotations that score equally well: a cube has four of them.
+    """
 
     planner: PickPlaceParameters
 
@@ -143,14 +147,14 @@ class ReleaseRoom:
                 look.image[3], look.resolution, pixel, draft.theta, *placement, self.planner
             )
 
-        # Of equals the first: it has the best score.
+        # `min` returns the first of equals, which has the best score.
         rotation, goal = min(as_good, key=blocked)
         return dataclasses.replace(draft, rotation=rotation, goal=goal)
 
 
 @dataclass(frozen=True)
 class BelongingFirst:
-    """What belongs into a recess goes before anything else (`belonging`)."""
+    """Picks first what belongs into a recess (`belonging`)."""
 
     def refine(self, draft: Draft) -> Draft:
         if draft.belongs:
@@ -162,11 +166,10 @@ class BelongingFirst:
 
 @dataclass(frozen=True)
 class StopRule:
-    """Stops where the networks' log-odds that there is something to pick are below their
-    threshold."""
+    """Stops when the networks' log-odds of something to pick are below their threshold."""
 
     ask_outlines: bool = False
-    """Whether the threshold moves with what the outlines say."""
+    """Whether the outlines shift the threshold."""
 
     def refine(self, draft: Draft) -> Draft:
         odds, threshold = draft.look.picking.log_odds, draft.look.networks.stop_threshold
@@ -179,8 +182,10 @@ class StopRule:
 
 @dataclass(frozen=True)
 class CertainFits:
-    """Where the policy would stop while an object certainly fits into a recess, picks that one:
-    to the networks nothing looks like an object, and an outline says that something is one."""
+    """Overrules a stop when an object certainly fits into a recess, and picks that object.
+
+    The networks may fail to see an object that its outline shows.
+    """
 
     def refine(self, draft: Draft) -> Draft:
         if not draft.stop:
@@ -191,9 +196,11 @@ class CertainFits:
 
 @dataclass(frozen=True)
 class Recovery:
-    """Mends what an earlier action left undone (`recovery_action`): presses down what protrudes at
-    once; takes out what could not be pressed down when nothing is left that belongs into a
-    recess, because that may fail again, and actions are counted."""
+    """Mends a failed insertion (`recovery_action`).
+
+    It presses a protruding object down at once. It takes an object out only when nothing else
+    belongs into a recess, because that may fail again and the number of actions is limited.
+    """
 
     planner: PickPlaceParameters
 

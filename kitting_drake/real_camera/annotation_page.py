@@ -3,11 +3,12 @@
 The server listens on 127.0.0.1 only, and speaks JSON and PNG:
 
 - `GET /` is the page, one file of HTML and JavaScript,
-- `GET /steps` tells the grid, the jaws, and each step's name and action,
-- `GET /steps/N/color.png` and `height.png` are o_t, a pixel of the image a pixel of the grid,
+- `GET /` is the page, one file of HTML and JavaScript,
+- `GET /steps` is the grid, the jaws, and each step's name and action,
+- `GET /steps/N/color.png` and `height.png` are o_t, one image pixel per grid pixel,
 - `POST /steps/N` with the content of an `action.json` writes it beside the frames.
 
-Errors are `{"error": ...}` with one sentence, by status 400 or 404.
+Errors are `{"error": ...}` with one sentence and the status 400, 403 or 404.
 """
 
 from __future__ import annotations
@@ -43,31 +44,31 @@ from systems.signals import Observation
 _PAGE = Path(__file__).with_name("annotation_page.html")
 _HOST = "127.0.0.1"
 _LONGEST = 100_000
-"""No action has more bytes than this."""
+"""The largest size of an action, in bytes."""
 _LEAST_RANGE = 0.02
-"""The height that is white, in metres, at the least: noise on an empty table stays dark."""
+"""White is at least this height, in metres, to keep noise on an empty table dark."""
 _UNSEEN = np.array([60, 0, 90], np.uint8)
 """The colour of pixels that no camera sees."""
 
 
 class AnnotationServer(ThreadingHTTPServer):
-    """Serves the page; `serve_forever` until it is shut down."""
+    """Serves the page with `serve_forever`, until it is shut down."""
 
     def __init__(self, steps: Sequence[StepFolder], calibration: Calibration, port: int = 0):
         """
         Args:
-            steps: to annotate, at least one.
+            steps: the steps to annotate, at least one.
             calibration: of the cameras.
-            port: of 127.0.0.1; 0: any that is free.
+            port: of 127.0.0.1; 0 for any free port.
 
         Raises:
-            UserError: the first step's frames cannot be used, or the port is taken.
+            UserError: the first step's frames are unusable, or the port is taken.
         """
         self.steps = tuple(steps)
         self.calibration = calibration
         self._lock = threading.Lock()
         self._read = lru_cache(maxsize=8)(lambda path: read_observation(path, calibration))
-        # Fail early: a calibration that does not fit would otherwise be reported on the page only.
+        # Fail early: otherwise only the page would report a wrong calibration.
         self.observation(0)
         try:
             super().__init__((_HOST, port), _Handler)
@@ -80,7 +81,7 @@ class AnnotationServer(ThreadingHTTPServer):
         return f"http://{_HOST}:{self.server_address[1]}/"
 
     def handle_error(self, request: Any, client_address: Any) -> None:
-        """Tells of what went wrong, but not of a browser that waits for an image no longer."""
+        """Reports errors, except for connections that the browser closed."""
         if not isinstance(sys.exception(), ConnectionError):
             super().handle_error(request, client_address)
 
@@ -88,13 +89,13 @@ class AnnotationServer(ThreadingHTTPServer):
         """o_t of a step.
 
         Raises:
-            UserError: its frames cannot be used.
+            UserError: its frames are unusable.
         """
         with self._lock:
             return self._read(self.steps[index].path)
 
     def describe(self) -> dict[str, Any]:
-        """Describes grid and steps to the page, in metres and radians."""
+        """The grid and the steps as JSON for the page, in metres and radians."""
         grid = self.calibration.grid
         return {
             "grid": {
@@ -119,7 +120,7 @@ class AnnotationServer(ThreadingHTTPServer):
         """Writes the action of a step.
 
         Raises:
-            UserError: it cannot be used, or not be written; then what was there stays.
+            UserError: the action is invalid or cannot be written; the old file then stays.
         """
         step = self.steps[index]
         action = dataclasses.replace(
@@ -154,11 +155,11 @@ class _Handler(BaseHTTPRequestHandler):
             self._fail(HTTPStatus.NOT_FOUND, f"there is no {self.path}")
 
     def do_POST(self) -> None:
-        """Takes an action."""
+        """Saves an action."""
         step = re.fullmatch(r"/steps/(\d+)", self.path)
-        # A page of another origin can send no JSON without asking first, and is not allowed to.
+        # Browsers do not let pages of other origins send JSON without permission.
         if not self._is_local() or self.headers.get_content_type() != "application/json":
-            self._fail(HTTPStatus.FORBIDDEN, "an action is JSON, from the page itself")
+            self._fail(HTTPStatus.FORBIDDEN, "an action must be JSON sent by the page itself")
             return
         if not step or int(step[1]) >= len(self.server.steps):
             self._fail(HTTPStatus.NOT_FOUND, f"there is no {self.path}")
@@ -171,28 +172,27 @@ class _Handler(BaseHTTPRequestHandler):
         self._send_json(self.server.describe())
 
     def log_message(self, format: str, *args: Any) -> None:
-        """Says nothing: the page itself tells what happens."""
+        """Logs nothing: the page itself reports what happens."""
 
     def _is_local(self) -> bool:
-        """Whether the page was asked for by a name of this machine, and not by one that somebody
-        else let point here."""
+        """Whether the request names this machine, rather than a foreign name that points to it."""
         name = self.headers.get("Host", "").split(":")[0]
         return name in (_HOST, "localhost")
 
     def _body(self) -> Any:
         length = self.headers.get("Content-Length", "")
         if not length.isdecimal() or int(length) > _LONGEST:
-            raise UserError(f"an action has a Content-Length of at most {_LONGEST} bytes")
+            raise UserError(f"an action must have a Content-Length of at most {_LONGEST} bytes")
         try:
             return json.loads(self.rfile.read(int(length)))
         except (ValueError, RecursionError) as error:
-            raise UserError(f"the action is no JSON: {error}") from error
+            raise UserError(f"the action is not JSON: {error}") from error
 
     def _send_json(self, value: Any, status: HTTPStatus = HTTPStatus.OK) -> None:
         self._send("application/json", json.dumps(value).encode(), status)
 
     def _fail(self, status: HTTPStatus, reason: str) -> None:
-        # What was sent may not have been read: nothing more is read on this connection.
+        # The request may be unread, so the connection cannot be reused.
         self.close_connection = True
         self._send_json({"error": reason}, status)
 
@@ -212,7 +212,7 @@ def draw_color(observation: Observation) -> bytes:
 
 
 def draw_height(observation: Observation) -> bytes:
-    """The heights of o_t, from black, the table, to white: a PNG as by `draw_color`."""
+    """The heights of o_t, from black at the table to white: a PNG as in `draw_color`."""
     height = observation.height
     top = max(float(np.percentile(height, 99.5)), _LEAST_RANGE)
     grey = np.rint(255 * np.clip(height / top, 0, 1)).astype(np.uint8)

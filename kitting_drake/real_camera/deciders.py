@@ -1,4 +1,4 @@
-"""The policies that decide on a bench, each with how sure it is and a picture of why."""
+"""The policies of a bench. Each gives an action, a confidence and a picture."""
 
 from __future__ import annotations
 
@@ -23,65 +23,65 @@ if TYPE_CHECKING:
     from kitting_drake.policies.learned_policy import Decision
 
 _SAME_PICK = 0.010
-"""The networks' probability within this of a pick speaks for it, in metres ..."""
+"""Probability within this distance of the pick supports it, in metres ..."""
 _OTHER_PICKS = 0.060
-"""... and that within this speaks of the same object."""
+"""... and probability within this distance belongs to the same object."""
 _SAME_ANGLE = math.radians(10)
-"""The same of the pick's angle, in radians."""
+"""Probability within this angle of the pick's angle supports it, in radians."""
 
 
 @dataclass(frozen=True)
 class Choice:
-    """The choice of a policy."""
+    """A policy's choice: an action with its confidence."""
 
     action: PickPlaceAction
     confidence: float | None
-    """0 to 1; None where a rule of geometry decided, which weighs nothing."""
+    """From 0 to 1; None for a rule of geometry without confidence."""
     parts: dict[str, float] = field(default_factory=dict)
     """The factors of the confidence."""
     draw: Callable[[], bytes] = bytes
-    """Draws the decision: a PNG."""
+    """Draws the decision as a PNG."""
 
 
 class BenchPolicy(Protocol):
-    """A policy that decides on a frame."""
+    """A policy for a bench."""
 
     @property
     def name(self) -> str:
-        """For the record."""
+        """Its name in records."""
         ...
 
     def check_grid(self, grid: PixelGrid) -> None:
-        """Makes sure that it can decide on such observations.
+        """Checks that it supports observations of this grid.
 
         Raises:
-            UserError: it cannot.
+            UserError: it does not.
         """
         ...
 
     def choose(self, observation: Observation, failed_picks: Sequence[PlanarPose] = ()) -> Choice:
-        """The choice for an observation; where picks failed they are not tried again."""
+        """The choice for an observation, avoiding failed picks."""
         ...
 
 
 @dataclass(frozen=True)
 class ShapeMatchingDecider:
-    """The training-free policy: outlines by height; see `ShapeMatchingPolicy`.
+    """The training-free policy, which matches outlines (see `ShapeMatchingPolicy`).
 
-    Its confidence is 1 where the outlines of object and recess agree wholly, and 0 where they
-    differ by as much as they may at all.
+    Its confidence is 1 for identical outlines of object and recess, and 0 for the largest accepted
+    difference.
     """
 
     recover: bool = False
     parameters: PickPlaceParameters = field(default_factory=PickPlaceParameters)
-    """How the robot picks and places; `decide` takes the same."""
+    """How the robot picks and places; give `decide` the same."""
 
     @property
     def name(self) -> str:
         return "shape_matching"
 
     def check_grid(self, grid: PixelGrid) -> None:
-        """It takes any grid."""
+        """It supports any grid."""
 
     def choose(self, observation: Observation, failed_picks: Sequence[PlanarPose] = ()) -> Choice:
         policy = make_shape_matching(self.parameters, recover=self.recover)
@@ -97,7 +97,7 @@ class ShapeMatchingDecider:
 
 @dataclass(frozen=True)
 class _Networks:
-    """A learned policy; made by `load_policy`."""
+    """A learned policy; see `load_policy`."""
 
     loaded: LoadedPolicy
 
@@ -131,20 +131,19 @@ def load_policy(
     recover: bool = False,
     parameters: PickPlaceParameters | None = None,
 ) -> BenchPolicy:
-    """A learned policy, as `policy: !Learned` of a scenario has it.
+    """A learned policy, as with `policy: !Learned` in a scenario.
 
     Args:
-        weights: a file that `train` wrote; None: the generalist's.
+        weights: a file that `train` wrote; None for the generalist.
         orientations: N.
-        fit_outlines: refine places by outlines and grasps by the room for the jaws: for tasks in
-            which objects are inserted; False: of equivalent rotations of a place, take one in which
-            the jaws have room to let go.
-        recover: mend what is not seated; see `Recovery`.
-        parameters: how the robot picks and places; None: as the cell does by default. `decide`
-            takes the same.
+        fit_outlines: for tasks with insertion: refine places by outlines, and grasps by the jaws'
+            room. Otherwise choose, among equivalent rotations of a place, one with room to let go.
+        recover: mend failed insertions; see `Recovery`.
+        parameters: how the robot picks and places; None for the cell's defaults. Give `decide` the
+            same.
 
     Raises:
-        UserError: the file cannot be used, or not at so many orientations.
+        UserError: the file is unusable, or the networks do not support N orientations.
     """
     loaded = load_learned_policy(
         weights,
@@ -158,15 +157,14 @@ def load_policy(
 
 
 def confidence_parts(decision: Decision, resolution: float) -> dict[str, float]:
-    """How sure the networks are of a decision, as shares of their own probabilities.
+    """The networks' confidence in a decision, as shares of their own probabilities.
 
-    - `something_to_pick` (of a stop: `nothing_to_pick`), by alpha's class for it, where they have
-      one;
-    - `pick`: of alpha's probability within 6 cm of the pick, the share within 1 cm: other objects
-      that could be picked as well are no doubt about this one;
+    - `something_to_pick`, or `nothing_to_pick` for a stop, by alpha's stop class, if it has one;
+    - `pick`: of alpha's probability within 6 cm of the pick, the share within 1 cm. Other objects
+      that could be picked as well do not lower it;
     - `angle`: beta's probability within 10 degrees of the pick's angle.
 
-    The place has none: its scores say which is best, not how good it is.
+    There is no part for the place, whose scores are only relative.
     """
     parts: dict[str, float] = {}
     if decision.log_odds is not None:

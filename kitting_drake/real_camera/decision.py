@@ -1,4 +1,4 @@
-"""From frames to an action in the robot's base frame, with the heights that it takes."""
+"""From frames to an action in the robot's base frame, with its heights."""
 
 from __future__ import annotations
 
@@ -17,21 +17,21 @@ from systems.signals import Observation, PickPlaceAction, PlanarPose, SurfaceHei
 from systems.surface_heights import read_surface_heights
 
 _SEEN_TO_STOP = 0.7
-"""Below this share of pixels seen, the decision is never to stop: an object may be hidden."""
+"""With a smaller share of pixels seen, a stop is an error: an object may be hidden."""
 
 
 @dataclass(frozen=True)
 class BenchDecision:
-    """An action, its heights, and how sure the policy is of it."""
+    """An action with its heights and confidence."""
 
     observation: Observation
     """o_t."""
     seen: float
-    """The share of its pixels in view of the cameras that they see, from 0 to 1."""
+    """The seen share of its pixels in view of the cameras, from 0 to 1."""
     choice: Choice
     surfaces: SurfaceHeights
     heights: MotionHeights
-    """Both mean nothing where the action is to stop."""
+    """Surfaces and heights are meaningless for a stop."""
     parameters: PickPlaceParameters
 
     @property
@@ -41,8 +41,8 @@ class BenchDecision:
 
     @property
     def place_height(self) -> float:
-        """Where the fingertips will be when the object stands at its place, in metres: as high
-        above the floor there, as o_t shows it, as they were above its support at the pick."""
+        """The height of the fingertips when the object stands at its place, in metres: as far above
+        the floor there, seen in o_t, as they were above its support at the pick."""
         hanging = max(self.heights.grasp - self.surfaces.support, 0.0)
         return max(self.surfaces.place_floor + hanging, self._lowest)
 
@@ -51,7 +51,7 @@ class BenchDecision:
         return self.surfaces.table + self.parameters.floor_clearance
 
     def as_dict(self) -> dict[str, Any]:
-        """The content of `action.json`: metres and radians in the base frame; docs/bench.md."""
+        """The content of `action.json`, in metres and radians in the base frame; docs/bench.md."""
         action, heights = self.action, self.heights
         result: dict[str, Any] = {
             "stop": action.stop,
@@ -84,7 +84,7 @@ class BenchDecision:
         return result
 
     def draw(self) -> bytes:
-        """A picture of the decision: a PNG."""
+        """Draws the decision as a PNG."""
         return self.choice.draw()
 
 
@@ -96,18 +96,18 @@ def decide(
     *,
     parameters: PickPlaceParameters | None = None,
 ) -> BenchDecision:
-    """One decision, by the arithmetic and the policies of the simulated cell.
+    """One decision, with the same heightmap and policies as the simulated cell.
 
     Args:
         frames: of each camera by its name.
         calibration: of the cameras.
         policy: `load_policy()` or `ShapeMatching()`; make it once.
-        failed_picks: where grasps failed before, in the base frame: there none is tried again.
-        parameters: of the motion, for its heights; None: the cell's.
+        failed_picks: where grasps failed before, in the base frame; it avoids them.
+        parameters: of the motion, for its heights; None for the cell's.
 
     Raises:
-        UserError: frames, calibration and policy do not fit together; says what would do. Or the
-            policy would stop, and too little is seen to say that nothing is left.
+        UserError: frames, calibration and policy do not fit together, or the policy would stop
+            although too little is seen.
     """
     policy.check_grid(calibration.grid)
     observation = observe(frames, calibration)
@@ -116,7 +116,7 @@ def decide(
     if choice.action.stop and seen < _SEEN_TO_STOP:
         raise UserError(
             f"only {100 * seen:.0f} % of what is in view is seen, too little to say that nothing "
-            "is left to do: see by --check what is wrong"
+            "is left to do: find the cause with --check"
         )
     parameters = PickPlaceParameters() if parameters is None else parameters
     surfaces = SurfaceHeights()

@@ -1,4 +1,4 @@
-"""Frames of real cameras as files: colour as PNG, depth as 16-bit PNG or .npy."""
+"""Frames of real cameras from files: colour as PNG, depth as 16-bit PNG or .npy."""
 
 from __future__ import annotations
 
@@ -19,31 +19,31 @@ _COLOUR_ENDINGS = (".png", ".jpg", ".jpeg")
 _DEPTH_ENDINGS = (".npy", ".png")
 _SIXTEEN_BIT = ("I;16", "I;16B", "I")
 _DAMAGED = (OSError, SyntaxError)
-"""Raised by Pillow for a file that is not whole: the second for a PNG with a broken chunk."""
+"""Pillow's exceptions for a damaged file; SyntaxError is for a PNG with a broken chunk."""
 
 
 @dataclass(frozen=True)
 class Frame:
-    """The images that a camera took at one time, depth registered to colour."""
+    """The images of a camera at one time, with depth registered to colour."""
 
     color: NDArray[np.uint8]
     """(height, width, 3): red, green, blue."""
     depth: NDArray[np.float32]
-    """(height, width) along the optical axis, in metres; 0, infinity and NaN are no depth."""
+    """(height, width) along the optical axis, in metres; 0, infinity and NaN mean no depth."""
 
 
 def read_frames(paths: Sequence[Path], calibration: Calibration) -> dict[str, Frame]:
-    """The frames of all cameras, by their names.
+    """The frames of all cameras, by name.
 
     Args:
-        paths: folders, or files in pairs of colour and depth, one pair for each camera in the order
-            of the calibration. A folder holds `NAME_color.png` and `NAME_depth.png` (or `.npy`) for
-            a camera NAME, or a folder NAME with `color.png` and `depth.png`; of the only camera,
-            `color.png` and `depth.png` will do.
+        paths: folders, or pairs of a colour and a depth file, one per camera in the order of the
+            calibration. For a camera NAME, a folder holds `NAME_color.png` and `NAME_depth.png` (or
+            `.npy`), or a folder NAME with `color.png` and `depth.png`. A single camera may also
+            have just `color.png` and `depth.png`.
         calibration: of the cameras.
 
     Raises:
-        UserError: a file is missing or cannot be read, or its size is not that of the calibration.
+        UserError: a file is missing, unreadable, or not of the calibration's size.
     """
     for path in paths:
         if not path.exists():
@@ -64,10 +64,10 @@ def read_frames(paths: Sequence[Path], calibration: Calibration) -> dict[str, Fr
 
 
 def check_frame(frame: Frame, camera: BenchCamera) -> Frame:
-    """A frame that did not come from files, if it has the sizes and types that it must have.
+    """Checks the sizes and types of a frame that did not come from files.
 
     Raises:
-        UserError: it has not.
+        UserError: one is wrong.
     """
     for what, image in (("colour", frame.color), ("depth", frame.depth)):
         _check_size(image.shape, camera, f"the {what} image of camera {camera.name}")
@@ -83,7 +83,7 @@ def check_frame(frame: Frame, camera: BenchCamera) -> Frame:
 
 
 def _pairs(files: Sequence[Path]) -> Iterator[tuple[Path, Path]]:
-    """(colour, depth) of files that come in pairs, either first."""
+    """(colour, depth) from files that come in pairs, in either order."""
     if len(files) % 2:
         raise UserError("frames that are files come in pairs: a colour image and a depth image")
     for first, second in zip(files[::2], files[1::2], strict=True):
@@ -134,14 +134,14 @@ def _open(path: Path) -> Image.Image:
     try:
         return Image.open(path)
     except OSError as error:
-        reason = error.strerror or "it is no image"
+        reason = error.strerror or "it is not an image"
         raise UserError(f"cannot read {path}: {reason}") from error
 
 
 def _read_color(path: Path, camera: BenchCamera) -> NDArray[np.uint8]:
     with _open(path) as image:
         if image.mode in _SIXTEEN_BIT:
-            raise UserError(f"{path} has 16 bits a pixel: colour has 8, is this the depth?")
+            raise UserError(f"{path} has 16 bits per pixel, but colour has 8: is this the depth?")
         try:
             data = np.asarray(image.convert("RGB"))
         except _DAMAGED as error:
@@ -155,11 +155,13 @@ def _read_depth(path: Path, camera: BenchCamera) -> NDArray[np.float32]:
         try:
             data = np.load(path, allow_pickle=False)
         except (OSError, ValueError, EOFError, SyntaxError, TokenError) as error:
-            raise UserError(f"cannot read {path}: it is no whole .npy file of numbers") from error
+            raise UserError(
+                f"cannot read {path}: it is not a complete .npy file of numbers"
+            ) from error
     else:
         with _open(path) as image:
             if image.mode not in _SIXTEEN_BIT:
-                raise UserError(f"{path} is no depth image, which has one channel of 16 bits")
+                raise UserError(f"{path} is not a depth image, with one channel of 16 bits")
             try:
                 data = np.asarray(image)
             except _DAMAGED as error:

@@ -1,4 +1,4 @@
-"""Demonstrations from outside: folders of frames and actions, as one file that `train` takes."""
+"""Demonstrations from real cameras: folders of frames and actions, converted for `train`."""
 
 from __future__ import annotations
 
@@ -33,18 +33,18 @@ from kitting_drake.real_camera.views import observe
 from systems.signals import Observation
 
 TASK = "bench"
-"""The task of demonstrations from outside, where those of the simulation have their own."""
+"""The task in the origin of demonstrations from outside; simulated ones have their own."""
 _FIRST_SEED = VALIDATION_SEEDS.stop
-"""No episode of the simulation has a seed from here on."""
+"""Simulated episodes have no seeds from here on."""
 
 
 @dataclass(frozen=True)
 class StepFolder:
-    """The frames of one observation, and perhaps an `action.json`."""
+    """The frames of one observation, and possibly an `action.json`."""
 
     path: Path
     is_last: bool
-    """Whether nothing comes after it in its demonstration."""
+    """Whether it is the last step of its demonstration."""
 
     @property
     def name(self) -> str:
@@ -54,22 +54,22 @@ class StepFolder:
 
 @dataclass(frozen=True)
 class Summary:
-    """The numbers of what was written."""
+    """The counts of a conversion."""
 
     demonstrations: int
     steps: int
     finals: int
-    """Demonstrations that end by an observation in which nothing is left to do."""
+    """Demonstrations that end with an observation with nothing left to do."""
 
 
 def find_demonstrations(folder: Path) -> list[list[StepFolder]]:
-    """The steps of each demonstration, by their names, in which numbers count as numbers.
+    """The steps of each demonstration in natural order of their names.
 
     Args:
-        folder: holds a folder for each demonstration, and that one for each step.
+        folder: holds a folder for each demonstration, which holds one for each step.
 
     Raises:
-        UserError: there is no demonstration, or one without steps.
+        UserError: there is no demonstration, or one has no steps.
     """
     if not folder.is_dir():
         raise UserError(f"there is no folder {folder}")
@@ -89,7 +89,7 @@ def find_demonstrations(folder: Path) -> list[list[StepFolder]]:
 
 def _subfolders(folder: Path) -> list[Path]:
     def key(path: Path) -> list[tuple[int, str]]:
-        # Numbers, which stand at odd places, come in the order of their values.
+        # Numbers are at odd positions and are compared by value.
         parts = re.split(r"(\d+)", path.name)
         return [(int(part) if i % 2 else 0, part) for i, part in enumerate(parts)]
 
@@ -101,10 +101,10 @@ def _subfolders(folder: Path) -> list[Path]:
 
 
 def read_observation(step: Path, calibration: Calibration) -> Observation:
-    """o_t of a step, as `decide` sees it.
+    """o_t of a step, as in `decide`.
 
     Raises:
-        UserError: its frames cannot be used; names the step.
+        UserError: its frames are unusable; names the step.
     """
     return _observe(step, calibration)[1]
 
@@ -121,23 +121,23 @@ def check_action(step: StepFolder, action: StepAction, calibration: Calibration)
     """Checks that an action fits its step.
 
     Raises:
-        UserError: it says stop where something comes after it, or was clicked by another
-            calibration, by which the same point of the table has other coordinates.
+        UserError: it stops before the last step, or it was clicked with another calibration, in
+            which the same point has other coordinates.
     """
     if action.action.stop and not step.is_last:
         raise UserError(
             f"{step.name} says that nothing is left to do, but steps come after it: only the last "
-            "step of a demonstration can"
+            "step of a demonstration may"
         )
     if action.calibration not in (None, calibration_digest(calibration)):
         raise UserError(
-            f"{step.name} was clicked by another calibration: give that by --camera, or click it "
-            "again"
+            f"{step.name} was clicked by another calibration: give that one with --camera, or "
+            "click it again"
         )
 
 
 def check_replaceable(path: Path, folder: Path) -> None:
-    """Checks that a file, if there is one, holds earlier demonstrations of a folder of that name.
+    """Checks that a file, if it exists, holds demonstrations of a folder with the same name.
 
     Raises:
         UserError: it holds something else.
@@ -147,7 +147,7 @@ def check_replaceable(path: Path, folder: Path) -> None:
     try:
         origin = read_demonstrations(path).origin
     except UserError as error:
-        raise UserError(f"{path} exists, and is no file of demonstrations: delete it") from error
+        raise UserError(f"{path} exists and is not a file of demonstrations: delete it") from error
     if (origin.scenario_name, origin.scenario.get("task")) != (folder.resolve().name, TASK):
         raise UserError(f"{path} holds demonstrations of {origin.scenario_name}: delete it")
 
@@ -158,12 +158,12 @@ def convert(folder: Path, calibration: Calibration, learning: Learning, path: Pa
     Args:
         folder: see `find_demonstrations`.
         calibration: of the cameras, one for all demonstrations.
-        learning: what training may assume of them.
+        learning: the assumptions that training may make.
         path: the file.
 
     Raises:
-        UserError: a step has no action, or one that cannot be; frames cannot be used; two
-            demonstrations are the same; or the file cannot be written. It names the step.
+        UserError: a step has no action or an invalid one, frames are unusable, two demonstrations
+            are the same, or the file cannot be written. It names the step.
     """
     labelled = [_labelled(steps, calibration) for steps in find_demonstrations(folder)]
     actions = [[action.as_dict() for _, action in steps] for steps in labelled]
@@ -172,7 +172,7 @@ def convert(folder: Path, calibration: Calibration, learning: Learning, path: Pa
         scenario={
             "task": TASK,
             "calibration": calibration_record(calibration),
-            # With the frames, which the seeds stand for, these determine what is learned.
+            # With the frames, which determine the seeds, these determine the content.
             "actions": hashlib.sha256(json.dumps(actions).encode()).hexdigest(),
         },
         grid=calibration.grid,
@@ -204,7 +204,7 @@ def _labelled(
 def _demonstrations(
     labelled: Sequence[Sequence[tuple[StepFolder, StepAction]]], calibration: Calibration
 ) -> Iterator[Demonstration]:
-    """The demonstrations, one in memory at a time."""
+    """The demonstrations, one at a time to save memory."""
     names: dict[int, str] = {}
     for steps in labelled:
         digest = hashlib.sha256()
@@ -236,6 +236,6 @@ def _update(digest: hashlib._Hash, frames: dict[str, Frame]) -> None:
 
 
 def _seed(digest: bytes) -> int:
-    """A number for the frames of a demonstration, which have no seed: by it `train` notices that
-    the same demonstration is learned from and validated by."""
+    """A seed derived from a demonstration's frames. By it `train` notices that training and
+    validation share a demonstration."""
     return _FIRST_SEED + int.from_bytes(digest[:8], "big") % (2**32 - _FIRST_SEED)

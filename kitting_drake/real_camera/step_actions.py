@@ -1,4 +1,4 @@
-"""The action of a person or a robot after a frame: `action.json` beside it, read and written."""
+"""Reads and writes `action.json`, the action of a person or robot for the frame beside it."""
 
 from __future__ import annotations
 
@@ -15,24 +15,24 @@ from systems.signals import PickPlaceAction, PixelGrid, PlanarPose, wrap_to_pi
 
 NAME = "action.json"
 UNNAMED = "object"
-"""The name of an object that has none in the file."""
+"""The default name of an object."""
 
 
 @dataclass(frozen=True)
 class StepAction:
-    """An action, and what is known about it."""
+    """An action and its labels."""
 
     action: PickPlaceAction
-    """Pick and place in the base frame; or stop: nothing is left to do."""
+    """Pick and place in the base frame, or a stop."""
     object: str = UNNAMED
-    """The name of what is picked."""
+    """The name of the picked object."""
     category: str = ""
-    """Its category, where objects have categories."""
+    """Its category, if objects have categories."""
     calibration: str | None = None
-    """The digest of the calibration by which it was clicked; None: it was not clicked."""
+    """The digest of the calibration with which it was clicked; None if it was not clicked."""
 
     def as_dict(self) -> dict[str, Any]:
-        """The content of `action.json`, in the layout of `decide`; metres and radians."""
+        """The content of `action.json`, in the layout of `decide`, in metres and radians."""
         result: dict[str, Any] = {
             "units": "metres and radians, in the base frame; docs/bench.md",
             "stop": self.action.stop,
@@ -51,15 +51,15 @@ class StepAction:
 
 
 def parse_action(record: Any, grid: PixelGrid, where: str) -> StepAction:
-    """An action from the content of an `action.json`; fields that are not needed are ignored.
+    """An action from the content of an `action.json`; unneeded fields are ignored.
 
     Args:
         record: the content.
-        grid: pick and place must be on it.
-        where: what an error begins with.
+        grid: pick and place must lie on it.
+        where: the beginning of an error.
 
     Raises:
-        UserError: a field is missing or cannot be, or pick or place is outside the workspace.
+        UserError: a field is missing or invalid, or pick or place is outside the workspace.
     """
     if not isinstance(record, dict):
         raise UserError(f"{where} must be an object with pick and place, or with stop: true")
@@ -76,7 +76,7 @@ def parse_action(record: Any, grid: PixelGrid, where: str) -> StepAction:
     if record.get("stop", False):
         return StepAction(PickPlaceAction(stop=True), **known)
     if record.get("press", False):
-        raise UserError(f"{where} presses down, which is no pick and place: leave this step out")
+        raise UserError(f"{where} presses down instead of picking and placing: leave it out")
     pick, place = (_pose(record.get(name), grid, f"{where}: {name}") for name in ("pick", "place"))
     return StepAction(PickPlaceAction(pick, place), **known)
 
@@ -103,7 +103,7 @@ def read_action(step: Path, grid: PixelGrid) -> StepAction:
         grid: as for `parse_action`.
 
     Raises:
-        UserError: the file is missing or cannot be used; names it.
+        UserError: the file is missing or invalid; names it.
     """
     path = step / NAME
     if not path.is_file():
@@ -113,14 +113,14 @@ def read_action(step: Path, grid: PixelGrid) -> StepAction:
     except OSError as error:
         raise UserError(f"cannot read {path}: {error.strerror}") from error
     except (ValueError, RecursionError) as error:
-        raise UserError(f"{path} is no JSON: {error}") from error
+        raise UserError(f"{path} is not JSON: {error}") from error
     return parse_action(record, grid, str(path))
 
 
 def write_action(step: Path, action: StepAction) -> None:
-    """Writes the action of a step, atomically, over what was there.
+    """Writes the action of a step, atomically, replacing an existing one.
 
     Raises:
-        UserError: it cannot be written.
+        UserError: the file cannot be written.
     """
     write_json(step / NAME, action.as_dict())

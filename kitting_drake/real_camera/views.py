@@ -1,4 +1,4 @@
-"""Whether cameras see the workspace, and whether their depths can be metres."""
+"""Checks that cameras see the workspace and that their depths are plausible, and makes o_t."""
 
 from __future__ import annotations
 
@@ -17,25 +17,24 @@ from systems.signals import Observation, PixelGrid
 Array = NDArray[np.float64]
 
 _LEAST_SEEN = 0.01
-"""A camera that sees less than this share of the workspace looks elsewhere."""
+"""A camera that sees a smaller share of the workspace has a wrong pose."""
 _LEAST_DEPTH = 0.01
-"""The same for the share of pixels towards the workspace that have any depth."""
+"""The least share of pixels towards the workspace with any depth."""
 _NEAREST, _FARTHEST = 0.8, 1.25
-"""Depths, as shares of that of the table, that may be something on the table, or a pose that is
-off: beyond these the unit is wrong, or the pose."""
+"""Plausible median depths, as multiples of the table's; outside them the unit or pose is wrong."""
 _TALL = 0.1
-"""Depths may be those of what stands on the table, up to this height in metres."""
+"""The height up to which depths may be those of objects on the table, in metres."""
 _WIDEST = 0.15
-"""Half of these shares lie within a range as narrow as this if a table is seen."""
+"""The largest interquartile range of these multiples if the table is seen."""
 _STEP = 4
-"""Every so many pixels are enough to judge by."""
+"""Only every fourth pixel is checked."""
 _OPTICAL = np.eye(4)
 _OPTICAL[:3, :3] = Rotation.from_euler("xyz", [-90, 0, -90], degrees=True).as_matrix()
-"""The optical frame in a camera's body frame as ROS has it (x forward, y left, z up)."""
+"""The optical frame in ROS's body frame of a camera (x forward, y left, z up)."""
 
 
 def observe(frames: Mapping[str, Frame], calibration: Calibration) -> Observation:
-    """o_t, by the arithmetic of the simulated cell.
+    """o_t, with the same heightmap as in the simulated cell.
 
     Args:
         frames: of each camera by its name.
@@ -48,11 +47,11 @@ def observe(frames: Mapping[str, Frame], calibration: Calibration) -> Observatio
 
 
 def make_views(frames: Mapping[str, Frame], calibration: Calibration) -> list[View]:
-    """The cameras' views, once it is plausible that they show the workspace.
+    """The cameras' views, after checking that they plausibly show the workspace.
 
     Raises:
-        UserError: a camera has no frame or one of a wrong size or type, sees nothing of the
-            workspace, or has no depths or depths in another unit.
+        UserError: a camera has no frame, one of a wrong size or type, or no plausible depths, or
+            does not see the workspace.
     """
     views = []
     for camera in calibration.cameras:
@@ -69,8 +68,8 @@ def make_views(frames: Mapping[str, Frame], calibration: Calibration) -> list[Vi
 def table_depth(
     camera: BenchCamera, X_BC: Array, grid: PixelGrid, step: int = 1
 ) -> NDArray[np.float64]:
-    """(height, width): the depth of the table where a pixel looks at the workspace, in metres, by
-    the camera's pose alone; NaN elsewhere. Of every `step`th pixel along rows and columns."""
+    """(height, width): the depth of the table by the camera's pose alone, for pixels that look at
+    the workspace, in metres; NaN elsewhere. Only every `step`th pixel along rows and columns."""
     rays = camera.rays
     u, v = (item[::step, ::step] for item in np.broadcast_arrays(rays.u, rays.v))
     directions = np.stack([u, v, np.ones_like(u)], axis=-1) @ X_BC[:3, :3].T
@@ -82,7 +81,7 @@ def table_depth(
 
 
 def seen_share(observation: Observation, calibration: Calibration) -> float:
-    """The share of o_t's pixels in view of any camera that one sees, from 0 to 1."""
+    """The seen share of o_t's pixels in view of any camera, from 0 to 1."""
     grid = observation.grid
     views = [_in_view(camera, camera.X_BC, grid, 1) for camera in calibration.cameras]
     return float(observation.valid.ravel()[np.any(views, axis=0)].mean())
@@ -91,8 +90,8 @@ def seen_share(observation: Observation, calibration: Calibration) -> float:
 def _in_view(
     camera: BenchCamera, X_BC: Array, grid: PixelGrid, step: int = _STEP
 ) -> NDArray[np.bool_]:
-    """(n,) of every `step`th of the workspace's pixels along rows and columns, whether it is in the
-    image, at the table's height."""
+    """(n,): whether each of the workspace's pixels is in the image, at the table's height. Only
+    every `step`th pixel along rows and columns."""
     rows, cols = np.meshgrid(
         np.arange(0, grid.rows, step), np.arange(0, grid.cols, step), indexing="ij"
     )
@@ -144,7 +143,7 @@ def _check_depth(frame: Frame, camera: BenchCamera, grid: PixelGrid) -> None:
     towards = np.isfinite(expected)
     if not towards.any():
         raise UserError(
-            f"the workspace is too small for camera {camera.name}, which has next to no pixel of "
+            f"the workspace is too small for camera {camera.name}, which sees almost no pixel of "
             "it: give it more rows and cols"
         )
     depth = frame.depth[::_STEP, ::_STEP][towards]
@@ -155,7 +154,7 @@ def _check_depth(frame: Frame, camera: BenchCamera, grid: PixelGrid) -> None:
             f"depth of camera {camera.name} is all zero or NaN where it looks at the workspace"
         )
     ratios = depth[returned] / expected[towards][returned]
-    # Along a ray, the share that is left is that of the camera's height.
+    # Objects on the table shorten a ray by the share of their height in the camera's height.
     on_table = (ratios < 1) & (ratios > 1 - _TALL / (camera.X_BC[2, 3] - grid.z_min))
     ratios[on_table] = 1
     low, ratio, high = (float(value) for value in np.percentile(ratios, (25, 50, 75)))
@@ -184,10 +183,10 @@ def _check_depth(frame: Frame, camera: BenchCamera, grid: PixelGrid) -> None:
 
 
 def _check_limits(depth: NDArray[np.float32], camera: BenchCamera) -> None:
-    """Raises UserError where a camera's limits leave next to nothing of its depths (n), in m."""
+    """Raises UserError if the camera's limits exclude almost all of its depths (n,), in metres."""
     low, high = camera.min_depth, camera.max_depth
     if ((depth >= low) & (depth <= high)).mean() < _LEAST_DEPTH:
         raise UserError(
             f"depth of camera {camera.name} is {np.median(depth):.3g} m, the median, and by its "
-            f"min_depth {low:g} and max_depth {high:g} next to none is taken: these are in metres"
+            f"min_depth {low:g} and max_depth {high:g} almost none is used: give these in metres"
         )

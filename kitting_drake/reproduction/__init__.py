@@ -1,1 +1,1 @@
-"""The command `benchmark`: measurements on this machine."""
+"""The command `benchmark`, with measurements on this machine, and the page of results."""

@@ -1,1 +1,1 @@
-"""Static scenes to learn from, rendered without physics."""
+"""Static training scenes, rendered without physics."""

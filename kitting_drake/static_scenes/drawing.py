@@ -1,9 +1,9 @@
-"""Static scenes to learn from: random tools and kits, rendered where they stand; no physics.
+"""Draws static training scenes: random tools and kits, rendered without physics.
 
-Tools are drawn (`hkd.generation.random_tools`), a kit is laid out for some of them, and several
-scenes are rendered of it. They differ in the poses, in which tools are seated already, in the
-things without a cavity that lie about, and in the noise of the cameras. The labels are geometry:
-every grasp that leaves the jaws room, and the pose that seats the tool.
+For each batch, tools are drawn (`hkd.generation.random_tools`). Each kit is laid out for some of
+them and rendered in several scenes, with varying poses, seated tools, clutter and camera noise.
+Labels follow from the geometry: every grasp with room for the jaws, and the pose that seats the
+tool.
 """
 
 from collections.abc import Iterator, Sequence
@@ -56,29 +56,29 @@ from systems.signals import Observation, PixelGrid
 _TOOLS_A_BATCH = 12
 _TOOLSETS_A_BATCH = 10
 _SCENES_A_TOOLSET = 4
-"""At most: a toolset for which there is no room is left out."""
+"""At most; a toolset is left out if there is no room for it."""
 
 _COUNTS = np.array([2, 4, 8, 24, 8, 6, 4, 2, 2, 1, 1, 1], float)
-"""How often kits of 1, 2, ... 12 tools are drawn: mostly of four."""
+"""Relative frequencies of kits with 1, 2, ... 12 tools; four is most frequent."""
 _MOST_LOOSE = 8
-"""The most loose tools; any others are seated, as the workspace has no room for all."""
+"""Largest number of loose tools; the others are seated, because the workspace is too small."""
 _CLUTTERED = 0.5
-"""The share of scenes with things that have no cavity, ..."""
+"""Share of scenes with clutter, i.e. objects without a cavity."""
 _MOST_STRANGERS, _MOST_BOXES = 2, 6
-"""... at most so many other tools, and boxes."""
+"""Largest numbers of other tools and of boxes in the clutter."""
 _WALL = 0.003
 _IN_CAVITY = 0.0008
-"""Standard deviation of where a seated tool lies in its clearance, in metres."""
+"""Standard deviation of a seated tool's position in its cavity, in metres."""
 
 
 def draw_batch(seed: int) -> Iterator[StaticScene]:
-    """The static scenes of a seed.
+    """Draws the static scenes of a seed.
 
     Args:
-        seed: of all draws; different seeds share neither tools nor kits.
+        seed: of all draws. Different seeds share neither tools nor kits.
 
     Raises:
-        UserError: images cannot be rendered here.
+        MachineError: this machine cannot render.
     """
     require_rendering()
     rng = np.random.default_rng([seed, 0])
@@ -89,18 +89,18 @@ def draw_batch(seed: int) -> Iterator[StaticScene]:
         count = 1 + int(rng.choice(len(_COUNTS), p=_COUNTS / _COUNTS.sum()))
         chosen = [tools[i] for i in rng.choice(len(tools), count, replace=False)]
         if rng.random() < 0.5:
-            # Of one kind, tools are nested; of four, they take the slots of a toolset.
+            # Tools of one category are nested; four of different ones take a toolset's slots.
             chosen = [replace(tool, category="drawn") for tool in chosen]
         try:
             kit = _draw_kit(chosen, rng)
             others = [tool for tool in tools if all(tool.name != own.name for own in chosen)]
             for scene in range(_SCENES_A_TOOLSET):
-                # Of its own, so that noise and scene have nothing to do with each other.
+                # A separate stream makes the noise independent of the scene.
                 own = np.random.SeedSequence([seed, 1, number, scene])
                 noise_seed = int(own.generate_state(1)[0])
                 yield _draw_scene(kit, chosen, others, rng, noise_seed)
         except UserError:
-            # There is no room for so many such tools.
+            # There is no room for these tools.
             continue
 
 
@@ -108,7 +108,7 @@ def draw_batch(seed: int) -> Iterator[StaticScene]:
 class _DrawnKit:
     kit: Kit
     text: str
-    """The Wavefront text of the block."""
+    """The block as Wavefront text."""
 
 
 def _draw_kit(tools: Sequence[RandomTool], rng: np.random.Generator) -> _DrawnKit:
@@ -131,7 +131,7 @@ def _draw_scene(
     rng: np.random.Generator,
     noise_seed: int,
 ) -> StaticScene:
-    """A scene of a kit, its tools, and perhaps some of the others, for which it has no cavity."""
+    """A scene of a kit, its tools, and perhaps other tools without a cavity as clutter."""
     grid = PixelGrid()
     kit = drawn.kit
     loose = _draw_loose(len(tools), rng)
@@ -179,7 +179,7 @@ def _draw_scene(
 
 
 def _draw_loose(count: int, rng: np.random.Generator) -> list[int]:
-    """Which of so many tools are not seated yet."""
+    """Draws which of so many tools are loose."""
     order = rng.permutation(count)
     seated = int(rng.integers(0, count + 1))
     if rng.random() < 0.5:
@@ -212,7 +212,7 @@ def _actions(
 
 
 def _draw_noise(rng: np.random.Generator) -> SensorNoiseParameters:
-    """From none to what a poor camera, poorly calibrated, has."""
+    """Draws camera noise, from none to that of a poorly calibrated, poor camera."""
     if rng.random() < 0.25:
         return SensorNoiseParameters()
     severity = rng.uniform(0.0, 1.0, 8)
@@ -231,16 +231,16 @@ def _draw_noise(rng: np.random.Generator) -> SensorNoiseParameters:
 
 
 Body = tuple[str, RigidTransform]
-"""A mesh as Wavefront text, in metres, and its pose in the world."""
+"""A mesh as Wavefront text in metres, and its pose in the world."""
 
 
 def render(
     bodies: Sequence[Body], grid: PixelGrid, noise: SensorNoiseParameters, seed: int
 ) -> Observation:
-    """o_t of bodies on a table, by the scenario's default cameras; heights only, colours are black.
+    """Renders o_t of bodies on a table with the default cameras. Heights only; colours are black.
 
     Args:
-        bodies: what stands on the table, the plane z = 0.
+        bodies: on the table, the plane z = 0.
         grid: of the observation.
         noise: of the cameras.
         seed: of the noise.
@@ -302,5 +302,5 @@ def _solid_text(solid: Manifold) -> str:
 
 
 def _obj(vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> str:
-    """Wavefront text with the faces' normals, which the renderer insists on."""
+    """Wavefront text with face normals, which the renderer needs."""
     return flat_obj(vertices, faces, digits=6, normal_digits=3)

@@ -1,4 +1,4 @@
-"""From a scenario to its station: the only place where systems are wired together."""
+"""Builds the station of a scenario. All systems are wired together here."""
 
 from kitting_drake.station.policy import connect_policy, make_policy, with_policy
 from kitting_drake.station.station import KittingStation, build_station

@@ -1,4 +1,4 @@
-"""The planner and the controller of the hand, and the loop through the plant."""
+"""Adds the planner and the hand's controller to the station."""
 
 import numpy as np
 from pydrake.multibody.plant import MultibodyPlant
@@ -19,7 +19,7 @@ _EXPORTED = {
     "desired_motion": "commanded",
     "desired_opening": "commanded_opening",
 }
-"""The planner's output ports, and what the station calls them."""
+"""Names of the planner's output ports, and the station's names for them."""
 
 
 def add_control(
@@ -29,14 +29,15 @@ def add_control(
     plant: MultibodyPlant,
     projector: HeightmapProjector | None,
 ) -> PickPlacePlanner:
-    """Adds both, closes the loop, and exports the planner's ports, and what robot and wrist say.
+    """Adds planner and controller, connects them to the plant, and exports their ports.
 
     Args:
         builder: of the station.
-        scenario: whose planner and controller they are.
-        scene: says how many actions there are, and whether objects are inserted.
-        plant: finalized; it has the hand.
-        projector: what the planner reads heights off; None: each action must bring its own.
+        scenario: configures planner and controller.
+        scene: the number of actions, and whether objects are inserted.
+        plant: finalized, with the hand.
+        projector: provides o_t, from which the planner reads heights; None if each action carries
+            its heights.
     """
     hand = plant.GetModelInstanceByName("franka_hand")
     planner = builder.AddNamedSystem(

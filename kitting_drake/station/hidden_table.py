@@ -1,4 +1,4 @@
-"""Whether the hand, where it waits, hides part of the table from a camera."""
+"""Checks whether the waiting hand hides part of the table from a camera."""
 
 import itertools
 
@@ -13,14 +13,13 @@ from systems.signals import PixelGrid
 
 _YAWS = np.deg2rad([0.0, 45.0, 90.0, 135.0])
 _PLACES = 9
-"""Along the workspace's y, at which the hand may wait after an action: it keeps its y."""
+"""Number of waiting positions to check along the workspace's y. The hand keeps its y to wait."""
 
 
 def hidden_table_note(scenario: Scenario) -> str | None:
-    """A sentence for people where the waiting hand hides part of the workspace from a camera.
+    """A warning if the waiting hand hides part of the workspace from a camera; else None.
 
-    There o_t has a hole or, where others see what it hides, is of fewer cameras. None where it
-    hides nothing, as from the three default cameras.
+    The hidden part of o_t is a hole, unless another camera sees it.
     """
     grid = scenario.heightmap.grid()
     p_WPoints = _waiting_hand(scenario.planner.home, grid)
@@ -35,7 +34,7 @@ def hidden_table_note(scenario: Scenario) -> str | None:
 
 
 def _waiting_hand(home: list[float], grid: PixelGrid) -> NDArray[np.float64]:
-    """(n, 3): points of boxes about the hand, wherever it may wait, in the world, in metres."""
+    """(n, 3) points of boxes around the hand, at all waiting positions, in the world, in metres."""
     half_x, half_y = PALM_SIZE[0] / 2, PALM_SIZE[1] / 2
     p_GPoints = np.stack(
         np.meshgrid(
@@ -54,7 +53,7 @@ def _waiting_hand(home: list[float], grid: PixelGrid) -> NDArray[np.float64]:
 
 
 def _hides(p_WPoints: NDArray[np.float64], camera: Camera, grid: PixelGrid) -> bool:
-    """Whether a camera sees one of some points before a place of the workspace."""
+    """Whether any of the points hides a part of the workspace from a camera."""
     X_WC = camera_pose(camera)
     lens = depth_camera(camera, "").core().intrinsics()
     x, y, z = X_WC.inverse().multiply(p_WPoints.T)
@@ -65,7 +64,7 @@ def _hides(p_WPoints: NDArray[np.float64], camera: Camera, grid: PixelGrid) -> b
     in_image = ahead & (u > 0) & (u < lens.width()) & (v > 0) & (v < lens.height())
     p_WC = X_WC.translation()
     rays = p_WPoints - p_WC
-    # Where each ray meets the table, if it goes down.
+    # Intersect each downward ray with the table.
     down = in_image & (rays[:, 2] < -1e-6)
     along = (grid.z_min - p_WC[2]) / np.where(down, rays[:, 2], -1.0)
     p_WTable = p_WC + along[:, np.newaxis] * rays

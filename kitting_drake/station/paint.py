@@ -1,4 +1,4 @@
-"""Gives the station's surfaces the colours, the sheen and the lights that a scenario asks for."""
+"""Applies a scenario's colours, sheen and lights to the station."""
 
 import colorsys
 from collections.abc import Mapping
@@ -23,9 +23,9 @@ from kitting_drake.scenario.appearance import Appearance, Drawn, Fixed, Light, P
 from systems.sensor_noise import SHEEN_LABELS
 
 _COLOUR_STREAM, _LIGHT_STREAM = 11, 12
-"""Streams of the seed: what is drawn here changes nothing else that is drawn."""
+"""Random streams of the seed, used by nothing else."""
 _STEEPEST_LIGHT = 0.35
-"""The least z of a drawn light's direction, which points down."""
+"""Least ratio of downward to horizontal component of a drawn light's direction."""
 
 
 def paint_surfaces(
@@ -35,17 +35,17 @@ def paint_surfaces(
     groups: Mapping[BodyIndex, str],
     seed: int,
 ) -> None:
-    """Paints the surfaces; to be called before cameras are added.
+    """Paints the surfaces. Call it before cameras are added.
 
     Args:
         plant: finalized.
-        scene_graph: its.
+        scene_graph: of the plant.
         appearance: of the scenario.
-        groups: `table`, `fixtures/NAME` or `objects/NAME` of each body.
+        groups: `table`, `fixtures/NAME` or `objects/NAME` for each body.
         seed: of the draws.
 
     Raises:
-        UserError: a pattern names no surface.
+        UserError: a pattern matches no surface.
     """
     if not appearance.paints and not appearance.sheen:
         return
@@ -68,7 +68,7 @@ def paint_surfaces(
 
 
 def lights_of(appearance: Appearance, seed: int) -> list[LightParameter]:
-    """The lights of the cameras' renderer; none: Drake's default, from each camera."""
+    """The lights of the cameras' renderer; if empty, Drake's default light at each camera."""
     if appearance.drawn_lights is None:
         return [_light(item) for item in appearance.lights]
     rng = np.random.default_rng([seed, _LIGHT_STREAM])
@@ -98,7 +98,7 @@ def _light(light: Light) -> LightParameter:
 def _surfaces(
     plant: MultibodyPlant, scene_graph: SceneGraph, groups: Mapping[BodyIndex, str]
 ) -> dict[str, list[GeometryId]]:
-    """The visual geometries by their names, in the order of the bodies."""
+    """The visual geometries by name, in the order of the bodies."""
     inspector = scene_graph.model_inspector()
     surfaces: dict[str, list[GeometryId]] = {}
     for body, group in groups.items():
@@ -115,7 +115,7 @@ def _matching(pattern: str, surfaces: dict[str, list[GeometryId]], field: str) -
     ]
     if not found:
         names = ", ".join(sorted(surfaces))
-        raise UserError(f"appearance.{field}: no surface is called {pattern}; there are {names}")
+        raise UserError(f"appearance.{field}: no surface matches {pattern}; choose from {names}")
     return found
 
 
@@ -128,7 +128,7 @@ def _colour(paint: Paint, own: Rgba, rng: np.random.Generator) -> Rgba:
     if isinstance(paint, Fixed):
         return Rgba(*paint.rgb)
     if paint.spread is None:
-        # Every hue; greys and dark colours are as frequent as others.
+        # HSV gives all hues, and as many grey and dark colours as others.
         return Rgba(*colorsys.hsv_to_rgb(*rng.uniform((0, 0, 0.12), (1, 1, 0.95))))
     near = np.array([own.r(), own.g(), own.b()]) + rng.uniform(-paint.spread, paint.spread, 3)
     return Rgba(*np.clip(near, 0.0, 1.0))
@@ -137,7 +137,7 @@ def _colour(paint: Paint, own: Rgba, rng: np.random.Generator) -> Rgba:
 def _recolour(
     plant: MultibodyPlant, scene_graph: SceneGraph, geometry: GeometryId, colour: Rgba
 ) -> None:
-    """Recolours what the cameras see, and what a person sees in Meshcat."""
+    """Recolours a surface for the cameras and for Meshcat."""
     inspector = scene_graph.model_inspector()
     seen = PerceptionProperties(inspector.GetPerceptionProperties(geometry))
     seen.UpdateProperty("phong", "diffuse", colour)
@@ -156,7 +156,8 @@ def _replace(
     role: Role,
     properties: PerceptionProperties | IllustrationProperties,
 ) -> None:
-    """`AssignRole` cannot replace what renderers see, and warns of what a visualizer may miss."""
+    """Replaces properties. `AssignRole` alone cannot replace perception properties, and warns for
+    illustration properties."""
     source = plant.get_source_id()
     scene_graph.RemoveRole(source, geometry, role)
     scene_graph.AssignRole(source, geometry, properties)

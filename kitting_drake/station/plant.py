@@ -1,4 +1,4 @@
-"""The station's plant: table, fixtures, objects and hand."""
+"""Builds the station's plant: table, fixtures, objects and hand."""
 
 from pathlib import Path
 
@@ -21,7 +21,7 @@ from systems.rest_detector import BoundedBody, Box
 _X_WTABLE = RigidTransform([0.5, 0.0, 0.0])
 
 _VARIATION_STREAM = 13
-"""Stream of the seed: what is drawn here changes nothing else that is drawn."""
+"""Random stream of the seed, used by nothing else."""
 
 
 def add_plant(builder: DiagramBuilder, scenario: Scenario) -> tuple[MultibodyPlant, SceneGraph]:
@@ -36,19 +36,18 @@ def add_models(
 
     Args:
         plant: not finalized yet.
-        scene: the episode's.
-        variation: says how much friction and mass vary; the hand's do not.
-        seed: of their draws.
+        scene: of the episode.
+        variation: ranges of friction and mass; the hand's are not varied.
+        seed: of the draws.
 
     Returns:
-        The scene's objects with their bodies, and the bodies that never move: the table, then the
-        fixtures.
+        The scene's objects with their bodies, and the bodies that never move: table, then fixtures.
 
     Raises:
-        UserError: a model cannot be loaded, or is not of one link.
+        UserError: a model cannot be loaded, or does not have exactly one link.
     """
     parser = Parser(plant)
-    # The same model may be there several times.
+    # A model may occur several times.
     parser.SetAutoRenaming(True)
     parser.package_map().AddPackageXml(str(MODELS / "package.xml"))
     rng = np.random.default_rng([seed, _VARIATION_STREAM])
@@ -79,7 +78,7 @@ def add_models(
 def _add_body(
     parser: Parser, plant: MultibodyPlant, model: Path, text: str | None = None
 ) -> RigidBody:
-    """Adds a model of one link from its file, or from a text that replaces it."""
+    """Adds a model of one link from its file, or from a text that replaces the file."""
     try:
         if text is None:
             instances = parser.AddModels(str(model))
@@ -87,17 +86,17 @@ def _add_body(
             instances = parser.AddModelsFromString(text, "sdf")
     except (RuntimeError, ValueError) as error:
         reason = str(error).splitlines()[0]
-        raise UserError(f"task: {model} cannot be loaded: {reason}") from error
+        raise UserError(f"task: cannot load {model}: {reason}") from error
     bodies = [body for instance in instances for body in plant.GetBodyIndices(instance)]
     if len(bodies) != 1:
-        raise UserError(f"task: {model} has {len(bodies)} links: it must have one")
+        raise UserError(f"task: {model} must have one link, not {len(bodies)}")
     return plant.get_body(bodies[0])
 
 
 def set_initial_poses(
     plant: MultibodyPlant, scenario: Scenario, scene: Scene, objects: tuple[PlacedObject, ...]
 ) -> None:
-    """Makes the scene's poses, and the hand at home with open jaws, the plant's default state."""
+    """Sets the plant's default state: the scene's poses, and the open hand at home."""
     for placed, item in zip(objects, scene.objects, strict=True):
         plant.SetDefaultFloatingBaseBodyPose(plant.get_body(placed.body), item.X_WB)
     for joint, position in zip(("x", "y", "z", "yaw"), scenario.planner.home, strict=True):

@@ -1,4 +1,4 @@
-"""Plugs a policy into a station: the scenario's own, or any LeafSystem."""
+"""Connects a policy to a station: the scenario's own, or any LeafSystem."""
 
 from pydrake.systems.framework import Diagram, DiagramBuilder, System
 
@@ -9,14 +9,14 @@ from kitting_drake.station.station import KittingStation
 
 
 def make_policy(station: KittingStation, observer: DecisionObserver | None = None) -> System:
-    """The system of the policy that the station's scenario names.
+    """Makes the policy system of the station's scenario.
 
     Args:
-        station: what it is to be connected to.
-        observer: told of every decision of a learned policy, and of the observation it is about.
+        station: to which the policy will be connected.
+        observer: called with every decision of a learned policy and its observation.
 
     Raises:
-        UserError: it cannot be made.
+        UserError: the policy cannot be made.
     """
     scenario = station.scenario
     return scenario.policy.make_system(
@@ -46,21 +46,21 @@ def connect_policy(
     the policy's output port `action` to the station's input port.
 
     Args:
-        builder: holds both.
-        station: decides nothing.
-        policy: decides.
-        through: a system with an input and an output port `action`, through which actions go.
+        builder: contains both.
+        station: the station.
+        policy: its policy.
+        through: a system with input and output port `action`, inserted after the policy.
 
     Raises:
-        UserError: the policy looks at images, and there are no cameras.
-        MachineError: it does, and images cannot be rendered here.
+        UserError: the policy needs images, but the scenario has no cameras.
+        MachineError: the policy needs images, but this machine cannot render.
     """
     for index in range(policy.num_input_ports()):
         port = policy.get_input_port(index)
         name = port.get_name()
         if name.startswith("observation") and not station.has_cameras:
             if not station.scenario.cameras:
-                raise UserError("cameras is empty: this policy needs at least one to see by")
+                raise UserError("cameras is empty: this policy needs at least one camera")
             require_rendering()
         builder.Connect(station.GetOutputPort(name), port)
     last = policy

@@ -1,4 +1,4 @@
-"""Adds to the station its cameras, their noise, and the projector of their images."""
+"""Adds cameras, sensor noise and the heightmap projector to the station."""
 
 from pydrake.geometry import ColorRenderCamera, SceneGraph
 from pydrake.systems.framework import DiagramBuilder, LeafSystem
@@ -20,13 +20,13 @@ _IMAGES = {
     "depth_image_32f": "depth_image",
     "body_pose_in_world": "body_pose_in_world",
 }
-"""A camera's output ports, and the projector's input ports but for the camera's name."""
+"""Output ports of a camera, and the prefixes of the projector's input ports."""
 _EXPORTED = {
     "color_image": "color_image",
     "depth_image_32f": "depth_image",
     "body_pose_in_world": "camera_pose",
 }
-"""A camera's output ports, and the station's but for the camera's name."""
+"""Output ports of a camera, and the prefixes of the station's output ports."""
 
 
 def add_cameras(
@@ -36,12 +36,12 @@ def add_cameras(
     grid: PixelGrid,
     seed: int,
 ) -> HeightmapProjector:
-    """Adds a scenario's cameras, what makes them imperfect, and what fuses their images.
+    """Adds a scenario's cameras, their noise, and the projector of their images.
 
     Args:
         builder: of the station.
-        scenario: whose cameras, appearance and sensor noise they are.
-        scene_graph: what they see.
+        scenario: configures cameras, appearance and sensor noise.
+        scene_graph: seen by the cameras.
         grid: of the observation.
         seed: of lights and noise.
 
@@ -49,10 +49,11 @@ def add_cameras(
         The projector, whose port `observation` is o_t.
 
     Raises:
-        UserError: there are no cameras, or images cannot be rendered here.
+        UserError: there are no cameras.
+        MachineError: this machine cannot render.
     """
     if not scenario.cameras:
-        raise UserError("cameras is empty: the heightmap needs at least one")
+        raise UserError("cameras is empty: the heightmap needs at least one camera")
     lights = lights_of(scenario.appearance, seed)
     renderer = add_observation_renderer(scene_graph, lights)
     cameras = {name: depth_camera(config, renderer) for name, config in scenario.cameras.items()}

@@ -1,4 +1,4 @@
-"""The station: a Diagram of everything but the policy, with ports to plug one into."""
+"""The station: a Diagram of everything but the policy."""
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -28,11 +28,11 @@ from systems.rest_detector import RestDetector
 from systems.signals import Observation, PickPlaceAction
 
 Monitor = Callable[[Context], EventStatus]
-"""What a Simulator calls after each step, with the root context."""
+"""A monitor of a Simulator: called after each step, with the root context."""
 
 
 class KittingStation(Diagram):
-    """A robot, its cameras and its controllers, on a table with objects; the policy is outside.
+    """A table with objects, a robot hand, cameras and controllers. The policy is connected outside.
 
     .. pydrake_system::
 
@@ -68,27 +68,27 @@ class KittingStation(Diagram):
         - depth_image_<camera>
         - camera_pose_<camera>
 
-    - `action` (abstract, `PickPlaceAction`): evaluated only when the planner asks.
-    - `observation` (abstract, `Observation`): o_t. `observation_heights`: o_t without colours, for
-      which no colour image is rendered. These and the cameras' images are there only where the
-      scenario has cameras and the machine can render.
+    - `action` (abstract, `PickPlaceAction`): evaluated only when the planner needs an action.
+    - `observation` (abstract, `Observation`): o_t. `observation_heights`: o_t without colours;
+      evaluating it renders no colour images. These and the camera ports exist only if the scenario
+      has cameras and the machine can render.
     - `failed_picks`, `accepted_action`, `asks`, `mode`, `counts`: the `PickPlacePlanner`'s.
     - `robot_state` (12): positions, then velocities of x, y, z, yaw and both fingers; m, rad, s.
     - `wrist_force` (6): contact forces on x, y, z (N), about z (N m), and on each finger (N).
-    - `actuation` (6): what drives x, y, z (N), yaw (N m) and each finger (N).
+    - `actuation` (6): actuation of x, y, z (N), yaw (N m) and each finger (N).
     - `commanded` (12): q_d, v_d, a_d of x, y, z and yaw. `commanded_opening` (2): the opening
       between the pads in m, and its rate.
     - `body_poses`, `contact_results`: the plant's. `query_object`: the scene graph's.
-    - `at_rest` (n): 1 for an object that is at rest: the `RestDetector`'s.
-    - The others are those of the `PlacementMonitor`, one element for each of the n objects.
-    - `color_image_<camera>`, `depth_image_<camera>`, `camera_pose_<camera>`: what o_t is projected
-      from, noise included, and X_WB as the calibration has it.
+    - `at_rest` (n): the `RestDetector`'s; 1 for an object at rest.
+    - `placements` to `height_error`: the `PlacementMonitor`'s.
+    - `color_image_<camera>`, `depth_image_<camera>`, `camera_pose_<camera>`: the projector's
+      inputs: images with noise, and the calibrated X_WB.
 
-    All memory is in the Context. Ports compute only on demand: images are rendered when something
-    asks for an observation.
+    All state is in the Context. Ports compute only on demand; in particular, images are rendered
+    only when an observation is evaluated.
 
-    Simulate it by `make_simulator`: objects at rest sleep there, and cost nothing; and objects that
-    arrive during the episode do so.
+    Simulate the station with `make_simulator`. It lets objects sleep when at rest, and appear
+    during the episode.
     """
 
     def __init__(self, scenario: Scenario, *, seed: int, base: Path) -> None:
@@ -104,8 +104,8 @@ class KittingStation(Diagram):
         self.objects, self.still_bodies = add_models(
             self.plant, self.scene, scenario.variation, seed
         )
-        """The scene's objects with their bodies; the bodies of the table and the fixtures. By their
-        indices: a body would keep the plant, and that the station, in memory for good."""
+        """The scene's objects with their bodies, and the bodies of table and fixtures. Held as
+        indices: a body would keep the plant, and with it the station, alive forever."""
         self.plant.Finalize()
         set_initial_poses(self.plant, scenario, self.scene, self.objects)
         groups = _surface_groups(self.scene, self.still_bodies, self.objects)
@@ -116,7 +116,7 @@ class KittingStation(Diagram):
             builder.ExportOutput(projector.GetOutputPort("observation"), "observation")
             builder.ExportOutput(projector.GetOutputPort("heights"), "observation_heights")
         self.has_cameras = projector is not None
-        """Whether there is the port `observation`."""
+        """Whether the port `observation` exists."""
         planner = add_control(builder, scenario, self.scene, self.plant, projector)
         self._add_score_and_rest(builder)
         self._feeder = self._add_feeder(builder)
@@ -130,7 +130,7 @@ class KittingStation(Diagram):
         self.set_name("station")
 
     def _add_score_and_rest(self, builder: DiagramBuilder) -> None:
-        """Adds what watches the objects, and exports its ports."""
+        """Adds placement monitor and rest detector, and exports their ports."""
         scene, plant, sleep = self.scene, self.plant, self.scenario.sleep
         self._monitor = builder.AddNamedSystem(
             "monitor",
@@ -155,7 +155,7 @@ class KittingStation(Diagram):
                 builder.ExportOutput(port, port.get_name())
 
     def _add_feeder(self, builder: DiagramBuilder) -> ObjectFeeder | None:
-        """Adds what lets objects appear, if any do."""
+        """Adds the feeder, if objects appear during the episode."""
         arrivals = self.scene.arrivals
         if arrivals is None:
             return None
@@ -172,7 +172,7 @@ class KittingStation(Diagram):
         builder.Connect(self.plant.get_body_poses_output_port(), feeder.GetInputPort("body_poses"))
         return feeder
 
-    # What its ports say, for callers that hold the context of a Diagram that it is part of.
+    # Values of the ports, for callers that hold the context of an enclosing Diagram.
 
     def object_poses(self, root_context: Context) -> list[RigidTransform]:
         """X_WB of each of the scene's objects."""
@@ -180,7 +180,7 @@ class KittingStation(Diagram):
         return [body.EvalPoseInWorld(context) for body in self._bodies]
 
     def placements(self, root_context: Context) -> list[Placement]:
-        """The port `placements`: where each of the scene's objects is relative to its goal."""
+        """The port `placements`: one for each of the scene's objects."""
         return self._monitor.placements(self._monitor.GetMyContextFromRoot(root_context))
 
     def reward(self, root_context: Context) -> float:
@@ -209,15 +209,15 @@ class KittingStation(Diagram):
         return actions, missed, dropped
 
     def point_contact_pairs(self, root_context: Context) -> int:
-        """How many pairs are in point contact; 0 where contact is strictly hydroelastic."""
+        """Number of pairs in point contact; 0 if contact is strictly hydroelastic."""
         return self._eval(root_context, "contact_results").num_point_pair_contacts()
 
     def proposed_action(self, root_context: Context) -> PickPlaceAction:
-        """The port `action`: what the policy that is plugged in would do now."""
+        """The port `action`: the connected policy's present action."""
         return self.GetInputPort("action").Eval(self.GetMyContextFromRoot(root_context))
 
     def accepted_action(self, root_context: Context) -> PickPlaceAction:
-        """The port `accepted_action`: the action begun last, as the hand goes there."""
+        """The port `accepted_action`: the last action begun."""
         return self._eval(root_context, "accepted_action")
 
     def _eval(self, root_context: Context, port: str) -> Any:
@@ -228,19 +228,19 @@ class KittingStation(Diagram):
     def make_simulator(
         self, diagram: Diagram | None = None, *, monitor: Monitor | None = None
     ) -> Simulator:
-        """A Simulator in which objects appear (see `ObjectFeeder`), and those at rest sleep (see
-        `RestDetector`) if the scenario says so.
+        """Makes a Simulator in which objects appear (see `ObjectFeeder`) and, if the scenario
+        enables it, sleep (see `RestDetector`).
 
         Args:
-            diagram: the outermost Diagram that this station is part of; None: the station alone.
-            monitor: called after each step and all this. (Drake's `set_monitor` would replace the
-                one that does it.)
+            diagram: the outermost Diagram, which contains this station; None: the station alone.
+            monitor: called after each step. Use it instead of `Simulator.set_monitor`, which would
+                disable appearing and sleep.
 
         Raises:
-            ValueError: no `diagram`, though the station is part of one.
+            ValueError: `diagram` is missing, but the station is part of one.
         """
         if diagram is None and self.GetSystemPathname().strip(":").count("::"):
-            raise ValueError("give make_simulator the outermost Diagram that holds the station")
+            raise ValueError("make_simulator needs the outermost Diagram that contains the station")
         simulator = Simulator(self if diagram is None else diagram)
 
         def step(root_context: Context) -> EventStatus:
@@ -251,11 +251,11 @@ class KittingStation(Diagram):
         simulator.set_monitor(step)
         return simulator
 
-    # No LeafSystem may touch another's part of a context, hence these two for the simulator's
-    # monitor.
+    # The simulator's monitor calls these two, because a LeafSystem cannot change the context of
+    # another system.
 
     def _let_appear(self, root_context: Context) -> None:
-        """Moves the object that is to appear now, if any, to where it appears; it wakes there."""
+        """Moves the next object to its place of appearance, if one is to appear; it wakes there."""
         if self._feeder is None:
             return
         port = self._feeder.get_output_port()
@@ -268,11 +268,11 @@ class KittingStation(Diagram):
         self.plant.SetFreeBodyPose(plant_context, body, self.scene.arrivals.poses[index])
 
     def _apply_sleep(self, root_context: Context) -> None:
-        """Freezes the objects that are at rest and thaws the others.
+        """Freezes objects at rest and thaws the others.
 
-        A frozen object's joint is locked, and its contact with table, fixtures and other frozen
-        objects is not computed; what comes near it still collides with it. Where the scenario has
-        no sleep, only what is yet to appear is frozen.
+        A frozen object's joint is locked. Its contact with table, fixtures and other frozen objects
+        is filtered, but awake bodies still collide with it. If sleep is disabled, only objects that
+        have not appeared are frozen.
         """
         may_sleep = self.at_rest(root_context)
         if not self.scenario.sleep.enabled:
@@ -293,7 +293,7 @@ class KittingStation(Diagram):
             self.scene_graph.GetMyMutableContextFromRoot(root_context)
         )
         still = [self.plant.get_body(index) for index in self.still_bodies]
-        # First those that wake, as they are free of all; then those that fall asleep.
+        # Wake first, which allows all contacts; then freeze, which filters some.
         for body, resting in sorted(changed, key=lambda change: change[1]):
             own = self._geometry([body])
             if resting:
@@ -322,40 +322,40 @@ def build_station(scenario: Scenario, seed: int = 0, base: Path | None = None) -
     """Builds the station of a scenario.
 
     Args:
-        scenario: what to build; its policy stays outside (see `station.policy`).
+        scenario: what to build, except for its policy (see `station.policy`).
         seed: of the scene and of all noise; see `TaskConfig.make_scene`.
-        base: where relative paths in the scenario start; None: the working directory.
+        base: base folder of the scenario's relative paths; None: the working directory.
 
     Raises:
-        UserError: something in the scenario cannot be had.
+        UserError: the scenario is invalid.
     """
     return KittingStation(scenario, seed=seed, base=Path.cwd() if base is None else base)
 
 
 def _check_scene(scenario: Scenario, scene: Scene) -> None:
-    """Raises UserError where the hand would collide with what it cannot see or cannot span."""
+    """Raises UserError if an object is too high for the heightmap or too wide for the jaws."""
     tops = {item.name: float((item.X_WB @ item.p_BPoints.T)[2].max()) for item in scene.objects}
     tops |= {goal.name: goal.rim_height for goal in scene.goals if goal.rim_height is not None}
     name, top = max(tops.items(), key=lambda pair: pair[1])
     if top > scenario.heightmap.z_max:
         raise UserError(
-            f"heightmap.z_max is {scenario.heightmap.z_max:g}, and the hand would not see how high "
-            f"{name} is: at least {top:.3f} is needed"
+            f"heightmap.z_max is {scenario.heightmap.z_max:g}, too low to see the top of {name}: "
+            f"set at least {top:.3f}"
         )
     for index in scene.goal_objects:
         item = scene.objects[index]
         narrowest = min((grasp.width for grasp in item.grasps), default=0.0)
         if narrowest >= scenario.planner.open_width:
             raise UserError(
-                f"planner.open_width is {scenario.planner.open_width:g}, and {item.name} is "
-                f"{narrowest:.3f} m wide where it is gripped"
+                f"planner.open_width is {scenario.planner.open_width:g}, too narrow for {item.name}"
+                f": set more than {narrowest:.3f}"
             )
 
 
 def _surface_groups(
     scene: Scene, still_bodies: Sequence[BodyIndex], objects: Sequence[PlacedObject]
 ) -> dict[BodyIndex, str]:
-    """The names by which a scenario's `appearance` calls the bodies' surfaces."""
+    """The names of the bodies' surfaces in a scenario's `appearance`."""
     groups = {still_bodies[0]: "table"}
     for fixture, body in zip(scene.fixtures, still_bodies[1:], strict=True):
         groups[body] = f"fixtures/{fixture.name}"

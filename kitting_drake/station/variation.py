@@ -1,4 +1,4 @@
-"""Models with other friction and mass than their files say."""
+"""Varies the friction and mass of models."""
 
 import xml.etree.ElementTree as ElementTree
 from pathlib import Path
@@ -17,13 +17,13 @@ def varied_model(path: Path, *, friction: float, mass: float) -> str:
         mass: factor of all masses and moments of inertia.
 
     Raises:
-        UserError: the file is no SDFormat that can be read.
+        UserError: the file is not valid SDFormat.
     """
     ElementTree.register_namespace("drake", _DRAKE)
     try:
         text = path.read_text()
         if "xmlns:drake" not in text:
-            # Drake's parser does not ask for it.
+            # Drake's parser does not need the declaration, but XML does.
             text = text.replace("<sdf ", f'<sdf xmlns:drake="{_DRAKE}" ', 1)
         root = ElementTree.fromstring(text)
         for name in ("mu_static", "mu_dynamic"):
@@ -33,10 +33,10 @@ def varied_model(path: Path, *, friction: float, mass: float) -> str:
             for element in (*inertial.iter("mass"), *inertial.findall("inertia/*")):
                 _scale(element, mass)
     except (OSError, ElementTree.ParseError, ValueError, TypeError) as error:
-        raise UserError(f"task: {path} cannot be read: {error}") from error
+        raise UserError(f"task: cannot read {path} as SDFormat: {error}") from error
     for uri in root.iter("uri"):
         if uri.text and "://" not in uri.text:
-            # A text has no folder of its own; Drake takes what follows the scheme as it stands.
+            # A text has no folder, so make URIs absolute. Drake decodes no escapes in them.
             uri.text = f"file://{path.resolve().parent / uri.text}"
     return ElementTree.tostring(root, encoding="unicode")
 

@@ -1,4 +1,4 @@
-"""Visualization: Meshcat, films, and drawings of a Diagram."""
+"""Visualization: Meshcat, videos, and drawings of a Diagram."""
 
 import shutil
 import subprocess
@@ -30,19 +30,19 @@ MESHCAT_PERIOD = 1 / 32
 
 
 def start_meshcat(parameters: MeshcatParams) -> Meshcat:
-    """Starts Meshcat, looking at the table.
+    """Starts Meshcat with a view of the table.
 
     Args:
         parameters: of a scenario.
 
     Raises:
-        UserError: there is no free port.
+        UserError: no port is free.
     """
     try:
         meshcat = Meshcat(parameters)
     except RuntimeError as error:
         raise UserError(
-            "Meshcat finds no free port from 7000 to 7099: close viewers, or give --no-meshcat"
+            "no port from 7000 to 7099 is free for Meshcat: close viewers, or pass --no-meshcat"
         ) from error
     meshcat.SetProperty("/Background", "top_color", [0.93, 0.95, 0.97])
     meshcat.SetProperty("/Background", "bottom_color", [0.80, 0.83, 0.86])
@@ -62,15 +62,15 @@ def add_meshcat(builder: DiagramBuilder, station: KittingStation, meshcat: Meshc
 
 
 def add_video(builder: DiagramBuilder, station: KittingStation, path: Path) -> "VideoWriter":
-    """Adds a camera that sees the whole station, and the writer of its film.
+    """Adds a camera that sees the whole station, and a writer of its video.
 
     Args:
-        builder: holds the station; no context of it was made yet.
-        station: what to film.
+        builder: contains the station, for which no context exists yet.
+        station: to record.
         path: a .gif or .webp file, written by the writer's `Save()`.
 
     Raises:
-        MachineError: images cannot be rendered here.
+        MachineError: this machine cannot render.
     """
     # Import matplotlib lazily.
     from pydrake.visualization import VideoWriter
@@ -95,8 +95,8 @@ def draw_diagram(diagram: Diagram, path: Path) -> None:
     """Draws a Diagram with Graphviz.
 
     Raises:
-        UserError: an ending other than .svg, .png, .pdf and .dot, or Graphviz is not there or
-            cannot write it.
+        UserError: the file's suffix is not .svg, .png, .pdf or .dot, or Graphviz is missing or
+            fails.
     """
     source = diagram.GetGraphvizString(max_depth=2)
     if path.suffix == ".dot":
@@ -107,7 +107,7 @@ def draw_diagram(diagram: Diagram, path: Path) -> None:
     if shutil.which("dot") is None:
         raise UserError(
             "--graphviz needs the program dot: install it (Debian and Ubuntu: apt-get install "
-            "graphviz), or write the source to a .dot file"
+            "graphviz), or write a .dot file"
         )
     drawn = subprocess.run(
         ["dot", f"-T{path.suffix[1:]}"], input=source.encode(), capture_output=True

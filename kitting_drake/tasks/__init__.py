@@ -1,4 +1,4 @@
-"""Tasks: what stands on the table, what is to be brought about, and when it is success."""
+"""Tasks: their scenes, goals and success predicates."""
 
 from kitting_drake.tasks.kitting.kitting import ArrangedKitting, Kitting, ToolsetKitting
 from kitting_drake.tasks.python_task import PythonTask
@@ -22,7 +22,7 @@ Task = (
 """The variants of a scenario's `task:`; the first is the default."""
 
 PAPER_TASKS = {task.title: task for task in (Kitting(), ToolsetKitting(split="test"))}
-"""The tasks of the paper (section V-B.1) by their titles; nothing in them is changed."""
+"""The paper's tasks (section V-B.1) by title, with default parameters."""
 
 RAVENS_TASKS = (
     BlockInsertion(),
@@ -31,4 +31,4 @@ RAVENS_TASKS = (
     AlignBoxCorner(),
     StackBlockPyramid(),
 )
-"""The Ravens tasks (section V-B.2), in the order of table I; nothing in them is changed."""
+"""The Ravens tasks (section V-B.2) in the order of table I, with default parameters."""

@@ -1,4 +1,4 @@
-"""Boxes of any size and colour: their models, surface points, grasps and footprints.
+"""Boxes of any size and colour: models, surface points, grasps and footprints.
 
 The frame B of a box has its origin in the middle of its bottom and its axes along the edges.
 """
@@ -22,7 +22,7 @@ _FILE = "model.sdf"
 Colour = tuple[float, float, float]
 """Diffuse red, green and blue, in [0, 1]."""
 
-# Tableau's ten colours, which are those of Ravens.
+# Tableau's ten colours, as in Ravens.
 COLOURS: dict[str, Colour] = {
     name: (red / 255, green / 255, blue / 255)
     for name, (red, green, blue) in {
@@ -45,7 +45,7 @@ CUBE_MASS = 0.01
 """In kg."""
 
 _MAX_WIDTH = 0.072
-"""The widest box that the open jaws go around, with room to spare, in metres."""
+"""Largest width of a box that the open jaws fit around with clearance, in metres."""
 _POINT_SPACING = 0.004
 
 _MODEL = """<?xml version="1.0"?>
@@ -95,8 +95,7 @@ def box_object(
     mass: float = 0.1,
     friction: float = 1.0,
 ) -> SceneObject:
-    """A box that can be picked; sizes in metres, mass in kg; grasps: None for those of its
-    middle."""
+    """A box to pick; sizes in metres, mass in kg. Default grasps: those around its middle."""
     return SceneObject(
         name=name,
         category=category,
@@ -111,7 +110,7 @@ def box_object(
 def cube_object(
     name: str, colour: Colour, X_WB: RigidTransform, grasps: tuple[Grasp, ...]
 ) -> SceneObject:
-    """One of the small cubes of Ravens."""
+    """A small cube of Ravens."""
     size = (CUBE_SIDE,) * 3
     return box_object(name, "cube", size, colour, X_WB, grasps=grasps, mass=CUBE_MASS)
 
@@ -119,7 +118,7 @@ def cube_object(
 def box_model(
     size: tuple[float, float, float], colour: Colour, *, mass: float, friction: float
 ) -> Path:
-    """The SDFormat of a homogeneous box, in the cache; the same box is the same file."""
+    """The SDFormat file of a homogeneous box, in the cache. Equal boxes share a file."""
     x, y, z = size
     text = _MODEL.format(
         middle=z / 2,
@@ -138,8 +137,8 @@ def coloured(model: str, colour: Colour) -> Path:
     """A model of `models/ravens` in another colour, in the cache.
 
     Args:
-        model: the name of the SDFormat file, in which one diffuse colour occurs.
-        colour: the colour to have instead.
+        model: the SDFormat file's name; the file contains one diffuse colour.
+        colour: the new colour.
     """
     text = (MODELS / "ravens" / model).read_text()
     before, _, after = text.partition("<diffuse>")
@@ -147,7 +146,7 @@ def coloured(model: str, colour: Colour) -> Path:
 
 
 def box_points(size: tuple[float, float, float]) -> NDArray[np.float64]:
-    """(m, 3) points spread evenly over the surface of a box, in B, in metres."""
+    """(m, 3) evenly spaced points on the surface of a box, in B, in metres."""
     half = np.array(size) / 2
     faces = []
     for axis in range(3):
@@ -161,7 +160,7 @@ def box_points(size: tuple[float, float, float]) -> NDArray[np.float64]:
 
 
 def box_grasps(size: tuple[float, float, float]) -> tuple[Grasp, ...]:
-    """The grasps around the middle of a box, across its narrower side first."""
+    """Grasps around the middle of a box, across its narrower side first."""
     x, y, z = size
     grasps = [
         Grasp(x=0.0, y=0.0, theta=0.0, width=y, surface_height=z),
@@ -172,12 +171,12 @@ def box_grasps(size: tuple[float, float, float]) -> tuple[Grasp, ...]:
 
 
 def grasp_along(size: tuple[float, float, float], axis: str, offset: float) -> Grasp:
-    """The grasp of a box on its centre line along an axis, across which the jaws close.
+    """A grasp on one of a box's centre lines; the jaws close across the line.
 
     Args:
         size: of the box, in metres.
-        axis: `x` or `y`.
-        offset: from the middle along the axis, in metres.
+        axis: of the centre line, `x` or `y`.
+        offset: from the middle along the line, in metres.
     """
     x, y, z = size
     if axis == "x":
@@ -188,7 +187,7 @@ def grasp_along(size: tuple[float, float, float], axis: str, offset: float) -> G
 def random_grasp(
     size: tuple[float, float, float], offset: float, rng: np.random.Generator
 ) -> Grasp:
-    """A grasp of a box on either of its centre lines, within a distance of its middle."""
+    """A random grasp on one of a box's centre lines, within a distance of its middle."""
     axis = "x" if rng.random() < 0.5 else "y"
     return grasp_along(size, axis, float(rng.uniform(-offset, offset)))
 
@@ -199,30 +198,29 @@ def box_symmetry(size: tuple[float, float, float]) -> int:
 
 
 def box_footprint(size: tuple[float, float, float], offset: float = 0.0) -> Footprint:
-    """The footprint of a box, and of the open hand that grasps it.
+    """The footprint of a box and of the open hand that grasps it.
 
     Args:
         size: of the box, in metres.
-        offset: how far from the middle along each axis the hand may grasp it, in metres.
+        offset: largest distance of a grasp from the middle along each axis, in metres.
     """
     return Footprint((rectangle(size[0], size[1]),), outermost_grasps(size, offset))
 
 
 def outermost_grasps(size: tuple[float, float, float], offset: float) -> tuple[Grasp, ...]:
-    """The grasps of a box farthest from its middle, to leave room for all between; see
-    `box_footprint`."""
+    """The grasps of a box farthest from its middle; room for them is room for all in between."""
     return tuple(
         grasp_along(size, axis, distance) for axis in ("x", "y") for distance in (-offset, offset)
     )
 
 
 CUBE_GRASP_OFFSET = 0.01
-"""The demonstrator takes hold of a cube within this distance of its middle, in metres."""
+"""The demonstrator grasps a cube within this distance of its middle, in metres."""
 CUBE_FOOTPRINT = box_footprint((CUBE_SIDE,) * 3, CUBE_GRASP_OFFSET)
 
 
 def random_brown(rng: np.random.Generator) -> Colour:
-    """A brown from dark to light."""
+    """A random brown between dark and light."""
     red, green, blue = (float(rng.uniform(0.5, 1.5)) * np.array(COLOURS["brown"])).tolist()
     return red, green, blue
 

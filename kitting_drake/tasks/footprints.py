@@ -1,4 +1,4 @@
-"""Poses on the table drawn from a seed: free of each other, and within reach of the open hand."""
+"""Draws poses on the table that are free of each other and reachable by the open hand."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from systems.hand_geometry import FINGER_DEPTH, FINGER_LENGTH, MAX_OPENING, PALM
 from systems.signals import PixelGrid
 
 OPEN_FINGERS = (FINGER_LENGTH, MAX_OPENING + 2 * FINGER_DEPTH)
-"""The open fingers and the room between them, seen from above: along the pads and across, in m."""
+"""The area of the open fingers and between them, from above: along the pads and across, in m."""
 
 _TRIES = 200
 _RESTARTS = 50
@@ -40,17 +40,17 @@ def rectangle(
 
 
 def disc(radius: float, *, sides: int = 16) -> Polygon:
-    """A regular polygon around a disc about the origin."""
+    """A regular polygon that contains a disc about the origin."""
     angles = np.arange(sides) * math.tau / sides
     corners = radius / math.cos(math.pi / sides) * np.column_stack([np.cos(angles), np.sin(angles)])
     return np.asarray(corners)
 
 
 def separation(a: Polygon, b: Polygon) -> float:
-    """How far apart two convex polygons are, in metres.
+    """The separation of two convex polygons, in metres.
 
     Returns:
-        The widest gap between them along a normal of one of their sides: never more than their
+        The widest gap between them along a normal of one of their sides. It is at most their
         distance, and negative if and only if they overlap.
     """
     gaps = [
@@ -63,24 +63,23 @@ def separation(a: Polygon, b: Polygon) -> float:
 
 @dataclass(frozen=True)
 class Footprint:
-    """The area that something covers on the table, in its own frame, in metres."""
+    """The area of a thing on the table, in its own frame, in metres."""
 
     body: tuple[Polygon, ...]
-    """Convex pieces of its outline."""
+    """Convex pieces of its area."""
     grasps: tuple[Grasp, ...] = ()
-    """Where the hand takes hold of it, or puts something down on it: the open fingers come near
-    nothing else there."""
+    """Grasps at which the hand picks or places there; the open fingers need free space."""
     tall: bool = False
-    """Whether it is, or will be built, so high that the palm must not come over it either."""
+    """Whether it is, or will be built, so high that the palm needs free space, too."""
 
     @cached_property
     def fingers(self) -> tuple[Polygon, ...]:
-        """The areas of the open fingers and of the room between them, at each of the grasps."""
+        """The areas of the open fingers and between them, one for each grasp."""
         return self._at_grasps(OPEN_FINGERS)
 
     @cached_property
     def palm(self) -> tuple[Polygon, ...]:
-        """The area of the palm at each of the grasps."""
+        """The areas of the palm, one for each grasp."""
         return self._at_grasps(PALM_SIZE)
 
     def moved(self, x: float, y: float, yaw: float) -> Placed:
@@ -105,13 +104,13 @@ class Placed:
     tall: bool
 
     def is_within(self, lower: NDArray[np.float64], upper: NDArray[np.float64]) -> bool:
-        """Whether the body is within a rectangle along the axes, given by its corners."""
+        """Whether the body is within an axis-aligned rectangle, given by two corners."""
         return all(
             bool((polygon >= lower).all() and (polygon <= upper).all()) for polygon in self.body
         )
 
     def is_clear_of(self, other: Placed, spacing: float) -> bool:
-        """Whether both stand so far apart, and neither is in the way of the hand at the other."""
+        """Whether the bodies have this spacing and neither obstructs the hand at the other."""
         return (
             _are_apart(self.body, other.body, spacing)
             and _are_apart(self.fingers, other.body, 0.0)
@@ -134,16 +133,15 @@ def draw_poses(
     rng: np.random.Generator,
     spacing: float = 0.01,
 ) -> list[RigidTransform]:
-    """Draws poses on the table, within the workspace, with headings all around.
+    """Draws poses with any heading on the table, within the workspace.
 
-    No two bodies come nearer than the spacing, and the open hand at each grasp touches nothing but
-    what it grasps.
+    All bodies keep the spacing, and the open hand at each grasp touches only what it grasps.
 
     Args:
-        footprints: of what is to be placed, in the order in which it is drawn: the large first.
+        footprints: of the things to place, in drawing order; put large ones first.
         grid: the workspace.
         rng: for all draws.
-        spacing: least distance between any two bodies, in metres.
+        spacing: least distance between two bodies, in metres.
 
     Returns:
         X_W of each.
@@ -173,15 +171,15 @@ def draw_in_turn(
     *,
     restarts: int,
 ) -> list[_Found] | None:
-    """Draws a place for one thing after the other, and begins anew where one finds none.
+    """Draws places one after another, and starts over if there is none for an item.
 
     Args:
-        items: what is to be placed, in the order in which it is drawn.
-        draw: draws the place of an item, given those of the items before it; None for no place.
-        restarts: how often to begin.
+        items: to place, in drawing order.
+        draw: returns a place for an item, given the places of earlier items; None if there is none.
+        restarts: largest number of attempts.
 
     Returns:
-        The places, in the same order; None if none were found.
+        The places, in the same order; None if all attempts failed.
     """
     for _ in range(restarts):
         placed: list[_Found] = []
@@ -203,7 +201,7 @@ def _draw_pose(
     rng: np.random.Generator,
     spacing: float,
 ) -> _Drawn | None:
-    """A free pose; None if none was found."""
+    """Draws a free pose; None if none was found."""
     if (upper <= lower).any():
         return None
     for _ in range(_TRIES):

@@ -1,4 +1,4 @@
-"""A task of one's own, named by a scenario as `module:Class`."""
+"""The user's own task, named in a scenario as `module:Class`."""
 
 from __future__ import annotations
 
@@ -18,14 +18,15 @@ from systems.signals import PixelGrid
 
 
 def import_task(reference: str, base: Path) -> type[TaskConfig]:
-    """The class of a task.
+    """Imports the class of a task.
 
     Args:
-        reference: `module:Class`; the module is importable, or lies in `base`.
+        reference: `module:Class`; the module is on Python's path, or in `base`.
         base: the folder of the scenario's file.
 
     Raises:
-        ValueError: it cannot be imported, or is not a task; begins with `task.class`.
+        ValueError: the import fails, or the class is not a task; the message begins with
+            `task.class`.
     """
     module, _, name = reference.partition(":")
     if not module or not name:
@@ -33,7 +34,7 @@ def import_task(reference: str, base: Path) -> type[TaskConfig]:
     try:
         found = import_own(reference, base)
     except (Exception, SystemExit) as error:
-        # The module may raise anything.
+        # Importing the module may raise anything.
         reason = f"{type(error).__name__}: {error}"
         raise ValueError(f"task.class: cannot import {reference}: {reason}") from error
     if not (isinstance(found, type) and issubclass(found, TaskConfig)):
@@ -100,7 +101,7 @@ class PythonTask(TaskConfig):
         return self.config.find_cause(scene, index, X_WB, placement, records)
 
     def _sources(self, base: Path) -> list[Path]:
-        """The files of the module, or of its package: results depend on them."""
+        """The files of the module or its package, on which results depend."""
         module = self.modules()[0]
         if beside := files_beside(module, base):
             return beside
@@ -112,8 +113,7 @@ class PythonTask(TaskConfig):
         files = [path for folder in folders for path in sorted(Path(folder).rglob("*.py"))]
         return files or [Path(spec.origin)]
 
-    # An instance of a class in a module beside the scenario travels to another process by its
-    # name and its fields.
+    # Pickled by class name and fields, because its module may exist only beside the scenario.
 
     def __reduce__(self) -> tuple[object, ...]:
         return _restore, (self.reference, vars(self.config), self.folder)

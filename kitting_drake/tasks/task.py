@@ -1,7 +1,7 @@
-"""The contract of a task: the Scene that it makes from a seed, and what it says about itself.
+"""The interface of a task: a dataclass of parameters that makes a Scene from a seed.
 
-A task is a config dataclass, a variant of the scenario's `task:` union. Nothing outside
-`kitting_drake/tasks/` knows more of it than what is here.
+A task is a variant of the scenario's `task:` union. Code outside `kitting_drake/tasks/` depends
+only on this interface.
 """
 
 from __future__ import annotations
@@ -26,52 +26,51 @@ SLIPPED = "slipped"
 MISPLACED = "misplaced"
 
 TABLE = ((0.0, -0.75), (1.0, 0.75))
-"""Lower and upper (x, y) corner of the table in the world, in metres; its top is z = 0."""
+"""Lower and upper (x, y) corner of the table in the world, in metres; its top is at z = 0."""
 
 
 @dataclass(frozen=True)
 class SceneObject:
-    """Something that can be picked."""
+    """An object that can be picked."""
 
     name: str
     """Unique in the scene."""
     category: str
-    """By which results are grouped."""
+    """Results are grouped by it."""
     model: Path
-    """SDFormat of one free link; its frame is the object's frame B."""
+    """SDFormat file of one free link; its frame is the object's frame B."""
     X_WB: RigidTransform
-    """Its initial pose."""
+    """Initial pose."""
     p_BPoints: NDArray[np.float64] = field(repr=False)
-    """(m, 3) points of its surface, sampled by area, in B, in metres."""
+    """(m, 3) surface points, sampled by area, in B, in metres."""
     grasps: tuple[Grasp, ...] = ()
-    """In B, best first; none is needed for what no goal takes."""
+    """In B, best first; may be empty if no goal takes the object."""
     symmetry: int = 1
-    """Rotations about B's z by 2 pi / symmetry that a person could not tell; 1: there are none."""
+    """Order of the rotational symmetry about B's z; 1 for none."""
 
 
 @dataclass(frozen=True)
 class Fixture:
-    """Something that stands on the table and never moves."""
+    """A body on the table that never moves."""
 
     name: str
     model: Path
-    """SDFormat of one link."""
+    """SDFormat file of one link."""
     X_WF: RigidTransform
-    """Pose of its link's frame."""
+    """Pose of the link's frame."""
 
 
 @dataclass(frozen=True)
 class Arrivals:
-    """Objects that appear one at a time during an episode; until then they are out of the cell.
+    """Objects that appear one at a time during an episode. Until then they are outside the cell.
 
-    The next one appears while the hand retreats or observes, as soon as no object's origin lies
-    over `area`.
+    The next one appears while the hand retreats or observes and no object's origin is over `area`.
     """
 
     objects: tuple[int, ...]
-    """Indices into the scene's objects, in the order in which they appear."""
+    """Indices of the scene's objects, in the order of appearance."""
     poses: tuple[RigidTransform, ...]
-    """X_WB of each as it appears, at rest in the air."""
+    """X_WB at which each object appears, at rest in the air."""
     area: tuple[tuple[float, float], tuple[float, float]]
     """Lower and upper (x, y) corner in the world, in metres."""
 
@@ -80,23 +79,23 @@ class Arrivals:
 
 
 def waiting_pose(index: int) -> RigidTransform:
-    """X_WB of an object that has yet to appear: out of the cell, and of the cameras' sight."""
+    """X_WB of an object that has not appeared: outside the cell, and out of the cameras' sight."""
     return RigidTransform([-20.0 - index, 0.0, -20.0])
 
 
 @dataclass(frozen=True)
 class Scene:
-    """The beginning of one episode, and what is to be brought about."""
+    """The initial state of an episode, and its goals."""
 
     objects: tuple[SceneObject, ...]
     fixtures: tuple[Fixture, ...]
     goals: tuple[Goal, ...]
-    """In the order in which an expert fills them; their rewards add up to 1."""
+    """In the expert's order; the rewards add up to 1."""
     success: SuccessPredicate
     max_actions: int
-    """After so many actions the episode is over."""
+    """The episode ends after this many actions."""
     arrivals: Arrivals | None = None
-    """Objects that are not there at the beginning; None: all are."""
+    """Objects that appear later; None: all are present initially."""
 
     def __post_init__(self) -> None:
         names = [item.name for item in self.objects] + [item.name for item in self.fixtures]
@@ -105,55 +104,55 @@ class Scene:
 
     @property
     def goal_objects(self) -> tuple[int, ...]:
-        """The indices of the objects that some goal takes: those that results speak of."""
+        """Indices of the objects that some goal takes. Results list these objects."""
         return tuple(sorted({index for goal in self.goals for index in goal.objects}))
 
 
 @dataclass
 class ActionRecord:
-    """One pick and place, against what the expert would have done. Keys of `results.json`."""
+    """A pick and place and its errors with respect to the expert's. Keys of `results.json`."""
 
     object: str
-    """The object that was lifted; if none was, the one nearest to the pick."""
+    """The lifted object; if none was lifted, the one nearest to the pick."""
     category: str
-    """The category of the object."""
+    """The object's category."""
     outcome: str
-    """`placed`, `missed` (nothing was grasped), `dropped` (on the way), `pressed` (down, where it
-    is), or `unfinished`."""
+    """`placed`, `missed` (nothing grasped), `dropped` (lost on the way), `pressed` (pushed down)
+    or `unfinished`."""
     pick: PlanarPose
     place: PlanarPose
     pick_position_error_mm: float | None
-    """From the nearest of the object's annotated grasps; None if it has none."""
+    """Distance from the nearest of the object's annotated grasps; None if it has none."""
     pick_angle_error_deg: float | None
-    """From that grasp, half rotations being the same: 0 to 90."""
+    """Angle from that grasp, modulo half rotations: 0 to 90."""
     place_position_error_mm: float | None
-    """How far from its goal the action would bring the middle of the object as it lay before the
-    pick; None if no goal takes it."""
+    """Distance of the object's middle from its goal after a rigid motion by the action; None if no
+    goal takes it."""
     place_angle_error_deg: float | None
-    """By how much its heading would be off, modulo its symmetry: 0 to 180."""
+    """Heading error after that motion, modulo the object's symmetry: 0 to 180."""
 
 
 class TaskConfig:
-    """The interface of a task; each variant of the scenario's `task:` derives from it.
+    """The interface of a task. Each variant of the scenario's `task:` derives from it.
 
     A variant is a dataclass of YAML fields with defaults (see `systems.bounds.bounded`).
     """
 
     causes: tuple[str, ...] = (MISSED_GRASP, SLIPPED, MISPLACED, NEVER_PICKED)
-    """The answers of `find_cause`, in the order of tables."""
+    """The possible results of `find_cause`, in the order of tables."""
     not_perturbed: tuple[str, ...] = ()
-    """Names of `--perturb` that would change what the task asks for, and do not apply to it."""
+    """Names of `--perturb` that do not apply, because they would change the task."""
     objects_are_independent: bool = False
-    """Whether no object of a scene stands on another, or in its way, once it is placed: intervals
-    of rates are then over objects, else over episodes."""
+    """Whether placed objects neither support nor obstruct each other. Intervals of rates are then
+    over objects, else over episodes."""
 
     def make_scene(self, *, grid: PixelGrid, seed: int, base: Path) -> Scene:
-        """The scene of a seed; the same seed gives the same scene.
+        """Makes the scene of a seed, deterministically.
 
         Args:
-            grid: the workspace. What is drawn lies within it, and on the table.
+            grid: the workspace. Drawn poses are in it, and on the table.
             seed: of all draws.
-            base: where relative paths start.
+            base: base folder of relative paths.
 
         Raises:
             UserError: the scene cannot be made.
@@ -162,28 +161,28 @@ class TaskConfig:
 
     @property
     def title(self) -> str:
-        """The task's name for results: that of the literature only where nothing was changed."""
+        """The task's name in results: that of the literature only if all parameters are default."""
         raise NotImplementedError
 
     @property
     def learning(self) -> Learning:
-        """The assumptions that a learner of the task may make."""
+        """Properties of the task that learning may assume."""
         return Learning()
 
     def input_files(self, base: Path) -> list[Path]:
-        """The files, beside those of the project, that the scenes depend on.
+        """The files on which the scenes depend, except for the project's own.
 
         Raises:
-            UserError: they cannot be found.
+            UserError: a file is missing.
         """
         return []
 
     def modules(self) -> list[str]:
-        """Modules of a person's own that it is made of."""
+        """The user's modules that define the task."""
         return []
 
     def validate(self) -> None:
-        """Checks what neither types nor ranges say.
+        """Checks conditions beyond types and ranges.
 
         Raises:
             ValueError: one sentence that begins with the path of a field, `task.x`.
@@ -197,12 +196,12 @@ class TaskConfig:
         placement: Placement,
         records: Sequence[ActionRecord],
     ) -> str:
-        """Why an object that did not end in success did not: one of `causes`.
+        """Why an object is not a success: one of `causes`.
 
         Args:
             scene: the episode's.
             index: of the object.
-            X_WB: where all objects ended.
+            X_WB: final poses of all objects.
             placement: of the object.
             records: the episode's actions.
         """
@@ -213,7 +212,7 @@ class TaskConfig:
 
 
 def last_action_on(name: str, records: Sequence[ActionRecord]) -> ActionRecord | str:
-    """The last action that held an object, or the cause why no action did."""
+    """The last action that held an object; if there is none, the cause."""
     grasped = [item for item in records if item.outcome not in ("unfinished", "pressed")]
     own = [item for item in grasped if item.object == name]
     held = [item for item in own if item.outcome != "missed"]

@@ -323,7 +323,7 @@ def broken_chunk(folder: Path) -> None:
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (broken_header, "no whole .npy file"),
+        (broken_header, "npy file of numbers"),
         (broken_chunk, "front_color.png is damaged: broken PNG file"),
         (spoil(lambda depth: 1000 * depth), "these are millimetres"),
         (as_png(1.0), "these are metres"),
@@ -333,7 +333,7 @@ def broken_chunk(folder: Path) -> None:
         (spoil(lambda depth: 0 * depth), "depth of camera front is all zero or NaN"),
         (spoil(lambda depth: np.nan * depth), "depth of camera front is all zero or NaN"),
         (spoil(lambda depth: np.dstack([depth] * 3)), "must have one channel, not 3"),
-        (broken, "no whole .npy file"),
+        (broken, "npy file of numbers"),
         (archive, r"is an archive of arrays \(.npz\)"),
     ],
 )

@@ -272,7 +272,7 @@ def test_every_decision_of_a_learned_policy_leaves_a_picture(
     [
         (None, "cannot read the weights {weights}: there is no such file"),
         ("text", "cannot read the weights {weights}: it is not a whole safetensors file"),
-        ("foreign", "{weights} is a safetensors file, but no policy of this program"),
+        ("foreign", "{weights} is a safetensors file, but not a policy of this program"),
     ],
 )
 @pytest.mark.usefixtures("rendering")

@@ -680,7 +680,7 @@ def test_a_damaged_checkpoint_is_refused(
         state = torch.load(path, weights_only=True)
         state["trainer"]["networks"].popitem()
         torch.save(state, path)
-    assert f"{path} cannot be taken up again: delete {folder}" in refused(demos, folder)
+    assert f"delete {folder}" in refused(demos, folder)
 
 
 def test_a_loss_that_is_no_number_ends_the_run(

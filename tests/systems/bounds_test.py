@@ -22,7 +22,7 @@ class Outer:
     listed: list[Inner] = dataclasses.field(default_factory=list)
 
 
-def test_defaults_and_limits_themselves_are_within():
+def test_defaults_and_inclusive_limits_are_valid():
     check_bounds(Outer())
     check_bounds(Inner(speed=0.0, corner=[-1.0, 1.0], count=1))
     check_bounds(Inner(speed=2.0))
@@ -36,18 +36,18 @@ def test_defaults_are_not_shared():
 @pytest.mark.parametrize(
     ("config", "message"),
     [
-        (Inner(speed=2.1), "speed must be between 0 and 2, not 2.1"),
-        (Inner(speed=-1e-9), "speed must be between 0 and 2"),
-        (Inner(speed=math.nan), "speed must be a finite number, not nan"),
-        (Inner(count=0), "count must be at least 1, not 0"),
-        (Inner(corner=[0.0]), "corner must hold 2 numbers, not 1"),
-        (Inner(corner=[0.0, 1.5]), "corner must be between -1 and 1, not 1.5"),
-        (Inner(corner=[0.0, math.inf]), "corner must be a finite number"),
+        (Inner(speed=2.1), "speed .*2.1"),
+        (Inner(speed=-1e-9), "speed"),
+        (Inner(speed=math.nan), "speed .*finite"),
+        (Inner(count=0), "count .*at least 1"),
+        (Inner(corner=[0.0]), "corner .*2 numbers"),
+        (Inner(corner=[0.0, 1.5]), "corner .*1.5"),
+        (Inner(corner=[0.0, math.inf]), "corner .*finite"),
         (Outer(inner=Inner(speed=3.0)), r"^inner\.speed must"),
         (Outer(named={"front": Inner(speed=3.0)}), r"^named\.front\.speed must"),
         (Outer(listed=[Inner(), Inner(speed=3.0)]), r"^listed\[1\]\.speed must"),
     ],
 )
-def test_the_first_number_out_of_bounds_is_named(config: Inner | Outer, message: str):
+def test_an_error_names_the_first_invalid_number(config: Inner | Outer, message: str):
     with pytest.raises(ValueError, match=message):
         check_bounds(config)

@@ -28,7 +28,7 @@ def sampled(goal, rate, delays=AT_ONCE, count=4001):
 
 @pytest.mark.parametrize("rate", [np.zeros(4), RATE])
 @pytest.mark.parametrize("delays", [AT_ONCE, np.array([0.2, 0.5, 0.0])])
-def test_starts_as_told_and_comes_to_rest_at_the_goal(rate, delays):
+def test_motion_starts_at_the_given_state_and_rests_at_the_goal(rate, delays):
     _, q, v, a = sampled(GOAL, rate, delays)
     np.testing.assert_allclose([q[0], v[0], a[0]], [START, rate, np.zeros(4)], atol=1e-12)
     np.testing.assert_allclose([q[-1], v[-1], a[-1]], [GOAL, np.zeros(4), np.zeros(4)], atol=1e-9)
@@ -42,16 +42,16 @@ def test_velocity_and_acceleration_are_the_derivatives(rate):
 
 
 @pytest.mark.parametrize("distance", [0.001, 0.02, 0.1, 1.0])
-def test_travel_takes_no_longer_than_its_limits_and_its_smoothness_ask_for(distance):
+def test_travel_is_time_optimal_up_to_smoothing(distance):
     times = np.linspace(0, travel_time(distance, 0.6, 3.0), 2001)
     position, velocity, acceleration = np.array([travel(distance, 0.6, 3.0, t) for t in times]).T
     assert (np.diff(position) >= 0).all()
     assert velocity.max() <= 0.6 + 1e-9
     assert abs(acceleration).max() <= 3.0 + 1e-9
-    # Without smoothness the quickest way is a trapezoid of velocity, or a triangle.
+    # Without smoothing, the fastest velocity profile is a trapezoid or a triangle.
     trapezoid = max(2 * np.sqrt(distance / 3.0), distance / 0.6 + 0.6 / 3.0)
     assert times[-1] <= trapezoid + SMOOTHING + 1e-9
-    # From one way to the other at the middle of a short way.
+    # Worst case: the acceleration reverses at the middle of a short travel.
     assert abs(np.diff(acceleration) / np.diff(times)).max() <= 2 * 3.0 / SMOOTHING * (1 + 1e-6)
 
 
@@ -61,7 +61,7 @@ def test_time_to_reach(part):
     assert travel(0.1, 0.6, 3.0, when)[0] == pytest.approx(part, abs=1e-4)
 
 
-def test_each_part_begins_when_told():
+def test_each_part_begins_after_its_delay():
     delays = np.array([0.2, 0.5, 0.0])
     times, q, _, _ = sampled(GOAL, np.zeros(4), delays)
     for part, delay in zip(PARTS, delays, strict=True):
@@ -69,13 +69,13 @@ def test_each_part_begins_when_told():
         assert times[moved][0] == pytest.approx(delay, abs=2e-3)
 
 
-def test_the_way_in_the_plane_is_straight():
+def test_motion_in_the_plane_is_straight():
     _, q, _, _ = sampled(GOAL, np.zeros(4))
     along = (q[:, :2] - START[:2]) / (GOAL - START)[:2]
     np.testing.assert_allclose(along[:, 0], along[:, 1], atol=1e-9)
 
 
-def test_braking_never_turns_back_and_keeps_the_limits():
+def test_braking_never_reverses_and_keeps_the_limits():
     rest = START + RATE * braking_time(RATE, LIMITS) / 2
     _, _, v, a = sampled(rest, RATE)
     assert (v * np.sign(RATE) >= -1e-9).all()
@@ -89,8 +89,8 @@ def test_braking_never_turns_back_and_keeps_the_limits():
     [
         (0.1, 0.4, 0.0, (0.1, 0.4)),
         (3.0, -3.0, 0.0, (3.0 - np.pi, np.pi - 3.0)),  # 8 degrees each way, not 172.
-        (3.0, -3.0, 2.9, (3.0, 2 * np.pi - 3.0)),  # Beyond pi, where that is nearer.
-        (0.2, 0.2 + np.pi, 0.0, None),  # A half turn is a half turn: the object's ends differ.
+        (3.0, -3.0, 2.9, (3.0, 2 * np.pi - 3.0)),  # A yaw beyond pi can be nearer.
+        (0.2, 0.2 + np.pi, 0.0, None),  # A half rotation of the object is not skipped.
         (5.0, 11.0, 1.0, None),
         (-np.pi / 2, np.pi, -3.0, None),
     ],
@@ -101,12 +101,12 @@ def test_shortest_yaws(pick, place, present, expected):
     if expected is not None:
         np.testing.assert_allclose(rotated, expected)
     assert max(map(abs, rotated)) <= limit
-    # The same grasp and the same rotation of what is held...
+    # The same grasp and the same rotation of the object.
     half_turns = (rotated[0] - pick) / np.pi
     assert half_turns == pytest.approx(round(half_turns))
     turns = ((rotated[1] - rotated[0]) - (place - pick)) / (2 * np.pi)
     assert turns == pytest.approx(round(turns))
-    # ... and no equivalent pair within the limit is a shorter way.
+    # No equivalent pair within the limit rotates less.
     ways = [
         abs(a - present) + abs(b - a)
         for half in (0, 1)

@@ -40,7 +40,7 @@ GRID = PixelGrid()
 
 
 class _Scene:
-    """The box on the table, seen by the cameras, each in a sensor body of another pose."""
+    """A box on the table seen by the cameras, each mounted in its sensor body by another pose."""
 
     def __init__(self):
         builder = DiagramBuilder()
@@ -77,7 +77,7 @@ class _Scene:
         self.context = self.diagram.CreateDefaultContext()
 
     def observe(self, xy, yaw):
-        """The observation with the box standing at `xy`, and its true pose."""
+        """The observation with the box at `xy`, and the box's true pose."""
         X_WBox = RigidTransform(RotationMatrix.MakeZRotation(yaw), [*xy, BOX[2] / 2])
         self.plant.SetFreeBodyPose(self.plant.GetMyContextFromRoot(self.context), self.body, X_WBox)
         projector_context = self.projector.GetMyContextFromRoot(self.context)
@@ -94,8 +94,8 @@ CORNERS = np.array([(-0.5, -0.5), (-0.5, 0.5), (0.5, -0.5), (0.5, 0.5)])
 
 
 def _cells_against_box(X_WBox):
-    """Exactly which pixels' squares lie inside the box's footprint, and which touch none of it
-    (the separating axis theorem with a margin of 0.3 mm)."""
+    """Which pixel squares lie inside the box's footprint, and which do not touch it (separating
+    axis theorem with a margin of 0.3 mm)."""
     offset_W = GRID.to_world(PIXELS) - X_WBox.translation()[:2]
     R = X_WBox.rotation().matrix()[:2, :2]
     offset_Box = offset_W @ R
@@ -108,7 +108,7 @@ def _cells_against_box(X_WBox):
 
 
 def _is_hidden(X_WBox, camera, pixels):
-    """Whether the box stands between the camera and the table at these (..., 2) pixels."""
+    """Whether the box hides the table from the camera at these pixels (..., 2)."""
     p_W = np.insert(GRID.to_world(pixels), 2, 0, axis=-1).reshape(-1, 3).T
     p_Box = X_WBox.inverse().multiply(p_W).T
     ray = X_WBox.inverse().multiply(CAMERAS[camera].translation()) - p_Box
@@ -131,7 +131,7 @@ def _is_hidden(X_WBox, camera, pixels):
         for yaw_deg in (0, 30, 45, 90, 137)
     ],
 )
-def test_box_is_where_it_stands(scene, xy, yaw_deg):
+def test_heightmap_shows_the_box_at_its_true_pose(scene, xy, yaw_deg):
     observation, X_WBox = scene.observe(xy, math.radians(yaw_deg))
     inside, apart = _cells_against_box(X_WBox)
     height = observation.height
@@ -144,7 +144,7 @@ def test_box_is_where_it_stands(scene, xy, yaw_deg):
     assert np.max(np.abs(lit_xy.mean(axis=0) - xy)) < 0.5 * GRID.resolution
     _, axes = np.linalg.eigh(np.cov(lit_xy.T))
     angle = math.degrees(math.atan2(axes[1, 1], axes[0, 1]))
-    assert abs(math.remainder(angle - yaw_deg, 180)) < 1.5  # A pixel over the length is 1.8.
+    assert abs(math.remainder(angle - yaw_deg, 180)) < 1.5  # One pixel over the length is 1.8.
 
     # Shading scales a colour but keeps its hue. At outlines the renderer blends the two.
     blank = np.all(observation.image == 0, axis=0)
@@ -155,7 +155,7 @@ def test_box_is_where_it_stands(scene, xy, yaw_deg):
         assert np.quantile(np.abs(hue - color / color.sum()), 0.999) < 0.01
         assert 0.5 < seen.max() / color.max() <= 1.01
 
-    # What a camera sees whole is not left blank, save for a stray gap.
+    # Fully visible surfaces are seen, save for stray gaps.
     squares = PIXELS[:, :, None] + CORNERS
     visible = np.zeros(GRID.shape, bool)
     for camera in CAMERAS:
@@ -164,7 +164,7 @@ def test_box_is_where_it_stands(scene, xy, yaw_deg):
 
 
 @needs_renderer
-def test_what_the_only_camera_cannot_see_is_zero(scene):
+def test_hidden_pixels_are_zero_with_one_camera(scene):
     _, X_WBox = scene.observe((0.6, -0.3), 0.4)
     projector = HeightmapProjector(cameras={"eye": scene.camera})
     context = projector.CreateDefaultContext()
@@ -174,8 +174,8 @@ def test_what_the_only_camera_cannot_see_is_zero(scene):
     _fix(projector, context, "eye", color.data, depth.data[:, :, 0], X_WB)
     image = projector.GetOutputPort("observation").Eval(context).image
 
-    # The shadow that the box casts on the table is convex: a square three pixels wide whose
-    # corners are in it is in it.
+    # The shadow of the box on the table is convex: it contains a square of three pixels if it
+    # contains its corners.
     squares = PIXELS[:, :, None] + 3 * CORNERS
     in_shadow = np.all(_is_hidden(X_WBox, "left", squares), axis=-1)
     in_shadow &= _cells_against_box(X_WBox)[1]
@@ -184,7 +184,7 @@ def test_what_the_only_camera_cannot_see_is_zero(scene):
 
 
 # By hand: a 5x4 image from one metre above a grid of 4 rows and 5 columns. At depth 1 the image's
-# pixels are the grid's, row for row and column for column; at depth 1/2 they draw in by half.
+# pixels coincide with the grid's; at depth 1/2 their distances are halved.
 
 SMALL = PixelGrid(x_min=0, y_min=0, resolution=0.1, rows=4, cols=5, z_max=0.6)
 X_WD = RigidTransform(RotationMatrix([[0, 1, 0], [1, 0, 0], [0, 0, -1]]), [0.2, 0.25, 1])
@@ -220,7 +220,7 @@ def _small_projector(*names, grid=SMALL):
 
 
 def _project(*views, grid=SMALL):
-    """The observation's image of (color, depth) for each of several cameras."""
+    """The observation's image from (color, depth) of several cameras."""
     names = [f"camera{i}" for i in range(len(views))]
     projector, context = _small_projector(*names, grid=grid)
     for name, (color, depth) in zip(names, views, strict=True):
@@ -234,11 +234,11 @@ def test_ports():
     assert names == [f"{name}_{camera}" for camera in "ab" for name in INPUTS]
     names = [projector.get_output_port(i).get_name() for i in range(projector.num_output_ports())]
     assert names == ["observation", "heights"]
-    with pytest.raises(ValueError, match="at least one camera"):
+    with pytest.raises(ValueError, match="camera"):
         HeightmapProjector(cameras={})
 
 
-def test_flat_ground_is_the_image_itself():
+def test_flat_ground_reproduces_the_camera_image():
     image = _project((COLOR, FLAT))
     np.testing.assert_allclose(image[:3], RGB.transpose(2, 0, 1), atol=1e-6)
     np.testing.assert_allclose(image[3], 0, atol=1e-6)
@@ -246,7 +246,7 @@ def test_flat_ground_is_the_image_itself():
     np.testing.assert_allclose(raised[3], 0.1, atol=1e-6)
 
 
-def test_the_highest_point_wins_and_brings_its_color():
+def test_each_pixel_takes_height_and_color_of_its_highest_point():
     depth = FLAT.copy()
     depth[0, 0] = 0.5  # Seen at x = 0.2 - 0.075, y = 0.25 - 0.1: over pixel (1, 1).
     image = _project((COLOR, depth))
@@ -256,7 +256,7 @@ def test_the_highest_point_wins_and_brings_its_color():
 
 
 @pytest.mark.parametrize("out", [0, 0.09, 1.3, np.inf, np.nan])
-def test_depths_out_of_range_are_no_points(out):
+def test_depths_out_of_range_are_ignored(out):
     high = PixelGrid(x_min=0, y_min=0, resolution=0.1, rows=4, cols=5, z_min=-1, z_max=2)
     assert not np.any(_project((COLOR, out * FLAT), grid=high))
 
@@ -269,7 +269,7 @@ def test_points_above_the_workspace_are_dropped_and_below_it_read_as_zero():
     np.testing.assert_allclose(image[:, 2, 2], [*RGB[2, 2], 0], atol=1e-6)
 
 
-def test_only_gaps_of_one_pixel_within_one_surface_are_bridged():
+def test_only_gaps_of_one_pixel_within_one_surface_are_filled():
     hole, step, ridge = FLAT.copy(), FLAT.copy(), FLAT.copy()
     hole[1:3, 1:3] = 0
     np.testing.assert_array_equal(_project((COLOR, hole))[:, 1:3, 1:3], 0)
@@ -281,7 +281,7 @@ def test_only_gaps_of_one_pixel_within_one_surface_are_bridged():
 
 
 @pytest.mark.parametrize(("lower", "tints"), [(0.005, True), (0.02, False)])
-def test_only_cameras_that_see_the_top_give_it_color(lower, tints):
+def test_only_cameras_that_see_the_top_surface_color_it(lower, tints):
     depth = FLAT.copy()
     depth[1, 2] -= 0.02  # The pixel in the middle row is a little nearer to one camera.
     image = _project((COLOR, depth), (2 * COLOR, depth + np.float32(lower)))
@@ -289,7 +289,7 @@ def test_only_cameras_that_see_the_top_give_it_color(lower, tints):
     np.testing.assert_allclose(image[:, 1, 2], [*share * RGB[1, 2], 0.02], atol=1e-6)
 
 
-def test_heights_alone_need_no_color_image():
+def test_port_heights_needs_no_color_image():
     projector, context = _small_projector("a")
     _fix(projector, context, "a", COLOR, 0.9 * FLAT, X_WB)
     whole = projector.GetOutputPort("observation").Eval(context)
@@ -303,7 +303,7 @@ def test_heights_alone_need_no_color_image():
     assert not heights.rgb.any()
 
 
-def test_unchanged_inputs_are_not_computed_again():
+def test_outputs_are_cached_until_an_input_changes():
     projector, context = _small_projector("a")
     _fix(projector, context, "a", COLOR, FLAT, X_WB)
     port = projector.GetOutputPort("observation")
@@ -329,10 +329,10 @@ def test_outputs_follow_the_pose_of_a_camera(name):
 
 
 @pytest.mark.parametrize("wrong", ["color", "depth"])
-def test_an_image_of_another_size_is_refused(wrong):
+def test_an_image_of_the_wrong_size_raises(wrong):
     images = {"color": COLOR, "depth": FLAT}
     images[wrong] = images[wrong].swapaxes(0, 1)
     projector, context = _small_projector("a")
     _fix(projector, context, "a", **images, X_WB=X_WB)
-    with pytest.raises(ValueError, match=f"{wrong}_image_a .* is 4x5 .* declared as 5x4"):
+    with pytest.raises(ValueError, match=f"{wrong}_image_a .*4x5 .*5x4"):
         projector.GetOutputPort("observation").Eval(context)

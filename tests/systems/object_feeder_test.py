@@ -16,7 +16,7 @@ ELSEWHERE = [0.5, 2.0, 0.0]
 
 
 def arriving(positions: dict[int, list[float]], mode: Mode = Mode.OBSERVE) -> float:
-    """What the port says, of objects that wait unless positions (m) tell otherwise."""
+    """The port's value; objects wait unless `positions` (m) sets theirs."""
     feeder = ObjectFeeder(
         waiting=[(BodyIndex(body), np.array(WAITS[body])) for body in (FIRST, SECOND)],
         others=[BodyIndex(BOWL)],
@@ -39,16 +39,18 @@ def arriving(positions: dict[int, list[float]], mode: Mode = Mode.OBSERVE) -> fl
         ({FIRST: [0.5, 0.5, 0.0]}, -1),
         ({BOWL: [0.5, 0.5, 0.0]}, -1),
         ({FIRST: ELSEWHERE, SECOND: ELSEWHERE}, -1),
-        # What fell off the table does not come back.
+        # An object that fell off the table does not come back.
         ({FIRST: [0.5, 2.0, -40.0]}, 1),
         ({FIRST: [math.nan] * 3}, 1),
     ],
     ids=["all wait", "one is placed", "one is there", "another is there", "none", "lost", "NaN"],
 )
-def test_the_next_appears_where_nothing_lies(positions: dict[int, list[float]], expected: float):
+def test_the_next_object_appears_when_the_area_is_clear(
+    positions: dict[int, list[float]], expected: float
+):
     assert arriving(positions) == expected
 
 
 @pytest.mark.parametrize("mode", list(Mode))
-def test_only_while_the_hand_is_empty_and_leaves(mode: Mode):
+def test_objects_appear_only_while_the_hand_retreats_or_observes(mode: Mode):
     assert arriving({}, mode) == (0 if mode in (Mode.RETREAT, Mode.OBSERVE) else -1)

@@ -14,7 +14,7 @@ from systems.placement import AddS, Goal, PlacedObject, PoseWithin, SuccessPredi
 from systems.signals import PickPlaceAction, PixelGrid, wrap_to_pi
 
 BOX = 0.5 * np.array([[x, y, z] for x in (-0.1, 0.1) for y in (-0.04, 0.04) for z in (0, 0.04)])
-"""The corners of a box, 100 x 40 x 20 mm, that stands on its origin."""
+"""The corners of a box of 100 x 40 x 20 mm, with the origin at the middle of its bottom."""
 ALONG_Y = Grasp(0.0, 0.0, 0.0, 0.04, 0.02)
 ALONG_X = Grasp(0.0, 0.0, math.pi / 2, 0.05, 0.02)
 
@@ -40,7 +40,7 @@ def ask(
     quantizer: ActionQuantizer | None = None,
     kept: list[float] | None = None,
 ) -> PickPlaceAction:
-    """The action for these poses of the objects."""
+    """The action for these object poses."""
     oracle = OraclePolicy(
         objects=objects or [HAMMER, PLIERS],
         grasps=grasps or [(HAMMER_GRASP,), (PLIERS_GRASP,)],
@@ -56,7 +56,7 @@ def ask(
 
 
 def ask_boxes(poses: list[RigidTransform], goals: list[Goal], **more) -> PickPlaceAction:
-    """The same for boxes that are all alike."""
+    """The action for identical boxes."""
     objects = [PlacedObject(f"box {i}", BodyIndex(i + 1), BOX, 2) for i in range(len(poses))]
     grasps = more.pop("grasps", (ALONG_Y,))
     return ask(poses, goals, objects=objects, grasps=[grasps] * len(poses), **more)
@@ -72,8 +72,8 @@ def test_ports():
     assert oracle.GetOutputPort("action").Allocate().get_value() == PickPlaceAction()
 
 
-def test_what_is_kept_is_not_done_again():
-    """What lies on a row that was complete holds it down, though it has been nudged since."""
+def test_kept_goals_are_not_filled_again():
+    """A complete row was nudged, but is kept: the blocks on it must not be moved."""
     nudged = [HAMMER_GOAL.poses[0] @ planar(0.02, 0), planar(0.3, 0.0)]
     goals = [HAMMER_GOAL, dataclasses.replace(PLIERS_GOAL, after=(0,))]
     hammer = gripper_pose(nudged[0], HAMMER_GRASP)
@@ -98,7 +98,7 @@ def test_takes_the_first_goal_in_order_that_is_not_filled():
     assert ask(seated, [HAMMER_GOAL, PLIERS_GOAL]).pick.x == pytest.approx(at_pliers.x)
 
 
-def test_an_object_that_failed_at_its_goal_is_tried_again_last():
+def test_a_goal_with_a_misplaced_object_comes_last():
     protruding = HAMMER_GOAL.poses[0] @ planar(0, 0, 0, 0.012)
     away = planar(0.3, 0.0)
     goals = [HAMMER_GOAL, PLIERS_GOAL]
@@ -114,8 +114,8 @@ def test_stops_when_every_goal_is_filled():
 
 
 @pytest.mark.parametrize("goal_yaw", [0.0, 1.0, math.pi, -2.5])
-def test_what_is_held_arrives_at_the_goal(goal_yaw: float):
-    """The gripper carries the object rigidly; goal and object are rotated by any angles."""
+def test_the_action_brings_the_object_to_its_goal(goal_yaw: float):
+    """The gripper carries the object rigidly, for any yaws of goal and object."""
     X_WGoal = planar(0.5, 0.0, goal_yaw) @ planar(0.02, -0.03, 0.3, 0.033)
     X_WB = planar(0.35, 0.2, 2.9)
     action = ask([planar(0, 0), X_WB], [Goal("p", (1,), (X_WGoal,), 1.0)])
@@ -124,13 +124,13 @@ def test_what_is_held_arrives_at_the_goal(goal_yaw: float):
     arrived = X_WPlace @ X_WPick.inverse() @ X_WB
     np.testing.assert_allclose(arrived.rotation().matrix(), X_WGoal.rotation().matrix(), atol=1e-12)
     np.testing.assert_allclose(arrived.translation()[:2], X_WGoal.translation()[:2], atol=1e-12)
-    # The jaws close across the object where its annotation says.
+    # The jaws close across the object as annotated.
     X_BPick = X_WB.inverse() @ X_WPick
     np.testing.assert_allclose(X_BPick.translation()[:2], (0.02, 0.01), atol=1e-12)
     assert RollPitchYaw(X_BPick.rotation()).yaw_angle() == pytest.approx(0.4)
 
 
-def test_heights_are_the_truth():
+def test_heights_are_the_true_heights():
     heights = ask([planar(0, 0), planar(0.3, 0.0, 0.0, 0.04)], [PLIERS_GOAL]).heights
     assert heights is not None
     assert heights.pick_top == pytest.approx(0.05)
@@ -139,7 +139,7 @@ def test_heights_are_the_truth():
     assert heights.highest == pytest.approx(0.06)
 
 
-def test_goals_wait_for_those_that_come_before():
+def test_goals_wait_for_their_prerequisites():
     ground, top = planar(0.5, 0), planar(0.5, 0, 0, 0.02)
     goals = [
         Goal("top", (0, 1), (top,), 0.5, after=(1,)),
@@ -151,7 +151,7 @@ def test_goals_wait_for_those_that_come_before():
     assert first.pick.y == pytest.approx(-0.3)
 
 
-def test_the_highest_of_objects_that_will_do_is_taken():
+def test_the_highest_suitable_object_is_picked():
     stack = [planar(0.3, 0.2, 0, 0.02 * level) for level in (0, 2, 1)]
     goals = [Goal("anywhere", (0, 1, 2), (planar(0.5, 0),), 1.0)]
     heights = ask_boxes(stack, goals).heights
@@ -159,7 +159,7 @@ def test_the_highest_of_objects_that_will_do_is_taken():
     assert heights.support == pytest.approx(0.04)
 
 
-def test_of_several_poses_the_free_one_that_rotates_least():
+def test_the_free_goal_pose_that_rotates_least_is_chosen():
     corners = tuple(planar(0.5, 0, k * math.pi / 2) for k in range(4))
     goals = [Goal("corner", (0,), corners, 1.0)]
     action = ask_boxes([planar(0.3, 0.3, 1.5)], goals)
@@ -169,7 +169,7 @@ def test_of_several_poses_the_free_one_that_rotates_least():
     success = PoseWithin(0.02, 0.3)
     action = ask_boxes([bowls[0], planar(0.3, 0.3, 0.4)], [*goals, *goals], success=success)
     assert action.place.x == pytest.approx(0.6)
-    # Any heading will do, and it is given that of the pose.
+    # The place has the heading of the free pose.
     assert action.place.theta == pytest.approx(action.pick.theta - 0.4)
 
 
@@ -183,7 +183,7 @@ def test_of_several_poses_the_free_one_that_rotates_least():
     ],
     ids=["beside the pick", "at its end", "beside the place", "nowhere"],
 )
-def test_the_first_grasp_at_which_the_fingers_are_free(neighbour: RigidTransform, expected: float):
+def test_the_first_grasp_with_free_fingers_is_chosen(neighbour: RigidTransform, expected: float):
     axes = (np.linspace(low, high, 9) for low, high in zip(BOX.min(0), BOX.max(0), strict=True))
     dense = np.stack(np.meshgrid(*axes))
     objects = [PlacedObject(str(i), BodyIndex(i + 1), dense.reshape(3, -1).T, 2) for i in range(2)]
@@ -196,15 +196,15 @@ def test_the_first_grasp_at_which_the_fingers_are_free(neighbour: RigidTransform
     assert action.pick.theta == pytest.approx(expected)
 
 
-def test_what_no_oracle_can_do_is_refused():
-    with pytest.raises(ValueError, match="at least one goal"):
+def test_missing_goals_or_grasps_raise():
+    with pytest.raises(ValueError, match="goal"):
         ask([], [])
-    with pytest.raises(ValueError, match="h has no grasp"):
+    with pytest.raises(ValueError, match="grasp"):
         ask([planar(0, 0)] * 2, [HAMMER_GOAL], grasps=[(), (PLIERS_GRASP,)])
 
 
 @pytest.mark.parametrize("yaw", [0.0, 2.0, -3.0])
-def test_the_grasp_taken_is_the_inverse_of_the_gripper_pose(yaw: float):
+def test_grasp_taken_inverts_gripper_pose(yaw: float):
     X_WB = planar(0.4, -0.1, yaw)
     taken = grasp_taken(X_WB, gripper_pose(X_WB, PLIERS_GRASP))
     expected = (PLIERS_GRASP.x, PLIERS_GRASP.y, PLIERS_GRASP.theta)
@@ -213,7 +213,7 @@ def test_the_grasp_taken_is_the_inverse_of_the_gripper_pose(yaw: float):
 
 @pytest.mark.parametrize("orientations", [36, 180])
 @pytest.mark.parametrize("yaw", [0.03, 1.234, 2.9, -2.0])
-def test_quantized_actions_are_the_nearest_there_are(yaw: float, orientations: int):
+def test_quantized_actions_are_the_nearest_possible(yaw: float, orientations: int):
     grid = PixelGrid()
     X_WB = planar(0.3512, 0.2034, yaw)
     quantizer = ActionQuantizer(grid, orientations)
@@ -232,7 +232,7 @@ def test_quantized_actions_are_the_nearest_there_are(yaw: float, orientations: i
     assert abs(action.pick.y - pick.y) <= half_pixel
     assert abs(wrap_to_pi(action.pick.theta - pick.theta)) <= half_bin
     assert abs(wrap_to_pi(rotation - (-2.0 - yaw))) <= half_bin
-    # The place is that of the rounded pick, not of the annotated grasp.
+    # The place belongs to the rounded pick, not to the annotated grasp.
     X_WPick = planar(action.pick.x, action.pick.y, action.pick.theta)
     ideal = (PLIERS_GOAL.poses[0] @ X_WB.inverse() @ X_WPick).translation()
     assert abs(action.place.x - ideal[0]) <= half_pixel

@@ -26,10 +26,10 @@ HEIGHTS = SurfaceHeights(pick_top=0.05, highest=0.06)
 ACTION = PickPlaceAction(PICK, PLACE, heights=HEIGHTS)
 PARAMETERS = PickPlaceParameters(grasp_depth_share=0.0)
 TEN = 10
-"""Actions that the planner of most tests may take."""
+"""Number of actions in most tests."""
 GRASP_Z = 0.05 - PARAMETERS.grasp_depth
 HANGING = GRASP_Z
-"""How far what is held reaches below the fingertips: it stood on the table."""
+"""How far the held object extends below the fingertips; it stood on the table."""
 WIDTH, WEIGHT = 0.02, 6.0
 NO_TOUCH = -1.0
 
@@ -42,14 +42,14 @@ def mode_of(planner: PickPlacePlanner, context: Context) -> Mode:
 
 @dataclasses.dataclass
 class World:
-    """What the hand meets: heights that its tips, or what they hold, touch; between its jaws what.
+    """What the hand touches.
 
     Attributes:
-        touch_pick: height in m at which something is touched on the pick side of the table.
-        touch_place: likewise on the place side.
-        cavity: yaws between which, and the height at which, it is touched there instead.
-        stiffness: of what is touched, in N/m.
-        width: of what is between the pads, in m, by number of the attempt (from 1) and mode.
+        touch_pick: height of the surface on the pick side of the table, in m.
+        touch_place: height of the surface on the place side, in m.
+        cavity: (lowest yaw, highest yaw, height) of a cavity on the place side.
+        stiffness: of the surfaces, in N/m.
+        width: of the object between the pads in m, by attempt (from 1) and mode.
     """
 
     touch_pick: float = NO_TOUCH
@@ -60,7 +60,7 @@ class World:
 
 
 class PerfectHand(LeafSystem):
-    """Moves exactly as desired; jaws stop at what is between them; feels what the World says."""
+    """Follows the desired motion exactly, stops the jaws at the object, and feels the World."""
 
     def __init__(self, world: World) -> None:
         super().__init__()
@@ -107,7 +107,7 @@ class PerfectHand(LeafSystem):
 
 
 class StubPolicy(LeafSystem):
-    """Gives one answer a number of times, then stop; notes when it was asked."""
+    """Returns one action a number of times, then stop; records when it is asked."""
 
     def __init__(self, actions: int, answer: PickPlaceAction) -> None:
         super().__init__()
@@ -122,7 +122,7 @@ class StubPolicy(LeafSystem):
 
 
 class Run:
-    """The planner, a perfect hand and a stub of a policy, simulated until the planner is done."""
+    """The planner, a perfect hand and a stub policy, simulated until the planner is done."""
 
     def __init__(
         self,
@@ -213,7 +213,7 @@ def test_ports():
         assert planner.GetOutputPort(name).size() == size
 
 
-def test_begins_at_home_with_open_jaws():
+def test_the_hand_starts_at_home_with_open_jaws():
     planner = PickPlacePlanner(parameters=PARAMETERS, max_actions=TEN)
     context = planner.CreateDefaultContext()
     motion = planner.GetOutputPort("desired_motion").Eval(context)
@@ -229,7 +229,7 @@ def test_all_modes_of_a_pick_and_place_in_order():
     assert run.counts == [1, 0, 0]
 
 
-def test_where_the_hand_goes():
+def test_the_hand_reaches_the_commanded_poses():
     run = Run()
     run.until(Mode.CLOSE)
     np.testing.assert_allclose(run.output("desired_motion")[:3], [PICK.x, PICK.y, GRASP_Z])
@@ -245,7 +245,7 @@ def test_where_the_hand_goes():
     pick, place = accepted.pick, accepted.place
     assert (pick.x, pick.y, pick.theta) == (PICK.x, PICK.y, pytest.approx(turned))
     assert (place.x, place.y) == (PLACE.x, PLACE.y)
-    # What is held turns by exactly this: the jaws being alike, the hand may be turned by pi.
+    # The object rotates by exactly this. The hand itself may be rotated by a further pi.
     assert run.output("desired_motion")[3] - turned == pytest.approx(PLACE.theta - PICK.theta)
     run.until(Mode.RETREAT)
     assert run.output("closing_force")[0] == 0
@@ -260,7 +260,7 @@ def test_where_the_hand_goes():
 
 
 @pytest.mark.parametrize(("heavy_load", "firm"), [(WEIGHT - 0.5, True), (WEIGHT + 0.5, False)])
-def test_what_is_heavy_is_gripped_more_firmly_until_it_is_let_go(heavy_load: float, firm: bool):
+def test_a_heavy_object_is_gripped_more_firmly_until_its_release(heavy_load: float, firm: bool):
     parameters = dataclasses.replace(PARAMETERS, heavy_load=heavy_load)
     run = Run(parameters=parameters).until(Mode.LIFT)
     assert run.output("closing_force")[0] == parameters.grasp_force
@@ -274,18 +274,18 @@ def test_what_is_heavy_is_gripped_more_firmly_until_it_is_let_go(heavy_load: flo
 
 
 @pytest.mark.parametrize("height", [0.02, 0.045])
-def test_lowering_stops_where_something_is_touched(height: float):
+def test_lowering_stops_at_contact(height: float):
     run = Run(World(touch_place=height)).until(Mode.RELEASE)
     z = run.output("desired_motion")[2]
-    # The planner looks every 1/64 s: at most one look late, at the lowering speed.
+    # Updates every 1/64 s: at most one period late, at the lowering speed.
     assert height - PARAMETERS.lower_speed / 64 - 1e-4 <= z < height
     run.simulator.AdvanceTo(run.simulator.get_context().get_time() + 0.05)
     assert run.sequence[-1] == Mode.RELEASE
     assert run.output("desired_motion")[2] == z
 
 
-def test_a_touch_is_told_from_the_load():
-    """On something soft: 4 N beyond the load is 2 mm deep, 4 N in all would be 5 mm."""
+def test_contact_force_is_measured_relative_to_the_payload():
+    """On a soft surface 4 N above the payload is 2 mm deep, 4 N in all would be 5 mm."""
     soft = World(touch_place=0.04, stiffness=2000.0)
     run = Run(soft).until(Mode.RELEASE)
     deep = PARAMETERS.contact_threshold / soft.stiffness
@@ -293,7 +293,7 @@ def test_a_touch_is_told_from_the_load():
     assert 0.04 - deep - 2 * PARAMETERS.lower_speed / 64 <= z < 0.04 - deep
 
 
-def test_lowering_over_nothing_ends_above_the_floor():
+def test_lowering_without_contact_ends_above_the_table():
     run = Run(World(touch_place=NO_TOUCH)).until(Mode.RELEASE)
     assert run.output("desired_motion")[2] == pytest.approx(PARAMETERS.floor_clearance)
 
@@ -304,7 +304,7 @@ OVER_A_CAVITY = dataclasses.replace(ACTION, heights=dataclasses.replace(HEIGHTS,
 
 
 @pytest.mark.parametrize("offset", [-0.1, -0.05, 0.05, 0.1])
-def test_what_stands_on_the_rim_is_turned_into_its_cavity(offset: float):
+def test_an_object_on_the_rim_is_rotated_into_its_cavity(offset: float):
     yaw = PLACE.theta + offset
     world = World(touch_place=ON_THE_RIM, cavity=(yaw - 0.02, yaw + 0.02, IN_THE_CAVITY))
     run = Run(world, answer=OVER_A_CAVITY, insertion=True).until(Mode.RELEASE)
@@ -321,8 +321,8 @@ def test_what_stands_on_the_rim_is_turned_into_its_cavity(offset: float):
 
 
 @pytest.mark.parametrize(("doubt", "follows"), [(0.0, Mode.RELEASE), (0.002, Mode.SEARCH)])
-def test_a_rim_may_be_off_by_what_o_t_leaves_in_doubt(doubt: float, follows: Mode):
-    """What comes to stand a little below where the rim was read may stand on it."""
+def test_the_rim_check_allows_for_the_doubt_of_the_heights(doubt: float, follows: Mode):
+    """An object slightly below the measured rim may stand on it."""
     heights = dataclasses.replace(OVER_A_CAVITY.heights, doubt=doubt)
     world = World(touch_place=ON_THE_RIM - 0.0015)
     answer = dataclasses.replace(OVER_A_CAVITY, heights=heights)
@@ -330,7 +330,7 @@ def test_a_rim_may_be_off_by_what_o_t_leaves_in_doubt(doubt: float, follows: Mod
     assert run.sequence[-2:] == [Mode.LOWER, follows]
 
 
-def test_a_search_in_vain_ends_where_it_began():
+def test_a_failed_search_ends_where_it_began():
     run = Run(World(touch_place=ON_THE_RIM), answer=OVER_A_CAVITY, insertion=True).until(
         Mode.RELEASE
     )
@@ -338,7 +338,7 @@ def test_a_search_in_vain_ends_where_it_began():
     q = run.output("desired_motion")[:4]
     assert q[2] == pytest.approx(ON_THE_RIM, abs=2.5e-3)
     np.testing.assert_allclose(q[[0, 1, 3]], (PLACE.x, PLACE.y, PLACE.theta), atol=1e-9)
-    # Both ways, and around, as far as it may.
+    # It tries both directions and the spiral, up to its limits.
     began = next(time for time, mode in run.modes if mode == Mode.SEARCH)
     log = run.log.FindLog(run.simulator.get_context())
     searched = log.data()[:4, log.sample_times() > began]
@@ -356,7 +356,7 @@ def test_a_search_in_vain_ends_where_it_began():
     [(IN_THE_CAVITY, True, 0.12), (ON_THE_RIM, False, 0.12), (ON_THE_RIM, True, 0.0)],
     ids=["in its cavity", "no insertion", "not wanted"],
 )
-def test_nothing_is_searched_for(touched: float, insertion: bool, amplitude: float):
+def test_no_search_is_made(touched: float, insertion: bool, amplitude: float):
     parameters = dataclasses.replace(
         PARAMETERS, search=InsertionSearch(amplitude=amplitude, reach=amplitude / 30)
     )
@@ -369,14 +369,14 @@ def test_nothing_is_searched_for(touched: float, insertion: bool, amplitude: flo
     assert run.sequence == [*PICK_AND_PLACE, Mode.OBSERVE, Mode.DONE]
 
 
-def test_what_is_laid_on_the_table_has_arrived():
-    """Where insertions are searched for too: the table has no cavity."""
+def test_an_object_placed_on_the_table_is_released_without_a_search():
+    """Insertion tasks too: the table has no cavity."""
     run = Run(World(touch_place=GRASP_Z), insertion=True).finish()
     assert run.sequence == [*PICK_AND_PLACE, Mode.OBSERVE, Mode.DONE]
 
 
-def test_the_rim_is_told_from_what_the_object_stood_on():
-    """Picked off something 20 mm high, its bottom is 20 mm nearer to the fingertips."""
+def test_the_rim_check_allows_for_the_height_of_the_support():
+    """Picked from a support 20 mm high, the object's bottom is 20 mm nearer to the fingertips."""
     on_a_box = dataclasses.replace(HEIGHTS, support=0.02, place_rim=RIM)
     answer = dataclasses.replace(ACTION, heights=on_a_box)
     run = Run(World(touch_place=ON_THE_RIM - 0.02), answer=answer, insertion=True).finish()
@@ -386,7 +386,7 @@ def test_the_rim_is_told_from_what_the_object_stood_on():
 
 
 def seen(**heights: float) -> Observation:
-    """A table, a tall block in a corner, and something at the pick and at the place."""
+    """A table with a tall block in a corner, and surfaces at the pick and at the place."""
     grid = PixelGrid()
     image = np.full((4, *grid.shape), 0.5, np.float32)
     image[3] = heights.get("table", 0.0)
@@ -397,12 +397,12 @@ def seen(**heights: float) -> Observation:
     return Observation(image, grid)
 
 
-def test_heights_are_read_off_the_observation_unless_the_action_brings_its_own():
+def test_heights_come_from_the_action_or_else_from_the_observation():
     run = Run(observation=seen(table=0.01, pick=0.04), answer=ACTION).until(Mode.CLOSE)
     assert run.output("desired_motion")[2] == pytest.approx(GRASP_Z)
     run = Run(observation=seen(table=0.01, pick=0.04)).until(Mode.CLOSE)
     assert run.output("desired_motion")[2] == pytest.approx(0.04 - PARAMETERS.grasp_depth)
-    # Nothing goes below the table, wherever that is.
+    # Nothing goes below the table, at any table height.
     run = Run(observation=seen(table=0.01, pick=0.012)).until(Mode.CLOSE)
     assert run.output("desired_motion")[2] == pytest.approx(0.01 + PARAMETERS.floor_clearance)
     run = Run(World(touch_place=NO_TOUCH), observation=seen(table=0.01)).until(Mode.RELEASE)
@@ -410,8 +410,8 @@ def test_heights_are_read_off_the_observation_unless_the_action_brings_its_own()
 
 
 @pytest.mark.parametrize("tallest", [0.05, 0.16])
-def test_what_crosses_the_table_clears_the_highest_surface(tallest: float):
-    """But for the last two centimetres, which are over what o_t shows around the goal."""
+def test_travel_clears_the_highest_surface(tallest: float):
+    """Except for the last two centimetres, over the surfaces around the goal."""
     run = Run(observation=seen(pick=0.06, place=0.03, tallest=tallest)).finish()
     q = run.log.FindLog(run.simulator.get_context()).data()[:3]
     times = run.log.FindLog(run.simulator.get_context()).sample_times()
@@ -419,7 +419,7 @@ def test_what_crosses_the_table_clears_the_highest_surface(tallest: float):
     hanging = 0.06 - PARAMETERS.grasp_depth
 
     def lowest(mode: Mode, before: PlanarPose | None, after: PlanarPose | None) -> float:
-        """The lowest that the fingertips are in a mode and away from where it begins and ends."""
+        """Lowest fingertip height in a mode, away from its start and end."""
         during = (times >= begins[mode]) & (times < begins[Mode((mode + 1) % Mode.DONE)])
         for pose in (before, after):
             if pose is not None:
@@ -438,8 +438,8 @@ def test_what_crosses_the_table_clears_the_highest_surface(tallest: float):
 
 
 @pytest.mark.parametrize("higher", [0.0, 0.006, 0.012])
-def test_what_is_gripped_higher_than_planned_clears_the_rim_as_well(higher: float):
-    """Something is touched early: more of the object is below the hand than o_t had told."""
+def test_an_object_gripped_higher_than_planned_clears_the_rim(higher: float):
+    """Early contact: more of the object hangs below the hand than o_t predicted."""
     world = World(touch_pick=GRASP_Z + higher if higher else NO_TOUCH)
     seen_heights = dataclasses.replace(HEIGHTS, near_place=0.05, place_rim=0.05)
     run = Run(world, answer=dataclasses.replace(ACTION, heights=seen_heights)).until(Mode.LIFT)
@@ -450,7 +450,7 @@ def test_what_is_gripped_higher_than_planned_clears_the_rim_as_well(higher: floa
 
 
 @pytest.mark.parametrize("ramp", [0.05, 0.4])
-def test_the_force_builds_up_and_goes_on_to_a_firm_grip_without_a_step(ramp: float):
+def test_the_closing_force_is_continuous_up_to_a_firm_grip(ramp: float):
     parameters = dataclasses.replace(PARAMETERS, force_ramp=ramp, heavy_load=WEIGHT - 0.5)
     run = Run(parameters=parameters).until(Mode.CHECK)
     forces, step = [run.output("closing_force")[0]], ramp / 16
@@ -473,36 +473,36 @@ def test_the_hand_rises_before_it_leaves_the_place():
 
 def test_an_action_without_heights_needs_an_observation():
     run = Run(answer=PickPlaceAction(PICK, PLACE))
-    with pytest.raises(RuntimeError, match="`observation` is not connected"):
+    with pytest.raises(RuntimeError, match="observation"):
         run.simulator.AdvanceTo(2.0)
 
 
-def test_descent_stops_where_something_is_touched():
+def test_descent_stops_at_contact():
     touched = GRASP_Z + 0.02
     run = Run(World(touch_pick=touched)).until(Mode.CLOSE)
     z = run.output("desired_motion")[2]
     late = PARAMETERS.descend_speed / 64
     assert touched - late < z <= touched
-    # Pressed fingertips would not close: it backs off.
+    # It backs off, because the jaws cannot close while the fingertips press.
     backed_off = run.until(Mode.CHECK).output("desired_motion")[2]
     assert backed_off == pytest.approx(z + PARAMETERS.floor_clearance, abs=2e-4)
 
 
 @pytest.mark.parametrize(("height", "depth"), [(0.02, 0.010), (0.04, 0.016), (0.09, 0.018)])
-def test_high_objects_are_gripped_deeper(height: float, depth: float):
+def test_tall_objects_are_gripped_deeper(height: float, depth: float):
     heights = SurfaceHeights(pick_top=0.03 + height, support=0.03)
     answer = dataclasses.replace(ACTION, heights=heights)
     run = Run(answer=answer, parameters=PickPlaceParameters()).until(Mode.CLOSE)
     assert run.output("desired_motion")[2] == pytest.approx(0.03 + height - depth)
 
 
-def test_descent_to_a_flat_object_keeps_off_the_floor():
+def test_descent_to_a_flat_object_stays_above_the_table():
     flat = dataclasses.replace(PARAMETERS, grasp_depth=0.05)
     run = Run(parameters=flat).until(Mode.CLOSE)
     assert run.output("desired_motion")[2] == pytest.approx(PARAMETERS.floor_clearance)
 
 
-def test_a_missed_grasp_is_counted_and_tried_again():
+def test_a_missed_grasp_is_counted_and_retried():
     world = World(width=lambda attempt, mode: 0.0 if attempt == 1 else WIDTH)
     run = Run(world, actions=2).finish()
     missed = [*PICK_AND_PLACE[: PICK_AND_PLACE.index(Mode.CHECK) + 1], Mode.RETREAT]
@@ -512,7 +512,7 @@ def test_a_missed_grasp_is_counted_and_tried_again():
 
 
 def test_the_latest_failed_picks_are_remembered():
-    """As many as there is room for, in their order."""
+    """In their order, and no more than there is room for."""
     world = World(width=lambda attempt, mode: 0.0)
     run = Run(world, actions=20, parameters=dataclasses.replace(PARAMETERS, max_actions=20))
     picks = [dataclasses.replace(PICK, x=0.3 + 0.01 * number) for number in range(20)]
@@ -524,18 +524,18 @@ def test_the_latest_failed_picks_are_remembered():
 @pytest.mark.parametrize(
     ("name", "x", "message"),
     [
-        ("pick", np.nan, "pick has no finite"),
-        ("place", 50.0, "place is out .* x is 50, not between"),
+        ("pick", np.nan, "pick .*finite"),
+        ("place", 50.0, "place .*x is 50"),
     ],
 )
-def test_an_action_out_of_reach_is_refused(name: str, x: float, message: str):
+def test_an_action_out_of_reach_raises(name: str, x: float, message: str):
     pose = dataclasses.replace(PLACE, x=x)
     run = Run(answer=dataclasses.replace(ACTION, **{name: pose}))
     with pytest.raises(RuntimeError, match=message):
         run.simulator.AdvanceTo(2.0)
 
 
-def test_what_is_pressed_has_no_place():
+def test_a_press_ignores_the_place():
     nowhere = PlanarPose(np.nan, np.nan, np.nan)
     answer = dataclasses.replace(ACTION, press=True, place=nowhere)
     assert Run(answer=answer).finish().counts == [1, 0, 0]
@@ -552,7 +552,7 @@ def test_an_object_dropped_while_searching_is_counted():
 
 
 @pytest.mark.parametrize("where", [Mode.LIFT, Mode.CARRY, Mode.LOWER])
-def test_a_dropped_object_is_counted_and_tried_again(where: Mode):
+def test_a_dropped_object_is_counted_and_retried(where: Mode):
     def width(attempt: int, mode: Mode) -> float:
         return 0.0 if attempt == 1 and mode >= where else WIDTH
 
@@ -566,7 +566,7 @@ def test_max_actions():
     parameters = dataclasses.replace(PARAMETERS, max_actions=2)
     run = Run(World(width=lambda attempt, mode: 0.0), actions=100, parameters=parameters).finish()
     assert run.counts == [2, 2, 0]
-    assert len(run.policy.asked) == 2  # It would not heed a third answer, and asks for none.
+    assert len(run.policy.asked) == 2  # A third action would be ignored, so it is not requested.
 
 
 def test_the_policy_is_asked_only_at_the_end_of_observing():
@@ -607,18 +607,18 @@ def test_motion_is_smooth_and_within_the_limits_of_its_mode(answer: PickPlaceAct
         mean_v, mean_a = (before[4:8] + v) / 2, (before[8:12] + a) / 2
         np.testing.assert_allclose(difference[:4], mean_v, atol=1e-3)
         np.testing.assert_allclose(difference[4:8], mean_a, atol=0.3)
-        for part in (slice(0, 2), slice(2, 3)):  # In the plane, and along z.
+        for part in (slice(0, 2), slice(2, 3)):  # In the plane and along z.
             speed, acceleration = np.linalg.norm(v[part]), np.linalg.norm(a[part])
             assert speed <= speeds[mode] * 1.0001, mode
             assert acceleration <= accelerations[mode] * 1.0001, mode
             fastest[mode] = max(fastest.get(mode, 0.0), speed)
-        # Both limits together.
+        # Combined limit of both.
         assert np.linalg.norm(v[:3]) <= 1.7
         assert np.linalg.norm(a[:3]) <= 13.0
         assert abs(v[3]) <= p.yaw_speed * 1.0001
         assert abs(a[3]) <= p.yaw_acceleration * 1.0001
         turning = max(turning, abs(v[3]))
-    # Limits that are never reached would say nothing, and cost time.
+    # The limits are reached.
     assert fastest[Mode.LOWER] == pytest.approx(p.lower_speed, rel=1e-2)
     if answer is FAR:
         assert fastest[Mode.CARRY] == pytest.approx(p.carry_speed, rel=1e-2)
@@ -650,14 +650,14 @@ def test_an_object_is_pressed_down_with_closed_jaws():
     assert run.output("desired_opening")[0] == pytest.approx(0.0, abs=1e-3)
     run.until(Mode.RETREAT)
     assert run.sequence == [Mode.OBSERVE, Mode.APPROACH, Mode.DESCEND, Mode.RETREAT]
-    # 30 N on 10 kN/m, and a period further at most.
+    # 30 N at 10 kN/m, and at most one period more.
     z = run.output("desired_motion")[2]
     assert 0.047 - 0.003 - PARAMETERS.descend_speed / 64 - 1e-3 < z < 0.047 - 0.003
     assert run.finish().counts == [1, 0, 0]
     assert run.output("failed_picks") == (PICK,)
 
 
-def test_a_press_that_meets_nothing_ends_at_its_depth():
+def test_a_press_without_contact_ends_at_its_depth():
     run = Run(answer=dataclasses.replace(ACTION, press=True), actions=1).until(Mode.RETREAT)
     z = run.output("desired_motion")[2]
     assert z == pytest.approx(HEIGHTS.pick_top - PARAMETERS.press_depth, abs=2e-3)

@@ -26,7 +26,7 @@ def test_ports(heights_only: bool):
     assert policy.GetOutputPort("action").Eval(context) == ACTION
 
 
-def test_is_asked_once_for_each_observation():
+def test_the_policy_is_called_once_for_each_observation():
     asked = []
 
     def answer(o: Observation, _) -> PickPlaceAction:
@@ -46,23 +46,23 @@ def test_is_asked_once_for_each_observation():
     assert asked == [0.25, 0.5]
 
 
-def test_an_answer_of_another_type_is_refused():
+def test_a_result_of_the_wrong_type_raises():
     policy = PickPlacePolicy(policy=lambda *_: (0.4, 0.1))  # type: ignore[arg-type, return-value]
     context = policy.CreateDefaultContext()
     policy.GetInputPort("observation").FixValue(context, Value(Observation()))
-    with pytest.raises(TypeError, match="answered with tuple, not a PickPlaceAction"):
+    with pytest.raises(TypeError, match="PickPlaceAction, not tuple"):
         policy.GetOutputPort("action").Eval(context)
 
 
 @pytest.mark.parametrize(
     ("answer", "error", "message"),
     [
-        (PickPlaceAction(pick=(0.3, 0, 0)), TypeError, "a pick that is no PlanarPose: .0.3, 0, 0."),
-        (PickPlaceAction(place=PlanarPose("0.3")), TypeError, "a place of text"),
-        (PickPlaceAction(place=PlanarPose(np.nan)), ValueError, "no finite numbers"),
+        (PickPlaceAction(pick=(0.3, 0, 0)), TypeError, "PlanarPose as pick"),
+        (PickPlaceAction(place=PlanarPose("0.3")), TypeError, "place"),
+        (PickPlaceAction(place=PlanarPose(np.nan)), ValueError, "finite"),
     ],
 )
-def test_poses_that_are_no_numbers_are_refused(answer, error: type, message: str):
+def test_invalid_poses_raise(answer, error: type, message: str):
     policy = PickPlacePolicy(policy=lambda *_: answer)
     context = policy.CreateDefaultContext()
     policy.GetInputPort("observation").FixValue(context, Value(Observation()))
@@ -70,7 +70,7 @@ def test_poses_that_are_no_numbers_are_refused(answer, error: type, message: str
         policy.GetOutputPort("action").Eval(context)
 
 
-def test_what_means_nothing_is_not_looked_at():
+def test_unused_poses_are_not_checked():
     nowhere = PlanarPose(np.nan, 0, 0)
     for answer in (
         PickPlaceAction(nowhere, nowhere, stop=True),
@@ -82,7 +82,7 @@ def test_what_means_nothing_is_not_looked_at():
         assert policy.GetOutputPort("action").Eval(context).press == answer.press
 
 
-def test_what_the_policy_raises_is_told_as_its_error():
+def test_an_exception_in_the_policy_raises_policy_error():
     def fail(*_) -> PickPlaceAction:
         raise KeyError("no such weight")
 
@@ -94,7 +94,7 @@ def test_what_the_policy_raises_is_told_as_its_error():
     assert isinstance(caught.value.__cause__, KeyError)
 
 
-def test_a_policy_is_given_where_grasps_failed():
+def test_failed_picks_are_passed_to_the_policy():
     given = []
 
     def answer(_: Observation, failed_picks=None) -> PickPlaceAction:
@@ -109,15 +109,15 @@ def test_a_policy_is_given_where_grasps_failed():
     for failed in ((), (PlanarPose(0.4, 0.1, 0.2),)):
         policy.GetInputPort("failed_picks").FixValue(context, Value(failed))
         assert port.Eval(context) == ACTION
-    # Not connected: none.
+    # Empty if not connected.
     assert given == [(), (), (PlanarPose(0.4, 0.1, 0.2),)]
 
 
 @pytest.mark.parametrize("number", [np.nan, np.inf])
-def test_an_action_that_is_no_number_is_refused(number: float):
+def test_an_action_that_is_not_finite_raises(number: float):
     action = PickPlaceAction(PlanarPose(0.4, 0.1, number), PlanarPose())
     policy = PickPlacePolicy(policy=lambda *_: action)
     context = policy.CreateDefaultContext()
     policy.GetInputPort("observation").FixValue(context, Value(Observation()))
-    with pytest.raises(ValueError, match="answered with no finite numbers"):
+    with pytest.raises(ValueError, match="finite"):
         policy.GetOutputPort("action").Eval(context)

@@ -25,7 +25,7 @@ SQUARE = np.array([[1.0, 1.0, 0.0], [-1.0, 1.0, 0.0], [-1.0, -1.0, 0.0], [1.0, -
 
 GOAL = RigidTransform(RollPitchYaw(0, 0, 0.5), [0.5, -0.1, 0.03])
 BAR = 0.5 * np.array([[x, y, z] for x in (-0.2, 0.2) for y in (-0.03, 0.03) for z in (0, 0.02)])
-"""The corners of a bar, 200 x 30 x 10 mm, that stands on its origin."""
+"""The corners of a bar of 200 x 30 x 10 mm, with the origin at the middle of its bottom."""
 
 
 def planar(x: float, y: float, yaw: float = 0.0, z: float = 0.0) -> RigidTransform:
@@ -41,7 +41,7 @@ def goal(*objects: int, pose: RigidTransform = GOAL, **fields) -> Goal:
 
 
 def place(item: PlacedObject, target: Goal, X_WB: RigidTransform, success=None) -> Placement:
-    """The placement of one object with one goal."""
+    """The placement of one object with respect to one goal."""
     (placement,) = evaluate_placements([item], [target], success or AddS(), [X_WB])
     return placement
 
@@ -57,16 +57,16 @@ def test_add_s_takes_the_nearest_point_not_the_same_point():
 
 
 def test_add_s_measures_from_the_goal_to_the_actual_pose():
-    """The two directions differ for a shape that is not symmetric; equation 9 has this one."""
+    """Asymmetric shapes give two directed distances; equation 9 starts from the goal."""
     points = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [3.0, 0.0, 0.0]])
-    moved = RigidTransform([3.0, 0.0, 0.0])  # Goal 0, 1, 3; actual 3, 4, 6.
+    moved = RigidTransform([3.0, 0.0, 0.0])  # Goal points at x = 0, 1, 3; actual at 3, 4, 6.
     assert add_s(points, RigidTransform(), moved) == pytest.approx((3 + 2 + 0) / 3)
-    back = RigidTransform([-3.0, 0.0, 0.0])  # Goal 0, 1, 3; actual -3, -2, 0.
+    back = RigidTransform([-3.0, 0.0, 0.0])  # Goal points at x = 0, 1, 3; actual at -3, -2, 0.
     assert add_s(points, RigidTransform(), back) == pytest.approx((0 + 1 + 3) / 3)
 
 
 @pytest.mark.parametrize("quarters", [1, 2, 3])
-def test_a_rotation_that_maps_the_object_onto_itself_costs_nothing(quarters: int):
+def test_add_s_is_zero_for_rotations_of_the_symmetry(quarters: int):
     rotated = GOAL @ RigidTransform(RollPitchYaw(0, 0, quarters * np.pi / 2), [0, 0, 0])
     assert add_s(SQUARE, GOAL, rotated) == pytest.approx(0.0, abs=1e-12)
     assert add_s(SQUARE, GOAL, GOAL @ RigidTransform(RollPitchYaw(0, 0, np.pi / 4), [0, 0, 0])) > 0
@@ -85,13 +85,13 @@ def test_errors_and_their_signs():
     assert placement.angle_error == pytest.approx(0.2)
     assert placement.height_error == pytest.approx(-0.02)
     assert placement.add_s == pytest.approx(add_s(BAR, GOAL, there))
-    # The short way round.
+    # The angle takes the short way round.
     across = goal(0, pose=planar(0, 0, 3.0))
     assert place(bar(), across, planar(0, 0, -3.0)).angle_error == pytest.approx(2 * math.pi - 6)
 
 
-def test_a_round_object_that_rolls_stays_where_it_is():
-    """The origin is on the table, below the axis; positions are compared on the axis."""
+def test_rolling_does_not_change_the_position_of_a_round_object():
+    """The origin is below the axis; positions are compared on the axis."""
     angles = np.arange(16) * np.pi / 8
     ring = np.stack([0 * angles, np.sin(angles), 1 + np.cos(angles)], axis=1)
     rolled = (
@@ -103,7 +103,7 @@ def test_a_round_object_that_rolls_stays_where_it_is():
 
 
 @pytest.mark.parametrize(("symmetry", "strict"), [(1, False), (2, True)])
-def test_a_declared_symmetry_makes_half_a_rotation_nothing(symmetry: int, strict: bool):
+def test_a_declared_symmetry_ignores_half_a_rotation(symmetry: int, strict: bool):
     reversed_ = GOAL @ planar(0, 0, math.pi)
     placement = place(bar(symmetry=symmetry), goal(0), reversed_)
     assert placement.success
@@ -120,13 +120,13 @@ def test_a_declared_symmetry_makes_half_a_rotation_nothing(symmetry: int, strict
         (planar(0, 0, math.radians(21)), False),
     ],
 )
-def test_a_strict_success_is_at_its_height_and_heading(offset: RigidTransform, strict: bool):
+def test_strict_success_checks_height_and_heading(offset: RigidTransform, strict: bool):
     placement = place(bar(), goal(0), GOAL @ offset, AddS(0.1))
     assert placement.success
     assert placement.strict_success == strict
 
 
-def test_success_as_ravens_has_it():
+def test_pose_within_thresholds():
     success = PoseWithin()
     assert place(bar(), goal(0), GOAL @ planar(0.009, 0, 0.25, 0.1), success).success
     assert not place(bar(), goal(0), GOAL @ planar(0.011, 0), success).success
@@ -135,7 +135,7 @@ def test_success_as_ravens_has_it():
     assert place(bar(), anyhow, GOAL @ planar(0, 0, 2.0), success).strict_success
 
 
-def test_the_share_of_a_volume_in_a_zone():
+def test_in_zone_measures_the_share_of_the_volume():
     zone = InZone(GOAL, (0.2, 0.2, 0.3), BAR)
     assert place(bar(), goal(0), GOAL, zone).share == 1.0
     assert place(bar(), goal(0), GOAL @ planar(0.05, 0), zone).share == 0.5
@@ -152,14 +152,14 @@ def test_interchangeable_objects_fill_each_others_goals():
         placements = evaluate_placements(objects, goals, AddS(), order)
         assert [item.success for item in placements] == [True, True]
         assert {item.goal for item in placements} == {0, 1}
-    # What only one may fill, the other does not.
+    # A goal of one object is not filled by the other.
     fixed = [goal(0, pose=left, reward=0.5), goal(1, pose=right, reward=0.5)]
     assert not any(item.success for item in evaluate_placements(objects, fixed, AddS(), order))
 
 
-def test_a_row_in_place_is_not_assigned_anew_for_what_lies_beside_it():
-    """To move each by one, and the last to the third, is less displacement in all: -2, -2, -2 mm
-    against 0.5, 0.5 and what is between the third and its goal."""
+def test_a_correct_row_keeps_its_goals_beside_another_object():
+    """Shifting every object by one goal would reduce the total displacement: -2, -2, -2 mm against
+    0.5, 0.5 mm and the distance from the third object to its goal."""
     row = [planar(0, 0.05 * k) for k in range(3)]
     goals = [goal(0, 1, 2, pose=pose, reward=1 / 3) for pose in row]
     objects = [bar(k) for k in range(3)]
@@ -170,7 +170,7 @@ def test_a_row_in_place_is_not_assigned_anew_for_what_lies_beside_it():
     assert total_reward(goals, placements) == pytest.approx(2 / 3)
 
 
-def test_an_object_whose_pose_is_no_number_fills_no_goal():
+def test_an_object_with_a_pose_that_is_not_finite_fills_no_goal():
     objects, left = [bar(0), bar(1)], planar(0, 0)
     goals = [goal(0, 1, pose=left, reward=1.0)]
     nowhere = RigidTransform([np.nan, 0, 0])
@@ -179,14 +179,14 @@ def test_an_object_whose_pose_is_no_number_fills_no_goal():
     assert not np.isfinite(lost.add_s)
 
 
-def test_any_pose_of_a_goal_will_do():
+def test_any_pose_of_a_goal_fills_it():
     corners = tuple(GOAL @ planar(0, 0, k * math.pi / 2) for k in range(4))
     placement = place(bar(), goal(0, poses=corners), corners[2] @ planar(0.002, 0, 0.01))
     assert placement.pose == 2
     assert placement.success
 
 
-def test_goals_count_only_after_those_that_come_before():
+def test_goals_count_only_after_their_prerequisites():
     poses = [planar(0, 0), planar(0, 0, 0, 0.01)]
     goals = [
         goal(0, pose=poses[0], reward=0.75),
@@ -202,7 +202,7 @@ def test_goals_count_only_after_those_that_come_before():
     assert total_reward(goals, first) == 0.75
 
 
-def test_a_stage_that_was_complete_keeps_its_reward():
+def test_a_complete_stage_keeps_its_reward():
     row = [planar(0, 0), planar(0.1, 0)]
     top = planar(0.05, 0, 0, 0.01)
     goals = [
@@ -219,16 +219,16 @@ def test_a_stage_that_was_complete_keeps_its_reward():
     assert complete_stages(goals, half) == frozenset()
     kept = complete_stages(goals, whole)
     assert kept == {0, 1}
-    # It is kept from then on, and nothing is counted twice.
+    # It is kept from then on, and counted once.
     assert complete_stages(goals, fallen, kept) == kept
     assert (total_reward(goals, fallen), total_reward(goals, fallen, kept)) == (0.25, 0.5)
     assert total_reward(goals, at(*row, top), kept) == 1.0
-    # What comes after it counts on its own, as in Ravens: the row was popped from its goals.
+    # Later goals count on their own, as in Ravens, which removes a complete row from its goals.
     moved = evaluate_placements(objects, goals, AddS(), [row[0], away, top], kept)
     assert (moved[1].success, moved[2].success) == (False, True)
     assert total_reward(goals, moved, kept) == 1.0
     assert total_reward(goals, at(row[0], away, top)) == 0.25
-    # The last stage, which nothing comes after, counts as it stands.
+    # The last stage is no prerequisite, so it is not kept.
     assert complete_stages(goals, at(*row, top)) == kept
     assert strict_reward(goals, fallen) == 0.25
 

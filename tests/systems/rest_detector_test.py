@@ -15,7 +15,7 @@ AWAY, BESIDE = 1.0, 0.004
 
 
 class Table:
-    """Two bars 20 cm long and 2 cm wide, 20 cm apart, and a hand; their poses set by hand."""
+    """Two bars of 20 x 2 cm, 20 cm apart, and a hand; the test sets their poses."""
 
     def __init__(self, time_to_sleep: float = PATIENCE) -> None:
         bar = Box(RigidTransform(), np.array([0.1, 0.01, 0.01]))
@@ -32,7 +32,7 @@ class Table:
         self.poses[HAND] = RigidTransform([0, 0, AWAY])
 
     def advance(self, seconds: float) -> Context:
-        """All but the update at the end of that time."""
+        """Advances by this time, excluding the update at its end."""
         context = self.simulator.get_mutable_context()
         poses = [RigidTransform(), *(self.poses[i] for i in (LEFT, RIGHT, HAND))]
         self.detector.GetInputPort("body_poses").FixValue(context, Value(poses))
@@ -40,7 +40,7 @@ class Table:
         return context
 
     def at_rest_after(self, seconds: float) -> list[bool]:
-        """Whether left and right are at rest, some time later."""
+        """Whether left and right are at rest after this time."""
         context = self.advance(seconds)
         self.simulator.AdvancePendingEvents()
         assert self.detector.GetOutputPort("at_rest").Eval(context).tolist() == [
@@ -54,7 +54,7 @@ class Table:
         self.poses[body] = self.poses[body] @ motion
 
     def hand_over(self, body: int, gap: float) -> None:
-        """Puts the hand over a bar, with a gap between the boxes."""
+        """Puts the hand over a bar with this gap between the boxes."""
         self.poses[HAND] = self.poses[body] @ RigidTransform([0, 0, 0.01 + 0.02 + gap])
 
 
@@ -75,8 +75,8 @@ def test_rest_takes_time_to_sleep():
 @pytest.mark.parametrize(
     ("metres", "radians"), [(0.8 * POSITION, 0.8 * ANGLE), (0.0, 0.8 * ANGLE), (0.0, 0.0)]
 )
-def test_what_trembles_in_place_rests(metres: float, radians: float):
-    """However fast: a tolerance in 1/64 s is ten times as fast as one in the time to sleep."""
+def test_an_object_that_trembles_in_place_rests(metres: float, radians: float):
+    """At any speed: one tolerance per 1/64 s is ten times one tolerance per `time_to_sleep`."""
     table = Table()
     for sign in (1, -1) * 8:
         table.move_by(LEFT, sign * metres, sign * radians)
@@ -85,8 +85,8 @@ def test_what_trembles_in_place_rests(metres: float, radians: float):
 
 
 @pytest.mark.parametrize(("metres", "radians"), [(0.1 * POSITION, 0.0), (0.0, 0.1 * ANGLE)])
-def test_what_creeps_does_not_rest(metres: float, radians: float):
-    """Slowly, but always the same way: ten periods take it out of a tolerance."""
+def test_an_object_that_creeps_does_not_rest(metres: float, radians: float):
+    """Slow drift in one direction leaves the tolerance within ten periods."""
     table = Table()
     for _ in range(64):
         table.move_by(LEFT, metres, radians)
@@ -94,7 +94,7 @@ def test_what_creeps_does_not_rest(metres: float, radians: float):
     assert table.at_rest_after(0)[1] is True
 
 
-def test_a_stir_starts_the_wait_again():
+def test_a_movement_restarts_the_wait():
     table = Table()
     table.at_rest_after(0.2)
     table.move_by(LEFT, 2 * POSITION)
@@ -103,7 +103,7 @@ def test_a_stir_starts_the_wait_again():
     assert table.at_rest_after(0.1) == [True, True]
 
 
-def test_a_mover_nearby_keeps_awake():
+def test_a_mover_nearby_keeps_an_object_awake():
     table = Table()
     table.hand_over(RIGHT, gap=BESIDE)
     assert table.at_rest_after(1.0) == [True, False]
@@ -111,7 +111,7 @@ def test_a_mover_nearby_keeps_awake():
     assert table.at_rest_after(1 / 64) == [True, True]
 
 
-def test_wakes_at_once():
+def test_an_object_wakes_at_the_next_update():
     table = Table()
     table.at_rest_after(1.0)
     table.hand_over(LEFT, gap=BESIDE)
@@ -119,7 +119,7 @@ def test_wakes_at_once():
 
 
 @pytest.mark.parametrize("metres", [20.0, np.nan])
-def test_what_has_left_the_cell_rests_however_it_flies(metres: float):
+def test_an_object_outside_the_cell_rests_even_if_it_moves(metres: float):
     table = Table()
     table.poses[RIGHT] = RigidTransform([0, -0.1, metres])
     assert table.at_rest_after(1 / 64) == [False, True]
@@ -131,16 +131,16 @@ def test_what_has_left_the_cell_rests_however_it_flies(metres: float):
 def test_an_awake_neighbour_wakes_a_sleeper():
     table = Table()
     table.poses[RIGHT] = RigidTransform([0, 0.1 - 0.02 - BESIDE, 0])
-    assert table.at_rest_after(1.0) == [True, True]  # Two that lie side by side may both rest.
+    assert table.at_rest_after(1.0) == [True, True]  # Two adjacent bars may both rest.
     # The hand touches the far side of the left bar only.
     table.poses[HAND] = RigidTransform([0, 0.1 + 0.01 + 0.02 + BESIDE, 0])
     assert table.at_rest_after(1 / 64) == [False, False]
-    # The neighbour moves off: only the bar at the hand stays awake.
+    # The neighbour moves away: only the bar near the hand stays awake.
     table.poses[RIGHT] = RigidTransform([0, -0.1, 0])
     assert table.at_rest_after(1.0) == [False, True]
 
 
-def test_nearness_is_that_of_turned_boxes():
+def test_distances_are_between_oriented_boxes():
     """The boxes' world-aligned bounds overlap here, but they are 3 cm apart."""
     table = Table()
     turn = RollPitchYaw(0, 0, np.pi / 4)
@@ -152,8 +152,8 @@ def test_nearness_is_that_of_turned_boxes():
     assert table.at_rest_after(1 / 64) == [False, True]
 
 
-def test_what_is_between_pieces_is_not_near():
-    """A hook of two bars: the hand in its bend is within the box around both."""
+def test_distances_are_to_the_pieces_of_a_body():
+    """The hand is in the bend of a hook: inside its enclosing box, but not near its two bars."""
     hook = [
         Box(RigidTransform([0.1, 0, 0]), np.array([0.1, 0.01, 0.01])),
         Box(
@@ -182,7 +182,7 @@ def test_what_is_between_pieces_is_not_near():
     assert not rests([0.01 + 0.02 + BESIDE, 0.1, 0.0])
 
 
-def test_what_moves_does_not_rest_however_soon_it_may():
+def test_a_moving_object_does_not_rest_with_zero_time_to_sleep():
     table = Table(time_to_sleep=0.0)
     for _ in range(4):
         table.move_by(LEFT, 2 * POSITION)

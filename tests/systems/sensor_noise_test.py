@@ -49,7 +49,7 @@ def depth_of(noise: SensorNoise, context) -> np.ndarray:
     return np.array(noise.GetOutputPort("depth_image_32f").Eval(context).data[:, :, 0])
 
 
-def test_ports_are_those_of_a_sensor():
+def test_output_ports_are_those_of_a_sensor():
     noise = system(use_labels=True)
     inputs = [noise.get_input_port(i).get_name() for i in range(noise.num_input_ports())]
     outputs = [noise.get_output_port(i).get_name() for i in range(noise.num_output_ports())]
@@ -58,7 +58,7 @@ def test_ports_are_those_of_a_sensor():
     assert system().num_input_ports() == 3
 
 
-def test_without_noise_everything_passes():
+def test_without_noise_the_outputs_equal_the_inputs():
     noise = system()
     depth = np.linspace(0.5, 1.5, WIDTH * HEIGHT, dtype=np.float32).reshape(HEIGHT, WIDTH)
     depth[0, 0], depth[0, 1] = 0, np.inf
@@ -73,12 +73,12 @@ def test_noise_grows_with_the_square_of_depth():
     for distance in (0.5, 1.0, 2.0):
         seen = depth_of(noise, context_of(noise, np.full((HEIGHT, WIDTH), distance)))
         assert seen.std() == pytest.approx(0.002 * distance**2, rel=0.02)
-        # Neighbours err alike.
+        # Neighbours are correlated.
         left, right = seen[:, :-1].ravel(), seen[:, 1:].ravel()
         assert np.corrcoef(left, right)[0, 1] > 0.7
 
 
-def test_it_repeats_itself_and_differs_by_time_seed_and_camera():
+def test_noise_depends_on_time_seed_and_camera_only():
     flat = np.full((HEIGHT, WIDTH), 0.9)
 
     def seen(time: float = 0.5, **arguments: int) -> np.ndarray:
@@ -92,7 +92,7 @@ def test_it_repeats_itself_and_differs_by_time_seed_and_camera():
         assert (other != seen()).mean() > 0.9
 
 
-def test_holes_have_their_share_and_shiny_surfaces_more():
+def test_hole_shares_of_the_image_and_of_shiny_surfaces():
     flat = np.full((HEIGHT, WIDTH), 1.0, np.float32)
     random = np.random.default_rng(0)
     shares = [
@@ -109,15 +109,15 @@ def test_holes_have_their_share_and_shiny_surfaces_more():
     holes = depth_of(noise, context) == 0
     assert not holes[:, : WIDTH // 2].any()
     assert 0.45 < holes[:, WIDTH // 2 :].mean() < 0.75
-    # What the labels say now, not what they said.
+    # A change of the labels takes effect.
     labels.mutable_data[:] = 7
     noise.GetInputPort("label_image").FixValue(context, Value(labels))
     assert (depth_of(noise, context) != 0).all()
 
 
 @pytest.mark.parametrize("normal", [(0.0, 0.0, 1.0), (0.7, 0.1, 0.7), (-0.3, 0.8, 0.5)])
-def test_what_is_seen_at_a_grazing_angle_is_a_hole(normal: tuple[float, float, float]):
-    """Of a plane the angle between each ray and the normal is known."""
+def test_pixels_at_grazing_angles_are_holes(normal: tuple[float, float, float]):
+    """On a plane the angle between each ray and the normal is known."""
     x, y = np.meshgrid(
         (np.arange(WIDTH) + 0.5 - INFO.center_x()) / FOCAL,
         (np.arange(HEIGHT) + 0.5 - INFO.center_y()) / FOCAL,
@@ -134,9 +134,9 @@ def test_what_is_seen_at_a_grazing_angle_is_a_hole(normal: tuple[float, float, f
     assert ((seen == 0) == (angle > limit))[clear].mean() > 0.99
 
 
-def test_a_wall_that_is_faced_squarely_has_the_same_holes_on_all_sides():
+def test_holes_of_a_frontal_wall_are_symmetric():
     depth = np.full((HEIGHT, WIDTH), 0.7, np.float32)
-    # Of this angle some pixels near a corner are, and their neighbours are not.
+    # Near a corner some pixels exceed this angle and their neighbours do not.
     noise = SensorNoiseParameters(steepest_deg=36.0)
     holes = noisy_depth(depth, noise, INFO, np.random.default_rng(0)) == 0
     assert 0 < holes.mean() < 0.5
@@ -144,7 +144,7 @@ def test_a_wall_that_is_faced_squarely_has_the_same_holes_on_all_sides():
     np.testing.assert_array_equal(holes, holes[:, ::-1])
 
 
-def test_what_has_no_depth_is_no_surface():
+def test_pixels_without_depth_stay_unchanged():
     depth = np.full((HEIGHT, WIDTH), 0.7, np.float32)
     depth[:, WIDTH // 3 :] = np.inf
     depth[:, 2 * WIDTH // 3 :] = 0.0
@@ -153,7 +153,7 @@ def test_what_has_no_depth_is_no_surface():
     np.testing.assert_array_equal(seen, depth)
 
 
-def test_depths_come_in_steps_that_grow_with_the_square_of_depth():
+def test_depth_steps_grow_with_the_square_of_depth():
     for distance in (0.5, 1.5):
         depth = np.full((HEIGHT, WIDTH), distance, np.float32)
         noise = SensorNoiseParameters(depth_std=0.002, depth_step=0.004)
@@ -183,7 +183,7 @@ def test_outputs_follow_their_inputs():
         assert (old != new).any()
 
 
-def test_pixels_fly_only_beside_edges():
+def test_flying_pixels_occur_only_beside_edges():
     step = np.full((HEIGHT, WIDTH), 1.0, np.float32)
     step[:, WIDTH // 2 :] = 0.9
     seen = noisy_depth(
@@ -213,7 +213,7 @@ def test_the_median_of_frames_is_less_noisy_and_has_fewer_holes():
     assert not (five == 0).any()
 
 
-def test_a_median_is_of_what_has_a_depth():
+def test_the_median_ignores_invalid_depths():
     frames = np.array([[3, 0, np.inf, 1], [1, 2, np.inf, 0], [2, 4, np.inf, 0]], np.float32)
     found = median_depth([frame[None] for frame in frames])
     np.testing.assert_array_equal(found, np.array([[2, 3, np.inf, 1]], np.float32))
@@ -226,7 +226,7 @@ def believed_pose(*, seed: int, number: int = 0, **errors: float) -> RigidTransf
 
 
 def rig_error(seed: int) -> RigidTransform:
-    """The error of all cameras together, about the middle of the workspace."""
+    """The error common to all cameras, about the middle of the workspace."""
     middle = RigidTransform([0.5, 0.0, 0.0])
     errors = {"rig_position_error": 0.01, "rig_angle_error_deg": 2.0}
     return middle.inverse() @ believed_pose(seed=seed, **errors) @ POSE.inverse() @ middle
@@ -238,7 +238,7 @@ def camera_error(seed: int, number: int = 0) -> RigidTransform:
 
 
 @pytest.mark.parametrize("error", [rig_error, camera_error])
-def test_errors_of_poses_follow_the_seed(error: Callable[[int], RigidTransform]):
+def test_pose_errors_depend_on_the_seed(error: Callable[[int], RigidTransform]):
     first, other = error(7), error(8)
     assert error(7).IsExactlyEqualTo(first)
     assert np.linalg.norm(first.translation() - other.translation()) > 1e-3
@@ -249,11 +249,11 @@ def test_errors_of_poses_follow_the_seed(error: Callable[[int], RigidTransform])
     ("error", "own"),
     [(rig_error, [14]), (camera_error, [15, 0]), (lambda seed: camera_error(seed, 2), [15, 2])],
 )
-def test_errors_of_poses_have_streams_of_their_own(
+def test_pose_errors_have_their_own_random_streams(
     error: Callable[[int], RigidTransform], own: list[int]
 ):
-    """Scenes are drawn from [seed] and [seed, k] with a k of a few, the rest of a cell from greater
-    ones. numpy pads with zeros: [seed, 15, 0] is [seed, 15]."""
+    """Scenes use the streams [seed] and [seed, k] with small k, the rest of a cell larger ones.
+    NumPy pads with zeros: [seed, 15, 0] equals [seed, 15]."""
     shift = error(7).translation()
     shift = shift / np.linalg.norm(shift)
     others = [[stream, number] for stream in range(20) for number in range(3)]
@@ -274,12 +274,12 @@ def test_no_two_draws_share_a_stream(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr("numpy.random.default_rng", recorded)
     noise = system(seed=7, depth_std=0.001)
     depth_of(noise, context_of(noise, np.ones((HEIGHT, WIDTH))))
-    # Of the rig, of the camera, and of the image.
+    # One each for rig, camera and image.
     assert len(streams) == 3
     assert len(set(map(tuple, streams))) == 3
 
 
-def test_calibration_is_off_by_what_was_asked():
+def test_calibration_errors_have_the_given_sizes():
     def believed(number: int, **errors: float) -> RigidTransform:
         noise = system(number=number, **errors)
         context = context_of(noise, np.ones((HEIGHT, WIDTH)))
@@ -289,7 +289,7 @@ def test_calibration_is_off_by_what_was_asked():
         believed(number, rig_position_error=0.003, rig_angle_error_deg=0.3) @ POSE.inverse()
         for number in (0, 1)
     ]
-    # The same for all cameras, about the middle of the workspace.
+    # The rig's error is the same for all cameras, about the middle of the workspace.
     assert rig[0].IsNearlyEqualTo(rig[1], 1e-12)
     assert np.linalg.norm(rig[0] @ np.array([0.5, 0, 0]) - (0.5, 0, 0)) == pytest.approx(0.003)
     angle = rig[0].rotation().ToAngleAxis().angle()
@@ -303,7 +303,7 @@ def test_calibration_is_off_by_what_was_asked():
         assert np.linalg.norm(error.translation()) == pytest.approx(0.001)
 
 
-def test_colours_are_out_of_balance():
+def test_white_balance_scales_the_colour_channels():
     noise = system(white_balance_std=0.2)
     seen = noise.GetOutputPort("color_image").Eval(context_of(noise, np.ones((HEIGHT, WIDTH)))).data
     channels = seen.reshape(-1, 4)

@@ -9,7 +9,7 @@ PICK, PLACE = PlanarPose(0.40, 0.20), PlanarPose(0.60, -0.20)
 
 
 def observation(*boxes: tuple[PlanarPose, float, float]) -> Observation:
-    """Boxes by their middle, half their side and their height above the world's origin."""
+    """Boxes by middle, half side and top height above the world's origin."""
     image = np.full((4, *GRID.shape), 0.5, np.float32)
     image[3] = -GRID.z_min
     for middle, half, height in boxes:
@@ -63,8 +63,8 @@ def on_a_kit(grid: PixelGrid) -> np.ndarray:
 
 @pytest.mark.parametrize("noise", [0.0, 0.0015])
 @pytest.mark.parametrize("off", [0.0, 0.003])
-def test_errors_of_cameras_are_taken_away(noise: float, off: float):
-    """Noise, a tilt of 0.3 degrees and an error in height hardly change what is read."""
+def test_noise_and_calibration_errors_are_corrected(noise: float, off: float):
+    """Noise, a tilt of 0.3 degrees and a height error hardly change the result."""
     grid = PixelGrid()
     true = on_a_kit(grid)
     rng = np.random.default_rng(0)
@@ -76,15 +76,15 @@ def test_errors_of_cameras_are_taken_away(noise: float, off: float):
         image[3] = np.maximum(seen, 0)
         found = read_surface_heights(Observation(image, grid), PICK, PLACE)
         errors.append([found.pick_top - 0.02, found.place_rim - 0.05, found.place_floor - 0.02])
-        # What is lowered stands on the rim by their difference.
+        # This difference decides whether the lowered object stands on the rim.
         errors[-1].append(found.support - (found.place_rim - 0.05))
         assert (found.doubt > 0) == bool(noise or off)
     assert np.abs(errors).max() < (0.002 if noise else 0.0005)
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.0015])
-def test_what_no_camera_sees_is_not_the_table(noise: float):
-    """A hole over most of the pick, and the shadow that a tool on a block casts beside itself."""
+def test_unseen_pixels_do_not_count_as_the_table(noise: float):
+    """A hole covers most of the pick, and a tool on a block casts a shadow beside itself."""
     grid = PixelGrid()
     row, col = np.rint(grid.to_pixel((PLACE.x, PLACE.y))).astype(int)
     height = noise * np.random.default_rng(0).standard_normal(grid.shape)
@@ -101,8 +101,8 @@ def test_what_no_camera_sees_is_not_the_table(noise: float):
     assert found.support == pytest.approx(0.05, abs=1e-6 + 2 * noise)
 
 
-def test_edges_are_no_noise():
-    """A crowded table: half of all pixels are near an edge, and each pixel is exact."""
+def test_edges_do_not_count_as_noise():
+    """A crowded table: half of the pixels are near an edge, and all are exact."""
     image = np.full((4, *GRID.shape), 0.5, np.float32)
     image[3] = 0.0
     image[3, ::24] = image[3, 1::24] = 0.012
@@ -112,7 +112,7 @@ def test_edges_are_no_noise():
     assert found.highest == pytest.approx(GRID.z_min + 0.012, abs=1e-6)
 
 
-def test_a_table_far_above_the_bottom_of_the_grid_is_where_it_is():
+def test_a_table_far_above_the_bottom_of_the_grid_is_not_corrected():
     image = np.full((4, *GRID.shape), 0.5, np.float32)
     image[3] = 0.02
     found = read_surface_heights(Observation(image, GRID), PICK, PLACE)

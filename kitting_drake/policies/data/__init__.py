@@ -1,1 +1,1 @@
-"""Observations and actions to learn from: demonstrations, static scenes, labelled images."""
+"""Training data: demonstrations, static scenes, labelled images."""

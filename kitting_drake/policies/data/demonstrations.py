@@ -1,16 +1,16 @@
-"""Demonstrations to learn from: episodes of an expert, as (o_t, a_pick, a_place), in one file.
+"""Demonstrations: an expert's episodes of (o_t, a_pick, a_place) in one HDF5 file.
 
-The file is HDF5. Its attributes are `format`, `format_version`, `first_seed`, `scenario_name` and,
-as JSON, `scenario`, `grid`, `learning`, `versions` and `rejected`. Each demonstration of T steps is
-a group, `seed_00010000`, with the attributes `seed` and `score` and the datasets
+The file's attributes are `format`, `format_version`, `first_seed`, `scenario_name` and, as JSON,
+`scenario`, `grid`, `learning`, `versions` and `rejected`. Each demonstration of T steps is a group,
+such as `seed_00010000`, with the attributes `seed` and `score` and the datasets
 
 - `rgb` (T, 3, rows, cols), 8 bits, and `height` (T, rows, cols), metres: the observations,
 - `pick` and `place` (T, 3), x and y in metres and theta in radians: the actions,
-- `object` and `category` (T,): what was picked,
-- `final_rgb` (3, rows, cols) and `final_height` (rows, cols): what was seen when nothing was left
-  to do. They are absent where the episode ended before the hand was ready for another action.
+- `object` and `category` (T,): the picked object,
+- `final_rgb` (3, rows, cols) and `final_height` (rows, cols): the observation with nothing left to
+  do. They are absent if the episode ended before the hand was ready for another action.
 
-A group tells the `commit` of the code that made it too, if that was a checkout.
+A group also has the attribute `commit`, the code's commit, if the code ran from a checkout.
 """
 
 from __future__ import annotations
@@ -44,19 +44,19 @@ class Demonstration:
 
     seed: int
     score: float
-    """Share of the objects that it placed."""
+    """The share of the objects that were placed."""
     steps: tuple[DemonstrationStep, ...]
     final: FinalObservation | None = None
-    """None: the episode ended before the hand was ready for another action."""
+    """None if the episode ended before the hand was ready for another action."""
     commit: str | None = None
-    """The commit of the code that ran it; None where there was no checkout, or it is not known."""
+    """The commit of the code that ran it; None if unknown."""
     digest: str | None = None
-    """The digest of all that its group in a file holds; None where it comes from no file."""
+    """The digest of its group in the file; None if it was not read from a file."""
 
 
 @dataclass(frozen=True)
 class Rejection:
-    """A seed with which the expert did not do well enough to be learned from."""
+    """A seed whose episode scored too low to learn from."""
 
     seed: int
     score: float
@@ -65,16 +65,16 @@ class Rejection:
 
 @dataclass(frozen=True)
 class Origin:
-    """Where demonstrations come from."""
+    """The origin of demonstrations."""
 
     scenario_name: str
     scenario: dict[str, Any]
-    """Its fields, as JSON has them."""
+    """The scenario's fields as JSON values."""
     grid: PixelGrid
     first_seed: int
-    """Demonstrations are of the first seeds from here on that were not rejected."""
+    """The demonstrations are of successive seeds from this one on, without the rejected ones."""
     versions: dict[str, str]
-    """The versions that the last of them were made with."""
+    """The package versions that made the latest of them."""
     learning: Learning = field(default_factory=Learning)
     """The assumptions that the task allows in training."""
 
@@ -91,13 +91,13 @@ class Demonstrations:
 
 @dataclass(frozen=True)
 class Contents:
-    """The contents of a file, without the demonstrations themselves."""
+    """The contents of a file without the demonstrations themselves."""
 
     origin: Origin
     rejected: tuple[Rejection, ...]
     seeds: tuple[int, ...]
     commits: tuple[str, ...] = ()
-    """The commits of the code that made them, as far as they are recorded."""
+    """The recorded commits of the code that made them."""
 
 
 def read_demonstrations(path: Path, first: int | None = None) -> Demonstrations:
@@ -105,10 +105,10 @@ def read_demonstrations(path: Path, first: int | None = None) -> Demonstrations:
 
     Args:
         path: the file.
-        first: how many, in the order of their seeds; all when None.
+        first: how many to read, in the order of their seeds; None for all.
 
     Raises:
-        UserError: the file cannot be used.
+        UserError: the file is unusable.
     """
     with _opened(path, keep=True) as file:
         contents = _contents(file)
@@ -120,10 +120,10 @@ def read_demonstrations(path: Path, first: int | None = None) -> Demonstrations:
 
 
 def read_contents(path: Path) -> Contents:
-    """Reads what a file of demonstrations holds, which is quick.
+    """Quickly reads the contents of a file without the demonstrations themselves.
 
     Raises:
-        UserError: the file cannot be used.
+        UserError: the file is unusable.
     """
     with _opened(path) as file:
         return _contents(file)
@@ -135,7 +135,7 @@ def write_demonstrations(
     demonstrations: Iterable[Demonstration],
     rejected: Iterable[Rejection] = (),
 ) -> None:
-    """Writes a file of demonstrations atomically, over any that was there.
+    """Writes a file of demonstrations atomically, replacing any existing one.
 
     Raises:
         UserError: the file cannot be written.
@@ -148,16 +148,16 @@ def write_demonstrations(
 def merge_demonstrations(
     path: Path, sources: Iterable[tuple[Path, int]], origin: Origin, rejected: Iterable[Rejection]
 ) -> None:
-    """Writes atomically a file of demonstrations taken as they are from other files.
+    """Copies demonstrations from other files into one file, atomically.
 
     Args:
-        path: the file; may be one of the others.
-        sources: files, each with the seed of a demonstration that is in it.
-        origin: of them all.
-        rejected: seeds left out.
+        path: the file; may be one of the sources.
+        sources: pairs of a file and the seed of a demonstration in it.
+        origin: of the new file.
+        rejected: the rejected seeds.
 
     Raises:
-        UserError: a file cannot be used or written.
+        UserError: a file is unusable or cannot be written.
     """
     with _created(path, origin, rejected) as file:
         for source, seed in sources:
@@ -166,7 +166,7 @@ def merge_demonstrations(
 
 
 def _copy(part: h5py.File, name: str, file: h5py.File, path: Path) -> None:
-    """Copies a group; where that fails, nobody knows whether it was read or written."""
+    """Copies a group. On failure HDF5 does not say whether reading or writing failed."""
     try:
         part.copy(name, file)
     except (OSError, RuntimeError) as error:
@@ -179,7 +179,7 @@ def _group_name(seed: int) -> str:
 
 @contextlib.contextmanager
 def _created(path: Path, origin: Origin, rejected: Iterable[Rejection]) -> Iterator[h5py.File]:
-    """A file to write demonstrations to; it comes to its place when all is written."""
+    """A new file of demonstrations, which is moved into place when it is complete."""
     scratch = path.with_name(f".{path.name}.scratch")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -196,7 +196,7 @@ def _created(path: Path, origin: Origin, rejected: Iterable[Rejection]) -> Itera
             yield file
         os.replace(scratch, path)
     except (OSError, RuntimeError) as error:
-        # HDF5 has the second for a disk that is full when it closes the file.
+        # HDF5 raises RuntimeError if the disk is full when it closes the file.
         reason = getattr(error, "strerror", None) or error
         raise UserError(f"cannot write {path}: {reason}") from error
     finally:
@@ -233,15 +233,17 @@ def _write_images(
 
 @contextlib.contextmanager
 def _opened(path: Path, *, keep: bool = False) -> Iterator[h5py.File]:
-    """A file of demonstrations to read; whatever is wrong with it becomes a UserError.
+    """Opens a file of demonstrations, turning any failure into a UserError.
 
     Args:
         path: the file.
-        keep: leave it open for as long as anything refers to its datasets.
+        keep: leave the file open as long as its datasets are in use.
     """
     if not path.is_file():
-        raise UserError(f"there is no file {path}: make it by python -m kitting_drake.collect")
-    foreign = f"{path} is no file of demonstrations: make one by python -m kitting_drake.collect"
+        raise UserError(f"there is no file {path}: make it with python -m kitting_drake.collect")
+    foreign = (
+        f"{path} is not a file of demonstrations: make one with python -m kitting_drake.collect"
+    )
     try:
         if not h5py.is_hdf5(path):
             raise UserError(foreign)
@@ -252,8 +254,8 @@ def _opened(path: Path, *, keep: bool = False) -> Iterator[h5py.File]:
             version = file.attrs["format_version"]
             if version != FORMAT_VERSION:
                 raise UserError(
-                    f"{path} is of format version {version}, and version {FORMAT_VERSION} is what "
-                    "can be read: use the kitting_drake that made it, or collect anew"
+                    f"{path} has format version {version}, but version {FORMAT_VERSION} is needed: "
+                    "use the kitting_drake that made it, or collect again"
                 )
             yield file
     except UserError:
@@ -261,7 +263,7 @@ def _opened(path: Path, *, keep: bool = False) -> Iterator[h5py.File]:
     except PermissionError as error:
         raise UserError(f"cannot read {path}: {error.strerror}") from error
     except (OSError, LookupError, TypeError, AttributeError, ValueError, RuntimeError) as error:
-        # h5py has all of these for bytes that make no sense.
+        # h5py may raise any of these for damaged bytes.
         raise UserError(
             f"{path} is truncated or damaged: delete it and collect again ({error})"
         ) from error
@@ -287,7 +289,7 @@ def _read_group(group: h5py.Group, grid: PixelGrid) -> Demonstration:
     texts = [group[name].asstr()[()] for name in ("object", "category")]
     steps = len(texts[0])
     if not steps:
-        raise ValueError(f"{group.name} holds no step")
+        raise ValueError(f"{group.name} has no steps")
     digest = hashlib.sha256(repr([list(text) for text in texts]).encode())
 
     def checked(name: str, *shape: int) -> h5py.Dataset:
@@ -322,17 +324,17 @@ def _read_group(group: h5py.Group, grid: PixelGrid) -> Demonstration:
 
 
 def _checked(group: h5py.Group, name: str, shape: tuple[int, ...], digest: Any) -> h5py.Dataset:
-    """A dataset of some shape, all of whose entries are finite; it is added to a digest."""
+    """A dataset of the given shape with finite entries; its content is added to a digest."""
     dataset = group[name]
     values = dataset[()]
     if values.shape != shape:
-        raise ValueError(f"{group.name}/{name} is of the shape {values.shape}")
+        raise ValueError(f"{group.name}/{name} has the wrong shape, {values.shape}")
     if not np.isfinite(values).all():
-        raise ValueError(f"{group.name}/{name} holds what is no number")
+        raise ValueError(f"{group.name}/{name} has entries that are not finite")
     digest.update(np.ascontiguousarray(values).data)
     return dataset
 
 
 def content_digest(demonstrations: Iterable[Demonstration]) -> str:
-    """A digest of all that is learned from demonstrations that were read from a file."""
+    """A digest of the content of demonstrations that were read from a file."""
     return hashlib.sha256(repr([(d.seed, d.digest) for d in demonstrations]).encode()).hexdigest()

@@ -1,7 +1,7 @@
-"""Labelled images, crops of them, and data augmentation.
+"""Labelled images, their crops, and data augmentation.
 
-Positions are continuous (row, col) with pixel centres at whole numbers, and rotations are
-counter-clockwise: both as `systems.signals.PixelGrid` has them. There is no other convention here.
+As in `systems.signals.PixelGrid`, positions are continuous (row, col) with pixel centres at whole
+numbers, and rotations are counter-clockwise.
 """
 
 from __future__ import annotations
@@ -20,19 +20,19 @@ Image = NDArray[np.float32]
 """(4, rows, cols): red, green, blue in [0, 1] and height in metres."""
 
 _CURVATURE_STD = 0.2
-"""Standard deviation of both coefficients of a curvature."""
+"""The standard deviation of both coefficients of a curvature."""
 _FARTHEST_CURVED = 1.4
-"""The distance from the pick beyond which no displacement grows, in half sides of the crop: that of
-the crop's corners."""
+"""The distance from the pick at which displacements stop growing, in half sides of the crop: the
+crop's corners."""
 _ROTATION_STD = math.radians(60)
-"""Standard deviation of augmentation's rotations, in radians (as in the authors' code)."""
+"""The standard deviation of augmentation's rotations in radians, as in the authors' code."""
 _SHIFT_STD = 1 / 6
-"""Standard deviation of augmentation's shifts, in sides of the image. In Ravens it is in shorter
-sides along both axes: here what is shifted along the longer one goes twice as far."""
+"""The standard deviation of augmentation's shifts, in sides of the image. Ravens uses the shorter
+side for both axes; here shifts along the longer side are twice as large."""
 
 
 class Pictured(Protocol):
-    """An object with an image, which is made when it is asked for."""
+    """An object whose image is made on demand."""
 
     @property
     def image(self) -> Image:
@@ -47,23 +47,23 @@ class LabelledImage:
     pick: NDArray[np.float64]
     """(row, col)."""
     pick_theta: float
-    """The angle of the gripper, in radians; adding pi gives the same grasp."""
+    """The gripper's angle in radians; adding pi gives the same grasp."""
     place: NDArray[np.float64]
-    """(row, col) that the object's point under the gripper is brought to."""
+    """(row, col) of the place for the object's point at the pick."""
     rotation: float
     """The rotation of the object between pick and place, in radians."""
     other_picks: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 2)))
-    """(n, 2): where other objects could be picked instead."""
+    """(n, 2): possible picks of other objects."""
     other_thetas: NDArray[np.float64] = field(default_factory=lambda: np.zeros(0))
-    """(n,): the angles of the gripper there."""
+    """(n,): the gripper's angles at `other_picks`, in radians."""
     motion: Motion | None = None
-    """The motion of the scene by which the image was augmented, if it was."""
+    """The motion that augmented the image; None without augmentation."""
     curvatures: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 2)))
-    """(1 + n, 2): a curvature for the object of each pick (see `curved_crop`), or none at all."""
+    """(1 + n, 2): a curvature for the object of each pick (see `curved_crop`), or empty."""
 
     @classmethod
     def from_action(cls, image: Image, action: PickPlaceAction, grid: PixelGrid) -> LabelledImage:
-        """The labels that correspond to an action."""
+        """The labels of an action."""
         return cls(
             image=image,
             pick=grid.to_pixel((action.pick.x, action.pick.y)),
@@ -73,20 +73,20 @@ class LabelledImage:
         )
 
     def place_of(self, pixel: NDArray[np.float64]) -> NDArray[np.float64]:
-        """(row, col) that the object's point which is now at `pixel` is brought to."""
+        """(row, col) of the place for the object's point at `pixel`."""
         return self.place + rotation_matrix(self.rotation) @ (pixel - self.pick)
 
     def curved_crop(self, index: int, pixel: tuple[int, int], side: int) -> Image:
         """A crop in which the object is bent: curvature augmentation.
 
-        For a curvature (a, b), let u be the distance from the pick along the gripper's angle, in
-        half sides of the crop. The crop shows at u what lies a u^2 + b u^3 half sides further
-        across. At the pick itself position and direction stay the same, so the label is exact,
-        while the far ends of the object become less informative.
+        Let u be the distance from the pick along the gripper's angle, in half sides of the crop. A
+        curvature (a, b) shifts the image at u across that direction by a u^2 + b u^3 half sides.
+        Position and direction at the pick stay the same, so the label remains exact, while the
+        object's far ends become less informative.
 
         Args:
             index: 0 for the pick, 1 + i for other pick i.
-            pixel: the middle of the crop, near that pick.
+            pixel: the centre of the crop, near that pick.
             side: of the crop, odd, in pixels.
 
         Returns:
@@ -104,7 +104,7 @@ class LabelledImage:
         source = np.stack([along, across], axis=-1) @ axes.T + picks[index]
         if self.motion is None:
             return nearest(self.image, source)
-        # One lookup in the original image instead of two in a row.
+        # One lookup in the original image, to resample only once.
         rows, cols = self.image.shape[1:]
         inside = ((source > -0.5) & (source < (rows - 0.5, cols - 0.5))).all(axis=-1)
         return nearest(self.motion.image, self.motion.before(source)) * inside
@@ -117,16 +117,16 @@ def make_action(
     place: NDArray[np.float64],
     rotation: float,
 ) -> PickPlaceAction:
-    """The action of a prediction in pixels: the inverse of `LabelledImage.from_action`.
+    """The action of a prediction in pixels; the inverse of `LabelledImage.from_action`.
 
-    Heights are left to the planner, which reads them off the observation for every policy.
+    The planner reads the heights from the observation.
 
     Args:
-        observation: what was seen.
+        observation: o_t.
         pick: (row, col).
         theta: of the gripper at the pick, in radians.
         place: (row, col).
-        rotation: of the object, in radians.
+        rotation: of the object from pick to place, in radians.
     """
     grid = observation.grid
     pick_x, pick_y = grid.to_world(pick)
@@ -140,7 +140,7 @@ def make_action(
 
 @dataclass(frozen=True)
 class Motion:
-    """An SE(2) motion of an image: a rotation about its middle followed by a shift."""
+    """An SE(2) motion of an image: a rotation about its centre followed by a shift."""
 
     image: Image
     """The image before the motion."""
@@ -158,16 +158,16 @@ class Motion:
 
     @property
     def middle(self) -> NDArray[np.float64]:
-        """(row, col) of the middle of the image."""
+        """(row, col) of the image's centre."""
         return (np.array(self.image.shape[1:]) - 1) / 2
 
     def after(self, pixels: NDArray[np.float64]) -> NDArray[np.float64]:
-        """(..., 2): where the motion brings positions (..., 2)."""
+        """(..., 2): the positions (..., 2) after the motion."""
         rotated = (pixels - self.middle) @ rotation_matrix(self.angle).T
         return rotated + self.middle + self.shift
 
     def before(self, pixels: NDArray[np.float64]) -> NDArray[np.float64]:
-        """(..., 2): where positions (..., 2) come from; the inverse of `after`."""
+        """(..., 2): the positions (..., 2) before the motion; the inverse of `after`."""
         return (pixels - self.middle - self.shift) @ rotation_matrix(self.angle) + self.middle
 
     def moved_image(self) -> Image:
@@ -184,7 +184,7 @@ def rotation_matrix(angle: float) -> NDArray[np.float64]:
 
 
 def crop(image: Image, centre: tuple[int, int], side: int) -> Image:
-    """(channels, side, side) around a pixel, `side` odd; zero, as if unseen, outside the image."""
+    """(channels, side, side) around a pixel, `side` odd; zero (unseen) outside the image."""
     channels, rows, cols = image.shape
     reach = side // 2
     result = np.zeros((channels, side, side), image.dtype)
@@ -197,15 +197,14 @@ def crop(image: Image, centre: tuple[int, int], side: int) -> Image:
 
 
 def nearest(image: Image, source: NDArray[np.float64]) -> Image:
-    """An image resampled at other positions, by nearest neighbours: interpolating between two
-    heights would make up a height that is nowhere in the scene.
+    """An image resampled by nearest neighbours: interpolation would invent heights between objects.
 
     Args:
         image: (channels, rows, cols).
-        source: (n, m, 2): the position (row, col) that each new pixel is taken from.
+        source: (n, m, 2): the source position (row, col) of each new pixel.
 
     Returns:
-        (channels, n, m); zero, as if unseen, where that position is outside the image.
+        (channels, n, m); zero (unseen) if the source position is outside the image.
     """
     rows, cols = image.shape[1:]
     row, col = np.rint(source).astype(int).transpose(2, 0, 1)
@@ -214,11 +213,11 @@ def nearest(image: Image, source: NDArray[np.float64]) -> Image:
 
 
 def move(sample: LabelledImage, angle: float, shift: NDArray[np.float64]) -> LabelledImage:
-    """A sample after a motion of the scene; its labels are moved exactly.
+    """A sample after a motion of the scene, with exact labels.
 
     Args:
-        sample: what to move.
-        angle: of the rotation about the image's middle, counter-clockwise, in radians.
+        sample: the sample.
+        angle: of the rotation about the image's centre, counter-clockwise, in radians.
         shift: (row, col), in pixels.
     """
     return _moved(sample, Motion(sample.image, angle, np.asarray(shift, float)))
@@ -238,10 +237,9 @@ def _moved(sample: LabelledImage, motion: Motion) -> LabelledImage:
 
 
 def reflect(sample: LabelledImage) -> LabelledImage:
-    """The mirror image of a sample, columns reversed; its labels are those of the mirrored scene.
+    """The mirror image of a sample, with reversed columns and the labels of the mirrored scene.
 
-    A reflection turns every rotation about. For networks that are equivariant to rotations only it
-    is a new scene, of objects of other shapes.
+    Networks that are equivariant to rotations alone see it as a new scene with new shapes.
     """
     last = sample.image.shape[2] - 1
 
@@ -269,15 +267,14 @@ def augment(
 ) -> LabelledImage:
     """A sample after a random SE(2) motion of the scene that keeps both labels inside the image.
 
-    The motion is drawn again while a label is outside. A sample for which a hundred draws are not
-    enough stays where it is.
+    Motions are drawn until one does; after a hundred failed draws the sample is not moved.
 
     Args:
-        sample: what to augment.
+        sample: the sample.
         random: for all draws.
-        curvature: also draw curvatures (see `LabelledImage.curved_crop`), so that pick angles are
-            learned from bent objects as well: this is not in the paper.
-        reflection: reflect every other sample first: this is not in the paper.
+        curvature: also draw curvatures (see `LabelledImage.curved_crop`), to learn pick angles from
+            bent objects. Not in the paper.
+        reflection: reflect every other sample first. Not in the paper.
     """
     if reflection and random.random() < 0.5:
         sample = reflect(sample)

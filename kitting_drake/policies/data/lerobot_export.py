@@ -1,14 +1,14 @@
-"""Demonstrations as a LeRobotDataset v3.0, which LeRobot loads as it stands: see docs/learning.md.
+"""Demonstrations as a LeRobotDataset v3.0, which LeRobot loads without conversion.
 
-The format is that of https://huggingface.co/docs/lerobot/lerobot-dataset-v3 and of the module
-`lerobot.datasets`: Parquet files of frames (`data/`) and of episodes (`meta/episodes/`), tasks
-(`meta/tasks.parquet`), statistics (`meta/stats.json`) and features (`meta/info.json`). Parquet is
-written by pyarrow; neither LeRobot nor torch is needed here.
+See docs/learning.md, and https://huggingface.co/docs/lerobot/lerobot-dataset-v3 for the format:
+Parquet files of frames (`data/`) and of episodes (`meta/episodes/`), tasks (`meta/tasks.parquet`),
+statistics (`meta/stats.json`) and features (`meta/info.json`). The export needs pyarrow, but
+neither LeRobot nor torch.
 
-A demonstration is an episode, and a decision of it is a frame: one pick and one place, not a time
-step. Colours are PNG and heights are TIFF of float32, both inside the Parquet files, because a
-video would lose something of either. What LeRobot does not know of (grid, seeds, scenario,
-versions) is in `meta/kitting_drake.json`.
+A demonstration is an episode. A frame is a decision, one pick and one place, rather than a time
+step. Colours are PNG and heights are TIFF of float32, both inside the Parquet files, because video
+compression would be lossy. Metadata that LeRobot does not know (grid, seeds, scenario, versions) is
+in `meta/kitting_drake.json`.
 """
 
 from __future__ import annotations
@@ -44,34 +44,35 @@ from kitting_drake.policies.data.lerobot_statistics import aggregate, statistics
 from systems.signals import PixelGrid
 
 ACTION = ("pick_x", "pick_y", "pick_theta", "place_x", "place_y", "place_theta", "stop")
-"""The entries of an action, as the Gymnasium environments take it (`kitting_drake.gym.spaces`):
-poses of the gripper in the world, in metres and radians, and whether to stop instead (0 or 1)."""
+"""The entries of an action as in the Gymnasium environments (`kitting_drake.gym.spaces`): gripper
+poses in the world, in metres and radians, and whether to stop instead (0 or 1)."""
 
 COLOUR = "observation.images.colour"
 HEIGHT = "observation.images.height"
 
 Track = Callable[[Sequence[Demonstration]], Iterable[Demonstration]]
-"""Goes through demonstrations and shows how far it is, as `rich.progress.track` does."""
+"""Iterates over demonstrations and shows progress, as `rich.progress.track` does."""
 
 FPS = 1
-"""Decisions a second. It is nominal, for LeRobot wants one: `timestamp` counts decisions."""
+"""Decisions per second. It is nominal, because LeRobot requires a value: `timestamp` counts
+decisions."""
 
 _MEGABYTES = 100
-"""An episode that would make a file of frames larger begins a new one; LeRobot's own limit."""
+"""The largest size of a file of frames, LeRobot's default; the next episode begins a new file."""
 _FILES_PER_CHUNK = 1000
 _DATA = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
 _RECORD = Path("meta", "kitting_drake.json")
 
 
 def require_export(folder: Path) -> None:
-    """Tells before new demonstrations are made what would stop their export afterwards.
+    """Checks before new demonstrations are made that they can be exported.
 
     Raises:
         UserError: pyarrow is not installed, or the folder exists.
     """
     require_pyarrow()
     if folder.exists():
-        raise UserError(f"{folder} exists, without the new demonstrations: delete it")
+        raise UserError(f"{folder} exists and would lack the new demonstrations: delete it")
 
 
 def export_lerobot(
@@ -79,17 +80,17 @@ def export_lerobot(
 ) -> None:
     """Writes demonstrations as a LeRobotDataset, episode by episode, atomically.
 
-    A folder that holds this very export is left alone.
+    A folder that already holds this export is left unchanged.
 
     Args:
-        source: a file of demonstrations, of `collect` or of `demonstrate`.
-        folder: where to.
-        task: what LeRobot tells policies to do, in words; None: the name of the scenario's task.
-        track: goes through the demonstrations and shows how far it is.
+        source: a file of demonstrations, from `collect` or `demonstrate`.
+        folder: the new dataset.
+        task: the instruction to policies, in words; None for the name of the scenario's task.
+        track: shows progress over the demonstrations.
 
     Raises:
-        UserError: the demonstrations cannot be used, the folder is something else or cannot be
-            written to, or pyarrow is not installed.
+        UserError: the demonstrations are unusable, the folder holds something else or cannot be
+            written, or pyarrow is not installed.
     """
     pyarrow = require_pyarrow()
     read = read_demonstrations(source)
@@ -100,10 +101,10 @@ def export_lerobot(
     if folder.exists():
         if _found(folder / _RECORD) == record:
             return
-        raise UserError(f"{folder} exists, and is not of {source} as it is now: delete it")
+        raise UserError(f"{folder} exists but is not an export of the current {source}: delete it")
     scratch = folder.with_name(f".{folder.name}.scratch")
     try:
-        # What a killed process has left.
+        # Remove what a killed process left.
         shutil.rmtree(scratch, ignore_errors=True)
         (scratch / "meta").mkdir(parents=True)
         _write(pyarrow, scratch, read, task, track)
@@ -116,7 +117,7 @@ def export_lerobot(
 
 
 def features(grid: PixelGrid) -> dict[str, dict[str, Any]]:
-    """The `features` of `meta/info.json`, and so the columns of a frame."""
+    """The `features` of `meta/info.json`, which are the columns of a frame."""
     sides = ["height", "width", "channels"]
     scalars = {
         "object": "string",
@@ -128,8 +129,8 @@ def features(grid: PixelGrid) -> dict[str, dict[str, Any]]:
         "index": "int64",
         "task_index": "int64",
     }
-    # LeRobot takes a single channel of metric values for a depth map. These are heights above
-    # `grid.z_min`: the depth below an orthographic camera at `grid.z_max` is what they lack of it.
+    # LeRobot treats a single channel of metric values as a depth map. These are heights above
+    # `grid.z_min`, not depths below a camera.
     height = {"is_depth_map": True, "depth_unit": "m"}
     return {
         COLOUR: {"dtype": "image", "shape": [*grid.shape, 3], "names": sides},
@@ -144,7 +145,7 @@ def require_pyarrow() -> ModuleType:
 
 
 def _task(origin: Origin) -> str:
-    """`stack block pyramid` for the task `!StackBlockPyramid`."""
+    """The task's name in words: `stack block pyramid` for `!StackBlockPyramid`."""
     task = origin.scenario.get("task", origin.scenario_name)
     name = str(task["_tag"] if isinstance(task, dict) else task)
     return re.sub(r"(?<=[a-z])(?=[A-Z])", " ", name.lstrip("!")).lower()
@@ -229,7 +230,7 @@ def _write(
 
 
 def _write_tasks(pyarrow: ModuleType, path: Path, task: str) -> None:
-    """LeRobot finds a task by the index of a pandas table, which the metadata tell of."""
+    """Writes the tasks as a pandas table, which LeRobot indexes by task."""
     table = pyarrow.table({"task_index": pyarrow.array([0], pyarrow.int64()), "task": [task]})
     column = {"metadata": None, "pandas_type": "int64", "numpy_type": "int64"}
     text = {"metadata": None, "pandas_type": "unicode", "numpy_type": "object"}
@@ -249,14 +250,14 @@ def _write_tasks(pyarrow: ModuleType, path: Path, task: str) -> None:
 
 
 def _columns(demonstration: Demonstration, number: int, first: int) -> dict[str, Any]:
-    """An episode's frames by feature: a frame for each step, and one for the final observation.
+    """An episode's frames by feature: one per step, and one for the final observation.
 
-    Where the final observation is labelled stop, the poses mean nothing. They are those of the last
-    step then, so that the statistics are of true poses.
+    The final frame is labelled stop and repeats the last step's poses, which keeps placeholders out
+    of the statistics.
 
     Args:
-        demonstration: the episode; steps without a final observation end without a stop.
-        number: its index.
+        demonstration: the episode; without a final observation it has no stop frame.
+        number: the episode's index.
         first: the index of its first frame.
     """
     steps, final = demonstration.steps, demonstration.final
@@ -284,14 +285,14 @@ def _columns(demonstration: Demonstration, number: int, first: int) -> dict[str,
 
 
 class _DataFiles:
-    """The files of `data/`: an episode is a row group of one of them."""
+    """The files of `data/`, with one row group per episode."""
 
     def __init__(self, pyarrow: ModuleType, folder: Path, described: dict[str, Any]) -> None:
         self._pyarrow = pyarrow
         self._folder = folder
         self._described = described
         kinds = {name: self._type(feature) for name, feature in described.items()}
-        # The package datasets asks the schema what is an image, where nobody tells it.
+        # The package datasets recognizes image columns by the schema's metadata.
         named = {name: _hugging_face(feature) for name, feature in described.items()}
         metadata = {"huggingface": json.dumps({"info": {"features": named}})}
         self._schema = pyarrow.schema(kinds, metadata=metadata)
@@ -301,7 +302,7 @@ class _DataFiles:
         self._bytes = 0
 
     def write(self, columns: dict[str, Any]) -> tuple[int, int]:
-        """Writes an episode; returns the chunk and the file that it is in."""
+        """Writes an episode and returns its chunk and file numbers."""
         values = {name: self._encoded(name, columns[name]) for name in self._described}
         table = self._pyarrow.table(values, schema=self._schema)
         if not self._writer or self._bytes + table.nbytes > _MEGABYTES * 2**20:
@@ -311,7 +312,7 @@ class _DataFiles:
         return self._place
 
     def close(self) -> None:
-        """Ends the file that is being written."""
+        """Closes the current file."""
         if self._writer:
             self._writer.close()
 
@@ -352,7 +353,7 @@ def _tiff(image: NDArray[np.float32]) -> bytes:
 
 
 def _hugging_face(feature: dict[str, Any]) -> dict[str, Any]:
-    """A feature in the words of the package datasets."""
+    """A feature in the format of the package datasets."""
     if feature["dtype"] == "image":
         return {"_type": "Image"}
     value = {"dtype": feature["dtype"], "_type": "Value"}

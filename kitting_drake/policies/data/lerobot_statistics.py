@@ -1,6 +1,6 @@
-"""The statistics of a LeRobotDataset, by which LeRobot normalises: see `lerobot_export`.
+"""The normalisation statistics of a LeRobotDataset (see `lerobot_export`).
 
-They are those of `lerobot.datasets.compute_stats`, of every pixel and not of some.
+They equal those of `lerobot.datasets.compute_stats`, but use every pixel instead of a subset.
 """
 
 from __future__ import annotations
@@ -15,11 +15,12 @@ QUANTILES = {"q01": 0.01, "q10": 0.1, "q50": 0.5, "q90": 0.9, "q99": 0.99}
 
 
 def statistics_of(values: NDArray[Any], *, image: bool) -> dict[str, NDArray[Any]]:
-    """LeRobot's statistics of a feature in an episode: over frames, and over pixels of an image.
+    """LeRobot's statistics of a feature over the frames, and pixels, of an episode.
 
     Args:
         values: (frames,), (frames, entries) or (frames, rows, cols, channels).
-        image: whether it is an image: (channels, 1, 1) a statistic, and 8 bits are [0, 1].
+        image: whether it is an image. Its statistics have the shape (channels, 1, 1), and 8-bit
+            values are scaled to [0, 1].
     """
     flat = values.reshape(-1, values.shape[-1] if values.ndim > 1 else 1)
     samples = flat.astype(np.float64) / (255 if image and values.dtype == np.uint8 else 1)
@@ -36,8 +37,8 @@ def statistics_of(values: NDArray[Any], *, image: bool) -> dict[str, NDArray[Any
 
 
 def aggregate(episodes: Sequence[dict[str, NDArray[Any]]]) -> dict[str, Any]:
-    """Those of all episodes, as LeRobot's `aggregate_stats` has them: a quantile is the mean of
-    the episodes' quantiles."""
+    """The statistics of all episodes, as by LeRobot's `aggregate_stats`: a quantile is the mean of
+    the episodes' quantiles, weighted by their frames."""
     counts = np.array([item["count"][0] for item in episodes])
     stacked = {name: np.stack([item[name] for item in episodes]) for name in episodes[0]}
 

@@ -1,4 +1,4 @@
-"""Recorded episodes: their observations, whose images may stay in a file, and actions."""
+"""Recorded episodes: actions and observations, whose images may stay in a file."""
 
 from __future__ import annotations
 
@@ -15,24 +15,24 @@ from systems.signals import Observation, PickPlaceAction, PlanarPose
 
 @dataclass(frozen=True)
 class Stored:
-    """An array that stays in its file and is read whenever NumPy asks for it.
+    """An array in a file, read whenever NumPy asks for it.
 
-    The file stays open meanwhile, so that nothing changes when another one takes its place.
+    The file stays open, so replacing it does not affect the array.
     """
 
     file: h5py.File
     dataset: str
-    """The name of a dataset. An open dataset would keep what was read of it in memory."""
+    """The name of a dataset. An open dataset would cache what was read in memory."""
     shape: tuple[int, ...]
     """The array's shape."""
     dtype: np.dtype[Any]
     """The type of its entries."""
     row: int | None = None
-    """The row of the dataset that is meant; None: the whole dataset."""
+    """The row of the dataset; None for the whole dataset."""
 
     @classmethod
     def of(cls, dataset: h5py.Dataset, row: int | None = None) -> Stored:
-        """A dataset, or a row of it."""
+        """A dataset or a row of it."""
         shape = dataset.shape if row is None else dataset.shape[1:]
         return cls(dataset.file, dataset.name, shape, dataset.dtype, row)
 
@@ -40,18 +40,18 @@ class Stored:
         """The array, read from the file.
 
         Raises:
-            UserError: the file cannot be read any more.
+            UserError: the file can no longer be read.
         """
         try:
             values = self.file[self.dataset][() if self.row is None else self.row]
         except (OSError, LookupError, RuntimeError) as error:
-            raise UserError(f"cannot read {self.dataset} again: {error}") from error
+            raise UserError(f"cannot reread {self.dataset} of its file: {error}") from error
         return np.asarray(values, dtype)
 
 
 @dataclass(frozen=True)
 class Recorded:
-    """An observation as the file holds it, with colours in 8 bits: in memory, or in the file."""
+    """An observation with 8-bit colours, in memory or in a file."""
 
     rgb: NDArray[np.uint8] | Stored
     """(3, rows, cols)."""
@@ -60,8 +60,8 @@ class Recorded:
 
     @property
     def image(self) -> NDArray[np.float32]:
-        """(4, rows, cols), as `Observation.image`: colours in [0, 1], height in metres; made, and
-        read where it is stored, each time."""
+        """(4, rows, cols), as `Observation.image`: colours in [0, 1], height in metres. Computed at
+        each access."""
         image = np.empty((4, *self.height.shape), np.float32)
         np.divide(np.asarray(self.rgb), 255, out=image[:3], dtype=np.float32)
         image[3] = np.asarray(self.height)
@@ -70,20 +70,20 @@ class Recorded:
 
 @dataclass(frozen=True)
 class DemonstrationStep(Recorded):
-    """One observation, and what the expert did."""
+    """One observation and the expert's action."""
 
     pick: PlanarPose
     place: PlanarPose
     object: str
-    """The name of what is picked."""
+    """The name of the picked object."""
     category: str = ""
-    """Its category, where the task has categories."""
+    """Its category, if the task has categories."""
 
     @staticmethod
     def of(
         observation: Observation, action: PickPlaceAction, *, name: str, category: str = ""
     ) -> DemonstrationStep:
-        """A step as it happened; colours are rounded to 8 bits."""
+        """A step of an episode, with colours rounded to 8 bits."""
         seen = record(observation)
         return DemonstrationStep(seen.rgb, seen.height, action.pick, action.place, name, category)
 
@@ -94,7 +94,7 @@ class FinalObservation(Recorded):
 
     @staticmethod
     def of(observation: Observation) -> FinalObservation:
-        """The observation; colours are rounded to 8 bits."""
+        """The observation, with colours rounded to 8 bits."""
         seen = record(observation)
         return FinalObservation(seen.rgb, seen.height)
 

@@ -1,4 +1,4 @@
-"""Training samples: the labels that demonstrations give each of their observations."""
+"""Training samples: labelled observations of demonstrations."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ from systems.signals import Observation, PickPlaceAction, PixelGrid, fill_unseen
 
 @dataclass(frozen=True)
 class HeightsOnly:
-    """A recorded observation as networks that see heights alone are shown it."""
+    """A recorded observation as the input of networks that see heights alone."""
 
     recorded: Pictured
 
     @property
     def image(self) -> Image:
-        """(4, rows, cols): black, and what no camera saw filled in; made anew each time."""
+        """(4, rows, cols): black, with unseen heights filled in. Computed at each access."""
         image = self.recorded.image
         image[3] = fill_unseen(image[3], np.any(image, axis=0))
         image[:3] = 0
@@ -34,8 +34,8 @@ def observed(image: Image, grid: PixelGrid) -> Observation:
     """The observation of a recorded image.
 
     Args:
-        image: (4, rows, cols). Where it is black, what was unseen has been filled in.
-        grid: its pixels.
+        image: (4, rows, cols). In an all-black image unseen pixels have been filled in.
+        grid: of the image.
     """
     valid = None if image[:3].any() else np.ones(image.shape[1:], bool)
     return Observation(image, grid, valid)  # type: ignore[arg-type]
@@ -43,21 +43,21 @@ def observed(image: Image, grid: PixelGrid) -> Observation:
 
 @dataclass(frozen=True)
 class ObservedScene:
-    """One observation, and the actions that an expert may take next."""
+    """One observation and the actions that the expert may take next."""
 
     recorded: Pictured
     actions: tuple[PickPlaceAction, ...]
-    """First the one that the expert took."""
+    """The expert's own action comes first."""
     grid: PixelGrid
 
     @property
     def observation(self) -> Observation:
-        """The observation; made anew each time."""
+        """The observation; computed at each access."""
         return observed(self.recorded.image, self.grid)
 
     @property
     def targets(self) -> tuple[LabelledImage, ...]:
-        """A label for each of the actions; the image is made anew each time, once for all."""
+        """A label for each action. All share one image, which is computed at each access."""
         image = self.recorded.image
         return tuple(LabelledImage.from_action(image, action, self.grid) for action in self.actions)
 
@@ -65,13 +65,13 @@ class ObservedScene:
 def scenes(
     demonstrations: Iterable[Demonstration], grid: PixelGrid, *, later_picks_possible: bool
 ) -> list[ObservedScene]:
-    """Every observation of some demonstrations in which there is something to pick.
+    """Every observation of some demonstrations with something to pick.
 
     Args:
         demonstrations: of an expert.
         grid: of their observations.
-        later_picks_possible: see `Learning`: an object that is picked later lies where it lay, so
-            that the expert's later actions are possible at once.
+        later_picks_possible: whether the expert's later actions are already possible (see
+            `Learning`).
     """
     result = []
     for demonstration in demonstrations:
@@ -83,25 +83,25 @@ def scenes(
 
 
 def final_observations(demonstrations: Iterable[Demonstration]) -> list[FinalObservation]:
-    """The observations of some demonstrations in which there is nothing left to pick."""
+    """The observations of some demonstrations with nothing left to pick."""
     return [item.final for item in demonstrations if item.final is not None]
 
 
 def labelled_images(
     observed: Iterable[ObservedScene], *, taken_only: bool
 ) -> Sequence[LabelledImage]:
-    """The samples to learn from; their images are made when a sample is asked for.
+    """The training samples; their images are made on demand.
 
     Args:
         observed: the observations.
-        taken_only: as in the paper, one sample for each observation, of the action that the expert
-            took; otherwise one for each possible action, which knows of the others.
+        taken_only: one sample for each observation, of the expert's own action, as in the paper.
+            Otherwise one for each possible action, with the others as `other_picks`.
     """
     return _Samples(list(observed), taken_only)
 
 
 class _Samples(Sequence[LabelledImage]):
-    """Samples that are made of their observations when they are asked for."""
+    """Samples made from their observations on demand."""
 
     def __init__(self, observed: list[ObservedScene], taken_only: bool) -> None:
         self._observed, self._taken_only = observed, taken_only

@@ -1,15 +1,16 @@
-"""Static scenes as a file, and as samples to learn from (see `static_scenes.drawing`).
+"""Static scenes as a file and as training samples (see `static_scenes.drawing`).
 
 The file is HDF5, with the attributes `format`, `format_version`, `first_seed` and, as JSON, `grid`
 and `versions`, and these datasets for n scenes with m actions in all:
 
-- `height` (n, rows, cols), uint16, steps of 0.1 mm above `grid.z_min`: o_t, with what no camera saw
+- `height` (n, rows, cols), uint16, steps of 0.1 mm above `grid.z_min`: o_t, with unseen pixels
   filled in (`fill_unseen`);
 - `actions` (m, 8): number of the object, cost of the grasp, pick x, y, theta, place x, y, theta, in
   metres and radians;
-- `first` (n + 1,): scene i has the actions `first[i]` to `first[i + 1]`; one without any is final;
-- `batch_ends` (b,): how many scenes there are up to the end of each batch. The scenes of a batch
-  share their tools, and those of different batches nothing. Older files lack it.
+- `first` (n + 1,): scene i has the actions `first[i]` to `first[i + 1]`; a scene without actions is
+  final;
+- `batch_ends` (b,): the number of scenes up to the end of each batch. Scenes share tools only
+  within a batch. Older files lack this dataset.
 """
 
 from __future__ import annotations
@@ -33,7 +34,7 @@ from kitting_drake.policies.data.images import LabelledImage
 from systems.signals import Observation, PixelGrid, fill_unseen
 
 STATIC = "static scenes"
-"""The name of the scenario in the card of weights that learned from static scenes."""
+"""The scenario name in the card of weights trained on static scenes."""
 
 FORMAT = "kitting_drake static scenes"
 FORMAT_VERSION = 1
@@ -43,14 +44,14 @@ _STEP = 1e-4
 _TEMPERATURE = 0.6
 """A grasp is drawn with a probability proportional to exp(-cost / temperature)."""
 _HEIGHT_SHIFT = 0.002
-"""Standard deviation of the shift of all heights of a sample, in metres."""
+"""The standard deviation of a sample's common height shift, in metres."""
 _DRAWS = 64
-"""How many draws of grasps there are of each scene."""
+"""The number of samples per scene, each with its own random grasps."""
 
 
 @dataclass(frozen=True)
 class StaticScene:
-    """One scene, seen once."""
+    """One observed scene."""
 
     height: NDArray[np.uint16]
     """(rows, cols), in steps of 0.1 mm."""
@@ -59,7 +60,7 @@ class StaticScene:
 
     @classmethod
     def of(cls, observation: Observation, actions: NDArray[np.float64]) -> StaticScene:
-        """A scene as it was observed, and the actions that it allows."""
+        """An observed scene and its possible actions."""
         filled = fill_unseen(observation.height, observation.valid)
         steps = np.clip(np.rint(filled / _STEP), 0, 65535)
         return cls(steps.astype(np.uint16), actions)
@@ -72,7 +73,7 @@ class StaticScene:
         return image
 
     def label(self, image: NDArray[np.float32], row: int, grid: PixelGrid) -> LabelledImage:
-        """The labels of one of its actions."""
+        """The labels of one action."""
         _, _, x, y, theta, place_x, place_y, place_theta = self.actions[row]
         return LabelledImage(
             image=image,
@@ -85,20 +86,20 @@ class StaticScene:
 
 @dataclass(frozen=True)
 class StaticScenes:
-    """The content of a file."""
+    """The contents of a file."""
 
     grid: PixelGrid
     scenes: tuple[StaticScene, ...]
     first_seed: int = 0
     versions: dict[str, Any] = dataclasses.field(default_factory=dict)
     batch_ends: tuple[int, ...] = ()
-    """They are as in the file; where none is given, the scenes are one batch."""
+    """As in the file; by default all scenes are one batch."""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "batch_ends", self.batch_ends or (len(self.scenes),))
 
     def part(self, first: int, last: int) -> StaticScenes:
-        """Some of the scenes."""
+        """The scenes from `first` up to `last`."""
         scenes = self.scenes[first:last]
         inside = (end - first for end in self.batch_ends if first < end < first + len(scenes))
         return dataclasses.replace(self, scenes=scenes, batch_ends=(*inside, len(scenes)))
@@ -116,10 +117,10 @@ def write_static_scenes(path: Path, content: StaticScenes) -> None:
     """Writes a file atomically.
 
     Raises:
-        MachineError: it cannot be written.
+        MachineError: the file cannot be written.
     """
     counts = [len(scene.actions) for scene in content.scenes]
-    # In memory: HDF5 crashes where a disk is full.
+    # Build the file in memory, because HDF5 crashes when the disk is full.
     data = io.BytesIO()
     with h5py.File(data, "w") as file:
         file.attrs["format"], file.attrs["format_version"] = FORMAT, FORMAT_VERSION
@@ -128,7 +129,7 @@ def write_static_scenes(path: Path, content: StaticScenes) -> None:
         file.attrs["versions"] = json.dumps(content.versions)
         heights = np.array([scene.height for scene in content.scenes], np.uint16)
         heights = heights.reshape(-1, *content.grid.shape)
-        # Of no scenes there are no chunks.
+        # HDF5 does not chunk an empty dataset.
         packed: dict[str, Any] = {"chunks": (1, *content.grid.shape), "compression": "gzip"}
         file.create_dataset("height", data=heights, **(packed if len(heights) else {}))
         file["actions"] = np.concatenate([np.zeros((0, 8)), *(s.actions for s in content.scenes)])
@@ -147,17 +148,17 @@ def is_static_scenes(path: Path) -> bool:
 
 
 def read_static_scenes(path: Path) -> StaticScenes:
-    """Reads a file.
+    """Reads a file of static scenes.
 
     Raises:
-        UserError: it cannot be read, or is none of ours.
+        UserError: the file is unreadable or not a file of static scenes.
     """
     try:
         with h5py.File(path) as file:
             if file.attrs.get("format") != FORMAT:
-                raise UserError(f"{path} holds no static scenes")
+                raise UserError(f"{path} is not a file of static scenes")
             if file.attrs["format_version"] != FORMAT_VERSION:
-                raise UserError(f"{path} is of another version: draw the scenes again")
+                raise UserError(f"{path} has another format version: draw the scenes again")
             grid = PixelGrid(**json.loads(file.attrs["grid"]))
             heights, actions, first = (file[key][()] for key in ("height", "actions", "first"))
             _check(heights, actions, first, grid)
@@ -169,34 +170,34 @@ def read_static_scenes(path: Path) -> StaticScenes:
             ends = file["batch_ends"][()] if "batch_ends" in file else np.array([len(scenes)])
             _check_batches(ends, len(scenes))
     except (OSError, LookupError, ValueError, TypeError, AttributeError, RuntimeError) as error:
-        # h5py has all of these for bytes that make no sense.
+        # h5py may raise any of these for damaged bytes.
         raise UserError(f"cannot read {path}: {error}") from error
     return StaticScenes(grid, scenes, seed, versions, tuple(ends.tolist()))
 
 
 def _check(heights: NDArray, actions: NDArray, first: NDArray, grid: PixelGrid) -> None:
-    """Raises ValueError for what cannot be the content of a file."""
+    """Raises ValueError for contents that are inconsistent."""
     if heights.shape[1:] != grid.shape or heights.dtype != np.uint16:
-        raise ValueError(f"its heights are {heights.dtype} of the shape {heights.shape}")
+        raise ValueError(f"its heights have the wrong shape {heights.shape} or type")
     if actions.ndim != 2 or actions.shape[1] != 8 or not np.isfinite(actions).all():
-        raise ValueError(f"its actions, of the shape {actions.shape}, are not 8 numbers each")
+        raise ValueError(f"its actions must be rows of 8 numbers, not {actions.shape}")
     bounds = first.shape == (len(heights) + 1,) and first.dtype.kind in "iu"
     if not bounds or first[0] != 0 or first[-1] != len(actions) or (np.diff(first) < 0).any():
-        raise ValueError("it does not tell which actions are whose")
+        raise ValueError("`first` does not divide the actions among the scenes")
 
 
 def _check_batches(ends: NDArray, count: int) -> None:
-    """Raises ValueError for what cannot be the ends of the batches of so many scenes."""
+    """Raises ValueError unless `ends` divides the scenes into batches."""
     whole = ends.ndim == 1 and ends.dtype.kind in "iu" and len(ends) > 0
     if not whole or ends[-1] != count or (np.diff(ends) <= 0).any():
-        raise ValueError("it does not tell which scenes are of one batch")
+        raise ValueError("`batch_ends` does not divide the scenes into batches")
 
 
 class StaticSamples(Sequence[LabelledImage]):
-    """Samples that are drawn from static scenes when they are asked for.
+    """Samples drawn from static scenes on demand.
 
-    A sample has one grasp of each loose object, drawn by its cost: over many samples a network
-    learns the distribution over all that would hold.
+    A sample has one grasp of each loose object, drawn by its cost. Over many samples a network
+    learns the distribution of all feasible grasps.
     """
 
     def __init__(self, content: StaticScenes) -> None:

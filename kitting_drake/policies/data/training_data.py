@@ -1,4 +1,4 @@
-"""The data of a training run, or of its validation: demonstrations, or static scenes."""
+"""The data of a training run or its validation: demonstrations or static scenes."""
 
 from __future__ import annotations
 
@@ -39,12 +39,12 @@ from systems.signals import PickPlaceAction, PixelGrid, PlanarPose
 Item = TypeVar("Item")
 
 _TABLE = ("task", "heightmap")
-"""The fields of a scenario that determine, with the seed, what stands where."""
+"""The scenario fields that, with the seed, determine the scene."""
 _NO_SCENE = (
     *("tries", "random_order", "distractors"),
     *("success_threshold", "position_threshold", "angle_threshold_deg"),
 )
-"""Fields of a task that change nothing about that, or nothing but what lies about beside it."""
+"""Task fields that do not affect the scene, except for distractors."""
 
 
 @dataclass(frozen=True)
@@ -53,48 +53,48 @@ class TrainingData:
 
     scenario: str
     origin: dict[str, Any]
-    """The scenario's fields, as JSON has them."""
+    """The scenario's fields as JSON values."""
     grid: PixelGrid
     learning: Learning
     colour: bool
-    """Whether there are colours to learn from."""
+    """Whether the images have colours."""
     seeds: tuple[int, ...]
     """The seeds of the demonstrations, or the first seed of static scenes."""
     items: tuple[Demonstration, ...] | StaticScenes
     made_by: dict[str, str]
-    """The versions that made them and a digest of the content, which distinguish data of the same
-    seeds."""
+    """The versions that made the data and a digest of its content. They distinguish data with the
+    same seeds."""
 
     @property
     def count(self) -> int:
-        """How many demonstrations, or static scenes."""
+        """The number of demonstrations or static scenes."""
         return len(self.items.scenes if isinstance(self.items, StaticScenes) else self.items)
 
     @property
     def kind(self) -> str:
-        """Its items' name, for people."""
+        """The name of its items, for messages."""
         return "scenes" if isinstance(self.items, StaticScenes) else "demonstrations"
 
     @property
     def has_taken(self) -> bool:
-        """Whether it is told what was picked, not only what could be."""
+        """Whether the data record the expert's own picks rather than only possible ones."""
         return not isinstance(self.items, StaticScenes)
 
     @property
     def made(self) -> str:
-        """The command by which one gets some, for people."""
+        """The name of the command that makes such data, for messages."""
         return "draw" if isinstance(self.items, StaticScenes) else "collect"
 
     @property
     def unrelated(self) -> tuple[int, ...]:
-        """After how many of them they may be cut in two, so that neither side shows what the other
-        one does: static scenes of one batch share their tools, demonstrations nothing."""
+        """The numbers of items after which the data can be split without shared scenes: static
+        scenes share tools within a batch, demonstrations are independent."""
         if isinstance(self.items, StaticScenes):
             return self.items.batch_ends
         return tuple(range(1, self.count + 1))
 
     def part(self, first: int, last: int) -> TrainingData:
-        """Some of them."""
+        """The items from `first` up to `last`."""
         if isinstance(self.items, StaticScenes):
             return dataclasses.replace(self, items=self.items.part(first, last))
         items = self.items[first:last]
@@ -106,10 +106,10 @@ class TrainingData:
         )
 
     def scenes(self, most: int | None = None) -> list[ObservedScene]:
-        """The observations in which there is something to pick.
+        """The observations with something to pick.
 
         Args:
-            most: evenly chosen ones if there are more than this.
+            most: the largest number of observations, chosen evenly; None for all.
         """
         if not isinstance(self.items, StaticScenes):
             possible = self.learning.later_picks_possible
@@ -126,8 +126,8 @@ class TrainingData:
         return result
 
     def finals(self, most: int | None = None, *, colour: bool = True) -> Sequence[Pictured]:
-        """The observations in which there is nothing left to pick; `most` as for `scenes`, `colour`
-        as for `samples`."""
+        """The observations with nothing left to pick. The arguments are those of `scenes` and
+        `samples`."""
         if not isinstance(self.items, StaticScenes):
             found = evenly_chosen(final_observations(self.items), most)
             return found if colour else [HeightsOnly(final) for final in found]
@@ -135,12 +135,12 @@ class TrainingData:
         return [_recorded(FinalObservation, item.image) for item in evenly_chosen(seated, most)]
 
     def samples(self, *, taken_only: bool, colour: bool = True) -> Sequence[LabelledImage]:
-        """The samples to learn from, of the observations in which there is something to pick.
+        """The training samples, of the observations with something to pick.
 
         Args:
             taken_only: see `labelled_images`.
-            colour: whether the networks see colours. If not, they learn from what they will be
-                shown: what no camera saw is filled in.
+            colour: whether the networks see colours. If not, unseen pixels are filled in, as at
+                inference.
         """
         if isinstance(self.items, StaticScenes):
             return StaticSamples(self.items)
@@ -152,14 +152,15 @@ class TrainingData:
         return labelled_images(found, taken_only=taken_only)
 
     def shares_scenes(self, other: TrainingData) -> int | None:
-        """A seed of which both hold the same scene; None if there is none."""
+        """A seed for which both hold the same scene; None if there is none."""
         shared = set(self.seeds) & set(other.seeds)
         same = all(_alike(self.origin.get(key), other.origin.get(key)) for key in _TABLE)
         return min(shared) if shared and same else None
 
 
 def _alike(one: Any, other: Any) -> bool:
-    """Whether scenes may be the same by these fields; older files lack some, which says nothing."""
+    """Whether two values of a scenario field allow the same scenes. Fields that one of them lacks,
+    as older files do, are ignored."""
     if not isinstance(one, Mapping) or not isinstance(other, Mapping):
         return bool(one == other)
     both = (one.keys() & other.keys()) - {*_NO_SCENE}
@@ -167,7 +168,7 @@ def _alike(one: Any, other: Any) -> bool:
 
 
 def evenly_chosen(items: list[Item], most: int | None) -> list[Item]:
-    """All of them, or evenly chosen ones if there are more than `most`."""
+    """At most `most` items, chosen evenly; None for all."""
     count = len(items) if most is None else min(len(items), most)
     return [items[i * len(items) // count] for i in range(count)]
 
@@ -180,7 +181,7 @@ def read_training_data(path: Path) -> TrainingData:
     """Reads a file of demonstrations or of static scenes.
 
     Raises:
-        UserError: it is neither, cannot be read, or is empty.
+        UserError: the file is neither, unreadable or empty.
     """
     if is_static_scenes(path):
         content = read_static_scenes(path)
@@ -197,12 +198,12 @@ def read_training_data(path: Path) -> TrainingData:
     else:
         demonstrations: Demonstrations = read_demonstrations(path)
         origin = demonstrations.origin
-        # On a bench the grid begins at the table, wherever that is.
+        # A scenario's grid may start below the table; a bench's starts at the table.
         z_min = (origin.scenario.get("heightmap") or {}).get("z_min", 0.0)
         if z_min != 0:
             raise UserError(
-                f"{path} was collected with heightmap.z_min {z_min:g}, and networks learn from "
-                "heights above the table: collect with 0"
+                f"{path} was collected with heightmap.z_min {z_min:g}, but training needs heights "
+                "above the table: collect with z_min 0"
             )
         data = TrainingData(
             scenario=origin.scenario_name,

@@ -1,7 +1,7 @@
-"""Grasps of an object that o_t allows: the jaws open, come down, close and find faces.
+"""Grasps of an object for which o_t leaves the jaws room.
 
-At each place and angle the heights along the jaws' way are read off o_t. What rises above the
-fingertips is in the way of a finger, or it is what is gripped; the grasp is centred between its
+For each place and angle the heights along the jaws' path are sampled from o_t. Anything above the
+fingertips is either the gripped object or an obstacle. The grasp is centred between the object's
 faces, as closing jaws would centre it.
 """
 
@@ -22,26 +22,26 @@ from systems.pick_place_parameters import PickPlaceParameters
 Array = NDArray[np.float64]
 
 RETRY_DISTANCE = 0.010
-"""A grasp is not tried again this near to where one failed, in metres."""
+"""A grasp is not retried within this distance of a failed one, in metres."""
 _ANGLES = 36
 _MOST_PLACES = 80
 _REACH = 0.055
-"""Grasps are looked for this near to the object's middle, in metres."""
+"""Grasps are sought within this distance of the object's centre, in metres."""
 _STEP = 0.0015
-"""Between samples across the jaws, in metres."""
+"""The distance between samples across the jaws, in metres."""
 _LINES = 5
-"""Lines of samples along the pads' length."""
+"""The number of sampled lines along the pads' length."""
 _ROOM = 0.010
-"""What is gripped is at least this much narrower than the open jaws, so that the fingers can come
-down on either side, in metres."""
+"""The gripped part is at least this much narrower than the open jaws, in metres, to let the fingers
+come down on either side."""
 _NARROWEST = 0.003
-"""The least width that is worth a grasp, in metres."""
+"""The least width of a grasp, in metres."""
 _LOWEST = 0.003
-"""Anything that rises by less than this above its support is no obstacle, in metres."""
+"""Anything lower than this above its support is no obstacle, in metres."""
 _FINGER_MARGIN = 0.003
-"""Space left beyond the fingers of the open jaws, in metres."""
+"""The clearance kept outside the fingers of the open jaws, in metres."""
 _STRAIGHT = 0.003
-"""A face that stands back by less than this along the pads touches them, in metres."""
+"""A face recessed by less than this along the pads touches them, in metres."""
 
 
 @dataclass(frozen=True)
@@ -51,17 +51,17 @@ class JawGrasp:
     pixel: Array
     """(row, col), midway between the faces."""
     theta: float
-    """The angle of the gripper, in radians; adding pi gives the same grasp."""
+    """The gripper's angle in radians; adding pi gives the same grasp."""
     cost: float
-    """How far from the middle it is and how crooked its faces are; without a unit, 0 is best."""
+    """A dimensionless penalty for distance from the centre and for crooked faces; 0 is best."""
 
 
 def untried(grasps: Sequence[JawGrasp], failed: Array, resolution: float) -> list[JawGrasp]:
-    """The grasps that are not where one failed before.
+    """The grasps farther than `RETRY_DISTANCE` from every failed one.
 
     Args:
-        grasps: some.
-        failed: (n, 2), the (row, col) of where grasps failed.
+        grasps: candidates.
+        failed: (n, 2), the (row, col) of the failed grasps.
         resolution: of a pixel, in metres.
     """
     return [
@@ -80,14 +80,14 @@ def jaw_grasps(
     *,
     support: float = 0.0,
 ) -> list[JawGrasp]:
-    """The grasps of an object, the best first; empty if there is none.
+    """The grasps of an object, best first; empty if there is none.
 
     Args:
         segmentation: of the observation.
-        region: what is to be gripped.
+        region: the object.
         resolution: of a pixel, in metres.
         planner: how deep the fingertips go, and how wide the jaws open.
-        support: height above the table of what the object stands on, in metres.
+        support: height of the object's support above the table, in metres.
     """
     relief = segmentation.relief
     pixels = region.pixels
@@ -106,7 +106,7 @@ def jaw_grasps(
     found = grip(places[place.astype(int)], theta.astype(float))
     if not found:
         return []
-    # The best at the angle at which its faces are parallel to the pads.
+    # Refine the best angle, to align the faces with the pads.
     best = found[0]
     nearby = best.theta + np.radians(np.linspace(-4, 4, 9))
     refined = grip(np.repeat(best.pixel[None], len(nearby), axis=0), nearby)
@@ -114,13 +114,14 @@ def jaw_grasps(
 
 
 def tip_height(top: Array, support: float, planner: PickPlaceParameters) -> Array:
-    """Where the fingertips go, in metres above the table: as `motion_heights` has it, but not down
-    to the support itself.
+    """The height of the fingertips above the table, in metres.
+
+    It follows `motion_heights`, but stays clear of the support.
 
     Args:
         top: of the object, in metres above the table.
-        support: of what the object stands on, in metres above the table.
-        planner: how deep they go, and how far they stay above the table.
+        support: of the object's support, in metres above the table.
+        planner: the depth of the fingertips and their clearance above the table.
     """
     share = planner.grasp_depth_share * (top - support)
     depth = np.maximum(planner.grasp_depth, np.minimum(share, planner.max_grasp_depth))
@@ -136,7 +137,7 @@ def _grip(
     planner: PickPlaceParameters,
     support: float,
 ) -> list[JawGrasp]:
-    """The grasps among places (n, 2) and angles (n,) that the jaws can take."""
+    """The feasible grasps among places (n, 2) and angles (n,)."""
     raised = ndimage.maximum_filter(relief, 3)
     top = raised[tuple(np.rint(places).astype(int).T)].astype(float)
     tip = tip_height(top, support, planner)
@@ -174,7 +175,7 @@ def _grip(
     if not fits.any():
         return []
 
-    # How straight the faces are along the pads: each line's own run about the middle.
+    # How straight the faces are along the pads, from each line's own run about the centre.
     inside = occupied & own[:, None, :]
     low = np.where(inside.any(axis=2), s[inside.argmax(axis=2)], np.nan)
     high = np.where(inside.any(axis=2), s[len(s) - 1 - inside[:, :, ::-1].argmax(axis=2)], np.nan)
@@ -201,13 +202,13 @@ def _grip(
 
 
 def _run(occupied: NDArray[np.bool_]) -> NDArray[np.intp]:
-    """(n,) the index of the last of the leading True values of each row."""
+    """(n,): the index of the last of the leading True values of each row."""
     free = ~occupied
     ends = free.argmax(axis=1)
     return np.where(free.any(axis=1), ends - 1, occupied.shape[1] - 1)
 
 
 def _slope(u: Array, values: Array) -> Array:
-    """(n,) the least-squares slopes of values (n, lines) over u (lines,); nan where one is."""
+    """(n,): the least-squares slopes of values (n, lines) over u (lines,); NaN propagates."""
     centred = u - u.mean()
     return (values * centred).sum(axis=1) / (centred**2).sum()

@@ -1,8 +1,8 @@
-"""The outcome of the last action, as the next o_t shows it, and how to recover from it.
+"""Recovery from a failed insertion, seen in the next o_t.
 
-An object that stands out of the fixture is not seated. Where it stands out by little, it is pressed
-down once; where it stands out by more, or pressing did not help, it is taken out and laid on the
-table, from where it is tried again. Geometry alone, by height: not in the paper.
+An object that protrudes from the fixture is not seated. If it protrudes a little, it is pressed
+down once. If it protrudes more, or pressing did not help, it is taken out and laid on the table to
+be tried again. This uses heights alone and is not in the paper.
 """
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ from systems.signals import Observation, PickPlaceAction, PlanarPose
 Array = NDArray[np.float64]
 
 _PRESSED = 0.012
-"""An object that protrudes by more than this is taken out, not pressed down, in metres."""
+"""An object that protrudes by more than this is taken out rather than pressed, in metres."""
 _TRIED = 0.020
-"""A press or a grasp this near to a tried one is the same, in metres."""
+"""A press or grasp within this distance of an earlier one counts as the same, in metres."""
 _ROOM = 0.045
-"""The least distance of where an object is laid from all else, in metres."""
+"""The least distance between an object laid down and everything else, in metres."""
 
 
 def recovery_action(
@@ -37,13 +37,13 @@ def recovery_action(
     planner: PickPlaceParameters,
     tried: Sequence[PlanarPose] = (),
 ) -> PickPlaceAction | None:
-    """The recovery of the object that is seated worst; None if there is none, or no recovery.
+    """The recovery of the worst-seated object; None if all are seated or no recovery is feasible.
 
     Args:
         observation: o_t.
-        segmentation: of it.
+        segmentation: of o_t.
         planner: how the hand will pick.
-        tried: where grasps failed, and where was pressed, before.
+        tried: poses of earlier failed grasps and presses.
     """
     for region in segmentation.protruding:
         pressed = _press(observation, segmentation, region)
@@ -56,7 +56,7 @@ def recovery_action(
 
 
 def _press(observation: Observation, segmentation: Segmentation, region: Region) -> PickPlaceAction:
-    """Presses on the highest part of what stands out."""
+    """Presses on the highest part of a protruding object."""
     pixels = region.pixels
     heights = segmentation.relief[region.mask]
     highest = pixels[heights >= np.percentile(heights, 80)].astype(float)
@@ -72,7 +72,7 @@ def _take_out(
     planner: PickPlaceParameters,
     tried: Sequence[PlanarPose],
 ) -> PickPlaceAction | None:
-    """Grips what stands out, and lays it where there is room on the table."""
+    """Grips a protruding object and lays it on a free place of the table."""
     resolution = observation.grid.resolution
     free = _free_place(segmentation, resolution)
     if free is None:
@@ -86,11 +86,11 @@ def _take_out(
 
 
 def _free_place(segmentation: Segmentation, resolution: float) -> Array | None:
-    """The (row, col) farthest from everything; None if there is no room."""
+    """The (row, col) farthest from everything; None without enough room."""
     taken = segmentation.fixture.copy()
     for region in segmentation.objects:
         taken |= region.mask
-    # Beyond the image nothing may lie.
+    # Padding keeps objects within the image.
     distance = ndimage.distance_transform_edt(~np.pad(taken, 1, constant_values=True))[1:-1, 1:-1]
     if distance.max() * resolution < _ROOM:
         return None

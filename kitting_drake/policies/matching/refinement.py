@@ -1,9 +1,9 @@
-"""Refinement of what a network predicted: the place by fitting the object's outline to the recess,
-and the grasp by what room o_t leaves the jaws.
+"""Refinement of a network's prediction by the geometry of o_t: its place and its grasp.
 
-Not in the paper. It corrects by millimetres and degrees, and tells a place from the one a half turn
-away, which differs only at the object's ends. Where the outlines do not agree, as with a recess
-that is hidden or an object that is not inserted, the prediction stays as it is.
+The place is refined by fitting the object's outline to the recess, the grasp by the jaws' room. The
+fit corrects millimetres and degrees, and resolves the half turn, which only an object's ends
+distinguish. A prediction stays as it is where the outlines disagree, as with a hidden recess or
+without insertion. This is not in the paper.
 """
 
 from __future__ import annotations
@@ -33,30 +33,31 @@ from systems.signals import wrap_to_pi
 Array = NDArray[np.float64]
 
 _WORST_COST = 0.0016
-"""Outlines that differ by more on average say nothing, in metres."""
+"""A fit with a larger mean difference of the outlines is rejected, in metres."""
 _HALF_TURN_GAIN = 0.00005
-"""The half turn is taken if it fits better by more than this where the two differ, in metres."""
+"""The half turn is taken if its `preference` is larger than this, in metres."""
 _RIVAL_GAIN = 0.85
-"""Another recess is taken if its mismatch is at most this share of the predicted one's."""
+"""Another recess is taken if its mismatch is less than this share of the predicted one's."""
 _PROMISING = 1.2
-"""Another is registered if its coarse cost is at most this many times the predicted one's."""
+"""Another recess is registered only if its coarse cost is at most this multiple of the predicted
+one's."""
 _LARGEST_SHIFT = 0.010
-"""A correction moves the object's middle by at most this, in metres, ..."""
+"""The largest correction of the object's centre, in metres, ..."""
 _LARGEST_ROTATION = math.radians(10)
-"""... and rotates it by at most this, but for a half turn."""
+"""... and of its rotation, apart from a half turn."""
 _LEVER = 0.03
-"""A rotation of the jaws by a radian counts as this way, in metres."""
+"""A rotation of the jaws by one radian weighs as much as this distance, in metres."""
 _POOR = 0.03
-"""A cost of a grasp of one counts as this way, in metres."""
+"""A grasp cost of one weighs as much as this distance, in metres."""
 _SAME_PLACE, _SAME_ANGLE = 0.008, math.radians(8)
-"""Grasps that are nearer to each other than this, in metres and radians, are the same."""
+"""Grasps closer than this, in metres and radians, count as the same."""
 _NEAR = 6.0
-"""A position this near to a region, in pixels, belongs to it."""
+"""A position within this distance of a region belongs to it, in pixels."""
 
 
 @dataclass(frozen=True)
 class RefinedPlace:
-    """A rotation, and where it brings the pick."""
+    """A rotation and the resulting place of the pick."""
 
     rotation: float
     """In radians."""
@@ -67,12 +68,12 @@ class RefinedPlace:
 def refine_place(
     segmentation: Segmentation, pick: Array, rotation: float, place: Array, resolution: float
 ) -> RefinedPlace | None:
-    """A predicted place, refined; None where the outlines cannot tell.
+    """A refined place; None where the outlines do not determine it.
 
     Args:
         segmentation: of o_t.
         pick: (row, col).
-        rotation: predicted, of the object, in radians.
+        rotation: predicted rotation of the object, in radians.
         place: (row, col) predicted for the object's point under the pick.
         resolution: of a pixel, in metres.
     """
@@ -87,7 +88,7 @@ def refine_place(
     target = trace_outline(recess.mask, resolution)
 
     def fit(angle: float, middle: Array) -> Registration | None:
-        """From where the object's middle is brought to `middle`; None if it ends far away."""
+        """The fit that starts with the object's centre at `middle`; None if it ends far away."""
         start = (angle, middle - rotation_matrix(angle) @ outline.middle)
         found = register(outline, target, starts=(start,))
         away = np.linalg.norm(found.moved(outline.middle) - middle) * resolution
@@ -119,14 +120,14 @@ def _better_elsewhere(
     others: list[Region],
     resolution: float,
 ) -> Registration | None:
-    """The fit to another recess where that is clearly better than to the predicted one; else None.
+    """The fit to another recess if it is clearly better than the fit to the predicted one.
 
     Args:
         taken: the object.
         outline: its outline.
-        recess: the predicted one.
+        recess: the predicted recess.
         target: its outline.
-        fit: of the one to the other.
+        fit: the registration of `outline` to `target`.
         others: the other recesses.
         resolution: of a pixel, in metres.
     """
@@ -144,7 +145,7 @@ def _better_elsewhere(
 
 
 def _nearest(regions: tuple[Region, ...], pixel: Array) -> Region | None:
-    """The region that is nearest to a position (row, col), if it is near."""
+    """The region nearest to a position (row, col); None if all are farther than `_NEAR`."""
     best, least = None, _NEAR
     for region in regions:
         distance = float(np.linalg.norm(region.pixels - pixel, axis=1).min())
@@ -155,7 +156,7 @@ def _nearest(regions: tuple[Region, ...], pixel: Array) -> Region | None:
 
 @dataclass(frozen=True)
 class RefinedGrasp:
-    """A grasp that the jaws can take."""
+    """A grasp for which the jaws have room."""
 
     pick: Array
     """(row, col)."""
@@ -171,16 +172,17 @@ def refine_grasp(
     planner: PickPlaceParameters,
     failed: Array | None = None,
 ) -> RefinedGrasp | None:
-    """A grasp near a predicted one for which o_t leaves the jaws no room; None if it does leave it,
-    or there is none.
+    """A feasible grasp near a predicted one.
+
+    None if the predicted grasp is feasible itself, or if there is no feasible grasp.
 
     Args:
         segmentation: of o_t.
         pick: (row, col) predicted.
-        theta: of the gripper, predicted, in radians.
+        theta: predicted angle of the gripper, in radians.
         resolution: of a pixel, in metres.
         planner: how the hand will pick.
-        failed: (n, 2), the (row, col) of where grasps failed: none is taken there.
+        failed: (n, 2), the (row, col) of failed grasps, which are avoided.
     """
     taken = _nearest(segmentation.objects, pick)
     if taken is None:
@@ -199,7 +201,7 @@ def refine_grasp(
         return distance + _LEVER * turned + _POOR * grasp.cost
 
     grasps = jaw_grasps(segmentation, taken, resolution, planner)
-    # A network knows more of a grasp than that the jaws have room: where they have, it stays.
+    # The network knows more about a grasp than the jaws' room, so keep it where it is feasible.
     if not grasps or any(is_same(*away(grasp)) for grasp in grasps):
         return None
     if failed is not None:

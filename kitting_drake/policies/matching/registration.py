@@ -1,13 +1,13 @@
-"""Registration of an object's outline to a recess's, to fractions of a pixel.
+"""Sub-pixel registration of an object's outline to a recess's.
 
 Both outlines are signed distances on a grid finer than o_t's. A recess is cut as the object's
-outline, closed and grown by a clearance (see `kitting_drake.hkd.kits.layout`); so the object's is
-closed first, and what remains is an offset, which is fitted too: the clearance, and half a pixel by
-which seeing only what is highest fattens objects and thins recesses.
+outline, closed and grown by a clearance (see `kitting_drake.hkd.kits.layout`). The object's outline
+is therefore closed first. The remaining offset is fitted: it is the clearance plus half a pixel,
+because a view from above makes objects wider and recesses narrower.
 
 The cost is the mean of a robust function of the difference of the signed distances about the
-object's outline; its minimum over (rotation, row, col, offset) is found by Gauss-Newton from the
-best of many rotations.
+object's outline. Gauss-Newton minimizes it over (rotation, row, col, offset), from the best of many
+rotations.
 """
 
 from __future__ import annotations
@@ -25,23 +25,22 @@ from kitting_drake.policies.matching.segmentation import Mask, Region
 Array = NDArray[np.float64]
 
 _SUBSAMPLING = 3
-"""Fine pixels in a pixel of o_t."""
+"""Fine pixels per pixel of o_t."""
 _CLOSING_RADIUS = 0.008
-"""Notches of an object narrower than twice this are not in its recess, in metres."""
+"""Notches of an object narrower than twice this are missing in its recess, in metres."""
 _BAND = 0.006
-"""The cost is taken at points within this of the object's outline, in metres."""
+"""The cost is taken at points within this distance of the object's outline, in metres."""
 _FARTHEST = 0.012
 """Distances are clipped to this, in metres."""
 _ROBUST = 0.002
-"""Differences beyond this count as no more, in metres: what is hidden, or touches a neighbour, may
-be anywhere."""
+"""Residuals beyond this stop growing in the cost, in metres: hidden or touching parts are outliers.
+"""
 _WORST_REVERSE = 0.0025
-"""A recess whose outline is farther than this from an object's, on average, is another's, in
-metres."""
+"""The largest mean distance of a recess's outline from the object's for a match, in metres."""
 _LARGEST_OFFSET = 0.004
-"""The offset of the outlines is within plus or minus this, in metres."""
+"""The offset of the outlines is clipped to plus or minus this, in metres."""
 _HEIGHT_WEIGHT = 0.1
-"""By how much a difference of an object's height and a recess's depth adds to a mismatch."""
+"""The weight in a mismatch of the difference of object height and recess depth."""
 _POINTS, _COARSE_POINTS = 700, 160
 _ROTATIONS = 72
 _STARTS = 3
@@ -50,30 +49,30 @@ _ITERATIONS = 15
 
 @dataclass(frozen=True)
 class Outline:
-    """The outline of a region as signed distances; metres, negative inside."""
+    """The outline of a region as signed distances in metres, negative inside."""
 
     distance: NDArray[np.float32]
     """(m, n) on the fine grid."""
     gradient: tuple[NDArray[np.float32], NDArray[np.float32]]
-    """Along its rows and columns, per fine pixel."""
+    """Along rows and columns, per fine pixel."""
     origin: Array
-    """(row, col) in pixels of o_t of the fine pixel (0, 0)."""
+    """(row, col) of the fine pixel (0, 0), in pixels of o_t."""
     middle: Array
-    """(row, col) the centroid of what is inside."""
+    """(row, col) of the region's centroid."""
     points: Array
-    """(p, 2) positions (row, col) near the outline, in pixels of o_t, evenly spread."""
+    """(p, 2): evenly spread positions (row, col) near the outline, in pixels of o_t."""
     values: Array
-    """(p,) their signed distances."""
+    """(p,): the signed distances at `points`."""
 
     def sample(self, field: NDArray[np.float32], positions: Array, outside: float) -> Array:
-        """(n,) one of its fields at positions (n, 2) in pixels of o_t."""
+        """(n,): `distance` or a `gradient` at positions (n, 2) in pixels of o_t."""
         fine = ((positions - self.origin) * _SUBSAMPLING).T
         return ndimage.map_coordinates(field, fine, order=1, mode="constant", cval=outside)
 
 
 @dataclass(frozen=True)
 class Registration:
-    """Where an object's outline fits a recess's: positions p of o_t go to R(rotation) p + shift."""
+    """The fit of an object's outline to a recess's: a point p moves to R(rotation) p + shift."""
 
     rotation: float
     """Counter-clockwise, in radians."""
@@ -83,7 +82,7 @@ class Registration:
     """The mean robust difference of the outlines, in metres."""
 
     def moved(self, pixel: Array) -> Array:
-        """Where a position (row, col) of the object is brought to."""
+        """The new position of a point (row, col) of the object."""
         return rotation_matrix(self.rotation) @ pixel + self.shift
 
 
@@ -91,9 +90,9 @@ def trace_outline(mask: Mask, resolution: float, *, close: bool = False) -> Outl
     """The outline of a region.
 
     Args:
-        mask: (rows, cols), True somewhere.
+        mask: (rows, cols) with at least one True.
         resolution: of its pixels, in metres.
-        close: bridge the notches that a recess for this object would not have.
+        close: bridge narrow notches, which the object's recess does not have.
     """
     margin = math.ceil((_FARTHEST + _CLOSING_RADIUS) / resolution) + 1
     rows, cols = np.nonzero(mask)
@@ -134,8 +133,8 @@ def register(
     Args:
         outline: the object's, closed.
         recess: the recess's.
-        starts: rotations and shifts to begin at; without any, all rotations about the middles are
-            tried and the best are refined.
+        starts: initial rotations and shifts. Without any, the best of many rotations about the
+            centroids are refined.
     """
     begins = starts or _coarse_starts(outline, recess)
     found = [_refine(outline, recess, rotation, shift) for rotation, shift in begins]
@@ -143,18 +142,17 @@ def register(
 
 
 def coarse_cost(outline: Outline, recess: Outline) -> float:
-    """About the cost of `register`, in metres, quickly."""
+    """A quick estimate of the cost of `register`, in metres."""
     return float(_coarse(outline, recess)[0].min())
 
 
 def preference(
     outline: Outline, recess: Outline, first: Registration, second: Registration
 ) -> float:
-    """By how much a fit is better than another where the two differ, in metres.
+    """By how much the first fit is better than the second where the two differ, in metres.
 
-    The costs of two fits are means over the whole outline, most of which may tell nothing of them,
-    but for noise: as of an object and the same object a half turn away. Here each point counts by
-    how differently the two would have the recess there.
+    For an object and its half turn, most points of the outline agree, and the mean costs differ
+    by noise alone. Here each point is weighted by the difference of the two fits there.
     """
     there, away = zip(*(_compared(outline, recess, fit) for fit in (first, second)), strict=True)
     telling = np.abs(there[0] - there[1])
@@ -163,15 +161,15 @@ def preference(
 
 
 def _compared(outline: Outline, recess: Outline, fit: Registration) -> tuple[Array, Array]:
-    """(p,) each: the recess's signed distances at the points of an object's outline, where a fit
-    brings them, without the offset; and by how much they differ from the object's own."""
+    """(p,) each: the recess's signed distances at the fitted points of an object's outline, without
+    the offset, and their difference from the object's own."""
     there, offset = _brought(outline, recess, fit)
     return there - offset, there - offset - outline.values
 
 
 def _brought(outline: Outline, recess: Outline, fit: Registration) -> tuple[Array, float]:
-    """(p,) the recess's signed distances at the points of an object's outline, where a fit brings
-    them; and the offset of the outlines."""
+    """(p,): the recess's signed distances at the fitted points of an object's outline, and the
+    offset of the outlines."""
     positions = outline.points @ rotation_matrix(fit.rotation).T + fit.shift
     there = recess.sample(recess.distance, positions, _FARTHEST)
     offset = float(np.median(there - outline.values))
@@ -179,12 +177,11 @@ def _brought(outline: Outline, recess: Outline, fit: Registration) -> tuple[Arra
 
 
 def is_covered(outline: Outline, recess: Outline, fit: Registration) -> bool:
-    """Whether a fit brings the object's outline to all of the recess's.
+    """Whether a fit also brings every part of the recess's outline near the object's.
 
-    `register` asks for each point of the object how far from its own the recess's outline is, and
-    all that is far is alike: so a box lies well enough along a cavity that is longer or, with most
-    of it beside, on what a seated object leaves to be seen of its own. Asked of the recess's
-    points, that costs as much as it is wrong.
+    `register` measures the distance from the object's outline to the recess's, clipped far away.
+    By that measure a box fits well into a longer cavity, or onto the visible remainder of a filled
+    recess. Measured from the recess's points, such fits are poor.
     """
     back = (recess.points - fit.shift) @ rotation_matrix(fit.rotation)
     _, offset = _brought(outline, recess, fit)
@@ -193,12 +190,12 @@ def is_covered(outline: Outline, recess: Outline, fit: Registration) -> bool:
 
 
 def mismatch(fit: Registration, item: Region, recess: Region) -> float:
-    """How ill an object and a recess agree in outline and height, in metres."""
+    """How poorly an object and a recess agree in outline and height, in metres."""
     return fit.cost + _HEIGHT_WEIGHT * abs(item.height - recess.height)
 
 
 def _coarse(outline: Outline, recess: Outline) -> tuple[Array, Array]:
-    """The cost at each of the coarse rotations about the middles, and the rotations."""
+    """The costs at the coarse rotations about the centroids, and the rotations in radians."""
     step = max(1, len(outline.points) // _COARSE_POINTS)
     offsets = outline.points[::step] - outline.middle
     angles = np.arange(_ROTATIONS) * math.tau / _ROTATIONS
@@ -219,7 +216,7 @@ def _coarse_starts(outline: Outline, recess: Outline) -> list[tuple[float, Array
     lowest = (costs <= np.roll(costs, 1)) & (costs < np.roll(costs, -1))
     candidates = np.flatnonzero(lowest)
     if not len(candidates):
-        # The middle of an L may be so far from all of it that a small object reaches it nowhere.
+        # The centroid of an L may be so far outside it that a small object never overlaps it.
         candidates = np.array([costs.argmin()])
     best = candidates[np.argsort(costs[candidates])][:_STARTS]
     return [
@@ -229,7 +226,7 @@ def _coarse_starts(outline: Outline, recess: Outline) -> list[tuple[float, Array
 
 
 def _refine(outline: Outline, recess: Outline, rotation: float, shift: Array) -> Registration:
-    """Gauss-Newton over (rotation about the object's middle, row, col, offset), reweighted."""
+    """Reweighted Gauss-Newton over (rotation about the object's centroid, row, col, offset)."""
     arms = outline.points - outline.middle
     place = rotation_matrix(rotation) @ outline.middle + shift
     offset, cost = 0.0, math.inf

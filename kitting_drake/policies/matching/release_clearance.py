@@ -1,8 +1,8 @@
-"""Whether the fingers have room where an object is put down, as o_t shows it.
+"""The fingers' room at the place, as o_t shows it.
 
-Where a place is as good in several rotations, as that of a cube is, a network cannot know which:
-its encodings of object and place do not tell how the jaws hold the object. Between neighbours it
-matters. Geometry alone, by height: not in the paper.
+A symmetric object such as a cube can be placed in several rotations, and the network cannot choose
+among them: its features do not encode how the jaws hold the object. Between neighbouring objects
+the choice matters. This uses heights alone and is not in the paper.
 """
 
 from __future__ import annotations
@@ -21,15 +21,15 @@ from systems.pick_place_parameters import PickPlaceParameters
 Array = NDArray[np.float64]
 
 _STEP = 0.001
-"""Between samples along the jaws' way, in metres."""
+"""The distance between samples along the jaws' path, in metres."""
 _LINES = 7
-"""Lines of samples along the fingers' length."""
+"""The number of sampled lines along the fingers' length."""
 _SUPPORT_REACH, _SUPPORT_SHARE = 0.06, 10.0
-"""The support of an object is this percentile of the heights this near to it, in metres."""
+"""The support's height is this percentile of the heights within this distance, in metres."""
 _UNDER = 0.009
-"""The support at the place is the highest within this of it, in metres."""
+"""The support at the place is the highest point within this distance, in metres."""
 _LEAST = 0.004
-"""Anything that rises above the fingertips by less than this is no obstacle, in metres."""
+"""Anything lower than this above the fingertips is no obstacle, in metres."""
 
 
 def blocked_at_place(
@@ -41,16 +41,16 @@ def blocked_at_place(
     place: Array,
     planner: PickPlaceParameters,
 ) -> float:
-    """The share of what the fingers need at a place that something stands in.
+    """The blocked share of the space that the fingers need at the place.
 
     Args:
         height: (rows, cols) of o_t, in metres.
         resolution: of a pixel, in metres.
         pick: (row, col) where the object is gripped.
         theta: of the gripper there, in radians.
-        rotation: of the object on its way, in radians.
-        place: (row, col) where the gripper is to let go of it.
-        planner: how deep the fingertips go, and how far the jaws draw back.
+        rotation: of the object from pick to place, in radians.
+        place: (row, col) where the gripper releases it.
+        planner: the depth of the fingertips, and how far the jaws open at release.
     """
     top = _highest(height, pick, resolution, resolution)
     around = _window(height, pick, _SUPPORT_REACH / resolution)
@@ -75,12 +75,12 @@ def blocked_at_place(
 
 
 def _sample(height: NDArray[np.float32], positions: Array) -> Array:
-    """(n,) the heights at positions (n, 2) in pixels; zero outside."""
+    """(n,): the heights at positions (n, 2) in pixels; zero outside the image."""
     return ndimage.map_coordinates(height, positions.T, order=1, mode="constant", cval=0.0)
 
 
 def _window(height: NDArray[np.float32], pixel: Array, reach: float) -> NDArray[np.float32]:
-    """The heights within so many rows and cols of a pixel, which is brought into the image."""
+    """The heights within `reach` rows and columns of a pixel, which is clipped to the image."""
     size = np.array(height.shape)
     middle = np.clip(np.rint(pixel), 0, size - 1)
     (top, left), (bottom, right) = (

@@ -1,7 +1,7 @@
 """Segmentation of o_t by height alone: table, fixture, loose objects, recesses.
 
-No colour is used, and no network. The fixture is the largest plateau above the table; what rises
-beside it is a loose object; what lies below its top is a recess, or what is left of one.
+It uses neither colour nor a network. The fixture is the largest plateau above the table. Anything
+that rises beside it is a loose object; anything below its top is a recess or a part of one.
 """
 
 from __future__ import annotations
@@ -20,29 +20,31 @@ Plane = NDArray[np.float64]
 """(3,): the height at (row, col) is `plane @ (row, col, 1)`, in metres."""
 
 _PLANE_BAND = 0.004
-"""Pixels within this of a plane belong to it, in metres."""
+"""Pixels within this distance of a plane belong to it, in metres."""
 _LEAST_FIXTURE_HEIGHT = 0.015
-"""A plateau lower than this above the table is no fixture, in metres."""
+"""The least height of a fixture above the table, in metres."""
 _LEAST_FIXTURE_AREA = 0.003
-"""The same for its area, in square metres."""
+"""The least area of a fixture, in square metres."""
 _OBJECT_HEIGHT = 0.003
 """Anything that rises by more than this above the table is an object, in metres."""
 _RECESS_DEPTH = 0.003
-"""Anything deeper than this below the top of the fixture is a recess, in metres."""
+"""Anything deeper than this below the fixture's top is a recess, in metres."""
 _PROTRUSION = 0.002
-"""Anything that rises by more than this above the fixture is not seated, in metres."""
+"""An object that rises by more than this above the fixture is not seated, in metres."""
 _LEAST_AREA = 0.0004
-"""Smaller regions are noise, in square metres."""
+"""Smaller regions are ignored as noise, in square metres."""
 _LEAST_PROTRUDING = 0.00012
-"""The same for what protrudes: perhaps one end of an object."""
+"""The same for protruding objects, of which only one end may protrude."""
 _FIXTURE_MARGIN = 0.006
-"""Closer to the fixture's outline than this is neither table nor recess, in metres."""
+"""Pixels closer to the fixture's outline than this are neither table nor recess, in metres."""
 _CLEAN = 0.0005
-"""Heights with less noise than this are taken as they are, in metres."""
+"""Heights with less noise than this are not filtered, in metres."""
 _CLEARLY = 2.0
-"""A height that differs by more standard deviations of the noise than this is no noise: few pixels
-of it do, and apart. More would cut off flat ends, by which a tool is told from the same
-tool a half turn away."""
+"""Heights that differ by more standard deviations than this are signal.
+
+The few noisy pixels beyond it are isolated. A larger value would cut off an object's flat ends,
+which distinguish it from its half turn.
+"""
 _NEIGHBOURS = np.ones((3, 3), bool)
 _CROSS = ndimage.generate_binary_structure(2, 1)
 
@@ -54,12 +56,12 @@ class Region:
     mask: Mask
     """(rows, cols)."""
     height: float
-    """By how much the object rises above the table, or the recess's floor lies below the top of the
-    fixture: the 90th percentile, in metres."""
+    """The object's height above the table, or the recess's depth below the fixture's top, in
+    metres: the 90th percentile over the region."""
 
     @property
     def pixels(self) -> NDArray[np.intp]:
-        """(n, 2): row and column of each."""
+        """(n, 2): the row and column of each pixel."""
         return np.argwhere(self.mask)
 
 
@@ -68,17 +70,16 @@ class Segmentation:
     """The regions of an observation: fixture, recesses, objects."""
 
     fixture: Mask
-    """(rows, cols) the fixture; nowhere if there is none."""
+    """(rows, cols): the fixture; all False without one."""
     objects: tuple[Region, ...]
-    """Loose, on the table."""
+    """Loose on the table."""
     recesses: tuple[Region, ...]
-    """Regions below the top of the fixture. One that a seated object fills leaves fragments, which
-    are among them."""
+    """Regions below the fixture's top, including the visible fragments of filled recesses."""
     protruding: tuple[Region, ...]
-    """The objects that protrude from the fixture, the highest first. Their height is that above
-    its top."""
+    """The objects that protrude from the fixture, highest first, with their height above its top.
+    """
     relief: NDArray[np.float32]
-    """(rows, cols) height above the table plane, in metres, with what was not seen filled in."""
+    """(rows, cols): height above the table plane in metres; unseen pixels are filled in."""
 
 
 def segment(observation: Observation) -> Segmentation:
@@ -88,7 +89,7 @@ def segment(observation: Observation) -> Segmentation:
         observation: o_t.
 
     Returns:
-        The segmentation. Where no plateau stands out there is no fixture and there are no recesses.
+        The segmentation. Without a plateau there are neither a fixture nor recesses.
     """
     resolution = observation.grid.resolution
     height = fill_unseen(observation.height, observation.valid)
@@ -97,7 +98,7 @@ def segment(observation: Observation) -> Segmentation:
     fixture, top = _find_fixture(height, relief, resolution)
     noise = _noise_of(height, relief, fixture, top)
     if noise > _CLEAN:
-        # A median erases what is one pixel wide: only where it must be.
+        # A median filter erases details one pixel wide, so use it only on noisy heights.
         height = ndimage.median_filter(height, footprint=_CROSS, mode="nearest")
         relief = ndimage.median_filter(relief, footprint=_CROSS, mode="nearest")
         fixture, top = _find_fixture(height, relief, resolution)
@@ -115,7 +116,7 @@ def segment(observation: Observation) -> Segmentation:
         depth = (_plane_heights(top, height.shape) - height).astype(np.float32)
         inside = ndimage.distance_transform_edt(fixture) > margin / 2
         depth[~inside] = 0
-        # What no camera sees into is the bottom of a recess, where it is part of one.
+        # An unseen region belongs to the recess that it touches.
         hidden = inside & ~observation.valid
         rise[fixture] = -depth[fixture]
     deep = depth > max(_RECESS_DEPTH, _CLEARLY * noise)
@@ -136,13 +137,15 @@ def segment(observation: Observation) -> Segmentation:
 def _noise_of(
     height: NDArray[np.float32], relief: NDArray[np.float32], fixture: Mask, top: Plane
 ) -> float:
-    """The standard deviation of the noise of the table and, as what lies lower than the grid reads
-    as flat, of the fixture's top too."""
+    """The standard deviation of the noise of the table or the fixture's top, whichever is larger.
+
+    The table's noise can be underestimated, because heights below the grid are clipped.
+    """
     return max(_noise(relief), _noise((height - _plane_heights(top, height.shape))[fixture]))
 
 
 def _noise(relief: NDArray[np.floating]) -> float:
-    """The standard deviation of heights above a plane that most of them belong to, robustly."""
+    """A robust standard deviation of heights above a plane that contains most of them."""
     flat = np.abs(relief[np.abs(relief) < 3 * _PLANE_BAND])
     return 1.4826 * float(np.median(flat)) if flat.size else 0.0
 
@@ -152,7 +155,7 @@ def _plane_heights(plane: Plane, shape: tuple[int, ...]) -> NDArray[np.float64]:
 
 
 def _fit_plane(height: NDArray[np.float32], start: float, where: Mask) -> Plane:
-    """A plane through most of some pixels, by least squares on those near it, three times."""
+    """A plane through most pixels of a mask, by three rounds of least squares on inliers."""
     plane = np.array([0.0, 0.0, start])
     rows, cols = np.nonzero(where)
     design = np.column_stack([rows, cols, np.ones(len(rows))])
@@ -166,7 +169,7 @@ def _fit_plane(height: NDArray[np.float32], start: float, where: Mask) -> Plane:
 
 
 def _mode(values: NDArray[np.float32]) -> float:
-    """The height about which most values lie."""
+    """The most frequent height."""
     width = 0.001
     low = float(values.min())
     counts = np.bincount(((values - low) / width).astype(int))
@@ -189,7 +192,7 @@ def _find_fixture(
         return none
     level = _mode(relief[high])
     plateau = ndimage.binary_opening(np.abs(relief - level) < _PLANE_BAND, _NEIGHBOURS)
-    # A recess from rim to rim must not cut it in two.
+    # Close gaps, so that a recess from rim to rim does not cut the plateau in two.
     labels, count = ndimage.label(ndimage.binary_closing(plateau, _NEIGHBOURS, 3), _NEIGHBOURS)
     if not count:
         return none
@@ -217,14 +220,14 @@ def _regions(
     least: float = _LEAST_AREA,
     core: Mask | None = None,
 ) -> tuple[Region, ...]:
-    """The connected regions of a mask that are large enough, the largest first.
+    """The connected regions of a mask with enough area, largest first.
 
     Args:
         mask: (rows, cols).
-        relief: by which their heights are measured, within the core.
+        relief: the heights, measured within the core.
         resolution: of a pixel, in metres.
-        least: area of a region within the core, in square metres.
-        core: the part of the mask that counts; all of it if None.
+        least: the least area within the core, in square metres.
+        core: the part of the mask that counts; None for all of it.
     """
     core = mask if core is None else core
     labels, count = ndimage.label(mask, _NEIGHBOURS)

@@ -1,4 +1,4 @@
-"""The training-free policy: outlines matched to recesses, jaws where o_t leaves them room."""
+"""The training-free policy: match outlines to recesses, and grasp where the jaws have room."""
 
 from __future__ import annotations
 
@@ -25,39 +25,37 @@ from systems.pick_place_parameters import PickPlaceParameters
 from systems.signals import Observation, PickPlaceAction, PlanarPose
 
 _WORST_COST = 0.0019
-"""An outline and a recess that differ by more than this on average do not belong together, in
-metres."""
+"""The largest mean difference of an outline and its recess, in metres."""
 _CERTAIN_COST = 0.0010
-"""Those that differ by less certainly do."""
+"""Pairs that differ by less certainly belong together, in metres."""
 _PROMISING = 2.0
-"""A recess is registered if its coarse cost is at most this many times the least of the object."""
+"""A recess is registered if its coarse cost is at most this multiple of the object's least."""
 
 
 @dataclass(frozen=True)
 class Matched:
-    """An action, and how well the outlines behind it agree."""
+    """An action and how well the outlines behind it agree."""
 
     action: PickPlaceAction
     agreement: float | None = None
-    """1: the outlines of object and recess are the same; 0: they differ by as much as they may.
-    None where no outlines were matched: the action mends something, or stops."""
+    """From 1, identical outlines of object and recess, to 0, the largest accepted difference; None
+    for an action without outlines, which mends another or stops."""
 
 
 class ShapeMatchingPolicy:
-    """A function from an observation to an action that needs neither training nor colour.
+    """A training-free function from an observation to an action. It uses no colour.
 
-    Loose objects and recesses are segmented by height. Every outline is registered to every recess,
-    and a linear assignment chooses which object goes into which. Of the pairs that fit, the one
-    whose outlines agree best, and which the jaws can take, is next. It stops where nothing is left
-    that fits. It has no memory.
+    It segments loose objects and recesses by height, registers every outline to every recess, and
+    assigns objects to recesses by linear assignment. It picks the best-fitting object for which the
+    jaws have room, and stops when nothing fits. It has no memory.
     """
 
     def __init__(self, planner: PickPlaceParameters, *, recover: bool = False) -> None:
         """
         Args:
             planner: how the hand will pick and place.
-            recover: press down what protrudes at once, and take out what could not be pressed
-                down where nothing else is left that fits (`recovery_action`).
+            recover: press protruding objects down at once; take out those that could not be
+                pressed down when nothing else fits (`recovery_action`).
         """
         self._planner = planner
         self._recover = recover
@@ -69,12 +67,12 @@ class ShapeMatchingPolicy:
 
         Args:
             observation: o_t.
-            failed_picks: where a grasp failed before: there it is not tried again.
+            failed_picks: poses at which a grasp failed before; it avoids them.
         """
         return self.decide(observation, failed_picks).action
 
     def decide(self, observation: Observation, failed_picks: Sequence[PlanarPose] = ()) -> Matched:
-        """The action, and how well the outlines behind it agree; see `__call__`."""
+        """The action and how well the outlines behind it agree; see `__call__`."""
         segmentation = segment(observation)
         mending = None
         if self._recover:
@@ -95,7 +93,7 @@ class ShapeMatchingPolicy:
                 place = fit.moved(best.pixel)
                 action = make_action(observation, best.pixel, best.theta, place, fit.rotation)
                 return Matched(action, min(max(1 - fit.cost / _WORST_COST, 0.0), 1.0))
-        # What must be taken out waits for all else: it may fail again, and actions are counted.
+        # Taking out comes last: it may fail again, and the number of actions is limited.
         return Matched(mending or PickPlaceAction(stop=True))
 
 
@@ -109,9 +107,7 @@ def certain_fits(segmentation: Segmentation, resolution: float) -> NDArray[np.bo
 
 
 def belonging(segmentation: Segmentation, resolution: float) -> NDArray[np.bool_] | None:
-    """(rows, cols): the loose objects that belong into a recess, by the assignment of `match`; what
-    else lies about is no business of a policy. None where nothing is seen that has recesses.
-    """
+    """(rows, cols): the loose objects that `match` assigns to a recess; None without a fixture."""
     if not segmentation.fixture.any():
         return None
     mask = np.zeros(segmentation.fixture.shape, bool)
@@ -121,7 +117,7 @@ def belonging(segmentation: Segmentation, resolution: float) -> NDArray[np.bool_
 
 
 def match(segmentation: Segmentation, resolution: float) -> list[tuple[int, Registration]]:
-    """Which loose objects go where: their indices and registrations, the best fit first.
+    """The indices of the loose objects and their fits into recesses, best fit first.
 
     Args:
         segmentation: of an observation.
@@ -145,6 +141,6 @@ def match(segmentation: Segmentation, resolution: float) -> list[tuple[int, Regi
 
 
 def _assign(costs: NDArray[np.float64]) -> list[tuple[int, int]]:
-    """The pairs of the assignment with the least sum; more than `_WORST_COST` is as none."""
+    """The pairs of the assignment with the least sum; costs are clipped to `_WORST_COST`."""
     rows, cols = linear_sum_assignment(np.minimum(costs, _WORST_COST))
     return list(zip(rows.tolist(), cols.tolist(), strict=True))

@@ -19,18 +19,17 @@ class AngleNetSize:
     """The depth and width of a pick-angle network."""
 
     stages: tuple[tuple[int, ...], ...]
-    """The number of fields of each layer, stage by stage; there is a pooling between stages."""
+    """The number of fields of each layer, by stage; features are pooled between stages."""
     kernel: int = 7
     """The side of each layer's kernels, in pixels."""
     readout: int = 7
     """The side of the last layer's kernel, in pixels."""
     full_readout: bool = False
     """Whether the last layer's kernel covers the whole feature map. Otherwise the last layer is
-    padded, and the mean over its output is taken."""
+    padded, and its output is averaged."""
     residual: bool = False
-    """Whether a stage of two layers is a residual block, with a convolution of the same kernel size
-    as its shortcut where the number of fields changes. The first stage takes scalars and must then
-    have another number of layers."""
+    """Whether a stage of two layers is a residual block. If the number of fields changes, its
+    shortcut is a convolution of the same kernel size. Not allowed in the first stage."""
 
     def __post_init__(self) -> None:
         if self.residual and len(self.stages[0]) == 2:
@@ -38,8 +37,10 @@ class AngleNetSize:
 
 
 class AngleNet(MixedPrecision):
-    """Maps a crop to one vector of the output fibre, equivariantly (equation 3): as the crop is
-    rotated by r, the vector is transformed by the fibre's representation rho(r)."""
+    """Maps a crop to one vector of the output fibre, equivariantly (equation 3).
+
+    If the crop is rotated by r, the vector is transformed by the fibre's representation rho(r).
+    """
 
     def __init__(
         self,
@@ -78,7 +79,7 @@ class AngleNet(MixedPrecision):
             if index:
                 features = self.pool(features)
             for layer in layers:
-                # A residual block ends with an ELU of its own.
+                # A residual block applies its own ELU.
                 is_block = isinstance(layer, ResidualBlock)
                 features = layer(features) if is_block else F.elu_(layer(features))
         # The readout always computes in float32: angles need more than eight bits.

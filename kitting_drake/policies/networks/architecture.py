@@ -1,4 +1,4 @@
-"""The architecture of a policy's networks: all that a weights file must say beside the weights."""
+"""The architecture of a policy's networks: the config that a weights file needs."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class Preset:
     unet: UNetSize = field(default_factory=UNetSize)
     """The U-nets alpha, phi and psi."""
     samples: int = 16
-    """How many samples of each SO(2) field of the U-nets their nonlinearity acts on."""
+    """The number of samples of each SO(2) field of the U-nets, on which the nonlinearity acts."""
     angle: AngleNetSize = field(
         default_factory=lambda: AngleNetSize(
             stages=((16,), (32, 32), (16, 16), (16, 16), (8,)), residual=True
@@ -31,14 +31,14 @@ class Preset:
     angle_band: int = 6
     """j_c of beta's hidden fields."""
     angle_samples: int = 32
-    """How many samples of each of beta's SO(2) fields its nonlinearity acts on."""
+    """The number of samples of each of beta's SO(2) fields, on which the nonlinearity acts."""
     group_angle: AngleNetSize = field(
         default_factory=lambda: AngleNetSize(
             stages=((18,), (36, 36), (18, 18), (18, 18), (8,)), residual=True
         )
     )
-    """The Equivariant Transporter's angle network, in regular fields of N / 2 channels. In residual
-    blocks it has the authors' 0.90, 1.81, 3.01 and 4.51 M parameters at N = 36, 72, 120, 180."""
+    """The Equivariant Transporter's angle network, in regular fields of N / 2 channels. The default
+    has the authors' 0.90, 1.81, 3.01 and 4.51 M parameters at N = 36, 72, 120, 180."""
     resnet: tuple[int, int, int, int, int] = (64, 64, 128, 256, 512)
     """Channels of the Transporter's stem and of its four stages."""
 
@@ -62,8 +62,9 @@ PRESETS = {
     "paper": Preset(),
     # For machines without an accelerator: each U-net has 0.2 M parameters.
     "small": _SMALL,
-    # The same for ours. The Transporter keeps as large a share of the original's parameters as
-    # ours, a 25th, and at N = 36 the Equivariant Transporter's angle network has as many as beta.
+    # "small" with baselines reduced like the SO(2) networks. The Transporter keeps the same share
+    # of the original's parameters, 1/25. At N = 36 the Equivariant Transporter's angle network has
+    # as many parameters as beta.
     "matched": dataclasses.replace(
         _SMALL,
         group_angle=AngleNetSize(
@@ -71,7 +72,7 @@ PRESETS = {
         ),
         resnet=(13, 13, 26, 52, 102),
     ),
-    # For tests: every part of the architecture, as small as it can be.
+    # For tests: every part of the architecture at its smallest.
     "tiny": Preset(
         unet=UNetSize(down=(2, 4, 4, 4, 4), up=(4, 4, 2, 2), head=4, skip=1),
         samples=8,
@@ -108,20 +109,20 @@ class NetworkConfig:
     orientations: int = 180
     """N, the number of orientations, at which the networks are trained."""
     colour_mean: float = 0.5
-    """Mean of the colours that the networks are trained on; inputs are normalised by it."""
+    """The mean colour in training; inputs are normalised by it."""
     colour_std: float = 0.25
-    """Standard deviation of these colours."""
+    """The standard deviation of the colours in training."""
     height_mean: float = 0.005
-    """Mean of the heights that the networks are trained on, in metres."""
+    """The mean height in training, in metres."""
     height_std: float = 0.01
-    """Standard deviation of these heights, in metres."""
+    """The standard deviation of the heights in training, in metres."""
     band: int = BAND
     """j_c of the U-nets' fields."""
     angle_frequencies: tuple[int, ...] = ANGLE_FREQUENCIES
     """The frequencies of beta's output."""
     colour: bool = True
-    """Whether the networks see colours; if not, what no camera saw is filled in for them (see
-    `systems.signals.fill_unseen`)."""
+    """Whether the networks see colours. Otherwise they see heights alone, with unseen pixels filled
+    in (see `systems.signals.fill_unseen`)."""
     stop: bool = False
     """Whether the picking module has a class "nothing to pick" (see `losses.log_odds`)."""
 
@@ -146,10 +147,10 @@ class NetworkConfig:
         return 4 if self.colour else 1
 
     def has_unets_of(self, preset: str) -> bool:
-        """Whether the U-nets alpha, phi and psi are those of a preset, whatever its beta."""
+        """Whether alpha, phi and psi have the sizes of a preset; beta may differ."""
         own, other = PRESETS[self.preset], PRESETS[preset]
         return (own.unet, own.samples) == (other.unet, other.samples)
 
     def as_dict(self) -> dict[str, Any]:
-        """The fields, as JSON takes them."""
+        """The fields as JSON values."""
         return dataclasses.asdict(self)

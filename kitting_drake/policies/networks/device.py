@@ -1,4 +1,4 @@
-"""Where networks compute, and in which type."""
+"""The device and the floating-point type of the networks."""
 
 from __future__ import annotations
 
@@ -9,28 +9,26 @@ import torch
 import torch.nn.functional as F
 
 _CLEARLY = 0.8
-"""bfloat16 is taken only if it takes less than this share of the time, so that the choice is the
-same at every start."""
+"""bfloat16 must take less than this share of float32's time, to make the choice reproducible."""
 _ROUNDS = 5
 _SHAPES = ((1, 32, 81, 161), (32, 32, 3, 3))
-"""A convolution as the U-nets have it, of a few milliseconds: its input and its kernel."""
+"""The input and the kernel of a typical U-net convolution, which takes a few milliseconds."""
 
 
 def preferred_device() -> torch.device:
-    """The device to train and infer on: an accelerator where there is one, else the CPU."""
+    """The device for training and inference: an accelerator if available, otherwise the CPU."""
     return torch.device("cuda" if torch.cuda.is_available() else "cpu")
 
 
 @functools.cache
 def preferred_type() -> torch.dtype:
-    """The type to compute in: bfloat16 where the preferred device is faster in it, else float32.
+    """The type to compute in: bfloat16 if the preferred device is faster in it, otherwise float32.
 
-    That a CPU has instructions for bfloat16 does not tell. With AMX convolutions take a fifth of
-    the time; with AVX-512 alone, half of it on some CPUs and half as much again on others, so that
-    there one is timed, once a process.
+    Convolutions in bfloat16 take a fifth of the time with AMX. With AVX-512 alone they take between
+    0.5 and 1.5 times as long, depending on the CPU, so one is timed once per process.
     """
     if preferred_device().type == "cuda":
-        # Before compute capability 8 it is emulated, and slower.
+        # Below compute capability 8 bfloat16 is emulated and slower.
         native = torch.cuda.is_bf16_supported(including_emulation=False)
         return torch.bfloat16 if native else torch.float32
     if torch.backends.cpu.get_cpu_capability() not in ("AVX512", "AMX"):
@@ -42,13 +40,13 @@ def preferred_type() -> torch.dtype:
 
 
 def _is_faster_in_bfloat16() -> bool:
-    """Whether a convolution is; the two types take turns, and the fastest of each counts."""
+    """Compares the fastest of several alternating convolutions in each type."""
     fastest = dict.fromkeys((torch.float32, torch.bfloat16), float("inf"))
     threads = torch.get_num_threads()
-    # Threads that wait for one another would count as work where cores are shared.
+    # On shared cores, threads that wait for one another would add processor time.
     torch.set_num_threads(1)
     try:
-        for _ in range(1 + _ROUNDS):  # In the first, kernels are chosen.
+        for _ in range(1 + _ROUNDS):  # The first round is a warm-up.
             for dtype in fastest:
                 fastest[dtype] = min(fastest[dtype], _seconds(dtype))
     finally:
@@ -58,7 +56,7 @@ def _is_faster_in_bfloat16() -> bool:
 
 @torch.inference_mode()
 def _seconds(dtype: torch.dtype) -> float:
-    """The processor time of one convolution, which other processes hardly lengthen."""
+    """The processor time of one convolution, which other processes barely affect."""
     features, kernel = (
         torch.ones(shape, dtype=dtype).to(memory_format=torch.channels_last) for shape in _SHAPES
     )

@@ -1,7 +1,7 @@
 """The Equivariant Transporter, the first baseline of the paper (section V-C.3).
 
-It differs from the paper's own method in its fields: regular fields of C_6 where the output is
-invariant, and regular fields of C_N / C_2 throughout the angle network. N is thereby part of the
+It differs from the SO(2) method in its fields: regular fields of C_6 in the U-nets, whose output is
+invariant, and regular fields of C_N / C_2 in the angle network. N is therefore part of the
 architecture: the angle network's parameters, kernels and time grow with N.
 """
 
@@ -19,14 +19,14 @@ from kitting_drake.policies.networks.layers.steerable import Convolution, Steera
 from kitting_drake.policies.networks.unet import UNet
 
 _ORDER = 6
-"""The order of the group whose regular fields the U-nets have."""
+"""The order of the cyclic group of the U-nets' regular fields."""
 
 
 class EquivariantTransporterNetworks(FactoredNetworks):
     """Networks of regular fields.
 
-    With the preset "paper" the angle network has 0.90, 1.81, 3.01 and 4.51 million parameters at
-    N = 36, 72, 120 and 180, as the authors' has.
+    With the preset "paper" the angle network has the authors' 0.90, 1.81, 3.01 and 4.51 million
+    parameters at N = 36, 72, 120 and 180.
     """
 
     def __init__(self, config: NetworkConfig, convolution: Convolution = SteerableConv2d) -> None:
@@ -40,11 +40,11 @@ class EquivariantTransporterNetworks(FactoredNetworks):
         self.psi = UNet(config.channels, sizes.FEATURES, fibre, preset.unet, convolution)
 
     def check_orientations(self, orientations: int) -> None:
-        """Raises ValueError if the networks were made for another N."""
+        """Raises ValueError if the networks were trained at another N."""
         if orientations != self.config.orientations:
             raise ValueError(
-                f"this Equivariant Transporter predicts at {self.config.orientations} "
-                f"orientations, not at {orientations}: train one for that"
+                f"this Equivariant Transporter was trained at {self.config.orientations} "
+                f"orientations and cannot predict at {orientations}: train one for that number"
             )
 
     def crop_angle_logits(self, crops: Tensor, orientations: int) -> Tensor:

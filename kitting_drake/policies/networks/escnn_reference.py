@@ -1,8 +1,8 @@
-"""The SO(2) networks built of escnn's own modules: the reference that folding is measured against.
+"""The SO(2) networks built from escnn's own modules, as the reference for the folded convolutions.
 
-They are built from networks of this package and have the same weights, so that both are the same
-function. Between escnn's layers there are Fourier coefficients, and FourierELU transforms every
-feature map to samples and back. Only the benchmark and the tests need this module.
+They copy the weights of this package's networks and compute the same function. Their features are
+Fourier coefficients, which FourierELU transforms to samples and back. Only the benchmark and the
+tests use this module.
 """
 
 from __future__ import annotations
@@ -23,15 +23,15 @@ from kitting_drake.policies.networks.methods import make_networks
 from kitting_drake.policies.networks.unet import ResidualBlock, UNet
 
 _SIGMA = 0.66
-"""Standard deviation of the blur of the poolings, in pixels, as in `BlurPool`."""
+"""The standard deviation of the pooling blur in pixels, as in `BlurPool`."""
 
 
 def as_escnn(networks: SO2Networks, autocast: torch.dtype | None = None) -> Networks:
-    """The same networks, built of escnn's modules.
+    """The same networks built from escnn's modules.
 
     Args:
         networks: made with `SteerableConv2d`; their weights are copied.
-        autocast: the type for torch's automatic mixed precision; None: float32.
+        autocast: the type for torch's automatic mixed precision; None for float32.
     """
     reference = make_networks(networks.config)
     for name, network in networks.named_children():
@@ -43,7 +43,7 @@ def as_escnn(networks: SO2Networks, autocast: torch.dtype | None = None) -> Netw
 
 
 class EscnnUNet(nn.Module):
-    """A `UNet` built of escnn's modules."""
+    """A `UNet` built from escnn's modules."""
 
     def __init__(self, source: UNet, autocast: torch.dtype | None = None) -> None:
         super().__init__()
@@ -69,16 +69,16 @@ class EscnnUNet(nn.Module):
                     features = self.pools[index - 1](features)
                 features = block(features)
             for block in self.up:
-                # escnn's R2Upsampling computes the same, but must know the size when it is made.
+                # escnn's R2Upsampling computes the same, but needs the size at construction.
                 larger = enn.GeometricTensor(upsample(features.tensor), features.type)
                 features = block(enn.tensor_directsum([larger, levels.pop()]))
-            # For escnn, frequency 0 alone and the trivial representation are different types.
+            # escnn distinguishes frequency 0 alone from the trivial representation.
             scalars = enn.GeometricTensor(features.tensor, self.mix.in_type)
             return self.out(self.mix_elu(self.mix(scalars))).tensor.float()
 
 
 class _EscnnBlock(nn.Module):
-    """A `ResidualBlock` built of escnn's modules."""
+    """A `ResidualBlock` built from escnn's modules."""
 
     def __init__(self, source: nn.Module, *, invariant: bool = False) -> None:
         """
@@ -106,7 +106,7 @@ class _EscnnBlock(nn.Module):
 
 
 class EscnnAngleNet(nn.Module):
-    """An `AngleNet` of irreps built of escnn's modules."""
+    """An `AngleNet` of irreps built from escnn's modules."""
 
     def __init__(self, source: AngleNet, autocast: torch.dtype | None = None) -> None:
         super().__init__()
@@ -140,14 +140,14 @@ def _field_type(fibre: Fibre, count: int) -> enn.FieldType:
     if isinstance(fibre, Scalar):
         return enn.FieldType(space, count * [space.trivial_repr])
     if not isinstance(fibre, Irreps):
-        raise ValueError(f"{fibre} is no fibre of SO(2)")
+        raise ValueError(f"{fibre} is not a fibre of SO(2)")
     irreps = [(j,) for j in fibre.frequencies]
     group = space.fibergroup
     return enn.FieldType(space, count * [group.spectral_regular_representation(*irreps, name=None)])
 
 
 def _convolution(source: nn.Module) -> enn.R2Conv:
-    """The same convolution with the same weights, whose order is escnn's."""
+    """The same convolution with the same weights, which are stored in escnn's order."""
     assert isinstance(source, SteerableConv2d)
     out_fields, in_fields, _ = source.weights.shape
     layer = enn.R2Conv(
@@ -169,7 +169,7 @@ def _convolution(source: nn.Module) -> enn.R2Conv:
 
 
 def _fourier_elu(source: nn.Module, *, invariant: bool = False) -> enn.FourierELU:
-    """The nonlinearity after a convolution, at as many samples as its output fibre has."""
+    """The nonlinearity after a convolution, with as many samples as its output fibre."""
     assert isinstance(source, SteerableConv2d)
     assert isinstance(source.out_fibre, Irreps)
     return enn.FourierELU(

@@ -40,8 +40,8 @@ from kitting_drake.policies.networks.losses import (
 from kitting_drake.policies.networks.unet import STRIDE, UNet
 
 _JITTER = 2
-"""Crops of a training step are centred up to this many pixels beside the label, as are those of a
-pick position that is predicted imperfectly."""
+"""The crops of a training step are shifted by up to this many pixels, to imitate errors of the
+predicted pick."""
 
 
 class AnglePrediction(NamedTuple):
@@ -50,8 +50,8 @@ class AnglePrediction(NamedTuple):
     logits: Tensor
     """(N / 2,), at the gripper angles 2 pi i / N."""
     refined: float | None
-    """The most likely of all angles, in radians: sub-bin refinement. None where the method predicts
-    discrete angles only."""
+    """The most likely angle in radians, not quantized; None if the method predicts discrete angles
+    only."""
 
 
 @dataclass(frozen=True)
@@ -63,7 +63,8 @@ class PickPrediction:
     angle: Callable[[tuple[int, int]], AnglePrediction]
     """f_theta at a pixel (row, col)."""
     log_odds: float | None
-    """That there is something to pick (see `losses.log_odds`); None: the networks cannot tell."""
+    """The log-odds that there is something to pick (see `losses.log_odds`); None if the networks do
+    not predict it."""
 
 
 @dataclass(frozen=True)
@@ -73,33 +74,33 @@ class PlacePrediction:
     candidates: list[Candidate]
     """Windows of f_place around its peaks, best first."""
     score_map: Tensor
-    """(rows, cols): the best score over all rotations, perhaps at a coarser resolution."""
+    """(rows, cols): the best score over all rotations, possibly interpolated."""
 
 
 class Networks(nn.Module):
-    """The base of the networks of every method: their inputs, and the placing module.
+    """The base class of every method's networks: their inputs and the placing module.
 
     Subclasses define `phi` and `psi` (scalar encodings of the scene and of a crop) and the picking
-    module. Nothing is remembered between calls.
+    module. Calls keep no state.
     """
 
     phi: nn.Module
     psi: nn.Module
     picking: str
-    """The name of the loss that trains where to pick."""
+    """The name of the loss of the pick position."""
 
     def __init__(self, config: NetworkConfig) -> None:
         super().__init__()
         self.config = config
         self.preset = PRESETS[config.preset]
         self.compute_type = torch.float32
-        """The type of the networks' inputs, and with it the type that they compute in."""
+        """The type of the networks' inputs, in which they compute."""
         self.rotations: int | None = None
-        """How many rotations of the crop a training step of the Transporter computes, and half as
-        many of the scene; None: a few (see `transporter.draw_bins`). Other methods rotate none."""
+        """The number of crop rotations in a training step of the Transporter; scene rotations are
+        half as many. None for a few (see `transporter.draw_bins`). Other methods do not use it."""
         self.stop_threshold: float | None = None
-        """A policy stops where the log-odds are below it; None: it never stops. It is chosen for
-        the weights (see `validation.validate`) and stored with them."""
+        """The log-odds below which a policy stops; None if it never stops. `validation.validate`
+        chooses it, and it is stored with the weights."""
 
     @property
     def device(self) -> torch.device:
@@ -107,7 +108,7 @@ class Networks(nn.Module):
         return next(self.parameters()).device
 
     def freeze(self, compute_type: torch.dtype) -> None:
-        """Prepares for inference: evaluation mode, no gradients, and weights that are cast once.
+        """Prepares for inference: evaluation mode, no gradients, weights cast once.
 
         Args:
             compute_type: the type to compute in.
@@ -119,7 +120,7 @@ class Networks(nn.Module):
                 module.cast(compute_type)
 
     def prepare(self, image: Image) -> Tensor:
-        """An observation, or a crop of one, as an input of the networks.
+        """An observation, or a crop of one, as a network input.
 
         Args:
             image: (4, rows, cols), as `Observation.image`.
@@ -130,14 +131,14 @@ class Networks(nn.Module):
         return self.prepare_batch(torch.from_numpy(np.array(image, order="C"))[None])
 
     def prepare_batch(self, images: Tensor) -> Tensor:
-        """Inputs of the networks.
+        """A batch of network inputs.
 
         Args:
             images: (n, 4, rows, cols), each as `Observation.image`.
 
         Returns:
-            (n, channels, rows, cols): normalised, in `compute_type`, on `device`, and padded below
-            and on the right, with what unseen pixels hold, to sides that a U-net takes.
+            (n, channels, rows, cols): normalised, in `compute_type`, on `device`. Zero padding
+            below and on the right, before normalisation, extends the sides to sizes of a U-net.
         """
         config = self.config
         rows, cols = images.shape[2:]
@@ -150,7 +151,7 @@ class Networks(nn.Module):
         return normalised.to(self.device, self.compute_type)
 
     def encode_scene(self, image: Image) -> Tensor:
-        """phi(o_t): (1, channels, rows, cols), the padding included."""
+        """phi(o_t): (1, channels, rows, cols), including the padding."""
         return self.phi(self.prepare(image))
 
     def encode_crop(self, image: Image, pixel: tuple[int, int]) -> Tensor:
@@ -158,7 +159,7 @@ class Networks(nn.Module):
         return self.psi(self.prepare(crop(image, pixel, sizes.PLACE_CROP)))
 
     def check_orientations(self, orientations: int) -> None:
-        """Raises ValueError if the networks cannot predict at N orientations."""
+        """Raises ValueError if the networks do not support N orientations."""
         discretization_matrix(orientations, self.config.angle_frequencies, quotient=2)
 
     def predict_pick(self, image: Image, orientations: int) -> PickPrediction:
@@ -187,7 +188,7 @@ class Networks(nn.Module):
     def losses(
         self, sample: LabelledImage, random: np.random.Generator
     ) -> Iterator[tuple[str, Callable[[], Tensor]]]:
-        """Each module's name and its loss on a sample, to be called and differentiated in turn."""
+        """Each module's name and a function that computes its loss on a sample."""
         sample = within_image(sample)
         pixels = [jittered(pick, random) for pick in (sample.pick, *sample.other_picks)]
         seed = int(random.integers(2**62))
@@ -203,14 +204,14 @@ class Networks(nn.Module):
         """The losses of the picking module.
 
         Args:
-            sample: what to learn from.
-            pixels: the middles of the crops: near the pick, and near each of the other picks.
+            sample: the training sample.
+            pixels: the centres of the crops, near the pick and each of the other picks.
             random: for all further draws.
         """
         raise NotImplementedError
 
     def stop_loss(self, image: Image, random: np.random.Generator) -> Tensor:
-        """The cross-entropy of an observation in which there is nothing to pick.
+        """The cross-entropy for an observation with nothing to pick.
 
         Args:
             image: the observation.
@@ -222,9 +223,9 @@ class Networks(nn.Module):
         """The loss of the placing module.
 
         Args:
-            sample: what to learn from.
-            pixel: the middle of the crop, near the pick.
-            seed: of all draws.
+            sample: the training sample.
+            pixel: the centre of the crop, near the pick.
+            seed: of all random draws.
         """
         goal = sample.place_of(np.array(pixel, float))
         return place_loss(
@@ -237,12 +238,12 @@ class Networks(nn.Module):
         )
 
     def modules_by_loss(self) -> dict[str, list[nn.Module]]:
-        """The modules that each loss trains; each loss has an optimiser of its own."""
+        """The modules that each loss trains. Each loss has its own optimiser."""
         raise NotImplementedError
 
 
 class FactoredNetworks(Networks):
-    """Networks that predict first where to pick, then at which angle (section III-C.1)."""
+    """Networks that predict the pick position first, then the angle (section III-C.1)."""
 
     alpha: nn.Module
     beta: nn.Module
@@ -254,7 +255,7 @@ class FactoredNetworks(Networks):
         return self.alpha(self.prepare(image))[0, 0, :rows, :cols]
 
     def crop_angle_logits(self, crops: Tensor, orientations: int) -> Tensor:
-        """f_theta: (n, channels, side, side), prepared crops, to (n, N / 2)."""
+        """f_theta: prepared crops (n, channels, side, side) to logits (n, N / 2)."""
         raise NotImplementedError
 
     def predict_angle(
@@ -291,7 +292,7 @@ class FactoredNetworks(Networks):
         yield "pick_angle", lambda: self._angle_loss(sample, pixels)
 
     def _angle_loss(self, sample: LabelledImage, pixels: list[tuple[int, int]]) -> Tensor:
-        """The mean over all picks, and once more over bent objects where there are curvatures."""
+        """The mean over all picks and, where there are curvatures, their bent copies."""
         orientations = self.config.orientations
         crops = [crop(sample.image, pixel, sizes.PICK_CROP) for pixel in pixels]
         thetas = [sample.pick_theta, *sample.other_thetas]
@@ -351,7 +352,7 @@ class SO2Networks(FactoredNetworks):
 
 
 def within_image(sample: LabelledImage) -> LabelledImage:
-    """The sample without those other picks that lie outside the image."""
+    """The sample without other picks outside the image."""
     rows, cols = sample.image.shape[1:]
     picks = sample.other_picks
     inside = ((picks >= 0) & (picks <= (rows - 1, cols - 1))).all(axis=1)
@@ -365,7 +366,7 @@ def within_image(sample: LabelledImage) -> LabelledImage:
 
 
 def jittered(pixel: NDArray[np.float64], random: np.random.Generator) -> tuple[int, int]:
-    """A pixel near a position."""
+    """A random pixel near a position."""
     offset = random.integers(-_JITTER, _JITTER + 1, size=2)
     row, col = np.rint(pixel).astype(int) + offset
     return int(row), int(col)

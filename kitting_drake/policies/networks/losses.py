@@ -1,12 +1,12 @@
-"""Cross-entropy losses over pixels, orientations and both (section V-C.1 of the paper).
+"""Cross-entropy losses over pixels, orientations or both (section V-C.1 of the paper).
 
-A label between two pixels or orientations becomes a soft label: it is interpolated linearly between
-its neighbours, so that the mean of the best prediction is the label. A label on a pixel is one-hot,
-as in the paper.
+A label between two pixels or orientations becomes a soft label, interpolated linearly between its
+neighbours: the mean of the optimal prediction is then the label. A label on a pixel is one-hot, as
+in the paper.
 
-Networks that can stop have one more class beside the pixels, "nothing to pick", whose logit is the
-constant `NOTHING_LOGIT`. The cross-entropy over all classes is then the sum of two losses: the one
-over the pixels alone, and `presence_loss` of the log-odds that there is something to pick.
+Networks that can stop have one more class, "nothing to pick", with the constant logit
+`NOTHING_LOGIT`. The cross-entropy over all classes then splits into the cross-entropy over the
+pixels and the `presence_loss` of the log-odds that there is something to pick.
 """
 
 from __future__ import annotations
@@ -25,24 +25,24 @@ from kitting_drake.policies.networks.layers.correlation import (
 )
 
 NOTHING_LOGIT = math.log(160 * 320)
-"""The logit of "nothing to pick". Fresh networks, whose logits are nearly zero, then find it about
-as likely as that there is something to pick in an image of the paper's size."""
+"""The logit of "nothing to pick". Untrained networks, whose logits are nearly zero, then predict
+even odds for an image of the paper's size."""
 
 _WINDOW = 17
 """The side of the window of the plain correlation around a label, in pixels."""
 _FINE_REACH = math.radians(10)
-"""How far from the label's rotation the window reaches, in radians."""
+"""How far the window extends from the label's rotation, in radians."""
 
 
 def interpolate_label(
     position: float, count: int, *, cyclic: bool = False
 ) -> list[tuple[int, float]]:
-    """A position between whole numbers as (index, weight) pairs: linear interpolation.
+    """A fractional position as (index, weight) pairs, by linear interpolation.
 
     Args:
         position: in bins.
         count: the number of bins; weight beyond them goes to the outermost.
-        cyclic: whether bin `count` is bin 0.
+        cyclic: whether the bins wrap around.
     """
     first = math.floor(position)
     share = position - first
@@ -53,7 +53,7 @@ def interpolate_label(
 
 
 def soft_label(*axes: list[tuple[int, float]], like: Tensor) -> Tensor:
-    """The outer product of one interpolated label for each axis, shaped as `like`."""
+    """The outer product of one interpolated label per axis, shaped as `like`."""
     label = torch.zeros_like(like)
     corners: list[tuple[tuple[int, ...], float]] = [((), 1.0)]
     for axis in axes:
@@ -74,9 +74,8 @@ def log_odds(logits: Tensor, orientations: int = 1) -> Tensor:
     """The log-odds that there is something to pick, against the class "nothing to pick".
 
     Args:
-        logits: of all actions: (rows, cols), or (orientations, rows, cols) where a method has
-            logits of both at once.
-        orientations: over which the logits range; the odds do not depend on how many there are.
+        logits: of all actions: (rows, cols), or (orientations, rows, cols) for a joint prediction.
+        orientations: the number of orientations in `logits`, which the odds do not depend on.
     """
     return logits.flatten().logsumexp(0) - math.log(orientations) - NOTHING_LOGIT
 
@@ -96,7 +95,7 @@ def position_loss(logits: Tensor, *pixels: tuple[float, float]) -> Tensor:
 
     Args:
         logits: (rows, cols).
-        pixels: the labels (row, col), which need not be whole numbers; all are equally likely.
+        pixels: the labels (row, col), which may be fractional; all are equally likely.
     """
     rows, cols = logits.shape
     labels = [
@@ -127,11 +126,11 @@ def place_loss(
     orientations: int,
     generator: torch.Generator,
 ) -> Tensor:
-    """Cross-entropy over all pixels and rotations of f_place (equation 8), estimated.
+    """An estimate of the cross-entropy over all pixels and rotations of f_place (equation 8).
 
-    Near the label the plain correlation is computed at every pixel and rotation. Everywhere else
-    the cells of the coarse volume stand for the pixels and rotations that they cover. The coarse
-    volume has a cross-entropy loss of its own besides, as the search at inference starts from it.
+    Near the label the full correlation is computed. Elsewhere each cell of the coarse volume stands
+    for the pixels and rotations that it covers. The coarse volume has an additional cross-entropy
+    loss of its own, because the search at inference starts from it.
 
     Args:
         scene: (1, channels, rows, cols), phi(o_t).
@@ -139,7 +138,7 @@ def place_loss(
         pixel: the label (row, col).
         rotation: the label, in radians.
         orientations: N.
-        generator: draws where the window and the coarse rotations lie about the label.
+        generator: draws the offsets of the window and of the coarse rotations from the label.
     """
     draws = torch.rand(3, generator=generator).tolist()
     coarse_angles = rotation_angles(COARSE_ROTATIONS, scene, draws[0])
@@ -158,7 +157,7 @@ def place_loss(
     first = min(first, math.floor(rotation / step))
     last = max(math.floor((rotation + _FINE_REACH) / step), math.floor(rotation / step) + 1)
     margin = _WINDOW // 2
-    # The label lies anywhere in the middle half of the window.
+    # The label lies anywhere in the central half of the window.
     top = round(pixel[0]) - margin + round((draws[1] - 0.5) * margin)
     left = round(pixel[1]) - margin + round((draws[2] - 0.5) * margin)
     angles = torch.arange(first, last + 1, dtype=scene.dtype, device=scene.device) * step
@@ -170,7 +169,7 @@ def place_loss(
         like=fine,
     )
 
-    # Coarse cells stand for what lies outside the window.
+    # Coarse cells represent everything outside the window.
     stands_for = math.log(4 * orientations / COARSE_ROTATIONS)
     covered = _covered(coarse, coarse_angles - rotation, (top, left))
     outside = (coarse + stands_for).masked_fill(covered, -torch.inf)
@@ -179,11 +178,11 @@ def place_loss(
 
 
 def _covered(coarse: Tensor, differences: Tensor, corner: tuple[int, int]) -> Tensor:
-    """Which cells of a coarse volume lie in the window around a label.
+    """The mask of the coarse cells inside the window around a label.
 
     Args:
         coarse: (n, rows, cols), at half the resolution.
-        differences: (n,), of the cells' rotations to the label's, in radians.
+        differences: (n,), the cells' rotations minus the label's, in radians.
         corner: the window's first pixel (row, col).
     """
     row = torch.arange(coarse.shape[1], device=coarse.device) * 2 - corner[0]
@@ -199,11 +198,11 @@ def _covered(coarse: Tensor, differences: Tensor, corner: tuple[int, int]) -> Te
 def joint_loss(
     logits: Tensor, *labels: tuple[list[tuple[int, float]], tuple[float, float]]
 ) -> Tensor:
-    """Cross-entropy over orientations and pixels at once, as in the Transporter.
+    """Cross-entropy over orientations and pixels jointly, as in the Transporter.
 
     Args:
         logits: (orientations, rows, cols).
-        labels: for each its orientation as (index, weight) pairs (see `interpolate_label`) and its
+        labels: pairs of an orientation as (index, weight) pairs (see `interpolate_label`) and a
             pixel (row, col); all are equally likely.
     """
     _, rows, cols = logits.shape

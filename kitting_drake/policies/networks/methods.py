@@ -1,4 +1,4 @@
-"""The methods by the names that configs and command lines use."""
+"""The methods, by their names in configs and command lines."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ _METHODS: dict[str, Callable[[NetworkConfig, Convolution], Networks]] = {
 
 
 def make_networks(config: NetworkConfig, convolution: Convolution = SteerableConv2d) -> Networks:
-    """Makes the networks of a config, with fresh weights.
+    """The networks of a config with untrained weights.
 
     Args:
-        config: what to make.
-        convolution: `SteerableConv2d` to train them, `PlainConv2d` to load exported weights.
+        config: the architecture.
+        convolution: `SteerableConv2d` for training, `PlainConv2d` to load exported weights.
     """
     return _METHODS[config.method](config, convolution)

@@ -14,7 +14,7 @@ from kitting_drake.policies.networks.layers.steerable import MixedPrecision, ups
 
 
 class PlainLayer(nn.Module):
-    """A convolution that computes in the type of its input, whatever the type of its weights."""
+    """A convolution that computes in the type of its input and casts its weights to it."""
 
     def __init__(
         self, channels_in: int, channels: int, size: int, *, stride: int = 1, gain: float = 1.0
@@ -33,7 +33,7 @@ class PlainLayer(nn.Module):
 
 
 class Bottleneck(nn.Module):
-    """Three convolutions, of one, three and one pixels, with a shortcut beside them."""
+    """Convolutions of 1, 3 and 1 pixels in a row, with a shortcut."""
 
     def __init__(
         self,
@@ -57,8 +57,7 @@ class Bottleneck(nn.Module):
         super().__init__()
         self.first = PlainLayer(channels_in, width, 1, stride=stride)
         self.second = PlainLayer(width, width, 3)
-        # There is no normalisation: fourteen blocks at full gain would let the features grow too
-        # large.
+        # Without normalisation, fourteen blocks at full gain would make the features too large.
         self.third = PlainLayer(width, channels, 1, gain=0.5 * gain)
         self.shortcut = (
             nn.Identity()
@@ -70,9 +69,8 @@ class Bottleneck(nn.Module):
         """(batch, channels in, rows, cols) to (batch, channels, rows / stride, cols / stride).
 
         Args:
-            features: what comes in.
-            result_type: in which the last convolution and the shortcut compute, if not in that of
-                the input.
+            features: the input.
+            result_type: the type of the last convolution and the shortcut; by default the input's.
         """
         hidden = F.relu_(self.second(F.relu_(self.first(features))))
         result_type = result_type or features.dtype
@@ -80,10 +78,10 @@ class Bottleneck(nn.Module):
 
 
 class ResNet(MixedPrecision):
-    """The Transporter's hourglass, which goes down to an eighth of the resolution and up again.
+    """The Transporter's hourglass: down to an eighth of the resolution and up again.
 
     It has 43 layers: a stem, and two blocks of three convolutions in each of four stages down and
-    three up. Convolutions in shortcuts are not counted.
+    three up. Shortcut convolutions are not counted.
     """
 
     def __init__(
@@ -102,7 +100,7 @@ class ResNet(MixedPrecision):
     def forward(self, image: Tensor) -> Tensor:
         """(batch, in channels, rows, cols) to (batch, out channels, rows, cols) in float32.
 
-        Computes in the type of the image, whose sides are one more than a multiple of 8.
+        Computes in the type of the image. Its sides must be one more than a multiple of 8.
         """
         features = F.relu_(self.stem(image.contiguous(memory_format=torch.channels_last)))
         for stage in self.down:
@@ -110,7 +108,7 @@ class ResNet(MixedPrecision):
         for stage in self.up:
             features = stage(upsample(features))
         features = F.relu_(self.last(upsample(features)))
-        # Logits need more than eight bits.
+        # Logits need float32: bfloat16 has eight bits of precision only.
         return self.out(features, torch.float32)
 
     def reduced_precision_parts(self) -> Iterator[nn.Module]:
@@ -118,7 +116,7 @@ class ResNet(MixedPrecision):
 
 
 def _stage(channels_in: int, channels: int, *, stride: int = 1) -> nn.Sequential:
-    """Two blocks, of which the first has the stride."""
+    """Two blocks; the first has the stride."""
     return nn.Sequential(
         Bottleneck(channels_in, channels, channels, stride=stride),
         nn.ReLU(inplace=True),

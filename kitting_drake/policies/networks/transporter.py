@@ -1,9 +1,9 @@
 """The Transporter, the second baseline of the paper (section V-C.3): ordinary convolutions.
 
-Its networks are not equivariant to rotations, so it shows them rotated images. For a parallel jaw
-the scene is rotated N / 2 times, and f_pick predicts for each rotated scene where a gripper at
-angle zero would pick. For placing, as in the original (Zeng et al.), the crop is rotated N times
-and each rotated crop is encoded by psi; the equivariant methods encode the crop once instead.
+Its networks are not equivariant to rotations, so they get rotated images. For picking, the scene is
+rotated N / 2 times (a parallel jaw is symmetric), and f_pick predicts for each rotated scene where
+a gripper at angle zero would pick. For placing, as in the original (Zeng et al.), the crop is
+rotated N times and psi encodes each rotated crop. The equivariant methods encode the crop once.
 """
 
 from __future__ import annotations
@@ -45,29 +45,31 @@ from kitting_drake.policies.networks.losses import (
 from kitting_drake.policies.networks.resnet import ResNet
 
 _NEAR = math.radians(10)
-"""Rotations up to this far from a label are easily confused with it: they are a stratum of their
-own (see `draw_bins`)."""
+"""Rotations within this of a label are easily confused with it and form their own stratum (see
+`draw_bins`)."""
 _DRAWS = 2
-"""The number of rotations that a training step draws in each stratum, where nothing else is asked
-for. More make a step slower. In the one comparison that was made they taught no more: after 750
-steps of the place networks alone on align-box-corner, at a learning rate of 3e-4, the cross-entropy
-over all rotations of validation scenes was 6.6 with 2, and 7.9 with 16 (the script is not kept)."""
+"""The default number of rotations that a training step draws in each stratum.
+
+More make a step slower, and did not help in a test: 750 steps of the place networks on
+align-box-corner at a learning rate of 3e-4 gave a validation cross-entropy over all rotations of
+6.6 with 2 and 7.9 with 16.
+"""
 _COARSE = 36
-"""The most rotations of the crop that are all encoded at inference."""
+"""The largest number of crop rotations that are encoded first at inference."""
 _CANDIDATES = 3
-"""The number of peaks among the coarse rotations that are refined at inference."""
+"""The number of coarse peaks that are refined at inference."""
 
 
 class TransporterNetworks(Networks):
-    """f_pick, and phi and psi, as three residual networks of 43 layers."""
+    """f_pick, phi and psi, as three residual networks of 43 layers."""
 
     picking = "pick"
 
     def __init__(self, config: NetworkConfig, convolution: Convolution = SteerableConv2d) -> None:
         """
         Args:
-            config: what to make.
-            convolution: not used, as there are no steerable convolutions.
+            config: the architecture.
+            convolution: unused; there are no steerable convolutions.
         """
         super().__init__(config)
         widths = self.preset.resnet
@@ -76,12 +78,12 @@ class TransporterNetworks(Networks):
         self.psi = ResNet(config.channels, sizes.FEATURES, widths)
 
     def check_orientations(self, orientations: int) -> None:
-        """Raises ValueError if N is odd: N / 2 of them must span half a rotation."""
+        """Raises ValueError if N is odd: N / 2 rotations must span half a turn."""
         if orientations < 2 or orientations % 2:
             raise ValueError(f"orientations must be an even number, not {orientations}")
 
     def pick_volume(self, image: Image, orientations: int) -> Tensor:
-        """f_pick: (N / 2, rows, cols), the logits of all gripper angles 2 pi i / N and pixels."""
+        """f_pick: (N / 2, rows, cols), the logits of all pixels at gripper angles 2 pi i / N."""
         self.check_orientations(orientations)
         step = math.tau / orientations
         return torch.stack([self._pick_scores(image, i * step) for i in range(orientations // 2)])
@@ -99,8 +101,7 @@ class TransporterNetworks(Networks):
         return torch.from_numpy(np.array(image, order="C")).to(self.device)[None]
 
     def predict_pick(self, image: Image, orientations: int) -> PickPrediction:
-        """Position and angle are read off one volume: the position is that of its maximum, and the
-        angle the best one there."""
+        """Reads position and angle from one volume: its maximum, and the best angle per pixel."""
         volume = self.pick_volume(image, orientations)
         return PickPrediction(
             position=volume.amax(0),
@@ -142,17 +143,17 @@ class TransporterNetworks(Networks):
 
     @property
     def _pick_rotations(self) -> int | None:
-        """Half of `rotations`, as a gripper has half as many angles."""
+        """Half of `rotations`, because a gripper has half as many distinct angles."""
         return None if self.rotations is None else self.rotations // 2
 
     def _drawn_scores(self, image: Image, drawn: dict[int, float]) -> Tensor:
-        """(n, rows, cols): the logits at the angles that `draw_bins` drew, weighted accordingly."""
+        """(n, rows, cols): the logits at the angles drawn by `draw_bins`, with their weights."""
         step = math.tau / self.config.orientations
         scores = [self._pick_scores(image, bin_ * step) + stands for bin_, stands in drawn.items()]
         return torch.stack(scores)
 
     def encode_crops(self, image: Image, pixel: tuple[int, int], angles: Sequence[float]) -> Tensor:
-        """psi of crops around a pixel of the rotated scene, the kernels of f_place.
+        """The kernels of f_place: psi of crops around a pixel of the rotated scene.
 
         Args:
             image: the observation.
@@ -170,11 +171,10 @@ class TransporterNetworks(Networks):
     def predict_place(
         self, image: Image, pixel: tuple[int, int], orientations: int
     ) -> PlacePrediction:
-        """f_place, all pixels at once, at all rotations for N up to 36.
+        """f_place over all pixels, at all rotations for N up to 36.
 
-        For larger N, 36 nearly evenly spaced bins come first. Around the three best peaks among
-        them, all bins between the neighbouring ones are then encoded and correlated as well, at
-        pixels near the peak.
+        For larger N, 36 nearly evenly spaced bins come first. Then all bins between the neighbours
+        of the three best peaks are encoded and correlated at pixels near each peak.
         """
         shape = (image.shape[1], image.shape[2])
         step = math.tau / orientations
@@ -198,8 +198,7 @@ class TransporterNetworks(Networks):
         return PlacePrediction(ranked(candidates, orientations), volume.amax(0))
 
     def place_loss(self, sample: LabelledImage, pixel: tuple[int, int], seed: int) -> Tensor:
-        """Cross-entropy over all pixels and a sample of the rotations: the label's own, some near
-        it and some elsewhere (see `draw_bins`)."""
+        """Cross-entropy over all pixels and sampled rotations (see `draw_bins`)."""
         orientations = self.config.orientations
         step = math.tau / orientations
         row, col = sample.place_of(np.array(pixel, float))
@@ -217,13 +216,13 @@ class TransporterNetworks(Networks):
 
 
 def coarse_bins(orientations: int) -> list[int]:
-    """The rotations of the crop, in bins, that are all encoded at inference: at most 36."""
+    """The crop rotations that are encoded first at inference, in bins; at most 36."""
     count = min(orientations, _COARSE)
     return [round(i * orientations / count) for i in range(count)]
 
 
 def encodings_per_decision(orientations: int) -> int:
-    """The number of rotated crops that `TransporterNetworks.predict_place` encodes at N."""
+    """The number of crops that `TransporterNetworks.predict_place` encodes at N."""
     coarse = len(coarse_bins(orientations))
     if coarse == orientations:
         return coarse
@@ -238,20 +237,19 @@ def draw_bins(
     random: np.random.Generator,
     rotations: int | None = None,
 ) -> dict[int, float]:
-    """The rotations that a training step computes: sampled softmax in two strata.
+    """The rotations of a training step: sampled softmax with two strata, near the labels and far.
 
     Args:
-        labels: bins that must be among them.
-        bins: how many there are, over half a rotation or a full one.
+        labels: bins to include.
+        bins: the total number of bins, over half a rotation or a full one.
         step: between neighbours, in radians.
-        random: draws the others.
-        rotations: how many there are to be, with those of the labels: half of the others near a
-            label, as far as there are so many. At most all; at least as many as with None, which
-            draws two in each stratum.
+        random: draws the other bins.
+        rotations: the number of bins to return, including the labels. Half of the drawn bins are
+            near a label, if there are enough. None draws two per stratum, the minimum.
 
     Returns:
-        The bins, each with what is added to its logits, in nats, so that those that were drawn
-        stand for all of their stratum.
+        A dict from bins to log weights in nats. Adding these to the logits makes the drawn bins
+        stand for their whole stratum.
     """
     strata: tuple[list[int], list[int]] = ([], [])
     for bin_ in range(bins):
@@ -274,28 +272,28 @@ def draw_bins(
 
 
 def among(label: list[tuple[int, float]], drawn: dict[int, float]) -> list[tuple[int, float]]:
-    """An interpolated label in terms of positions among the bins that `draw_bins` drew."""
+    """An interpolated label over positions in `drawn` instead of bins."""
     index = {bin_: position for position, bin_ in enumerate(drawn)}
     return [(index[bin_], weight) for bin_, weight in label]
 
 
 def canvas_shape(shape: tuple[int, int], angle: float) -> tuple[int, int]:
-    """Rows and cols that hold all pixel centres of an image of some rows and cols, rotated."""
+    """Rows and cols that hold all pixel centres of a rotated image of the given shape."""
     cos, sin = abs(math.cos(angle)), abs(math.sin(angle))
     height, width = shape[0] - 1, shape[1] - 1
-    # Rounding errors must not make a rotation by 90 degrees a pixel larger.
+    # Rounding errors must not add a pixel to a rotation by 90 degrees.
     rows = math.ceil(height * cos + width * sin - 1e-6)
     cols = math.ceil(height * sin + width * cos - 1e-6)
     return rows + 1, cols + 1
 
 
 def rotated(image: Tensor, angle: float, shape: tuple[int, int]) -> Tensor:
-    """An image rotated about its middle, bilinearly sampled; zero, as if unseen, outside it.
+    """An image rotated about its centre with bilinear sampling; zero (unseen) outside it.
 
     Args:
         image: (1, channels, rows, cols).
         angle: counter-clockwise, in radians.
-        shape: rows and cols of the result; its middle is the image's.
+        shape: rows and cols of the result, which has the same centre.
 
     Returns:
         (1, channels, *shape).
@@ -305,16 +303,17 @@ def rotated(image: Tensor, angle: float, shape: tuple[int, int]) -> Tensor:
 
 
 def rotated_crops(image: Tensor, pixel: tuple[int, int], angles: Sequence[float]) -> Tensor:
-    """Crops of the scene rotated about a pixel, which is in the middle of each: no corner of a crop
-    is missing that is in the scene.
+    """Crops of the scene rotated about a pixel, which is the centre of each crop.
+
+    Rotating the scene rather than the crop keeps the crop's corners filled.
 
     Args:
         image: (1, channels, rows, cols).
         pixel: (row, col).
-        angles: n of them, counter-clockwise, in radians.
+        angles: n counter-clockwise angles in radians.
 
     Returns:
-        (n, channels, PLACE_CROP, PLACE_CROP); zero, as if unseen, outside the image.
+        (n, channels, PLACE_CROP, PLACE_CROP); zero (unseen) outside the image.
     """
     return _sampled(image, pixel, angles, (sizes.PLACE_CROP, sizes.PLACE_CROP))
 
@@ -322,7 +321,7 @@ def rotated_crops(image: Tensor, pixel: tuple[int, int], angles: Sequence[float]
 def _sampled(
     image: Tensor, centre: tuple[float, float], angles: Sequence[float], shape: tuple[int, int]
 ) -> Tensor:
-    """An image rotated about a point by each of some angles, with that point in the middle."""
+    """An image rotated about a point by each angle, with that point at the centre."""
     axes = [
         torch.arange(side, dtype=image.dtype, device=image.device) - (side - 1) / 2
         for side in shape
@@ -332,7 +331,7 @@ def _sampled(
     sources = []
     for angle in angles:
         cos, sin = math.cos(angle), math.sin(angle)
-        # Each pixel is taken from where the inverse rotation brings it: (col, row) from -1 to 1.
+        # Sample each pixel at its inverse rotation, as (col, row) from -1 to 1.
         source_row = cos * row + sin * col + (centre[0] - (rows - 1) / 2)
         source_col = cos * col - sin * row + (centre[1] - (cols - 1) / 2)
         source = [source_col * (2 / (cols - 1)), source_row * (2 / (rows - 1))]

@@ -20,7 +20,7 @@ from kitting_drake.policies.networks.layers.steerable import (
 )
 
 STRIDE = 16
-"""The sides of an image must be one more than a multiple of this, in pixels."""
+"""The sides of an image in pixels must be one more than a multiple of this."""
 
 
 @dataclass(frozen=True)
@@ -28,17 +28,17 @@ class UNetSize:
     """The width of a U-net."""
 
     down: tuple[int, int, int, int, int] = (16, 32, 64, 128, 128)
-    """The number of fields of each of the five blocks of the encoder, with poolings between."""
+    """The number of fields of the encoder's five blocks, with pooling between them."""
     up: tuple[int, int, int, int] = (64, 32, 16, 16)
-    """The number of fields of each of the four blocks of the decoder."""
+    """The number of fields of the decoder's four blocks."""
     head: int = 16
     """The number of scalar channels before the last layer."""
     skip: int = 3
-    """The side of the kernel in a residual block's shortcut that changes the number of fields."""
+    """The kernel side of residual shortcuts that change the number of fields."""
 
 
 class ResidualBlock(nn.Module):
-    """Two convolutions with a shortcut beside them, and ELU after each."""
+    """Two convolutions with a shortcut, and ELU after each."""
 
     def __init__(
         self,
@@ -51,7 +51,7 @@ class ResidualBlock(nn.Module):
     ) -> None:
         super().__init__()
         self.first = convolution(fields_in, fibre, fields, fibre, size)
-        # There is no normalisation: nine blocks at full gain would let the features grow too large.
+        # Without normalisation, nine blocks at full gain would make the features too large.
         self.second = convolution(fields, fibre, fields, fibre, size, gain=0.5)
         self.shortcut = (
             BandLimit(fibre, fields)
@@ -68,7 +68,8 @@ class ResidualBlock(nn.Module):
 class UNet(MixedPrecision):
     """Maps scalar images to scalar images through hidden fields of one fibre, in 21 layers.
 
-    It commutes with rotations of the image (equation 3): its input and output are trivial fields.
+    Its input and output are trivial fields, so it commutes with rotations of the image (equation
+    3).
     """
 
     def __init__(
@@ -101,11 +102,15 @@ class UNet(MixedPrecision):
     def forward(self, image: Tensor) -> Tensor:
         """(batch, in channels, rows, cols) to (batch, out channels, rows, cols) in float32.
 
-        Computes in the type of the image, whose sides are one above a multiple of 16.
+        Computes in the type of the image. Its sides must be one more than a multiple of 16.
+
+        Raises:
+            ValueError: a side is not one more than a multiple of 16.
         """
         if image.shape[2] % STRIDE != 1 or image.shape[3] % STRIDE != 1:
             raise ValueError(
-                f"an image of {tuple(image.shape[2:])} pixels cannot be halved 4 times"
+                f"an image of {tuple(image.shape[2:])} pixels does not fit the U-net: its sides "
+                f"must be one more than a multiple of {STRIDE}"
             )
         features = F.elu_(self.lift(image.contiguous(memory_format=torch.channels_last)))
         levels = []
@@ -116,8 +121,7 @@ class UNet(MixedPrecision):
             features = block(features)
         for block in self.up:
             features = block(torch.cat([upsample(features), levels.pop()], dim=1))
-        # The last two layers are small and always compute in float32: logits need more than eight
-        # bits.
+        # The last two layers always compute in float32: logits need more precision than bfloat16.
         scalars = self.invariant(features).float()
         return self.out(F.elu(self.mix(scalars)))
 

@@ -1,8 +1,8 @@
-"""Trained networks as files: safetensors, loaded as plain convolutions without any group library.
+"""Trained networks as safetensors files. Loading gives plain convolutions, without a group library.
 
-A file holds the trained weights, which are coefficients of kernel bases, and these few bases, from
-which the plain kernels are expanded. That is a tenth of what the plain kernels would take (4 MB
-instead of 37 for the preset "small").
+A file holds the trained weights, which are coefficients of kernel bases, and the few bases. The
+plain kernels are expanded from these when the file is loaded. Storing the kernels themselves would
+take ten times the space (37 MB instead of 4 for the preset "small").
 """
 
 from __future__ import annotations
@@ -38,34 +38,34 @@ FORMAT = "kitting_drake policy"
 FORMAT_VERSION = 1
 
 _RENAMED = {"colour_deviation": "colour_std", "height_deviation": "height_std"}
-"""Config fields of older files, by the names that they have now."""
+"""Renamed config fields of older files."""
 _ADDED = ("colour", "stop")
-"""Config fields that older files lack: they take their defaults."""
+"""Config fields that older files lack; they take their defaults."""
 
 
 @dataclass(frozen=True)
 class WeightsFile:
-    """The metadata of a file of weights."""
+    """The metadata of a weights file."""
 
     config: NetworkConfig
     card: dict[str, Any]
-    """Where the weights come from: data, seeds, steps, validation. Its `stop_threshold`, if there
-    is one, is `Networks.stop_threshold`."""
+    """The origin of the weights: data, seeds, steps, validation. An optional `stop_threshold` sets
+    `Networks.stop_threshold`."""
 
 
 def card_seeds(card: Mapping[str, Any]) -> set[int]:
-    """The seeds of the demonstrations that weights were made with, learned from or validated by,
-    with those of the weights that training began with."""
+    """The seeds of all demonstrations for training and validation, including those of the weights
+    that training started from."""
     seeds = set(card.get("start_seeds", ()))
-    # Those of static scenes are of scenes, which no episode has.
+    # Seeds of static scenes are not seeds of episodes.
     if card.get("scenario") != STATIC:
         seeds |= {*card.get("demonstration_seeds", ()), *card.get("validation_seeds", ())}
     return seeds
 
 
 def learned_seeds(card: Mapping[str, Any]) -> dict[str, list[int]]:
-    """The seeds of the demonstrations that weights learned from, by scenario, with those of all
-    the weights that training began with, one after another."""
+    """The seeds of the training demonstrations by scenario, including those of all weights that
+    training started from."""
     learned = {scenario: set(seeds) for scenario, seeds in card.get("start_learned", {}).items()}
     own = set(card.get("demonstration_seeds", ()))
     scenario = str(card.get("scenario"))
@@ -74,12 +74,12 @@ def learned_seeds(card: Mapping[str, Any]) -> dict[str, list[int]]:
 
 
 def save_weights(path: Path, networks: Networks, card: dict[str, Any]) -> None:
-    """Writes networks, as they are trained, to a file.
+    """Writes trained networks to a file.
 
     Args:
-        path: the file, which is written atomically.
-        networks: made with steerable convolutions.
-        card: see `WeightsFile`; anything that JSON takes.
+        path: the file; it is written atomically.
+        networks: with steerable convolutions.
+        card: see `WeightsFile`; must be serializable as JSON.
     """
     tensors: dict[str, Tensor] = {}
     bases: dict[str, str] = {}
@@ -123,25 +123,25 @@ def _plain_size(layer: SteerableConv2d) -> int:
 
 
 def read_weights_file(path: Path) -> WeightsFile:
-    """Reads what a file says beside the weights, without reading these.
+    """Reads the metadata of a weights file without its weights.
 
     Raises:
-        UserError: the file cannot be used.
+        UserError: the file is unusable.
     """
     metadata, _ = _read(path, tensors=False)
     return WeightsFile(_config(path, metadata), _json(path, metadata, "card"))
 
 
 def load_networks(path: Path, compute_type: torch.dtype = torch.float32) -> Networks:
-    """Networks of plain convolutions, for inference.
+    """Networks of plain convolutions for inference.
 
     Args:
         path: a file that `save_weights` wrote.
-        compute_type: of the convolutions; the weights are cast to it once, here.
+        compute_type: of the convolutions; the weights are cast to it once.
 
     Raises:
-        UserError: the file cannot be read, is not such a file, or its weights are not those of the
-            networks that its config names.
+        UserError: the file is unreadable or not a weights file, or its weights do not fit its
+            config.
     """
     metadata, tensors = _read(path, tensors=True)
     config = _config(path, metadata)
@@ -150,18 +150,17 @@ def load_networks(path: Path, compute_type: torch.dtype = torch.float32) -> Netw
     try:
         networks = make_networks(config, PlainConv2d)
     except (TypeError, ValueError) as error:
-        raise UserError(f"{path}: its config cannot be used: {error}") from error
+        raise UserError(f"{path}: its config is unusable: {error}") from error
     try:
         networks.load_state_dict(state)
     except RuntimeError as error:
-        # Torch lists every tensor that does not fit; the first is enough.
+        # Torch lists every mismatched tensor; the first is enough.
         first = textwrap.shorten(str(error).splitlines()[1], 150, placeholder=" ...")
         raise UserError(
-            f"{path}: the weights are not those of a {config.preset} {config.method} network: "
-            f"{first}"
+            f"{path}: the weights do not fit a {config.preset} {config.method} network: {first}"
         ) from error
     if not all(bool(value.isfinite().all()) for value in state.values()):
-        raise UserError(f"{path}: the weights are not all finite numbers")
+        raise UserError(f"{path}: the weights must be finite numbers")
     networks.stop_threshold = threshold
     networks.freeze(compute_type)
     return networks
@@ -170,21 +169,21 @@ def load_networks(path: Path, compute_type: torch.dtype = torch.float32) -> Netw
 def load_trainable(
     path: Path, fresh_angle_at: int | None = None, preset: str | None = None
 ) -> Networks:
-    """Networks as they are trained, to go on from a file's weights.
+    """Trainable networks that continue from a file's weights.
 
-    The optimisers' state is not in a file: training begins anew, from these weights.
+    The file does not hold the optimisers' state, so they start afresh.
 
     Args:
         path: a file that `save_weights` wrote.
-        fresh_angle_at: N of the result, whose pick-angle network then has fresh weights: of the
-            `FactoredNetworks` it is the only one in whose architecture N may be. None: the file's
-            N, and all its weights.
-        preset: of the result, whose U-nets must be of the same size (`NetworkConfig.has_unets_of`).
-            None: the file's.
+        fresh_angle_at: N of the result, with untrained weights in its pick-angle network: the only
+            one of `FactoredNetworks` whose architecture may depend on N. None for the file's N and
+            all its weights.
+        preset: of the result, whose U-nets must have the same size (`NetworkConfig.has_unets_of`).
+            None for the file's.
 
     Raises:
         UserError: as `load_networks`.
-        ValueError: there are no such networks at that N.
+        ValueError: the networks do not support that N.
     """
     plain = load_networks(path)
     config = plain.config
@@ -217,7 +216,7 @@ def load_trainable(
 def _plain_state(
     path: Path, tensors: dict[str, Tensor], bases: dict[str, Any]
 ) -> dict[str, Tensor]:
-    """The state of networks of plain convolutions: kernels expanded from their bases."""
+    """The state dict of networks of plain convolutions, with kernels expanded from their bases."""
     state = {}
     for name, tensor in tensors.items():
         layer, _, kind = name.rpartition(".")
@@ -246,11 +245,11 @@ def _read(path: Path, *, tensors: bool) -> tuple[dict[str, str], dict[str, Tenso
             reason = "there is no such file"
         raise UserError(f"cannot read the weights {path}: {reason}") from error
     if metadata.get("format") != FORMAT:
-        raise UserError(f"{path} is a safetensors file, but no policy of this program")
+        raise UserError(f"{path} is a safetensors file, but not a policy of this program")
     if metadata.get("format_version") != str(FORMAT_VERSION):
         raise UserError(
-            f"{path} has format version {metadata.get('format_version')}, and this program reads "
-            f"{FORMAT_VERSION}"
+            f"{path} has format version {metadata.get('format_version')}, but this version of "
+            f"kitting_drake reads {FORMAT_VERSION}"
         )
     return metadata, content
 
@@ -259,9 +258,9 @@ def _json(path: Path, metadata: dict[str, str], key: str) -> dict[str, Any]:
     try:
         value = json.loads(metadata[key])
     except (KeyError, ValueError) as error:
-        raise UserError(f"{path}: its {key} cannot be read") from error
+        raise UserError(f"{path}: its {key} is missing or not valid JSON") from error
     if not isinstance(value, dict):
-        raise UserError(f"{path}: its {key} cannot be read")
+        raise UserError(f"{path}: its {key} must be a JSON object")
     return value
 
 
@@ -276,7 +275,7 @@ def _config(path: Path, metadata: dict[str, str]) -> NetworkConfig:
         values["angle_frequencies"] = tuple(values["angle_frequencies"])
         return NetworkConfig(**values)
     except (TypeError, ValueError) as error:
-        raise UserError(f"{path}: its config cannot be used: {error}") from error
+        raise UserError(f"{path}: its config is unusable: {error}") from error
 
 
 def _stop_threshold(path: Path, metadata: dict[str, str]) -> float | None:
@@ -284,5 +283,5 @@ def _stop_threshold(path: Path, metadata: dict[str, str]) -> float | None:
     if value is None:
         return None
     if not isinstance(value, int | float) or not math.isfinite(value):
-        raise UserError(f"{path}: the stop_threshold of its card is {value!r}, not a number")
+        raise UserError(f"{path}: the stop_threshold of its card must be a number, not {value!r}")
     return float(value)

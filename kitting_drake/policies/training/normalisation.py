@@ -1,4 +1,4 @@
-"""How the inputs of networks are normalised: by the mean and spread of what they learn from."""
+"""Normalisation of the networks' inputs, by the mean and standard deviation of training images."""
 
 import math
 
@@ -10,8 +10,8 @@ from kitting_drake.policies.networks.architecture import NetworkConfig
 
 
 def normalisation(observed: list[ObservedScene]) -> dict[str, float]:
-    """The fields of a `NetworkConfig` by which inputs are normalised."""
-    # One image in memory at a time.
+    """The normalisation fields of a `NetworkConfig`."""
+    # A generator keeps only one image in memory.
     images = (scene.recorded.image for scene in observed)
     moments = np.array([[_moments(image[:3]), _moments(image[3])] for image in images])
     default = NetworkConfig()
@@ -25,17 +25,17 @@ def normalisation(observed: list[ObservedScene]) -> dict[str, float]:
 
 
 def _moments(values: NDArray[np.float32]) -> tuple[float, float]:
-    """The means of some values and of their squares."""
+    """The mean of some values and the mean of their squares."""
     return float(values.mean(dtype=float)), float(np.square(values, dtype=float).mean())
 
 
 def _mean_and_std(moments: NDArray[np.float64]) -> tuple[float, float]:
-    """Mean and standard deviation from what `_moments` returns for equal shares of all values.
+    """The mean and standard deviation from the `_moments` of equally many values each.
 
     Args:
         moments: (2, n).
     """
     mean, square = moments.mean(axis=1)
     variance = float(square) - float(mean) ** 2
-    # Where all values are alike, the difference is a rounding error.
+    # For constant values the difference is a rounding error.
     return float(mean), math.sqrt(variance) if variance > 1e-12 else 0.0

@@ -1,4 +1,4 @@
-"""Networks as ONNX, for other programs; docs/learning.md says how to run them."""
+"""ONNX export of the networks; docs/learning.md describes how to run them."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ from kitting_drake.policies.networks.unet import STRIDE
 from kitting_drake.policies.networks.weights import load_networks, read_weights_file
 
 GRAPHS = ("alpha", "beta", "phi", "psi")
-"""The networks; a file each."""
+"""The exported networks, one file each."""
 _OPSET = 17
 
 
 class _BlurOfAnySize(nn.Module):
-    """`BlurPool` in operators that ONNX has for images of any size."""
+    """`BlurPool` in ONNX operators that support any image size."""
 
     kernel: Tensor
 
@@ -53,27 +53,30 @@ def require_onnx() -> ModuleType:
 
 
 def export_onnx(weights: Path, folder: Path) -> list[Path]:
-    """Writes the networks of a weights file as ONNX, in float32, and `policy.json`.
+    """Writes the networks of a weights file as ONNX in float32, and `policy.json`.
 
-    Each graph maps `image`, prepared as `policy.json` says, to `output`. The U-nets alpha, phi and
-    psi take any sides that are one above a multiple of 16 pixels; beta takes its crop. What lies
-    between them (crops, rotations, correlation) is not exported; see docs/learning.md.
+    Each graph maps `image`, prepared as in `policy.json`, to `output`. The U-nets alpha, phi and
+    psi take any sides that are one more than a multiple of 16 pixels; beta takes its crop. Crops,
+    rotations and correlation are not exported (see docs/learning.md).
 
     Args:
         weights: a file that `train` wrote.
-        folder: where to.
+        folder: the output folder.
 
     Returns:
-        The files.
+        The paths of the files.
 
     Raises:
-        UserError: the weights cannot be used, are those of a Transporter, which rotates whole
-            images between its networks, or the package onnx is not installed.
+        UserError: the weights are unusable or those of a Transporter, which rotates images between
+            its networks, or the package onnx is not installed.
     """
     networks = load_networks(weights)
     card = read_weights_file(weights).card
     if not isinstance(networks, FactoredNetworks):
-        raise UserError(f"{weights}: a {networks.config.method} cannot be exported as ONNX")
+        raise UserError(
+            f"{weights}: a {networks.config.method} cannot be exported as ONNX, because it rotates "
+            "images between its networks"
+        )
     onnx = require_onnx()
     require_folder(folder)
     config = networks.config
@@ -116,8 +119,8 @@ def _graph(network: nn.Module, example: Tensor, *, any_size: bool) -> bytes:
         warnings.catch_warnings(),
         torch.no_grad(),
     ):
-        # Of shapes that it checks while it traces, and of itself: torch's newer exporter takes a
-        # minute for each network, this one a second.
+        # The exporter warns about traced shape checks and about its age. The newer exporter takes a
+        # minute per network instead of a second.
         warnings.simplefilter("ignore")
         file = Path(scratch) / "network.onnx"
         torch.onnx.export(

@@ -1,4 +1,4 @@
-"""One training run: its settings, its steps, and its files, by which it goes on when stopped."""
+"""A training run: its settings, steps, and the files from which it resumes."""
 
 import dataclasses
 import io
@@ -43,7 +43,7 @@ _CHECKPOINT_EVERY = 100
 _MOST_VALIDATED = 64
 """The most scenes, and the most final observations, that a validation uses."""
 _MOST_NORMALISED = 512
-"""The most scenes whose images tell by what inputs are normalised."""
+"""The most scenes that the normalisation is computed from."""
 _DAMAGED = (
     OSError,
     EOFError,
@@ -62,7 +62,7 @@ class Settings:
 
     scenario: str
     demonstrations: int
-    """The number of demonstrations, or of static scenes, that are learned from."""
+    """The number of demonstrations or static scenes for training."""
     demonstration_seeds: tuple[int, ...]
     validation_seeds: tuple[int, ...]
     method: str
@@ -74,31 +74,31 @@ class Settings:
     learning_rate: float
     decay: bool
     taken_only: bool
-    """Whether later picks of a demonstration are no labels of its earlier observations."""
+    """Whether observations are labelled with the expert's own action only, not with later picks."""
     rigid: bool
-    """Whether there is no curvature augmentation."""
+    """Whether curvature augmentation is off."""
     reflection: bool
-    """Whether half of the samples are mirror images."""
+    """Whether half of the samples are reflected."""
     colour: bool
     """Whether the networks see colours."""
     stop: bool
-    """Whether the networks learn from final observations that there is nothing left to pick."""
+    """Whether the networks learn to stop from final observations."""
     validate_every: int
     seed: int
     angle_only: bool
-    """Whether only the pick-angle network is trained, afresh, beside those that it begins with."""
+    """Whether only the pick-angle network is trained, from untrained weights."""
     start: str | None
-    """A digest of the weights that training begins with; None: fresh ones."""
+    """A digest of the weights that training starts from; None for untrained ones."""
     start_seeds: tuple[int, ...]
-    """The seeds of the demonstrations that those weights were made with."""
+    """All demonstration seeds of the starting weights (see `card_seeds`)."""
     start_learned: dict[str, list[int]]
-    """Those of them that were learned from, by scenario."""
+    """The training seeds of the starting weights by scenario (see `learned_seeds`)."""
     device: str
     compute_type: str
 
 
 def _begun(settings: Settings, learned: TrainingData, start: Path | None) -> Networks:
-    """The networks before the first step: fresh ones, or those of a file."""
+    """The networks before the first step: untrained ones, or those of a file."""
     torch.manual_seed(settings.seed)
     try:
         if start is not None:
@@ -135,14 +135,14 @@ class TrainingRun:
         """
         Args:
             settings: of the run.
-            learned: what to learn from.
-            held_out: what to choose a checkpoint by.
+            learned: the training data.
+            held_out: the validation data, by which a checkpoint is chosen.
             folder: of its files.
             console: for progress.
-            start: weights to begin with; None: fresh ones.
+            start: weights to start from; None for untrained ones.
 
         Raises:
-            UserError: such networks cannot be made, or the weights not be read.
+            UserError: the settings do not fit the networks, or the weights are unusable.
         """
         self.settings, self.folder, self.console = settings, folder, console
         self._log = folder / "log.jsonl"
@@ -183,7 +183,7 @@ class TrainingRun:
         }
 
     def train(self) -> None:
-        """Trains to the last step, from the checkpoint if there is one."""
+        """Trains to the last step, resuming from a checkpoint if there is one."""
         self._resume()
         trainer, settings = self.trainer, self.settings
         if trainer.step_count >= settings.steps:
@@ -242,7 +242,7 @@ class TrainingRun:
             raise UserError(f"{DIVERGED} at step {self.trainer.step_count}: lower --learning-rate")
 
     def _log_losses(self, writer: SummaryWriter) -> None:
-        """The mean of each loss since the last point of the curves, over the steps that have it."""
+        """Logs the mean of each loss over the steps since the last point of the curves."""
         step = self.trainer.step_count
         names = {name: None for losses in self.recent for name in losses}
         means = {
@@ -288,7 +288,7 @@ class TrainingRun:
                 state[key] for key in ("best", "seconds", "recent")
             )
         except _DAMAGED as error:
-            raise UserError(f"{path} cannot be taken up again: delete {self.folder}") from error
+            raise UserError(f"cannot resume from {path}: delete {self.folder}") from error
         kept = [line for line in read_lines(self._log) if line["step"] <= self.trainer.step_count]
         write_atomically(self._log, "".join(json.dumps(line) + "\n" for line in kept))
 

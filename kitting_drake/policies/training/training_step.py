@@ -23,20 +23,20 @@ _STOP_PROBABILITY = 1 / 8
 
 @dataclass(frozen=True)
 class _Draw:
-    """The sample, and perhaps the final observation, of a step."""
+    """The random sample of a step, with a final observation in some steps."""
 
     sample: LabelledImage
     random: np.random.Generator
-    """For the draws of the losses."""
+    """For the random draws of the losses."""
     final: Image | None
-    """A final observation, if the step has one."""
+    """A final observation; None in most steps."""
     stop_random: np.random.Generator
-    """For the draws of its loss."""
+    """For the random draws of the stop loss."""
 
 
 @dataclass(frozen=True)
 class _Prepared:
-    """The draw that is being prepared for a later step."""
+    """The draw for the next step, prepared in the background."""
 
     step: int
     samples: Sequence[LabelledImage]
@@ -44,24 +44,23 @@ class _Prepared:
     draw: Future[_Draw]
 
     def of(self, samples: Sequence[LabelledImage], finals: Sequence[Pictured]) -> bool:
-        """Whether it is drawn from these very samples and final observations."""
+        """Whether the draw is from these sequences (by identity)."""
         return self.samples is samples and self.finals is finals
 
 
 def decayed(step: int, steps: int) -> float:
-    """The share of the learning rate at a step: it rises over the first hundred, and falls to zero
-    over all steps (half a cosine)."""
+    """The factor of the learning rate at a step: linear warm-up over a hundred steps, and cosine
+    decay to zero over all steps."""
     rise = min(1.0, (step + 1) / 100)
     return rise * 0.5 * (1 + math.cos(math.pi * min(1.0, step / steps)))
 
 
 class Trainer:
-    """Networks and their optimisers, an Adam for each loss.
+    """Networks and their optimisers, one Adam per loss.
 
-    All random draws of a step depend on the seed and the step's number alone, so that a run which
-    is resumed continues as if it had not been interrupted. What a step learns from is prepared in
-    another thread, during the step before: torch's DataLoader would prepare it in another process,
-    to which the samples, which stay in an open HDF5 file, cannot be sent.
+    All random draws of a step depend only on the seed and the step's number, so a resumed run
+    continues exactly. A thread prepares the next step's sample. The processes of torch's DataLoader
+    could not receive the samples, which refer to an open HDF5 file.
     """
 
     def __init__(
@@ -78,16 +77,15 @@ class Trainer:
     ) -> None:
         """
         Args:
-            networks: what to train.
-            seed: of all draws.
-            steps: how many there will be.
-            learning_rate: Adam's.
-            decay: let the learning rate fall to zero over the steps (`decayed`) instead of keeping
-                it constant.
+            networks: to train.
+            seed: of all random draws.
+            steps: the total number of steps.
+            learning_rate: of Adam.
+            decay: let the learning rate decay to zero (`decayed`) instead of keeping it constant.
             curvature: see `augment`.
             reflection: see `augment`.
-            only: the loss whose modules are trained, in the very steps that they take when all
-                are; the others keep their weights. None: all losses.
+            only: the single loss to train; other modules keep their weights. Its steps equal those
+                of a full training. None for all losses.
         """
         self.networks = networks
         self.seed = seed
@@ -112,7 +110,7 @@ class Trainer:
         self._schedules = self._scheduled()
 
     def _scheduled(self) -> list[LambdaLR]:
-        """The schedules of the optimisers' learning rates, at the present step."""
+        """The learning rate schedules of the optimisers, at the current step."""
         for optimiser in self.optimisers.values():
             for group in optimiser.param_groups:
                 group["initial_lr"] = self.learning_rate
@@ -128,17 +126,17 @@ class Trainer:
     def step(
         self, samples: Sequence[LabelledImage], finals: Sequence[Pictured] = ()
     ) -> dict[str, float]:
-        """One step on a sample that is drawn at random and augmented.
+        """One step on a random, augmented sample.
 
-        Networks that can stop also learn, in one step of eight, from one of the final observations.
-        Its loss is added to that of the picking module; all else sees as many samples as ever.
+        In one step of eight, networks that can stop also learn from a final observation. Its loss
+        is added to that of the picking module. The other modules are not affected.
 
         Args:
             samples: observations with something to pick.
-            finals: observations in which nothing is left to pick.
+            finals: observations with nothing left to pick.
 
         Returns:
-            Each loss, in nats; `stop`, that of a final observation, only where there was one.
+            Each loss in nats. `stop` is present only in steps with a final observation.
         """
         draw = self._take(samples, finals)
         self.networks.train()
@@ -162,7 +160,7 @@ class Trainer:
         return values
 
     def _take(self, samples: Sequence[LabelledImage], finals: Sequence[Pictured]) -> _Draw:
-        """The draw of this step; the preparation of the next one's begins."""
+        """The draw of this step; starts preparing the next one."""
         prepared = self._prepared
         if prepared and prepared.step == self.step_count and prepared.of(samples, finals):
             draw = prepared.draw.result()
@@ -184,18 +182,18 @@ class Trainer:
             curvature=self.curvature,
             reflection=self.reflection,
         )
-        # Has draws of its own, so that the sample is the same with and without final observations.
+        # A separate generator keeps the samples independent of the final observations.
         stop_random = np.random.default_rng([self.seed, step, 1])
         return _Draw(sample, random, self._draw_final(finals, stop_random), stop_random)
 
     def _draw_final(self, finals: Sequence[Pictured], random: np.random.Generator) -> Image | None:
-        """A final observation after a random motion, if this step has one."""
+        """A randomly moved final observation, or None in most steps."""
         if not (self.networks.config.stop and finals) or random.random() >= _STOP_PROBABILITY:
             return None
         return Motion.draw(finals[int(random.integers(len(finals)))].image, random).moved_image()
 
     def state_dict(self) -> dict[str, Any]:
-        """All that `load_state_dict` needs to continue bit by bit."""
+        """Everything that `load_state_dict` needs to continue exactly."""
         return {
             "step_count": self.step_count,
             "networks": self.networks.state_dict(),

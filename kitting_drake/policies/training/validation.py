@@ -1,4 +1,4 @@
-"""How far a policy's predictions are from an expert's, on observations not trained on."""
+"""Errors of a policy's predictions against an expert, on unseen observations."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ from kitting_drake.policies.learned_policy import Decision, LearnedPolicy
 from kitting_drake.policies.networks.factored import Networks
 
 ERRORS = ("pick_mm", "pick_deg", "place_mm", "rotation_deg", "displacement_mm")
-"""The names of what `prediction_errors` returns."""
+"""The names of the errors in `prediction_errors`."""
 
 _ARM = 50.0
-"""The mean distance of a tool's points from its grasp, in mm: what an error of an angle moves."""
+"""The mean distance of a tool's points from its grasp, in mm; converts angles to displacements."""
 _LOST = 20.0
-"""An object that is displaced by this much or more is lost, however far it is, in mm."""
+"""Displacements are clipped to this, in mm: the object is lost."""
 
 
 def prediction_errors(
     decision: Decision, targets: Sequence[LabelledImage], millimetres: float
 ) -> NDArray[np.float64]:
-    """Errors of a prediction against the target whose pick is nearest, as if it did not stop.
+    """Errors of a prediction against the target with the nearest pick, ignoring a stop.
 
     Args:
         decision: the prediction.
@@ -34,10 +34,10 @@ def prediction_errors(
         millimetres: the side of a pixel.
 
     Returns:
-        (5,), as `ERRORS` names them: the pick's distance from the target's; the pick angle's error
-        modulo pi; the distance of the object, where it is put, from where the expert puts it; the
-        error of its rotation; and the displacement of the object's points due to all of these, at
-        most 20 mm.
+        (5,), in the order of `ERRORS`: the distance between the picks; the error of the pick angle
+        modulo pi; the distance of the placed object from the expert's place; the error of its
+        rotation; and the resulting displacement of the object's points, at most 20 mm. Lengths are
+        in mm, angles in degrees.
     """
 
     def distance(target: LabelledImage) -> float:
@@ -68,13 +68,13 @@ def choose_stop_threshold(present: ArrayLike, absent: ArrayLike) -> float | None
     """The log-odds below which a policy should stop.
 
     Args:
-        present: the log-odds of scenes in which there is something to pick.
-        absent: the log-odds of final observations, in which there is not.
+        present: the log-odds of scenes with something to pick.
+        absent: the log-odds of final observations.
 
     Returns:
-        The threshold with the fewest errors. It is a quarter of the way up from the log-odds below
-        it to those above, and of several such thresholds the lowest: an action too many costs less
-        than an object that stays where it is. None where either kind is missing: never stop.
+        The threshold with the fewest errors; None if either kind is missing. It lies a quarter of
+        the way from the log-odds below it to those above. Of several such thresholds it is the
+        lowest, because an unneeded action costs less than a forgotten object.
     """
     present, absent = np.sort(np.asarray(present, float)), np.sort(np.asarray(absent, float))
     if not len(present) or not len(absent):
@@ -93,20 +93,23 @@ def validate(
     """Validates a policy on scenes with something to pick, and on final observations.
 
     Args:
-        policy: what to validate; whether it has a threshold for stopping already does not matter.
+        policy: may or may not have a stop threshold; it is ignored.
         scenes: at least one.
-        finals: in which there is nothing left to pick; none if the networks cannot stop.
+        finals: observations with nothing left to pick; empty if the networks cannot stop.
 
     Returns:
-        For each of `ERRORS` its median over the scenes, as `median_...`, its 95th percentile, as
-        `p95_...`, and as `displacement_mm` the mean displacement. Where there are final
-        observations, also the `stop_threshold` chosen for them, by how many nats the two kinds
-        are separated, as `stop_margin` (negative: they overlap), and how many scenes are judged
-        wrongly: `false_stops`, in which there is something to pick, and `missed_stops`.
-        And `cost_mm`, by which a checkpoint is chosen where the expert's action is the only right
-        one: the mean displacement over all scenes and
-        final observations, where what is judged wrongly counts as lost (20 mm) and a final
-        observation that is judged rightly as 0.
+        - `median_...` and `p95_...` for each of `ERRORS`: its median and 95th percentile;
+        - `displacement_mm`: the mean displacement;
+        - `cost_mm`, by which a checkpoint is chosen if the expert's action is the only right one:
+          the mean displacement over all scenes and final observations. A wrong stop decision counts
+          20 mm, a final observation with a right one 0.
+
+        With final observations also:
+
+        - `stop_threshold`: the threshold chosen for them;
+        - `stop_margin`: the gap between the log-odds of both kinds in nats, negative if they
+          overlap;
+        - `false_stops` and `missed_stops`: the numbers of wrong decisions.
     """
     errors, present = [], []
     for scene in scenes:
@@ -123,7 +126,7 @@ def validate(
     report["cost_mm"] = report["displacement_mm"]
     grid = scenes[0].grid
     absent = [policy.log_odds(observed(final.image, grid)) for final in finals]
-    # Where the networks cannot tell, there are no odds.
+    # Networks without a stop class predict no odds.
     if absent and None not in (*present, *absent):
         report |= _stop_report(np.array(present, float), np.array(absent, float), displacements)
     return report
@@ -131,12 +134,11 @@ def validate(
 
 @torch.no_grad()
 def mean_loss(networks: Networks, samples: Sequence[LabelledImage]) -> float:
-    """The mean over samples of the sum of all losses, in nats: of the action that was taken, how
-    improbable it is to the networks.
+    """The mean over samples of the sum of all losses, in nats.
 
     Args:
         networks: of any method, for inference.
-        samples: at least one, as networks of their kind learn from.
+        samples: at least one, prepared as for training.
     """
     values = [
         sum(float(loss()) for _, loss in networks.losses(sample, np.random.default_rng(index)))
@@ -148,11 +150,11 @@ def mean_loss(networks: Networks, samples: Sequence[LabelledImage]) -> float:
 def _stop_report(
     present: NDArray[np.float64], absent: NDArray[np.float64], displacements: NDArray[np.float64]
 ) -> dict[str, float]:
-    """The part of `validate`'s report that is about stopping.
+    """The part of `validate`'s report about stopping.
 
     Args:
-        present: the log-odds of scenes in which there is something to pick.
-        absent: those of final observations.
+        present: the log-odds of scenes with something to pick.
+        absent: the log-odds of final observations.
         displacements: of the scenes, in mm.
     """
     threshold = choose_stop_threshold(present, absent)

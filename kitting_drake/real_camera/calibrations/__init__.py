@@ -1,1 +1,1 @@
-"""Calibrations of real cameras, and the YAML layouts they are read from."""
+"""Calibrations of real cameras and their YAML layouts."""

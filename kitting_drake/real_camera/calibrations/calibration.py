@@ -1,4 +1,4 @@
-"""The cameras of a bench: intrinsics and poses, read from YAML and written to it."""
+"""The cameras of a bench: intrinsics and poses, read from and written to YAML."""
 
 from __future__ import annotations
 
@@ -33,11 +33,11 @@ from systems.signals import PixelGrid
 Array = NDArray[np.float64]
 
 _UNDISTORTED = 1e-4
-"""A ray is found when its pixel is met to this, at depth 1."""
+"""The largest reprojection error of an undistorted ray, at depth 1."""
 _HEIGHT = PixelGrid().z_max - PixelGrid().z_min
-"""Points higher above the table than this are left out, unless the calibration says more."""
+"""The default of `max_height`: points higher above the table are ignored, in metres."""
 _MOST_PIXELS = 10_000_000
-"""A workspace that has more is a mistake in the unit of its resolution."""
+"""A workspace with more pixels has its resolution in a wrong unit."""
 _DEPTH_FIELDS = ("depth_scale", "min_depth", "max_depth")
 _BENCH_FIELDS = ("table_height", "workspace")
 _GRID_FIELDS = ("x_min", "y_min", "resolution", "rows", "cols", "max_height")
@@ -45,27 +45,27 @@ _GRID_FIELDS = ("x_min", "y_min", "resolution", "rows", "cols", "max_height")
 
 @dataclass(frozen=True)
 class BenchCamera:
-    """An RGB-D camera: colour and depth are registered, so that one lens stands for both."""
+    """An RGB-D camera. Depth is registered to colour, so one lens describes both."""
 
     name: str
     intrinsics: Intrinsics
     X_BC: Array
-    """(4, 4) the optical frame C (x right, y down, z forward) in the robot's base frame B."""
+    """(4, 4): the optical frame C (x right, y down, z forward) in the robot's base frame B."""
     depth_scale: float = 0.001
-    """Metres that a step of a 16-bit depth image stands for."""
+    """Metres per step of a 16-bit depth image."""
     min_depth: float = 0.01
     max_depth: float = 10.0
-    """Depths outside these are none, in metres."""
+    """Depths outside these limits are ignored, in metres."""
 
     @cached_property
     def rays(self) -> DepthRays:
         """The pixels' rays.
 
         Raises:
-            UserError: the distortion cannot be undone.
+            UserError: the distortion cannot be inverted.
         """
         lens = self.intrinsics
-        # From whole numbers at the pixels' centres to the corner of the image.
+        # Shift the origin from the first pixel's centre to the corner of the image.
         plain = DepthRays.from_pinhole(
             size=lens.size,
             focal=lens.focal,
@@ -81,11 +81,11 @@ class BenchCamera:
 
 @dataclass(frozen=True)
 class Calibration:
-    """All cameras of a bench, and the workspace that they look at."""
+    """All cameras of a bench and their workspace."""
 
     cameras: tuple[BenchCamera, ...]
     grid: PixelGrid
-    """The pixels of o_t; its `z_min` is the height of the table in the base frame."""
+    """The pixels of o_t; `z_min` is the height of the table in the base frame."""
 
     @property
     def table_height(self) -> float:
@@ -94,14 +94,14 @@ class Calibration:
 
 
 def read_calibration(path: Path, *, table_height: float | None = None) -> Calibration:
-    """Reads a calibration; `docs/bench.md` shows the layouts.
+    """Reads a calibration; `docs/bench.md` describes the layouts.
 
     Args:
         path: the file.
-        table_height: of the table in the base frame, in metres; None: the file's, or zero.
+        table_height: of the table in the base frame, in metres; None for the file's, or zero.
 
     Raises:
-        UserError: a field is missing or cannot be; names the file and the field.
+        UserError: a field is missing or invalid; names the file and the field.
     """
     content = read_yaml(path)
     if "cameras" in content:
@@ -114,12 +114,12 @@ def read_calibration(path: Path, *, table_height: float | None = None) -> Calibr
                 if isinstance(node, dict) and key in node:
                     raise UserError(
                         f"{path}: camera {name} has the field '{key}', which all cameras share: "
-                        "put it beside 'cameras'"
+                        "move it beside 'cameras'"
                     )
         beside: tuple[str, ...] = ()
     else:
         entries = {str(content.get("camera_name", "camera")): content}
-        # A file of one camera has the bench's fields beside the camera's.
+        # A file of one camera has the bench's fields at the same level.
         beside = (*_BENCH_FIELDS, "camera_name")
     cameras = tuple(_read_camera(path, str(name), node, beside) for name, node in entries.items())
     if table_height is None:
@@ -139,10 +139,10 @@ def _read_camera(path: Path, name: str, node: Any, beside: Sequence[str]) -> Ben
         file = path.parent / str(node["camera_info"])
         lens = read_yaml(file)
         if not has_intrinsics(lens):
-            raise UserError(f"{where}: {file} holds no camera_matrix and no k")
+            raise UserError(f"{where}: {file} has neither camera_matrix nor k")
         _check_distortion(lens, f"{where}: {file}")
     elif not has_intrinsics(node):
-        # Where a camera's intrinsics are, or seem to be.
+        # Suggest the fields that could hold the intrinsics.
         lenses = ("cameras", "camera_info", "camera_matrix", "fx")
         _check_misspelt(node, lenses, (*known, "camera_name"), where, likeness=0.6)
     limits = {key: number(node[key], f"{where}: {key}") for key in _DEPTH_FIELDS if key in node}
@@ -150,7 +150,7 @@ def _read_camera(path: Path, name: str, node: Any, beside: Sequence[str]) -> Ben
         raise UserError(f"{where}: depth_scale, min_depth and max_depth must be positive")
     intrinsics, X_BC = read_intrinsics(lens, where), read_pose(node, where)
     if "fx" not in node:
-        # OpenCV and ROS write fields that mean nothing here, such as image_height.
+        # OpenCV and ROS write other fields, such as image_height, which are ignored.
         _check_distortion(node, where)
         _check_misspelt(node, (*known, *_BENCH_FIELDS), known, where, likeness=0.85)
     else:
@@ -165,29 +165,39 @@ def _read_camera(path: Path, name: str, node: Any, beside: Sequence[str]) -> Ben
 
 
 def _check_distortion(node: dict[str, Any], where: str) -> None:
-    """Raises UserError for coefficients that would be passed over. OpenCV and ROS write other
-    fields that we do not know, and none whose name begins so."""
+    """Raises UserError for misspelt distortion coefficients, which would be ignored.
+
+    OpenCV and ROS write no other fields that begin with "dist".
+    """
     for key in node:
         if str(key).lower().startswith("dist") and key not in OWN_INTRINSICS:
             raise UserError(
                 f"{where} has the unknown field '{key}': the lens's coefficients are called "
-                "distortion_coefficients, and in ROS d"
+                "distortion_coefficients, or d in ROS"
             )
 
 
 def _check_fields(node: dict[str, Any], known: Sequence[str], where: str) -> None:
-    """Raises UserError for a field that would be passed over, as if it were not there."""
+    """Raises UserError for an unknown field, which would be ignored."""
     for key in node:
         if key not in known:
             close = difflib.get_close_matches(str(key), known, n=1)
-            advice = f"did you mean '{close[0]}'?" if close else "it means nothing here"
+            advice = f"did you mean '{close[0]}'?" if close else "remove it"
             raise UserError(f"{where} has the unknown field '{key}': {advice}")
 
 
 def _check_misspelt(
     node: dict[str, Any], meant: Sequence[str], known: Sequence[str], where: str, likeness: float
 ) -> None:
-    """Raises UserError for an unknown field that is like one that may be meant, from 0 to 1."""
+    """Raises UserError for an unknown field that resembles an expected one.
+
+    Args:
+        node: the fields.
+        meant: the expected fields.
+        known: fields that are allowed.
+        where: the beginning of the error.
+        likeness: the least similarity, from 0 to 1.
+    """
     for key in node:
         close = difflib.get_close_matches(str(key), meant, cutoff=likeness)
         if close and key not in known:
@@ -197,15 +207,15 @@ def _check_misspelt(
 def _read_grid(path: Path, node: Any, table_height: float) -> PixelGrid:
     if not isinstance(node, dict) or not set(node) <= set(_GRID_FIELDS):
         fields = ", ".join(_GRID_FIELDS)
-        raise UserError(f"{path}: workspace has the fields {fields}, and no others")
+        raise UserError(f"{path}: workspace may only have the fields {fields}")
     values: dict[str, Any] = {}
     for key, value in node.items():
         read = whole_number if key in ("rows", "cols") else number
         values[key] = read(value, f"{path}: workspace.{key}")
     if values.get("rows", 1) * values.get("cols", 1) > _MOST_PIXELS:
         raise UserError(
-            f"{path}: workspace has {values['rows']} x {values['cols']} pixels, and "
-            f"{_MOST_PIXELS:.0e} is the most: resolution is in metres"
+            f"{path}: workspace has {values['rows']} x {values['cols']} pixels, more than "
+            f"{_MOST_PIXELS:.0e}: give the resolution in metres"
         )
     top = table_height + values.pop("max_height", _HEIGHT)
     try:
@@ -215,7 +225,7 @@ def _read_grid(path: Path, node: Any, table_height: float) -> PixelGrid:
 
 
 def calibration_record(calibration: Calibration) -> dict[str, Any]:
-    """A calibration in our own layout, as YAML and JSON take it, to the last bit."""
+    """A calibration in our own layout as YAML and JSON values, without rounding."""
     grid = calibration.grid
     content: dict[str, Any] = {
         "table_height": float(grid.z_min),
@@ -241,17 +251,17 @@ def calibration_record(calibration: Calibration) -> dict[str, Any]:
 
 
 def calibration_digest(calibration: Calibration) -> str:
-    """Equal for calibrations that say the same, in whichever layout.
+    """A digest that is equal for equal calibrations in any layout.
 
-    Numbers count to nine decimals: a rotation that was read as a quaternion differs from the same
-    as a matrix in the last bit.
+    Numbers are rounded to nine decimals, because the same rotation as a quaternion and as a matrix
+    may differ in the last bit.
     """
     text = json.dumps(_rounded(calibration_record(calibration)), sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
 def _rounded(value: Any) -> Any:
-    """A record with its numbers rounded, and without negative zeros."""
+    """A record with rounded numbers and without negative zeros."""
     if isinstance(value, dict):
         return {key: _rounded(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
@@ -260,7 +270,7 @@ def _rounded(value: Any) -> Any:
 
 
 def write_calibration(path: Path, calibration: Calibration) -> None:
-    """Writes a calibration in our own layout, to the last bit.
+    """Writes a calibration in our own layout, without rounding.
 
     Raises:
         UserError: the file cannot be written.
@@ -270,7 +280,7 @@ def write_calibration(path: Path, calibration: Calibration) -> None:
 
 
 def with_poses(calibration: Calibration, poses: dict[str, Array]) -> Calibration:
-    """A calibration with other poses of some of its cameras."""
+    """A calibration with new poses for some cameras."""
     cameras = tuple(
         dataclasses.replace(camera, X_BC=poses.get(camera.name, camera.X_BC))
         for camera in calibration.cameras
@@ -279,7 +289,7 @@ def with_poses(calibration: Calibration, poses: dict[str, Array]) -> Calibration
 
 
 def _undistort(u: Array, v: Array, distortion: tuple[float, ...], name: str) -> tuple[Array, Array]:
-    """Where rays at depth 1 really go, which a lens shows at (u, v); as cv2.undistortPoints."""
+    """The rays at depth 1 that the lens images at (u, v), as by cv2.undistortPoints."""
     k1, k2, p1, p2, k3, k4, k5, k6 = (*distortion, *(0.0,) * (8 - len(distortion)))
 
     def factors(x: Array, y: Array) -> tuple[Array, Array, Array]:

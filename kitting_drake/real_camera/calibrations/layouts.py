@@ -1,4 +1,4 @@
-"""Intrinsics and poses of cameras out of YAML: OpenCV's layout, ROS's CameraInfo, and our own."""
+"""Intrinsics and poses of cameras from YAML: OpenCV's layout, ROS's CameraInfo, and our own."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from kitting_drake.real_camera.calibrations.yaml_values import matrix, number, n
 Array = NDArray[np.float64]
 
 _ORTHOGONAL = 1e-3
-"""By how much the entries of R^T R may differ from the identity's."""
+"""The largest difference of an entry of R^T R from the identity's."""
 _MODELS = ("plumb_bob", "rational_polynomial", "radtan", "none", "")
 _COEFFICIENTS = (0, 4, 5, 8)
 _MATRICES = ("camera_matrix", "k", "K")
@@ -27,20 +27,20 @@ _POSITIONS = ("position", "translation")
 _ROTATIONS = ("orientation", "quaternion_xyzw", "rotation", "rpy_deg", "rvec")
 _MOST_ENVELOPES = 4
 _ENVELOPE = ("header", "child_frame_id", "covariance")
-"""The keys that ROS writes around a pose."""
+"""The other keys of ROS messages that contain a pose."""
 
 POSE_FIELDS = ("R_cam2base", "t_cam2base", *_POSES)
-"""The fields of a mapping that tell a pose."""
+"""The fields of a camera's pose."""
 OWN_INTRINSICS = (
     *("fx", "fy", "cx", "cy", "image_size", *_WIDTHS, *_HEIGHTS),
     *("distortion_model", *_DISTORTIONS),
 )
-"""The fields of intrinsics in our own layout; OpenCV and ROS write more, which mean nothing."""
+"""The fields of intrinsics in our own layout; other fields of OpenCV and ROS are ignored."""
 
 
 @dataclass(frozen=True)
 class Intrinsics:
-    """The numbers of a lens; positions in an image are whole at the pixels' centres."""
+    """The intrinsics of a lens; image positions are whole numbers at pixel centres."""
 
     size: tuple[int, int]
     """(width, height), in pixels."""
@@ -49,7 +49,7 @@ class Intrinsics:
     centre: tuple[float, float]
     """(cx, cy), in pixels."""
     distortion: tuple[float, ...] = ()
-    """k1, k2, p1, p2, k3, k4, k5, k6, as OpenCV and ROS order them; fewer, or none."""
+    """k1, k2, p1, p2, k3, k4, k5, k6 in the order of OpenCV and ROS; fewer, or none."""
 
 
 def has_intrinsics(node: dict[str, Any]) -> bool:
@@ -58,10 +58,10 @@ def has_intrinsics(node: dict[str, Any]) -> bool:
 
 
 def read_intrinsics(node: dict[str, Any], where: str) -> Intrinsics:
-    """The intrinsics in a mapping, in any of the three layouts.
+    """Reads the intrinsics in a mapping, in any of the three layouts.
 
     Raises:
-        UserError: they are not all there, or cannot be; names the field.
+        UserError: a field is missing or invalid; names the field.
     """
     if "fx" in node:
         fx, fy, cx, cy = (
@@ -118,11 +118,10 @@ def _read_distortion(node: dict[str, Any], where: str) -> tuple[float, ...]:
 
 
 def read_pose(node: dict[str, Any], where: str) -> Array:
-    """(4, 4) the pose of the camera's optical frame in the base frame, in any of the layouts.
+    """(4, 4): the pose of the camera's optical frame in the base frame, in any of the layouts.
 
     Raises:
-        UserError: there is no pose, or more than one, or its rotation is not a rotation; names the
-            field.
+        UserError: there is not exactly one pose, or its rotation is invalid; names the field.
     """
     given = [key for key in ("R_cam2base", *_POSES) if key in node]
     if "t_cam2base" in node and "R_cam2base" not in node:
@@ -152,7 +151,7 @@ def read_pose(node: dict[str, Any], where: str) -> Array:
 
 
 def _pose_of_parts(value: dict[str, Any], where: str) -> Array:
-    # geometry_msgs wraps a Pose into PoseStamped and PoseWithCovariance, and one into the other.
+    # geometry_msgs nests Pose in PoseStamped and PoseWithCovariance.
     for _ in range(_MOST_ENVELOPES):
         inner = _first(value, "pose", "transform")
         if inner is None:
@@ -173,7 +172,7 @@ def _pose_of_parts(value: dict[str, Any], where: str) -> Array:
     turn = numbers(value[key], f"{where}.{key}")
     if key in ("rpy_deg", "rvec"):
         turn = matrix(value[key], 1, 3, f"{where}.{key}")[0]
-        # Roll, pitch and yaw are about the fixed axes x, y and z, in this order, as in ROS.
+        # Roll, pitch and yaw about the fixed axes x, y and z, in this order, as in ROS.
         rotation = (
             Rotation.from_euler("xyz", turn, degrees=True)
             if key == "rpy_deg"
@@ -194,7 +193,7 @@ def _pose_of_parts(value: dict[str, Any], where: str) -> Array:
 def _checked(X: Array, where: str) -> Array:
     R = X[:3, :3]
     if np.abs(R.T @ R - np.eye(3)).max() > _ORTHOGONAL or np.linalg.det(R) < 0:
-        raise UserError(f"{where} is no rigid pose: its rotation is not orthonormal")
+        raise UserError(f"{where} is not a rigid pose: its rotation is not orthonormal")
     if not np.allclose(X[3], [0, 0, 0, 1]):
         raise UserError(f"{where}: the last row of a pose must be 0 0 0 1")
     if np.linalg.norm(X[:3, 3]) > 20:
@@ -214,7 +213,7 @@ def _first(node: dict[str, Any], *keys: str) -> str | None:
 
 
 def _refuse_two(node: dict[str, Any], keys: tuple[str, ...], where: str) -> str | None:
-    """The one of some fields that is there, if any; raises UserError where there are more."""
+    """The only given one of some fields, or None; raises UserError if there are several."""
     given = [key for key in keys if key in node]
     if len(given) > 1:
         raise UserError(f"{where} has {' and '.join(given)}: give one of them")
@@ -225,4 +224,4 @@ def _refuse_unknown(node: dict[str, Any], keys: tuple[str, ...], where: str) -> 
     """Raises UserError for a field that is not among the known ones."""
     for key in node:
         if key not in keys:
-            raise UserError(f"{where} has '{key}', which means nothing there")
+            raise UserError(f"{where} has the unknown field '{key}': remove it")

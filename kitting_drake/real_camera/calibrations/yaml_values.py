@@ -1,4 +1,4 @@
-"""YAML as OpenCV, ROS and people write it, and numbers out of it."""
+"""Reads YAML as OpenCV, ROS and people write it, and numbers from it."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ Array = NDArray[np.float64]
 
 
 class _Loader(yaml.SafeLoader):
-    """Plain YAML without repeated fields, and the matrices of `cv2.FileStorage`."""
+    """Plain YAML with `cv2.FileStorage` matrices; repeated fields are errors."""
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
-        """The mapping; of two fields of one name PyYAML would take the last and say nothing."""
+        """The mapping. PyYAML itself would silently take the last of repeated fields."""
         pairs = node.value if isinstance(node, yaml.MappingNode) else []
         fields = [key.value for key, _ in pairs if isinstance(key, yaml.ScalarNode)]
         repeated = next((name for name in fields if fields.count(name) > 1), None)
         if repeated is not None:
             raise yaml.constructor.ConstructorError(
-                problem=f"'{repeated}' is there twice", problem_mark=node.start_mark
+                problem=f"'{repeated}' is given twice", problem_mark=node.start_mark
             )
         return super().construct_mapping(node, deep)
 
@@ -38,19 +38,19 @@ _Loader.add_constructor("tag:yaml.org,2002:opencv-matrix", _opencv_matrix)
 
 
 def read_yaml(path: Path) -> dict[str, Any]:
-    """The mapping of a YAML file; of several documents, the first.
+    """The mapping in a YAML file; the first one of several documents.
 
     Raises:
-        UserError: the file cannot be read, or does not hold a mapping.
+        UserError: the file is unreadable or does not hold a mapping.
     """
     try:
         text = path.read_text()
     except (OSError, ValueError) as error:
-        # ValueError: what is no text, and a path with a NUL.
+        # ValueError: the content is not text, or the path has a NUL.
         reason = getattr(error, "strerror", None) or "it is not text"
         raise UserError(f"cannot read {path}: {reason}") from error
     if text.startswith("%YAML:"):
-        # What cv2.FileStorage writes as a first line is no YAML directive.
+        # The first line that cv2.FileStorage writes is not a valid YAML directive.
         text = text.partition("\n")[2]
     try:
         first = next(iter(yaml.load_all(text, _Loader)), None)
@@ -60,7 +60,7 @@ def read_yaml(path: Path) -> dict[str, Any]:
         problem = getattr(error, "problem", None) or "it is not YAML"
         raise UserError(f"{path}:{where} {problem}") from error
     except (ValueError, KeyError, AttributeError) as error:
-        # A text that looks like a date but is not one, or a tag that does not fit its value.
+        # Text that resembles a date, or a tag that does not fit its value.
         raise UserError(f"{path} is not YAML: {error}") from error
     except RecursionError as error:
         raise UserError(f"{path} is nested too deeply") from error
@@ -76,7 +76,7 @@ def number(value: Any, where: str) -> float:
         UserError: the value is something else; names the field.
     """
     try:
-        # YAML 1.1 takes 4e2 for a text.
+        # YAML 1.1 reads 4e2 as text.
         result = float(value) if not isinstance(value, bool) else math.nan
     except (TypeError, ValueError, OverflowError):
         result = math.nan
@@ -98,11 +98,11 @@ def whole_number(value: Any, where: str) -> int:
 
 
 def numbers(value: Any, where: str) -> Array:
-    """A flat array of finite numbers: of a list, of a list of lists, of a matrix as OpenCV and ROS
-    write it (`rows`, `cols`, `data`), or of a mapping with x, y, z and perhaps w.
+    """A flat array of finite numbers from a list, a list of lists, a matrix of OpenCV or ROS
+    (`rows`, `cols`, `data`), or a mapping with x, y, z and possibly w.
 
     Raises:
-        UserError: they are none; names the field.
+        UserError: the value is something else; names the field.
     """
     if isinstance(value, dict) and "data" in value:
         value = value["data"]
@@ -115,10 +115,10 @@ def numbers(value: Any, where: str) -> Array:
 
 
 def matrix(value: Any, rows: int, cols: int, where: str) -> Array:
-    """(rows, cols) of `numbers`.
+    """`numbers` with the shape (rows, cols).
 
     Raises:
-        UserError: there are not as many.
+        UserError: their count is wrong.
     """
     flat = numbers(value, where)
     if flat.size != rows * cols:

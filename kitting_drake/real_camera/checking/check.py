@@ -1,4 +1,4 @@
-"""Finds errors of cameras from a look at the empty table, or at a block of known size on it."""
+"""Finds errors of cameras by looking at an empty table or at a block of known size on it."""
 
 from __future__ import annotations
 
@@ -25,25 +25,25 @@ Array = NDArray[np.float64]
 
 _LEAST_POINTS = 500
 _SHARED = 100
-"""Two cameras are compared over at least so many pixels of o_t."""
+"""Two cameras are compared only if they share at least this many pixels of o_t."""
 
 
 @dataclass(frozen=True)
 class TableCheck:
-    """The table, as some cameras see it: level, and at its height, if all is well."""
+    """The table as one or all cameras see it: its plane, noise and holes."""
 
     tilt: Array
-    """(2,): the rotation about base x and y by which it looks rotated, in radians."""
+    """(2,): the apparent rotation of the table about base x and y, in radians."""
     bias: float
-    """By how much the middle of the workspace looks too high, in metres."""
+    """How much too high the table appears at the workspace's centre, in metres."""
     noise: float
-    """Standard deviation of heights, robustly, in metres."""
+    """A robust standard deviation of the heights, in metres."""
     holes: float
-    """The share of what should be seen of the table that has no depth."""
+    """The share of the table in view without depth."""
 
     @property
     def tilt_angle(self) -> float:
-        """In radians."""
+        """The size of the rotation, in radians."""
         return float(np.linalg.norm(self.tilt))
 
 
@@ -53,48 +53,48 @@ class CameraCheck:
 
     table: TableCheck
     distance: float
-    """From the camera to the middle of what it sees of the table, in metres."""
+    """From the camera to the centre of the seen part of the table, in metres."""
     depth_bias: float
-    """The constant by which its depths would be too long if its pose were right, in metres."""
+    """The constant depth error that explains the heights if the pose is right, in metres."""
     depth_bias_noise: float
-    """Standard deviation of heights that such a constant leaves, in metres."""
+    """A robust standard deviation of the heights after subtracting that error, in metres."""
     block: SeenBlock | None
 
 
 @dataclass(frozen=True)
 class Check:
-    """The errors that were found, and the poses that correct them."""
+    """The errors of all cameras, and the poses that correct them."""
 
     cameras: dict[str, CameraCheck]
     together: TableCheck
-    """The check of o_t, in which the highest point of a pixel wins."""
+    """The check of o_t, which takes the highest point in each pixel."""
     disagreements: dict[tuple[str, str], float]
-    """By how much the first of two cameras sees the table higher, in metres."""
+    """How much higher the first of two cameras sees the table, in metres."""
     block_shifts: dict[tuple[str, str], Array]
-    """(2,) how far beside the second of two cameras the first one sees the block, in metres."""
+    """(2,): the block's position in the first of two cameras minus that in the second, in metres.
+    """
     block: Block | None
     corrected: Calibration
     heights: dict[str, NDArray[np.float32]]
-    """(rows, cols) above the table by each camera, and by all as ''; NaN where unseen."""
+    """(rows, cols) above the table for each camera, and for o_t as ''; NaN where unseen."""
 
 
 def check_cameras(
     frames: Mapping[str, Frame], calibration: Calibration, block: Block | None = None
 ) -> Check:
-    """Checks cameras by the table, which is level and at its height in the base frame.
+    """Checks cameras by the table, which should be level and at its height in the base frame.
 
-    A camera's corrected pose is rotated about the camera until the table is level, as poses err by
-    rotations first, and then lifted. With a block, the cameras are also shifted and rotated about
-    the vertical until each sees it where it is or, if that is not known, where they see it on
-    average.
+    Each camera's pose is corrected by a rotation that makes the table level, and then by a lift.
+    With a block, the cameras are also shifted and rotated about the vertical to agree on its pose:
+    the given one, or else the mean of what they see.
 
     Args:
-        frames: of each camera by its name; the table is empty, but for the block.
+        frames: of each camera by its name, with nothing but the block on the table.
         calibration: of the cameras.
-        block: what lies on the table, if anything.
+        block: the block on the table, if any.
 
     Raises:
-        UserError: a camera does not see the table, or the block.
+        UserError: a camera does not see the table or the block.
     """
     views = make_views(frames, calibration)
     grid = calibration.grid
@@ -115,7 +115,7 @@ def check_cameras(
     if block is not None:
         seen_by = {name: item.block for name, item in found.items() if item.block is not None}
         poses = _aligned(poses, seen_by, block)
-    # Heights below the table are reported, too; o_t itself would cut them off.
+    # Include heights below the table, which o_t itself would clip.
     fused = project(views, dataclasses.replace(grid, z_min=grid.z_min - FARTHEST))
     maps[""] = np.where(fused.valid, fused.height - FARTHEST, np.nan).astype(np.float32)
     return Check(
@@ -136,11 +136,11 @@ def check_cameras(
 
 
 def levelled(X_BC: Array, plane: Plane, grid: PixelGrid) -> Array:
-    """(4, 4): a camera's pose by which the plane that it sees is the table."""
+    """(4, 4): the corrected pose of a camera, which makes the plane that it sees the table."""
     R = plane.levelling()
     corrected = X_BC.copy()
     corrected[:3, :3] = R @ X_BC[:3, :3]
-    # A point of the plane, rotated about the camera.
+    # A point of the plane, after the rotation about the camera.
     point = np.array([*X_BC[:2, 3], float(plane.height(X_BC[:2, 3]))])
     height = (R @ (point - X_BC[:3, 3]) + X_BC[:3, 3])[2]
     corrected[2, 3] += grid.z_min - height
@@ -148,7 +148,7 @@ def levelled(X_BC: Array, plane: Plane, grid: PixelGrid) -> Array:
 
 
 def middle_of(grid: PixelGrid) -> Array:
-    """(2,) the middle of the workspace, in metres."""
+    """(2,): the centre of the workspace in the base frame, in metres."""
     return np.array([(grid.x_min + grid.x_max) / 2, (grid.y_min + grid.y_max) / 2])
 
 
@@ -156,7 +156,7 @@ def _plane_of(points: Array, camera: BenchCamera) -> Plane:
     seen = points[np.isfinite(points[..., 2])]
     if len(seen) < _LEAST_POINTS:
         raise UserError(
-            f"camera {camera.name} sees next to nothing within "
+            f"camera {camera.name} sees almost nothing within "
             f"{1e3 * FARTHEST:.0f} mm of the table's height: check its pose and table_height"
         )
     return fit_plane(seen)
@@ -173,7 +173,7 @@ def _check_camera(
     with np.errstate(invalid="ignore"):
         on_table = has_point & towards & (np.abs(z - plane.height(points[..., :2])) < 0.004)
     above = z[on_table] - grid.z_min
-    # A depth that is longer by d moves a point down by d times the camera's height over its depth.
+    # A depth error d lowers a point by d times the camera's height divided by the depth.
     falls = -(camera.X_BC[2, 3] - grid.z_min) / expected[on_table]
     depth_bias = float((falls * above).sum() / (falls * falls).sum())
     rest = above - falls * depth_bias
@@ -227,7 +227,7 @@ def _disagreements(maps: Mapping[str, NDArray[np.float32]]) -> dict[tuple[str, s
 def _aligned(
     poses: Mapping[str, Array], seen: Mapping[str, SeenBlock], block: Block
 ) -> dict[str, Array]:
-    """The poses, shifted and rotated in the plane until the cameras see the block at one place."""
+    """The poses, shifted and rotated about the vertical to agree on the block's pose."""
     period = block.period
     if block.pose is None:
         first = next(iter(seen.values())).yaw

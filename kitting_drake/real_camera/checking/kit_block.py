@@ -1,4 +1,4 @@
-"""A block of known size on the table: the scale of what a camera sees, and where it sees it."""
+"""Measures a block of known size on the table, in the image of one camera."""
 
 from __future__ import annotations
 
@@ -17,40 +17,41 @@ Array = NDArray[np.float64]
 
 _LEAST_PIXELS = 400
 _CLEAN = 0.0005
-"""Heights with more noise than this are smoothed, in metres."""
+"""Heights with more noise than this are filtered, in metres."""
 _LEAST_BAND = 0.001
-"""Points this near to the height of the block's top are of it, or three times their noise."""
+"""Points within this distance of the top's height belong to it, in metres, or three times the
+noise if that is more."""
 
 
 @dataclass(frozen=True)
 class Block:
-    """A block, as a ruler knows it."""
+    """A block, as measured with a ruler."""
 
     size: tuple[float, float, float]
     """Length, width and height, in metres."""
     pose: tuple[float, float, float] | None = None
-    """x, y of its middle in the base frame, in metres, and the yaw of its length, in radians."""
+    """x, y of its centre in the base frame, in metres, and the yaw of its length, in radians."""
 
     @property
     def period(self) -> float:
-        """The rotation after which it looks the same, in radians; a quarter where length and width
-        are too much alike to be told apart."""
+        """The rotation under which it looks the same, in radians: a quarter turn if length and
+        width are nearly equal, otherwise a half turn."""
         length, width, _ = self.size
         return math.pi / 2 if math.isclose(length, width, rel_tol=0.05) else math.pi
 
 
 @dataclass(frozen=True)
 class SeenBlock:
-    """A block, as one camera sees it."""
+    """A block as one camera sees it."""
 
     middle: Array
-    """(2,) in the base frame, in metres."""
+    """(2,): its centre in the base frame, in metres."""
     yaw: float
     """The direction of the length about z, in radians, modulo `Block.period`."""
     size: tuple[float, float, float]
     """Length, width and height, in metres."""
     corner: float
-    """The angle between its sides, in radians: a right one, if the camera is square."""
+    """The angle between its sides, in radians; a right angle for a correct camera."""
 
 
 def see_block(
@@ -58,22 +59,20 @@ def see_block(
 ) -> SeenBlock:
     """Measures the block in a camera's image.
 
-    Its top is a region of the image whose pixels look at parts of the plane of the top that are
-    known exactly, so the moments of these areas give its middle, its direction and its sides
-    without bias; depth tells only which pixels are of the top. The walls that the camera sees add a
-    strip that is as high as the band of depths that counts as the top; its width is known, and is
-    taken off again. Cavities within the outline do not matter; notches in it do.
-
+    Depth only selects the pixels of the top. Their rays are intersected with the plane of the top,
+    and the moments of the areas that they cover give the centre, direction and sides without bias.
+    Visible walls add a strip as high as the band of depths around the top; its width is computed
+    and subtracted. Recesses within the outline do not matter, but notches in it do.
     Args:
         points: (height, width, 3) in the base frame, as `table_points` gives them.
-        camera: whose.
+        camera: the camera.
         X_BC: its pose.
-        block: what to look for.
+        block: the block to find.
         table: height of the table, in metres.
         noise: of the heights, in metres.
 
     Raises:
-        UserError: no such block is seen.
+        UserError: the camera does not see such a block.
     """
     z = np.where(np.isfinite(points[..., 2]), points[..., 2] - table, -1.0)
     if noise > _CLEAN:
@@ -82,7 +81,7 @@ def see_block(
     if near.sum() < _LEAST_PIXELS:
         raise UserError(f"camera {camera.name} sees no block {1e3 * block.size[2]:g} mm high")
     values = z[near]
-    # A millimetre each, also where all heights are the same.
+    # Bins of a millimetre, with a margin in case all heights are equal.
     low, high = values.min() - 0.002, values.max() + 0.002
     counts, edges = np.histogram(values, math.ceil((high - low) / 0.001), (low, high))
     mode = edges[counts.argmax()] + (edges[1] - edges[0]) / 2
@@ -108,7 +107,7 @@ def see_block(
     if not (0.5 < length / block.size[0] < 2 and 0.5 < width / block.size[1] < 2):
         raise UserError(
             f"camera {camera.name} sees a block of {1e3 * length:.0f} x {1e3 * width:.0f} x "
-            f"{1e3 * top:.0f} mm: nothing else as high may be in the workspace"
+            f"{1e3 * top:.0f} mm: give its true size, and remove other objects of that height"
         )
     turned, other = _side_angles(border @ axes)
     yaw = math.atan2(axes[1, 0], axes[0, 0])
@@ -116,8 +115,8 @@ def see_block(
 
 
 def _filled(mask: NDArray[np.bool_], camera: BenchCamera) -> NDArray[np.bool_]:
-    """The largest part of a mask, with the holes in it. Not its convex hull: of a noisy outline
-    that is the outermost."""
+    """The largest part of a mask, with its holes filled. The convex hull would follow the outermost
+    points of a noisy outline."""
     mask = ndimage.binary_fill_holes(ndimage.binary_closing(mask, iterations=2))
     mask = ndimage.binary_opening(mask, iterations=3)
     labels, count = ndimage.label(mask)
@@ -130,11 +129,11 @@ def _filled(mask: NDArray[np.bool_], camera: BenchCamera) -> NDArray[np.bool_]:
 
 
 def _on_plane(camera: BenchCamera, X_BC: Array, height: float) -> tuple[Array, Array]:
-    """(height, width, 2) where each pixel's ray meets a horizontal plane, in metres, and
-    (height, width) the area of it that the pixel covers, up to a factor."""
+    """Where each pixel's ray meets a horizontal plane, (height, width, 2) in metres, and the area
+    that the pixel covers there, (height, width), up to a factor."""
     u, v = (item.astype(float) for item in np.broadcast_arrays(camera.rays.u, camera.rays.v))
     directions = np.stack([u, v, np.ones_like(u)], axis=-1) @ X_BC[:3, :3].T
-    # What a pixel covers at depth 1: all alike, unless the lens distorts.
+    # The area of a pixel at depth 1, which varies only with distortion.
     (u_row, u_col), (v_row, v_col) = np.gradient(u), np.gradient(v)
     covered = np.abs(u_col * v_row - u_row * v_col)
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -148,7 +147,7 @@ def _rotation(angle: float) -> Array:
 
 
 def _least_rectangle(points: Array) -> Array:
-    """(2, 2): the directions, as columns, of the least rectangle around points (n, 2)."""
+    """(2, 2): the directions, as columns, of the smallest rectangle around points (n, 2)."""
     corners = points[ConvexHull(points).vertices]
     edges = np.diff(corners, axis=0, append=corners[:1])
     candidates = [_rotation(angle) for angle in np.arctan2(edges[:, 1], edges[:, 0])]
@@ -156,15 +155,15 @@ def _least_rectangle(points: Array) -> Array:
 
 
 def _side_angles(local: Array) -> tuple[float, float]:
-    """By how much the sides along x, and those along y, of the outline (n, 2) of a rectangle about
-    the origin are rotated from these axes, in radians, counter-clockwise."""
+    """The rotations of the sides along x and of those along y from these axes, in radians,
+    counter-clockwise, for the outline (n, 2) of a rectangle about the origin."""
     half = np.abs(local).max(axis=0)
     angles = []
     for along in (0, 1):
         across = 1 - along
         slopes = []
         for side in (-1, 1):
-            # Not the corners, which belong to two sides.
+            # Exclude the corners, which belong to two sides.
             own = (side * local[:, across] > half[across] - 0.2 * half.min()) & (
                 np.abs(local[:, along]) < 0.8 * half[along]
             )

@@ -1,4 +1,4 @@
-"""The report of a check of cameras: numbers, and their meaning for the clearance."""
+"""The report of a camera check: each number and its meaning for the clearance."""
 
 from __future__ import annotations
 
@@ -12,22 +12,22 @@ from kitting_drake.real_camera.checking.kit_block import Block, SeenBlock
 from systems.pick_place_parameters import PickPlaceParameters
 
 CLEARANCE = 0.002
-"""Between a tool and the wall of its cavity, in metres."""
+"""The clearance between a tool and its recess, in metres."""
 GOOD, TIGHT, BAD = "good", "tight", "too much"
 _HALF_KIT = 0.1
-"""From the middle of a kit to its edge, in metres."""
+"""The distance from a kit's centre to its edge, in metres."""
 _OUT_OF_SCALE = 0.008
-"""A scale that is off by less may be noise."""
+"""A smaller error of the scale may be noise."""
 _HALF_WORKSPACE = 0.5
 """In metres."""
 _LEVEL = math.radians(0.02)
-"""A table that looks tilted by less than this looks level."""
+"""A table with less tilt than this counts as level."""
 _CLEAN, _NOISY = 0.0005, 0.0016
-"""Heights with less noise than the first are taken as they are; with more than the second, what is
-3 mm high or deep is lost (`policies/matching/segmentation.py`). In metres."""
+"""Noise levels in metres. Heights with more than the first are filtered; with more than the second,
+details of 3 mm are lost (`policies/matching/segmentation.py`)."""
 _LOST = 1.8
-"""Anything lower than this many times the noise is lost: two standard deviations of what smoothing
-leaves of it, nine tenths where neighbouring pixels err alike."""
+"""Details lower than this many times the noise are lost: two standard deviations of the filtered
+noise, which is nine tenths of the original one if neighbouring pixels are correlated."""
 _FEW_HOLES, _MANY_HOLES = 0.02, 0.10
 
 
@@ -36,7 +36,7 @@ class Finding:
     """One line of a report."""
 
     who: str
-    """A camera, two of them, or `together`."""
+    """A camera, a pair of cameras, or `together`."""
     what: str
     value: str
     verdict: str
@@ -48,7 +48,7 @@ def findings(check: Check, planner: PickPlaceParameters | None = None) -> list[F
 
     Args:
         check: of the cameras.
-        planner: how the robot picks and places; None: as the cell does by default.
+        planner: how the robot picks and places; None for the cell's defaults.
     """
     planner = PickPlaceParameters() if planner is None else planner
     lines: list[Finding] = []
@@ -61,8 +61,8 @@ def findings(check: Check, planner: PickPlaceParameters | None = None) -> list[F
                     "depth",
                     f"{1e3 * camera.depth_bias:+.2f} mm",
                     _verdict(camera.depth_bias),
-                    "a constant error of its depths explains tilt and bias as well as its pose "
-                    "does: measure one distance before you correct the pose",
+                    "a constant depth error explains tilt and bias as well as a wrong pose does: "
+                    "measure one distance before you correct the pose",
                 )
             )
         if camera.block is not None and check.block is not None:
@@ -75,7 +75,7 @@ def findings(check: Check, planner: PickPlaceParameters | None = None) -> list[F
                 "disagreement",
                 f"{1e3 * height:+.2f} mm",
                 _verdict(height),
-                "in height: an edge that both see at a slant is drawn twice, about as far apart",
+                "in height: an edge seen at a slant appears twice, about this far apart",
             )
         )
     for (one, other), shift in check.block_shifts.items():
@@ -85,14 +85,14 @@ def findings(check: Check, planner: PickPlaceParameters | None = None) -> list[F
                 "disagreement",
                 f"({1e3 * shift[0]:+.2f}, {1e3 * shift[1]:+.2f}) mm",
                 _verdict(float(np.linalg.norm(shift))),
-                "of where the block is, in x and y: objects look wider by it, cavities narrower",
+                "in the block's x and y: objects look wider by this, recesses narrower",
             )
         )
     return lines
 
 
 def explains_depth(camera: CameraCheck) -> bool:
-    """Whether a constant error of depth explains what is seen as well as an error of the pose."""
+    """Whether a constant depth error explains the heights as well as an error of the pose."""
     if abs(camera.depth_bias) < CLEARANCE / 4:
         return False
     return camera.depth_bias_noise < 1.05 * camera.table.noise + 5e-5
@@ -111,20 +111,20 @@ def _of_table(
     else:
         about_x, about_y = np.degrees(table.tilt)
         tilted = (
-            f"{about_x:+.3f} about x and {about_y:+.3f} about y: a camera that is rotated so sees "
-            f"everything {1e3 * aside:.1f} mm aside"
+            f"{about_x:+.3f} about x and {about_y:+.3f} about y: with this rotation of the camera "
+            f"everything is displaced by {1e3 * aside:.1f} mm"
         )
     high = "high" if table.bias > 0 else "low"
     bias = f"grasps and rims look {1e3 * abs(table.bias):.1f} mm too {high}"
     if table.bias > floor:
-        # The hand stops that much above `table_height`, wherever the depths are.
+        # The hand stops this far above `table_height`, whatever the depths.
         into = f"{1e3 * (table.bias - floor):.1f} mm"
-        bias += f"; if it is table_height that is too low, fingertips may go {into} into the table"
+        bias += f"; if table_height is too low, fingertips may go {into} into the table"
     if table.noise <= _CLEAN:
-        noise, blurred = "heights are taken as they are", GOOD
+        noise, blurred = "heights are used unfiltered", GOOD
     else:
         least = max(3.0, 1e3 * _LOST * table.noise)
-        noise = f"heights are smoothed, and what is less than {least:.1f} mm high or deep is lost"
+        noise = f"heights are filtered, and details below {least:.1f} mm are lost"
         blurred = TIGHT if table.noise <= _NOISY else BAD
     holes = GOOD if table.holes < _FEW_HOLES else TIGHT if table.holes < _MANY_HOLES else BAD
     return [
@@ -136,14 +136,14 @@ def _of_table(
             "holes",
             f"{100 * table.holes:.1f} %",
             holes,
-            "what no camera sees is filled in from around it",
+            "unseen pixels are filled in from their neighbours",
         ),
     ]
 
 
 def _of_block(who: str, seen: SeenBlock, block: Block) -> list[Finding]:
     length, width, height = scales(seen, block)
-    # Opposite errors of length and width do not make up for one another.
+    # Opposite errors of length and width must not cancel.
     worst = max(length, width, key=lambda share: abs(share - 1))
     wrong = (worst - 1) * _HALF_KIT
     reason = ""
@@ -177,21 +177,21 @@ def _of_block(who: str, seen: SeenBlock, block: Block) -> list[Finding]:
                 "offset",
                 f"({1e3 * x:+.2f}, {1e3 * y:+.2f}) mm, {math.degrees(yaw):+.2f} deg",
                 _verdict(math.hypot(x, y) + _HALF_KIT * abs(yaw)),
-                "picks and places go as far beside, and by the angle farther away from the block",
+                "picks and places are off by this, and by more with the distance from the block",
             )
         )
     return lines
 
 
 def scales(seen: SeenBlock, block: Block) -> tuple[float, float, float]:
-    """How long, wide and high a block looks, as shares of what it is."""
+    """The apparent length, width and height of a block, as shares of the true ones."""
     length, width, height = np.divide(seen.size, block.size).tolist()
     return length, width, height
 
 
 def offset(seen: SeenBlock, block: Block) -> tuple[float, float, float] | None:
-    """x, y in metres and yaw in radians by which a block looks displaced, if it is known where it
-    is; yaw modulo `Block.period`."""
+    """The apparent displacement of a block with known pose: x, y in metres and yaw in radians,
+    modulo `Block.period`. None without a known pose."""
     if block.pose is None:
         return None
     x, y = seen.middle - np.array(block.pose[:2])
@@ -199,6 +199,6 @@ def offset(seen: SeenBlock, block: Block) -> tuple[float, float, float] | None:
 
 
 def _verdict(error: float) -> str:
-    """The word for an error, in metres, by its share of the clearance."""
+    """The verdict on an error in metres, by its share of the clearance."""
     share = abs(error) / CLEARANCE
     return GOOD if share < 0.25 else TIGHT if share < 0.75 else BAD

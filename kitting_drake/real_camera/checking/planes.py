@@ -1,4 +1,4 @@
-"""Points in the base frame, and the plane that most of them lie on."""
+"""Points in the base frame, and the plane through most of them."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from systems.signals import PixelGrid
 Array = NDArray[np.float64]
 
 FARTHEST = 0.15
-"""Points farther above or below the table than this are not part of it, in metres."""
+"""Points farther than this above or below the table are not part of it, in metres."""
 _TRIALS = 200
 _TRIED = 4000
-"""So many of the points judge a trial."""
+"""The number of points that score a trial."""
 _BAND = 0.004
-"""Points within this of a trial's plane speak for it, in metres."""
+"""Points within this distance of a trial's plane are its inliers, in metres."""
 _REFITS = 4
 
 
@@ -33,34 +33,34 @@ class Plane:
     """(2,)."""
     offset: float
     noise: float
-    """The standard deviation of its points about it, robustly, in metres."""
+    """A robust standard deviation of its points, in metres."""
 
     def height(self, xy: Array) -> Array:
-        """(...) of positions (..., 2), in metres."""
+        """(...): the heights at positions (..., 2), in metres."""
         return np.asarray(xy @ self.slope + self.offset)
 
     @property
     def normal(self) -> Array:
-        """(3,) of unit length, upwards."""
+        """(3,): the upward unit normal."""
         normal = np.array([-self.slope[0], -self.slope[1], 1.0])
         return normal / np.linalg.norm(normal)
 
     @property
     def tilt(self) -> Array:
-        """(2,): the rotation vector, about base x and y, that brings the base's xy plane onto this
-        one, in radians."""
+        """(2,): the rotation vector about base x and y from the base's xy plane to this plane, in
+        radians."""
         axis = np.cross([0.0, 0.0, 1.0], self.normal)
         sine = np.linalg.norm(axis)
         return axis[:2] * (math.asin(min(float(sine), 1.0)) / sine if sine > 0 else 0.0)
 
     def levelling(self) -> Array:
-        """(3, 3): the least rotation that makes it horizontal."""
+        """(3, 3): the smallest rotation that makes it horizontal."""
         return Rotation.from_rotvec([*-self.tilt, 0.0]).as_matrix()
 
 
 def table_points(frame: Frame, camera: BenchCamera, X_BC: Array, grid: PixelGrid) -> Array:
-    """(height, width, 3): the point in the base frame that each pixel sees; NaN where it has no
-    depth, or sees beside the workspace or far from the table."""
+    """(height, width, 3): the point of each pixel in the base frame; NaN without depth, outside the
+    workspace, or far from the table."""
     rays, depth = camera.rays, frame.depth
     with np.errstate(invalid="ignore"):
         good = np.isfinite(depth) & (depth >= rays.min_depth) & (depth <= rays.max_depth)
@@ -73,10 +73,10 @@ def table_points(frame: Frame, camera: BenchCamera, X_BC: Array, grid: PixelGrid
 
 
 def fit_plane(points: Array) -> Plane:
-    """The plane that most points lie on: of random triples the best, refitted to what is near it.
+    """The plane through most points: RANSAC, refitted to its inliers.
 
     Args:
-        points: (n, 3), a hundred or more.
+        points: (n, 3), at least a hundred.
     """
     random = np.random.default_rng(0)
     some = points[random.integers(0, len(points), min(_TRIED, len(points)))]

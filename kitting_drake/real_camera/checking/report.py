@@ -1,4 +1,4 @@
-"""Decisions and checks as files, and as text on a terminal."""
+"""Decisions and checks as files and as terminal output."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from kitting_drake.real_camera.checking.meaning import BAD, GOOD, findings, offs
 CHECK_FILES = ("check.json", "corrected.yaml", "check.png")
 """The files that `save_check` writes."""
 _WELL_SEEN = 0.9
-"""A note says so where less than this share of the workspace in view is seen."""
+"""A smaller seen share of the workspace in view is reported."""
 
 
 def print_decision(console: Console, record: dict[str, Any]) -> None:
@@ -31,7 +31,7 @@ def print_decision(console: Console, record: dict[str, Any]) -> None:
     if record["seen"] < _WELL_SEEN:
         console.print(
             f"  only {100 * record['seen']:.0f} % of what is in view is seen; the rest is filled "
-            "in from around it",
+            "in from its neighbours",
             highlight=False,
         )
     for name in ("pick", "place"):
@@ -60,7 +60,7 @@ def save_check(folder: Path, check: Check) -> None:
 
 
 def check_record(check: Check) -> dict[str, Any]:
-    """A check as JSON: mm, degrees and percent."""
+    """A check as JSON, in mm, degrees and percent."""
     cameras = {}
     for name, camera in check.cameras.items():
         record = {**_table(camera.table), "depth_bias_mm": _mm(camera.depth_bias)}
@@ -92,7 +92,7 @@ def check_record(check: Check) -> dict[str, Any]:
 
 
 def print_check(console: Console, check: Check) -> None:
-    """Prints what was found, and what each finding means for a clearance of 2 mm."""
+    """Prints the findings and their meaning for a clearance of 2 mm."""
     table = Table(box=None, pad_edge=False)
     for title in ("camera", "", "", "2 mm clearance", "meaning"):
         table.add_column(title, overflow="fold")

@@ -1,1 +1,1 @@
-"""The measurements of the command `benchmark`, apart from networks and the paper."""
+"""The measurements of the command `benchmark`, except for those of networks and the paper."""

@@ -18,17 +18,17 @@ from kitting_drake.hkd.tools.toolsets import PAPER_SPLITS, toolsets
 
 
 def benchmark_kits(count: int | None, console: Console) -> dict[str, Any]:
-    """Builds the dataset's kits anew and measures them; times in seconds, lengths in millimetres.
+    """Builds the dataset's kits and measures them; times in seconds, lengths in millimetres.
 
     Args:
-        count: how many of each split, or all when None.
+        count: the number of kits of each split; None for all.
         console: for progress.
     """
     build_times, triangles, medians, minima = [], [], [], []
     chosen = [names for split in PAPER_SPLITS for names in toolsets(split)[:count]]
     for names in track(chosen, "kits", console=console, transient=True, disable=console.quiet):
         start = time.perf_counter()
-        # From the meshes on disk to the block; nothing comes from the cache.
+        # Build from the meshes on disk, without the cache.
         tools = [load_tool(name) for name in names]
         layout = layout_kit(tools, KitParameters())
         parameters = layout.parameters
@@ -55,7 +55,7 @@ def benchmark_kits(count: int | None, console: Console) -> dict[str, Any]:
 
 
 def kits_table(measured: dict[str, Any]) -> Table:
-    """For the terminal."""
+    """The measurements as a table for the terminal."""
     table = numbers_table(f"{measured['kits']} kits, one core", "what", "measured")
     build, triangles = measured["build_s"], measured["contact_triangles"]
     clearance = measured["clearance_mm"]

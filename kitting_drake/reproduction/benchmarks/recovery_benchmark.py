@@ -1,8 +1,9 @@
-"""`benchmark recovery`: what a policy makes of an action that goes wrong, and of one that does not.
+"""`benchmark recovery`: how a policy recovers from a failed action.
 
-In each episode the first action is made to fail in one of three ways: the object is moved while the
-hand comes down, the grasp is off, or the place is off. What is counted is whether that
-object is kitted at the end all the same, and how often an object that was kitted is touched again.
+The first action of each episode is made to fail in one of three ways: the object is moved while the
+hand comes down, the grasp is off, or the place is off. The benchmark counts how often that object
+is kitted in the end, and how often a kitted object is disturbed again. Undisturbed episodes are the
+baseline.
 """
 
 import dataclasses
@@ -37,15 +38,15 @@ from systems.weak_calc import weak_calc
 _MOVED = (0.03, 0.06)
 """How far an object is moved, in metres, ..."""
 _MOVED_YAW = math.radians(45)
-"""... and turned, at most."""
+"""... and the largest angle by which it is turned, in radians."""
 _MISSED = 0.04
-"""By how much a grasp is off, in metres."""
+"""The error of a grasp, in metres."""
 _BLOCKED = 0.003
-"""By how much a place is off, in metres."""
+"""The error of a place, in metres."""
 _ROOM = 0.012
-"""An object is moved to where it is at least this far from all others, in metres."""
+"""The least distance of a moved object from all others, in metres."""
 _INSIDE = 0.02
-"""An object is moved to where all of it is at least this far within o_t, in metres."""
+"""The least distance of a moved object from the border of o_t, in metres."""
 _DRAWS = 200
 
 
@@ -69,14 +70,14 @@ class ActionOffset(LeafSystem):
         output_ports:
         - action
 
-    Both abstract, `PickPlaceAction`. The numeric parameter 0 has the shifts of pick x, pick y,
-    place x and place y, in metres; zero changes nothing.
+    Both are abstract, `PickPlaceAction`. The numeric parameter 0 holds the shifts of pick x, pick
+    y, place x and place y, in metres. If all are zero, the action passes unchanged.
     """
 
     def __init__(self, offset: NDArray[np.float64]) -> None:
         """
         Args:
-            offset: (4,) at the beginning.
+            offset: (4,), the initial value of the parameter.
         """
         super().__init__()
         self._action = self.DeclareAbstractInputPort("action", Value(PickPlaceAction()))
@@ -86,7 +87,7 @@ class ActionOffset(LeafSystem):
         )
 
     def stop(self, context: Context) -> None:
-        """From now on nothing is shifted."""
+        """Sets all shifts to zero."""
         context.get_mutable_numeric_parameter(self._offset).SetFromVector(np.zeros(4))
 
     def _calc(self, context: Context, output: Any) -> None:
@@ -109,7 +110,7 @@ def _shifted(pose: PlanarPose, offset: NDArray[np.float64]) -> PlanarPose:
 
 
 class _Adversary:
-    """An `EpisodeObserver` that brings a disturbance about, and counts what is touched again."""
+    """An `EpisodeObserver` that causes a disturbance and counts disturbed kitted objects."""
 
     def __init__(
         self,
@@ -123,11 +124,11 @@ class _Adversary:
         self._offset, self._shift = offset, shift
         self._actions = 0
         self.victim: int | None = None
-        """The object whose action went wrong; None if nothing could be done to it."""
+        """The object whose action fails; None if no disturbance was possible."""
         self.seated: set[int] = set()
         """The objects that were kitted when an action began."""
         self.touched: set[int] = set()
-        """Those of them that the action went for."""
+        """The kitted objects that an action then picked."""
 
     def observe(self, event: ModeChange) -> None:
         if event.is_last:
@@ -156,7 +157,7 @@ class _Adversary:
         self.touched |= seated & {wanted}
 
     def _move(self, root_context: Context) -> None:
-        """Moves the object on the table to where there is room."""
+        """Moves the object to a free place on the table."""
         station, rng = self._station, self._rng
         if self.victim is None:
             return
@@ -206,9 +207,9 @@ class _Count:
     seated: int = 0
     actions: int = 0
     failed: int = 0
-    """Episodes that failed: none of their objects counts as kitted."""
+    """Failed episodes; none of their objects counts as kitted."""
     timed_out: int = 0
-    """Episodes that timed out: none of their objects counts as kitted either."""
+    """Timed-out episodes; none of their objects counts as kitted either."""
 
 
 def benchmark_recovery(
@@ -216,22 +217,23 @@ def benchmark_recovery(
 ) -> tuple[dict[str, Any], bytes]:
     """Runs episodes with each disturbance.
 
-    Returns the figures, and a PNG of one episode of each as a strip of frames: the one that took
-    the most actions, but recovered.
-
     Args:
-        chosen: the scenario, with the policy that is to recover.
-        episodes: with each disturbance.
-        seed: of the first; the others follow.
+        chosen: the scenario with the tested policy.
+        episodes: the number with each disturbance.
+        seed: of the first episode; the others follow.
         console: for progress.
 
+    Returns:
+        The counts, and a PNG with the frames of one episode per disturbance: the one that recovered
+        with the most actions.
+
     Raises:
-        UserError: there are no cameras, by whose images episodes are drawn, or the scene of a seed
-            cannot be built.
+        UserError: the scenario has no cameras for the frames, or the scene of a seed cannot be
+            built.
     """
     if not chosen.scenario.cameras:
         raise UserError(
-            f"{chosen.path}: cameras is empty: the strips of episodes need at least one"
+            f"{chosen.path}: cameras is empty: the frames of episodes need at least one camera"
         )
     counts = {kind: _Count() for kind in Disturbance}
     strips: dict[Disturbance, _Strip] = {}
@@ -263,7 +265,7 @@ def _build(
 
 
 def _run(chosen: ChosenScenario, kind: Disturbance, seed: int, count: _Count) -> _Strip | None:
-    """Runs an episode and counts; returns it as a strip if everything was kitted."""
+    """Runs an episode and counts its outcome; returns its frames if everything was kitted."""
     rng = np.random.default_rng([seed, list(Disturbance).index(kind)])
     way = rng.uniform(0, math.tau)
     direction = np.array([math.cos(way), math.sin(way)])
@@ -297,7 +299,7 @@ def _run(chosen: ChosenScenario, kind: Disturbance, seed: int, count: _Count) ->
 
 
 def recovery_table(measured: dict[str, Any]) -> Table:
-    """The measurements, for a person."""
+    """The measurements as a table for the terminal."""
     table = Table(title=f"{measured['policy']['name']}: {measured['episodes']} episodes each")
     columns = ("recovered", "kitted in all", "disturbed again", "actions", "failed, timed out")
     table.add_column("the first action")

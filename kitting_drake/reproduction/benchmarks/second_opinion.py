@@ -1,4 +1,4 @@
-"""The second opinion: tools let go of in MuJoCo where they were here, and the verdicts compared."""
+"""Releases tools in MuJoCo at the poses where Drake released them, and compares the verdicts."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -25,19 +25,19 @@ from systems.placement import Placement, evaluate_placements
 
 _TIME_STEP = 0.001
 _REST = 2.0
-"""How long a tool may fall and come to rest, in s."""
+"""The time for a tool to fall and come to rest, in s."""
 _CONTACT_TIME = 0.004
-"""MuJoCo's time constant of contact, in s: twice the step at least, and stiff."""
+"""MuJoCo's time constant of contact, in s: stiff, but at least twice the step."""
 _FRICTION = 0.375
-"""Drake combines a tool's 0.5 and a kit's 0.3 to their harmonic mean; MuJoCo would take 0.5."""
+"""The harmonic mean of a tool's 0.5 and a kit's 0.3, as in Drake; MuJoCo would take 0.5."""
 
 _MOST_FRUITLESS = 5
-"""So many episodes in a row in which nothing is let go of mean that the policy cannot do it."""
+"""The benchmark fails after this many episodes in a row without a release."""
 
 
 @dataclass(frozen=True)
 class Release:
-    """A tool as the jaws begin to open over it, and the scene that it is in."""
+    """A tool when the jaws begin to open, and its station."""
 
     station: KittingStation
     index: int
@@ -48,21 +48,21 @@ class Release:
 def ask_mujoco(
     placements: int, seed: int, orientations: int | None, console: Console
 ) -> dict[str, Any]:
-    """Lets go of tools in MuJoCo where oracles on unseen toolsets let go of them here.
+    """Releases tools in MuJoCo at the poses where oracles on unseen toolsets release them in Drake.
 
-    The grasp is left out: there is the table, the kit and the one tool, at rest.
+    The MuJoCo scene has no hand: only the table, the kit and the tool at rest.
 
     Args:
-        placements: how many.
+        placements: how many to compare.
         seed: of the first episode.
-        orientations: those of a quantized oracle, which misses more; None: the oracle.
+        orientations: those of a quantized oracle, which misses more often; None for the oracle.
         console: for the progress bar.
 
     Returns:
-        What `benchmark mujoco` writes: the share of equal verdicts, and each placement.
+        The record of `benchmark mujoco`: the share of equal verdicts, and each placement.
 
     Raises:
-        UserError: the package mujoco is not installed; or the oracle lets go of nothing.
+        UserError: the package mujoco is not installed, or the oracle releases nothing.
     """
     mujoco = import_extra("mujoco", purpose="benchmark mujoco", extra="mujoco")
     rows: list[dict[str, Any]] = []
@@ -74,7 +74,7 @@ def ask_mujoco(
             fruitless = 0 if witness.releases else fruitless + 1
             if fruitless == _MOST_FRUITLESS:
                 raise UserError(
-                    f"nothing was let go of in {fruitless} episodes: raise --orientations"
+                    f"nothing was released in {fruitless} episodes: raise --orientations"
                 )
             for release in witness.releases.values():
                 rows.append(_row(seed, witness, release, _fall(mujoco, release)))
@@ -97,17 +97,17 @@ def ask_mujoco(
 
 
 class _Witness:
-    """Keeps where tools are let go of, and how they end: an `EpisodeObserver`."""
+    """An `EpisodeObserver` that records where tools are released and where they end."""
 
     def __init__(self, station: KittingStation) -> None:
         self._station = station
         self.releases: dict[int, Release] = {}
-        """The last of each object, by its index."""
+        """The last release of each object, by its index."""
         self.final_poses: list[RigidTransform] = []
         self.placements: list[Placement] = []
 
     def observe(self, event: ModeChange) -> None:
-        """Takes down a release, and the end."""
+        """Records a release, and the end of the episode."""
         station = self._station
         poses = station.object_poses(event.root_context)
         if event.is_last:
@@ -119,7 +119,7 @@ class _Witness:
 
 
 def _episode(seed: int, orientations: int | None) -> _Witness:
-    """An episode of an oracle, which needs no cameras, on an unseen toolset."""
+    """Runs an oracle, which needs no cameras, on an unseen toolset."""
     policy = Oracle() if orientations is None else QuantizedOracle(orientations=orientations)
     scenario = Scenario(task=ToolsetKitting(split="test"), policy=policy, cameras={})
     station = build_station(scenario, seed)
@@ -132,7 +132,7 @@ def _episode(seed: int, orientations: int | None) -> _Witness:
 
 
 def _row(seed: int, witness: _Witness, release: Release, X_WB: RigidTransform) -> dict[str, Any]:
-    """A placement here and, at X_WB, in MuJoCo: each scored among all that ended here."""
+    """Compares a placement in Drake with X_WB in MuJoCo, scored among the final poses in Drake."""
     station, index = release.station, release.index
     poses = list(witness.final_poses)
     poses[index] = X_WB
@@ -161,7 +161,7 @@ def _verdict(placement: Placement) -> dict[str, Any]:
 
 
 def _fall(mujoco: Any, release: Release) -> RigidTransform:
-    """X_WB of a tool that was let go of, at rest in MuJoCo."""
+    """X_WB of a released tool at rest in MuJoCo."""
     scene = release.station.scene
     item = scene.objects[release.index]
     world = mujoco.MjSpec()
@@ -171,7 +171,7 @@ def _fall(mujoco: Any, release: Release) -> RigidTransform:
     for number, fixture in enumerate(scene.fixtures):
         kit = _spec(mujoco, kit_mjcf(fixture.model), fixture.model.parent)
         for geom in kit.geoms:
-            # The kit's friction counts, whatever the tool's is.
+            # With priority, the kit's friction applies instead of the tool's.
             geom.priority, geom.friction[0] = 1, _FRICTION
         _attach(world, kit, fixture.X_WF, f"fixture_{number}_")
     tool = _spec(mujoco, tool_mjcf(item.model), item.model.parent)
@@ -193,14 +193,14 @@ def _spec(mujoco: Any, text: str, folder: Path) -> Any:
 
 
 def _attach(world: Any, spec: Any, X_WF: RigidTransform, prefix: str) -> None:
-    """Puts what a model holds into the world, at a pose."""
+    """Attaches a model to the world at a pose."""
     quaternion = X_WF.rotation().ToQuaternion().wxyz()
     frame = world.worldbody.add_frame(pos=X_WF.translation(), quat=quaternion)
     world.attach(spec, prefix=prefix, frame=frame)
 
 
 def opinion_table(measured: dict[str, Any]) -> Table:
-    """The verdicts here against those in MuJoCo."""
+    """The verdicts in Drake and in MuJoCo, as a table for the terminal."""
     table = Table(title=f"{measured['placements']} placements of the {measured['policy']}")
     for heading in ("measure", "yes here", "yes in MuJoCo", "alike"):
         table.add_column(heading, justify="left" if heading == "measure" else "right")

@@ -1,4 +1,4 @@
-"""`benchmark simulation`: where the time of an episode goes, start-up, images."""
+"""`benchmark simulation`: the time of episodes by phase, of starting up, and of images."""
 
 import os
 import platform
@@ -30,14 +30,14 @@ _LEARNED = SCENARIOS / "paper/kitting_seen.yaml"
 
 
 def benchmark_simulation(episodes: int, seed: int, console: Console) -> dict[str, Any]:
-    """Measures everything that `benchmark simulation` shows.
+    """Runs all measurements of `benchmark simulation`.
 
     Args:
-        episodes: how many whole episodes to run of the oracle, and as many of the learned policy.
-        seed: of the first; the others follow.
+        episodes: the number of episodes of each of the oracle and the learned policy.
+        seed: of the first episode; the others follow.
         console: for progress.
     """
-    # Before PyTorch is loaded: one thread, as `evaluate` gives each of its workers.
+    # Set before PyTorch is loaded: one thread, as for each worker of `evaluate`.
     os.environ["OMP_NUM_THREADS"] = "1"
     stopwatch = PhaseStopwatch()
     return {
@@ -65,7 +65,7 @@ def benchmark_simulation(episodes: int, seed: int, console: Console) -> dict[str
 def _whole_episodes(
     path: Path, episodes: int, seed: int, stopwatch: "PhaseStopwatch", console: Console
 ) -> dict[str, Any]:
-    """Runs whole episodes; gives their cost for each object kitted, building aside."""
+    """Runs whole episodes and returns their cost per kitted object, without building."""
     scenario = load_scenario(path)
     simulated = wall = kitted = 0.0
     for number in track(
@@ -94,16 +94,16 @@ def _whole_episodes(
 
 
 def _require_whole(result: EpisodeResult) -> None:
-    """Raises UserError for an episode that failed or timed out, which is no measurement."""
+    """Raises UserError for an episode that failed or timed out and cannot be measured."""
     if result.failure or result.timed_out:
         reason = result.failure or "timed out"
         raise UserError(
-            f"{result.scenario}, seed {result.seed}: the episode cannot count: {reason}"
+            f"{result.scenario}, seed {result.seed}: the episode cannot be measured: {reason}"
         )
 
 
 class PhaseStopwatch:
-    """Adds up simulated and wall time by the planner's mode, over episodes."""
+    """Sums simulated and wall time by the planner's mode, over episodes."""
 
     def __init__(self) -> None:
         self.phases: dict[str, tuple[float, float]] = {}
@@ -111,12 +111,11 @@ class PhaseStopwatch:
         self._last = (0.0, 0.0)
 
     def start(self) -> None:
-        """An episode begins."""
+        """Starts an episode."""
         self._last = (0.0, time.perf_counter())
 
     def observe(self, event: ModeChange) -> None:
-        """Adds the time since the last event to the mode that it was spent in: an
-        `EpisodeObserver`."""
+        """Adds the time since the last event to the previous mode; an `EpisodeObserver`."""
         now = (event.root_context.get_time(), time.perf_counter())
         name = event.previous.name.lower()
         simulated, wall = self.phases.get(name, (0.0, 0.0))
@@ -125,10 +124,10 @@ class PhaseStopwatch:
 
 
 def _start_up_times() -> dict[str, float]:
-    """The times from the shell to the end of a run of a few steps, Meshcat and files included."""
+    """The wall times of short runs from the shell, including Meshcat and files."""
     times = {}
     with tempfile.TemporaryDirectory() as folder:
-        # The first run finds nothing in the cache, the second what the first has built.
+        # The first run fills the cache for the second.
         environment = os.environ | {"XDG_CACHE_HOME": folder}
         command = [sys.executable, "-m", "kitting_drake.run", str(_SCENARIO), "--quiet"]
         command += ["--scenario_text", "{time_limit: 0.1}", "--output", folder]
@@ -159,11 +158,11 @@ def _image_times(scenario: Scenario, seed: int) -> dict[str, float]:
 
     render_times, project_times = [], []
     for second in range(6):
-        # Images depend on time, so that what was rendered before is stale.
+        # A new time invalidates the rendered images.
         context.SetTime(float(second + 1))
         render_times.append(_timed(render))
         project_times.append(_timed(project))
-    # The first one loads meshes into the engine.
+    # The first image loads the meshes, so it does not count.
     return {
         "rgbd_image": float(np.median(render_times[1:])) / len(scenario.cameras),
         "heightmap": float(np.median(project_times[1:])),
@@ -177,7 +176,7 @@ def _timed(function: Callable[[], None]) -> float:
 
 
 def simulation_tables(measured: dict[str, Any]) -> list[Table]:
-    """For the terminal."""
+    """The measurements as tables for the terminal."""
     whole = numbers_table(
         "whole episodes, one thread",
         "policy",

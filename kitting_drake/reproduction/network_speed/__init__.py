@@ -1,7 +1,7 @@
-"""The cost of the networks on this machine: figure 6(c) of the paper, and what goes with it.
+"""The cost of the networks on this machine: figure 6(c) of the paper, and related measurements.
 
-All figures come from one run on one machine, and alternatives that are compared are timed in
-alternation. Drake is not needed.
+All numbers come from one run on one machine, and compared alternatives are timed in alternation.
+Drake is not needed.
 """
 
 from __future__ import annotations
@@ -33,9 +33,9 @@ from kitting_drake.reproduction.network_speed.timing import describe_machine, me
 
 
 def benchmark_networks(plan: Plan, console: Console) -> dict[str, Any]:
-    """Measures all that `benchmark networks` shows.
+    """Runs all measurements of `benchmark networks`.
 
-    Times are in seconds of wall time, rates in operations a second; a multiply-accumulate is two
+    Times are in seconds of wall time, rates in operations per second; a multiply-accumulate is two
     operations.
 
     Args:
@@ -43,7 +43,7 @@ def benchmark_networks(plan: Plan, console: Console) -> dict[str, Any]:
         console: for progress.
 
     Raises:
-        UserError: the demonstrations cannot be used.
+        UserError: the demonstrations are unusable.
     """
     device = preferred_device()
     machine = describe_machine(device)

@@ -1,4 +1,4 @@
-"""The convolutions of a function, alone: what it would take if nothing else took any time."""
+"""Times a function's convolutions alone, as a lower bound of its time."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from kitting_drake.reproduction.network_speed.timing import Timing
 
 _GROUPS = {"aten::conv2d": 6, "aten::convolution": 8, "aten::convolution_backward": 9}
-"""torch's convolutions, each with the position of its number of groups among its arguments."""
+"""torch's convolutions, each with the index of its `groups` argument."""
 
 
 class _Outline(NamedTuple):
-    """A tensor without its values."""
+    """The shape, type and memory format of a tensor."""
 
     shape: tuple[int, ...]
     type: torch.dtype
@@ -41,27 +41,27 @@ class _Outline(NamedTuple):
 
 @dataclass(frozen=True)
 class Convolutions:
-    """The convolutions that a function computes, in both directions if it differentiates.
+    """The convolutions that a function computes, including those of its backward passes.
 
-    Depthwise ones, which are filters and no layers, are not among them.
+    Depthwise convolutions are filters rather than layers, and are not included.
     """
 
     calls: Counter[tuple[Any, tuple[Any, ...]]]
-    """How often each is called: torch's function and its arguments, tensors outlined."""
+    """The number of calls by torch's function and its arguments, with tensors as outlines."""
 
     @classmethod
     def of(cls, function: Callable[[], object]) -> Convolutions:
-        """Those of a function, which is run once."""
+        """The convolutions of a function, which is run once."""
         with _Recorder() as recorder:
             function()
         return cls(recorder.calls)
 
     def alone(self, device: torch.device) -> dict[Any, Callable[[], object]]:
-        """A function for each key of `calls`, which computes it once, of random numbers."""
+        """A function for each key of `calls`, which computes it once on random numbers."""
         return {call: _replay(*call, device) for call in self.calls}
 
     def seconds(self, timings: dict[Any, Timing]) -> float:
-        """The time of all of them.
+        """The total time of all calls.
 
         Args:
             timings: of each function of `alone`.
@@ -75,7 +75,7 @@ def _replay(function: Any, outlined: tuple[Any, ...], device: torch.device) -> C
 
 
 class _Recorder(TorchDispatchMode):
-    """Records convolutions as they are called."""
+    """Records convolutions when they are called."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -85,7 +85,7 @@ class _Recorder(TorchDispatchMode):
         self, function: Any, types: Any, args: Any = (), kwargs: Any = None
     ) -> Any:
         place = _GROUPS.get(function.name())
-        # A trailing argument that has its default is left out: there is one group then.
+        # torch omits trailing arguments with default values; the default is one group.
         if place is not None and args[place : place + 1] in ((), (1,)):
             outlined = (
                 _Outline.of(item)

@@ -1,4 +1,4 @@
-"""The speed of the paper's networks as this package runs them, relative to plain escnn."""
+"""The speed of the SO(2) networks in this package relative to plain escnn."""
 
 from __future__ import annotations
 
@@ -21,21 +21,22 @@ from kitting_drake.reproduction.network_speed.plan import SpeedSetup, times_of, 
 from kitting_drake.reproduction.network_speed.timing import Timing, count_operations
 
 MEASURES = ("training_step", "alpha_training_step", "decision", "alpha_inference")
-"""The operations that are timed for each way to run the same networks."""
+"""The timed operations."""
 
 
 def measure_folding(setup: SpeedSetup) -> dict[str, Any]:
-    """Times the paper's networks built of escnn's modules, and as this package runs them.
+    """Times the SO(2) networks built from escnn's modules, and as this package runs them.
 
-    Their weights are the same, and so is what they compute, up to rounding.
+    Both have the same weights and compute the same function, up to rounding.
 
     Returns:
-        By way of running them, `rungs`: the time of each of `MEASURES`; `speed_up`: how many times
-        faster than plain escnn in float32 each of them is; `convolution_share`: for ours, the share
-        of the time of a training step and of a decision that its convolutions alone take, by plain
-        torch on tensors of the same shapes and type; `alpha_difference`: the difference of alpha's
-        output from plain escnn's, relative to its standard deviation; and `alpha_operations` of one
-        inference.
+        - `rungs`: the time of each of `MEASURES`, for each variant;
+        - `speed_up`: how many times faster than plain escnn in float32 it is;
+        - `convolution_share`: for our variants, the share of a training step and of a decision that
+          plain torch needs for convolutions of the same shapes and type;
+        - `alpha_difference`: the difference of alpha's output from plain escnn's, relative to its
+          standard deviation;
+        - `alpha_operations`: the operations of one inference of alpha.
     """
     ways = _ways(setup)
     exported = {name: pair[1] for name, pair in ways.items()}
@@ -71,7 +72,7 @@ def measure_folding(setup: SpeedSetup) -> dict[str, Any]:
             name: float((output - exact).std() / exact.std()) for name, output in outputs.items()
         },
         "alpha_operations": {
-            # Those of autocast cannot be counted, but they are the same.
+            # Operations under autocast cannot be counted, but they are the same.
             name: count_operations(inferring(*_alpha(exported[f"{name}_float32"], setup)))
             for name in ("escnn", "ours")
         },
@@ -79,7 +80,7 @@ def measure_folding(setup: SpeedSetup) -> dict[str, Any]:
 
 
 def _ways(setup: SpeedSetup) -> dict[str, tuple[Networks, Networks]]:
-    """The same networks in each way to run them: one for training, and one for inference."""
+    """The variants of the networks, each for training and for inference."""
     ours = make_networks(NetworkConfig("so2", setup.plan.preset))
     assert isinstance(ours, SO2Networks)
     types = [type_ for type_ in (torch.float32, torch.bfloat16) if type_ in setup.peak]
@@ -87,7 +88,7 @@ def _ways(setup: SpeedSetup) -> dict[str, tuple[Networks, Networks]]:
     escnn = as_escnn(ours)
     for type_ in types:
         trained = _with_autocast(escnn, type_)
-        # In evaluation mode escnn keeps the kernels that it has expanded.
+        # In evaluation mode escnn caches the expanded kernels.
         exported = copy.deepcopy(trained).eval().requires_grad_(False)
         ways[f"escnn_{type_name(type_)}"] = (trained, exported)
     for type_ in types:
@@ -99,7 +100,7 @@ def _ways(setup: SpeedSetup) -> dict[str, tuple[Networks, Networks]]:
 
 
 def _with_autocast(escnn: Networks, type_: torch.dtype) -> Networks:
-    """A copy that computes in a type by torch's automatic mixed precision."""
+    """A copy that computes in a type with torch's automatic mixed precision."""
     escnn = copy.deepcopy(escnn)
     for network in escnn.children():
         if isinstance(network, EscnnUNet | EscnnAngleNet):
@@ -110,7 +111,7 @@ def _with_autocast(escnn: Networks, type_: torch.dtype) -> Networks:
 def _time_ways(
     setup: SpeedSetup, ways: dict[str, tuple[Networks, Networks]]
 ) -> dict[str, dict[str, Timing]]:
-    """Each of `MEASURES` for each way to run the networks."""
+    """The timings of each of `MEASURES` for each variant."""
     trained = {name: pair[0] for name, pair in ways.items()}
     exported = {name: pair[1] for name, pair in ways.items()}
     return {
@@ -132,9 +133,9 @@ def _time_ways(
 
 
 def _convolution_share(function: Callable[[], object], setup: SpeedSetup, training: bool) -> float:
-    """The share of a function's time that its convolutions take when they are computed alone."""
+    """The share of a function's time that its convolutions alone take."""
     convolutions = Convolutions.of(function)
-    # In alternation with the function, so that other load on the machine affects both alike.
+    # Time them in alternation with the function, to share the effect of other load.
     functions: dict[Any, Callable[[], object]] = {"all": function}
     functions |= convolutions.alone(setup.device)
     timings = setup.time_each(functions, training=training)
@@ -142,27 +143,26 @@ def _convolution_share(function: Callable[[], object], setup: SpeedSetup, traini
 
 
 def _alpha(networks: Networks, setup: SpeedSetup) -> tuple[nn.Module, Tensor]:
-    """The network alpha, and its input."""
+    """The network alpha and its input."""
     return networks.get_submodule("alpha"), setup.inputs(networks)["alpha"]
 
 
 def computing_in(networks: Networks, type_: torch.dtype) -> Networks:
-    """A copy that computes in another type, to be trained."""
+    """A copy for training that computes in another type."""
     networks = copy.deepcopy(networks)
     networks.compute_type = type_
     return networks
 
 
 def _training(networks: Networks, scene: ObservedScene) -> Callable[[], object]:
-    """Training steps of all four networks, augmentation and losses included: the same ones,
-    whatever the networks."""
+    """The same training steps of all four networks for all variants, including augmentation."""
     trainer = Trainer(networks, seed=0, curvature=True)
     samples = labelled_images([scene], taken_only=False)
     return lambda: trainer.step(samples)
 
 
 def stepping(network: nn.Module, features: Tensor) -> Callable[[], object]:
-    """A training step of one network: forwards, backwards, Adam."""
+    """A training step of one network: forward, backward, Adam."""
     optimiser = torch.optim.Adam(network.parameters(), lr=1e-6)
 
     def step() -> None:
@@ -174,7 +174,7 @@ def stepping(network: nn.Module, features: Tensor) -> Callable[[], object]:
 
 
 def inferring(network: nn.Module, features: Tensor) -> Callable[[], object]:
-    """An inference of one network."""
+    """One inference of a network."""
     return lambda: network(features)
 
 

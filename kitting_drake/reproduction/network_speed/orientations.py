@@ -1,4 +1,4 @@
-"""The cost of a prediction at N orientations: figure 6(c) of the paper, and the whole decision."""
+"""The cost of a prediction at N orientations: figure 6(c) of the paper, and whole decisions."""
 
 from __future__ import annotations
 
@@ -25,17 +25,17 @@ PARTS = {
     "phi": ("phi",),
     "psi": ("psi",),
 }
-"""The networks that compute each part of a decision. The rest of a decision is `search`: the
-correlation, what is read off the networks' outputs, and the preparation of their inputs."""
+"""The networks of each part of a decision. The remaining part is `search`: the correlation, and the
+processing of inputs and outputs."""
 
 _MADE_FOR_N = ("equivariant_transporter",)
-"""Methods of whose architecture N is a part; the other methods' networks predict at any N."""
+"""Methods with N in their architecture; the other methods' networks predict at any N."""
 
 
 def measure_pick_angles(setup: SpeedSetup, preset: str) -> list[dict[str, Any]]:
-    """Parameters and inference time of the models that predict the pick angle.
+    """The parameters and inference time of the pick-angle models.
 
-    For the Transporter that is all of its picking: one network that takes the scene at every angle.
+    For the Transporter this is its whole picking module, which sees the scene at every angle.
 
     Returns:
         A row for each method and N.
@@ -57,7 +57,7 @@ def measure_pick_angles(setup: SpeedSetup, preset: str) -> list[dict[str, Any]]:
         skipped = {n: setup.why_not(outlined, count) for n, count in operations.items()}
         timings: dict[int, Timing] = {}
         if not all(skipped.values()):
-            # Fresh weights take as long as trained ones; some of these would be files of gigabytes.
+            # Untrained weights take the same time; saving them could take gigabytes.
             networks = _without_others(make_networks(config, PlainConv2d), names).to(setup.device)
             networks.freeze(preferred_type())
             timings = setup.time_each(
@@ -79,7 +79,7 @@ def measure_pick_angles(setup: SpeedSetup, preset: str) -> list[dict[str, Any]]:
 
 
 def _cells(plan: Plan) -> Iterator[tuple[str, tuple[int, ...]]]:
-    """Each method, with the N at which one set of its networks is measured."""
+    """Each method with the values of N that share one set of its networks."""
     for method in METHODS:
         if method in _MADE_FOR_N:
             yield from ((method, (n,)) for n in plan.orientations)
@@ -90,21 +90,21 @@ def _cells(plan: Plan) -> Iterator[tuple[str, tuple[int, ...]]]:
 
 
 def _outlined(config: NetworkConfig) -> Networks:
-    """Plain networks on the meta device: their operations are counted without being carried out."""
+    """Plain networks on the meta device, to count operations without computing."""
     with torch.device("meta"):
         return make_networks(config, PlainConv2d).to("meta").requires_grad_(False)
 
 
 def _without_others(networks: Networks, names: set[str]) -> Networks:
-    """The networks with none but the named children; the memory of the others is freed."""
+    """The networks with only the named children; frees the memory of the others."""
     for name in [name for name, _ in networks.named_children() if name not in names]:
         delattr(networks, name)
     return networks
 
 
 def _compute_angles(networks: Networks, setup: SpeedSetup, n: int) -> Callable[[], object]:
-    """The computation of all angles at a known pixel; nothing is read off the result, which has no
-    values on the meta device."""
+    """Computes all angles at a known pixel, without reading the result, which has no values on the
+    meta device."""
     if isinstance(networks, FactoredNetworks):
         crops = networks.prepare(crop(setup.image, setup.pixel, PICK_CROP))
         return lambda: networks.crop_angle_logits(crops, n)
@@ -112,17 +112,17 @@ def _compute_angles(networks: Networks, setup: SpeedSetup, n: int) -> Callable[[
 
 
 def _predict_angle(networks: Networks, setup: SpeedSetup, n: int) -> Callable[[], object]:
-    """The prediction of the angle at a known pixel."""
+    """Predicts the angle at a known pixel."""
     if isinstance(networks, FactoredNetworks):
         return lambda: networks.predict_angle(setup.image, setup.pixel, n)
     return lambda: networks.predict_pick(setup.image, n).angle(setup.pixel)
 
 
 def measure_decisions(setup: SpeedSetup) -> list[dict[str, Any]]:
-    """Time of a whole decision on exported networks, and of its parts.
+    """The time of a whole decision of exported networks, and of its parts.
 
     Returns:
-        A row for each method and N; the parts are those of the run of median time.
+        A row for each method and N. The parts are those of the run with median time.
     """
     rows = []
     for method, orientations in _cells(setup.plan):
@@ -163,10 +163,10 @@ def measure_decisions(setup: SpeedSetup) -> list[dict[str, Any]]:
 
 
 def _compute_others(networks: Networks, setup: SpeedSetup, n: int) -> Callable[[], object]:
-    """All that the networks compute for a decision but the angles; the search is left out."""
+    """All computations of the networks for a decision, except for angles and search."""
 
     def compute() -> None:
-        # The Transporter computes positions and angles at once.
+        # The Transporter computes positions together with angles.
         if isinstance(networks, FactoredNetworks):
             networks.position_logits(setup.image)
         networks.encode_scene(setup.image)
@@ -180,7 +180,7 @@ def _compute_others(networks: Networks, setup: SpeedSetup, n: int) -> Callable[[
 
 
 class _WatchedPolicy:
-    """A policy that takes the time of each part of its decisions."""
+    """A policy that times each part of its decisions."""
 
     def __init__(self, setup: SpeedSetup, networks: Networks) -> None:
         self._setup, self._device = setup, setup.device
@@ -203,7 +203,7 @@ class _WatchedPolicy:
         return hook
 
     def deciding(self, orientations: int, runs: list[dict[str, float]]) -> Callable[[], object]:
-        """A decision at N, which appends the seconds of its parts to `runs`."""
+        """A function that decides at N and appends the seconds of its parts to `runs`."""
         policy = LearnedPolicy(self._networks, orientations=orientations)
 
         def decide() -> None:
@@ -221,11 +221,11 @@ def growth(rows: list[dict[str, Any]], orientations: tuple[int, ...]) -> list[di
     """The cost at the largest N relative to that at the smallest.
 
     Args:
-        rows: of `measure_pick_angles` or `measure_decisions`.
+        rows: from `measure_pick_angles` or `measure_decisions`.
         orientations: N.
 
     Returns:
-        A row for each preset and method: ratios, or None where one of the two was not measured.
+        A row of ratios for each preset and method; None for values that were not measured.
     """
     ends = (min(orientations), max(orientations))
     cells = {(row["preset"], row["method"], row["orientations"]): row for row in rows}

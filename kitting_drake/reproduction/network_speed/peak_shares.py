@@ -1,4 +1,4 @@
-"""The share of the machine's peak that the paper's networks reach, whole and level by level."""
+"""The share of the machine's peak that the SO(2) networks reach, in total and by level."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from kitting_drake.reproduction.network_speed.timing import count_operations, re
 
 
 def measure_shares(setup: SpeedSetup) -> list[dict[str, Any]]:
-    """The share of the machine's peak that the paper's networks reach.
+    """The share of the machine's peak that the SO(2) networks reach.
 
     Returns:
         A row for each network, type and mode (`inference`, `training`).
@@ -55,11 +55,11 @@ def measure_shares(setup: SpeedSetup) -> list[dict[str, Any]]:
 
 
 def measure_levels(setup: SpeedSetup) -> dict[str, Any]:
-    """Times alpha's inference, level by level of the U-net and layer by layer.
+    """Times alpha's inference by level of the U-net and by layer.
 
     Returns:
-        `levels` and `layers`. A level's `convolution_s` is the time in its convolutions, `rest_s`
-        that in all else (ELU, sums, resampling, concatenation). The times are medians.
+        `levels` and `layers`, with median times. A level's `convolution_s` is the time of its
+        convolutions; `rest_s` is that of ELU, sums, resampling and concatenation.
     """
     type_ = preferred_type()
     networks = setup.export(make_networks(NetworkConfig("so2", setup.plan.preset)), type_)
@@ -109,16 +109,16 @@ def measure_levels(setup: SpeedSetup) -> dict[str, Any]:
 
 
 class _UNetWatch:
-    """Hooks that record when each level and each convolution of a U-net begins and ends."""
+    """Hooks that record the start and end of each level and convolution of a U-net."""
 
     def __init__(self, network: UNet, device: torch.device) -> None:
         self._network, self._device = network, device
         self._starts: dict[str, float] = {}
         self._ends: dict[str, float] = {}
         self.operations: dict[str, int] = {}
-        """The number of operations of each convolution."""
+        """The operations of each convolution."""
         self.types: dict[str, torch.dtype] = {}
-        """The type that each convolution computes in."""
+        """The type in which each convolution computes."""
         self._blocks = {
             f"{way}.{i}": f"{way} {i + 1}" for way, n in (("down", 5), ("up", 4)) for i in range(n)
         }
@@ -152,7 +152,7 @@ class _UNetWatch:
         return hook
 
     def run(self, features: Tensor) -> dict[str, float]:
-        """Seconds of each level and of each convolution of one inference."""
+        """The seconds of each level and each convolution in one inference."""
         start = read_clock(self._device)
         self._network(features)
         end = read_clock(self._device)
@@ -161,7 +161,7 @@ class _UNetWatch:
             for names in self.layers.values()
             for name in names
         }
-        # The resampling and concatenation before a block belong to it.
+        # Count the resampling and concatenation before a block as part of it.
         seconds["input"] = self._starts["down.0"] - start
         before = self._starts["down.0"]
         for block, level in self._blocks.items():

@@ -1,4 +1,4 @@
-"""The common part of all measurements of networks: the plan, the machine and the observation."""
+"""The common part of all network measurements: the plan, the machine and the observation."""
 
 from __future__ import annotations
 
@@ -32,29 +32,29 @@ from kitting_drake.reproduction.network_speed.timing import (
 from systems.signals import Observation, PickPlaceAction, PixelGrid, PlanarPose
 
 _EXPECTED_SHARE = 0.3
-"""The share of the machine's peak that networks are assumed to reach when times are predicted."""
+"""The assumed share of the machine's peak, to predict times."""
 
 
 @dataclass(frozen=True)
 class Plan:
-    """The measurements to make, and how often."""
+    """What to measure, and how often."""
 
     preset: str = "small"
     compared_preset: str | None = "paper"
-    """Another preset, of which only the models that predict the pick angle are measured."""
+    """Another preset, of which only the pick-angle models are measured."""
     orientations: tuple[int, ...] = (36, 72, 120, 180)
     """N of section V-B.1 of the paper."""
     finer: int = 720
-    """N at which only the paper's own method is measured as well."""
+    """An additional N for the SO(2) method."""
     repeats: int = 9
-    """The number of timings of which the median is taken."""
+    """The number of timings for each median."""
     peak_side: int = 2048
-    """The side of the matrices whose product shows the machine's peak; four times that on an
-    accelerator."""
+    """The side of the matrices whose product measures the peak; four times that on an accelerator.
+    """
     budget: float = 60.0
-    """The time that a figure may take, in seconds; what is predicted to take longer is left out."""
+    """The time for each number, in seconds; measurements that would take longer are skipped."""
     demonstrations: Path | None = None
-    """The file that the observation is taken from; None: it is synthetic."""
+    """The file with the observation; None for a synthetic one."""
 
     def __post_init__(self) -> None:
         if self.preset not in PRESETS:
@@ -77,12 +77,12 @@ class SpeedSetup:
     def __post_init__(self) -> None:
         self.image: Image = self.scene.recorded.image
         row, col = np.rint(self.scene.targets[0].pick).astype(int)
-        # Here, as `targets` decodes the image: that is not to be timed.
+        # Stored here because `targets` decodes the image, which must not be timed.
         self.pixel = int(row), int(col)
         """(row, col) of the expert's pick."""
 
     def observe(self) -> Observation:
-        """The observation of the decisions that are timed."""
+        """The observation of the timed decisions."""
         return Observation(self.image, self.scene.grid)
 
     def time_each(
@@ -104,7 +104,7 @@ class SpeedSetup:
         }
 
     def export(self, networks: Networks, type_: torch.dtype) -> Networks:
-        """The networks as evaluation runs them: saved, and loaded as plain convolutions."""
+        """The networks as in evaluation: saved, and loaded as plain convolutions."""
         path = self.folder / "networks.safetensors"
         save_weights(path, networks, {})
         return load_networks(path, type_).to(self.device)
@@ -116,10 +116,10 @@ class SpeedSetup:
         return self._counts[key]
 
     def why_not(self, outlined: Networks, operations: int) -> str | None:
-        """The reason not to time something, if there is one.
+        """The reason to skip a measurement; None to run it.
 
         Args:
-            outlined: its networks, on the meta device.
+            outlined: the networks, on the meta device.
             operations: of one run.
         """
         seconds = operations / (_EXPECTED_SHARE * self.peak[preferred_type()]["best"])
@@ -132,12 +132,12 @@ class SpeedSetup:
 
 
 def times_of(timing: Timing | None) -> dict[str, Any]:
-    """A timing as the results hold it."""
+    """A timing in the format of the results."""
     return dataclasses.asdict(timing) if timing else {"seconds": None}
 
 
 def type_name(type_: torch.dtype) -> str:
-    """A type as the results hold it, for example `float32`."""
+    """A type in the format of the results, for example `float32`."""
     return str(type_).removeprefix("torch.")
 
 
@@ -145,7 +145,7 @@ def observed_scene(path: Path | None) -> ObservedScene:
     """The first observation of a demonstration, or a synthetic one.
 
     Raises:
-        UserError: the demonstrations cannot be used.
+        UserError: the demonstrations are unusable.
     """
     if path is None:
         return synthetic_scene(PixelGrid())
@@ -153,12 +153,12 @@ def observed_scene(path: Path | None) -> ObservedScene:
     grid = demonstrations.origin.grid
     observed = scenes(demonstrations.demonstrations, grid, later_picks_possible=True)
     if not observed:
-        raise UserError(f"{path} holds no demonstration")
+        raise UserError(f"{path} holds no demonstrations")
     return observed[0]
 
 
 def synthetic_scene(grid: PixelGrid) -> ObservedScene:
-    """Four bars on a table, and a block with a hole for each."""
+    """Four bars on a table, and a block with a recess for each."""
     random = np.random.default_rng(0)
     pixel = np.stack(np.meshgrid(np.arange(grid.rows), np.arange(grid.cols), indexing="ij"), -1)
     image = np.full((4, *grid.shape), 0.4, np.float32)

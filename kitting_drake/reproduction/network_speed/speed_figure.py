@@ -1,4 +1,4 @@
-"""The figure of `benchmark networks`: figure 6(c) of the paper, and what goes with it."""
+"""The figure of `benchmark networks`: figure 6(c) of the paper, and related measurements."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from kitting_drake.reproduction.network_speed.speed_tables import (
 )
 
 _METHODS = {"so2": "#009e73", "equivariant_transporter": "#e69f00", "transporter": "#56646f"}
-"""Colours for the colour-blind too; the first two are the paper's green and orange."""
+"""Colour-blind safe colours; the first two are the paper's green and orange."""
 _PARTS = {
     "pick_position": "#0072b2",
     "pick_angle": "#d55e00",
@@ -44,16 +44,16 @@ _STYLE = {
 
 
 def draw_networks(measured: dict[str, Any], path: Path) -> None:
-    """Draws the figures of a benchmark.
+    """Draws the figure of a benchmark.
 
     Args:
-        measured: what `benchmark_networks` returns.
+        measured: the result of `benchmark_networks`.
         path: a .png file.
 
     Raises:
         UserError: the file cannot be written.
     """
-    # Imported here, because it takes long and other commands do not need it.
+    # Import matplotlib lazily.
     import matplotlib
     from matplotlib.figure import Figure
 
@@ -87,11 +87,11 @@ def draw_networks(measured: dict[str, Any], path: Path) -> None:
 
 
 def _draw_pick_angle(axis: Any, measured: dict[str, Any], preset: str) -> None:
-    """Parameters as bars, and times as lines."""
+    """Draws parameters as bars and times as lines."""
     rows = [row for row in measured["pick_angle"] if row["preset"] == preset]
     counts = sorted({row["orientations"] for row in rows})
     places = {n: index for index, n in enumerate(counts)}
-    # The Transporter has no model of the angle alone: only the time of its picking is comparable.
+    # The Transporter has no separate angle model, so only its picking time is shown.
     barred = [method for method in _METHODS if method != "transporter"]
     width = 0.32
     for index, method in enumerate(barred):
@@ -124,7 +124,7 @@ def _draw_pick_angle(axis: Any, measured: dict[str, Any], preset: str) -> None:
 
 
 def _draw_times(times: Any, rows: list[dict[str, Any]], places: dict[int, int]) -> None:
-    """A line for each method, labelled with its times."""
+    """Draws a line for each method, labelled with its times."""
     from matplotlib.ticker import LogLocator
 
     times.spines["right"].set_visible(True)
@@ -161,7 +161,7 @@ def _draw_times(times: Any, rows: list[dict[str, Any]], places: dict[int, int]) 
             )
     low, high = times.get_ylim()
     times.set_ylim(low * (low / high) ** 0.3, high * (high / low) ** 0.3)
-    # One tick for each decade, or three where there are few decades.
+    # One tick per decade, or three if there are few decades.
     times.yaxis.set_major_locator(LogLocator(subs=(1.0,) if high > 100 * low else (1.0, 2.0, 5.0)))
     times.yaxis.set_major_formatter(lambda seconds, _: seconds_text(seconds))
     times.minorticks_off()
@@ -169,13 +169,13 @@ def _draw_times(times: Any, rows: list[dict[str, Any]], places: dict[int, int]) 
 
 
 def _draw_decisions(axis: Any, measured: dict[str, Any]) -> None:
-    """A stacked bar of the parts for each method and N; a bar that is far too long is cut off."""
+    """Draws a stacked bar of the parts for each method and N; very long bars are cut off."""
     rows = [row for row in measured["decision"] if row["seconds"]]
     if not rows:
         axis.text(0.5, 0.5, "every decision takes too long here", horizontalalignment="center")
         return
     others = [row["seconds"] for row in rows if row["method"] != "transporter"]
-    # This leaves room for the legend.
+    # Leave room for the legend.
     limit = 1.5e3 * max(others or [row["seconds"] for row in rows])
     place, places, labels, groups = 0.0, [], [], {}
     for method in dict.fromkeys(row["method"] for row in rows):
@@ -222,7 +222,7 @@ def _draw_decisions(axis: Any, measured: dict[str, Any]) -> None:
 
 
 def _draw_folding(axis: Any, measured: dict[str, Any]) -> None:
-    """The speed-ups over plain escnn as bars, a group for each measure."""
+    """Draws the speed-ups over plain escnn as bars, grouped by measure."""
     folding = measured["folding"]
     rungs = list(folding["rungs"])
     height = 0.8 / len(rungs)
@@ -248,7 +248,7 @@ def _draw_folding(axis: Any, measured: dict[str, Any]) -> None:
 
 
 def _draw_levels(axis: Any, measured: dict[str, Any]) -> None:
-    """Alpha's time by level as bars, labelled with the convolutions' share of the peak."""
+    """Draws alpha's time by level as bars, labelled with the convolutions' share of the peak."""
     levels = measured["alpha_levels"]["levels"]
     names = [row["level"] for row in levels]
     convolution = [1e3 * row["convolution_s"] for row in levels]

@@ -34,10 +34,10 @@ MEASURE_NAMES = {
 
 
 def network_tables(measured: dict[str, Any]) -> list[Table]:
-    """All tables.
+    """All tables of `benchmark networks`.
 
     Args:
-        measured: what `benchmark_networks` returns.
+        measured: the result of `benchmark_networks`.
     """
     presets = dict.fromkeys(row["preset"] for row in measured["pick_angle"])
     return [
@@ -63,8 +63,8 @@ def _add_by_method(
     cells: Callable[[dict[str, Any]], Iterable[str]],
     growth_cells: Callable[[dict[str, Any]], Iterable[str]],
 ) -> None:
-    """Adds, for each method, a line for each N, and one for the growth from the least to the most
-    of them."""
+    """Adds, for each method, a line for each N and one for the growth from the smallest to the
+    largest N."""
     for method in dict.fromkeys(row["method"] for row in rows):
         chosen = [row for row in rows if row["method"] == method]
         for row in chosen:

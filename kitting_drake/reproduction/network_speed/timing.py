@@ -1,4 +1,4 @@
-"""Timing, counting of operations, and the machine's peak, for benchmarks of networks."""
+"""Timing, operation counts and the machine's peak, for benchmarks of networks."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ from torch.utils.flop_counter import flop_registry
 Name = TypeVar("Name")
 
 _WARM_UPS = 2
-"""The most runs before the first that counts, in which kernels are chosen and memory laid out."""
+"""The largest number of uncounted runs, in which kernels are chosen and memory is allocated."""
 _PEAK_RUNS = 15
-"""The number of runs of which the fastest shows the peak."""
+"""The number of runs; the fastest gives the peak."""
 
 
 @dataclass(frozen=True)
 class Timing:
-    """The wall time that something took, in seconds."""
+    """The wall time of an operation, in seconds."""
 
     seconds: float
     """The median."""
@@ -41,7 +41,7 @@ class Timing:
 
 
 def read_clock(device: torch.device) -> float:
-    """Seconds, once the device has finished all work that it was given."""
+    """The time in seconds, after the device has finished all its work."""
     if device.type == "cuda":
         torch.cuda.synchronize(device)
     return time.perf_counter()
@@ -54,13 +54,13 @@ def time_each(
     repeats: int,
     budget: float,
 ) -> dict[Name, Timing]:
-    """Times functions in alternation, so that other load on the machine affects all of them alike.
+    """Times functions in alternation, to share the effect of other load on the machine.
 
     Args:
-        functions: what to run.
+        functions: the functions.
         device: on which they compute.
-        repeats: how often each is timed, after warming up.
-        budget: the time after which a function is not run again, in seconds.
+        repeats: the number of timings of each, after warming up.
+        budget: the time in seconds after which a function is not run again.
     """
     spent = dict.fromkeys(functions, 0.0)
     times: dict[Name, list[float]] = {name: [] for name in functions}
@@ -74,15 +74,15 @@ def time_each(
             elapsed = read_clock(device) - start
             spent[name] += elapsed
             times[name].append(elapsed)
-    # Warming up counts only where there was no time for more, and of that the warmest run.
+    # If there was only time for warm-up runs, the last of them counts.
     return {name: Timing.of(runs[warm_ups:] or runs[-1:]) for name, runs in times.items()}
 
 
 def count_operations(function: Callable[[], object]) -> int:
-    """The number of floating-point operations of a function's convolutions and matrix products.
+    """The floating-point operations of a function's convolutions and matrix products.
 
-    A multiply-accumulate counts as two. Backward passes within the function are counted. What runs
-    in `torch.inference_mode` cannot be counted.
+    A multiply-accumulate counts as two. Backward passes are included. Functions in
+    `torch.inference_mode` cannot be counted.
     """
     with _OperationCounter() as counter:
         function()
@@ -90,7 +90,7 @@ def count_operations(function: Callable[[], object]) -> int:
 
 
 class _OperationCounter(TorchDispatchMode):
-    """Counts by torch's formulas; torch's own FlopCounterMode takes ten times as long."""
+    """Counts with torch's formulas; torch's own FlopCounterMode takes ten times as long."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -108,7 +108,7 @@ class _OperationCounter(TorchDispatchMode):
 
 
 def measure_peak(type_: torch.dtype, device: torch.device, *, side: int) -> dict[str, float]:
-    """The machine's peak, in operations a second.
+    """The machine's peak, in operations per second.
 
     Args:
         type_: to compute in.
@@ -116,8 +116,8 @@ def measure_peak(type_: torch.dtype, device: torch.device, *, side: int) -> dict
         side: of the matrices; the convolution has an eighth as many channels.
 
     Returns:
-        `matmul`, the rate of a product of large square matrices, `convolution`, that of a wide 3x3
-        convolution in channels_last, and `best`, the better of the two.
+        `matmul`, the rate of a product of large square matrices; `convolution`, that of a wide 3x3
+        convolution in channels_last; and `best`, the larger of both.
     """
     channels = side // 8
     matrix = torch.randn(side, side, device=device, dtype=type_)
@@ -139,7 +139,7 @@ def measure_peak(type_: torch.dtype, device: torch.device, *, side: int) -> dict
 
 
 def describe_machine(device: torch.device) -> dict[str, Any]:
-    """The machine that the figures were measured on."""
+    """The machine of the measurements."""
     return {
         "cpu": _cpu_name(),
         "cores": len(os.sched_getaffinity(0)),
@@ -147,13 +147,13 @@ def describe_machine(device: torch.device) -> dict[str, Any]:
         "device": torch.cuda.get_device_name(device) if device.type == "cuda" else "cpu",
         "torch": torch.__version__,
         "python": platform.python_version(),
-        # The load by other programs: 0 on an idle machine, before anything is measured.
+        # The load of other programs before the measurements; 0 on an idle machine.
         "load_before": os.getloadavg()[0],
     }
 
 
 def memory_bytes(device: torch.device) -> int:
-    """The memory of the machine, or of the accelerator if that is less."""
+    """The memory of the machine or the accelerator, whichever is less."""
     size = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
     if device.type == "cuda":
         size = min(size, torch.cuda.get_device_properties(device).total_memory)

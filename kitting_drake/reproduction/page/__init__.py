@@ -1,1 +1,1 @@
-"""The page of results, made from result files alone."""
+"""The page of results, generated from result files."""

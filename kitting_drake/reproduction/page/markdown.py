@@ -1,10 +1,10 @@
-"""Markdown for pages that people also read as source."""
+"""Markdown that is readable as source."""
 
 from collections.abc import Sequence
 
 
 def rate_text(rate: float, interval: Sequence[float]) -> str:
-    """A rate and its interval, shares of one, in percent."""
+    """A rate and its interval in percent; both are given as shares of one."""
     low, high = interval
     return f"{100 * rate:.1f} ({100 * low:.1f} to {100 * high:.1f})"
 
@@ -12,12 +12,12 @@ def rate_text(rate: float, interval: Sequence[float]) -> str:
 def markdown_table(
     headings: Sequence[str], rows: Sequence[Sequence[str]], left_columns: int = 1
 ) -> str:
-    """A table whose source is aligned.
+    """A table with an aligned source.
 
     Args:
         headings: of the columns.
         rows: cells.
-        left_columns: how many columns, from the first, are aligned left; the others are aligned
+        left_columns: the number of leading columns that are aligned left; the others are aligned
             right.
     """
     # Some readers require rules of at least three characters.

@@ -1,4 +1,4 @@
-"""Two runs of the same seeds compared, and intervals of a rate for tools in general.
+"""Paired differences of two runs on the same seeds, and tool-level intervals of a rate.
 
 Both intervals are bootstrap intervals. They are too narrow where few episodes differ or few tools
 fail.
@@ -14,12 +14,12 @@ from numpy.typing import NDArray
 
 _RESAMPLES = 10_000
 _TAILS = (2.5, 97.5)
-"""Percentiles of a 95 % interval."""
+"""The percentiles of a 95 % interval."""
 _FEWEST_TOOLS = 3
 """With fewer tools that ever fail, a bootstrap over tools is not informative."""
 
 STRICT, OWN = "strict_success_rate", "success_rate"
-"""The two rates of an episode: the strict one, and by the task's own measure."""
+"""The two rates of an episode: strict, and by the task's own measure."""
 
 
 @dataclass(frozen=True)
@@ -36,17 +36,16 @@ def paired_difference(
 ) -> Estimate | None:
     """How much better one run is than another, on the seeds that both ran.
 
-    The interval is a bootstrap's that draws episodes, each with both of its rates: what makes a
-    scene hard for both is in neither's favour. How much one training differs from another of the
-    same method is not in it.
+    The interval is a bootstrap over episodes, each with both of its rates, so scenes that are hard
+    for both runs cancel. It does not include the variation between trainings of a method.
 
     Args:
-        first: a summary, with its `outcomes`.
-        second: another.
+        first: a summary with its `outcomes`.
+        second: another summary.
         rate: `STRICT` or `OWN`.
 
     Returns:
-        The mean over the seeds; None if there are none that both ran.
+        The mean over the common seeds; None without any.
     """
     return mean_paired_difference([(first, second)], rate)
 
@@ -54,17 +53,16 @@ def paired_difference(
 def mean_paired_difference(
     pairs: Sequence[tuple[Mapping[str, Any], Mapping[str, Any]]], rate: str
 ) -> Estimate | None:
-    """The mean over several pairs of runs of how much better the first of each is.
+    """The mean over several pairs of runs of how much better the first of each pair is.
 
-    Episodes are resampled jointly: one that is drawn brings its rates in all runs, as its scene is
-    the same in all of them.
+    Episodes are resampled jointly over all runs, because they share their scenes.
 
     Args:
-        pairs: of summaries, as `paired_difference` takes them.
+        pairs: of summaries, as in `paired_difference`.
         rate: `STRICT` or `OWN`.
 
     Returns:
-        The mean over the seeds; None if there are none that all ran.
+        The mean over the common seeds; None without any.
     """
     runs = [
         [{item["seed"]: item[rate] for item in run["outcomes"]} for run in pair] for pair in pairs
@@ -82,16 +80,16 @@ def mean_paired_difference(
 
 
 def points_text(found: Estimate) -> str:
-    """A difference of rates in points, with its interval where any episode differs."""
+    """A difference of rates in points, with its interval if any episode differs."""
     if found.low == found.high == 0:
         return "+0.0 (none differs)"
     return f"{100 * found.value:+.1f} ({100 * found.low:+.1f} to {100 * found.high:+.1f})"
 
 
 def over_tools(outcomes: Sequence[Mapping[str, Any]], rate: str) -> Estimate | None:
-    """The share of successes, with an interval by a bootstrap that draws tools.
+    """The share of successes with a bootstrap interval over tools.
 
-    It tells what to expect of other tools of the kind; intervals over objects tell it of these.
+    This interval applies to other tools of the same kind, unlike intervals over objects.
 
     Args:
         outcomes: of a summary.

@@ -28,7 +28,7 @@ def pooled_section(runs: Sequence[Run]) -> list[str]:
         runs: all reproducible runs that fill no cell.
 
     Raises:
-        UserError: two runs of a policy have a seed in common.
+        UserError: two runs of a policy share a seed.
     """
     rows = []
     for label, policy in shipped_policies().items():
@@ -81,4 +81,4 @@ def _check_seeds(label: str, runs: Sequence[Run]) -> None:
     twice = min((seed for seed, count in counts.items() if count > 1), default=None)
     if twice is not None:
         files = " and ".join(run.name for run in runs if twice in run.summary["seeds"])
-        raise UserError(f"{files} are both of {label}, seed {twice}: remove one")
+        raise UserError(f"{files} both hold seed {twice} of {label}: remove one")

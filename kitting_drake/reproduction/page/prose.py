@@ -8,14 +8,14 @@ _PART = re.compile(r"<!-- part: (\w+) -->\n")
 
 
 def prose(part: str, **values: object) -> str:
-    """A part of the prose, with a line end.
+    """A part of the prose, with a final newline.
 
     Args:
         part: its name.
-        values: what stands in the place of `{name}`.
+        values: the values for the placeholders `{name}`.
 
     Raises:
-        KeyError: there is no such part, or a value is missing.
+        KeyError: the part does not exist, or a value is missing.
     """
     return _parts()[part].format(**values) + "\n"
 

@@ -1,4 +1,4 @@
-"""The five Ravens tasks: what the paper gives (table I), and our runs of them by default."""
+"""The five Ravens tasks: the paper's numbers (table I) and our runs with default settings."""
 
 from collections import defaultdict
 from collections.abc import Sequence
@@ -51,7 +51,7 @@ def in_ravens_table(run: Run) -> bool:
 
 
 def ravens_section(runs: Sequence[Run]) -> list[str]:
-    """The section of the five tasks; nothing without a run of them.
+    """The section on the five tasks; empty without runs of them.
 
     Args:
         runs: all runs; those that are not `in_ravens_table` are ignored.

@@ -1,4 +1,4 @@
-"""The table of what each perturbation costs each policy: a part of `docs/robustness.md`."""
+"""The table of `docs/robustness.md`: the effect of each perturbation on each policy."""
 
 from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
@@ -25,7 +25,7 @@ _COLUMNS = {
     "shape_matching": "shape matching",
 }
 _COMPARED = ("generalist, minus unperturbed", "generalist, minus shape matching")
-"""In points, on the seeds that both ran."""
+"""The paired differences, in points, on the seeds that both ran."""
 _TRIES = 2
 _FRAMES = 5
 """The number of images that are averaged in further rows."""
@@ -39,7 +39,7 @@ Key = tuple[str, str]
 
 
 def robustness_table(runs: Sequence[Run]) -> str:
-    """Strict success on unseen toolsets, with two tries a tool and policies that recover.
+    """Strict success on unseen toolsets, with two tries per tool and recovering policies.
 
     All runs of the first table use the same seeds. The second table has the other levels, on the
     first of these seeds. The last table pools all seeds of cells that ran on further ones: a choice
@@ -98,7 +98,7 @@ def robustness_table(runs: Sequence[Run]) -> str:
 
 
 def _table(found: Mapping[Key, Sequence[Run]], labels: Sequence[str], counted: bool = False) -> str:
-    """One row for each perturbation that was run.
+    """A table with one row for each perturbation that was run.
 
     Args:
         counted: whether cells have the number of objects.
@@ -140,7 +140,7 @@ def _table(found: Mapping[Key, Sequence[Run]], labels: Sequence[str], counted: b
 
 
 def _needless_table(found: Mapping[Key, Sequence[Run]], labels: Sequence[str]) -> str:
-    """One row for each perturbation that lays other things on the table; empty without runs."""
+    """One row for each perturbation with distractors; empty without runs."""
 
     def share(key: Key) -> str:
         summaries = [run.summary for run in found.get(key, ())]
@@ -168,7 +168,7 @@ def _check_seeds(found: Mapping[Key, Sequence[Run]]) -> None:
         if twice is not None:
             files = " and ".join(run.name for run in runs if twice in run.summary["seeds"])
             raise UserError(
-                f"{files} are both of {_COLUMNS[method]}, {label}, seed {twice}: delete one"
+                f"{files} both hold seed {twice} of {_COLUMNS[method]}, {label}: delete one"
             )
 
 
@@ -185,7 +185,7 @@ def _is_other_level(label: str) -> bool:
 
 
 def _strict(run: Run) -> tuple[int, int]:
-    """How many objects were a strict success, and how many there were."""
+    """The number of strictly successful objects, and of all objects."""
     objects = sum(category["objects"] for category in run.summary["categories"].values())
     return round(run.summary["strict_success_rate"] * objects), objects
 
@@ -194,7 +194,7 @@ def with_figures(page: str, figures: str) -> str:
     """A page with the text between its two marks replaced.
 
     Raises:
-        UserError: it lacks the marks.
+        UserError: the page lacks the marks.
     """
     head, begin, rest = page.partition(_BEGIN)
     _, end, tail = rest.partition(_END)
@@ -204,13 +204,13 @@ def with_figures(page: str, figures: str) -> str:
 
 
 def _shipped() -> dict[str, str | None]:
-    """The digests of the weights that come with the package, by method."""
+    """The digests of the shipped weights, by method."""
     policies = {"generalist": Learned(weights=""), "so2": load_scenario(_UNSEEN).policy}
     return {method: policy.digest(SCENARIOS / "paper") for method, policy in policies.items()}
 
 
 def _expected() -> dict[str, dict[str, Any]]:
-    """The scenario of each row, as JSON holds it."""
+    """The scenario of each row, as JSON values."""
     path, task = _UNSEEN, f"task: {{tries: {_TRIES}}}"
     one, more = f"{{{task}}}", f"{{{task}, sensor_noise: {{frames: {_FRAMES}}}}}"
     rows: dict[str, tuple[str, str | None]] = {_UNPERTURBED: (one, None)}

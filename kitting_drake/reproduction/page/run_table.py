@@ -24,16 +24,16 @@ Summary = dict[str, Any]
 TABLE = "runs.csv"
 EPISODES = "episodes.jsonl.xz"
 _NAME = "run"
-"""The column, and the field of a line, that holds the name of the run."""
+"""The column, and the field of a line, with the name of the run."""
 _LONG = ("categories", "outcomes", "resolved_scenario")
-"""The fields that stand in `EPISODES`."""
+"""The fields in `EPISODES`."""
 
 
 def read_summaries(folder: Path) -> dict[str, Summary]:
-    """The summaries of all runs, by name; none where there are no files.
+    """The summaries of all runs, by name; empty without files.
 
     Raises:
-        UserError: a file is damaged, or the two are not of the same runs.
+        UserError: a file is damaged, or both files do not have the same runs.
     """
     rows, lines = _read_table(folder / TABLE), _read_lines(folder / EPISODES)
     for name in sorted(rows.keys() ^ lines.keys()):
@@ -46,15 +46,15 @@ def read_summaries(folder: Path) -> dict[str, Summary]:
 
 
 def add_run(folder: Path, name: str, summary: Mapping[str, Any]) -> None:
-    """Adds a run to both files, which are made if need be.
+    """Adds a run to both files, creating them if necessary.
 
     Args:
         folder: of the files.
         name: of the run.
-        summary: of `evaluate`.
+        summary: from `evaluate`.
 
     Raises:
-        UserError: there is another run of that name, or a file is damaged.
+        UserError: another run has that name, or a file is damaged.
     """
     require_folder(folder)
     with alone_in(folder):
@@ -64,7 +64,7 @@ def add_run(folder: Path, name: str, summary: Mapping[str, Any]) -> None:
         if rows.get(name, row) != row or lines.get(name, line) != line:
             raise UserError(
                 f"{folder / TABLE} has another run '{name}': give another name, or remove that "
-                f"first (--remove {name})"
+                f"run first (--remove {name})"
             )
         _write(folder, rows | {name: row}, lines | {name: line})
 
@@ -98,7 +98,7 @@ def _write(folder: Path, rows: Mapping[str, Summary], lines: Mapping[str, Summar
 
 
 def _columns(rows: Iterable[Mapping[str, str]]) -> list[str]:
-    """The columns of all rows; one that earlier rows lack stands behind its neighbour."""
+    """The columns of all rows; a column that earlier rows lack follows its neighbour."""
     columns: list[str] = []
     for row in rows:
         place = 0
@@ -112,7 +112,7 @@ def _columns(rows: Iterable[Mapping[str, str]]) -> list[str]:
 
 
 def _flatten(value: Any, column: str = "") -> dict[str, str]:
-    """The cells of a value by their columns."""
+    """The cells of a value, by column."""
     if isinstance(value, dict) and value and not any("." in key for key in value):
         cells: dict[str, str] = {}
         for key, item in value.items():
@@ -122,7 +122,7 @@ def _flatten(value: Any, column: str = "") -> dict[str, str]:
 
 
 def _cell(value: Any, column: str) -> str:
-    """JSON, and text without quotes where that cannot be taken for something else."""
+    """A value as JSON, or as plain text if that is unambiguous."""
     if isinstance(value, str) and value and _value(value, column) == value:
         return value
     if column == "seeds" and value and value == list(range(value[0], value[-1] + 1)):
@@ -156,12 +156,12 @@ def _read_table(path: Path) -> dict[str, Summary]:
     try:
         content = path.read_bytes().decode() if path.exists() else ""
         if content and not content.endswith("\n"):
-            raise ValueError("its last line has no end")
+            raise ValueError("its last line is incomplete")
         for row in csv.DictReader(io.StringIO(content, newline=""), strict=True):
             name = row.pop(_NAME)
-            # Columns too many are under None, and of columns too few the cells are None.
+            # Surplus cells are under the key None; missing cells have the value None.
             if not name or name in rows or None in (*row, *row.values()):
-                raise ValueError(f"the row '{name}' is twice there, or not as long as the heading")
+                raise ValueError(f"the row '{name}' is repeated or has the wrong length")
             rows[name] = _unflatten(row)
     except (OSError, ValueError, LookupError, TypeError, AttributeError, csv.Error) as error:
         raise _damaged(path, error) from error

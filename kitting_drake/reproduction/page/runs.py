@@ -32,7 +32,7 @@ LEARNED = ("so2", "equivariant_transporter", "transporter")
 """The methods that the paper compares."""
 
 _NOT_THE_TASK = ("policy", "random_seed", "target_realtime_rate", "meshcat")
-"""The fields of a scenario in which runs of one task may differ."""
+"""The scenario fields in which runs of one task may differ."""
 
 _ADDED: dict[str, Any] = {
     "task.distractors": 0,
@@ -72,7 +72,7 @@ _KINDS: dict[str, Any] = {
     **dict.fromkeys(("success_rate", "strict_success_rate", "wall_seconds"), int | float),
     "episodes": int,
 }
-"""The fields of a summary, and what each is."""
+"""The fields of a summary and their types."""
 
 
 @dataclass(frozen=True)
@@ -83,7 +83,7 @@ class Run:
     summary: Summary
 
     def detail(self, key: str) -> Any:
-        """An entry of the policy's details; None if it has no such entry."""
+        """An entry of the policy's details; None if it is missing."""
         return self.summary["policy_details"].get(key)
 
     @property
@@ -95,14 +95,14 @@ class Run:
 
     @property
     def seeds(self) -> str:
-        """The first and the last seed, for a person."""
+        """The first and the last seed, as text."""
         seeds = self.summary["seeds"]
         first, last = min(seeds), max(seeds)
         return f"{first} to {last}" if last - first + 1 == len(seeds) else f"{first} .. {last}"
 
     @property
     def label(self) -> str:
-        """The policy and the parameters that the paper varies, for a person."""
+        """The policy and the parameters that the paper varies, as text."""
         parts = [METHODS.get(self.method, self.method)]
         for key, text in (
             ("orientations", "N = {}"),
@@ -140,7 +140,7 @@ class Run:
 
     @property
     def departures_text(self) -> str:
-        """The departures in a few words."""
+        """The departures as short text."""
         shown = "; ".join(f"`{item}`" for item in self.departures[:_MOST_SHOWN])
         more = len(self.departures) - _MOST_SHOWN
         return f"{shown}; and {more} more" if more > 0 else shown
@@ -153,7 +153,7 @@ def described(scenario: Scenario) -> dict[str, Any]:
 
 
 def scenario_differences(found: dict[str, Any], expected: dict[str, Any]) -> list[str]:
-    """The fields, policy aside, in which two scenarios differ, as `described` has them."""
+    """The fields in which two scenarios (see `described`) differ, apart from the policy."""
     return _differences(_without(found), _without(expected))
 
 
@@ -218,10 +218,10 @@ def _differences(found: Any, expected: Any, path: str = "") -> list[str]:
 
 
 def read_runs(folder: Path) -> list[Run]:
-    """All runs of the table in a folder, in the order of their names; there may be none.
+    """All runs in a folder's table, sorted by name; the table may be empty.
 
     Raises:
-        UserError: there is no table, its files are damaged, or a run is not one of `evaluate`.
+        UserError: there is no table, a file is damaged, or a run is not from `evaluate`.
     """
     if not (folder / TABLE).exists():
         raise UserError(
@@ -234,13 +234,13 @@ def read_runs(folder: Path) -> list[Run]:
 
 
 def read_evaluation(path: Path) -> Summary:
-    """The summary that `evaluate` left.
+    """The summary that `evaluate` wrote.
 
     Args:
-        path: its file, or the folder with its `summary.json`.
+        path: the file, or the folder with its `summary.json`.
 
     Raises:
-        UserError: it cannot be read, or is not one.
+        UserError: it is unreadable or not a summary.
     """
     path = path / "summary.json" if path.is_dir() else path
     try:
@@ -252,7 +252,7 @@ def read_evaluation(path: Path) -> Summary:
 
 
 def check_summary(summary: Any, where: str) -> None:
-    """Checks that a summary has the fields of `evaluate`, and that each is of its kind.
+    """Checks that a summary has the fields of `evaluate` with their types.
 
     Args:
         summary: the content of a file, or of a row.

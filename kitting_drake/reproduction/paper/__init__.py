@@ -1,1 +1,1 @@
-"""The paper's experiments: the cells of its tables, the queue that fills them, their page."""
+"""The paper's experiments: the cells of its tables, the queue that runs them, and their page."""

@@ -1,4 +1,4 @@
-"""The runs that fill the cells of the paper's tables."""
+"""The results of the cells of the paper's tables."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ MISSING, TO_RUN_AGAIN = "-", "- ‡"
 
 @dataclass(frozen=True)
 class Result:
-    """A cell, and its summary."""
+    """A cell with its summary."""
 
     cell: Cell
     summary: Mapping[str, Any]
@@ -38,9 +38,9 @@ class Divided(NamedTuple):
     """The groups into which `cell_results` divides runs."""
 
     results: list[Result]
-    """Of the cells, in their order."""
+    """The results of cells, in the order of the cells."""
     others: list[Run]
-    """The other runs, in the order in which they were given."""
+    """The other runs, in their given order."""
     set_aside: list[Run]
     """Runs from trees with uncommitted changes, of cells or not. No table may use them."""
 
@@ -51,14 +51,14 @@ class Divided(NamedTuple):
 
 
 def cell_results(runs: Sequence[Run], rates: Rates) -> Divided:
-    """Divides runs into those of cells and others: a run that is named as a cell must be it.
+    """Divides runs into those of cells and others. A run with the name of a cell must fit it.
 
     Args:
-        runs: of `read_runs`.
-        rates: of `read_rates`.
+        runs: from `read_runs`.
+        rates: from `read_rates`.
 
     Raises:
-        UserError: a run is not what its name says.
+        UserError: a run does not fit the cell of its name.
     """
     found = {run.name: run.summary for run in runs}
     cells = {cell.name: cell for cell in paper_cells() if cell.name in found}
@@ -72,22 +72,22 @@ def cell_results(runs: Sequence[Run], rates: Rates) -> Divided:
 
 
 def absent_text(name: str, to_run_again: Collection[str]) -> str:
-    """What a table shows for a cell without a result."""
+    """The text for a cell without a result."""
     return TO_RUN_AGAIN if name in to_run_again else MISSING
 
 
 def check_cell(cell: Cell, summary: Summary, rates: Rates) -> None:
-    """Checks that a summary is that of a cell.
+    """Checks that a summary fits a cell.
 
     Raises:
-        UserError: it is not; says why.
+        UserError: it does not; says why.
     """
     try:
         departure = cell.departure(summary, rates)
         if departure is None and not isinstance(summary["outcomes"], list):
-            departure = "its outcomes are no list"
+            departure = "its outcomes are not a list"
     except (KeyError, TypeError, AttributeError) as error:
-        raise UserError(f"run '{cell.name}' is no summary of evaluate: {error!r}") from error
+        raise UserError(f"run '{cell.name}' is not a summary of evaluate: {error!r}") from error
     if departure is not None:
         raise UserError(
             f"run '{cell.name}' is not that of the cell of this name ({departure}): give it "
@@ -96,10 +96,10 @@ def check_cell(cell: Cell, summary: Summary, rates: Rates) -> None:
 
 
 def check_new_cell(cell: Cell, summary: Summary, rates: Rates) -> None:
-    """Checks that a summary may fill a cell from now on.
+    """Checks that a new summary may fill a cell.
 
     Raises:
-        UserError: it is not of the cell, or cannot be run again from what it tells.
+        UserError: it does not fit the cell, or cannot be repeated.
     """
     check_cell(cell, summary, rates)
     commits = summary["commit"]

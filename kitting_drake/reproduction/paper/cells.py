@@ -1,5 +1,4 @@
-"""A cell of the paper's tables: what is collected, trained and evaluated for it, and whether a
-summary is that of its cell."""
+"""The cells of the paper's tables: their trainings and evaluations, and which summaries fit."""
 
 from __future__ import annotations
 
@@ -17,41 +16,41 @@ from kitting_drake.scenario.loader import load_scenario
 from kitting_drake.scenario.schema import Scenario
 
 ORIENTATIONS = (180, 36, 72, 120)
-"""N of figure 6, the most telling first."""
+"""N of figure 6, in order of importance."""
 PRESET = "small"
 LEARNING_RATES = (1e-3, 3e-4, 3e-3)
-"""The candidates: each baseline uses the best on validation scenes, and ours the first."""
+"""The candidates. Each baseline uses the best on validation scenes, the SO(2) method the first."""
 VALIDATE_EVERY = 250
 _EARLIER_RELEASE = ("planner.release_clearance: 0.006", "planner.open_width: 0.08")
-"""How Ravens' tasks were run before their release, and their demonstrator, were the original's."""
+"""Fields of older runs of Ravens tasks, which used another release and demonstrator."""
 _NO_SEARCH = "planner: {search: {amplitude: 0.0, reach: 0.0}}"
 
 
 @dataclass(frozen=True)
 class Task:
-    """A task, and the scenarios by which it is learned and tested."""
+    """A task with its scenarios for training and testing."""
 
     name: str
     file: str
-    """The file of its scenarios."""
+    """The scenario file."""
     tested: str
-    """The name of the scenario that is evaluated."""
+    """The name of the evaluated scenario."""
     demonstrated: str
     """The name of the scenario of the demonstrations."""
     first_seed: int
     table: str = "6"
-    """The table that it is in: `6` (figure 6), `I` (table I) or `fresh`."""
+    """The table of the task: `6` (figure 6), `I` (table I) or `fresh`."""
     episodes: int = 100
     steps: int = 1500
     more_steps: int = 0
-    """Steps beyond these where more is learned from than the taken actions, moved rigidly."""
+    """Additional steps for trainings with more labels or augmentation than the paper's."""
     demonstrations: int = 100
-    """The most that are learned from, from seed 10000; those to validate by begin with 20000."""
+    """The most training demonstrations, from seed 10000 on; those for validation start at 20000."""
     validation: int = 24
     rates_from: str = "unseen"
-    """The task on which the learning rates of the baselines are chosen."""
+    """The task on which the baselines' learning rates are chosen."""
     earlier: tuple[str, ...] = ()
-    """Differences of its scenario that a run may have; see `Cell.is_earlier`."""
+    """Differences that a run's scenario may have; see `Cell.is_earlier`."""
 
 
 TASKS = {
@@ -95,11 +94,10 @@ TASKS = {
                 rates_from=rates_from,
                 earlier=earlier,
             )
-            # Of eighteen decisions each, few episodes are enough to validate by; and each of many
-            # places is as good as the next, which takes longer to learn.
-            # On the pyramid and align box corner the rate of figure 6 left a baseline short, and on
-            # align box corner that of the pyramid left the Transporter short: each has its own.
-            # Palletizing, which had not been run, takes that of the pyramid.
+            # Palletizing has eighteen decisions per episode, so few episodes suffice for
+            # validation. Its many equally good places take more steps to learn.
+            # On the pyramid and align-box-corner a baseline underperforms at the learning rate of
+            # figure 6, so these tasks choose their own. Palletizing takes that of the pyramid.
             for name, scenario, episodes, steps, validation, rates_from, earlier in (
                 ("block_insertion", "BlockInsertion", 100, 1000, 24, "unseen", _EARLIER_RELEASE),
                 (
@@ -138,7 +136,7 @@ TASKS = {
 
 @dataclass(frozen=True)
 class Training:
-    """Networks of a method, learned from a task's demonstrations."""
+    """The training of a method's networks on a task's demonstrations."""
 
     task: str
     method: str
@@ -146,24 +144,24 @@ class Training:
     demonstrations: int
     seed: int = 0
     learning_rate: float | None = None
-    """None: for ours the first of `LEARNING_RATES`, for a baseline the one that is best for
-    `reference`."""
+    """None for the first of `LEARNING_RATES` (SO(2)) or the best one for `reference` (baselines).
+    """
     taken_only: bool = True
     """Whether only the taken action is a label, as in the paper."""
     rigid: bool = True
-    """Whether the only augmentation is a motion of the whole scene, as in the paper."""
+    """Whether the only augmentation is a rigid motion of the scene, as in the paper."""
     angle_only: bool = False
-    """Whether only the pick-angle network is trained; all else is that of `base`."""
+    """Whether only the pick-angle network is trained; the others are those of `base`."""
     times: int = 1
-    """How many times the steps that every method gets as in the paper."""
+    """A multiple of the usual number of steps."""
     preset: str = PRESET
     """The size of its networks."""
     rotations: int | None = None
-    """How many rotations a step of the Transporter computes; None: a few. See `Networks`."""
+    """The number of rotations in a step of the Transporter; None for a few. See `Networks`."""
 
     @property
     def base(self) -> Training | None:
-        """The training whose networks this one has but for the pick angle's."""
+        """The training that provides all networks but the pick-angle network."""
         if not self.angle_only:
             return None
         return dataclasses.replace(
@@ -172,7 +170,7 @@ class Training:
 
     @property
     def steps(self) -> int:
-        """Those of all methods as in the paper; more where more is learned from."""
+        """The number of steps: equal for all methods as in the paper, more with more labels."""
         task = TASKS[self.task]
         more = 0 if self.taken_only and self.rigid else task.more_steps
         return self.times * (task.steps + more)
@@ -200,12 +198,12 @@ class Training:
 
 
 def reference(training: Training) -> Training:
-    """The training by which the learning rate of a baseline's training is chosen; has none yet."""
+    """The training that chooses the learning rate for a baseline; its own rate is open."""
     return Training(TASKS[training.task].rates_from, training.method, 36, 100)
 
 
 def rates_key(chosen_by: Training) -> str:
-    """The key in `Rates` of what the learning rates come to in a training of `reference`."""
+    """The key in `Rates` of a training of `reference`."""
     return f"{chosen_by.task}_{chosen_by.method}"
 
 
@@ -215,26 +213,26 @@ class Cell:
 
     task: str
     policy: Training | str
-    """The training of its networks, or a policy as YAML of a scenario."""
+    """The training of its networks, or another policy as the YAML of a scenario."""
     orientations: int | None
-    """N in use; None where the policy has none."""
+    """N at inference; None if the policy has none."""
     label: str = ""
-    """Distinguishes it from the paper's own cell of the same task, policy and N."""
+    """Distinguishes it from the paper's own cell with the same task, policy and N."""
     continuous: bool = False
-    """Refined between pixels and orientations; in the paper actions are quantized."""
+    """Whether actions are refined beyond pixels and bins; the paper quantizes them."""
     fit_outlines: bool = False
     search: bool = False
-    """Whether the hand searches where an insertion is blocked; not in the paper."""
+    """Whether the hand searches when an insertion is blocked; not in the paper."""
     end_at_success: bool = False
-    """Whether the episode ends by itself once all is done, as in the paper."""
+    """Whether the episode ends as soon as the task is done, as in the paper."""
     recover: bool = False
-    """Whether what went wrong is mended, and each object allows two actions."""
+    """Whether failed insertions are mended, with two actions per object."""
     avoid_failed_picks: bool = False
-    """Whether no pick is tried again where a grasp failed; not in the paper."""
+    """Whether failed picks are avoided; not in the paper."""
 
     @property
     def name(self) -> str:
-        """The name of its file of results."""
+        """The name of its run."""
         if isinstance(self.policy, str):
             parts = [self.task, self.label, str(self.orientations or "")]
             return "_".join(part for part in parts if part)
@@ -251,15 +249,15 @@ class Cell:
 
     @property
     def seeds(self) -> range:
-        """The seeds of its episodes, which all cells of a task share."""
+        """The seeds of its episodes, which are the same for all cells of a task."""
         task = TASKS[self.task]
         return range(task.first_seed, task.first_seed + task.episodes)
 
     def scenario_text(self, weights: str) -> str:
-        """The YAML that is merged over its scenario.
+        """The YAML to merge over its scenario.
 
         Args:
-            weights: the file of its networks, if it has any.
+            weights: the weights file; unused without networks.
         """
         if isinstance(self.policy, str):
             policy = self.policy
@@ -283,11 +281,11 @@ class Cell:
         return f"{{{', '.join(parts)}}}"
 
     def departure(self, summary: Mapping[str, Any], rates: Rates | None = None) -> str | None:
-        """Why a summary is not this cell's; None if it is.
+        """The reason why a summary does not fit this cell; None if it fits.
 
         Args:
-            summary: of `evaluate`.
-            rates: what each learning rate of each baseline came to, if that is known.
+            summary: from `evaluate`.
+            rates: the costs of the baselines' learning rates, if known.
         """
         expected = _expected(self)
         allowed = TASKS[self.task].earlier
@@ -297,7 +295,7 @@ class Cell:
         if list(summary["seeds"]) != list(self.seeds):
             return f"its seeds are not {self.seeds[0]} to {self.seeds[-1]}"
         if isinstance(self.policy, str):
-            # Older runs do not say that they avoided failed picks. The digest tells the weights.
+            # Runs without this field avoided failed picks. The digest identifies the weights.
             policies = (summary["resolved_scenario"]["policy"], expected["policy"])
             found, wanted = (
                 {"avoid_failed_picks": True} | policy | {"weights": ""} for policy in policies
@@ -307,7 +305,7 @@ class Cell:
             same = summary["policy_digest"] == _loaded(self).policy.digest(SCENARIOS / "paper")
             return None if same else "its weights are not those that come with the package"
         details = self._details(self.policy)
-        # Runs that do not say so avoided failed picks: the page tells what that can have changed.
+        # Runs without this field avoided failed picks; the page estimates the effect.
         earlier = {"angle_only": False, "avoid_failed_picks": self.avoid_failed_picks}
         found = earlier | {"rotations": None} | summary["policy_details"]
         key = rates_key(reference(self.policy))
@@ -319,7 +317,7 @@ class Cell:
         return None
 
     def is_earlier(self, summary: Mapping[str, Any]) -> bool:
-        """Whether a run of this cell was of an earlier version of its task."""
+        """Whether a run of this cell used an earlier version of its task."""
         return bool(scenario_differences(summary["resolved_scenario"], _expected(self)))
 
     def _details(self, training: Training) -> dict[str, Any]:
@@ -346,7 +344,7 @@ class Cell:
         elif training.method == "so2":
             wanted["learning_rate"] = LEARNING_RATES[0]
         if learned_at.table == "6":
-            # Elsewhere the task itself says what of these is possible.
+            # In the other tables the task itself determines these.
             wanted |= {"taken_only": training.taken_only, "rigid": training.rigid}
         return wanted
 

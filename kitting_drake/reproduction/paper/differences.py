@@ -29,7 +29,7 @@ from kitting_drake.reproduction.paper.paper_tables import (
 
 
 def differences(results: Mapping[str, Result]) -> list[str]:
-    """The section; empty where no two cells can be compared."""
+    """The section; empty if no two cells can be compared."""
     rows = []
     for name, result in results.items():
         for label, other in _rivals(result.cell):
@@ -51,8 +51,8 @@ def differences(results: Mapping[str, Result]) -> list[str]:
 
 
 def _means(results: Mapping[str, Result]) -> list[list[str]]:
-    """Rows of how ours differs from the Equivariant Transporter on a mean: over the N of figure 6,
-    where all of its cells are there, and over the trainings that are there of both."""
+    """The mean differences between SO(2) and the Equivariant Transporter: over N of figure 6 if all
+    of its cells exist, and over the trainings that both have."""
     rows = []
     ours, theirs = LEARNED[:2]
     for task in FIGURE_6:
@@ -74,7 +74,7 @@ def _means(results: Mapping[str, Result]) -> list[list[str]]:
 def _mean_row(
     results: Mapping[str, Result], label: str, names: Sequence[Sequence[str]]
 ) -> list[str]:
-    """A row: `label`, and the mean over pairs of cells of what the first has more."""
+    """A row with `label` and the mean difference over pairs of cells."""
     pairs = [(results[one].summary, results[two].summary) for one, two in names]
     found = [mean_paired_difference(pairs, rate) for rate in (STRICT, OWN)]
     texts = [points_text(item) for item in found if item is not None]
@@ -82,7 +82,7 @@ def _mean_row(
 
 
 def _rivals(cell: Cell) -> list[tuple[str, str]]:
-    """The cells that a cell is compared with: labels, and names."""
+    """The labels and names of the cells that a cell is compared with."""
     training = cell.policy
     if cell.label == "trained_at_36" and isinstance(training, Training):
         return [("trained at N = 180", f"{cell.task}_{training.method}_36_100")]

@@ -1,5 +1,4 @@
-"""Figure 6(c), what it costs to predict the pick angle: the section of the page of results, from a
-file of `benchmark networks` alone."""
+"""The section on figure 6(c), the cost of predicting the pick angle, from `benchmark networks`."""
 
 from __future__ import annotations
 
@@ -15,11 +14,11 @@ from kitting_drake.reproduction.page.prose import prose
 from kitting_drake.reproduction.page.runs import LEARNED, METHODS
 
 EFFICIENCY = "networks.json"
-"""The file, beside the results: a copy of the one that `benchmark networks` leaves."""
+"""The file beside the results: a copy of the output of `benchmark networks`."""
 
 
 def read_efficiency(folder: Path) -> dict[str, Any] | None:
-    """The measurements of `benchmark networks`; None where there is no file.
+    """The measurements of `benchmark networks`; None without a file.
 
     Raises:
         UserError: the file is damaged.
@@ -31,7 +30,7 @@ def read_efficiency(folder: Path) -> dict[str, Any] | None:
         measured: dict[str, Any] = json.loads(path.read_text())
         efficiency_section(measured)
     except (OSError, ValueError, LookupError, TypeError) as error:
-        raise UserError(f"{path} is no file of benchmark networks: delete it") from error
+        raise UserError(f"{path} is not a file of benchmark networks: delete it") from error
     return measured
 
 
@@ -39,7 +38,7 @@ def efficiency_section(measured: Mapping[str, Any]) -> str:
     """The section of the page.
 
     Args:
-        measured: what `benchmark_networks` returns.
+        measured: the result of `benchmark_networks`.
     """
     machine = measured["machine"]
     place = machine["cpu"] if machine["device"] == "cpu" else machine["device"]
@@ -81,5 +80,5 @@ def efficiency_section(measured: Mapping[str, Any]) -> str:
 
 
 def _cost_text(row: Mapping[str, Any]) -> str:
-    """Parameters, and the time or why there is none."""
+    """The parameters, and the time or the reason why it is missing."""
     return f"{count_text(row['parameters'])}, {row['skipped'] or seconds_text(row['seconds'])}"

@@ -1,9 +1,8 @@
-"""How many actions a policy's memory of failed grasps can have changed.
+"""The number of actions that a policy's memory of failed grasps can have changed.
 
-The policies do not pick within 10 mm of where a grasp of the same episode failed, unless they are
-told to forget (`avoid_failed_picks`). The paper has no such memory. It can change nothing but the
-actions after the first failed grasp of an episode. Newer summaries count these actions; of older
-ones there are bounds.
+Policies do not pick within 10 mm of a failed grasp of the same episode, unless `avoid_failed_picks`
+is false. The paper has no such memory. It can only change actions after the first failed grasp of
+an episode. Newer summaries count these actions; for older ones there are bounds.
 """
 
 from __future__ import annotations
@@ -25,13 +24,13 @@ _MOST_ACTIONS = {
     "!PalletizingBoxes": 30,
     "!StackBlockPyramid": 12,
 }
-"""The most actions of an episode in the runs that do not count those after a failed grasp; on any
-other task it is one an object."""
+"""The most actions of an episode in runs that do not count the actions after a failed grasp. On any
+other task it is one per object."""
 
 
 @dataclass(frozen=True)
 class Changeable:
-    """The actions that the memory can have changed, of all actions."""
+    """The number of actions that the memory can have changed, and of all actions."""
 
     at_least: int
     at_most: int
@@ -46,23 +45,23 @@ class Changeable:
 
     @property
     def text(self) -> str:
-        """For a person."""
+        """The numbers as text."""
         if self.at_least == self.at_most:
             return f"{self.at_most} of {self.actions}"
         return f"{self.at_least} to {self.at_most} of {self.actions}"
 
 
 def changeable(summary: Mapping[str, Any]) -> Changeable:
-    """The actions that were decided after a failed grasp of their episode.
+    """The actions after a failed grasp of their episode.
 
-    The bounds where a summary does not count them, with F failed grasps in E episodes: at most
-    min(F, E) episodes have one, and all failed grasps but the first of each come after one. The
-    most come after one if these are the episodes in which the fewest objects were placed, as each
-    placed object took an action of its own, and if each of them began with a failed grasp.
+    If a summary does not count them, bounds follow from F failed grasps in E episodes. At most
+    min(F, E) episodes have a failed grasp, and all but the first of each episode come after one.
+    The upper bound assumes that each of these episodes began with a failed grasp, and that these
+    are the episodes with the fewest placed objects, because each placed object took an action.
 
     Args:
-        summary: of `evaluate`, of a learned policy. If it does not count its actions, the most that
-            the task allows stand for them.
+        summary: from `evaluate`, of a learned policy. Without a count of actions, the task's
+            largest number is used.
     """
     episodes = [item["objects"] for item in summary["outcomes"]]
     tag = summary["resolved_scenario"]["task"]["_tag"]
@@ -86,7 +85,7 @@ def changeable(summary: Mapping[str, Any]) -> Changeable:
 
 
 def failed_grasps(results: Sequence[Result]) -> list[str]:
-    """The section: the sums over the cells of each task and method that are as in the paper."""
+    """The section: sums over the cells of each task and method that are as in the paper."""
     sums: dict[tuple[str, str], list[Changeable]] = {}
     for result in results:
         if is_as_in_the_paper(result):
@@ -112,6 +111,6 @@ def failed_grasps(results: Sequence[Result]) -> list[str]:
 
 
 def is_as_in_the_paper(result: Result) -> bool:
-    """Whether a result is of a learned policy, and its actions are as in the paper."""
+    """Whether a result is of a learned policy with the paper's quantized actions."""
     cell = result.cell
     return isinstance(cell.policy, Training) and cell.end_at_success and not cell.continuous

@@ -1,4 +1,4 @@
-"""The learning rates of the baselines: the file of what each came to on validation scenes."""
+"""The file of the baselines' learning rates, with their costs on validation scenes."""
 
 import json
 import math
@@ -9,16 +9,15 @@ from kitting_drake.common.errors import UserError
 from kitting_drake.common.files import write_json
 
 RATES = "learning_rates.json"
-"""The file, beside the results."""
+"""The file beside the results."""
 
 Rates = Mapping[str, Mapping[str, float]]
-"""For each task and method (`rates_key`) and for each learning rate, the criterion of a checkpoint
-on validation scenes: the cost in mm, on a Ravens task the loss in nats. It is infinite where
-training diverged, which the file has as null."""
+"""The cost on validation scenes by task and method (`rates_key`) and learning rate: in mm, or the
+loss in nats on a Ravens task. It is infinite (null in the file) if training diverged."""
 
 
 def read_rates(folder: Path) -> dict[str, dict[str, float]]:
-    """The learning rates that have been tried; none where there is no file.
+    """The learning rates that have been tried; empty without a file.
 
     Raises:
         UserError: the file is damaged.
@@ -33,14 +32,14 @@ def read_rates(folder: Path) -> dict[str, dict[str, float]]:
             for key, costs in found.items()
         }
         if not all(rates.values()):
-            raise ValueError("a method without any rate")
+            raise ValueError("a method has no rates")
         return rates
     except (OSError, ValueError, TypeError, AttributeError) as error:
         raise UserError(f"{path} is damaged: delete it") from error
 
 
 def write_rates(folder: Path, rates: Rates) -> None:
-    """Writes what `read_rates` reads.
+    """Writes the file of `read_rates`.
 
     Raises:
         UserError: the file cannot be written.
@@ -53,5 +52,5 @@ def write_rates(folder: Path, rates: Rates) -> None:
 
 
 def best_rate(costs: Mapping[str, float]) -> str:
-    """The learning rate at which a method does best."""
+    """The learning rate with the least cost."""
     return min(costs, key=lambda rate: costs[rate])

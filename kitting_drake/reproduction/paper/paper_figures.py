@@ -1,5 +1,4 @@
-"""Figures 6(a) and 6(b) of the paper, and its table I as a figure, from the results of
-`benchmark paper`."""
+"""Figures 6(a) and 6(b) of the paper, and its table I as a figure, from `benchmark paper`."""
 
 from __future__ import annotations
 
@@ -22,31 +21,31 @@ _COLOURS = {10: "#009e73", 100: "#d55e00"}
 """Green and orange, as in the paper."""
 _MARKERS = {"so2": "o", "equivariant_transporter": "s", "transporter": "^"}
 _STEP = 0.12
-"""Between the markers of one N."""
+"""The distance between the markers of one N."""
 _ROWS = {
     ("so2", 36): "#d55e00",
     ("so2", 180): "#a01a3a",
     ("equivariant_transporter", 36): "#0072b2",
     ("transporter", 36): "#666666",
 }
-"""The rows of table I, method and N, and their colours."""
+"""The rows of table I, as method and N, and their colours."""
 _ROW_STEP = 0.19
-"""Between the markers of one number of demonstrations."""
+"""The distance between the markers of one number of demonstrations."""
 _STYLE = {"font.size": 10, "axes.spines.top": False, "axes.spines.right": False}
 
 
 def draw_figure_6(task: str, results: Mapping[str, Result]) -> bytes:
-    """A PNG: success over N, after 10 and after 100 demonstrations.
+    """Draws success over N after 10 and 100 demonstrations, as a PNG.
 
-    A filled marker is the strict success rate with its 95 % interval, a hollow one above it the
-    rate by the paper's measure, which the paper draws. A black line is the strict rate of the
-    rounded oracle. What was not run is not there.
+    A filled marker is the strict success rate with its 95 % interval. A hollow marker is the rate
+    by the paper's measure, as in the paper's figure. A black line is the strict rate of the
+    quantized oracle. Missing results are left out.
 
     Args:
         task: `seen` or `unseen`.
-        results: by the names of their cells.
+        results: by cell name.
     """
-    # Imported here: the other commands should not wait for it.
+    # Import matplotlib lazily.
     import matplotlib
 
     matplotlib.use("Agg")
@@ -81,7 +80,7 @@ def draw_figure_6(task: str, results: Mapping[str, Result]) -> bytes:
 def _draw_marker(
     axis: Axes, where: float, summary: Mapping[str, Any], method: str, count: int
 ) -> None:
-    """Both rates of a cell."""
+    """Draws both rates of a cell."""
     rate, (low, high) = summary["strict_success_rate"], summary["strict_ci95"]
     look = {"color": _COLOURS[count], "marker": _MARKERS[method], "markersize": 6, "linestyle": ""}
     axis.errorbar(
@@ -97,16 +96,15 @@ def _draw_marker(
 
 
 def draw_table_1(results: Mapping[str, Result]) -> bytes:
-    """A PNG: the mean reward of each Ravens task over the number of demonstrations.
+    """Draws the mean reward of each Ravens task over the number of demonstrations, as a PNG.
 
-    A filled marker is measured, with its 95 % interval; a diamond is with what goes beyond the
-    paper; a hollow one is what the paper gives for the same cell. What was not run is not there,
-    nor is the paper's beside it.
+    A filled marker is measured, with its 95 % interval; a diamond is with our extensions; a hollow
+    marker is the paper's number for the same cell. Cells without a result are left out.
 
     Args:
-        results: by the names of their cells.
+        results: by cell name.
     """
-    # Imported here: the other commands should not wait for it.
+    # Import matplotlib lazily.
     import matplotlib
 
     matplotlib.use("Agg")
@@ -133,7 +131,7 @@ def draw_table_1(results: Mapping[str, Result]) -> bytes:
 
 
 def _draw_task(axis: Axes, task: str, column: int, results: Mapping[str, Result]) -> None:
-    """The panel of a task: its cells, and the paper's beside those as in the paper."""
+    """Draws the panel of a task, with the paper's numbers beside our results."""
     for index, ((method, n), colour) in enumerate(_ROWS.items()):
         for place, count in enumerate(sorted(RAVENS_DEMONSTRATIONS)):
             where = place + _ROW_STEP * (index - (len(_ROWS) - 1) / 2)
@@ -165,13 +163,13 @@ def _draw_reward(
 
 
 def _explain(axis: Axes, filled: str, hollow: str) -> None:
-    """Adds to the legend what filled and hollow markers are."""
+    """Adds the meaning of filled and hollow markers to the legend."""
     axis.plot([], [], "o", color="0.4", label=f"filled: {filled}")
     axis.plot([], [], "o", color="0.4", markerfacecolor="white", label=f"hollow: {hollow}")
 
 
 def _finish(figure: Figure) -> bytes:
-    """A PNG of a figure with its legend, in which each label stands once; closes the figure."""
+    """Adds a legend without duplicates, closes the figure and returns it as a PNG."""
     import matplotlib.pyplot as plt
 
     pairs = [axis.get_legend_handles_labels() for axis in figure.axes]

@@ -1,4 +1,4 @@
-"""The cells of the paper's tables (figure 6, table I), of our ablation and of the fresh tools."""
+"""The cells of the paper's tables (figure 6, table I), of our ablation and of fresh tools."""
 
 from __future__ import annotations
 
@@ -14,39 +14,39 @@ from kitting_drake.reproduction.paper.cells import ORIENTATIONS, TASKS, Cell, Tr
 DEMONSTRATIONS = (100, 10)
 RAVENS_DEMONSTRATIONS = (100, 10, 1)
 HEADLINE_SEEDS = (0, 1, 2)
-"""From which each method of figure 6 is trained at N = 180 on 100 demonstrations."""
+"""The training seeds of each method of figure 6 at N = 180 with 100 demonstrations."""
 FIGURE_6 = ("unseen", "seen")
 """The tasks of figure 6."""
 PATIENCE = 3
 PATIENT = f"{PATIENCE}_times_the_steps"
-"""The label of the cells whose networks were trained for `PATIENCE` times the steps."""
+"""The label of cells trained for `PATIENCE` times the usual steps."""
 FASTER = 3e-3
 AT_FASTER = f"learning_rate_{FASTER:g}"
-"""The label of the cells of ours at the largest learning rate instead of its own."""
+"""The label of SO(2) cells at the largest learning rate instead of the usual one."""
 STEADIER = {
     ("palletizing_boxes", "equivariant_transporter", 10): 1e-3,
     ("palletizing_boxes", "equivariant_transporter", 1): 1e-3,
 }
-"""The learning rates of trainings, by task, method and demonstrations, that do not take the best
-rate of their `reference`: at that rate, after ten demonstrations, the pick-angle network's loss
-exploded and never came down again. They take the second best."""
+"""The learning rates of trainings, by task, method and demonstrations, that diverged at the best
+rate of their `reference` (the pick-angle loss exploded with ten demonstrations). They take the
+second best."""
 MATCHED = "matched"
-"""The preset in which the baselines are as large beside their originals as ours; see
-`paper.parameter_table`."""
+"""The preset in which baselines and SO(2) networks keep the same share of their originals'
+parameters; see `paper.parameter_table`."""
 ROTATIONS = 18
-"""Of how many of 36 rotations a step of the Transporter learns in `_every_chance`."""
+"""The number of rotations, of 36, in a training step of the Transporter in `_every_chance`."""
 EVERY_CHANCE = "every_chance"
 """The label of those cells."""
 BEYOND_OF_TABLE_1 = ("stack_block_pyramid",)
-"""The tasks of table I that are also run with the extensions: those where, as published
-and after ten or a hundred demonstrations, ours comes out below the paper."""
+"""The tasks of table I that are also run with our extensions: those on which the published
+SO(2) method scores lower here than in the paper after ten or a hundred demonstrations."""
 
 
 def _paper_cell(
     task: str, method: str, n: int, demonstrations: int, seed: int = 0, times: int = 1
 ) -> Cell:
-    # What does not depend on N is trained once, at the largest: all of ours, and all but the angle
-    # network of the Equivariant Transporter. `_checks` are to show that this costs nothing.
+    # Networks that do not depend on N are trained once, at the largest N: all SO(2) networks, and
+    # all Equivariant Transporter networks but the angle network. `_checks` verifies this.
     trained_at = ORIENTATIONS[0] if method == "so2" else n
     shared = (
         method == "equivariant_transporter" and n != ORIENTATIONS[0] and TASKS[task].table == "6"
@@ -78,7 +78,7 @@ def _figure_6() -> list[Cell]:
 
 
 def _checks() -> list[Cell]:
-    """All networks trained at the N that they are tested at."""
+    """Cells with all networks trained at the N of the test."""
     trainings = [
         *(Training(task, "so2", 36, 100) for task in FIGURE_6),
         Training("unseen", "equivariant_transporter", 36, 100),
@@ -90,8 +90,7 @@ def _checks() -> list[Cell]:
 
 
 def _patient() -> list[Cell]:
-    """Ours in more steps than the others get: on the pyramid, and of one demonstration of
-    place-red-in-green."""
+    """SO(2) with more steps than the other methods, on two tasks of table I."""
     return [
         _paper_cell(task, "so2", n, count, times=PATIENCE)
         for task, count in (("stack_block_pyramid", 100), ("place_red_in_green", 1))
@@ -100,8 +99,8 @@ def _patient() -> list[Cell]:
 
 
 def _faster() -> list[Cell]:
-    """Ours on the pyramid at the learning rate that is best for the Equivariant Transporter there:
-    that of ours is not tuned."""
+    """SO(2) on the pyramid at the Equivariant Transporter's best learning rate there, because its
+    own is not tuned."""
     own = (_paper_cell("stack_block_pyramid", "so2", n, 100) for n in (180, 36))
     return [
         dataclasses.replace(
@@ -113,12 +112,12 @@ def _faster() -> list[Cell]:
 
 
 def headline(task: str, method: str, seed: int) -> Cell:
-    """A method's cell at N = 180 after 100 demonstrations, of one of `HEADLINE_SEEDS`."""
+    """A method's cell at N = 180 with 100 demonstrations, for one of `HEADLINE_SEEDS`."""
     return _paper_cell(task, method, 180, 100, seed)
 
 
 def _headline_seeds() -> list[Cell]:
-    """Those of all seeds but the first, whose cells are in figure 6."""
+    """The cells of all seeds but the first, which figure 6 includes."""
     return [
         headline(task, method, seed)
         for seed in HEADLINE_SEEDS[1:]
@@ -128,7 +127,7 @@ def _headline_seeds() -> list[Cell]:
 
 
 def _ablation() -> list[Cell]:
-    """All extensions beyond the paper, and the same without one of them at a time."""
+    """All our extensions, and all but one of them at a time."""
 
     def ours(task: str, label: str, **changes: Any) -> Cell:
         kept = ("taken_only", "rigid")
@@ -160,8 +159,8 @@ def _ablation() -> list[Cell]:
 
 
 def _every_chance() -> list[Cell]:
-    """The baselines at the share of the original's parameters that ours keeps, where they are
-    behind. The Transporter learns from more rotations a step, in more steps."""
+    """The baselines at SO(2)'s share of the original's parameters, on tasks on which they score
+    lower. The Transporter also learns from more rotations per step, in more steps."""
     trainings = [
         *(
             Training(
@@ -175,7 +174,7 @@ def _every_chance() -> list[Cell]:
             )
             for task in ("unseen", "stack_block_pyramid", "palletizing_boxes")
         ),
-        # All but the angle network is that of the cell as in the paper.
+        # All but the angle network are those of the paper's cell.
         Training("unseen", "equivariant_transporter", 36, 100, angle_only=True, preset=MATCHED),
     ]
     return [
@@ -219,16 +218,16 @@ SHIPPED = {
     "shape_matching": "!ShapeMatching {}",
     "oracle": "!Oracle {}",
 }
-"""The policies as they come, with all extensions; the second is the scenario's."""
+"""The shipped policies with all extensions; `!Learned {}` takes the scenario's weights."""
 
 
 def _fresh_tools() -> list[Cell]:
-    """The policies as they come, on unseen tools."""
+    """The shipped policies on unseen tools."""
     return [Cell("fresh", policy, None, label, search=True) for label, policy in SHIPPED.items()]
 
 
 def paper_cells() -> list[Cell]:
-    """All cells, the most telling first."""
+    """All cells, in order of importance."""
     return [
         *_figure_6()[:10],
         *_ablation()[:4],
@@ -245,15 +244,15 @@ def paper_cells() -> list[Cell]:
 
 
 def choose_cells(patterns: Sequence[str]) -> list[Cell]:
-    """The cells whose names match patterns, in the order of the patterns.
+    """The cells whose names match the patterns, in the order of the patterns.
 
     Raises:
-        UserError: a pattern matches none.
+        UserError: a pattern matches no cell.
     """
     chosen: dict[str, Cell] = {}
     for pattern in patterns:
         matching = {cell.name: cell for cell in paper_cells() if fnmatch(cell.name, pattern)}
         if not matching:
-            raise UserError(f"--cells: there is no cell of the name '{pattern}'")
+            raise UserError(f"--cells: no cell matches '{pattern}'")
         chosen |= matching
     return list(chosen.values())

@@ -1,5 +1,4 @@
-"""The parameters of every network, beside those of the original networks: a table of the page of
-results, counted from the networks themselves."""
+"""The table of the parameters of every network and its original, counted from the networks."""
 
 from __future__ import annotations
 
@@ -9,11 +8,11 @@ from kitting_drake.reproduction.page.markdown import markdown_table
 from kitting_drake.reproduction.page.runs import LEARNED, METHODS
 
 ORIENTATIONS = 36
-"""N at which the networks are counted; only the Equivariant Transporter's depend on it."""
+"""N of the counted networks; only the Equivariant Transporter depends on it."""
 PRESETS = ("small", "matched", "paper")
 COLUMNS = ("alpha", "beta", "phi", "psi")
 ORIGINAL = {"alpha": 4_537_185, "beta": 835_888, "phi": 4_537_185, "psi": 4_537_185}
-"""Ours, as the authors ran it."""
+"""The parameters of the authors' SO(2) networks."""
 
 _TEXT = f"""\
 #### Parameters of every network
@@ -37,7 +36,7 @@ _ORIGINAL_TEXTS = {
     "so2": [*(f"{ORIGINAL[name]:,}" for name in COLUMNS), f"{sum(ORIGINAL.values()):,}"],
     "equivariant_transporter": ["4.54 M", "0.90 M", "4.54 M", "4.54 M", "14.5 M"],
 }
-"""The cells of a method's original networks, and of all of them together."""
+"""The original parameters of each network and of all together, as text."""
 
 
 @cache
@@ -49,9 +48,9 @@ def count_parameters(method: str, preset: str) -> dict[str, int]:
         preset: the size of the networks.
 
     Returns:
-        By its name, of `COLUMNS`; the Transporter's f_pick is `alpha`, and it has no `beta`.
+        Counts by the names in `COLUMNS`. The Transporter's f_pick is `alpha`; it has no `beta`.
     """
-    # Torch takes seconds to import.
+    # Import torch lazily.
     from kitting_drake.policies.networks.architecture import NetworkConfig
     from kitting_drake.policies.networks.methods import make_networks
 
@@ -64,13 +63,13 @@ def count_parameters(method: str, preset: str) -> dict[str, int]:
 
 
 def original_parameters(method: str) -> int:
-    """The number of parameters of all of a method's original networks."""
+    """The number of parameters of all original networks of a method."""
     counts = ORIGINAL if method == "so2" else count_parameters(method, "paper")
     return sum(counts.values())
 
 
 def parameters_section() -> str:
-    """The table with its text, in Markdown."""
+    """The table and its text, in Markdown."""
     rows = []
     for method in LEARNED:
         by_counts: dict[tuple[int | None, ...], list[str]] = {}

@@ -1,7 +1,7 @@
 """The queue of the paper's experiments: collects, trains and evaluates, cell by cell.
 
-Everything is done by the project's own commands, one at a time. They take up what they left, so the
-queue may be stopped and begun again at any time, and does nothing twice.
+It runs the project's own commands one at a time. These resume unfinished work, so the queue can be
+stopped and restarted at any time and repeats nothing.
 """
 
 from __future__ import annotations
@@ -38,14 +38,14 @@ from kitting_drake.reproduction.paper.cells import (
 from kitting_drake.reproduction.paper.learning_rates import best_rate, read_rates, write_rates
 
 _PATIENCE = 60.0
-"""How long a command may take to end itself, in s."""
+"""The time for a terminated command to exit, in s."""
 _FIRST_SEED, _FIRST_VALIDATION_SEED = 10000, 20000
 _BEFORE = {"angle_only": False}
-"""What the trainings of earlier versions were, of which their summaries say nothing."""
+"""The values of fields that summaries of older trainings lack."""
 
 
 class Failed(Exception):  # noqa: N818  A cell failed, not the queue.
-    """One of the project's commands failed."""
+    """A command of the project failed."""
 
 
 @dataclass
@@ -54,25 +54,25 @@ class Queue:
 
     folder: Path
     results: Path
-    """The folder of the table of runs (`run_table`), and of the learning rates."""
+    """The folder of the table of runs (`run_table`) and the learning rates."""
     console: Console
     workers: int = 1
-    """Episodes side by side."""
+    """The number of episodes in parallel."""
     _wanted: dict[str, int] = field(default_factory=dict, init=False)
-    """The most demonstrations of each task that a training of this run learns from."""
+    """The most training demonstrations of each task in this run."""
     _collected: set[Path] = field(default_factory=set, init=False)
-    """The folders of demonstrations that were checked."""
+    """The folders of demonstrations that have been checked."""
     _failed: dict[Path, str] = field(default_factory=dict, init=False)
-    """Why the command of a folder failed in this run: it is not tried again for the next cell."""
+    """The errors of commands that failed in this run, by folder; they are not tried again."""
 
     def run(self, cells: Sequence[Cell]) -> dict[str, str]:
-        """Fills cells, in their order.
+        """Fills cells in order.
 
         Returns:
-            For each cell that could not be filled, by its name, why.
+            The reason for each cell that could not be filled, by name.
 
         Raises:
-            UserError: a result is not that of its cell.
+            UserError: a result does not fit its cell.
         """
         if note := uncommitted_note():
             self._say(f"note: {note}")
@@ -93,10 +93,10 @@ class Queue:
         return failures
 
     def pending(self, cells: Sequence[Cell]) -> list[Cell]:
-        """The cells that the table has no run of, or none that can be run again.
+        """The cells without a repeatable run in the table.
 
         Raises:
-            UserError: the table is damaged, or a run there is not that of its cell.
+            UserError: the table is damaged, or a run does not fit its cell.
         """
         done, rates = read_summaries(self.results), read_rates(self.results)
         for cell in cells:
@@ -106,12 +106,11 @@ class Queue:
         return [cell for cell in cells if cell.name not in kept]
 
     def collect(self, task: Task, *, validation: bool) -> Path:
-        """The file of a task's demonstrations, as many as this run needs, or of those to validate
-        by."""
+        """The file of a task's demonstrations, for training or validation."""
         count = task.validation if validation else self._wanted.get(task.name, task.demonstrations)
         folder = self.folder / "demonstrations" / f"{task.name}{'_validation' * validation}"
         if folder not in self._collected:
-            # Where all are there, it checks whether they are those of this task.
+            # If all exist, the command checks that they belong to this task.
             self._command(
                 "collect",
                 SCENARIOS / task.file,
@@ -126,8 +125,7 @@ class Queue:
         return folder / "demonstrations.h5"
 
     def _needed(self, policy: Training | str) -> Iterator[Training]:
-        """The trainings that a policy takes: its own, that of its base, and that which chooses its
-        learning rate."""
+        """The trainings of a policy: its own, its base, and the one for its learning rate."""
         if isinstance(policy, str):
             return
         yield policy
@@ -137,7 +135,7 @@ class Queue:
             yield reference(policy)
 
     def train(self, training: Training) -> Path:
-        """The file of the weights of a training."""
+        """The weights file of a training."""
         rate = training.learning_rate or LEARNING_RATES[0]
         if _is_rate_chosen(training):
             rate = self._best_rate(reference(training))
@@ -172,9 +170,9 @@ class Queue:
         )
 
     def _best_rate(self, chosen_by: Training) -> float:
-        """The learning rate at which a training of `reference` does best on validation scenes.
+        """The learning rate with the best validation result in a training of `reference`.
 
-        What each comes to is written as soon as it is known, and not tried again.
+        Each result is saved at once and not computed again.
         """
         for rate in self._untried(chosen_by):
             try:
@@ -186,12 +184,12 @@ class Queue:
                 continue
             summary = json.loads(weights.with_name("summary.json").read_text())
             best = summary["best"]
-            # The one of the two by which the checkpoint was chosen.
+            # The criterion by which the checkpoint was chosen.
             self._keep_rate(chosen_by, rate, best.get("loss", best["cost_mm"]))
         return float(best_rate(read_rates(self.results)[rates_key(chosen_by)]))
 
     def _untried(self, chosen_by: Training) -> list[float]:
-        """The learning rates of which it is not known what a training of `reference` comes to."""
+        """The learning rates that a training of `reference` has not tried."""
         tried = read_rates(self.results).get(rates_key(chosen_by), {})
         return [rate for rate in LEARNING_RATES if f"{rate:g}" not in tried]
 
@@ -214,7 +212,7 @@ class Queue:
             folder=folder,
         )
         text = (folder / "summary.json").read_text()
-        # The results say nothing of where they were made.
+        # Results contain no absolute paths.
         if weights is not None:
             name = str(weights.resolve().relative_to(self.folder.resolve()))
             text = text.replace(json.dumps(str(weights.resolve())), json.dumps(name))
@@ -231,15 +229,15 @@ class Queue:
         self._say(f"{cell.name}: {rate:.1f} % strict, {100 * summary['success_rate']:.1f} %")
 
     def _command(self, verb: str, *arguments: Any, folder: Path) -> None:
-        """Runs a command of the project with its output in a folder, and a log beside it.
+        """Runs a command of the project, with its output in a folder and a log beside it.
 
         Raises:
-            Failed: it failed, now or before in this run.
+            Failed: it failed, now or earlier in this run.
         """
         if folder in self._failed:
             raise Failed(self._failed[folder])
         command = [sys.executable, "-m", f"kitting_drake.{verb}", *map(str, arguments)]
-        # Beside the folder: the command takes none that holds anything else.
+        # The log is beside the folder, because commands reject folders with other files.
         log_file = require_folder(folder.parent) / f"{folder.name}.log"
         with log_file.open("w") as log:
             process = subprocess.Popen(
@@ -247,7 +245,7 @@ class Queue:
                 stdout=log,
                 stderr=subprocess.STDOUT,
                 text=True,
-                # Ctrl-C is for the queue, which ends it.
+                # Ctrl-C must reach only the queue, which terminates the command.
                 start_new_session=True,
             )
             try:
@@ -264,12 +262,12 @@ class Queue:
 
 
 def _is_rate_chosen(training: Training) -> bool:
-    """Whether its learning rate is the best one of `reference`."""
+    """Whether its learning rate is chosen by `reference`."""
     return training.learning_rate is None and training.method != "so2"
 
 
 def _check_training(training: Training, folder: Path) -> None:
-    """Raises Failed if what was trained in a folder, by an earlier version, is another."""
+    """Raises Failed if a folder holds another training, from an earlier version."""
     summary = json.loads((folder / "summary.json").read_text())
     for key, wanted in (
         ("method", training.method),
@@ -283,11 +281,11 @@ def _check_training(training: Training, folder: Path) -> None:
     ):
         found = summary.get(key, _BEFORE.get(key))
         if found != wanted:
-            raise Failed(f"{folder}: its {key} is {found}, not {wanted}: delete it")
+            raise Failed(f"{folder}: {key} is {found}, not {wanted}: delete it")
 
 
 def _end(process: subprocess.Popen[str]) -> None:
-    """Ends a command: a training saves what it has before."""
+    """Terminates a command, which may save its state first."""
     if process.poll() is None:
         process.terminate()
         try:
@@ -298,23 +296,23 @@ def _end(process: subprocess.Popen[str]) -> None:
 
 
 def run_paper(queue: Queue, cells: Sequence[Cell]) -> dict[str, str]:
-    """Fills cells, as `Queue.run` does; ended itself, it ends what it began and says how to go on.
+    """Fills cells with `Queue.run`. When stopped, it stops its child process too.
 
     Returns:
-        For each cell that could not be filled, by its name, why.
+        The reason for each cell that could not be filled, by name.
 
     Raises:
-        UserError: a result is not that of its cell.
+        UserError: a result does not fit its cell.
     """
-    # A command that goes on would keep the next queue out of its folder.
+    # A child that kept running would lock its folder against the next queue.
     ended_by = (signal.SIGTERM, signal.SIGHUP)
     before = [signal.signal(number, lambda came, _: sys.exit(128 + came)) for number in ended_by]
     try:
         return queue.run(cells)
     except (KeyboardInterrupt, SystemExit):
         queue.console.print(
-            f"stopped: what was begun is in {queue.folder}, finished cells in {queue.results}; "
-            "the same command goes on from there",
+            f"stopped: unfinished work is in {queue.folder}, finished cells are in "
+            f"{queue.results}; run the same command again to continue",
             highlight=False,
             markup=False,
         )

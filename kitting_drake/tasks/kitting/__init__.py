@@ -1,1 +1,1 @@
-"""Kitting: hand tools on a table, and a kit with a cavity for each (section IV)."""
+"""Kitting: hand tools and a kit with a cavity for each (section IV)."""

@@ -1,4 +1,4 @@
-"""Why a tool that was not kitted was not. Decided from true poses, which no policy sees."""
+"""Finds why a tool was not kitted, from true poses, which policies cannot see."""
 
 import math
 from collections.abc import Sequence
@@ -25,13 +25,13 @@ REVERSED = "reversed"
 CAUSES = (MISSED_GRASP, SLIPPED, BLOCKED, WRONG_CAVITY, REVERSED, MISPLACED, NEVER_PICKED)
 
 _NEAR = 0.030
-"""A tool this close to a cavity is over it: half the distance of two cavities, in m."""
+"""Within this distance a tool is over a cavity, in m; half the distance of two cavities."""
 _BORDER = 0.015
-"""How far a kit reaches beyond its tools, in m."""
+"""Width of the kit's border around the tools, in m."""
 _ALIGNED = math.radians(20.0)
-"""With its heading no further than this from a cavity's, a tool lies along it."""
+"""Largest heading difference of a tool that lies along a cavity."""
 _TILTED = math.radians(60.0)
-"""Tilted further than this, a tool does not lie on the side on which it should."""
+"""A tool tilted further than this lies on the wrong side."""
 
 
 def find_cause(
@@ -43,19 +43,19 @@ def find_cause(
 ) -> str:
     """Why a tool was not placed: one of `CAUSES`.
 
-    - `never picked`: no action on it came to an end.
-    - `missed grasp`: it was tried, and never held.
-    - `reversed`: at its cavity, but the wrong way round or on the wrong side.
-    - `insertion blocked`: over its cavity, but protruding or off.
-    - `slipped`: lost on the way; or left outside the kit by an action that was right.
-    - `wrong cavity`: over another tool's.
-    - `misplaced`: put anywhere else.
+    - `never picked`: no action on it was completed.
+    - `missed grasp`: no grasp of it held.
+    - `reversed`: at its cavity, but rotated by 180 degrees or on the wrong side.
+    - `insertion blocked`: over its cavity, but protruding or displaced.
+    - `slipped`: lost on the way, or left outside the kit by a correct action.
+    - `wrong cavity`: over another tool's cavity.
+    - `misplaced`: anywhere else.
 
     Args:
         scene: the episode's.
         index: of the tool among the scene's objects.
-        X_WB: where it ended.
-        placement: against the cavity that it is nearest to filling.
+        X_WB: its final pose.
+        placement: of the tool, with respect to the goal assigned to it.
         records: the episode's actions.
     """
     item = scene.objects[index]
@@ -67,9 +67,9 @@ def find_cause(
     if goal is not None:
         X_WGoal = goal.poses[placement.pose]
         grasp_point = np.array([item.grasps[0].x, item.grasps[0].y, 0.0])
-        # Half a rotation about the grasp leaves the grasp where it was and takes the middle away.
+        # Half a rotation about the grasp displaces the middle, but not the grasp.
         if min(_gap(X_WB, X_WGoal, middle), _gap(X_WB, X_WGoal, grasp_point)) < _NEAR:
-            # Modulo the tool's symmetry: a reversible one cannot be reversed.
+            # Modulo the tool's symmetry: a symmetric tool cannot be reversed.
             rotation = abs(placement.angle_error)
             if rotation > math.pi - _ALIGNED or _tilt(X_WB) > _TILTED:
                 return REVERSED
@@ -86,7 +86,7 @@ def find_cause(
 
 
 def _gap(X_WB: RigidTransform, X_WGoal: RigidTransform, point: np.ndarray) -> float:
-    """Horizontal distance of a body's point (3) from where it belongs, in m."""
+    """Horizontal distance of a body-fixed point (3) from its place at the goal, in m."""
     return float(np.linalg.norm((X_WB @ point - X_WGoal @ point)[:2]))
 
 
@@ -96,13 +96,13 @@ def _tilt(X_WB: RigidTransform) -> float:
 
 
 def _is_over(p_WMiddle: np.ndarray, X_WB: RigidTransform, X_WGoal: RigidTransform) -> bool:
-    """Whether a tool lies over and along a cavity, either way round."""
+    """Whether a tool lies over and along a cavity, in either direction."""
     along = abs(wrap_to_pi(2 * (heading(X_WB) - heading(X_WGoal)))) / 2 < _ALIGNED
     return along and float(np.linalg.norm((p_WMiddle - X_WGoal.translation())[:2])) < _NEAR
 
 
 def _is_over_kit(scene: Scene, p_WPoint: np.ndarray) -> bool:
-    """Whether a point is over the kit: over the bounding box, in its frame, of all seated tools."""
+    """Whether a point is over the kit, i.e. the bounding box of all seated tools in its frame."""
     X_KW = scene.fixtures[0].X_WF.inverse()
     seated = np.concatenate(
         [

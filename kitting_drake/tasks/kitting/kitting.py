@@ -1,4 +1,4 @@
-"""The kitting tasks: which tools, which kit, where they stand, and when a tool is kitted."""
+"""The kitting tasks: tools, kits, their poses and goals."""
 
 import dataclasses
 import itertools
@@ -37,20 +37,20 @@ _ANNOTATE = "save another grasp by `hkd annotate`"
 
 SEEN = "kitting-seen-toolset"
 UNSEEN = "kitting-unseen-toolsets"
-"""The tasks of the paper (section V-B.1)."""
+"""The paper's task with unseen toolsets (section V-B.1)."""
 
 _TITLES = {"train": "kitting-train-toolsets", "test": UNSEEN, "fresh": "kitting-fresh-toolsets"}
-"""The titles of the tasks that draw toolsets, by their split, where nothing else is changed."""
+"""Titles of the tasks that draw toolsets, by split, if all other parameters are default."""
 
 
 @dataclass
 class _KittingTask(TaskConfig):
-    """The fields and the scoring that all kitting tasks share."""
+    """The parameters and scoring shared by all kitting tasks."""
 
     # The kit block and its cavities.
     kit: KitParameters = field(default_factory=KitParameters)
 
-    # How many actions the episode may take for each tool; the paper's tasks allow one.
+    # Actions per tool; the paper's tasks allow one.
     tries: int = bounded(1, 1, 10)
 
     # ADD-S below this is a success (section IV-C of the paper), in m.
@@ -82,18 +82,18 @@ class _KittingTask(TaskConfig):
 
 @dataclass
 class _DrawnKitting(_KittingTask):
-    """The kitting tasks whose tools and kit stand anywhere, in poses drawn from the seed."""
+    """Kitting tasks that draw the poses of tools and kit from the seed."""
 
-    # Least distance between any two of tools and kit, in m.
+    # Least distance between tools and kit, in m.
     spacing: float = bounded(0.008, 0.0, 0.2)
 
-    # Rotations of tools and kit are drawn within plus or minus this, in degrees.
+    # Tools and kit are rotated by random angles in plus or minus this, in degrees.
     yaw_range_deg: float = bounded(180.0, 0.0, 180.0)
 
-    # The order in which an oracle takes the tools: drawn from the seed, or as listed.
+    # Whether the oracle takes the tools in random order; else as listed.
     random_order: bool = True
 
-    # Boxes in the way, which no cavity takes; fewer where there is no room.
+    # Number of boxes without a cavity, as clutter; fewer if there is no room.
     distractors: int = bounded(0, 0, 12)
 
     def _draw_scene(self, tools: list[Tool], grid: PixelGrid, seed: int) -> Scene:
@@ -131,10 +131,9 @@ class _DrawnKitting(_KittingTask):
 
 @dataclass
 class Kitting(_DrawnKitting):
-    """A kit and its tools, in poses drawn from the seed: kitting-seen-toolset."""
+    """A kit and its tools in random poses: kitting-seen-toolset."""
 
-    # 1 to 12 tools, one of them several times too: names under models/tools, or paths of tool
-    # folders.
+    # 1 to 12 tools, repetitions allowed: names under models/tools, or paths of tool folders.
     tools: list[str] = field(
         default_factory=lambda: [
             "claw_hammer",
@@ -162,16 +161,16 @@ class Kitting(_DrawnKitting):
 
 @dataclass
 class ToolsetKitting(_DrawnKitting):
-    """Tools and kit drawn from the seed too, out of a pool: kitting-unseen-toolsets."""
+    """Random tools from a pool, and their kit, in random poses: kitting-unseen-toolsets."""
 
-    # The pool: train or test (section IV-B.1 of the paper), or fresh, which are neither ...
+    # The pool: train or test (section IV-B.1 of the paper), or fresh, which is disjoint from both.
     split: str = "test"
 
-    # ... or tools of one's own, names or paths of tool folders: of each of their categories one.
+    # Alternatively, a custom pool of names or paths of tool folders; one of each category is drawn.
     pool: list[str] = field(default_factory=list)
 
-    # Whether each tool's length is drawn, within tool_length in m (section IV-B.2); else it is
-    # that of the dataset.
+    # Whether tool lengths are drawn from tool_length in m (section IV-B.2); else they are those of
+    # the dataset.
     random_lengths: bool = True
     tool_length: list[float] = bounded([0.15, 0.20], 0.05, 0.30)
 
@@ -182,8 +181,7 @@ class ToolsetKitting(_DrawnKitting):
 
     def make_scene(self, *, grid: PixelGrid, seed: int, base: Path) -> Scene:
         choices = self._toolsets(base)
-        # Streams of their own: the poses of a seed depend neither on how many toolsets there are
-        # nor on the lengths.
+        # Separate streams: the poses depend neither on the number of toolsets nor on lengths.
         names = choices[np.random.default_rng([seed, 1]).integers(len(choices))]
         tools = _load_tools(names, base)
         if self.random_lengths:
@@ -215,19 +213,19 @@ class ToolsetKitting(_DrawnKitting):
         if self.split not in SPLITS:
             raise ValueError(f"task.split must be one of {', '.join(SPLITS)}, not '{self.split}'")
         if self.tool_length[0] > self.tool_length[1]:
-            raise ValueError("task.tool_length must be the least length and then the greatest")
+            raise ValueError("task.tool_length must be [least, greatest] length")
 
 
 @dataclass
 class ArrangedKitting(_KittingTask):
-    """Tools and kit stand where you say, and an oracle takes them in the order given."""
+    """Tools and kit in given poses. The oracle takes the tools in the given order."""
 
-    # Tools by name or path, each with its pose on the table.
+    # Tools by name or path, with their poses on the table.
     tools: dict[str, TablePose] = field(
         default_factory=lambda: {"claw_hammer": TablePose(x=0.35, y=0.3, yaw_deg=90.0)}
     )
 
-    # Where the kit stands.
+    # The kit's pose.
     kit_pose: TablePose = field(default_factory=lambda: TablePose(x=0.5, y=-0.1))
 
     @property
@@ -256,7 +254,7 @@ class ArrangedKitting(_KittingTask):
 
     @staticmethod
     def _check_workspace(scene: Scene, grid: PixelGrid) -> None:
-        """Raises UserError where the hand would have to go beside o_t, whose heights it goes by."""
+        """Raises UserError if a pick or place is outside the workspace, where o_t is unknown."""
         things = {f"task.tools.{item.name}": item.X_WB for item in scene.objects}
         for goal in scene.goals:
             name = scene.objects[goal.objects[0]].name
@@ -264,8 +262,9 @@ class ArrangedKitting(_KittingTask):
         for name, X_WThing in things.items():
             if not grid.contains(X_WThing.translation()[:2]):
                 raise UserError(
-                    f"{name} is not in the workspace (heightmap), x from {grid.x_min:g} to "
-                    f"{grid.x_max:g} m and y from {grid.y_min:g} to {grid.y_max:g} m"
+                    f"{name} is not in the workspace: choose x from {grid.x_min:g} to "
+                    f"{grid.x_max:g} m and y from {grid.y_min:g} to {grid.y_max:g} m, or enlarge "
+                    "heightmap"
                 )
 
     def input_files(self, base: Path) -> list[Path]:
@@ -282,15 +281,15 @@ def kitting_scene(
     order: Sequence[int] | np.ndarray,
     threshold: float,
 ) -> Scene:
-    """The scene of a kit and its tools; a goal for each cavity.
+    """Makes the scene of a kit and its tools, with a goal for each cavity.
 
-    Tools that are alike may fill each other's cavities.
+    Identical tools may fill each other's cavities.
 
     Args:
-        kit: the kit, which knows its tools.
+        kit: the kit and its tools.
         X_WKit: its pose.
         X_WTools: the initial pose of each tool.
-        order: in which an expert takes the tools, indices into the kit's.
+        order: the expert's order, as indices into the kit's tools.
         threshold: of ADD-S, in metres.
     """
     tools = [kit.tools[index] for index in order]
@@ -338,7 +337,7 @@ def _unique_names(tools: Sequence[Tool]) -> list[str]:
     names: list[str] = []
     for tool in tools:
         name, number = tool.name, 2
-        # As the kit, and what else is on the table, is called.
+        # Other bodies in the scene have these names.
         while name in names or re.fullmatch(r"kit|distractor_\d+", name):
             name, number = f"{tool.name}_{number}", number + 1
         names.append(name)
@@ -346,13 +345,13 @@ def _unique_names(tools: Sequence[Tool]) -> list[str]:
 
 
 def _check_grasps(tools: Sequence[Tool], advice: str) -> None:
-    """Raises UserError, with advice, for a tool that is wider at its grasp than the jaws open."""
+    """Raises UserError, with advice, if a tool's grasp is wider than the open jaws."""
     for tool in tools:
         if tool.grasp.width >= MAX_OPENING:
             raise UserError(
                 f"task: at a length of {1e3 * tool.length:.0f} mm the tool '{tool.name}' is "
-                f"{1e3 * tool.grasp.width:.0f} mm wide where it is held, and the jaws open to "
-                f"{1e3 * MAX_OPENING:.0f} mm: {advice}"
+                f"{1e3 * tool.grasp.width:.0f} mm wide where it is held, but the jaws open to "
+                f"{1e3 * MAX_OPENING:.0f} mm only: {advice}"
             )
 
 
@@ -379,4 +378,4 @@ def _check_count(count: int) -> None:
     if not count:
         raise ValueError("task.tools is empty: name at least one tool")
     if count > _MOST_TOOLS:
-        raise ValueError(f"task.tools has {count} tools: a kit takes up to {_MOST_TOOLS}")
+        raise ValueError(f"task.tools has {count} tools: a kit holds up to {_MOST_TOOLS}")

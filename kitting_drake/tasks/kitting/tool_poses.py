@@ -1,4 +1,4 @@
-"""Poses of kit and tools on the table: drawn from a seed, or checked where a person gives them."""
+"""Draws poses of kit and tools on the table, or checks given ones."""
 
 import math
 from collections.abc import Sequence
@@ -20,9 +20,9 @@ from systems.signals import PixelGrid
 _TRIES = 300
 _RESTARTS = 60
 _DISTRACTOR_SPACING = 0.01
-"""Least distance of a drawn box from all else, in metres."""
+"""Least distance of a drawn box from anything else, in metres."""
 _MANY = 6
-"""With more tools than this, those that are hardest to place are drawn first."""
+"""If there are more tools than this, those hardest to place are drawn first."""
 
 
 @dataclass
@@ -37,19 +37,19 @@ class TablePose:
     yaw_deg: float = bounded(0.0, -360.0, 360.0)
 
     def transform(self) -> RigidTransform:
-        """X_W of a frame that stands there."""
+        """X_W of a frame at this pose."""
         yaw = np.deg2rad(self.yaw_deg)
         return RigidTransform(RollPitchYaw(0, 0, yaw), [self.x, self.y, 0])
 
 
 @dataclass(frozen=True)
 class _Footprint:
-    """The areas of the table that a thing, and the open hand that grasps it, cover."""
+    """The areas that a thing, and the open hand that grasps it, cover on the table."""
 
     outline: CrossSection
     fingers: CrossSection
     palm: CrossSection
-    """The palm is above every tool, but not above a kit block."""
+    """The palm clears the tools, but not the kit block."""
 
     def moved(self, pose: TablePose) -> "_Footprint":
         return _Footprint(
@@ -64,28 +64,28 @@ _Drawn = tuple[TablePose, _Footprint]
 
 
 def outline_at(outline: CrossSection, X_W: RigidTransform) -> CrossSection:
-    """The outline of something upright, at a pose on the table."""
+    """The outline of an upright thing at a pose on the table."""
     yaw = RollPitchYaw(X_W.rotation()).yaw_angle()
     return outline.rotate(math.degrees(yaw)).translate(tuple(X_W.translation()[:2]))
 
 
 def block_outline(kit: Kit) -> CrossSection:
-    """The kit block from above, in its frame, in metres."""
+    """The outline of the kit block from above, in its frame, in metres."""
     return CrossSection.square(kit.size[:2], True)
 
 
 def check_arrangement(
     kit: Kit, kit_pose: TablePose, tools: dict[str, tuple[Tool, TablePose]]
 ) -> None:
-    """Checks that kit and tools are on the table, and not within each other.
+    """Checks that kit and tools are on the table and do not overlap.
 
     Args:
         kit: the kit.
-        kit_pose: where it stands.
-        tools: the tools by the names that the scenario gives them, and where they lie.
+        kit_pose: its pose.
+        tools: the tools and their poses, by the scenario's names.
 
     Raises:
-        UserError: they are not; names the fields.
+        UserError: they are off the table or overlap; the message names the fields.
     """
     table = _rectangle(*TABLE)
     placed: dict[str, CrossSection] = {}
@@ -96,12 +96,12 @@ def check_arrangement(
         if (outline - table).area() > 1e-9:
             (x_min, y_min), (x_max, y_max) = TABLE
             raise UserError(
-                f"{name} is not whole on the table, which is x from {x_min:g} to {x_max:g} m and "
+                f"{name} is not whole on the table: choose x from {x_min:g} to {x_max:g} m and "
                 f"y from {y_min:g} to {y_max:g} m"
             )
         for other, standing in placed.items():
             if _overlap(outline, standing):
-                raise UserError(f"{other} and {name} are within each other")
+                raise UserError(f"{other} and {name} overlap: move one of them")
         placed[name] = outline
 
 
@@ -114,10 +114,9 @@ def draw_poses(
     yaw_range_deg: float,
     rng: np.random.Generator,
 ) -> tuple[RigidTransform, list[RigidTransform]]:
-    """Poses of the kit and of the tools, within the workspace and on the table.
+    """Draws poses of the kit and the tools, within the workspace and on the table.
 
-    Nothing collides, and every tool can be reached: the open hand at its grasp touches no other
-    tool and no kit.
+    Nothing overlaps, and the open hand at each tool's grasp touches no other tool and no kit.
 
     Args:
         kit: the kit.
@@ -149,7 +148,7 @@ def draw_poses(
     if found is None:
         raise UserError(
             f"there is no free space in the workspace for the kit and {len(tools)} tools: "
-            "enlarge heightmap.rows and heightmap.cols, or lessen task.spacing"
+            "enlarge heightmap.rows and heightmap.cols, or reduce task.spacing"
         )
     drawn = {index: pose for index, (pose, _) in zip(order, found, strict=True)}
     transforms = [drawn[index].transform() for index in range(len(shapes))]
@@ -165,7 +164,7 @@ def _draw_pose(
     yaw_range_deg: float,
     rng: np.random.Generator,
 ) -> _Drawn | None:
-    """A free pose, the first of them that is placed being the kit; None if none was found."""
+    """Draws a free pose; None if none was found. The first placed thing is the kit."""
     for _ in range(_TRIES):
         x, y = rng.uniform((grid.x_min, grid.y_min), (grid.x_max, grid.y_max))
         pose = TablePose(x=x, y=y, yaw_deg=rng.uniform(-yaw_range_deg, yaw_range_deg))
@@ -186,13 +185,13 @@ def _draw_pose(
 
 @dataclass(frozen=True)
 class DrawnBox:
-    """A box on the table, drawn at random."""
+    """A random box on the table."""
 
     size: tuple[float, float, float]
-    """Along its axes, in metres."""
+    """Along the box's axes, in metres."""
     colour: tuple[float, float, float]
     X_WB: RigidTransform
-    """Pose of the middle of its bottom."""
+    """Pose of the middle of the box's bottom."""
 
 
 def draw_boxes(
@@ -205,13 +204,13 @@ def draw_boxes(
     grid: PixelGrid,
     rng: np.random.Generator,
 ) -> list[DrawnBox]:
-    """Boxes of any size and colour, which no cavity takes.
+    """Draws boxes without a cavity, of random size and colour.
 
-    They keep clear of kit and tools and of the hand that grasps a tool. Where there is no room for
-    as many, there are fewer.
+    They keep clear of the kit, the tools, and the hand at each grasp. There are fewer than `count`
+    if there is no room.
 
     Args:
-        count: how many.
+        count: largest number.
         kit: the kit.
         X_WKit: its pose.
         tools: the tools.
@@ -249,7 +248,7 @@ def _tool_footprint(tool: Tool) -> _Footprint:
     fingers, palm = (
         rectangle_at(size, grasp.x, grasp.y, grasp.theta) for size in (OPEN_FINGERS, PALM_SIZE)
     )
-    # The hull is coarser than the outline and never smaller.
+    # The hull contains the outline and has fewer vertices.
     return _Footprint(tool.footprint.hull(), fingers, palm)
 
 

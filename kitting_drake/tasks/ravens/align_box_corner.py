@@ -1,4 +1,4 @@
-"""align-box-corner: a box of any size is put with a corner into a marker on the table."""
+"""align-box-corner: put a box of any size with a corner into a marker on the table."""
 
 import math
 from dataclasses import dataclass
@@ -26,12 +26,12 @@ from systems.signals import PixelGrid
 _ARM_LENGTH, _ARM_WIDTH = 0.055, 0.005
 """The size of each arm of the marker, in metres."""
 _GRASP_OFFSET = 0.01
-"""The demonstrator takes hold of the box within this distance of its middle, in metres."""
+"""The demonstrator grasps the box within this distance of its middle, in metres."""
 
 
 @dataclass
 class AlignBoxCorner(PoseTask):
-    """A box is put with a corner into a marker, in any of the four ways."""
+    """A box is put with one of its four corners into a marker."""
 
     # Least and greatest length of the horizontal edges of the box, in m.
     box_sides: list[float] = bounded([0.03, 0.07], 0.01, 0.07)
@@ -64,7 +64,7 @@ class AlignBoxCorner(PoseTask):
         for name in ("box_sides", "box_height"):
             least, greatest = getattr(self, name)
             if least > greatest:
-                raise ValueError(f"task.{name} must be the least and then the greatest")
+                raise ValueError(f"task.{name} must be [least, greatest]")
 
 
 def corner_poses(size: tuple[float, float, float]) -> list[RigidTransform]:
@@ -77,7 +77,7 @@ def corner_poses(size: tuple[float, float, float]) -> list[RigidTransform]:
 
 
 def _marker_footprint(size: tuple[float, float, float]) -> Footprint:
-    """The marker and, around it, all boxes that may stand there, and the hand that puts them."""
+    """The marker, all boxes that may be put there, and the hand that puts them."""
     longest = max(size[:2])
     side = max(_ARM_LENGTH - _ARM_WIDTH, longest)
     middle = (side - _ARM_WIDTH) / 2

@@ -16,11 +16,11 @@ from systems.placement import Goal
 from systems.signals import PixelGrid
 
 _ARMS = (((0.08, 0.03, 0.04), (0.025, 0.0)), ((0.03, 0.05, 0.04), (0.0, 0.04)))
-"""Size and middle of the two boxes of the block, in metres: see `models/ravens/l_block.sdf`."""
+"""Size and middle of the block's two boxes, in metres, as in `models/ravens/l_block.sdf`."""
 _HEIGHT = 0.04
 _WALL_HEIGHT = 0.02
 _ALONG_ARM = (0.035, 0.055)
-"""How far from the corner the demonstrator takes hold of an arm, in metres."""
+"""Range of the demonstrator's grasps along an arm, from the corner, in metres."""
 
 
 def _grasp(along_x: bool, distance: float) -> Grasp:
@@ -77,7 +77,7 @@ def _surface_points() -> np.ndarray:
     (long_size, long_middle), (short_size, short_middle) = _ARMS
     long_points = box_points(long_size) + (*long_middle, 0.0)
     short_points = box_points(short_size) + (*short_middle, 0.0)
-    # The face where the two meet is inside the block.
+    # The face where the boxes meet is inside the block.
     seam = long_size[1] / 2
     on_seam = np.isclose(long_points[:, 1], seam) & (np.abs(long_points[:, 0]) < short_size[0] / 2)
     return np.concatenate(

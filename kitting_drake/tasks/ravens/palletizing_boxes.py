@@ -29,32 +29,32 @@ _BOX = (0.085, 0.04, 0.04)
 _X_WPALLET = RigidTransform([0.5, 0.25, 0.0])
 _PALLET_HEIGHT = 0.04
 _P_WSOURCE = (0.5, -0.25)
-"""Where the boxes appear ..."""
+"""(x, y) at which the boxes appear."""
 _DROP = 0.08
-"""... with their bottoms at this height, in metres; the first one lies there already."""
+"""Height of a box's bottom when it appears, in metres; the first box lies on the table."""
 _SOURCE_AREA = ((-5.0, -0.5), (5.0, 0.0))
-"""The next one appears when no box lies here: lower and upper (x, y) in the world, in metres."""
+"""The next box appears if no box is in this area: lower and upper (x, y), in metres."""
 _GRASP_OFFSET = 0.025
-"""The demonstrator takes hold of a box within this distance of its middle, along its longer side,
-in metres."""
+"""The demonstrator grasps a box within this distance of its middle along its longer side, in
+metres."""
 _ZONE = (0.30, 0.25, 0.30)
-"""The room on the pallet, and the pallet's own, that counts."""
+"""Size of the zone that counts, on and including the pallet, in metres."""
 
 _END_GAP = 0.01
-"""Between the ends of two boxes in a line."""
+"""Gap between the ends of two boxes in a line, in metres."""
 _TARGET_PITCH = 0.076
-"""From box to box across the jaws, on the pallet, so that three lines take up 190 mm; a finger is
-26.3 mm deep, and has room between two boxes."""
+"""Pitch of the three lines on the pallet, in metres: leaves room for a finger of 26.3 mm between
+two boxes."""
 
 _POINT_SPACING = 0.02
-"""The spacing of the points by which the reward measures the share of a box in the zone, in m."""
+"""Spacing of the points that measure a box's share in the zone, in metres."""
 
 
 @dataclass
 class PalletizingBoxes(RavensTask):
-    """Boxes that come one at a time are stacked on a pallet.
+    """Boxes that appear one at a time are stacked on a pallet.
 
-    The demonstrator fills one layer after the other, each in an order drawn anew.
+    The demonstrator fills one layer after the other, each in random order.
     """
 
     causes = (NEVER_APPEARED, *RavensTask.causes)
@@ -86,7 +86,7 @@ class PalletizingBoxes(RavensTask):
             )
         )
         X_WDeck = _X_WPALLET @ RigidTransform([0, 0, _PALLET_HEIGHT])
-        # Every layer is across the one below, which ties the columns together.
+        # Each layer is rotated by 90 degrees, to tie the columns together.
         X_WGoals = [
             X_WDeck @ layer[place]
             for level in range(self.layers)
@@ -120,7 +120,7 @@ class PalletizingBoxes(RavensTask):
         placement: Placement,
         records: Sequence[ActionRecord],
     ) -> str:
-        # What has fallen off the table was picked, or has been where it could be.
+        # An object far from the cell may also have fallen off the table after it appeared.
         waits = X_WB[index].IsNearlyEqualTo(scene.objects[index].X_WB, 1.0)
         if waits and np.linalg.norm(X_WB[index].translation()) > GONE:
             return NEVER_APPEARED
@@ -128,12 +128,12 @@ class PalletizingBoxes(RavensTask):
 
 
 def layer_poses(level: int, pitch: float, *, across: bool = False) -> list[RigidTransform]:
-    """The poses of six boxes in a layer, two in a line, in the frame in which they are stacked.
+    """The poses of six boxes in a layer, two per line, in the frame of the stack.
 
     Args:
         level: 0 for the lowest layer.
-        pitch: from one line to the next, in metres.
-        across: whether the lines are along y, not along x.
+        pitch: between lines, in metres.
+        across: whether the lines are along y instead of x.
     """
     X_StackLayer = RigidTransform(
         RollPitchYaw(0, 0, math.pi / 2 if across else 0), [0, 0, level * _BOX[2]]
@@ -145,7 +145,7 @@ def layer_poses(level: int, pitch: float, *, across: bool = False) -> list[Rigid
 
 
 def volume_points(size: tuple[float, float, float]) -> NDArray[np.float64]:
-    """(m, 3) points of a grid that fill a box, in its frame, in metres."""
+    """(m, 3) grid points that fill a box, in its frame, in metres."""
 
     def along(length: float) -> NDArray[np.float64]:
         count = math.ceil(length / _POINT_SPACING - 1e-9)
@@ -161,6 +161,6 @@ def _check_workspace(
     for X_WB in poses:
         if not grid.contains(X_WB.multiply(p_BPoints.T)[:2].T).all():
             raise UserError(
-                "heightmap: the workspace must hold the place where boxes appear and the pallet, "
-                "around (0.5, -0.25) and (0.5, 0.25) m"
+                "heightmap: the workspace must contain the boxes that appear around (0.5, -0.25) m "
+                "and the pallet around (0.5, 0.25) m"
             )

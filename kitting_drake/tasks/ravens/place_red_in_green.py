@@ -1,4 +1,4 @@
-"""place-red-in-green: red cubes are put into green bowls, among objects of other colours."""
+"""place-red-in-green: put red cubes into green bowls, among objects of other colours."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -26,27 +26,27 @@ from systems.signals import PixelGrid
 _BOWL = Footprint((disc(0.06),))
 _DISTRACTOR_CUBE = Footprint(CUBE_FOOTPRINT.body)
 _BOWL_FLOOR = 0.004
-"""Height of the floor of a bowl, in metres."""
+"""Height of a bowl's floor, in metres."""
 
 
 @dataclass
 class PlaceRedInGreen(RavensTask):
     """Red cubes are put into green bowls.
 
-    The demonstrator takes hold of a cube on either of its centre lines, and gives it the heading of
-    the bowl, which nothing shows.
+    The demonstrator grasps a cube on one of its centre lines. It gives the cube the heading of the
+    bowl, which is not visible.
     """
 
-    # Colours say what is to be done, and what else lies there has them too.
+    # Colours define the goals, and distractors already have them.
     not_perturbed = ("colour", "distractors")
 
-    # The most green bowls; there are one to so many, and no more red cubes than bowls.
+    # Largest number of green bowls. The number of red cubes is at most that of bowls.
     bowls: int = bounded(3, 1, 6)
 
     # Cubes and bowls of other colours.
     distractors: int = bounded(10, 0, 12)
 
-    # A cube is in a bowl within this distance of its middle, seen from above, in m.
+    # A cube within this horizontal distance of a bowl's middle is in it, in m.
     position_threshold: float = bounded(0.05, 0.001, 0.06)
 
     @property
@@ -57,7 +57,7 @@ class PlaceRedInGreen(RavensTask):
         rng = np.random.default_rng([seed, 1])
         bowl_count = int(rng.integers(1, self.bowls + 1))
         cube_count = int(rng.integers(1, bowl_count + 1))
-        # The two kinds are as frequent, and each kind goes through its colours.
+        # Both kinds are equally likely; each kind cycles through its colours.
         are_cubes = rng.random(self.distractors) < 0.5
         bowl_colours = ["green"] * bowl_count + _others("green", int((~are_cubes).sum()), rng)
         cube_colours = ["red"] * cube_count + _others("red", int(are_cubes.sum()), rng)
@@ -108,7 +108,7 @@ def _cubes(
 
 
 def _others(excluded: str, count: int, rng: np.random.Generator) -> list[str]:
-    """The names of so many colours but one, all of them before any comes again."""
+    """Colour names without one, cycled through all before any repeats."""
     names = [name for name in COLOURS if name != excluded]
     rng.shuffle(names)
     return [names[index % len(names)] for index in range(count)]

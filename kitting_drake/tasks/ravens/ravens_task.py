@@ -17,21 +17,21 @@ TOPPLED = "toppled"
 PREREQUISITE_MISSING = "prerequisite missing"
 
 _GRASP_STREAM = 2
-"""Stream of the seed: the demonstrator's grasps change nothing else that is drawn."""
+"""Random stream of the demonstrator's grasps; other draws do not depend on it."""
 
 _UPRIGHT = math.cos(math.radians(20.0))
-"""The cosine of the tilt beyond which an object has toppled."""
+"""The cosine of the tilt above which an object has toppled."""
 
 
 def grasp_rng(seed: int) -> np.random.Generator:
-    """Where the demonstrator takes hold of an object is drawn from this, as in the gripper version
-    of Ravens: off its middle, so that the pick tells which way the jaws close."""
+    """The random generator of the demonstrator's grasps. As in the gripper version of Ravens, they
+    are off an object's middle, so that the pick reveals along which axis the jaws close."""
     return np.random.default_rng([seed, _GRASP_STREAM])
 
 
 @dataclass
 class RavensTask(TaskConfig):
-    """A task of Ravens: its name, and why its objects fail."""
+    """A task of Ravens: its title and the causes of failure."""
 
     causes = (*TaskConfig.causes[:-1], TOPPLED, PREREQUISITE_MISSING, TaskConfig.causes[-1])
 
@@ -59,19 +59,19 @@ class RavensTask(TaskConfig):
         if X_WB[index].rotation().matrix()[2, 2] < _UPRIGHT:
             return TOPPLED
         if scene.success.share(placement, X_WB[index]) > 1 - 1e-9:
-            # It is where it belongs, before what has to be there first.
+            # It is in place, but its prerequisites are not.
             return PREREQUISITE_MISSING
         return cause
 
 
 @dataclass
 class PoseTask(RavensTask):
-    """A task whose objects are to come to rest in given poses."""
+    """A task whose objects must come to rest in given poses."""
 
-    # An object is in place within this distance of its goal, seen from above, in m, ...
+    # An object is in place within this horizontal distance of its goal, in m ...
     position_threshold: float = bounded(0.01, 1e-4, 0.5)
 
-    # ... and within this angle of its heading, modulo the object's symmetry, in degrees.
+    # ... and this heading difference, modulo the object's symmetry, in degrees.
     angle_threshold_deg: float = bounded(15.0, 0.1, 180.0)
 
     @property

@@ -1,4 +1,4 @@
-"""stack-block-pyramid: six cubes of six colours are stacked on a base, row by row."""
+"""stack-block-pyramid: stack six cubes of six colours on a base, row by row."""
 
 import math
 from dataclasses import dataclass
@@ -26,7 +26,7 @@ from systems.signals import PixelGrid
 _ROWS = (("purple", "blue", "green"), ("yellow", "orange"), ("red",))
 """The colours of the rows, from the bottom up."""
 _PITCH = 0.05
-"""Between the cubes of a row, along y of the base, in metres."""
+"""Distance of neighbouring cubes in a row, along y of the base, in metres."""
 _BASE_SIZE = (0.05, 0.15, 0.005)
 
 _BASE = Footprint(
@@ -44,11 +44,11 @@ _BASE = Footprint(
 class StackBlockPyramid(PoseTask):
     """Six cubes are stacked to a pyramid.
 
-    The demonstrator takes hold of a cube on its centre line along y and puts it down with the
-    heading of the base, so that the jaws open across the row.
+    The demonstrator grasps a cube on its centre line along y and gives it the heading of the base,
+    so that the jaws open across the row.
     """
 
-    # The colour of a cube says where it belongs.
+    # The colour of a cube determines its place.
     not_perturbed = ("colour",)
 
     def make_scene(self, *, grid: PixelGrid, seed: int, base: Path) -> Scene:
@@ -77,7 +77,7 @@ class StackBlockPyramid(PoseTask):
 def _goals(X_WBase: RigidTransform) -> tuple[Goal, ...]:
     """A goal for each place of the pyramid, row by row.
 
-    Any cube of a row may be at any place of it. A row counts once the one below it is complete.
+    Any cube of a row may fill any place of it. A row counts once the row below is complete.
     """
     goals: list[Goal] = []
     below: tuple[int, ...] = ()

@@ -8,7 +8,7 @@ from kitting_drake.common import cached_folder as cache_module
 from kitting_drake.common.cached_folder import cached_folder, prune
 
 
-def test_the_cache_keeps_the_newest_and_the_young(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_prune_keeps_the_newest_and_the_young(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(cache_module, "KEPT_ENTRIES", 3)
     now = time.time()
     hour = cache_module.YOUNGEST_REMOVED
@@ -21,7 +21,7 @@ def test_the_cache_keeps_the_newest_and_the_young(tmp_path: Path, monkeypatch: p
         folder.mkdir()
         write(folder)
         os.utime(folder, (now - age * hour,) * 2)
-    # A use makes the oldest the newest.
+    # Using a folder makes it the newest.
     cached_folder(tmp_path / "a", ["file"], write)
     prune(tmp_path)
     assert {path.name for path in tmp_path.iterdir()} == {"a", "e", "d"}

@@ -1,4 +1,4 @@
-"""`RayWorkers` without Ray: `tests/kitting_drake/ray_cluster_test.py` has a real cluster."""
+"""`RayWorkers` with a fake Ray. `tests/kitting_drake/ray_cluster_test.py` uses a real cluster."""
 
 import functools
 import os
@@ -25,7 +25,7 @@ KILLED = ProcessCrashed(-signal.SIGKILL)
 
 
 class FakeRay(types.ModuleType):
-    """As much of Ray as is used; a task is done when its answer is asked for."""
+    """The part of Ray that is used. A task runs when its result is requested."""
 
     class exceptions:  # noqa: N801
         class RayError(Exception): ...
@@ -89,35 +89,35 @@ def workers(address: str = "auto") -> RayWorkers:
     return RayWorkers(address, RUNTIME_ENV)
 
 
-def test_a_function_runs_in_a_process_of_its_own(ray: FakeRay):
+def test_a_call_runs_in_its_own_process(ray: FakeRay):
     with workers() as there:
         assert there.run(os.getpid) not in (os.getpid(), None)
         assert there.run(os._exit, 3) == ProcessCrashed(3)
     assert ray.options["runtime_env"] == RUNTIME_ENV
 
 
-def test_there_is_room_for_as_many_as_there_are_cpus(ray: FakeRay):
+def test_capacity_is_the_number_of_cpus(ray: FakeRay):
     with workers() as there:
         assert there.capacity() == 3
-        # A task that waits is what makes a cluster grow.
+        # A waiting task makes a cluster grow.
         ray.cpus = {}
         assert there.capacity() == 1
 
 
-def test_what_is_lost_for_good_was_killed(ray: FakeRay):
+def test_a_lost_call_counts_as_killed(ray: FakeRay):
     with workers() as there:
         ray.error = ray.exceptions.RayError("its nodes died, again and again")
         assert there.run(os.getpid) == KILLED
 
 
-def test_a_worker_that_cannot_begin_is_told_of(ray: FakeRay):
+def test_a_worker_that_cannot_start_raises(ray: FakeRay):
     with workers() as there:
         ray.error = ray.exceptions.RayTaskError("A traceback\nNo module named 'rich'")
-        with pytest.raises(UserError, match="node of the cluster cannot work: No module named 'r"):
+        with pytest.raises(UserError, match="No module named 'r"):
             there.run(os.getpid)
 
 
-def test_nobody_waits_for_those_that_are_stopped(ray: FakeRay):
+def test_stop_cancels_running_calls(ray: FakeRay):
     found: list[object] = []
     with workers() as there:
         ray.waits = True
@@ -130,31 +130,31 @@ def test_nobody_waits_for_those_that_are_stopped(ray: FakeRay):
         assert there.run(os.getpid) == KILLED
 
 
-def test_a_node_with_other_versions_is_named(monkeypatch: pytest.MonkeyPatch):
+def test_an_error_names_a_node_with_other_versions(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr("platform.node", lambda: "second")
     wanted = versions() | {"drake": "0.1"}
     outcome = pickle.loads(cluster._answer(wanted, pickle.dumps(("os", "getpid", ()))))
-    assert outcome.reason.startswith(f"the node second has drake {versions()['drake']}, this ")
+    assert f"node second has drake {versions()['drake']}" in outcome.reason
 
 
-def test_a_package_without_a_version_on_a_node_is_named():
-    """Not a failure of the episode, which would be kept as its result."""
+def test_an_error_names_a_package_without_a_version():
+    """It is no failure of the episode, which would be kept as its result."""
     wanted = {**versions(), "absent": "1.2"}
     outcome = pickle.loads(cluster._answer(wanted, pickle.dumps(("os", "getpid", ()))))
-    assert "has absent none, this machine 1.2" in outcome.reason
+    assert "absent" in outcome.reason
 
 
-def test_a_node_without_a_package_is_named(monkeypatch: pytest.MonkeyPatch):
+def test_an_error_names_a_node_without_a_package(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr("platform.node", lambda: "second")
     call = pickle.dumps(("no_such_module", "work", ()))
     outcome = pickle.loads(cluster._answer(versions(), call))
-    assert outcome.reason == (
-        "the node second cannot import what it needs: No module named 'no_such_module': "
-        "install it there"
-    )
+    assert outcome.reason.startswith("the node second ")
+    assert "No module named 'no_such_module'" in outcome.reason
 
 
-def test_a_node_that_lacks_something_is_named(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
+def test_an_error_names_a_node_that_lacks_something(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+):
     monkeypatch.setattr("platform.node", lambda: "second")
     (tmp_path / "file").touch()
     call = ("kitting_drake.common.files", "require_folder", (tmp_path / "file" / "folder",))
@@ -162,7 +162,7 @@ def test_a_node_that_lacks_something_is_named(monkeypatch: pytest.MonkeyPatch, t
     assert outcome.reason.startswith("the node second cannot work: cannot write into ")
 
 
-def test_a_function_of_the_main_module_has_the_name_of_its_file(monkeypatch: pytest.MonkeyPatch):
+def test_a_function_of_the_main_module_is_importable(monkeypatch: pytest.MonkeyPatch):
     main = types.ModuleType("__main__")
     main.__spec__ = types.SimpleNamespace(name="kitting_drake.collect")  # type: ignore[assignment]
     monkeypatch.setitem(sys.modules, "__main__", main)
@@ -173,38 +173,38 @@ def test_a_function_of_the_main_module_has_the_name_of_its_file(monkeypatch: pyt
     assert cluster._name(work) == ("kitting_drake.collect", "work")
 
 
-def test_without_ray_one_sentence(monkeypatch: pytest.MonkeyPatch):
+def test_missing_ray_raises_user_error(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setitem(sys.modules, "ray", None)
-    with pytest.raises(UserError, match=r"--ray needs the package ray: pip install 'ray"):
+    with pytest.raises(UserError, match="pip install 'ray"):
         workers().__enter__()
 
 
 @pytest.mark.parametrize("address", ["local", "here:", ":6379", "here:port"])
-def test_an_address_is_told_from_other_words(address: str, ray: FakeRay):
-    with pytest.raises(UserError, match=f"--ray takes auto, HOST:PORT or .*, not '{address}'"):
+def test_an_invalid_address_raises(address: str, ray: FakeRay):
+    with pytest.raises(UserError, match=f"HOST:PORT .*'{address}'"):
         workers(address).__enter__()
 
 
 @pytest.mark.parametrize("prefix", ["", "ray://"])
-def test_where_nobody_listens_one_sentence(prefix: str, ray: FakeRay):
+def test_an_address_without_a_cluster_raises(prefix: str, ray: FakeRay):
     with socket.socket() as listener:
         listener.bind(("127.0.0.1", 0))
         port = listener.getsockname()[1]
-    with pytest.raises(UserError, match=rf"no cluster at 127.0.0.1:{port} \(Connection re"):
+    with pytest.raises(UserError, match=rf"127.0.0.1:{port} \(Connection re"):
         workers(f"{prefix}127.0.0.1:{port}").__enter__()
 
 
-def test_a_cluster_that_is_gone_is_told_of(ray: FakeRay):
+def test_an_outdated_cluster_address_raises(ray: FakeRay):
     with socket.socket() as listener:
         listener.bind(("127.0.0.1", 0))
-        # As after a power cut: the machine remembers where it was.
+        # As after a power failure: Ray still has the address of the last cluster.
         ray.address = f"127.0.0.1:{listener.getsockname()[1]}"
-    with pytest.raises(UserError, match=f"--ray auto: there is no cluster at {ray.address}"):
+    with pytest.raises(UserError, match=f"--ray auto: .*{ray.address}"):
         workers().__enter__()
 
 
 @pytest.mark.parametrize("error", [ConnectionError, FakeRay.exceptions.RuntimeEnvSetupError])
-def test_a_cluster_that_refuses_is_told_of(error: type[Exception], ray: FakeRay):
+def test_a_cluster_that_rejects_the_files_raises(error: type[Exception], ray: FakeRay):
     ray.error = error("It is too large.\nAnd more.")
-    with pytest.raises(UserError, match=r"^--ray auto: cannot use the cluster: It is too large\.$"):
+    with pytest.raises(UserError, match=r"^--ray auto: .*: It is too large\.$"):
         workers().__enter__()

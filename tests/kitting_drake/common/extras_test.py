@@ -7,7 +7,7 @@ from kitting_drake.common.extras import EXTRAS, import_extra
 from kitting_drake.common.paths import SCENARIOS
 
 
-def test_the_advice_is_what_the_project_declares():
+def test_extras_equal_those_of_pyproject():
     project = tomllib.loads((SCENARIOS.parent / "pyproject.toml").read_text())["project"]
     declared = project["optional-dependencies"]
     assert {name: list(packages) for name, packages in EXTRAS.items()} == {
@@ -15,7 +15,7 @@ def test_the_advice_is_what_the_project_declares():
     }
 
 
-def test_what_is_missing_is_told_with_what_would_bring_it():
+def test_a_missing_package_raises_with_its_install_command():
     with pytest.raises(UserError) as told:
         import_extra("no_such_package", purpose="--this", extra="lerobot")
     assert str(told.value) == (

@@ -38,25 +38,25 @@ def lack_room() -> None:
     raise MachineError("cannot write: No space left on device")
 
 
-def test_what_a_machine_lacks_is_raised_here():
+def test_a_machine_error_is_raised_in_the_parent():
     with LocalWorkers(1) as workers:
         with pytest.raises(MachineError, match="No space left"):
             workers.run(lack_room)
         assert workers.run(add, 2, 3) == 5
 
 
-def test_the_result_comes_back_from_another_process():
+def test_a_call_returns_the_result_of_another_process():
     assert run_in_subprocess(add, 2, 3) == 5
     process, _ = run_in_subprocess(process_and_threads)
     assert process != os.getpid()
 
 
-def test_a_process_that_dies_takes_nothing_with_it():
+def test_a_dead_process_is_reported_without_other_effects():
     assert run_in_subprocess(kill_itself) == ProcessCrashed(-signal.SIGKILL)
     assert run_in_subprocess(leave) == ProcessCrashed(3)
 
 
-def test_processes_answer_again_but_not_for_ever_nor_after_a_crash():
+def test_processes_are_reused_up_to_a_limit_and_not_after_a_crash():
     with LocalWorkers(1) as workers:
         found = [workers.run(os.getpid) for _ in range(12)]
         assert len(set(found[:10])) == 1
@@ -65,12 +65,12 @@ def test_processes_answer_again_but_not_for_ever_nor_after_a_crash():
         last = workers.run(os.getpid)
         assert last not in found
     assert command(last) == ""
-    # Nobody would end it.
+    # Outside of a `with`, processes are not reused: nothing would end them.
     assert len({workers.run(os.getpid) for _ in range(2)}) == 2
 
 
 @pytest.mark.parametrize(("count", "threads"), [(2, "1"), (1, "7")])
-def test_side_by_side_processes_compute_in_one_thread(
+def test_parallel_processes_use_one_thread_each(
     count: int, threads: str, monkeypatch: pytest.MonkeyPatch
 ):
     monkeypatch.setenv("OMP_NUM_THREADS", "7")
@@ -84,7 +84,7 @@ def test_side_by_side_processes_compute_in_one_thread(
 
 
 class Growing(LocalWorkers):
-    """Has room for one, then for two."""
+    """Can run one call at first, then two."""
 
     def __init__(self) -> None:
         super().__init__(1)
@@ -96,7 +96,7 @@ class Growing(LocalWorkers):
 
 
 @pytest.mark.parametrize("workers", [LocalWorkers(2), Growing()])
-def test_more_is_asked_for_after_every_result(workers: LocalWorkers):
+def test_side_by_side_draws_again_after_every_result(workers: LocalWorkers):
     wanted, given, most = {0, 1, 2}, [], []
 
     def draw() -> int | None:
@@ -120,7 +120,7 @@ def test_more_is_asked_for_after_every_result(workers: LocalWorkers):
     assert max(most) == 2
 
 
-def test_who_ends_early_does_not_wait():
+def test_ending_early_kills_running_calls():
     items = iter([60.0, 0.0])
     workers = LocalWorkers(2)
 
@@ -145,7 +145,7 @@ if __name__ == "__main__":
 """
 
 
-def test_a_killed_parent_leaves_no_process_behind(tmp_path: Path):
+def test_child_processes_end_with_a_killed_parent(tmp_path: Path):
     program = tmp_path / "parent.py"
     program.write_text(_PROGRAM)
     parent = subprocess.Popen([sys.executable, program], env=os.environ | {"PYTHONPATH": str(ROOT)})
@@ -153,7 +153,7 @@ def test_a_killed_parent_leaves_no_process_behind(tmp_path: Path):
     while not children:
         time.sleep(0.02)
         listed = Path(f"/proc/{parent.pid}/task/{parent.pid}/children").read_text().split()
-        # There is multiprocessing's resource tracker, too.
+        # The other child is multiprocessing's resource tracker.
         children = [pid for pid in map(int, listed) if "spawn_main" in command(pid)]
     parent.kill()
     parent.wait()

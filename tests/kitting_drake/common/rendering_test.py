@@ -22,9 +22,8 @@ torch.optim.Adam([torch.zeros(1, requires_grad=True)])
 
 
 @pytest.mark.slow
-def test_an_optimizer_can_be_made_after_an_image_was_rendered():
-    """As a person does who trains on a gymnasium environment: PyTorch's Triton and Mesa each bring
-    an LLVM."""
+def test_an_optimizer_can_be_made_after_rendering():
+    """As in training on a Gymnasium environment: PyTorch's Triton and Mesa each bring an LLVM."""
     result = subprocess.run(
         [sys.executable, "-c", RENDER_THEN_TRAIN], capture_output=True, text=True, check=False
     )
@@ -42,10 +41,10 @@ def tell_refusal(connection: Connection) -> None:
 
 @pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")
 @pytest.mark.parametrize(
-    ("start", "refusal"), [("fork", "this process was forked from"), ("spawn", "nothing")]
+    ("start", "refusal"), [("fork", "this process was forked"), ("spawn", "nothing")]
 )
-def test_a_fork_of_a_process_that_rendered_is_told_so(start: str, refusal: str):
-    """It would wait for ever for threads that only its parent has."""
+def test_a_fork_of_a_process_that_rendered_raises(start: str, refusal: str):
+    """It would deadlock on threads that only its parent has."""
     require_rendering()
     context = multiprocessing.get_context(start)
     here, there = context.Pipe()

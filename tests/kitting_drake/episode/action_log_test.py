@@ -34,7 +34,7 @@ def planar(X: RigidTransform) -> PlanarPose:
 
 
 class Action:
-    """A log that is told of one action, mode by mode, and objects that are where one says."""
+    """An ActionLog that is driven through one action, mode by mode, with given object poses."""
 
     def __init__(self, station: KittingStation, pick: PlanarPose, place: PlanarPose) -> None:
         self.station = station
@@ -63,7 +63,7 @@ class Action:
 
 
 def right_action(station: KittingStation, index: int) -> tuple[PlanarPose, PlanarPose]:
-    """What the expert does with an object."""
+    """The expert's action for an object."""
     item = station.scene.objects[index]
     (X_WGoal,) = station.scene.goals[index].poses
     return gripper_pose(item.X_WB, item.grasps[0]), gripper_pose(X_WGoal, item.grasps[0])
@@ -81,9 +81,9 @@ def test_the_right_action_has_no_error(station: KittingStation, index: int):
     assert record.place_angle_error_deg == pytest.approx(0.0, abs=1e-9)
 
 
-def test_an_action_is_judged_by_where_it_would_bring_the_object(station: KittingStation):
+def test_place_errors_are_those_of_the_arrival_pose(station: KittingStation):
     pick, place = right_action(station, OBJECT)
-    # Another grasp, to which the place is suited: only the pick is off.
+    # With another grasp and a matching place, only the pick is wrong.
     off = flat(3e-3, -4e-3, math.radians(7.0))
     shifted = [planar(flat(pose.x, pose.y, pose.theta) @ off) for pose in (pick, place)]
     record = Action(station, *shifted).record
@@ -93,13 +93,13 @@ def test_an_action_is_judged_by_where_it_would_bring_the_object(station: Kitting
     assert record.place_angle_error_deg == pytest.approx(0.0, abs=1e-9)
 
 
-def test_half_a_rotation_of_the_jaws_is_nothing_and_of_the_object_much(station: KittingStation):
+def test_half_a_rotation_is_ignored_for_the_jaws_but_not_for_the_object(station: KittingStation):
     pick, place = right_action(station, OBJECT)
     rotated = PlanarPose(pick.x, pick.y, pick.theta + math.pi)
     record = Action(station, rotated, place).record
     assert record.pick_angle_error_deg == pytest.approx(0.0, abs=1e-9)
     assert record.place_angle_error_deg == pytest.approx(180.0)
-    # About the grasp, which takes the middle of the object to its other side.
+    # Rotating about the grasp moves the object's middle to the other side.
     (grasp,) = station.scene.objects[OBJECT].grasps
     middle = station.objects[OBJECT].p_BMiddle
     arm = math.hypot(grasp.x - middle[0], grasp.y - middle[1])
@@ -118,7 +118,7 @@ def test_headings_are_compared_modulo_the_declared_symmetry(
     assert record.place_angle_error_deg == pytest.approx(0.0, abs=1e-9)
 
 
-def test_outcomes_by_the_modes_gone_through(station: KittingStation):
+def test_outcomes_follow_from_the_sequence_of_modes(station: KittingStation):
     action = right_action(station, OBJECT)
     held = (*GRASP, Mode.LIFT, Mode.CARRY, Mode.LOWER)
     for modes, outcome in (
@@ -134,25 +134,25 @@ def test_outcomes_by_the_modes_gone_through(station: KittingStation):
         assert Action(station, *action).go(*modes, Mode.OBSERVE).record.outcome == outcome
 
 
-def test_the_end_of_an_episode_is_no_event_of_an_action(station: KittingStation):
+def test_the_end_of_an_episode_does_not_change_the_outcome(station: KittingStation):
     action = Action(station, *right_action(station, OBJECT)).go(*GRASP)
     action.log.observe(ModeChange(Mode.RELEASE, Mode.RELEASE, action.root, is_last=True))
     assert action.record.outcome == "unfinished"
 
 
-def test_what_was_lifted_is_what_was_picked(station: KittingStation):
+def test_the_lifted_object_is_recorded(station: KittingStation):
     action = Action(station, *right_action(station, 0)).go(*GRASP, Mode.LIFT)
     action.put(2, flat(0.0, 0.0, 0.0, 0.05) @ station.scene.objects[2].X_WB)
     action.go(Mode.CARRY, Mode.LOWER, Mode.RELEASE)
     assert action.record.object == station.scene.objects[2].name
     assert action.record.outcome == "placed"
-    # Judged by the pose before it was lifted, against the goal of what was lifted.
+    # The errors use the lifted object's initial pose and goal.
     here, there = (station.scene.objects[index].X_WB.translation() for index in (0, 2))
     assert action.record.pick_position_error_mm > 1e3 * np.linalg.norm(there - here) / 2
     assert action.record.place_position_error_mm > 30.0
 
 
-def test_of_twins_the_nearer_cavity_is_what_was_meant():
+def test_place_errors_refer_to_the_nearest_suitable_cavity():
     twins = Kitting(tools=["flat_screwdriver", "flat_screwdriver"], random_order=False)
     station = build_station(Scenario(task=twins, cameras={}))
     (pick, _), (_, place) = right_action(station, 0), right_action(station, 1)
@@ -165,7 +165,7 @@ def test_of_twins_the_nearer_cavity_is_what_was_meant():
 def test_an_object_without_grasp_or_goal_has_no_errors(
     station: KittingStation, monkeypatch: pytest.MonkeyPatch
 ):
-    """A distractor: it may be picked all the same."""
+    """A distractor may be picked."""
     items = list(station.scene.objects)
     items[OBJECT] = dataclasses.replace(items[OBJECT], grasps=())
     scene = dataclasses.replace(
@@ -185,7 +185,7 @@ def test_an_object_without_grasp_or_goal_has_no_errors(
     assert record.place_position_error_mm is record.place_angle_error_deg is None
 
 
-def test_the_nearest_object_is_by_surface_and_not_by_middle(station: KittingStation):
+def test_nearest_object_measures_to_surfaces(station: KittingStation):
     poses = [item.X_WB for item in station.scene.objects]
     for index, item in enumerate(station.objects):
         end = item.p_BPoints[item.p_BPoints[:, 0].argmax()]

@@ -24,7 +24,7 @@ def log() -> EpisodeLog:
     return log
 
 
-def test_every_step_is_there(log: EpisodeLog):
+def test_the_log_has_every_step(log: EpisodeLog):
     arrays = log.arrays()
     n = len(arrays["time"])
     assert arrays["time"] == pytest.approx(np.arange(n) / 128)
@@ -34,7 +34,7 @@ def test_every_step_is_there(log: EpisodeLog):
     assert arrays["wrist_force"].shape == (n, 6)
     assert arrays["object_poses"].shape == (n, 1, 3, 4)
     assert set(arrays["mode"].tolist()) >= {Mode.OBSERVE, Mode.APPROACH, Mode.DESCEND, Mode.LIFT}
-    # It goes where it is told to, and feels the tool that it lifts.
+    # The hand follows its commands and feels the lifted tool.
     error = np.abs(arrays["joint_position"] - arrays["commanded_position"])
     assert error[:, :3].max() < 0.01
     lifted = arrays["wrist_force"][arrays["mode"] == Mode.LIFT]
@@ -42,20 +42,20 @@ def test_every_step_is_there(log: EpisodeLog):
     assert np.diff(arrays["joint_position"], axis=0)[:, 2].min() < -1e-4
 
 
-def test_actions_have_what_the_policy_saw(log: EpisodeLog):
+def test_each_logged_action_has_the_policys_observation(log: EpisodeLog):
     arrays = log.arrays()
     assert arrays["pick"].shape == arrays["place"].shape == (1, 3)
     assert arrays["observation_height"].shape == (1, 160, 320)
     begun = int(np.searchsorted(arrays["time"], arrays["action_time"][0]))
     assert arrays["mode"][begun] == Mode.APPROACH
-    # The hand grips at the pick, and there is a tool there.
+    # The hand grips at the pick, where a tool is.
     grips = arrays["joint_position"][arrays["mode"] == Mode.CLOSE][-1]
     assert grips[:2] == pytest.approx(arrays["pick"][0, :2], abs=1e-3)
     row, col = ((arrays["pick"][0, :2] - (0.25, -0.5)) / 0.003125).astype(int)
     assert arrays["observation_height"][0, row, col] > 0.01
 
 
-def test_both_files_hold_the_same(log: EpisodeLog, tmp_path: Path):
+def test_npz_and_mcap_files_agree(log: EpisodeLog, tmp_path: Path):
     for ending in ("npz", "mcap"):
         log.save(tmp_path / f"log.{ending}")
     arrays = np.load(tmp_path / "log.npz")
@@ -74,7 +74,7 @@ def test_both_files_hold_the_same(log: EpisodeLog, tmp_path: Path):
     assert {item.child_frame_id for item in topics["/tf"][0].ros_msg.transforms} >= {"hand"}
 
 
-def test_logging_changes_nothing(log: EpisodeLog):
+def test_logging_does_not_change_the_episode(log: EpisodeLog):
     rig = build_rig(SCENARIO)
     ends: list[np.ndarray] = []
     rig.run(
@@ -84,12 +84,12 @@ def test_logging_changes_nothing(log: EpisodeLog):
 
 
 @pytest.mark.parametrize("name", ["log.csv", "log"])
-def test_another_ending_is_refused_before_the_episode(name: str):
+def test_an_unsupported_log_file_raises_before_the_episode(name: str):
     with pytest.raises(UserError, match=r"--log"):
         check_log(Path(name))
 
 
-def test_each_seed_has_its_file(tmp_path: Path):
+def test_each_seed_has_its_own_log_file(tmp_path: Path):
     assert log_of_seed(Path("runs/log.npz"), 7) == Path("runs/log_00000007.npz")
     assert log_of_many(None, "auto") is None
     with pytest.raises(UserError, match=r"--ray"):

@@ -1,4 +1,4 @@
-"""Episodes from their first to their last step. The oracle's need no cameras."""
+"""Tests of whole episodes. Those of the oracle need no cameras."""
 
 import dataclasses
 import json
@@ -31,7 +31,7 @@ def build(scenario: Scenario = BLIND) -> Rig:
 
 @dataclasses.dataclass(frozen=True)
 class Seen:
-    """What is kept of an event, whose context goes on."""
+    """A snapshot of an event."""
 
     previous: Mode
     mode: Mode
@@ -44,7 +44,7 @@ class Seen:
 
 
 class Observer:
-    """Keeps what it is told of."""
+    """Records snapshots of events."""
 
     def __init__(self, rig: Rig) -> None:
         self._rig = rig
@@ -69,7 +69,7 @@ class Observer:
 
 @pytest.fixture(scope="module")
 def grasp_to_release() -> tuple[EpisodeResult, Sequence[Seen]]:
-    """The oracle kits one tool, by real physics, without cameras."""
+    """The oracle kits one tool, with real physics and without cameras."""
     rig = build()
     observer = Observer(rig)
     return rig.run(observer.observe, seconds=30.0), observer.seen
@@ -93,27 +93,27 @@ def test_the_oracle_kits_one_tool(grasp_to_release: tuple[EpisodeResult, Sequenc
     assert json.loads(json.dumps(result.as_dict()))["success_rate"] == 1.0
 
 
-def test_modes_are_told_in_order(grasp_to_release: tuple[EpisodeResult, Sequence[Seen]]):
+def test_observers_get_the_modes_in_order(grasp_to_release: tuple[EpisodeResult, Sequence[Seen]]):
     _, (*seen, last) = grasp_to_release
     motion = [Mode.APPROACH, Mode.DESCEND, Mode.CLOSE, Mode.CHECK, Mode.LIFT, Mode.CARRY]
     motion += [Mode.LOWER, Mode.RELEASE, Mode.RETREAT, Mode.OBSERVE]
     modes = [event.mode for event in seen if Mode.SEARCH not in (event.mode, event.previous)]
     assert modes == [*motion, Mode.DONE]
-    # Each goes on where the one before it has ended, and takes its time.
+    # Each event continues from the previous one, at a later time.
     assert [event.previous for event in seen] == [Mode.OBSERVE, *(e.mode for e in seen[:-1])]
     assert sorted({event.time for event in seen}) == [event.time for event in seen]
     assert [event.is_action_start for event in seen] == [True] + [False] * (len(seen) - 1)
     assert [event.is_stop for event in seen] == [False] * (len(seen) - 1) + [True]
-    # The last event tells of no change, and is told once.
+    # The last event is no mode change and occurs once.
     assert not any(event.is_last for event in seen)
     assert (last.is_last, last.previous, last.mode) == (True, Mode.DONE, Mode.DONE)
     assert not last.is_action_start
     assert not last.is_stop
-    # At the start of an action it is counted already.
+    # The first event already counts the action.
     assert [event.counts for event in seen] == [(1.0, 0.0, 0.0)] * len(seen)
 
 
-def test_a_tool_sleeps_until_the_hand_comes(
+def test_a_tool_sleeps_until_the_hand_arrives(
     grasp_to_release: tuple[EpisodeResult, Sequence[Seen]],
 ):
     asleep = {event.mode: event.asleep for event in grasp_to_release[1]}
@@ -123,7 +123,7 @@ def test_a_tool_sleeps_until_the_hand_comes(
     assert asleep[Mode.DONE]
 
 
-def test_an_episode_whose_time_is_up_has_no_reward():
+def test_an_episode_that_times_out_has_no_reward():
     rig = build()
     observer = Observer(rig)
     result = rig.run(observer.observe, seconds=0.5)
@@ -136,8 +136,8 @@ def test_an_episode_whose_time_is_up_has_no_reward():
     assert [event.is_last for event in observer.seen] == [False, True]
 
 
-def test_what_is_there_already_counts_only_if_the_episode_ends_well():
-    """Nothing is left to do: the expert says stop at once."""
+def test_initially_filled_goals_count_unless_the_episode_times_out():
+    """The goal is already filled, so the expert stops at once."""
     rig = build()
     (X_WGoal,) = rig.scene.goals[0].poses
     rig.plant.SetDefaultFloatingBaseBodyPose(rig.plant.get_body(rig.objects[0].body), X_WGoal)
@@ -147,15 +147,15 @@ def test_what_is_there_already_counts_only_if_the_episode_ends_well():
     assert result.objects[0].success
     assert [event.mode for event in observer.seen] == [Mode.DONE, Mode.DONE]
     assert observer.seen[0].is_stop
-    # The objects have come to rest, and no more time is taken.
+    # The episode ends as soon as the objects rest.
     assert result.sim_seconds < 1.0
     early = rig.run(seconds=0.1)
     assert early.objects[0].success
     assert (early.timed_out, early.success_rate, early.strict_success_rate) == (True, 0.0, 0.0)
 
 
-def test_an_episode_that_ends_at_success_asks_for_no_action_more():
-    """With two tries a tool the planner would ask again."""
+def test_end_at_success_ends_the_episode_without_another_action():
+    """With two tries per tool, the planner could request another action."""
     told: dict[bool, list[Mode]] = {}
     for ends in (False, True):
         task = dataclasses.replace(ONE_TOOL, tries=2)
@@ -175,7 +175,7 @@ def raise_at(mode: Mode, error: BaseException) -> EpisodeObserver:
     return observe
 
 
-def test_a_simulation_that_fails_ends_the_episode_with_its_reason():
+def test_a_failing_simulation_ends_the_episode_with_its_error():
     rig = build()
     told = Observer(rig)
     fails = raise_at(Mode.APPROACH, RuntimeError("the solver did\nnot converge"))
@@ -187,7 +187,7 @@ def test_a_simulation_that_fails_ends_the_episode_with_its_reason():
     assert result.sim_seconds < 1.0
     assert len(result.objects) == 1
     assert [event.is_last for event in told.seen] == [True]
-    # Plain numbers, of which JSON can be made.
+    # JSON needs plain Python numbers.
     kinds = {type(value) for item in result.objects for value in vars(item).values()}
     assert kinds == {str, float, bool}
 
@@ -199,7 +199,7 @@ def test_an_interrupted_episode_has_a_result():
     assert result.sim_seconds < 1.0
 
 
-# Policies that are shown the rig.
+# Policies that need a custom station.
 
 SMALL = {
     name: dataclasses.replace(camera, width=160, height=120, focal_length=112.5)
@@ -209,7 +209,7 @@ SMALL = {
 
 
 class Stub:
-    """A policy that sends the hand to where nothing lies, then says stop."""
+    """A policy that picks at an empty spot, then stops."""
 
     def __init__(self) -> None:
         self.seen: list[Observation] = []
@@ -221,7 +221,7 @@ class Stub:
 
 
 def install(policy: object, monkeypatch: pytest.MonkeyPatch) -> Scenario:
-    """A scenario with a policy of one's own."""
+    """A scenario with a custom policy."""
     monkeypatch.setitem(sys.modules, "stub_policy", types.SimpleNamespace(policy=policy))
     return Scenario(
         task=ArrangedKitting(
@@ -234,31 +234,31 @@ def install(policy: object, monkeypatch: pytest.MonkeyPatch) -> Scenario:
 
 
 @pytest.mark.usefixtures("rendering")
-def test_a_policy_is_asked_only_when_the_planner_has_observed(monkeypatch: pytest.MonkeyPatch):
+def test_a_policy_is_called_only_after_the_planner_has_observed(monkeypatch: pytest.MonkeyPatch):
     stub = Stub()
     scenario = install(stub, monkeypatch)
     rig = build(scenario)
     asked: list[tuple[Mode, int]] = []
     result = rig.run(lambda event: asked.append((event.mode, len(stub.seen))), seconds=30.0)
-    # Asked once before each of the two modes that follow upon OBSERVE, and at no other time.
+    # It is called once before each of the two modes that follow OBSERVE, and at no other time.
     assert asked[0] == (Mode.APPROACH, 1)
     assert {count for mode, count in asked[:-2]} == {1}
     assert asked[-2:] == [(Mode.DONE, 2), (Mode.DONE, 2)]
     assert (result.actions, result.missed_grasps, result.failure) == (1, 1, None)
     assert [action.outcome for action in result.actions_taken] == ["missed"]
     assert result.objects[0].cause == "missed grasp"
-    # It was shown the block, 50 mm high, where it stands, and not the hand.
+    # It saw the block, 50 mm high, where it stands, but not the hand.
     seen = stub.seen[1]
     row, col = np.round(seen.grid.to_pixel([0.45, 0.08])).astype(int)
     block = seen.height[row - 8 : row + 9, col - 8 : col + 9]
-    assert np.count_nonzero(block) > 20  # These small images do not reach every pixel.
+    assert np.count_nonzero(block) > 20  # These small images do not cover every pixel.
     np.testing.assert_allclose(block[block > 0], 0.05, atol=0.004)
     assert seen.height.max() < 0.07
 
 
 @pytest.mark.usefixtures("rendering")
 @pytest.mark.parametrize("kind", [ValueError, RuntimeError])
-def test_a_policy_that_fails_ends_the_episode_with_its_reason(
+def test_a_failing_policy_ends_the_episode_with_its_error(
     kind: type[Exception], monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ):
     def fail(_: Observation) -> PickPlaceAction:
@@ -267,5 +267,5 @@ def test_a_policy_that_fails_ends_the_episode_with_its_reason(
     scenario = install(fail, monkeypatch)
     result = build(scenario).run(seconds=1.0)
     assert result.failure == f"{kind.__name__}: weights of the wrong shape"
-    # Its author is told where.
+    # The log names the failing function.
     assert "in fail" in caplog.text

@@ -1,4 +1,4 @@
-"""What the physics must show, over whole episodes.
+"""Tests of the physics in whole episodes.
 
 The slow ones take minutes and run by `pytest -m slow`.
 """
@@ -44,8 +44,8 @@ def run(
     ],
 )
 @pytest.mark.usefixtures("rendering")
-def test_a_shipped_policy_kits_nearly_all(name: str):
-    """As they stand, from a seed that no policy has learned from."""
+def test_a_shipped_policy_kits_at_least_three_of_four_tools(name: str):
+    """With unchanged scenarios, on a seed from which no policy learned."""
     path = SCENARIOS / f"{name}.yaml"
     scenario = load_scenario(path)
     assert 0 not in scenario.policy.training_seeds(path.parent)
@@ -58,7 +58,7 @@ def test_a_shipped_policy_kits_nearly_all(name: str):
 
 
 @pytest.mark.slow
-def test_the_oracle_kits_all_four_and_does_so_again():
+def test_the_oracle_kits_all_four_tools_reproducibly():
     results = [run(Scenario(cameras={})) for _ in range(2)]
     first, second = (dataclasses.replace(result, wall_seconds=0.0) for result in results)
     assert first == second
@@ -73,8 +73,8 @@ def test_the_oracle_kits_all_four_and_does_so_again():
 
 
 @pytest.mark.slow
-def test_sleep_changes_nothing_that_counts():
-    """A tool is kitted beside one that rests, and is or is not frozen."""
+def test_sleep_does_not_change_the_result():
+    """A tool is kitted beside a resting one, which is frozen or not."""
     task = ArrangedKitting(
         tools={
             "combination_wrench": TablePose(x=0.42, y=0.14),
@@ -97,14 +97,14 @@ def test_sleep_changes_nothing_that_counts():
 
 
 class Seated:
-    """Awake tools at or near their cavities in a rotated kit, and a hand that keeps away."""
+    """Awake tools at or near their cavities in a rotated kit; the hand does not move."""
 
     def __init__(self, *names: str) -> None:
         task = ArrangedKitting(
             tools={name: TablePose(x=0.35, y=0.4 - 0.09 * i) for i, name in enumerate(names)},
             kit_pose=TablePose(x=0.5, y=-0.2, yaw_deg=30.0),
         )
-        # At its cavity a tool is done with: the oracle has nothing to do.
+        # The goals are filled, so the oracle stops at once.
         scenario = Scenario(task=task, sleep=Sleep(enabled=False), cameras={})
         self.rig: Rig = build_rig(scenario, seed=0, base=Path())
         self.station = self.rig.station
@@ -114,7 +114,7 @@ class Seated:
         self.bodies = [self.station.plant.get_body(item.body) for item in self.station.objects]
 
     def put(self, index: int, X_GoalB: RigidTransform) -> None:
-        """Puts a tool to a pose given in its goal's frame."""
+        """Sets the pose of a tool in its goal's frame."""
         X_WB = self.station.scene.goals[index].poses[0] @ X_GoalB
         self.station.plant.SetFreeBodyPose(self.context, self.bodies[index], X_WB)
 
@@ -132,11 +132,11 @@ class Seated:
 @pytest.mark.slow
 @pytest.mark.parametrize("sign", [1, -1])
 @pytest.mark.parametrize("name", TOOLS)
-def test_a_tool_released_off_its_place_slips_in(name: str, sign: int):
+def test_a_tool_released_beside_its_place_slips_into_its_cavity(name: str, sign: int):
     seated = Seated(name)
     (item,) = seated.station.scene.objects
     height = item.p_BPoints[:, 2].max()
-    # 1 mm off, 1 degree off, its bottom 10 mm below the top of the block.
+    # 1 mm and 1 degree off; the bottom is 10 mm below the top of the block.
     offset = [sign * 1e-3 * np.sqrt(0.5), 1e-3 * np.sqrt(0.5), height - 0.010]
     rotation = RollPitchYaw(0, 0, np.deg2rad(sign * 1.0))
     seated.put(0, RigidTransform(rotation, offset))
@@ -159,7 +159,7 @@ def test_tools_in_their_cavities_do_not_creep():
     seated.simulator.AdvanceTo(11.0)
     for index, item in enumerate(seated.station.scene.objects):
         moved = before[index].InvertAndCompose(seated.pose(index))
-        # Wherever on the tool one looks.
+        # At any point of the tool.
         points = item.p_BPoints[:200]
         creep = np.linalg.norm(moved.multiply(points.T).T - points, axis=1).max()
         assert creep < 2e-4, item.name
@@ -167,7 +167,7 @@ def test_tools_in_their_cavities_do_not_creep():
 
 
 class Misjudged(ArrangedKitting):
-    """The annotated grasp is 5 degrees off: the jaws rotate the tool by as much."""
+    """The annotated grasp is 5 degrees off, so the closing jaws rotate the tool."""
 
     def make_scene(self, **more) -> Scene:
         scene = super().make_scene(**more)
@@ -179,9 +179,7 @@ class Misjudged(ArrangedKitting):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("amplitude", "kitted"), [(0.0, False), (0.12, True)])
-def test_a_tool_that_the_closing_jaws_rotated_is_rotated_into_its_cavity(
-    amplitude: float, kitted: bool
-):
+def test_the_search_undoes_a_rotation_by_the_closing_jaws(amplitude: float, kitted: bool):
     task = Misjudged(tools={"s_wrench": TablePose(x=0.36, y=0.3, yaw_deg=75.0)})
     planner = PickPlaceParameters(
         search=InsertionSearch(amplitude=amplitude, reach=0.0), max_actions=1

@@ -41,7 +41,7 @@ def drawn(observation: Observation, decision: Decision) -> np.ndarray:
         return np.asarray(picture.convert("RGB"))
 
 
-def test_a_picture_shows_the_decision(observation: Observation):
+def test_draw_decision_shows_the_decision(observation: Observation):
     picture = drawn(observation, decision(observation))
     assert picture.shape == (880, 1320, 3)
     np.testing.assert_array_equal(picture, drawn(observation, decision(observation)))
@@ -53,7 +53,7 @@ def test_a_picture_shows_the_decision(observation: Observation):
         assert (drawn(observation, other) != picture).any()
 
 
-def test_a_policy_that_stops_moves_no_gripper(observation: Observation):
+def test_no_gripper_is_drawn_if_the_policy_stops(observation: Observation):
     pick_colour, place_colour = (228, 87, 46), (27, 153, 139)
     acts = decision(observation)
     stops = dataclasses.replace(acts, action=PickPlaceAction(stop=True), log_odds=-4.0)
@@ -64,8 +64,8 @@ def test_a_policy_that_stops_moves_no_gripper(observation: Observation):
         assert (counts[1] > 0) == shown_in_curve
 
 
-def test_a_decision_upon_nothing_and_without_doubt_is_drawn_too():
-    """No colour, no height, all probability in one place, and a grasp at the edge."""
+def test_draw_decision_of_an_empty_observation_with_certain_maps():
+    """No colours, flat heights, all probability in one pixel, and a grasp at the edge."""
     nothing = Observation(np.zeros((4, *GRID.shape), np.float32), GRID)
     sure = decision(nothing, pick=(0.0, 0.0))
     sure.pick_map[:], sure.angle_curve[:], sure.place_map[:] = 0, 0, 0

@@ -1,4 +1,4 @@
-"""Made-up episodes, of the types that real ones are of."""
+"""Synthetic episodes, in the format of real ones."""
 
 from pathlib import Path
 from typing import Any
@@ -24,7 +24,7 @@ def make_object(
     height_error_mm: float = 0.0,
     angle_error_deg: float = 1.0,
 ) -> ObjectResult:
-    """An object that is a success below an ADD-S of 3.5 mm; None: no goal was left for it."""
+    """An object that succeeds below an ADD-S of 3.5 mm; None: no goal was left for it."""
     success = error_mm is not None and error_mm < 3.5
     is_strict = abs(height_error_mm) <= 2 and abs(angle_error_deg) <= 20
     return ObjectResult(
@@ -41,7 +41,7 @@ def make_object(
 
 
 def make_result(seed: int, objects: list[ObjectResult], **fields: Any) -> EpisodeResult:
-    """An episode of objects that count equally, each with one action."""
+    """An episode of equally weighted objects, each with one action."""
     lost = bool(fields.get("failure") or fields.get("timed_out"))
     counted = max(sum(item.add_s_mm is not None for item in objects), 1)
     fields = {
@@ -71,14 +71,14 @@ def make_result(seed: int, objects: list[ObjectResult], **fields: Any) -> Episod
 
 
 def make_episode(seed: int, errors_mm: list[float], **fields: Any) -> dict[str, Any]:
-    """The episode, as JSON holds it, of an object of each category in turn, with these errors."""
+    """An episode as JSON values, with one object of each category in turn and these errors."""
     names = CATEGORIES[: len(errors_mm)]
     objects = [make_object(name, error) for name, error in zip(names, errors_mm, strict=True)]
     return make_result(seed, objects, **fields).as_dict()
 
 
 def make_lost_episode(seed: int) -> dict[str, Any]:
-    """The episode of a process that died."""
+    """An episode whose process died."""
     return make_result(seed, [], failure="its process died").as_dict()
 
 

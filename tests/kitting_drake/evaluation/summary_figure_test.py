@@ -25,7 +25,7 @@ NINE = [make_object(f"thing {number}", 0.5 + number) for number in range(9)]
     ("episodes", "success", "categories"),
     [
         ([make_episode(seed, [1.0, 9.0, 500.0, 0.0]) for seed in range(3)], ADD_S, 4),
-        # More than there are colours, and one that no goal was left for.
+        # More categories than colours, and an object for which no goal was left.
         ([make_result(0, [*NINE, make_object("spare", None)]).as_dict()], PoseWithin(), 9),
         pytest.param(
             [make_episode(0, [1.0], timed_out=True)], PoseWithin(), 1, marks=pytest.mark.slow
@@ -33,7 +33,7 @@ NINE = [make_object(f"thing {number}", 0.5 + number) for number in range(9)]
         ([make_lost_episode(0)], ADD_S, 1),
     ],
 )
-def test_draws_whatever_there_is(
+def test_draw_summary(
     episodes: list[dict[str, Any]], success: SuccessPredicate, categories: int, tmp_path: Path
 ):
     summary = summarise(episodes, CHOSEN, success, wall_seconds_total=1.0)
@@ -47,9 +47,9 @@ def test_draws_whatever_there_is(
         assert (pixels == rgb).all(axis=2).any(), colour
 
 
-def test_categories_do_not_look_alike():
+def test_categories_have_distinct_styles():
     looks = [look for look, _ in zip(_looks(), range(21), strict=False)]
     assert len(set(looks)) == 21
-    # In a bar there are no lines, and in a curve no hatches.
+    # Bars show no line style, and curves no hatch.
     assert len({(look.colour, look.hatch) for look in looks}) == 21
     assert len({(look.colour, look.line) for look in looks}) == 21

@@ -17,7 +17,7 @@ from tests.kitting_drake.evaluation.episodes import (
     make_result,
 )
 
-# Fixed by the design: other programs read them.
+# Other programs read these keys.
 KEYS = {
     "episodes",
     "failed_episodes",
@@ -57,7 +57,7 @@ def summarised(episodes: list[dict]) -> dict:
     return json.loads(json.dumps(summary))
 
 
-def test_episodes_that_came_to_nothing_count_zero_and_are_never_dropped():
+def test_failed_episodes_count_zero():
     episodes = [
         make_episode(0, [1.0, 1.0]),
         make_episode(1, [1.0, 9.0], moving_at_end=["bolt"]),
@@ -71,15 +71,15 @@ def test_episodes_that_came_to_nothing_count_zero_and_are_never_dropped():
     assert summary["success_rate"] == pytest.approx(3 / 8)
     assert summary["ci95"] == pytest.approx(proportion_interval(3, 8))
     assert summary["causes"] == CAUSES | {"misplaced": 1, "failed episode": 2, "timed out": 2}
-    # Errors are of the others.
+    # Errors are those of the completed episodes.
     assert summary["add_s_mm"] == pytest.approx({"median": 1.0, "p95": 7.8, "max": 9.0})
     assert summary["action_errors"]["place_position_error_mm"]["max"] == pytest.approx(18.0)
     assert (summary["wall_seconds"], summary["wall_seconds_total"]) == (40.0, 25.0)
     assert summary["moving_at_end"] == 1
 
 
-def test_actions_on_what_has_no_goal_are_counted():
-    """As on a box, which is among no objects, or on one of these that no goal is left for."""
+def test_needless_actions_are_counted():
+    """The action is on a distractor, or on an object for which no goal is left."""
     episodes = [make_episode(0, [1.0, 9.0]), make_episode(1, [1.0, 1.0])]
     assert summarised(episodes)["needless_actions"] == 0
     episodes[0]["actions_taken"][0]["object"] = "distractor_1"
@@ -88,7 +88,7 @@ def test_actions_on_what_has_no_goal_are_counted():
     assert (summary["needless_actions"], summary["actions"]) == (2, 4)
 
 
-def test_what_it_takes_to_run_it_again():
+def test_a_summary_holds_what_reproduces_it():
     summary = summarised([make_episode(0, [1.0])])
     assert summary["task"] == "kitting-seen-toolset"
     assert summary["success_description"] == "ADD-S below 3.5 mm"
@@ -97,12 +97,12 @@ def test_what_it_takes_to_run_it_again():
     assert "drake" in summary["versions"]
 
 
-def test_categories_are_those_that_occur_and_add_up_to_the_whole():
+def test_categories_add_up_to_the_whole():
     episodes = [
         make_episode(0, [1.0, 1.0]),
         make_episode(1, [2.0, 9.0]),
         make_episode(2, [1.0, 1.0], failure="solver"),
-        # Nobody knows any more what it held.
+        # The names of its objects are lost.
         make_lost_episode(3),
     ]
     summary = summarised(episodes)
@@ -119,8 +119,8 @@ def test_categories_are_those_that_occur_and_add_up_to_the_whole():
         assert count == sum(row["causes"][cause] for row in summary["categories"].values())
 
 
-def test_ambiguous_successes_are_counted_and_not_strict():
-    """ADD-S forgives a flat object that protrudes, or lies the wrong way round."""
+def test_ambiguous_successes_are_not_strict():
+    """ADD-S tolerates a flat object that protrudes or is reversed."""
     objects = [
         make_object("cup", 1.0, height_error_mm=2.5),
         make_object("bolt", 1.0, angle_error_deg=178.0),
@@ -136,17 +136,17 @@ def test_ambiguous_successes_are_counted_and_not_strict():
     assert (bolt["success_rate"], bolt["strict_success_rate"]) == (1.0, 0.0)
 
 
-def test_an_object_that_no_goal_was_left_for_is_in_no_statistic():
+def test_objects_without_a_goal_are_excluded():
     objects = [make_object(name, error) for name, error in (("cup", 1.0), ("spare_cup", None))]
     summary = summarised([make_result(0, objects).as_dict()])
     assert list(summary["categories"]) == ["cup"]
     assert (summary["success_rate"], summary["causes"]) == (1.0, CAUSES)
     assert summary["ci95"] == pytest.approx(proportion_interval(1, 1))
-    # The action that took it has errors at its pick alone.
+    # Its action has pick errors only.
     assert summary["action_errors"]["place_position_error_mm"]["max"] == pytest.approx(2.0)
 
 
-def test_partial_rewards_vary_by_episode():
+def test_intervals_of_partial_rewards_are_over_episodes():
     episodes = [
         make_episode(seed, [9.0, 9.0], success_rate=score)
         for seed, score in enumerate((0.8, 0.9, 0.7))
@@ -159,8 +159,8 @@ def test_partial_rewards_vary_by_episode():
     assert summary["success_threshold_mm"] is None
 
 
-def test_objects_that_stand_on_each_other_vary_by_episode():
-    """However their rewards come out: here as the share of the objects."""
+def test_intervals_of_dependent_objects_are_over_episodes():
+    """Even if the rewards are shares of the objects, as here."""
     chosen = dataclasses.replace(CHOSEN, scenario=Scenario(task=StackBlockPyramid()))
     episodes = [make_episode(seed, [1.0, 9.0 if seed % 2 else 1.0]) for seed in range(6)]
     summary = summarise(episodes, chosen, PoseWithin(), wall_seconds_total=1.0)
@@ -171,7 +171,7 @@ def test_objects_that_stand_on_each_other_vary_by_episode():
     assert summary["ci95_method"] == "Wilson, over objects"
 
 
-def test_nothing_but_failures_has_a_summary():
+def test_summary_of_failed_episodes_only():
     summary = summarised([make_lost_episode(0)])
     assert summary["success_rate"] == 0.0
     assert summary["add_s_mm"]["median"] is None

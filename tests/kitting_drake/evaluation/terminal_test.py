@@ -17,7 +17,7 @@ from tests.kitting_drake.evaluation.episodes import (
 
 
 def rows(shown: str) -> dict[str, list[str]]:
-    """The cells of a table's rows by the first of them."""
+    """The cells of a table's rows, by first cell."""
     lines = [line.strip("│ \n").split("│") for line in shown.splitlines() if "│" in line]
     return {cells[0].strip(): [cell.strip() for cell in cells[1:]] for cells in lines}
 
@@ -30,7 +30,7 @@ def captured(*things: object, width: int = 110) -> str:
     return shown.get()
 
 
-def test_an_ambiguous_success_is_no_plain_yes():
+def test_the_table_names_the_ambiguity_of_a_success():
     objects = [
         make_object("cup", 1.0),
         make_object("bolt", 1.0, height_error_mm=-2.5),
@@ -56,14 +56,14 @@ def test_an_ambiguous_success_is_no_plain_yes():
     assert all("yellow" in str(word) for word in words[1:4])
 
 
-def test_headings_stay_whole_in_a_narrow_terminal():
+def test_headings_break_between_words_only():
     summary = summarise([make_episode(0, [1.0])], CHOSEN, ADD_S, wall_seconds_total=1.0)
     shown = captured(summary_table(summary), width=80)
     assert "position" in shown
     assert "…" not in shown
 
 
-def test_the_words_below_an_episode():
+def test_the_lines_below_the_table_of_an_episode():
     console = Console(width=200)
     result = make_result(
         0,
@@ -78,15 +78,15 @@ def test_the_words_below_an_episode():
     assert "still moving at the end: cup, ring[/]" in shown.get()
 
 
-def test_what_a_policy_raised_is_shown_as_it_is():
-    """Its text is no markup: this one would not even be valid."""
+def test_the_text_of_a_failure_is_printed_unchanged():
+    """Its text is no markup; as markup, this one would be invalid."""
     console = Console(width=200)
     with console.capture() as shown:
         print_episode(console, make_result(0, [], failure="KeyError: [/x]"))
     assert "failed: KeyError: [/x]; the episode scores 0" in shown.get()
 
 
-def test_the_table_of_an_evaluation_leads_with_the_strict_rate():
+def test_the_summary_table_starts_with_the_strict_rate():
     protruding = make_object("cup", 1.0, height_error_mm=3.0)
     episodes = [
         make_result(0, [protruding, make_object("bolt", 1.0)]).as_dict(),

@@ -1,4 +1,4 @@
-"""The Gymnasium environments: their contract, and that they tell the same as `evaluate`."""
+"""The Gymnasium environments satisfy Gymnasium's contract and agree with `evaluate`."""
 
 import dataclasses
 import subprocess
@@ -59,12 +59,12 @@ def test_all_are_registered():
     names |= {"StackBlockPyramid", "PalletizingBoxes", "Scenario"}
     registered = {spec.name for spec in gymnasium.registry.values() if spec.namespace}
     assert names <= registered
-    # Each names a scenario that there is; none is built.
+    # Their scenarios exist; none is built.
     for name in kitting_drake.gym.SCENARIOS:
         gymnasium.make(f"kitting_drake/{name}-v0").close()
 
 
-def test_a_file_beside_ones_script_replaces_no_environment(
+def test_a_file_in_the_working_directory_replaces_no_environment(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     (tmp_path / "kitting_unseen.yaml").write_text("Mine: {}")
@@ -74,7 +74,7 @@ def test_a_file_beside_ones_script_replaces_no_environment(
 
 @pytest.mark.slow
 def test_gymnasiums_own_checks_pass(small: Path):
-    # Rendering is checked below: theirs makes many pictures.
+    # Rendering is tested below, because theirs makes many pictures.
     check_env(make(small, cameras=True).unwrapped, skip_render_check=True)
 
 
@@ -87,7 +87,7 @@ def test_a_picture_shows_the_cell(small: Path):
 
 
 class Recorder:
-    """Shape matching as a policy of one's own, which keeps what it did."""
+    """Shape matching as a custom policy that records its actions."""
 
     def __init__(self) -> None:
         self.actions: list[PickPlaceAction] = []
@@ -101,7 +101,7 @@ class Recorder:
 def evaluated(
     path: Path, policy: Callable, seed: int, monkeypatch: pytest.MonkeyPatch, name: str | None
 ) -> dict[str, Any]:
-    """The result of an episode as `evaluate` runs it."""
+    """The result of an episode run as by `evaluate`."""
     monkeypatch.setitem(sys.modules, "own", types.SimpleNamespace(policy=policy))
     chosen = find_scenario(path, name)
     own = PythonPolicy(function="own:policy")
@@ -110,7 +110,7 @@ def evaluated(
 
 
 def played(environment: gymnasium.Env, policy: Callable, seed: int) -> tuple[float, dict[str, Any]]:
-    """The return of an episode, and the last `info`."""
+    """The return of an episode and its last `info`."""
     grid = environment.unwrapped.grid
     arrays, info = environment.reset(seed=seed)
     total, is_over = 0.0, False
@@ -121,8 +121,8 @@ def played(environment: gymnasium.Env, policy: Callable, seed: int) -> tuple[flo
     return total, info
 
 
-def test_an_episode_is_the_one_that_evaluate_runs(small: Path, monkeypatch: pytest.MonkeyPatch):
-    """By a policy that misses once: the same bits, and the return is the task's reward."""
+def test_an_episode_equals_that_of_evaluate(small: Path, monkeypatch: pytest.MonkeyPatch):
+    """With a policy that misses once: results are bit-identical, and the return is the reward."""
 
     class MissesFirst(Recorder):
         def __call__(self, observation: Observation) -> PickPlaceAction:
@@ -135,14 +135,12 @@ def test_an_episode_is_the_one_that_evaluate_runs(small: Path, monkeypatch: pyte
     assert expected["missed_grasps"] == 1
     assert total == expected["success_rate"] == 1.0
     assert len(info["failed_picks"]) == 1
-    # Every goal is filled: the agent need not say stop to be done.
+    # Every goal is filled, so the agent need not stop.
     assert {key for key in expected if info.get(key) != expected[key]} == {"policy", "wall_seconds"}
 
 
-def test_an_observation_is_rendered_once_an_action_and_once_at_the_end(
-    small: Path, monkeypatch: pytest.MonkeyPatch
-):
-    """Rendering is what a step could cost more than an action in `evaluate`."""
+def test_each_step_renders_one_observation(small: Path, monkeypatch: pytest.MonkeyPatch):
+    """More renderings would make a step costlier than an action in `evaluate`."""
     count = []
     render = HeightmapProjector._CalcObservation
 
@@ -160,7 +158,7 @@ def test_an_observation_is_rendered_once_an_action_and_once_at_the_end(
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("freed_diagrams")
-def test_scene_after_scene_leaves_the_memory(small: Path):
+def test_earlier_scenes_are_garbage_collected(small: Path):
     environment = make(small, render_mode="rgb_array")
     environment.reset(seed=0)
     environment.step(NOWHERE)
@@ -173,7 +171,7 @@ def test_scene_after_scene_leaves_the_memory(small: Path):
     assert second() is None
 
 
-def test_what_ends_an_episode(small: Path):
+def test_termination_and_truncation(small: Path):
     environment = make(small)
     environment.reset(seed=0)
     *_, terminated, truncated, info = environment.step(STOP)
@@ -189,39 +187,39 @@ def test_what_ends_an_episode(small: Path):
     assert (reward, terminated, truncated, info["timed_out"]) == (0.0, False, True, True)
 
 
-def test_bad_input_is_told(small: Path, tmp_path: Path):
+def test_invalid_input_raises(small: Path, tmp_path: Path):
     blind = tmp_path / "blind.yaml"
     blind.write_text("Blind: {cameras: {}}\n")
     environment = make(small)
     with pytest.raises(gymnasium.error.ResetNeeded):
         environment.step(NOWHERE)
     environment.reset(seed=0)
-    with pytest.raises(ValueError, match="place_x of an action must be a finite number, not nan"):
+    with pytest.raises(ValueError, match=r"place_x .*nan"):
         environment.step(np.where(np.arange(7) == 3, np.nan, NOWHERE))
-    with pytest.raises(ValueError, match=r"7 numbers, not of the shape \(4,\)"):
+    with pytest.raises(ValueError, match=r"\(4,\)"):
         environment.unwrapped.step(np.zeros(4))
-    # It goes on: off the table is moved to its edge.
+    # The episode continues; positions off the table are clipped.
     far = np.array([9.0, -9.0, 100.0, -3.0, 5.0, -77.0, 0.0])
     assert environment.unwrapped.step(far)[4]["failure"] is None
-    with pytest.raises(ValueError, match="a seed is a whole number"):
+    with pytest.raises(ValueError, match="seed"):
         environment.unwrapped.reset(seed=-1)
     short = make(small, scenario_text="{time_limit: 0.1}")
-    with pytest.raises(UserError, match=r"seed 3 the episode was over before.*limit of 0\.1 s"):
+    with pytest.raises(UserError, match=r"seed 3 .*time_limit is 0\.1 s"):
         short.reset(seed=3)
-    with pytest.raises(UserError, match="cannot read the scenario"):
+    with pytest.raises(UserError, match="scenario"):
         make(tmp_path / "nowhere.yaml")
-    with pytest.raises(UserError, match="cameras is empty"):
+    with pytest.raises(UserError, match="cameras"):
         make(blind)
 
 
-def test_values_say_the_same_as_actions():
+def test_as_values_inverts_as_action():
     action = PickPlaceAction(PlanarPose(0.4, 0.1, 3.0), PlanarPose(0.5, -0.2, 5.0))
     assert as_action(as_values(action), PixelGrid()) == action
-    with pytest.raises(ValueError, match="cannot press"):
+    with pytest.raises(ValueError, match="press"):
         as_values(dataclasses.replace(action, press=True))
 
 
-def test_a_seed_is_drawn_where_none_is_given(small: Path):
+def test_reset_without_a_seed_draws_one(small: Path):
     environment = make(small)
     _, first = environment.reset(seed=5)
     drawn = environment.reset()[1]["seed"]
@@ -231,13 +229,13 @@ def test_a_seed_is_drawn_where_none_is_given(small: Path):
 
 
 @pytest.mark.slow
-def test_many_at_once(small: Path):
+def test_vector_environments(small: Path):
     make(small).reset(seed=0)
     environments = gymnasium.make_vec(
         "kitting_drake/Scenario-v0",
         num_envs=2,
         vectorization_mode="async",
-        # A fork of this process, which has rendered, would wait for threads that it does not have.
+        # This process has rendered, so a fork would deadlock.
         vector_kwargs={"context": "spawn"},
         scenario=small,
     )
@@ -252,7 +250,7 @@ def test_many_at_once(small: Path):
         environments.close()
 
 
-def test_an_environment_is_named_without_an_import_of_ours():
+def test_gymnasium_imports_the_module_from_the_environments_name():
     program = (
         "import gymnasium, sys\n"
         "name = 'kitting_drake.gym:kitting_drake/BlockInsertion-v0'\n"
@@ -264,7 +262,7 @@ def test_an_environment_is_named_without_an_import_of_ours():
 
 @pytest.mark.slow
 def test_a_step_costs_what_an_action_costs_in_evaluate(monkeypatch: pytest.MonkeyPatch):
-    """The same decisions through both; by CPU time, which no other work on the machine is in."""
+    """Compares the same decisions through both by CPU time, which ignores other processes."""
     path = Path("kitting_unseen.yaml")
     environment = gymnasium.make("kitting_drake/KittingUnseen-v0")
     evaluated(path, Recorder(), 1, monkeypatch, "KittingUnseenToolsets")
@@ -273,7 +271,7 @@ def test_a_step_costs_what_an_action_costs_in_evaluate(monkeypatch: pytest.Monke
     for seed in range(2, 10):
         start = time.process_time()
         if seed % 2:
-            # Neither always finds the caches as the other left them.
+            # Alternate the order, because the first warms the caches of the second.
             total, info = played(environment, Recorder(), seed)
             middle = time.process_time()
             result = evaluated(path, Recorder(), seed, monkeypatch, "KittingUnseenToolsets")
@@ -285,7 +283,7 @@ def test_a_step_costs_what_an_action_costs_in_evaluate(monkeypatch: pytest.Monke
             here, there = here + time.process_time() - middle, there + middle - start
         assert total == result["success_rate"]
         for own, other in zip(info["objects"], result["objects"], strict=True):
-            # To the bit only where nothing moved any more as o_t was taken, a step earlier.
+            # o_t is taken one step earlier, so results are identical only if nothing moved then.
             assert own["add_s_mm"] == pytest.approx(other["add_s_mm"], abs=0.01)
     print(f"a step costs {here / there:.3f} of an action in evaluate")
     assert here / there < 1.1

@@ -1,4 +1,4 @@
-"""Images to rotate, and errors of equivariance."""
+"""Smooth images, rotations of them, and equivariance errors."""
 
 import math
 
@@ -16,7 +16,7 @@ def distance_from_middle(side: int) -> Tensor:
 
 
 def smooth_image(side: int, *, seed: int = 0, channels: int = 4, blur: int = 6) -> Tensor:
-    """(1, channels, side, side): random, no detail below `blur` pixels, zero near the edge."""
+    """(1, channels, side, side): random, without detail below `blur` pixels, zero at the edge."""
     generator = torch.Generator().manual_seed(seed)
     reach = 3 * blur
     noise = torch.randn(channels, 1, side + 2 * reach, side + 2 * reach, generator=generator)
@@ -27,7 +27,7 @@ def smooth_image(side: int, *, seed: int = 0, channels: int = 4, blur: int = 6) 
 
 
 def rotate_image(image: Tensor, degrees: float) -> Tensor:
-    """A square image rotated counter-clockwise about its middle, exactly by 90 degrees."""
+    """A square image rotated counter-clockwise about its centre; exact for multiples of 90."""
     quarters, rest = divmod(degrees, 90)
     if rest == 0:
         return image.rot90(int(quarters), (2, 3))

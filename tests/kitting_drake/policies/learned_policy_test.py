@@ -18,7 +18,7 @@ from kitting_drake.policies.networks.methods import make_networks
 from kitting_drake.policies.stages import SubPixel
 from systems.signals import Observation, PickPlaceAction, PixelGrid, PlanarPose
 
-# No defaults, no two numbers alike.
+# Unlike the defaults, and all numbers differ.
 GRID = PixelGrid(x_min=0.3, y_min=-0.2, resolution=0.004, rows=97, cols=129, z_min=0.02, z_max=0.3)
 PICK = (61.3, 22.4)
 GOAL = np.array([40, 90])
@@ -27,7 +27,7 @@ BIN = math.tau / N
 ROTATION = 19
 THETA = math.radians(62.0)
 ARMS = ((0, 0), (0, 18), (9, 0))
-"""The (row, col) from the pick of the encodings' blobs, each in a channel of its own."""
+"""The (row, col) offsets from the pick of the encodings' blobs, one per channel."""
 
 
 def blob(shape: tuple[int, int], centre: tuple[float, float] | NDArray[np.float64]) -> Tensor:
@@ -36,7 +36,7 @@ def blob(shape: tuple[int, int], centre: tuple[float, float] | NDArray[np.float6
 
 
 def linear(shape: tuple[int, ...], label: tuple[float, ...]) -> Tensor:
-    """Logits of a network that has learned an interpolated label."""
+    """The optimal logits for an interpolated label."""
     offsets = torch.meshgrid(*map(torch.arange, shape), indexing="ij")
     shares = [(1 - (n - at).abs()).clamp(min=0) for n, at in zip(offsets, label, strict=True)]
     return torch.stack(shares).prod(0).double().log().float()
@@ -50,7 +50,7 @@ def rotated(vector: tuple[float, float] | NDArray[np.float64], angle: float) -> 
 
 
 class Known(Networks):
-    """Networks with given predictions, whose encodings fit at GOAL and nowhere else."""
+    """Networks with given predictions. Their encodings match only at GOAL."""
 
     def __init__(
         self,
@@ -94,7 +94,7 @@ def decide(networks: Networks, *, continuous: bool, seen: Observation | None = N
     return policy.decide(seen or observation())
 
 
-def test_a_quantized_action_is_a_pixel_and_a_bin():
+def test_without_refinement_an_action_is_a_pixel_and_a_bin():
     found = decide(Known(), continuous=False)
     np.testing.assert_array_equal(found.pick_pixel, [61, 22])
     np.testing.assert_allclose(found.place_pixel, GOAL, atol=1e-9)
@@ -104,7 +104,7 @@ def test_a_quantized_action_is_a_pixel_and_a_bin():
     assert not action.stop
 
 
-def test_a_continuous_action_is_refined_beyond_them():
+def test_refinement_goes_beyond_pixels_and_bins():
     networks = Known(rotation=(ROTATION + 0.4) * BIN)
     found = decide(networks, continuous=True)
     assert networks.crops == [(61, 22)]
@@ -119,7 +119,7 @@ def test_a_continuous_action_is_refined_beyond_them():
 
 @pytest.mark.parametrize("bins", [0, ROTATION, 40, N - 1])
 def test_the_offset_of_a_refined_pick_is_rotated_to_the_place(bins: int):
-    """The motion of the crop's middle, a pixel, is applied to the refined pick."""
+    """The motion of the crop's centre pixel is applied to the refined pick."""
     at_the_pixel, beside_it = (
         decide(Known(pick=pick, rotation=bins * BIN), continuous=True) for pick in ((61, 22), PICK)
     )
@@ -135,7 +135,7 @@ def test_poses_are_in_the_world():
         assert pose.y == pytest.approx(-0.2 + 0.004 * (pixel[1] + 0.5))
 
 
-def test_the_maps_are_what_the_action_was_read_from():
+def test_the_maps_agree_with_the_action():
     found = decide(Known(), continuous=True)
     assert found.pick_map.shape == found.place_map.shape == GRID.shape
     assert found.pick_map.sum() == pytest.approx(1, abs=1e-5)
@@ -158,7 +158,7 @@ def test_a_method_of_discrete_angles_predicts_a_bin():
     ("log_odds", "threshold", "stop"),
     [(-2.1, -2.0, True), (-1.9, -2.0, False), (None, -2.0, False), (-99.0, None, False)],
 )
-def test_stops_where_the_odds_that_there_is_something_to_pick_are_below_the_threshold(
+def test_stops_when_the_log_odds_are_below_the_threshold(
     log_odds: float | None, threshold: float | None, stop: bool
 ):
     networks = Known(log_odds=log_odds)
@@ -182,14 +182,14 @@ def test_stops_where_the_odds_that_there_is_something_to_pick_are_below_the_thre
 @pytest.mark.parametrize(
     "pixel", [(3.0, 4.0), (3.5, 4.5), (2.7, 4.1), (0.0, 0.2), (6.0, 7.9), (5.6, 8.0), (0.5, 0.0)]
 )
-def test_an_interpolated_position_is_found_again(pixel: tuple[float, float]):
+def test_recovers_an_interpolated_position(pixel: tuple[float, float]):
     logits = linear((7, 9), pixel)
     row, col = divmod(int(logits.argmax()), 9)
     np.testing.assert_allclose(expected_position(logits, (row, col)), pixel, atol=1e-5)
 
 
 def test_a_position_does_not_depend_on_other_peaks():
-    """Two objects may be picked equally well, and there is none between them."""
+    """Two objects may be equally good picks, and the mean of both is none."""
     two = (linear((9, 9), (2, 2)).exp() + linear((9, 9), (2, 6)).exp()).log()
     np.testing.assert_allclose(expected_position(two, (2, 2)), (2, 2), atol=1e-5)
 
@@ -203,7 +203,7 @@ PLACEMENTS = [
 
 
 @pytest.mark.parametrize(("first", "corner", "label"), PLACEMENTS)
-def test_an_interpolated_placement_is_found_again(
+def test_recovers_an_interpolated_placement(
     first: int, corner: tuple[int, int], label: tuple[float, float, float]
 ):
     candidate = Candidate(linear((7, 9, 9), label), first, corner)
@@ -224,7 +224,7 @@ def plain_networks(compute_type: torch.dtype) -> Networks:
     return networks
 
 
-def test_decisions_do_not_depend_on_earlier_ones():
+def test_a_decision_does_not_depend_on_earlier_ones():
     policy = LearnedPolicy(plain_networks(torch.bfloat16), orientations=N)
     random = np.random.default_rng(0)
     one, other = (
@@ -244,7 +244,7 @@ def test_a_read_only_image_is_accepted_and_not_changed():
 
 
 class Distracted(Known):
-    """Networks whose encodings fit best in the padding, below and beside the image."""
+    """Networks whose encodings match best in the padding, below and beside the image."""
 
     def encode_scene(self, image: Image) -> Tensor:
         scene = super().encode_scene(image)
@@ -253,7 +253,7 @@ class Distracted(Known):
 
 @pytest.mark.parametrize("continuous", [True, False])
 def test_the_place_lies_in_the_image(continuous: bool):
-    """The networks take the image padded to sides that they can halve."""
+    """The search must ignore the padding, which networks need."""
     grid = dataclasses.replace(GRID, rows=70, cols=110)
     seen = Observation(np.zeros((4, *grid.shape), np.float32), grid)
     found = decide(Distracted(), continuous=continuous, seen=seen)
@@ -266,7 +266,7 @@ def test_the_place_lies_in_the_image(continuous: bool):
     ("orientations", "message"),
     [(24, r"at least 26 are needed \(Nyquist\)"), (37, "not a multiple of 2")],
 )
-def test_an_n_at_which_the_networks_cannot_predict_is_refused(orientations: int, message: str):
+def test_unsupported_orientations_are_rejected(orientations: int, message: str):
     with pytest.raises(ValueError, match=message):
         LearnedPolicy(Known(), orientations=orientations)
 
@@ -283,7 +283,7 @@ def test_every_decision_is_reported_to_watch():
     assert decision.action is action
 
 
-def test_where_a_grasp_failed_another_is_tried():
+def test_avoids_failed_grasps():
     networks = Known()
     policy = LearnedPolicy(networks, orientations=N, stages=())
     seen = Observation(np.zeros((4, *GRID.shape), np.float32), GRID)

@@ -1,9 +1,9 @@
-"""What LeRobot itself reads, for lerobot_export_test.py; run by an interpreter that has LeRobot.
+"""Reads a dataset with LeRobot itself, for lerobot_export_test.py.
 
-Usage: python lerobot_reader.py DATASET EXPECTED.npz
+It needs an interpreter with LeRobot. Usage: python lerobot_reader.py DATASET EXPECTED.npz
 
-It prints, as JSON, in how many values the frames differ from those expected, and by how much the
-dataset's statistics differ from those that LeRobot computes.
+It prints as JSON the number of values that differ from the expected frames, and the largest
+difference of the dataset's statistics from those that LeRobot computes.
 """
 
 import json
@@ -19,7 +19,7 @@ COLOUR, HEIGHT = "observation.images.colour", "observation.images.height"
 
 
 def differing(one: torch.Tensor, other: np.ndarray) -> int:
-    """In how many values two float32 arrays differ, to the bit."""
+    """The number of bitwise different values in two float32 arrays."""
     read = one.numpy()
     assert read.dtype == other.dtype == np.float32, (read.dtype, other.dtype)
     assert read.shape == other.shape, (read.shape, other.shape)
@@ -27,10 +27,10 @@ def differing(one: torch.Tensor, other: np.ndarray) -> int:
 
 
 def statistics_difference(dataset: LeRobotDataset, expected: dict[str, np.ndarray]) -> float:
-    """The largest difference of the dataset's statistics from LeRobot's of the expected values."""
+    """The largest difference from LeRobot's own statistics of the expected values."""
     values = {
         COLOUR: expected["colour"] / 255,
-        # LeRobot adds up in the type that it is given, and float32 is off by 4e-3 for real images.
+        # LeRobot sums in the input's type; float32 is off by 4e-3 for real images.
         HEIGHT: expected["height"].astype(np.float64),
         "action": expected["action"].astype(np.float64),
     }

@@ -1,4 +1,4 @@
-"""Synthetic scenes to learn from: a tool of a few blocks, and a kit with a cavity for it."""
+"""Synthetic training scenes: a tool of a few blocks, and a kit with a recess for it."""
 
 import math
 from pathlib import Path
@@ -14,14 +14,14 @@ from systems.signals import Observation, PixelGrid
 SIDE = 113
 ORIENTATIONS = 36
 ROOM = 8
-"""How far a rotated scene may be shifted, in pixels: at most the tip of a corner leaves it."""
+"""How far a rotated scene may be shifted, in pixels; at most the tip of a corner leaves it."""
 
 _BLOCK = 4.0
 """The side of a block, in pixels."""
 _APART = 22
-"""The distance of the tool and of the cavity from the middle of the image, in pixels."""
+"""The distance of the tool and of the recess from the centre of the image, in pixels."""
 _FINE = 4
-"""A pixel shows the mean of so many points along each of its sides, as in a camera."""
+"""The number of samples per pixel along each axis; a pixel is their mean, as in a camera."""
 
 _Blocks = frozenset[tuple[int, int]]
 _HANDLE: _Blocks = frozenset((i, 0) for i in range(-4, 1))
@@ -30,7 +30,7 @@ _KIT: _Blocks = frozenset((i, j) for i in range(-5, 4) for j in range(-3, 4))
 
 
 def stored_observation(name: str) -> Observation:
-    """A rendered observation that is stored beside the tests.
+    """A rendered observation from the file beside the tests.
 
     `rgb` (3, rows, cols), 8 bits, and `height_tenth_mm` (rows, cols), in tenths of a millimetre.
 
@@ -43,7 +43,7 @@ def stored_observation(name: str) -> Observation:
 
 
 def config(method: str, *, stop: bool = False) -> NetworkConfig:
-    """The smallest networks, normalised so that empty pixels are zero, as outside the image."""
+    """The smallest networks, normalised to make empty pixels zero, as outside the image."""
     return NetworkConfig(
         method=method,
         preset="tiny",
@@ -57,20 +57,20 @@ def config(method: str, *, stop: bool = False) -> NetworkConfig:
 
 
 def scene(seed: int, degrees: float = 0.0) -> LabelledImage:
-    """A scene, rendered anew at every rotation: no image is resampled.
+    """A scene that is rendered anew at every rotation instead of resampled.
 
-    The tool is picked by its neck, along its handle. The labels of scenes that are not rotated lie
-    on pixels and bins.
+    The tool is picked at its neck, along its handle. Without rotation the labels lie on pixels and
+    bins.
 
     Args:
-        seed: of the tool and of where everything lies.
-        degrees: of the rotation about the middle, counter-clockwise.
+        seed: of the tool and all poses.
+        degrees: of the rotation about the centre, counter-clockwise.
     """
     return _scene(seed, degrees, placed=False)
 
 
 def final_scene(seed: int, degrees: float = 0.0) -> Image:
-    """The same scene after the tool was placed: it lies in its cavity, and nothing is left to pick.
+    """The same scene after the tool was placed into its recess, with nothing left to pick.
 
     Returns:
         (4, SIDE, SIDE).
@@ -107,7 +107,7 @@ def _scene(seed: int, degrees: float, *, placed: bool) -> LabelledImage:
 
 
 def _tool(random: np.random.Generator) -> _Blocks:
-    """A handle, and a head of three blocks that is not symmetric between left and right."""
+    """A handle and a head of three blocks without mirror symmetry."""
     while True:
         chosen = random.choice(len(_BESIDE), 2, replace=False)
         head = {_BESIDE[index] for index in chosen}
@@ -116,7 +116,7 @@ def _tool(random: np.random.Generator) -> _Blocks:
 
 
 def _filled(centre: NDArray[np.float64], angle: float, blocks: _Blocks) -> NDArray[np.bool_]:
-    """(SIDE * _FINE, SIDE * _FINE): which points lie in some rotated blocks around a centre."""
+    """(SIDE * _FINE, SIDE * _FINE): the mask of samples inside rotated blocks around a centre."""
     points = (np.arange(SIDE * _FINE) + 0.5) / _FINE - 0.5
     grid = np.stack(np.meshgrid(points, points, indexing="ij"), axis=-1)
     row, col = np.rint((grid - centre) @ rotation_matrix(angle) / _BLOCK).astype(int).clip(-6, 6).T

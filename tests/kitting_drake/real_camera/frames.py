@@ -27,11 +27,11 @@ ROOT = Path(__file__).resolve().parents[3]
 
 @dataclass(frozen=True)
 class Rendered:
-    """What the cameras of a cell see as an episode begins."""
+    """The first frames of a cell's cameras."""
 
     frames: dict[str, Frame]
     calibration: Calibration
-    """With the poses that the cell believes."""
+    """With the poses that the cell assumes."""
     rig: Rig
     context: Context
 
@@ -41,7 +41,7 @@ class Rendered:
 
     @property
     def action(self) -> PickPlaceAction:
-        """Of the cell's own policy."""
+        """The action of the cell's own policy."""
         return self.rig.port("action", self.context)
 
 
@@ -75,9 +75,9 @@ def write_frames(folder: Path, frames: dict[str, Frame], depth: str = "npy") -> 
 
 
 def difference(one: PickPlaceAction, other: PickPlaceAction) -> NDArray[np.float64]:
-    """(3,) between two actions: the picks and where the picked point of the object comes to, in mm,
-    and the object's rotation in degrees. A grasp further along the object, or from its other side,
-    is as good, if the object moves alike."""
+    """(3,): the distance of two picks in mm, the distance of the picked point's places in mm, and
+    the difference of the object's rotations in degrees. Different grasps of an object agree in the
+    last two if they move it alike."""
     turned, other_turned = (item.place.theta - item.pick.theta for item in (one, other))
     c, s = math.cos(turned), math.sin(turned)
     x, y = other.pick.x - one.pick.x, other.pick.y - one.pick.y
@@ -92,7 +92,7 @@ def difference(one: PickPlaceAction, other: PickPlaceAction) -> NDArray[np.float
 
 
 def calibration_of(scenario: Scenario) -> Calibration:
-    """The cameras of a scenario, as they are."""
+    """The true calibration of a scenario's cameras."""
     cameras = tuple(
         BenchCamera(
             name,
@@ -109,7 +109,7 @@ def calibration_of(scenario: Scenario) -> Calibration:
 
 
 def cast(calibration: Calibration, block: Block | None = None) -> dict[str, Frame]:
-    """What the cameras see of a table that is empty, or but for a block: rays met exactly."""
+    """Frames of a table, empty or with a block, by exact ray casting."""
     frames = {}
     for camera in calibration.cameras:
         u, v = np.broadcast_arrays(camera.rays.u, camera.rays.v)
@@ -127,7 +127,7 @@ def cast(calibration: Calibration, block: Block | None = None) -> dict[str, Fram
 def _entered(
     block: Block, origin: NDArray[np.float64], rays: NDArray[np.float64], table: float
 ) -> NDArray[np.float64]:
-    """The depth at which rays enter a block; NaN for those that do not."""
+    """The depth at which rays enter a block; NaN for rays that miss it."""
     assert block.pose is not None
     x, y, yaw = block.pose
     R = np.array([[math.cos(yaw), math.sin(yaw)], [-math.sin(yaw), math.cos(yaw)]])
@@ -141,7 +141,7 @@ def _entered(
 
 
 def render_table(scenario: Scenario) -> dict[str, Frame]:
-    """What a scenario's cameras see of an empty table, rendered."""
+    """Rendered frames of an empty table."""
     builder = DiagramBuilder()
     plant, scene_graph = AddMultibodyPlantSceneGraph(builder, time_step=0.01)
     X, size = RigidTransform([0.5, 0, -0.05]), Box(2, 3, 0.1)

@@ -1,6 +1,7 @@
 """The figures in README.md, docs/robustness.md and docs/results.md agree with the result files.
 
-They are computed here from the outcomes of the episodes, by none of the code that writes the pages.
+They are recomputed here from the outcomes of the episodes, independently of the code that writes
+the pages.
 """
 
 import csv
@@ -26,14 +27,14 @@ METHODS = {
     "Transporter": "transporter",
 }
 POLICIES = ("so2_small_180_100", "generalist", "shape_matching")
-"""As the names of runs have them, in the order of the columns on robustness."""
+"""The policies in the names of runs, in the order of the columns on robustness."""
 STRICT, OWN = 2, 1
-"""The least outcome of an object that counts."""
+"""The least outcome that counts as a success."""
 
 
 @pytest.fixture(scope="module")
 def runs() -> dict[str, Summary]:
-    """Those whose code can be checked out."""
+    """The runs whose code can be checked out."""
     found = read_summaries(RESULTS)
     return {name: run for name, run in found.items() if is_reproducible(run["commit"])}
 
@@ -44,7 +45,7 @@ def readme() -> str:
 
 
 def rows(page: str, *sections: str) -> list[list[str]]:
-    """The cells of all tables of a section, or of a whole page, line by line."""
+    """The cells of all tables of a section, or of a whole page, by line."""
     for section in sections:
         page = page.split(section, 1)[1]
     lines = page.split("\n#", 1)[0].splitlines() if sections else page.splitlines()
@@ -61,7 +62,7 @@ def half_up(value: float) -> int:
 
 
 def counts(found: list[Summary], least: int = STRICT) -> tuple[int, int]:
-    """How many objects of some runs were a success, and how many there were."""
+    """The number of successful objects, and of all objects."""
     ends = [end for run in found for item in run["outcomes"] for end in item["objects"].values()]
     return sum(end >= least for end in ends), len(ends)
 
@@ -75,19 +76,19 @@ def wilson(good: int, objects: int) -> tuple[float, float]:
 
 
 def share(found: list[Summary], least: int = STRICT) -> str:
-    """The share of objects and its interval, as README.md has it."""
+    """The share of objects and its interval, in the format of README.md."""
     good, objects = counts(found, least)
     low, high = wilson(good, objects)
     return short(f"{100 * good / objects:.1f} ({100 * low:.1f} to {100 * high:.1f})")
 
 
 def short(text: str) -> str:
-    """As README.md has it: a whole 100 without decimals."""
+    """In the format of README.md, which shows 100.0 as 100."""
     return text.replace("100.0", "100")
 
 
 def reward(run: Summary) -> str:
-    """The mean reward and the interval of the run."""
+    """The mean reward of a run and its interval."""
     rate = np.mean([item["success_rate"] for item in run["outcomes"]])
     low, high = run["ci95"]
     return f"{100 * rate:.1f} ({100 * low:.1f} to {100 * high:.1f})"
@@ -276,7 +277,7 @@ def own(run: Summary) -> str:
     return f"{100 * good / objects:.1f}"
 
 
-def test_the_mishaps_name_runs_that_there_are():
+def test_the_mishaps_name_existing_runs():
     names = read_summaries(RESULTS).keys()
     with (RESULTS / "mishaps.csv").open(newline="") as file:
         listed = list(csv.DictReader(file))

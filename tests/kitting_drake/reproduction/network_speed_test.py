@@ -36,7 +36,7 @@ MEASURES = {"training_step", "alpha_training_step", "decision", "alpha_inference
 
 @pytest.fixture(scope="module")
 def measured(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
-    """The smallest benchmark, on a demonstration of a small image."""
+    """The smallest benchmark, on a demonstration with a small image."""
     torch.set_num_threads(1)
     path = tmp_path_factory.mktemp("benchmark") / "demonstrations.h5"
     x, y = GRID.to_world((16.0, 24.0))
@@ -79,7 +79,7 @@ def test_describes_the_machine(measured: dict[str, Any]):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["pick_angle", "decision"])
-def test_a_row_for_each_method_and_count(name: str, measured: dict[str, Any]):
+def test_there_is_a_row_for_each_method_and_n(name: str, measured: dict[str, Any]):
     cells = [(row["method"], row["orientations"]) for row in measured[name]]
     expected = [(method, n) for method in METHODS for n in (26, 30)]
     expected.insert(2, ("so2", 32))
@@ -92,7 +92,7 @@ def test_a_row_for_each_method_and_count(name: str, measured: dict[str, Any]):
 
 
 @pytest.mark.slow
-def test_only_the_equivariant_transporter_grows(measured: dict[str, Any]):
+def test_only_the_equivariant_transporter_grows_in_parameters(measured: dict[str, Any]):
     growth = {row["method"]: row for row in measured["pick_angle_growth"]}
     assert growth["so2"]["from"] == 26
     assert growth["so2"]["to"] == 30
@@ -133,7 +133,7 @@ def test_the_transporter_encodes_every_rotated_crop(measured: dict[str, Any]):
 
 
 @pytest.mark.slow
-def test_folding_computes_the_same(measured: dict[str, Any]):
+def test_folding_computes_the_same_function(measured: dict[str, Any]):
     folding = measured["folding"]
     types = ["float32"] + ["bfloat16"] * (preferred_type() == torch.bfloat16)
     rungs = [f"{kind}_{type_}" for kind in ("escnn", "ours") for type_ in types]
@@ -147,7 +147,7 @@ def test_folding_computes_the_same(measured: dict[str, Any]):
         assert all(value > 0 for value in share.values())
     assert set(folding["speed_up"]["escnn_float32"].values()) == {1.0}
     assert folding["alpha_difference"]["ours_float32"] < 1e-4
-    # Eight samples travel for seven coefficients.
+    # Each field has eight samples instead of seven coefficients.
     operations = folding["alpha_operations"]
     assert 1 < operations["ours"] / operations["escnn"] < (8 / 7) ** 2
 
@@ -165,11 +165,11 @@ def test_shares_of_the_peak(measured: dict[str, Any]):
 
 
 @pytest.mark.slow
-def test_levels_hold_all_layers(measured: dict[str, Any]):
+def test_levels_include_all_layers(measured: dict[str, Any]):
     levels, layers = measured["alpha_levels"]["levels"], measured["alpha_levels"]["layers"]
     blocks = [f"down {i}" for i in range(1, 6)] + [f"up {i}" for i in range(1, 5)]
     assert [row["level"] for row in levels] == ["input", *blocks, "head"]
-    # 21 layers, and seven convolutions in shortcuts.
+    # 21 layers and the shortcut convolutions.
     assert len(layers) == 21 + sum(row["layer"].endswith("shortcut") for row in layers)
     assert sum(row["operations"] for row in layers) == sum(row["operations"] for row in levels)
     for row in levels:
@@ -178,7 +178,7 @@ def test_levels_hold_all_layers(measured: dict[str, Any]):
 
 
 @pytest.mark.slow
-def test_draws_and_prints_what_was_measured(measured: dict[str, Any], tmp_path: Path):
+def test_skipped_measurements_are_drawn_and_printed(measured: dict[str, Any], tmp_path: Path):
     measured = copy.deepcopy(measured)
     for row in measured["pick_angle"] + measured["decision"]:
         if row["method"] == "transporter":
@@ -192,7 +192,7 @@ def test_draws_and_prints_what_was_measured(measured: dict[str, Any], tmp_path: 
 
 
 @pytest.mark.slow
-def test_the_page_of_results_tells_what_the_angle_costs(measured: dict[str, Any], tmp_path: Path):
+def test_the_page_of_results_shows_the_cost_of_angles(measured: dict[str, Any], tmp_path: Path):
     assert read_efficiency(tmp_path) is None
     path = tmp_path / EFFICIENCY
     path.write_text(json.dumps(measured))
@@ -209,11 +209,11 @@ def test_the_page_of_results_tells_what_the_angle_costs(measured: dict[str, Any]
     assert NAMES["transporter"] not in table
     for damaged in ({"machine": 7}, measured | {"pick_angle": []}, []):
         path.write_text(json.dumps(damaged))
-        with pytest.raises(UserError, match="is no file of benchmark networks: delete it"):
+        with pytest.raises(UserError, match="not a file of benchmark networks"):
             read_efficiency(tmp_path)
 
 
-def test_the_synthetic_scene_has_its_picks_on_tools():
+def test_the_picks_of_the_synthetic_scene_are_on_tools():
     scene = synthetic_scene(PixelGrid())
     assert len(scene.targets) == 4
     for target in scene.targets:
@@ -228,7 +228,7 @@ def test_counts_operations():
     assert count_operations(lambda: matrix @ matrix.T) == 2 * 3 * 5 * 3
 
 
-def test_records_the_convolutions_of_a_function_but_no_depthwise_ones():
+def test_records_all_but_depthwise_convolutions():
     image, kernel = torch.ones(1, 3, 9, 9), torch.ones(4, 3, 3, 3, requires_grad=True)
     filters = torch.ones(4, 1, 3, 3)
 
@@ -255,7 +255,7 @@ def test_records_the_convolutions_of_a_function_but_no_depthwise_ones():
     assert len(found.calls) == 1
 
 
-def test_stops_when_the_budget_is_spent():
+def test_time_each_stops_when_the_budget_is_spent():
     ran = []
     timings = time_each(
         {name: lambda name=name: ran.append(name) for name in "ab"},
@@ -267,10 +267,10 @@ def test_stops_when_the_budget_is_spent():
     assert timings["a"].runs == 1
 
 
-def test_where_the_budget_is_spent_in_warming_up_the_warmest_run_counts(
+def test_if_warming_up_spends_the_budget_the_last_run_counts(
     monkeypatch: pytest.MonkeyPatch,
 ):
-    clock = iter([0.0, 3.0, 10.0, 11.0])  # Of 3 s and of 1 s.
+    clock = iter([0.0, 3.0, 10.0, 11.0])  # Two runs, of 3 s and 1 s.
     monkeypatch.setattr(timing, "read_clock", lambda _: next(clock))
     timings = time_each({"a": lambda: None}, torch.device("cpu"), repeats=5, budget=3.5)
     assert timings["a"] == timing.Timing.of([1.0])
@@ -279,15 +279,15 @@ def test_where_the_budget_is_spent_in_warming_up_the_warmest_run_counts(
 @pytest.mark.parametrize(
     ("value", "text"), [(0.00123, "1.23 ms"), (1.234, "1.23 s"), (1234.0, "1234 s"), (None, "-")]
 )
-def test_seconds(value: float | None, text: str):
+def test_seconds_text(value: float | None, text: str):
     assert seconds_text(value) == text
 
 
-def test_counts():
+def test_count_text():
     assert [count_text(count) for count in (12, 4_540_000, 2.3e12)] == ["12", "4.54 M", "2.3 T"]
 
 
-def test_an_unknown_preset_is_refused():
+def test_an_unknown_preset_is_rejected():
     presets = "paper, small, matched, tiny"
     with pytest.raises(UserError, match=f"--preset must be one of {presets}, not 'huge'"):
         Plan(preset="huge")

@@ -1,4 +1,4 @@
-"""Random tools, the static scenes made of them, and the samples drawn of those."""
+"""Tests of random tools, static scenes, and training samples from them."""
 
 import math
 from pathlib import Path
@@ -33,7 +33,7 @@ def tools() -> list[RandomTool]:
     return [draw_tool(ENTRIES, np.random.default_rng(seed), str(seed)) for seed in (3, 9, 12)]
 
 
-def test_random_tools_lie_on_the_table_and_differ(tools: list[RandomTool]):
+def test_random_tools_are_valid_and_distinct(tools: list[RandomTool]):
     for tool in tools:
         low, high = tool.triangles.min(axis=(0, 1)), tool.triangles.max(axis=(0, 1))
         np.testing.assert_allclose(low[2], 0, atol=1e-9)
@@ -48,7 +48,7 @@ def test_random_tools_lie_on_the_table_and_differ(tools: list[RandomTool]):
     np.testing.assert_array_equal(again.triangles, tools[2].triangles)
 
 
-def test_random_tools_depart_from_tools_to_train_with_only(monkeypatch: pytest.MonkeyPatch):
+def test_random_tools_derive_from_training_tools_only(monkeypatch: pytest.MonkeyPatch):
     given: list[ToolEntry] = []
 
     def take_down(entries: list[ToolEntry], *_: object) -> None:
@@ -72,7 +72,7 @@ def scenes(tools: list[RandomTool]) -> list[StaticScene]:
     return [static_scenes._draw_scene(kit, tools, (), rng, seed) for seed in range(6)]
 
 
-def test_picks_are_on_tools_and_places_in_the_kit(scenes: list[StaticScene]):
+def test_picks_are_on_tools_and_places_are_in_cavities(scenes: list[StaticScene]):
     loose = [scene for scene in scenes if len(scene.actions)]
     assert loose
     for scene in loose:
@@ -82,14 +82,14 @@ def test_picks_are_on_tools_and_places_in_the_kit(scenes: list[StaticScene]):
             pick, place = (np.rint(GRID.to_pixel(row[i : i + 2])).astype(int) for i in (2, 5))
             around = height[pick[0] - 1 : pick[0] + 2, pick[1] - 1 : pick[1] + 2]
             assert around.max() > 0.003
-            # In a cavity, within the block.
+            # The place is in a cavity, within the block.
             window = height[place[0] - 10 : place[0] + 11, place[1] - 10 : place[1] + 11]
             assert window.max() > 0.8 * top
 
 
 @needs_renderer
-def test_a_place_brings_the_tool_into_a_cavity_of_its_shape(tools: list[RandomTool]):
-    """What rises at the tool's pixels finds room where the action brings them."""
+def test_an_action_moves_the_tool_into_a_cavity_of_its_shape(tools: list[RandomTool]):
+    """The tool's pixels fit into the cavity after the motion of the action."""
     rng = np.random.default_rng(5)
     tools = tools[:2]
     kit = static_scenes._draw_kit(tools, rng)
@@ -114,7 +114,7 @@ def test_a_place_brings_the_tool_into_a_cavity_of_its_shape(tools: list[RandomTo
                     assert height[tuple(there)] < block - 0.003
 
 
-def test_a_file_gives_back_what_was_written(scenes: list[StaticScene], tmp_path: Path):
+def test_scenes_are_unchanged_by_writing_and_reading(scenes: list[StaticScene], tmp_path: Path):
     path = tmp_path / "scenes.h5"
     write_static_scenes(path, StaticScenes(GRID, tuple(scenes), 7, {"drake": "x"}))
     assert is_static_scenes(path)
@@ -142,7 +142,7 @@ def test_samples_have_a_grasp_of_each_loose_tool():
     scene = StaticScene.of(Observation(), actions)
     final = StaticScene.of(Observation(), np.zeros((0, 8)))
     samples = StaticSamples(StaticScenes(GRID, (final, scene)))
-    # As of any sequence, the last follows from its end, and there is an end.
+    # A sequence has an end, and negative indices count from it.
     assert (samples[-1].pick == samples[len(samples) - 1].pick).all()
     with pytest.raises(IndexError):
         samples[len(samples)]
@@ -156,6 +156,6 @@ def test_samples_have_a_grasp_of_each_loose_tool():
         }
         assert len(picks & {0, 1, 2}) == len(picks & {3, 4}) == 1
         seen |= picks
-    # The one that would not hold is never drawn.
+    # Samples never use the grasp that would not hold.
     assert seen == {0, 1, 3, 4}
     np.testing.assert_array_equal(samples[3].pick, samples[3].pick)

@@ -31,12 +31,12 @@ def observed(text: str) -> Observation:
 
 @pytest.fixture(scope="module")
 def plain() -> Observation:
-    """As nothing is painted."""
+    """The observation without paint."""
     return observed("{}")
 
 
 @needs_renderer
-def test_colours_are_painted_and_heights_stay(plain: Observation):
+def test_paint_changes_colours_but_not_heights(plain: Observation):
     red = observed('{appearance: {paints: {"*": !Fixed {rgb: [1.0, 0.0, 0.0]}}}}').image
     np.testing.assert_array_equal(red[3], plain.height)
     assert red[1:3].max() == 0
@@ -44,32 +44,32 @@ def test_colours_are_painted_and_heights_stay(plain: Observation):
 
 
 @needs_renderer
-def test_drawn_colours_are_the_seeds(plain: Observation):
+def test_drawn_colours_depend_on_the_seed(plain: Observation):
     text = '{appearance: {paints: {"table/*": !Drawn {}, "fixtures/*": !Drawn {shared: true}}}}'
     one = observed(text).image
     np.testing.assert_array_equal(one, observed(text).image)
     changed = (one[:3] != plain.rgb).any(axis=0)
-    # The tools stay as they are.
+    # The tools keep their colours.
     assert 0.8 < changed.mean() < 1.0
     np.testing.assert_array_equal(one[3], plain.height)
 
 
-def test_a_pattern_that_names_nothing_is_told():
-    with pytest.raises(UserError, match=r"appearance\.paints: no surface is called tabel/\*"):
+def test_a_pattern_without_a_match_raises():
+    with pytest.raises(UserError, match=r"appearance\.paints: .*tabel/\*"):
         rig_of('{appearance: {paints: {"tabel/*": !Drawn {}}}}')
-    with pytest.raises(UserError, match=r"appearance\.sheen\.\* must be from 0 to 1, not 2"):
+    with pytest.raises(UserError, match=r"appearance\.sheen\.\*"):
         rig_of('{appearance: {sheen: {"*": 2.0}}}')
 
 
 @needs_renderer
-def test_sheen_makes_holes_on_what_has_it(plain: Observation):
+def test_sheen_makes_holes_on_its_surfaces_only(plain: Observation):
     holed = observed('{appearance: {sheen: {"objects/*": 0.9}}}')
     lost = plain.valid & ~holed.valid
     tools = (plain.height > 0.004) & (plain.height < 0.04)
     assert lost[tools].mean() > 5 * lost[plain.height < 0.001].mean()
 
 
-def test_drawn_lights_are_the_seeds_and_point_down():
+def test_drawn_lights_depend_on_the_seed_and_point_down():
     appearance = Appearance(drawn_lights=0.6)
     drawn = [lights_of(appearance, seed) for seed in range(20)]
     assert {len(lights) for lights in drawn} == {1, 2, 3}
@@ -104,7 +104,7 @@ def test_a_models_friction_is_scaled_and_its_meshes_are_found(tmp_path: Path):
     assert "<mass>0.1805997838</mass>" in tool
     assert "mu_static>0.25<" in tool
     assert f"file://{MODELS / 'tools' / 'claw_hammer' / 'steel.obj'}" in tool
-    # Where homes have such names; Drake decodes nothing.
+    # Folder names may contain such characters, and Drake does not decode URIs.
     folder = tmp_path / "ä b#c%20d"
     shutil.copytree(MODELS / "tools" / "claw_hammer", folder)
     plant, _ = AddMultibodyPlantSceneGraph(DiagramBuilder(), time_step=0.01)
@@ -112,5 +112,5 @@ def test_a_models_friction_is_scaled_and_its_meshes_are_found(tmp_path: Path):
     assert Parser(plant).AddModelsFromString(moved, "sdf")
     broken = tmp_path / "broken.sdf"
     broken.write_text("<sdf")
-    with pytest.raises(UserError, match=r"broken\.sdf cannot be read"):
+    with pytest.raises(UserError, match=r"broken\.sdf"):
         varied_model(broken, friction=1, mass=1)

@@ -19,8 +19,8 @@ from tests.kitting_drake.rig import build_rig
 
 @pytest.mark.parametrize("force", [pytest.param(30.0, marks=pytest.mark.slow), 60.0])
 @pytest.mark.usefixtures("rendering")
-def test_it_presses_as_hard_as_it_is_told(monkeypatch: pytest.MonkeyPatch, force: float):
-    """Through an impact at `lower_speed`, and from one period of the planner to the next."""
+def test_a_press_reaches_the_press_force(monkeypatch: pytest.MonkeyPatch, force: float):
+    """Includes the impact at `lower_speed` and the delay of one planner period."""
     action = PickPlaceAction(pick=PlanarPose(0.42, 0.14), press=True)
     monkeypatch.setitem(sys.modules, "presser", types.SimpleNamespace(press=lambda _: action))
     scenario = Scenario(

@@ -12,8 +12,8 @@ from systems.signals import PixelGrid
 
 SPREAD = 0.3
 OTHER_STREAMS = [stream for stream in range(20) if stream != 13]
-"""Scenes are drawn from [seed] and [seed, 1] to [seed, 3], colours, light and cameras from others.
-numpy pads with zeros: [seed, 0] is [seed]."""
+"""Scenes use the streams [seed] and [seed, 1] to [seed, 3]; colours, lights and cameras use others.
+NumPy pads with zeros: [seed, 0] equals [seed]."""
 
 
 @pytest.fixture(scope="module")
@@ -22,14 +22,14 @@ def scene() -> Scene:
 
 
 def mass_factors(scene: Scene, seed: int, spread: float = SPREAD) -> np.ndarray:
-    """By how much the masses of a scene's objects, which are all alike, are scaled."""
+    """The mass factors of a scene of identical objects."""
     plant, _ = AddMultibodyPlantSceneGraph(DiagramBuilder(), time_step=0.01)
     objects, _ = add_models(plant, scene, Variation(mass=spread), seed)
     masses = [plant.get_body(item.body).default_mass() for item in objects]
     return np.array(masses) / 0.01
 
 
-def test_masses_vary_with_the_seed_alone(scene: Scene):
+def test_masses_vary_with_the_seed_only(scene: Scene):
     np.testing.assert_allclose(mass_factors(scene, 5, spread=0.0), 1.0, rtol=1e-12)
     first, other = mass_factors(scene, 5), mass_factors(scene, 6)
     np.testing.assert_array_equal(mass_factors(scene, 5), first)
@@ -37,7 +37,7 @@ def test_masses_vary_with_the_seed_alone(scene: Scene):
     assert (np.abs(first - 1) <= SPREAD).all()
 
 
-def test_masses_have_a_stream_of_their_own(scene: Scene):
+def test_masses_have_their_own_random_stream(scene: Scene):
     seed = 5
     drawn = (mass_factors(scene, seed) - 1) / SPREAD
     for stream in OTHER_STREAMS:

@@ -1,1 +1,1 @@
-"""The layers that the equivariant networks are built of."""
+"""The layers of the equivariant networks."""

@@ -1,9 +1,9 @@
 """Lifting and cross-correlation: the placing module's last step (equations 7 and 8 of the paper).
 
-`cross_correlation` computes the plain correlation. `search` finds its largest values without
-computing all of it: a coarse volume, at half the resolution and a fixed number of rotations, is
-correlated by FFT, and the plain correlation is evaluated around the coarse volume's best cells
-only, at any N. The cost of the search hardly grows with N.
+`cross_correlation` computes the full correlation. `search` finds its largest values without
+computing all of it. It computes a coarse volume by FFT, at half the resolution and a fixed number
+of rotations, and evaluates the full correlation only around the coarse volume's best cells. Its
+cost barely grows with N.
 """
 
 from __future__ import annotations
@@ -23,20 +23,20 @@ from torch.autograd.function import once_differentiable
 from kitting_drake.policies.networks.layers.steerable import BlurPool
 
 KERNEL = 65
-"""The side of the part of the crop's encoding that is correlated, in pixels."""
+"""The side of the correlated part of the crop's encoding, in pixels."""
 COARSE_ROTATIONS = 48
 """The number of rotations of the coarse volume."""
 _REACH = 4
-"""How far around a cell of the coarse volume the plain correlation is evaluated, in pixels."""
+"""How far around a coarse cell the full correlation is evaluated, in pixels."""
 
 
 def lift(encoding: Tensor, angles: Tensor, size: int) -> Tensor:
-    """R_N (equation 7): the encoding rotated about its middle, bilinearly sampled.
+    """R_N (equation 7): the encoding rotated about its centre with bilinear sampling.
 
     Args:
-        encoding: (1, channels, side, side), of odd side: the middle is a pixel.
+        encoding: (1, channels, side, side); the side is odd, so the centre is a pixel.
         angles: (n,), counter-clockwise, in radians.
-        size: the side of the part around the middle that is kept, odd, in pixels.
+        size: the side of the central part to keep, odd, in pixels.
 
     Returns:
         (n, channels, size, size).
@@ -46,7 +46,7 @@ def lift(encoding: Tensor, angles: Tensor, size: int) -> Tensor:
     offsets = torch.arange(-reach, reach + 1, dtype=encoding.dtype, device=encoding.device)
     row, col = torch.meshgrid(offsets, offsets, indexing="ij")
     cos, sin = torch.cos(angles)[:, None, None], torch.sin(angles)[:, None, None]
-    # Each pixel is taken from where the inverse rotation brings it, as (col, row) from -1 to 1.
+    # Sample each pixel at its inverse rotation, as (col, row) from -1 to 1.
     source = torch.stack([cos * col - sin * row, cos * row + sin * col], dim=-1)
     grid = source * (2 / (side - 1))
     stack = encoding.expand(len(angles), -1, -1, -1)
@@ -61,14 +61,14 @@ def cross_correlation(scene: Tensor, kernels: Tensor) -> Tensor:
         kernels: (n, channels, size, size) of odd size, R_N(psi(c)).
 
     Returns:
-        (n, rows, cols): the score of bringing the middle of each kernel to each pixel.
+        (n, rows, cols): the score of placing the centre of each kernel at each pixel.
     """
     reach = kernels.shape[-1] // 2
     return F.conv2d(scene, kernels, padding=reach)[0] / KERNEL
 
 
 def cross_correlation_fft(scene: Tensor, kernels: Tensor) -> Tensor:
-    """Equation 8 by fast Fourier transforms: the same as `cross_correlation`."""
+    """Equation 8 by fast Fourier transforms; same result as `cross_correlation`."""
     reach = kernels.shape[-1] // 2
     return _FourierCorrelation.apply(F.pad(scene[0], 4 * (reach,)), kernels) / KERNEL
 
@@ -76,8 +76,8 @@ def cross_correlation_fft(scene: Tensor, kernels: Tensor) -> Tensor:
 class _FourierCorrelation(torch.autograd.Function):
     """Cross-correlation without padding, by fast Fourier transforms.
 
-    Its gradients are transforms of real signals as well, and no transform reads or writes rows that
-    are zero or not wanted. Autograd through `torch.fft` would do three times the work.
+    Its gradients also use transforms of real signals, and no transform touches zero or unneeded
+    rows. Autograd through `torch.fft` would do three times the work.
     """
 
     @staticmethod
@@ -99,7 +99,7 @@ class _FourierCorrelation(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, Tensor]:
-        """The gradients of the scene and of the kernels."""
+        """The gradients with respect to the scene and the kernels."""
         conjugate, spectra = ctx.saved_tensors
         shape, scene_shape, kernel_shape = ctx.shapes
         spectrum = _spectrum(gradient, shape)
@@ -114,9 +114,9 @@ class _FourierCorrelation(torch.autograd.Function):
 
 
 def _spectrum(signals: Tensor, shape: tuple[int, int]) -> Tensor:
-    """The transposed `torch.fft.rfft2` of signals that are padded with zeros to a shape."""
+    """The transposed `torch.fft.rfft2` of signals that are zero-padded to a shape."""
     along_rows = torch.fft.rfft(signals, n=shape[1]).mT
-    # Transposed, each transform reads and writes neighbouring numbers.
+    # The transpose makes each transform read and write contiguous memory.
     return torch.fft.fft(F.pad(along_rows, (0, shape[0] - signals.shape[-2])))
 
 
@@ -124,9 +124,9 @@ def _first_lags(spectra: Tensor, shape: tuple[int, int], lags: tuple[int, int]) 
     """The first entries of correlations.
 
     Args:
-        spectra: the complex conjugates of their spectra, transposed.
+        spectra: the transposed complex conjugates of their spectra.
         shape: rows and cols of the transforms.
-        lags: how many rows and cols of the correlations are wanted.
+        lags: the number of rows and cols to compute.
     """
     # The inverse transform of a conjugate is the conjugate of the transform.
     along_cols = torch.fft.fft(spectra, norm="forward")[..., : lags[0]]
@@ -138,7 +138,7 @@ def rotation_angles(count: int, like: Tensor, phase: float = 0.0) -> Tensor:
     """(count,): evenly spaced angles over a full rotation, in radians.
 
     Args:
-        count: how many.
+        count: the number of angles.
         like: a tensor of the same type and on the same device.
         phase: the first angle, in steps.
     """
@@ -150,7 +150,7 @@ _halve = BlurPool()
 
 
 def coarse_volume(scene: Tensor, encoding: Tensor, angles: Tensor) -> Tensor:
-    """The correlation at half the resolution, scaled to approximate the plain one.
+    """The correlation at half the resolution, scaled to approximate the full one.
 
     Args:
         scene: (1, channels, rows, cols), odd sides.
@@ -168,13 +168,13 @@ def coarse_volume(scene: Tensor, encoding: Tensor, angles: Tensor) -> Tensor:
 def window(
     scene: Tensor, encoding: Tensor, angles: Tensor, corner: tuple[int, int], shape: tuple[int, int]
 ) -> Tensor:
-    """A window of the plain correlation with the rotated encoding of a crop.
+    """A window of the full correlation with the rotated encoding of a crop.
 
     Args:
         scene: (1, channels, rows, cols).
         encoding: (1, channels, side, side).
         angles: (n,).
-        corner: the window's first pixel (row, col); may lie outside the scene, which is zero there.
+        corner: the window's first pixel (row, col); the scene is zero outside its image.
         shape: the window's rows and cols.
 
     Returns:
@@ -186,7 +186,7 @@ def window(
 def kernel_window(
     scene: Tensor, kernels: Tensor, corner: tuple[int, int], shape: tuple[int, int]
 ) -> Tensor:
-    """A window of the plain correlation with given kernels.
+    """A window of the full correlation with given kernels.
 
     Args:
         scene: (1, channels, rows, cols).
@@ -204,14 +204,14 @@ def kernel_window(
     part = scene[:, :, vertical[0], horizontal[0]]
     padded = F.pad(part, (*horizontal[1], *vertical[1]))
     if kernels.requires_grad:
-        # Plain gradients of so large a kernel take three times as long.
+        # The gradients of conv2d with so large a kernel take three times as long.
         return _FourierCorrelation.apply(padded[0], kernels) / KERNEL
-    # U-nets leave their outputs in channels_last, in which so large a kernel is much slower.
+    # U-net outputs are channels_last, in which so large a kernel is much slower.
     return F.conv2d(padded.contiguous(), kernels.contiguous())[0] / KERNEL
 
 
 def _overlap(start: int, length: int, side: int) -> tuple[slice, tuple[int, int]]:
-    """The part of a span that lies on an axis of `side` pixels, and what lies before and after."""
+    """The slice of an axis of `side` pixels within a span, and the padding before and after it."""
     first = min(max(start, 0), side)
     last = min(max(start + length, first), side)
     before = min(max(-start, 0), length)
@@ -220,12 +220,12 @@ def _overlap(start: int, length: int, side: int) -> tuple[slice, tuple[int, int]
 
 @dataclass(frozen=True)
 class Candidate:
-    """A window of the plain correlation around one of its peaks."""
+    """A window of the full correlation around one of its peaks."""
 
     scores: Tensor
-    """(n, rows, cols), for n successive rotations."""
+    """(n, rows, cols): n successive rotations."""
     first_bin: int
-    """The rotation of `scores[0]`, in bins; it is cyclic, so it may be negative or exceed N."""
+    """The rotation of `scores[0]` in bins. It is cyclic, so it may be negative or exceed N."""
     corner: tuple[int, int]
     """The pixel (row, col) of `scores[:, 0, 0]`; all pixels lie in the scene."""
 
@@ -236,7 +236,7 @@ class Candidate:
         return score, self.first_bin + rotation, self.corner[0] + row, self.corner[1] + col
 
     def known_neighbours(self) -> int:
-        """How many scores there are of the largest's own cell and those next to it, of 27."""
+        """The number of the maximum's 27 neighbours, itself included, within the window."""
         at = _argmax(self.scores)
         return math.prod(
             min(i + 2, n) - max(i - 1, 0) for i, n in zip(at, self.scores.shape, strict=True)
@@ -244,14 +244,13 @@ class Candidate:
 
 
 def ranked(candidates: Iterable[Candidate], orientations: int) -> list[Candidate]:
-    """The candidates, best first, each of another cell.
+    """The candidates, best first, one for each cell.
 
-    Windows overlap, and the largest score of one may be that of the next, where it lies at the
-    edge. Of those with the same cell the one is kept that knows most of its neighbours, which
-    sub-pixel refinement needs; which is largest by rounding says nothing.
+    Overlapping windows may have the same maximum, possibly at the edge of one of them. The window
+    with most neighbours of the maximum is kept, because sub-pixel refinement needs them.
 
     Args:
-        candidates: those of the coarse volume's peaks.
+        candidates: windows around the peaks of the coarse volume.
         orientations: N.
     """
     of_cell: dict[tuple[int, int, int], Candidate] = {}
@@ -270,11 +269,11 @@ def _argmax(volume: Tensor) -> tuple[int, int, int]:
 
 
 def peaks(volume: Tensor, count: int) -> Iterator[tuple[int, int, int]]:
-    """(rotation, row, col) of the largest values of a volume, largest first, none next to another.
+    """(rotation, row, col) of the largest values of a volume, largest first, none adjacent.
 
     Args:
         volume: (n, rows, cols), over a full rotation.
-        count: how many.
+        count: the number of peaks.
     """
     remaining = volume.clone()
     best = volume.amax(0)
@@ -289,7 +288,7 @@ def peaks(volume: Tensor, count: int) -> Iterator[tuple[int, int, int]]:
 
 
 def finer_bins(rotation: int, coarse: int, orientations: int) -> tuple[int, int]:
-    """The first and last bin at N orientations of what lies between a coarse rotation's neighbours.
+    """The first and last of the N bins between the neighbours of a coarse rotation.
 
     Args:
         rotation: the coarse rotation, in coarse bins.
@@ -303,7 +302,8 @@ def finer_bins(rotation: int, coarse: int, orientations: int) -> tuple[int, int]
 def window_around(
     pixel: tuple[int, int], shape: tuple[int, int]
 ) -> tuple[tuple[int, int], tuple[int, int]]:
-    """The corner (row, col) and shape (rows, cols) of the window around a pixel, kept in an image.
+    """The corner (row, col) and shape (rows, cols) of the window around a pixel, clipped to an
+    image.
 
     Args:
         pixel: (row, col).
@@ -322,14 +322,14 @@ def search(
     shape: tuple[int, int] | None = None,
     candidates: int = 6,
 ) -> tuple[list[Candidate], Tensor]:
-    """The peaks of the plain correlation at N orientations, best first, and the coarse volume.
+    """The peaks of the full correlation at N orientations, best first, and the coarse volume.
 
     Args:
         scene: (1, channels, rows, cols), odd sides, phi(o_t).
         encoding: (1, channels, side, side), psi(c).
         orientations: N.
-        shape: the rows and cols, from the first ones on, that are searched; by default all.
-        candidates: how many of the coarse volume's peaks are refined.
+        shape: searches only the first rows and cols; all by default.
+        candidates: the number of coarse peaks to refine.
 
     Returns:
         The candidates, and the coarse volume (COARSE_ROTATIONS, about rows / 2, about cols / 2).

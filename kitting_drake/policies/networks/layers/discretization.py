@@ -1,6 +1,6 @@
 """The group discretization operation of the paper (section III-B.2), and its continuous limit.
 
-The number of orientations N is no property of the network: the same Fourier coefficients can be
+The number of orientations N is not a property of the network. The same Fourier coefficients can be
 discretized at any N that the band limit allows, and the maximum of the series needs no N at all.
 """
 
@@ -19,26 +19,26 @@ from kitting_drake.policies.networks.layers.fibres import fourier_basis
 def discretization_matrix(
     orientations: int, frequencies: Sequence[int], *, quotient: int = 1
 ) -> NDArray[np.float64]:
-    """Q of the paper, the matrix of Dis from SO(2) to C_N (equations 5, 6) or of its quotient form.
+    """Q of the paper, the matrix of Dis from SO(2) to C_N (equations 5, 6), or for a quotient.
 
     Args:
         orientations: N, the number of bins over a full rotation.
         frequencies: j of the irreps, ascending.
-        quotient: 2 for SO(2)/C_2 to C_N/C_2: the matrix has bins 0 to N/2 - 1 only, at the same
+        quotient: 2 for SO(2)/C_2 to C_N/C_2. The matrix then has only the bins 0 to N/2 - 1, at the
             angles 2 pi i / N, and every frequency must be even.
 
     Returns:
         (N / quotient, d).
 
     Raises:
-        ValueError: N is not a multiple of `quotient`, a frequency is no multiple of it either, or N
-            / quotient is smaller than d, which aliases (Nyquist).
+        ValueError: N or a frequency is not a multiple of `quotient`, or N / quotient is too small
+            for the band limit and would alias (Nyquist).
     """
     if orientations < 1 or orientations % quotient:
         raise ValueError(f"{orientations} orientations are not a multiple of {quotient}")
     odd = [j for j in frequencies if j % quotient]
     if odd:
-        raise ValueError(f"frequency {odd[0]} is not one of SO(2)/C_{quotient}")
+        raise ValueError(f"frequency {odd[0]} is not a frequency of SO(2)/C_{quotient}")
     bins = orientations // quotient
     size = sum(2 if j else 1 for j in frequencies)
     # The band limit within the quotient's own period.

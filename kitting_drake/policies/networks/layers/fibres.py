@@ -1,7 +1,7 @@
-"""The fibre of a feature field: what the field carries at each pixel, and how it is stored.
+"""The fibre of a feature field: its representation at each pixel, and how it is stored.
 
-Fields of irreps are stored as *samples* of the function that their coefficients describe, so that a
-pointwise nonlinearity acts on them directly (see `steerable.py`). Everything here is plain linear
+Fields of irreps are stored as *samples* of the function that their coefficients describe, and a
+pointwise nonlinearity acts on the samples directly (see `steerable.py`). This is plain linear
 algebra: inference needs no group library.
 """
 
@@ -17,27 +17,27 @@ from numpy.typing import NDArray
 
 
 class Fibre(Protocol):
-    """The representation by which one field transforms, and how its vectors are stored."""
+    """The representation of one field, and how its vectors are stored."""
 
     def __hash__(self) -> int: ...
 
     @property
     def size(self) -> int:
-        """Dimension of the representation."""
+        """The dimension of the representation."""
 
     @property
     def channels(self) -> int:
-        """The number of channels in which one field is stored."""
+        """The number of stored channels of one field."""
 
     def synthesis(self) -> NDArray[np.float64]:
-        """(channels, size): from a vector of the representation to the stored channels."""
+        """(channels, size): maps a vector of the representation to the stored channels."""
 
     def analysis(self) -> NDArray[np.float64]:
-        """(size, channels): the left inverse of `synthesis`, which projects."""
+        """(size, channels): the left inverse of `synthesis`; it projects onto the irreps."""
 
     def invariant(self) -> NDArray[np.float64]:
-        """(channels,): the functional that is invariant to rotations: it gives the coefficient of
-        frequency 0, scaled as in escnn's Fourier ELU."""
+        """(channels,): the rotation-invariant functional. It gives the coefficient of frequency 0,
+        scaled as in escnn's Fourier ELU."""
 
 
 @dataclass(frozen=True)
@@ -61,18 +61,18 @@ class Scalar:
 class Irreps:
     """A direct sum of irreps of SO(2), equation 4 of the paper.
 
-    Even frequencies alone make a field of the quotient SO(2)/C_2.
+    Even frequencies alone give a field of the quotient SO(2)/C_2.
     """
 
     frequencies: tuple[int, ...]
     """j of each rho_j, ascending."""
     samples: int = 0
-    """How many evenly spaced samples of the band-limited function are stored; 0: the coefficients
-    themselves are."""
+    """The number of stored, evenly spaced samples of the band-limited function; 0 stores the
+    coefficients themselves."""
 
     def __post_init__(self) -> None:
         if list(self.frequencies) != sorted(set(self.frequencies)) or min(self.frequencies) < 0:
-            raise ValueError("frequencies must ascend from 0 or more")
+            raise ValueError("frequencies must be non-negative and ascending")
         if 0 < self.samples <= 2 * max(self.frequencies):
             raise ValueError(
                 f"{self.samples} samples cannot hold frequency {max(self.frequencies)}: "
@@ -101,13 +101,13 @@ class Irreps:
 
     def invariant(self) -> NDArray[np.float64]:
         if not self.samples:
-            raise ValueError("the invariant of a field of coefficients is the first of them")
+            raise ValueError("invariant() needs samples: a field of coefficients stores it first")
         return np.full(self.samples, math.sqrt(self.size) / self.samples)
 
 
 @dataclass(frozen=True)
 class Regular:
-    """The regular representation of C_N or of its quotient C_N / C_q: it permutes N / q numbers."""
+    """The regular representation of C_N, or of the quotient C_N / C_q, on N / q channels."""
 
     order: int
     quotient: int = 1
@@ -135,14 +135,14 @@ class Regular:
 
 
 def fourier_basis(angles: NDArray[np.float64], frequencies: Sequence[int]) -> NDArray[np.float64]:
-    """The basis of equation 5 at some angles.
+    """The basis of equation 5 at given angles.
 
     Args:
         angles: (n,), in radians.
         frequencies: ascending.
 
     Returns:
-        (n, d): for each frequency a column of cosines and, above zero, one of sines.
+        (n, d): a column of cosines for each frequency, followed by sines if the frequency is not 0.
     """
     columns = []
     for j in frequencies:

@@ -1,4 +1,4 @@
-"""The maximum of a Fourier series, the continuous limit of the group discretization; no torch."""
+"""The maximum of a Fourier series: the continuous limit of the discretization. Needs no torch."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ from kitting_drake.policies.networks.layers.fibres import fourier_basis
 
 
 def series_maximum(coefficients: NDArray[np.float64], frequencies: Sequence[int]) -> float:
-    """The angle at which a Fourier series is largest, exactly and not only among N bins.
+    """The angle at which a Fourier series is largest, without discretization.
 
     Args:
         coefficients: (d,), in the order of `fourier_basis`.
         frequencies: ascending.
 
     Returns:
-        Radians in [0, 2 pi): the first of several equal maxima, which there are on a quotient.
+        Radians in [0, 2 pi). A series on a quotient has several equal maxima; this is the first.
     """
-    # A series of a shorter period, as on a quotient, is searched over one period.
+    # On a quotient the period is shorter: search one period only.
     period = math.gcd(*frequencies) or 1
     reduced = np.array(frequencies) // period
     count = 32 * max(int(reduced.max()), 1)
@@ -34,7 +34,7 @@ def series_maximum(coefficients: NDArray[np.float64], frequencies: Sequence[int]
 
     best, largest = 0.0, -math.inf
     for peak in peaks:
-        # Newton's method; no step leads beyond the neighbouring samples.
+        # Newton's method; no step goes beyond the neighbouring samples.
         angle = math.tau * float(peak) / count
         for _ in range(8):
             terms = evaluate(angle)
@@ -49,7 +49,7 @@ def series_maximum(coefficients: NDArray[np.float64], frequencies: Sequence[int]
         value = float(evaluate(angle).real.sum())
         if value > largest + 1e-12 * float(np.ptp(values)):
             best, largest = angle, value
-    # An angle just below a full rotation is zero, up to rounding.
+    # Rounding can put an angle of zero just below a full rotation.
     best %= math.tau
     return 0.0 if math.tau - best < 1e-9 else best / period
 

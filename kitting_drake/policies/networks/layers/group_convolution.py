@@ -1,13 +1,13 @@
-"""Convolutions between the regular fields of large cyclic groups, without a dense basis.
+"""Convolutions between regular fields of large cyclic groups, without a dense basis.
 
 Between regular fields of C_N, or of C_N / C_q, with M = N / q channels, every steerable kernel is
 
     K[m, n](x) = kappa[(n - m) mod M](R_m^-1 x),
 
-where R_m is the rotation by 2 pi m / N: the kernels to output channel 0 are free, and those to
-channel m are the same kernels, rotated. This is the same space of kernels as escnn's. escnn's basis
-of it, M B kernels of M^2 numbers a pixel, would not fit into memory at N = 180; here only B
-patterns in M rotations are stored.
+where R_m is the rotation by 2 pi m / N. The kernels to output channel 0 are free, and those to
+channel m are their rotated copies. escnn spans the same space, but its basis of M B kernels, each
+with M^2 numbers per pixel, does not fit into memory at N = 180. This layer stores only B patterns
+in M rotations.
 """
 
 from __future__ import annotations
@@ -18,47 +18,27 @@ import math
 import torch
 from torch import Tensor
 
-from kitting_drake.policies.networks.layers.fibres import Fibre, Irreps, Regular, Scalar
+from kitting_drake.policies.networks.layers.fibres import Irreps, Regular, Scalar
 from kitting_drake.policies.networks.layers.steerable import ExpandedConv2d, kernel_basis
 
 
 class GroupConv2d(ExpandedConv2d):
-    """The counterpart of `SteerableConv2d` for regular fields of one cyclic group, and scalars."""
+    """The counterpart of `SteerableConv2d` for regular fields of one cyclic group, and scalars.
 
-    basis: Tensor
+    At most one of the two fibres may be scalar.
+    """
 
-    def __init__(
-        self,
-        in_fields: int,
-        in_fibre: Fibre,
-        out_fields: int,
-        out_fibre: Fibre,
-        size: int,
-        *,
-        padding: int | None = None,
-        bias: bool = False,
-        gain: float = 1.0,
-    ) -> None:
-        """
-        Args:
-            in_fields: the number of input fields.
-            in_fibre: the fibre of each of them.
-            out_fields: the number of output fields.
-            out_fibre: the fibre of each of them; one of the two fibres may be scalar.
-            size: the side of the kernel, odd, in pixels.
-            padding: zeros around the image, in pixels; by default the image keeps its size.
-            bias: whether each output field has a bias.
-            gain: a factor of the initial weights' standard deviation.
-        """
-        fibres = [fibre for fibre in (in_fibre, out_fibre) if not isinstance(fibre, Scalar)]
+    def _make_basis(self, in_fields: int, size: int) -> tuple[Tensor, int, float]:
+        fibres = [f for f in (self.in_fibre, self.out_fibre) if not isinstance(f, Scalar)]
         if not fibres or not isinstance(fibres[0], Regular) or fibres[0] != fibres[-1]:
-            raise ValueError(f"no group convolution leads from {in_fibre} to {out_fibre}")
+            raise ValueError(
+                f"GroupConv2d cannot map {self.in_fibre} to {self.out_fibre}: they must be equal "
+                "regular fibres, or one of them scalar"
+            )
         basis = rotated_patterns(fibres[0], size)
-        scale = math.sqrt(2 / (in_fields * in_fibre.channels * float(basis[0].square().sum())))
+        gathered = in_fields * self.in_fibre.channels * float(basis[0].square().sum())
         taps = basis.shape[1] * (len(basis) if len(fibres) == 2 else 1)
-        weights = torch.randn(out_fields, in_fields, taps) * (gain * scale)
-        super().__init__(in_fibre, out_fibre, size, padding, weights, bias)
-        self.register_buffer("basis", basis.to(torch.get_default_dtype()), persistent=False)
+        return basis.to(torch.get_default_dtype()), taps, math.sqrt(2 / gathered)
 
     def kernel(self, dtype: torch.dtype = torch.float32) -> Tensor:
         if isinstance(self.in_fibre, Scalar):
@@ -66,8 +46,7 @@ class GroupConv2d(ExpandedConv2d):
         elif isinstance(self.out_fibre, Scalar):
             kernel = torch.einsum("oib,nbxy->oxyin", self.weights, self.basis)
         else:
-            # kappa is repeated once, so that its cyclic shifts are windows of it; that of m starts
-            # at -m.
+            # The cyclic shifts of kappa are windows of kappa repeated twice; shift m starts at -m.
             kappa = self.weights.unflatten(2, self.basis.shape[:2])
             cyclic = torch.cat([kappa, kappa], dim=2).unfold(2, len(self.basis), 1)
             kernel = torch.einsum("oimbn,mbxy->omxyin", cyclic[:, :, 1:].flip(2), self.basis)
@@ -77,8 +56,8 @@ class GroupConv2d(ExpandedConv2d):
 
     @torch.no_grad()
     def fit(self, kernel: Tensor) -> None:
-        # Of each output field the first channel, which is not rotated, has all weights; all of them
-        # together would take 20 GB at N = 180.
+        # The first channel of each output field is not rotated and determines all weights. A fit to
+        # all channels would take 20 GB at N = 180.
         first = kernel[:: self.out_fibre.channels].unflatten(1, (self.weights.shape[1], -1))
         if isinstance(self.out_fibre, Scalar):
             first = first[:, :, :1]
@@ -89,25 +68,25 @@ class GroupConv2d(ExpandedConv2d):
 
 @functools.lru_cache(maxsize=16)
 def rotated_patterns(fibre: Regular, size: int) -> Tensor:
-    """escnn's circular harmonics that are invariant under C_q, rotated by all of C_N / C_q.
+    """escnn's circular harmonics that are invariant under C_q, in all rotations of C_N / C_q.
 
     Args:
-        fibre: C_N / C_q, the regular representation whose kernels are wanted.
+        fibre: the regular representation of C_N / C_q.
         size: the side of the kernel, odd, in pixels.
 
     Returns:
         (M, B, size, size), float64: B patterns, each rotated counter-clockwise by 2 pi m / N.
     """
     reach = size // 2
-    # An upper bound: escnn itself keeps about as many frequencies as the radius has pixels.
+    # An upper bound: escnn itself keeps about as many frequencies as the radius in pixels.
     frequencies = tuple(range(0, 3 * reach + 1, fibre.quotient))
     pairs = kernel_basis(Scalar(), Irreps(frequencies), size)[:, :, 0]
     angles = 2 * math.pi * torch.arange(fibre.size, dtype=torch.float64) / fibre.order
     rotated = []
     row = 0
     for j in frequencies:
-        # For a kernel (p, q) from scalars to rho_j, (p, q)(R x) = rho_j(R) (p, q)(x): the rotated p
-        # is a combination of p and q.
+        # A kernel (p, q) from scalars to rho_j satisfies (p, q)(R x) = rho_j(R) (p, q)(x), so the
+        # rotated p is a combination of p and q.
         block = pairs[:, row : row + (2 if j else 1)]
         block = block[block.abs().amax(dim=(1, 2, 3)) > 1e-9]
         first, last = block[:, 0], block[:, -1]

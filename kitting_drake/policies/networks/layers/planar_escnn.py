@@ -1,8 +1,8 @@
-"""escnn for groups of the plane: every import of escnn in this project goes through here.
+"""escnn for planar groups. All other modules import escnn from here.
 
-escnn imports one function of lie_learn, and calls it for SO(3) alone. lie_learn 0.0.2 does not load
-with numpy 2 and has no wheel for Python 3.13: see the requests QUVA-Lab/escnn#80 and
-AMLab-Amsterdam/lie_learn#30. A module with a function that refuses stands in for it here.
+escnn imports lie_learn, but uses it for SO(3) only. lie_learn 0.0.2 fails to load with numpy 2 and
+has no wheel for Python 3.13 (see QUVA-Lab/escnn#80 and AMLab-Amsterdam/lie_learn#30). This module
+replaces it with a stub that raises an error when called.
 """
 
 import sys
@@ -15,12 +15,12 @@ _MODULE = "lie_learn.representations.SO3.wigner_d"
 
 
 def _stand_in() -> types.ModuleType:
-    """The module that escnn imports, with a function that refuses."""
+    """The stub for the module that escnn imports."""
 
     def wigner_d_matrix(*args: object, **options: object) -> None:
         raise NotImplementedError(
-            "escnn needs the package lie_learn for SO(3), and kitting_drake put a stand-in in its "
-            "place: install lie_learn, and import escnn before kitting_drake"
+            "escnn needs the package lie_learn for SO(3), which kitting_drake replaces with a "
+            "stub: install lie_learn, and import escnn before kitting_drake"
         )
 
     module = types.ModuleType(_MODULE)
@@ -28,10 +28,10 @@ def _stand_in() -> types.ModuleType:
     return module
 
 
-# Where escnn was imported before, the real lie_learn is loaded and stays.
+# If escnn was imported before, the real lie_learn stays.
 sys.modules.setdefault(_MODULE, _stand_in())
 with warnings.catch_warnings():
-    # escnn warns of an optional package that planar groups never use.
+    # escnn warns about an optional package that planar groups do not need.
     warnings.simplefilter("ignore")
     from escnn import gspaces
     from escnn import nn as enn

@@ -1,13 +1,12 @@
 """Steerable convolutions that run as plain ones.
 
-A kernel is a linear combination of escnn's basis kernels. The Fourier transforms that a pointwise
-nonlinearity needs before and after it are folded into the kernels,
+A kernel is a linear combination of escnn's basis kernels. The Fourier transforms before and after a
+pointwise nonlinearity are folded into the kernels,
 
-    kernel' = synthesis_out . kernel . analysis_in,
+    kernel' = synthesis_out . kernel . analysis_in.
 
-so that feature maps are stored as samples and ELU acts on them directly, without a transform of the
-feature map around it. With the same weights this is the same function as escnn's R2Conv followed by
-FourierELU.
+Feature maps are therefore stored as samples, and ELU acts on them directly. With the same weights
+this is the same function as escnn's R2Conv followed by FourierELU.
 """
 
 from __future__ import annotations
@@ -27,74 +26,16 @@ from torch.autograd.function import once_differentiable
 from kitting_drake.policies.networks.layers.fibres import Fibre, Irreps, Regular, Scalar
 
 Convolution = Callable[..., nn.Module]
-"""A class of layers: `SteerableConv2d`, `GroupConv2d` or `PlainConv2d`. It makes a layer from
+"""A layer class: `SteerableConv2d`, `GroupConv2d` or `PlainConv2d`, called with
 (in_fields, in_fibre, out_fields, out_fibre, size, padding=..., bias=..., gain=...)."""
 
 
 _TOGETHER = 64
-"""The most channels that `BandLimit` and `InvariantPart` take in one product."""
+"""The most channels that `BandLimit` and `InvariantPart` combine in one product."""
 
 
 class ExpandedConv2d(nn.Module):
-    """A trainable convolution between fields, whose kernel is computed from fewer weights."""
-
-    def __init__(
-        self,
-        in_fibre: Fibre,
-        out_fibre: Fibre,
-        size: int,
-        padding: int | None,
-        weights: Tensor,
-        bias: bool,
-    ) -> None:
-        super().__init__()
-        self.in_fibre, self.out_fibre = in_fibre, out_fibre
-        self.padding = size // 2 if padding is None else padding
-        self.weights = nn.Parameter(weights)
-        self.bias = nn.Parameter(torch.zeros(len(weights))) if bias else None
-
-    def kernel(self, dtype: torch.dtype = torch.float32) -> Tensor:
-        """(out channels, in channels, size, size), in channels_last: what a plain convolution
-        takes."""
-        raise NotImplementedError
-
-    @torch.no_grad()
-    def fit(self, kernel: Tensor) -> None:
-        """Sets the weights to those of a plain kernel that came from such a layer.
-
-        Args:
-            kernel: as `kernel` returns it.
-        """
-        out_fields, in_fields = self.weights.shape[:2]
-        out_channels, in_channels = self.out_fibre.channels, self.in_fibre.channels
-        shape = self.weights.shape[2:]
-        rows = []
-        for unit in torch.eye(shape.numel()):
-            # All blocks of fields are alike then: the first is what this weight brings.
-            self.weights.copy_(unit.view(shape).expand_as(self.weights))
-            rows.append(self.kernel()[:out_channels, :in_channels].flatten())
-        blocks = kernel.reshape(out_fields, out_channels, in_fields, in_channels, *kernel.shape[2:])
-        targets = blocks.transpose(1, 2).flatten(2).flatten(0, 1)
-        found = torch.linalg.lstsq(torch.stack(rows).double().T, targets.double().T).solution
-        self.weights.copy_(found.T.reshape(self.weights.shape))
-
-    def channel_bias(self) -> Tensor | None:
-        """(out channels,), if there is a bias."""
-        return None if self.bias is None else self.bias.repeat_interleave(self.out_fibre.channels)
-
-    def forward(self, features: Tensor) -> Tensor:
-        """(batch, in channels, rows, cols) to (batch, out channels, rows, cols)."""
-        bias = self.channel_bias()
-        return F.conv2d(
-            features,
-            self.kernel(features.dtype),
-            None if bias is None else bias.to(features.dtype),
-            padding=self.padding,
-        )
-
-
-class SteerableConv2d(ExpandedConv2d):
-    """An equivariant convolution between fields (equation 3), in escnn's basis of kernels."""
+    """A trainable convolution between fields. Its kernel is a linear combination of a basis."""
 
     basis: Tensor
 
@@ -113,25 +54,81 @@ class SteerableConv2d(ExpandedConv2d):
         """
         Args:
             in_fields: the number of input fields.
-            in_fibre: the fibre of each of them.
+            in_fibre: the fibre of each input field.
             out_fields: the number of output fields.
-            out_fibre: the fibre of each of them.
+            out_fibre: the fibre of each output field.
             size: the side of the kernel, odd, in pixels.
-            padding: zeros around the image, in pixels; by default the image keeps its size.
-            bias: whether each output field has a bias, on its invariant part. The output fibre must
-                be stored as samples or be scalar.
+            padding: zero padding, in pixels; by default the image keeps its size.
+            bias: whether each output field has a bias on its invariant part. The output fibre must
+                be scalar or regular, or be stored as samples.
             gain: a factor of the initial weights' standard deviation.
+
+        Raises:
+            ValueError: there are no such kernels between the fibres.
         """
-        basis = kernel_basis(in_fibre, out_fibre, size)
-        # He initialisation. The samples of a field are no more independent than its coefficients.
-        repeated = in_fibre.channels / in_fibre.size
-        gathered = in_fields * float(basis.square().sum()) * repeated / out_fibre.channels
-        scale = math.sqrt(2 / gathered)
-        weights = torch.randn(out_fields, in_fields, len(basis)) * (gain * scale)
-        super().__init__(in_fibre, out_fibre, size, padding, weights, bias)
-        # In the memory order that `expand_kernel` needs.
+        super().__init__()
+        self.in_fibre, self.out_fibre = in_fibre, out_fibre
+        self.padding = size // 2 if padding is None else padding
+        basis, taps, scale = self._make_basis(in_fields, size)
+        self.weights = nn.Parameter(torch.randn(out_fields, in_fields, taps) * (gain * scale))
+        self.bias = nn.Parameter(torch.zeros(out_fields)) if bias else None
+        self.register_buffer("basis", basis, persistent=False)
+
+    def _make_basis(self, in_fields: int, size: int) -> tuple[Tensor, int, float]:
+        """The basis, the number of weights between two fields, and their initial standard deviation
+        (He initialisation)."""
+        raise NotImplementedError
+
+    def kernel(self, dtype: torch.dtype = torch.float32) -> Tensor:
+        """(out channels, in channels, size, size), in channels_last: the plain kernel."""
+        raise NotImplementedError
+
+    @torch.no_grad()
+    def fit(self, kernel: Tensor) -> None:
+        """Sets the weights to those of a plain kernel of such a layer.
+
+        Args:
+            kernel: as `kernel` returns it.
+        """
+        out_fields, in_fields = self.weights.shape[:2]
+        out_channels, in_channels = self.out_fibre.channels, self.in_fibre.channels
+        shape = self.weights.shape[2:]
+        rows = []
+        for unit in torch.eye(shape.numel()):
+            # All blocks of fields are equal here, so the first one holds this weight's kernel.
+            self.weights.copy_(unit.view(shape).expand_as(self.weights))
+            rows.append(self.kernel()[:out_channels, :in_channels].flatten())
+        blocks = kernel.reshape(out_fields, out_channels, in_fields, in_channels, *kernel.shape[2:])
+        targets = blocks.transpose(1, 2).flatten(2).flatten(0, 1)
+        found = torch.linalg.lstsq(torch.stack(rows).double().T, targets.double().T).solution
+        self.weights.copy_(found.T.reshape(self.weights.shape))
+
+    def channel_bias(self) -> Tensor | None:
+        """(out channels,); None without a bias."""
+        return None if self.bias is None else self.bias.repeat_interleave(self.out_fibre.channels)
+
+    def forward(self, features: Tensor) -> Tensor:
+        """(batch, in channels, rows, cols) to (batch, out channels, rows, cols)."""
+        bias = self.channel_bias()
+        return F.conv2d(
+            features,
+            self.kernel(features.dtype),
+            None if bias is None else bias.to(features.dtype),
+            padding=self.padding,
+        )
+
+
+class SteerableConv2d(ExpandedConv2d):
+    """An equivariant convolution between fields (equation 3), in escnn's basis of kernels."""
+
+    def _make_basis(self, in_fields: int, size: int) -> tuple[Tensor, int, float]:
+        basis = kernel_basis(self.in_fibre, self.out_fibre, size)
+        # The samples of a field are no more independent than its coefficients.
+        repeated = self.in_fibre.channels / self.in_fibre.size
+        gathered = in_fields * float(basis.square().sum()) * repeated / self.out_fibre.channels
+        # The memory order that `expand_kernel` needs.
         order = basis.permute(0, 1, 3, 4, 2).to(torch.get_default_dtype()).contiguous()
-        self.register_buffer("basis", order.permute(0, 1, 4, 2, 3), persistent=False)
+        return order.permute(0, 1, 4, 2, 3), len(basis), math.sqrt(2 / gathered)
 
     def kernel(self, dtype: torch.dtype = torch.float32) -> Tensor:
         return expand_kernel(self.weights, self.basis, dtype)
@@ -151,7 +148,7 @@ def expand_kernel(weights: Tensor, basis: Tensor, dtype: torch.dtype = torch.flo
     out_fields, in_fields, _ = weights.shape
     _, out_channels, in_channels, size, _ = basis.shape
     kernel = weights.flatten(0, 1) @ basis.permute(0, 1, 3, 4, 2).flatten(1)
-    # Before the fields are interleaved, which is then cheaper.
+    # Casting before the fields are interleaved is cheaper.
     kernel = kernel.to(dtype)
     kernel = kernel.view(out_fields, in_fields, out_channels, size, size, in_channels)
     kernel = kernel.permute(0, 2, 3, 4, 1, 5).reshape(
@@ -161,10 +158,10 @@ def expand_kernel(weights: Tensor, basis: Tensor, dtype: torch.dtype = torch.flo
 
 
 class PlainConv2d(nn.Conv2d):
-    """An `ExpandedConv2d` as it is exported for inference: an ordinary convolution.
+    """The plain convolution of an `ExpandedConv2d`, for inference.
 
-    It computes in the type of its input. If its weights are of another type, they are cast at every
-    call; `MixedPrecision.cast` casts them once.
+    It computes in the type of its input and casts its weights at every call if necessary.
+    `MixedPrecision.cast` casts them once.
     """
 
     def __init__(
@@ -195,20 +192,20 @@ class PlainConv2d(nn.Conv2d):
 
 
 @functools.lru_cache(maxsize=64)
-@torch.inference_mode(False)  # escnn keeps tensors for later, and those are for any mode.
+@torch.inference_mode(False)  # escnn caches tensors, which must work outside inference mode too.
 def kernel_basis(in_fibre: Fibre, out_fibre: Fibre, size: int) -> Tensor:
-    """escnn's basis of the steerable kernels between two fields, with the transforms folded in.
+    """escnn's basis of the steerable kernels between two fibres, with the transforms folded in.
 
     Returns:
         (D, out channels, in channels, size, size), float64.
     """
-    # Shipped weights carry their kernels: whoever only decides needs no escnn.
+    # Shipped weights include their kernel bases, so inference does not import escnn.
     from kitting_drake.policies.networks.layers.planar_escnn import enn, gspaces
 
     orders = {fibre.order for fibre in (in_fibre, out_fibre) if isinstance(fibre, Regular)}
     irreps = [fibre for fibre in (in_fibre, out_fibre) if isinstance(fibre, Irreps)]
     if len(orders) > 1 or (orders and irreps):
-        raise ValueError(f"no kernels lead from {in_fibre} to {out_fibre}: their groups differ")
+        raise ValueError(f"no kernels map {in_fibre} to {out_fibre}: their groups differ")
     if orders:
         space = gspaces.rot2dOnR2(orders.pop())
     else:
@@ -246,11 +243,11 @@ def kernel_basis(in_fibre: Fibre, out_fibre: Fibre, size: int) -> Tensor:
 
 
 def frequencies_cutoff(in_fibre: Fibre, out_fibre: Fibre, size: int) -> float | None:
-    """The largest angular frequency of the kernels on a ring of pixels, in units of its radius.
+    """The largest angular frequency of the kernels on a ring of pixels, per pixel of its radius.
 
-    A kernel of angular frequency k maps rho_i to rho_j with j up to i + k. Where escnn's own limit
-    would leave the highest frequencies of the output zero for ever, the limit is raised to exactly
-    what these need on the outermost ring; any higher frequency would alias on the pixels.
+    A kernel of angular frequency k maps rho_i to rho_j with j up to i + k. With escnn's own limit
+    the highest output frequencies could always be zero. The limit is then raised to what they need
+    on the outermost ring, because any higher frequency would alias on the pixels.
 
     Returns:
         The limit; None for escnn's own.
@@ -260,25 +257,25 @@ def frequencies_cutoff(in_fibre: Fibre, out_fibre: Fibre, size: int) -> float | 
     missing = max(out_fibre.frequencies) - max(in_fibre.frequencies)
     radius = size // 2
     if missing > 0 and not radius:
-        raise ValueError("a kernel of one pixel cannot lead to higher frequencies")
+        raise ValueError("a kernel of one pixel cannot produce higher frequencies")
     return missing / radius if missing > radius else None
 
 
 class MixedPrecision(nn.Module):
-    """A network that computes in the type of its input, except for parts that stay in float32."""
+    """A network that computes in the type of its input, except for some parts in float32."""
 
     def reduced_precision_parts(self) -> Iterator[nn.Module]:
         """The submodules that compute in the type of the input."""
         raise NotImplementedError
 
     def cast(self, compute_type: torch.dtype) -> None:
-        """Casts these submodules for good, for inputs of a type."""
+        """Casts these submodules permanently to the type of the inputs."""
         for part in self.reduced_precision_parts():
             part.to(compute_type).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
 
 
 class BandLimit(nn.Module):
-    """Projects the samples of each field onto its irreps, as ELU introduces higher frequencies."""
+    """Projects the samples of each field onto its irreps, because ELU adds higher frequencies."""
 
     projection: Tensor
 
@@ -294,7 +291,7 @@ class BandLimit(nn.Module):
 
 
 class InvariantPart(nn.Module):
-    """Takes the part of each field that is invariant to rotations: its frequency 0."""
+    """Takes the rotation-invariant part of each field, its frequency 0."""
 
     functional: Tensor
 
@@ -309,9 +306,9 @@ class InvariantPart(nn.Module):
 
 
 def _of_several_fields(matrix: NDArray[np.float64], fields: int) -> Tensor:
-    """A matrix that acts on each of a few fields, as one matrix for their channels together.
+    """The block-diagonal matrix that applies a matrix to each of several fields.
 
-    With its zeros, a product with about 64 channels takes half as long as one with eight.
+    Despite its zeros, a product with about 64 channels takes half as long as one with eight.
     """
     together = math.gcd(fields, max(_TOGETHER // len(matrix), 1))
     blocks = np.kron(np.eye(together), matrix)
@@ -319,11 +316,11 @@ def _of_several_fields(matrix: NDArray[np.float64], fields: int) -> Tensor:
 
 
 def _multiply_fields(features: Tensor, matrix: Tensor) -> Tensor:
-    """Multiplies the channels of fields at each pixel, from the left, by a matrix.
+    """Multiplies the channels of fields at each pixel by a matrix, from the right.
 
     Args:
         features: (batch, fields * channels, rows, cols), in channels_last.
-        matrix: of `_of_several_fields`.
+        matrix: from `_of_several_fields`.
     """
     last = features.permute(0, 2, 3, 1)
     product = last.reshape(-1, len(matrix)) @ matrix.to(features.dtype)
@@ -331,10 +328,10 @@ def _multiply_fields(features: Tensor, matrix: Tensor) -> Tensor:
 
 
 class BlurPool(nn.Module):
-    """Antialiased pooling to every other pixel, the outermost ones included.
+    """Antialiased pooling to every other pixel, including both outermost ones.
 
-    A side of 2 n + 1 pixels becomes n + 1, so that equivariance to rotations by 90 degrees about
-    the middle of the image is exact.
+    A side of 2 n + 1 pixels becomes n + 1, which keeps equivariance to rotations by 90 degrees
+    about the image's centre exact.
     """
 
     kernel: Tensor
@@ -352,8 +349,8 @@ class BlurPool(nn.Module):
 
 
 class _Blur(torch.autograd.Function):
-    """The convolution of `BlurPool`, with a gradient that is always computed in float32: on a CPU
-    that of depthwise convolutions takes six times as long in bfloat16."""
+    """The convolution of `BlurPool`, with a gradient in float32: on a CPU the gradient of depthwise
+    convolutions takes six times as long in bfloat16."""
 
     @staticmethod
     def forward(ctx: Any, features: Tensor, kernel: Tensor) -> Tensor:
@@ -379,7 +376,7 @@ def upsample(features: Tensor) -> Tensor:
         features, size=(2 * rows - 1, 2 * cols - 1), mode="bilinear", align_corners=True
     )
     if larger.requires_grad:
-        # That of a part of a concatenation has gaps, with which torch takes many times as long.
+        # The gradient of a part of a concatenation is not contiguous, which slows torch down.
         larger.register_hook(
             lambda gradient: gradient.contiguous(memory_format=torch.channels_last)
         )

@@ -69,7 +69,7 @@ def written(folder: Path) -> Path:
     return path
 
 
-def test_a_step_is_the_observation_to_half_a_colour():
+def test_a_step_rounds_colours_to_8_bits_and_keeps_heights():
     image = np.random.default_rng(0).random((4, *GRID.shape), np.float32)
     observation = Observation(image, GRID)
     taken = DemonstrationStep.of(observation, PickPlaceAction(), name="")
@@ -81,7 +81,7 @@ def test_a_step_is_the_observation_to_half_a_colour():
         np.testing.assert_array_equal(found[3], image[3])
 
 
-def test_what_is_written_is_read(tmp_path: Path):
+def test_a_written_file_reads_back(tmp_path: Path):
     path = written(tmp_path)
     assert [item.name for item in tmp_path.iterdir()] == [path.name]
     read = read_demonstrations(path)
@@ -95,10 +95,10 @@ def test_what_is_written_is_read(tmp_path: Path):
     assert [item.seed for item in read_demonstrations(path, first=1).demonstrations] == [10]
 
 
-def test_images_stay_in_the_file_that_was_read(tmp_path: Path):
+def test_images_stay_available_when_their_file_is_replaced(tmp_path: Path):
     path = written(tmp_path)
     read = read_demonstrations(path).demonstrations
-    # Neither a new file in its place nor none at all makes a difference.
+    # Replacing or deleting the file makes no difference.
     write_demonstrations(path, ORIGIN, [demonstration(99)])
     path.unlink()
     for found, expected in zip(read, [demonstration(10), demonstration(12)], strict=True):
@@ -126,7 +126,7 @@ def test_the_layout_of_the_file(tmp_path: Path):
         assert "final_rgb" not in file["seed_00000010"]
 
 
-def test_a_file_takes_in_others_and_itself(tmp_path: Path):
+def test_merging_may_include_the_file_itself(tmp_path: Path):
     path, part = written(tmp_path), tmp_path / "part.h5"
     write_demonstrations(part, ORIGIN, [demonstration(13, steps=1)])
     sources = [(path, 10), (path, 12), (part, 13)]
@@ -141,7 +141,7 @@ def test_a_file_takes_in_others_and_itself(tmp_path: Path):
         assert_same(found, expected)
 
 
-def test_what_was_there_stays_whole_when_writing_fails(tmp_path: Path):
+def test_a_failed_merge_keeps_the_old_file(tmp_path: Path):
     path = written(tmp_path)
     before = path.read_bytes()
     with pytest.raises(UserError, match="there is no file"):
@@ -150,7 +150,7 @@ def test_what_was_there_stays_whole_when_writing_fails(tmp_path: Path):
     assert list(tmp_path.iterdir()) == [path]
 
 
-def test_a_disk_that_is_full_blames_no_demonstration(
+def test_a_full_disk_is_not_reported_as_a_damaged_file(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     path = written(tmp_path)
@@ -164,7 +164,7 @@ def test_a_disk_that_is_full_blames_no_demonstration(
     assert "delete" not in str(e.value)
 
 
-def test_the_commits_are_told_that_made_them(tmp_path: Path):
+def test_commits_are_recorded(tmp_path: Path):
     path = tmp_path / "demonstrations.h5"
     made = [dataclasses.replace(demonstration(seed), commit=f"c{seed % 2}") for seed in (1, 2, 3)]
     write_demonstrations(path, ORIGIN, [*made, demonstration(4)])
@@ -184,25 +184,25 @@ def test_thousands_of_rejected_seeds_fit(tmp_path: Path):
     assert read_contents(path).rejected == rejected
 
 
-def test_a_file_that_is_not_there_is_refused(tmp_path: Path):
-    with pytest.raises(UserError, match=r"no file .*gone\.h5: make it by"):
+def test_a_missing_file_is_rejected(tmp_path: Path):
+    with pytest.raises(UserError, match=r"gone\.h5"):
         read_demonstrations(tmp_path / "gone.h5")
 
 
 @pytest.mark.parametrize("share", [0.001, 0.5, 0.99])
-def test_a_truncated_file_is_refused(tmp_path: Path, share: float):
+def test_a_truncated_file_is_rejected(tmp_path: Path, share: float):
     path = written(tmp_path)
     content = path.read_bytes()
     path.write_bytes(content[: int(share * len(content))])
-    with pytest.raises(UserError, match=r"demonstrations\.h5 is (truncated|no file of)"):
+    with pytest.raises(UserError, match=r"demonstrations\.h5"):
         read_demonstrations(path)
 
 
-def test_a_damaged_file_is_refused(tmp_path: Path):
+def test_a_damaged_file_is_rejected(tmp_path: Path):
     path = written(tmp_path)
     with h5py.File(path, "a") as file:
         del file["seed_00000010"]["place"]
-    with pytest.raises(UserError, match="damaged: delete it and collect again"):
+    with pytest.raises(UserError, match="damaged"):
         read_demonstrations(path)
 
 
@@ -218,16 +218,16 @@ def test_a_damaged_file_is_refused(tmp_path: Path):
         ("place", np.zeros((2, 3))),
     ],
 )
-def test_content_that_makes_no_sense_is_refused(tmp_path: Path, name: str, value: np.ndarray):
+def test_invalid_content_is_rejected(tmp_path: Path, name: str, value: np.ndarray):
     path = written(tmp_path)
     with h5py.File(path, "a") as file:
         del file["seed_00000012"][name]
         file["seed_00000012"][name] = value
-    with pytest.raises(UserError, match=rf"damaged: delete it .*seed_00000012/{name} "):
+    with pytest.raises(UserError, match=rf"damaged.*seed_00000012/{name} "):
         read_demonstrations(path)
 
 
-def test_flipped_bytes_never_end_in_anything_but_a_sentence(tmp_path: Path):
+def test_flipped_bytes_raise_only_user_errors(tmp_path: Path):
     path = written(tmp_path)
     content, rng = path.read_bytes(), np.random.default_rng(0)
     refused = 0
@@ -243,25 +243,25 @@ def test_flipped_bytes_never_end_in_anything_but_a_sentence(tmp_path: Path):
     assert refused > 10
 
 
-def test_a_foreign_file_is_refused(tmp_path: Path):
+def test_a_foreign_file_is_rejected(tmp_path: Path):
     text, other = tmp_path / "notes.h5", tmp_path / "other.h5"
     text.write_text("not HDF5 at all\n")
     with h5py.File(other, "w") as file:
         file["weights"] = np.zeros(3)
     for path in (text, other):
-        with pytest.raises(UserError, match=rf"{path.name} is no file of demonstrations"):
+        with pytest.raises(UserError, match=f"{path.name} is not a file of demonstrations"):
             read_demonstrations(path)
 
 
-def test_another_version_of_the_format_is_refused(tmp_path: Path):
+def test_another_format_version_is_rejected(tmp_path: Path):
     path = written(tmp_path)
     with h5py.File(path, "a") as file:
         file.attrs["format_version"] = 1
-    with pytest.raises(UserError, match="is of format version 1, and version 2 is what"):
+    with pytest.raises(UserError, match="format version 1"):
         read_demonstrations(path)
 
 
-def test_reads_where_drake_is_not_installed():
+def test_reading_does_not_import_drake():
     module = "kitting_drake.policies.data.demonstrations"
     program = f"import sys, {module}; print('pydrake' in sys.modules)"
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)

@@ -20,7 +20,7 @@ MIDDLE = np.array([(ROWS - 1) / 2, (COLS - 1) / 2])
 
 
 def marked(pick: tuple[float, float], place: tuple[float, float]) -> LabelledImage:
-    """An image whose height has a round hill at each of the labels, 1 m and 2 m high."""
+    """An image with a round hill at each label, 1 m and 2 m high."""
     row, col = np.meshgrid(np.arange(ROWS), np.arange(COLS), indexing="ij")
     height = sum(
         top * np.exp(-((row - at[0]) ** 2 + (col - at[1]) ** 2) / 8)
@@ -34,7 +34,7 @@ SAMPLE = marked((20.0, 30.0), (38.25, 55.5))
 
 
 def hill(sample: LabelledImage, near: np.ndarray) -> np.ndarray:
-    """The middle of the hill near a position."""
+    """The centre of the hill near a position."""
     row, col = np.rint(near).astype(int)
     rows, cols = np.arange(row - 6, row + 7), np.arange(col - 6, col + 7)
     weights = sample.image[3][np.ix_(rows, cols)]
@@ -42,11 +42,11 @@ def hill(sample: LabelledImage, near: np.ndarray) -> np.ndarray:
     return np.array([(weights.sum(1) * rows).sum(), (weights.sum(0) * cols).sum()]) / total
 
 
-def test_rotation_is_counter_clockwise_on_a_picture_with_row_0_on_top():
+def test_rotations_are_counter_clockwise_with_row_0_on_top():
     down, right = np.array([1.0, 0]), np.array([0, 1.0])
     np.testing.assert_allclose(rotation_matrix(math.pi / 2) @ down, right, atol=1e-12)
     image = np.zeros((3, 3))
-    image[2, 1] = 1  # Below the middle, which a counter-clockwise rotation brings to its right.
+    image[2, 1] = 1  # Below the centre; a counter-clockwise rotation moves it to the right.
     assert np.rot90(image)[1, 2] == 1
 
 
@@ -62,7 +62,7 @@ def test_labels_of_an_action():
 
 
 def test_other_points_of_the_object_move_rigidly_with_it():
-    # A rotation by 90 degrees: what is below the pick comes to the right of the place.
+    # A rotation by 90 degrees moves a point below the pick to the right of the place.
     sample = LabelledImage(
         SAMPLE.image, np.array([10.0, 20]), 0.0, np.array([40.0, 50]), math.pi / 2
     )
@@ -82,7 +82,7 @@ def test_crops_are_around_their_pixel_and_zero_outside(centre: tuple[int, int]):
             np.testing.assert_array_equal(taken[:, row, col], image[:, i, j] if inside else 0)
 
 
-def test_what_is_at_the_labels_moves_with_them():
+def test_labels_move_with_the_image():
     random = np.random.default_rng(1)
     for _ in range(10):
         angle, shift = random.uniform(-np.pi, np.pi), random.uniform(-3, 3, size=2)
@@ -91,7 +91,7 @@ def test_what_is_at_the_labels_moves_with_them():
         np.testing.assert_allclose(hill(moved, moved.place), moved.place, atol=0.3)
         assert moved.pick_theta == pytest.approx(0.3 + angle)
         assert moved.rotation == 1.1
-        # The vector from pick to place has rotated, and nothing else.
+        # The vector from pick to place only rotates.
         expected = rotation_matrix(angle) @ (np.array([36.5, 52.25]) - (27.0, 40.0))
         np.testing.assert_allclose(moved.place - moved.pick, expected)
 
@@ -121,7 +121,7 @@ def test_heights_are_not_interpolated():
     moved = move(SAMPLE, 0.7, np.array([0.4, -0.3]))
     assert set(np.unique(moved.image[3])) <= {0, *np.unique(SAMPLE.image[3])}
     assert moved.image.dtype == np.float32
-    # What comes in from outside the image was not seen.
+    # Pixels from outside the image are unseen.
     np.testing.assert_array_equal(moved.image[:, 0, 0], 0)
 
 
@@ -140,7 +140,7 @@ def test_augmentation_keeps_both_labels_inside():
     assert len(set(angles)) == 100
 
 
-def test_augmentation_is_that_of_the_seed():
+def test_augmentation_is_determined_by_the_seed():
     one, same, other = (augment(SAMPLE, np.random.default_rng(seed)) for seed in (3, 3, 4))
     np.testing.assert_array_equal(one.image, same.image)
     np.testing.assert_array_equal(one.pick, same.pick)
@@ -153,7 +153,7 @@ def test_a_sample_that_cannot_stay_inside_is_not_moved():
 
 
 def barred(theta: float) -> LabelledImage:
-    """A long bar, 6 pixels wide, that is picked by its middle."""
+    """A long bar, 6 pixels wide, picked at its centre."""
     row, col = np.meshgrid(np.arange(ROWS), np.arange(COLS), indexing="ij")
     offsets = np.stack([row, col], axis=-1) - MIDDLE
     across = offsets @ rotation_matrix(theta)[:, 1]
@@ -163,7 +163,7 @@ def barred(theta: float) -> LabelledImage:
 
 
 def middle_line(image: np.ndarray, theta: float, u: float) -> float:
-    """The offset of the bar's middle line, at u pixels along its direction from the middle."""
+    """The offset of the bar's centre line, `u` pixels along its direction from the centre."""
     across = np.linspace(-12, 12, 97)
     points = (
         np.array(image.shape[1:]) // 2
@@ -177,12 +177,10 @@ def middle_line(image: np.ndarray, theta: float, u: float) -> float:
 @pytest.mark.parametrize("theta", [0.0, 0.7, 2.0])
 @pytest.mark.parametrize("moved", [False, True])
 @pytest.mark.parametrize("index", [0, 1])
-def test_curvature_keeps_the_objects_position_and_direction_at_its_pick(
-    theta: float, moved: bool, index: int
-):
+def test_curvature_keeps_position_and_direction_at_the_pick(theta: float, moved: bool, index: int):
     sample = barred(theta)
     if index:
-        # The bar is one of the other objects, not the one that is picked.
+        # The bar is one of the other objects.
         sample = dataclasses.replace(
             sample,
             pick=np.array([10.0, 80.0]),
@@ -200,12 +198,12 @@ def test_curvature_keeps_the_objects_position_and_direction_at_its_pick(
     start = middle_line(curved, theta, 0)
     for u in (-16, -8, -3, 3, 8, 16):
         v = u / 20
-        # The object is displaced against the direction in which its pixels are looked up.
+        # The object moves opposite to the displacement of the sampled pixels.
         expected = -20 * (0.3 * v**2 - 0.1 * v**3)
         assert middle_line(curved, theta, u) - start == pytest.approx(expected, abs=1.2)
 
 
-def test_without_curvature_it_is_the_crop():
+def test_a_crop_with_zero_curvature_is_a_plain_crop():
     sample = move(SAMPLE, 0.6, np.array([3.0, -2]))
     pixel = (22, 31)
     expected = crop(sample.image, pixel, 41)
@@ -213,7 +211,7 @@ def test_without_curvature_it_is_the_crop():
     np.testing.assert_array_equal(straight.curved_crop(0, pixel, 41), expected)
 
 
-def test_every_object_has_a_curvature_of_its_own():
+def test_every_object_has_its_own_curvature():
     others = np.array([[20.0, 60], [40, 30]])
     sample = dataclasses.replace(SAMPLE, other_picks=others, other_thetas=np.zeros(2))
     curved = augment(sample, np.random.default_rng(0), curvature=True)
@@ -222,7 +220,7 @@ def test_every_object_has_a_curvature_of_its_own():
 
 
 @pytest.mark.parametrize("theta", [0.0, 0.7, 2.0])
-def test_reflection_mirrors_what_is_seen_and_the_labels(theta: float):
+def test_reflection_mirrors_the_image_and_its_labels(theta: float):
     sample = dataclasses.replace(
         SAMPLE, other_picks=np.array([[20.0, 60]]), other_thetas=np.array([0.2])
     )
@@ -232,11 +230,11 @@ def test_reflection_mirrors_what_is_seen_and_the_labels(theta: float):
         np.testing.assert_allclose(hill(mirrored, at), at, atol=0.02)
     assert (mirrored.pick_theta, mirrored.rotation) == (-0.3, -1.1)
     np.testing.assert_array_equal(mirrored.other_picks, [[20.0, COLS - 1 - 60]])
-    # A bar that is gripped at an angle is gripped alike in the mirror.
+    # The grasp of a bar stays along the bar.
     bar = reflect(barred(theta))
     middles = [middle_line(bar.image, bar.pick_theta, u) for u in (-12, 0, 12)]
     np.testing.assert_allclose(middles, 0.0, atol=0.5)
-    # What a rotation of the object does is undone in the mirror by the opposite one.
+    # The mirrored object rotates in the opposite direction.
     beside = sample.pick + (3.0, -2.0)
     across = np.array([0, COLS - 1]) + beside * (1, -1)
     expected = np.array([0, COLS - 1]) + sample.place_of(beside) * (1, -1)
@@ -246,7 +244,7 @@ def test_reflection_mirrors_what_is_seen_and_the_labels(theta: float):
     np.testing.assert_array_equal(twice.place, sample.place)
 
 
-def test_half_of_the_samples_are_reflected_where_they_may_be():
+def test_half_of_the_samples_are_reflected_if_allowed():
     random = np.random.default_rng(0)
     rotations = [augment(SAMPLE, random, reflection=True).rotation for _ in range(60)]
     assert set(rotations) == {SAMPLE.rotation, -SAMPLE.rotation}
@@ -254,7 +252,7 @@ def test_half_of_the_samples_are_reflected_where_they_may_be():
     assert augment(SAMPLE, random).rotation == SAMPLE.rotation
 
 
-def test_a_motion_is_undone():
+def test_before_inverts_after():
     motion = Motion(SAMPLE.image, 0.7, np.array([3.0, -2]))
     points = np.array([[[1.0, 2], [30, 40]]])
     np.testing.assert_allclose(motion.before(motion.after(points)), points)

@@ -1,7 +1,7 @@
-"""Demonstrations as a LeRobotDataset: all frames as they were, by pyarrow and by LeRobot itself.
+"""Demonstrations as a LeRobotDataset: all frames read back by pyarrow and by LeRobot itself.
 
-LeRobot needs other versions of numpy and torch than this project, and so an environment of its own:
-KITTING_LEROBOT_PYTHON tells its interpreter.
+LeRobot needs other versions of numpy and torch than this project, and therefore its own
+environment: KITTING_LEROBOT_PYTHON is the path of its interpreter.
 """
 
 import dataclasses
@@ -39,14 +39,14 @@ LEROBOT = os.environ.get("KITTING_LEROBOT_PYTHON")
 
 @pytest.fixture
 def parquet() -> ModuleType:
-    """`pyarrow.parquet`, where it is installed."""
+    """`pyarrow.parquet`; skips the test if it is not installed."""
     pytest.importorskip("pyarrow", exc_type=ImportError)
     return pytest.importorskip("pyarrow.parquet")
 
 
 def observation(rng: np.random.Generator) -> Observation:
     image = rng.random((4, *GRID.shape), np.float32)
-    # What a 16-bit image, or millimetres, would lose.
+    # Values that a 16-bit image or millimetres would lose.
     image[3, 0] = np.array([0.0, -0.0, 1e-40, 1e-30, 0.05 + 1e-8, -1e-4, 123.4], np.float32)
     return Observation(image, GRID)
 
@@ -85,7 +85,7 @@ def source(tmp_path: Path) -> Path:
 
 
 def expected() -> dict[str, NDArray[Any]]:
-    """The frames, told in another way than by the code that is tested."""
+    """The frames, computed independently of the tested code."""
     rows: list[dict[str, Any]] = []
     for number, episode in enumerate(EPISODES):
         last = [episode.final] if episode.final else []
@@ -141,7 +141,7 @@ def test_all_frames_are_in_the_files(source: Path, tmp_path: Path, parquet: Modu
         assert row["task_index"] == 0
 
 
-def test_what_is_told_about_the_frames(source: Path, tmp_path: Path, parquet: ModuleType):
+def test_the_metadata_of_the_frames(source: Path, tmp_path: Path, parquet: ModuleType):
     folder = tmp_path / "lerobot"
     export_lerobot(source, folder)
     info = json.loads((folder / "meta/info.json").read_text())
@@ -185,14 +185,14 @@ def test_the_statistics(source: Path, tmp_path: Path, parquet: ModuleType):
             shape = (-1, 1, 1) if "image" in name else (-1,)
             wanted = getattr(values, key)(axis=0).reshape(shape)
             np.testing.assert_allclose(found[name][key], wanted, rtol=1e-9, atol=1e-12)
-        # Of the first episode, exactly.
+        # The quantiles of the first episode are exact.
         first = values[: len(values) * 4 // 8]
         for key, share in (("q01", 0.01), ("q50", 0.5), ("q99", 0.99)):
             stored = np.ravel(episodes[0][f"stats/{name}/{key}"])
             np.testing.assert_allclose(stored, np.quantile(first, share, axis=0))
 
 
-def test_many_frames_are_in_many_files(
+def test_many_frames_are_split_into_files(
     source: Path, tmp_path: Path, parquet: ModuleType, monkeypatch: pytest.MonkeyPatch
 ):
     monkeypatch.setattr(lerobot_export, "_MEGABYTES", 1e-6)
@@ -211,14 +211,14 @@ def test_many_frames_are_in_many_files(
     assert places == [(0, 0), (0, 1), (1, 0)]
 
 
-def test_an_action_is_that_of_the_environments():
+def test_actions_have_the_layout_of_the_environments():
     pytest.importorskip("gymnasium")
     from kitting_drake.gym import spaces
 
     assert spaces.ACTION == ACTION
 
 
-def test_what_is_exported_is_left_alone_and_nothing_else_written_over(
+def test_an_existing_export_is_kept_and_other_folders_are_not_overwritten(
     source: Path, tmp_path: Path, parquet: ModuleType
 ):
     folder = tmp_path / "lerobot"
@@ -226,15 +226,15 @@ def test_what_is_exported_is_left_alone_and_nothing_else_written_over(
     before = folder.stat()
     export_lerobot(source, folder, "stack them")
     assert folder.stat() == before
-    # Fewer demonstrations, and as many that tell of other actions.
+    # Fewer demonstrations, and the same number with another action.
     step = EPISODES[-1].steps[0]
     other = dataclasses.replace(step, pick=dataclasses.replace(step.pick, x=step.pick.x + 0.001))
     changed = dataclasses.replace(EPISODES[-1], steps=[other, *EPISODES[-1].steps[1:]])
     for episodes in (EPISODES[:2], [*EPISODES[:-1], changed]):
         write_demonstrations(source, ORIGIN, episodes)
-        with pytest.raises(UserError, match=r"lerobot exists, and is not of .*demonstrations\.h5"):
+        with pytest.raises(UserError, match=r"lerobot exists.*demonstrations\.h5"):
             export_lerobot(source, folder, "stack them")
-    with pytest.raises(UserError, match="lerobot exists, without the new demonstrations"):
+    with pytest.raises(UserError, match="lerobot exists"):
         require_export(folder)
     require_export(tmp_path / "other")
 
@@ -257,22 +257,20 @@ def test_a_stopped_export_leaves_nothing(
     assert not list(tmp_path.rglob("of_a_killed_process"))
 
 
-def test_what_cannot_be_exported_is_told_in_a_sentence(
-    source: Path, tmp_path: Path, parquet: ModuleType
-):
+def test_impossible_exports_raise_user_errors(source: Path, tmp_path: Path, parquet: ModuleType):
     with pytest.raises(UserError, match="there is no file"):
         export_lerobot(tmp_path / "none.h5", tmp_path / "lerobot")
     with pytest.raises(UserError, match=r"cannot write .*Not a directory"):
         export_lerobot(source, source / "lerobot")
     write_demonstrations(source, ORIGIN, [])
-    with pytest.raises(UserError, match="holds no demonstrations: collect some"):
+    with pytest.raises(UserError, match="no demonstrations"):
         export_lerobot(source, tmp_path / "lerobot")
 
 
-def test_without_pyarrow_one_sentence(
+def test_without_pyarrow_the_error_names_the_package(
     source: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    # None in sys.modules is what Python takes for a module that cannot be imported.
+    # None in sys.modules makes the import fail.
     monkeypatch.setitem(sys.modules, "pyarrow", None)
     for call in (lambda: require_export(tmp_path), lambda: export_lerobot(source, tmp_path / "x")):
         with pytest.raises(UserError, match=r"package pyarrow: pip install .pyarrow"):
@@ -291,14 +289,14 @@ def test_the_task_in_words(scenario: dict[str, Any], task: str):
     assert lerobot_export._task(dataclasses.replace(ORIGIN, scenario=scenario)) == task
 
 
-@pytest.mark.skipif(not LEROBOT, reason="KITTING_LEROBOT_PYTHON names no interpreter with LeRobot")
+@pytest.mark.skipif(not LEROBOT, reason="KITTING_LEROBOT_PYTHON is not set")
 def test_lerobot_reads_what_was_written(source: Path, tmp_path: Path, parquet: ModuleType):
     export_lerobot(source, tmp_path / "lerobot")
     np.savez(tmp_path / "expected.npz", **expected())
     reader = Path(__file__).with_name("lerobot_reader.py")
     done = subprocess.run(
         [str(LEROBOT), str(reader), str(tmp_path / "lerobot"), str(tmp_path / "expected.npz")],
-        # It may neither ask the Hub for anything nor see this project's packages.
+        # Neither the Hub nor this project's packages may be used.
         env={"PATH": os.environ["PATH"], "HF_HUB_OFFLINE": "1", "HF_HOME": str(tmp_path / "hub")},
         capture_output=True,
         text=True,

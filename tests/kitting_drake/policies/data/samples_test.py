@@ -22,7 +22,7 @@ ROTATION = 1.25
 
 
 def demonstration(seed: int, steps: int) -> Demonstration:
-    """In step i the object at pixel (i, 2 i) is brought to (10 + i, 3)."""
+    """Step i moves the object at pixel (i, 2 i) to (10 + i, 3)."""
     taken = []
     for i in range(steps):
         pick, place = GRID.to_world((i, 2 * i)), GRID.to_world((10 + i, 3))
@@ -41,7 +41,7 @@ def observed() -> list[ObservedScene]:
     return scenes(items, GRID, later_picks_possible=True)
 
 
-def test_what_was_picked_later_might_have_been_picked_at_once(observed: list[ObservedScene]):
+def test_later_picks_are_labels_of_earlier_observations(observed: list[ObservedScene]):
     assert [len(scene.targets) for scene in observed] == [3, 2, 1, 1]
     for index, scene in enumerate(observed[:3]):
         for i, target in enumerate(scene.targets, start=index):
@@ -50,12 +50,12 @@ def test_what_was_picked_later_might_have_been_picked_at_once(observed: list[Obs
             np.testing.assert_allclose(target.place, (10 + i, 3), atol=1e-9)
             assert target.pick_theta == THETAS[i]
             assert target.rotation == pytest.approx(ROTATION)
-    # Each observation has its own image: nothing is picked that was gone by then.
+    # Each observation has its own image.
     heights = [scene.recorded.height[0, 0] for scene in observed]
     assert heights == pytest.approx([0.10, 0.11, 0.12, 0.20])
 
 
-def test_where_objects_cover_each_other_only_the_pick_that_was_taken_is_a_label():
+def test_without_later_picks_only_the_taken_pick_is_a_label():
     items = [demonstration(10, 3), demonstration(20, 1)]
     observed = scenes(items, GRID, later_picks_possible=False)
     assert [len(scene.targets) for scene in observed] == [1, 1, 1, 1]
@@ -64,18 +64,18 @@ def test_where_objects_cover_each_other_only_the_pick_that_was_taken_is_a_label(
     assert [len(sample.other_picks) for sample in samples] == [0, 0, 0, 0]
 
 
-def test_final_observations_are_those_of_episodes_that_the_expert_ended():
+def test_final_observations_come_from_episodes_that_the_expert_ended():
     (final,) = final_observations([demonstration(10, 3), demonstration(20, 1)])
     assert final.height[0, 0] == 0.5
 
 
-def test_as_in_the_paper_there_is_one_sample_for_each_observation(observed: list[ObservedScene]):
+def test_taken_only_gives_one_sample_per_observation(observed: list[ObservedScene]):
     samples = labelled_images(observed, taken_only=True)
     assert [tuple(np.rint(sample.pick)) for sample in samples] == [(0, 0), (1, 2), (2, 4), (0, 0)]
     assert all(sample.other_picks.shape == (0, 2) for sample in samples)
 
 
-def test_a_sample_for_each_possible_action_knows_of_the_others(observed: list[ObservedScene]):
+def test_a_sample_of_an_action_includes_the_other_picks(observed: list[ObservedScene]):
     samples = labelled_images(observed, taken_only=False)
     assert len(samples) == 3 + 2 + 1 + 1
     second = samples[1]
@@ -91,13 +91,13 @@ def test_inputs_are_normalised_over_all_observations(observed: list[ObservedScen
     levels = np.array([0.10, 0.11, 0.12, 0.20])
     assert found["height_mean"] == pytest.approx(levels.mean(), rel=1e-5)
     assert found["height_std"] == pytest.approx(levels.std(), rel=1e-5)
-    # Demonstrations hold colours in 8 bits.
+    # Demonstrations store 8-bit colours.
     levels = np.rint(255 * levels) / 255
     assert found["colour_mean"] == pytest.approx(levels.mean(), rel=1e-5)
     assert found["colour_std"] == pytest.approx(levels.std(), rel=1e-5)
 
 
-def test_constant_inputs_are_not_divided_by_zero():
+def test_constant_inputs_do_not_divide_by_zero():
     grid = PixelGrid(rows=5, cols=5)
     blank = record(Observation(np.zeros((4, 5, 5), np.float32), grid))
     found = normalisation([ObservedScene(blank, (), grid)])
@@ -107,7 +107,7 @@ def test_constant_inputs_are_not_divided_by_zero():
 
 
 def with_a_hole() -> np.ndarray:
-    """A coloured plate of 20 mm on a coloured table, and in the plate a pixel that nobody saw."""
+    """A coloured 20 mm plate on a coloured table, with an unseen pixel in the plate."""
     image = np.full((4, *GRID.shape), 0.5, np.float32)
     image[3] = 0.0
     image[3, 5:12, 5:12] = 0.02
@@ -115,7 +115,7 @@ def with_a_hole() -> np.ndarray:
     return image
 
 
-def test_networks_without_colours_learn_from_what_they_will_be_shown():
+def test_networks_without_colours_learn_from_the_inputs_of_inference():
     whole = with_a_hole()
     recorded = FinalObservation.of(Observation(whole, GRID))
     shown = HeightsOnly(recorded).image
@@ -130,8 +130,8 @@ def test_networks_without_colours_learn_from_what_they_will_be_shown():
     np.testing.assert_array_equal(sample.image, shown)
 
 
-def test_in_a_black_image_nothing_is_unseen():
-    """The table is at height zero, and is not to be filled in with what stands beside it."""
+def test_a_black_image_has_no_unseen_pixels():
+    """Otherwise the table, at height zero, would be filled in from its neighbours."""
     assert not samples.observed(with_a_hole(), GRID).valid[8, 8]
     black = with_a_hole()
     black[:3] = 0.0

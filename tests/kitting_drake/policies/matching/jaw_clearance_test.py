@@ -1,4 +1,4 @@
-"""Grasps that the heights of o_t leave room for, by what the planner does."""
+"""Grasps with enough room for the jaws in o_t, compared with the planner's motion."""
 
 import dataclasses
 
@@ -16,7 +16,7 @@ HIGH, LOW = 0.040, 0.024
 
 
 def beside(distance: float) -> Observation:
-    """A bar, 20 mm wide, and a lower one on either side of it that is so far from its middle."""
+    """A 20 mm wide bar between two lower bars at the given distance from its centre."""
     image = np.zeros((4, *GRID.shape), np.float32)
     row, half, away = 80, round(0.010 / GRID.resolution), round(distance / GRID.resolution)
     image[3, row - half : row + half, 100:140] = HIGH
@@ -27,7 +27,7 @@ def beside(distance: float) -> Observation:
 
 
 def grasps_across(planner: PickPlaceParameters) -> int:
-    """The grasps of the high bar near its middle, fingers between the bars."""
+    """The number of grasps near the high bar's centre, with fingers between the bars."""
     seen = beside(0.035)
     segmentation = segment(seen)
     bar = max(segmentation.objects, key=lambda region: region.height)
@@ -35,12 +35,12 @@ def grasps_across(planner: PickPlaceParameters) -> int:
     return sum(110 < grasp.pixel[1] < 130 for grasp in found)
 
 
-def test_the_jaws_have_room_above_what_is_lower_than_they_go():
+def test_the_jaws_have_room_above_lower_objects():
     assert grasps_across(PickPlaceParameters(grasp_depth=0.012, max_grasp_depth=0.012)) > 0
     assert grasps_across(PickPlaceParameters(grasp_depth=0.030, max_grasp_depth=0.030)) == 0
 
 
-def test_jaws_that_open_less_stay_clear_of_what_is_beside():
+def test_jaws_that_open_less_stay_clear_of_neighbours():
     deep = PickPlaceParameters(grasp_depth=0.030, max_grasp_depth=0.030)
     assert grasps_across(dataclasses.replace(deep, open_width=0.032)) > 0
 
@@ -54,7 +54,7 @@ def test_jaws_that_open_less_stay_clear_of_what_is_beside():
     ],
 )
 @pytest.mark.parametrize("top", [0.012, 0.024, 0.045])
-def test_the_fingertips_go_where_the_planner_brings_them(planner: PickPlaceParameters, top: float):
+def test_the_tip_height_is_that_of_the_planner(planner: PickPlaceParameters, top: float):
     expected = motion_heights(SurfaceHeights(pick_top=top), planner).grasp
-    # But for a margin above what the object stands on.
+    # `tip_height` keeps a margin above the support.
     assert tip_height(np.array(top), 0.0, planner) == pytest.approx(max(expected, 0.003))

@@ -13,7 +13,7 @@ TOP = 0.05
 
 
 def observed(rise: float = 0.0) -> Observation:
-    """A block with a recess in which an object stands, `rise` above the top, and a loose object."""
+    """A fixture with an object `rise` above its top in a recess, and a loose object."""
     height = np.zeros(GRID.shape, np.float32)
     height[40:120, 60:140] = TOP
     height[60:66, 75:125] = TOP - 0.02
@@ -35,12 +35,12 @@ def is_on_object(action) -> bool:
 
 
 @pytest.mark.parametrize("rise", [-0.003, 0.0, 0.0015])
-def test_what_is_seated_is_left_alone(rise: float):
+def test_a_seated_object_is_left_alone(rise: float):
     assert mending(observed(rise)) is None
     assert mending(Observation()) is None
 
 
-def test_what_protrudes_a_little_is_pressed_down_once():
+def test_a_slightly_protruding_object_is_pressed_down_once():
     first = mending(observed(0.006))
     assert first is not None
     assert first.press
@@ -50,7 +50,7 @@ def test_what_protrudes_a_little_is_pressed_down_once():
 
 
 @pytest.mark.parametrize("rise", [0.014, 0.018])
-def test_what_protrudes_by_more_is_laid_on_the_table(rise: float):
+def test_a_strongly_protruding_object_is_laid_on_the_table(rise: float):
     action = mending(observed(rise))
     assert action is not None
     assert not action.press
@@ -59,12 +59,12 @@ def test_what_protrudes_by_more_is_laid_on_the_table(rise: float):
     around = observed().height[row - 12 : row + 13, col - 12 : col + 13]
     assert around.shape == (25, 25)
     assert around.max() == 0
-    # Where that grasp failed, another is tried.
+    # After that grasp failed, another one is tried.
     other = mending(observed(rise), [action.pick])
     if other is not None:
         assert math.dist((other.pick.x, other.pick.y), (action.pick.x, action.pick.y)) > 0.019
 
 
-def test_the_segmentation_tells_how_far_it_protrudes():
+def test_the_segmentation_measures_the_protrusion():
     (region,) = segment(observed(0.006)).protruding
     assert region.height == pytest.approx(0.006, abs=5e-4)

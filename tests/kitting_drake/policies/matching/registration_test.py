@@ -26,7 +26,7 @@ def tool(middle: tuple[float, float], angle: float, grown: float = 0.0) -> np.nd
 
 
 @pytest.mark.parametrize("angle", [0.0, 0.3, 2.0, -2.9])
-def test_an_outline_is_brought_into_its_recess(angle: float):
+def test_registers_an_outline_to_its_recess(angle: float):
     random = np.random.default_rng(int(10 * abs(angle)))
     start, goal = random.uniform((40, 40), (120, 140)), random.uniform((40, 200), (120, 280))
     first = random.uniform(-math.pi, math.pi)
@@ -66,13 +66,13 @@ def test_a_recess_of_another_shape_costs_more():
 
 
 def bar(middle: tuple[float, float], angle: float, grown: float = 0.0) -> np.ndarray:
-    """A bar whose ends differ by a step of a pixel, drawn at pixel centres; `grown` in pixels."""
+    """A bar with ends that differ by one pixel, drawn at pixel centres; `grown` in pixels."""
     rows, cols = np.indices(SHAPE)
     u, v = np.moveaxis((np.stack([rows, cols], axis=-1) - middle) @ rotation_matrix(angle), -1, 0)
     return (np.abs(u) < 28 + grown) & (np.abs(v) < np.where(u > 18, 4.5, 3.5) + grown)
 
 
-def test_a_fit_is_preferred_by_the_points_that_tell_the_two_apart():
+def test_preference_weighs_the_points_where_two_fits_differ():
     random = np.random.default_rng(5)
     for _ in range(8):
         first, turn = random.uniform(-math.pi, math.pi, 2)
@@ -89,7 +89,7 @@ def test_a_fit_is_preferred_by_the_points_that_tell_the_two_apart():
         assert preference(outline, recess, right, right) == 0
 
 
-def test_a_small_object_is_registered_to_a_recess_that_is_far_from_its_own_middle():
+def test_registers_a_small_object_to_a_recess_far_from_its_own_centroid():
     rows, cols = np.indices(SHAPE)
     box = trace_outline((abs(rows - 30) < 4) & (abs(cols - 30) < 4), RESOLUTION, close=True)
     ell = (abs(rows - 80) < 55) & (abs(cols - 160) < 55) & ~((rows > 36) & (cols < 204))

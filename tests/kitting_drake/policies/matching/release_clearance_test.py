@@ -1,4 +1,4 @@
-"""Room for the fingers where an object is let go of, on heights of which all is known."""
+"""Room for the fingers at release, on known heights."""
 
 import math
 
@@ -19,14 +19,14 @@ GRID = PixelGrid(x_min=0.3, y_min=-0.2, resolution=0.004, rows=97, cols=129, z_m
 PICK, PLACE = np.array([60, 25]), np.array([40, 90])
 CUBE = 0.040
 PAD = 0.005
-"""The height of what cubes are put on."""
+"""The height of the support at the place."""
 SPACING = 0.052
-"""Between the middles of neighbours: less than the fingers need."""
+"""The distance between the centres of neighbours: less than the fingers need."""
 PLANNER = PickPlaceParameters()
 
 
 def heights(heading: float | None, lifted: float = 0.0) -> NDArray[np.float32]:
-    """A cube to pick; where it is to go, a cube on either side in a row of a heading, if any."""
+    """A cube to pick and, with a heading, a neighbour of its place on either side along it."""
     found = np.zeros(GRID.shape, np.float32)
     rows, cols = np.indices(GRID.shape)
 
@@ -70,11 +70,11 @@ def test_fingers_have_room_across_a_row_and_none_along_it(heading: float, lifted
         assert blocked(found, math.pi / 2, heading + half_turn) > 0.1
 
 
-def test_the_planner_says_how_far_the_jaws_draw_back_and_how_low_they_go():
+def test_opening_and_depth_are_those_of_the_planner():
     along = heights(0.0), 0.0, math.pi / 2
-    # What they would stand in is farther away than the fingertips reach.
+    # A small opening keeps the fingertips farther from the neighbours.
     assert blocked(*along, PickPlaceParameters(release_clearance=0.001)) < blocked(*along) - 0.05
-    # Gripped near its top, the cube lets the fingers stay above low neighbours.
+    # A shallow grasp keeps the fingers above low neighbours.
     low = heights(0.0)
     low[low > CUBE + PAD / 2] = PAD + 0.024
     deep = PickPlaceParameters(grasp_depth=0.035, max_grasp_depth=0.035)
@@ -82,7 +82,7 @@ def test_the_planner_says_how_far_the_jaws_draw_back_and_how_low_they_go():
     assert blocked(low, 0.0, math.pi / 2, deep) > 0.1
 
 
-def test_nothing_is_in_the_way_on_a_bare_table_nor_at_the_image_s_edge():
+def test_nothing_is_blocked_on_a_bare_table_or_at_the_image_s_edge():
     found = heights(None)
     assert blocked(found, 0.3, 1.0) == 0.0
     corner = np.array([0.0, GRID.cols - 1.0])
@@ -90,7 +90,7 @@ def test_nothing_is_in_the_way_on_a_bare_table_nor_at_the_image_s_edge():
 
 
 class Cubes(Networks):
-    """Networks of a cube: they know where it goes, but for quarter turns."""
+    """Networks that predict a cube's place, up to quarter turns."""
 
     def __init__(self) -> None:
         super().__init__(NetworkConfig(preset="tiny"))
@@ -120,7 +120,7 @@ def _corners(shape, middle) -> torch.Tensor:
 
 @pytest.mark.parametrize("continuous", [True, False])
 @pytest.mark.parametrize("heading", [0.0, math.pi / 2])
-def test_of_rotations_that_are_as_good_the_one_with_room_is_taken(heading: float, continuous: bool):
+def test_of_equally_good_rotations_the_one_with_room_is_taken(heading: float, continuous: bool):
     image = np.zeros((4, *GRID.shape), np.float32)
     image[3] = heights(heading)
     seen = Observation(image, GRID)
@@ -133,8 +133,8 @@ def test_of_rotations_that_are_as_good_the_one_with_room_is_taken(heading: float
     assert abs(math.remainder(jaws - heading, math.pi)) < math.radians(3)
 
 
-def test_what_is_not_as_good_is_not_taken():
-    """Only an L fits, one way, whatever is beside it."""
+def test_a_worse_rotation_is_not_taken():
+    """An L fits in one rotation only, even next to neighbours."""
 
     class Corner(Cubes):
         def encode_scene(self, image) -> torch.Tensor:

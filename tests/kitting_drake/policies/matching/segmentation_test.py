@@ -1,4 +1,4 @@
-"""What is an object, and what is noise."""
+"""Objects and recesses in noisy heights."""
 
 import numpy as np
 import pytest
@@ -17,7 +17,7 @@ CAVITY = (slice(70, 74), slice(210, 260))
 @pytest.mark.parametrize("noise", [0.0, 0.001, 0.002])
 @pytest.mark.parametrize("height", [0.008, 0.02])
 def test_flat_objects_and_cavities_are_whole_in_noise(noise: float, height: float):
-    """Their ends tell which way round an object goes."""
+    """The ends of a region must survive, because they distinguish the half turn."""
     true = np.zeros(GRID.shape)
     true[50:130, 190:280] = 0.05
     true[FLAT], true[CAVITY] = height, 0.05 - height

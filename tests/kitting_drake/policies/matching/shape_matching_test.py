@@ -1,4 +1,4 @@
-"""The training-free policy, and the refinement of places, on rendered observations."""
+"""The training-free policy and the refinement of places, on rendered observations."""
 
 import dataclasses
 import math
@@ -33,7 +33,7 @@ FITTING = make_stages(PLANNER, insertion=True)
     params=[pytest.param(None, marks=pytest.mark.slow), "colour:severe,depth_noise,depth_holes"],
 )
 def seen(request):
-    """An observation of four tools beside their kit, and the truth."""
+    """An observation of four tools beside their kit, and the true scene."""
     scenario = load_scenario(
         SCENARIOS / "paper/kitting_seen.yaml", None, "{policy: !Oracle {}}", request.param
     )
@@ -43,7 +43,7 @@ def seen(request):
 
 
 def true_places(scene):
-    """For each object (x, y, yaw) where it lies, and where it belongs."""
+    """For each object the (x, y, yaw) of its current pose and of its goal."""
     result = []
     for index, item in enumerate(scene.objects):
         goal = next(g for g in scene.goals if index in g.objects)
@@ -55,7 +55,7 @@ def true_places(scene):
 
 
 def errors_of(action, scene) -> tuple[float, float]:
-    """Of the place of the object nearest to the pick: in metres, and in radians."""
+    """The errors of the place, for the object nearest to the pick, in metres and radians."""
     pick, place = (np.array([p.x, p.y]) for p in (action.pick, action.place))
     lies, belongs = min(true_places(scene), key=lambda o: math.dist(o[0][:2], pick))
     rotation = belongs[2] - lies[2]
@@ -64,7 +64,7 @@ def errors_of(action, scene) -> tuple[float, float]:
     return math.dist(want, place), abs(math.remainder(turned - rotation, math.tau))
 
 
-def test_it_finds_kit_tools_and_recesses(seen):
+def test_segments_kit_tools_and_recesses(seen):
     observation, scene = seen
     found = segment(observation)
     assert len(found.objects) == 4
@@ -74,7 +74,7 @@ def test_it_finds_kit_tools_and_recesses(seen):
     assert np.linalg.norm(observation.grid.to_world(middle) - X[:2]) < 0.004
 
 
-def test_its_action_brings_a_tool_to_its_place(seen):
+def test_places_a_tool_into_its_recess(seen):
     observation, scene = seen
     action = ShapeMatchingPolicy(PLANNER)(observation)
     assert not action.stop
@@ -83,7 +83,7 @@ def test_its_action_brings_a_tool_to_its_place(seen):
     assert angle < math.radians(2)
 
 
-def test_where_a_grasp_failed_another_is_tried(seen):
+def test_avoids_failed_grasps(seen):
     observation, _ = seen
     tried = []
     for _ in range(3):
@@ -94,11 +94,11 @@ def test_where_a_grasp_failed_another_is_tried(seen):
         tried.append(action.pick)
 
 
-def test_what_must_be_taken_out_waits_for_all_that_fits(seen):
+def test_takes_out_a_protruding_object_only_when_nothing_else_fits(seen):
     observation, _ = seen
     segmentation = segment(observation)
     policy = ShapeMatchingPolicy(PLANNER, recover=True)
-    # Something that stands 40 mm out of the fixture, where there is no recess.
+    # An obstacle 40 mm above the fixture, where there is no recess.
     top = float(np.median(observation.height[segmentation.fixture]))
     rows, cols = np.nonzero(segmentation.fixture)
     image = observation.image.copy()
@@ -119,7 +119,7 @@ def pixel_of(observation: Observation, action) -> tuple[int, int]:
     return row, col
 
 
-def test_it_stops_where_nothing_is_left(seen):
+def test_stops_when_nothing_is_left(seen):
     observation, _ = seen
     image = observation.image.copy()
     for region in segment(observation).objects:
@@ -130,7 +130,7 @@ def test_it_stops_where_nothing_is_left(seen):
 
 
 @pytest.mark.parametrize("seen", [None], indirect=True)
-def test_what_certainly_fits_is_picked_though_the_networks_see_nothing(seen):
+def test_an_object_that_certainly_fits_is_picked_even_if_the_networks_miss_it(seen):
     observation, _ = seen
     networks = load_networks(GENERALIST)
     predict = networks.predict_pick
@@ -148,7 +148,7 @@ def test_what_certainly_fits_is_picked_though_the_networks_see_nothing(seen):
         pixel_of(observation, action)
     ]
     assert LearnedPolicy(networks)(observation).stop
-    # Where a grasp of each of them failed everywhere, nothing is left.
+    # After grasps of all objects failed everywhere, nothing is left.
     grid = observation.grid
     everywhere = [
         PlanarPose(*grid.to_world(pixel), 0.0)
@@ -159,16 +159,16 @@ def test_what_certainly_fits_is_picked_though_the_networks_see_nothing(seen):
 
 
 @pytest.mark.parametrize("turn", [0.0, math.pi])
-def test_a_place_that_is_nearly_right_or_reversed_is_put_right(seen, turn: float):
+def test_a_nearly_right_or_reversed_place_is_corrected(seen, turn: float):
     observation, scene = seen
     grid, segmentation = observation.grid, segment(observation)
-    # The second is a screwdriver, the recess of whose shaft is lost in noise.
+    # The second object is a screwdriver, whose recess is partly lost in noise.
     for lies, belongs in true_places(scene)[: 1 if turn and not observation.valid.all() else 2]:
         pick, place = grid.to_pixel(lies[:2]), grid.to_pixel(belongs[:2])
         rotation = belongs[2] - lies[2]
         off = place + (1.1, -0.7)
         if turn:
-            # What a network takes for the place then: the recess the wrong way round.
+            # A network then predicts the recess's place the wrong way round.
             recess = min(
                 segmentation.recesses,
                 key=lambda item: np.linalg.norm(item.pixels - place, axis=1).min(),
@@ -180,8 +180,8 @@ def test_a_place_that_is_nearly_right_or_reversed_is_put_right(seen, turn: float
         assert abs(math.remainder(found.rotation - rotation, math.tau)) < math.radians(2)
 
 
-def test_a_place_in_a_recess_that_fits_far_worse_than_another_moves_there():
-    """A precision screwdriver, thin enough to lie in a hammer's cavity, and placed there."""
+def test_a_place_moves_to_a_recess_that_fits_far_better():
+    """A precision screwdriver is thin enough to lie in a hammer's recess."""
     scenario = load_scenario(SCENARIOS / "paper/kitting_unseen.yaml", None, "{policy: !Oracle {}}")
     rig = build_rig(scenario, seed=1216, base=SCENARIOS)
     context = rig.diagram.CreateDefaultContext()
@@ -204,7 +204,7 @@ def test_a_place_in_a_recess_that_fits_far_worse_than_another_moves_there():
     assert abs(math.remainder(found.rotation - rotation, math.tau)) < math.radians(2)
 
 
-def test_a_grasp_with_no_room_for_the_jaws_moves_to_where_there_is(seen):
+def test_a_grasp_without_room_moves_to_one_with_room(seen):
     observation, scene = seen
     grid, segmentation = observation.grid, segment(observation)
 
@@ -218,11 +218,11 @@ def test_a_grasp_with_no_room_for_the_jaws_moves_to_where_there_is(seen):
         near = refined(pick, theta)
         if near is not None:
             assert np.linalg.norm(near.pick - pick) * grid.resolution < 0.04
-        # Along the handle instead of across it, the jaws would close on nothing.
+        # Along the handle the jaws would close on nothing.
         along = refined(pick, theta + math.pi / 2)
         assert along is not None
         assert abs(math.remainder(along.theta - theta, math.pi)) < math.radians(40)
-        # Not where a grasp failed before; and where all failed, nowhere.
+        # Failed grasps are avoided; if all failed, there is none.
         other = refined(pick, theta + math.pi / 2, along.pick[None])
         if other is not None:
             assert np.linalg.norm(other.pick - along.pick) * grid.resolution > 0.0099
@@ -232,7 +232,7 @@ def test_a_grasp_with_no_room_for_the_jaws_moves_to_where_there_is(seen):
     assert refined(np.array([80.0, 160.0]), 0.0) is None
 
 
-def test_a_place_without_a_recess_stays(seen):
+def test_a_place_far_from_any_recess_is_not_refined(seen):
     observation, scene = seen
     grid = observation.grid
     lies = true_places(scene)[0][0]
@@ -244,7 +244,7 @@ def test_a_place_without_a_recess_stays(seen):
     )
 
 
-def test_holes_take_the_lowest_of_their_neighbours():
+def test_unseen_pixels_take_the_lowest_neighbouring_height():
     height = np.full((20, 20), 0.05, np.float32)
     height[:, 10:] = 0.0
     valid = np.ones(height.shape, bool)
@@ -256,7 +256,7 @@ def test_holes_take_the_lowest_of_their_neighbours():
     assert set(np.unique(filled)) == {np.float32(0.0), np.float32(0.05)}
 
 
-def test_it_needs_no_torch():
+def test_does_not_import_torch():
     code = (
         "import sys, kitting_drake.policies.matching.shape_matching; print('torch' in sys.modules)"
     )
@@ -283,8 +283,8 @@ def kitted(request) -> Observation:
     return rig.port("observation", context)
 
 
-def test_boxes_fit_nothing_that_tools_leave_of_their_cavities(kitted: Observation):
-    """What is left to be seen of a filled cavity is narrow, and lies well along a box's side."""
+def test_boxes_do_not_match_the_visible_parts_of_filled_recesses(kitted: Observation):
+    """These parts are narrow and match a box's side."""
     segmentation = segment(kitted)
     assert segmentation.recesses
     assert len(segmentation.objects) == 4
@@ -294,12 +294,12 @@ def test_boxes_fit_nothing_that_tools_leave_of_their_cavities(kitted: Observatio
     assert policy(kitted).stop
 
 
-def test_a_box_is_no_tool_and_a_tool_is(seen):
+def test_tools_match_recesses_and_a_box_does_not(seen):
     observation, _ = seen
     segmentation = segment(observation)
     resolution = observation.grid.resolution
     assert len(match(segmentation, resolution)) == 4
-    # A square among the tools: the largest that a cavity would hold.
+    # The largest square that fits into a recess.
     box = np.zeros(segmentation.fixture.shape, bool)
     box[4:18, 4:18] = True
     recesses = dataclasses.replace(

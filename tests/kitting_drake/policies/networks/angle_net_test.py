@@ -19,7 +19,7 @@ from kitting_drake.policies.networks.layers.steerable import SteerableConv2d
 from tests.kitting_drake.policies.equivariance import rotate_image, smooth_image
 
 MEAN = AngleNetSize(stages=((4,), (6,), (6,), (6,)), kernel=3, readout=3)
-"""The last layer is followed by a mean, as in the paper."""
+"""The output of the last layer is averaged, as in the paper."""
 WHOLE = PRESETS["tiny"].angle
 """The kernel of the last layer covers the whole feature map."""
 
@@ -88,7 +88,7 @@ def test_other_rotations_are_nearly_exact(frequencies: tuple[int, ...], median: 
 
 
 @pytest.mark.parametrize("preset", ["tiny", "small", pytest.param("paper", marks=pytest.mark.slow)])
-def test_every_frequency_of_the_output_is_reached(preset: str):
+def test_every_output_frequency_is_used(preset: str):
     networks = SO2Networks(NetworkConfig(preset=preset))
     crop = torch.randn(1, 4, PICK_CROP, PICK_CROP)
     with torch.no_grad():
@@ -97,7 +97,7 @@ def test_every_frequency_of_the_output_is_reached(preset: str):
     assert min(sizes) > 1e-3 * max(sizes)
 
 
-def test_neither_parameters_nor_weights_depend_on_n():
+def test_parameters_and_weights_do_not_depend_on_n():
     few, many = (SO2Networks(NetworkConfig(preset="tiny", orientations=n)) for n in (36, 720))
     many.load_state_dict(few.state_dict())
     image = np.random.default_rng(0).random((4, 80, 80), np.float32)

@@ -12,7 +12,7 @@ from kitting_drake.policies.networks import device
 
 @pytest.fixture(autouse=True)
 def forgotten() -> Iterator[None]:
-    """The choice is made once a process: these tests must not leave theirs."""
+    """Clears the cached choice before and after each test."""
     device.preferred_type.cache_clear()
     yield
     device.preferred_type.cache_clear()
@@ -47,6 +47,6 @@ def test_an_accelerator_that_emulates_bfloat16_computes_in_float32(
     assert device.preferred_type() == chosen
 
 
-def test_what_is_timed_takes_time() -> None:
+def test_the_timing_is_plausible() -> None:
     times = [device._seconds(dtype) for dtype in (torch.float32, torch.bfloat16)]
     assert all(1e-5 < seconds < 10 for seconds in times)

@@ -14,7 +14,7 @@ from kitting_drake.policies.networks.methods import make_networks
 
 @pytest.fixture(scope="module")
 def both() -> tuple[Networks, Networks]:
-    """Ours, with biases that are not zero, and escnn's."""
+    """Our networks with nonzero biases, and the reference."""
     torch.manual_seed(0)
     ours = make_networks(NetworkConfig(preset="tiny"))
     assert isinstance(ours, SO2Networks)
@@ -29,7 +29,7 @@ def layers(network: nn.Module, kind: type[nn.Module]) -> list[nn.Module]:
 
 
 def assert_close(found: Tensor, expected: Tensor) -> None:
-    """Up to float32's rounding in some thirty layers."""
+    """Equal up to float32 rounding in about thirty layers."""
     scale = float(expected.detach().abs().max())
     torch.testing.assert_close(found, expected, atol=1e-5 * scale, rtol=0)
 
@@ -46,7 +46,7 @@ def test_is_the_same_network(name: str, sides: tuple[int, int], both: tuple[Netw
     assert expected.std() > 0.01
     assert_close(found, expected)
 
-    # And trains the same: the gradient of every weight.
+    # The gradient of every weight is also the same.
     (expected**2).sum().backward()
     (found**2).sum().backward()
     pairs = list(zip(layers(ours, SteerableConv2d), layers(escnn, enn.R2Conv), strict=True))
@@ -55,7 +55,7 @@ def test_is_the_same_network(name: str, sides: tuple[int, int], both: tuple[Netw
         assert (one.bias is None) == (other.bias is None)
         if one.bias is not None:
             assert_close(one.bias.grad, other.bias.grad)
-    # Nothing else is trained, in either.
+    # Neither network has other parameters.
     for network, kind in ((ours, SteerableConv2d), (escnn, enn.R2Conv)):
         weights = itertools.chain.from_iterable(
             layer.parameters(recurse=False) for layer in layers(network, kind)
@@ -63,7 +63,7 @@ def test_is_the_same_network(name: str, sides: tuple[int, int], both: tuple[Netw
         assert {id(weight) for weight in weights} == {id(item) for item in network.parameters()}
 
 
-def test_for_inference_it_is_still_the_same(both: tuple[Networks, Networks]):
+def test_inference_gives_the_same(both: tuple[Networks, Networks]):
     ours, _ = both
     assert isinstance(ours, SO2Networks)
     image = torch.randn(1, 4, 33, 33)
@@ -73,11 +73,11 @@ def test_for_inference_it_is_still_the_same(both: tuple[Networks, Networks]):
         half = as_escnn(ours, torch.bfloat16).eval().alpha(image)
     assert half.dtype == torch.float32
     difference = float((half - expected).std() / expected.std())
-    # Computed in eight bits, not in 24.
+    # bfloat16 has eight bits of precision.
     assert 1e-4 < difference < 0.1
 
 
-def test_only_fibres_of_so2():
+def test_supports_only_fibres_of_so2():
     networks = make_networks(NetworkConfig("equivariant_transporter", "tiny", 36))
-    with pytest.raises(ValueError, match="no fibre of SO"):
+    with pytest.raises(ValueError, match=r"SO\(2\)"):
         as_escnn(networks)  # type: ignore[arg-type]

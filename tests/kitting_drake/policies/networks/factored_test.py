@@ -1,4 +1,4 @@
-"""The inputs, crops and labels that the networks are trained with, several objects at once."""
+"""The networks' training inputs, crops and labels, with several objects."""
 
 import dataclasses
 import math
@@ -21,7 +21,7 @@ STEP = math.tau / ORIENTATIONS
 
 
 class ZeroNetworks(FactoredNetworks):
-    """Their logits are zero, so that the gradients tell the labels; they keep the last input."""
+    """Networks with zero logits, whose gradients reveal the labels. They store the last input."""
 
     def __init__(self, *, stop: bool = False) -> None:
         super().__init__(config("so2", stop=stop))
@@ -46,7 +46,7 @@ class ZeroNetworks(FactoredNetworks):
 
 
 def two_tools() -> LabelledImage:
-    """A scene with another object, to be picked at bin 5, and a third one outside the image."""
+    """A scene with another object, to be picked at bin 5, and one outside the image."""
     return dataclasses.replace(
         scene(0),
         other_picks=np.array([[-4.0, 30.0], [30.0, 70.0]]),
@@ -66,13 +66,13 @@ def test_inputs_are_normalised_and_padded_below_and_on_the_right():
     assert (prepared[:, 160:] == 0).all()
 
 
-def test_the_class_nothing_to_pick_adds_the_loss_of_presence():
+def test_a_stop_class_adds_the_presence_loss():
     sample = two_tools()
     losses = [
         dict(networks.losses(sample, np.random.default_rng(0)))["pick_position"]().item()
         for networks in (ZeroNetworks(), ZeroNetworks(stop=True))
     ]
-    # All logits are zero: the odds are the number of pixels to that constant.
+    # With zero logits, the odds are the number of pixels over exp(NOTHING_LOGIT).
     odds = SIDE**2 / math.exp(NOTHING_LOGIT)
     assert losses[1] - losses[0] == pytest.approx(math.log1p(1 / odds), rel=1e-4)
     stopping = ZeroNetworks(stop=True)
@@ -83,7 +83,7 @@ def test_the_class_nothing_to_pick_adds_the_loss_of_presence():
     assert ZeroNetworks().predict_pick(sample.image, ORIENTATIONS).log_odds is None
 
 
-def test_every_pick_in_the_image_is_a_label():
+def test_every_pick_inside_the_image_is_a_label():
     networks, random = ZeroNetworks(), np.random.default_rng(0)
     sample = two_tools()
     losses = dict(networks.losses(sample, random))
@@ -94,7 +94,7 @@ def test_every_pick_in_the_image_is_a_label():
     assert label.sum() == pytest.approx(1.0, abs=1e-4)
 
 
-def test_each_crop_has_the_angle_and_the_curvature_of_its_own_object():
+def test_each_crop_has_the_angle_and_curvature_of_its_own_object():
     networks, random = ZeroNetworks(), np.random.default_rng(0)
     sample = networks_module.within_image(two_tools())
     pixels = [(int(sample.pick[0]) + 1, int(sample.pick[1]) - 2), (31, 69)]
@@ -108,7 +108,7 @@ def test_each_crop_has_the_angle_and_the_curvature_of_its_own_object():
     torch.testing.assert_close(
         networks.crops, torch.cat([networks.prepare(image) for image in shown])
     )
-    # The object outside the image is gone, and so is its curvature.
+    # The object outside the image is dropped with its curvature.
     np.testing.assert_array_equal(sample.curvatures, [[0.1, 0.0], [0.3, -0.2]])
 
 
@@ -124,8 +124,8 @@ def test_crops_are_centred_near_the_label(monkeypatch: pytest.MonkeyPatch):
     }
 
 
-def test_the_place_is_that_of_the_pixel_that_was_picked(monkeypatch: pytest.MonkeyPatch):
-    """A crop centred beside the pick is brought to beside the place, by the rotation."""
+def test_the_place_label_follows_the_crop_s_centre(monkeypatch: pytest.MonkeyPatch):
+    """A crop beside the pick goes beside the place, rotated with the object."""
     networks, sample = ZeroNetworks(), dataclasses.replace(scene(0), rotation=math.radians(-150.0))
     told: list[Any] = []
     monkeypatch.setattr(networks, "encode_scene", lambda image: "phi")

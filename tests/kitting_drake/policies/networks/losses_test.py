@@ -51,7 +51,7 @@ def test_interpolates_between_neighbours(position: float, cyclic: bool, expected
     np.testing.assert_allclose(found, [expected.get(i, 0.0) for i in range(10)])
 
 
-def test_labels_on_a_pixel_or_a_bin_are_those_of_the_paper():
+def test_a_label_on_a_pixel_or_bin_is_one_hot():
     pixels, bins = torch.randn(7, 9), torch.randn(N // 2)
     torch.testing.assert_close(
         position_loss(pixels, (4.0, 5.0)), F.cross_entropy(pixels.view(1, -1), torch.tensor([41]))
@@ -67,10 +67,10 @@ def test_labels_on_a_pixel_or_a_bin_are_those_of_the_paper():
     )
 
 
-def test_the_best_prediction_has_its_mean_at_the_label():
+def test_the_optimal_prediction_has_its_mean_at_the_label():
     logits = torch.randn(7, 9, requires_grad=True)
     (gradient,) = torch.autograd.grad(position_loss(logits, (3.25, 4.6)), logits)
-    # The gradient vanishes where this is what is predicted.
+    # The gradient is the softmax minus the optimal prediction.
     best = logits.detach().flatten().softmax(0).view(7, 9) - gradient
     assert best.min() > -1e-6
     assert float(best.sum(1) @ torch.arange(7.0)) == pytest.approx(3.25, abs=1e-5)
@@ -85,7 +85,7 @@ def test_angles_are_equal_modulo_pi():
     assert angle_loss(logits, between, N) < angle_loss(logits, 5 * STEP, N) - 4
 
 
-def test_nothing_to_pick_is_one_more_class():
+def test_nothing_to_pick_is_an_additional_class():
     logits, label = torch.randn(7, 9), (4.0, 5.0)
     classes = torch.cat([logits.flatten(), torch.tensor([NOTHING_LOGIT])])[None]
     odds = log_odds(logits)
@@ -96,7 +96,7 @@ def test_nothing_to_pick_is_one_more_class():
     torch.testing.assert_close(
         presence_loss(odds, present=False), F.cross_entropy(classes, torch.tensor([63]))
     )
-    # A volume of the same logits at every orientation tells the same.
+    # Repeating the logits at every orientation does not change the odds.
     torch.testing.assert_close(log_odds(logits.expand(6, -1, -1), 6), odds)
 
 
@@ -119,12 +119,12 @@ class Placing:
         self.volume = volume * (std / volume.std())
 
     def exact(self, pixel: tuple[float, float], rotation: float) -> float:
-        """Equation 8 at all pixels and bins, and its cross-entropy."""
+        """The cross-entropy of equation 8 at all pixels and bins."""
         label = (interpolate_label(rotation / STEP, N, cyclic=True), pixel)
         return float(joint_loss(self.volume, label))
 
     def coarse(self, pixel: tuple[float, float], rotation: float, seed: int) -> float:
-        """The loss of the coarse volume, which is a part of `place_loss`."""
+        """The part of `place_loss` for the coarse volume."""
         phase = float(torch.rand(1, generator=torch.Generator().manual_seed(seed)))
         volume = coarse_volume(
             self.scene, self.encoding, rotation_angles(COARSE_ROTATIONS, self.scene, phase)
@@ -140,7 +140,7 @@ class Placing:
         return float(cross_entropy(volume, label))
 
     def estimated(self, pixel: tuple[float, float], rotation: float, seed: int) -> float:
-        """`place_loss` without that part."""
+        """`place_loss` without the coarse part."""
         generator = torch.Generator().manual_seed(seed)
         loss = place_loss(self.scene, self.encoding, pixel, rotation, N, generator)
         return float(loss) - self.coarse(pixel, rotation, seed)
@@ -148,9 +148,7 @@ class Placing:
 
 @pytest.mark.parametrize(("std", "tolerance"), [(0.5, 0.02), (2.0, 0.3)])
 @pytest.mark.parametrize("seed", range(3))
-def test_the_loss_of_placing_estimates_that_of_the_whole_volume(
-    seed: int, std: float, tolerance: float
-):
+def test_the_place_loss_estimates_that_of_the_full_volume(seed: int, std: float, tolerance: float):
     placing = Placing(seed, std)
     best, row, col = np.unravel_index(int(placing.volume.argmax()), placing.volume.shape)
     for pixel, angle in [
@@ -175,7 +173,7 @@ def test_gradients_are_finite(orientations: int, pixel: tuple[float, float]):
         assert gradient.abs().max() > 0
 
 
-def test_draws_are_those_of_the_generator():
+def test_the_generator_determines_the_draws():
     placing = Placing(0, 3.0)
 
     def loss(seed: int) -> Tensor:

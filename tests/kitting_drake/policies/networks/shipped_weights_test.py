@@ -1,4 +1,4 @@
-"""The weights that come with the project: their cards, their decisions and their equivariance."""
+"""The shipped weights: their cards, decisions and equivariance."""
 
 import math
 from pathlib import Path
@@ -24,20 +24,20 @@ ONE_OF_THEM = [
     for path in SHIPPED
 ]
 TAUGHT = [path for path in SHIPPED if path.stem != "generalist"]
-"""Those that learned from demonstrations."""
+"""The weights that were trained on demonstrations."""
 OBSERVED = {"generalist": "kitting_unseen"}
-"""A rendered observation for each of them (seeds 103 and 105, at rest, four tools on the table)."""
+"""The rendered observation for each file (seeds 103 and 105, at rest, four tools on the table)."""
 
 GOLDEN = {
     "generalist": ((59.179, 219.931), 40.516, (69.985, 124.046), -146.184),
     "kitting_seen": ((19.879, 24.805), 57.140, (60.811, 177.621), -151.209),
     "kitting_unseen": ((59.612, 219.980), 41.040, (69.570, 123.653), -146.237),
 }
-"""The pick (row, col) and its angle, and the place (row, col) and the rotation, in degrees, that
-the weights predicted for these observations when they were shipped (float32)."""
+"""The predictions of the shipped weights for these observations (float32): pick (row, col), pick
+angle in degrees, place (row, col), rotation in degrees."""
 
 
-def test_there_is_one_file_for_each_task_and_one_for_any_tools():
+def test_there_is_a_file_for_each_task_and_a_generalist():
     assert [path.stem for path in SHIPPED] == ["generalist", "kitting_seen", "kitting_unseen"]
 
 
@@ -54,7 +54,7 @@ def test_the_generalist_sees_no_colour():
 
 
 @pytest.mark.parametrize("path", TAUGHT, ids=lambda path: path.stem)
-def test_no_test_seed_was_learned_from(path: Path):
+def test_no_test_seed_was_used_in_training(path: Path):
     file = read_weights_file(path)
     assert file.config == NetworkConfig(
         **{**file.config.as_dict(), "method": "so2", "preset": "small", "orientations": 180}
@@ -67,20 +67,20 @@ def test_no_test_seed_was_learned_from(path: Path):
 
 
 def test_stops_when_all_tools_are_in_the_kit():
-    """The last observation of a demonstration with a validation seed (20011)."""
+    """On the last observation of a demonstration with a validation seed (20011)."""
     networks = load_networks(MODELS / "policies" / "kitting_unseen.safetensors")
     policy = LearnedPolicy(networks, orientations=180)
     names = ("kitting_unseen_final", "kitting_unseen")
     finished, unfinished = (policy(stored_observation(name)) for name in names)
     assert finished.stop
     assert not unfinished.stop
-    # The threshold is nearly four nats away from either.
+    # Both log-odds are far from the threshold.
     odds = [policy.log_odds(stored_observation(name)) for name in names]
     assert odds[0] < networks.stop_threshold - 2 < networks.stop_threshold + 2 < odds[1]
 
 
 @pytest.mark.parametrize("path", SHIPPED, ids=lambda path: path.stem)
-def test_decides_as_when_it_was_shipped(path: Path):
+def test_predicts_as_when_it_was_shipped(path: Path):
     policy = LearnedPolicy(load_networks(path), orientations=180)
     found = policy.decide(stored_observation(OBSERVED.get(path.stem, path.stem)))
 
@@ -96,7 +96,7 @@ def test_decides_as_when_it_was_shipped(path: Path):
 
 @pytest.mark.parametrize("path", ONE_OF_THEM)
 @torch.inference_mode()
-def test_training_keeps_them_equivariant(path: Path):
+def test_trained_networks_stay_equivariant(path: Path):
     trained = load_networks(path)
     image = smooth_image(113)[:, -trained.config.channels :]
     torch.manual_seed(0)

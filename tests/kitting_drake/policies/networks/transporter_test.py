@@ -66,7 +66,7 @@ def centroid(image: Tensor) -> Tensor:
 
 
 @pytest.mark.parametrize("angle", ANGLES)
-def test_a_point_is_rotated_about_the_middle(angle: float):
+def test_a_point_is_rotated_about_the_centre(angle: float):
     shape = (60, 101)
     point = np.array([22.3, 61.8])
     canvas = canvas_shape(shape, angle)
@@ -87,7 +87,7 @@ def test_a_rotation_by_90_degrees_is_exact():
 
 
 @pytest.mark.parametrize("angle", ANGLES)
-def test_the_canvas_holds_every_pixel_and_hardly_more(angle: float):
+def test_the_canvas_holds_every_pixel_with_little_margin(angle: float):
     shape = (20, 31)
     canvas = np.array(canvas_shape(shape, angle))
     half = np.array(shape) / 2 - 0.5
@@ -103,7 +103,7 @@ def test_has_43_layers():
     assert sum("shortcut" not in name for name in layers) == 43
     image = torch.randn(1, 4, 33, 49)
     assert network(image).shape == (1, 3, 33, 49)
-    # Strides of two at three stages.
+    # Three stages have a stride of two.
     sides = []
     halved = network.stem(image)
     for stage in network.down:
@@ -118,7 +118,7 @@ def test_the_volume_is_equivariant_to_rotations_by_90_degrees():
     image = sample().image
     volume = networks.pick_volume(image, N)
     assert volume.shape == (N // 2, *image.shape[1:])
-    # Ordinary networks do not know that beyond pi the angles are the same as before.
+    # The network does not know that angles beyond pi repeat.
     found = networks.pick_volume(np.rot90(image, axes=(1, 2)).copy(), N)[N // 4 :]
     expected = volume[: N // 4].rot90(1, (1, 2))
     assert expected.std() > 1e-3
@@ -126,7 +126,7 @@ def test_the_volume_is_equivariant_to_rotations_by_90_degrees():
 
 
 @torch.no_grad()
-def test_picks_the_best_of_the_volume():
+def test_picks_the_maximum_of_the_volume():
     networks = transporter().eval()
     image = sample().image
     volume = networks.pick_volume(image, N)
@@ -135,7 +135,7 @@ def test_picks_the_best_of_the_volume():
     angles = picking.angle((row, col)).logits
     assert angles.shape == (N // 2,)
     assert angles.max() == volume.max()
-    # N is no part of the architecture.
+    # N is not part of the architecture.
     finer = networks.predict_pick(image, 16).angle((row, col)).logits
     torch.testing.assert_close(finer[::2], angles)
     with pytest.raises(ValueError, match="even"):
@@ -143,7 +143,7 @@ def test_picks_the_best_of_the_volume():
 
 
 @torch.no_grad()
-def test_position_and_angle_come_from_one_volume_and_nothing_is_remembered(
+def test_position_and_angle_share_one_volume_that_is_not_cached(
     monkeypatch: pytest.MonkeyPatch,
 ):
     networks = transporter().eval()
@@ -160,14 +160,14 @@ def test_position_and_angle_come_from_one_volume_and_nothing_is_remembered(
     angles = before.angle((20, 30)).logits
     assert len(computed) == N // 2
     assert angles.max() == before.position[20, 30]
-    # The same array may hold another image the next time.
+    # The same array may hold another image later.
     image[:] = image[:, ::-1].copy()
     assert not torch.equal(networks.predict_pick(image, N).position, before.position)
 
 
 @pytest.mark.parametrize("angle", ANGLES)
 def test_crops_are_those_of_the_rotated_scene(angle: float):
-    """A point is rotated about the pick, which is in the middle of the crop."""
+    """A point is rotated about the pick, which is the crop's centre."""
     pixel, point = (50, 70), np.array([58.0, 49.0])
     scene = blob((101, 121), (point[0], point[1]))
     (found,) = rotated_crops(scene, pixel, [angle])
@@ -176,7 +176,7 @@ def test_crops_are_those_of_the_rotated_scene(angle: float):
     np.testing.assert_allclose(centroid(found[None]), expected, atol=1e-3)
 
 
-def test_no_corner_of_a_rotated_crop_is_missing():
+def test_the_corners_of_a_rotated_crop_are_filled():
     scene = torch.ones(1, 4, 161, 161)
     crops = rotated_crops(scene, (80, 80), [0.0, math.radians(30), math.radians(45)])
     assert crops.shape == (3, 4, PLACE_CROP, PLACE_CROP)
@@ -185,14 +185,14 @@ def test_no_corner_of_a_rotated_crop_is_missing():
 
 @torch.no_grad()
 @pytest.mark.parametrize("orientations", [8, 36])
-def test_places_where_the_correlation_with_all_rotated_crops_is_best(orientations: int):
+def test_places_at_the_maximum_of_the_correlation_with_all_rotated_crops(orientations: int):
     networks = transporter().eval()
     image, pixel = sample().image, (14, 22)
     rows, cols = image.shape[1:]
     placing = networks.predict_place(image, pixel, orientations)
     angles = [i * math.tau / orientations for i in range(orientations)]
     kernels = networks.encode_crops(image, pixel, angles)
-    # Rotating the crop is not the same as rotating its encoding.
+    # Rotating a crop differs from rotating its encoding.
     rotated_encodings = lift(networks.encode_crop(image, pixel), torch.tensor(angles), KERNEL)
     assert (kernels[1:] - rotated_encodings[1:]).norm() > 0.01 * kernels[1:].norm()
     volume = cross_correlation(networks.encode_scene(image), kernels)[:, :rows, :cols]
@@ -203,7 +203,7 @@ def test_places_where_the_correlation_with_all_rotated_crops_is_best(orientation
 
 
 @torch.no_grad()
-def test_finer_rotations_than_36_are_searched_around_the_best_of_them(
+def test_more_than_36_rotations_are_searched_from_coarse_to_fine(
     monkeypatch: pytest.MonkeyPatch,
 ):
     networks = transporter().eval()
@@ -221,13 +221,13 @@ def test_finer_rotations_than_36_are_searched_around_the_best_of_them(
     best = placing.candidates[0]
     score, rotation, row, col = best.best()
     assert score >= placing.score_map.max() - 1e-4
-    # Its scores are those of the bins that it names.
+    # Its score is that of its bin.
     kernels = encode(image, pixel, [rotation * math.tau / 180])
     volume = cross_correlation(networks.encode_scene(image), kernels)
     assert volume[0, row, col] == pytest.approx(score, rel=1e-4)
 
 
-def test_drawn_bins_stand_for_all():
+def test_drawn_bins_represent_all_bins():
     step = math.tau / 180
     drawn = draw_bins({89, 0, 30}, 90, step, np.random.default_rng(0))
     assert [drawn[bin_] for bin_ in (0, 30, 89)] == [0, 0, 0]
@@ -237,11 +237,11 @@ def test_drawn_bins_stand_for_all():
     assert near == [True, True, False, False]
     everything = draw_bins({0, 1}, 4, math.tau / 8, np.random.default_rng(0))
     assert everything == dict.fromkeys(range(4), 0.0)
-    # Of a place, bins are cyclic over the full rotation.
+    # Place bins are cyclic over a full rotation.
     drawn = draw_bins({0}, 180, step, np.random.default_rng(0))
     near = [min(bin_, 180 - bin_) <= 5 for bin_ in drawn if bin_]
     assert near == [True, True, False, False]
-    # Without labels, as in a final observation, some stand for all.
+    # A final observation has no labels.
     drawn = draw_bins(set(), 90, step, np.random.default_rng(0))
     assert sum(math.exp(weight) for weight in drawn.values()) == pytest.approx(90)
 
@@ -249,18 +249,20 @@ def test_drawn_bins_stand_for_all():
 @pytest.mark.parametrize(
     ("labels", "rotations", "near", "far"),
     [
-        # Two bins beside those of a label are near it at N = 36: the rest is elsewhere.
+        # At N = 36 only one bin on either side is near a label; the others are far.
         ({3, 4}, 9, 2, 5),
         ({3, 4}, 18, 2, 14),
         ({3, 4}, 36, 2, 32),
         ({3, 4}, 99, 2, 32),
-        # Never fewer than without a number.
+        # Never fewer than the default.
         ({3, 4}, 1, 2, 2),
         ({3}, 9, 2, 6),
         (set(), 9, 0, 9),
     ],
 )
-def test_as_many_bins_are_drawn_as_wanted(labels: set[int], rotations: int, near: int, far: int):
+def test_the_requested_number_of_bins_is_drawn(
+    labels: set[int], rotations: int, near: int, far: int
+):
     drawn = draw_bins(labels, 36, math.tau / 36, np.random.default_rng(0), rotations)
     assert labels <= set(drawn)
     others = set(drawn) - labels
@@ -269,13 +271,13 @@ def test_as_many_bins_are_drawn_as_wanted(labels: set[int], rotations: int, near
     assert sum(math.exp(weight) for weight in drawn.values()) == pytest.approx(36)
 
 
-def test_all_bins_are_drawn_even_where_most_are_near():
+def test_all_bins_can_be_drawn_even_if_most_are_near():
     assert len(draw_bins({0, 40}, 90, math.tau / 180, np.random.default_rng(0), 90)) == 90
     few = draw_bins({0, 1}, 8, math.tau / 180, np.random.default_rng(0), 8)
     assert few == dict.fromkeys(range(8), 0.0)
 
 
-def test_the_losses_are_those_of_the_whole_volumes_where_all_bins_are_drawn():
+def test_with_all_bins_the_losses_are_exact():
     networks = transporter(dataclasses.replace(TINY, stop=True))
     networks.rotations = N
     one = dataclasses.replace(sample(), other_picks=np.zeros((0, 2)), other_thetas=np.zeros(0))
@@ -307,13 +309,13 @@ def losses(steps: int) -> list[dict[str, float]]:
     trainer = Trainer(transporter(), seed=0, learning_rate=1e-3)
     found = []
     for _ in range(steps):
-        # The same draws, so the same motion of the scene.
+        # The same step number repeats the draws, including the motion of the scene.
         trainer.step_count = 0
         found.append(trainer.step([sample()]))
     return found
 
 
-def test_learns_a_sample_and_the_same_for_a_seed():
+def test_learns_a_sample_reproducibly():
     found = losses(5)
     assert set(found[0]) == {"pick", "place"}
     for name in found[0]:
@@ -322,7 +324,7 @@ def test_learns_a_sample_and_the_same_for_a_seed():
 
 
 @torch.no_grad()
-def test_comes_back_from_a_file(tmp_path: Path):
+def test_loads_from_a_file(tmp_path: Path):
     networks = transporter().eval()
     path = tmp_path / "policy.safetensors"
     save_weights(path, networks, {})

@@ -15,7 +15,7 @@ def tiny_unet(fibre: Fibre = BAND_3) -> UNet:
     return UNet(4, 3, fibre, PRESETS["tiny"].unet, SteerableConv2d)
 
 
-def test_has_the_papers_size():
+def test_has_the_paper_s_size():
     preset = PRESETS["paper"]
     fibre = Irreps((0, 1, 2, 3), preset.samples)
     alpha = UNet(4, 1, fibre, preset.unet, SteerableConv2d)
@@ -53,7 +53,7 @@ def test_other_rotations_are_nearly_exact(samples: int):
                 relative_error(network(rotate_image(image, degrees)), rotate_image(output, degrees))
                 for degrees in (15, 30, 45)
             ]
-    # What remains is the aliasing of four poolings.
+    # The remaining error is the aliasing of four poolings.
     assert np.median(errors) < 0.2
     assert np.max(errors) < 0.3
 
@@ -68,6 +68,6 @@ def test_computes_in_the_type_of_the_image():
 
 
 @pytest.mark.parametrize("sides", [(48, 49), (49, 50), (32, 32)])
-def test_refuses_sides_that_cannot_be_halved(sides: tuple[int, int]):
-    with pytest.raises(ValueError, match="cannot be halved 4 times"):
+def test_rejects_sides_that_do_not_fit(sides: tuple[int, int]):
+    with pytest.raises(ValueError, match="multiple of 16"):
         tiny_unet()(torch.zeros(1, 4, *sides))

@@ -1,4 +1,4 @@
-"""Memorised scenes (overfitting test), and copies of them rendered at other rotations."""
+"""Overfits a few scenes, and tests copies of them rendered at other rotations."""
 
 import math
 
@@ -25,14 +25,14 @@ from tests.kitting_drake.policies.scenes import (
 
 SCENES = range(4)
 ROTATIONS = (10, 20, 33, 45, 57, 70, 110, 155)
-"""In degrees: after any of them the labels lie between pixels."""
+"""In degrees; each puts the labels between pixels."""
 GRID = PixelGrid(rows=SIDE, cols=SIDE)
 
 
 def prediction_errors(
     networks: Networks, sample: LabelledImage, *, continuous: bool = False
 ) -> list[float]:
-    """Errors of the pick in pixels and bins, then of the place."""
+    """Errors of the pick in pixels and bins, then those of the place."""
     policy = LearnedPolicy(
         networks, orientations=ORIENTATIONS, stages=DEFAULT_STAGES if continuous else ()
     )
@@ -56,7 +56,7 @@ def log_odds(networks: Networks, image: NDArray[np.float32]) -> float:
 
 
 def shifted(sample: LabelledImage, random: np.random.Generator, **_: bool) -> LabelledImage:
-    """The only augmentation: training sees no scene rotated."""
+    """Replaces the augmentation: training sees no rotated scene."""
     return move(sample, 0.0, random.integers(-ROOM, ROOM + 1, size=2).astype(float))
 
 
@@ -92,7 +92,7 @@ def test_memorises_scenes_and_generalises_by_equivariance(
 
     seen, quarter, half = errors(0, 90, 180)
     rotated = errors(*ROTATIONS, continuous=True)
-    # Errors of one whole bin are rounded.
+    # The tolerance is one whole bin, plus rounding.
     right = (rotated < 1.001).all(axis=2)
     present = [log_odds(networks, sample.image) for sample in samples]
     absent = [log_odds(networks, final.image) for final in finals]
@@ -101,7 +101,7 @@ def test_memorises_scenes_and_generalises_by_equivariance(
         print(f"  {name:9}{found.max(0).round(2)}")
     print(f"  others   {rotated.max((0, 1)).round(2)}, {right.sum()} of {right.size} within one")
     print(f"  log-odds at least {min(present):.1f} with a tool, {max(absent):.1f} without at most")
-    # Not every method is done to the last pixel after so few steps.
+    # The baselines have not converged to the last pixel.
     assert seen.max() < (0.01 if method == "so2" else 1.001)
     assert min(present) > max(absent)
     if method == "so2":

@@ -28,7 +28,7 @@ def assert_same(one: Trainer, other: Trainer) -> None:
     assert all(torch.equal(a, b) for a, b in pairs)
 
 
-def test_all_draws_are_those_of_the_seed():
+def test_the_seed_determines_all_draws():
     samples = [scene(0), scene(1)]
     one, same, other = trainer(), trainer(), trainer(seed=1)
     losses = [[item.step(samples) for _ in range(2)] for item in (one, same)]
@@ -40,9 +40,7 @@ def test_all_draws_are_those_of_the_seed():
 @pytest.mark.parametrize(
     ("decay", "stop"), [pytest.param(False, False, marks=pytest.mark.slow), (True, True)]
 )
-def test_a_resumed_run_continues_bit_by_bit(
-    decay: bool, stop: bool, monkeypatch: pytest.MonkeyPatch
-):
+def test_a_resumed_run_continues_exactly(decay: bool, stop: bool, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(training, "_STOP_PROBABILITY", 0.5)
     samples = [scene(0), scene(1)]
     whole, before, after = (
@@ -56,11 +54,11 @@ def test_a_resumed_run_continues_bit_by_bit(
     assert found == expected
     assert after.step_count == 4
     assert_same(after, whole)
-    # Some steps had a final observation and some had none, unless the networks cannot stop.
+    # Networks that can stop had a final observation in some steps.
     assert {"stop" in losses for losses in found} == ({True, False} if stop else {False})
 
 
-def test_a_final_observation_trains_where_to_pick_and_changes_nothing_else(
+def test_a_final_observation_only_affects_the_pick_position(
     monkeypatch: pytest.MonkeyPatch,
 ):
     outcomes = []
@@ -76,7 +74,7 @@ def test_a_final_observation_trains_where_to_pick_and_changes_nothing_else(
     assert changed == {"alpha"}
 
 
-def test_one_loss_alone_is_trained_as_beside_the_others():
+def test_training_one_loss_alone_gives_the_same_weights():
     whole, alone = trainer(learning_rate=1e-3), trainer(learning_rate=1e-3, only="pick_angle")
     before = copy.deepcopy(alone.networks.state_dict())
     for _ in range(2):
@@ -89,7 +87,7 @@ def test_one_loss_alone_is_trained_as_beside_the_others():
     assert not torch.equal(expected["alpha.lift.weights"], before["alpha.lift.weights"])
 
 
-def test_what_is_prepared_is_only_for_the_step_and_the_samples_that_it_was_drawn_for():
+def test_a_prepared_draw_is_used_only_for_its_step_and_samples():
     samples, others = [scene(0), scene(1)], [scene(2)]
     one, other = trainer(), trainer()
     for learner, first in ((one, samples), (other, others)):
@@ -106,7 +104,7 @@ def test_one_step_in_eight_has_a_final_observation():
     drawn = [learner._draw(step, samples, FINALS).final for step in range(240)]
     images = [image for image in drawn if image is not None]
     assert 18 < len(images) < 45
-    # Each after a motion of its own.
+    # Each has its own motion.
     assert len({image.tobytes() for image in images}) == len(images)
 
 
@@ -115,7 +113,7 @@ def rates(learner: Trainer) -> set[float]:
     return {group["lr"] for item in learner.optimisers.values() for group in item.param_groups}
 
 
-def test_the_rate_is_that_of_the_step():
+def test_the_learning_rate_follows_the_step():
     learner, constant = trainer(steps=300, decay=True), trainer(steps=300)
     constant.step([scene(0)])
     assert rates(constant) == {1e-4}
@@ -149,15 +147,15 @@ def test_every_weight_is_trained_by_one_loss(method: str):
     Trainer(networks, seed=0).step([scene(0)])
     after = networks.state_dict()
     unmoved = {name for name in before if torch.equal(before[name], after[name])}
-    # A softmax does not depend on what is added to all logits: only rounding moves these.
+    # A softmax does not depend on an offset of all logits: only rounding changes these biases.
     assert unmoved <= {"alpha.out.bias", "f_pick.out.third.bias", "f_pick.out.shortcut.bias"}
 
 
-def test_the_learning_rate_rises_and_falls_to_nothing():
+def test_the_learning_rate_warms_up_and_decays_to_zero():
     shares = [decayed(step, 1000) for step in range(1001)]
     assert shares[0] == pytest.approx(0.01, rel=0.01)
     assert max(shares) == pytest.approx(1, rel=0.05)
     assert (np.diff(shares[100:]) < 0).all()
     assert shares[1000] == pytest.approx(0, abs=1e-8)
-    # Beyond the last step it does not rise again.
+    # It stays zero after the last step.
     assert decayed(1500, 1000) == pytest.approx(0, abs=1e-8)

@@ -20,7 +20,7 @@ from kitting_drake.policies.training.validation import (
 from systems.signals import Observation, PixelGrid
 
 GRID = PixelGrid(resolution=0.002, rows=60, cols=80)
-"""2 mm a pixel."""
+"""2 mm per pixel."""
 IMAGE: Image = np.zeros((4, *GRID.shape), np.float32)
 SEEN = Observation(IMAGE, GRID)
 PICK, PLACE, THETA, ROTATION = np.array([20.0, 30.0]), np.array([40.0, 60.0]), 1.2, 2.9
@@ -42,7 +42,7 @@ def predicted(
     rotation: float = 0.0,
     log_odds: float | None = None,
 ) -> Decision:
-    """The expert's action with some errors; the place is that of what was picked."""
+    """The expert's action with the given errors; the place follows the actual pick."""
     pick_pixel = PICK + pick
     place_pixel = PLACE + rotation_matrix(ROTATION) @ np.array(pick) + place
     action = make_action(SEEN, pick_pixel, THETA + theta, place_pixel, ROTATION + rotation)
@@ -55,17 +55,17 @@ def predicted(
     ("decision", "expected"),
     [
         (predicted(), (0, 0, 0, 0, 0)),
-        # An object that is gripped elsewhere and put down accordingly is where it belongs.
+        # Another grasp does not matter if the object is placed correctly.
         (predicted(pick=(3, 4)), (10, 0, 0, 0, 0)),
         (predicted(place=(0.3, -0.4)), (0, 0, 1, 0, 1)),
         (predicted(theta=math.radians(2)), (0, 2, 0, 0, 50 * math.radians(2))),
         (predicted(theta=math.pi - math.radians(2)), (0, 2, 0, 0, 50 * math.radians(2))),
         (predicted(rotation=-math.radians(3)), (0, 0, 0, 3, 50 * math.radians(3))),
         (predicted(rotation=math.tau), (0, 0, 0, 0, 0)),
-        # All errors together, and no more than lost.
+        # The errors add up, but are clipped.
         (predicted(place=(3, 4), theta=0.02, rotation=0.04), (0, 1.1459, 10, 2.2918, 13)),
         (predicted(rotation=math.pi), (0, 0, 0, 180, 20)),
-        # A pick beside every object moves none of them, wherever it is placed.
+        # A pick that misses every object moves none.
         (predicted(pick=(-9, 6)), (2 * math.hypot(9, 6), 0, 0, 0, 20)),
     ],
 )
@@ -75,7 +75,7 @@ def test_errors_of_a_prediction(decision: Decision, expected: tuple[float, ...])
 
 
 class Scripted:
-    """A policy that returns given decisions, and given log-odds, one after the other."""
+    """A policy that returns given decisions and log-odds in turn."""
 
     def __init__(self, *decisions: Decision, log_odds: tuple[float, ...] = ()) -> None:
         self._decisions, self._log_odds = iter(decisions), iter(log_odds)
@@ -89,7 +89,7 @@ class Scripted:
         return next(self._log_odds)
 
 
-def test_a_report_of_some_scenes():
+def test_the_report_without_final_observations():
     policy = Scripted(predicted(), predicted(place=(0, 1)), predicted(place=(9, 12)))
     report = validate(policy, [SCENE] * 3)  # type: ignore[arg-type]
     assert report["median_place_mm"] == pytest.approx(2)
@@ -99,7 +99,7 @@ def test_a_report_of_some_scenes():
     assert report.keys() == {"displacement_mm", "cost_mm", *named}
 
 
-def test_scenes_that_are_judged_wrongly_are_counted_and_cost_as_if_lost():
+def test_wrong_stop_decisions_are_counted_and_cost_as_if_lost():
     policy = Scripted(
         predicted(log_odds=5.0),
         predicted(log_odds=-2.0),
@@ -118,22 +118,22 @@ def test_scenes_that_are_judged_wrongly_are_counted_and_cost_as_if_lost():
 @pytest.mark.parametrize(
     ("present", "absent", "threshold"),
     [
-        # Between them, nearer to those with nothing to pick, where they separate.
+        # Where they separate, between them and nearer to the final observations.
         ((3.0, 9.0, 5.0), (-1.0, -7.0), 0.0),
-        # Otherwise the fewest errors; of equally many, an action too many rather than one too few.
+        # Otherwise the fewest errors; among equals, the lower threshold.
         ((3.0, 5.0, 6.0, -2.0), (-1.0, -3.0, 0.0), 0.75),
         ((1.0,), (2.0,), 0.0),
         ((), (1.0,), None),
         ((1.0,), (), None),
     ],
 )
-def test_the_threshold_for_stopping(
+def test_the_stop_threshold(
     present: tuple[float, ...], absent: tuple[float, ...], threshold: float | None
 ):
     assert choose_stop_threshold(present, absent) == threshold
 
 
-def test_the_mean_loss_is_that_of_the_action_that_was_taken():
+def test_the_mean_loss_is_that_of_the_taken_action():
     networks = make_networks(NetworkConfig(preset="tiny")).eval()
     seen = np.random.default_rng(0).random((4, *GRID.shape)).astype(np.float32)
     sample = dataclasses.replace(SCENE.targets[0], image=seen)

@@ -1,4 +1,4 @@
-"""Calibrations as OpenCV, ROS and people write them."""
+"""Calibrations in the layouts of OpenCV, ROS and this project."""
 
 import dataclasses
 import math
@@ -56,7 +56,7 @@ t_cam2base: !!opencv-matrix
 camera_name: eye
 table_height: 0.012
 """
-# As `ros2 topic echo --once` prints it.
+# The output of `ros2 topic echo --once`.
 CAMERA_INFO = """
 header:
   frame_id: eye_color_optical_frame
@@ -87,7 +87,7 @@ def read(folder: Path, text: str, **others: str) -> Calibration:
     return read_calibration(folder / "calibration.yaml")
 
 
-def test_three_layouts_tell_the_same_camera(tmp_path: Path):
+def test_three_layouts_give_the_same_camera(tmp_path: Path):
     own = read(tmp_path, OWN)
     for text in (OPENCV, ROS):
         other = read(tmp_path, text, eye_info=CAMERA_INFO)
@@ -95,13 +95,13 @@ def test_three_layouts_tell_the_same_camera(tmp_path: Path):
         (one,), (two,) = own.cameras, other.cameras
         assert (two.name, two.intrinsics) == (one.name, one.intrinsics)
         np.testing.assert_allclose(two.X_BC, one.X_BC, atol=1e-12)
-    # Straight down, the image's right is the base's -y.
+    # The camera looks straight down; the image's right is the base's -y.
     np.testing.assert_allclose(own.cameras[0].X_BC[:3, :3] @ [0, 0, 1], [0, 0, -1], atol=1e-12)
     np.testing.assert_allclose(own.cameras[0].X_BC[:3, :3] @ [1, 0, 0], [0, -1, 0], atol=1e-12)
     assert own.table_height == 0.012
 
 
-def test_a_file_of_one_camera_says_where_the_table_is(tmp_path: Path):
+def test_a_file_of_one_camera_may_give_the_table_height(tmp_path: Path):
     one = """
 camera_name: eye
 table_height: 0.012
@@ -114,8 +114,8 @@ transform:
     assert (found.cameras[0].name, found.table_height) == ("eye", 0.012)
 
 
-def test_rays_are_where_the_lens_bends_them_from(tmp_path: Path):
-    """Bent by the lens, as OpenCV's manual states it, a ray comes back to its pixel."""
+def test_rays_invert_the_distortion(tmp_path: Path):
+    """Distorted by the formula in OpenCV's manual, a ray hits its pixel."""
     camera = read(tmp_path, OWN).cameras[0]
     x, y = camera.rays.u.astype(float), camera.rays.v.astype(float)
     k1, k2, p1, p2, k3 = camera.intrinsics.distortion
@@ -123,12 +123,12 @@ def test_rays_are_where_the_lens_bends_them_from(tmp_path: Path):
     radial = 1 + k1 * r2 + k2 * r2**2 + k3 * r2**3
     bent_x = x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x**2)
     bent_y = y * radial + p1 * (r2 + 2 * y**2) + 2 * p2 * x * y
-    # Whole numbers are the pixels' centres.
+    # Pixel centres are whole numbers.
     np.testing.assert_allclose(50 * bent_x + 31.5, np.tile(np.arange(64), (48, 1)), atol=0.01)
     np.testing.assert_allclose(51 * bent_y + 23.25, np.tile(np.arange(48), (64, 1)).T, atol=0.01)
 
 
-def test_what_is_written_is_read_again_to_the_last_bit(tmp_path: Path):
+def test_a_written_calibration_reads_back_exactly(tmp_path: Path):
     before = read(tmp_path, OWN + "workspace: {rows: 100, cols: 90, max_height: 0.2}\n")
     turned = before.cameras[0].X_BC.copy()
     turned[:3, :3] = Rotation.from_rotvec([0.1, 0.2, 0.3]).as_matrix() @ turned[:3, :3]
@@ -152,7 +152,7 @@ def test_what_is_written_is_read_again_to_the_last_bit(tmp_path: Path):
         (("0.001, -0.002, 0.01]", "0.001]"), "distortion must hold 0, 4, 5 or 8 numbers, not 3"),
         (("[0.1, -0.05,", "[-9.0, -0.05,"), "its distortion cannot be undone"),
         ((", rpy_deg: [180, 0, -90]", ""), "camera eye: pose has no rotation"),
-        (("rpy_deg: [180, 0, -90]", "yaw: 3"), "camera eye: pose has 'yaw', which means nothing"),
+        (("rpy_deg: [180, 0, -90]", "yaw: 3"), "camera eye: pose has the unknown field 'yaw'"),
         (
             ("rpy_deg: [180, 0, -90]", "rpy_deg: [0, 0, 0], quaternion_xyzw: [1, 0, 0, 0]"),
             "pose has quaternion_xyzw and rpy_deg: give one of them",
@@ -168,48 +168,48 @@ def test_what_is_written_is_read_again_to_the_last_bit(tmp_path: Path):
             "camera eye has camera_to_base and pose: give one",
         ),
         (("table_height: 0.012", "table_height: high"), "table_height must be a finite number"),
-        (("cameras:", "workspace: {cells: 3}\ncameras:"), "workspace has the fields x_min"),
+        (("cameras:", "workspace: {cells: 3}\ncameras:"), "workspace .*fields x_min"),
         (("  eye:\n", "  eye: {\n"), "line "),
         (("cameras:", "camera:"), "unknown field 'camera': did you mean 'cameras'?"),
         (("fx:", "fxx:"), "unknown field 'fxx': did you mean 'fx'?"),
         (("table_height:", "table_hieght:"), "unknown field 'table_hieght': did you mean 'table_h"),
         (("distortion:", "distorsion:"), "camera eye has the unknown field 'distorsion'"),
-        (("fy: 51", "fy: 51\n    fy: 52"), "'fy' is there twice"),
+        (("fy: 51", "fy: 51\n    fy: 52"), "'fy' is given twice"),
         (("fy: 51", "fy: 51\n    min_depth: 300"), "min_depth 300 must be less than max_depth 10"),
-        (("fy: 51", "fy: 51\n    table_height: 1"), "which all cameras share: put it beside 'cam"),
+        (("fy: 51", "fy: 51\n    table_height: 1"), "table_height.*beside 'cameras'"),
         (("table_height: 0.012", "when: 2024-13-45"), "is not YAML: month must be"),
         (("table_height: 0.012", "when: !!bool 5"), "is not YAML"),
         (("table_height: 0.012", "deep: " + 3000 * "["), "is nested too deeply"),
         (
             ("pose: {position: [0.5, 0.1, 0.9], rpy_deg: [180, 0, -90]}", "pose: &p {pose: *p}"),
-            "pose has 'pose', which means nothing",
+            "pose has the unknown field 'pose'",
         ),
-        (("cameras:", "workspace: {rows: 1000000, cols: 1000000}\ncameras:"), "is the most: res"),
+        (("cameras:", "workspace: {rows: 1000000, cols: 1000000}\ncameras:"), "resolution"),
     ],
 )
-def test_one_sentence_says_what_is_wrong(tmp_path: Path, change: tuple[str, str], message: str):
+def test_errors_are_one_sentence(tmp_path: Path, change: tuple[str, str], message: str):
     assert change[0] in OWN
     with pytest.raises(UserError, match=message) as raised:
         _ = read(tmp_path, OWN.replace(*change)).cameras[0].rays
     assert "\n" not in str(raised.value)
 
 
-def test_a_pose_that_is_no_rotation_is_refused(tmp_path: Path):
+def test_a_pose_without_a_valid_rotation_is_rejected(tmp_path: Path):
     rows = "[[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 2, 1], [0, 0, 0, 1]]"
     text = OWN.replace("pose: {position: [0.5, 0.1, 0.9], rpy_deg: [180, 0, -90]}", "pose: " + rows)
-    with pytest.raises(UserError, match="its rotation is not orthonormal"):
+    with pytest.raises(UserError, match="rotation"):
         read(tmp_path, text)
 
 
-def test_a_transposed_camera_matrix_is_refused(tmp_path: Path):
+def test_a_transposed_camera_matrix_is_rejected(tmp_path: Path):
     transposed = "[50.0, 0.0, 0.0, 0.0, 51.0, 0.0, 31.5, 23.25, 1.0]"
     info = CAMERA_INFO.replace("[50.0, 0.0, 31.5, 0.0, 51.0, 23.25, 0.0, 0.0, 1.0]", transposed)
-    with pytest.raises(UserError, match="k must be fx 0 cx, 0 fy cy, 0 0 1: is it transposed"):
+    with pytest.raises(UserError, match="transposed"):
         read(tmp_path, ROS, eye_info=info)
 
 
-def test_poses_may_be_wrapped_as_ros_does(tmp_path: Path):
-    """As PoseWithCovarianceStamped has them."""
+def test_poses_may_be_nested_as_in_ros(tmp_path: Path):
+    """As in PoseWithCovarianceStamped."""
     pose = "{position: {x: 0.5, y: 0.1, z: 0.9}, orientation: {x: 0.7071068, y: -0.7071068}}"
     pose = pose.replace("-0.7071068}", "-0.7071068, z: 0.0, w: 0.0}")
     wrapped = f"{{header: {{frame_id: base}}, pose: {{pose: {pose}, covariance: [0.0]}}}}"
@@ -219,8 +219,8 @@ def test_poses_may_be_wrapped_as_ros_does(tmp_path: Path):
     )
 
 
-def test_fields_beside_those_of_other_programs_are_not_passed_over(tmp_path: Path):
-    """What stands beside `camera_info` would not count: it has a distortion of its own."""
+def test_misplaced_and_misspelt_fields_are_rejected(tmp_path: Path):
+    """With `camera_info`, a distortion beside it would be ignored."""
     text = ROS.replace("camera_info:", "distortion: []\n    camera_info:")
     with pytest.raises(UserError, match="camera eye has the unknown field 'distortion'"):
         read(tmp_path, text, eye_info=CAMERA_INFO)
@@ -238,7 +238,7 @@ def test_fields_beside_those_of_other_programs_are_not_passed_over(tmp_path: Pat
         read(tmp_path, ROS, eye_info=CAMERA_INFO.replace("\nd: ", "\ndistortion_coeffs: "))
 
 
-def test_a_file_that_is_no_calibration_is_refused(tmp_path: Path):
+def test_invalid_files_are_rejected(tmp_path: Path):
     with pytest.raises(UserError, match=r"cannot read .*No such file"):
         read_calibration(tmp_path / "nothing.yaml")
     with pytest.raises(UserError, match="must hold a mapping"):
@@ -248,7 +248,7 @@ def test_a_file_that_is_no_calibration_is_refused(tmp_path: Path):
         read_calibration(tmp_path / "calibration.yaml", table_height=math.nan)
 
 
-def test_the_documented_files_say_the_same(tmp_path: Path):
+def test_the_documented_examples_are_equal(tmp_path: Path):
     page = (Path(__file__).resolve().parents[4] / "docs" / "bench.md").read_text()
     own_text, opencv_text, ros_text = re.findall(r"```yaml\n(.*?)```", page, re.DOTALL)
     own, opencv = read(tmp_path, own_text), read(tmp_path, opencv_text)

@@ -1,4 +1,4 @@
-"""Known faults of cameras are found by a look at the table."""
+"""The check finds known camera errors by looking at the table."""
 
 import dataclasses
 import functools
@@ -32,12 +32,12 @@ SCENARIO = Scenario()
 TRUE = calibration_of(SCENARIO)
 BLOCK = Block((0.20, 0.15, 0.05), (0.45, -0.2, 1.1))
 MODERATE = SensorNoiseParameters(depth_std=0.002, depth_step=0.001, flying_share=0.2)
-"""As `--perturb depth_noise:moderate` has it."""
+"""The noise of `--perturb depth_noise:moderate`."""
 MILD = SensorNoiseParameters(depth_std=0.001, depth_step=0.0005, flying_share=0.1)
 
 
 def slow(value: Any) -> Any:
-    """One more value of a parameter, for `make test-slow`."""
+    """A parameter value for `make test-slow` only."""
     return pytest.param(value, marks=pytest.mark.slow)
 
 
@@ -55,7 +55,7 @@ def frames_of_block() -> dict[str, Frame]:
 def noisy(
     frames: dict[str, Frame], longer: float = 0.0, *, noise=MODERATE, takes: int = 1
 ) -> dict[str, Frame]:
-    """Frames with noise, and depths that are too long; the median of several takes."""
+    """Frames with noise and a depth error; each depth is the median of several takes."""
     random = np.random.default_rng(0)
     result = {}
     for name, frame in frames.items():
@@ -68,14 +68,14 @@ def noisy(
 
 
 def moved(name: str, *, shift=(0.0, 0.0, 0.0), rotvec_deg=(0.0, 0.0, 0.0)) -> Calibration:
-    """A calibration in which one camera is believed to be elsewhere."""
+    """A calibration with a wrong pose for one camera."""
     X = next(camera.X_BC for camera in TRUE.cameras if camera.name == name).copy()
     X[:3, :3] = Rotation.from_rotvec(rotvec_deg, degrees=True).as_matrix() @ X[:3, :3]
     X[:3, 3] += shift
     return with_poses(TRUE, {name: X})
 
 
-def test_nothing_is_found_where_nothing_is_wrong(table: dict[str, Frame]):
+def test_correct_cameras_pass(table: dict[str, Frame]):
     check = check_cameras(table, TRUE)
     for camera in check.cameras.values():
         assert math.degrees(camera.table.tilt_angle) < 0.002
@@ -85,28 +85,26 @@ def test_nothing_is_found_where_nothing_is_wrong(table: dict[str, Frame]):
 
 
 @pytest.mark.parametrize("longer", [0.002, -0.002])
-def test_depths_that_are_too_long_are_found(table: dict[str, Frame], longer: float):
+def test_finds_a_depth_bias(table: dict[str, Frame], longer: float):
     check = check_cameras(noisy(table, longer), TRUE)
     for camera in check.cameras.values():
         assert camera.depth_bias == pytest.approx(longer, rel=0.2)
         assert explains_depth(camera)
-        # The cameras look down at a slant.
+        # Longer depths make the table look lower.
         assert camera.table.bias * longer < 0
 
 
 @pytest.mark.parametrize("axis", [slow((0.3, 0, 0)), slow((0, -0.3, 0)), (0.18, 0.24, 0)])
-def test_a_tilt_is_found_and_about_which_axis(
-    table: dict[str, Frame], axis: tuple[float, float, float]
-):
+def test_finds_a_tilt_and_its_axis(table: dict[str, Frame], axis: tuple[float, float, float]):
     check = check_cameras(noisy(table), moved("left", rotvec_deg=axis))
     found = np.degrees(check.cameras["left"].table.tilt)
     np.testing.assert_allclose(found, axis[:2], atol=0.06)
     assert math.degrees(check.cameras["right"].table.tilt_angle) < 0.03
 
 
-def test_a_camera_that_is_too_high_is_found(table: dict[str, Frame]):
+def test_finds_a_camera_that_is_too_high(table: dict[str, Frame]):
     check = check_cameras(noisy(table), moved("front", shift=(0, 0, 0.003)))
-    # The hand stops 1.5 mm above where the table is believed to be.
+    # The hand stops 1.5 mm above the assumed table.
     assert "may go 1.5 mm into the table" in _meaning(check, "height bias")
     lines = findings(check, PickPlaceParameters(floor_clearance=0.0025))
     assert any("may go 0.5 mm into the table" in line.meaning for line in lines)
@@ -116,14 +114,14 @@ def test_a_camera_that_is_too_high_is_found(table: dict[str, Frame]):
     assert abs(check.cameras["left"].table.bias) < 0.0003
     assert check.disagreements["front", "left"] == pytest.approx(0.003, rel=0.2)
     assert abs(check.disagreements["left", "right"]) < 0.0003
-    # As much is wrong as went in, and no more.
+    # The measured noise is that of the input.
     assert check.cameras["front"].table.noise == pytest.approx(0.0016, rel=0.5)
 
 
 @pytest.mark.parametrize(
     "size", [(0.20, 0.15, 0.05), slow((0.15, 0.20, 0.03)), slow((0.16, 0.16, 0.05))]
 )
-def test_a_block_tells_where_a_camera_is_beside_itself(size: tuple[float, float, float]):
+def test_a_block_shows_the_displacement_of_a_camera(size: tuple[float, float, float]):
     block = dataclasses.replace(BLOCK, size=size)
     believed = moved("left", shift=(0.003, 0, 0), rotvec_deg=(0, 0, 0.4))
     check = check_cameras(noisy(cast(TRUE, block), noise=MILD, takes=5), believed, block)
@@ -142,15 +140,15 @@ def test_a_block_tells_where_a_camera_is_beside_itself(size: tuple[float, float,
 
 
 @pytest.mark.parametrize("yaw", [slow(-0.5), 0.7, slow(1.2)])
-def test_a_square_block_is_not_seen_rotated_by_a_quarter(yaw: float):
+def test_a_square_block_is_never_off_by_a_quarter_turn(yaw: float):
     block = Block((0.16, 0.16, 0.05), (0.45, -0.2, yaw))
     for camera in check_cameras(cast(TRUE, block), TRUE, block).cameras.values():
         assert math.degrees(offset(camera.block, block)[2]) == pytest.approx(0, abs=0.3)
 
 
 @pytest.mark.parametrize("pose", [slow((0.45, -0.2, 1.1)), (0.6, 0.2, 0.3)])
-def test_a_block_is_where_it_is_through_a_lens_that_distorts(pose: tuple[float, float, float]):
-    """A pixel near the border covers more of the block than one in the middle."""
+def test_distortion_does_not_displace_the_block(pose: tuple[float, float, float]):
+    """A pixel near the image's border covers a larger area than one at the centre."""
     block = Block((0.20, 0.15, 0.05), pose)
     cameras = (
         dataclasses.replace(
@@ -163,7 +161,7 @@ def test_a_block_is_where_it_is_through_a_lens_that_distorts(pose: tuple[float, 
         assert np.hypot(*offset(camera.block, block)[:2]) < 3e-4
 
 
-def test_the_scale_tells_depth_from_focal_length():
+def test_the_scale_distinguishes_depth_and_focal_length_errors():
     frames = frames_of_block()
     stretched = {k: Frame(f.color, f.depth * np.float32(1.01)) for k, f in frames.items()}
     check = check_cameras(stretched, TRUE, BLOCK)
@@ -187,7 +185,7 @@ def test_opposite_errors_of_two_focal_lengths_do_not_cancel():
     assert _line(check, "scale").verdict == BAD
 
 
-def test_a_rotation_about_the_block_is_an_offset_beside_it():
+def test_a_rotation_about_the_block_is_reported_as_an_offset():
     x, y, _ = BLOCK.pose
     R = Rotation.from_euler("z", 1.5, degrees=True).as_matrix()
     X = TRUE.cameras[0].X_BC.copy()
@@ -200,7 +198,7 @@ def test_a_rotation_about_the_block_is_an_offset_beside_it():
 
 
 @pytest.mark.parametrize("high", [0.3, slow(0.6)])
-def test_a_camera_that_looks_straight_down_sees_all_heights_alike(high: float):
+def test_a_camera_that_looks_straight_down_can_be_checked(high: float):
     down = dataclasses.replace(
         TRUE.cameras[0],
         X_BC=np.array([[0.0, -1, 0, 0.5], [-1, 0, 0, 0], [0, 0, -1, high], [0, 0, 0, 1]]),
@@ -219,8 +217,8 @@ def _meaning(check: Check, what: str) -> str:
     return _line(check, what).meaning
 
 
-def test_corrected_poses_are_those_of_the_cameras():
-    """Of rotations and shifts alike, once a block is where it is known to be."""
+def test_corrected_poses_are_the_true_ones():
+    """Rotations and shifts are both corrected if the block's pose is known."""
     believed = with_poses(
         moved("left", shift=(0.002, -0.001, 0.003), rotvec_deg=(0.3, 0.1, -0.2)),
         {"right": moved("right", rotvec_deg=(-0.2, 0.2, 0)).cameras[2].X_BC},
@@ -237,7 +235,7 @@ def test_corrected_poses_are_those_of_the_cameras():
         assert np.hypot(*offset(camera.block, BLOCK)[:2]) < 5e-4
 
 
-def test_a_block_that_is_not_there_is_missed():
+def test_a_missing_or_different_block_is_an_error():
     with pytest.raises(UserError, match="camera front sees no block 50 mm high"):
         check_cameras(cast(TRUE), TRUE, BLOCK)
     other = dataclasses.replace(BLOCK, size=(0.6, 0.15, 0.05))

@@ -37,13 +37,13 @@ def chosen(scenario: Scenario) -> ChosenScenario:
     return ChosenScenario(scenario, Path("mine.yaml"), "mine", text=None)
 
 
-def test_a_scenario_without_cameras_is_refused():
+def test_a_scenario_without_cameras_is_rejected():
     with pytest.raises(UserError, match=r"mine\.yaml: cameras is empty"):
         benchmark_recovery(chosen(Scenario(cameras={})), 1, 0, Console(quiet=True))
 
 
 @pytest.mark.skipif(not can_render(), reason="images cannot be rendered here")
-def test_episodes_that_fail_or_time_out_are_counted_and_kit_nothing():
+def test_failed_and_timed_out_episodes_are_counted_without_kitted_objects():
     task = Kitting(tools=["combination_wrench"])
     broken = PythonPolicy(function=f"{__name__}:raise_always")
     for policy, limit, key in [(broken, 30.0, "failed"), (Oracle(), 1.0, "timed_out")]:
@@ -59,7 +59,7 @@ def raise_always(observation: Observation) -> PickPlaceAction:
 
 @pytest.mark.slow
 @pytest.mark.skipif(not can_render(), reason="images cannot be rendered here")
-def test_a_policy_that_recovers_does_and_leaves_alone_what_is_well():
+def test_a_recovering_policy_recovers_and_leaves_kitted_objects_alone():
     scenario = Scenario(
         task=Kitting(tools=["claw_hammer", "combination_wrench"], tries=3),
         policy=ShapeMatching(recover=True),
@@ -71,7 +71,7 @@ def test_a_policy_that_recovers_does_and_leaves_alone_what_is_well():
         assert count["recovered"] == count["disturbed"], name
         assert count["disturbed"] == (0 if name == "nothing" else 2)
         assert count["failed"] == count["timed_out"] == 0
-    # A missed grasp takes another action.
+    # A missed grasp costs another action.
     actions = {name: count["actions"] for name, count in measured["disturbances"].items()}
     assert actions["grasp off by 40 mm"] > actions["nothing"] == 4
     assert recovery_table(measured).row_count == 4

@@ -1,4 +1,4 @@
-"""The second opinion: that MuJoCo is asked about the right tool, in the right place."""
+"""MuJoCo is asked about the right tool at the right pose."""
 
 from types import SimpleNamespace
 
@@ -11,7 +11,7 @@ from kitting_drake.reproduction.benchmarks.second_opinion import ask_mujoco, opi
 
 
 @pytest.mark.slow
-def test_most_verdicts_are_alike():
+def test_most_verdicts_agree():
     pytest.importorskip("mujoco")
     measured = ask_mujoco(8, 0, None, Console(quiet=True))
     assert measured["placements"] == len(measured["rows"]) == 8
@@ -20,8 +20,8 @@ def test_most_verdicts_are_alike():
     assert opinion_table(measured).row_count == 2
 
 
-def test_who_lets_go_of_nothing_is_not_waited_for(monkeypatch: pytest.MonkeyPatch):
+def test_an_oracle_that_releases_nothing_is_an_error(monkeypatch: pytest.MonkeyPatch):
     pytest.importorskip("mujoco")
     monkeypatch.setattr(second_opinion, "_episode", lambda *_: SimpleNamespace(releases={}))
-    with pytest.raises(UserError, match="nothing was let go of in 5 episodes"):
+    with pytest.raises(UserError, match="nothing was released in 5 episodes"):
         ask_mujoco(8, 0, 2, Console(quiet=True))

@@ -6,7 +6,7 @@ from kitting_drake.scenario.schema import Scenario
 from tests.kitting_drake.rig import build_rig
 
 
-def test_phases_add_up_to_their_episodes():
+def test_phases_sum_to_their_episodes():
     scenario = Scenario(cameras={}, time_limit=1.5)
     stopwatch = PhaseStopwatch()
     simulated = wall = 0.0
@@ -16,14 +16,14 @@ def test_phases_add_up_to_their_episodes():
         result = rig.run(stopwatch.observe)
         simulated += result.sim_seconds
         wall += result.wall_seconds
-    # It ends in the middle of a phase, which counts too.
+    # The episode ends within a phase, which also counts.
     assert list(stopwatch.phases)[:2] == ["observe", "approach"]
     assert sum(phase[0] for phase in stopwatch.phases.values()) == pytest.approx(simulated)
     assert sum(phase[1] for phase in stopwatch.phases.values()) == pytest.approx(wall, rel=0.5)
     assert all(phase[0] > 0 for phase in stopwatch.phases.values())
 
 
-def test_tables_of_the_terminal():
+def test_terminal_tables():
     measured = {
         "policies": {
             "oracle": {

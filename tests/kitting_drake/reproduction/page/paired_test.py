@@ -20,25 +20,25 @@ def run(rates: dict[int, float]) -> dict:
     }
 
 
-def test_a_difference_is_of_the_seeds_that_both_ran():
+def test_a_difference_uses_the_seeds_that_both_ran():
     found = paired_difference(run({1: 1.0, 2: 0.5, 3: 1.0}), run({2: 0.25, 3: 1.0, 4: 0.0}), STRICT)
     assert found.value == pytest.approx(0.125)
     assert 0 <= found.low <= found.value <= found.high <= 0.25
     assert paired_difference(run({1: 1.0}), run({2: 1.0}), STRICT) is None
 
 
-def test_an_episode_is_drawn_with_its_rates_in_all_runs():
+def test_episodes_are_resampled_jointly_over_runs():
     zeros = run(dict.fromkeys(range(50), 0.0))
     halves = ({i: float(i % 2 == k) for i in range(50)} for k in (0, 1))
     pairs = [(run(rates), zeros) for rates in halves]
     found = mean_paired_difference(pairs, STRICT)
-    # What one pair gains in an episode the other does not.
+    # The gains of the two pairs are complementary in every episode.
     assert (found.low, found.value, found.high) == (0.5, 0.5, 0.5)
     assert paired_difference(*pairs[0], STRICT).low < 0.45
     assert mean_paired_difference([*pairs, (run({99: 1.0}), zeros)], STRICT) is None
 
 
-def test_what_is_hard_for_both_does_not_widen_the_interval_of_the_difference():
+def test_hard_scenes_do_not_widen_the_interval_of_the_difference():
     rng = np.random.default_rng(1)
     hard = rng.uniform(0, 0.8, 200)
     found = paired_difference(
@@ -47,7 +47,7 @@ def test_what_is_hard_for_both_does_not_widen_the_interval_of_the_difference():
     assert (found.low, found.high) == pytest.approx((0.1, 0.1), abs=1e-9)
 
 
-def test_the_interval_holds_the_truth_as_often_as_it_says():
+def test_the_interval_has_its_nominal_coverage():
     rng = np.random.default_rng(2)
     held = 0
     for _ in range(100):
@@ -57,7 +57,7 @@ def test_the_interval_holds_the_truth_as_often_as_it_says():
     assert held >= 88
 
 
-def test_runs_that_never_differ_are_said_to():
+def test_equal_runs_are_reported_as_such():
     same = run(dict.fromkeys(range(100), 1.0))
     found = paired_difference(same, same, OWN)
     assert (found.low, found.value, found.high) == (0.0, 0.0, 0.0)
@@ -74,7 +74,7 @@ def outcomes(by_tool: dict[str, list[int]]) -> list[dict]:
     ]
 
 
-def test_the_interval_over_tools_is_wide_where_tools_differ():
+def test_the_interval_over_tools_is_wide_if_tools_differ():
     good = {f"tool{i}": [2] * 50 for i in range(5)}
     bad = {f"bad{i}": [1, 0] * 25 for i in range(3)}
     found = over_tools(outcomes({**good, **bad}), STRICT)
@@ -84,7 +84,7 @@ def test_the_interval_over_tools_is_wide_where_tools_differ():
     assert own.value == pytest.approx(325 / 400)
 
 
-def test_few_tools_that_fail_tell_nothing_of_others():
+def test_without_enough_failing_tools_there_is_no_interval():
     good = {f"tool{i}": [2] * 50 for i in range(18)}
     one = {"bad": [1, 0] * 25}
     for by_tool in (good, good | one, {**one, "worse": [0] * 50}, {}):

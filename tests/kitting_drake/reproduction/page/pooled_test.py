@@ -1,4 +1,4 @@
-"""The figures of the shipped policies pool runs by a rule."""
+"""The section on the shipped policies pools all suitable runs."""
 
 from typing import Any
 
@@ -17,7 +17,7 @@ GENERALIST = shipped_policies()["generalist"].digest(SCENARIOS)
 def run(
     ends: list[int], seeds: range, recover: str = "false", limit: float = 180.0, **fields: Any
 ) -> Run:
-    """A run of the generalist whose episodes all end alike."""
+    """A run of the generalist with the same outcome in all episodes."""
     policy = f"!Learned {{weights: '', recover: {recover}}}"
     scenario = load_scenario(UNSEEN, text=f"{{policy: {policy}, time_limit: {limit}}}")
     objects = {str(index): end for index, end in enumerate(ends)}
@@ -33,11 +33,11 @@ def run(
     return Run(f"from_{seeds[0]}", summary | fields)
 
 
-def test_every_run_of_the_shipped_weights_counts():
+def test_all_runs_of_the_shipped_weights_are_pooled():
     _, _, table = pooled_section([run([2, 2], range(9, 29)), run([2, 0], range(4))])
     row = [cell.strip() for cell in table.splitlines()[-1].strip("|").split("|")]
     assert row[:3] == ["generalist", "0 to 3, 9 to 28", "48"]
-    # 44 of 48.
+    # 44 of 48 objects.
     assert [cell.split(" ")[0] for cell in row[3:]] == ["91.7", "91.7"]
 
 
@@ -49,10 +49,10 @@ def test_every_run_of_the_shipped_weights_counts():
         run([0], range(4), recover="true"),
     ],
 )
-def test_what_is_something_else_does_not(other: Run):
+def test_other_runs_are_ignored(other: Run):
     assert pooled_section([other]) == []
 
 
-def test_no_seed_counts_twice():
-    with pytest.raises(UserError, match="from_0 and from_3 are both of generalist, seed 3"):
+def test_a_seed_in_two_runs_is_an_error():
+    with pytest.raises(UserError, match="from_0 and from_3 both hold seed 3"):
         pooled_section([run([2], range(4)), run([2], range(3, 9))])

@@ -1,4 +1,4 @@
-"""The table of what perturbations cost: each summary goes where its scenario says."""
+"""The table of perturbations: each run goes into the row of its scenario."""
 
 from typing import Any
 
@@ -15,7 +15,7 @@ UNSEEN = SCENARIOS / "paper/kitting_unseen.yaml"
 
 
 SAME = range(2870, 2895)
-"""The seeds that all cells of the first table share."""
+"""The common seeds of the first table's cells."""
 
 
 def run(
@@ -47,12 +47,12 @@ def run(
 
 
 def rows(table: str) -> dict[str, list[str]]:
-    """The cells of each row by its label; of the last of several tables."""
+    """The cells of each row by its label, from the last table."""
     lines = [line.strip("|").split("|") for line in table.splitlines() if "|" in line]
     return {line[0].strip(): [cell.strip() for cell in line[1:]] for line in lines}
 
 
-def test_each_run_goes_into_the_row_that_its_scenario_says():
+def test_each_run_goes_into_the_row_of_its_scenario():
     table = robustness_table([run(None, 1.0), run("mass:mild", 0.9), run("all", 0.5)])
     found = rows(table)
     assert found["unperturbed"][2] == "100.0 (96 to 100)"
@@ -62,7 +62,7 @@ def test_each_run_goes_into_the_row_that_its_scenario_says():
     assert "25 episodes from seed 2870" in table
 
 
-def test_runs_of_other_seeds_are_pooled_in_a_table_of_their_own():
+def test_runs_on_other_seeds_are_pooled_in_another_table():
     elsewhere = run("all", 0.5, seeds=range(7, 32))
     table = robustness_table([elsewhere, run("all", 0.9), run(None, 1.0)])
     first, second = table.split("All seeds together")
@@ -71,7 +71,7 @@ def test_runs_of_other_seeds_are_pooled_in_a_table_of_their_own():
     assert "unperturbed" not in rows(second)
 
 
-def test_other_levels_are_of_the_first_seeds_and_tell_how_many():
+def test_other_levels_use_the_first_seeds_and_show_their_number():
     first = run("mass:severe", 0.5, seeds=SAME[:12])
     table = robustness_table([run(None, 1.0), first, run("mass:mild", 1.0, seeds=SAME[:5])])
     _, levels = table.split("The other levels")
@@ -82,7 +82,7 @@ def test_other_levels_are_of_the_first_seeds_and_tell_how_many():
     assert "severe" not in pooled
 
 
-def test_the_generalist_is_compared_on_the_seeds_that_both_ran():
+def test_the_generalist_is_compared_on_common_seeds():
     learned = {"method": "generalist", "digest": Learned(weights="").digest(SCENARIOS)}
     better, worse = run("all", 0.9, **learned), run("all", 0.5)
     table = robustness_table(
@@ -95,19 +95,19 @@ def test_the_generalist_is_compared_on_the_seeds_that_both_ran():
     assert rows(table)["unperturbed"][-2:] == ["-", "-"]
 
 
-def test_what_is_something_else_is_left_out():
+def test_other_runs_are_ignored():
     others = [run("mass", 0.9, tries=1), run("mass", 0.9, recover=False)]
     others.append(run("mass,light", 0.9))
     others.append(run("mass", 0.9, method="generalist", digest="sha256 of earlier weights"))
     assert robustness_table(others) == "No runs yet.\n"
 
 
-def test_no_episode_counts_twice():
-    with pytest.raises(UserError, match="shape matching, `all:moderate`, seed 2880: delete one"):
+def test_a_seed_in_two_runs_is_an_error():
+    with pytest.raises(UserError, match="seed 2880 of shape matching, `all:moderate`"):
         robustness_table([run("all", 0.9), run("all", 0.9, seeds=range(2880, 2881))])
 
 
-def test_needless_actions_are_told_where_other_things_lie_about():
+def test_needless_actions_are_shown_for_scenes_with_distractors():
     runs = [run("all", 0.9), run("mass", 1.0)]
     assert "no cavity" not in robustness_table(runs)
     for item in runs:
@@ -117,7 +117,7 @@ def test_needless_actions_are_told_where_other_things_lie_about():
     assert "`mass:moderate`" not in rows(table)
 
 
-def test_the_figures_are_put_between_their_marks():
+def test_the_figures_are_inserted_between_their_marks():
     page = "before\n<!-- figures -->\nold\n<!-- end of figures -->\nafter\n"
     new = with_figures(page, "new\n")
     assert new == "before\n<!-- figures -->\nnew\n<!-- end of figures -->\nafter\n"

@@ -1,4 +1,4 @@
-"""How many actions the memory of failed grasps can have changed: counted, or between bounds."""
+"""The number of actions that the memory of failed grasps can have changed, or its bounds."""
 
 from typing import Any
 
@@ -9,7 +9,7 @@ from kitting_drake.reproduction.paper.failed_grasps import changeable
 
 
 def summary(outcomes: list[list[int]], missed: int, dropped: int = 0, **fields: Any) -> dict:
-    """Of episodes by how each of their objects ended."""
+    """A summary of episodes, given by the outcomes of their objects."""
     return {
         "resolved_scenario": {"task": {"_tag": "!ToolsetKitting"}},
         "policy_details": {},
@@ -22,27 +22,27 @@ def summary(outcomes: list[list[int]], missed: int, dropped: int = 0, **fields: 
 GOOD, ONE_LOST = [2, 2, 1, 2], [2, 2, 0, 2]
 
 
-def test_without_a_failed_grasp_nothing_can_differ():
+def test_without_failed_grasps_nothing_changes():
     assert changeable(summary([GOOD, ONE_LOST], 0, actions=8)).text == "0 of 8"
 
 
-def test_a_failed_grasp_comes_before_three_of_four_actions_at_most():
+def test_a_failed_grasp_precedes_at_most_three_of_four_actions():
     assert changeable(summary([GOOD, GOOD, ONE_LOST], 1, actions=12)).text == "0 to 3 of 12"
-    # Of two in one episode the later one comes after the first.
+    # Of two failures in one episode, the second comes after the first.
     assert changeable(summary([[0, 0, 2, 2]], 1, 1, actions=4)).text == "1 to 3 of 4"
 
 
-def test_placed_objects_took_actions_of_their_own():
+def test_placed_objects_took_their_own_actions():
     pyramid = {"resolved_scenario": {"task": {"_tag": "!StackBlockPyramid"}}}
     found = changeable(summary([[2] * 6, [2, 2, 2, 2, 2, 0]], 2, actions=14, **pyramid))
     assert found.text == "0 to 12 of 14"
     found = changeable(summary([[2] * 6, [2, 2, 2, 2, 2, 0]], 1, actions=14, **pyramid))
-    # Six of the fourteen placed the six cubes of the other episode.
+    # Six of the fourteen actions placed the six cubes of the other episode.
     assert found.text == "0 to 7 of 14"
     assert changeable(summary([[2] * 6], 1, **pyramid)).text == "0 to 11 of 12"
 
 
-def test_a_run_that_counts_them_needs_no_bounds():
+def test_counted_actions_need_no_bounds():
     counted = summary([ONE_LOST], 1, actions=4, actions_after_failed_grasps=2)
     assert changeable(counted).text == "2 of 4"
     forgets = {"policy_details": {"avoid_failed_picks": False}}
@@ -58,6 +58,6 @@ def test_a_run_that_counts_them_needs_no_bounds():
         ([], 0),
     ],
 )
-def test_they_are_counted_from_the_first_failure_on(outcomes: list[str], count: int):
+def test_actions_are_counted_from_the_first_failure_on(outcomes: list[str], count: int):
     episode = {"actions_taken": [{"outcome": outcome} for outcome in outcomes]}
     assert actions_after_failed_grasp(episode) == count

@@ -30,7 +30,7 @@ CELLS = {cell.name: cell for cell in paper_cells()}
 
 
 def make_run(name: str, errors_mm: list[float]) -> Run:
-    """The run of a cell whose episodes are all alike."""
+    """The run of a cell with equal episodes."""
     cell: Cell = CELLS[name]
     task = TASKS[cell.task]
     scenario = load_scenario(SCENARIOS / task.file, task.tested, cell.scenario_text("w"))
@@ -57,7 +57,7 @@ def make_run(name: str, errors_mm: list[float]) -> Run:
             "rigid": cell.policy.rigid,
         }
     summary |= {"resolved_scenario": described(scenario), "policy_details": details}
-    # Not that of the tree of this test, which may have uncommitted changes.
+    # The commit of this checkout may have uncommitted changes.
     summary["commit"] = "0123456789"
     if isinstance(cell.policy, str):
         summary["policy_digest"] = scenario.policy.digest(SCENARIOS / "paper")
@@ -85,13 +85,13 @@ def runs() -> tuple[Run, ...]:
 
 
 def rows(text: str) -> dict[tuple[str, ...], list[str]]:
-    """The tables' lines, by their first two cells."""
+    """The rows of all tables, by their first two cells."""
     lines = [line for line in text.splitlines() if line.startswith("| ")]
     cells = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines]
     return {tuple(row[:2]): row[2:] for row in cells}
 
 
-def test_the_tables_hold_the_cells_and_say_what_is_missing(runs: tuple[Run, ...]):
+def test_the_tables_show_cells_and_missing_ones(runs: tuple[Run, ...]):
     text = sections(runs)
     found = rows(text)
     assert found["SO(2)-equivariant (ours)", "100"] == ["-"] * 3 + ["75.0 (70.5 to 79.0) / 75.0"]
@@ -111,7 +111,7 @@ def test_the_tables_hold_the_cells_and_say_what_is_missing(runs: tuple[Run, ...]
     assert found["generalist", "-"] == ["-", "-"]
 
 
-def test_prose_on_a_cell_is_there_with_the_cell(runs: tuple[Run, ...]):
+def test_prose_about_a_cell_appears_with_the_cell(runs: tuple[Run, ...]):
     told = {
         "palletizing_boxes_so2_180_1": "After one demonstration of palletizing",
         "palletizing_boxes_transporter_36_100": "Every method learns palletizing in 3000 steps",
@@ -122,23 +122,23 @@ def test_prose_on_a_cell_is_there_with_the_cell(runs: tuple[Run, ...]):
     for words in told.values():
         assert words in everything
         assert words not in without
-    # No placeholder is left.
+    # No placeholder remains.
     assert not set("{}$") & set(everything)
     assert "<!--" not in everything
 
 
-def test_the_mean_over_n_is_compared_once_all_of_it_is_there(runs: tuple[Run, ...]):
+def test_the_mean_over_n_needs_all_of_its_cells(runs: tuple[Run, ...]):
     more = list(runs)
     label = ("unseen, 100 demonstrations, mean over N", "Equivariant Transporter")
     for n in (36, 72, 120):
         more.append(make_run(f"unseen_so2_{n}_100", [1.0, 1.0, 9.0, 9.0]))
         assert label not in rows(sections(more))
         more.append(make_run(f"unseen_equivariant_transporter_{n}_100", [1.0, 1.0, 1.0, 1.0]))
-    # -50 three times and +25 once.
+    # The mean of three times -50 and once +25.
     assert rows(sections(more))[label] == ["-31.2 (-31.2 to -31.2)"] * 2
 
 
-def test_trainings_are_compared_once_there_are_two(runs: tuple[Run, ...]):
+def test_trainings_are_compared_from_two_on(runs: tuple[Run, ...]):
     assert "Variation between trainings" not in sections(runs)
     more = [*runs, make_run("unseen_so2_180_100_seed2", [1.0, 1.0, 1.0, 1.0])]
     found = rows(sections(more))
@@ -152,7 +152,7 @@ def test_trainings_are_compared_once_there_are_two(runs: tuple[Run, ...]):
     assert rows(sections(more))[label] == ["+25.0 (+25.0 to +25.0)"] * 2
 
 
-def test_a_longer_training_is_compared_with_the_same_cell_in_the_usual_steps():
+def test_a_longer_training_is_compared_with_the_usual_one():
     ours = "stack_block_pyramid_so2_36_100"
     text = sections(
         [
@@ -166,7 +166,7 @@ def test_a_longer_training_is_compared_with_the_same_cell_in_the_usual_steps():
     assert "| 100, 3 times the steps | 100.0" in text
 
 
-def test_a_baseline_with_every_chance_is_compared_with_itself_and_with_ours():
+def test_a_matched_baseline_is_compared_with_the_usual_one_and_with_ours():
     theirs = "unseen_transporter_36_100"
     text = sections(
         [
@@ -181,10 +181,10 @@ def test_a_baseline_with_every_chance_is_compared_with_itself_and_with_ours():
     assert found[name, "SO(2)-equivariant (ours)"][0] == "-50.0 (-50.0 to -50.0)"
 
 
-def test_an_interval_over_tools_is_given_only_where_tools_are_drawn():
+def test_an_interval_over_tools_needs_drawn_tools():
     pair = [make_run(f"{task}_so2_180_100", [1.0, 1.0, 1.0, 1.0]) for task in ("seen", "unseen")]
     for run in pair:
-        # Every tool fails once, and so tells something of others.
+        # Every tool fails once, so the interval is defined.
         first = run.summary["outcomes"][0]
         first["objects"] = dict.fromkeys(first["objects"], 0)
     every = sections(pair).split("### Every cell")[1]
@@ -193,7 +193,7 @@ def test_an_interval_over_tools_is_given_only_where_tools_are_drawn():
     assert " to " in cells["unseen_so2_180_100"][7]
 
 
-def test_the_learning_rates_that_were_tried_are_told(runs: tuple[Run, ...]):
+def test_the_tried_learning_rates_are_listed(runs: tuple[Run, ...]):
     rates = {
         "unseen_transporter": {"0.001": 4.0, "0.0003": 2.5, "0.01": math.inf},
         "stack_block_pyramid_transporter": {"0.001": 9.25, "0.0003": 12.0},
@@ -209,7 +209,7 @@ def test_the_learning_rates_that_were_tried_are_told(runs: tuple[Run, ...]):
     )
 
 
-def test_a_run_that_is_not_what_its_name_says_is_refused(runs: tuple[Run, ...]):
+def test_a_run_that_does_not_fit_its_name_is_rejected(runs: tuple[Run, ...]):
     good = runs[0]
 
     def spoiled(**fields: Any) -> list[Run]:
@@ -219,10 +219,10 @@ def test_a_run_that_is_not_what_its_name_says_is_refused(runs: tuple[Run, ...]):
     said = r"run 'unseen_so2_180_100' is not that of the cell of this name \(camer"
     with pytest.raises(UserError, match=said):
         cell_results(spoiled(resolved_scenario=scenario), {})
-    with pytest.raises(UserError, match=r"its outcomes are no list"):
+    with pytest.raises(UserError, match="outcomes"):
         cell_results(spoiled(outcomes=3), {})
     for fields in ({"outcomes": None}, {"seeds": None}):
-        with pytest.raises(UserError, match=r"run 'unseen_so2_180_100' is no"):
+        with pytest.raises(UserError, match=r"run 'unseen_so2_180_100' is not"):
             cell_results(spoiled(**fields), {})
     rates = {"unseen_equivariant_transporter": {"0.001": 4.0, "0.0003": 2.5}}
     with pytest.raises(UserError, match=r"learning_rate is 0\.001, not 0\.0003"):
@@ -231,7 +231,7 @@ def test_a_run_that_is_not_what_its_name_says_is_refused(runs: tuple[Run, ...]):
     assert cell_results([other], {}) == ([], [other], [])
 
 
-def test_what_nobody_can_run_again_is_told_from_what_was_not_run(runs: tuple[Run, ...]):
+def test_unrepeatable_runs_are_marked_differently_from_missing_ones(runs: tuple[Run, ...]):
     name = "unseen_so2_180_100"
     marked = [
         Run(run.name, run.summary | ({"commit": "01234567, 89abcdef+"} if run.name == name else {}))
@@ -246,7 +246,7 @@ def test_what_nobody_can_run_again_is_told_from_what_was_not_run(runs: tuple[Run
     assert len(found.results) == len(runs) - 1
 
 
-def test_learning_rates_that_are_damaged_are_told(tmp_path: Path):
+def test_damaged_learning_rates_are_an_error(tmp_path: Path):
     assert read_rates(tmp_path) == {}
     for content in ("[]", '{"unseen_equivariant_transporter": {}}', "{"):
         (tmp_path / RATES).write_text(content)
@@ -258,7 +258,7 @@ def test_no_results_no_sections():
     assert fresh_tools([]) == paper_sections([]) == protocol_sections([], {}) == []
 
 
-def test_the_figure_is_drawn_from_what_there_is(runs: tuple[Run, ...]):
+def test_figure_6_is_drawn_from_the_existing_results(runs: tuple[Run, ...]):
     found = cell_results(runs, {}).results
     assert has_figure("unseen", found)
     assert not has_figure("seen", found)
@@ -269,7 +269,7 @@ def test_the_figure_is_drawn_from_what_there_is(runs: tuple[Run, ...]):
     assert drawn != draw_figure_6("seen", results)
 
 
-def test_table_1_is_drawn_from_what_there_is(runs: tuple[Run, ...]):
+def test_table_1_is_drawn_from_the_existing_results(runs: tuple[Run, ...]):
     found = cell_results(runs, {}).results
     assert has_table_1(found)
     assert "results_ravens.png" in sections(runs)

@@ -12,24 +12,24 @@ from kitting_drake.reproduction.paper.parameter_table import (
 
 
 def share(method: str, preset: str) -> float:
-    """Of the original's parameters."""
+    """The share of the original's parameters."""
     return sum(count_parameters(method, preset).values()) / original_parameters(method)
 
 
-def test_at_the_size_of_the_paper_ours_are_as_large_as_the_authors():
+def test_the_paper_preset_has_the_authors_sizes():
     found = count_parameters("so2", "paper")
     assert found == pytest.approx(ORIGINAL, rel=1e-3)
-    # The paper: 4.54 M; the authors' angle network: 0.90 M at N = 36.
+    # The paper gives 4.54 M; the authors' angle network has 0.90 M at N = 36.
     theirs = count_parameters("equivariant_transporter", "paper")
     assert [round(theirs[name] / 1e6, 2) for name in COLUMNS] == [4.54, 0.90, 4.54, 4.54]
 
 
-def test_matched_baselines_keep_the_share_that_ours_keep():
+def test_matched_baselines_keep_the_share_of_so2():
     assert count_parameters("so2", "matched") == count_parameters("so2", "small")
     ours = share("so2", "small")
     assert share("transporter", "small") < 0.4 * ours
     assert share("transporter", "matched") == pytest.approx(ours, rel=0.02)
-    # Of the Equivariant Transporter only the angle network differs.
+    # The Equivariant Transporters differ only in the angle network.
     small, matched = (
         count_parameters("equivariant_transporter", preset) for preset in ("small", "matched")
     )

@@ -32,7 +32,7 @@ def record(scene: Scene, outcome: str, place_error_mm: float = 1.0, tool: int = 
 
 
 def cause(scene: Scene, X_GoalB: RigidTransform, *records: ActionRecord) -> str:
-    """Of a tool that ended at a pose given in its goal's frame, the others at their goals."""
+    """The cause of a tool with this final pose in its goal's frame; the others are kitted."""
     X_WB = [goal.poses[0] for goal in scene.goals]
     X_WB[TOOL] = X_WB[TOOL] @ X_GoalB
     objects = [
@@ -47,7 +47,7 @@ def cause(scene: Scene, X_GoalB: RigidTransform, *records: ActionRecord) -> str:
     return found
 
 
-def test_what_was_never_held(scene: Scene):
+def test_causes_of_an_object_that_was_never_held(scene: Scene):
     beside = flat(0.3, 0.0)
     assert cause(scene, beside) == "never picked"
     assert cause(scene, beside, record(scene, "unfinished")) == "never picked"
@@ -56,9 +56,9 @@ def test_what_was_never_held(scene: Scene):
 
 
 @pytest.mark.parametrize("outcome", ["placed", "dropped"])
-def test_at_its_own_cavity(scene: Scene, outcome: str):
+def test_causes_at_its_own_cavity(scene: Scene, outcome: str):
     done = record(scene, outcome)
-    # A grasp that was missed when it was to be taken out again changes nothing.
+    # A later missed grasp of the placed tool does not matter.
     for records in ([done], [done, record(scene, "missed")]):
         assert cause(scene, flat(0.004, 0.01, 0.2, 0.012), *records) == "insertion blocked"
         assert cause(scene, flat(0.0, 0.0, math.pi - 0.1), *records) == "reversed"
@@ -82,7 +82,7 @@ def test_a_reversible_tool_cannot_be_reversed(scene: Scene):
     assert cause(reversible, protruding, record(scene, "placed")) == "insertion blocked"
 
 
-def test_elsewhere(scene: Scene):
+def test_causes_elsewhere(scene: Scene):
     placed, dropped = record(scene, "placed"), record(scene, "dropped")
     meant_elsewhere = record(scene, "placed", place_error_mm=90.0)
     off_the_kit = flat(0.3, 0.0)

@@ -49,7 +49,7 @@ def placements(scene: Scene, X_WB: list[RigidTransform]) -> list[Placement]:
     return evaluate_placements(objects, scene.goals, scene.success, X_WB)
 
 
-def test_the_seed_is_the_scene():
+def test_the_seed_determines_the_scene():
     scene, again = draw(3), draw(3)
     assert poses(scene) == poses(again)
     assert names(scene) == names(again)
@@ -57,7 +57,7 @@ def test_the_seed_is_the_scene():
 
 
 def test_poses_and_goals_follow_the_order():
-    """Whatever the order, each tool keeps its own pose, and its goal is in its own cavity."""
+    """Each tool keeps its own pose and cavity in any order."""
     scene, listed = draw(0), draw(0, Kitting(random_order=False))
     assert names(listed) == Kitting().tools
     assert names(scene) != Kitting().tools
@@ -69,7 +69,7 @@ def test_poses_and_goals_follow_the_order():
         ((X_WGoal,), (expected,)) = goal.poses, listed.goals[there].poses
         assert item.X_WB.IsExactlyEqualTo(listed.objects[there].X_WB)
         assert X_WGoal.IsExactlyEqualTo(expected)
-        # Flush with the rim, along the kit.
+        # The goal is flush with the rim and aligned with the kit.
         tool = load_tool(item.name)
         assert (item.category, item.symmetry) == (tool.category, tool.symmetry)
         assert X_WGoal.translation()[2] + tool.height == pytest.approx(goal.rim_height)
@@ -77,20 +77,20 @@ def test_poses_and_goals_follow_the_order():
         assert goal.rim_height == pytest.approx(Kitting().kit.height)
 
 
-def test_tools_at_their_goals_are_all_of_the_reward():
+def test_tools_at_their_goals_earn_the_whole_reward():
     scene = draw(1)
     assert (scene.max_actions, scene.goal_objects) == (4, (0, 1, 2, 3))
     done = placements(scene, [goal.poses[0] for goal in scene.goals])
     assert all(item.strict_success for item in done)
     assert total_reward(scene.goals, done) == pytest.approx(1.0)
-    # The threshold is the task's.
+    # The task's threshold applies.
     off = [RigidTransform([0.003, 0, 0]) @ goal.poses[0] for goal in scene.goals]
     assert total_reward(scene.goals, placements(scene, off)) == pytest.approx(1.0)
     strict = draw(1, Kitting(success_threshold=0.0005))
     assert total_reward(strict.goals, placements(strict, off)) == 0.0
 
 
-def test_twins_fill_each_others_cavities():
+def test_identical_tools_fill_each_others_cavities():
     scene = draw(0, TWINS)
     assert sorted(names(scene)) == ["combination_wrench", "flat_screwdriver", "flat_screwdriver_2"]
     wrench = names(scene).index("combination_wrench")
@@ -107,13 +107,13 @@ def test_twins_fill_each_others_cavities():
         assert (done[one].goal, done[other].goal) == goals
         assert all(item.success for item in done)
         assert total_reward(scene.goals, done) == pytest.approx(1.0)
-    # Both in one cavity fill it once.
+    # Both tools in one cavity fill one goal.
     both = list(own)
     both[other] = own[one]
     assert total_reward(scene.goals, placements(scene, both)) == pytest.approx(2 / 3)
 
 
-def test_of_three_alike_all_are_named():
+def test_identical_tools_have_distinct_names():
     scene = draw(0, Kitting(tools=["s_wrench"] * 3))
     assert names(scene) == ["s_wrench", "s_wrench_2", "s_wrench_3"]
     assert {goal.objects for goal in scene.goals} == {(0, 1, 2)}
@@ -121,7 +121,7 @@ def test_of_three_alike_all_are_named():
 
 @pytest.mark.parametrize("count", [1, 2, pytest.param(7, marks=pytest.mark.slow), 12])
 def test_kits_of_any_number_of_tools(count: int):
-    # Every fifth, so that all categories are there, and several times.
+    # Include all categories, some repeatedly.
     tools = tool_names()[:: len(tool_names()) // 12][:count]
     scene = draw(0, Kitting(tools=tools))
     assert sorted(names(scene)) == sorted(tools)
@@ -133,7 +133,7 @@ def test_kits_of_any_number_of_tools(count: int):
     assert not any(item.success for item in away)
 
 
-def test_arranged_stands_where_you_say():
+def test_arranged_kitting_has_the_given_poses():
     task = ArrangedKitting(
         tools={
             "flat_screwdriver": TablePose(x=0.3, y=0.2, yaw_deg=30.0),
@@ -170,24 +170,24 @@ def test_toolsets_are_drawn_from_a_pool():
     assert any(path.name == "club_hammer.sdf" for path in task.input_files(BASE))
     with pytest.raises(UserError, match=r"task\.pool.*no_such_tool"):
         draw(0, ToolsetKitting(pool=["no_such_tool"]))
-    with pytest.raises(UserError, match=r"no tool 'a\\x00b'"):
+    with pytest.raises(UserError, match=r"a\\x00b"):
         draw(0, ToolsetKitting(pool=["a\0b"]))
 
 
-def test_tools_that_are_scaled_beyond_what_the_jaws_take_are_refused(tmp_path: Path):
+def test_tools_scaled_too_wide_for_the_jaws_raise(tmp_path: Path):
     folder = tmp_path / "wide"
     shutil.copytree(MODELS / "tools" / "stubby_screwdriver", folder)
     tool = load_tool(str(folder))
     record = yaml.safe_load((folder / "tool.yaml").read_text())
-    # As wide as the jaws open, at a length of 0.2 m.
+    # At a length of 0.2 m its grasp is as wide as the open jaws.
     record["grasp"]["width"] = 0.08 * tool.length / 0.2
     (folder / "tool.yaml").write_text(yaml.safe_dump(record))
     draw(0, ToolsetKitting(pool=[str(folder)], tool_length=[0.15, 0.19]))
-    with pytest.raises(UserError, match=r"'stubby_screwdriver' is 8\d mm wide where it is held"):
+    with pytest.raises(UserError, match=r"'stubby_screwdriver' is 8\d mm wide"):
         draw(0, ToolsetKitting(pool=[str(folder)], tool_length=[0.201, 0.21]))
 
 
-def test_lengths_are_drawn_only_if_asked_for():
+def test_lengths_are_drawn_only_with_random_lengths():
     def lengths(**fields: bool) -> dict[str, float]:
         scene = draw(0, ToolsetKitting(split="test", **fields))
         return {item.name: float(np.ptp(item.p_BPoints[:, 0])) for item in scene.objects}
@@ -197,12 +197,12 @@ def test_lengths_are_drawn_only_if_asked_for():
     as_made = lengths(random_lengths=False)
     for name, length in as_made.items():
         assert length == pytest.approx(load_tool(name).length, rel=0.02)
-    # Whatever their lengths, the tools of a seed are the same.
+    # The seed draws the same tools with and without random lengths.
     assert scaled.keys() == as_made.keys()
     assert scaled != as_made
 
 
-def test_only_what_is_unchanged_is_called_as_in_the_paper():
+def test_only_default_parameters_have_the_papers_title():
     assert Kitting().title == "kitting-seen-toolset"
     assert Kitting(spacing=0.01).title == "kitting"
     assert ToolsetKitting().title == "kitting-unseen-toolsets"
@@ -214,7 +214,7 @@ def test_only_what_is_unchanged_is_called_as_in_the_paper():
 
 
 @pytest.mark.parametrize("task", [Kitting(), ToolsetKitting(), ArrangedKitting()])
-def test_what_kitting_says_of_itself(task: TaskConfig):
+def test_properties_of_the_kitting_tasks(task: TaskConfig):
     task.validate()
     assert task.learning == Learning(later_picks_possible=True, curvature=True, reflection=True)
     assert task.causes == diagnosis.CAUSES
@@ -224,20 +224,20 @@ def test_what_kitting_says_of_itself(task: TaskConfig):
     assert cause == "never picked"
 
 
-def test_the_files_that_scenes_depend_on():
+def test_input_files():
     files = Kitting(tools=["claw_hammer"]).input_files(BASE)
     assert {"tool.yaml", "claw_hammer.sdf"} <= {path.name for path in files}
-    assert ToolsetKitting().input_files(BASE) == []  # Its own alone.
-    with pytest.raises(UserError, match=r"task\.tools: there is no tool 'spoon'"):
+    assert ToolsetKitting().input_files(BASE) == []
+    with pytest.raises(UserError, match=r"task\.tools: .*'spoon'"):
         ArrangedKitting(tools={"spoon": TablePose()}).input_files(BASE)
 
 
-def test_tools_that_cannot_be_had_are_told_by_their_field():
-    with pytest.raises(UserError, match=r"task\.tools: there is no tool 'spoon'"):
+def test_an_error_names_the_field_of_a_missing_tool():
+    with pytest.raises(UserError, match=r"task\.tools: .*'spoon'"):
         draw(0, Kitting(tools=["spoon"]))
 
 
-def test_a_tool_may_be_called_as_something_else_on_the_table(tmp_path: Path, monkeypatch):
+def test_a_tool_may_have_the_name_of_another_body(tmp_path: Path, monkeypatch):
     for name in ("kit", "distractor_1"):
         shutil.copytree(load_tool("flat_screwdriver", BASE).directory, tmp_path / name)
         (tmp_path / name / "flat_screwdriver.sdf").rename(tmp_path / name / f"{name}.sdf")
@@ -248,7 +248,7 @@ def test_a_tool_may_be_called_as_something_else_on_the_table(tmp_path: Path, mon
     assert {"kit_2", "distractor_1_2"} <= set(names(scene))
 
 
-def test_a_kit_that_is_too_small_is_told_by_its_field():
+def test_an_error_names_the_field_of_a_kit_without_room():
     small = KitParameters(fixed_size=True, length=0.1, width=0.1)
-    with pytest.raises(UserError, match=r"^task\.kit: there is no room"):
+    with pytest.raises(UserError, match=r"^task\.kit: "):
         draw(0, Kitting(kit=small))

@@ -1,4 +1,4 @@
-"""The expert at the tasks of Ravens, in physics."""
+"""The expert executes the Ravens tasks with real physics."""
 
 import pytest
 
@@ -12,7 +12,7 @@ pytestmark = pytest.mark.slow
 
 
 @pytest.mark.parametrize(("task", "share"), [(BlockInsertion(), 1.0), (StackBlockPyramid(), 1 / 6)])
-def test_the_first_pick_and_place(task: TaskConfig, share: float):
+def test_the_expert_succeeds_at_the_first_action(task: TaskConfig, share: float):
     scenario = Scenario(task=task, cameras={}, planner=PickPlaceParameters(max_actions=1))
     result = build_rig(scenario).run(seconds=30.0)
     assert result.failure is None

@@ -1,4 +1,4 @@
-"""Rewards of the tasks of Ravens, whole and partial, and why objects fail; no physics."""
+"""Rewards and causes of failure of the Ravens tasks, without physics."""
 
 import math
 from collections.abc import Sequence
@@ -56,7 +56,7 @@ def moved(X_WB: RigidTransform, *, x: float = 0.0, z: float = 0.0, yaw_deg: floa
 
 
 @pytest.mark.parametrize("kind", [AlignBoxCorner, BlockInsertion])
-def test_one_object_is_in_place_within_10_mm_and_15_degrees(kind: type[TaskConfig]):
+def test_success_is_within_10_mm_and_15_degrees(kind: type[TaskConfig]):
     scene = make_scene(kind())
     assert reward(scene, initial_poses(scene)) == 0
     for X_WGoal in scene.goals[0].poses:
@@ -64,12 +64,12 @@ def test_one_object_is_in_place_within_10_mm_and_15_degrees(kind: type[TaskConfi
         assert reward(scene, [moved(X_WGoal, x=0.009, z=0.02)]) == 1
         assert reward(scene, [moved(X_WGoal, x=0.011)]) == 0
     (X_WGoal, *_) = scene.goals[0].poses
-    # The middle of the L-block is beside the origin about which it is rotated here.
+    # The L-block's middle is off the origin about which it is rotated here.
     assert reward(scene, [moved(X_WGoal, yaw_deg=14 if kind is AlignBoxCorner else 10)]) == 1
     assert reward(scene, [moved(X_WGoal, yaw_deg=16)]) == 0
 
 
-def test_a_box_may_have_any_of_its_corners_in_the_marker():
+def test_any_corner_of_the_box_fills_the_marker():
     scene = make_scene(AlignBoxCorner())
     (marker,) = scene.fixtures
     corners = []
@@ -85,7 +85,7 @@ def test_a_box_may_have_any_of_its_corners_in_the_marker():
     }
 
 
-def test_each_red_cube_in_any_green_bowl_has_its_share():
+def test_each_red_cube_in_a_green_bowl_earns_its_share():
     scene = next(
         s for s in (make_scene(PlaceRedInGreen(), i) for i in range(50)) if len(s.goals) == 3
     )
@@ -95,12 +95,12 @@ def test_each_red_cube_in_any_green_bowl_has_its_share():
     assert reward(scene, poses) == pytest.approx(1 / 3)
     poses[1] = moved(bowls[1], x=-0.049)
     assert reward(scene, poses) == pytest.approx(2 / 3)
-    # Two in one bowl count as well.
+    # Two cubes in one bowl count, too.
     poses[2] = moved(bowls[1], x=0.03)
     assert reward(scene, poses) == pytest.approx(1)
     poses[2] = moved(bowls[1], x=0.051)
     assert reward(scene, poses) == pytest.approx(2 / 3)
-    # A cube of another colour is worth nothing.
+    # A cube of another colour does not count.
     poses[2], poses[3] = scene.objects[2].X_WB, bowls[2]
     assert reward(scene, poses) == pytest.approx(2 / 3)
 
@@ -112,13 +112,13 @@ def test_a_pyramid_counts_row_by_row():
     assert reward(scene, start) == 0
     for done, expected in enumerate([0, 1 / 6, 2 / 6, 3 / 6, 4 / 6, 5 / 6, 1]):
         assert reward(scene, places[:done] + start[done:]) == pytest.approx(expected)
-    # Within a row places may be exchanged, and quarter turns cannot be told.
+    # Cubes of a row are interchangeable, and symmetric under quarter rotations.
     exchanged = [places[2], moved(places[0], yaw_deg=90), places[1], *places[3:]]
     assert reward(scene, exchanged) == pytest.approx(1)
-    # A cube of another row may not stand in for it, ...
+    # A cube of another row does not count.
     wrong = [places[5], *places[1:5], places[0]]
     assert reward(scene, wrong) == pytest.approx(2 / 6)
-    # ... and what is above an incomplete row does not count.
+    # Cubes above an incomplete row do not count.
     assert reward(scene, [start[0], *places[1:]]) == pytest.approx(2 / 6)
 
 
@@ -128,17 +128,17 @@ def test_cubes_of_the_pyramid_touch_those_below():
     assert heights == pytest.approx([0.005] * 3 + [0.045] * 2 + [0.085])
 
 
-def test_boxes_count_by_what_of_them_is_on_the_pallet():
+def test_boxes_earn_the_share_of_their_volume_in_the_zone():
     scene = make_scene(PalletizingBoxes())
     places = [goal.poses[0] for goal in scene.goals]
     start = initial_poses(scene)
     assert reward(scene, start) == 0
     assert reward(scene, places) == pytest.approx(1)
-    # Each counts by itself, wherever in the zone it is and whichever it is, ...
+    # Each box counts separately, anywhere in the zone.
     assert reward(scene, [*start[:17], places[17]]) == pytest.approx(1 / 18)
     tilted = RigidTransform(RollPitchYaw(0.4, 0.3, 0.2), [0.45, 0.25, 0.15])
     assert reward(scene, [tilted, *start[1:]]) == pytest.approx(1 / 18)
-    # ... and in part: of five rows of points along its length two are beyond the edge at x = 0.65.
+    # A box counts partially: two of five rows of points are beyond the zone's edge at x = 0.65.
     over_the_edge = RigidTransform([0.645, 0.25, 0.04])
     assert reward(scene, [over_the_edge, *start[1:]]) == pytest.approx(3 / 5 / 18)
     assert reward(scene, [moved(over_the_edge, x=0.05), *start[1:]]) == 0
@@ -146,7 +146,7 @@ def test_boxes_count_by_what_of_them_is_on_the_pallet():
     assert reward(scene, [moved(places[0], z=0.30), *start[1:]]) == 0
 
 
-def test_a_box_that_did_not_come_was_not_left():
+def test_a_box_that_never_appeared_has_its_own_cause():
     task = PalletizingBoxes()
     scene = make_scene(task)
     poses = initial_poses(scene)

@@ -1,4 +1,4 @@
-"""What the scenes of the tasks of Ravens promise, checked on the geometry that the plant has."""
+"""Tests of the Ravens scenes with the collision geometry of the plant."""
 
 import dataclasses
 import functools
@@ -36,7 +36,7 @@ def make_scene(task: TaskConfig, seed: int) -> Scene:
 
 
 def there_at_first(scene: Scene) -> list[int]:
-    """The indices of the objects that do not appear later."""
+    """The indices of the objects that are present initially."""
     later = () if scene.arrivals is None else scene.arrivals.objects
     return [index for index in range(len(scene.objects)) if index not in later]
 
@@ -47,10 +47,10 @@ def shared_cell(kind: type[TaskConfig], seed: int) -> Rig:
 
 
 class Posed:
-    """A scene whose objects and hand are put where a test wants them.
+    """A scene whose objects and hand are posed by the test.
 
-    Objects float a little above what they stand on, the higher the more: what rests on something
-    does not touch it, and any contact is one that should not be.
+    Objects float above their supports, the upper ones higher. Resting objects therefore do not
+    touch, and every contact is an error.
     """
 
     def __init__(self, kind: type[TaskConfig], seed: int) -> None:
@@ -76,7 +76,7 @@ class Posed:
         self.put(index, RigidTransform([index, 3.0, 1.0]))
 
     def put_hand(self, index: int, grasp: Grasp, opening: float) -> None:
-        """Puts the hand as deep as it ever grips to where it grasps an object; an opening in m."""
+        """Puts the hand at a grasp, at the greatest grasp depth, with an opening in m."""
         gripper = gripper_pose(self.poses[index], grasp)
         z = self.poses[index].translation()[2] + grasp.surface_height
         z -= PickPlaceParameters().max_grasp_depth
@@ -101,7 +101,7 @@ class Posed:
 
 
 @each_task
-def test_the_seed_is_the_scene(kind: type[TaskConfig]):
+def test_the_seed_determines_the_scene(kind: type[TaskConfig]):
     def drawn(seed: int) -> tuple:
         scene = make_scene(kind(), seed)
         return (
@@ -114,7 +114,7 @@ def test_the_seed_is_the_scene(kind: type[TaskConfig]):
 
 
 @each_task
-def test_everything_lies_in_the_workspace(kind: type[TaskConfig]):
+def test_all_objects_are_in_the_workspace(kind: type[TaskConfig]):
     for seed in range(10):
         scene = make_scene(kind(), seed)
         poses = {index: scene.objects[index].X_WB for index in there_at_first(scene)}
@@ -134,8 +134,8 @@ def test_everything_lies_in_the_workspace(kind: type[TaskConfig]):
 
 @each_task
 @pytest.mark.parametrize("seed", SEEDS)
-def test_objects_are_free_and_the_open_hand_reaches_them(kind: type[TaskConfig], seed: int):
-    """One after another, from the top, by any of its grasps; and nothing touches to begin with."""
+def test_objects_are_free_and_reachable(kind: type[TaskConfig], seed: int):
+    """Initially nothing touches. Objects are taken from the top, by any of their grasps."""
     posed = Posed(kind, seed)
     assert posed.contacts() == set()
     opening = PickPlaceParameters().open_width
@@ -145,7 +145,7 @@ def test_objects_are_free_and_the_open_hand_reaches_them(kind: type[TaskConfig],
         for grasp in posed.scene.objects[index].grasps:
             posed.put_hand(index, grasp, opening)
             assert posed.contacts() == set(), (index, grasp)
-        # The jaws do go around it.
+        # The closed jaws touch the object.
         posed.put_hand(index, grasp, grasp.width - 0.002)
         assert len(posed.contacts()) >= 2
         posed.take_away(index)
@@ -153,8 +153,8 @@ def test_objects_are_free_and_the_open_hand_reaches_them(kind: type[TaskConfig],
 
 @each_task
 @pytest.mark.parametrize("seed", SEEDS)
-def test_goals_are_free_of_each_other_and_of_the_hand(kind: type[TaskConfig], seed: int):
-    """They are filled in their order, by a hand that opens as it lets go."""
+def test_goals_are_free_and_reachable(kind: type[TaskConfig], seed: int):
+    """Goals are filled in order, by a hand that opens to release."""
     posed = Posed(kind, seed)
     filled: set[int] = set()
     taken: list[np.ndarray] = []
@@ -175,7 +175,7 @@ def test_goals_are_free_of_each_other_and_of_the_hand(kind: type[TaskConfig], se
 
 @each_task
 def test_objects_come_to_rest_at_once(kind: type[TaskConfig]):
-    """Light and stiff boxes must not chatter on the table: what rests costs nothing."""
+    """Light and stiff boxes must not chatter on the table, or they never sleep."""
     rig = shared_cell(kind, 1)
     simulator = rig.station.make_simulator(rig.diagram)
     simulator.AdvanceTo(0.4)
@@ -187,7 +187,7 @@ def test_objects_come_to_rest_at_once(kind: type[TaskConfig]):
 
 @pytest.mark.parametrize("sleeps", [True, False])
 def test_boxes_appear_one_at_a_time(sleeps: bool):
-    """The second once the first is on the pallet; with it at rest the third still waits."""
+    """The second appears when the first is on the pallet; then the third still waits."""
     scenario = Scenario(
         task=PalletizingBoxes(),
         cameras={},
@@ -211,7 +211,7 @@ def test_boxes_appear_one_at_a_time(sleeps: bool):
 
 
 def test_surface_points_span_the_object():
-    """Positions are compared in the middle of their bounding box, rewards depend on it."""
+    """Positions are compared at the middle of the points' bounding box."""
     block = make_scene(BlockInsertion(), 0).objects[0]
     np.testing.assert_allclose(block.p_BPoints.min(axis=0), [-0.015, -0.015, 0], atol=1e-12)
     np.testing.assert_allclose(block.p_BPoints.max(axis=0), [0.065, 0.065, 0.04], atol=1e-12)
@@ -239,7 +239,7 @@ def test_red_in_green_draws_bowls_cubes_and_distractors():
 
 
 @each_task
-def test_only_the_task_as_it_is_has_the_name_of_the_literature(kind: type[TaskConfig]):
+def test_only_default_parameters_have_the_literatures_title(kind: type[TaskConfig]):
     task = kind()
     assert task.title == "".join(f"-{c.lower()}" if c.isupper() else c for c in kind.__name__)[1:]
     changes = [item for item in dataclasses.fields(task) if isinstance(item.default, int | float)]
@@ -248,10 +248,10 @@ def test_only_the_task_as_it_is_has_the_name_of_the_literature(kind: type[TaskCo
         assert changed.title == f"{task.title}, changed"
 
 
-def test_ranges_the_wrong_way_round_are_told():
-    with pytest.raises(ValueError, match=r"task\.box_sides must be the least and then"):
+def test_invalid_parameters_raise():
+    with pytest.raises(ValueError, match=r"task\.box_sides"):
         AlignBoxCorner(box_sides=[0.06, 0.04]).validate()
     with pytest.raises(UserError, match="no free space"):
         PlaceRedInGreen().make_scene(grid=PixelGrid(rows=50, cols=100), seed=0, base=Path())
-    with pytest.raises(UserError, match="the workspace must hold the place"):
+    with pytest.raises(UserError, match="heightmap"):
         PalletizingBoxes().make_scene(grid=PixelGrid(cols=240), seed=0, base=Path())

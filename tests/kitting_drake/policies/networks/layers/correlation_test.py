@@ -26,14 +26,14 @@ SIDE = 97
 
 
 def random_pair(seed: int, blur: int = 3) -> tuple[Tensor, Tensor]:
-    """An unrelated pair of a scene and a crop's encoding, as smooth as networks make them."""
+    """A scene and an unrelated crop encoding, as smooth as those of the networks."""
     scene = smooth_image(113, seed=2 * seed, channels=3, blur=blur)
     encoding = smooth_image(SIDE, seed=2 * seed + 1, channels=3, blur=blur)
     return scene[:, :, 16:, 8:][:, :, : SCENE[0], : SCENE[1]], encoding
 
 
 def plain_volume(scene: Tensor, encoding: Tensor, orientations: int) -> Tensor:
-    """Equations 7 and 8, a few rotations at a time."""
+    """Equations 7 and 8, computed 30 rotations at a time."""
     parts = [
         cross_correlation_fft(scene, lift(encoding, angles, KERNEL))
         for angles in rotation_angles(orientations, scene).split(30)
@@ -49,7 +49,7 @@ def test_lifts_counter_clockwise():
         torch.testing.assert_close(lifted[quarters], expected, atol=1e-4, rtol=0)
 
 
-def test_a_point_is_rotated_as_labels_are():
+def test_lift_rotates_a_point_like_a_label():
     encoding = torch.zeros(1, 1, 41, 41)
     offset = np.array([9, 4])
     encoding[0, 0, 20 + offset[0], 20 + offset[1]] = 1
@@ -60,7 +60,7 @@ def test_a_point_is_rotated_as_labels_are():
         np.testing.assert_allclose(centroid, rotation_matrix(angle) @ offset, atol=0.2)
 
 
-def test_correlates_as_equation_8_says():
+def test_cross_correlation_computes_equation_8():
     generator = torch.Generator().manual_seed(0)
     scene = torch.randn(1, 3, 21, 33, generator=generator)
     kernels = torch.randn(4, 3, 5, 5, generator=generator)
@@ -73,14 +73,14 @@ def test_correlates_as_equation_8_says():
 
 
 @pytest.mark.parametrize(("sides", "size"), [((21, 33), 5), ((81, 97), 65), ((7, 100), 9)])
-def test_fourier_transforms_give_the_same(sides: tuple[int, int], size: int):
+def test_correlation_by_fft_equals_direct_correlation(sides: tuple[int, int], size: int):
     scene, kernels = torch.randn(1, 3, *sides), torch.randn(4, 3, size, size)
     plain, fast = cross_correlation(scene, kernels), cross_correlation_fft(scene, kernels)
     torch.testing.assert_close(fast, plain, atol=1e-5 * float(plain.std()), rtol=0)
 
 
 @pytest.mark.parametrize(("sides", "size"), [((21, 33), 5), ((7, 30), 9)])
-def test_so_are_their_gradients(sides: tuple[int, int], size: int):
+def test_gradients_by_fft_equal_direct_gradients(sides: tuple[int, int], size: int):
     scene, kernels = torch.randn(1, 3, *sides), torch.randn(4, 3, size, size)
     weights = torch.randn(4, *sides)
     gradients = []
@@ -92,7 +92,7 @@ def test_so_are_their_gradients(sides: tuple[int, int], size: int):
         torch.testing.assert_close(fast, plain, atol=1e-5 * float(plain.std()), rtol=1e-4)
 
 
-def test_a_window_is_the_same_where_gradients_are_wanted():
+def test_a_window_is_the_same_with_gradients():
     scene, encoding = random_pair(0)
     arguments = (torch.tensor([0.0, 0.7]), (-3, 40), (9, 17))
     plain = window(scene, encoding, *arguments)
@@ -105,7 +105,9 @@ def test_a_window_is_the_same_where_gradients_are_wanted():
     ("corner", "shape"),
     [((30, 40), (5, 9)), ((0, 0), (4, 4)), ((77, 90), (4, 7)), ((0, 50), SCENE)],
 )
-def test_a_window_is_a_part_of_the_whole(corner: tuple[int, int], shape: tuple[int, int]):
+def test_a_window_is_a_part_of_the_full_correlation(
+    corner: tuple[int, int], shape: tuple[int, int]
+):
     scene, encoding = random_pair(0)
     angles = torch.tensor([0.0, 0.7, 3.0])
     found = window(scene, encoding, angles, corner, shape)
@@ -126,20 +128,20 @@ def test_a_window_may_lie_outside_the_scene():
         torch.testing.assert_close(found, expected, atol=1e-3, rtol=0)
 
 
-def test_the_coarse_volume_approximates_the_plain_one():
+def test_the_coarse_volume_approximates_the_full_correlation():
     scene, encoding = random_pair(1)
     angles = rotation_angles(8, scene)
     coarse = coarse_volume(scene, encoding, angles)
     plain = cross_correlation(scene, lift(encoding, angles, KERNEL))[:, ::2, ::2]
     assert coarse.shape == plain.shape
-    # The coarse one lacks the finest detail of the encodings.
+    # The coarse volume lacks the finest detail.
     assert (coarse - plain).std() < 0.1 * plain.std()
 
 
 @pytest.mark.parametrize(
     ("orientations", "seed"), [(36, 0), (36, 1), (36, 2), (72, 0), (72, 3), (180, 0), (180, 4)]
 )
-def test_the_search_finds_the_plain_maximum(orientations: int, seed: int):
+def test_the_search_finds_the_full_maximum(orientations: int, seed: int):
     scene, encoding = random_pair(seed)
     volume = plain_volume(scene, encoding, orientations)
     expected = np.unravel_index(int(volume.argmax()), volume.shape)
@@ -153,7 +155,7 @@ def test_the_search_finds_the_plain_maximum(orientations: int, seed: int):
 
 @pytest.mark.parametrize("pixel", [(40, 50), (0, 0), (80, 96), (3, 95)])
 @pytest.mark.parametrize("rotation", [0, 7, 71])
-def test_the_search_finds_the_crop_itself(pixel: tuple[int, int], rotation: int):
+def test_the_search_finds_the_crop_in_the_scene(pixel: tuple[int, int], rotation: int):
     _, encoding = random_pair(5)
     angle = rotation * math.tau / 72
     stamp = lift(encoding, torch.tensor([angle]), KERNEL)
@@ -163,17 +165,17 @@ def test_the_search_finds_the_crop_itself(pixel: tuple[int, int], rotation: int)
     scene = canvas[:, :, reach:-reach, reach:-reach]
     candidates, _ = search(scene, encoding, 72)
     _, found, row, col = candidates[0].best()
-    # At an edge, where half of the crop is not seen, the rotation may be off by a bin.
+    # At an edge half of the crop is unseen, and the rotation may be off by a bin.
     assert (row, col) == pixel
     assert (found - rotation + 36) % 72 - 36 in (-1, 0, 1)
 
 
-def test_of_windows_with_the_same_maximum_the_one_counts_that_has_it_inside():
-    """Else rounding decides between them, and sub-pixel refinement lacks neighbours."""
+def test_of_windows_with_the_same_maximum_the_one_with_more_neighbours_is_kept():
+    """Sub-pixel refinement needs the maximum's neighbours."""
     volume = torch.zeros(72, 20, 20)
     volume[70, 9, 9], volume[30, 2, 2] = 3.0, 5.0
     cut = Candidate(torch.cat([volume[66:], volume[:3]])[:, 1:10, 3:12], 66, (1, 3))
-    # The same, but for rounding: by another turn of the bins, and whole.
+    # The same maximum up to rounding, a full turn of bins away, with all its neighbours.
     whole = Candidate(volume[66:72, 5:14, 5:14] * (1 - 1e-6), 66 - 72, (5, 5))
     other = Candidate(volume[28:33, 0:7, 0:7], 28, (0, 0))
     for given in itertools.permutations([cut, whole, other]):

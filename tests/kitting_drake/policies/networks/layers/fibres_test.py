@@ -26,7 +26,7 @@ def fourier_elu(frequencies: tuple[int, ...], samples: int) -> enn.FourierELU:
 @pytest.mark.parametrize(
     ("frequencies", "samples"), [((0, 1, 2, 3), 8), ((0, 1, 2, 3), 16), ((0, 2, 4), 12)]
 )
-def test_samples_are_those_of_escnn(frequencies: tuple[int, ...], samples: int):
+def test_samples_equal_those_of_escnn(frequencies: tuple[int, ...], samples: int):
     elu = fourier_elu(frequencies, samples)
     fibre = Irreps(frequencies, samples)
     np.testing.assert_allclose(fibre.synthesis(), elu.A.numpy(), atol=1e-6)
@@ -40,7 +40,7 @@ def test_analysis_undoes_synthesis(fibre: Fibre):
 
 
 def rotation(fibre: Fibre, steps: int) -> NDArray[np.float64]:
-    """(channels, channels): a rotation by so many of the steps between channels."""
+    """(channels, channels): a rotation by `steps` times the angle between samples."""
     return np.roll(np.eye(fibre.channels), steps, axis=0)
 
 
@@ -54,8 +54,8 @@ def test_the_invariant_does_not_depend_on_rotation(fibre: Fibre):
         np.testing.assert_allclose(first, np.eye(fibre.size)[0], atol=1e-12)
 
 
-def test_coefficients_have_no_mean():
-    with pytest.raises(ValueError, match="coefficients is the first of them"):
+def test_invariant_needs_samples():
+    with pytest.raises(ValueError, match="needs samples"):
         Irreps((0, 1)).invariant()
 
 
@@ -63,17 +63,17 @@ def test_coefficients_have_no_mean():
     ("frequencies", "samples", "message"),
     [
         ((0, 1, 2, 3), 6, "6 samples cannot hold frequency 3: at least 7 are needed"),
-        ((0, 2, 1), 0, "ascend"),
-        ((0, 1, 1), 0, "ascend"),
-        ((-1, 0), 0, "ascend"),
+        ((0, 2, 1), 0, "ascending"),
+        ((0, 1, 1), 0, "ascending"),
+        ((-1, 0), 0, "ascending"),
     ],
 )
-def test_refuses_irreps(frequencies: tuple[int, ...], samples: int, message: str):
+def test_rejects_invalid_irreps(frequencies: tuple[int, ...], samples: int, message: str):
     with pytest.raises(ValueError, match=message):
         Irreps(frequencies, samples)
 
 
 @pytest.mark.parametrize(("order", "quotient"), [(9, 2), (0, 1), (4, 0)])
-def test_refuses_a_subgroup_that_there_is_not(order: int, quotient: int):
+def test_rejects_a_nonexistent_subgroup(order: int, quotient: int):
     with pytest.raises(ValueError, match="has no subgroup"):
         Regular(order, quotient)

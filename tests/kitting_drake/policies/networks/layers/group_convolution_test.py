@@ -10,7 +10,7 @@ QUOTIENT = Regular(8, quotient=2)
 
 
 def kernels(layer: GroupConv2d) -> Tensor:
-    """(D, entries): the layer's basis of kernels, from one unit vector of weights after another."""
+    """(D, entries): the layer's kernels for each unit vector of weights."""
     count = layer.weights.shape[-1]
     rows = []
     with torch.no_grad():
@@ -41,7 +41,7 @@ def test_spans_the_kernels_of_escnn(fibre: Regular, size: int, direction: str):
 
 
 def rotate(features: Tensor, fibre: Fibre) -> Tensor:
-    """A feature field rotated by 90 degrees (equation 2): the image, and each of the fields."""
+    """A feature field rotated by 90 degrees (equation 2): both the image and the fields."""
     fields = features.rot90(1, (2, 3)).unflatten(1, (-1, fibre.channels))
     if isinstance(fibre, Regular):
         fields = fields.roll(fibre.order // 4, 2)
@@ -65,7 +65,7 @@ def test_rotations_by_90_degrees_are_exact(group: Regular, direction: str):
     assert expected.std() > 0.1
 
 
-def test_features_start_at_the_scale_of_the_image():
+def test_initial_features_have_the_scale_of_the_input():
     fibre = Regular(36, quotient=2)
     layer = GroupConv2d(4, fibre, 8, fibre, 3)
     features = torch.randn(1, 4 * 18, 32, 32)
@@ -73,7 +73,7 @@ def test_features_start_at_the_scale_of_the_image():
 
 
 @pytest.mark.parametrize("bias", [False, True])
-def test_becomes_a_plain_layer(bias: bool):
+def test_converts_to_a_plain_layer(bias: bool):
     layer = GroupConv2d(2, QUOTIENT, 3, QUOTIENT, 3, padding=0, bias=bias)
     plain = PlainConv2d(2, QUOTIENT, 3, QUOTIENT, 3, padding=0, bias=bias)
     state = {"weight": layer.kernel()}
@@ -85,7 +85,7 @@ def test_becomes_a_plain_layer(bias: bool):
     torch.testing.assert_close(plain(features), layer(features), atol=1e-5, rtol=0)
 
 
-def test_weights_grow_with_the_group_and_no_faster():
+def test_the_number_of_weights_is_proportional_to_the_group():
     def count(order: int) -> int:
         fibre = Regular(order, quotient=2)
         return GroupConv2d(3, fibre, 5, fibre, 7).weights.numel()
@@ -94,7 +94,7 @@ def test_weights_grow_with_the_group_and_no_faster():
     assert [count(order) for order in (36, 72, 180)] == [3 * 5 * 10 * m for m in (18, 36, 90)]
 
 
-def test_only_fields_of_one_group_and_scalars():
+def test_supports_only_fields_of_one_group_and_scalars():
     for pair in [
         (Regular(6), Regular(4)),
         (Regular(6), Regular(6, quotient=2)),
@@ -102,5 +102,5 @@ def test_only_fields_of_one_group_and_scalars():
         (Irreps((0, 1)), Regular(6)),
         (Scalar(), Irreps((0, 1))),
     ]:
-        with pytest.raises(ValueError, match="no group convolution"):
+        with pytest.raises(ValueError, match="GroupConv2d"):
             GroupConv2d(1, pair[0], 1, pair[1], 3)

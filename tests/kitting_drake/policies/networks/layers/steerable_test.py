@@ -27,12 +27,12 @@ def random_features(*shape: int) -> Tensor:
 
 
 def rotate_by_90(features: Tensor) -> Tensor:
-    """The image rotated; the fields stay as they are."""
+    """Rotates the image but not the fields."""
     return features.rot90(1, (2, 3))
 
 
 def rotate_fields(features: Tensor, fibre: Fibre, degrees: float = 90) -> Tensor:
-    """Each field's channels transformed; the image stays as it is."""
+    """Transforms each field's channels but not the image."""
     if isinstance(fibre, Irreps):
         blocks = []
         for j in fibre.frequencies:
@@ -67,7 +67,7 @@ def test_rotations_by_90_degrees_are_exact(fibre_in: Fibre, fibre_out: Fibre, si
     expected = rotate_fields(rotate_by_90(layer(features)), fibre_out)
     found = layer(rotate_fields(rotate_by_90(features), fibre_in))
     torch.testing.assert_close(found, expected, atol=1e-5, rtol=1e-5)
-    # The output is not simply zero.
+    # The output is not trivially zero.
     assert expected.std() > 0.1
 
 
@@ -107,12 +107,12 @@ def escnn_layers(fields: int) -> tuple[enn.R2Conv, enn.FourierELU, enn.R2Conv]:
 
 
 def copy_weights(source: enn.R2Conv, target: SteerableConv2d) -> None:
-    """escnn's order is that of ours: out fields, in fields, basis."""
+    """escnn has the same order: out fields, in fields, basis."""
     with torch.no_grad():
         target.weights.copy_(source.weights.view_as(target.weights))
 
 
-def test_two_layers_are_those_of_escnn():
+def test_two_layers_equal_those_of_escnn():
     reference_first, reference_elu, reference_second = escnn_layers(fields=3)
     first = SteerableConv2d(2, Scalar(), 3, SAMPLES, 5)
     second = SteerableConv2d(3, SAMPLES, 3, SAMPLES, 3)
@@ -140,7 +140,7 @@ def test_two_layers_are_those_of_escnn():
 
 
 @pytest.mark.parametrize("samples", [8, 16, 32])
-def test_the_first_gain_does_not_depend_on_the_samples(samples: int):
+def test_the_initial_gain_does_not_depend_on_the_samples(samples: int):
     fibre = Irreps(FREQUENCIES, samples)
     layer = SteerableConv2d(32, fibre, 32, fibre, 3)
     features = BandLimit(fibre, 32)(random_features(1, 32 * samples, 32, 32))
@@ -150,7 +150,7 @@ def test_the_first_gain_does_not_depend_on_the_samples(samples: int):
 
 
 @pytest.mark.parametrize("bias", [False, True])
-def test_becomes_a_plain_layer(bias: bool):
+def test_converts_to_a_plain_layer(bias: bool):
     layer = SteerableConv2d(2, SAMPLES, 3, SAMPLES, 3, bias=bias)
     plain = PlainConv2d(2, SAMPLES, 3, SAMPLES, 3, bias=bias)
     state = {"weight": layer.kernel()}
@@ -164,13 +164,13 @@ def test_becomes_a_plain_layer(bias: bool):
     half = plain(features.bfloat16())
     assert half.dtype == torch.bfloat16
     torch.testing.assert_close(half.float(), layer(features), atol=0.05, rtol=0.05)
-    # Computing in another type has not changed the layer.
+    # Computing in another type does not change the layer.
     for name, value in plain.state_dict().items():
         assert value.dtype == torch.float32
         assert torch.equal(value, before[name])
 
 
-def test_groups_do_not_mix():
+def test_fibres_of_different_groups_are_rejected():
     for pair in [(SAMPLES, Regular(4)), (Regular(4), Regular(6))]:
         with pytest.raises(ValueError, match="their groups differ"):
             SteerableConv2d(1, pair[0], 1, pair[1], 3)
@@ -190,7 +190,7 @@ def test_resampling_is_equivariant_to_rotations_by_90_degrees(sides: tuple[int, 
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
-def test_gradients_of_resampling_are_those_of_the_plain_operations(dtype: torch.dtype):
+def test_gradients_of_resampling_equal_those_of_plain_operations(dtype: torch.dtype):
     features = random_features(1, 3, 9, 17).to(dtype)
     pool = BlurPool()
     kernel = pool.kernel.expand(3, 1, 5, 5)
@@ -206,7 +206,7 @@ def test_gradients_of_resampling_are_those_of_the_plain_operations(dtype: torch.
         gradients = []
         for way, precision in ((function, dtype), (plain, torch.float32)):
             leaf = features.clone().to(precision).requires_grad_()
-            # As where features are concatenated: the gradient is a part of a larger one.
+            # After a concatenation the gradient is a slice of a larger one.
             output = torch.cat([way(leaf), way(leaf.detach())], dim=1)
             output.backward(torch.cat([wanted, wanted], dim=1).to(precision))
             gradients.append(leaf.grad.float())
@@ -214,7 +214,7 @@ def test_gradients_of_resampling_are_those_of_the_plain_operations(dtype: torch.
         torch.testing.assert_close(*gradients, atol=tolerance, rtol=tolerance)
 
 
-def test_pooling_keeps_constants_and_drops_chequers():
+def test_pooling_keeps_constants_and_removes_chequers():
     chequers = (-1.0) ** (torch.arange(33)[:, None] + torch.arange(33))
     inside = (slice(None), slice(None), slice(1, -1), slice(1, -1))
     pool = BlurPool()
@@ -228,7 +228,7 @@ def test_upsampling_is_exact_for_a_plane():
     torch.testing.assert_close(upsample(plane[:, :, ::2, ::2]), plane)
 
 
-def test_expands_any_basis():
+def test_expand_kernel_works_for_any_basis():
     weights, basis = torch.randn(2, 3, 5), torch.randn(5, 4, 6, 3, 3)
     kernel = expand_kernel(weights, basis)
     assert kernel.shape == (8, 18, 3, 3)
