@@ -184,7 +184,7 @@ def test_the_tables_on_robustness(runs: dict[str, Summary]):
     ):
         for label, *cells in table:
             axis, _, level = label.split(",")[0].strip("`").partition(":")
-            kind = "none" if axis == "as it is" else axis
+            kind = "none" if axis == "unperturbed" else axis
             kind += "" if level in ("", "moderate") else f"_{level}"
             kind += "_frames" if label.endswith("frames") else ""
             for policy, cell in zip(POLICIES, cells, strict=False):
