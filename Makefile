@@ -31,7 +31,7 @@ lint: $(READY)
 	$(BIN)/mypy
 
 docs: $(DOCS)/ready
-	NO_MKDOCS_2_WARNING=1 $(DOCS)/bin/python -m mkdocs build --strict --quiet
+	NO_MKDOCS_2_WARNING=1 $(DOCS)/bin/python -m mkdocs build --strict
 	@echo "open site/index.html"
 
 clean:

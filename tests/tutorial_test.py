@@ -2,6 +2,7 @@
 
 import json
 import os
+import tempfile
 from pathlib import Path
 from typing import Any
 
@@ -39,7 +40,7 @@ def test_the_cells_run_in_a_folder_outside_the_tree(
 
     matplotlib.use("Agg")
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("TMPDIR", str(tmp_path))
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
     # The notebook starts `python -m kitting_drake.hkd` too.
     tree = str(NOTEBOOK.parents[1])
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join([tree, os.environ.get("PYTHONPATH", "")]))

@@ -122,11 +122,12 @@ def draw_table_1(results: Mapping[str, Result]) -> bytes:
     import matplotlib.pyplot as plt
 
     names = [task.name for task in TASKS.values() if task.table == "I"]
-    columns = {
+    drawn = {
         column: task
         for column, task in enumerate(names)
         if any(name.startswith(f"{task}_") for name in results)
     }
+    columns = drawn or dict(enumerate(names))
     counts = sorted(RAVENS_DEMONSTRATIONS)
     with plt.rc_context(_STYLE):
         figure, axes = plt.subplots(
