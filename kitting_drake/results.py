@@ -1,10 +1,10 @@
 """`python -m kitting_drake.results`: writes the pages of results from the runs in docs/results/.
 
-The pages are docs/results.md with its figures, and the table in docs/robustness.md. `--add` adds a
-run of `evaluate` to the runs, and `--remove` removes one. A run with the name of a cell of
-`benchmark paper` fills that cell; it needs a tree without uncommitted changes. The folder also
-holds `learning_rates.json` of `benchmark paper` and a copy of `networks.json` of
-`benchmark networks`. All numbers come from this folder, except the paper's own.
+The pages are docs/results.md with its figures, docs/protocol.md, and the table in
+docs/robustness.md. `--add` adds a run of `evaluate` to the runs, and `--remove` removes one. A run
+with the name of a cell of `benchmark paper` fills that cell; it needs a tree without uncommitted
+changes. The folder also holds `learning_rates.json` of `benchmark paper` and a copy of
+`networks.json` of `benchmark networks`. All numbers come from this folder, except the paper's own.
 """
 
 import argparse
@@ -17,6 +17,7 @@ from rich.console import Console
 
 from kitting_drake.common.command_line import run_command
 from kitting_drake.common.files import write_atomically
+from kitting_drake.reproduction.page.protocol_page import protocol_page
 from kitting_drake.reproduction.page.results_page import results_page
 from kitting_drake.reproduction.page.robustness import robustness_table, with_figures
 from kitting_drake.reproduction.page.run_table import add_run, remove_runs
@@ -25,8 +26,14 @@ from kitting_drake.reproduction.paper.cell_results import Result, cell_results, 
 from kitting_drake.reproduction.paper.efficiency import read_efficiency
 from kitting_drake.reproduction.paper.learning_rates import read_rates
 from kitting_drake.reproduction.paper.paper_figures import draw_figure_6, draw_table_1
-from kitting_drake.reproduction.paper.paper_sections import has_figure, has_table_1, paper_sections
+from kitting_drake.reproduction.paper.paper_sections import (
+    fresh_tools,
+    has_figure,
+    has_table_1,
+    paper_sections,
+)
 from kitting_drake.reproduction.paper.paper_tables import paper_cells
+from kitting_drake.reproduction.paper.protocol_sections import protocol_sections
 
 
 def main() -> int:
@@ -47,13 +54,14 @@ def main() -> int:
     answers, others = divided.results, divided.others
     efficiency = read_efficiency(folder)
     link = os.path.relpath(folder, output.parent)
+    again = divided.to_run_again
     page = results_page(
-        others,
-        link,
-        paper_sections(answers, rates, efficiency, divided.to_run_again),
-        divided.set_aside,
+        others, link, fresh_tools(answers, again), paper_sections(answers, efficiency, again)
     )
     write_atomically(output, page)
+    cells = protocol_sections(answers, rates, again)
+    page = protocol_page(others, link, cells, divided.set_aside)
+    write_atomically(output.with_name("protocol.md"), page)
     _draw(answers, efficiency, output.parent)
     robustness = output.with_name("robustness.md")
     if robustness.exists():
@@ -82,7 +90,7 @@ def _parser() -> argparse.ArgumentParser:
         type=Path,
         metavar="FILE.md",
         default=Path("docs/results.md"),
-        help="page to write (docs/results.md)",
+        help="page to write; protocol.md is written beside it (docs/results.md)",
     )
     parser.add_argument(
         "--add",

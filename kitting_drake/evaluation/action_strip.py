@@ -5,16 +5,22 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from matplotlib import rc_context
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 from numpy.typing import NDArray
 
 from kitting_drake.episode import ModeChange
 from kitting_drake.station import KittingStation
 from systems.signals import Observation, PlanarPose
 
-_MOST_FRAMES = 7
-_PICK, _PLACE = "#e4572e", "#1b998b"
+_MOST_FRAMES = 10
+_COLUMNS = 5
+_MARK = {"markeredgecolor": "white", "markeredgewidth": 1.2, "markersize": 10}
+_PICK = {"color": "#e69f00", "marker": "o", **_MARK}
+_PLACE = {"color": "#009e73", "marker": "s", **_MARK}
+"""Colours for the colour-blind too."""
 
 
 @dataclass(frozen=True)
@@ -59,7 +65,7 @@ def _pixel(observation: Observation, pose: PlanarPose) -> NDArray[np.float64]:
 
 
 def draw_strips(rows: Sequence[tuple[str, Sequence[StripFrame], Sequence[str]]]) -> bytes:
-    """Draws several strips, one below the other.
+    """Several strips, one below the other; a long one goes on in another line.
 
     Args:
         rows: for each strip its title, its frames and the outcome of each action.
@@ -67,28 +73,34 @@ def draw_strips(rows: Sequence[tuple[str, Sequence[StripFrame], Sequence[str]]])
     Returns:
         A PNG.
     """
-    columns = min(_MOST_FRAMES, max(len(frames) for _, frames, _ in rows))
-    figure = Figure(figsize=(3.1 * columns, 1.95 * len(rows)), layout="constrained", dpi=110)
-    grid = figure.subplots(len(rows), columns, squeeze=False)
-    for line, (title, frames, outcomes) in zip(grid, rows, strict=True):
-        for axes in line:
-            axes.set_axis_off()
-        for number, (axes, frame) in enumerate(zip(line, frames, strict=False)):
-            outcome = outcomes[number] if number < len(outcomes) else "done"
-            _draw(axes, frame, f"{title}: {outcome}" if number == 0 else outcome)
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png")
+    columns = min(_COLUMNS, max(len(frames) for _, frames, _ in rows))
+    lines = [-(-min(len(frames), _MOST_FRAMES) // columns) for _, frames, _ in rows]
+    with rc_context({"font.size": 14}):
+        figure = Figure(figsize=(2.9 * columns, 1.9 * sum(lines) + 0.4), layout="constrained")
+        parts = figure.subfigures(len(rows), 1, squeeze=False, height_ratios=lines)[:, 0]
+        for part, count, (title, frames, outcomes) in zip(parts, lines, rows, strict=True):
+            part.suptitle(title, x=0.005, horizontalalignment="left", fontweight="bold")
+            grid = list(part.subplots(count, columns, squeeze=False).flat)
+            for axes in grid:
+                axes.set_axis_off()
+            for number, (axes, frame) in enumerate(zip(grid, frames, strict=False)):
+                _draw(axes, frame, outcomes[number] if number < len(outcomes) else "done")
+        keys = [Line2D([], [], linestyle="", **look) for look in (_PICK, _PLACE)]
+        names = ["pick", "place"]
+        figure.legend(keys, names, loc="upper right", ncols=2, frameon=False, borderpad=0)
+        buffer = io.BytesIO()
+        figure.savefig(buffer, format="png", dpi=110)
     return buffer.getvalue()
 
 
 def _draw(axes: Axes, frame: StripFrame, title: str) -> None:
     axes.imshow(frame.colours)
-    axes.set_title(title, loc="left", fontsize=9)
+    axes.set_title(title, loc="left", fontsize=14)
     if frame.pick is None or frame.place is None:
         return
     ends = np.stack([frame.pick, frame.place])
-    axes.plot(ends[:, 1], ends[:, 0], color="white", lw=1.0)
-    for pixel, colour in ((frame.pick, _PICK), (frame.place, _PLACE)):
-        axes.plot(pixel[1], pixel[0], "o", color=colour, mec="white", mew=0.8, ms=6)
+    axes.plot(ends[:, 1], ends[:, 0], color="white", lw=1.6)
+    for pixel, look in ((frame.pick, _PICK), (frame.place, _PLACE)):
+        axes.plot(pixel[1], pixel[0], **look)
     rows, cols = frame.colours.shape[:2]
     axes.set(xlim=(-0.5, cols - 0.5), ylim=(rows - 0.5, -0.5))

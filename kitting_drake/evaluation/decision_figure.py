@@ -67,6 +67,31 @@ def draw_action(observation: Observation, action: PickPlaceAction) -> bytes:
     return _as_png(figure)
 
 
+def draw_maps(observation: Observation, decision: Decision, *, width: int) -> bytes:
+    """The two maps alone, side by side, as a strip of a film.
+
+    Args:
+        observation: the observation decided on.
+        decision: of a learned policy.
+        width: of the picture, in pixels; its height follows from the maps.
+
+    Returns:
+        A PNG.
+    """
+    rows, cols = observation.height.shape
+    dpi, gap, title = 100, 4, 20
+    map_width = (width - gap) / 2
+    height = map_width * rows / cols + title
+    figure = Figure(figsize=(width / dpi, height / dpi), dpi=dpi)
+    share = map_width / width, 1 - title / height
+    pick = figure.add_axes((0.0, 0.0, *share))
+    place = figure.add_axes((1 - share[0], 0.0, *share))
+    _draw_maps(pick, place, decision, np.clip(observation.rgb.transpose(1, 2, 0), 0, 1))
+    pick.set_title("stop" if decision.stop else "where to pick", loc="left", fontsize=9, pad=5)
+    place.set_title("" if decision.stop else "where to place", loc="left", fontsize=9, pad=5)
+    return _as_png(figure)
+
+
 def _as_png(figure: Figure) -> bytes:
     buffer = io.BytesIO()
     with matplotlib.rc_context({"font.size": 9}):

@@ -1,20 +1,25 @@
 """Visualization: Meshcat, videos, and drawings of a Diagram."""
 
+import itertools
 import shutil
 import subprocess
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from pydrake.geometry import (
+    Box,
     ColorRenderCamera,
+    Cylinder,
     DepthRange,
     DepthRenderCamera,
     Meshcat,
     MeshcatParams,
     MeshcatVisualizer,
     MeshcatVisualizerParams,
+    Rgba,
     Role,
 )
+from pydrake.math import RigidTransform
 from pydrake.systems.framework import Diagram, DiagramBuilder
 from pydrake.systems.sensors import RgbdSensor
 
@@ -27,6 +32,8 @@ if TYPE_CHECKING:
     from pydrake.visualization import VideoWriter
 
 MESHCAT_PERIOD = 1 / 32
+_FIELD_OF_VIEW_DEG = 34.0
+"""Of Meshcat's first view, from top to bottom."""
 
 
 def start_meshcat(parameters: MeshcatParams) -> Meshcat:
@@ -44,12 +51,27 @@ def start_meshcat(parameters: MeshcatParams) -> Meshcat:
         raise UserError(
             "no port from 7000 to 7099 is free for Meshcat: close viewers, or pass --no-meshcat"
         ) from error
-    meshcat.SetProperty("/Background", "top_color", [0.93, 0.95, 0.97])
-    meshcat.SetProperty("/Background", "bottom_color", [0.80, 0.83, 0.86])
+    meshcat.SetProperty("/Background", "top_color", [0.86, 0.91, 0.96])
+    meshcat.SetProperty("/Background", "bottom_color", [0.96, 0.97, 0.98])
     meshcat.SetProperty("/Grid", "visible", False)
     meshcat.SetProperty("/Axes", "visible", False)
-    meshcat.SetCameraPose(camera_in_world=[1.02, -0.48, 0.62], target_in_world=[0.45, -0.02, 0.08])
+    _add_room(meshcat)
+    # A narrow field of view from farther away shows the workspace large and little distorted.
+    meshcat.SetProperty("/Cameras/default/rotated/<object>", "fov", _FIELD_OF_VIEW_DEG)
+    meshcat.SetCameraPose(camera_in_world=[1.55, -0.42, 0.98], target_in_world=[0.47, -0.02, 0.09])
     return meshcat
+
+
+def _add_room(meshcat: Meshcat) -> None:
+    """Adds a floor, and legs to the table. They are in Meshcat alone: no camera sees them."""
+    top, floor = -0.07, -0.75
+    meshcat.SetObject("/room/floor", Cylinder(5.0, 0.02), Rgba(0.80, 0.72, 0.62))
+    meshcat.SetTransform("/room/floor", RigidTransform([0.5, 0.0, floor - 0.01]))
+    for x, y in itertools.product((0, 1), (0, 1)):
+        leg = f"/room/leg_{x}{y}"
+        meshcat.SetObject(leg, Box(0.05, 0.05, top - floor), Rgba(0.62, 0.52, 0.40))
+        p_WLeg = [0.06 + 0.88 * x, -0.69 + 1.38 * y, (top + floor) / 2]
+        meshcat.SetTransform(leg, RigidTransform(p_WLeg))
 
 
 def add_meshcat(builder: DiagramBuilder, station: KittingStation, meshcat: Meshcat) -> None:

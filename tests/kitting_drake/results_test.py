@@ -12,6 +12,7 @@ from kitting_drake import results
 from kitting_drake.common.errors import UserError
 from kitting_drake.common.paths import SCENARIOS
 from kitting_drake.evaluation.summary import summarise
+from kitting_drake.reproduction.page.protocol_page import protocol_page
 from kitting_drake.reproduction.page.results_page import results_page
 from kitting_drake.reproduction.page.robustness import robustness_table, with_figures
 from kitting_drake.reproduction.page.run_table import (
@@ -25,7 +26,8 @@ from kitting_drake.reproduction.page.runs import Run, read_evaluation, read_runs
 from kitting_drake.reproduction.paper.cell_results import cell_results
 from kitting_drake.reproduction.paper.efficiency import read_efficiency
 from kitting_drake.reproduction.paper.learning_rates import read_rates
-from kitting_drake.reproduction.paper.paper_sections import paper_sections
+from kitting_drake.reproduction.paper.paper_sections import fresh_tools, paper_sections
+from kitting_drake.reproduction.paper.protocol_sections import protocol_sections
 from kitting_drake.scenario.policies import PythonPolicy, QuantizedOracle
 from kitting_drake.scenario.schema import Heightmap, Scenario
 from kitting_drake.tasks import PAPER_TASKS, ArrangedKitting, Kitting, ToolsetKitting
@@ -87,7 +89,7 @@ def spoil(folder: Path, name: str, **fields: Any) -> None:
 
 
 def page(folder: Path) -> str:
-    return results_page(read_runs(folder), "results")
+    return protocol_page(read_runs(folder), "results")
 
 
 def tables(page: str) -> dict[str, list[list[list[str]]]]:
@@ -212,7 +214,7 @@ def test_marks_show_differences_from_the_paper(
 
 
 def test_every_run_is_listed(folder: Path):
-    assert "[a table](results/runs.csv)" in page(folder)
+    assert "[a table of runs](results/runs.csv)" in page(folder)
     (files,) = tables(page(folder))["Runs"]
     assert [row[0] for row in files[1:]] == ["ours", "quantized"]
     assert files[1][3:6] == ["1234", "10", "100 to 109"]
@@ -232,8 +234,8 @@ def test_tables_are_aligned(folder: Path):
 
 
 def test_without_runs_there_is_a_page(tmp_path: Path):
-    text = results_page([], "results")
-    assert tables(text) == {}
+    text = protocol_page([], "results")
+    assert tables(text).keys() == {"Which seeds were inspected"}
     assert text.endswith("There are none yet.\n")
     with pytest.raises(UserError, match=r"there is no .*runs\.csv: add a run to it"):
         read_runs(tmp_path)
@@ -272,16 +274,17 @@ def test_errors_name_the_invalid_run(folder: Path, tmp_path: Path):
 
 
 def command(monkeypatch: pytest.MonkeyPatch, folder: Path, *words: str) -> str:
-    """Runs the verb; returns the page that it writes."""
+    """Runs the verb; returns the protocol that it writes."""
     output = folder / "docs" / "results.md"
     arguments = ["results", "--results", str(folder), "--output", str(output), *words]
     monkeypatch.setattr(sys, "argv", arguments)
     assert results.main() == 0
-    return output.read_text()
+    assert output.read_text().startswith("# Results\n")
+    return output.with_name("protocol.md").read_text()
 
 
 def test_the_command(folder: Path, monkeypatch: pytest.MonkeyPatch, capsys):
-    assert command(monkeypatch, folder) == results_page(read_runs(folder), "..")
+    assert command(monkeypatch, folder) == protocol_page(read_runs(folder), "..")
     assert capsys.readouterr().out.startswith("2 runs: ")
 
 
@@ -364,8 +367,12 @@ def test_own_pages_are_up_to_date(own_runs: list[Run]):
     rates = read_rates(OWN)
     divided = cell_results(own_runs, rates)
     cells, others, set_aside = divided
-    sections = paper_sections(cells, rates, read_efficiency(OWN), divided.to_run_again)
-    page = results_page(others, "results", sections, set_aside)
+    again = divided.to_run_again
+    sections = paper_sections(cells, read_efficiency(OWN), again)
+    page = results_page(others, "results", fresh_tools(cells, again), sections)
     assert page == (OWN.parent / "results.md").read_text()
+    assert len(page.encode()) < 20_000
+    protocol = protocol_page(others, "results", protocol_sections(cells, rates, again), set_aside)
+    assert protocol == (OWN.parent / "protocol.md").read_text()
     robustness = (OWN.parent / "robustness.md").read_text()
     assert with_figures(robustness, robustness_table(others)) == robustness

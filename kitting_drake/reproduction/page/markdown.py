@@ -20,7 +20,7 @@ def markdown_table(
         left_columns: the number of leading columns that are aligned left; the others are aligned
             right.
     """
-    # Some Markdown parsers need rules of at least three characters.
+    # Some readers require rules of at least three characters.
     widths = [max(3, *map(len, column)) for column in zip(headings, *rows, strict=True)]
     rule = [
         "-" * width if index < left_columns else "-" * (width - 1) + ":"

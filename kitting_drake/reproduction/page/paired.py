@@ -1,6 +1,6 @@
 """Paired differences of two runs on the same seeds, and tool-level intervals of a rate.
 
-Both intervals are bootstrap intervals, which are too narrow if few episodes differ or few tools
+Both intervals are bootstrap intervals. They are too narrow where few episodes differ or few tools
 fail.
 """
 
@@ -16,7 +16,7 @@ _RESAMPLES = 10_000
 _TAILS = (2.5, 97.5)
 """The percentiles of a 95 % interval."""
 _FEWEST_TOOLS = 3
-"""With fewer tools that ever fail, resampling tools says nothing about other tools."""
+"""With fewer tools that ever fail, a bootstrap over tools is not informative."""
 
 STRICT, OWN = "strict_success_rate", "success_rate"
 """The two rates of an episode: strict, and by the task's own measure."""

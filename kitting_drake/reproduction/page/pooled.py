@@ -1,4 +1,4 @@
-"""The section on the shipped policies on the default unseen toolsets, over all runs together."""
+"""The shipped policies on the unseen toolsets of the paper, all runs pooled."""
 
 from collections import Counter
 from collections.abc import Sequence
@@ -19,12 +19,13 @@ _, _UNSEEN = PAPER_TASKS
 
 
 def pooled_section(runs: Sequence[Run]) -> list[str]:
-    """The section; empty without such runs.
+    """The section; empty without such a run.
 
-    It pools every run of the task by a shipped policy with default options and shipped weights.
+    It pools every run of the task by a shipped policy with its default options and the digest of
+    the shipped weights. No seed counts twice.
 
     Args:
-        runs: all runs that can be repeated.
+        runs: all reproducible runs that fill no cell.
 
     Raises:
         UserError: two runs of a policy share a seed.
@@ -50,7 +51,7 @@ def pooled_section(runs: Sequence[Run]) -> list[str]:
     if not rows:
         return []
     return [
-        "### The shipped policies on unseen toolsets\n",
+        "### Unseen toolsets, all runs of the shipped policies\n",
         prose("pooled"),
         markdown_table(["policy", "seeds", "objects", "strict, %", "paper's, %"], rows, 2),
     ]
@@ -66,7 +67,8 @@ def shipped_policies() -> dict[str, Policy]:
 
 
 def _is_of(run: Run, policy: Policy) -> bool:
-    """Whether a run has the policy's weights and options. Older runs may lack newer options."""
+    """Whether a run is of this policy, with its weights and options. Older runs may lack newer
+    options."""
     found: dict[str, Any] = run.summary["resolved_scenario"]["policy"]
     expected: dict[str, Any] = described(Scenario(policy=policy))["policy"]
     return run.summary.get("policy_digest") == policy.digest(SCENARIOS / "paper") and all(

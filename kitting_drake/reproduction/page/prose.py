@@ -1,4 +1,4 @@
-"""Reads the prose of the page of results from `results_prose.md`."""
+"""The prose of the pages of results, which stands in `prose.md`."""
 
 import re
 from functools import cache
@@ -22,6 +22,6 @@ def prose(part: str, **values: object) -> str:
 
 @cache
 def _parts() -> dict[str, str]:
-    text = Path(__file__).with_name("results_prose.md").read_text()
+    text = Path(__file__).with_name("prose.md").read_text()
     _, *found = _PART.split(text)
     return {name: part.strip() for name, part in zip(found[::2], found[1::2], strict=True)}

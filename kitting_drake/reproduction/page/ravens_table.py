@@ -44,7 +44,7 @@ PAPER: dict[tuple[str, int], tuple[tuple[float, float, float], ...]] = {
 
 
 def in_ravens_table(run: Run) -> bool:
-    """Whether a run is of an unmodified Ravens task, with refined actions."""
+    """Whether a run is of one of the default tasks, with refined actions."""
     if run.summary["task"] not in TASKS or run.departures:
         return False
     return run.method not in LEARNED or bool(run.detail("continuous"))
@@ -54,7 +54,7 @@ def ravens_section(runs: Sequence[Run]) -> list[str]:
     """The section on the five tasks; empty without runs of them.
 
     Args:
-        runs: all runs; those without `in_ravens_table` are ignored.
+        runs: all runs; those that are not `in_ravens_table` are ignored.
     """
     cells: dict[tuple[str, int | None, int | None], dict[str, list[str]]] = defaultdict(
         lambda: defaultdict(list)
@@ -73,13 +73,13 @@ def ravens_section(runs: Sequence[Run]) -> list[str]:
     rows = []
     for (method, orientations, count), found in sorted(cells.items(), key=str):
         name = METHODS.get(method, method)
-        # Show all runs, because a selection would be biased.
+        # Lists all of them: a choice would be flattering.
         values = ["<br>".join(found[task]) if task in found else "-" for task in TASKS]
         rows.append([name, str(orientations or ""), str(count or ""), *values])
     headings = ["method", "N", "demonstrations", *TASKS]
     return [
-        "### The five Ravens tasks\n",
-        "With sub-pixel and sub-bin refinement. The mean reward in percent, its 95 % interval and "
-        "the\nnumber of episodes.\n",
+        "### The five Ravens tasks, by default\n",
+        "With sub-pixel and sub-bin refinement. A cell has the mean reward in percent, its 95 % "
+        "interval\nand the number of episodes.\n",
         markdown_table(headings, rows),
     ]

@@ -18,21 +18,21 @@ from kitting_drake.scenario.policies import Learned
 
 _UNSEEN = SCENARIOS / "paper/kitting_unseen.yaml"
 _BEGIN, _END = "<!-- figures -->\n", "<!-- end of figures -->\n"
-_AS_IT_IS = "as it is"
+_UNPERTURBED = "unperturbed"
 _COLUMNS = {
     "so2": "of 100 demonstrations",
     "generalist": "generalist",
     "shape_matching": "shape matching",
 }
-_COMPARED = ("generalist, minus as it is", "generalist, minus shape matching")
+_COMPARED = ("generalist, minus unperturbed", "generalist, minus shape matching")
 """The paired differences, in points, on the seeds that both ran."""
 _TRIES = 2
 _FRAMES = 5
-"""The number of averaged images in additional rows."""
+"""The number of images that are averaged in further rows."""
 _SEEDS = range(2870, 2895)
-"""The seeds of every cell, unseen before their first run."""
+"""Those on which every policy meets every perturbation; unseen before their first run."""
 _FEWEST = 12
-"""The other levels need at least this many of them, from the first on."""
+"""The least number of these seeds, from the first, at levels other than moderate."""
 
 Key = tuple[str, str]
 """A row of the table and a method."""
@@ -41,15 +41,16 @@ Key = tuple[str, str]
 def robustness_table(runs: Sequence[Run]) -> str:
     """Strict success on unseen toolsets, with two tries per tool and recovering policies.
 
-    The first table is of `_SEEDS`. The second, of the other levels, is of the first of them. The
-    third pools all seeds of the cells that were run on further ones, because a selection would be
-    biased.
+    All runs of the first table use the same seeds. The second table has the other levels, on the
+    first of these seeds. The last table pools all seeds of cells that ran on further ones: a choice
+    among them would be flattering.
 
     Args:
-        runs: all runs; those of other scenarios or weights are ignored.
+        runs: all runs. Runs of other scenarios or with other weights than the shipped ones are
+            ignored.
 
     Raises:
-        UserError: two runs of a cell share a seed.
+        UserError: two runs of one cell share seeds.
     """
     expected, shipped = _expected(), _shipped()
     found: dict[Key, list[Run]] = defaultdict(list)
@@ -73,7 +74,7 @@ def robustness_table(runs: Sequence[Run]) -> str:
     parts = []
     if common:
         parts.append(
-            f"{len(_SEEDS)} episodes from seed {_SEEDS[0]}, the same in every cell:\n\n"
+            f"{len(_SEEDS)} episodes from seed {_SEEDS[0]} in every cell:\n\n"
             + _table(common, [label for label in expected if not _is_other_level(label)])
         )
     if any(_is_other_level(label) for label, _ in common):
@@ -85,12 +86,12 @@ def robustness_table(runs: Sequence[Run]) -> str:
     needless = _needless_table(common, list(expected))
     if needless:
         parts.append(
-            "Of these runs, the actions on boxes and whatever else has no cavity, and of how many. "
-            "No rate of success\ntells of them:\n\n" + needless
+            "Actions in these runs on objects that have no cavity, such as boxes, of all actions. "
+            "Success rates do not\ninclude them:\n\n" + needless
         )
     if further:
         parts.append(
-            "All seeds together, where there are more, with the number of objects:\n\n"
+            "All seeds together, where more were run, with the number of objects:\n\n"
             + _table(found, [label for label in expected if label in further], counted=True)
         )
     return "\n".join(parts) or "No runs yet.\n"
@@ -100,9 +101,7 @@ def _table(found: Mapping[Key, Sequence[Run]], labels: Sequence[str], counted: b
     """A table with one row for each perturbation that was run.
 
     Args:
-        found: the runs of each cell.
-        labels: of the rows.
-        counted: whether to show the number of objects.
+        counted: whether cells have the number of objects.
     """
 
     def share(key: Key) -> str:
@@ -114,7 +113,7 @@ def _table(found: Mapping[Key, Sequence[Run]], labels: Sequence[str], counted: b
         return f"{text}, {objects}" if counted else text
 
     def outcomes(key: Key) -> dict[str, Any]:
-        # Older summaries have no outcomes.
+        # Older summaries lack outcomes.
         return {
             "outcomes": [
                 item for run in found.get(key, ()) for item in run.summary.get("outcomes", ())
@@ -131,7 +130,7 @@ def _table(found: Mapping[Key, Sequence[Run]], labels: Sequence[str], counted: b
         [
             label,
             *(share((label, method)) for method in _COLUMNS),
-            difference((label, "generalist"), (_AS_IT_IS, "generalist")),
+            difference((label, "generalist"), (_UNPERTURBED, "generalist")),
             difference((label, "generalist"), (label, "shape_matching")),
         ]
         for label in labels
@@ -145,7 +144,7 @@ def _needless_table(found: Mapping[Key, Sequence[Run]], labels: Sequence[str]) -
 
     def share(key: Key) -> str:
         summaries = [run.summary for run in found.get(key, ())]
-        # Older summaries lack this field.
+        # Older summaries lack the count.
         if not summaries or not all("needless_actions" in item for item in summaries):
             return "-"
         needless, every = (
@@ -174,7 +173,7 @@ def _check_seeds(found: Mapping[Key, Sequence[Run]]) -> None:
 
 
 def _common(run: Run, label: str) -> bool:
-    """Whether a run is on the common seeds."""
+    """Whether a run has the seeds that all cells share."""
     seeds = list(run.summary["seeds"])
     if _is_other_level(label):
         return len(seeds) >= _FEWEST and seeds == list(_SEEDS)[: len(seeds)]
@@ -214,7 +213,7 @@ def _expected() -> dict[str, dict[str, Any]]:
     """The scenario of each row, as JSON values."""
     path, task = _UNSEEN, f"task: {{tries: {_TRIES}}}"
     one, more = f"{{{task}}}", f"{{{task}, sensor_noise: {{frames: {_FRAMES}}}}}"
-    rows: dict[str, tuple[str, str | None]] = {_AS_IT_IS: (one, None)}
+    rows: dict[str, tuple[str, str | None]] = {_UNPERTURBED: (one, None)}
     for level in LEVELS:
         rows |= {f"`{name}:{level}`": (one, f"{name}:{level}") for name in NAMES}
     for name in ("depth_noise", "all"):

@@ -1,10 +1,9 @@
-"""The files behind the page of results: a table of runs, and a compressed file of episodes.
+"""The files behind the pages of results: a table with a row a run, and a compressed file.
 
-`runs.csv` has a row for each run, with the fields of the `summary.json` of `evaluate`. Nested
-fields have columns such as `versions.drake`; an empty cell means that the run lacks the field.
-`episodes.jsonl.xz` has a line for each run with the remaining fields: `outcomes` (the success rate
-of each episode and the outcome of each object), `categories` and `resolved_scenario`. Together they
-restore every summary exactly.
+`runs.csv` holds the short fields of the `summary.json` of `evaluate`, and those of dictionaries in
+it under names such as `versions.drake`. An empty cell is a field that the run lacks.
+`episodes.jsonl.xz` has a line a run with the rest: `outcomes` (a success rate an episode, and how
+each object ended), `categories` and `resolved_scenario`. Both together restore every summary.
 """
 
 import csv
@@ -93,7 +92,7 @@ def _write(folder: Path, rows: Mapping[str, Summary], lines: Mapping[str, Summar
     writer = csv.DictWriter(table, [_NAME, *_columns(flat.values())], lineterminator="\n")
     writer.writeheader()
     writer.writerows({_NAME: name, **row} for name, row in flat.items())
-    # Write the table last: a run without a row is detected and can be added again.
+    # Write the table last: a run without a row can be detected, and added again.
     write_atomically(folder / EPISODES, lzma.compress(text.encode()))
     write_atomically(folder / TABLE, table.getvalue())
 

@@ -1,4 +1,4 @@
-"""The runs on the page of results, and how their scenarios differ from the paper's tasks."""
+"""The runs behind the pages of results, and how they depart from the paper's tasks."""
 
 import json
 from collections.abc import Mapping
@@ -21,12 +21,12 @@ METHODS = {
     "so2": "SO(2)-equivariant (ours)",
     "equivariant_transporter": "Equivariant Transporter",
     "transporter": "Transporter",
-    "generalist": "generalist, of static scenes",
-    "shape_matching": "shape matching, of nothing",
+    "generalist": "generalist",
+    "shape_matching": "shape matching",
     "quantized_oracle": "oracle, quantized",
     "oracle": "oracle, exact",
 }
-"""The displayed names of methods; others are displayed by their own names."""
+"""Names of methods for people. Other methods keep their own names."""
 
 LEARNED = ("so2", "equivariant_transporter", "transporter")
 """The methods that the paper compares."""
@@ -43,10 +43,10 @@ _ADDED: dict[str, Any] = {
     "sensor_noise.frames": 1,
     "end_at_success": False,
 }
-"""Fields that older runs lack, with the values that these runs used."""
+"""Fields that older runs lack, with the values that those used."""
 
 _ADDED_WHOLE = ("sensor_noise", "appearance")
-"""Whole sections that older runs lack; these runs used the defaults."""
+"""Fields that older runs lack, and that have the scenario's defaults."""
 
 _HAND = (
     "planner.firm_grasp_force",
@@ -57,11 +57,11 @@ _HAND = (
     "planner.search.speed",
 )
 _EARLIER_HAND = "an earlier hand"
-"""The displayed name of runs without these fields. That hand did not grip heavy objects more
-firmly, press, or search in a spiral, and took objects thinner than 3 mm for missed grasps."""
+"""The label of runs that lack these fields. That hand did not grip heavy objects more firmly, press
+or search in a spiral, and a grasp under 3 mm of width counted as failed."""
 
 _MOST_SHOWN = 4
-"""The number of listed differences of a run; more are only counted."""
+"""The most differences of one run that are listed; further ones are counted."""
 
 
 _KINDS: dict[str, Any] = {
@@ -118,11 +118,8 @@ class Run:
 
     @cached_property
     def departures(self) -> list[str]:
-        """The differences of its scenario from the paper's or Ravens task of its kind.
-
-        The policy is ignored. For other tasks, the differences from the default scenario, ignoring
-        the task too.
-        """
+        """The fields in which its scenario differs, policy aside, from the paper's task or the
+        Ravens task of its kind. For other tasks: from the default scenario, task aside."""
         found = self.summary["resolved_scenario"]
         for task in PAPER_TASKS.values():
             expected = described(Scenario(task=task))
@@ -136,7 +133,8 @@ class Run:
 
     @property
     def paper_task(self) -> str | None:
-        """The title of the paper's task if the scenario differs in nothing but the policy."""
+        """The title of the paper's task, if the run differs from that in nothing but the
+        policy."""
         task = self.summary["task"]
         return task if task in PAPER_TASKS and not self.departures else None
 
@@ -149,7 +147,7 @@ class Run:
 
 
 def described(scenario: Scenario) -> dict[str, Any]:
-    """The scenario as JSON values."""
+    """The scenario as JSON data."""
     fields = ChosenScenario(scenario, Path(), "", None).described
     return json.loads(json.dumps(fields, default=str))
 
@@ -165,7 +163,7 @@ def _without(scenario: dict[str, Any], *more: str) -> dict[str, Any]:
 
 
 def _translated(plant: Any) -> dict[str, Any]:
-    """The current fields for an older run's `plant`; empty for newer runs."""
+    """The fields of an older run's `plant`, under their present names."""
     if not isinstance(plant, dict) or "contact_approximation" not in plant:
         return {}
     defaults = _defaults()
@@ -197,7 +195,7 @@ def _added() -> dict[str, Any]:
 
 
 def _differences(found: Any, expected: Any, path: str = "") -> list[str]:
-    """The differences of JSON values, by field path, with the found values."""
+    """The paths at which JSON values differ, with the values found there."""
     if found == expected:
         return []
     if not isinstance(found, Mapping) or not isinstance(expected, Mapping):
@@ -257,11 +255,11 @@ def check_summary(summary: Any, where: str) -> None:
     """Checks that a summary has the fields of `evaluate` with their types.
 
     Args:
-        summary: the content of a file or a row.
-        where: the beginning of an error.
+        summary: the content of a file, or of a row.
+        where: its origin, for the error.
 
     Raises:
-        UserError: a field is missing or has a wrong type; names the field.
+        UserError: a field is missing or of another kind.
     """
     must = "it must be a summary.json of evaluate"
     for key, kind in _KINDS.items():

@@ -17,7 +17,7 @@ from kitting_drake.reproduction.paper.learning_rates import Rates
 from kitting_drake.reproduction.paper.paper_tables import paper_cells
 
 MISSING, TO_RUN_AGAIN = "-", "- ‡"
-"""The text for a cell that was not run, and for one whose run cannot be repeated."""
+"""Texts of a cell that was not run, and of one whose run is not reproducible."""
 
 
 @dataclass(frozen=True)
@@ -35,14 +35,14 @@ class Result:
 
 
 class Divided(NamedTuple):
-    """The runs, divided by `cell_results`."""
+    """The groups into which `cell_results` divides runs."""
 
     results: list[Result]
     """The results of cells, in the order of the cells."""
     others: list[Run]
     """The other runs, in their given order."""
     set_aside: list[Run]
-    """Runs, of cells or not, whose code cannot be checked out again. No table may use them."""
+    """Runs from trees with uncommitted changes, of cells or not. No table may use them."""
 
     @property
     def to_run_again(self) -> frozenset[str]:

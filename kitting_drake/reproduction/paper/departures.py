@@ -1,4 +1,4 @@
-"""How the cells "as in the paper" depart from it all the same, and what each departure changes."""
+"""How the cells "as in the paper" depart from it, and the effect of each departure."""
 
 from __future__ import annotations
 
@@ -11,70 +11,54 @@ from kitting_drake.reproduction.paper.cell_results import Result
 from kitting_drake.reproduction.paper.cells import PRESET
 from kitting_drake.reproduction.paper.failed_grasps import changeable, is_as_in_the_paper
 
-_NOT_MEASURED = "not measured"
-
-_OF_THE_CELL = (
-    ("physics and cameras", "another simulator", "Drake, hydroelastic contact; cameras of its own"),
-    ("arm", "an arm", "none: the hand alone moves in x, y, z and yaw, faster than an arm's joints"),
+_NOT_MEASURED = (
+    ("physics and cameras", "another simulator", "Drake, hydroelastic contact; its own cameras"),
+    ("arm", "an arm", "the hand alone, moving in x, y, z and yaw faster than an arm could"),
     ("rim of a cavity", "not given", "a lead-in bevel of 1 mm"),
     ("friction of a kit", "not given", "0.3"),
     ("scenes", "not given", "drawn until the open hand is free at every annotated grasp"),
-    ("release, where table I has an `e`", "the jaws open by 5 mm in all", "each draws back 6 mm"),
-    ("open jaws, place red in green with an `e`", "50 mm apart", "80 mm apart, as everywhere"),
+    ("release, in cells marked `e`", "the jaws open by 5 mm in all", "each jaw opens by 6 mm"),
+    ("open jaws, place red in green, cells marked `e`", "50 mm apart", "80 mm apart"),
+    ("demonstrated picks, in cells marked `e`", "off the middle along one axis", "at the middle"),
     (
-        "the demonstrator's picks, where table I has an `e`",
-        "off the middle along one axis",
-        "at the middle",
+        "size of the networks",
+        "as given (preset `paper`)",
+        f"preset `{PRESET}`: ours has 1/25 of the parameters, the Transporter 1/70",
     ),
-)
-"""What departs, as in the paper and the original Ravens tasks, and here. Nothing of it has been
-measured."""
-
-_OF_LEARNING = (
     ("label", "one-hot", "shared among neighbouring pixels and orientations"),
-    (
-        "search for a place",
-        "one correlation",
-        "begins at half the resolution, with a loss of its own",
-    ),
+    ("search for a place", "one correlation", "starts at half the resolution, with its own loss"),
     (
         "shift of a scene",
         "not given",
-        "a standard deviation of a sixth of each side; in Ravens, of the shorter side",
+        "a standard deviation of a sixth of each side (Ravens: of the shorter side)",
     ),
-    ("alpha", "the classes of the paper", 'one more class, "nothing to pick"'),
+    ("alpha", "the paper's classes", 'one more class, "nothing to pick"'),
     ("checkpoint", "the best on the test runs", "the best on separate validation scenes"),
     (
         "the Transporter's rotations",
         "all 36 in a training step",
-        "5 of 36 in a training step: the right one, and draws of the others",
+        "5 of 36 in a training step: the right one and random others",
     ),
     (
         "learning rate",
         "0.0001 for every method",
-        "0.001 for ours, the best of three for the others",
+        "0.001 for ours, the best of three for others",
     ),
 )
-"""The same of networks and training."""
+"""What departs, as in the paper and the original Ravens tasks, and here."""
 
 
 def departures(results: Mapping[str, Result]) -> str:
-    """The two tables, and what stands above them.
+    """The section, with its two tables.
 
     Args:
         results: by the names of their cells.
     """
-    rows = [
-        (
-            "size of the networks",
-            "as given (preset `paper`)",
-            f"preset `{PRESET}`: ours keeps 1/22 of the parameters, the Transporter 1/70",
-            _NOT_MEASURED,
-        ),
+    measured = [
         (
             "steps",
             "10,000 at one rate",
-            "1000 to 3000, the rate rises and falls",
+            "1000 to 3000; the rate rises, then falls",
             _compared(
                 results,
                 "three times the steps, ours, pyramid",
@@ -91,7 +75,7 @@ def departures(results: Mapping[str, Result]) -> str:
             "trained once, at N = 180",
             _compared(
                 results,
-                "trained at N = 36 instead",
+                "trained at N = 36",
                 {
                     label: (f"{name}_trained_at_36", name)
                     for label, name in (
@@ -108,17 +92,14 @@ def departures(results: Mapping[str, Result]) -> str:
         (
             "memory",
             "none",
-            "no pick within 10 mm of where a grasp of the episode failed",
+            "no pick within 10 mm of a failed grasp of the same episode",
             _memory(results),
         ),
-        *((*row, _NOT_MEASURED) for row in _OF_LEARNING),
     ]
-    headings = ["what", "in the paper", "here", "what it changes"]
-    tables = [
-        markdown_table(headings, table, left_columns=4)
-        for table in ([(*row, _NOT_MEASURED) for row in _OF_THE_CELL], rows)
-    ]
-    return f"{prose('departures')}\n{tables[0]}\n{prose('departures_of_learning')}\n{tables[1]}"
+    headings = ["what", "in the paper", "here"]
+    with_effect = markdown_table([*headings, "effect"], measured, left_columns=4)
+    without = markdown_table(headings, _NOT_MEASURED, left_columns=3)
+    return f"{prose('departures')}\n{with_effect}\n{prose('departures_not_measured')}\n{without}"
 
 
 def _compared(
@@ -131,7 +112,7 @@ def _compared(
             points = paired_difference(results[one].summary, results[other].summary, OWN)
             if points is not None:
                 found.append(f"{label}: {points_text(points)}")
-    return f"{what}: {'; '.join(found)}" if found else _NOT_MEASURED
+    return f"{what}:<br>{'<br>'.join(found)}" if found else "not yet measured"
 
 
 def _memory(results: Mapping[str, Result]) -> str:
@@ -147,4 +128,4 @@ def _memory(results: Mapping[str, Result]) -> str:
             total = sum(found[1:], found[0])
             least, most = (100 * count / total.actions for count in (total.at_least, total.at_most))
             parts.append(f"{label}: {least:.1f} to {most:.1f} % of the actions")
-    return "; ".join(parts) or _NOT_MEASURED
+    return "; ".join(parts) or "not yet measured"

@@ -1,4 +1,4 @@
-"""The section on paired differences: how much better one cell is than another on the same seeds."""
+"""The section of the protocol on how much better one method is than another on the same seeds."""
 
 from __future__ import annotations
 

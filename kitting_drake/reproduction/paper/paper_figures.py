@@ -18,20 +18,30 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _COLOURS = {10: "#009e73", 100: "#d55e00"}
-"""Green and orange, as in the paper."""
+"""Green and orange, as in the paper, and for the colour-blind too."""
 _MARKERS = {"so2": "o", "equivariant_transporter": "s", "transporter": "^"}
 _STEP = 0.12
 """The distance between the markers of one N."""
 _ROWS = {
-    ("so2", 36): "#d55e00",
-    ("so2", 180): "#a01a3a",
-    ("equivariant_transporter", 36): "#0072b2",
-    ("transporter", 36): "#666666",
+    ("so2", 36): ("#e69f00", "o"),
+    ("so2", 180): ("#d55e00", "D"),
+    ("equivariant_transporter", 36): ("#0072b2", "s"),
+    ("transporter", 36): ("#56646f", "^"),
 }
-"""The rows of table I, as method and N, and their colours."""
+"""The rows of table I, method and N, with their colours, for the colour-blind too, and markers."""
 _ROW_STEP = 0.19
-"""The distance between the markers of one number of demonstrations."""
-_STYLE = {"font.size": 10, "axes.spines.top": False, "axes.spines.right": False}
+"""Between the markers of one number of demonstrations."""
+_STYLE = {
+    "font.size": 13,
+    "axes.edgecolor": "0.5",
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.titlesize": 13,
+    "lines.markersize": 8,
+}
+"""Readable at half the size of the picture."""
+_TOP = 102.5
+"""The upper end of an axis of percents: a marker at 100 is whole."""
 
 
 def draw_figure_6(task: str, results: Mapping[str, Result]) -> bytes:
@@ -53,7 +63,7 @@ def draw_figure_6(task: str, results: Mapping[str, Result]) -> bytes:
 
     series = [(method, count) for count in sorted(DEMONSTRATIONS) for method in _MARKERS]
     with plt.rc_context(_STYLE):
-        figure, axis = plt.subplots(figsize=(7.0, 3.8), layout="constrained")
+        figure, axis = plt.subplots(figsize=(9.6, 5.6), layout="constrained")
         for index, (method, count) in enumerate(series):
             for place, n in enumerate(COLUMNS):
                 result = results.get(f"{task}_{method}_{n}_{count}")
@@ -66,10 +76,10 @@ def draw_figure_6(task: str, results: Mapping[str, Result]) -> bytes:
             if oracle is not None:
                 rate = 100 * oracle.summary["strict_success_rate"]
                 ends = (place - 0.42, place + 0.42)
-                axis.hlines(rate, *ends, color="black", linewidth=1.0, label="oracle, quantized")
+                axis.hlines(rate, *ends, color="black", linewidth=1.5, label="oracle, quantized")
         axis.set_xticks(range(len(COLUMNS)), [f"N = {n}" for n in COLUMNS])
         axis.set_xlim(-0.55, len(COLUMNS) - 0.45)
-        axis.set_ylim(top=101)
+        axis.set_ylim(top=_TOP)
         axis.set_ylabel("success, %")
         axis.grid(axis="y", color="0.9", zorder=0)
         axis.set_axisbelow(True)
@@ -82,12 +92,12 @@ def _draw_marker(
 ) -> None:
     """Draws both rates of a cell."""
     rate, (low, high) = summary["strict_success_rate"], summary["strict_ci95"]
-    look = {"color": _COLOURS[count], "marker": _MARKERS[method], "markersize": 6, "linestyle": ""}
+    look = {"color": _COLOURS[count], "marker": _MARKERS[method], "linestyle": ""}
     axis.errorbar(
         where,
         100 * rate,
         yerr=[[100 * (rate - low)], [100 * (high - rate)]],
-        elinewidth=1.2,
+        elinewidth=1.8,
         label=f"{METHODS[method]}, {count} demonstrations",
         zorder=3,
         **look,
@@ -98,8 +108,9 @@ def _draw_marker(
 def draw_table_1(results: Mapping[str, Result]) -> bytes:
     """Draws the mean reward of each Ravens task over the number of demonstrations, as a PNG.
 
-    A filled marker is measured, with its 95 % interval; a diamond is with our extensions; a hollow
-    marker is the paper's number for the same cell. Cells without a result are left out.
+    A filled marker is measured, with its 95 % interval; a star is with what goes beyond the
+    paper; a hollow one is what the paper gives for the same cell. What was not run is not there,
+    nor is the paper's beside it; a task of which nothing was run has no panel.
 
     Args:
         results: by cell name.
@@ -110,39 +121,52 @@ def draw_table_1(results: Mapping[str, Result]) -> bytes:
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
-    tasks = [task.name for task in TASKS.values() if task.table == "I"]
+    names = [task.name for task in TASKS.values() if task.table == "I"]
+    drawn = {
+        column: task
+        for column, task in enumerate(names)
+        if any(name.startswith(f"{task}_") for name in results)
+    }
+    columns = drawn or dict(enumerate(names))
     counts = sorted(RAVENS_DEMONSTRATIONS)
     with plt.rc_context(_STYLE):
         figure, axes = plt.subplots(
-            1, len(tasks), figsize=(9.6, 3.4), sharey=True, layout="constrained"
+            1,
+            len(columns),
+            figsize=(10.5, 5.0),
+            sharey=True,
+            squeeze=False,
+            layout="constrained",
         )
-        for column, (task, axis) in enumerate(zip(tasks, axes, strict=True)):
+        axes = axes[0]
+        for (column, task), axis in zip(columns.items(), axes, strict=True):
             _draw_task(axis, task, column, results)
-            axis.set_title(task.replace("_", " "), fontsize=10)
+            # In two lines, as five tasks stand side by side.
+            axis.set_title("\n".join(task.replace("_", " ").rsplit(" ", 1)))
             axis.set_xticks(range(len(counts)), [str(count) for count in counts])
             axis.set_xlim(-0.5, len(counts) - 0.5)
             axis.grid(axis="y", color="0.9", zorder=0)
             axis.set_axisbelow(True)
-        axes[0].set_ylim(top=102)
+        axes[0].set_ylim(top=_TOP)
         axes[0].set_ylabel("mean reward, %")
-        axes[len(tasks) // 2].set_xlabel("demonstrations")
+        axes[len(axes) // 2].set_xlabel("demonstrations")
         _explain(axes[0], "measured here", "the paper's")
         return _finish(figure)
 
 
 def _draw_task(axis: Axes, task: str, column: int, results: Mapping[str, Result]) -> None:
-    """Draws the panel of a task, with the paper's numbers beside our results."""
-    for index, ((method, n), colour) in enumerate(_ROWS.items()):
+    """The panel of a task: its cells, and the paper's beside those as in the paper."""
+    for index, ((method, n), (colour, marker)) in enumerate(_ROWS.items()):
         for place, count in enumerate(sorted(RAVENS_DEMONSTRATIONS)):
             where = place + _ROW_STEP * (index - (len(_ROWS) - 1) / 2)
             name, row = f"{task}_{method}_{n}_{count}", f"{METHODS[method]}, N = {n}"
             if name in results:
-                look = {"color": colour, "marker": _MARKERS[method], "linestyle": ""}
+                look = {"color": colour, "marker": marker, "linestyle": ""}
                 paper = TABLE_1[METHODS[method], n][column][place]
                 axis.plot(where, paper, markerfacecolor="white", zorder=2, **look)
                 _draw_reward(axis, where, results[name].summary, row, look)
             if f"{name}_ours" in results:
-                look = {"color": colour, "marker": "d", "linestyle": ""}
+                look = {"color": colour, "marker": "*", "linestyle": ""}
                 summary = results[f"{name}_ours"].summary
                 _draw_reward(axis, where, summary, f"{row}, with extensions", look)
 
@@ -155,7 +179,7 @@ def _draw_reward(
         where,
         100 * rate,
         yerr=[[100 * (rate - low)], [100 * (high - rate)]],
-        elinewidth=1.2,
+        elinewidth=1.8,
         label=label,
         zorder=3,
         **look,
@@ -180,7 +204,7 @@ def _finish(figure: Figure) -> bytes:
         loc="outside lower center",
         ncols=2,
         frameon=False,
-        fontsize=9,
+        fontsize=12,
     )
     image = io.BytesIO()
     figure.savefig(image, format="png", dpi=130)

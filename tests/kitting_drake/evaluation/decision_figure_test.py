@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from kitting_drake.evaluation.decision_figure import draw_decision
+from kitting_drake.evaluation.decision_figure import draw_decision, draw_maps
 from kitting_drake.policies.data.images import make_action
 from kitting_drake.policies.learned_policy import Decision
 from systems.signals import Observation, PickPlaceAction, PixelGrid
@@ -71,3 +71,15 @@ def test_draw_decision_of_an_empty_observation_with_certain_maps():
     sure.pick_map[:], sure.angle_curve[:], sure.place_map[:] = 0, 0, 0
     sure.pick_map[0, 0] = sure.angle_curve[0] = 1
     assert drawn(nothing, sure).shape == (880, 1320, 3)
+
+
+def test_the_maps_alone_are_as_wide_as_asked(observation: Observation):
+    pictures = []
+    for item in (decision(observation), decision(observation, pick=(20.0, 12.0))):
+        with Image.open(io.BytesIO(draw_maps(observation, item, width=400))) as picture:
+            pictures.append(np.asarray(picture.convert("RGB")))
+    assert pictures[0].shape[1] == 400
+    changed = (pictures[0] != pictures[1]).any(axis=(0, 2))
+    # The pick map is on the left.
+    assert changed[:200].any()
+    assert not changed[204:].any()

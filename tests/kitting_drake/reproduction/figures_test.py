@@ -1,4 +1,4 @@
-"""The numbers in README.md, docs/robustness.md and docs/results.md equal those of the result files.
+"""The figures in README.md, docs/robustness.md and docs/results.md agree with the result files.
 
 They are recomputed here from the outcomes of the episodes, independently of the code that writes
 the pages.
@@ -98,55 +98,37 @@ def percent(runs: dict[str, Summary], name: str) -> int:
     return half_up(100 * float(np.mean([item["success_rate"] for item in runs[name]["outcomes"]])))
 
 
-def test_the_shipped_policies_in_the_readme(runs: dict[str, Summary], readme: str):
-    found = {row[0]: row[1:] for row in rows(readme, "## Results") if len(row) == 4}
-    generalist, shipped, matching = (
-        next(cells for label, cells in found.items() if label.startswith(start))
-        for start in ("the generalist", "shipped", "`!ShapeMatching")
-    )
-    perturbed = [
-        [run for name, run in runs.items() if re.fullmatch(rf"robust_all_{policy}_\d+", name)]
-        for policy in POLICIES
-    ]
-    unseen = [
-        ["unseen_so2_small_180_100_outlines_2600", "unseen_so2_small_180_100_outlines_3525"],
+@pytest.fixture(scope="module")
+def headline(readme: str) -> list[list[str]]:
+    """The table of results in README.md, without its headings."""
+    return rows(readme, "## Results")[2:]
+
+
+def test_the_shipped_policies_in_the_readme(runs: dict[str, Summary], headline: list[list[str]]):
+    generalist = [
         ["unseen_generalist_2600", "unseen_generalist_3525"],
-        ["unseen_shape_matching_2600"],
+        ["fresh_generalist"],
+        [name for name in runs if re.fullmatch(r"robust_all_generalist_\d+", name)],
     ]
-    fresh = ["fresh_of_100_demonstrations", "fresh_generalist", "fresh_shape_matching"]
-    for cells, names, name, more in zip(
-        (shipped, generalist, matching), unseen, fresh, perturbed, strict=True
-    ):
-        assert cells == [share([runs[n] for n in names]), share([runs[name]]), share(more)]
-        digests = {run["policy_digest"] for run in (*(runs[n] for n in names), runs[name], *more)}
-        assert len(digests) == 1
-    for name in ("real_scans_generalist", "real_scans_shape_matching"):
-        assert counts([runs[name]]) == (160, 160)
-    assert "each kit 160 of 160 [laser scans]" in one_line(readme)
+    matching = ["unseen_shape_matching_2600"]
+    for row, names in zip(headline[:4], [*generalist, matching], strict=True):
+        assert row[2:4] == ["strict", share([runs[name] for name in names])]
+    assert ["generalist" in row[1] for row in headline[:4]] == [True, True, True, False]
+    assert len({runs[name]["policy_digest"] for names in generalist for name in names}) == 1
 
 
-def test_the_papers_experiments_in_the_readme(runs: dict[str, Summary], readme: str):
-    found = {row[0]: row[1:3] for row in rows(readme, "## Results") if row[0].count(", N = ")}
-
-    def text(name: str, least: int | None) -> str:
-        if name not in runs:
-            return "-"
-        return short(reward(runs[name])) if least is None else share([runs[name]], least)
-
-    for task, label in (("seen", "seen toolset"), ("unseen", "unseen toolsets")):
-        ours = f"{task}_so2_180_100"
-        expected = [text(ours, OWN), text(f"{ours}_ours", OWN)]
-        assert found[f"{label}, N = 180"] == expected
-    for n in (36, 180):
-        ours = f"stack_block_pyramid_so2_{n}_100"
-        expected = [text(ours, None), text(f"{ours}_ours", None)]
-        assert found[f"stack block pyramid, N = {n}"] == expected
-        palletizing = text(f"palletizing_boxes_so2_{n}_100", None)
-        assert found[f"palletizing boxes, N = {n}"] == [palletizing.split(" ")[0], ""]
-        for task in ("block_insertion", "place_red_in_green", "align_box_corner"):
-            assert percent(runs, f"{task}_so2_{n}_100") == 100
-    label = "block insertion, place red in green, align box corner, N = 36 and 180"
-    assert found[label] == ["100 each", ""]
+def test_the_papers_experiments_in_the_readme(runs: dict[str, Summary], headline: list[list[str]]):
+    assert len(headline) == 8
+    for row, task in zip(headline[4:6], ("unseen", "seen"), strict=True):
+        assert row[0].startswith(f"{task} toolset")
+        assert row[2:4] == ["ADD-S", share([runs[f"{task}_so2_180_100"]], OWN)]
+    for task in ("block_insertion", "place_red_in_green", "align_box_corner"):
+        assert task.replace("_", " ") in headline[6][0]
+        assert percent(runs, f"{task}_so2_180_100") == 100
+    assert headline[6][2:] == ["reward", "100 each", "100 each"]
+    last = ("palletizing_boxes_so2_180_100", "stack_block_pyramid_so2_180_100")
+    found = "; ".join(short(reward(runs[name])) if name in runs else "-" for name in last)
+    assert headline[7][2:] == ["reward", found, "100; 99.0"]
 
 
 def test_the_sentences_of_the_readme(runs: dict[str, Summary], readme: str):
@@ -161,8 +143,8 @@ def test_the_sentences_of_the_readme(runs: dict[str, Summary], readme: str):
         ]
         behind[task] = 100 * (rates[1] - rates[0])
     assert (
-        f"on the unseen toolsets ({behind['unseen']:.1f} points ahead, strict) and "
-        f"{-behind['seen']:.1f} points behind on the seen one"
+        f"It is {behind['unseen']:.1f} points ahead on the unseen toolsets and "
+        f"{-behind['seen']:.1f} points behind on the seen one (strict)"
     ) in text
     red = [percent(runs, f"place_red_in_green_so2_{n}_1") for n in (36, 180)]
     assert f"place red in green ({red[0]} and {red[1]} %)" in text
@@ -175,6 +157,8 @@ def test_the_sentences_of_the_readme(runs: dict[str, Summary], readme: str):
         for preset in ("small", "paper")
     ]
     assert f"a factor of {factors[0]:.0f} (`small`) to {factors[1]:.0f} (`paper`)" in text
+    for preset in ("small", "paper"):
+        assert seconds["equivariant_transporter", preset, 36] < seconds["so2", preset, 36]
 
 
 def robust_share(runs: dict[str, Summary], pattern: str, counted: bool) -> str:
@@ -200,7 +184,7 @@ def test_the_tables_on_robustness(runs: dict[str, Summary]):
     ):
         for label, *cells in table:
             axis, _, level = label.split(",")[0].strip("`").partition(":")
-            kind = "none" if axis == "as it is" else axis
+            kind = "none" if axis == "unperturbed" else axis
             kind += "" if level in ("", "moderate") else f"_{level}"
             kind += "_frames" if label.endswith("frames") else ""
             for policy, cell in zip(POLICIES, cells, strict=False):
@@ -215,24 +199,31 @@ def test_the_tables_on_robustness(runs: dict[str, Summary]):
 
 
 def test_the_sentences_on_robustness(runs: dict[str, Summary]):
-    text = one_line((TREE / "docs" / "robustness.md").read_text())
+    page = (TREE / "docs" / "robustness.md").read_text()
+    text = one_line(page)
 
     def kitted(name: str) -> str:
-        good, objects = counts([runs[name]])
-        return f"{good} of {objects}"
+        run = runs[name]
+        objects = sum(row["objects"] for row in run["categories"].values())
+        return f"{round(objects * run['strict_success_rate'])} of {objects}"
 
     assert f"kitted {kitted('colours_and_lights_generalist')} unseen tools" in text
-    meshes = runs["real_tools_shape_matching"]
-    objects = sum(row["objects"] for row in meshes["categories"].values())
-    assert f"generalist {kitted('real_tools_generalist')}, from seed 2960; shape matching " in text
-    assert f"{round(objects * meshes['strict_success_rate'])} of {objects}, from seed 1600" in text
-    assert f"shape matching {kitted('real_scans_shape_matching')}, and" in text
-    assert f"and {kitted('real_scans_generalist')} the networks of the generalist" in text
-    assert f"kitted {counts([runs['real_scans_oracle']])[0]}. These" in text
+    table = rows(page, "### Real meshes and laser scans")[2:]
+    names = (
+        "real_tools_generalist",
+        "real_tools_shape_matching",
+        "real_scans_generalist",
+        "real_scans_shape_matching",
+        "real_scans_oracle",
+    )
+    for row, name in zip(table, names, strict=True):
+        assert row[2:] == [kitted(name), str(min(runs[name]["seeds"]))], name
     lost = [runs[f"robust_all_generalist_{seed}"] for seed in (2870, 2900, 3500)]
     good, objects = counts(lost)
     assert (objects - good, objects) == (16, 300)
-    assert "sixteen tools of three hundred: ten the wrong way round" in text
+    assert "lost sixteen tools of three hundred" in text
+    lost_rows = rows(page, "### What is lost")[2:]
+    assert [row[0] for row in lost_rows] == ["10", "4", "1", "1"]
     causes: dict[str, int] = {
         name: sum(run["causes"].get(name, 0) for run in lost) for name in lost[0]["causes"]
     }
@@ -242,17 +233,12 @@ def test_the_sentences_on_robustness(runs: dict[str, Summary]):
         "insertion blocked": 1,
     }
     assert sum(run["ambiguous"]["reversed"] for run in lost) == 7
-    seconds: list[Any] = [
-        runs[f"robust_{kind}_{policy}_2870"]["sim_seconds"] / 25
-        for kind in ("none", "depth_noise", "all")
-        for policy in POLICIES[1:]
-    ]
-    a, b, *more = (f"{value:.1f}" for value in seconds)
-    assert a == b
-    assert (
-        f"{a} s of simulated time each as it is, {more[0]} and {more[1]} s under depth noise, "
-        f"{more[2]} and {more[3]} s with everything at once"
-    ) in text
+    times = rows(page, "### How long it takes")[2:]
+    for row, kind in zip(times, ("none", "depth_noise", "all"), strict=True):
+        seconds = [
+            runs[f"robust_{kind}_{policy}_2870"]["sim_seconds"] / 25 for policy in POLICIES[1:]
+        ]
+        assert row[1:] == [f"{value:.1f} s" for value in seconds]
 
 
 def test_figure_6_and_table_1_of_the_results(runs: dict[str, Summary]):

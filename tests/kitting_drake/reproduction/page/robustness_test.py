@@ -55,7 +55,7 @@ def rows(table: str) -> dict[str, list[str]]:
 def test_each_run_goes_into_the_row_of_its_scenario():
     table = robustness_table([run(None, 1.0), run("mass:mild", 0.9), run("all", 0.5)])
     found = rows(table)
-    assert found["as it is"][2] == "100.0 (96 to 100)"
+    assert found["unperturbed"][2] == "100.0 (96 to 100)"
     assert found["`mass:mild`"][2] == "90.0 (83 to 94), 100"
     assert found["`all:moderate`"][2] == "50.0 (40 to 60)"
     assert "`mass:moderate`" not in found
@@ -68,7 +68,7 @@ def test_runs_on_other_seeds_are_pooled_in_another_table():
     first, second = table.split("All seeds together")
     assert rows(first)["`all:moderate`"][2] == "90.0 (83 to 94)"
     assert rows(second)["`all:moderate`"][2] == "70.0 (63 to 76), 200"
-    assert "as it is" not in rows(second)
+    assert "unperturbed" not in rows(second)
 
 
 def test_other_levels_use_the_first_seeds_and_show_their_number():
@@ -92,7 +92,7 @@ def test_the_generalist_is_compared_on_common_seeds():
         lost, ahead = rows(part)["`all:moderate`"][-2:]
         assert lost.startswith("-10.0 (")
         assert ahead.startswith("+40.0 (")
-    assert rows(table)["as it is"][-2:] == ["-", "-"]
+    assert rows(table)["unperturbed"][-2:] == ["-", "-"]
 
 
 def test_other_runs_are_ignored():

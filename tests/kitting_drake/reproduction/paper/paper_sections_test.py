@@ -1,4 +1,4 @@
-"""The paper's part of the page of results, from synthetic summaries."""
+"""The paper's part of the results and of the protocol, of summaries made for it."""
 
 import math
 from collections.abc import Iterable
@@ -15,8 +15,14 @@ from kitting_drake.reproduction.paper.cell_results import cell_results
 from kitting_drake.reproduction.paper.cells import TASKS, Cell, Training
 from kitting_drake.reproduction.paper.learning_rates import RATES, Rates, read_rates
 from kitting_drake.reproduction.paper.paper_figures import draw_figure_6, draw_table_1
-from kitting_drake.reproduction.paper.paper_sections import has_figure, has_table_1, paper_sections
+from kitting_drake.reproduction.paper.paper_sections import (
+    fresh_tools,
+    has_figure,
+    has_table_1,
+    paper_sections,
+)
 from kitting_drake.reproduction.paper.paper_tables import paper_cells
+from kitting_drake.reproduction.paper.protocol_sections import protocol_sections
 from kitting_drake.scenario.loader import load_scenario
 from tests.kitting_drake.evaluation.episodes import ADD_S, CHOSEN, make_episode
 
@@ -59,9 +65,11 @@ def make_run(name: str, errors_mm: list[float]) -> Run:
 
 
 def sections(runs: Iterable[Run], rates: Rates | None = None) -> str:
+    """Those of both pages."""
     divided = cell_results(list(runs), rates or {})
-    found = paper_sections(divided.results, rates or {}, None, divided.to_run_again)
-    return "\n".join(found)
+    results, again = divided.results, divided.to_run_again
+    found = fresh_tools(results, again) + paper_sections(results, None, again)
+    return "\n".join(found + protocol_sections(results, rates or {}, again))
 
 
 @pytest.fixture(scope="module")
@@ -107,7 +115,7 @@ def test_prose_about_a_cell_appears_with_the_cell(runs: tuple[Run, ...]):
     told = {
         "palletizing_boxes_so2_180_1": "After one demonstration of palletizing",
         "palletizing_boxes_transporter_36_100": "Every method learns palletizing in 3000 steps",
-        "stack_block_pyramid_so2_36_10_ours": "The pyramid with two extensions",
+        "stack_block_pyramid_so2_36_10_ours": "The pyramid, with two extensions",
     }
     rates, without = {"unseen_transporter": {"0.001": 1.0}}, sections(runs)
     everything = sections([*runs, *(make_run(name, [1.0, 9.0]) for name in told)], rates)
@@ -232,7 +240,7 @@ def test_unrepeatable_runs_are_marked_differently_from_missing_ones(runs: tuple[
     text = sections(marked)
     assert rows(text)["SO(2)-equivariant (ours)", "100"] == ["-"] * 3 + ["- ‡"]
     assert f"| {name} " not in text.split("### Every cell")[1]
-    assert "1\ncells with ‡" in text
+    assert "Another 1 cells, marked ‡" in text
     found = cell_results(marked, {})
     assert [run.name for run in found.set_aside] == [name]
     assert len(found.results) == len(runs) - 1
@@ -246,8 +254,8 @@ def test_damaged_learning_rates_are_an_error(tmp_path: Path):
             read_rates(tmp_path)
 
 
-def test_without_results_there_are_no_sections():
-    assert paper_sections([], {}) == []
+def test_no_results_no_sections():
+    assert fresh_tools([]) == paper_sections([]) == protocol_sections([], {}) == []
 
 
 def test_figure_6_is_drawn_from_the_existing_results(runs: tuple[Run, ...]):
@@ -271,4 +279,4 @@ def test_table_1_is_drawn_from_the_existing_results(runs: tuple[Run, ...]):
     del results["stack_block_pyramid_so2_36_10"]
     assert drawn != draw_table_1(results)
     assert not has_table_1(results.values())
-    assert "results_ravens.png" not in "\n".join(paper_sections(list(results.values()), {}))
+    assert "results_ravens.png" not in "\n".join(paper_sections(list(results.values())))
