@@ -1,4 +1,4 @@
-"""What `make docs` builds the site from is there."""
+"""Tests the sources of the site that `make docs` builds."""
 
 import re
 from pathlib import Path

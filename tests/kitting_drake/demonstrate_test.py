@@ -176,7 +176,7 @@ def test_the_command_needs_neither_drake_nor_torch(folder: Path):
 
     done = run()
     assert done.returncode == 0, done.stderr
-    assert "holds 2 demonstrations of 3 steps in all; 1 of them" in done.stdout
+    assert "holds 2 demonstrations with 3 steps in all; 1 of them" in done.stdout
     assert done.stdout.endswith("False\n")
     (folder / "demo2" / "step1" / "action.json").unlink()
     done = run()
