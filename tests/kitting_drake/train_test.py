@@ -382,7 +382,7 @@ def test_signals_save_the_last_step(
 
 
 @pytest.mark.parametrize("stop", [pytest.param(1, marks=pytest.mark.slow), 3])
-def test_a_stopped_run_resumes_as_if_it_had_not_been_stopped(
+def test_a_resumed_run_gives_the_same_weights(
     demos: Path, trained: Path, tmp_path: Path, stop: int, monkeypatch: pytest.MonkeyPatch
 ):
     step = Trainer.step
