@@ -216,7 +216,7 @@ BAD = {
         "A: {task: !ToolsetKitting {tool_length: [0.2, 0.15]}}",
         ["task.tool_length"],
     ),
-    "looks straight down": (
+    "camera that looks straight down": (
         "A: {cameras: {f: !LookAt {position: [0, 0, 1], target: [0, 0, 0]}}}",
         ["cameras.f", "!Pinhole"],
     ),

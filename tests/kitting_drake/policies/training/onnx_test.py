@@ -100,4 +100,4 @@ def test_the_command_exports_trained_networks(
         with pytest.raises(SystemExit) as caught:
             command(*words)
         assert caught.value.code == 2
-    assert "--demos says what to learn from" in capsys.readouterr().err
+    assert "--demos is required" in capsys.readouterr().err
