@@ -21,7 +21,7 @@ run: $(READY)
 	$(BIN)/python -m kitting_drake.run $(SCENARIO)
 
 test: $(READY)
-	$(BIN)/python -m pytest -n 2
+	$(BIN)/python -m pytest -n 2 --dist loadscope
 
 test-slow: $(READY)
 	$(BIN)/python -m pytest -n 2 -m slow
