@@ -202,6 +202,7 @@ def test_shape_matching_needs_neither_drake_nor_torch(bench: Path):
     assert (bench / "out" / "decision.png").stat().st_size > 10_000
 
 
+@pytest.mark.slow
 def test_networks_need_no_drake(bench: Path, weights_file: Path):
     done = command(bench, "--weights", weights_file, "--orientations", 36)
     assert (done.returncode, done.stderr.strip()) == (0, "True"), done.stderr
@@ -210,6 +211,7 @@ def test_networks_need_no_drake(bench: Path, weights_file: Path):
     assert 0 <= record["confidence"] <= 1
 
 
+@pytest.mark.slow
 def test_the_check_needs_no_drake(bench: Path):
     done = command(bench, "--check", "--kit_size_mm", 200, 150, 50)
     assert (done.returncode, done.stderr.strip()) == (0, "False"), done.stderr

@@ -71,7 +71,9 @@ def shipped() -> list[Any]:
             path,
             key.value,
             id=f"{path.stem}:{key.value}",
-            marks=[pytest.mark.slow] if key.value.endswith(MORE_OF_THE_SAME) else [],
+            marks=[pytest.mark.slow]
+            if key.value.endswith(MORE_OF_THE_SAME) or path.parent.name == "paper"
+            else [],
         )
         for path in sorted(SCENARIOS.rglob("*.yaml"))
         for key, _ in yaml.compose(path.read_text(), Loader=yaml.SafeLoader).value

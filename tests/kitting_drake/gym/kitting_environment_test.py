@@ -78,6 +78,7 @@ def test_gymnasiums_own_checks_pass(small: Path):
     check_env(make(small, cameras=True).unwrapped, skip_render_check=True)
 
 
+@pytest.mark.slow
 def test_a_picture_shows_the_cell(small: Path):
     environment = make(small, render_mode="rgb_array")
     environment.reset(seed=1)

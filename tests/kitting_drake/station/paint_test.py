@@ -43,6 +43,7 @@ def test_paint_changes_colours_but_not_heights(plain: Observation):
     assert red[0].max() > 0.5
 
 
+@pytest.mark.slow
 @needs_renderer
 def test_drawn_colours_depend_on_the_seed(plain: Observation):
     text = '{appearance: {paints: {"table/*": !Drawn {}, "fixtures/*": !Drawn {shared: true}}}}'

@@ -240,6 +240,7 @@ def test_a_sealed_hollow_has_no_mass(inverted: bool):
     assert "kept 1 sealed hollow" in notes
 
 
+@pytest.mark.slow
 def test_a_mesh_of_many_triangles_is_decimated(tmp_path: Path):
     mesh = mallet().subdivide_to_size(1.7)
     assert len(mesh.faces) > 11_000
