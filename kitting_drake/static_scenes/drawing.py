@@ -179,7 +179,7 @@ def _draw_scene(
 
 
 def _draw_loose(count: int, rng: np.random.Generator) -> list[int]:
-    """Draws which of so many tools are loose."""
+    """Draws which of `count` tools are loose; the others are seated."""
     order = rng.permutation(count)
     seated = int(rng.integers(0, count + 1))
     if rng.random() < 0.5:

@@ -272,15 +272,15 @@ def _proposal(
 def _hold(
     reach: _Reach, centre: int, levels: Array, touch: float, planner: PickPlaceParameters
 ) -> _Hold | None:
-    """The hold of two pads with their middle at a column; None if they cannot hold the tool.
+    """How two pads hold the tool when they are centred on a column; None if they cannot.
 
-    `find_grip` measures only the extent between the pads; this also measures their contact.
+    `find_grip` measures only the distance between the pads; this also measures their contact.
 
     Args:
         reach: of the tool.
-        centre: the column whose lower edge is at the middle of the pads.
+        centre: the pads' middle is at the lower edge of this column.
         levels: the heights of the slices.
-        touch: surface that stands back by less than this counts as touched.
+        touch: a pad touches the surface that lies less than this behind the foremost surface.
         planner: gives the pads' depth and their clearance to the table.
     """
     fingers = slice(centre - _FINGER_COLUMNS, centre + _FINGER_COLUMNS)

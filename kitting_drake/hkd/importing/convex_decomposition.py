@@ -26,8 +26,8 @@ OUTLINE_TOLERANCES_MM = ((0.26, 0.12), (0.30, 0.2), (0.4, 0.2), (0.6, 0.3), (0.9
 Each pair is tried if the one before needs too many hulls."""
 ADDED_SHARE = 0.05
 """The share of the tool's volume that one hull may add above and below the tool."""
-# Vertices are thinned at the first tolerance that leaves this many, or at the last one. The outline
-# has its own tolerance.
+# Vertices are thinned at the first tolerance that leaves at most this many, or at the last one. The
+# outline has its own tolerance.
 _MOST_VERTICES = 20
 _VERTEX_TOLERANCES_MM = (0.2, 0.3, 0.45, 0.6)
 _OUTLINE_VERTEX_TOLERANCE_MM = 0.08

@@ -307,7 +307,8 @@ def _prepare(request: ImportRequest, name: str, directory: Path) -> Prepared:
     if drawn:
         if tipping_deg(solid) < _TIPS_DEG:
             raise UserError(
-                f"{request.height_mm:g} mm high, it falls over: draw it from above, as it lies"
+                f"the tool is {request.height_mm:g} mm high and would tip over: draw it from "
+                "above, as it lies at rest"
             )
         lengths = [length]
         assumed = f"an outline, {length:.0f} mm long and extruded to {request.height_mm:g} mm"

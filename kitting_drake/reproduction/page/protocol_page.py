@@ -45,7 +45,7 @@ def protocol_page(
 
     Args:
         runs: from `read_runs`; there may be none of a task, or none at all.
-        link: the folder of the table of runs, from the page's own.
+        link: the path from the page's folder to that of the table of runs.
         cells: the sections of
             `kitting_drake.reproduction.paper.protocol_sections.protocol_sections`.
         set_aside: the runs that nobody can repeat, which are in no other table.

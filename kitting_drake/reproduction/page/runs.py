@@ -133,8 +133,7 @@ class Run:
 
     @property
     def paper_task(self) -> str | None:
-        """The title of the paper's task, if the run differs from that in nothing but the
-        policy."""
+        """The title of the paper's task; None if more than the policy differs from it."""
         task = self.summary["task"]
         return task if task in PAPER_TASKS and not self.departures else None
 

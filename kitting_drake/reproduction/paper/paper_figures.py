@@ -155,7 +155,7 @@ def draw_table_1(results: Mapping[str, Result]) -> bytes:
 
 
 def _draw_task(axis: Axes, task: str, column: int, results: Mapping[str, Result]) -> None:
-    """The panel of a task: its cells, and the paper's beside those as in the paper."""
+    """The panel of a task: our cells, and the paper's figures beside those without extensions."""
     for index, ((method, n), (colour, marker)) in enumerate(_ROWS.items()):
         for place, count in enumerate(sorted(RAVENS_DEMONSTRATIONS)):
             where = place + _ROW_STEP * (index - (len(_ROWS) - 1) / 2)

@@ -27,8 +27,10 @@ _Dumper.add_representer(dict, _represent_tagged)
 
 
 def dumped(raw: dict) -> str:
-    """The YAML of a mapping, in its order: of paints the later one wins. Drake's `yaml_dump` sorts
-    it."""
+    """The YAML of a mapping in its own order, which matters for paints: the last match wins.
+
+    Drake's `yaml_dump` would sort it.
+    """
     return yaml.dump(raw, Dumper=_Dumper, sort_keys=False)
 
 

@@ -308,7 +308,8 @@ class InvariantPart(nn.Module):
 def _of_several_fields(matrix: NDArray[np.float64], fields: int) -> Tensor:
     """The block-diagonal matrix that applies a matrix to each of several fields.
 
-    Despite its zeros, a product with about 64 channels takes half as long as one with eight.
+    It combines about 64 channels. Although it is mostly zeros, this takes half as long as products
+    with eight channels each.
     """
     together = math.gcd(fields, max(_TOGETHER // len(matrix), 1))
     blocks = np.kron(np.eye(together), matrix)
