@@ -81,7 +81,7 @@ class ShapeMatchingDecider:
         return "shape_matching"
 
     def check_grid(self, grid: PixelGrid) -> None:
-        """It supports any grid."""
+        """Does nothing: shape matching supports every grid."""
 
     def choose(self, observation: Observation, failed_picks: Sequence[PlanarPose] = ()) -> Choice:
         policy = make_shape_matching(self.parameters, recover=self.recover)

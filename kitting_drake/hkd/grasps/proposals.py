@@ -211,7 +211,7 @@ def _search(
 ) -> list[GraspProposal]:
     """The acceptable grasps at one rotation of the hand, along the whole tool or close to `near`.
 
-    Surface that stands back by less than `touch` counts as touched.
+    A pad touches the surface that lies less than `touch` behind the foremost surface.
     """
     reach = _reach(points, level, levels, theta)
     first, last = _FINGER_COLUMNS, len(reach.left) - _FINGER_COLUMNS
@@ -331,7 +331,12 @@ def _hold(
 
 
 def _lean(profile: Array, step: float) -> float:
-    """The inward lean of a face, in radians, at a pad's lower edge, from its reach by level."""
+    """By how much a face leans inward at a pad's lower edge, in radians.
+
+    Args:
+        profile: how far the face reaches out at each level, from the lowest one up.
+        step: the distance of the levels, in metres.
+    """
     above = min(2, len(profile) - 1)
     if above == 0 or profile.argmax() > 0 or not np.isfinite(profile[above]):
         return 0.0

@@ -132,7 +132,7 @@ def _halves(part: Manifold) -> tuple[Manifold, Manifold]:
             normal = np.eye(3)[axis]
             halves = part.split_by_plane(tuple(normal), low[axis] + share * size[axis])
             volume = sum(half.hull().volume() for half in halves)
-            # Prefer the middle of equal cuts, which leaves the smallest parts.
+            # Of cuts that are equally good, prefer the one nearest to the middle.
             volume *= 1.0 + 0.02 * abs(share - 0.5)
             if volume < best_volume:
                 best, best_volume = halves, volume

@@ -145,7 +145,7 @@ def _own(summary: dict[str, Any]) -> str:
 def _most_tested_run(runs: list[Run]) -> list[str]:
     """Tables by category of the most tested network, or of the most tested run if there is none."""
     learned = [run for run in runs if run.method in LEARNED]
-    # Not the best: of few episodes, that is the luckiest.
+    # Not the best run, which may be the luckiest of those with few episodes.
     most = max(learned or runs, key=lambda run: (run.summary["episodes"], run.name))
     rows = [*most.summary["categories"].items(), ("all", most.summary)]
 

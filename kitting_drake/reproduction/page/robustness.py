@@ -86,8 +86,9 @@ def robustness_table(runs: Sequence[Run]) -> str:
     needless = _needless_table(common, list(expected))
     if needless:
         parts.append(
-            "Actions in these runs on objects that have no cavity, such as boxes, of all actions. "
-            "Success rates do not\ninclude them:\n\n" + needless
+            "Some actions were on objects that have no cavity, such as boxes. The table shows how "
+            "many, of all\nactions in these runs. Success rates do not include these objects:\n\n"
+            + needless
         )
     if further:
         parts.append(

@@ -116,7 +116,7 @@ def _compared(
 
 
 def _memory(results: Mapping[str, Result]) -> str:
-    """The share of actions that it can have changed, in kitting and on the Ravens tasks."""
+    """The share of actions that the memory of failed grasps can have changed, by kind of task."""
     parts = []
     for label, is_kitting in (("kitting", True), ("Ravens", False)):
         found = [

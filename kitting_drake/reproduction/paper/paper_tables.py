@@ -117,7 +117,7 @@ def headline(task: str, method: str, seed: int) -> Cell:
 
 
 def _headline_seeds() -> list[Cell]:
-    """The cells of all seeds but the first, which figure 6 includes."""
+    """The cells of all seeds but the first. Figure 6 has those of the first."""
     return [
         headline(task, method, seed)
         for seed in HEADLINE_SEEDS[1:]
@@ -159,8 +159,11 @@ def _ablation() -> list[Cell]:
 
 
 def _every_chance() -> list[Cell]:
-    """The baselines at SO(2)'s share of the original's parameters, on tasks on which they score
-    lower. The Transporter also learns from more rotations per step, in more steps."""
+    """Cells that give the baselines every chance, on the tasks on which they score lower.
+
+    Their networks keep the same share of the originals' parameters as the SO(2) networks. The
+    Transporter also learns from more rotations per step, in more steps.
+    """
     trainings = [
         *(
             Training(
