@@ -32,7 +32,8 @@ NARROWEST = 0.003
 RELEASE_REACH = PLANNER.release_clearance + FINGERTIP_DEPTH
 """The reach of the fingertips beyond the gripped faces when they release."""
 
-# Surface that stands back by less than this touches a pad, in the fine and the coarse search.
+# A pad touches the surface that lies less than this behind the foremost surface: in the fine search
+# and in the coarse one.
 _TOUCH = 0.0003
 _COARSE_TOUCH = 0.0008
 # The hand's upper fingers are set back from its pads by this much.

@@ -65,8 +65,8 @@ _MOST_WAITING = 10.0
 _MAKING = ".making-"
 """The prefix of the folders of unfinished tools."""
 _MOST_MEMORY = 12 * 2**30
-# A tool that comes to rest tilted by more than this, in degrees, is laid again that way, at most
-# this many times.
+# A tool that comes to rest tilted by more than `_SAME_POSE_DEG` is moved to that pose and dropped
+# again, at most `_LAYINGS` times.
 _SAME_POSE_DEG, _LAYINGS = 2.0, 3
 # A tool that tips over when the table tilts by this, in degrees, is not stable.
 _TIPS_DEG = 10.0

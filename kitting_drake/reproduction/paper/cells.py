@@ -170,7 +170,7 @@ class Training:
 
     @property
     def steps(self) -> int:
-        """The number of steps: equal for all methods as in the paper, more with more labels."""
+        """The number of steps: the same for all methods, as in the paper; more with more labels."""
         task = TASKS[self.task]
         more = 0 if self.taken_only and self.rigid else task.more_steps
         return self.times * (task.steps + more)

@@ -48,7 +48,7 @@ def parse(content: str, where: str) -> dict:
         # A Python mapping swallows a field that is given twice.
         node = yaml.compose(content, Loader=yaml.SafeLoader)
         _check_names(node)
-        # It would be dropped without a word.
+        # Drake's loader would drop such a tag without a warning.
         if isinstance(node, yaml.MappingNode) and node.tag != "tag:yaml.org,2002:map":
             raise ValueError(f"the tag {node.tag} at the beginning means nothing there")
         # Drake takes an empty text for no text at all.
