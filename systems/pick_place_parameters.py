@@ -70,9 +70,9 @@ class PickPlaceParameters:
     # Force of each pad on the held object, in N.
     grasp_force: float = bounded(30.0, 1.0, 140.0)
 
-    # The force above a measured load of `heavy_load`, both in N. A heavy object that is gripped
-    # beside its centre of mass would rotate between the pads. 70 N is the continuous grasping force
-    # of a Franka Hand.
+    # Force of each pad on an object whose measured load exceeds `heavy_load`, both in N. A heavy
+    # object that is gripped beside its centre of mass would rotate between the pads. 70 N is the
+    # continuous grasping force of a Franka Hand.
     firm_grasp_force: float = bounded(70.0, 1.0, 140.0)
     heavy_load: float = bounded(5.0, 0.5, 100.0)
 

@@ -116,7 +116,7 @@ def _with_others(usual: Iterable[int], found: Iterable[int | None]) -> list[int]
 
 
 def _cell(runs: list[Run]) -> str:
-    # List all runs that differ only in their training: a choice would be flattering.
+    # List all runs that differ only in their training: a selection could flatter the policy.
     return (
         "<br>".join(
             f"{_strict(run.summary)} / {_own(run.summary)}, {run.summary['episodes']}{_marks(run)}"

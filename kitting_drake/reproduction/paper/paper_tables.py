@@ -99,8 +99,10 @@ def _patient() -> list[Cell]:
 
 
 def _faster() -> list[Cell]:
-    """SO(2) on the pyramid at the Equivariant Transporter's best learning rate there, because its
-    own is not tuned."""
+    """SO(2) on the pyramid, at the best learning rate of the Equivariant Transporter there.
+
+    SO(2)'s own learning rate is not tuned.
+    """
     own = (_paper_cell("stack_block_pyramid", "so2", n, 100) for n in (180, 36))
     return [
         dataclasses.replace(

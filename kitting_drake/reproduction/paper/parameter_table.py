@@ -25,10 +25,10 @@ original's parameters as ours does, and the Equivariant Transporter's pick-angle
 as many as that of ours.
 
 The originals are counted as follows. Our method: the authors' code. The Equivariant Transporter:
-the paper gives 4.54 M for alpha; the authors' pick-angle network has 0.90 M at N = {ORIENTATIONS}; phi
-and psi are the same U-net as alpha. The Transporter: the paper does not count it, so its original
-is the preset `paper` here, with the published widths of ResNets of 43 layers. The shares of both
-baselines refer to the preset `paper`.
+the paper gives 4.54 M for alpha, and phi and psi are the same U-net; the authors' pick-angle
+network has 0.90 M at N = {ORIENTATIONS}. The Transporter: the paper does not count it, so its
+original is the preset `paper` here, with the published widths of ResNets of 43 layers. The shares
+of both baselines refer to the preset `paper`.
 """
 
 

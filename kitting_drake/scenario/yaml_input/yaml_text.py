@@ -61,7 +61,7 @@ def parse(content: str, where: str) -> dict:
     except ValueError as error:
         raise UserError(f"{where}: {error}") from error
     except RecursionError as error:
-        raise UserError(f"{where} is not YAML that ends: it contains itself") from error
+        raise UserError(f"{where} is endless: an alias in it contains itself") from error
     if root is None:
         return {}
     if not isinstance(root, dict):

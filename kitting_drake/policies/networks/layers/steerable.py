@@ -246,8 +246,8 @@ def frequencies_cutoff(in_fibre: Fibre, out_fibre: Fibre, size: int) -> float | 
     """The largest angular frequency of the kernels on a ring of pixels, per pixel of its radius.
 
     A kernel of angular frequency k maps rho_i to rho_j with j up to i + k. With escnn's own limit
-    the highest output frequencies could always be zero. The limit is then raised to what they need
-    on the outermost ring, because any higher frequency would alias on the pixels.
+    the highest output frequencies may be out of reach, so that they are always zero. The limit is
+    then raised to what they need on the outermost ring: higher frequencies would alias there.
 
     Returns:
         The limit; None for escnn's own.
