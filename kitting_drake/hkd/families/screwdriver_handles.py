@@ -246,7 +246,8 @@ def handle(
         ValueError: the style is not known.
     """
     if style not in STYLES:
-        raise ValueError(f"the handle must be one of {', '.join(STYLES)}, not {style!r}")
+        known = ("fluted", "tee", "offset", *STYLES)
+        raise ValueError(f"the handle must be one of {', '.join(known)}, not {style!r}")
     section, zones = STYLES[style]
     result = []
     for zone in zones:

@@ -45,7 +45,7 @@ _NOT_MEASURED = (
         "0.001 for ours, the best of three for others",
     ),
 )
-"""What departs: its name, its value in the paper or the original Ravens tasks, and its value here."""
+"""Rows of what departs: its name, how it is in the paper or in Ravens, and how it is here."""
 
 
 def departures(results: Mapping[str, Result]) -> str:
