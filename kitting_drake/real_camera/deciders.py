@@ -52,10 +52,10 @@ class BenchPolicy(Protocol):
         ...
 
     def check_grid(self, grid: PixelGrid) -> None:
-        """Checks that it supports observations of this grid.
+        """Checks that the policy supports observations of this grid.
 
         Raises:
-            UserError: it does not.
+            UserError: the policy does not.
         """
         ...
 

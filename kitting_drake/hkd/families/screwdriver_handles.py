@@ -246,8 +246,9 @@ def handle(
         ValueError: the style is not known.
     """
     if style not in STYLES:
-        known = ("fluted", "tee", "offset", *STYLES)
-        raise ValueError(f"the handle must be one of {', '.join(known)}, not {style!r}")
+        raise ValueError(
+            f"the handle must be one of fluted, tee, offset, {', '.join(STYLES)}, not {style!r}"
+        )
     section, zones = STYLES[style]
     result = []
     for zone in zones:
