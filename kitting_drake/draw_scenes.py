@@ -132,7 +132,7 @@ class _Parts:
             if self._gapless() >= count:
                 return None
             batch = next(i for i in range(_MOST_BATCHES) if i not in begun)
-            # Earlier batches in progress may suffice.
+            # Begin no further batch if those before it, once complete, may hold enough scenes.
             if sum(self._counts.values()) >= count and batch > max(self._counts):
                 return None
             begun.add(batch)

@@ -339,8 +339,10 @@ def _split(
 
 
 def _most_unrelated(data: TrainingData, wanted: int) -> int:
-    """The largest number, up to `wanted`, of first scenes that share no tools with later ones; if
-    there is none, `wanted`."""
+    """The largest number, up to `wanted`, of leading scenes that share no tools with later ones.
+
+    If there is none, it is `wanted`.
+    """
     return max((end for end in data.unrelated if end <= wanted), default=wanted)
 
 

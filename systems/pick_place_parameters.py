@@ -45,8 +45,8 @@ class PickPlaceParameters:
     # [-0.4, 0, 0.4, 0].
     home: list[float] = bounded([0.5, 0.0, 0.4, 0.0], -2.0, 2.0)
 
-    # Clearance of the fingertips or the held object above the highest surface of o_t while the hand
-    # crosses the table, in m.
+    # Clearance of the fingertips or the held object above the highest surface of the heightmap o_t
+    # while the hand crosses the table, in m.
     travel_clearance: float = bounded(0.015, 0.0, 0.1)
 
     # The hand comes down fast to this far above the surfaces around its goal in o_t, in m.
@@ -70,18 +70,18 @@ class PickPlaceParameters:
     # Force of each pad on the held object, in N.
     grasp_force: float = bounded(30.0, 1.0, 140.0)
 
-    # The force above a measured load of `heavy_load`, both in N. A heavy object that is gripped
-    # beside its centre of mass would rotate between the pads. 70 N is the continuous grasping force
-    # of a Franka Hand.
+    # Force of each pad on an object whose measured load exceeds `heavy_load`, both in N. A heavy
+    # object that is gripped beside its centre of mass would rotate between the pads. 70 N is the
+    # continuous grasping force of a Franka Hand.
     firm_grasp_force: float = bounded(70.0, 1.0, 140.0)
     heavy_load: float = bounded(5.0, 0.5, 100.0)
 
     # Below this width between the squeezing pads the grasp counts as empty, in m.
     minimum_width: float = bounded(0.0015, 0.0, 0.08)
 
-    # Force with which closed jaws press down an object that is not seated, in N, and how far below
-    # its top they may go, in m. They descend at `lower_speed`; first contact alone causes about
-    # 25 N, and the force overshoots by about 5 N.
+    # To seat an object that sticks out, closed jaws press it down with this force, in N, and go at
+    # most this far below its top, in m. They descend at `lower_speed`. First contact alone causes
+    # about 25 N, and the force overshoots by about 5 N.
     press_force: float = bounded(30.0, 1.0, 140.0)
     press_depth: float = bounded(0.020, 0.001, 0.05)
 

@@ -363,7 +363,7 @@ class PickPlacePlanner(LeafSystem):
             state.dropped += 1
             self._motion.begin(state, Mode.RETREAT, time)
         elif free and self._parameters.search.has_slipped_in(hand[2], state.touch_z):
-            # The height makes it stop dead, where the object fits.
+            # The object has found its cavity: stop here without braking, and lower it.
             self._motion.begin(state, Mode.LOWER, time, z=hand[2])
         elif time >= self._motion.arrival(state):
             state.search_step += 1

@@ -64,7 +64,7 @@ class SensorNoiseParameters:
     camera_position_error: float = bounded(0.0, 0.0, 0.1)
     camera_angle_error_deg: float = bounded(0.0, 0.0, 20.0)
 
-    # Error common to all cameras, about the middle of the workspace, in m and degrees.
+    # Error of the pose of all cameras together, in m and in degrees about the workspace's middle.
     rig_position_error: float = bounded(0.0, 0.0, 0.1)
     rig_angle_error_deg: float = bounded(0.0, 0.0, 20.0)
 

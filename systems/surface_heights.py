@@ -151,7 +151,7 @@ def _table(height: NDArray[np.float32], noise: float) -> NDArray[np.float64]:
         tilt = rows * plane[0] + cols * plane[1]
         near = np.abs(height - tilt - plane[2]) < _TABLE_BAND / 2 + 2 * noise
     level = float(np.median((height - tilt)[near])) if near.any() else 0.0
-    # A large offset is no calibration error: the grid begins below the table.
+    # A large offset means that the grid begins below the table: calibration errors are smaller.
     return tilt + level if level < _MOST_OFF else tilt
 
 

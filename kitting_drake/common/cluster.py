@@ -171,7 +171,7 @@ def _answer(versions_wanted: dict[str, str], call: bytes) -> bytes:
     try:
         found = versions()
         if found != versions_wanted:
-            # A missing package has no version.
+            # A package that is missing on one side has a version only on the other.
             names = (*versions_wanted, *found)
             name = next(key for key in names if found.get(key) != versions_wanted.get(key))
             there, here = (which.get(name, "none") for which in (found, versions_wanted))

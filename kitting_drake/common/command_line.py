@@ -69,8 +69,10 @@ def interrupts_wait() -> Iterator[Callable[[], bool]]:
 
 
 def _interrupt(number: int, frame: FrameType | None) -> None:
-    """Raises KeyboardInterrupt, but not while trimesh is imported, whose optional imports catch it:
-    then a timer tries again."""
+    """Raises KeyboardInterrupt, unless trimesh is being imported: its optional imports catch it.
+
+    In that case a timer tries again.
+    """
     while frame is not None:
         module = str(frame.f_globals.get("__name__", ""))
         if module.partition(".")[0] == "trimesh" and frame.f_code.co_name == "<module>":

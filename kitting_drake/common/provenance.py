@@ -51,8 +51,8 @@ def is_reproducible(commits: str | None) -> bool:
     """Whether the code can be checked out again.
 
     Args:
-        commits: a result of `commit`, or several separated by commas; None or empty is unknown
-            code.
+        commits: a result of `commit`, or several separated by commas. None or an empty text means
+            that the code is unknown.
     """
     return commits is not None and commits != "" and _UNCOMMITTED not in commits
 
@@ -78,7 +78,7 @@ def source_digest(*names: str) -> str:
     """A digest of the Python sources of packages and modules.
 
     Args:
-        names: of packages, including their submodules, and of modules.
+        names: the packages and modules; a package includes its submodules.
     """
     digest = hashlib.sha256()
     for name in names:

@@ -29,13 +29,13 @@ def build_chosen(chosen: ChosenScenario, *, seed: int) -> tuple[Diagram, Kitting
 
 
 def build_any_chosen(chosen: ChosenScenario, seeds: Iterable[int]) -> KittingStation:
-    """Builds the station with the first of a few seeds for which this succeeds.
+    """Builds the station with the first seed that gives a valid scene; tries a few.
 
-    A random scene may be invalid for some seeds; only their episodes then fail.
+    A random scene may be invalid for some seeds. That should fail only the episodes of these seeds.
 
     Raises:
         MachineError: this machine cannot build it.
-        UserError: it fails with each of the first seeds; the error is that of the first.
+        UserError: none of the seeds that were tried works; this is the error of the first one.
     """
     errors = []
     for seed in itertools.islice(seeds, _TRIED):

@@ -191,7 +191,7 @@ def _draw_grippers(axes: Axes, grid: PixelGrid, action: PickPlaceAction) -> None
 def _draw_gripper(
     axes: Axes, pixel: NDArray[np.float64], theta: float, reach: float, colour: str
 ) -> None:
-    """Draws a line between the jaws, and the two pads; at theta zero they close along the cols."""
+    """Draws the pads and a line between them; at theta zero the jaws close along the columns."""
     closing = np.array([-math.sin(theta), math.cos(theta)])
     pad = np.array([math.cos(theta), math.sin(theta)])
     ends = np.stack([pixel - reach * closing, pixel + reach * closing])

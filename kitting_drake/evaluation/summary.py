@@ -147,9 +147,9 @@ def actions_after_failed_grasp(episode: Episode) -> int:
 def counted_objects(episodes: Sequence[Episode]) -> list[list[Entry]]:
     """The objects of each episode that count, i.e. for which a goal was left.
 
-    In a failed or timed-out episode no object is a success or has errors. If its process was lost
-    together with the objects' names, it gets for each category the largest number of objects in any
-    other episode.
+    In a failed or timed-out episode no object is a success or has errors. If its process died, the
+    names of its objects may be unknown. It then gets, for each category, the largest number of
+    objects in any other episode.
     """
     found = [
         [item for item in episode["objects"] if item["add_s_mm"] is not None]

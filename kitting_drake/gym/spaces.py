@@ -14,7 +14,7 @@ ACTION = ("pick_x", "pick_y", "pick_theta", "place_x", "place_y", "place_theta",
 """The entries of an action: the gripper's poses in the world, in metres and radians, and `stop`, 0
 to 1: above `STOP` the episode ends."""
 STOP = 0.95
-"""A random agent seldom stops."""
+"""So close to 1 that a random agent seldom stops."""
 _ANGLES = [2, 5]
 
 

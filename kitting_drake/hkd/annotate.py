@@ -113,7 +113,7 @@ def with_grasp(catalogue: str, name: str, grasp: Grasp) -> str:
     )
     changed, count = entry.subn(lambda match: match[1] + text, catalogue)
     if count != 1:
-        raise UserError(f"the catalogue has no tool '{name}' with a grasp on one line")
+        raise UserError(f"the catalogue has no tool '{name}' whose grasp is on one line")
     return changed
 
 

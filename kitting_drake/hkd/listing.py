@@ -34,7 +34,7 @@ def chosen_entries(entries: list[ToolEntry], names: list[str]) -> list[ToolEntry
 def chosen_with_own(
     entries: list[ToolEntry], names: list[str]
 ) -> tuple[list[ToolEntry], list[str]]:
-    """The named entries and the user's named tools; all of both if no name is given.
+    """The entries and the user's own tools that have these names; all of them without names.
 
     Raises:
         CatalogueError: a name is unknown.

@@ -3,7 +3,6 @@
 The server listens on 127.0.0.1 only, and speaks JSON and PNG:
 
 - `GET /` is the page, one file of HTML and JavaScript,
-- `GET /` is the page, one file of HTML and JavaScript,
 - `GET /steps` is the grid, the jaws, and each step's name and action,
 - `GET /steps/N/color.png` and `height.png` are o_t, one image pixel per grid pixel,
 - `POST /steps/N` with the content of an `action.json` writes it beside the frames.

@@ -52,10 +52,10 @@ class BenchPolicy(Protocol):
         ...
 
     def check_grid(self, grid: PixelGrid) -> None:
-        """Checks that it supports observations of this grid.
+        """Checks that the policy supports observations of this grid.
 
         Raises:
-            UserError: it does not.
+            UserError: the policy does not.
         """
         ...
 
@@ -81,7 +81,7 @@ class ShapeMatchingDecider:
         return "shape_matching"
 
     def check_grid(self, grid: PixelGrid) -> None:
-        """It supports any grid."""
+        """Does nothing: shape matching supports every grid."""
 
     def choose(self, observation: Observation, failed_picks: Sequence[PlanarPose] = ()) -> Choice:
         policy = make_shape_matching(self.parameters, recover=self.recover)

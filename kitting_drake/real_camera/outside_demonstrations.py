@@ -172,7 +172,7 @@ def convert(folder: Path, calibration: Calibration, learning: Learning, path: Pa
         scenario={
             "task": TASK,
             "calibration": calibration_record(calibration),
-            # With the frames, which determine the seeds, these determine the content.
+            # The seeds identify the frames, and this digest the actions: together all the content.
             "actions": hashlib.sha256(json.dumps(actions).encode()).hexdigest(),
         },
         grid=calibration.grid,
@@ -236,6 +236,8 @@ def _update(digest: hashlib._Hash, frames: dict[str, Frame]) -> None:
 
 
 def _seed(digest: bytes) -> int:
-    """A seed derived from a demonstration's frames. By it `train` notices that training and
-    validation share a demonstration."""
+    """A seed derived from a demonstration's frames.
+
+    `train` compares seeds to find demonstrations that training and validation share.
+    """
     return _FIRST_SEED + int.from_bytes(digest[:8], "big") % (2**32 - _FIRST_SEED)

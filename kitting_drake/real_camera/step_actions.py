@@ -76,7 +76,7 @@ def parse_action(record: Any, grid: PixelGrid, where: str) -> StepAction:
     if record.get("stop", False):
         return StepAction(PickPlaceAction(stop=True), **known)
     if record.get("press", False):
-        raise UserError(f"{where} presses down instead of picking and placing: leave it out")
+        raise UserError(f"{where} presses down instead of picking and placing: leave this step out")
     pick, place = (_pose(record.get(name), grid, f"{where}: {name}") for name in ("pick", "place"))
     return StepAction(PickPlaceAction(pick, place), **known)
 

@@ -163,8 +163,8 @@ def _check_depth(frame: Frame, camera: BenchCamera, grid: PixelGrid) -> None:
             _check_limits(depth[returned], camera)
             return
         raise UserError(
-            f"by its pose camera {camera.name} sees no table: half of its depths are from "
-            f"{low:.2f} to {high:.2f} times that of the table: check the pose (or is it the "
+            f"camera {camera.name} sees no table where it should be by the camera's pose: half of "
+            f"the depths are {low:.2f} to {high:.2f} times the table's: check the pose (is it the "
             "inverse, that of the base in the camera?)"
         )
     found = float(np.median(depth[returned]))

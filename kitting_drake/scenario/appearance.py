@@ -54,7 +54,7 @@ class Appearance:
     # patterns match a surface, the last one wins.
     paints: dict[str, Paint] = dc.field(default_factory=dict)
 
-    # Share of a surface's pixels without depth, 0 to 1, by the same patterns.
+    # The share, 0 to 1, of a surface's pixels that have no depth. The keys are patterns as above.
     sheen: dict[str, float] = dc.field(default_factory=dict)
 
     # If empty, a light at each camera.

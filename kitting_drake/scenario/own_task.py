@@ -56,4 +56,4 @@ def _default(kind: type[TaskConfig]) -> TaskConfig:
     try:
         return kind()
     except TypeError as error:
-        raise ValueError(f"task.class: its fields all need defaults ({error})") from error
+        raise ValueError(f"task.class: all its fields need defaults ({error})") from error

@@ -56,7 +56,7 @@ from systems.signals import Observation, PixelGrid
 _TOOLS_A_BATCH = 12
 _TOOLSETS_A_BATCH = 10
 _SCENES_A_TOOLSET = 4
-"""At most; a toolset is left out if there is no room for it."""
+"""The most scenes of a toolset. A toolset is left out if there is no room for it."""
 
 _COUNTS = np.array([2, 4, 8, 24, 8, 6, 4, 2, 2, 1, 1, 1], float)
 """Relative frequencies of kits with 1, 2, ... 12 tools; four is most frequent."""
@@ -179,7 +179,7 @@ def _draw_scene(
 
 
 def _draw_loose(count: int, rng: np.random.Generator) -> list[int]:
-    """Draws which of so many tools are loose."""
+    """Draws which of `count` tools are loose; the others are seated."""
     order = rng.permutation(count)
     seated = int(rng.integers(0, count + 1))
     if rng.random() < 0.5:

@@ -161,7 +161,7 @@ class TaskConfig:
 
     @property
     def title(self) -> str:
-        """The task's name in results: that of the literature only if all parameters are default."""
+        """The task's name in results: the literature's if all parameters are default."""
         raise NotImplementedError
 
     @property

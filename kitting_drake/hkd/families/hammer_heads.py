@@ -91,7 +91,7 @@ def build_head(
     back: HeadEnd,
     material: str,
 ) -> list[Part]:
-    """The parts of a head with its eye at the origin: tips first, then the steel."""
+    """The parts of a head with its eye at the origin: the tips first, then the steel body."""
     half = cheek_length / 2
     cheeks = head_loft(
         [

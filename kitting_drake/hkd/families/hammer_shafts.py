@@ -34,7 +34,7 @@ class Shaft:
     # Corners of a section: 0 is square, 1 is round; `octagonal` makes them flat.
     roundness: float = 0.55
     octagonal: bool = False
-    # How far the middle line bows toward the face, and the end back from there.
+    # How far the middle line bows toward the face, and how far the end bows back from there.
     bow_mm: float = 0.0
     # The number of grooves in the grip.
     ribs: int = 7

@@ -17,7 +17,7 @@ Line = list[tuple[float, float]]
 class Jaws:
     """A pair of jaws. Lengths in mm of the full-size tool with the rivet at the origin."""
 
-    # A key of OUTLINES, and that of the lower jaw (empty: the same).
+    # The shape of the upper jaw, a key of OUTLINES, and that of the lower jaw (empty: the same).
     kind: str = "combination"
     lower_kind: str = ""
     length_mm: float = 46.0

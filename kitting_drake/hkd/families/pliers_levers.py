@@ -238,8 +238,9 @@ def slab_hulls(
 ) -> list[np.ndarray]:
     """Few convex prisms for a plate with a bevelled lower rim; holes and gaps are filled.
 
-    The profile is cut across x into bands as long as possible: the hulls of a band's pieces stay
-    within the tolerance (mm). At the gripped flanks (x start, x end, y) they stay within 0.05 mm.
+    The profile is cut across x into bands. Each is as long as it can be while the hulls of its
+    pieces exceed the profile by less than the tolerance (mm), or 0.05 mm at the gripped flanks
+    (x start, x end, y).
     """
 
     def grown(p: CrossSection, d: float) -> CrossSection:

@@ -136,7 +136,7 @@ def build_locking(k: Locking) -> list[Part]:
         )
     ]
 
-    # The hulls are one slab for all flat parts, as thick as the body.
+    # All flat parts but the jaws share the hulls of one slab, which is as thick as the body.
     def together(*names: str) -> CrossSection:
         profiles = [
             CrossSection([outlines[name]]) + CrossSection([outlines[name][::-1]]) for name in names

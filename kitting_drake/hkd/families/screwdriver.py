@@ -95,7 +95,7 @@ def _shaft_parts(p: ScrewdriverParameters) -> list[Part]:
             p.tip_width_mm,
         )
     else:
-        raise ValueError(f"no screwdriver tip is called {p.tip!r}, only flat, {', '.join(TIPS)}")
+        raise ValueError(f"the tip must be one of flat, {', '.join(TIPS)}, not {p.tip!r}")
     parts = [Part("shaft", p.shaft_material, shaft.solid, shaft.hulls)]
     if p.sleeve_diameter_mm > 0:
         end = p.shaft_length_mm - p.bare_mm

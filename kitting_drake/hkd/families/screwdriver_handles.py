@@ -246,7 +246,9 @@ def handle(
         ValueError: the style is not known.
     """
     if style not in STYLES:
-        raise ValueError(f"no handle is called {style!r}, only {', '.join(STYLES)}")
+        raise ValueError(
+            f"the handle must be one of fluted, tee, offset, {', '.join(STYLES)}, not {style!r}"
+        )
     section, zones = STYLES[style]
     result = []
     for zone in zones:

@@ -63,7 +63,7 @@ def head_shape(head: Head, x: float, heading_deg: float, bevel_mm: float) -> Hea
         ValueError: the kind of head is not known.
     """
     if head.kind not in _KINDS:
-        raise ValueError(f"no wrench head is called {head.kind!r}, only {', '.join(_KINDS)}")
+        raise ValueError(f"the head must be one of {', '.join(_KINDS)}, not {head.kind!r}")
     return _KINDS[head.kind](head, x, heading_deg + head.angle_deg, bevel_mm)
 
 

@@ -32,7 +32,8 @@ NARROWEST = 0.003
 RELEASE_REACH = PLANNER.release_clearance + FINGERTIP_DEPTH
 """The reach of the fingertips beyond the gripped faces when they release."""
 
-# Surface that stands back by less than this touches a pad, in the fine and the coarse search.
+# A pad touches the surface that lies less than this behind the foremost surface: in the fine search
+# and in the coarse one.
 _TOUCH = 0.0003
 _COARSE_TOUCH = 0.0008
 # The hand's upper fingers are set back from its pads by this much.
@@ -211,7 +212,7 @@ def _search(
 ) -> list[GraspProposal]:
     """The acceptable grasps at one rotation of the hand, along the whole tool or close to `near`.
 
-    Surface that stands back by less than `touch` counts as touched.
+    A pad touches the surface that lies less than `touch` behind the foremost surface.
     """
     reach = _reach(points, level, levels, theta)
     first, last = _FINGER_COLUMNS, len(reach.left) - _FINGER_COLUMNS
@@ -272,15 +273,15 @@ def _proposal(
 def _hold(
     reach: _Reach, centre: int, levels: Array, touch: float, planner: PickPlaceParameters
 ) -> _Hold | None:
-    """The hold of two pads with their middle at a column; None if they cannot hold the tool.
+    """How two pads hold the tool when they are centred on a column; None if they cannot.
 
-    `find_grip` measures only the extent between the pads; this also measures their contact.
+    `find_grip` measures only the distance between the pads; this also measures their contact.
 
     Args:
         reach: of the tool.
-        centre: the column whose lower edge is at the middle of the pads.
+        centre: the pads' middle is at the lower edge of this column.
         levels: the heights of the slices.
-        touch: surface that stands back by less than this counts as touched.
+        touch: a pad touches the surface that lies less than this behind the foremost surface.
         planner: gives the pads' depth and their clearance to the table.
     """
     fingers = slice(centre - _FINGER_COLUMNS, centre + _FINGER_COLUMNS)
@@ -331,7 +332,12 @@ def _hold(
 
 
 def _lean(profile: Array, step: float) -> float:
-    """The inward lean of a face, in radians, at a pad's lower edge, from its reach by level."""
+    """By how much a face leans inward at a pad's lower edge, in radians.
+
+    Args:
+        profile: how far the face reaches out at each level, from the lowest one up.
+        step: the distance of the levels, in metres.
+    """
     above = min(2, len(profile) - 1)
     if above == 0 or profile.argmax() > 0 or not np.isfinite(profile[above]):
         return 0.0

@@ -26,8 +26,8 @@ OUTLINE_TOLERANCES_MM = ((0.26, 0.12), (0.30, 0.2), (0.4, 0.2), (0.6, 0.3), (0.9
 Each pair is tried if the one before needs too many hulls."""
 ADDED_SHARE = 0.05
 """The share of the tool's volume that one hull may add above and below the tool."""
-# Vertices are thinned at the first tolerance that leaves this many, or at the last one. The outline
-# has its own tolerance.
+# Vertices are thinned at the first tolerance that leaves at most this many, or at the last one. The
+# outline has its own tolerance.
 _MOST_VERTICES = 20
 _VERTEX_TOLERANCES_MM = (0.2, 0.3, 0.45, 0.6)
 _OUTLINE_VERTEX_TOLERANCE_MM = 0.08
@@ -132,7 +132,7 @@ def _halves(part: Manifold) -> tuple[Manifold, Manifold]:
             normal = np.eye(3)[axis]
             halves = part.split_by_plane(tuple(normal), low[axis] + share * size[axis])
             volume = sum(half.hull().volume() for half in halves)
-            # Prefer the middle of equal cuts, which leaves the smallest parts.
+            # Of cuts that are equally good, prefer the one nearest to the middle.
             volume *= 1.0 + 0.02 * abs(share - 0.5)
             if volume < best_volume:
                 best, best_volume = halves, volume

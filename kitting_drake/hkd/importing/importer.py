@@ -65,8 +65,8 @@ _MOST_WAITING = 10.0
 _MAKING = ".making-"
 """The prefix of the folders of unfinished tools."""
 _MOST_MEMORY = 12 * 2**30
-# A tool that comes to rest tilted by more than this, in degrees, is laid again that way, at most
-# this many times.
+# A tool that comes to rest tilted by more than `_SAME_POSE_DEG` is moved to that pose and dropped
+# again, at most `_LAYINGS` times.
 _SAME_POSE_DEG, _LAYINGS = 2.0, 3
 # A tool that tips over when the table tilts by this, in degrees, is not stable.
 _TIPS_DEG = 10.0
@@ -307,7 +307,8 @@ def _prepare(request: ImportRequest, name: str, directory: Path) -> Prepared:
     if drawn:
         if tipping_deg(solid) < _TIPS_DEG:
             raise UserError(
-                f"{request.height_mm:g} mm high, it falls over: draw it from above, as it lies"
+                f"the tool is {request.height_mm:g} mm high and would tip over: draw it from "
+                "above, as it lies at rest"
             )
         lengths = [length]
         assumed = f"an outline, {length:.0f} mm long and extruded to {request.height_mm:g} mm"

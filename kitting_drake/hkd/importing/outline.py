@@ -140,9 +140,10 @@ def _svg_curves(path: Path) -> list[Curve]:
 
 
 def _settle_size(root: ElementTree.Element) -> tuple[float, float]:
-    """Completes the root's size; returns the viewBox's size in pixels, for a root without one.
+    """Completes the width and height of the root element; returns the viewBox's size in pixels.
 
-    If the root has only one of them, it gets the other by the viewBox's aspect ratio.
+    A root that has only one of the two gets the other from the viewBox's aspect ratio. A root that
+    has neither has the returned size.
     """
     box = root.get("viewBox", "0 0 1000 1000").replace(",", " ").split()
     sides = {"width": float(box[2]), "height": float(box[3])}

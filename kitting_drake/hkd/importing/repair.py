@@ -31,8 +31,8 @@ _GAP_MM, _DIRT = 1.5, 0.02
 _LOST = 0.03
 # The size of a pixel of the compared projections.
 _PIXEL_MM = 0.5
-# A larger share of added surface is reported. It is sampled at this many points, and those further
-# than this (mm) from the given surface count as added.
+# If repair adds more than this share of surface, it is reported. The repaired surface is sampled at
+# `_PROBES` points; one that is further than `_AWAY_MM` from the given surface counts as added.
 _TELLING, _AWAY_MM, _PROBES = 0.03, 1.5, 20_000
 _MOST_COMPONENTS = 3000
 _VOXEL_MM = 0.75

@@ -15,7 +15,8 @@ Array = NDArray[np.float64]
 # Stable poses whose centres of mass are this close to the lowest count as equal. The one with the
 # broadest support, rounded to this step, is chosen. Both are for a solid about 180 mm long.
 _EQUAL_HEIGHT_MM, _MARGIN_STEP_MM = 0.3, 0.5
-# The largest angle between the length and the axis of least inertia, and the spread of a vote.
+# The largest angle between the length and the axis of least inertia, and the standard deviation of
+# the angle at which an edge still votes for a direction.
 _SIDEWAYS_DEG, _LIKE_DEG = 25.0, 6.0
 _END = 0.3
 """The share of the length that counts as an end."""

@@ -156,7 +156,7 @@ def build_block(cavities: Sequence[Cavity], parameters: KitParameters) -> Manifo
 def _add_floor(surface: _Surface, cavity: Cavity, cavities: Sequence[Cavity]) -> None:
     """Adds a cavity's floor as its bounding rectangle, minus other cavities at least as deep.
 
-    Inside those, the rectangle would be a shelf or a second floor.
+    Inside those other cavities the rectangle would be a shelf or a second floor.
     """
     x_min, y_min, x_max, y_max = cavity.outline.bounds()
     corners = np.array([(x_min, y_min), (x_max, y_min), (x_max, y_max), (x_min, y_max)])

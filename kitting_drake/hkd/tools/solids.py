@@ -192,8 +192,8 @@ def plate(
 ) -> Shape:
     """A plate between two heights with its outer edges bevelled at 45 degrees.
 
-    Holes have plain edges and do not appear in the hulls. Each of `cells` gives one hull, of the
-    profile inside it; without cells, each triangle of a triangulation does.
+    Holes have plain edges and do not appear in the hulls. There is one hull for the part of the
+    profile in each of `cells`, or without cells for each triangle of a triangulation.
     """
     if isinstance(profile, np.ndarray):
         profile = CrossSection([profile])

@@ -117,7 +117,8 @@ def _surface_distance(triangles: NDArray[np.float64], order: int, start: Shift) 
     c, s = np.cos(2 * np.pi / order), np.sin(2 * np.pi / order)
     R = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
 
-    # From the copy to the original and back; both are equal for a half turn.
+    # The mean of two directions: from the copy to the original, and from the original to the copy.
+    # For a half turn they are equal.
     def mean_distance(shift: Shift) -> float:
         offset = np.append(shift, 0.0)
         there = tree.query(points @ R.T + offset)[0].mean()

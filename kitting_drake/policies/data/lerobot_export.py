@@ -72,7 +72,7 @@ def require_export(folder: Path) -> None:
     """
     require_pyarrow()
     if folder.exists():
-        raise UserError(f"{folder} exists and would lack the new demonstrations: delete it")
+        raise UserError(f"{folder} already exists, without the new demonstrations: delete it")
 
 
 def export_lerobot(

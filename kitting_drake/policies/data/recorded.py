@@ -45,7 +45,7 @@ class Stored:
         try:
             values = self.file[self.dataset][() if self.row is None else self.row]
         except (OSError, LookupError, RuntimeError) as error:
-            raise UserError(f"cannot reread {self.dataset} of its file: {error}") from error
+            raise UserError(f"cannot read {self.dataset} from its file again: {error}") from error
         return np.asarray(values, dtype)
 
 

@@ -161,8 +161,13 @@ def preference(
 
 
 def _compared(outline: Outline, recess: Outline, fit: Registration) -> tuple[Array, Array]:
-    """(p,) each: the recess's signed distances at the fitted points of an object's outline, without
-    the offset, and their difference from the object's own."""
+    """Compares an object's outline, fitted to a recess, with that recess.
+
+    Returns:
+        (p,): the recess's signed distances at the fitted points of the object's outline, less the
+            offset of the outlines.
+        (p,): the same, less the signed distances of the object's own outline.
+    """
     there, offset = _brought(outline, recess, fit)
     return there - offset, there - offset - outline.values
 

@@ -352,7 +352,7 @@ class SO2Networks(FactoredNetworks):
 
 
 def within_image(sample: LabelledImage) -> LabelledImage:
-    """The sample without other picks outside the image."""
+    """The sample without those of its `other_picks` that lie outside the image."""
     rows, cols = sample.image.shape[1:]
     picks = sample.other_picks
     inside = ((picks >= 0) & (picks <= (rows - 1, cols - 1))).all(axis=1)

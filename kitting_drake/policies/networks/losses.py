@@ -75,7 +75,7 @@ def log_odds(logits: Tensor, orientations: int = 1) -> Tensor:
 
     Args:
         logits: of all actions: (rows, cols), or (orientations, rows, cols) for a joint prediction.
-        orientations: the number of orientations in `logits`, which the odds do not depend on.
+        orientations: the number of orientations in `logits`; the odds are corrected for it.
     """
     return logits.flatten().logsumexp(0) - math.log(orientations) - NOTHING_LOGIT
 

@@ -84,8 +84,8 @@ class Trainer:
             decay: let the learning rate decay to zero (`decayed`) instead of keeping it constant.
             curvature: see `augment`.
             reflection: see `augment`.
-            only: the single loss to train; other modules keep their weights. Its steps equal those
-                of a full training. None for all losses.
+            only: the single loss to train, while other modules keep their weights; None trains all.
+                The steps of the loss are those of a full training.
         """
         self.networks = networks
         self.seed = seed

@@ -93,7 +93,7 @@ def validate(
     """Validates a policy on scenes with something to pick, and on final observations.
 
     Args:
-        policy: may or may not have a stop threshold; it is ignored.
+        policy: the policy; its stop threshold, if it has one, is ignored.
         scenes: at least one.
         finals: observations with nothing left to pick; empty if the networks cannot stop.
 
@@ -101,8 +101,8 @@ def validate(
         - `median_...` and `p95_...` for each of `ERRORS`: its median and 95th percentile;
         - `displacement_mm`: the mean displacement;
         - `cost_mm`, by which a checkpoint is chosen if the expert's action is the only right one:
-          the mean displacement over all scenes and final observations. A wrong stop decision counts
-          20 mm, a final observation with a right one 0.
+          the mean displacement over all scenes and final observations. A wrong decision to stop or
+          to go on counts 20 mm, and a right one on a final observation counts 0.
 
         With final observations also:
 

@@ -63,6 +63,7 @@ def see_block(
     and the moments of the areas that they cover give the centre, direction and sides without bias.
     Visible walls add a strip as high as the band of depths around the top; its width is computed
     and subtracted. Recesses within the outline do not matter, but notches in it do.
+
     Args:
         points: (height, width, 3) in the base frame, as `table_points` gives them.
         camera: the camera.

@@ -132,7 +132,10 @@ def _episode(seed: int, orientations: int | None) -> _Witness:
 
 
 def _row(seed: int, witness: _Witness, release: Release, X_WB: RigidTransform) -> dict[str, Any]:
-    """Compares a placement in Drake with X_WB in MuJoCo, scored among the final poses in Drake."""
+    """Compares a placement in Drake with the object's pose X_WB in MuJoCo.
+
+    The latter is scored with all other objects at their final poses in Drake.
+    """
     station, index = release.station, release.index
     poses = list(witness.final_poses)
     poses[index] = X_WB

@@ -65,7 +65,7 @@ def benchmark_simulation(episodes: int, seed: int, console: Console) -> dict[str
 def _whole_episodes(
     path: Path, episodes: int, seed: int, stopwatch: "PhaseStopwatch", console: Console
 ) -> dict[str, Any]:
-    """Runs whole episodes and returns their cost per kitted object, without building."""
+    """Runs whole episodes; returns the cost per kitted object, without building the stations."""
     scenario = load_scenario(path)
     simulated = wall = kitted = 0.0
     for number in track(

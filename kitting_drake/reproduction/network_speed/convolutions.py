@@ -32,7 +32,7 @@ class _Outline(NamedTuple):
         return cls(tuple(tensor.shape), tensor.dtype, channels_last)
 
     def filled(self, device: torch.device) -> Tensor:
-        """A tensor of random numbers with this outline."""
+        """A tensor of random numbers of this shape, type and memory format."""
         tensor = torch.randn(self.shape, device=device).to(self.type)
         return (
             tensor.contiguous(memory_format=torch.channels_last) if self.channels_last else tensor
@@ -57,7 +57,7 @@ class Convolutions:
         return cls(recorder.calls)
 
     def alone(self, device: torch.device) -> dict[Any, Callable[[], object]]:
-        """A function for each key of `calls`, which computes it once on random numbers."""
+        """For each key of `calls`, a function that computes it once on random numbers."""
         return {call: _replay(*call, device) for call in self.calls}
 
     def seconds(self, timings: dict[Any, Timing]) -> float:

@@ -27,7 +27,7 @@ _RUNGS = {
 _BARRED = ("training_step", "decision")
 """The measures that have bars; the tables have them all."""
 _COLUMNS = 6
-"""Of the mosaic: it is divided among the presets."""
+"""The number of columns of the mosaic of panels, divided among the presets."""
 _STYLE = {
     "font.size": 12.0,
     "axes.edgecolor": "0.5",

@@ -19,10 +19,10 @@ _, _UNSEEN = PAPER_TASKS
 
 
 def pooled_section(runs: Sequence[Run]) -> list[str]:
-    """The section; empty without such a run.
+    """The section that pools, for each shipped policy, its runs with its default options.
 
-    It pools every run of the task by a shipped policy with its default options and the digest of
-    the shipped weights. No seed counts twice.
+    It is empty without such a run. Weights must have the digest of the shipped ones. No seed counts
+    twice.
 
     Args:
         runs: all reproducible runs that fill no cell.

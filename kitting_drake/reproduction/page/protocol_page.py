@@ -45,7 +45,7 @@ def protocol_page(
 
     Args:
         runs: from `read_runs`; there may be none of a task, or none at all.
-        link: the folder of the table of runs, from the page's own.
+        link: the path from the page's folder to that of the table of runs.
         cells: the sections of
             `kitting_drake.reproduction.paper.protocol_sections.protocol_sections`.
         set_aside: the runs that nobody can repeat, which are in no other table.
@@ -116,7 +116,7 @@ def _with_others(usual: Iterable[int], found: Iterable[int | None]) -> list[int]
 
 
 def _cell(runs: list[Run]) -> str:
-    # List all runs that differ only in their training: a choice would be flattering.
+    # List all runs that differ only in their training: a selection could flatter the policy.
     return (
         "<br>".join(
             f"{_strict(run.summary)} / {_own(run.summary)}, {run.summary['episodes']}{_marks(run)}"
@@ -145,7 +145,7 @@ def _own(summary: dict[str, Any]) -> str:
 def _most_tested_run(runs: list[Run]) -> list[str]:
     """Tables by category of the most tested network, or of the most tested run if there is none."""
     learned = [run for run in runs if run.method in LEARNED]
-    # Not the best: of few episodes, that is the luckiest.
+    # Not the best run, which may be the luckiest of those with few episodes.
     most = max(learned or runs, key=lambda run: (run.summary["episodes"], run.name))
     rows = [*most.summary["categories"].items(), ("all", most.summary)]
 

@@ -73,7 +73,7 @@ def ravens_section(runs: Sequence[Run]) -> list[str]:
     rows = []
     for (method, orientations, count), found in sorted(cells.items(), key=str):
         name = METHODS.get(method, method)
-        # Lists all of them: a choice would be flattering.
+        # List all runs: a selection could flatter the policy.
         values = ["<br>".join(found[task]) if task in found else "-" for task in TASKS]
         rows.append([name, str(orientations or ""), str(count or ""), *values])
     headings = ["method", "N", "demonstrations", *TASKS]

@@ -15,7 +15,7 @@ def results_page(
 
     Args:
         runs: those that fill no cell, from `cell_results`.
-        link: the folder of the table of runs, from the page's own.
+        link: the path from the page's folder to that of the table of runs.
         fresh: the sections of `kitting_drake.reproduction.paper.paper_sections.fresh_tools`.
         paper: the sections of `kitting_drake.reproduction.paper.paper_sections.paper_sections`.
     """

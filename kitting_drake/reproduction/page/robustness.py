@@ -30,9 +30,9 @@ _TRIES = 2
 _FRAMES = 5
 """The number of images that are averaged in further rows."""
 _SEEDS = range(2870, 2895)
-"""Those on which every policy meets every perturbation; unseen before their first run."""
+"""The seeds of all cells of the first table. They were unseen before their first run."""
 _FEWEST = 12
-"""The least number of these seeds, from the first, at levels other than moderate."""
+"""Levels other than moderate need at least this many of these seeds, counted from the first."""
 
 Key = tuple[str, str]
 """A row of the table and a method."""
@@ -42,8 +42,8 @@ def robustness_table(runs: Sequence[Run]) -> str:
     """Strict success on unseen toolsets, with two tries per tool and recovering policies.
 
     All runs of the first table use the same seeds. The second table has the other levels, on the
-    first of these seeds. The last table pools all seeds of cells that ran on further ones: a choice
-    among them would be flattering.
+    first of these seeds. The last table pools all seeds of cells that ran on further ones: a
+    selection could flatter the policy.
 
     Args:
         runs: all runs. Runs of other scenarios or with other weights than the shipped ones are
@@ -86,8 +86,9 @@ def robustness_table(runs: Sequence[Run]) -> str:
     needless = _needless_table(common, list(expected))
     if needless:
         parts.append(
-            "Actions in these runs on objects that have no cavity, such as boxes, of all actions. "
-            "Success rates do not\ninclude them:\n\n" + needless
+            "Some actions were on objects that have no cavity, such as boxes. The table shows how "
+            "many, of all\nactions in these runs. Success rates do not include these objects:\n\n"
+            + needless
         )
     if further:
         parts.append(

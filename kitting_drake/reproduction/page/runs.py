@@ -118,8 +118,11 @@ class Run:
 
     @cached_property
     def departures(self) -> list[str]:
-        """The fields in which its scenario differs, policy aside, from the paper's task or the
-        Ravens task of its kind. For other tasks: from the default scenario, task aside."""
+        """The fields in which the run's scenario differs from the expected one, without the policy.
+
+        Expected is the scenario of the paper's or the Ravens task of its kind. For any other task
+        it is the default scenario, and the task is not compared.
+        """
         found = self.summary["resolved_scenario"]
         for task in PAPER_TASKS.values():
             expected = described(Scenario(task=task))
@@ -133,8 +136,7 @@ class Run:
 
     @property
     def paper_task(self) -> str | None:
-        """The title of the paper's task, if the run differs from that in nothing but the
-        policy."""
+        """The title of the paper's task; None if more than the policy differs from it."""
         task = self.summary["task"]
         return task if task in PAPER_TASKS and not self.departures else None
 

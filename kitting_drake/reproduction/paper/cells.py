@@ -170,7 +170,7 @@ class Training:
 
     @property
     def steps(self) -> int:
-        """The number of steps: equal for all methods as in the paper, more with more labels."""
+        """The number of steps: the same for all methods, as in the paper; more with more labels."""
         task = TASKS[self.task]
         more = 0 if self.taken_only and self.rigid else task.more_steps
         return self.times * (task.steps + more)
@@ -198,7 +198,7 @@ class Training:
 
 
 def reference(training: Training) -> Training:
-    """The training that chooses the learning rate for a baseline; its own rate is open."""
+    """The training that chooses the learning rate of a baseline. It has no rate of its own yet."""
     return Training(TASKS[training.task].rates_from, training.method, 36, 100)
 
 
@@ -344,7 +344,7 @@ class Cell:
         elif training.method == "so2":
             wanted["learning_rate"] = LEARNING_RATES[0]
         if learned_at.table == "6":
-            # In the other tables the task itself determines these.
+            # For tasks of the other tables the task itself determines these two.
             wanted |= {"taken_only": training.taken_only, "rigid": training.rigid}
         return wanted
 

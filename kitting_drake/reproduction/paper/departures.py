@@ -45,7 +45,7 @@ _NOT_MEASURED = (
         "0.001 for ours, the best of three for others",
     ),
 )
-"""What departs, as in the paper and the original Ravens tasks, and here."""
+"""Rows of what departs: its name, how it is in the paper or in Ravens, and how it is here."""
 
 
 def departures(results: Mapping[str, Result]) -> str:
@@ -105,7 +105,7 @@ def departures(results: Mapping[str, Result]) -> str:
 def _compared(
     results: Mapping[str, Result], what: str, pairs: Mapping[str, tuple[str, str]]
 ) -> str:
-    """The differences in points by the paper's measure of the pairs that are there."""
+    """The differences of pairs of cells that have results, in points by the paper's measure."""
     found = []
     for label, (one, other) in pairs.items():
         if one in results and other in results:
@@ -116,7 +116,7 @@ def _compared(
 
 
 def _memory(results: Mapping[str, Result]) -> str:
-    """The share of actions that it can have changed, in kitting and on the Ravens tasks."""
+    """The share of actions that the memory of failed grasps can have changed, by kind of task."""
     parts = []
     for label, is_kitting in (("kitting", True), ("Ravens", False)):
         found = [

@@ -30,7 +30,7 @@ _ROWS = {
 }
 """The rows of table I, method and N, with their colours, for the colour-blind too, and markers."""
 _ROW_STEP = 0.19
-"""Between the markers of one number of demonstrations."""
+"""The distance between the markers of one number of demonstrations."""
 _STYLE = {
     "font.size": 13,
     "axes.edgecolor": "0.5",
@@ -108,9 +108,9 @@ def _draw_marker(
 def draw_table_1(results: Mapping[str, Result]) -> bytes:
     """Draws the mean reward of each Ravens task over the number of demonstrations, as a PNG.
 
-    A filled marker is measured, with its 95 % interval; a star is with what goes beyond the
-    paper; a hollow one is what the paper gives for the same cell. What was not run is not there,
-    nor is the paper's beside it; a task of which nothing was run has no panel.
+    A filled marker is our result with its 95 % interval, a star our result with extensions, and a
+    hollow marker the paper's figure for the same cell. Cells without a run are left out, with the
+    paper's figure for them. A task without a run has no panel.
 
     Args:
         results: by cell name.
@@ -155,7 +155,7 @@ def draw_table_1(results: Mapping[str, Result]) -> bytes:
 
 
 def _draw_task(axis: Axes, task: str, column: int, results: Mapping[str, Result]) -> None:
-    """The panel of a task: its cells, and the paper's beside those as in the paper."""
+    """The panel of a task: our cells, and the paper's figures beside those without extensions."""
     for index, ((method, n), (colour, marker)) in enumerate(_ROWS.items()):
         for place, count in enumerate(sorted(RAVENS_DEMONSTRATIONS)):
             where = place + _ROW_STEP * (index - (len(_ROWS) - 1) / 2)

@@ -99,8 +99,10 @@ def _patient() -> list[Cell]:
 
 
 def _faster() -> list[Cell]:
-    """SO(2) on the pyramid at the Equivariant Transporter's best learning rate there, because its
-    own is not tuned."""
+    """SO(2) on the pyramid, at the best learning rate of the Equivariant Transporter there.
+
+    SO(2)'s own learning rate is not tuned.
+    """
     own = (_paper_cell("stack_block_pyramid", "so2", n, 100) for n in (180, 36))
     return [
         dataclasses.replace(
@@ -117,7 +119,7 @@ def headline(task: str, method: str, seed: int) -> Cell:
 
 
 def _headline_seeds() -> list[Cell]:
-    """The cells of all seeds but the first, which figure 6 includes."""
+    """The cells of all seeds but the first. Figure 6 has those of the first."""
     return [
         headline(task, method, seed)
         for seed in HEADLINE_SEEDS[1:]
@@ -159,8 +161,11 @@ def _ablation() -> list[Cell]:
 
 
 def _every_chance() -> list[Cell]:
-    """The baselines at SO(2)'s share of the original's parameters, on tasks on which they score
-    lower. The Transporter also learns from more rotations per step, in more steps."""
+    """Cells that give the baselines every chance, on the tasks on which they score lower.
+
+    Their networks keep the same share of the originals' parameters as the SO(2) networks. The
+    Transporter also learns from more rotations per step, in more steps.
+    """
     trainings = [
         *(
             Training(

@@ -24,11 +24,11 @@ The preset `matched` is `small` with larger baselines: the Transporter keeps as 
 original's parameters as ours does, and the Equivariant Transporter's pick-angle network (beta) has
 as many as that of ours.
 
-The original figures of ours are those of the authors' code. For the Equivariant Transporter the
-paper gives 4.54 M for alpha, and the authors' pick-angle network has 0.90 M at N = {ORIENTATIONS};
-its phi and psi are the same U-net as alpha. The paper does not count the Transporter: its original
-is taken to be the preset `paper` here, with the published widths of ResNets of 43 layers. The
-shares of both baselines are of the preset `paper`.
+The originals are counted as follows. Our method: the authors' code. The Equivariant Transporter:
+the paper gives 4.54 M for alpha, and phi and psi are the same U-net; the authors' pick-angle
+network has 0.90 M at N = {ORIENTATIONS}. The Transporter: the paper does not count it, so its
+original is the preset `paper` here, with the published widths of ResNets of 43 layers. The shares
+of both baselines refer to the preset `paper`.
 """
 
 

@@ -79,7 +79,7 @@ def protocol_sections(
 
 def _rates_text(rates: Rates) -> str:
     if not rates:
-        return f"The learning rate of ours is {LEARNING_RATES[0]:g}.\n"
+        return f"Our method learns with the rate {LEARNING_RATES[0]:g}.\n"
     parts = []
     for training in _baselines():
         costs = rates.get(rates_key(training))
@@ -99,7 +99,7 @@ def _rates_text(rates: Rates) -> str:
 
 
 def _baselines() -> list[Training]:
-    """The trainings of `reference`: of each baseline on each task that chooses its rate."""
+    """The trainings that choose the learning rates: each baseline on each task of `rates_from`."""
     tasks = dict.fromkeys(task.rates_from for task in TASKS.values())
     return [Training(task, method, 36, 100) for method in LEARNED[1:] for task in tasks]
 

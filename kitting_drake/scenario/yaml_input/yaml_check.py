@@ -81,7 +81,7 @@ def _check_dataclass(schema: Any, value: Any, where: str) -> None:
     if not isinstance(value, dict):
         raise ValueError(f"{where or 'the scenario'} must be a mapping, not {_shown(value)}")
     types_by_name = typing.get_type_hints(schema)
-    # A class may annotate what is no field.
+    # A class may also annotate attributes that are not fields.
     hints = {item.name: types_by_name[item.name] for item in dataclasses.fields(schema)}
     _check_names(hints, value, where)
     for key, item in value.items():

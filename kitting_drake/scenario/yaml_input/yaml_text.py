@@ -27,8 +27,10 @@ _Dumper.add_representer(dict, _represent_tagged)
 
 
 def dumped(raw: dict) -> str:
-    """The YAML of a mapping, in its order: of paints the later one wins. Drake's `yaml_dump` sorts
-    it."""
+    """The YAML of a mapping in its own order, which matters for paints: the last match wins.
+
+    Drake's `yaml_dump` would sort it.
+    """
     return yaml.dump(raw, Dumper=_Dumper, sort_keys=False)
 
 
@@ -46,7 +48,7 @@ def parse(content: str, where: str) -> dict:
         # A Python mapping swallows a field that is given twice.
         node = yaml.compose(content, Loader=yaml.SafeLoader)
         _check_names(node)
-        # It would be dropped without a word.
+        # Drake's loader would drop such a tag without a warning.
         if isinstance(node, yaml.MappingNode) and node.tag != "tag:yaml.org,2002:map":
             raise ValueError(f"the tag {node.tag} at the beginning means nothing there")
         # Drake takes an empty text for no text at all.
@@ -59,7 +61,7 @@ def parse(content: str, where: str) -> dict:
     except ValueError as error:
         raise UserError(f"{where}: {error}") from error
     except RecursionError as error:
-        raise UserError(f"{where} is not YAML that ends: it contains itself") from error
+        raise UserError(f"{where} is endless: an alias in it contains itself") from error
     if root is None:
         return {}
     if not isinstance(root, dict):

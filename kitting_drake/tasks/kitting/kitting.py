@@ -213,7 +213,7 @@ class ToolsetKitting(_DrawnKitting):
         if self.split not in SPLITS:
             raise ValueError(f"task.split must be one of {', '.join(SPLITS)}, not '{self.split}'")
         if self.tool_length[0] > self.tool_length[1]:
-            raise ValueError("task.tool_length must be [least, greatest] length")
+            raise ValueError("task.tool_length must be [least, greatest]")
 
 
 @dataclass

@@ -1,4 +1,4 @@
-"""align-box-corner: put a box of any size with a corner into a marker on the table."""
+"""align-box-corner: put a corner of a box of random size into an L-shaped marker on the table."""
 
 import math
 from dataclasses import dataclass

@@ -108,7 +108,7 @@ def _cubes(
 
 
 def _others(excluded: str, count: int, rng: np.random.Generator) -> list[str]:
-    """Colour names without one, cycled through all before any repeats."""
+    """Colour names without `excluded`, in random order. They repeat once all have been used."""
     names = [name for name in COLOURS if name != excluded]
     rng.shuffle(names)
     return [names[index % len(names)] for index in range(count)]

@@ -68,10 +68,9 @@ class RavensTask(TaskConfig):
 class PoseTask(RavensTask):
     """A task whose objects must come to rest in given poses."""
 
-    # An object is in place within this horizontal distance of its goal, in m ...
+    # An object is in place if its horizontal distance from its goal is below this, in m, and if the
+    # difference of headings, modulo the object's symmetry, is below the second, in degrees.
     position_threshold: float = bounded(0.01, 1e-4, 0.5)
-
-    # ... and this heading difference, modulo the object's symmetry, in degrees.
     angle_threshold_deg: float = bounded(15.0, 0.1, 180.0)
 
     @property

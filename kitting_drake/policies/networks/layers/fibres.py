@@ -101,7 +101,7 @@ class Irreps:
 
     def invariant(self) -> NDArray[np.float64]:
         if not self.samples:
-            raise ValueError("invariant() needs samples: a field of coefficients stores it first")
+            raise ValueError("invariant() needs samples: give the fibre a number of samples")
         return np.full(self.samples, math.sqrt(self.size) / self.samples)
 
 

@@ -246,8 +246,8 @@ def frequencies_cutoff(in_fibre: Fibre, out_fibre: Fibre, size: int) -> float | 
     """The largest angular frequency of the kernels on a ring of pixels, per pixel of its radius.
 
     A kernel of angular frequency k maps rho_i to rho_j with j up to i + k. With escnn's own limit
-    the highest output frequencies could always be zero. The limit is then raised to what they need
-    on the outermost ring, because any higher frequency would alias on the pixels.
+    the highest output frequencies may be out of reach, so that they are always zero. The limit is
+    then raised to what they need on the outermost ring: higher frequencies would alias there.
 
     Returns:
         The limit; None for escnn's own.
@@ -308,7 +308,8 @@ class InvariantPart(nn.Module):
 def _of_several_fields(matrix: NDArray[np.float64], fields: int) -> Tensor:
     """The block-diagonal matrix that applies a matrix to each of several fields.
 
-    Despite its zeros, a product with about 64 channels takes half as long as one with eight.
+    It combines about 64 channels. Although it is mostly zeros, this takes half as long as products
+    with eight channels each.
     """
     together = math.gcd(fields, max(_TOGETHER // len(matrix), 1))
     blocks = np.kron(np.eye(together), matrix)
