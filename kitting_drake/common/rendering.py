@@ -69,6 +69,10 @@ def _load_triton() -> None:
     Both bring an LLVM. PyTorch imports Triton with the first optimizer; after Mesa's LLVM (software
     rendering) this import crashes, but the reverse order works.
     """
+    with contextlib.suppress(OSError):
+        if b"libLLVM" in Path("/proc/self/maps").read_bytes():
+            # Someone else has rendered before: loading Triton now would crash at once.
+            return
     package = importlib.util.find_spec("triton")
     for folder in (package and package.submodule_search_locations) or ():
         for library in Path(folder, "_C").glob("libtriton*.so"):
