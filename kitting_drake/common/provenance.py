@@ -74,6 +74,20 @@ def uncommitted_note() -> str | None:
     )
 
 
+def source_files(name: str) -> tuple[Path, list[Path]]:
+    """The folder and the Python files of a module, or of a package with its submodules.
+
+    Raises:
+        ImportError: there is no such package or module.
+    """
+    spec = importlib.util.find_spec(name)
+    if spec is None or spec.origin is None:
+        raise ImportError(f"there is no package or module {name}")
+    root = Path(spec.origin).parent
+    is_package = spec.submodule_search_locations is not None
+    return root, sorted(root.rglob("*.py")) if is_package else [Path(spec.origin)]
+
+
 def source_digest(*names: str) -> str:
     """A digest of the Python sources of packages and modules.
 
@@ -82,12 +96,8 @@ def source_digest(*names: str) -> str:
     """
     digest = hashlib.sha256()
     for name in names:
-        spec = importlib.util.find_spec(name)
-        if spec is None or spec.origin is None:
-            raise ImportError(f"there is no package or module {name}")
-        root = Path(spec.origin).parent
-        is_package = spec.submodule_search_locations is not None
-        for path in sorted(root.rglob("*.py")) if is_package else [Path(spec.origin)]:
+        root, files = source_files(name)
+        for path in files:
             digest.update(path.relative_to(root).as_posix().encode())
             digest.update(hashlib.sha256(path.read_bytes()).digest())
     return digest.hexdigest()[:16]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -10,7 +9,8 @@ from pathlib import Path
 from pydrake.math import RigidTransform
 
 from kitting_drake.common.errors import UserError
-from kitting_drake.common.own_modules import files_beside, import_own, modules_beside
+from kitting_drake.common.own_modules import files_beside, import_own
+from kitting_drake.common.provenance import source_files
 from kitting_drake.policies.data.learning import Learning
 from kitting_drake.tasks.task import ActionRecord, Scene, TaskConfig
 from systems.placement import Placement
@@ -105,13 +105,10 @@ class PythonTask(TaskConfig):
         module = self.modules()[0]
         if beside := files_beside(module, base):
             return beside
-        with modules_beside(base):
-            spec = importlib.util.find_spec(module.partition(".")[0])
-        if spec is None or spec.origin is None:
-            raise UserError(f"task.class: there is no file of the module {module}")
-        folders = spec.submodule_search_locations or []
-        files = [path for folder in folders for path in sorted(Path(folder).rglob("*.py"))]
-        return files or [Path(spec.origin)]
+        try:
+            return source_files(module.partition(".")[0])[1]
+        except ImportError as error:
+            raise UserError(f"task.class: {error}") from error
 
     # Pickled by class name and fields, because its module may exist only beside the scenario.
 
