@@ -13,7 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from systems.signals import Observation, PixelGrid
+from systems.table_plane import level
 
+_DEEPEST = 0.05
+"""Points farther than this below `grid.z_min` are ignored, in metres."""
+_ROUNDING = 1e-5
+"""Heights are computed to better than this, in metres."""
 SAME_SURFACE = 0.01
 """Heights that differ by less than this belong to one surface, in metres."""
 
@@ -78,20 +83,55 @@ class View(NamedTuple):
     rays: DepthRays
 
 
-def project(views: Sequence[View], grid: PixelGrid) -> Observation:
+def project(
+    views: Sequence[View], grid: PixelGrid, region: NDArray[np.bool_] | None = None
+) -> Observation:
     """Computes o_t as `HeightmapProjector` documents.
 
     Args:
         views: one for each camera, at least one.
         grid: the pixels of the heightmap.
+        region: (rows, cols), the pixels of interest; None for all. The others count as out of
+            view.
     """
+    in_view = np.any([looks_at(view, grid) for view in views], axis=0)
     image, valid = _fuse(np.stack([_see(view, grid) for view in views]))
-    image.flags.writeable = valid.flags.writeable = False
-    return Observation(image=image, grid=grid, valid=valid)
+    if region is not None:
+        in_view &= region
+        valid &= region
+    image[3], table = level(image[3], valid & in_view, grid.resolution)
+    image[:3, ~valid] = 0
+    image[3] = np.where(valid, np.maximum(image[3], 0), 0)
+    _bridge_gaps(image, valid)
+    if region is not None:
+        image[:, ~region] = 0
+        valid &= region
+    for array in (image, valid, in_view):
+        array.flags.writeable = False
+    return Observation(image=image, grid=grid, valid=valid, in_view=in_view, table=table)
+
+
+def looks_at(view: View, grid: PixelGrid) -> NDArray[np.bool_]:
+    """(rows, cols): the pixels that are in a camera's image at the height of the table."""
+    rays, X_WD = view.rays, view.X_WD
+    corner = grid.to_world((0, 0))
+    steps = grid.resolution * np.arange(max(grid.shape))
+    # The camera's coordinates of a pixel are the sum of a part of its row and one of its column.
+    offset = X_WD[:3, :3].T @ (np.array([*corner, grid.z_min]) - X_WD[:3, 3])
+    x, y, z = (
+        offset[k] + X_WD[0, k] * steps[: grid.rows, None] + X_WD[1, k] * steps[None, : grid.cols]
+        for k in range(3)
+    )
+    inside = z > 0
+    for value, limits in ((x, rays.u), (y, rays.v)):
+        inside &= (value >= float(limits.min()) * z) & (value <= float(limits.max()) * z)
+    return inside
 
 
 def _see(view: View, grid: PixelGrid) -> NDArray[np.float32]:
-    """One camera's heightmap: (4, rows, cols) red, green, blue, height; height -1 where unseen.
+    """One camera's heightmap: (4, rows, cols) red, green, blue, and height above `grid.z_min`.
+
+    The height is -inf where nothing is seen.
 
     The rigid transform and `PixelGrid.to_pixel` are affine. They are applied once, to the camera's
     centre and axes; the grid coordinates of a pixel are then linear in its depth.
@@ -120,36 +160,50 @@ def _see(view: View, grid: PixelGrid) -> NDArray[np.float32]:
         & (col >= 0)
         & (col < grid.cols)
         & (z <= grid.z_max - grid.z_min)
+        & (z >= -_DEEPEST)
     )
     row, col, z = (values.ravel()[point] for values in (row, col, z))
     cell = row.astype(np.int64) * grid.cols + col.astype(np.int64)
 
-    # The bits of a float32 >= +0 sort like its value. With the height's bits above the point's
-    # index in one integer, a single maximum finds the highest point and its colour.
-    z = np.maximum(z, 0) + np.float32(0)  # Adding 0 turns -0 into +0.
-    key = (z.view(np.int32).astype(np.int64) << 32) | point
-    highest = np.full(grid.rows * grid.cols, -1, np.int64)
+    # Points of the table itself, lower by rounding alone, tie; the last of them gives the colour.
+    z = np.where((z < 0) & (z > -_ROUNDING), 0, z) + np.float32(0)  # Adding 0 turns -0 into +0.
+    # With the sign folded in, the bits of a float32 sort like its value. With these bits above the
+    # point's index in one integer, a single maximum finds the highest point and its colour.
+    key = (_sortable(z).astype(np.int64) << 32) | point
+    unseen = np.iinfo(np.int64).min
+    highest = np.full(grid.rows * grid.cols, unseen, np.int64)
     np.maximum.at(highest, cell, key)
 
     seen_image = np.zeros((4, highest.size), np.float32)
-    seen_image[3] = -1
-    seen = np.flatnonzero(highest >= 0)
+    seen_image[3] = -np.inf
+    seen = np.flatnonzero(highest > unseen)
     if view.color is not None:
         color = view.color.reshape(-1, view.color.shape[-1])
         seen_image[:3, seen] = color[highest[seen] & 0xFFFFFFFF, :3].T / np.float32(255)
-    seen_image[3, seen] = (highest[seen] >> 32).astype(np.int32).view(np.float32)
+    bits = _sortable((highest[seen] >> 32).astype(np.int32).view(np.float32))
+    seen_image[3, seen] = bits.view(np.float32)
     return seen_image.reshape(4, *grid.shape)
 
 
+def _sortable(values: NDArray[np.float32]) -> NDArray[np.int32]:
+    """The bits of numbers, ordered as the numbers are; its own inverse."""
+    bits = values.view(np.int32)
+    return np.where(bits < 0, bits ^ np.int32(0x7FFFFFFF), bits)
+
+
 def _fuse(views: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-    """The fused image (4, rows, cols) of the cameras' (n, 4, rows, cols), and its valid mask."""
+    """The fused image (4, rows, cols) of the cameras' (n, 4, rows, cols), and its valid mask.
+
+    Heights are above `grid.z_min`, and negative below it.
+    """
     height = views[:, 3].max(axis=0)
-    seen = height >= 0
-    on_top = (views[:, 3] >= 0) & (views[:, 3] >= height - np.float32(SAME_SURFACE))
+    seen = height > -np.inf
+    # Whatever is below the table counts as its surface.
+    heights = np.maximum(views[:, 3], 0)
+    on_top = (views[:, 3] > -np.inf) & (heights >= heights.max(axis=0) - np.float32(SAME_SURFACE))
     image = np.empty_like(views[0])
     image[:3] = (views[:, :3] * on_top[:, None]).sum(axis=0) / np.maximum(on_top.sum(axis=0), 1)
-    image[3] = np.where(seen, height, 0)
-    _bridge_gaps(image, seen)
+    image[3] = height
     return image, seen
 
 
@@ -159,7 +213,7 @@ def _bridge_gaps(image: NDArray[np.float32], seen: NDArray[np.bool_]) -> None:
     padded_image = np.pad(image, ((0, 0), (1, 1), (1, 1)))
     padded_seen = np.pad(seen, 1)
     fill = np.zeros((4, row.size), np.float32)
-    fill_height = np.full(row.size, -1, np.float32)
+    fill_height = np.full(row.size, -np.inf, np.float32)
     for along_row, along_col in ((1, 0), (0, 1)):
         before = (row + 1 - along_row, col + 1 - along_col)
         after = (row + 1 + along_row, col + 1 + along_col)
@@ -171,4 +225,4 @@ def _bridge_gaps(image: NDArray[np.float32], seen: NDArray[np.bool_]) -> None:
         fill = np.where(bridge, mean, fill)
         fill_height = np.where(bridge, mean[3], fill_height)
     image[:, row, col] = fill
-    seen[row, col] = fill_height >= 0
+    seen[row, col] = fill_height > -np.inf

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -82,15 +83,22 @@ class Observation:
     """o_t of the paper (section III-A): the workspace seen orthographically from above."""
 
     image: NDArray[np.float32] = field(default_factory=lambda: np.zeros((4, 160, 320), np.float32))
-    """(4, rows, cols): red, green, blue in [0, 1], and height above `grid.z_min` in metres.
-    Unseen pixels are zero in all four channels."""
+    """(4, rows, cols): red, green, blue in [0, 1], and height above the table in metres. Unseen
+    pixels are zero in all four channels."""
     grid: PixelGrid = field(default_factory=PixelGrid)
     valid: NDArray[np.bool_] = None  # type: ignore[assignment]
     """(rows, cols): pixels seen by some camera. Default: the pixels with a non-zero channel."""
+    in_view: NDArray[np.bool_] = None  # type: ignore[assignment]
+    """(rows, cols): pixels that some camera looks at, if nothing hides them. Default: all."""
+    table: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """The table's plane, which was subtracted from the heights: at (row, col) it lay
+    `table @ (row, col, 1)` metres above `grid.z_min`."""
 
     def __post_init__(self) -> None:
         if self.valid is None:
             object.__setattr__(self, "valid", self.image.any(axis=0))
+        if self.in_view is None:
+            object.__setattr__(self, "in_view", np.ones(self.image.shape[1:], bool))
 
     @property
     def rgb(self) -> NDArray[np.float32]:
@@ -99,19 +107,34 @@ class Observation:
 
     @property
     def height(self) -> NDArray[np.float32]:
-        """(rows, cols), metres above `grid.z_min`."""
+        """(rows, cols), metres above the table."""
         return self.image[3]
 
+    @cached_property
+    def filled_height(self) -> NDArray[np.float32]:
+        """(rows, cols): `height` with unseen pixels filled in (`fill_unseen`)."""
+        return fill_unseen(self.height, self.valid, self.in_view)
 
-def fill_unseen(height: NDArray[np.float32], valid: NDArray[np.bool_]) -> NDArray[np.float32]:
-    """Fills the heights of unseen pixels from their neighbours.
+
+_FILL_REACH = 25
+"""A hole is filled from neighbours at most this far away, in pixels."""
+
+
+def fill_unseen(
+    height: NDArray[np.float32],
+    valid: NDArray[np.bool_],
+    in_view: NDArray[np.bool_] | None = None,
+) -> NDArray[np.float32]:
+    """Fills the heights of unseen pixels.
 
     A hidden surface is lower than what hides it, so a hole is filled with the lowest neighbour,
-    from its border inwards.
+    from its border inwards. What lies outside all views, or deep in a large hole, gets the table's
+    height, zero: nothing is known about it.
 
     Args:
-        height: (rows, cols).
+        height: (rows, cols), in metres above the table.
         valid: (rows, cols), where the height was seen.
+        in_view: (rows, cols), where a camera looks; None for everywhere.
     """
     if valid.all() or not valid.any():
         return height
@@ -119,14 +142,15 @@ def fill_unseen(height: NDArray[np.float32], valid: NDArray[np.bool_]) -> NDArra
     from scipy import ndimage
 
     filled = np.where(valid, height, np.inf).astype(np.float32)
-    missing = ~valid
-    for _ in range(max(height.shape)):
-        lowest = ndimage.minimum_filter(filled, size=3, mode="nearest")
-        filled = np.where(missing, lowest, filled)
-        missing = ~np.isfinite(filled)
+    holes = ~valid if in_view is None else ~valid & in_view
+    missing = holes
+    for _ in range(_FILL_REACH):
         if not missing.any():
             break
-    return filled
+        lowest = ndimage.minimum_filter(filled, size=3, mode="nearest")
+        filled = np.where(missing, lowest, filled)
+        missing = holes & ~np.isfinite(filled)
+    return np.where(np.isfinite(filled), filled, np.float32(0))
 
 
 @dataclass(frozen=True)
@@ -175,6 +199,16 @@ class SurfaceHeights:
     """Uncertainty of the differences of these heights; zero if o_t has neither noise nor tilt."""
 
 
+STOP_REASONS = {
+    "done": "nothing is left to do",
+    "nothing fits": "objects and free cavities are left, but none fit each other",
+    "no kit seen": "no kit is seen",
+    "not seen": "too little is seen of where the robot would have to pick or place",
+    "not sure": "no pick and place is likely enough to succeed",
+}
+"""Why a policy stops, and what to tell a person."""
+
+
 @dataclass(frozen=True)
 class PickPlaceAction:
     """A pick and a place: a_pick and a_place of the paper (section III-A), both in SE(2).
@@ -187,6 +221,8 @@ class PickPlaceAction:
     place: PlanarPose = field(default_factory=PlanarPose)
     stop: bool = False
     """True: the task is finished, and the poses are ignored."""
+    reason: str = ""
+    """Why it stops, a word of `STOP_REASONS`; empty if unknown."""
     press: bool = False
     """True: only push down at the pick with closed jaws; the place is ignored."""
     heights: SurfaceHeights | None = None

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from systems.signals import Observation, PlanarPose, SurfaceHeights, fill_unseen
+from systems.signals import Observation, PlanarPose, SurfaceHeights
 
 _PICK_REACH = 1
 """Radius around the pick that is searched for the object's top, in pixels."""
@@ -25,6 +25,8 @@ _TABLE_SHARE = 5.0
 """Percentile of all heights that estimates the table's height."""
 _CLEAN = 0.0003
 """A smaller standard deviation counts as no noise, in metres."""
+_LEAST_FLAT = 500
+"""The least number of flat squares that tell whether there is noise."""
 _SMOOTHED = 9
 """Noise is the deviation from the mean over a square of so many pixels."""
 _FLAT = 0.012
@@ -35,13 +37,8 @@ standard deviations. About two thirds of these pixels belong to the rim."""
 _NOISY_FLOOR_SHARE, _NOISY_FLOOR_BIAS = 25.0, -0.67
 """Percentile of the heights at a place that estimates its floor's height, and its bias in standard
 deviations."""
-_TABLE_BAND = 0.008
-"""Pixels within this height difference may belong to the table, if tilted, in metres."""
-_LEAST_TABLE, _FITS = 500, 3
-_LEVEL = 0.0003
-"""A table with smaller deviations counts as level, in metres."""
-_MOST_OFF = 0.008
-"""An offset above this is the table's true height and no calibration error, in metres."""
+_SUNK = 0.003
+"""A table that looks lower than expected by more than this is lower, in metres."""
 _TILT_DOUBT, _MOST_DOUBT = 0.3, 0.0025
 """Uncertainty after levelling: this share of the table's deviation, limited to this, in metres."""
 
@@ -51,13 +48,14 @@ def read_surface_heights(
 ) -> SurfaceHeights:
     """The surface heights around a pick and a place, from o_t alone.
 
-    - Unseen pixels are filled from their neighbours (`fill_unseen`).
+    - Unseen pixels are filled in (`fill_unseen`).
     - An object's support is a low percentile of the heights around it. An object in the middle of
       others is thus assumed to stand on the same surface.
     - Tops are maxima over a few pixels; the floor of a place is the minimum over the seen ones. If
       o_t is noisy, they are medians and percentiles instead, corrected for their bias.
-    - The table is assumed to be level and at the bottom of the grid. A small tilt or offset in o_t
-      is a calibration error and is subtracted.
+    - The table is assumed to be level and at the bottom of the grid. A tilt or offset in o_t, which
+      `project` subtracts, is a calibration error, but for a table that looks more than 3 mm lower
+      than expected: guarded motions may go too low, but not end too high.
 
     Args:
         observation: o_t.
@@ -74,7 +72,9 @@ def read_surface_heights(
             ("near_place", _PLACE_CLEARANCE_REACH),
         )
     }
-    height, noise, doubt = _level(fill_unseen(observation.height, observation.valid))
+    height = observation.filled_height
+    noise = _noise(height)
+    doubt = min(noise + _TILT_DOUBT * _deviation(observation), _MOST_DOUBT)
     at_pick, at_place = (grid.to_pixel((pose.x, pose.y)) for pose in (pick, place))
     around_pick = _around(height, at_pick, reach["support"])
     top, rim = _around(height, at_pick, _PICK_REACH), _around(height, at_place, reach["rim"])
@@ -92,34 +92,36 @@ def read_surface_heights(
     else:
         pick_top, place_rim = float(top.max(initial=0.0)), float(rim.max(initial=0.0))
         place_floor = float(floor.min())
+    sunk = [_sunk(observation, pixel) for pixel in (at_pick, at_place)]
+    pick_z, place_z = (grid.z_min + value for value in sunk)
     return SurfaceHeights(
-        pick_top=grid.z_min + pick_top,
-        support=grid.z_min + support,
-        place_rim=grid.z_min + place_rim,
-        place_floor=grid.z_min + place_floor,
-        near_pick=grid.z_min + float(_around(height, at_pick, reach["near_pick"]).max(initial=0.0)),
-        near_place=grid.z_min
-        + float(_around(height, at_place, reach["near_place"]).max(initial=0.0)),
+        pick_top=pick_z + pick_top,
+        support=pick_z + support,
+        place_rim=place_z + place_rim,
+        place_floor=place_z + place_floor,
+        near_pick=pick_z + float(_around(height, at_pick, reach["near_pick"]).max(initial=0.0)),
+        near_place=place_z + float(_around(height, at_place, reach["near_place"]).max(initial=0.0)),
         highest=grid.z_min + float(height.max(initial=0.0)),
-        table=grid.z_min + max(table, 0.0),
+        table=min(pick_z, place_z) + max(table, 0.0),
         doubt=doubt,
     )
 
 
+def _deviation(observation: Observation) -> float:
+    """The largest deviation of the table from the bottom of the grid, in metres."""
+    row, col, offset = observation.table
+    rows, cols = observation.grid.shape
+    return max(abs(row * i + col * j + offset) for i in (0, rows) for j in (0, cols))
+
+
+def _sunk(observation: Observation, pixel: NDArray[np.float64]) -> float:
+    """How much the table is lower than the bottom of the grid at a (row, col): 0 or negative."""
+    level = float(np.array(observation.table) @ np.append(pixel, 1.0))
+    return level if level < -_SUNK else 0.0
+
+
 def _percentile(values: NDArray[np.float32], share: float) -> float:
     return float(np.percentile(values, share)) if values.size else 0.0
-
-
-def _level(height: NDArray[np.float32]) -> tuple[NDArray[np.float32], float, float]:
-    """Heights (rows, cols) above the levelled table, standard deviation of their noise, and their
-    remaining uncertainty."""
-    noise = _noise(height)
-    table = _table(height, noise)
-    largest = float(np.abs(table).max())
-    if largest < _LEVEL:
-        return height, noise, min(noise, _MOST_DOUBT)
-    doubt = min(noise + _TILT_DOUBT * largest, _MOST_DOUBT)
-    return (height - table).astype(np.float32), noise, doubt
 
 
 def _noise(height: NDArray[np.float32]) -> float:
@@ -131,28 +133,10 @@ def _noise(height: NDArray[np.float32]) -> float:
     highest = ndimage.maximum_filter(height, _SMOOTHED, mode="nearest")
     flat = highest - ndimage.minimum_filter(height, _SMOOTHED, mode="nearest") < _FLAT
     # Flat squares are a biased sample (the calmest), so they only decide whether there is noise.
-    if flat.sum() >= _LEAST_TABLE and 1.4826 * np.median(away[flat]) < _CLEAN:
+    if flat.sum() >= _LEAST_FLAT and 1.4826 * np.median(away[flat]) < _CLEAN:
         return 0.0
     noise = 1.4826 * float(np.median(away))
     return noise if noise >= _CLEAN else 0.0
-
-
-def _table(height: NDArray[np.float32], noise: float) -> NDArray[np.float64]:
-    """(rows, cols) the table's plane in o_t; zero if no table is found near zero."""
-    start = np.percentile(height, _TABLE_SHARE) + noise
-    rows, cols = (axis - axis.mean() for axis in np.indices(height.shape, np.float64))
-    tilt = np.zeros(height.shape)
-    near = np.abs(height - start) < _TABLE_BAND + 3 * noise
-    for _ in range(_FITS):
-        if near.sum() < _LEAST_TABLE:
-            return np.zeros(height.shape)
-        design = np.column_stack([rows[near], cols[near], np.ones(near.sum())])
-        plane = np.linalg.lstsq(design, height[near], rcond=None)[0]
-        tilt = rows * plane[0] + cols * plane[1]
-        near = np.abs(height - tilt - plane[2]) < _TABLE_BAND / 2 + 2 * noise
-    level = float(np.median((height - tilt)[near])) if near.any() else 0.0
-    # A large offset means that the grid begins below the table: calibration errors are smaller.
-    return tilt + level if level < _MOST_OFF else tilt
 
 
 def _around(values: NDArray[Any], pixel: NDArray[np.float64], reach: int) -> NDArray[Any]:

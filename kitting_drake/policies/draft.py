@@ -25,7 +25,6 @@ from systems.signals import (
     PickPlaceAction,
     PixelGrid,
     PlanarPose,
-    fill_unseen,
     wrap_to_pi,
 )
 
@@ -43,7 +42,7 @@ def network_input(networks: Networks, observation: Observation) -> Image:
     """
     if networks.config.colour:
         return observation.image
-    filled = fill_unseen(observation.height, observation.valid)
+    filled = observation.filled_height
     return np.concatenate([observation.rgb, filled[None]])
 
 
@@ -80,6 +79,11 @@ class Look:
     def segmentation(self) -> Segmentation:
         """The segmentation of o_t by height."""
         return segment(self.observation)
+
+    @property
+    def kit_seen(self) -> bool | None:
+        """Whether o_t shows a kit; None if no stage asked for the segmentation."""
+        return self.segmentation.kit_seen if "segmentation" in self.__dict__ else None
 
     @cached_property
     def failed_pixels(self) -> Array:
@@ -128,12 +132,19 @@ class Draft:
     """The predicted (row, col) of the place for `pixel`."""
     continuous: bool = False
     """Whether positions and angles are refined beyond pixels and bins."""
+    grasp_cost: float | None = None
+    """See `JawGrasp.cost`; None if no feasible grasp is known."""
+    fit_cost: float | None = None
+    """The mean difference of the outlines of object and recess, in metres; None if they do not
+    fit."""
     fitted: Array | None = None
     """(row, col) of the place by the outlines of object and recess; None where they do not fit."""
     belongs: bool = False
     """Whether the outlines show that the object belongs at this place."""
     stop: bool = False
-    """Whether there is nothing left to pick."""
+    """Whether there is nothing left to pick, or nothing that is seen well enough."""
+    reason: str = ""
+    """Why it stops; see `PickPlaceAction.reason`."""
     mending: PickPlaceAction | None = None
     """An action that mends an earlier one and replaces this draft."""
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
@@ -16,6 +17,11 @@ from kitting_drake.policies.draft import Draft, Look, Stage, make_draft, network
 from kitting_drake.policies.networks.factored import Networks
 from kitting_drake.policies.stages import StopRule, SubPixel
 from systems.signals import Observation, PickPlaceAction, PlanarPose
+
+_ELSEWHERE = 8.0
+"""Places farther apart than this are different, in pixels."""
+_MOST_MARGIN = 20.0
+"""The largest margin of a place's score over another, in nats."""
 
 
 @dataclass(frozen=True)
@@ -38,6 +44,14 @@ class Decision:
     """The log-odds that there is something to pick; None if the networks do not predict it."""
     belongs: bool = False
     """Whether the outlines show that the object belongs at its place."""
+    grasp_cost: float | None = None
+    """See `Draft.grasp_cost`."""
+    fit_cost: float | None = None
+    """See `Draft.fit_cost`."""
+    kit_seen: bool | None = None
+    """Whether o_t shows a kit; None if outlines are not used."""
+    place_margin: float = 0.0
+    """How much worse the best other place scores, in nats."""
 
     @property
     def stop(self) -> bool:
@@ -101,7 +115,9 @@ class LearnedPolicy:
         decision = _decision(draft)
         if self._watch is not None:
             self._watch(observation, decision)
-        return PickPlaceAction(stop=True) if decision.stop else decision.action, decision
+        if decision.stop:
+            return PickPlaceAction(stop=True, reason=decision.action.reason), decision
+        return decision.action, decision
 
     def decide(self, observation: Observation, failed_picks: Sequence[PlanarPose] = ()) -> Decision:
         """The networks' action and the distributions behind it; it never mends an earlier action.
@@ -129,7 +145,7 @@ def _decision(draft: Draft) -> Decision:
         draft.look.observation, draft.pick, draft.theta, draft.place, draft.rotation
     )
     return Decision(
-        action=dataclasses.replace(action, stop=draft.stop),
+        action=dataclasses.replace(action, stop=draft.stop, reason=draft.reason),
         pick_map=F.softmax(logits.flatten(), 0).view(logits.shape).float().cpu().numpy(),
         angle_curve=F.softmax(draft.angles.logits, 0).float().cpu().numpy(),
         place_map=(scores - scores.max()).float().cpu().numpy(),
@@ -137,4 +153,20 @@ def _decision(draft: Draft) -> Decision:
         place_pixel=draft.place,
         log_odds=draft.look.picking.log_odds,
         belongs=draft.belongs,
+        grasp_cost=draft.grasp_cost,
+        fit_cost=draft.fit_cost,
+        kit_seen=draft.look.kit_seen,
+        place_margin=_place_margin(draft),
     )
+
+
+def _place_margin(draft: Draft) -> float:
+    """How much worse the networks score the best place more than `_ELSEWHERE` away, in nats."""
+    candidates = draft.placing.candidates
+    best, _, row, col = candidates[0].best()
+    others = [
+        score
+        for score, _, other_row, other_col in (item.best() for item in candidates[1:])
+        if math.hypot(other_row - row, other_col - col) > _ELSEWHERE
+    ]
+    return min(best - max(others), _MOST_MARGIN) if others else _MOST_MARGIN

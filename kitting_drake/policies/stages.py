@@ -14,15 +14,20 @@ from numpy.typing import NDArray
 
 from kitting_drake.policies.draft import Draft, Stage, expected_position
 from kitting_drake.policies.matching.recovery import recovery_action
-from kitting_drake.policies.matching.refinement import refine_grasp, refine_place
+from kitting_drake.policies.matching.refinement import nearest_region, refine_grasp, refine_place
 from kitting_drake.policies.matching.release_clearance import blocked_at_place
-from kitting_drake.policies.matching.shape_matching import belonging, certain_fits
+from kitting_drake.policies.matching.shape_matching import belonging, certain_fits, why_stop
+from kitting_drake.policies.matching.visibility import Visibility
 from systems.pick_place_parameters import PickPlaceParameters
 
 _AS_GOOD = 2.0
 """Rotations within this of the best score count as equally good, in nats, ..."""
 _SAME_PLACE = 4.0
 """... if their places are at most this far apart, in pixels."""
+_TRIES = 5
+"""The number of picks that are tried for one that is seen."""
+_ANOTHER = 0.010
+"""The next pick is farther than this from the last one, in metres."""
 _SOMETHING_FITS, _NOTHING_FITS = -1.0, 2.0
 """The shift of the stop threshold when the outlines show a fitting object, or none, in nats.
 
@@ -63,6 +68,8 @@ def make_stages(
         stages.append(StopRule(ask_outlines=recover))
     if outlines and may_stop and not recover:
         stages.append(CertainFits())
+    if continuous:
+        stages.append(SeenOnly(planner, outlines))
     if recover:
         stages.append(Recovery(planner))
     return tuple(stages)
@@ -102,7 +109,7 @@ class JawRoom:
         )
         if grasp is None:
             return draft
-        return dataclasses.replace(draft, pick=grasp.pick, theta=grasp.theta)
+        return dataclasses.replace(draft, pick=grasp.pick, theta=grasp.theta, grasp_cost=grasp.cost)
 
 
 @dataclass(frozen=True)
@@ -117,7 +124,11 @@ class OutlinePlace:
         if fitted is None:
             return draft
         return dataclasses.replace(
-            draft, rotation=fitted.rotation, fitted=fitted.place, belongs=True
+            draft,
+            rotation=fitted.rotation,
+            fitted=fitted.place,
+            fit_cost=fitted.cost,
+            belongs=True,
         )
 
 
@@ -177,7 +188,9 @@ class StopRule:
             return draft
         if self.ask_outlines and draft.look.segmentation.fixture.any():
             threshold += _SOMETHING_FITS if draft.belongs else _NOTHING_FITS
-        return dataclasses.replace(draft, stop=odds < threshold)
+        if odds >= threshold:
+            return dataclasses.replace(draft, stop=False)
+        return dataclasses.replace(draft, stop=True, reason=why_stop(draft.look.segmentation))
 
 
 @dataclass(frozen=True)
@@ -191,7 +204,43 @@ class CertainFits:
         if not draft.stop:
             return draft
         found = draft.among(certain_fits(draft.look.segmentation, draft.look.resolution))
-        return draft if found is None else dataclasses.replace(found, stop=False)
+        return draft if found is None else dataclasses.replace(found, stop=False, reason="")
+
+
+@dataclass(frozen=True)
+class SeenOnly:
+    """Picks and places only where o_t shows enough (`Visibility`); otherwise stops."""
+
+    planner: PickPlaceParameters
+    outlines: bool = True
+    """Whether objects are told apart by their outlines."""
+
+    def refine(self, draft: Draft) -> Draft:
+        visibility = Visibility.of(draft.look.observation)
+        allowed = visibility.pickable
+        found: Draft | None = draft
+        for _ in range(_TRIES):
+            if found is None or found.stop:
+                break
+            if allowed[found.pixel] and self._is_seen(found, visibility):
+                return found
+            rows, cols = np.indices(allowed.shape)
+            away = np.hypot(rows - found.pixel[0], cols - found.pixel[1])
+            allowed = allowed & (away * found.look.resolution > _ANOTHER)
+            found = draft.among(allowed)
+        if draft.stop:
+            return draft
+        return dataclasses.replace(draft, stop=True, reason="not seen")
+
+    def _is_seen(self, draft: Draft, visibility: Visibility) -> bool:
+        picks = draft.pick[None], np.array([draft.theta])
+        if not visibility.picks_are_seen(*picks, self.planner.open_width).all():
+            return False
+        region = None
+        if self.outlines:
+            region = nearest_region(draft.look.segmentation.objects, draft.pick)
+        footprint = None if region is None else region.pixels.astype(float)
+        return visibility.place_is_seen(footprint, draft.pick, draft.rotation, draft.place)
 
 
 @dataclass(frozen=True)

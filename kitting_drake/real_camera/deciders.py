@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Protocol
+from typing import Protocol
 
-import numpy as np
-from numpy.typing import NDArray
-
+from kitting_drake.policies.confidence import (
+    Evidence,
+    certainty,
+    evidence_of_matching,
+    evidence_of_networks,
+    read_reliability,
+)
 from kitting_drake.policies.factory import (
     LoadedPolicy,
     load_learned_policy,
@@ -18,16 +22,6 @@ from kitting_drake.policies.factory import (
 )
 from systems.pick_place_parameters import PickPlaceParameters
 from systems.signals import Observation, PickPlaceAction, PixelGrid, PlanarPose
-
-if TYPE_CHECKING:
-    from kitting_drake.policies.learned_policy import Decision
-
-_SAME_PICK = 0.010
-"""Probability within this distance of the pick supports it, in metres ..."""
-_OTHER_PICKS = 0.060
-"""... and probability within this distance belongs to the same object."""
-_SAME_ANGLE = math.radians(10)
-"""Probability within this angle of the pick's angle supports it, in radians."""
 
 
 @dataclass(frozen=True)
@@ -38,9 +32,17 @@ class Choice:
     confidence: float | None
     """From 0 to 1; None for a rule of geometry without confidence."""
     parts: dict[str, float] = field(default_factory=dict)
-    """The factors of the confidence."""
+    """The networks' certainty, by part; see `certainty`."""
     draw: Callable[[], bytes] = bytes
     """Draws the decision as a PNG."""
+    reason: str = ""
+    """A sentence on why it acts or stops; empty if the action's own word says enough."""
+
+    @classmethod
+    def stopped(cls, observation: Observation) -> Choice:
+        """A stop without a decision."""
+        action = PickPlaceAction(stop=True)
+        return cls(action, None, draw=lambda: _draw_action(observation, action))
 
 
 class BenchPolicy(Protocol):
@@ -66,15 +68,13 @@ class BenchPolicy(Protocol):
 
 @dataclass(frozen=True)
 class ShapeMatchingDecider:
-    """The training-free policy, which matches outlines (see `ShapeMatchingPolicy`).
-
-    Its confidence is 1 for identical outlines of object and recess, and 0 for the largest accepted
-    difference.
-    """
+    """The training-free policy, which matches outlines (see `ShapeMatchingPolicy`)."""
 
     recover: bool = False
     parameters: PickPlaceParameters = field(default_factory=PickPlaceParameters)
     """How the robot picks and places; give `decide` the same."""
+    least_confidence: float | None = None
+    """It does not act with less confidence, from 0 to 1; None for the fitted threshold."""
 
     @property
     def name(self) -> str:
@@ -86,13 +86,11 @@ class ShapeMatchingDecider:
     def choose(self, observation: Observation, failed_picks: Sequence[PlanarPose] = ()) -> Choice:
         policy = make_shape_matching(self.parameters, recover=self.recover)
         matched = policy.decide(observation, failed_picks)
-        parts = {} if matched.agreement is None else {"outlines": matched.agreement}
-        return Choice(
-            matched.action,
-            matched.agreement,
-            parts,
-            lambda: _draw_action(observation, matched.action),
-        )
+        draw = partial(_draw_action, observation, matched.action)
+        if matched.action.stop or matched.fit_cost is None:
+            return Choice(matched.action, None, draw=draw)
+        evidence = evidence_of_matching(observation, matched)
+        return _if_sure("shape_matching", evidence, self.least_confidence, matched.action, {}, draw)
 
 
 @dataclass(frozen=True)
@@ -100,6 +98,7 @@ class _Networks:
     """A learned policy; see `load_policy`."""
 
     loaded: LoadedPolicy
+    least_confidence: float | None
 
     @property
     def name(self) -> str:
@@ -111,8 +110,8 @@ class _Networks:
     def choose(self, observation: Observation, failed_picks: Sequence[PlanarPose] = ()) -> Choice:
         action, decision = self.loaded.function.act(observation, failed_picks)
         if decision is None:
-            return Choice(action, None, draw=lambda: _draw_action(observation, action))
-        parts = confidence_parts(decision, observation.grid.resolution)
+            return Choice(action, None, draw=partial(_draw_action, observation, action))
+        parts = certainty(decision, observation.grid.resolution)
 
         def draw() -> bytes:
             # Import matplotlib lazily.
@@ -120,7 +119,32 @@ class _Networks:
 
             return draw_decision(observation, decision)
 
-        return Choice(action, math.prod(parts.values()) if parts else None, parts, draw)
+        if decision.kit_seen is False:
+            stop = PickPlaceAction(stop=True, reason="no kit seen")
+            return Choice(stop, None, parts, draw)
+        if action.stop:
+            return Choice(action, parts.get("nothing_to_pick"), parts, draw)
+        evidence = evidence_of_networks(observation, decision)
+        return _if_sure("networks", evidence, self.least_confidence, action, parts, draw)
+
+
+def _if_sure(
+    policy: str,
+    evidence: Evidence,
+    least: float | None,
+    action: PickPlaceAction,
+    parts: dict[str, float],
+    draw: Callable[[], bytes],
+) -> Choice:
+    """The action with its confidence, or a stop if that is too low."""
+    reliability = read_reliability(policy)
+    confidence = reliability.confidence(evidence)
+    least = reliability.threshold if least is None else least
+    if confidence >= least:
+        said = f"the probability of success is {confidence:.2f}"
+        return Choice(action, confidence, parts, draw, said)
+    said = f"the best pick and place has a probability of {confidence:.2f}, less than {least:.2f}"
+    return Choice(PickPlaceAction(stop=True, reason="not sure"), confidence, parts, draw, said)
 
 
 def load_policy(
@@ -130,6 +154,7 @@ def load_policy(
     fit_outlines: bool = True,
     recover: bool = False,
     parameters: PickPlaceParameters | None = None,
+    least_confidence: float | None = None,
 ) -> BenchPolicy:
     """A learned policy, as with `policy: !Learned` in a scenario.
 
@@ -141,6 +166,8 @@ def load_policy(
         recover: mend failed insertions; see `Recovery`.
         parameters: how the robot picks and places; None for the cell's defaults. Give `decide` the
             same.
+        least_confidence: it does not act with less confidence, from 0 to 1; None for the fitted
+            threshold.
 
     Raises:
         UserError: the file is unusable, or the networks do not support N orientations.
@@ -153,40 +180,7 @@ def load_policy(
         orientations_field="--orientations",
         recover=recover,
     )
-    return _Networks(loaded)
-
-
-def confidence_parts(decision: Decision, resolution: float) -> dict[str, float]:
-    """The networks' confidence in a decision, as shares of their own probabilities.
-
-    - `something_to_pick`, or `nothing_to_pick` for a stop, by alpha's stop class, if it has one;
-    - `pick`: of alpha's probability within 6 cm of the pick, the share within 1 cm. Other objects
-      that could be picked as well do not lower it;
-    - `angle`: beta's probability within 10 degrees of the pick's angle.
-
-    There is no part for the place, whose scores are only relative.
-    """
-    parts: dict[str, float] = {}
-    if decision.log_odds is not None:
-        odds = decision.log_odds if not decision.stop else -decision.log_odds
-        name = "nothing_to_pick" if decision.stop else "something_to_pick"
-        parts[name] = 1 / (1 + math.exp(-max(-50.0, min(odds, 50.0))))
-    if decision.stop:
-        return parts
-    rows, cols = np.indices(decision.pick_map.shape)
-    row, col = decision.pick_pixel
-    distance = np.hypot(rows - row, cols - col) * resolution
-    about = _mass(decision.pick_map, distance < _OTHER_PICKS)
-    parts["pick"] = _mass(decision.pick_map, distance < _SAME_PICK) / max(about, 1e-12)
-    count = len(decision.angle_curve)
-    angles = np.arange(count) * math.pi / count - decision.action.pick.theta
-    off = np.abs((angles + math.pi / 2) % math.pi - math.pi / 2)
-    parts["angle"] = _mass(decision.angle_curve, off <= _SAME_ANGLE)
-    return {key: min(max(value, 0.0), 1.0) for key, value in parts.items()}
-
-
-def _mass(probabilities: NDArray[np.float32], where: NDArray[np.bool_]) -> float:
-    return float(probabilities[where].sum(dtype=float))
+    return _Networks(loaded, least_confidence)
 
 
 def _draw_action(observation: Observation, action: PickPlaceAction) -> bytes:

@@ -3,27 +3,39 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
-from kitting_drake.common.errors import UserError
 from kitting_drake.real_camera.calibrations.calibration import Calibration
+from kitting_drake.real_camera.checking.table_check import CalibrationError, check_table
 from kitting_drake.real_camera.deciders import BenchPolicy, Choice
 from kitting_drake.real_camera.frames import Frame
-from kitting_drake.real_camera.views import observe, seen_share
+from kitting_drake.real_camera.views import check_views, observe, seen_share
 from systems.motion_heights import MotionHeights, motion_heights
 from systems.pick_place_parameters import PickPlaceParameters
-from systems.signals import Observation, PickPlaceAction, PlanarPose, SurfaceHeights, wrap_to_pi
+from systems.signals import (
+    STOP_REASONS,
+    Observation,
+    PickPlaceAction,
+    PlanarPose,
+    SurfaceHeights,
+    wrap_to_pi,
+)
 from systems.surface_heights import read_surface_heights
 
 _SEEN_TO_STOP = 0.7
-"""With a smaller share of pixels seen, a stop is an error: an object may be hidden."""
+"""With a smaller share of pixels seen, an object may be hidden, and nothing is done."""
 
 
 @dataclass(frozen=True)
 class BenchDecision:
-    """An action with its heights and confidence."""
+    """An action with its heights and confidence, or a refusal."""
 
+    result: str
+    """`pick and place`, `press`, `done`, `no kit seen`, `nothing fits`, `not sure`, `not seen` or
+    `calibration`."""
+    reason: str
+    """The same as a sentence."""
     observation: Observation
     """o_t."""
     seen: float
@@ -33,11 +45,18 @@ class BenchDecision:
     heights: MotionHeights
     """Surfaces and heights are meaningless for a stop."""
     parameters: PickPlaceParameters
+    warnings: list[str] = field(default_factory=list)
+    """Doubts about the calibration, a sentence each."""
 
     @property
     def action(self) -> PickPlaceAction:
-        """Pick and place in the base frame."""
+        """Pick and place in the base frame; a stop unless the result is an action."""
         return self.choice.action
+
+    @property
+    def in_view(self) -> float:
+        """The share of the workspace that the cameras look at, from 0 to 1."""
+        return float(self.observation.in_view.mean())
 
     @property
     def place_height(self) -> float:
@@ -54,10 +73,14 @@ class BenchDecision:
         """The content of `action.json`, in metres and radians in the base frame; docs/bench.md."""
         action, heights = self.action, self.heights
         result: dict[str, Any] = {
+            "result": self.result,
+            "reason": self.reason,
             "stop": action.stop,
             "confidence": self.choice.confidence,
             "confidence_parts": self.choice.parts,
+            "in_view": round(self.in_view, 3),
             "seen": round(self.seen, 3),
+            "warnings": self.warnings,
         }
         if action.stop:
             return result
@@ -98,6 +121,9 @@ def decide(
 ) -> BenchDecision:
     """One decision, with the same heightmap and policies as the simulated cell.
 
+    It acts only if the cameras see the table where it should be, if enough is seen of pick and
+    place, and if the action is likely to succeed.
+
     Args:
         frames: of each camera by its name.
         calibration: of the cameras.
@@ -106,21 +132,54 @@ def decide(
         parameters: of the motion, for its heights; None for the cell's.
 
     Raises:
-        UserError: frames, calibration and policy do not fit together, or the policy would stop
-            although too little is seen.
+        UserError: frames, calibration and policy do not fit together.
     """
     policy.check_grid(calibration.grid)
-    observation = observe(frames, calibration)
-    choice = policy.choose(observation, failed_picks)
-    seen = seen_share(observation, calibration)
-    if choice.action.stop and seen < _SEEN_TO_STOP:
-        raise UserError(
-            f"only {100 * seen:.0f} % of what is in view is seen, too little to say that nothing "
-            "is left to do: find the cause with --check"
-        )
     parameters = PickPlaceParameters() if parameters is None else parameters
+    checked = check_views(frames, calibration)
+    observation = observe(checked, calibration)
+    seen = seen_share(observation)
+    try:
+        warnings = check_table(checked, calibration)
+    except CalibrationError as error:
+        return _stopped("calibration", str(error), observation, seen, parameters)
+    choice = policy.choose(observation, failed_picks)
+    action = choice.action
+    if action.stop and action.reason != "not seen" and seen < _SEEN_TO_STOP:
+        said = f"only {100 * seen:.0f} % of what is in view is seen: an object may be hidden"
+        return _stopped("not seen", said, observation, seen, parameters, choice, warnings)
+    if action.stop:
+        said = choice.reason or STOP_REASONS.get(action.reason, "nothing is left to do")
+        result = action.reason or "done"
+        return _stopped(result, said, observation, seen, parameters, choice, warnings)
+    surfaces = read_surface_heights(observation, action.pick, action.place)
+    result = "press" if action.press else "pick and place"
+    return BenchDecision(
+        result,
+        choice.reason,
+        observation,
+        seen,
+        choice,
+        surfaces,
+        motion_heights(surfaces, parameters),
+        parameters,
+        warnings,
+    )
+
+
+def _stopped(
+    result: str,
+    reason: str,
+    observation: Observation,
+    seen: float,
+    parameters: PickPlaceParameters,
+    choice: Choice | None = None,
+    warnings: Sequence[str] = (),
+) -> BenchDecision:
     surfaces = SurfaceHeights()
-    if not choice.action.stop:
-        surfaces = read_surface_heights(observation, choice.action.pick, choice.action.place)
     heights = motion_heights(surfaces, parameters)
-    return BenchDecision(observation, seen, choice, surfaces, heights, parameters)
+    if choice is None:
+        choice = Choice.stopped(observation)
+    return BenchDecision(
+        result, reason, observation, seen, choice, surfaces, heights, parameters, list(warnings)
+    )

@@ -38,8 +38,9 @@ from kitting_drake.hkd.kits.layout import kit_cavities, layout_kit
 from kitting_drake.hkd.kits.parameters import KitParameters
 from kitting_drake.hkd.tools.meshes import flat_obj, vertices_and_faces
 from kitting_drake.policies.data.static_scenes import StaticScene
-from kitting_drake.scenario.cameras import camera_pose, depth_camera
+from kitting_drake.scenario.cameras import Camera, camera_pose, depth_camera
 from kitting_drake.scenario.schema import Scenario
+from kitting_drake.static_scenes.random_views import draw_views
 from kitting_drake.tasks.footprints import OPEN_FINGERS
 from kitting_drake.tasks.kitting.tool_poses import (
     DrawnBox,
@@ -71,11 +72,56 @@ _IN_CAVITY = 0.0008
 """Standard deviation of a seated tool's position in its cavity, in metres."""
 
 
-def draw_batch(seed: int) -> Iterator[StaticScene]:
-    """Draws the static scenes of a seed.
+Body = tuple[str, RigidTransform]
+"""A mesh as Wavefront text in metres, and its pose in the world."""
+
+
+@dataclass(frozen=True)
+class LooseTool:
+    """A tool on the table, and where it belongs."""
+
+    tool: RandomTool
+    X_WT: RigidTransform
+    X_WGoal: RigidTransform
+    around: tuple[CrossSection, ...]
+    """The outlines of everything else that stands on the table."""
+
+
+@dataclass(frozen=True)
+class DrawnScene:
+    """A scene with its truth, before it is rendered."""
+
+    bodies: tuple[Body, ...]
+    loose: tuple[LooseTool, ...]
+    cameras: dict[str, Camera]
+    noise: SensorNoiseParameters
+    noise_seed: int
+
+    def render(self, grid: PixelGrid) -> Observation:
+        """o_t, heights only."""
+        return render(self.bodies, grid, self.noise, self.noise_seed, self.cameras)
+
+    def static_scene(self) -> StaticScene:
+        """The scene as a sample for training."""
+        rows = []
+        for number, loose in enumerate(self.loose):
+            rows += _actions(number, loose)
+        return StaticScene.of(self.render(PixelGrid()), np.array(rows).reshape(-1, 8))
+
+
+def draw_batch(seed: int, *, random_views: bool = False) -> Iterator[StaticScene]:
+    """Draws the static scenes of a seed; see `draw_scenes`."""
+    for scene in draw_scenes(seed, random_views=random_views):
+        yield scene.static_scene()
+
+
+def draw_scenes(seed: int, *, random_views: bool = False) -> Iterator[DrawnScene]:
+    """Draws the scenes of a seed.
 
     Args:
         seed: of all draws. Different seeds share neither tools nor kits.
+        random_views: one to three cameras at random poses (`draw_views`) instead of the default
+            cameras.
 
     Raises:
         MachineError: this machine cannot render.
@@ -98,7 +144,12 @@ def draw_batch(seed: int) -> Iterator[StaticScene]:
                 # A separate stream makes the noise independent of the scene.
                 own = np.random.SeedSequence([seed, 1, number, scene])
                 noise_seed = int(own.generate_state(1)[0])
-                yield _draw_scene(kit, chosen, others, rng, noise_seed)
+                drawn = _draw_scene(kit, chosen, others, rng, noise_seed)
+                if random_views:
+                    # A separate stream, so that the views do not change the scenes.
+                    own = np.random.SeedSequence([seed, 2, number, scene])
+                    drawn = replace(drawn, cameras=draw_views(np.random.default_rng(own)))
+                yield drawn
         except UserError:
             # There is no room for these tools.
             continue
@@ -130,7 +181,7 @@ def _draw_scene(
     others: Sequence[RandomTool],
     rng: np.random.Generator,
     noise_seed: int,
-) -> StaticScene:
+) -> DrawnScene:
     """A scene of a kit, its tools, and perhaps other tools without a cavity as clutter."""
     grid = PixelGrid()
     kit = drawn.kit
@@ -164,18 +215,19 @@ def _draw_scene(
         dx, dy = np.clip(rng.normal(0, _IN_CAVITY, 2), -0.0015, 0.0015)
         bodies.append((_text(tools[index]), RigidTransform([dx, dy, 0.0]) @ X_WGoals[index]))
     bodies += [(_solid_text(_box(box)), box.X_WB) for box in boxes]
-    observation = render(bodies, grid, _draw_noise(rng), noise_seed)
+    noise = _draw_noise(rng)
 
     standing = [outline_at(block_outline(kit), X_WKit)]
     standing += [
         outline_at(tool.footprint.hull(), X) for tool, X in zip(lying, X_WTools, strict=True)
     ]
     standing += [outline_at(CrossSection.square(box.size[:2], True), box.X_WB) for box in boxes]
-    actions = []
+    found = []
     for place, index in enumerate(loose):
-        around = [item for k, item in enumerate(standing) if k != place + 1]
-        actions += _actions(place, tools[index], X_WTools[place], X_WGoals[index], around)
-    return StaticScene.of(observation, np.array(actions).reshape(-1, 8))
+        around = tuple(item for k, item in enumerate(standing) if k != place + 1)
+        found.append(LooseTool(tools[index], X_WTools[place], X_WGoals[index], around))
+    cameras = dict(Scenario().cameras)
+    return DrawnScene(tuple(bodies), tuple(found), cameras, noise, noise_seed)
 
 
 def _draw_loose(count: int, rng: np.random.Generator) -> list[int]:
@@ -187,22 +239,17 @@ def _draw_loose(count: int, rng: np.random.Generator) -> list[int]:
     return sorted(order[max(seated, count - _MOST_LOOSE) :].tolist())
 
 
-def _actions(
-    number: int,
-    tool: RandomTool,
-    X_WT: RigidTransform,
-    X_WGoal: RigidTransform,
-    others: Sequence[CrossSection],
-) -> list[tuple[float, ...]]:
+def _actions(number: int, loose: LooseTool) -> list[tuple[float, ...]]:
     """The rows of `StaticScene.actions` of one loose tool."""
     rows: list[tuple[float, ...]] = []
+    X_WT, X_WGoal = loose.X_WT, loose.X_WGoal
     yaw = RollPitchYaw(X_WT.rotation()).yaw_angle()
     rotation = RollPitchYaw(X_WGoal.rotation()).yaw_angle() - yaw
-    for grasp in tool.grasps:
+    for grasp in loose.tool.grasps:
         pick = X_WT @ np.array([grasp.x, grasp.y, 0.0])
         theta = yaw + grasp.theta
         fingers = rectangle_at(OPEN_FINGERS, pick[0], pick[1], theta)
-        if any((fingers ^ other).area() > 1e-9 for other in others):
+        if any((fingers ^ other).area() > 1e-9 for other in loose.around):
             continue
         place = X_WGoal @ np.array([grasp.x, grasp.y, 0.0])
         rows.append(
@@ -230,20 +277,21 @@ def _draw_noise(rng: np.random.Generator) -> SensorNoiseParameters:
     )
 
 
-Body = tuple[str, RigidTransform]
-"""A mesh as Wavefront text in metres, and its pose in the world."""
-
-
 def render(
-    bodies: Sequence[Body], grid: PixelGrid, noise: SensorNoiseParameters, seed: int
+    bodies: Sequence[Body],
+    grid: PixelGrid,
+    noise: SensorNoiseParameters,
+    seed: int,
+    views: dict[str, Camera],
 ) -> Observation:
-    """Renders o_t of bodies on a table with the default cameras. Heights only; colours are black.
+    """Renders o_t of bodies on a table. Heights only; colours are black.
 
     Args:
         bodies: on the table, the plane z = 0.
         grid: of the observation.
         noise: of the cameras.
         seed: of the noise.
+        views: the cameras by name.
     """
     builder = DiagramBuilder()
     scene_graph = builder.AddSystem(SceneGraph())
@@ -259,10 +307,9 @@ def render(
         properties.AddProperty("label", "id", RenderLabel(number))
         instance.set_perception_properties(properties)
         scene_graph.RegisterAnchoredGeometry(source, instance)
-    configs = Scenario().cameras
-    cameras = {name: depth_camera(config, renderer) for name, config in configs.items()}
+    cameras = {name: depth_camera(config, renderer) for name, config in views.items()}
     projector = builder.AddSystem(HeightmapProjector(cameras=cameras, grid=grid))
-    for number, (name, config) in enumerate(configs.items()):
+    for number, (name, config) in enumerate(views.items()):
         sensor = builder.AddSystem(
             RgbdSensor(
                 parent_id=scene_graph.world_frame_id(),

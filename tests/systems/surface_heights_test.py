@@ -3,6 +3,7 @@ import pytest
 
 from systems.signals import Observation, PixelGrid, PlanarPose
 from systems.surface_heights import read_surface_heights
+from systems.table_plane import level
 
 GRID = PixelGrid(z_min=-0.1)
 PICK, PLACE = PlanarPose(0.40, 0.20), PlanarPose(0.60, -0.20)
@@ -73,8 +74,9 @@ def test_noise_and_calibration_errors_are_corrected(noise: float, off: float):
         tilt = np.tan(np.radians(0.3)) * np.arange(grid.cols) * grid.resolution
         seen = true + noise * rng.standard_normal(grid.shape) + off + (tilt if off else 0)
         image = np.full((4, *grid.shape), 0.5, np.float32)
-        image[3] = np.maximum(seen, 0)
-        found = read_surface_heights(Observation(image, grid), PICK, PLACE)
+        above, table = level(seen.astype(np.float32), image[3] > 0, grid.resolution)
+        image[3] = np.maximum(above, 0)
+        found = read_surface_heights(Observation(image, grid, table=table), PICK, PLACE)
         errors.append([found.pick_top - 0.02, found.place_rim - 0.05, found.place_floor - 0.02])
         # This difference decides whether the lowered object stands on the rim.
         errors[-1].append(found.support - (found.place_rim - 0.05))

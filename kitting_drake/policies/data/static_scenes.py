@@ -4,7 +4,7 @@ The file is HDF5, with the attributes `format`, `format_version`, `first_seed` a
 and `versions`, and these datasets for n scenes with m actions in all:
 
 - `height` (n, rows, cols), uint16, steps of 0.1 mm above `grid.z_min`: o_t, with unseen pixels
-  filled in (`fill_unseen`);
+  filled in (`Observation.filled_height`);
 - `actions` (m, 8): number of the object, cost of the grasp, pick x, y, theta, place x, y, theta, in
   metres and radians;
 - `first` (n + 1,): scene i has the actions `first[i]` to `first[i + 1]`; a scene without actions is
@@ -31,7 +31,7 @@ from numpy.typing import NDArray
 from kitting_drake.common.errors import UserError
 from kitting_drake.common.files import write_atomically
 from kitting_drake.policies.data.images import LabelledImage
-from systems.signals import Observation, PixelGrid, fill_unseen
+from systems.signals import Observation, PixelGrid
 
 STATIC = "static scenes"
 """The scenario name in the card of weights trained on static scenes."""
@@ -61,7 +61,7 @@ class StaticScene:
     @classmethod
     def of(cls, observation: Observation, actions: NDArray[np.float64]) -> StaticScene:
         """An observed scene and its possible actions."""
-        filled = fill_unseen(observation.height, observation.valid)
+        filled = observation.filled_height
         steps = np.clip(np.rint(filled / _STEP), 0, 65535)
         return cls(steps.astype(np.uint16), actions)
 

@@ -99,7 +99,7 @@ def jaw_grasps(
 
     def grip(places: Array, thetas: Array) -> list[JawGrasp]:
         found = _grip(relief, places, thetas, middle, resolution, planner, support)
-        return sorted(found, key=lambda item: item.cost)
+        return sorted(_seen(found, segmentation, planner), key=lambda item: item.cost)
 
     thetas = np.arange(_ANGLES) * math.pi / _ANGLES
     place, theta = (item.ravel() for item in np.meshgrid(np.arange(len(places)), thetas))
@@ -111,6 +111,18 @@ def jaw_grasps(
     nearby = best.theta + np.radians(np.linspace(-4, 4, 9))
     refined = grip(np.repeat(best.pixel[None], len(nearby), axis=0), nearby)
     return sorted([*refined, *found], key=lambda item: item.cost)
+
+
+def _seen(
+    grasps: list[JawGrasp], segmentation: Segmentation, planner: PickPlaceParameters
+) -> list[JawGrasp]:
+    """The grasps whose surroundings are seen (`Visibility.picks_are_seen`)."""
+    if not grasps:
+        return grasps
+    pixels = np.array([grasp.pixel for grasp in grasps])
+    thetas = np.array([grasp.theta for grasp in grasps])
+    seen = segmentation.visibility.picks_are_seen(pixels, thetas, planner.open_width)
+    return [grasp for grasp, good in zip(grasps, seen, strict=True) if good]
 
 
 def tip_height(top: Array, support: float, planner: PickPlaceParameters) -> Array:

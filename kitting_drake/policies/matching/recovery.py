@@ -17,7 +17,7 @@ from scipy import ndimage
 
 from kitting_drake.policies.data.images import make_action
 from kitting_drake.policies.matching.jaw_clearance import jaw_grasps
-from kitting_drake.policies.matching.segmentation import Region, Segmentation
+from kitting_drake.policies.matching.segmentation import Mask, Region, Segmentation
 from systems.pick_place_parameters import PickPlaceParameters
 from systems.signals import Observation, PickPlaceAction, PlanarPose
 
@@ -45,20 +45,24 @@ def recovery_action(
         planner: how the hand will pick.
         tried: poses of earlier failed grasps and presses.
     """
+    pickable = segmentation.visibility.pickable
     for region in segmentation.protruding:
-        pressed = _press(observation, segmentation, region)
-        if region.height <= _PRESSED and not _is_near(pressed.pick, tried):
-            return pressed
+        if region.height <= _PRESSED and pickable[region.mask].any():
+            pressed = _press(observation, segmentation, region, pickable)
+            if not _is_near(pressed.pick, tried):
+                return pressed
         taken = _take_out(observation, segmentation, region, planner, tried)
         if taken is not None:
             return taken
     return None
 
 
-def _press(observation: Observation, segmentation: Segmentation, region: Region) -> PickPlaceAction:
-    """Presses on the highest part of a protruding object."""
-    pixels = region.pixels
-    heights = segmentation.relief[region.mask]
+def _press(
+    observation: Observation, segmentation: Segmentation, region: Region, pickable: Mask
+) -> PickPlaceAction:
+    """Presses on the highest part of a protruding object that is seen."""
+    mask = region.mask & pickable
+    pixels, heights = np.argwhere(mask), segmentation.relief[mask]
     highest = pixels[heights >= np.percentile(heights, 80)].astype(float)
     middle = highest[np.linalg.norm(highest - np.median(highest, axis=0), axis=1).argmin()]
     action = make_action(observation, middle, 0.0, middle, 0.0)
@@ -87,7 +91,10 @@ def _take_out(
 
 def _free_place(segmentation: Segmentation, resolution: float) -> Array | None:
     """The (row, col) farthest from everything; None without enough room."""
-    taken = segmentation.fixture.copy()
+    visibility = segmentation.visibility
+    taken = segmentation.fixture | ~visibility.in_view
+    # Single holes are noise.
+    taken |= ndimage.binary_opening(~visibility.seen, iterations=2)
     for region in segmentation.objects:
         taken |= region.mask
     # Padding keeps objects within the image.

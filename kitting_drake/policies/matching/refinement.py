@@ -47,6 +47,8 @@ _LARGEST_ROTATION = math.radians(10)
 """... and of its rotation, apart from a half turn."""
 _LEVER = 0.03
 """A rotation of the jaws by one radian weighs as much as this distance, in metres."""
+_FARTHEST_GRASP = 0.04
+"""A refined grasp is at most this far from the predicted one, in metres."""
 _POOR = 0.03
 """A grasp cost of one weighs as much as this distance, in metres."""
 _SAME_PLACE, _SAME_ANGLE = 0.008, math.radians(8)
@@ -63,6 +65,8 @@ class RefinedPlace:
     """In radians."""
     place: Array
     """(row, col)."""
+    cost: float
+    """The mean difference of the outlines, in metres."""
 
 
 def refine_place(
@@ -77,12 +81,12 @@ def refine_place(
         place: (row, col) predicted for the object's point under the pick.
         resolution: of a pixel, in metres.
     """
-    taken = _nearest(segmentation.objects, pick)
+    taken = nearest_region(segmentation.objects, pick)
     if taken is None:
         return None
     outline = trace_outline(taken.mask, resolution, close=True)
     goal = place + rotation_matrix(rotation) @ (outline.middle - pick)
-    recess = _nearest(segmentation.recesses, goal)
+    recess = nearest_region(segmentation.recesses, goal)
     if recess is None:
         return None
     target = trace_outline(recess.mask, resolution)
@@ -108,7 +112,10 @@ def refine_place(
         best = elsewhere
     elif not is_covered(outline, target, best):
         return None
-    return RefinedPlace(wrap_to_pi(best.rotation), best.moved(pick))
+    refined = RefinedPlace(wrap_to_pi(best.rotation), best.moved(pick), best.cost)
+    rows, cols = segmentation.fixture.shape
+    inside = (refined.place >= 0).all() and (refined.place <= (rows - 1, cols - 1)).all()
+    return refined if inside else None
 
 
 def _better_elsewhere(
@@ -144,7 +151,7 @@ def _better_elsewhere(
     return best
 
 
-def _nearest(regions: tuple[Region, ...], pixel: Array) -> Region | None:
+def nearest_region(regions: tuple[Region, ...], pixel: Array) -> Region | None:
     """The region nearest to a position (row, col); None if all are farther than `_NEAR`."""
     best, least = None, _NEAR
     for region in regions:
@@ -162,6 +169,8 @@ class RefinedGrasp:
     """(row, col)."""
     theta: float
     """In radians."""
+    cost: float
+    """See `JawGrasp.cost`."""
 
 
 def refine_grasp(
@@ -172,9 +181,10 @@ def refine_grasp(
     planner: PickPlaceParameters,
     failed: Array | None = None,
 ) -> RefinedGrasp | None:
-    """A feasible grasp near a predicted one.
+    """A feasible grasp of the same object within 4 cm of a predicted one, or the predicted one
+    itself if it is feasible.
 
-    None if the predicted grasp is feasible itself, or if there is no feasible grasp.
+    None if there is no feasible grasp.
 
     Args:
         segmentation: of o_t.
@@ -184,7 +194,7 @@ def refine_grasp(
         planner: how the hand will pick.
         failed: (n, 2), the (row, col) of failed grasps, which are avoided.
     """
-    taken = _nearest(segmentation.objects, pick)
+    taken = nearest_region(segmentation.objects, pick)
     if taken is None:
         return None
 
@@ -202,11 +212,11 @@ def refine_grasp(
 
     grasps = jaw_grasps(segmentation, taken, resolution, planner)
     # The network knows more about a grasp than the jaws' room, so keep it where it is feasible.
-    if not grasps or any(is_same(*away(grasp)) for grasp in grasps):
-        return None
+    same = min((g.cost for g in grasps if is_same(*away(g))), default=None)
+    if same is not None:
+        return RefinedGrasp(pick, theta, same)
     if failed is not None:
         grasps = untried(grasps, failed, resolution)
-    best = min(grasps, key=departure, default=None)
-    if best is None:
-        return None
-    return RefinedGrasp(best.pixel, best.theta)
+    near = [grasp for grasp in grasps if away(grasp)[0] <= _FARTHEST_GRASP]
+    best = min(near, key=departure, default=None)
+    return None if best is None else RefinedGrasp(best.pixel, best.theta, best.cost)

@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 from scipy import ndimage
 from scipy.spatial import ConvexHull, QhullError
 
-from systems.signals import Observation, fill_unseen
+from kitting_drake.policies.matching.visibility import Visibility
+from systems.signals import Observation
 
 Mask = NDArray[np.bool_]
 Plane = NDArray[np.float64]
@@ -45,6 +46,8 @@ _CLEARLY = 2.0
 The few noisy pixels beyond it are isolated. A larger value would cut off an object's flat ends,
 which distinguish it from its half turn.
 """
+_GAP = 1.5
+"""The gap around an object in its recess is less than this far from its edges, in pixels."""
 _NEIGHBOURS = np.ones((3, 3), bool)
 _CROSS = ndimage.generate_binary_structure(2, 1)
 
@@ -80,6 +83,18 @@ class Segmentation:
     """
     relief: NDArray[np.float32]
     """(rows, cols): height above the table plane in metres; unseen pixels are filled in."""
+    visibility: Visibility
+    """What is seen of it."""
+
+    @property
+    def kit_seen(self) -> bool:
+        """Whether there is a kit: a fixture with recesses, or with objects in them."""
+        return bool(self.fixture.any()) and bool(self.recesses or self.protruding)
+
+    @property
+    def free_recesses(self) -> tuple[Region, ...]:
+        """The recesses that are not just the gaps around objects in them."""
+        return tuple(item for item in self.recesses if _inner_radius(item.mask) > _GAP)
 
 
 def segment(observation: Observation) -> Segmentation:
@@ -92,7 +107,7 @@ def segment(observation: Observation) -> Segmentation:
         The segmentation. Without a plateau there are neither a fixture nor recesses.
     """
     resolution = observation.grid.resolution
-    height = fill_unseen(observation.height, observation.valid)
+    height = observation.filled_height
     table = _fit_table(height)
     relief = (height - _plane_heights(table, height.shape)).astype(np.float32)
     fixture, top = _find_fixture(height, relief, resolution)
@@ -131,7 +146,13 @@ def segment(observation: Observation) -> Segmentation:
             )
         ),
         relief=relief,
+        visibility=Visibility.of(observation),
     )
+
+
+def _inner_radius(mask: Mask) -> float:
+    """The largest distance of a pixel of a mask from its edge, in pixels."""
+    return float(ndimage.distance_transform_edt(np.pad(mask, 1)).max())
 
 
 def _noise_of(

@@ -34,12 +34,13 @@ _PROMISING = 2.0
 
 @dataclass(frozen=True)
 class Matched:
-    """An action and how well the outlines behind it agree."""
+    """An action, and the quality of its fit and grasp."""
 
     action: PickPlaceAction
-    agreement: float | None = None
-    """From 1, identical outlines of object and recess, to 0, the largest accepted difference; None
-    for an action without outlines, which mends another or stops."""
+    fit_cost: float | None = None
+    """The mean difference of the outlines, in metres; None for an action without outlines."""
+    grasp_cost: float | None = None
+    """See `JawGrasp.cost`."""
 
 
 class ShapeMatchingPolicy:
@@ -72,7 +73,7 @@ class ShapeMatchingPolicy:
         return self.decide(observation, failed_picks).action
 
     def decide(self, observation: Observation, failed_picks: Sequence[PlanarPose] = ()) -> Matched:
-        """The action and how well the outlines behind it agree; see `__call__`."""
+        """The action with the quality of its fit and grasp; see `__call__`."""
         segmentation = segment(observation)
         mending = None
         if self._recover:
@@ -82,19 +83,34 @@ class ShapeMatchingPolicy:
         places = np.array([(pick.x, pick.y) for pick in failed_picks]).reshape(-1, 2)
         failed = observation.grid.to_pixel(places)
         resolution = observation.grid.resolution
+        reason = ""
         for index, fit in match(segmentation, resolution):
+            reason = "not seen"
             grasps = untried(
                 jaw_grasps(segmentation, segmentation.objects[index], resolution, self._planner),
                 failed,
                 resolution,
             )
-            if grasps:
-                best = grasps[0]
-                place = fit.moved(best.pixel)
+            if not grasps:
+                reason = "not sure"
+                continue
+            best = grasps[0]
+            place = fit.moved(best.pixel)
+            footprint = segmentation.objects[index].pixels.astype(float)
+            if segmentation.visibility.place_is_seen(footprint, best.pixel, fit.rotation, place):
                 action = make_action(observation, best.pixel, best.theta, place, fit.rotation)
-                return Matched(action, min(max(1 - fit.cost / _WORST_COST, 0.0), 1.0))
+                return Matched(action, fit.cost, best.cost)
         # Taking out comes last: it may fail again, and the number of actions is limited.
-        return Matched(mending or PickPlaceAction(stop=True))
+        stop = PickPlaceAction(stop=True, reason=reason or why_stop(segmentation))
+        return Matched(mending or stop)
+
+
+def why_stop(segmentation: Segmentation) -> str:
+    """The reason for which a policy stops that finds nothing to pick; see `STOP_REASONS`."""
+    if not segmentation.kit_seen:
+        return "no kit seen"
+    left = segmentation.objects and segmentation.free_recesses
+    return "nothing fits" if left else "done"
 
 
 def certain_fits(segmentation: Segmentation, resolution: float) -> NDArray[np.bool_]:

@@ -23,6 +23,10 @@ _TRIED = 4000
 _BAND = 0.004
 """Points within this distance of a trial's plane are its inliers, in metres."""
 _REFITS = 4
+_LEAST = 100
+"""The least number of points of a plane."""
+_STEEP = 1.0
+"""The largest slope of a plane that may be a table in a wrong pose."""
 
 
 @dataclass(frozen=True)
@@ -72,11 +76,12 @@ def table_points(frame: Frame, camera: BenchCamera, X_BC: Array, grid: PixelGrid
     return np.where(inside[..., None], p_B, np.nan)
 
 
-def fit_plane(points: Array) -> Plane:
+def fit_plane(points: Array, steepest: float = 0.3) -> Plane:
     """The plane through most points: RANSAC, refitted to its inliers.
 
     Args:
         points: (n, 3), at least a hundred.
+        steepest: the largest slope of the plane.
     """
     random = np.random.default_rng(0)
     some = points[random.integers(0, len(points), min(_TRIED, len(points)))]
@@ -88,7 +93,7 @@ def fit_plane(points: Array) -> Plane:
             continue
         plane = np.linalg.solve(design, triple[:, 2])
         near = np.abs(some[:, :2] @ plane[:2] + plane[2] - some[:, 2]) < _BAND
-        if near.sum() > most and np.hypot(*plane[:2]) < 0.3:
+        if near.sum() > most and np.hypot(*plane[:2]) < steepest:
             best, most = plane, int(near.sum())
     design = np.column_stack([points[:, :2], np.ones(len(points))])
     noise = _BAND
@@ -99,3 +104,41 @@ def fit_plane(points: Array) -> Plane:
         rest = (points[:, 2] - design @ best)[near]
         noise = max(1.4826 * float(np.median(np.abs(rest - np.median(rest)))), 1e-6)
     return Plane(best[:2], float(best[2]), noise)
+
+
+def find_planes(points: Array, most: int = 3) -> list[Plane]:
+    """The planes with most points, largest first; each is sought among the points off the others.
+
+    Args:
+        points: (n, 3).
+        most: the number of planes.
+    """
+    found = []
+    left = points
+    for _ in range(most):
+        if len(left) < _LEAST:
+            break
+        plane = fit_plane(left, _STEEP)
+        found.append(plane)
+        left = left[np.abs(left[:, 2] - plane.height(left[:, :2])) > 3 * _BAND]
+    return found
+
+
+def refit(points: Array, plane: Array) -> Plane | None:
+    """A plane (slope along x, along y, offset), refitted to the points near it; None without any.
+
+    Args:
+        points: (n, 3).
+        plane: (3,), to begin with.
+    """
+    design = np.column_stack([points[:, :2], np.ones(len(points))])
+    noise = _BAND
+    for band in (0.02, 0.012, 0.008, 0.0, 0.0):
+        rest = points[:, 2] - design @ plane
+        near = np.abs(rest) < (band or max(3.5 * noise, 0.0005))
+        if near.sum() < _LEAST:
+            return None
+        plane = np.linalg.lstsq(design[near], points[near, 2], rcond=None)[0]
+        rest = (points[:, 2] - design @ plane)[near]
+        noise = max(1.4826 * float(np.median(np.abs(rest - np.median(rest)))), 1e-6)
+    return Plane(plane[:2], float(plane[2]), noise)

@@ -1,0 +1,135 @@
+"""Where o_t shows enough to pick and place.
+
+A robot must not reach where no camera looks. It may reach into a small shadow: one camera sees no
+object from all sides. So the pick itself must be seen, and most of what the jaws sweep; nothing of
+it may be outside all views.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from kitting_drake.policies.data.images import rotation_matrix
+from systems.hand_geometry import FINGERTIP_DEPTH, PAD_LENGTH
+from systems.signals import Observation, PixelGrid
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+_MARGIN = 0.010
+"""A pick is at least this far inside of the cameras' views, in metres."""
+_AROUND = 5
+"""More than half of the pixels in a square of this side are seen around a pick."""
+_LANDING, _SWEPT = 0.5, 0.5
+"""The least seen shares of what each finger lands on, and of what the jaws sweep while closing."""
+_LINES, _DEPTHS, _SWEEPS = 5, 4, 17
+"""Numbers of samples along the pads, across a finger, and from finger to finger."""
+_INSIDE = 0.9
+"""The least share of an object within the workspace at its place."""
+_OUT_OF_VIEW = 0.02
+"""The largest share of an object outside all views at its place."""
+_RING = 3
+"""The surroundings of a place extend this far from the object, in pixels."""
+_RING_SEEN, _PLACE_SEEN = 0.5, 0.25
+"""The least seen shares of these surroundings and of the place itself."""
+_BLIND = 0.020
+"""The radius of an object of unknown outline, in metres."""
+
+
+@dataclass(frozen=True)
+class Visibility:
+    """The pixels of an observation that are seen, or could be seen."""
+
+    seen: Mask
+    """(rows, cols)."""
+    in_view: Mask
+    """(rows, cols): pixels towards which some camera looks, even if something hides them."""
+    resolution: float
+    """The side of a pixel, in metres."""
+
+    @classmethod
+    def of(cls, observation: Observation) -> Visibility:
+        """That of an observation."""
+        grid: PixelGrid = observation.grid
+        return cls(observation.valid, observation.in_view, grid.resolution)
+
+    @property
+    def pickable(self) -> Mask:
+        """(rows, cols): the pixels that are seen well enough for a pick."""
+        if self.seen.all() and self.in_view.all():
+            return self.seen
+        around = ndimage.uniform_filter(self.seen.astype(np.float32), _AROUND, mode="nearest")
+        pickable = self.seen & (around > 0.5)
+        if not self.in_view.all():
+            inside = ndimage.distance_transform_edt(self.in_view) * self.resolution
+            pickable &= inside > _MARGIN
+        return pickable
+
+    def picks_are_seen(self, pixels: Array, thetas: Array, open_width: float) -> Mask:
+        """(n,): whether the pixels of picks are seen, and what the jaws sweep.
+
+        Args:
+            pixels: (n, 2), row and column.
+            thetas: (n,), of the gripper, in radians.
+            open_width: of the jaws before they close, in metres.
+        """
+        if self.seen.all() and self.in_view.all():
+            return np.ones(len(pixels), bool)
+        along = np.stack([np.cos(thetas), np.sin(thetas)], axis=-1)[:, None, None]
+        across = np.stack([-np.sin(thetas), np.cos(thetas)], axis=-1)[:, None, None]
+        u = np.linspace(-PAD_LENGTH / 2, PAD_LENGTH / 2, _LINES)[:, None, None]
+        outwards = open_width / 2 + np.linspace(0, FINGERTIP_DEPTH, _DEPTHS)
+        sweep = np.linspace(-open_width / 2, open_width / 2, _SWEEPS)
+        good = np.ones(len(pixels), bool)
+        parts = ((outwards, _LANDING), (-outwards, _LANDING), (sweep, _SWEPT))
+        for offsets, share in parts:
+            s = offsets[None, :, None]
+            positions = pixels[:, None, None] + (along * u + across * s) / self.resolution
+            seen, in_view = self._at(positions)
+            good &= (seen.mean(axis=(1, 2)) >= share) & in_view.all(axis=(1, 2))
+        pickable, _ = Visibility(self.pickable, self.in_view, self.resolution)._at(pixels)
+        return good & pickable
+
+    def place_is_seen(
+        self, footprint: Array | None, pick: Array, rotation: float, place: Array
+    ) -> bool:
+        """Whether enough is seen of where an object will lie, and around it.
+
+        Args:
+            footprint: (n, 2), the pixels of the object where it lies; None if they are unknown.
+            pick: (row, col) at which it is gripped.
+            rotation: of the object from pick to place, in radians.
+            place: (row, col) to which that point goes.
+        """
+        if footprint is None:
+            reach = np.arange(-_BLIND, _BLIND + self.resolution, self.resolution) / self.resolution
+            disc = np.stack(np.meshgrid(reach, reach, indexing="ij"), axis=-1).reshape(-1, 2)
+            footprint = pick + disc[np.linalg.norm(disc, axis=1) * self.resolution <= _BLIND]
+        there = np.rint(place + (footprint - pick) @ rotation_matrix(rotation).T).astype(int)
+        rows, cols = self.seen.shape
+        within = ((there >= 0) & (there < (rows, cols))).all(axis=1)
+        if within.mean() < _INSIDE:
+            return False
+        if self.seen.all() and self.in_view.all():
+            return True
+        mask = np.zeros(self.seen.shape, bool)
+        mask[tuple(there[within].T)] = True
+        mask = ndimage.binary_closing(mask, iterations=2) | mask
+        ring = ndimage.binary_dilation(mask, iterations=_RING) & ~mask
+        return bool(
+            (~self.in_view[mask | ring]).mean() <= _OUT_OF_VIEW
+            and self.seen[ring].mean() >= _RING_SEEN
+            and self.seen[mask].mean() >= _PLACE_SEEN
+        )
+
+    def _at(self, positions: Array) -> tuple[Mask, Mask]:
+        """Whether positions (..., 2) are seen, and in view; True beyond the workspace."""
+        row, col = np.moveaxis(np.rint(positions).astype(int), -1, 0)
+        rows, cols = self.seen.shape
+        outside = (row < 0) | (row >= rows) | (col < 0) | (col >= cols)
+        at = np.clip(row, 0, rows - 1), np.clip(col, 0, cols - 1)
+        return self.seen[at] | outside, self.in_view[at] | outside

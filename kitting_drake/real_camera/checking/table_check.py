@@ -1,0 +1,238 @@
+"""Checks in every decision that the cameras see the table where the calibration says it is."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from kitting_drake.common.errors import UserError
+from kitting_drake.real_camera.calibrations.calibration import BenchCamera, Calibration
+from kitting_drake.real_camera.checking.planes import Plane, find_planes, refit
+from kitting_drake.real_camera.frames import Frame
+from systems.signals import PixelGrid
+
+Array = NDArray[np.float64]
+
+_REFUSED_OFF, _REFUSED_TILT = 0.010, math.radians(2)
+"""A table that is farther off, in metres, or tilted by more cannot be picked from."""
+_WARNED_OFF, _WARNED_TILT = 0.005, math.radians(1)
+_STEP = 4
+"""Only every fourth row and column of an image is used."""
+_FARTHEST = 0.35
+"""Planes are sought within this distance of the table's height, in metres."""
+_LEAST = 150
+"""The least number of such pixels on a plane."""
+_BELOW, _ABOVE = 0.5, 0.08
+"""The plane at the table's height is not the table if it has less than this share of the pixels of
+a plane below it, or above it. Large objects may hide most of a table."""
+_CURVED = 0.5
+"""Depths are distances if the table is flatter than this share when they are taken for such."""
+_FLAT = 0.002
+"""A table with less noise than this is flat, in metres."""
+
+
+class CalibrationError(UserError):
+    """The cameras see something else than the calibration says."""
+
+
+@dataclass(frozen=True)
+class TableFit:
+    """The table as a camera sees it."""
+
+    off: float
+    """How much higher than expected it is at the middle of its seen part, in metres."""
+    tilt: float
+    """Its angle with the base's xy plane, in radians."""
+    plane: Plane
+    support: int
+    """The number of pixels on it, of every fourth row and column."""
+
+    @property
+    def is_refused(self) -> bool:
+        """Whether no pick can be trusted."""
+        return abs(self.off) > _REFUSED_OFF or self.tilt > _REFUSED_TILT
+
+    @property
+    def is_doubtful(self) -> bool:
+        """Whether a warning is due."""
+        return abs(self.off) > _WARNED_OFF or self.tilt > _WARNED_TILT
+
+
+def check_table(frames: Mapping[str, Frame], calibration: Calibration) -> list[str]:
+    """Checks that every camera sees the table at its height, and level.
+
+    Args:
+        frames: of each camera by its name, checked by `check_frame`.
+        calibration: of the cameras.
+
+    Returns:
+        Warnings, a sentence each.
+
+    Raises:
+        CalibrationError: a camera sees the table more than 10 mm off, or tilted by more than 2
+            degrees, or sees no table. The error says what would agree.
+    """
+    warnings = []
+    for camera in calibration.cameras:
+        depth = frames[camera.name].depth
+        fit = _fit(camera, camera.X_BC, depth, calibration.grid)
+        if fit is None or fit.is_refused:
+            hint = _hint(camera, depth, calibration.grid, fit)
+            raise CalibrationError(f"camera {camera.name} {_said(fit, calibration.grid)}: {hint}")
+        if _is_range(camera, depth, calibration.grid, fit):
+            raise CalibrationError(
+                f"camera {camera.name} sees a curved table: its depths are distances from the "
+                "camera; give depths along the optical axis"
+            )
+        if fit.is_doubtful:
+            warnings.append(
+                f"camera {camera.name} {_said(fit, calibration.grid)}: check it with --check"
+            )
+    return warnings
+
+
+def _said(fit: TableFit | None, grid: PixelGrid) -> str:
+    if fit is None:
+        return "sees no table in the workspace"
+    parts = []
+    if abs(fit.off) > _WARNED_OFF:
+        side = "higher" if fit.off > 0 else "lower"
+        parts.append(f"{1e3 * abs(fit.off):.0f} mm {side} than {grid.z_min:g} m")
+    if fit.tilt > _WARNED_TILT:
+        parts.append(f"tilted by {math.degrees(fit.tilt):.1f} degrees")
+    return "sees the table " + " and ".join(parts)
+
+
+def _fit(
+    camera: BenchCamera, X_BC: Array, depth: NDArray[np.float32], grid: PixelGrid
+) -> TableFit | None:
+    """The plane that is most probably the table; None if there is none."""
+    points = _points(camera, X_BC, depth, grid)
+    expected = refit(points, np.array([0.0, 0.0, grid.z_min]))
+    local = None if expected is None else _measured(expected, points, grid)
+    if local is not None and (local.is_refused or local.support < _LEAST):
+        local = None
+    if local is not None and local.support >= len(points) / 2:
+        return local
+    planes = [_measured(plane, points, grid) for plane in find_planes(points)]
+    if local is not None:
+        others = [fit for fit in planes if abs(fit.off - local.off) > _REFUSED_OFF]
+        below = max((fit.support for fit in others if fit.off < local.off), default=0)
+        above = max((fit.support for fit in others if fit.off > local.off), default=0)
+        if local.support >= max(_BELOW * below, _ABOVE * above):
+            return local
+    planes = [fit for fit in planes if fit.support >= _LEAST]
+    return max(planes, key=lambda fit: fit.support, default=None)
+
+
+def _measured(plane: Plane, points: Array, grid: PixelGrid) -> TableFit:
+    near = np.abs(points[:, 2] - plane.height(points[:, :2])) < max(0.004, 3 * plane.noise)
+    middle = points[near, :2].mean(axis=0) if near.any() else np.zeros(2)
+    off = float(plane.height(middle)) - grid.z_min
+    return TableFit(off, float(np.linalg.norm(plane.tilt)), plane, int(near.sum()))
+
+
+def _points(camera: BenchCamera, X_BC: Array, depth: NDArray[np.float32], grid: PixelGrid) -> Array:
+    """(n, 3): points in the base frame above or below the workspace, not far from the table."""
+    rays = camera.rays
+    u, v = (item[::_STEP, ::_STEP] for item in np.broadcast_arrays(rays.u, rays.v))
+    z = depth[::_STEP, ::_STEP].astype(float)
+    with np.errstate(invalid="ignore"):
+        good = np.isfinite(z) & (z >= rays.min_depth) & (z <= rays.max_depth)
+    z = z[good]
+    p_C = np.stack([u[good] * z, v[good] * z, z], axis=-1)
+    p_B = p_C @ X_BC[:3, :3].T + X_BC[:3, 3]
+    inside = grid.contains(p_B[:, :2]) & (np.abs(p_B[:, 2] - grid.z_min) < _FARTHEST)
+    return np.asarray(p_B[inside])
+
+
+def _is_range(
+    camera: BenchCamera, depth: NDArray[np.float32], grid: PixelGrid, fit: TableFit
+) -> bool:
+    """Whether the table is flat only if depths are taken for distances from the camera."""
+    if fit.plane.noise < _FLAT / 4:
+        return False
+    rays = camera.rays
+    along = depth / np.sqrt(1 + rays.u**2 + rays.v**2)
+    other = _fit(camera, camera.X_BC, along.astype(np.float32), grid)
+    return (
+        other is not None
+        and not other.is_refused
+        and (other.plane.noise < _CURVED * fit.plane.noise)
+    )
+
+
+def _hint(
+    camera: BenchCamera, depth: NDArray[np.float32], grid: PixelGrid, fit: TableFit | None
+) -> str:
+    """What would agree with the frame."""
+    for text, other, X_BC, image in _suppositions(camera, depth):
+        found = _fit(other, X_BC, image, grid)
+        if found is not None and not found.is_doubtful:
+            return text
+    if fit is None:
+        return "check the pose and table_height"
+    if fit.tilt <= _REFUSED_TILT:
+        return f"table_height: {grid.z_min + fit.off:.3f} would agree, or correct the camera's pose"
+    about_x, about_y = np.degrees(fit.plane.tilt)
+    return (
+        f"the rotation of the pose is wrong by {about_x:.1f} degrees about base x and "
+        f"{about_y:.1f} about base y, or the image is rotated or of other intrinsics; --check on "
+        "an empty table writes a corrected calibration"
+    )
+
+
+def _suppositions(
+    camera: BenchCamera, depth: NDArray[np.float32]
+) -> Iterator[tuple[str, BenchCamera, Array, NDArray[np.float32]]]:
+    """Frequent mistakes: what to say, and the camera, pose and depth without the mistake."""
+    X = camera.X_BC
+    yield (
+        "its inverse would agree: is it the pose of the base in the camera?",
+        camera,
+        np.asarray(np.linalg.inv(X)),
+        depth,
+    )
+    body = np.eye(4)
+    body[:3, :3] = Rotation.from_euler("xyz", [-90, 0, -90], degrees=True).as_matrix()
+    yield (
+        "it would agree if this were the pose of ROS's body frame: give that of the optical frame",
+        camera,
+        X @ body,
+        depth,
+    )
+    yield (
+        "the image upside down would agree: is it rotated by 180 degrees?",
+        camera,
+        X,
+        depth[::-1, ::-1],
+    )
+    yield "the mirrored image would agree: is it flipped left to right?", camera, X, depth[:, ::-1]
+    yield "the mirrored image would agree: is it flipped top to bottom?", camera, X, depth[::-1]
+    for factor in (2.0, 0.5):
+        lens = camera.intrinsics
+        focal = (factor * lens.focal[0], factor * lens.focal[1])
+        other = dataclasses.replace(camera, intrinsics=dataclasses.replace(lens, focal=focal))
+        yield (
+            f"fx {focal[0]:.0f} and fy {focal[1]:.0f} would agree: are they of another resolution?",
+            other,
+            X,
+            depth,
+        )
+    for factor in (0.1, 10.0, 0.25, 4.0, 0.5, 2.0):
+        yield (
+            f"depth_scale: {factor * camera.depth_scale:g} would agree",
+            camera,
+            X,
+            (factor * depth).astype(np.float32),
+        )
+    for axis, name in ((0, "x"), (1, "y")):
+        turned = X.copy()
+        turned[:3, :3] = np.diag([-1.0 if k != axis else 1.0 for k in range(3)]) @ X[:3, :3]
+        yield f"its rotation by half a turn about base {name} would agree", camera, turned, depth

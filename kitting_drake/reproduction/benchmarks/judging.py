@@ -1,0 +1,99 @@
+"""Judges a decision on a drawn scene by its geometry, without physics."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+from manifold3d import CrossSection
+from numpy.typing import NDArray
+from pydrake.math import RigidTransform, RollPitchYaw
+from scipy.spatial import cKDTree
+
+from kitting_drake.static_scenes.drawing import LooseTool
+from systems.signals import PickPlaceAction, PlanarPose
+
+Array = NDArray[np.float64]
+
+_SPACING = 0.002
+"""The distance between points of an outline, in metres."""
+_BESIDE = 0.004
+"""A pick may lie this far beside its tool, in metres."""
+_GRASP_OFF, _GRASP_TURNED = 0.010, math.radians(15)
+"""A pick is right if a possible grasp is this near."""
+PLACE_OFF = 0.003
+"""A place is right if 95 % of the outline lie this near to where they belong, in metres."""
+
+
+def judge(action: PickPlaceAction, loose: Sequence[LooseTool]) -> str:
+    """Whether an action seats a tool: `right`, or what is wrong.
+
+    Args:
+        action: pick and place in the world.
+        loose: the tools that belong into a cavity.
+
+    Returns:
+        `right`, `no tool` (nothing that belongs into a cavity is picked), `grasp` (the hand cannot
+        hold it there), or `place`.
+    """
+    picked = _picked(action, loose)
+    if picked is None:
+        return "no tool"
+    if not _is_grasp(action, picked):
+        return "grasp"
+    here, there = (_outline(picked.tool.footprint, X) for X in (picked.X_WT, picked.X_WGoal))
+    turn = action.place.theta - action.pick.theta
+    c, s = math.cos(turn), math.sin(turn)
+    arm = here - (action.pick.x, action.pick.y)
+    moved = arm @ np.array([[c, s], [-s, c]]) + (action.place.x, action.place.y)
+    away = np.concatenate([cKDTree(there).query(moved)[0], cKDTree(moved).query(there)[0]])
+    return "right" if np.percentile(away, 95) <= PLACE_OFF else "place"
+
+
+def covering(action: PickPlaceAction, loose: Sequence[LooseTool]) -> list[PlanarPose]:
+    """Picks all over the tool that an action picks, so that a policy takes another one next."""
+    picked = _picked(action, loose)
+    if picked is None:
+        return [action.pick]
+    points = _outline(picked.tool.footprint, picked.X_WT)[::3]
+    return [action.pick, *(PlanarPose(float(x), float(y)) for x, y in points)]
+
+
+def _picked(action: PickPlaceAction, loose: Sequence[LooseTool]) -> LooseTool | None:
+    best, least = None, _BESIDE
+    spot = CrossSection.circle(_BESIDE).translate((action.pick.x, action.pick.y))
+    for item in loose:
+        if (_placed(item.tool.footprint, item.X_WT) ^ spot).area() > 0:
+            outline = _outline(item.tool.footprint, item.X_WT)
+            distance = float(cKDTree(outline).query((action.pick.x, action.pick.y))[0])
+            if best is None or distance < least:
+                best, least = item, distance
+    return best
+
+
+def _is_grasp(action: PickPlaceAction, picked: LooseTool) -> bool:
+    yaw = RollPitchYaw(picked.X_WT.rotation()).yaw_angle()
+    for grasp in picked.tool.grasps:
+        x, y, _ = picked.X_WT @ np.array([grasp.x, grasp.y, 0.0])
+        off = math.hypot(x - action.pick.x, y - action.pick.y)
+        turned = abs(math.remainder(yaw + grasp.theta - action.pick.theta, math.pi))
+        if off <= _GRASP_OFF and turned <= _GRASP_TURNED:
+            return True
+    return False
+
+
+def _placed(footprint: CrossSection, X_W: RigidTransform) -> CrossSection:
+    yaw = RollPitchYaw(X_W.rotation()).yaw_angle()
+    return footprint.rotate(math.degrees(yaw)).translate(tuple(X_W.translation()[:2]))
+
+
+def _outline(footprint: CrossSection, X_W: RigidTransform) -> Array:
+    """(n, 2): points of the outline at a pose, evenly spread."""
+    points = []
+    for polygon in _placed(footprint, X_W).to_polygons():
+        ends = np.roll(polygon, -1, axis=0)
+        for start, end in zip(polygon, ends, strict=True):
+            count = max(1, math.ceil(np.linalg.norm(end - start) / _SPACING))
+            points.append(start + (end - start) * (np.arange(count) / count)[:, None])
+    return np.concatenate(points)

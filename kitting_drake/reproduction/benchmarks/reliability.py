@@ -1,0 +1,218 @@
+"""How reliable the confidence of a decision is, on drawn scenes with random cameras.
+
+Scenes are drawn as for training, from seeds that no training uses. Decisions are judged by geometry
+(`judging`), without physics.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import minimize
+
+from kitting_drake.policies.confidence import (
+    Evidence,
+    Reliability,
+    evidence_of_matching,
+    evidence_of_networks,
+)
+from kitting_drake.policies.factory import load_learned_policy, make_shape_matching
+from kitting_drake.reproduction.benchmarks.judging import covering, judge
+from kitting_drake.static_scenes.drawing import DrawnScene, draw_scenes
+from systems.pick_place_parameters import PickPlaceParameters
+from systems.sensor_noise import SensorNoiseParameters
+from systems.signals import Observation, PickPlaceAction, PixelGrid, PlanarPose
+
+Array = NDArray[np.float64]
+
+_RANDOM_VIEWS = 0.7
+"""The share of scenes with random cameras; the others have the default cameras."""
+_WITHOUT_KIT = 0.1
+"""The share of scenes without a kit."""
+_DECISIONS = 3
+"""The most decisions of a policy in a scene; each avoids the tools of those before."""
+_BINS = 10
+_SHRINKAGE = 1e-3
+"""The weight of the squared coefficients in the fit."""
+
+
+@dataclass(frozen=True)
+class Judged:
+    """A decision to act, or a refusal."""
+
+    policy: str
+    """`networks` or `shape_matching`."""
+    scene: int
+    verdict: str
+    """As of `judge`; `stop` if the policy did not act."""
+    evidence: Evidence
+    reason: str = ""
+    """Why the policy stopped."""
+
+
+def draw_judged(first_seed: int, count: int) -> Iterator[Judged]:
+    """Decides on scenes, and judges the decisions.
+
+    Args:
+        first_seed: of the scenes.
+        count: the number of scenes.
+    """
+    planner = PickPlaceParameters()
+    networks = load_learned_policy(None, planner, insertion=True).function
+    matching = make_shape_matching(planner)
+
+    def by_networks(seen: Observation, tried: list[PlanarPose]) -> tuple[PickPlaceAction, Evidence]:
+        action, decision = networks.act(seen, tried)
+        if decision is None or action.stop:
+            return action, {}
+        return action, evidence_of_networks(seen, decision)
+
+    def by_matching(seen: Observation, tried: list[PlanarPose]) -> tuple[PickPlaceAction, Evidence]:
+        matched = matching.decide(seen, tried)
+        evidence = {} if matched.action.stop else evidence_of_matching(seen, matched)
+        return matched.action, evidence
+
+    for number, scene in zip(range(count), _scenes(first_seed), strict=False):
+        observation = scene.render(PixelGrid())
+        for policy, decide in (("networks", by_networks), ("shape_matching", by_matching)):
+            tried: list[PlanarPose] = []
+            for _ in range(_DECISIONS):
+                action, evidence = decide(observation, tried)
+                verdict = "stop" if action.stop else judge(action, scene.loose)
+                yield Judged(policy, number, verdict, evidence, action.reason)
+                if action.stop:
+                    break
+                tried += covering(action, scene.loose)
+
+
+def _scenes(first_seed: int) -> Iterator[DrawnScene]:
+    """Scenes of successive seeds, some without their kit."""
+    seed = first_seed
+    while True:
+        rng = np.random.default_rng([seed, 3])
+        for number, scene in enumerate(
+            draw_scenes(seed, random_views=rng.random() < _RANDOM_VIEWS)
+        ):
+            if number % 2:
+                continue
+            scene = replace(scene, noise=_draw_noise(rng))
+            if rng.random() < _WITHOUT_KIT:
+                # The kit is the first body. Without it, nothing belongs anywhere.
+                scene = replace(scene, bodies=scene.bodies[1:], loose=())
+            yield scene
+        seed += 1
+
+
+def _draw_noise(rng: np.random.Generator) -> SensorNoiseParameters:
+    """The errors of a camera that was calibrated to a millimetre and a tenth of a degree."""
+    if rng.random() < 0.3:
+        return SensorNoiseParameters()
+    share = rng.uniform(0.0, 1.0, 7)
+    return SensorNoiseParameters(
+        depth_std=float(0.002 * share[0]),
+        depth_step=float(0.001 * share[1]),
+        flying_share=float(0.2 * share[2]),
+        hole_share=float(0.03 * share[3]),
+        steepest_deg=float(90 - 10 * share[4]),
+        camera_position_error=float(0.0004 * share[5]),
+        camera_angle_error_deg=float(0.04 * share[5]),
+        rig_position_error=float(0.001 * share[6]),
+        rig_angle_error_deg=float(0.1 * share[6]),
+    )
+
+
+def fit(judged: list[Judged]) -> Reliability:
+    """Fits the regression of one policy, and the threshold.
+
+    The threshold refuses as few right decisions as possible, such that at most 1 % of those that
+    are left are wrong.
+    """
+    acted = [item for item in judged if item.verdict != "stop"]
+    names = sorted(acted[0].evidence)
+    facts = np.array([[item.evidence[name] for name in names] for item in acted])
+    right = np.array([item.verdict == "right" for item in acted])
+    middle, spread = facts.mean(axis=0), np.maximum(facts.std(axis=0), 1e-6)
+    scaled = np.column_stack([(facts - middle) / spread, np.ones(len(facts))])
+
+    def loss(weights: Array) -> tuple[float, Array]:
+        total = scaled @ weights
+        probability = 1 / (1 + np.exp(-total))
+        value = np.logaddexp(0, np.where(right, -total, total)).mean()
+        slope = scaled.T @ (probability - right) / len(right)
+        ridge = _SHRINKAGE * weights * (np.arange(len(weights)) < len(names))
+        return float(value + 0.5 * (ridge @ weights)), slope + ridge
+
+    found = minimize(loss, np.zeros(len(names) + 1), jac=True, method="L-BFGS-B").x
+    weights = found[:-1] / spread
+    constant = float(found[-1] - weights @ middle)
+    plain = dict(zip(names, map(float, weights), strict=True)) | {"": constant}
+    reliability = Reliability(plain, 0.0)
+    confidence = np.array([reliability.confidence(item.evidence) for item in acted])
+    return replace(reliability, threshold=_threshold(confidence, right))
+
+
+def _threshold(confidence: Array, right: NDArray[np.bool_]) -> float:
+    """The least threshold above which at most 1 % are wrong."""
+    order = np.argsort(-confidence)
+    wrong = np.cumsum(~right[order]) / np.arange(1, len(order) + 1)
+    good = np.flatnonzero(wrong <= 0.01)
+    return float(confidence[order[good[-1]]]) if len(good) else 1.0
+
+
+@dataclass(frozen=True)
+class Summary:
+    """How well a confidence tells right from wrong."""
+
+    decisions: int
+    right: float
+    """The share of right decisions."""
+    calibration_error: float
+    """The expected calibration error over ten bins."""
+    wrong_answers: float
+    """The share of wrong decisions among those above the threshold."""
+    refused: float
+    """The share of right decisions below the threshold."""
+    bins: list[tuple[float, float, int]]
+    """Mean confidence, share of right decisions and number of decisions."""
+
+
+def summarize(judged: list[Judged], reliability: Reliability) -> Summary:
+    """Summarizes decisions by a regression that was fitted to others."""
+    acted = [item for item in judged if item.verdict != "stop"]
+    right = np.array([item.verdict == "right" for item in acted])
+    confidence = np.array([reliability.confidence(item.evidence) for item in acted])
+    bins = []
+    for low in np.arange(_BINS) / _BINS:
+        inside = (confidence >= low) & (confidence < low + 1 / _BINS + (low > 0.89))
+        if inside.any():
+            bins.append(
+                (float(confidence[inside].mean()), float(right[inside].mean()), int(inside.sum()))
+            )
+    error = sum(abs(mean - share) * count for mean, share, count in bins) / len(acted)
+    answered = confidence >= reliability.threshold
+    return Summary(
+        decisions=len(acted),
+        right=float(right.mean()),
+        calibration_error=float(error),
+        wrong_answers=float((~right[answered]).mean()) if answered.any() else 0.0,
+        refused=float((~answered[right]).mean()) if right.any() else 0.0,
+        bins=bins,
+    )
+
+
+def as_lines(judged: Iterator[Judged]) -> Iterator[str]:
+    """Decisions as lines of JSON."""
+    for item in judged:
+        yield json.dumps(item.__dict__)
+
+
+def from_lines(path: Path) -> list[Judged]:
+    """The inverse of `as_lines`."""
+    records: list[dict[str, Any]] = [json.loads(line) for line in path.read_text().splitlines()]
+    return [Judged(**record) for record in records]

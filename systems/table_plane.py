@@ -1,0 +1,109 @@
+"""Finds the plane of the table in a heightmap."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+_STEP = 2
+"""Only every second row and column is used."""
+_LEAST = 200
+"""The least number of such pixels on the table."""
+_LEAST_SHARE = 0.15
+"""The least share of such pixels on the table among those that are seen."""
+_BIN = 0.001
+_FAR = 0.03
+"""The table is sought within this distance of the bottom of the grid, in metres."""
+_BAND = 0.004
+"""Pixels within this distance of a plane belong to it, in metres, or three times the noise."""
+_FITS = 8
+_LEVEL = 0.0003
+"""A table with smaller deviations counts as level, in metres."""
+_MOST_OFF, _STEEPEST = 0.010, 0.035
+"""A larger offset in metres, or slope, is no error of calibration, and is not corrected."""
+
+
+def level(
+    height: NDArray[np.float32], seen: NDArray[np.bool_], resolution: float
+) -> tuple[NDArray[np.float32], tuple[float, float, float]]:
+    """Subtracts the table's plane from a heightmap.
+
+    Args:
+        height: (rows, cols), in metres above the bottom of the grid; may be negative.
+        seen: (rows, cols), the pixels that may belong to the table.
+        resolution: of a pixel, in metres.
+
+    Returns:
+        (rows, cols): the heights above the table.
+        The plane (see `find_table`).
+    """
+    table = find_table(height, seen, resolution)
+    if not any(table):
+        return height, table
+    rows, cols = np.indices(height.shape)
+    plane = table[0] * rows + table[1] * cols + table[2]
+    return (height - plane).astype(np.float32), table
+
+
+def find_table(
+    height: NDArray[np.float32], seen: NDArray[np.bool_], resolution: float
+) -> tuple[float, float, float]:
+    """The table's plane in a heightmap: its height at (row, col) is `plane @ (row, col, 1)`.
+
+    The plane starts at the lowest frequent height, and is refitted to the pixels near it. It is
+    zero if it deviates by less than 0.3 mm, if it is not near the bottom of the grid, or if no
+    plane is found.
+
+    Args:
+        height: (rows, cols), in metres above the bottom of the grid; may be negative.
+        seen: (rows, cols), the pixels to use.
+        resolution: of a pixel, in metres.
+    """
+    none = (0.0, 0.0, 0.0)
+    some = seen[::_STEP, ::_STEP]
+    rows, cols = np.nonzero(some)
+    values = height[::_STEP, ::_STEP][some].astype(float)
+    near = np.abs(values) < _FAR
+    if near.sum() < max(_LEAST, _LEAST_SHARE * len(values)):
+        return none
+    middle = np.array(height.shape) / 2
+    design = np.column_stack(
+        [rows * _STEP - middle[0], cols * _STEP - middle[1], np.ones(len(rows))]
+    )
+    plane = np.array([0.0, 0.0, _lowest_mode(values[near])])
+    # Begin in the middle, where a tilt matters least.
+    reach = np.abs(design[:, :2]).max(axis=1)
+    noise = 0.0
+    for number in range(_FITS):
+        rest = values - design @ plane
+        band = max(_BAND, 3 * noise) * (2 if number < _FITS // 2 else 1)
+        inlying = (np.abs(rest) < band) & (reach <= middle.max() * (number + 1) / (_FITS // 2))
+        if inlying.sum() < _LEAST:
+            continue
+        plane = np.linalg.lstsq(design[inlying], values[inlying], rcond=None)[0]
+        rest = (values - design @ plane)[inlying]
+        noise = min(1.4826 * float(np.median(np.abs(rest))), _BAND)
+    inlying = np.abs(values - design @ plane) < max(_BAND, 3 * noise)
+    if inlying.sum() < max(_LEAST, _LEAST_SHARE * len(values)):
+        return none
+    if np.hypot(*plane[:2]) > _STEEPEST * resolution or abs(plane[2]) > _MOST_OFF:
+        return none
+    corners = np.abs(plane[:2]) @ middle + abs(plane[2])
+    if corners < _LEVEL:
+        return none
+    plane[2] -= plane[:2] @ middle
+    return float(plane[0]), float(plane[1]), float(plane[2])
+
+
+def _lowest_mode(values: NDArray[np.float64]) -> float:
+    """The lowest frequent height."""
+    counts = np.bincount(((values + _FAR) / _BIN).astype(int), minlength=int(2 * _FAR / _BIN) + 1)
+    smooth = np.convolve(counts, np.ones(5), "same")
+    peaks = np.flatnonzero(smooth >= 0.5 * smooth.max())
+    return float((peaks[0] + _argmax_run(smooth, peaks[0]) + 0.5) * _BIN - _FAR)
+
+
+def _argmax_run(counts: NDArray[np.float64], first: int) -> int:
+    """How far the first peak's maximum lies beyond its first bin."""
+    run = counts[first : first + 5]
+    return int(run.argmax())
