@@ -339,9 +339,9 @@ def _split(
 
 
 def _most_unrelated(data: TrainingData, wanted: int) -> int:
-    """The largest number, up to `wanted`, of leading scenes that share no tools with later ones.
+    """How many of the first items to train on, so that later ones are unrelated.
 
-    If there is none, it is `wanted`.
+    It is the largest such number that is at most `wanted`, or `wanted` if there is none.
     """
     return max((end for end in data.unrelated if end <= wanted), default=wanted)
 

@@ -75,7 +75,7 @@ def files_digest(paths: Iterable[Path]) -> str:
     """A digest of the files' contents, in order."""
     digest = hashlib.sha256()
     for path in paths:
-        # Digests have a fixed length, so file boundaries matter.
+        # Hash each file by itself, so that moving bytes from one to the next changes the result.
         digest.update(hashlib.sha256(path.read_bytes()).digest())
     return f"sha256 {digest.hexdigest()}"
 

@@ -60,7 +60,7 @@ class KitLayout:
 
 
 def slot_pose(tool: Tool, parameters: KitParameters) -> CavityPose:
-    """The pose of a tool in its category's slot, with its top level with the block's.
+    """The pose of a tool in its category's slot, with its top flush with the block's.
 
     Raises:
         KeyError: the tool's category has no slot.
