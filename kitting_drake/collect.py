@@ -108,7 +108,7 @@ def main() -> int:
         identity = {
             **chosen.described,
             "versions": versions(),
-            # A user's tools may change by another import or annotation.
+            # The user may import or annotate a tool again.
             "task_digest": files_digest(chosen.scenario.task.input_files(chosen.base)),
         }
         claim_folder(folder, "scenario.json", identity, of="scenario, tools or version")

@@ -225,8 +225,8 @@ def _parser() -> argparse.ArgumentParser:
         "--validation",
         type=Path,
         metavar="FILE.h5",
-        help="validation data, which select the checkpoint (default: of --demos, those after the "
-        "training data, a tenth as many; of static scenes, those with other tools)",
+        help="validation data, which select the checkpoint (default: those after the training data "
+        "in --demos, a tenth as many; with other tools, if they are static scenes)",
     )
     parser.add_argument(
         "--from",

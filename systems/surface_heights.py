@@ -41,9 +41,9 @@ _LEAST_TABLE, _FITS = 500, 3
 _LEVEL = 0.0003
 """A table with smaller deviations counts as level, in metres."""
 _MOST_OFF = 0.008
-"""An offset above this is the table's true height and no calibration error, in metres."""
+"""A larger offset is the table's true height, not a calibration error. In metres."""
 _TILT_DOUBT, _MOST_DOUBT = 0.3, 0.0025
-"""Uncertainty after levelling: this share of the table's deviation, limited to this, in metres."""
+"""Uncertainty after levelling: this share of the table's deviation, and its maximum in metres."""
 
 
 def read_surface_heights(
@@ -130,7 +130,7 @@ def _noise(height: NDArray[np.float32]) -> float:
     away = np.abs(height - ndimage.uniform_filter(height, _SMOOTHED, mode="nearest"))
     highest = ndimage.maximum_filter(height, _SMOOTHED, mode="nearest")
     flat = highest - ndimage.minimum_filter(height, _SMOOTHED, mode="nearest") < _FLAT
-    # Flat squares are a biased sample (the calmest), so they only decide whether there is noise.
+    # Flat squares are the least noisy ones, so they only decide whether there is noise at all.
     if flat.sum() >= _LEAST_TABLE and 1.4826 * np.median(away[flat]) < _CLEAN:
         return 0.0
     noise = 1.4826 * float(np.median(away))

@@ -117,7 +117,7 @@ def claim_folder(folder: Path, name: str, described: Any, *, of: str) -> None:
 
 
 def _first_difference(found: Any, described: Any) -> str:
-    """The first difference of two descriptions as text; empty if it is not short."""
+    """The first difference of two descriptions as text; empty if it would be long."""
     if not isinstance(found, dict) or not isinstance(described, dict):
         return ""
     for key in (*described, *found):

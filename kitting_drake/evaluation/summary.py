@@ -266,7 +266,7 @@ def _statistics(
 
 
 def find_ambiguities(item: Mapping[str, Any]) -> list[str]:
-    """The `AMBIGUITIES` because of which a success is not strict."""
+    """Why a success is not strict: names in `AMBIGUITIES`."""
     if not item["success"] or item["strict_success"]:
         return []
     return [name for name, (key, limit) in AMBIGUITIES.items() if abs(item[key]) > limit]
