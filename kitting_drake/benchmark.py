@@ -196,7 +196,7 @@ def _paper(arguments: argparse.Namespace, console: Console, folder: Path) -> int
 
 
 def _use_one_core() -> None:
-    """Restricts this process and its children to one core, as the tables state."""
+    """Restricts this process and its children to one core: the tables give times on one core."""
     os.sched_setaffinity(0, {max(os.sched_getaffinity(0))})
 
 

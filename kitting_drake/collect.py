@@ -108,7 +108,7 @@ def main() -> int:
         identity = {
             **chosen.described,
             "versions": versions(),
-            # A user's tools may change by another import or annotation.
+            # The user may import or annotate a tool again.
             "task_digest": files_digest(chosen.scenario.task.input_files(chosen.base)),
         }
         claim_folder(folder, "scenario.json", identity, of="scenario, tools or version")
@@ -295,7 +295,7 @@ def next_seed(
     rejected: Container[int],
     working: Container[int],
 ) -> int | None:
-    """The seed to try next, to get demonstrations of the first seeds that are not rejected.
+    """The seed to try next. The result is to hold the first `count` seeds that are not rejected.
 
     Args:
         seeds: the permitted seeds, in order.
@@ -305,7 +305,7 @@ def next_seed(
         working: seeds in progress.
 
     Returns:
-        A seed; None if there are enough, provided that the seeds in progress succeed.
+        A seed. None if the accepted seeds and those in progress already make `count`.
 
     Raises:
         UserError: no seed is left, or too many seeds in a row were rejected.
@@ -391,7 +391,7 @@ class DemonstrationRecorder:
         self._final: FinalObservation | None = None
 
     def observe(self, event: ModeChange) -> None:
-        """Records the observation and the action at the start of each action, and at a stop."""
+        """Records observation and action when an action begins, and the observation at the stop."""
         if event.is_last or not (event.is_action_start or event.is_stop):
             return
         observation = self._station.observation(event.root_context)
@@ -402,7 +402,7 @@ class DemonstrationRecorder:
             self._actions.append((observation, action))
 
     def demonstration(self, result: EpisodeResult) -> Demonstration | Rejection:
-        """The demonstration of a finished episode, without failed actions; or its rejection."""
+        """The demonstration of a finished episode, without its failed actions, or a `Rejection`."""
         if result.failure or result.success_rate < LEAST_SCORE:
             reason = result.failure or f"the reward was {result.success_rate:.0%}"
             return Rejection(result.seed, result.success_rate, reason)

@@ -97,7 +97,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--no_later_picks",
         action="store_true",
-        help="objects cannot be picked in any order, e.g. when stacking",
+        help="the order of the picks matters, e.g. when stacking",
     )
     parser.add_argument(
         "--no_curvature",

@@ -125,14 +125,14 @@ class _Parts:
         return self._folder / f"batch_{batch:06d}.h5"
 
     def draw(self, count: int, workers: LocalWorkers, console: Console) -> None:
-        """Draws batches until the batches before the first missing one hold `count` scenes."""
+        """Draws batches until they hold `count` scenes, without those after a missing batch."""
         begun = set(self._counts)
 
         def next_batch() -> int | None:
             if self._gapless() >= count:
                 return None
             batch = next(i for i in range(_MOST_BATCHES) if i not in begun)
-            # Begin no further batch if those before it, once complete, may hold enough scenes.
+            # Begin no further batch if the scenes suffice once the missing batches are complete.
             if sum(self._counts.values()) >= count and batch > max(self._counts):
                 return None
             begun.add(batch)

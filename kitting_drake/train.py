@@ -225,8 +225,8 @@ def _parser() -> argparse.ArgumentParser:
         "--validation",
         type=Path,
         metavar="FILE.h5",
-        help="validation data, which select the checkpoint (default: of --demos, those after the "
-        "training data, a tenth as many; of static scenes, those with other tools)",
+        help="validation data, which select the checkpoint (default: those after the training data "
+        "in --demos, a tenth as many; with other tools, if they are static scenes)",
     )
     parser.add_argument(
         "--from",
@@ -339,9 +339,9 @@ def _split(
 
 
 def _most_unrelated(data: TrainingData, wanted: int) -> int:
-    """The largest number, up to `wanted`, of leading scenes that share no tools with later ones.
+    """How many of the first items to train on, so that later ones are unrelated.
 
-    If there is none, it is `wanted`.
+    It is the largest such number that is at most `wanted`, or `wanted` if there is none.
     """
     return max((end for end in data.unrelated if end <= wanted), default=wanted)
 

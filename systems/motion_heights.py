@@ -28,8 +28,8 @@ def motion_heights(heights: SurfaceHeights, parameters: PickPlaceParameters) -> 
     """Computes the heights of a motion.
 
     The fingertips grip below the object's top by a share of its height, within limits, and stay
-    above the table. The object's bottom hangs below the fingertips by their height above its
-    support.
+    above the table. The object's bottom hangs as far below the fingertips as they were above its
+    support at the pick.
 
     Args:
         heights: of the surfaces, as `read_surface_heights` returns them.

@@ -90,9 +90,9 @@ class OraclePolicy(LeafSystem):
     4. The grasp: the first that keeps the fingers clear of other objects at the pick and the place.
 
     With a quantizer, the action is the best that a policy of the paper can choose. The pick is the
-    rounded annotated grasp. The place is where the gripper, holding the object as the *rounded*
-    pick does, brings it to its goal; then position and rotation are rounded. A place network whose
-    crop is centred on the pick needs these labels (section III-C.2).
+    rounded annotated grasp. The place is the gripper pose that brings the object, held by the
+    *rounded* pick, to its goal. Its position and the rotation are then rounded, too. A place
+    network whose crop is centred on the pick needs these labels (section III-C.2).
 
     Stateless: after a failed grasp, it returns the same object again.
     """
@@ -113,7 +113,7 @@ class OraclePolicy(LeafSystem):
         """
         Args:
             objects: n of them.
-            grasps: n, the grasps of each object, best first; empty if no goal takes the object.
+            grasps: n, the grasps of each object, best first; empty if it can fill no goal.
             goals: in the order in which to fill them.
             success: decides when a goal is filled.
             quantizer: rounds the actions; None leaves them exact.

@@ -190,7 +190,7 @@ class PickPlaceMotion:
     def _limits_of(self, state: PlannerState) -> MotionLimits:
         """The limits of the present mode's motion."""
         mode = Mode(int(state.mode))
-        # Faster than LOWER, the force would overshoot by too much within one period.
+        # Press no faster than LOWER: the force would overshoot too far within one period.
         return self._limits[Mode.LOWER if state.press and mode == Mode.DESCEND else mode]
 
     def set_force(self, state: PlannerState, time: float, force: float) -> None:

@@ -111,8 +111,8 @@ class PickPlaceParameters:
     # Speed of one finger, in m/s.
     finger_speed: float = bounded(0.05, 0.005, 0.05)
 
-    # Time in which the grasp force builds up and decays, in s. Released slowly, a heavy object
-    # swings about the pads.
+    # Time in which the grasp force builds up and decays, in s. It is short, because a heavy object
+    # that is released slowly swings about the pads.
     force_ramp: float = bounded(0.03, 0.0, 5.0)
 
     # How long the hand rests before the cameras look and before the payload is tared, in s.

@@ -249,8 +249,8 @@ def evaluate_placements(
     """Assigns objects to goals and measures their errors.
 
     The assignment (Hungarian method) fills as many goals as possible with objects within 5 cm of
-    them, then minimizes the total `displacement`. Minimizing displacement alone could assign each
-    object of a correct row to its neighbour's goal, if one more object lies along the row.
+    them, then minimizes the total `displacement`. Displacement alone does not suffice: if a spare
+    object lies at the end of a correct row, every object could get its neighbour's goal.
 
     Args:
         objects: n of them.

@@ -250,7 +250,7 @@ def noisy_depth(
         hole |= _incidence(z, seen, camera) < math.cos(math.radians(parameters.steepest_deg))
     noisy = z
     if parameters.flying_share:
-        # A pixel without a valid neighbour has no other side to mix with.
+        # Neighbours without a depth are ignored. If there are no others, the pixel keeps its depth.
         low, high = (
             np.where(seen, extreme(np.where(seen, z, none), 3), z)
             for extreme, none in (

@@ -230,7 +230,7 @@ class PickPlaceAction:
 
     @property
     def poses(self) -> dict[str, PlanarPose]:
-        """The poses in use, by name."""
+        """The poses that this action uses, by name: none to stop, only the pick to press."""
         if self.stop:
             return {}
         return {"pick": self.pick} if self.press else {"pick": self.pick, "place": self.place}

@@ -40,7 +40,7 @@ deviations."""
 _SUNK = 0.003
 """A table that looks lower than expected by more than this is lower, in metres."""
 _TILT_DOUBT, _MOST_DOUBT = 0.3, 0.0025
-"""Uncertainty after levelling: this share of the table's deviation, limited to this, in metres."""
+"""Uncertainty after levelling: this share of the table's deviation, and its maximum in metres."""
 
 
 def read_surface_heights(

@@ -21,9 +21,9 @@ from systems.pick_place_parameters import Mode
 SEED = 0
 WIDTH, HEIGHT = 720, 400
 STRIP = 202  # Pixels under the picture, for the maps.
-PERIOD = 1 / 16  # Of frames, in s of simulated time: the film is in real time.
-HOLD = 32  # Frames for which the film stands still at a decision.
-LAST = 40  # Frames after the last one.
+PERIOD = 1 / 16  # Simulated time between two frames, in s; also their time in the film.
+HOLD = 32  # Frames for which the picture stands still at a decision.
+LAST = 40  # Times that the last frame is repeated.
 X_WC = look_at([1.68, -0.62, 1.10], [0.45, -0.01, 0.08])
 
 
@@ -39,17 +39,17 @@ class Film:
         self._frames = []
 
     def decided(self, observation, decision):
-        """Shows the maps of a decision from now on; `with_policy` calls it."""
+        """Puts the maps of a decision under all further frames; `with_policy` calls it."""
         png = draw_maps(observation, decision, width=WIDTH)
         self._maps = Image.open(io.BytesIO(png)).convert("RGB")
 
     @property
     def shown(self):
-        """The maps that are shown."""
+        """The maps under the next frame; None before the first decision."""
         return self._maps
 
     def take(self, context, count=1):
-        """Takes one frame, and shows it so many times."""
+        """Renders one frame and adds it `count` times."""
         scene_graph = self._station.scene_graph
         own = scene_graph.GetMyContextFromRoot(context)
         query = scene_graph.get_query_output_port().Eval(own)

@@ -51,7 +51,7 @@ _linked: dict[str, Path] = {}
 
 
 def on_config(config):
-    """Leaves out what the navigation names and is not there."""
+    """Removes entries of the navigation whose pages do not exist."""
     made = {"index.md", "tutorial.md", "api/systems.md", *(f"api/{name}.md" for name in API)}
 
     def kept(entries):
@@ -134,7 +134,7 @@ def on_page_content(html: str, page, config, files: Files) -> str:
 
 
 def on_post_build(config) -> None:
-    """Copies the linked files outside docs/; of a folder, the list of its files."""
+    """Copies the linked files outside docs/. A folder becomes a list of its files."""
     for name, path in _linked.items():
         copy = Path(config.site_dir, name)
         copy.parent.mkdir(parents=True, exist_ok=True)
@@ -161,7 +161,7 @@ def _notebook(path: Path) -> str:
 
 
 def _outside_code(markdown: str, change) -> str:
-    """Changes all of a page but its fenced code."""
+    """Applies `change` to a page, except to its fenced code."""
     parts = re.split(r"(^```.*?^```$)", markdown, flags=re.DOTALL | re.MULTILINE)
     return "".join(part if i % 2 else change(part) for i, part in enumerate(parts))
 

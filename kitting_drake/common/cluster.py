@@ -61,7 +61,7 @@ class RayWorkers:
         Raises:
             UserError: Ray is not installed, there is no such cluster, or it rejects the files.
         """
-        # Ray explains a dead node once; this hides pages of the node's own log.
+        # Ray reports a dead node in one message. This keeps it from printing the node's log, too.
         os.environ.setdefault("RAY_DEDUP_LOGS_SKIP_REGEX", "Raylet is terminated")
         self._ray = import_extra("ray", purpose="--ray", extra="cluster")
         address = _find_cluster(self._address)
@@ -171,7 +171,7 @@ def _answer(versions_wanted: dict[str, str], call: bytes) -> bytes:
     try:
         found = versions()
         if found != versions_wanted:
-            # A package that is missing on one side has a version only on the other.
+            # Look at the names of both sides: a package may be installed on one side only.
             names = (*versions_wanted, *found)
             name = next(key for key in names if found.get(key) != versions_wanted.get(key))
             there, here = (which.get(name, "none") for which in (found, versions_wanted))

@@ -69,9 +69,10 @@ def interrupts_wait() -> Iterator[Callable[[], bool]]:
 
 
 def _interrupt(number: int, frame: FrameType | None) -> None:
-    """Raises KeyboardInterrupt, unless trimesh is being imported: its optional imports catch it.
+    """Raises KeyboardInterrupt, but not while trimesh is being imported.
 
-    In that case a timer tries again.
+    The optional imports of trimesh would catch the exception. A timer tries again until it can be
+    raised.
     """
     while frame is not None:
         module = str(frame.f_globals.get("__name__", ""))

@@ -75,7 +75,7 @@ def files_digest(paths: Iterable[Path]) -> str:
     """A digest of the files' contents, in order."""
     digest = hashlib.sha256()
     for path in paths:
-        # Digests have a fixed length, so file boundaries matter.
+        # Hash each file by itself, so that moving bytes from one to the next changes the result.
         digest.update(hashlib.sha256(path.read_bytes()).digest())
     return f"sha256 {digest.hexdigest()}"
 
@@ -117,7 +117,7 @@ def claim_folder(folder: Path, name: str, described: Any, *, of: str) -> None:
 
 
 def _first_difference(found: Any, described: Any) -> str:
-    """The first difference of two descriptions as text; empty if it is not short."""
+    """The first difference of two descriptions as text; empty if it would be long."""
     if not isinstance(found, dict) or not isinstance(described, dict):
         return ""
     for key in (*described, *found):

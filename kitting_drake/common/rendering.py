@@ -66,12 +66,12 @@ def require_rendering() -> None:
 def _load_triton() -> None:
     """Loads Triton before Mesa, if PyTorch is built for CUDA.
 
-    Both bring an LLVM. PyTorch imports Triton with the first optimizer; after Mesa's LLVM (software
-    rendering) this import crashes, but the reverse order works.
+    Each brings its own LLVM. PyTorch imports Triton with the first optimizer, and crashes if Mesa's
+    LLVM (for software rendering) is loaded already. The reverse order works.
     """
     with contextlib.suppress(OSError):
         if b"libLLVM" in Path("/proc/self/maps").read_bytes():
-            # Someone else has rendered before: loading Triton now would crash at once.
+            # Another renderer has loaded Mesa's LLVM already: loading Triton would crash.
             return
     package = importlib.util.find_spec("triton")
     for folder in (package and package.submodule_search_locations) or ():
@@ -85,7 +85,7 @@ def add_observation_renderer(scene_graph: SceneGraph, lights: Sequence[LightPara
     """Adds the plain and fast engine of the policy's cameras; returns its name.
 
     Args:
-        scene_graph: to which to add it.
+        scene_graph: gets the engine.
         lights: if empty, a light at each camera.
 
     Raises:

@@ -50,7 +50,7 @@ class EpisodeResult:
     policy: str
     seed: int
     objects: list[ObjectResult]
-    """The objects that some goal takes."""
+    """The objects that can fill a goal."""
     success_rate: float
     """The task's reward, 0 to 1 (in kitting the share of kitted tools); 0 if the episode failed or
     timed out."""
@@ -229,7 +229,7 @@ def object_results(
     placements: Sequence[Placement],
     records: Sequence[ActionRecord] = (),
 ) -> list[ObjectResult]:
-    """The results of all objects that some goal takes, in the scene's order.
+    """The results of all objects that can fill a goal, in the scene's order.
 
     Args:
         station: the episode's.

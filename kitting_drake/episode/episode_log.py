@@ -128,14 +128,23 @@ class EpisodeLog:
         """The log, with n samples and k actions; SI units, radians, world frame.
 
         Returns:
-            `time` (n); `joint_position`, `joint_velocity`, `joint_torque` (n, 4) of x, y, z, yaw;
-            `finger_position`, `finger_force` (n, 2), the force being the actuation; `wrist_force`
-            (n, 6), contact on x, y, z, about z, and on each finger; `commanded_position`,
-            `commanded_velocity`, `commanded_acceleration` (n, 4); `commanded_opening` (n, 2), value
-            and rate; `mode` (n), a `Mode`; `object_poses` (n, objects, 3, 4), X_WB. For each
-            action: `action_time` (k), its start; `pick`, `place` (k, 3), x, y, theta; `press` (k);
-            `observation_height` (k, rows, cols), the policy's o_t, missing without cameras. Texts:
-            `joint_names`, `mode_names`, `object_names`.
+            For each step:
+
+            - `time` (n); `mode` (n), a `Mode`;
+            - `joint_position`, `joint_velocity`, `joint_torque` (n, 4), of x, y, z, yaw;
+            - `finger_position`, `finger_force` (n, 2), the force of the actuators;
+            - `wrist_force` (n, 6), contact on x, y, z, about z, and on each finger;
+            - `commanded_position`, `commanded_velocity`, `commanded_acceleration` (n, 4);
+            - `commanded_opening` (n, 2), value and rate;
+            - `object_poses` (n, objects, 3, 4), X_WB.
+
+            For each action:
+
+            - `action_time` (k), its start;
+            - `pick`, `place` (k, 3), x, y, theta; `press` (k);
+            - `observation_height` (k, rows, cols), the policy's o_t; missing without cameras.
+
+            Texts: `joint_names`, `mode_names`, `object_names`.
         """
         found = {key: np.array(values) for key, values in self._samples.items()}
         state, torque, commanded = found["state"], found["torque"], found["commanded"]

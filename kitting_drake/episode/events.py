@@ -12,8 +12,9 @@ from systems.pick_place_parameters import Mode
 class ModeChange:
     """The planner changed its mode or, as the last event, the episode ended.
 
-    Observers are called one time step after the change. Nothing has moved since the planner's
-    update, but ports that depend on time, such as those with camera noise, are evaluated anew.
+    Observers are called one time step after the change. The bodies have not moved since the
+    planner's update. But ports that depend on time, such as those with camera noise, are evaluated
+    anew.
     """
 
     previous: Mode

@@ -23,7 +23,7 @@ TIMED_OUT = "timed out"
 """The cause of all objects of an episode that timed out."""
 
 UNKNOWN = "unknown"
-"""The category of the object of a failed episode if no other episode has objects."""
+"""A failed episode counts as one object of this category if no other episode has objects."""
 
 AMBIGUITIES = {
     "protruding": ("height_error_mm", 1e3 * STRICT_HEIGHT),
@@ -266,7 +266,7 @@ def _statistics(
 
 
 def find_ambiguities(item: Mapping[str, Any]) -> list[str]:
-    """The `AMBIGUITIES` because of which a success is not strict."""
+    """Why a success is not strict: names in `AMBIGUITIES`."""
     if not item["success"] or item["strict_success"]:
         return []
     return [name for name, (key, limit) in AMBIGUITIES.items() if abs(item[key]) > limit]

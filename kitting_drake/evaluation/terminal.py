@@ -15,7 +15,7 @@ _ERROR_HEADINGS = ("ADD-S mm", "position mm", "angle deg", "height mm")
 
 
 def episode_table(result: EpisodeResult) -> Table:
-    """A table with a row for each object that some goal takes."""
+    """A table with a row for each object that can fill a goal."""
     table = Table(
         title=escape(f"{result.scenario}, seed {result.seed}"),
         title_justify="left",

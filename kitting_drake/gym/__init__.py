@@ -1,7 +1,8 @@
 """The cell as Gymnasium environments, registered on import; see docs/gym.md.
 
-`gymnasium.make("kitting_drake.gym:kitting_drake/KittingUnseen-v0")` imports this module. Gymnasium
-1.0 and later ignore the entry points of installed packages.
+Gymnasium 1.0 and later do not load environments from the entry points of installed packages. So
+import this module first, or name it in the call, which imports it:
+`gymnasium.make("kitting_drake.gym:kitting_drake/KittingUnseen-v0")`.
 """
 
 import gymnasium

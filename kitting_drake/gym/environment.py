@@ -38,8 +38,8 @@ class KittingEnvironment(gymnasium.Env[dict[str, Any], NDArray[Any]]):
     - Observation and action: see `gym.spaces`. The observation is o_t at the time when a policy
       would be called, while the hand waits out of the cameras' sight.
     - Reward: the increase of the task's reward, so that the return equals `success_rate` in
-      `results.json`. It too is 0 if the episode times out or fails: the last step then subtracts
-      the reward earned before.
+      `results.json`. If the episode times out or fails, both are 0: the last step subtracts the
+      reward earned before.
     - Terminated: the agent stopped, or every goal is filled. Truncated: no actions or no time are
       left, or the simulation failed (`info["failure"]`).
     - `info`: the present values of the keys of `results.json`, without `wall_seconds`, which would
@@ -156,7 +156,7 @@ class KittingEnvironment(gymnasium.Env[dict[str, Any], NDArray[Any]]):
         result = episode.result()
         is_done = result.success_rate > ALL
         if is_done and not episode.is_over:
-            # Like a policy that sees a finished task.
+            # The task is finished: stop in place of the agent, as a policy would.
             self._give(episode, PickPlaceAction(stop=True))
             result = episode.result()
             is_done = result.success_rate > ALL

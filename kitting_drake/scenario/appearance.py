@@ -10,7 +10,7 @@ from systems.bounds import bounded
 
 @dc.dataclass
 class Fixed:
-    """A colour."""
+    """A given colour."""
 
     # Red, green and blue, 0 to 1.
     rgb: list[float] = bounded([0.5, 0.5, 0.5], 0.0, 1.0)
@@ -60,15 +60,15 @@ class Appearance:
     # If empty, a light at each camera.
     lights: list[Light] = dc.field(default_factory=list)
 
-    # If given, the seed draws one to three lights instead. Their total brightness deviates from
-    # full light by at most this share.
+    # If given, one to three lights drawn from the seed replace these. Their total brightness is
+    # between 1 - value and 1 + value times normal.
     drawn_lights: float | None = bounded(None, 0.0, 1.0)
 
     def validate(self) -> None:
         """Checks the constraints that types and ranges cannot express.
 
         Raises:
-            ValueError: a sentence that begins with the path of a field, `appearance.x`.
+            ValueError: a field violates one. The message begins with its path, `appearance.x`.
         """
         for pattern, share in self.sheen.items():
             if not 0.0 <= share <= 1.0:

@@ -39,7 +39,7 @@ class Pinhole:
     focal_length: float = bounded(450.0, 10.0, 10000.0)
 
     def to_camera_config(self) -> CameraConfig:
-        """The same camera in Drake's words."""
+        """The same camera as a `CameraConfig`."""
         rotation = Rotation(value=Rotation.Rpy(deg=self.rpy_deg))
         return _camera_config(self, Transform(translation=self.position, rotation=rotation))
 
@@ -58,17 +58,18 @@ class LookAt:
     focal_length: float = bounded(450.0, 10.0, 10000.0)
 
     def to_camera_config(self) -> CameraConfig:
-        """The same camera in Drake's words."""
+        """The same camera as a `CameraConfig`."""
         return _camera_config(self, Transform(look_at(self.position, self.target)))
 
     def validate(self) -> None:
         """Checks that the camera does not look straight up or down, where upright is undefined.
 
         Raises:
-            ValueError: the rest of a sentence whose subject is the camera's name.
+            ValueError: it does so. The message lacks its subject, which the caller adds: the
+                camera's name.
         """
         if self.position[:2] == self.target[:2]:
-            raise ValueError("looks straight up or down: use !Pinhole, as upright is undefined")
+            raise ValueError("looks straight up or down, so upright is undefined: use !Pinhole")
 
 
 Camera: TypeAlias = Pinhole | LookAt | CameraConfig
@@ -104,7 +105,8 @@ def check_camera(camera: Camera) -> None:
     """Checks the constraints that types and ranges cannot express.
 
     Raises:
-        ValueError: the rest of a sentence whose subject is the camera's name.
+        ValueError: the camera violates one. The message lacks its subject, which the caller adds:
+            the camera's name.
     """
     if isinstance(camera, LookAt):
         camera.validate()

@@ -71,7 +71,7 @@ class ChosenScenario:
 
     @contextlib.contextmanager
     def named_in_errors(self) -> Iterator[None]:
-        """Prefixes any UserError raised within by the name of the scenario's file."""
+        """Puts the name of the scenario's file before the message of a UserError raised inside."""
         try:
             yield
         except UserError as error:

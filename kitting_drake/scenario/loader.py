@@ -196,13 +196,13 @@ def _check_meaning(scenario: Scenario) -> None:
         )
     if scenario.heightmap.z_min > 0:
         raise ValueError(
-            f"heightmap.z_min is {scenario.heightmap.z_min:g}: use 0 or less, as the hand needs "
-            "the height of the table, which is at 0"
+            f"heightmap.z_min is {scenario.heightmap.z_min:g}, above the table, whose height the "
+            "hand needs: use 0 or less"
         )
     if -_PLAINLY_BELOW < scenario.heightmap.z_min < 0:
         raise ValueError(
-            f"heightmap.z_min is {scenario.heightmap.z_min:g}, too close to the table to tell "
-            f"from a calibration error: use 0, or -{_PLAINLY_BELOW:g} or less"
+            f"heightmap.z_min is {scenario.heightmap.z_min:g}, which looks like a calibration "
+            f"error: use 0, or -{_PLAINLY_BELOW:g} or less"
         )
     if scenario.heightmap.z_max <= scenario.heightmap.z_min:
         raise ValueError("heightmap.z_max must be above heightmap.z_min")

@@ -1,4 +1,4 @@
-"""Named sets of imperfections for the flag `--perturb`, as overlays of scenario fields.
+"""Named sets of imperfections for the flag `--perturb`. Each sets fields of the scenario.
 
 A scenario's YAML can give the same fields. All random draws depend on the episode's seed alone.
 """
@@ -61,12 +61,14 @@ NAMES = (*_OVERLAYS, "all")
 
 
 def perturbation(text: str, scenario: Scenario) -> dict[str, Any]:
-    """The overlay for the value of `--perturb`: a mapping of fields, with tags under `_tag`.
+    """The scenario fields that a value of `--perturb` sets, to merge over the scenario's own.
+
+    They are a nested mapping as from YAML; tags are under the key `_tag`.
 
     Args:
         text: `NAME[:LEVEL],...`. The default level is `moderate`. `all` means all perturbations
             that apply to the scenario's task.
-        scenario: to be perturbed.
+        scenario: the scenario to perturb. Its values stay where they are less perfect.
 
     Raises:
         UserError: a name or level is unknown, a name is given twice, or a perturbation does not

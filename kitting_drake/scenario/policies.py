@@ -119,7 +119,7 @@ class PolicyConfig:
         """Checks the constraints that types and ranges cannot express.
 
         Raises:
-            ValueError: a sentence that begins with the path of a field, `policy.x`.
+            ValueError: a field violates one. The message begins with its path, `policy.x`.
         """
 
 

@@ -72,8 +72,8 @@ class Controller:
 class Variation:
     """Random variation of all models but the hand."""
 
-    # The seed draws a factor for each model's friction coefficients, and one for its mass, between
-    # 1 - value and 1 + value.
+    # Each model's friction coefficients are multiplied by a factor between 1 - value and 1 + value,
+    # drawn from the seed. Likewise its mass.
     friction: float = bounded(0.0, 0.0, 0.9)
     mass: float = bounded(0.0, 0.0, 0.9)
 

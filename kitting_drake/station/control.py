@@ -34,7 +34,7 @@ def add_control(
     Args:
         builder: of the station.
         scenario: configures planner and controller.
-        scene: the number of actions, and whether objects are inserted.
+        scene: says how many actions there are, and whether objects are inserted.
         plant: finalized, with the hand.
         projector: provides o_t, from which the planner reads heights; None if each action carries
             its heights.

@@ -13,7 +13,7 @@ from systems.signals import PixelGrid
 
 _YAWS = np.deg2rad([0.0, 45.0, 90.0, 135.0])
 _PLACES = 9
-"""Number of waiting positions to check along the workspace's y. The hand keeps its y to wait."""
+"""Number of waiting positions to check along the workspace's y: the hand waits at any y."""
 
 
 def hidden_table_note(scenario: Scenario) -> str | None:

@@ -196,7 +196,7 @@ class KittingStation(Diagram):
         return Mode(int(self._eval(root_context, "mode")[0]))
 
     def asks(self, root_context: Context) -> bool:
-        """The port `asks`: whether the planner's next update evaluates the action."""
+        """The port `asks`: whether the planner will read the action at its next update."""
         return bool(self._eval(root_context, "asks")[0])
 
     def observation(self, root_context: Context) -> Observation:

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
 MESHCAT_PERIOD = 1 / 32
 _FIELD_OF_VIEW_DEG = 34.0
-"""Of Meshcat's first view, from top to bottom."""
+"""Vertical field of view with which Meshcat starts."""
 
 
 def start_meshcat(parameters: MeshcatParams) -> Meshcat:
@@ -56,7 +56,7 @@ def start_meshcat(parameters: MeshcatParams) -> Meshcat:
     meshcat.SetProperty("/Grid", "visible", False)
     meshcat.SetProperty("/Axes", "visible", False)
     _add_room(meshcat)
-    # A narrow field of view from farther away shows the workspace large and little distorted.
+    # From farther away, a narrow view fills the page with the workspace and distorts it little.
     meshcat.SetProperty("/Cameras/default/rotated/<object>", "fov", _FIELD_OF_VIEW_DEG)
     meshcat.SetCameraPose(camera_in_world=[1.55, -0.42, 0.98], target_in_world=[0.47, -0.02, 0.09])
     return meshcat

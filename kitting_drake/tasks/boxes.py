@@ -208,7 +208,7 @@ def box_footprint(size: tuple[float, float, float], offset: float = 0.0) -> Foot
 
 
 def outermost_grasps(size: tuple[float, float, float], offset: float) -> tuple[Grasp, ...]:
-    """The grasps of a box farthest from its middle; room for them is room for all in between."""
+    """The grasps of a box farthest from its middle. All others need no more room than these."""
     return tuple(
         grasp_along(size, axis, distance) for axis in ("x", "y") for distance in (-offset, offset)
     )

@@ -44,7 +44,7 @@ class SceneObject:
     p_BPoints: NDArray[np.float64] = field(repr=False)
     """(m, 3) surface points, sampled by area, in B, in metres."""
     grasps: tuple[Grasp, ...] = ()
-    """In B, best first; may be empty if no goal takes the object."""
+    """In B, best first; may be empty if the object can fill no goal."""
     symmetry: int = 1
     """Order of the rotational symmetry about B's z; 1 for none."""
 
@@ -104,7 +104,7 @@ class Scene:
 
     @property
     def goal_objects(self) -> tuple[int, ...]:
-        """Indices of the objects that some goal takes. Results list these objects."""
+        """Indices of the objects that can fill a goal. Results list these objects."""
         return tuple(sorted({index for goal in self.goals for index in goal.objects}))
 
 
@@ -126,8 +126,8 @@ class ActionRecord:
     pick_angle_error_deg: float | None
     """Angle from that grasp, modulo half rotations: 0 to 90."""
     place_position_error_mm: float | None
-    """Distance of the object's middle from its goal after a rigid motion by the action; None if no
-    goal takes it."""
+    """Distance of the object's middle from its goal after a rigid motion by the action; None if the
+    object can fill no goal."""
     place_angle_error_deg: float | None
     """Heading error after that motion, modulo the object's symmetry: 0 to 180."""
 
@@ -182,10 +182,10 @@ class TaskConfig:
         return []
 
     def validate(self) -> None:
-        """Checks conditions beyond types and ranges.
+        """Checks the constraints that types and ranges cannot express.
 
         Raises:
-            ValueError: one sentence that begins with the path of a field, `task.x`.
+            ValueError: a field violates one. The message begins with its path, `task.x`.
         """
 
     def find_cause(

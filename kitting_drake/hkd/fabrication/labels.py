@@ -26,8 +26,8 @@ _FARTHEST = 0.03
 """The largest distance of a label from its cavity, in metres."""
 _PLAINLY = 1.5
 """A label is at least this many times as far from other cavities as from its own."""
-# A label's cost, in metres, is the sum of minus 6 times the height of its letters, 6 mm if it is
-# read from the side, and a tenth of its distance from the cavity's middle.
+# A label's cost, in metres, is a sum of three terms: minus 6 times the height of its letters; 6 mm
+# if it is read from the side; and a tenth of its distance from the cavity's middle.
 _DISTANCE_FOR_HEIGHT, _FROM_THE_SIDE, _OFF_THE_MIDDLE = 6.0, 0.006, 0.1
 _FONT_SIZE = 100.0
 

@@ -24,9 +24,9 @@ _SLIDES = tuple(sign * step for step in np.arange(0.0, 0.041, 0.004) for sign in
 _SHARES = (0.85, 1.15)
 """The allowed area of a notch outside its cavity, as a share of a half disc's."""
 _FINS = 1.6
-"""The allowed area of thin fins beside a notch, as a multiple of that of two right corners."""
+"""The allowed area of thin fins beside a notch, as a multiple of what two right corners give."""
 _OVERLAP = 0.001
-"""The overlap of a notch with its cavity in metres; it leaves no skin between them."""
+"""The overlap of a notch with its cavity, in metres, so that no thin skin is left between them."""
 
 
 def cut_notches(

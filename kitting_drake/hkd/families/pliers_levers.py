@@ -238,8 +238,8 @@ def slab_hulls(
 ) -> list[np.ndarray]:
     """Few convex prisms for a plate with a bevelled lower rim; holes and gaps are filled.
 
-    The profile is cut across x into bands. Each is as long as it can be while the hulls of its
-    pieces exceed the profile by less than the tolerance (mm), or 0.05 mm at the gripped flanks
+    The profile is cut across x into bands, each as long as possible. The hulls of a band's pieces
+    may exceed the profile by the tolerance (mm), but only by 0.05 mm at the gripped flanks
     (x start, x end, y).
     """
 

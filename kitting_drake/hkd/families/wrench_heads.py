@@ -21,16 +21,25 @@ from kitting_drake.hkd.tools.solids import (
 class Head:
     """One end of a wrench. Lengths in mm."""
 
-    # open, box, ratchet (a box with a geared ring), flare_nut (a box with a gap for the pipe),
-    # adjustable, pipe, hook (of a hook spanner), tail (a round end with a hole), spike (a taper to
-    # align holes) or bar (a handle or striking block across the end).
+    # - open, box, adjustable, pipe;
+    # - ratchet: a box with a geared ring;
+    # - flare_nut: a box with a gap for the pipe;
+    # - hook: of a hook spanner;
+    # - tail: a round end with a hole;
+    # - spike: a taper to align holes;
+    # - bar: a handle or striking block across the end.
     kind: str = "open"
-    # The hexagon's size across flats. For adjustable and pipe, the opening of the jaws; for a tail,
-    # the diameter of the hole; for a hook, the length of its nose; for a spike, its length; for a
-    # bar, its depth along the shank.
+    # The hexagon's size across flats. Other kinds have another size here:
+    # - adjustable, pipe: the opening of the jaws;
+    # - tail: the diameter of the hole;
+    # - hook: the length of its nose;
+    # - spike: its length;
+    # - bar: its depth along the shank.
     size_mm: float = 17.0
-    # The head's diameter. For adjustable and pipe, the width across it; for a spike, the diameter
-    # of its foot; for a bar, its length.
+    # The head's diameter. Other kinds have another size here:
+    # - adjustable, pipe: the width across the head;
+    # - spike: the diameter of its foot;
+    # - bar: its length.
     diameter_mm: float = 38.0
     thickness_mm: float = 8.8
     # Angle of the head's axis to the shank, in degrees.

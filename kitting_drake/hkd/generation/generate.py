@@ -46,7 +46,7 @@ GRIP_TOLERANCE_MM = 0.06
 GRIP_CENTRING_MM = 0.2
 # Edges sharper than this are shaded as edges.
 CREASE_ANGLE_DEG = 35.0
-# The lengths of the pads and fingers along the tool, with a margin for a hand off its grasp.
+# The lengths of the pads and fingers along the tool, with a margin for an inexact grasp.
 PAD_LENGTH_MM = round(1e3 * PAD_LENGTH + 0.4, 3)
 FINGER_LENGTH_MM = round(1e3 * FINGER_LENGTH + 1.2, 3)
 

@@ -96,7 +96,7 @@ def _notches(part: CrossSection) -> list[Array]:
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     depth = ((hull * normals).sum(axis=1) - corners @ normals.T).min(axis=1)
     spacing = 0.1 * np.ptp(corners, axis=0).max()
-    # The centre comes first: of equally good cuts of an arc, halving leaves the fewest cells.
+    # Try the centre first. Where all cuts of an arc are equally good, halves give fewest cells.
     chosen = [0.5 * (corners.min(axis=0) + corners.max(axis=0))]
     for index in np.argsort(-depth, kind="stable"):
         if all(np.linalg.norm(corners[index] - other) > spacing for other in chosen[1:]):

@@ -15,8 +15,8 @@ Array = NDArray[np.float64]
 # Stable poses whose centres of mass are this close to the lowest count as equal. The one with the
 # broadest support, rounded to this step, is chosen. Both are for a solid about 180 mm long.
 _EQUAL_HEIGHT_MM, _MARGIN_STEP_MM = 0.3, 0.5
-# The largest angle between the length and the axis of least inertia, and the standard deviation of
-# the angle at which an edge still votes for a direction.
+# The largest angle between the length and the axis of least inertia. Edges vote for directions: the
+# weight of a vote is a Gaussian of the angle between edge and direction, with this deviation.
 _SIDEWAYS_DEG, _LIKE_DEG = 25.0, 6.0
 _END = 0.3
 """The share of the length that counts as an end."""
@@ -96,7 +96,7 @@ def _lowest_pose(vertices: Array, com: Array) -> StablePose:
 def long_direction_deg(outline: CrossSection) -> float:
     """The direction of an outline's length: that of most of its edges, near its principal axis.
 
-    So the two edges of a handle decide it, not a head or a jaw that sticks out to one side.
+    The long edges of a handle therefore outvote a head or a jaw that sticks out to one side.
 
     Args:
         outline: about 180 mm long.

@@ -28,8 +28,8 @@ def measure_clearance(
     """Measures the clearance along the whole outline of a seated tool.
 
     The wall is a slice of the block halfway between floor and bevel; the outline is that of the
-    tool's visual mesh. Each point of the outline has the distance to the nearest wall, also in
-    notches of the tool that the cavity bridges.
+    tool's visual mesh. The clearance of each point of the outline is its distance from the nearest
+    wall. This includes points in notches of the tool, which the cavity bridges.
 
     Args:
         block: the kit's, in frame K.

@@ -1,8 +1,8 @@
 """The layout of a kit: the poses and outlines of its cavities.
 
 A toolset, with at most one tool of each of the paper's categories, takes the slots of a template.
-Tools are nested instead if they are other tools, are too large for their slots, or if
-`always_nested` is set. The block then has the smallest size found, or a given size.
+Other sets of tools are nested. So is a toolset with a tool that is too large for its slot, or with
+`always_nested`. The block of nested tools has the smallest size found, or a given size.
 """
 
 import dataclasses
@@ -60,7 +60,7 @@ class KitLayout:
 
 
 def slot_pose(tool: Tool, parameters: KitParameters) -> CavityPose:
-    """The pose of a tool in its category's slot, with its top level with the block's.
+    """The pose of a tool in its category's slot, with its top flush with the block's.
 
     Raises:
         KeyError: the tool's category has no slot.

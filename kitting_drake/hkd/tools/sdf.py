@@ -8,9 +8,9 @@ import numpy as np
 from kitting_drake.hkd.tools.solids import MATERIALS
 
 # Contact parameters of every tool: Drake's hydroelastic modulus (Pa), dissipation (s/m), margin (m)
-# and friction. The margin is off, because Drake 1.51 fails on the margin of finely faceted convex
-# hulls when it loads them or they touch a mesh. At this modulus a flat bottom rests quietly without
-# one, at steps of 1/128 s.
+# and friction. The margin is zero: with a margin, Drake 1.51 fails when it loads finely faceted
+# convex hulls, or when they touch a mesh. At this modulus and steps of 1/128 s, a flat bottom rests
+# quietly without one.
 HYDROELASTIC_MODULUS = 2e6
 HUNT_CROSSLEY_DISSIPATION = 20.0
 HYDROELASTIC_MARGIN = 0.0

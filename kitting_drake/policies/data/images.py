@@ -22,8 +22,8 @@ Image = NDArray[np.float32]
 _CURVATURE_STD = 0.2
 """The standard deviation of both coefficients of a curvature."""
 _FARTHEST_CURVED = 1.4
-"""The distance from the pick at which displacements stop growing, in half sides of the crop: the
-crop's corners."""
+"""The distance from the pick at which displacements stop growing, in half sides of the crop. The
+crop's corners are that far away."""
 _ROTATION_STD = math.radians(60)
 """The standard deviation of augmentation's rotations in radians, as in the authors' code."""
 _SHIFT_STD = 1 / 6
@@ -49,7 +49,7 @@ class LabelledImage:
     pick_theta: float
     """The gripper's angle in radians; adding pi gives the same grasp."""
     place: NDArray[np.float64]
-    """(row, col) of the place for the object's point at the pick."""
+    """(row, col) where the object's point under the pick is to go."""
     rotation: float
     """The rotation of the object between pick and place, in radians."""
     other_picks: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 2)))
@@ -73,7 +73,7 @@ class LabelledImage:
         )
 
     def place_of(self, pixel: NDArray[np.float64]) -> NDArray[np.float64]:
-        """(row, col) of the place for the object's point at `pixel`."""
+        """(row, col) where the object's point at `pixel` is to go."""
         return self.place + rotation_matrix(self.rotation) @ (pixel - self.pick)
 
     def curved_crop(self, index: int, pixel: tuple[int, int], side: int) -> Image:

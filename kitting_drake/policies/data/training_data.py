@@ -87,8 +87,10 @@ class TrainingData:
 
     @property
     def unrelated(self) -> tuple[int, ...]:
-        """The numbers of items after which the data can be split without shared scenes: static
-        scenes share tools within a batch, demonstrations are independent."""
+        """The numbers of items after which the data can be split into unrelated parts.
+
+        Static scenes share tools within a batch; demonstrations are independent.
+        """
         if isinstance(self.items, StaticScenes):
             return self.items.batch_ends
         return tuple(range(1, self.count + 1))

@@ -96,8 +96,8 @@ class Networks(nn.Module):
         self.compute_type = torch.float32
         """The type of the networks' inputs, in which they compute."""
         self.rotations: int | None = None
-        """The number of crop rotations in a training step of the Transporter; scene rotations are
-        half as many. None for a few (see `transporter.draw_bins`). Other methods do not use it."""
+        """The number of crop rotations in a training step of the Transporter. Scene rotations are
+        half as many. None is the default of `transporter.draw_bins`. Other methods ignore it."""
         self.stop_threshold: float | None = None
         """The log-odds below which a policy stops; None if it never stops. `validation.validate`
         chooses it, and it is stored with the weights."""

@@ -175,9 +175,8 @@ def load_trainable(
 
     Args:
         path: a file that `save_weights` wrote.
-        fresh_angle_at: N of the result, with untrained weights in its pick-angle network: the only
-            one of `FactoredNetworks` whose architecture may depend on N. None for the file's N and
-            all its weights.
+        fresh_angle_at: N of the result. Its pick-angle network then has untrained weights, because
+            its architecture may depend on N. None keeps the file's N and all its weights.
         preset: of the result, whose U-nets must have the same size (`NetworkConfig.has_unets_of`).
             None for the file's.
 

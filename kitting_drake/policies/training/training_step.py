@@ -85,7 +85,7 @@ class Trainer:
             curvature: see `augment`.
             reflection: see `augment`.
             only: the single loss to train, while other modules keep their weights; None trains all.
-                The steps of the loss are those of a full training.
+                Its steps are the same as in a training of all losses.
         """
         self.networks = networks
         self.seed = seed
@@ -201,7 +201,7 @@ class Trainer:
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Resumes a run of the same networks and seed."""
+        """Restores the state of a run with the same networks and seed."""
         self.networks.load_state_dict(state["networks"])
         for name, optimiser in self.optimisers.items():
             optimiser.load_state_dict(state["optimisers"][name])

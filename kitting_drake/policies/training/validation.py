@@ -34,10 +34,13 @@ def prediction_errors(
         millimetres: the side of a pixel.
 
     Returns:
-        (5,), in the order of `ERRORS`: the distance between the picks; the error of the pick angle
-        modulo pi; the distance of the placed object from the expert's place; the error of its
-        rotation; and the resulting displacement of the object's points, at most 20 mm. Lengths are
-        in mm, angles in degrees.
+        (5,), in the order of `ERRORS`, in mm and degrees:
+
+        - the distance between the picks;
+        - the error of the pick angle, modulo pi;
+        - the distance of the placed object from the expert's place;
+        - the error of its rotation;
+        - the resulting displacement of the object's points, at most 20 mm.
     """
 
     def distance(target: LabelledImage) -> float:

@@ -36,9 +36,9 @@ from systems.signals import PickPlaceAction, PlanarPose
 from systems.weak_calc import weak_calc
 
 _MOVED = (0.03, 0.06)
-"""How far an object is moved, in metres, ..."""
+"""Least and largest distance by which an object is moved, in metres."""
 _MOVED_YAW = math.radians(45)
-"""... and the largest angle by which it is turned, in radians."""
+"""Largest angle by which a moved object is also turned, in radians."""
 _MISSED = 0.04
 """The error of a grasp, in metres."""
 _BLOCKED = 0.003

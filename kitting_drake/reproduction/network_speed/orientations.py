@@ -57,8 +57,8 @@ def measure_pick_angles(setup: SpeedSetup, preset: str) -> list[dict[str, Any]]:
         skipped = {n: setup.why_not(outlined, count) for n, count in operations.items()}
         timings: dict[int, Timing] = {}
         if not all(skipped.values()):
-            # Untrained networks are as fast as trained ones. They are not saved first, as in an
-            # evaluation, because the file could take gigabytes.
+            # Untrained networks are as fast as trained ones. An evaluation would load them from a
+            # file, but that file could take gigabytes.
             networks = _without_others(make_networks(config, PlainConv2d), names).to(setup.device)
             networks.freeze(preferred_type())
             timings = setup.time_each(

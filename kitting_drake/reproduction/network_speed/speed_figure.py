@@ -143,7 +143,7 @@ def _label(
     quantity: str,
     text: Callable[[float], str],
 ) -> None:
-    """The value of a point: below the lowest of several at its N, else above."""
+    """Writes the value of a point: below the lowest of several points at one N, else above it."""
     there = [other[quantity] for other in rows if other["orientations"] == row["orientations"]]
     below = len(there) > 1 and row[quantity] == min(there)
     axis.annotate(

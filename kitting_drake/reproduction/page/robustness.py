@@ -42,8 +42,8 @@ def robustness_table(runs: Sequence[Run]) -> str:
     """Strict success on unseen toolsets, with two tries per tool and recovering policies.
 
     All runs of the first table use the same seeds. The second table has the other levels, on the
-    first of these seeds. The last table pools all seeds of cells that ran on further ones: a
-    selection could flatter the policy.
+    first of these seeds. The last table has the cells that ran on more seeds, with all their seeds:
+    a selection could flatter the policy.
 
     Args:
         runs: all runs. Runs of other scenarios or with other weights than the shipped ones are
@@ -79,7 +79,7 @@ def robustness_table(runs: Sequence[Run]) -> str:
         )
     if any(_is_other_level(label) for label, _ in common):
         parts.append(
-            f"The other levels, on the first {_FEWEST} or more of these seeds, with the number of "
+            f"The other levels, on at least the first {_FEWEST} of these seeds, with the number of "
             "objects:\n\n"
             + _table(common, [label for label in expected if _is_other_level(label)], counted=True)
         )

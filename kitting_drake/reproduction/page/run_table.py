@@ -1,9 +1,10 @@
-"""The files behind the pages of results: a table with a row a run, and a compressed file.
+"""The files behind the pages of results: a table with one row per run, and a compressed file.
 
-`runs.csv` holds the short fields of the `summary.json` of `evaluate`, and those of dictionaries in
-it under names such as `versions.drake`. An empty cell is a field that the run lacks.
-`episodes.jsonl.xz` has a line a run with the rest: `outcomes` (a success rate an episode, and how
-each object ended), `categories` and `resolved_scenario`. Both together restore every summary.
+`runs.csv` holds the short fields of the `summary.json` of `evaluate`. Fields of dictionaries in it
+have names such as `versions.drake`. An empty cell is a field that the run lacks.
+`episodes.jsonl.xz` has one line per run with the rest: `outcomes` (the success rate of each
+episode, and how each object ended), `categories` and `resolved_scenario`. Both together restore
+every summary.
 """
 
 import csv

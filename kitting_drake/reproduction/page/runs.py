@@ -26,7 +26,7 @@ METHODS = {
     "quantized_oracle": "oracle, quantized",
     "oracle": "oracle, exact",
 }
-"""Names of methods for people. Other methods keep their own names."""
+"""Names of methods in tables. Other methods keep their own names."""
 
 LEARNED = ("so2", "equivariant_transporter", "transporter")
 """The methods that the paper compares."""

@@ -19,10 +19,10 @@ ORIENTATIONS = (180, 36, 72, 120)
 """N of figure 6, in order of importance."""
 PRESET = "small"
 LEARNING_RATES = (1e-3, 3e-4, 3e-3)
-"""The candidates. Each baseline uses the best on validation scenes, the SO(2) method the first."""
+"""Those to try. Each baseline uses the best on validation scenes, the SO(2) method the first."""
 VALIDATE_EVERY = 250
 _EARLIER_RELEASE = ("planner.release_clearance: 0.006", "planner.open_width: 0.08")
-"""Fields of older runs of Ravens tasks, which used another release and demonstrator."""
+"""Fields of older runs of Ravens tasks. Their jaws opened wider, and demonstrators differed."""
 _NO_SEARCH = "planner: {search: {amplitude: 0.0, reach: 0.0}}"
 
 
@@ -157,7 +157,7 @@ class Training:
     preset: str = PRESET
     """The size of its networks."""
     rotations: int | None = None
-    """The number of rotations in a step of the Transporter; None for a few. See `Networks`."""
+    """The number of rotations in a step of the Transporter, as in `Networks`."""
 
     @property
     def base(self) -> Training | None:
@@ -232,7 +232,7 @@ class Cell:
 
     @property
     def name(self) -> str:
-        """The name of its run."""
+        """The name of the run that fills this cell."""
         if isinstance(self.policy, str):
             parts = [self.task, self.label, str(self.orientations or "")]
             return "_".join(part for part in parts if part)

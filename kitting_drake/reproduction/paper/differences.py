@@ -109,7 +109,7 @@ def _rivals(cell: Cell) -> list[tuple[str, str]]:
     if cell.label.startswith("minus"):
         return [("ours, with all extensions", f"{cell.task}_so2_180_100_ours")]
     if cell.label == "ours_recovering":
-        return [("in one try a tool", f"{cell.task}_so2_180_100_ours")]
+        return [("in one try per tool", f"{cell.task}_so2_180_100_ours")]
     tail = f"{cell.orientations}_{training.demonstrations}"
     if cell.label:
         return [("ours, as in the paper", f"{cell.task}_so2_{tail}")]

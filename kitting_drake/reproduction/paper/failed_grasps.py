@@ -85,7 +85,7 @@ def changeable(summary: Mapping[str, Any]) -> Changeable:
 
 
 def failed_grasps(results: Sequence[Result]) -> list[str]:
-    """The section: sums over the cells of each task and method that are as in the paper."""
+    """The section: a row for each task and method, summed over the cells as in the paper."""
     sums: dict[tuple[str, str], list[Changeable]] = {}
     for result in results:
         if is_as_in_the_paper(result):

@@ -1,5 +1,5 @@
-"""The part of the page of results that answers the paper: figure 6, table I and the departures,
-from the results of `benchmark paper` alone."""
+"""The sections of the page of results to compare with the paper: figure 6, table I, and how we
+depart from it. They use only the results of `benchmark paper` and `benchmark networks`."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ _HEADINGS = {"seen": "Seen toolset, figure 6(a)", "unseen": "Unseen toolsets, fi
 _TITLES = {"seen": "kitting-seen-toolset", "unseen": "kitting-unseen-toolsets"}
 
 EARLIER_MARK = " e"
-"""Behind a figure of table I that was run with other settings of the task."""
+"""Marks numbers of table I whose runs had other task settings (see `Cell.is_earlier`)."""
 
 
 def paper_sections(
@@ -46,7 +46,7 @@ def paper_sections(
 
     Args:
         results: of `cell_results`.
-        efficiency: what `benchmark networks` measured, if it was.
+        efficiency: the result of `benchmark networks`; None without one.
         to_run_again: the names of the cells whose runs are set aside.
     """
     if not results:

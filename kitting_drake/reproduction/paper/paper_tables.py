@@ -27,9 +27,9 @@ STEADIER = {
     ("palletizing_boxes", "equivariant_transporter", 10): 1e-3,
     ("palletizing_boxes", "equivariant_transporter", 1): 1e-3,
 }
-"""The learning rates of trainings, by task, method and demonstrations, that diverged at the best
-rate of their `reference` (the pick-angle loss exploded with ten demonstrations). They take the
-second best."""
+"""Learning rates by task, method and demonstrations, for trainings that diverge at the best rate of
+their `reference`. They take its second best rate. (With ten demonstrations, the pick-angle loss
+exploded.)"""
 MATCHED = "matched"
 """The preset in which baselines and SO(2) networks keep the same share of their originals'
 parameters; see `paper.parameter_table`."""

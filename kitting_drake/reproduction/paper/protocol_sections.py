@@ -40,14 +40,14 @@ from kitting_drake.reproduction.paper.paper_tables import (
 _VARIANTS = {
     "as in the paper": "",
     "with all extensions": "_ours",
-    "with recovery, in two tries a tool": "_ours_recovering",
+    "with recovery, in two tries per tool": "_ours_recovering",
     "without the search by the hand": "_minus_search",
     "without outline fitting": "_minus_outlines",
     "without any refinement": "_minus_refinement",
     "without labels of later picks": "_minus_all_targets",
     "without curvature and reflection": "_minus_curvature",
 }
-"""Endings of the names of cells, by what their rows are called."""
+"""Endings of the names of cells, by the label of their row."""
 
 _TOLD = ("trained_orientations", "steps", "learning_rate", "training_seed", "compute_type")
 """The details of a policy that are columns of "Every cell"."""
@@ -60,7 +60,7 @@ def protocol_sections(
 
     Args:
         results: of `cell_results`.
-        rates: what each learning rate of each baseline came to on validation scenes.
+        rates: the cost of each learning rate of each baseline on validation scenes.
         to_run_again: the names of the cells whose runs are set aside.
     """
     if not results:

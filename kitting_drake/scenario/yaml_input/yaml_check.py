@@ -1,7 +1,7 @@
 """Checks YAML against a schema of dataclasses, so that an error names the path of the field.
 
-Drake's `yaml_load_typed` does the loading; its complaints name neither the file nor, often, the
-field, which is what a person needs to mend it.
+Drake's `yaml_load_typed` does the loading. Its own errors do not name the file, and often not the
+field either.
 """
 
 import dataclasses
@@ -27,7 +27,7 @@ def check_yaml(schema: Any, value: Any, where: str) -> None:
         where: the path to the value, for messages; empty at the root.
 
     Raises:
-        ValueError: with one sentence that begins with the path.
+        ValueError: the value does not fit. The message begins with its path.
     """
     origin = typing.get_origin(schema)
     if origin in (types.UnionType, typing.Union):
@@ -47,7 +47,7 @@ def check_yaml(schema: Any, value: Any, where: str) -> None:
     elif dataclasses.is_dataclass(schema):
         if isinstance(value, dict) and "_tag" in value:
             tag = str(value["_tag"]).lstrip("!")
-            raise ValueError(f"{where or 'the scenario'} has the tag !{tag}, and takes none")
+            raise ValueError(f"{where or 'the scenario'} has the tag !{tag}, but takes none")
         _check_dataclass(schema, value, where)
     else:
         _check_scalar(schema, value, where)
@@ -63,7 +63,7 @@ def _check_union(schema: Any, value: Any, where: str) -> None:
         check_yaml(options[0], value, where)
         return
     if not isinstance(value.get("_tag", ""), str):
-        raise ValueError(f"{where} has a tag that is no name: {_shown(value['_tag'])}")
+        raise ValueError(f"{where} has a tag that is not a name: {_shown(value['_tag'])}")
     # An untagged mapping takes the first option, as in Drake.
     tag = str(value.get("_tag", options[0].__name__)).lstrip("!")
     for option in options:

@@ -45,13 +45,13 @@ def parse(content: str, where: str) -> dict:
         UserError: it is not YAML, or not a mapping of names.
     """
     try:
-        # A Python mapping swallows a field that is given twice.
+        # Check for repeated fields here: a Python mapping would keep only the last.
         node = yaml.compose(content, Loader=yaml.SafeLoader)
         _check_names(node)
         # Drake's loader would drop such a tag without a warning.
         if isinstance(node, yaml.MappingNode) and node.tag != "tag:yaml.org,2002:map":
-            raise ValueError(f"the tag {node.tag} at the beginning means nothing there")
-        # Drake takes an empty text for no text at all.
+            raise ValueError(f"the tag {node.tag} at the beginning has no effect: remove it")
+        # Drake treats an empty text as if none were given.
         root = yaml_load(data=content) if content.strip() else None
     except yaml.YAMLError as error:
         mark = getattr(error, "problem_mark", None)
@@ -80,7 +80,9 @@ def _check_names(node: yaml.Node | None) -> None:
             if key.tag != _TEXT:
                 raise ValueError(f"the name on line {line} must be a text")
             if key.value == "_tag":
-                raise ValueError(f"'_tag' on line {line} is no field: write !Name before the value")
+                raise ValueError(
+                    f"'_tag' on line {line} is not a field: write !Name before the value"
+                )
             if key.value in seen:
                 raise ValueError(f"'{key.value}' is given twice (again on line {line})")
             seen.add(key.value)

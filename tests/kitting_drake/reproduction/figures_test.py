@@ -147,7 +147,7 @@ def test_the_sentences_of_the_readme(runs: dict[str, Summary], readme: str):
         f"{-behind['seen']:.1f} points behind on the seen one (strict)"
     ) in text
     red = [percent(runs, f"place_red_in_green_so2_{n}_1") for n in (36, 180)]
-    assert f"place red in green ({red[0]} and {red[1]} %)" in text
+    assert f"place red in green ({red[0]} and {red[1]} %, at N = 36 and 180)" in text
     rows_of = json.loads((RESULTS / "networks.json").read_text())["pick_angle"]
     seconds = {
         (row["method"], row["preset"], row["orientations"]): row["seconds"] for row in rows_of

@@ -284,7 +284,7 @@ def test_errors_in_scenario_text_name_the_flag():
         load_scenario(TEST_SCENARIOS, text="!Oracle {time_limit: 3.0}")
     with pytest.raises(UserError, match=r"^--scenario_text must be a mapping"):
         load_scenario(TEST_SCENARIOS, text="faster")
-    with pytest.raises(UserError, match=r"^--scenario_text: '_tag' on line 1 is no field"):
+    with pytest.raises(UserError, match=r"^--scenario_text: '_tag' on line 1 is not a field"):
         load_scenario(TEST_SCENARIOS, text="{task: {_tag: 5}}")
 
 

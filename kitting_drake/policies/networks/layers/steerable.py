@@ -123,7 +123,7 @@ class SteerableConv2d(ExpandedConv2d):
 
     def _make_basis(self, in_fields: int, size: int) -> tuple[Tensor, int, float]:
         basis = kernel_basis(self.in_fibre, self.out_fibre, size)
-        # The samples of a field are no more independent than its coefficients.
+        # The samples of a field are correlated: they follow from its coefficients, which are fewer.
         repeated = self.in_fibre.channels / self.in_fibre.size
         gathered = in_fields * float(basis.square().sum()) * repeated / self.out_fibre.channels
         # The memory order that `expand_kernel` needs.

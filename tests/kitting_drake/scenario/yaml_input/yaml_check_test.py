@@ -47,7 +47,7 @@ def test_accepts(value: Any):
     [
         ({"bottoms": [{}, {"side": 1.0}]}, r"^bottoms\[1\]\.side is an unknown field"),
         ({"lid": {"_tag": "!Sqare"}}, "^lid has the unknown tag !Sqare: use one of !Round, !Squa"),
-        ({"lid": {"_tag": 3}}, "^lid has a tag that is no name: '3'$"),
+        ({"lid": {"_tag": 3}}, "^lid has a tag that is not a name: '3'$"),
         ({"lid": {"_tag": "!Square", "radius": 1.0}}, r"^lid\.radius is an unknown field"),
         ({"lid": None}, "^lid is empty"),
         ({"by_name": {"a": {"side": "2e-3"}}}, "a number, not '2e-3': write 0.002$"),
