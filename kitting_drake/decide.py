@@ -69,6 +69,8 @@ def main() -> int:
     }
     write_atomically(picture, decision.draw())
     write_json(action, record)
+    if decision.result == "calibration":
+        raise UserError(decision.reason)
     print_decision(console, record)
     console.print(f"files: {folder}/", highlight=False, markup=False)
     return 0

@@ -15,13 +15,18 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import ndimage
 
 from kitting_drake.common.paths import MODELS
-from systems.signals import Observation, PickPlaceAction
+from kitting_drake.policies.data.images import rotation_matrix
+from kitting_drake.policies.matching.refinement import nearest_region
+from systems.signals import Observation
 
 if TYPE_CHECKING:
     from kitting_drake.policies.learned_policy import Decision
-    from kitting_drake.policies.matching.shape_matching import Matched
+    from kitting_drake.policies.matching.segmentation import Segmentation
+
+Array = NDArray[np.float64]
 
 FILE = MODELS / "policies" / "confidence.json"
 """The fitted regressions, by policy."""
@@ -31,8 +36,10 @@ _OTHER_PICKS = 0.060
 """... and probability within this distance belongs to the same object."""
 _SAME_ANGLE = math.radians(10)
 """Probability within this angle of the pick's angle supports it, in radians."""
-_AROUND_PICK, _AROUND_PLACE = 0.045, 0.060
-"""The radii in which the seen share counts, in metres."""
+_RING = 3
+"""The surroundings of an object extend this far, in pixels."""
+_HOLE = 0.003
+"""What is lower than its rim by more than this is a hole, in metres."""
 _WORST_FIT = 0.002
 _WORST_GRASP = 5.0
 
@@ -66,20 +73,15 @@ def read_reliability(policy: str) -> Reliability:
 def evidence_of_networks(observation: Observation, decision: Decision) -> Evidence:
     """The facts about a decision of networks that acts."""
     parts = certainty(decision, observation.grid.resolution)
-    evidence = {
+    return {
         "something_to_pick": float(np.clip(decision.log_odds or 0.0, -8, 8)),
         "pick": _logit(parts["pick"]),
         "angle": _logit(parts["angle"]),
         "place_margin": min(decision.place_margin, 10.0),
+        "moved_pick": decision.moved_pick,
+        "moved_place": decision.moved_place,
+        **decision.geometry,
     }
-    return evidence | _of_geometry(
-        observation, decision.action, decision.fit_cost, decision.grasp_cost
-    )
-
-
-def evidence_of_matching(observation: Observation, matched: Matched) -> Evidence:
-    """The facts about a decision of shape matching that acts."""
-    return _of_geometry(observation, matched.action, matched.fit_cost, matched.grasp_cost)
 
 
 def certainty(decision: Decision, resolution: float) -> dict[str, float]:
@@ -109,30 +111,62 @@ def certainty(decision: Decision, resolution: float) -> dict[str, float]:
     return {key: min(max(value, 0.0), 1.0) for key, value in parts.items()}
 
 
-def _of_geometry(
-    observation: Observation,
-    action: PickPlaceAction,
+def geometric_evidence(
+    segmentation: Segmentation,
+    pick: Array,
+    rotation: float,
+    place: Array,
     fit_cost: float | None,
     grasp_cost: float | None,
 ) -> Evidence:
+    """The facts about a pick and place that o_t shows.
+
+    Args:
+        segmentation: of o_t.
+        pick: (row, col).
+        rotation: of the object, in radians.
+        place: (row, col).
+        fit_cost: the mean difference of the outlines of object and recess, in metres; None if they
+            do not fit.
+        grasp_cost: see `JawGrasp.cost`; None without a feasible grasp.
+    """
     fits, grasped = fit_cost is not None, grasp_cost is not None
-    return {
+    evidence = {
         "outlines_fit": float(fits),
         "fit": 1e3 * min(fit_cost, _WORST_FIT) if fit_cost is not None else 0.0,
         "jaws_have_room": float(grasped),
         "grasp": min(grasp_cost, _WORST_GRASP) if grasp_cost is not None else 0.0,
-        "seen_at_pick": _seen_around(observation, action.pick.x, action.pick.y, _AROUND_PICK),
-        "seen_at_place": _seen_around(observation, action.place.x, action.place.y, _AROUND_PLACE),
+        "is_object": 0.0,
+        "object_seen": 0.0,
+        "place_seen": 0.0,
+        "depth": 0.0,
+        "hole": 0.0,
+    }
+    region = nearest_region(segmentation.objects, pick)
+    if region is None:
+        return evidence
+    seen, relief = segmentation.visibility.seen, segmentation.relief
+    rows, cols = seen.shape
+    there = np.rint(place + (region.pixels - pick) @ rotation_matrix(rotation).T).astype(int)
+    inside = ((there >= 0) & (there < (rows, cols))).all(axis=1)
+    target = np.zeros_like(seen)
+    target[tuple(there[inside].T)] = True
+    target = ndimage.binary_closing(target, iterations=2) | target
+    around = _ring(target)
+    rim = float(np.percentile(relief[around], 75)) if around.any() else 0.0
+    low = relief[target] < rim - _HOLE if target.any() else np.zeros(1, bool)
+    floor = float(np.percentile(relief[target], 25)) if target.any() else 0.0
+    return evidence | {
+        "is_object": 1.0,
+        "object_seen": float(seen[_ring(region.mask)].mean()),
+        "place_seen": float(seen[around].mean()) if around.any() else 0.0,
+        "depth": float(np.clip(1e3 * (rim - floor), -10.0, 30.0)),
+        "hole": float(low.mean()),
     }
 
 
-def _seen_around(observation: Observation, x: float, y: float, radius: float) -> float:
-    """The seen share of the pixels within a radius of (x, y), in metres."""
-    grid = observation.grid
-    rows, cols = np.indices(grid.shape)
-    row, col = grid.to_pixel((x, y))
-    near = np.hypot(rows - row, cols - col) * grid.resolution <= radius
-    return float(observation.valid[near].mean()) if near.any() else 0.0
+def _ring(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    return ndimage.binary_dilation(mask, iterations=_RING) & ~mask
 
 
 def _logit(share: float) -> float:

@@ -6,13 +6,15 @@ import dataclasses
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
 import torch.nn.functional as F
 from numpy.typing import NDArray
 
-from kitting_drake.policies.data.images import make_action
+from kitting_drake.policies.confidence import Evidence, geometric_evidence
+from kitting_drake.policies.data.images import make_action, rotation_matrix
 from kitting_drake.policies.draft import Draft, Look, Stage, make_draft, network_input
 from kitting_drake.policies.networks.factored import Networks
 from kitting_drake.policies.stages import StopRule, SubPixel
@@ -44,10 +46,12 @@ class Decision:
     """The log-odds that there is something to pick; None if the networks do not predict it."""
     belongs: bool = False
     """Whether the outlines show that the object belongs at its place."""
-    grasp_cost: float | None = None
-    """See `Draft.grasp_cost`."""
-    fit_cost: float | None = None
-    """See `Draft.fit_cost`."""
+    moved_pick: float = 0.0
+    """How far the stages moved the pick, in mm."""
+    moved_place: float = 0.0
+    """How far they moved the place, in mm."""
+    geometry: Evidence = dataclasses.field(default_factory=dict)
+    """What o_t tells about the action (`geometric_evidence`), if outlines are used."""
     kit_seen: bool | None = None
     """Whether o_t shows a kit; None if outlines are not used."""
     place_margin: float = 0.0
@@ -153,11 +157,30 @@ def _decision(draft: Draft) -> Decision:
         place_pixel=draft.place,
         log_odds=draft.look.picking.log_odds,
         belongs=draft.belongs,
-        grasp_cost=draft.grasp_cost,
-        fit_cost=draft.fit_cost,
         kit_seen=draft.look.kit_seen,
         place_margin=_place_margin(draft),
+        **_told(draft),
     )
+
+
+def _told(draft: Draft) -> dict[str, Any]:
+    """How far the stages moved an action, and what o_t tells about it."""
+    if draft.stop or draft.look.kit_seen is None:
+        return {}
+    millimetres = 1e3 * draft.look.resolution
+    predicted = draft.goal + rotation_matrix(draft.rotation) @ (draft.pick - np.array(draft.pixel))
+    return {
+        "moved_pick": min(np.linalg.norm(draft.pick - draft.pixel) * millimetres, 40.0),
+        "moved_place": min(np.linalg.norm(draft.place - predicted) * millimetres, 20.0),
+        "geometry": geometric_evidence(
+            draft.look.segmentation,
+            draft.pick,
+            draft.rotation,
+            draft.place,
+            draft.fit_cost,
+            draft.grasp_cost,
+        ),
+    }
 
 
 def _place_margin(draft: Draft) -> float:

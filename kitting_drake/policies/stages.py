@@ -24,7 +24,7 @@ _AS_GOOD = 2.0
 """Rotations within this of the best score count as equally good, in nats, ..."""
 _SAME_PLACE = 4.0
 """... if their places are at most this far apart, in pixels."""
-_TRIES = 5
+_TRIES = 4
 """The number of picks that are tried for one that is seen."""
 _ANOTHER = 0.010
 """The next pick is farther than this from the last one, in metres."""

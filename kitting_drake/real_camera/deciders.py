@@ -11,7 +11,6 @@ from typing import Protocol
 from kitting_drake.policies.confidence import (
     Evidence,
     certainty,
-    evidence_of_matching,
     evidence_of_networks,
     read_reliability,
 )
@@ -87,10 +86,10 @@ class ShapeMatchingDecider:
         policy = make_shape_matching(self.parameters, recover=self.recover)
         matched = policy.decide(observation, failed_picks)
         draw = partial(_draw_action, observation, matched.action)
-        if matched.action.stop or matched.fit_cost is None:
+        if matched.geometry is None:
             return Choice(matched.action, None, draw=draw)
-        evidence = evidence_of_matching(observation, matched)
-        return _if_sure("shape_matching", evidence, self.least_confidence, matched.action, {}, draw)
+        least = self.least_confidence
+        return _if_sure("shape_matching", matched.geometry, least, matched.action, {}, draw)
 
 
 @dataclass(frozen=True)

@@ -7,10 +7,16 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from kitting_drake.real_camera.calibrations.calibration import Calibration
-from kitting_drake.real_camera.checking.table_check import CalibrationError, check_table
+from kitting_drake.real_camera.checking.table_check import check_table
 from kitting_drake.real_camera.deciders import BenchPolicy, Choice
 from kitting_drake.real_camera.frames import Frame
-from kitting_drake.real_camera.views import check_views, observe, seen_share
+from kitting_drake.real_camera.views import (
+    CalibrationError,
+    check_frames,
+    check_views,
+    observe,
+    seen_share,
+)
 from systems.motion_heights import MotionHeights, motion_heights
 from systems.pick_place_parameters import PickPlaceParameters
 from systems.signals import (
@@ -136,10 +142,11 @@ def decide(
     """
     policy.check_grid(calibration.grid)
     parameters = PickPlaceParameters() if parameters is None else parameters
-    checked = check_views(frames, calibration)
+    checked = check_frames(frames, calibration)
     observation = observe(checked, calibration)
     seen = seen_share(observation)
     try:
+        check_views(checked, calibration)
         warnings = check_table(checked, calibration)
     except CalibrationError as error:
         return _stopped("calibration", str(error), observation, seen, parameters)

@@ -27,9 +27,10 @@ from kitting_drake.real_camera.calibrations.calibration import (
     calibration_digest,
     calibration_record,
 )
+from kitting_drake.real_camera.checking.table_check import check_table
 from kitting_drake.real_camera.frames import Frame, read_frames
 from kitting_drake.real_camera.step_actions import StepAction, read_action
-from kitting_drake.real_camera.views import observe
+from kitting_drake.real_camera.views import check_frames, check_views, observe
 from systems.signals import Observation
 
 TASK = "bench"
@@ -112,7 +113,10 @@ def read_observation(step: Path, calibration: Calibration) -> Observation:
 def _observe(step: Path, calibration: Calibration) -> tuple[dict[str, Frame], Observation]:
     try:
         frames = read_frames([step], calibration)
-        return frames, observe(frames, calibration)
+        checked = check_frames(frames, calibration)
+        check_views(checked, calibration)
+        check_table(checked, calibration)
+        return frames, observe(checked, calibration)
     except UserError as error:
         raise UserError(f"step {step.parent.name}/{step.name}: {error}") from error
 

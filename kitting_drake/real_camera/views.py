@@ -29,16 +29,19 @@ _OPTICAL[:3, :3] = Rotation.from_euler("xyz", [-90, 0, -90], degrees=True).as_ma
 """The optical frame in ROS's body frame of a camera (x forward, y left, z up)."""
 
 
-def check_views(frames: Mapping[str, Frame], calibration: Calibration) -> dict[str, Frame]:
-    """The frames of all cameras, after checking that they can show the workspace.
+class CalibrationError(UserError):
+    """The cameras see something else than the calibration says."""
+
+
+def check_frames(frames: Mapping[str, Frame], calibration: Calibration) -> dict[str, Frame]:
+    """The frames of all cameras, with contiguous arrays.
 
     Args:
         frames: of each camera by its name.
         calibration: of the cameras.
 
     Raises:
-        UserError: a camera has no frame, one of a wrong size or type, or does not look at the
-            workspace.
+        UserError: a camera has no frame, or one of a wrong size or type.
     """
     checked = {}
     for camera in calibration.cameras:
@@ -46,16 +49,29 @@ def check_views(frames: Mapping[str, Frame], calibration: Calibration) -> dict[s
         if frame is None:
             raise UserError(f"there is no frame of camera {camera.name}")
         checked[camera.name] = check_frame(frame, camera)
-        _check_pose(camera, calibration.grid)
-        _check_depth(checked[camera.name], camera, calibration.grid)
     return checked
+
+
+def check_views(frames: Mapping[str, Frame], calibration: Calibration) -> None:
+    """Checks that the cameras look at the workspace, and that their depths are in metres.
+
+    Args:
+        frames: as `check_frames` returns them.
+        calibration: of the cameras.
+
+    Raises:
+        CalibrationError: a camera does not look at the workspace, or its depths are implausible.
+    """
+    for camera in calibration.cameras:
+        _check_pose(camera, calibration.grid)
+        _check_depth(frames[camera.name], camera, calibration.grid)
 
 
 def observe(frames: Mapping[str, Frame], calibration: Calibration) -> Observation:
     """o_t, with the same heightmap as in the simulated cell.
 
     Args:
-        frames: as `check_views` returns them.
+        frames: as `check_frames` returns them.
         calibration: of the cameras.
     """
     return project(make_views(frames, calibration), calibration.grid)
@@ -131,12 +147,12 @@ def _check_pose(camera: BenchCamera, grid: PixelGrid) -> None:
         hint = hints[0]
     elif X_BC[2, 3] <= grid.z_min:
         hint = f"it is {1e3 * (grid.z_min - X_BC[2, 3]):.0f} mm below the table"
-    elif X_BC[2, 2] > 0:
+    elif X_BC[2, 2] >= 0:
         hint = "it looks upwards"
     else:
         x, y, _ = X_BC[:3, 3] + X_BC[:3, 2] * (grid.z_min - X_BC[2, 3]) / X_BC[2, 2]
         hint = f"it looks at ({x:.2f}, {y:.2f}) m on the table"
-    raise UserError(
+    raise CalibrationError(
         f"by its pose camera {camera.name} sees nothing of the workspace "
         f"({grid.x_min:g} to {grid.x_max:g}, {grid.y_min:g} to {grid.y_max:g} m): {hint}"
     )
@@ -146,7 +162,7 @@ def _check_depth(frame: Frame, camera: BenchCamera, grid: PixelGrid) -> None:
     expected = table_depth(camera, camera.X_BC, grid, _STEP)
     towards = np.isfinite(expected)
     if not towards.any():
-        raise UserError(
+        raise CalibrationError(
             f"the workspace is too small for camera {camera.name}, which sees almost no pixel of "
             "it: give it more rows and cols"
         )
@@ -154,7 +170,7 @@ def _check_depth(frame: Frame, camera: BenchCamera, grid: PixelGrid) -> None:
     with np.errstate(invalid="ignore"):
         returned = np.isfinite(depth) & (depth > 0)
     if returned.mean() < _LEAST_DEPTH:
-        raise UserError(
+        raise CalibrationError(
             f"depth of camera {camera.name} is all zero or NaN where it looks at the workspace"
         )
     ratios = depth[returned] / expected[towards][returned]
@@ -173,14 +189,14 @@ def _check_depth(frame: Frame, camera: BenchCamera, grid: PixelGrid) -> None:
         hint = "these are metres: a 16-bit PNG holds steps of depth_scale, of 1 mm by default"
     else:
         return  # `check_table` tells more.
-    raise UserError(f"{told}: {hint}")
+    raise CalibrationError(f"{told}: {hint}")
 
 
 def _check_limits(depth: NDArray[np.float32], camera: BenchCamera) -> None:
     """Raises UserError if the camera's limits exclude almost all of its depths (n,), in metres."""
     low, high = camera.min_depth, camera.max_depth
     if ((depth >= low) & (depth <= high)).mean() < _LEAST_DEPTH:
-        raise UserError(
+        raise CalibrationError(
             f"depth of camera {camera.name} is {np.median(depth):.3g} m, the median, and by its "
             f"min_depth {low:g} and max_depth {high:g} almost none is used: give these in metres"
         )

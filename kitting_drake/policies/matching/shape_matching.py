@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
+from kitting_drake.policies.confidence import Evidence, geometric_evidence
 from kitting_drake.policies.data.images import make_action
 from kitting_drake.policies.matching.jaw_clearance import jaw_grasps, untried
 from kitting_drake.policies.matching.recovery import recovery_action
@@ -34,13 +35,11 @@ _PROMISING = 2.0
 
 @dataclass(frozen=True)
 class Matched:
-    """An action, and the quality of its fit and grasp."""
+    """An action, and what o_t tells about it."""
 
     action: PickPlaceAction
-    fit_cost: float | None = None
-    """The mean difference of the outlines, in metres; None for an action without outlines."""
-    grasp_cost: float | None = None
-    """See `JawGrasp.cost`."""
+    geometry: Evidence | None = None
+    """The facts about a pick and place; None for another action."""
 
 
 class ShapeMatchingPolicy:
@@ -73,7 +72,7 @@ class ShapeMatchingPolicy:
         return self.decide(observation, failed_picks).action
 
     def decide(self, observation: Observation, failed_picks: Sequence[PlanarPose] = ()) -> Matched:
-        """The action with the quality of its fit and grasp; see `__call__`."""
+        """The action with what o_t tells about it; see `__call__`."""
         segmentation = segment(observation)
         mending = None
         if self._recover:
@@ -99,7 +98,10 @@ class ShapeMatchingPolicy:
             footprint = segmentation.objects[index].pixels.astype(float)
             if segmentation.visibility.place_is_seen(footprint, best.pixel, fit.rotation, place):
                 action = make_action(observation, best.pixel, best.theta, place, fit.rotation)
-                return Matched(action, fit.cost, best.cost)
+                geometry = geometric_evidence(
+                    segmentation, best.pixel, fit.rotation, place, fit.cost, best.cost
+                )
+                return Matched(action, geometry)
         # Taking out comes last: it may fail again, and the number of actions is limited.
         stop = PickPlaceAction(stop=True, reason=reason or why_stop(segmentation))
         return Matched(mending or stop)

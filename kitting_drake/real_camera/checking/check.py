@@ -17,7 +17,7 @@ from kitting_drake.real_camera.calibrations.calibration import BenchCamera, Cali
 from kitting_drake.real_camera.checking.kit_block import Block, SeenBlock, see_block
 from kitting_drake.real_camera.checking.planes import FARTHEST, Plane, fit_plane, table_points
 from kitting_drake.real_camera.frames import Frame
-from kitting_drake.real_camera.views import check_views, make_views, table_depth
+from kitting_drake.real_camera.views import check_frames, check_views, make_views, table_depth
 from systems.heightmap import project
 from systems.signals import PixelGrid
 
@@ -96,7 +96,8 @@ def check_cameras(
     Raises:
         UserError: a camera does not see the table or the block.
     """
-    frames = check_views(frames, calibration)
+    frames = check_frames(frames, calibration)
+    check_views(frames, calibration)
     views = make_views(frames, calibration)
     grid = calibration.grid
     poses: dict[str, Array] = {}

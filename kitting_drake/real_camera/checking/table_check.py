@@ -11,17 +11,17 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from kitting_drake.common.errors import UserError
 from kitting_drake.real_camera.calibrations.calibration import BenchCamera, Calibration
 from kitting_drake.real_camera.checking.planes import Plane, find_planes, refit
 from kitting_drake.real_camera.frames import Frame
+from kitting_drake.real_camera.views import CalibrationError
 from systems.signals import PixelGrid
 
 Array = NDArray[np.float64]
 
-_REFUSED_OFF, _REFUSED_TILT = 0.010, math.radians(2)
+_REFUSED_OFF, _REFUSED_TILT = 0.010, math.radians(1.3)
 """A table that is farther off, in metres, or tilted by more cannot be picked from."""
-_WARNED_OFF, _WARNED_TILT = 0.005, math.radians(1)
+_WARNED_OFF, _WARNED_TILT = 0.005, math.radians(0.65)
 _STEP = 4
 """Only every fourth row and column of an image is used."""
 _FARTHEST = 0.35
@@ -35,10 +35,6 @@ _CURVED = 0.5
 """Depths are distances if the table is flatter than this share when they are taken for such."""
 _FLAT = 0.002
 """A table with less noise than this is flat, in metres."""
-
-
-class CalibrationError(UserError):
-    """The cameras see something else than the calibration says."""
 
 
 @dataclass(frozen=True)
@@ -75,7 +71,7 @@ def check_table(frames: Mapping[str, Frame], calibration: Calibration) -> list[s
         Warnings, a sentence each.
 
     Raises:
-        CalibrationError: a camera sees the table more than 10 mm off, or tilted by more than 2
+        CalibrationError: a camera sees the table more than 10 mm off, or tilted by more than 1.3
             degrees, or sees no table. The error says what would agree.
     """
     warnings = []
@@ -159,13 +155,12 @@ def _is_range(
     if fit.plane.noise < _FLAT / 4:
         return False
     rays = camera.rays
-    along = depth / np.sqrt(1 + rays.u**2 + rays.v**2)
-    other = _fit(camera, camera.X_BC, along.astype(np.float32), grid)
-    return (
-        other is not None
-        and not other.is_refused
-        and (other.plane.noise < _CURVED * fit.plane.noise)
+    along = (depth / np.sqrt(1 + rays.u**2 + rays.v**2)).astype(np.float32)
+    points = _points(camera, camera.X_BC, along, grid)
+    other = refit(points, np.array([0.0, 0.0, grid.z_min])) or next(
+        iter(find_planes(points, 1)), None
     )
+    return other is not None and other.noise < _CURVED * fit.plane.noise
 
 
 def _hint(

@@ -12,6 +12,8 @@ from pydrake.math import RigidTransform, RollPitchYaw
 from scipy.spatial import cKDTree
 
 from kitting_drake.static_scenes.drawing import LooseTool
+from kitting_drake.tasks.kitting.tool_poses import rectangle_at
+from systems.hand_geometry import FINGER_LENGTH, FINGERTIP_DEPTH, MAX_OPENING, PAD_LENGTH
 from systems.signals import PickPlaceAction, PlanarPose
 
 Array = NDArray[np.float64]
@@ -20,8 +22,9 @@ _SPACING = 0.002
 """The distance between points of an outline, in metres."""
 _BESIDE = 0.004
 """A pick may lie this far beside its tool, in metres."""
-_GRASP_OFF, _GRASP_TURNED = 0.010, math.radians(15)
-"""A pick is right if a possible grasp is this near."""
+_TOUCHED, _HELD = 4e-6, 2e-5
+"""A finger touches something if it overlaps with more than this, and holds what overlaps with more
+than this between the pads, in square metres."""
 PLACE_OFF = 0.003
 """A place is right if 95 % of the outline lie this near to where they belong, in metres."""
 
@@ -73,14 +76,20 @@ def _picked(action: PickPlaceAction, loose: Sequence[LooseTool]) -> LooseTool | 
 
 
 def _is_grasp(action: PickPlaceAction, picked: LooseTool) -> bool:
-    yaw = RollPitchYaw(picked.X_WT.rotation()).yaw_angle()
-    for grasp in picked.tool.grasps:
-        x, y, _ = picked.X_WT @ np.array([grasp.x, grasp.y, 0.0])
-        off = math.hypot(x - action.pick.x, y - action.pick.y)
-        turned = abs(math.remainder(yaw + grasp.theta - action.pick.theta, math.pi))
-        if off <= _GRASP_OFF and turned <= _GRASP_TURNED:
-            return True
-    return False
+    """Whether the open fingers touch nothing, and hold something between them."""
+    pick = action.pick
+    outline = _placed(picked.tool.footprint, picked.X_WT)
+    side = (MAX_OPENING + FINGERTIP_DEPTH) / 2
+    across = np.array([-math.sin(pick.theta), math.cos(pick.theta)])
+    for sign in (1, -1):
+        x, y = np.array([pick.x, pick.y]) + sign * side * across
+        finger = rectangle_at((FINGER_LENGTH, FINGERTIP_DEPTH), x, y, pick.theta)
+        if any((finger ^ other).area() > _TOUCHED for other in (outline, *picked.around)):
+            return False
+    between = rectangle_at((PAD_LENGTH, MAX_OPENING), pick.x, pick.y, pick.theta)
+    held = between ^ outline
+    # Jaws that close beside the object's middle push it aside, but hold it.
+    return bool(held.area() > _HELD)
 
 
 def _placed(footprint: CrossSection, X_W: RigidTransform) -> CrossSection:

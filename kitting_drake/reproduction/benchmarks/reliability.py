@@ -19,7 +19,6 @@ from scipy.optimize import minimize
 from kitting_drake.policies.confidence import (
     Evidence,
     Reliability,
-    evidence_of_matching,
     evidence_of_networks,
 )
 from kitting_drake.policies.factory import load_learned_policy, make_shape_matching
@@ -75,8 +74,7 @@ def draw_judged(first_seed: int, count: int) -> Iterator[Judged]:
 
     def by_matching(seen: Observation, tried: list[PlanarPose]) -> tuple[PickPlaceAction, Evidence]:
         matched = matching.decide(seen, tried)
-        evidence = {} if matched.action.stop else evidence_of_matching(seen, matched)
-        return matched.action, evidence
+        return matched.action, matched.geometry or {}
 
     for number, scene in zip(range(count), _scenes(first_seed), strict=False):
         observation = scene.render(PixelGrid())
