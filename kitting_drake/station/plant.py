@@ -12,8 +12,8 @@ from pydrake.systems.framework import DiagramBuilder
 
 from kitting_drake.common.errors import UserError
 from kitting_drake.common.paths import MODELS
-from kitting_drake.scenario.schema import Scenario, Variation
 from kitting_drake.common.sdformat import model_text
+from kitting_drake.scenario.schema import Scenario, Variation
 from kitting_drake.tasks.task import Scene
 from systems.placement import PlacedObject
 from systems.rest_detector import BoundedBody, Box
