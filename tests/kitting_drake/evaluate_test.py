@@ -292,8 +292,8 @@ def test_a_process_killed_from_outside_is_retried_once(monkeypatch: pytest.Monke
         evaluation.run_in_worker(workers, CHOSEN, 7)
 
 
-def test_two_short_episodes_in_parallel(verb_process, tmp_path: Path):
-    done = verb_process(
+def test_two_short_episodes_in_parallel(verb, tmp_path: Path):
+    done = verb(
         "evaluate",
         *("scenarios/kits.yaml", "--scenario_name", "OneTool"),
         *("--episodes", 2, "--workers", 2, "--output", tmp_path),

@@ -57,7 +57,7 @@ def triangles(solid: Manifold) -> NDArray[np.float64]:
 )
 def test_symmetry_order(solid: Manifold, order: int, monkeypatch: pytest.MonkeyPatch):
     # Simple shapes need fewer points than tools.
-    monkeypatch.setattr(symmetry, "_DENSE_SAMPLES", 50_000)
+    monkeypatch.setattr(symmetry, "_DENSE_SAMPLES", 20_000)
     assert symmetry_order(triangles(solid)) == order
 
 
