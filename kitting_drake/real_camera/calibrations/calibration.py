@@ -82,6 +82,8 @@ class BenchCamera:
     """Depths outside these limits are ignored, in metres."""
     color: ColorLens | None = None
     """The colour's own lens; None if depth is registered to colour."""
+    topics: tuple[str, str] | None = None
+    """The topics of colour and depth in recordings; None if their names tell."""
 
     @cached_property
     def rays(self) -> DepthRays:
@@ -169,7 +171,7 @@ def _read_camera(
     where = f"{path}: camera {name}"
     if not isinstance(node, dict):
         raise UserError(f"{where} must be a mapping of fields")
-    known = (*POSE_FIELDS, *_DEPTH_FIELDS, "color", *beside)
+    known = (*POSE_FIELDS, *_DEPTH_FIELDS, "color", "topics", *beside)
     intrinsics = _read_lens(path, name, node, known, where)
     limits = {key: number(node[key], f"{where}: {key}") for key in _DEPTH_FIELDS if key in node}
     if any(value <= 0 for value in limits.values()):
@@ -177,7 +179,8 @@ def _read_camera(
     X_BC = read_pose(node, where, path.parent) if poses or has_pose(node) else np.eye(4)
     _check_entry(node, known, where)
     color = _read_color_lens(path, name, node["color"], where) if "color" in node else None
-    camera = BenchCamera(name, intrinsics, X_BC, **limits, color=color)
+    topics = _read_topics(node["topics"], where) if "topics" in node else None
+    camera = BenchCamera(name, intrinsics, X_BC, **limits, color=color, topics=topics)
     if camera.min_depth >= camera.max_depth:
         raise UserError(
             f"{where}: min_depth {camera.min_depth:g} must be less than max_depth "
@@ -225,6 +228,12 @@ def _read_lens_of_file(path: Path, name: str, node: dict[str, Any], where: str) 
     if size not in (None, intrinsics.size):
         raise UserError(f"{where}: resolution is not that of {file}, {intrinsics.size}")
     return intrinsics
+
+
+def _read_topics(value: Any, where: str) -> tuple[str, str]:
+    if not isinstance(value, dict) or set(value) != {"color", "depth"}:
+        raise UserError(f"{where}: topics must have color and depth, and nothing else")
+    return str(value["color"]), str(value["depth"])
 
 
 def _read_color_lens(path: Path, name: str, node: Any, where: str) -> ColorLens:
@@ -331,6 +340,9 @@ def calibration_record(calibration: Calibration) -> dict[str, Any]:
                 **_lens_record(camera.color.intrinsics),
                 "depth_to_color": np.asarray(camera.color.X_KC).tolist(),
             }
+        if camera.topics is not None:
+            topics = dict(zip(("color", "depth"), camera.topics, strict=True))
+            content["cameras"][camera.name]["topics"] = topics
     return content
 
 
