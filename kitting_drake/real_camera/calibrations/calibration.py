@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import difflib
 import hashlib
 import json
 from collections.abc import Sequence
@@ -18,6 +17,11 @@ from numpy.typing import NDArray
 
 from kitting_drake.common.errors import UserError
 from kitting_drake.common.files import write_atomically
+from kitting_drake.real_camera.calibrations.field_checks import (
+    check_distortion,
+    check_fields,
+    check_misspelt,
+)
 from kitting_drake.real_camera.calibrations.layouts import (
     OWN_INTRINSICS,
     Intrinsics,
@@ -136,7 +140,7 @@ def read_calibration(
     """
     content = read_yaml(path)
     if "cameras" in content:
-        _check_fields(content, ("cameras", *_BENCH_FIELDS), f"{path}")
+        check_fields(content, ("cameras", *_BENCH_FIELDS), f"{path}")
         entries = content["cameras"]
         if not isinstance(entries, dict) or not entries:
             raise UserError(f"{path}: cameras must be a mapping from names to cameras")
@@ -194,23 +198,23 @@ def _read_lens(
 ) -> Intrinsics:
     """The intrinsics in an entry, or in the file that it names."""
     if any(key in node for key in _LENS_FILES):
-        _check_fields(node, (*_FILE_FIELDS, *known), where)
+        check_fields(node, (*_FILE_FIELDS, *known), where)
         return _read_lens_of_file(path, name, node, where)
     if not has_intrinsics(node):
         # Suggest the fields that could hold the intrinsics.
         lenses = ("cameras", "camera_info", "camera_matrix", "fx")
-        _check_misspelt(node, lenses, (*known, "camera_name"), where, likeness=0.6)
+        check_misspelt(node, lenses, (*known, "camera_name"), where, likeness=0.6)
     return read_intrinsics(node, where)
 
 
 def _check_entry(node: dict[str, Any], known: Sequence[str], where: str) -> None:
     """Raises UserError for an unknown field of an entry."""
     if "fx" in node:
-        _check_fields(node, (*OWN_INTRINSICS, *known, "camera_name"), where)
+        check_fields(node, (*OWN_INTRINSICS, *known, "camera_name"), where)
     elif not any(key in node for key in _LENS_FILES):
         # OpenCV and ROS write other fields, such as image_height, which are ignored.
-        _check_distortion(node, where)
-        _check_misspelt(node, (*known, *_BENCH_FIELDS), known, where, likeness=0.85)
+        check_distortion(node, where)
+        check_misspelt(node, (*known, *_BENCH_FIELDS), known, where, likeness=0.85)
 
 
 def _read_lens_of_file(path: Path, name: str, node: dict[str, Any], where: str) -> Intrinsics:
@@ -223,7 +227,7 @@ def _read_lens_of_file(path: Path, name: str, node: dict[str, Any], where: str) 
         size = whole_number(across, f"{where}: resolution"), whole_number(down, f"{where}")
     lens = read_lens_file(file, str(node.get("stream", name)), size)
     check_lens(lens, file)
-    _check_distortion(lens, f"{where}: {file}")
+    check_distortion(lens, f"{where}: {file}")
     intrinsics = read_intrinsics(lens, f"{where}: {file}")
     if size not in (None, intrinsics.size):
         raise UserError(f"{where}: resolution is not that of {file}, {intrinsics.size}")
@@ -246,7 +250,7 @@ def _read_color_lens(path: Path, name: str, node: Any, where: str) -> ColorLens:
             f"{label} lacks depth_to_color: 4 x 4 numbers, or a pose, that map points from the "
             "depth's optical frame to the colour's, in metres"
         )
-    _check_fields(node, _COLOR_FIELDS, label)
+    check_fields(node, _COLOR_FIELDS, label)
     if any(key in node for key in _LENS_FILES):
         intrinsics = _read_lens_of_file(path, name, node, label)
     else:
@@ -254,46 +258,6 @@ def _read_color_lens(path: Path, name: str, node: Any, where: str) -> ColorLens:
     return ColorLens(
         intrinsics, pose_of_value(node["depth_to_color"], f"{label}: depth_to_color").X
     )
-
-
-def _check_distortion(node: dict[str, Any], where: str) -> None:
-    """Raises UserError for misspelt distortion coefficients, which would be ignored.
-
-    OpenCV and ROS write no other fields that begin with "dist".
-    """
-    for key in node:
-        if str(key).lower().startswith("dist") and key not in OWN_INTRINSICS:
-            raise UserError(
-                f"{where} has the unknown field '{key}': the lens's coefficients are called "
-                "distortion_coefficients, or d in ROS"
-            )
-
-
-def _check_fields(node: dict[str, Any], known: Sequence[str], where: str) -> None:
-    """Raises UserError for an unknown field, which would be ignored."""
-    for key in node:
-        if key not in known:
-            close = difflib.get_close_matches(str(key), known, n=1)
-            advice = f"did you mean '{close[0]}'?" if close else "remove it"
-            raise UserError(f"{where} has the unknown field '{key}': {advice}")
-
-
-def _check_misspelt(
-    node: dict[str, Any], meant: Sequence[str], known: Sequence[str], where: str, likeness: float
-) -> None:
-    """Raises UserError for an unknown field that resembles an expected one.
-
-    Args:
-        node: the fields.
-        meant: the expected fields.
-        known: fields that are allowed.
-        where: the beginning of the error.
-        likeness: the least similarity, from 0 to 1.
-    """
-    for key in node:
-        close = difflib.get_close_matches(str(key), meant, cutoff=likeness)
-        if close and key not in known:
-            raise UserError(f"{where} has the unknown field '{key}': did you mean '{close[0]}'?")
 
 
 def _read_grid(path: Path, node: Any, table_height: float) -> PixelGrid:
