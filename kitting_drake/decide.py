@@ -32,7 +32,11 @@ from kitting_drake.real_camera.checking.report import (
     save_check,
 )
 from kitting_drake.real_camera.markers.board_calibration import calibrate_cameras
-from kitting_drake.real_camera.markers.board_report import print_calibrated, save_calibrated
+from kitting_drake.real_camera.markers.board_report import (
+    clear_earlier,
+    print_calibrated,
+    save_calibrated,
+)
 from kitting_drake.real_camera.markers.boards import read_board
 from systems.signals import PixelGrid
 
@@ -84,10 +88,11 @@ def _calibrate(arguments: argparse.Namespace, folder: Path, console: Console) ->
     for flag, given in (("--check", arguments.check), ("--time", arguments.time is not None)):
         if given:
             raise UserError(f"{flag} cannot be combined with --calibrate")
+    path = clear_earlier(folder, arguments.camera)
     board = read_board(arguments.calibrate)
     lenses = read_calibration(arguments.camera, table_height=arguments.table_height, poses=False)
     calibrated = calibrate_cameras(board, arguments.frames, lenses)
-    path = save_calibrated(folder, calibrated, arguments.camera)
+    save_calibrated(path, calibrated)
     print_calibrated(console, calibrated)
     console.print(f"calibration: {path}", highlight=False, markup=False)
 

@@ -23,8 +23,10 @@ _STEEPEST = math.radians(70)
 """A board seen at a larger angle from its normal gives poor corners."""
 _SAME = math.radians(1)
 """Poses that differ by less are one."""
-_CLEARER = 1.5
-"""The second pose that could explain an image must have so many times the error of the first."""
+_CLEARER = 16.0
+"""By so many variances of a corner must the squared errors of a second pose exceed the first's."""
+_LIKELY = 0.2
+"""The error of corners that is to be expected in a real image, in pixels."""
 _NOISE = 0.05
 """The error of corners in a good image, in pixels."""
 _WORST = 3.0
@@ -71,7 +73,8 @@ def fit_board(points: Array, pixels: Array, lens: Intrinsics, where: str) -> Boa
         )
     for other, other_rms in fits[1:]:
         turned = Rotation.from_matrix(other[:3, :3].T @ X[:3, :3]).magnitude()
-        if turned > _SAME and other_rms < _CLEARER * max(rms, _NOISE):
+        excess = len(points) * (other_rms**2 - rms**2)
+        if turned > _SAME and excess < _CLEARER * max(rms, _LIKELY) ** 2:
             raise UserError(
                 f"{where}: two poses, {math.degrees(turned):.0f} degrees apart, explain the board "
                 "equally well: take it nearer, larger, or more from the side"

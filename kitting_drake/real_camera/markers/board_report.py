@@ -12,7 +12,7 @@ from PIL import Image, ImageDraw
 from rich.console import Console
 from rich.table import Table
 
-from kitting_drake.common.errors import UserError
+from kitting_drake.common.errors import MachineError, UserError
 from kitting_drake.common.files import write_atomically, write_json
 from kitting_drake.real_camera.calibrations.calibration import BenchCamera, write_calibration
 from kitting_drake.real_camera.frames.point_clouds import project_points
@@ -25,22 +25,42 @@ _TOLD = 0.01
 _AXES = ((230, 40, 40), (40, 180, 40), (60, 90, 255))
 
 
-def save_calibrated(folder: Path, calibrated: Calibrated, source: Path) -> Path:
-    """Writes `calibration.yaml`, `calibrate.json` and a picture of each camera; returns the first.
+def clear_earlier(folder: Path, source: Path) -> Path:
+    """Removes the files of an earlier run, so that nobody uses them after a failure; returns the
+    file of the new calibration.
+
+    Args:
+        folder: of the files.
+        source: the file of the intrinsics.
 
     Raises:
-        UserError: a file would replace the intrinsics' own, or cannot be written.
+        UserError: the file is that of the intrinsics, or is not from an earlier run.
     """
-    path = folder / "calibration.yaml"
+    path, record = folder / "calibration.yaml", folder / "calibrate.json"
     if path.resolve() == source.resolve():
         raise UserError(f"{path} is the file of the intrinsics: give another --output")
+    if path.exists() and not record.exists():
+        raise UserError(f"{path} was not written by --calibrate: give another --output")
+    try:
+        for item in (path, record):
+            item.unlink(missing_ok=True)
+    except OSError as error:
+        raise MachineError(f"cannot remove {item}: {error.strerror}") from error
+    return path
+
+
+def save_calibrated(path: Path, calibrated: Calibrated) -> None:
+    """Writes the calibration to a file, and `calibrate.json` and a picture of each camera beside.
+
+    Raises:
+        UserError: a file cannot be written.
+    """
     cameras = {camera.name: camera for camera in calibrated.calibration.cameras}
     for result in calibrated.cameras:
         picture = _draw(result, cameras[result.name], calibrated)
-        write_atomically(folder / f"calibrate_{result.name}.png", picture)
-    write_json(folder / "calibrate.json", _record(calibrated))
+        write_atomically(path.parent / f"calibrate_{result.name}.png", picture)
+    write_json(path.parent / "calibrate.json", _record(calibrated))
     write_calibration(path, calibrated.calibration)
-    return path
 
 
 def print_calibrated(console: Console, calibrated: Calibrated) -> None:
