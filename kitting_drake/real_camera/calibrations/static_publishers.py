@@ -52,7 +52,7 @@ def _calls_in_xml(text: str, path: Path) -> Iterator[list[str]]:
         raise UserError(f"{path} is not complete XML: {error}") from error
     for node in root.iter("node"):
         if PUBLISHER in (node.get("type"), node.get("exec")):
-            yield shlex.split(node.get("args", ""))
+            yield _split(node.get("args", ""), path)
 
 
 def _calls_in_python(text: str, path: Path) -> Iterator[list[str]]:
@@ -80,12 +80,16 @@ def _calls_in_lines(text: str, path: Path) -> Iterator[list[str]]:
     joined = text.replace("\\\n", " ")
     for line in joined.splitlines():
         if PUBLISHER in line or "--frame-id" in line:
-            try:
-                words = shlex.split(line.rpartition(PUBLISHER)[2], comments=True)
-            except ValueError as error:
-                raise UserError(f"{path}: {PUBLISHER}: {error}") from error
+            words = _split(line.rpartition(PUBLISHER)[2], path)
             if words:
                 yield words
+
+
+def _split(text: str, path: Path) -> list[str]:
+    try:
+        return shlex.split(text, comments=True)
+    except ValueError as error:
+        raise UserError(f"{path}: {PUBLISHER}: {error}") from error
 
 
 def _pose(words: Sequence[str], where: str) -> FoundPose:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import zipfile
+import zlib
 from pathlib import Path
 from tokenize import TokenError
 from typing import Any
@@ -20,7 +22,12 @@ _ALWAYS_DEPTH = (".npy", ".exr")
 _DEPTH_MODES = ("I;16", "I;16B", "I", "F")
 _DAMAGED = (OSError, SyntaxError, ValueError)
 """Pillow's exceptions for a damaged file; SyntaxError is for a PNG with a broken chunk."""
-_NOT_NUMPY = (OSError, ValueError, EOFError, SyntaxError, TokenError, KeyError)
+_NOT_AN_IMAGE = (*_DAMAGED, TypeError, KeyError, Image.DecompressionBombError)
+_NOT_NUMPY = (
+    *(OSError, ValueError, EOFError, SyntaxError, TokenError, KeyError, TypeError),
+    *(zipfile.BadZipFile, zlib.error, NotImplementedError, MemoryError),
+)
+"""Numpy's exceptions for a damaged file."""
 _DEPTH_CHANNELS = ("z", "depth", "v", "y")
 """The last parts of names of EXR's channels of depth; Blender writes Depth.V or Depth.Z."""
 
@@ -126,14 +133,15 @@ def depth_of_array(data: NDArray[Any], depth_scale: float, what: str) -> NDArray
 def _open(path: Path) -> Image.Image:
     try:
         image = Image.open(path)
-    except (OSError, ValueError) as error:
+        count = getattr(image, "n_frames", 1)
+    except _NOT_AN_IMAGE as error:
         reason = getattr(error, "strerror", None) or "it is not an image"
         if path.suffix.lower() in (".tif", ".tiff") and reason == "it is not an image":
             reason += " of 8 or 16 bits, or of 32-bit floats"
         raise UserError(f"cannot read {path}: {reason}") from error
-    if getattr(image, "n_frames", 1) > 1:
+    if count > 1:
         image.close()
-        raise UserError(f"{path} holds {image.n_frames} images: save one alone")  # type: ignore[attr-defined]
+        raise UserError(f"{path} holds {count} images: save one alone")
     return image
 
 
@@ -143,9 +151,6 @@ def _load(path: Path) -> Any:
     except _NOT_NUMPY as error:
         what = f"a complete {path.suffix} file of numbers"
         raise UserError(f"cannot read {path}: it is not {what}") from error
-    except Exception as error:
-        # zipfile's exceptions for a truncated archive derive from Exception.
-        raise UserError(f"cannot read {path}: it is not a complete archive") from error
 
 
 def _read_depth_image(path: Path) -> NDArray[Any]:

@@ -29,6 +29,7 @@ def read_pcd(path: Path) -> tuple[NDArray[np.float64], NDArray[np.uint8] | None,
         content = path.read_bytes()
         header, at = _read_header(content)
         table = _read_table(header, content[at:])
+        viewpoint = [float(word) for word in header.get("VIEWPOINT", [])] or _UNMOVED
     except OSError as error:
         raise UserError(f"cannot read {path}: {error.strerror}") from error
     except (ValueError, KeyError, IndexError, struct.error, TypeError) as error:
@@ -36,8 +37,7 @@ def read_pcd(path: Path) -> tuple[NDArray[np.float64], NDArray[np.uint8] | None,
     missing = [axis for axis in "xyz" if axis not in table]
     if missing:
         raise UserError(f"{path} has no field {missing[0]}")
-    viewpoint = [float(word) for word in header.get("VIEWPOINT", [])] or _UNMOVED
-    if not np.allclose(viewpoint, _UNMOVED):
+    if len(viewpoint) != 7 or not np.allclose(viewpoint, _UNMOVED):
         raise UserError(
             f"{path} has another VIEWPOINT than 0 0 0 1 0 0 0: save the points in the frame of the "
             "camera"

@@ -112,14 +112,14 @@ def _read_ply(path: Path) -> tuple[Array, NDArray[np.uint8] | None]:
         with path.open("rb") as file:
             fields: dict[str, Any] = trimesh.exchange.ply.load_ply(file, skip_materials=True)
         points = np.asarray(fields["vertices"], float).reshape(-1, 3)
+        colors = fields.get("vertex_colors", fields.get("colors"))
+        if colors is None:
+            return points, None
+        colors = np.asarray(colors)[:, :3]
+        if colors.dtype.kind == "f":
+            colors = np.rint(255 * np.clip(colors, 0, 1))
+        return points, colors.astype(np.uint8).reshape(len(points), 3)
     except OSError as error:
         raise UserError(f"cannot read {path}: {error.strerror}") from error
     except (ValueError, KeyError, IndexError, TypeError, AttributeError) as error:
         raise UserError(f"cannot read {path}: it is not a complete PLY file") from error
-    colors = fields.get("vertex_colors", fields.get("colors"))
-    if colors is None:
-        return points, None
-    colors = np.asarray(colors)[:, :3]
-    if colors.dtype.kind == "f":
-        colors = np.rint(255 * np.clip(colors, 0, 1))
-    return points, colors.astype(np.uint8)

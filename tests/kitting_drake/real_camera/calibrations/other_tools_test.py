@@ -291,6 +291,7 @@ MOVING = texts.TF_ECHO + texts.TF_ECHO.replace("0.500", "0.510")
         (texts.EASY_HANDEYE2.replace("eye_on_base", "both"), "must be eye_in_hand or eye_on_base"),
         (texts.MOVEIT_LAUNCH[:-12], "is not complete XML"),
         (texts.MOVEIT_LAUNCH.replace(" 0.1 ", " $(arg y) "), "must have x y z yaw pitch roll"),
+        (texts.MOVEIT_LAUNCH.replace("panda", "'panda"), "No closing quotation"),
         (texts.MOVEIT_PYTHON[:-60], "is not complete Python"),
         (texts.MOVEIT_PYTHON.replace('"0.5"', "x"), "must be written out, without variables"),
         (texts.MOVEIT_PYTHON.replace("--z", "--height"), "the unknown argument '--height'"),
