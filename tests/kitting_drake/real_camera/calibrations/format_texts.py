@@ -6,14 +6,14 @@ All describe the same lens, and the same pose in the base: looking straight down
 LENS = "width: 64\n    height: 48\n    fx: 50.0\n    fy: 51.0\n    cx: 31.5\n    cy: 23.25\n"
 
 OPENCV_SAMPLE = """%YAML:1.0
-calibration_Time: "08/19/11 20:44:38"
-nrOfFrames: 8
+calibration_Time: "11/02/26 09:15:00"
+nrOfFrames: 21
 image_Width: 64
 image_Height: 48
-board_Width: 9
-square_Size: 50.
-# flags:  +fix_aspectRatio +fix_principal_point +zero_tangent_dist
-flagValue: 14
+board_Width: 8
+square_Size: 25.
+# flags:  +fix_aspectRatio
+flagValue: 2
 Camera_Matrix: !!opencv-matrix
    rows: 3
    cols: 3
