@@ -56,7 +56,7 @@ def check_against_cell(seed: int, folder: Path) -> None:
     write_calibration(folder / "calibration.yaml", found.calibration)
     calibration = read_calibration(folder / "calibration.yaml")
     exact = read_frames([write_frames(folder / "npy", found.frames)], calibration)
-    policy = load_policy()
+    policy = load_policy(least_confidence=0.0)
     decision = decide(exact, calibration, policy)
     np.testing.assert_array_equal(decision.observation.image, found.observation.image)
     np.testing.assert_array_equal(decision.observation.valid, found.observation.valid)
