@@ -1,6 +1,6 @@
 """`python -m kitting_drake.benchmark NAME`: measures, prints tables and saves them.
 
-NAME is simulation, networks, kits, recovery, mujoco or paper.
+NAME is simulation, networks, kits, recovery, reliability, mujoco or paper.
 """
 
 import argparse
@@ -30,6 +30,7 @@ def main() -> int:
         "networks": _networks,
         "kits": _kits,
         "mujoco": _mujoco,
+        "reliability": _reliability,
     }[arguments.benchmark]
     for table in measure(arguments, console, folder):
         console.print(table)
@@ -87,6 +88,23 @@ def _parser() -> argparse.ArgumentParser:
         metavar="N",
         help="round the oracle's actions to N orientations",
     )
+    reliability = benchmarks.add_parser(
+        "reliability", help="whether a decision's confidence is its probability of success"
+    )
+    reliability.add_argument(
+        "--scenes", type=count_type, default=100, help="number of drawn scenes (100)"
+    )
+    reliability.add_argument(
+        "--seed", type=seed_type, default=900_000, help="seed of the first scenes (900000)"
+    )
+    reliability.add_argument(
+        "--weights", type=Path, metavar="FILE", help="of the networks (default: the generalist)"
+    )
+    reliability.add_argument(
+        "--fit",
+        action="store_true",
+        help="fit the confidence to these decisions: writes confidence.json",
+    )
     paper = benchmarks.add_parser(
         "paper", help="collect, train and evaluate for the cells of the paper's tables; takes days"
     )
@@ -105,7 +123,7 @@ def _parser() -> argparse.ArgumentParser:
         help="folder of the table of runs, which finished cells are added to (docs/results)",
     )
     paper.add_argument("--workers", type=count_type, default=1, help="parallel episodes (1)")
-    for benchmark in (simulation, networks, kits, recovery, opinion, paper):
+    for benchmark in (simulation, networks, kits, recovery, opinion, reliability, paper):
         benchmark.add_argument(
             "--output", type=Path, default=Path("output/benchmark"), help="folder for the files"
         )
@@ -169,6 +187,22 @@ def _recovery(arguments: argparse.Namespace, console: Console, folder: Path) -> 
     console.print(f"files: {folder}/", highlight=False, markup=False)
     counts = measured["disturbances"].values()
     return FAILED if all(count["failed"] == arguments.episodes for count in counts) else 0
+
+
+def _reliability(arguments: argparse.Namespace, console: Console, folder: Path) -> list[Table]:
+    from kitting_drake.reproduction.benchmarks.reliability import measure_reliability
+    from kitting_drake.reproduction.benchmarks.reliability_report import (
+        draw_reliability,
+        reliability_table,
+    )
+
+    _use_one_core()
+    measured = measure_reliability(
+        arguments.seed, arguments.scenes, arguments.weights, folder, console, fits=arguments.fit
+    )
+    write_json(folder / "reliability.json", measured)
+    write_atomically(folder / "reliability.png", draw_reliability(measured))
+    return [reliability_table(measured)]
 
 
 def _mujoco(arguments: argparse.Namespace, console: Console, folder: Path) -> list[Table]:

@@ -161,6 +161,12 @@ def _parser() -> argparse.ArgumentParser:
         action="store_true",
         help="networks: do not refine actions by outlines (for tasks without cavities)",
     )
+    parser.add_argument(
+        "--least_confidence",
+        type=_share,
+        metavar="P",
+        help="act only with at least this probability of success (default: as fitted)",
+    )
     parser.add_argument("--recover", action="store_true", help="recover from failed insertions")
     parser.add_argument(
         "--table_height",
@@ -211,13 +217,22 @@ def _policy(arguments: argparse.Namespace) -> BenchPolicy:
                 raise UserError(
                     f"{flag} cannot be combined with --shape_matching: it is for networks"
                 )
-        return ShapeMatching(recover=arguments.recover)
+        return ShapeMatching(recover=arguments.recover, least_confidence=arguments.least_confidence)
     return load_policy(
         arguments.weights,
         orientations=arguments.orientations or 180,
         fit_outlines=not arguments.no_outlines,
         recover=arguments.recover,
+        least_confidence=arguments.least_confidence,
     )
+
+
+def _share(text: str) -> float:
+    """A number from 0 to 1, for argparse."""
+    value = float(text)
+    if not 0 <= value <= 1:
+        raise argparse.ArgumentTypeError("give a probability from 0 to 1")
+    return value
 
 
 def _block(arguments: argparse.Namespace, grid: PixelGrid) -> Block | None:

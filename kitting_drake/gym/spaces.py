@@ -25,16 +25,17 @@ def action_space(grid: PixelGrid) -> spaces.Box:
 
 
 def observation_space(scenario: Scenario, *, cameras: bool) -> spaces.Dict:
-    """`colour` (rows, cols, 3), `height` (rows, cols) in metres above `grid.z_min` and `valid`
-    (rows, cols), as in `Observation`. With `cameras`, also the images of each camera under that
-    key: `colour` (height, width, 3) and `depth` (height, width) in metres, infinity where too far
-    and 0 where too near."""
+    """`colour` (rows, cols, 3), `height` (rows, cols) in metres above the table, `valid` and
+    `in_view` (rows, cols), as in `Observation`. With `cameras`, also the images of each camera
+    under that key: `colour` (height, width, 3) and `depth` (height, width) in metres, infinity
+    where too far and 0 where too near."""
     grid = scenario.heightmap.grid()
     depth_range = grid.z_max - grid.z_min
     parts: dict[str, spaces.Space[Any]] = {
         "colour": spaces.Box(0, 255, (*grid.shape, 3), np.uint8),
         "height": spaces.Box(0.0, float(np.float32(depth_range)), grid.shape, np.float32),
         "valid": spaces.MultiBinary(grid.shape),
+        "in_view": spaces.MultiBinary(grid.shape),
     }
     if cameras:
         images: dict[str, spaces.Space[Any]] = {
@@ -57,6 +58,7 @@ def as_arrays(observation: Observation) -> dict[str, NDArray[Any]]:
         "colour": colour,
         "height": observation.height.copy(),
         "valid": observation.valid.astype(np.int8),
+        "in_view": observation.in_view.astype(np.int8),
     }
 
 
@@ -69,7 +71,8 @@ def as_observation(arrays: dict[str, Any], grid: PixelGrid) -> Observation:
     """
     rgb = np.moveaxis(np.asarray(arrays["colour"], np.float32) / np.float32(255), -1, 0)
     image = np.concatenate([rgb, np.asarray(arrays["height"], np.float32)[None]])
-    return Observation(image=image, grid=grid, valid=np.asarray(arrays["valid"], bool))
+    valid, in_view = (np.asarray(arrays[name], bool) for name in ("valid", "in_view"))
+    return Observation(image=image, grid=grid, valid=valid, in_view=in_view)
 
 
 def as_action(values: ArrayLike, grid: PixelGrid) -> PickPlaceAction:

@@ -11,11 +11,13 @@ import json
 import math
 from dataclasses import dataclass
 from functools import cache
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from kitting_drake.common.errors import UserError
 from kitting_drake.common.paths import MODELS
 from kitting_drake.policies.matching.evidence import Evidence
 from systems.signals import Observation
@@ -49,11 +51,25 @@ class Reliability:
         return 1 / (1 + math.exp(-max(-30.0, min(total, 30.0))))
 
 
+def read_reliability(policy: str, weights: Path | None = None) -> Reliability:
+    """A fitted regression.
+
+    Args:
+        policy: `networks` or `shape_matching`.
+        weights: of the networks. If a file of that name with the ending `.confidence.json` lies
+            beside them, it holds their own regression.
+    """
+    own = None if weights is None else weights.with_suffix(".confidence.json")
+    return _read(FILE if own is None or not own.exists() else own, policy)
+
+
 @cache
-def read_reliability(policy: str) -> Reliability:
-    """The fitted regression of `networks` or `shape_matching`."""
-    record: dict[str, Any] = json.loads(FILE.read_text())[policy]
-    return Reliability(record["weights"], record["threshold"])
+def _read(path: Path, policy: str) -> Reliability:
+    try:
+        record: dict[str, Any] = json.loads(path.read_text())[policy]
+        return Reliability(record["weights"], record["threshold"])
+    except (OSError, ValueError, LookupError, TypeError) as error:
+        raise UserError(f"{path} does not hold the regression of {policy}: {error}") from error
 
 
 def evidence_of_networks(observation: Observation, decision: Decision) -> Evidence:

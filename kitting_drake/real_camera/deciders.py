@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Protocol
 
 from kitting_drake.policies.confidence import (
+    Reliability,
     certainty,
     evidence_of_networks,
     read_reliability,
@@ -89,7 +90,8 @@ class ShapeMatchingDecider:
         if matched.geometry is None:
             return Choice(matched.action, None, draw=draw)
         least = self.least_confidence
-        return _if_sure("shape_matching", matched.geometry, least, matched.action, {}, draw)
+        reliability = read_reliability("shape_matching")
+        return _if_sure(reliability, matched.geometry, least, matched.action, {}, draw)
 
 
 @dataclass(frozen=True)
@@ -124,11 +126,12 @@ class _Networks:
         if action.stop:
             return Choice(action, parts.get("nothing_to_pick"), parts, draw)
         evidence = evidence_of_networks(observation, decision)
-        return _if_sure("networks", evidence, self.least_confidence, action, parts, draw)
+        reliability = read_reliability("networks", self.loaded.path)
+        return _if_sure(reliability, evidence, self.least_confidence, action, parts, draw)
 
 
 def _if_sure(
-    policy: str,
+    reliability: Reliability,
     evidence: Evidence,
     least: float | None,
     action: PickPlaceAction,
@@ -136,7 +139,6 @@ def _if_sure(
     draw: Callable[[], bytes],
 ) -> Choice:
     """The action with its confidence, or a stop if that is too low."""
-    reliability = read_reliability(policy)
     confidence = reliability.confidence(evidence)
     least = reliability.threshold if least is None else least
     if confidence >= least:

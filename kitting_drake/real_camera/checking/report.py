@@ -25,9 +25,17 @@ def print_decision(console: Console, record: dict[str, Any]) -> None:
     """Prints the content of an `action.json`."""
     confidence = record["confidence"]
     sure = "" if confidence is None else f", confidence {confidence:.2f}"
-    said = "stop" if record["stop"] else "press" if record["press"] else "pick and place"
     by = f"({record['policy']}, {record['seconds']:.2f} s)"
-    console.print(f"{said}{sure} {by}", highlight=False, markup=False)
+    console.print(f"{record['result']}{sure} {by}", highlight=False, markup=False)
+    if record["stop"] and record["reason"]:
+        console.print(f"  {record['reason']}", highlight=False, markup=False)
+    for warning in record["warnings"]:
+        console.print(f"  [yellow]warning:[/] {escape(warning)}", highlight=False)
+    if record["in_view"] < _WELL_SEEN:
+        console.print(
+            f"  the cameras look at {100 * record['in_view']:.0f} % of the workspace",
+            highlight=False,
+        )
     if record["seen"] < _WELL_SEEN:
         console.print(
             f"  only {100 * record['seen']:.0f} % of what is in view is seen; the rest is filled "

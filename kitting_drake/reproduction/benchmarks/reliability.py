@@ -7,18 +7,23 @@ Scenes are drawn as for training, from seeds that no training uses. Decisions ar
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Iterator
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from rich.console import Console
 from scipy.optimize import minimize
 
+from kitting_drake.common.files import write_atomically, write_json
+from kitting_drake.common.processes import counting_bar
+from kitting_drake.common.provenance import commit
 from kitting_drake.policies.confidence import (
     Reliability,
     evidence_of_networks,
+    read_reliability,
 )
 from kitting_drake.policies.factory import load_learned_policy, make_shape_matching
 from kitting_drake.policies.matching.evidence import Evidence
@@ -31,6 +36,13 @@ from systems.signals import Observation, PickPlaceAction, PixelGrid, PlanarPose
 
 Array = NDArray[np.float64]
 
+POLICIES = ("networks", "shape_matching")
+_CAMERAS = {
+    "all": (0, 1, 2, 3),
+    "default cameras": (0,),
+    "one random camera": (1,),
+    "two or three": (2, 3),
+}
 _RANDOM_VIEWS = 0.7
 """The share of scenes with random cameras; the others have the default cameras."""
 _WITHOUT_KIT = 0.1
@@ -58,15 +70,82 @@ class Judged:
     """Why the policy stopped."""
 
 
-def draw_judged(first_seed: int, count: int) -> Iterator[Judged]:
+def measure_reliability(
+    first_seed: int,
+    count: int,
+    weights: Path | None,
+    folder: Path,
+    console: Console,
+    *,
+    fits: bool,
+) -> dict[str, Any]:
+    """Measures how reliable the confidence is.
+
+    Args:
+        first_seed: of the scenes.
+        count: the number of scenes.
+        weights: of the networks; None for the generalist.
+        folder: gets `decisions.jsonl`, and `confidence.json` if `fits`.
+        console: for the progress bar.
+        fits: whether to fit the confidence to these decisions, instead of using the fitted one.
+
+    Returns:
+        A summary of each policy's decisions, by the cameras.
+    """
+    judged: list[Judged] = []
+    with counting_bar(console, "scenes") as progress:
+        bar = progress.add_task("", total=count)
+        for item in draw_judged(first_seed, count, weights):
+            judged.append(item)
+            progress.update(bar, completed=item.scene)
+    write_atomically(folder / "decisions.jsonl", "".join(line + "\n" for line in as_lines(judged)))
+    return summarize_all(judged, weights, folder if fits else None) | {
+        "seeds": [first_seed, count],
+        "commit": commit(),
+    }
+
+
+def summarize_all(
+    judged: list[Judged], weights: Path | None, fitted: Path | None
+) -> dict[str, Any]:
+    """Summaries by policy and cameras.
+
+    Args:
+        judged: all decisions.
+        weights: of the networks; None for the generalist.
+        fitted: the folder for `confidence.json`, fitted to these decisions; None to use the one
+            that is fitted already.
+    """
+    found = {
+        policy: fit([item for item in judged if item.policy == policy])
+        if fitted
+        else read_reliability(policy, weights)
+        for policy in POLICIES
+    }
+    if fitted is not None:
+        write_json(fitted / "confidence.json", {k: asdict(item) for k, item in found.items()})
+    return {policy: _by_cameras(judged, policy, item) for policy, item in found.items()}
+
+
+def _by_cameras(judged: list[Judged], policy: str, reliability: Reliability) -> dict[str, Any]:
+    summaries: dict[str, Any] = {"threshold": reliability.threshold}
+    for name, cameras in _CAMERAS.items():
+        chosen = [item for item in judged if item.policy == policy and item.cameras in cameras]
+        if any(item.verdict != "stop" for item in chosen):
+            summaries[name] = asdict(summarize(chosen, reliability))
+    return summaries
+
+
+def draw_judged(first_seed: int, count: int, weights: Path | None = None) -> Iterator[Judged]:
     """Decides on scenes, and judges the decisions.
 
     Args:
         first_seed: of the scenes.
         count: the number of scenes.
+        weights: of the networks; None for the generalist.
     """
     planner = PickPlaceParameters()
-    networks = load_learned_policy(None, planner, insertion=True).function
+    networks = load_learned_policy(weights, planner, insertion=True).function
     matching = make_shape_matching(planner)
 
     def by_networks(seen: Observation, tried: list[PlanarPose]) -> tuple[PickPlaceAction, Evidence]:
@@ -168,7 +247,7 @@ def _threshold(confidence: Array, right: NDArray[np.bool_]) -> float:
 
 
 @dataclass(frozen=True)
-class Summary:
+class ReliabilitySummary:
     """How well a confidence tells right from wrong."""
 
     decisions: int
@@ -184,7 +263,7 @@ class Summary:
     """Mean confidence, share of right decisions and number of decisions."""
 
 
-def summarize(judged: list[Judged], reliability: Reliability) -> Summary:
+def summarize(judged: list[Judged], reliability: Reliability) -> ReliabilitySummary:
     """Summarizes decisions by a regression that was fitted to others."""
     acted = [item for item in judged if item.verdict != "stop"]
     right = np.array([item.verdict == "right" for item in acted])
@@ -198,7 +277,7 @@ def summarize(judged: list[Judged], reliability: Reliability) -> Summary:
             )
     error = sum(abs(mean - share) * count for mean, share, count in bins) / len(acted)
     answered = confidence >= reliability.threshold
-    return Summary(
+    return ReliabilitySummary(
         decisions=len(acted),
         right=float(right.mean()),
         calibration_error=float(error),
@@ -208,7 +287,7 @@ def summarize(judged: list[Judged], reliability: Reliability) -> Summary:
     )
 
 
-def as_lines(judged: Iterator[Judged]) -> Iterator[str]:
+def as_lines(judged: Iterable[Judged]) -> Iterator[str]:
     """Decisions as lines of JSON."""
     for item in judged:
         yield json.dumps(item.__dict__)

@@ -1,0 +1,70 @@
+"""The table and the diagram of `benchmark reliability`."""
+
+from __future__ import annotations
+
+import io
+from typing import Any
+
+import matplotlib
+from matplotlib.figure import Figure
+from rich.table import Table
+
+_NAMES = {"networks": "the generalist", "shape_matching": "shape matching"}
+_COLOURS = {"networks": "#e4572e", "shape_matching": "#1b998b"}
+
+
+def reliability_table(measured: dict[str, Any]) -> Table:
+    """A row for each policy and group of cameras."""
+    table = Table(title="confidence of decisions", title_justify="left")
+    for heading in ("policy", "cameras"):
+        table.add_column(heading)
+    for heading in ("decisions", "right", "calibration error", "wrong answers", "right refused"):
+        table.add_column(heading, justify="right")
+    for policy, name in _NAMES.items():
+        for cameras, found in measured[policy].items():
+            if cameras == "threshold":
+                continue
+            table.add_row(
+                name,
+                cameras,
+                str(found["decisions"]),
+                f"{100 * found['right']:.1f} %",
+                f"{found['calibration_error']:.3f}",
+                f"{100 * found['wrong_answers']:.1f} %",
+                f"{100 * found['refused']:.1f} %",
+            )
+    return table
+
+
+def draw_reliability(measured: dict[str, Any]) -> bytes:
+    """Draws the share of right decisions over their confidence, with their numbers.
+
+    Returns:
+        A PNG.
+    """
+    figure = Figure(figsize=(8, 4.4), layout="constrained", dpi=130)
+    for axes, (policy, name) in zip(
+        figure.subplots(1, 2, sharey=True), _NAMES.items(), strict=True
+    ):
+        found = measured[policy]["all"]
+        confidence, right, counts = zip(*found["bins"], strict=True)
+        axes.plot([0, 1], [0, 1], color="0.75", lw=1, zorder=0)
+        sizes = [12 + 0.9 * count for count in counts]
+        axes.scatter(confidence, right, s=sizes, color=_COLOURS[policy], alpha=0.85, lw=0)
+        for x, y, count in zip(confidence, right, counts, strict=True):
+            axes.annotate(
+                str(count), (x, y), xytext=(7, -11), textcoords="offset points", fontsize=7
+            )
+        axes.axvline(measured[policy]["threshold"], color="0.4", lw=1, ls="--")
+        axes.set(xlim=(-0.03, 1.03), ylim=(-0.05, 1.08), xlabel="confidence")
+        axes.set_title(
+            f"{name}: {found['decisions']} decisions, error {found['calibration_error']:.3f}",
+            loc="left",
+            fontsize=9,
+        )
+        axes.spines[["top", "right"]].set_visible(False)
+    figure.axes[0].set_ylabel("share of right decisions")
+    buffer = io.BytesIO()
+    with matplotlib.rc_context({"font.size": 9}):
+        figure.savefig(buffer, format="png")
+    return buffer.getvalue()
