@@ -295,7 +295,9 @@ def next_seed(
     rejected: Container[int],
     working: Container[int],
 ) -> int | None:
-    """The seed to try next. The result is to hold the first `count` seeds that are not rejected.
+    """The seed to try next.
+
+    Demonstrations are wanted of the first `count` seeds that are not rejected.
 
     Args:
         seeds: the permitted seeds, in order.
@@ -305,7 +307,7 @@ def next_seed(
         working: seeds in progress.
 
     Returns:
-        A seed. None if the accepted seeds and those in progress already make `count`.
+        The seed. None if there are already `count` seeds, accepted or in progress.
 
     Raises:
         UserError: no seed is left, or too many seeds in a row were rejected.

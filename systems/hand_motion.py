@@ -176,7 +176,8 @@ def _ways(
     limits: MotionLimits,
     delays: NDArray[np.float64],
 ) -> Iterator[tuple[list[int], list[float], float, tuple[float, float], float]]:
-    """For each part: axes, displacement after braking, its length, limits, delay."""
+    """For each part: its axes, its displacement after braking, the length of this displacement, its
+    limits and its delay."""
     ways = (goal - start - start_rate * braking_time(start_rate, limits) / 2).tolist()
     for part, limit, delay in zip(PARTS, limits.of_parts(), delays.tolist(), strict=True):
         way = [ways[i] for i in part]

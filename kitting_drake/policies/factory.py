@@ -109,7 +109,7 @@ def make_shape_matching(
 
     Args:
         planner: how the hand will pick and place.
-        recover: mend failed insertions.
+        recover: whether to correct failed insertions.
     """
     # Import SciPy lazily.
     from kitting_drake.policies.matching.shape_matching import ShapeMatchingPolicy
