@@ -149,8 +149,8 @@ class Collection:
         """Reads the files of earlier runs.
 
         Args:
-            folder: of the files.
-            origin: of the demonstrations.
+            folder: the folder of the files.
+            origin: the origin of the demonstrations.
 
         Raises:
             UserError: a file has another origin or is damaged.
@@ -211,7 +211,7 @@ class Collection:
             count: the number of demonstrations wanted.
             demonstrate: makes a demonstration; called in threads.
             workers: determine the number of parallel calls.
-            console: for the progress bar.
+            console: where to show the progress bar.
 
         Raises:
             UserError: no seeds are left, too many seeds in a row are rejected, or a process is
@@ -383,7 +383,7 @@ class DemonstrationRecorder:
     def __init__(self, station: KittingStation, *, later_picks_possible: bool = False) -> None:
         """
         Args:
-            station: with cameras and the oracle.
+            station: a station with cameras and the oracle.
             later_picks_possible: see `Learning`. Episodes with two actions on one object are then
                 rejected: the first action moves the object, so its later pick is a wrong label.
         """

@@ -89,8 +89,8 @@ class _Parts:
         """Reads the files of earlier runs.
 
         Args:
-            folder: of the files.
-            seed: of all draws.
+            folder: the folder of the files.
+            seed: the seed of all draws.
             drawn_by: versions and digests of the code.
 
         Raises:
@@ -125,7 +125,7 @@ class _Parts:
         return self._folder / f"batch_{batch:06d}.h5"
 
     def draw(self, count: int, workers: LocalWorkers, console: Console) -> None:
-        """Draws batches until there are `count` scenes. Batches after a missing one do not count."""
+        """Draws batches until the batches before the first missing one have `count` scenes."""
         begun = set(self._counts)
 
         def next_batch() -> int | None:

@@ -127,7 +127,7 @@ def motion_at(
         start: (4) position.
         goal: (4) position.
         start_rate: (4) velocity at the start.
-        limits: of each of the `PARTS`.
+        limits: the limits of each of the `PARTS`.
         delays: (3) when the `travel` of each part begins, in s after the start.
         elapsed: time since the start, in s.
 
@@ -204,7 +204,7 @@ def shortest_yaws(
         pick_yaw: in rad.
         place_yaw: in rad.
         present_yaw: the wrist's present yaw, in rad.
-        limit: of the magnitude of both yaws, in rad; at least pi, so that a solution exists.
+        limit: the largest magnitude of a yaw, in rad; at least pi, so that a solution exists.
 
     Returns:
         (pick, place) in rad.

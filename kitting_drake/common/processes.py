@@ -80,7 +80,7 @@ class Subprocess:
         Args:
             function: importable by name; arguments and result must be picklable. Exceptions end the
                 process, except for `MachineError`.
-            arguments: of the function.
+            arguments: the arguments of the function.
 
         Returns:
             The function's result, or how the process ended without one.

@@ -34,7 +34,7 @@ class LoadedPolicy:
         """Checks that the pixels have the size that the policy was trained with.
 
         Args:
-            grid: of the observations.
+            grid: the pixel grid of the observations.
             field: the caller's name of the grid's resolution, for the error.
 
         Raises:

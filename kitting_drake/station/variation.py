@@ -12,7 +12,7 @@ def varied_model(path: Path, *, friction: float, mass: float) -> str:
     """The SDFormat text of a model, with friction coefficients and inertia scaled.
 
     Args:
-        path: of the model.
+        path: the path of the model.
         friction: factor of all friction coefficients.
         mass: factor of all masses and moments of inertia.
 

@@ -140,7 +140,7 @@ def draw_poses(
     Args:
         footprints: the footprints of what to place, in drawing order; put large ones first.
         grid: the workspace.
-        rng: for all draws.
+        rng: the random generator of all draws.
         spacing: least distance between two bodies, in metres.
 
     Returns:
@@ -174,7 +174,7 @@ def draw_in_turn(
     """Draws places one after another, and starts over if there is none for an item.
 
     Args:
-        items: to place, in drawing order.
+        items: what to place, in drawing order.
         draw: returns a place for an item, given the places of earlier items; None if there is none.
         restarts: largest number of attempts.
 

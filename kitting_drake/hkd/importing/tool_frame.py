@@ -12,9 +12,9 @@ from kitting_drake.hkd.tools.stable_pose import StablePose, stable_poses
 
 Array = NDArray[np.float64]
 
-# For a solid about 180 mm long. Stable poses count as equally low if their centre of mass is at most
-# this much higher than in the lowest pose. Of these, the pose with the broadest support is chosen;
-# supports are compared in steps of the second number.
+# For a solid about 180 mm long. Stable poses count as equally low if their centre of mass is less
+# than the first number higher than in the lowest pose. Of these, the pose with the broadest support
+# is chosen; supports are compared in steps of the second number.
 _EQUAL_HEIGHT_MM, _MARGIN_STEP_MM = 0.3, 0.5
 # The largest angle between the direction of the length and the axis of least inertia; and the
 # standard deviation of the votes. Each edge votes for all directions, with a weight that is a
@@ -75,7 +75,7 @@ def size(solid: Manifold) -> Array:
 
 
 def _lowest_pose(vertices: Array, com: Array) -> StablePose:
-    """The stable pose with the lowest centre of mass; of equal ones, that with broadest support.
+    """The stable pose with the lowest centre of mass; of equally low ones, the broadest support.
 
     Raises:
         UserError: there is no stable pose.

@@ -92,7 +92,7 @@ def over_tools(outcomes: Sequence[Mapping[str, Any]], rate: str) -> Estimate | N
     This interval applies to other tools of the same kind, unlike intervals over objects.
 
     Args:
-        outcomes: of a summary.
+        outcomes: the outcomes of a summary.
         rate: `STRICT` or `OWN`.
 
     Returns:

@@ -147,8 +147,8 @@ class Training:
     demonstrations: int
     seed: int = 0
     learning_rate: float | None = None
-    """If None, the SO(2) method uses the first of `LEARNING_RATES`, and a baseline the one that is best
-    for its `reference`."""
+    """If None, the SO(2) method uses the first of `LEARNING_RATES`, and a baseline the best one for
+    its `reference`."""
     taken_only: bool = True
     """Whether only the taken action is a label, as in the paper."""
     rigid: bool = True
