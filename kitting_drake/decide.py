@@ -31,6 +31,13 @@ from kitting_drake.real_camera.checking.report import (
     print_decision,
     save_check,
 )
+from kitting_drake.real_camera.markers.board_calibration import calibrate_cameras
+from kitting_drake.real_camera.markers.board_report import (
+    clear_earlier,
+    print_calibrated,
+    save_calibrated,
+)
+from kitting_drake.real_camera.markers.boards import read_board
 from systems.signals import PixelGrid
 
 
@@ -39,6 +46,9 @@ def main() -> int:
     arguments = _parser().parse_args()
     console = Console(quiet=arguments.quiet)
     folder = require_folder(arguments.output)
+    if arguments.calibrate is not None:
+        _calibrate(arguments, folder, console)
+        return 0
     action, picture = folder / "action.json", folder / "decision.png"
     # Remove stale files: after a failure, nobody must use the action of an earlier frame.
     earlier = [folder / name for name in CHECK_FILES] if arguments.check else [action, picture]
@@ -49,7 +59,7 @@ def main() -> int:
             _remove(path)
     calibration = read_calibration(arguments.camera, table_height=arguments.table_height)
     block = _block(arguments, calibration.grid)
-    frames = read_frames(arguments.frames, calibration)
+    frames = read_frames(arguments.frames, calibration, time=arguments.time)
     if arguments.check:
         checked = check_cameras(frames, calibration, block)
         save_check(folder, checked)
@@ -74,6 +84,19 @@ def main() -> int:
     print_decision(console, record)
     console.print(f"files: {folder}/", highlight=False, markup=False)
     return 0
+
+
+def _calibrate(arguments: argparse.Namespace, folder: Path, console: Console) -> None:
+    for flag, given in (("--check", arguments.check), ("--time", arguments.time is not None)):
+        if given:
+            raise UserError(f"{flag} cannot be combined with --calibrate")
+    path = clear_earlier(folder, arguments.camera)
+    board = read_board(arguments.calibrate)
+    lenses = read_calibration(arguments.camera, table_height=arguments.table_height, poses=False)
+    calibrated = calibrate_cameras(board, arguments.frames, lenses)
+    save_calibrated(path, calibrated)
+    print_calibrated(console, calibrated)
+    console.print(f"calibration: {path}", highlight=False, markup=False)
 
 
 def _check_decided(action: Path) -> None:
@@ -161,6 +184,18 @@ def _parser() -> argparse.ArgumentParser:
         nargs=3,
         metavar=("X", "Y", "YAW"),
         help="with --kit_size_mm: the block's middle in the base frame, in m, and its yaw, in rad",
+    )
+    parser.add_argument(
+        "--calibrate",
+        type=Path,
+        metavar="BOARD.yaml",
+        help="find the cameras' poses by a board of markers on the table; --camera may lack poses",
+    )
+    parser.add_argument(
+        "--time",
+        type=float,
+        metavar="S",
+        help="in a recording, take the frame this long after its start, in s",
     )
     parser.add_argument("--quiet", action="store_true", help="print nothing but errors")
     return parser

@@ -271,6 +271,7 @@ def _lost_episode(chosen: ChosenScenario, seed: int, failure: str, seconds: floa
         failure=failure,
         timed_out=False,
         interrupted=False,
+        stop_reason="failure",
     ).as_dict()
 
 

@@ -153,7 +153,12 @@ class OraclePolicy(LeafSystem):
             kept = frozenset(np.flatnonzero(self._kept_goals.Eval(context)).tolist())
         placements = evaluate_placements(self._objects, self._goals, self._success, poses, kept)
         plan = self._plan(poses, placements, kept)
-        output.set_value(PickPlaceAction(stop=True) if plan is None else self._action(plan, poses))
+        if plan is not None:
+            output.set_value(self._action(plan, poses))
+            return
+        filled = {item.goal for item in placements if item.success}
+        reason = "done" if len(filled - {None}) >= len(self._goals) else "gave up"
+        output.set_value(PickPlaceAction(stop=True, reason=reason))
 
     def _plan(
         self, poses: list[RigidTransform], placements: list[Placement], kept: frozenset[int]

@@ -61,6 +61,8 @@ class PlannerState(VectorView):
     dropped = Number()
     press = Number()
     """1 if the action presses, else 0."""
+    stop = Number()
+    """0 while there are actions; then 1 plus the index of the reason in `STOP_REASONS`."""
 
 
 YAW_LIMIT = 3.4

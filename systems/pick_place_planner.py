@@ -20,7 +20,13 @@ from systems.hand_motion import shortest_yaws
 from systems.motion_heights import motion_heights
 from systems.pick_place_motion import YAW, YAW_LIMIT, PickPlaceMotion, PlannerState, Z
 from systems.pick_place_parameters import Mode, PickPlaceParameters
-from systems.signals import Observation, PickPlaceAction, PlanarPose, SurfaceHeights
+from systems.signals import (
+    STOP_REASONS,
+    Observation,
+    PickPlaceAction,
+    PlanarPose,
+    SurfaceHeights,
+)
 from systems.surface_heights import read_surface_heights
 from systems.weak_calc import weak_calc
 
@@ -195,7 +201,12 @@ class PickPlacePlanner(LeafSystem):
     def _calc_accepted_action(self, context: Context, output: AbstractValue) -> None:
         state = self._state(context)
         pick, place = (PlanarPose(*map(float, pose)) for pose in (state.pick, state.place))
-        output.set_value(PickPlaceAction(pick=pick, place=place, press=bool(state.press)))
+        reason = list(STOP_REASONS)[int(state.stop) - 1] if state.stop else ""
+        output.set_value(
+            PickPlaceAction(
+                pick, place, stop=bool(state.stop), reason=reason, press=bool(state.press)
+            )
+        )
 
     # The state machine.
 
@@ -237,11 +248,11 @@ class PickPlacePlanner(LeafSystem):
         context, state, time = moment.context, moment.state, moment.time
         if not self._has_settled(state, time):
             return
-        if state.actions >= self._max_actions:
-            self._motion.begin(state, Mode.DONE, time)
-            return
-        action: PickPlaceAction = self._action.Eval(context)
+        spent = state.actions >= self._max_actions
+        stop = PickPlaceAction(stop=True, reason="actions spent")
+        action: PickPlaceAction = stop if spent else self._action.Eval(context)
         if action.stop:
+            state.stop = 1 + list(STOP_REASONS).index(action.reason or "done")
             self._motion.begin(state, Mode.DONE, time)
             return
         check_reach(action)

@@ -205,8 +205,10 @@ STOP_REASONS = {
     "no kit seen": "no kit is seen",
     "not seen": "too little is seen of where the robot would have to pick or place",
     "not sure": "no pick and place is likely enough to succeed",
+    "gave up": "what is left could not be done",
+    "actions spent": "no actions are left",
 }
-"""Why a policy stops, and what to tell a person."""
+"""Why no more actions follow, and what to tell a person."""
 
 
 @dataclass(frozen=True)

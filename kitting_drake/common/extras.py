@@ -6,6 +6,12 @@ from types import ModuleType
 from kitting_drake.common.errors import MachineError
 
 EXTRAS = {
+    "camera": (
+        "mcap-ros2-support>=0.5",
+        "opencv-python-headless>=4.12",
+        "openexr>=3.3",
+        "rosbags>=0.10,<0.11",
+    ),
     "cluster": ("ray[client]>=2.50",),
     "fabrication": ("ezdxf>=1.4", "svgelements>=1.9.6"),
     "gym": ("gymnasium>=1.0",),

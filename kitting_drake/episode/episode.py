@@ -73,6 +73,9 @@ class EpisodeResult:
     """Whether the time limit ended the episode."""
     interrupted: bool
     """Whether Ctrl-C ended the episode."""
+    stop_reason: str
+    """Why no more actions followed: a word of `STOP_REASONS`, `time`, `failure` or `interrupted`;
+    empty before the end."""
 
     def as_dict(self) -> dict[str, Any]:
         """As plain values for JSON."""
@@ -220,7 +223,17 @@ class Episode:
             failure=self._failure,
             timed_out=self.timed_out,
             interrupted=self.interrupted,
+            stop_reason=self._stop_reason(),
         )
+
+    def _stop_reason(self) -> str:
+        if self._failure is not None or self.timed_out or self.interrupted:
+            ended = {"failure": self._failure is not None, "time": self.timed_out}
+            return next((word for word, true in ended.items() if true), "interrupted")
+        action = self._station.accepted_action(self.context)
+        if action.stop:
+            return action.reason
+        return "done" if self.is_over else ""
 
 
 def object_results(

@@ -89,6 +89,7 @@ def summarise(
         "episodes": len(episodes),
         "failed_episodes": sum(bool(episode["failure"]) for episode in episodes),
         "timed_out_episodes": sum(episode["timed_out"] for episode in episodes),
+        "stop_reasons": dict(Counter(episode.get("stop_reason", "") for episode in episodes)),
         **_rates(episodes, objects_of, chosen.scenario.task.objects_are_independent),
         **_statistics(objects, actions, causes),
         "categories": {

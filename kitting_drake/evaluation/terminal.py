@@ -51,8 +51,8 @@ def print_episode(console: Console, result: EpisodeResult) -> None:
     console.print(episode_table(result))
     rate = result.sim_seconds / result.wall_seconds if result.wall_seconds else 0.0
     console.print(
-        f"{result.strict_success_rate:.0%} strict success, {result.success_rate:.0%} by the task's "
-        f"measure, in {result.actions} actions, "
+        f"{result.stop_reason}: {result.strict_success_rate:.0%} strict success, "
+        f"{result.success_rate:.0%} by the task's measure, in {result.actions} actions, "
         f"{result.sim_seconds:.1f} s simulated in {result.wall_seconds:.1f} s ({rate:.1f}x), "
         f"{result.point_contact_pairs} point contacts"
     )

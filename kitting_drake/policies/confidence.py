@@ -15,18 +15,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import ndimage
 
 from kitting_drake.common.paths import MODELS
-from kitting_drake.policies.data.images import rotation_matrix
-from kitting_drake.policies.matching.refinement import nearest_region
+from kitting_drake.policies.matching.evidence import Evidence
 from systems.signals import Observation
 
 if TYPE_CHECKING:
     from kitting_drake.policies.learned_policy import Decision
-    from kitting_drake.policies.matching.segmentation import Segmentation
-
-Array = NDArray[np.float64]
 
 FILE = MODELS / "policies" / "confidence.json"
 """The fitted regressions, by policy."""
@@ -36,15 +31,6 @@ _OTHER_PICKS = 0.060
 """... and probability within this distance belongs to the same object."""
 _SAME_ANGLE = math.radians(10)
 """Probability within this angle of the pick's angle supports it, in radians."""
-_RING = 3
-"""The surroundings of an object extend this far, in pixels."""
-_HOLE = 0.003
-"""What is lower than its rim by more than this is a hole, in metres."""
-_WORST_FIT = 0.002
-_WORST_GRASP = 5.0
-
-Evidence = dict[str, float]
-"""Named facts about a decision; the same names for all decisions of a policy."""
 
 
 @dataclass(frozen=True)
@@ -109,64 +95,6 @@ def certainty(decision: Decision, resolution: float) -> dict[str, float]:
     off = np.abs((angles + math.pi / 2) % math.pi - math.pi / 2)
     parts["angle"] = _mass(decision.angle_curve, off <= _SAME_ANGLE)
     return {key: min(max(value, 0.0), 1.0) for key, value in parts.items()}
-
-
-def geometric_evidence(
-    segmentation: Segmentation,
-    pick: Array,
-    rotation: float,
-    place: Array,
-    fit_cost: float | None,
-    grasp_cost: float | None,
-) -> Evidence:
-    """The facts about a pick and place that o_t shows.
-
-    Args:
-        segmentation: of o_t.
-        pick: (row, col).
-        rotation: of the object, in radians.
-        place: (row, col).
-        fit_cost: the mean difference of the outlines of object and recess, in metres; None if they
-            do not fit.
-        grasp_cost: see `JawGrasp.cost`; None without a feasible grasp.
-    """
-    fits, grasped = fit_cost is not None, grasp_cost is not None
-    evidence = {
-        "outlines_fit": float(fits),
-        "fit": 1e3 * min(fit_cost, _WORST_FIT) if fit_cost is not None else 0.0,
-        "jaws_have_room": float(grasped),
-        "grasp": min(grasp_cost, _WORST_GRASP) if grasp_cost is not None else 0.0,
-        "is_object": 0.0,
-        "object_seen": 0.0,
-        "place_seen": 0.0,
-        "depth": 0.0,
-        "hole": 0.0,
-    }
-    region = nearest_region(segmentation.objects, pick)
-    if region is None:
-        return evidence
-    seen, relief = segmentation.visibility.seen, segmentation.relief
-    rows, cols = seen.shape
-    there = np.rint(place + (region.pixels - pick) @ rotation_matrix(rotation).T).astype(int)
-    inside = ((there >= 0) & (there < (rows, cols))).all(axis=1)
-    target = np.zeros_like(seen)
-    target[tuple(there[inside].T)] = True
-    target = ndimage.binary_closing(target, iterations=2) | target
-    around = _ring(target)
-    rim = float(np.percentile(relief[around], 75)) if around.any() else 0.0
-    low = relief[target] < rim - _HOLE if target.any() else np.zeros(1, bool)
-    floor = float(np.percentile(relief[target], 25)) if target.any() else 0.0
-    return evidence | {
-        "is_object": 1.0,
-        "object_seen": float(seen[_ring(region.mask)].mean()),
-        "place_seen": float(seen[around].mean()) if around.any() else 0.0,
-        "depth": float(np.clip(1e3 * (rim - floor), -10.0, 30.0)),
-        "hole": float(low.mean()),
-    }
-
-
-def _ring(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    return ndimage.binary_dilation(mask, iterations=_RING) & ~mask
 
 
 def _logit(share: float) -> float:

@@ -13,9 +13,9 @@ import torch
 import torch.nn.functional as F
 from numpy.typing import NDArray
 
-from kitting_drake.policies.confidence import Evidence, geometric_evidence
 from kitting_drake.policies.data.images import make_action, rotation_matrix
 from kitting_drake.policies.draft import Draft, Look, Stage, make_draft, network_input
+from kitting_drake.policies.matching.evidence import Evidence, geometric_evidence
 from kitting_drake.policies.networks.factored import Networks
 from kitting_drake.policies.stages import StopRule, SubPixel
 from systems.signals import Observation, PickPlaceAction, PlanarPose

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Protocol
 
 from kitting_drake.policies.confidence import (
-    Evidence,
     certainty,
     evidence_of_networks,
     read_reliability,
@@ -19,6 +18,7 @@ from kitting_drake.policies.factory import (
     load_learned_policy,
     make_shape_matching,
 )
+from kitting_drake.policies.matching.evidence import Evidence
 from systems.pick_place_parameters import PickPlaceParameters
 from systems.signals import Observation, PickPlaceAction, PixelGrid, PlanarPose
 

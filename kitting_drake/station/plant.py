@@ -7,13 +7,13 @@ from pydrake.geometry import SceneGraph
 from pydrake.math import RigidTransform
 from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import AddMultibodyPlant, MultibodyPlant
-from pydrake.multibody.tree import BodyIndex, RigidBody
+from pydrake.multibody.tree import BodyIndex, ModelInstanceIndex, RigidBody
 from pydrake.systems.framework import DiagramBuilder
 
 from kitting_drake.common.errors import UserError
 from kitting_drake.common.paths import MODELS
+from kitting_drake.common.sdformat import model_text
 from kitting_drake.scenario.schema import Scenario, Variation
-from kitting_drake.station.variation import varied_model
 from kitting_drake.tasks.task import Scene
 from systems.placement import PlacedObject
 from systems.rest_detector import BoundedBody, Box
@@ -57,10 +57,7 @@ def add_models(
             variation.friction,
             variation.mass,
         )
-        if friction == mass == 1:
-            return _add_body(parser, plant, model)
-        text = varied_model(model, friction=float(friction), mass=float(mass))
-        return _add_body(parser, plant, model, text)
+        return _add_body(parser, plant, model, float(friction), float(mass))
 
     still = [add(MODELS / "table" / "table.sdf")]
     plant.WeldFrames(plant.world_frame(), still[0].body_frame(), _X_WTABLE)
@@ -71,19 +68,25 @@ def add_models(
     for item in scene.objects:
         body = add(item.model)
         objects.append(PlacedObject(item.name, body.index(), item.p_BPoints, item.symmetry))
-    parser.AddModels(str(MODELS / "franka_hand" / "franka_hand.sdf"))
+    _add_model(parser, MODELS / "franka_hand" / "franka_hand.sdf")
     return tuple(objects), tuple(body.index() for body in still)
 
 
+def _add_model(
+    parser: Parser, model: Path, friction: float = 1.0, mass: float = 1.0
+) -> list[ModelInstanceIndex]:
+    text = model_text(model, friction=friction, mass=mass)
+    if text is None:
+        return parser.AddModels(str(model))
+    return parser.AddModelsFromString(text, "sdf")
+
+
 def _add_body(
-    parser: Parser, plant: MultibodyPlant, model: Path, text: str | None = None
+    parser: Parser, plant: MultibodyPlant, model: Path, friction: float, mass: float
 ) -> RigidBody:
-    """Adds a model of one link from its file, or from a text that replaces the file."""
+    """Adds a model of one link, with scaled friction coefficients and mass."""
     try:
-        if text is None:
-            instances = parser.AddModels(str(model))
-        else:
-            instances = parser.AddModelsFromString(text, "sdf")
+        instances = _add_model(parser, model, friction, mass)
     except (RuntimeError, ValueError) as error:
         reason = str(error).splitlines()[0]
         raise UserError(f"task: cannot load {model}: {reason}") from error

@@ -217,7 +217,7 @@ class KittingStation(Diagram):
         return self.GetInputPort("action").Eval(self.GetMyContextFromRoot(root_context))
 
     def accepted_action(self, root_context: Context) -> PickPlaceAction:
-        """The port `accepted_action`: the last action begun."""
+        """The port `accepted_action`: the last action begun, or the stop."""
         return self._eval(root_context, "accepted_action")
 
     def _eval(self, root_context: Context, port: str) -> Any:

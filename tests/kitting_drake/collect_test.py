@@ -134,7 +134,10 @@ def test_collects_the_first_seeds_that_are_not_rejected(tmp_path: Path, workers:
 
 
 @pytest.mark.parametrize("workers", [1, 3])
-@pytest.mark.parametrize("after", range(1, 7))
+@pytest.mark.parametrize(
+    "after",
+    [pytest.param(n, marks=[] if n in (1, 4, 6) else [pytest.mark.slow]) for n in range(1, 7)],
+)
 def test_resumes_a_stopped_run(tmp_path: Path, after: int, workers: int):
     collect(tmp_path / "whole", 4)
     with pytest.raises(KeyboardInterrupt):

@@ -191,10 +191,17 @@ def test_a_process_that_dies_leaves_a_failed_episode(monkeypatch: pytest.MonkeyP
     assert str(-signal.SIGSEGV) in lost["failure"]
 
 
+class Here(LocalWorkers):
+    """Runs calls in this process, because another one takes seconds to start."""
+
+    def run(self, function: Callable, *arguments: Any) -> Any:
+        return function(*arguments)
+
+
 def test_a_scene_that_cannot_be_built_is_a_failed_episode():
     scenario = Scenario(heightmap=Heightmap(rows=110, cols=110))
     chosen = dataclasses.replace(CHOSEN, scenario=scenario)
-    lost = evaluation.run_in_worker(LocalWorkers(1), chosen, 7)
+    lost = evaluation.run_in_worker(Here(1), chosen, 7)
     assert "there is no free space in the workspace" in lost["failure"]
 
 
@@ -220,18 +227,13 @@ def test_evaluates_if_any_seed_can_be_built(monkeypatch: pytest.MonkeyPatch):
         chosen_module.build_any_chosen(CHOSEN, range(2))
 
 
-def without_rendering(chosen: ChosenScenario, seed: int, log: Path | None) -> Any:
-    cameras.can_render = lambda: False
-    return evaluation._work(chosen, seed, log)
-
-
 def test_missing_rendering_is_not_a_failed_episode(monkeypatch: pytest.MonkeyPatch):
     """A failed episode would never be run again."""
-    monkeypatch.setattr(evaluation, "_work", without_rendering)
+    monkeypatch.setattr(cameras, "can_render", lambda: False)
     looks = PythonPolicy(function="systems.signals:PickPlaceAction")
     chosen = dataclasses.replace(CHOSEN, scenario=Scenario(policy=looks))
     with pytest.raises(UserError, match="rendering needs the system library"):
-        evaluation.run_in_worker(LocalWorkers(1), chosen, 7)
+        evaluation.run_in_worker(Here(1), chosen, 7)
 
 
 @pytest.mark.parametrize(("failures", "code"), [([None, "no"], 0), (["no", "no"], 1)])
@@ -290,8 +292,8 @@ def test_a_process_killed_from_outside_is_retried_once(monkeypatch: pytest.Monke
         evaluation.run_in_worker(workers, CHOSEN, 7)
 
 
-def test_two_short_episodes_in_parallel(verb_process, tmp_path: Path):
-    done = verb_process(
+def test_two_short_episodes_in_parallel(verb, tmp_path: Path):
+    done = verb(
         "evaluate",
         *("scenarios/kits.yaml", "--scenario_name", "OneTool"),
         *("--episodes", 2, "--workers", 2, "--output", tmp_path),

@@ -171,7 +171,9 @@ def test_from_starts_with_given_weights(
     assert "finer.h5 has pixels of 0.002 m" in told
 
 
-@pytest.mark.parametrize("method", ["so2", "equivariant_transporter"])
+@pytest.mark.parametrize(
+    "method", ["so2", pytest.param("equivariant_transporter", marks=pytest.mark.slow)]
+)
 def test_angle_only_with_another_n(demos: Path, tmp_path: Path, method: str):
     both = ("--method", method, "--steps", 1)
     train(demos, tmp_path / "first", *both, "--orientations", 36)
@@ -248,11 +250,13 @@ def test_rotations_of_a_transporter(
 @pytest.mark.parametrize(
     ("learning", "flags", "taken_only", "rigid", "reflection"),
     [
-        (Learning(), (), True, True, False),
+        pytest.param(Learning(), (), True, True, False, marks=pytest.mark.slow),
         (Learning(later_picks_possible=True), (), False, True, False),
         (Learning(curvature=True), (), True, False, False),
         (Learning(reflection=True), (), True, True, True),
-        (Learning(reflection=True), ("--rigid",), True, True, False),
+        pytest.param(
+            Learning(reflection=True), ("--rigid",), True, True, False, marks=pytest.mark.slow
+        ),
         (LEARNING, ("--taken-only", "--rigid"), True, True, False),
     ],
 )
@@ -348,7 +352,9 @@ def assert_same_outcome(folder: Path, other: Path) -> None:
     assert one | {"wall_seconds": 0} == two | {"wall_seconds": 0}
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize(
+    "number", [pytest.param(signal.SIGINT, marks=pytest.mark.slow), signal.SIGTERM]
+)
 def test_signals_save_the_last_step(
     number: signal.Signals,
     demos: Path,
@@ -377,11 +383,15 @@ def test_signals_save_the_last_step(
     assert "stopped after step 3" in capsys.readouterr().out
     state = torch.load(tmp_path / "checkpoint.pt", weights_only=True)
     assert state["trainer"]["step_count"] == 3
+    # Simulate a kill while a line is being written.
+    with (tmp_path / "log.jsonl").open("a") as file:
+        file.write('{"step": 9, "pla')
     train(demos, tmp_path)
     assert_same_outcome(tmp_path, trained)
 
 
-@pytest.mark.parametrize("stop", [pytest.param(1, marks=pytest.mark.slow), 3])
+@pytest.mark.slow
+@pytest.mark.parametrize("stop", [1, 3])
 def test_a_resumed_run_gives_the_same_weights(
     demos: Path, trained: Path, tmp_path: Path, stop: int, monkeypatch: pytest.MonkeyPatch
 ):
@@ -433,6 +443,8 @@ run_command(main)
 @pytest.mark.parametrize("method", ["transporter", pytest.param("so2", marks=pytest.mark.slow)])
 def test_trains_where_drake_is_not_installed(demos: Path, tmp_path: Path, method: str):
     flags = words(demos, tmp_path, "--method", method, "--steps", 1, "--quiet")
+    # Few rotations are faster.
+    flags += ["--orientations", "36"]
     command = [sys.executable, "-c", NO_DRAKE, *flags]
     done = subprocess.run(command, cwd=ROOT, env=ONE_THREAD, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr

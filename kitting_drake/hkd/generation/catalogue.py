@@ -7,7 +7,7 @@ from typing import Any
 import yaml
 
 from kitting_drake.common.errors import UserError
-from kitting_drake.hkd.tools.tool import CATEGORIES
+from kitting_drake.hkd.tools.tool import CATEGORIES, RecordLoader
 
 
 class CatalogueError(UserError):
@@ -40,7 +40,7 @@ class ToolEntry:
 def load_catalogue(path: Path) -> list[ToolEntry]:
     """Reads `catalogue.yaml`; raises CatalogueError for an invalid entry."""
     try:
-        data = yaml.safe_load(path.read_text())
+        data = yaml.load(path.read_text(), Loader=RecordLoader)
     except OSError as error:
         raise CatalogueError(f"cannot read {path}: {error.strerror}") from error
     except yaml.YAMLError as error:

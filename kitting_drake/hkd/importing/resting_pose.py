@@ -24,6 +24,8 @@ from pydrake.multibody.plant import (
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
 
+from kitting_drake.common.sdformat import model_text
+
 _DROP = 0.002
 """The height of the drop, in metres."""
 _SETTLE = 2.0
@@ -41,7 +43,9 @@ def resting_tilt(sdf: Path) -> NDArray[np.float64]:
     builder = DiagramBuilder()
     config = MultibodyPlantConfig(time_step=_STEP, contact_model="hydroelastic")
     plant, _ = AddMultibodyPlant(config, builder)
-    (model,) = Parser(plant).AddModels(str(sdf))
+    text = model_text(sdf)
+    parser = Parser(plant)
+    (model,) = parser.AddModelsFromString(text, "sdf") if text else parser.AddModels(str(sdf))
     ground = ProximityProperties()
     AddRigidHydroelasticProperties(ground)
     AddContactMaterial(friction=CoulombFriction(_FRICTION, _FRICTION), properties=ground)

@@ -23,7 +23,7 @@ CATEGORIES = ("hammer", "pliers", "wrench", "screwdriver")
 
 
 # libyaml reads records ten times as fast.
-_Loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+RecordLoader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 
 
 @dataclass(frozen=True)
@@ -144,7 +144,7 @@ def load_tool(name: str, base: Path | None = None) -> Tool:
         advice = f"did you mean '{close[0]}'?" if close else "`hkd list` lists all tools"
         raise UserError(f"there is no tool '{name}', nor a folder with a tool.yaml: {advice}")
     try:
-        record = yaml.load(record_path.read_text(), Loader=_Loader)
+        record = yaml.load(record_path.read_text(), Loader=RecordLoader)
         tool = Tool(
             directory=directory,
             name=str(record["name"]),

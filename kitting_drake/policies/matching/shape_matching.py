@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
-from kitting_drake.policies.confidence import Evidence, geometric_evidence
 from kitting_drake.policies.data.images import make_action
+from kitting_drake.policies.matching.evidence import Evidence, geometric_evidence
 from kitting_drake.policies.matching.jaw_clearance import jaw_grasps, untried
 from kitting_drake.policies.matching.recovery import recovery_action
 from kitting_drake.policies.matching.registration import (

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import difflib
 import hashlib
 import json
 from collections.abc import Sequence
@@ -18,34 +17,63 @@ from numpy.typing import NDArray
 
 from kitting_drake.common.errors import UserError
 from kitting_drake.common.files import write_atomically
+from kitting_drake.real_camera.calibrations.field_checks import (
+    check_distortion,
+    check_fields,
+    check_misspelt,
+)
 from kitting_drake.real_camera.calibrations.layouts import (
     OWN_INTRINSICS,
-    POSE_FIELDS,
     Intrinsics,
     has_intrinsics,
     read_intrinsics,
-    read_pose,
 )
-from kitting_drake.real_camera.calibrations.yaml_values import number, read_yaml, whole_number
+from kitting_drake.real_camera.calibrations.lens_chains import with_chained_poses
+from kitting_drake.real_camera.calibrations.lens_distortion import undistort
+from kitting_drake.real_camera.calibrations.lens_files import (
+    check_lens,
+    lens_of_mapping,
+    read_lens_file,
+)
+from kitting_drake.real_camera.calibrations.pose_values import pose_of_value
+from kitting_drake.real_camera.calibrations.poses import POSE_FIELDS, has_pose, read_pose
+from kitting_drake.real_camera.calibrations.yaml_values import (
+    matrix,
+    number,
+    read_yaml,
+    whole_number,
+)
 from systems.heightmap import DepthRays
 from systems.signals import PixelGrid
 
 Array = NDArray[np.float64]
 
-_UNDISTORTED = 1e-4
-"""The largest reprojection error of an undistorted ray, at depth 1."""
 _HEIGHT = PixelGrid().z_max - PixelGrid().z_min
 """The default of `max_height`: points higher above the table are ignored, in metres."""
 _MOST_PIXELS = 10_000_000
 """A workspace with more pixels has its resolution in a wrong unit."""
 _DEPTH_FIELDS = ("depth_scale", "min_depth", "max_depth")
+_LENS_FILES = ("camera_info", "intrinsics")
+"""Fields that name a file of intrinsics."""
+_FILE_FIELDS = (*_LENS_FILES, "stream", "resolution")
+_COLOR_FIELDS = (*_FILE_FIELDS, *OWN_INTRINSICS, "depth_to_color")
 _BENCH_FIELDS = ("table_height", "workspace")
 _GRID_FIELDS = ("x_min", "y_min", "resolution", "rows", "cols", "max_height")
 
 
 @dataclass(frozen=True)
+class ColorLens:
+    """The lens of colour images that are not registered to depth."""
+
+    intrinsics: Intrinsics
+    X_KC: Array
+    """(4, 4): maps points from the depth's optical frame C to the colour's, K."""
+
+
+@dataclass(frozen=True)
 class BenchCamera:
-    """An RGB-D camera. Depth is registered to colour, so one lens describes both."""
+    """An RGB-D camera. Depth is registered to colour, so one lens describes both, unless `color`
+    has another for colour."""
 
     name: str
     intrinsics: Intrinsics
@@ -56,6 +84,10 @@ class BenchCamera:
     min_depth: float = 0.01
     max_depth: float = 10.0
     """Depths outside these limits are ignored, in metres."""
+    color: ColorLens | None = None
+    """The colour's own lens; None if depth is registered to colour."""
+    topics: tuple[str, str] | None = None
+    """The topics of colour and depth in recordings; None if their names tell."""
 
     @cached_property
     def rays(self) -> DepthRays:
@@ -75,7 +107,7 @@ class BenchCamera:
         if not lens.distortion:
             return plain
         u, v = (np.broadcast_to(item, plain.shape).astype(float) for item in (plain.u, plain.v))
-        x, y = _undistort(u, v, lens.distortion, self.name)
+        x, y = undistort(u, v, lens.model, lens.distortion, self.name)
         return plain._replace(u=x.astype(np.float32), v=y.astype(np.float32))
 
 
@@ -93,19 +125,22 @@ class Calibration:
         return self.grid.z_min
 
 
-def read_calibration(path: Path, *, table_height: float | None = None) -> Calibration:
+def read_calibration(
+    path: Path, *, table_height: float | None = None, poses: bool = True
+) -> Calibration:
     """Reads a calibration; `docs/bench.md` describes the layouts.
 
     Args:
         path: the file.
         table_height: of the table in the base frame, in metres; None for the file's, or zero.
+        poses: whether cameras must have poses. Without, a missing pose is the identity.
 
     Raises:
         UserError: a field is missing or invalid; names the file and the field.
     """
     content = read_yaml(path)
     if "cameras" in content:
-        _check_fields(content, ("cameras", *_BENCH_FIELDS), f"{path}")
+        check_fields(content, ("cameras", *_BENCH_FIELDS), f"{path}")
         entries = content["cameras"]
         if not isinstance(entries, dict) or not entries:
             raise UserError(f"{path}: cameras must be a mapping from names to cameras")
@@ -117,11 +152,16 @@ def read_calibration(path: Path, *, table_height: float | None = None) -> Calibr
                         "move it beside 'cameras'"
                     )
         beside: tuple[str, ...] = ()
+        entries = with_chained_poses(entries, path)
     else:
+        # A file of another tool may hold a whole camera.
+        content = lens_of_mapping(content, str(path))
         entries = {str(content.get("camera_name", "camera")): content}
         # A file of one camera has the bench's fields at the same level.
         beside = (*_BENCH_FIELDS, "camera_name")
-    cameras = tuple(_read_camera(path, str(name), node, beside) for name, node in entries.items())
+    cameras = tuple(
+        _read_camera(path, str(name), node, beside, poses) for name, node in entries.items()
+    )
     if table_height is None:
         height = number(content.get("table_height", 0.0), f"{path}: table_height")
     else:
@@ -129,33 +169,22 @@ def read_calibration(path: Path, *, table_height: float | None = None) -> Calibr
     return Calibration(cameras, _read_grid(path, content.get("workspace", {}), height))
 
 
-def _read_camera(path: Path, name: str, node: Any, beside: Sequence[str]) -> BenchCamera:
+def _read_camera(
+    path: Path, name: str, node: Any, beside: Sequence[str], poses: bool
+) -> BenchCamera:
     where = f"{path}: camera {name}"
     if not isinstance(node, dict):
         raise UserError(f"{where} must be a mapping of fields")
-    lens, known = node, (*POSE_FIELDS, *_DEPTH_FIELDS, *beside)
-    if "camera_info" in node:
-        _check_fields(node, ("camera_info", *known), where)
-        file = path.parent / str(node["camera_info"])
-        lens = read_yaml(file)
-        if not has_intrinsics(lens):
-            raise UserError(f"{where}: {file} has neither camera_matrix nor k")
-        _check_distortion(lens, f"{where}: {file}")
-    elif not has_intrinsics(node):
-        # Suggest the fields that could hold the intrinsics.
-        lenses = ("cameras", "camera_info", "camera_matrix", "fx")
-        _check_misspelt(node, lenses, (*known, "camera_name"), where, likeness=0.6)
+    known = (*POSE_FIELDS, *_DEPTH_FIELDS, "color", "topics", *beside)
+    intrinsics = _read_lens(path, name, node, known, where)
     limits = {key: number(node[key], f"{where}: {key}") for key in _DEPTH_FIELDS if key in node}
     if any(value <= 0 for value in limits.values()):
         raise UserError(f"{where}: depth_scale, min_depth and max_depth must be positive")
-    intrinsics, X_BC = read_intrinsics(lens, where), read_pose(node, where)
-    if "fx" not in node:
-        # OpenCV and ROS write other fields, such as image_height, which are ignored.
-        _check_distortion(node, where)
-        _check_misspelt(node, (*known, *_BENCH_FIELDS), known, where, likeness=0.85)
-    else:
-        _check_fields(node, (*OWN_INTRINSICS, *known, "camera_name"), where)
-    camera = BenchCamera(name, intrinsics, X_BC, **limits)
+    X_BC = read_pose(node, where, path.parent) if poses or has_pose(node) else np.eye(4)
+    _check_entry(node, known, where)
+    color = _read_color_lens(path, name, node["color"], where) if "color" in node else None
+    topics = _read_topics(node["topics"], where) if "topics" in node else None
+    camera = BenchCamera(name, intrinsics, X_BC, **limits, color=color, topics=topics)
     if camera.min_depth >= camera.max_depth:
         raise UserError(
             f"{where}: min_depth {camera.min_depth:g} must be less than max_depth "
@@ -164,44 +193,71 @@ def _read_camera(path: Path, name: str, node: Any, beside: Sequence[str]) -> Ben
     return camera
 
 
-def _check_distortion(node: dict[str, Any], where: str) -> None:
-    """Raises UserError for misspelt distortion coefficients, which would be ignored.
-
-    OpenCV and ROS write no other fields that begin with "dist".
-    """
-    for key in node:
-        if str(key).lower().startswith("dist") and key not in OWN_INTRINSICS:
-            raise UserError(
-                f"{where} has the unknown field '{key}': the lens's coefficients are called "
-                "distortion_coefficients, or d in ROS"
-            )
-
-
-def _check_fields(node: dict[str, Any], known: Sequence[str], where: str) -> None:
-    """Raises UserError for an unknown field, which would be ignored."""
-    for key in node:
-        if key not in known:
-            close = difflib.get_close_matches(str(key), known, n=1)
-            advice = f"did you mean '{close[0]}'?" if close else "remove it"
-            raise UserError(f"{where} has the unknown field '{key}': {advice}")
+def _read_lens(
+    path: Path, name: str, node: dict[str, Any], known: Sequence[str], where: str
+) -> Intrinsics:
+    """The intrinsics in an entry, or in the file that it names."""
+    if any(key in node for key in _LENS_FILES):
+        check_fields(node, (*_FILE_FIELDS, *known), where)
+        return _read_lens_of_file(path, name, node, where)
+    if not has_intrinsics(node):
+        # Suggest the fields that could hold the intrinsics.
+        lenses = ("cameras", "camera_info", "camera_matrix", "fx")
+        check_misspelt(node, lenses, (*known, "camera_name"), where, likeness=0.6)
+    return read_intrinsics(node, where)
 
 
-def _check_misspelt(
-    node: dict[str, Any], meant: Sequence[str], known: Sequence[str], where: str, likeness: float
-) -> None:
-    """Raises UserError for an unknown field that resembles an expected one.
+def _check_entry(node: dict[str, Any], known: Sequence[str], where: str) -> None:
+    """Raises UserError for an unknown field of an entry."""
+    if "fx" in node:
+        check_fields(node, (*OWN_INTRINSICS, *known, "camera_name"), where)
+    elif not any(key in node for key in _LENS_FILES):
+        # OpenCV and ROS write other fields, such as image_height, which are ignored.
+        check_distortion(node, where)
+        check_misspelt(node, (*known, *_BENCH_FIELDS), known, where, likeness=0.85)
 
-    Args:
-        node: the fields.
-        meant: the expected fields.
-        known: fields that are allowed.
-        where: the beginning of the error.
-        likeness: the least similarity, from 0 to 1.
-    """
-    for key in node:
-        close = difflib.get_close_matches(str(key), meant, cutoff=likeness)
-        if close and key not in known:
-            raise UserError(f"{where} has the unknown field '{key}': did you mean '{close[0]}'?")
+
+def _read_lens_of_file(path: Path, name: str, node: dict[str, Any], where: str) -> Intrinsics:
+    given = [key for key in _LENS_FILES if key in node]
+    if len(given) > 1:
+        raise UserError(f"{where} has {' and '.join(given)}: give one of them")
+    file, size = path.parent / str(node[given[0]]), None
+    if "resolution" in node:
+        across, down = matrix(node["resolution"], 1, 2, f"{where}: resolution")[0]
+        size = whole_number(across, f"{where}: resolution"), whole_number(down, f"{where}")
+    lens = read_lens_file(file, str(node.get("stream", name)), size)
+    check_lens(lens, file)
+    check_distortion(lens, f"{where}: {file}")
+    intrinsics = read_intrinsics(lens, f"{where}: {file}")
+    if size not in (None, intrinsics.size):
+        raise UserError(f"{where}: resolution is not that of {file}, {intrinsics.size}")
+    return intrinsics
+
+
+def _read_topics(value: Any, where: str) -> tuple[str, str]:
+    if not isinstance(value, dict) or set(value) != {"color", "depth"}:
+        raise UserError(f"{where}: topics must have color and depth, and nothing else")
+    return str(value["color"]), str(value["depth"])
+
+
+def _read_color_lens(path: Path, name: str, node: Any, where: str) -> ColorLens:
+    """The colour's own lens, from the field `color` of a camera's entry."""
+    label = f"{where}: color"
+    if not isinstance(node, dict):
+        raise UserError(f"{label} must have intrinsics and depth_to_color")
+    if "depth_to_color" not in node:
+        raise UserError(
+            f"{label} lacks depth_to_color: 4 x 4 numbers, or a pose, that map points from the "
+            "depth's optical frame to the colour's, in metres"
+        )
+    check_fields(node, _COLOR_FIELDS, label)
+    if any(key in node for key in _LENS_FILES):
+        intrinsics = _read_lens_of_file(path, name, node, label)
+    else:
+        intrinsics = read_intrinsics(node, label)
+    return ColorLens(
+        intrinsics, pose_of_value(node["depth_to_color"], f"{label}: depth_to_color").X
+    )
 
 
 def _read_grid(path: Path, node: Any, table_height: float) -> PixelGrid:
@@ -236,18 +292,34 @@ def calibration_record(calibration: Calibration) -> dict[str, Any]:
         "cameras": {},
     }
     for camera in calibration.cameras:
-        lens = camera.intrinsics
         content["cameras"][camera.name] = {
-            **dict(zip(("width", "height"), lens.size, strict=True)),
-            **dict(zip(("fx", "fy"), map(float, lens.focal), strict=True)),
-            **dict(zip(("cx", "cy"), map(float, lens.centre), strict=True)),
-            "distortion": list(lens.distortion),
+            **_lens_record(camera.intrinsics),
             "depth_scale": camera.depth_scale,
             "min_depth": camera.min_depth,
             "max_depth": camera.max_depth,
             "camera_to_base": np.asarray(camera.X_BC).tolist(),
         }
+        if camera.color is not None:
+            content["cameras"][camera.name]["color"] = {
+                **_lens_record(camera.color.intrinsics),
+                "depth_to_color": np.asarray(camera.color.X_KC).tolist(),
+            }
+        if camera.topics is not None:
+            topics = dict(zip(("color", "depth"), camera.topics, strict=True))
+            content["cameras"][camera.name]["topics"] = topics
     return content
+
+
+def _lens_record(lens: Intrinsics) -> dict[str, Any]:
+    record: dict[str, Any] = {
+        **dict(zip(("width", "height"), lens.size, strict=True)),
+        **dict(zip(("fx", "fy"), map(float, lens.focal), strict=True)),
+        **dict(zip(("cx", "cy"), map(float, lens.centre), strict=True)),
+        "distortion": list(lens.distortion),
+    }
+    if lens.model:
+        record["distortion_model"] = lens.model
+    return record
 
 
 def calibration_digest(calibration: Calibration) -> str:
@@ -286,30 +358,3 @@ def with_poses(calibration: Calibration, poses: dict[str, Array]) -> Calibration
         for camera in calibration.cameras
     )
     return dataclasses.replace(calibration, cameras=cameras)
-
-
-def _undistort(u: Array, v: Array, distortion: tuple[float, ...], name: str) -> tuple[Array, Array]:
-    """The rays at depth 1 that the lens images at (u, v), as by cv2.undistortPoints."""
-    k1, k2, p1, p2, k3, k4, k5, k6 = (*distortion, *(0.0,) * (8 - len(distortion)))
-
-    def factors(x: Array, y: Array) -> tuple[Array, Array, Array]:
-        square = x * x + y * y
-        radial = (1 + square * (k1 + square * (k2 + square * k3))) / (
-            1 + square * (k4 + square * (k5 + square * k6))
-        )
-        along = 2 * p1 * x * y + p2 * (square + 2 * x * x)
-        return radial, along, p1 * (square + 2 * y * y) + 2 * p2 * x * y
-
-    x, y = u.copy(), v.copy()
-    with np.errstate(all="ignore"):
-        for _ in range(30):
-            radial, shift_x, shift_y = factors(x, y)
-            x, y = (u - shift_x) / radial, (v - shift_y) / radial
-        radial, shift_x, shift_y = factors(x, y)
-        missed = np.hypot(x * radial + shift_x - u, y * radial + shift_y - v)
-    if not (missed < _UNDISTORTED).all():
-        raise UserError(
-            f"camera {name}: its distortion cannot be undone over the whole image: check the order "
-            "k1, k2, p1, p2, k3, or rectify the images"
-        )
-    return x, y

@@ -1,4 +1,4 @@
-"""Reads YAML as OpenCV, ROS and people write it, and numbers from it."""
+"""Reads YAML and JSON as OpenCV, ROS and people write it, and numbers from it."""
 
 from __future__ import annotations
 
@@ -37,21 +37,41 @@ def _opencv_matrix(loader: yaml.SafeLoader, node: yaml.Node) -> Any:
 _Loader.add_constructor("tag:yaml.org,2002:opencv-matrix", _opencv_matrix)
 
 
-def read_yaml(path: Path) -> dict[str, Any]:
-    """The mapping in a YAML file; the first one of several documents.
+def read_text(path: Path) -> str:
+    """The text of a file.
 
     Raises:
-        UserError: the file is unreadable or does not hold a mapping.
+        UserError: the file is unreadable or is not text.
     """
     try:
-        text = path.read_text()
+        return path.read_text(encoding="utf-8-sig")
     except (OSError, ValueError) as error:
         # ValueError: the content is not text, or the path has a NUL.
         reason = getattr(error, "strerror", None) or "it is not text"
         raise UserError(f"cannot read {path}: {reason}") from error
+
+
+def read_yaml(path: Path) -> dict[str, Any]:
+    """The mapping in a YAML or JSON file; the first one of several documents.
+
+    Raises:
+        UserError: the file is unreadable or does not hold a mapping.
+    """
+    return parse_yaml(read_text(path), path)
+
+
+def parse_yaml(text: str, path: Path) -> dict[str, Any]:
+    """The mapping in the text of a YAML or JSON file; the first one of several documents.
+
+    Raises:
+        UserError: the text does not hold a mapping; names the file.
+    """
     if text.startswith("%YAML:"):
         # The first line that cv2.FileStorage writes is not a valid YAML directive.
         text = text.partition("\n")[2]
+    if path.suffix == ".json" or text.lstrip().startswith("{"):
+        # YAML forbids tabs, which JSON may have.
+        text = text.replace("\t", " ")
     try:
         first = next(iter(yaml.load_all(text, _Loader)), None)
     except yaml.YAMLError as error:

@@ -154,13 +154,17 @@ def _is_range(
     """Whether the table is flat only if depths are taken for distances from the camera."""
     if fit.plane.noise < _FLAT / 4:
         return False
-    rays = camera.rays
-    along = (depth / np.sqrt(1 + rays.u**2 + rays.v**2)).astype(np.float32)
-    points = _points(camera, camera.X_BC, along, grid)
+    points = _points(camera, camera.X_BC, _as_depth(camera, depth), grid)
     other = refit(points, np.array([0.0, 0.0, grid.z_min])) or next(
         iter(find_planes(points, 1)), None
     )
     return other is not None and other.noise < _CURVED * fit.plane.noise
+
+
+def _as_depth(camera: BenchCamera, distance: NDArray[np.float32]) -> NDArray[np.float32]:
+    """The depths along the optical axis of distances from the camera."""
+    rays = camera.rays
+    return (distance / np.sqrt(1 + rays.u**2 + rays.v**2)).astype(np.float32)
 
 
 def _hint(
@@ -188,6 +192,12 @@ def _suppositions(
 ) -> Iterator[tuple[str, BenchCamera, Array, NDArray[np.float32]]]:
     """Frequent mistakes: what to say, and the camera, pose and depth without the mistake."""
     X = camera.X_BC
+    yield (
+        "these depths are distances from the camera: give depths along the optical axis",
+        camera,
+        X,
+        _as_depth(camera, depth),
+    )
     yield (
         "its inverse would agree: is it the pose of the base in the camera?",
         camera,

@@ -20,12 +20,10 @@ Array = NDArray[np.float64]
 
 _SPACING = 0.002
 """The distance between points of an outline, in metres."""
-_BESIDE = 0.004
-"""A pick may lie this far beside its tool, in metres."""
 _TOUCHED, _HELD = 4e-6, 2e-5
 """Areas of overlap in square metres, seen from above. A finger touches an object if the two overlap
 by more than the first. The jaws hold an object if more than the second lies between the pads."""
-PLACE_OFF = 0.003
+PLACE_OFF = 0.0035
 """A place is right if 95 % of the outline lies this close to the outline at the goal, in metres."""
 
 
@@ -65,19 +63,17 @@ def covering(action: PickPlaceAction, loose: Sequence[LooseTool]) -> list[Planar
 
 
 def _picked(action: PickPlaceAction, loose: Sequence[LooseTool]) -> LooseTool | None:
-    best, least = None, _BESIDE
-    spot = CrossSection.circle(_BESIDE).translate((action.pick.x, action.pick.y))
-    for item in loose:
-        if (_placed(item.tool.footprint, item.X_WT) ^ spot).area() > 0:
-            outline = _outline(item.tool.footprint, item.X_WT)
-            distance = float(cKDTree(outline).query((action.pick.x, action.pick.y))[0])
-            if best is None or distance < least:
-                best, least = item, distance
-    return best
+    """The tool of which most lies between the open jaws."""
+    pick = action.pick
+    between = rectangle_at((PAD_LENGTH, MAX_OPENING), pick.x, pick.y, pick.theta)
+    held = [(between ^ _placed(item.tool.footprint, item.X_WT)).area() for item in loose]
+    if not held or max(held) < _HELD:
+        return None
+    return loose[int(np.argmax(held))]
 
 
 def _is_grasp(action: PickPlaceAction, picked: LooseTool) -> bool:
-    """Whether the open fingers touch nothing, and hold something between them."""
+    """Whether the open fingers touch nothing."""
     pick = action.pick
     outline = _placed(picked.tool.footprint, picked.X_WT)
     side = (MAX_OPENING + FINGERTIP_DEPTH) / 2
@@ -87,10 +83,7 @@ def _is_grasp(action: PickPlaceAction, picked: LooseTool) -> bool:
         finger = rectangle_at((FINGER_LENGTH, FINGERTIP_DEPTH), x, y, pick.theta)
         if any((finger ^ other).area() > _TOUCHED for other in (outline, *picked.around)):
             return False
-    between = rectangle_at((PAD_LENGTH, MAX_OPENING), pick.x, pick.y, pick.theta)
-    held = between ^ outline
-    # Jaws that close beside the object's middle push it aside, but hold it.
-    return bool(held.area() > _HELD)
+    return True
 
 
 def _placed(footprint: CrossSection, X_W: RigidTransform) -> CrossSection:

@@ -17,12 +17,13 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize
 
 from kitting_drake.policies.confidence import (
-    Evidence,
     Reliability,
     evidence_of_networks,
 )
 from kitting_drake.policies.factory import load_learned_policy, make_shape_matching
+from kitting_drake.policies.matching.evidence import Evidence
 from kitting_drake.reproduction.benchmarks.judging import covering, judge
+from kitting_drake.scenario import Scenario
 from kitting_drake.static_scenes.drawing import DrawnScene, draw_scenes
 from systems.pick_place_parameters import PickPlaceParameters
 from systems.sensor_noise import SensorNoiseParameters
@@ -51,6 +52,8 @@ class Judged:
     verdict: str
     """The result of `judge`; `stop` if the policy did not act."""
     evidence: Evidence
+    cameras: int
+    """Their number; zero for the default ones."""
     reason: str = ""
     """Why the policy stopped."""
 
@@ -83,7 +86,8 @@ def draw_judged(first_seed: int, count: int) -> Iterator[Judged]:
             for _ in range(_DECISIONS):
                 action, evidence = decide(observation, tried)
                 verdict = "stop" if action.stop else judge(action, scene.loose)
-                yield Judged(policy, number, verdict, evidence, action.reason)
+                cameras = len(scene.cameras) if scene.cameras != Scenario().cameras else 0
+                yield Judged(policy, number, verdict, evidence, cameras, action.reason)
                 if action.stop:
                     break
                 tried += covering(action, scene.loose)

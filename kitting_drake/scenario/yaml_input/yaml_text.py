@@ -1,11 +1,16 @@
 """Parses YAML with errors that a person understands, and writes what Drake reads."""
 
+import copy
+import functools
 from typing import Any
 
 import yaml
 from pydrake.common.yaml import yaml_load
 
 from kitting_drake.common.errors import UserError
+
+# libyaml composes several times as fast.
+_Composer = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 
 _TEXT, _MERGE = "tag:yaml.org,2002:str", "tag:yaml.org,2002:merge"
 
@@ -45,14 +50,7 @@ def parse(content: str, where: str) -> dict:
         UserError: it is not YAML, or not a mapping of names.
     """
     try:
-        # Check for repeated fields here: a Python mapping would keep only the last.
-        node = yaml.compose(content, Loader=yaml.SafeLoader)
-        _check_names(node)
-        # Drake's loader would drop such a tag without a warning.
-        if isinstance(node, yaml.MappingNode) and node.tag != "tag:yaml.org,2002:map":
-            raise ValueError(f"the tag {node.tag} at the beginning has no effect: remove it")
-        # Drake treats an empty text as if none were given.
-        root = yaml_load(data=content) if content.strip() else None
+        root = copy.deepcopy(_checked(content))
     except yaml.YAMLError as error:
         mark = getattr(error, "problem_mark", None)
         line = f", line {mark.line + 1}" if mark else ""
@@ -67,6 +65,24 @@ def parse(content: str, where: str) -> dict:
     if not isinstance(root, dict):
         raise UserError(f"{where} must be a mapping of names, not a {type(root).__name__}")
     return root
+
+
+# Benchmarks load one file hundreds of times.
+@functools.lru_cache(maxsize=64)
+def _checked(content: str) -> Any:
+    """What a text holds, for callers not to change."""
+    # Check for repeated fields here: a Python mapping would keep only the last.
+    try:
+        node = yaml.compose(content, Loader=_Composer)
+    except yaml.YAMLError:
+        # Its errors are clearer.
+        node = yaml.compose(content, Loader=yaml.SafeLoader)
+    _check_names(node)
+    # Drake's loader would drop such a tag without a warning.
+    if isinstance(node, yaml.MappingNode) and node.tag != "tag:yaml.org,2002:map":
+        raise ValueError(f"the tag {node.tag} at the beginning has no effect: remove it")
+    # Drake treats an empty text as if none were given.
+    return yaml_load(data=content) if content.strip() else None
 
 
 def _check_names(node: yaml.Node | None) -> None:

@@ -54,6 +54,7 @@ def make_result(seed: int, objects: list[ObjectResult], **fields: Any) -> Episod
         "failure": None,
         "timed_out": False,
         "moving_at_end": [],
+        "stop_reason": "failure" if fields.get("failure") else "done",
     } | fields
     return EpisodeResult(
         scenario="mine",

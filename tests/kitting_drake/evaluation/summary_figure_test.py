@@ -24,7 +24,12 @@ NINE = [make_object(f"thing {number}", 0.5 + number) for number in range(9)]
 @pytest.mark.parametrize(
     ("episodes", "success", "categories"),
     [
-        ([make_episode(seed, [1.0, 9.0, 500.0, 0.0]) for seed in range(3)], ADD_S, 4),
+        pytest.param(
+            [make_episode(seed, [1.0, 9.0, 500.0, 0.0]) for seed in range(3)],
+            ADD_S,
+            4,
+            marks=pytest.mark.slow,
+        ),
         # More categories than colours, and an object for which no goal was left.
         ([make_result(0, [*NINE, make_object("spare", None)]).as_dict()], PoseWithin(), 9),
         pytest.param(

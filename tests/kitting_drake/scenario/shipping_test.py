@@ -125,9 +125,14 @@ def test_absolute_paths_are_made_relative(folder: Path, tmp_path: Path):
 @pytest.mark.parametrize(
     ("name", "module", "place"),
     [
-        ("policy_of_mine.py", "policy_of_mine", "where_i_run"),
+        pytest.param("policy_of_mine.py", "policy_of_mine", "where_i_run", marks=pytest.mark.slow),
         ("policy_of_mine/__init__.py", "policy_of_mine", "where_i_run"),
-        ("policies_of_mine/policy.py", "policies_of_mine.policy", "where_i_run"),
+        pytest.param(
+            "policies_of_mine/policy.py",
+            "policies_of_mine.policy",
+            "where_i_run",
+            marks=pytest.mark.slow,
+        ),
         ("policies_of_mine/policy.py", "policies_of_mine.policy", "beside_the_scenario"),
     ],
 )

@@ -325,7 +325,7 @@ def test_a_learned_policy_acts_on_the_observation(weights_file: Path):
     ("policy", "sight"),
     [
         (ShapeMatching(), "observation_heights"),
-        (Learned(), "observation_heights"),
+        pytest.param(Learned(), "observation_heights", marks=pytest.mark.slow),
         (Learned(weights=str(MODELS / "policies" / "kitting_seen.safetensors")), "observation"),
         (PythonPolicy(function="systems.signals:PickPlaceAction"), "observation"),
     ],

@@ -83,25 +83,13 @@ class ExpandedConv2d(nn.Module):
         """(out channels, in channels, size, size), in channels_last: the plain kernel."""
         raise NotImplementedError
 
-    @torch.no_grad()
     def fit(self, kernel: Tensor) -> None:
         """Sets the weights to those of a plain kernel of such a layer.
 
         Args:
             kernel: as `kernel` returns it.
         """
-        out_fields, in_fields = self.weights.shape[:2]
-        out_channels, in_channels = self.out_fibre.channels, self.in_fibre.channels
-        shape = self.weights.shape[2:]
-        rows = []
-        for unit in torch.eye(shape.numel()):
-            # All blocks of fields are equal here, so the first one holds this weight's kernel.
-            self.weights.copy_(unit.view(shape).expand_as(self.weights))
-            rows.append(self.kernel()[:out_channels, :in_channels].flatten())
-        blocks = kernel.reshape(out_fields, out_channels, in_fields, in_channels, *kernel.shape[2:])
-        targets = blocks.transpose(1, 2).flatten(2).flatten(0, 1)
-        found = torch.linalg.lstsq(torch.stack(rows).double().T, targets.double().T).solution
-        self.weights.copy_(found.T.reshape(self.weights.shape))
+        raise NotImplementedError
 
     def channel_bias(self) -> Tensor | None:
         """(out channels,); None without a bias."""
@@ -132,6 +120,15 @@ class SteerableConv2d(ExpandedConv2d):
 
     def kernel(self, dtype: torch.dtype = torch.float32) -> Tensor:
         return expand_kernel(self.weights, self.basis, dtype)
+
+    @torch.no_grad()
+    def fit(self, kernel: Tensor) -> None:
+        out_fields, in_fields = self.weights.shape[:2]
+        out_channels, in_channels = self.out_fibre.channels, self.in_fibre.channels
+        blocks = kernel.reshape(out_fields, out_channels, in_fields, in_channels, *kernel.shape[2:])
+        targets = blocks.transpose(1, 2).flatten(2).flatten(0, 1).double()
+        found = torch.linalg.lstsq(self.basis.flatten(1).double().T, targets.T).solution
+        self.weights.copy_(found.T.reshape(self.weights.shape))
 
 
 def expand_kernel(weights: Tensor, basis: Tensor, dtype: torch.dtype = torch.float32) -> Tensor:

@@ -160,7 +160,7 @@ def test_the_contact_surface_has_the_walls_of_the_block(tools: list[Tool], lead_
         ["claw_hammer", "t_handle_screwdriver", "tin_snips", "pipe_wrench", "soft_face_mallet"] * 2,
     ],
 )
-@pytest.mark.parametrize("lead_in", [0.0, 0.001])
+@pytest.mark.parametrize("lead_in", [pytest.param(0.0, marks=pytest.mark.slow), 0.001])
 def test_no_part_of_the_contact_surface_is_inside_a_cavity(names: list[str], lead_in: float):
     parameters = KitParameters(lead_in=lead_in)
     tools = [load_tool(name) for name in names]

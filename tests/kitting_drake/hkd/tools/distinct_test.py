@@ -44,13 +44,13 @@ def test_the_distance_of_a_tool_from_itself_is_small():
     assert mean_surface_distance(tool, tool) < 0.0005
 
 
-ONE_OF_EACH = ("geologists_pick", "fencing_pliers", "basin_wrench", "cabinet_screwdriver")
+FAST = ("geologists_pick", "fencing_pliers")
 
 
 @pytest.mark.parametrize(
     "name",
     [
-        pytest.param(name, marks=[] if name in ONE_OF_EACH else [pytest.mark.slow])
+        pytest.param(name, marks=[] if name in FAST else [pytest.mark.slow])
         for name in tool_names()
         if load_tool(name).split == "fresh"
     ],

@@ -29,7 +29,6 @@ def triangles(solid: Manifold) -> NDArray[np.float64]:
 @pytest.mark.parametrize(
     ("solid", "order"),
     [
-        (bar(), 2),
         # The best centre is not at the origin.
         (bar().translate((3, -1, 0)), 2),
         # Point-symmetric but not mirror-symmetric.
@@ -49,8 +48,8 @@ def triangles(solid: Manifold) -> NDArray[np.float64]:
         (bar() - block(1, 4, 30).translate((90, 0, 0)), 2),
         (bar() - block(10, 4, 30).translate((90, 0, 0)), 1),
         (prism(6, 60), 6),
-        (prism(4, 60), 4),
-        (prism(3, 60), 3),
+        pytest.param(prism(4, 60), 4, marks=pytest.mark.slow),
+        pytest.param(prism(3, 60), 3, marks=pytest.mark.slow),
         (prism(128, 60), 24),
         # The same outline, but with a hollow at one end.
         (bar() - block(70, 18, 10).translate((50, 0, 5)), 1),
@@ -58,7 +57,7 @@ def triangles(solid: Manifold) -> NDArray[np.float64]:
 )
 def test_symmetry_order(solid: Manifold, order: int, monkeypatch: pytest.MonkeyPatch):
     # Simple shapes need fewer points than tools.
-    monkeypatch.setattr(symmetry, "_DENSE_SAMPLES", 50_000)
+    monkeypatch.setattr(symmetry, "_DENSE_SAMPLES", 20_000)
     assert symmetry_order(triangles(solid)) == order
 
 
@@ -72,7 +71,14 @@ def test_measure_rotation():
 
 
 @pytest.mark.parametrize(
-    "name", ["double_box_end_wrench", "offset_screwdriver", "s_wrench", "claw_hammer"]
+    "name",
+    [
+        "s_wrench",
+        *(
+            pytest.param(name, marks=pytest.mark.slow)
+            for name in ("double_box_end_wrench", "offset_screwdriver", "claw_hammer")
+        ),
+    ],
 )
 def test_tools_with_different_ends_are_not_reversible(name: str):
     tool = load_tool(name)

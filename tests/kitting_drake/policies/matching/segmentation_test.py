@@ -14,7 +14,7 @@ CAVITY = (slice(70, 74), slice(210, 260))
 """... and its cavity."""
 
 
-@pytest.mark.parametrize("noise", [0.0, 0.001, 0.002])
+@pytest.mark.parametrize("noise", [0.0, pytest.param(0.001, marks=pytest.mark.slow), 0.002])
 @pytest.mark.parametrize("height", [0.008, 0.02])
 def test_flat_objects_and_cavities_are_whole_in_noise(noise: float, height: float):
     """The ends of a region must survive, because they distinguish the half turn."""

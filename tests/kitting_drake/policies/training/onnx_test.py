@@ -12,6 +12,7 @@ from kitting_drake import train
 from kitting_drake.common.errors import UserError
 from kitting_drake.common.paths import GENERALIST
 from kitting_drake.policies.networks.architecture import NetworkConfig
+from kitting_drake.policies.networks.factored import Networks
 from kitting_drake.policies.networks.methods import make_networks
 from kitting_drake.policies.networks.weights import load_networks, save_weights
 from kitting_drake.policies.training import onnx_export
@@ -28,6 +29,11 @@ def exported(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.fixture(scope="module")
+def generalist() -> Networks:
+    return load_networks(GENERALIST)
+
+
 def prepared(image: np.ndarray, config: dict) -> np.ndarray:
     """(1, channels, rows, cols): an input of the graphs, as described in docs/learning.md."""
     channels, stride = config["channels"], config["stride"]
@@ -39,9 +45,9 @@ def prepared(image: np.ndarray, config: dict) -> np.ndarray:
 
 
 @pytest.mark.parametrize("name", GRAPHS)
-def test_the_graphs_agree_with_torch(exported: Path, name: str):
+def test_the_graphs_agree_with_torch(exported: Path, generalist: Networks, name: str):
     onnxruntime = pytest.importorskip("onnxruntime")
-    networks = load_networks(GENERALIST)
+    networks = generalist
     config = json.loads((exported / "policy.json").read_text())
     assert config["stop_threshold"] == networks.stop_threshold
     session = onnxruntime.InferenceSession(str(exported / f"{name}.onnx"))

@@ -37,9 +37,8 @@ def test_the_seed_determines_all_draws():
     assert_same(one, same)
 
 
-@pytest.mark.parametrize(
-    ("decay", "stop"), [pytest.param(False, False, marks=pytest.mark.slow), (True, True)]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize(("decay", "stop"), [(False, False), (True, True)])
 def test_a_resumed_run_continues_exactly(decay: bool, stop: bool, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(training, "_STOP_PROBABILITY", 0.5)
     samples = [scene(0), scene(1)]

@@ -4,8 +4,8 @@ from collections.abc import Callable
 from pathlib import Path
 
 
-def test_the_command(verb_process: Callable[..., subprocess.CompletedProcess[str]], tmp_path: Path):
-    done = verb_process("benchmark", "kits", "--kits", 1, "--output", tmp_path)
+def test_the_command(verb: Callable[..., subprocess.CompletedProcess[str]], tmp_path: Path):
+    done = verb("benchmark", "kits", "--kits", 1, "--output", tmp_path)
     assert done.returncode == 0, done.stderr
     assert "clearance, mm" in done.stdout
     measured = json.loads((tmp_path / "kits.json").read_text())

@@ -1,0 +1,99 @@
+"""Which of two frames is the base, the hand or the camera, by their names in ROS."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kitting_drake.common.errors import UserError
+
+Array = NDArray[np.float64]
+
+BASE, HAND, CAMERA = "base", "hand", "camera"
+_WORDS = {
+    CAMERA: r"cam|optical|rgb|depth|colou?r|realsense|kinect|zed|oak|eye|sensor|infra|d4\d\d",
+    HAND: r"hand|tool|flange|gripper|tcp|effector|wrist|(^|[_/-])ee([_/-]|$)|link_?[5-8]$|axis",
+    BASE: r"base|world|map|robot|table|link_?0$",
+}
+"""What names of frames contain. The first that fits counts, so camera_base is a camera."""
+_BODY = r"(link|base|base[_-]frame|screw[_-]frame|camera[_-]frame)$"
+"""Names of cameras' bodies, whose x points forward, as ROS's drivers give them."""
+
+
+@dataclass(frozen=True)
+class FoundPose:
+    """A pose in a file: of the frame `child` in the frame `parent`, as in ROS."""
+
+    X: Array
+    """(4, 4): maps points from `child` to `parent`."""
+    where: str
+    """The file or field, for errors."""
+    parent: str = ""
+    child: str = ""
+    """The frames' names; empty if the file does not say."""
+    in_hand: bool | None = None
+    """Whether the camera is on the hand; None if only the names may tell."""
+
+    @property
+    def inverse(self) -> FoundPose:
+        """The pose of `parent` in `child`."""
+        X = np.asarray(np.linalg.inv(self.X), dtype=float)
+        return FoundPose(X, self.where, self.child, self.parent, self.in_hand)
+
+
+@dataclass(frozen=True)
+class FrameNames:
+    """The frames' names that a user gives, where names alone do not tell; empty if not given."""
+
+    base: str = ""
+    camera: str = ""
+
+    @staticmethod
+    def of(node: dict[str, Any]) -> FrameNames:
+        """From the fields `base_frame` and `camera_frame`."""
+        return FrameNames(str(node.get("base_frame", "")), str(node.get("camera_frame", "")))
+
+    def kind(self, name: str) -> str:
+        """BASE, HAND, CAMERA, or an empty text if the name does not tell."""
+        plain = name.strip("/")
+        if plain and plain == self.base.strip("/"):
+            return BASE
+        if plain and plain == self.camera.strip("/"):
+            return CAMERA
+        for kind, words in _WORDS.items():
+            if re.search(words, plain.lower()):
+                return kind
+        return ""
+
+
+def directed(found: FoundPose, names: FrameNames) -> FoundPose:
+    """The pose of the camera, in the base or the hand: inverted if its frames' names say so.
+
+    Without names it is believed to be the pose of the camera in the base. A hand-eye calibration
+    itself says what it is of.
+
+    Raises:
+        UserError: the names do not tell, or neither frame is a camera.
+    """
+    if not found.parent or not found.child or found.in_hand is not None:
+        return found
+    kinds = names.kind(found.parent), names.kind(found.child)
+    if kinds[0] == CAMERA and kinds[1] in (BASE, HAND):
+        found, kinds = found.inverse, (kinds[1], CAMERA)
+    if kinds[1] != CAMERA or kinds[0] not in (BASE, HAND):
+        raise UserError(
+            f"{found.where} is a transform of {found.child} in {found.parent}, and the names do "
+            "not tell which is the robot's base and which the camera: give base_frame and "
+            "camera_frame beside it"
+        )
+    return FoundPose(found.X, found.where, found.parent, found.child, kinds[0] == HAND)
+
+
+def is_body(name: str) -> bool:
+    """Whether the name is that of a camera's body instead of its optical frame."""
+    plain = name.lower()
+    return "optical" not in plain and re.search(_BODY, plain) is not None

@@ -1,0 +1,142 @@
+"""The pose of a camera above a board, from the board's corners in its images."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import least_squares
+from scipy.spatial.transform import Rotation
+
+from kitting_drake.common.errors import UserError
+from kitting_drake.common.extras import import_extra
+from kitting_drake.real_camera.calibrations.layouts import Intrinsics
+from kitting_drake.real_camera.calibrations.lens_distortion import undistort
+from kitting_drake.real_camera.calibrations.pose_values import assembled
+from kitting_drake.real_camera.frames.point_clouds import project_points
+
+Array = NDArray[np.float64]
+
+_STEEPEST = math.radians(70)
+"""A board seen at a larger angle from its normal gives poor corners."""
+_SAME = math.radians(1)
+"""Poses that differ by less are one."""
+_CLEARER = 16.0
+"""By so many variances of a corner must the squared errors of a second pose exceed the first's."""
+_LIKELY = 0.2
+"""The error of corners that is to be expected in a real image, in pixels."""
+_NOISE = 0.05
+"""The error of corners in a good image, in pixels."""
+_WORST = 3.0
+"""With a larger error the lens is another one, or the board moved, in pixels."""
+
+
+@dataclass(frozen=True)
+class BoardFit:
+    """A camera's pose by a board, and how well it explains the corners."""
+
+    X_KM: Array
+    """(4, 4): the pose of the board's frame M in the optical frame K."""
+    rms: float
+    """The error of the corners, in pixels."""
+    angle: float
+    """Between the board's normal and the line of sight to its middle, in radians."""
+    focal_ratio: float
+    """By what factor the focal length would explain the corners best."""
+    focal_error: float
+    """The standard deviation of this factor."""
+
+
+def fit_board(points: Array, pixels: Array, lens: Intrinsics, where: str) -> BoardFit:
+    """Fits the pose of a board to its corners.
+
+    Args:
+        points: (n, 3) in the board's frame, in metres.
+        pixels: (n, 2) column and row, from pixel centres.
+        lens: of the image.
+        where: the beginning of errors.
+
+    Raises:
+        UserError: the corners do not fit, are seen too obliquely, or have two explanations.
+    """
+    starts = _starts(points, pixels, lens, where)
+    fits = sorted(
+        (_refined(start, points, pixels, lens) for start in starts), key=lambda fit: fit[1]
+    )
+    X, rms = fits[0]
+    if rms > _WORST:
+        raise UserError(
+            f"{where}: the corners are {rms:.1f} pixels off, in the mean square: check the "
+            "intrinsics, the board's sizes, and that neither board nor camera moved"
+        )
+    for other, other_rms in fits[1:]:
+        turned = Rotation.from_matrix(other[:3, :3].T @ X[:3, :3]).magnitude()
+        excess = len(points) * (other_rms**2 - rms**2)
+        if turned > _SAME and excess < _CLEARER * max(rms, _LIKELY) ** 2:
+            raise UserError(
+                f"{where}: two poses, {math.degrees(turned):.0f} degrees apart, explain the board "
+                "equally well: take it nearer, larger, or more from the side"
+            )
+    middle = X[:3, :3] @ points.mean(axis=0) + X[:3, 3]
+    # The board's z points up, and the line of sight down.
+    cosine = -(middle @ X[:3, 2]) / np.linalg.norm(middle)
+    angle = float(np.arccos(np.clip(cosine, -1, 1)))
+    if angle > _STEEPEST:
+        raise UserError(
+            f"{where}: the board is seen {math.degrees(angle):.0f} degrees from its normal: look "
+            f"at it from at most {math.degrees(_STEEPEST):.0f}"
+        )
+    return BoardFit(X, rms, angle, *_focal_ratio(X, points, pixels, lens))
+
+
+def _starts(points: Array, pixels: Array, lens: Intrinsics, where: str) -> list[Array]:
+    """The two poses that may explain the image of a plane."""
+    cv2 = import_extra("cv2", purpose="--calibrate", extra="camera")
+    u, v = ((pixels - lens.centre) / lens.focal).T
+    if lens.distortion:
+        u, v = undistort(u.copy(), v.copy(), lens.model, lens.distortion, where)
+    rays = np.ascontiguousarray(np.stack([u, v], axis=-1))
+    try:
+        _, turns, shifts, _ = cv2.solvePnPGeneric(
+            points, rays, np.eye(3), None, flags=cv2.SOLVEPNP_IPPE
+        )
+    except cv2.error as error:
+        raise UserError(f"{where}: the corners lie on a line: show more of the board") from error
+    return [
+        assembled(Rotation.from_rotvec(turn.ravel()).as_matrix(), shift.ravel())
+        for turn, shift in zip(turns, shifts, strict=True)
+    ]
+
+
+def _refined(start: Array, points: Array, pixels: Array, lens: Intrinsics) -> tuple[Array, float]:
+    """The pose of least error near a start, and its error in pixels."""
+    first = np.concatenate([Rotation.from_matrix(start[:3, :3]).as_rotvec(), start[:3, 3]])
+    found = least_squares(_errors, first, args=(points, pixels, lens), method="lm", x_scale="jac")
+    X = assembled(Rotation.from_rotvec(found.x[:3]).as_matrix(), found.x[3:6])
+    return X, float(np.sqrt(2 * found.cost / len(points)))
+
+
+def _errors(values: Array, points: Array, pixels: Array, lens: Intrinsics) -> Array:
+    """(2 n,) in pixels. A seventh value is the logarithm of the focal ratio."""
+    seen = points @ Rotation.from_rotvec(values[:3]).as_matrix().T + values[3:6]
+    seen[:, 2] = np.maximum(seen[:, 2], 1e-3)
+    found = np.stack(project_points(seen, lens), axis=-1)
+    if len(values) > 6:
+        found = (found - lens.centre) * np.exp(values[6]) + lens.centre
+    return np.asarray(found - pixels, dtype=float).ravel()
+
+
+def _focal_ratio(X: Array, points: Array, pixels: Array, lens: Intrinsics) -> tuple[float, float]:
+    """The factor of the focal length that explains the corners best, and its deviation."""
+    first = np.concatenate([Rotation.from_matrix(X[:3, :3]).as_rotvec(), X[:3, 3], [0.0]])
+    if 2 * len(points) <= len(first):
+        return 1.0, math.inf
+    found = least_squares(_errors, first, args=(points, pixels, lens), method="lm", x_scale="jac")
+    noise = max(2 * found.cost / (2 * len(points) - len(first)), _NOISE**2)
+    try:
+        deviation = math.sqrt(noise * np.linalg.inv(found.jac.T @ found.jac)[6, 6])
+    except (np.linalg.LinAlgError, ValueError):
+        return 1.0, math.inf
+    return float(np.exp(found.x[6])), deviation

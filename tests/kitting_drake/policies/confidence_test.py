@@ -1,0 +1,58 @@
+"""The confidence of decisions: its fit, and what it is made of."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from kitting_drake.policies.confidence import Reliability, read_reliability
+from kitting_drake.policies.matching.shape_matching import ShapeMatchingPolicy
+from kitting_drake.reproduction.benchmarks.reliability import Judged, fit, summarize
+from systems.pick_place_parameters import PickPlaceParameters
+from tests.kitting_drake.policies.matching.visibility_test import kit_and_bar
+
+
+def drawn(seed: int, count: int = 2000) -> list[Judged]:
+    """Decisions that succeed with the probability of a logistic law of two facts."""
+    random = np.random.default_rng(seed)
+    facts = random.normal(size=(count, 2))
+    probability = 1 / (1 + np.exp(-(1.0 + 3 * facts[:, 0] - 2 * facts[:, 1])))
+    right = random.random(count) < probability
+    return [
+        Judged("networks", number, "right" if good else "place", {"a": a, "b": b}, 0)
+        for number, (good, (a, b)) in enumerate(zip(right, facts.tolist(), strict=True))
+    ]
+
+
+def test_the_fit_finds_the_law_and_is_calibrated():
+    found = fit(drawn(0))
+    assert found.weights["a"] == pytest.approx(3, rel=0.15)
+    assert found.weights["b"] == pytest.approx(-2, rel=0.15)
+    summary = summarize(drawn(1), found)
+    assert summary.calibration_error < 0.03
+    assert summary.wrong_answers < 0.02
+    assert sum(count for *_, count in summary.bins) == summary.decisions == 2000
+    # A confidence that is always high is told.
+    bold = Reliability(dict.fromkeys(found.weights, 0.0) | {"": 4.0}, 0.5)
+    assert summarize(drawn(1), bold).calibration_error > 0.2
+
+
+@pytest.mark.parametrize("policy", ["networks", "shape_matching"])
+def test_the_shipped_regressions(policy: str):
+    found = read_reliability(policy)
+    assert 0.5 <= found.threshold < 1
+    assert found.weights["fit"] < 0
+
+
+def test_a_poor_fit_is_less_likely_to_succeed():
+    policy, reliability = (
+        ShapeMatchingPolicy(PickPlaceParameters()),
+        read_reliability("shape_matching"),
+    )
+    good = kit_and_bar(None)
+    image = good.image.copy()
+    image[3, 78:88, 220:262] = 0.015  # Shorter and wider than its recess.
+    poor = policy.decide(dataclasses.replace(good, image=image)).geometry
+    best = policy.decide(good).geometry
+    assert best is not None and reliability.confidence(best) > 0.9
+    assert poor is None or reliability.confidence(poor) < reliability.confidence(best)

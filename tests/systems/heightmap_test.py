@@ -1,0 +1,96 @@
+"""o_t from depth images: what is seen, what could be seen, and the level of the table."""
+
+import numpy as np
+import pytest
+
+from systems.heightmap import DepthRays, View, project
+from systems.signals import Observation, PixelGrid, PlanarPose, fill_unseen
+from systems.surface_heights import read_surface_heights
+from systems.table_plane import find_table
+
+GRID = PixelGrid()
+DOWN = np.array([[0.0, -1, 0, 0.5], [-1, 0, 0, 0], [0, 0, -1, 0.9], [0, 0, 0, 1]])
+
+
+def flat(
+    X_WD: np.ndarray = DOWN, *, lowered: float = 0.0, focal: float = 450.0, noise: float = 0.0
+) -> View:
+    """A camera above a level table with a box of 30 mm; the true table may be lower than z = 0."""
+    rays = DepthRays.from_pinhole(
+        size=(640, 480), focal=(focal, focal), centre=(320, 240), depth_range=(0.01, 10)
+    )
+    u, v = np.broadcast_arrays(rays.u, rays.v)
+    along = np.stack([u, v, np.ones_like(u)], -1) @ X_WD[:3, :3].T
+    table = (-lowered - X_WD[2, 3]) / along[..., 2]
+    top = (0.03 - lowered - X_WD[2, 3]) / along[..., 2]
+    xy = X_WD[:2, 3] + top[..., None] * along[..., :2]
+    on_box = (np.abs(xy - (0.45, 0.1)) < 0.05).all(axis=-1)
+    depth = np.where(on_box, top, table)
+    depth = depth + noise * np.random.default_rng(0).standard_normal(depth.shape)
+    return View(None, depth.astype(np.float32), X_WD, rays)
+
+
+def test_pixels_outside_all_images_are_out_of_view():
+    seen = project([flat(focal=900.0)], GRID)
+    assert 0.1 < seen.in_view.mean() < 0.7
+    assert seen.valid[seen.in_view].mean() > 0.99
+    # At an image's edge, the heights of the box itself may be seen beyond.
+    assert not seen.valid[~seen.in_view].mean() > 0.01
+    middle = tuple(np.rint(GRID.to_pixel((0.5, 0.0))).astype(int))
+    assert seen.in_view[middle]
+
+
+def test_a_region_of_interest_hides_the_rest():
+    region = np.zeros(GRID.shape, bool)
+    region[:, :170] = True
+    seen = project([flat()], GRID, region)
+    assert not seen.valid[:, 170:].any() and not seen.in_view[:, 170:].any()
+    assert not seen.image[:, :, 170:].any()
+
+
+@pytest.mark.parametrize("lowered", [-0.006, 0.005])
+def test_a_table_that_is_off_is_levelled(lowered: float):
+    true = project([flat()], GRID)
+    seen = project([flat(lowered=lowered, noise=0.0005)], GRID)
+    assert true.table == (0.0, 0.0, 0.0)
+    assert seen.table[2] == pytest.approx(-lowered, abs=5e-4)
+    assert np.median(seen.height[seen.height > 0.02]) == pytest.approx(0.03, abs=5e-4)
+    # Motions go down to a lower table, and to the expected one if it looks higher.
+    pick = PlanarPose(0.45, 0.1)
+    found = read_surface_heights(seen, pick, pick)
+    assert found.pick_top == pytest.approx(0.03 - max(lowered, 0.0), abs=2e-3)
+
+
+def test_a_tilted_camera_is_levelled():
+    tilt = np.radians(0.5)
+    turn = np.eye(4)
+    turn[:3, :3] = [[np.cos(tilt), 0, np.sin(tilt)], [0, 1, 0], [-np.sin(tilt), 0, np.cos(tilt)]]
+    view = flat()
+    seen = project([view._replace(X_WD=view.X_WD @ turn)], GRID)
+    assert np.hypot(*seen.table[:2]) == pytest.approx(tilt * GRID.resolution, rel=0.1)
+    assert np.percentile(seen.height[seen.valid], 80) < 0.0005
+
+
+def test_a_table_far_off_is_not_levelled():
+    assert project([flat(lowered=0.015)], GRID).table == (0.0, 0.0, 0.0)
+    rough = np.random.default_rng(0).uniform(0, 0.2, GRID.shape).astype(np.float32)
+    assert find_table(rough, np.ones(GRID.shape, bool), GRID.resolution) == (0.0, 0.0, 0.0)
+
+
+def test_what_no_camera_sees_is_not_filled_from_its_border():
+    height = np.zeros((40, 60), np.float32)
+    height[10:20, 25:30] = 0.05  # Ends at the border of the view.
+    valid = np.zeros(height.shape, bool)
+    valid[:, :30] = True
+    height[5:7, 5:7] = np.nan
+    valid[5:7, 5:7] = False
+    filled = fill_unseen(height, valid, in_view=np.arange(60) < np.full((40, 1), 30))
+    assert not filled[:, 30:].any()
+    assert not filled[5:7, 5:7].any() and filled[15, 27] == np.float32(0.05)
+    # In a large hole within the view, nothing is drawn far from its border.
+    assert not fill_unseen(height, valid)[:, 56:].any()
+
+
+def test_the_default_is_that_everything_is_in_view():
+    seen = Observation(np.zeros((4, 8, 9), np.float32), PixelGrid(rows=8, cols=9))
+    assert seen.in_view.all() and not seen.valid.any()
