@@ -149,8 +149,8 @@ class Collection:
         """Reads the files of earlier runs.
 
         Args:
-            folder: of the files.
-            origin: of the demonstrations.
+            folder: the folder of the files.
+            origin: the origin of the demonstrations.
 
         Raises:
             UserError: a file has another origin or is damaged.
@@ -211,7 +211,7 @@ class Collection:
             count: the number of demonstrations wanted.
             demonstrate: makes a demonstration; called in threads.
             workers: determine the number of parallel calls.
-            console: for the progress bar.
+            console: where to show the progress bar.
 
         Raises:
             UserError: no seeds are left, too many seeds in a row are rejected, or a process is
@@ -295,7 +295,9 @@ def next_seed(
     rejected: Container[int],
     working: Container[int],
 ) -> int | None:
-    """The seed to try next. The result is to hold the first `count` seeds that are not rejected.
+    """The seed to try next.
+
+    Demonstrations are wanted of the first `count` seeds that are not rejected.
 
     Args:
         seeds: the permitted seeds, in order.
@@ -305,7 +307,7 @@ def next_seed(
         working: seeds in progress.
 
     Returns:
-        A seed. None if the accepted seeds and those in progress already make `count`.
+        The seed. None if there are already `count` seeds, accepted or in progress.
 
     Raises:
         UserError: no seed is left, or too many seeds in a row were rejected.
@@ -381,7 +383,7 @@ class DemonstrationRecorder:
     def __init__(self, station: KittingStation, *, later_picks_possible: bool = False) -> None:
         """
         Args:
-            station: with cameras and the oracle.
+            station: a station with cameras and the oracle.
             later_picks_possible: see `Learning`. Episodes with two actions on one object are then
                 rejected: the first action moves the object, so its later pick is a wrong label.
         """

@@ -89,8 +89,8 @@ class _Parts:
         """Reads the files of earlier runs.
 
         Args:
-            folder: of the files.
-            seed: of all draws.
+            folder: the folder of the files.
+            seed: the seed of all draws.
             drawn_by: versions and digests of the code.
 
         Raises:
@@ -125,7 +125,7 @@ class _Parts:
         return self._folder / f"batch_{batch:06d}.h5"
 
     def draw(self, count: int, workers: LocalWorkers, console: Console) -> None:
-        """Draws batches until they hold `count` scenes, without those after a missing batch."""
+        """Draws batches until the batches before the first missing one have `count` scenes."""
         begun = set(self._counts)
 
         def next_batch() -> int | None:
@@ -162,7 +162,7 @@ class _Parts:
         """The number of scenes, including those of unfinished batches."""
         unfinished = 0
         for path in self._folder.glob(f"*{_DRAWN}"):
-            # Its process may just have removed or truncated it.
+            # The process that writes the file may just have removed or truncated it.
             with contextlib.suppress(OSError, ValueError):
                 unfinished += int(path.read_text())
         return sum(self._counts.values()) + unfinished

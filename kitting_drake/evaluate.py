@@ -134,10 +134,10 @@ def evaluate(
     Args:
         chosen: the scenario.
         seeds: one episode each.
-        folder: of `episodes.jsonl`.
+        folder: the folder of `episodes.jsonl`.
         run: runs an episode; called in threads.
         workers: determine the number of parallel episodes.
-        console: for the progress bar.
+        console: where to show the progress bar.
 
     Raises:
         UserError: the folder holds episodes of another scenario, policy, version or other input
@@ -213,7 +213,7 @@ def run_in_worker(
     Args:
         workers: run the process.
         chosen: the scenario, with paths that are valid for the workers.
-        seed: of the episode.
+        seed: the seed of the episode.
         log: the log file without the seed; see `log_of_seed`.
 
     Raises:

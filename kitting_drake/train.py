@@ -128,7 +128,7 @@ def _checked_start(
     if shared:
         raise UserError(
             f"{arguments.start} learned from seed {min(shared)}, which is in the validation data: "
-            "give others by --validation"
+            "give other validation data with --validation"
         )
     fixed = ["method", "preset", "orientations"]
     if arguments.angle_only:
@@ -153,14 +153,14 @@ def _check_validation(settings: Settings, held_out: TrainingData, path: Path) ->
     """Raises UserError if the data cannot select a checkpoint or the threshold for stopping."""
     if settings.colour and not held_out.colour:
         raise UserError(
-            f"{path} has no colours, but the networks need them: give others by --validation"
+            f"{path} has no colours, but the networks need them: give other data with --validation"
         )
     _require_picks(held_out, path, "for validation")
     if settings.stop and not held_out.finals(1):
         raise UserError(
-            f"none of the {held_out.count} {held_out.kind} in {path} for validation ends with "
-            "nothing left to pick, so the policy would never learn to stop: "
-            f"{held_out.made} more, or give others by --validation"
+            f"the policy cannot learn from {path} when to stop: none of the {held_out.count} "
+            f"{held_out.kind} for validation ends with nothing left to pick; {held_out.made} more, "
+            "or give other data with --validation"
         )
 
 

@@ -127,7 +127,7 @@ def motion_at(
         start: (4) position.
         goal: (4) position.
         start_rate: (4) velocity at the start.
-        limits: of each of the `PARTS`.
+        limits: the limits of each of the `PARTS`.
         delays: (3) when the `travel` of each part begins, in s after the start.
         elapsed: time since the start, in s.
 
@@ -176,7 +176,8 @@ def _ways(
     limits: MotionLimits,
     delays: NDArray[np.float64],
 ) -> Iterator[tuple[list[int], list[float], float, tuple[float, float], float]]:
-    """For each part: axes, displacement after braking, its length, limits, delay."""
+    """For each part: its axes, its displacement after braking, the length of this displacement, its
+    limits and its delay."""
     ways = (goal - start - start_rate * braking_time(start_rate, limits) / 2).tolist()
     for part, limit, delay in zip(PARTS, limits.of_parts(), delays.tolist(), strict=True):
         way = [ways[i] for i in part]
@@ -203,7 +204,7 @@ def shortest_yaws(
         pick_yaw: in rad.
         place_yaw: in rad.
         present_yaw: the wrist's present yaw, in rad.
-        limit: of the magnitude of both yaws, in rad; at least pi, so that a solution exists.
+        limit: the largest magnitude of a yaw, in rad; at least pi, so that a solution exists.
 
     Returns:
         (pick, place) in rad.

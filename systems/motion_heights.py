@@ -32,8 +32,8 @@ def motion_heights(heights: SurfaceHeights, parameters: PickPlaceParameters) -> 
     support at the pick.
 
     Args:
-        heights: of the surfaces, as `read_surface_heights` returns them.
-        parameters: of the motion primitive.
+        heights: the heights of the surfaces, as `read_surface_heights` returns them.
+        parameters: the parameters of the motion primitive.
     """
     floor = heights.table + parameters.floor_clearance
     share = parameters.grasp_depth_share * (heights.pick_top - heights.support)

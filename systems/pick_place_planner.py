@@ -119,7 +119,7 @@ class PickPlacePlanner(LeafSystem):
         """
         Args:
             parameters: heights, speeds, thresholds.
-            max_actions: stop after so many actions, unless `parameters.max_actions` overrides it.
+            max_actions: stop after this many actions, unless `parameters.max_actions` overrides it.
             insertion: whether to search for a cavity when a place is blocked.
             period: update period of the state machine, in s.
         """

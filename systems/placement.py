@@ -254,7 +254,7 @@ def evaluate_placements(
 
     Args:
         objects: n of them.
-        goals: of the task.
+        goals: the goals of the task.
         success: decides when a goal is filled.
         poses: n, X_WB of each object.
         kept: goals that count as filled in the prerequisites of others (`complete_stages`).
@@ -381,7 +381,7 @@ def complete_stages(
     As in the Ravens benchmark, their reward is kept even if the objects move later.
 
     Args:
-        goals: of the task.
+        goals: the goals of the task.
         placements: the present ones, evaluated with `kept`.
         kept: goals that were complete before.
     """
@@ -395,7 +395,7 @@ def total_reward(
     """The episode's score, 0 to 1.
 
     Args:
-        goals: of the task.
+        goals: the goals of the task.
         placements: the present ones, evaluated with `kept`.
         kept: goals that always count as filled (`complete_stages`).
     """

@@ -117,12 +117,12 @@ class RestDetector(LeafSystem):
         Args:
             objects: n bodies that may come to rest.
             movers: bodies that never rest: the links of the hand.
-            position_tolerance: of the body's origin, in m.
+            position_tolerance: the position tolerance of the body's origin, in m.
             angle_tolerance: in rad.
             time_to_sleep: in s.
             wake_distance: in m. A body that moves farther than this within one period may hit a
                 sleeping object, which stays fixed until the next update.
-            period: of the updates, in s.
+            period: the period of the updates, in s.
         """
         super().__init__()
         self._count = len(objects)

@@ -133,10 +133,10 @@ class SensorNoise(LeafSystem):
     ) -> None:
         """
         Args:
-            parameters: of the noise.
+            parameters: the parameters of the noise.
             camera: the sensor's depth camera.
-            seed: of all draws.
-            number: of the camera; the rig's error does not depend on it.
+            seed: the seed of all draws.
+            number: the number of the camera; the rig's error does not depend on it.
             workspace_middle: (x, y) in the world about which the rig's error rotates, in metres.
             use_labels: whether to declare the input port `label_image`.
         """
@@ -235,9 +235,9 @@ def noisy_depth(
 
     Args:
         depth: (height, width), in metres; 0 and infinity are invalid.
-        parameters: of the noise.
+        parameters: the parameters of the noise.
         camera: its intrinsics.
-        random: for all draws.
+        random: the random generator of all draws.
         sheen: (height, width) share of holes on each surface; None for no sheen.
     """
     seen = np.isfinite(depth) & (depth > 0)

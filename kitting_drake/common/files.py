@@ -85,7 +85,7 @@ def claim_folder(folder: Path, name: str, described: Any, *, of: str) -> None:
 
     Args:
         folder: the folder.
-        name: of the JSON file.
+        name: the name of the JSON file.
         described: the run's description, serializable as JSON.
         of: what a run is called in error messages.
 

@@ -24,8 +24,8 @@ _Result = TypeVar("_Result")
 _THREADS = "OMP_NUM_THREADS"
 
 _MOST_CALLS = 10
-"""A process is replaced after so many calls: Drake 1.51 never frees Diagrams, about 50 MB for each
-episode."""
+"""A process is replaced after this many calls: Drake 1.51 never frees Diagrams, which take about
+50 MB for each episode."""
 _PATIENCE = 3.0
 """Time for a stopped process to remove partial files, in s."""
 _MOST_AT_WORK = 1000
@@ -80,7 +80,7 @@ class Subprocess:
         Args:
             function: importable by name; arguments and result must be picklable. Exceptions end the
                 process, except for `MachineError`.
-            arguments: of the function.
+            arguments: the arguments of the function.
 
         Returns:
             The function's result, or how the process ended without one.

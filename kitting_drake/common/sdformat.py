@@ -15,7 +15,7 @@ def model_text(path: Path, *, friction: float = 1.0, mass: float = 1.0) -> str |
     again, which takes 70 ms.
 
     Args:
-        path: of the model.
+        path: the path of the model.
         friction: factor of all friction coefficients.
         mass: factor of all masses and moments of inertia.
 

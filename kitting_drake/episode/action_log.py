@@ -27,7 +27,7 @@ def nearest_object(station: KittingStation, poses: list[RigidTransform], pick: P
     Args:
         station: the episode's.
         poses: X_WB of each object.
-        pick: of the gripper, in the world.
+        pick: the gripper's pose at the pick, in the world.
     """
     distances = []
     for item, X_WB in zip(station.objects, poses, strict=True):

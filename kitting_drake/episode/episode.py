@@ -246,8 +246,8 @@ def object_results(
 
     Args:
         station: the episode's.
-        root_context: of the outermost Diagram.
-        placements: of the scene's objects, in order.
+        root_context: the root context of the outermost Diagram.
+        placements: the placements of the scene's objects, in order.
         records: the actions so far.
     """
     scene, task = station.scene, station.scenario.task

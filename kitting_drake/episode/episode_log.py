@@ -58,8 +58,8 @@ def log_of_many(path: Path | None, cluster: str | None) -> Path | None:
     """Checks and returns the file of `--log` for a command that runs many episodes.
 
     Args:
-        path: of `--log`, if given; see `log_of_seed`.
-        cluster: of `--ray`, if given.
+        path: the path of `--log`, if given; see `log_of_seed`.
+        cluster: the cluster of `--ray`, if given.
 
     Raises:
         UserError: as `check_log`, or both options are given.

@@ -85,7 +85,7 @@ def mcap_messages(arrays: Mapping[str, NDArray[Any]]) -> Iterator[Message]:
     - `/observation_height`: `Image` of 32-bit floats, o_t in metres.
 
     Args:
-        arrays: of `EpisodeLog.arrays`.
+        arrays: the arrays of `EpisodeLog.arrays`.
     """
     shown, before, begun = -np.inf, None, 0
     for index, time in enumerate(arrays["time"].tolist()):

@@ -68,7 +68,7 @@ def draw_strips(rows: Sequence[tuple[str, Sequence[StripFrame], Sequence[str]]])
     """Several strips, one below the other; a long one goes on in another line.
 
     Args:
-        rows: for each strip its title, its frames and the outcome of each action.
+        rows: the title of each strip, its frames and the outcome of each action.
 
     Returns:
         A PNG.

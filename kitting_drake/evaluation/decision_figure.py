@@ -72,8 +72,8 @@ def draw_maps(observation: Observation, decision: Decision, *, width: int) -> by
 
     Args:
         observation: the observation decided on.
-        decision: of a learned policy.
-        width: of the picture, in pixels; its height follows from the maps.
+        decision: a learned policy's decision.
+        width: the width of the picture, in pixels; its height follows from the maps.
 
     Returns:
         A PNG.

@@ -38,7 +38,7 @@ def measure_grasp(tool: Tool, x: float, y: float, theta: float) -> Grasp | None:
 
     Args:
         tool: at rest in its frame T.
-        x: of the middle of the pads in T, in metres.
+        x: x of the middle of the pads in T, in metres.
         y: as x. Only its component along the pads counts, because closing jaws centre the tool.
         theta: the rotation of the hand about T's z, in radians.
 

@@ -34,7 +34,7 @@ class LoadedPolicy:
         """Checks that the pixels have the size that the policy was trained with.
 
         Args:
-            grid: of the observations.
+            grid: the pixel grid of the observations.
             field: the caller's name of the grid's resolution, for the error.
 
         Raises:
@@ -109,7 +109,7 @@ def make_shape_matching(
 
     Args:
         planner: how the hand will pick and place.
-        recover: mend failed insertions.
+        recover: whether to correct failed insertions.
     """
     # Import SciPy lazily.
     from kitting_drake.policies.matching.shape_matching import ShapeMatchingPolicy

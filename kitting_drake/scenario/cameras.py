@@ -137,7 +137,7 @@ def depth_camera(camera: Camera, renderer: str) -> DepthRenderCamera:
     """Drake's description of a camera; its colour camera has the same pose.
 
     Args:
-        camera: of a scenario.
+        camera: the camera of a scenario.
         renderer: the name of its render engine.
     """
     config = copy.deepcopy(_config(camera))

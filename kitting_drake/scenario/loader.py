@@ -33,7 +33,7 @@ def load_scenario(
 
     Args:
         path: a YAML file that maps names to scenarios.
-        name: of the scenario; None for the first.
+        name: the name of the scenario; None for the first.
         text: YAML to merge over the scenario. Mappings merge field by field; other values are
             replaced. A mapping without a tag keeps the variant that it is merged over. A camera
             set to null is removed.

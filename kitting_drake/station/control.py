@@ -32,7 +32,7 @@ def add_control(
     """Adds planner and controller, connects them to the plant, and exports their ports.
 
     Args:
-        builder: of the station.
+        builder: the builder of the station.
         scenario: configures planner and controller.
         scene: says how many actions there are, and whether objects are inserted.
         plant: finalized, with the hand.

@@ -39,10 +39,10 @@ def paint_surfaces(
 
     Args:
         plant: finalized.
-        scene_graph: of the plant.
-        appearance: of the scenario.
+        scene_graph: the scene graph of the plant.
+        appearance: the appearance of the scenario.
         groups: `table`, `fixtures/NAME` or `objects/NAME` for each body.
-        seed: of the draws.
+        seed: the seed of the draws.
 
     Raises:
         UserError: a pattern matches no surface.

@@ -36,9 +36,9 @@ def add_models(
 
     Args:
         plant: not finalized yet.
-        scene: of the episode.
+        scene: the scene of the episode.
         variation: ranges of friction and mass; the hand's are not varied.
-        seed: of the draws.
+        seed: the seed of the draws.
 
     Returns:
         The scene's objects with their bodies, and the bodies that never move: table, then fixtures.

@@ -12,7 +12,7 @@ def make_policy(station: KittingStation, observer: DecisionObserver | None = Non
     """Makes the policy system of the station's scenario.
 
     Args:
-        station: to which the policy will be connected.
+        station: the station that the policy will be connected to.
         observer: called with every decision of a learned policy and its observation.
 
     Raises:

@@ -39,11 +39,11 @@ def add_cameras(
     """Adds a scenario's cameras, their noise, and the projector of their images.
 
     Args:
-        builder: of the station.
+        builder: the builder of the station.
         scenario: configures cameras, appearance and sensor noise.
-        scene_graph: seen by the cameras.
-        grid: of the observation.
-        seed: of lights and noise.
+        scene_graph: the scene graph that the cameras see.
+        grid: the pixel grid of the observation.
+        seed: the seed of lights and noise.
 
     Returns:
         The projector, whose port `observation` is o_t.

@@ -323,7 +323,7 @@ def build_station(scenario: Scenario, seed: int = 0, base: Path | None = None) -
 
     Args:
         scenario: what to build, except for its policy (see `station.policy`).
-        seed: of the scene and of all noise; see `TaskConfig.make_scene`.
+        seed: the seed of the scene and of all noise; see `TaskConfig.make_scene`.
         base: base folder of the scenario's relative paths; None: the working directory.
 
     Raises:

@@ -40,7 +40,7 @@ def start_meshcat(parameters: MeshcatParams) -> Meshcat:
     """Starts Meshcat with a view of the table.
 
     Args:
-        parameters: of a scenario.
+        parameters: the parameters of a scenario.
 
     Raises:
         UserError: no port is free.
@@ -88,7 +88,7 @@ def add_video(builder: DiagramBuilder, station: KittingStation, path: Path) -> "
 
     Args:
         builder: contains the station, for which no context exists yet.
-        station: to record.
+        station: the station to record.
         path: a .gif or .webp file, written by the writer's `Save()`.
 
     Raises:

@@ -174,8 +174,8 @@ def grasp_along(size: tuple[float, float, float], axis: str, offset: float) -> G
     """A grasp on one of a box's centre lines; the jaws close across the line.
 
     Args:
-        size: of the box, in metres.
-        axis: of the centre line, `x` or `y`.
+        size: the size of the box, in metres.
+        axis: the axis of the centre line, `x` or `y`.
         offset: from the middle along the line, in metres.
     """
     x, y, z = size
@@ -201,7 +201,7 @@ def box_footprint(size: tuple[float, float, float], offset: float = 0.0) -> Foot
     """The footprint of a box and of the open hand that grasps it.
 
     Args:
-        size: of the box, in metres.
+        size: the size of the box, in metres.
         offset: largest distance of a grasp from the middle along each axis, in metres.
     """
     return Footprint((rectangle(size[0], size[1]),), outermost_grasps(size, offset))

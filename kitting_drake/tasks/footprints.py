@@ -63,7 +63,7 @@ def separation(a: Polygon, b: Polygon) -> float:
 
 @dataclass(frozen=True)
 class Footprint:
-    """The area of a thing on the table, in its own frame, in metres."""
+    """The area that an object or fixture covers on the table, in its own frame, in metres."""
 
     body: tuple[Polygon, ...]
     """Convex pieces of its area."""
@@ -138,9 +138,9 @@ def draw_poses(
     All bodies keep the spacing, and the open hand at each grasp touches only what it grasps.
 
     Args:
-        footprints: of the things to place, in drawing order; put large ones first.
+        footprints: the footprints of what to place, in drawing order; put large ones first.
         grid: the workspace.
-        rng: for all draws.
+        rng: the random generator of all draws.
         spacing: least distance between two bodies, in metres.
 
     Returns:
@@ -159,8 +159,8 @@ def draw_poses(
     found = draw_in_turn(footprints, draw, restarts=_RESTARTS)
     if found is None:
         raise UserError(
-            f"there is no free space in the workspace for the {len(footprints)} things of the "
-            "task: enlarge heightmap.rows and heightmap.cols"
+            f"there is no free space in the workspace for the task's {len(footprints)} objects and "
+            "fixtures: enlarge heightmap.rows and heightmap.cols"
         )
     return [drawn.X_W for drawn in found]
 
@@ -174,7 +174,7 @@ def draw_in_turn(
     """Draws places one after another, and starts over if there is none for an item.
 
     Args:
-        items: to place, in drawing order.
+        items: what to place, in drawing order.
         draw: returns a place for an item, given the places of earlier items; None if there is none.
         restarts: largest number of attempts.
 

@@ -151,7 +151,7 @@ class TaskConfig:
 
         Args:
             grid: the workspace. Drawn poses are in it, and on the table.
-            seed: of all draws.
+            seed: the seed of all draws.
             base: base folder of relative paths.
 
         Raises:
@@ -200,9 +200,9 @@ class TaskConfig:
 
         Args:
             scene: the episode's.
-            index: of the object.
+            index: the index of the object.
             X_WB: final poses of all objects.
-            placement: of the object.
+            placement: the placement of the object.
             records: the episode's actions.
         """
         last = last_action_on(scene.objects[index].name, records)

@@ -142,7 +142,7 @@ def _placed(
     Args:
         choices: the same text at several sizes and rotations.
         free: the cells that the text may cover.
-        raster: of the cells.
+        raster: the raster of the cells.
         costs: the cost in metres of each position of the text's middle; infinite where forbidden.
     """
     blocked = np.pad(np.cumsum(np.cumsum(~free, axis=0), axis=1), ((1, 0), (1, 0)))

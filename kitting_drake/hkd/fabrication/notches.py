@@ -24,7 +24,8 @@ _SLIDES = tuple(sign * step for step in np.arange(0.0, 0.041, 0.004) for sign in
 _SHARES = (0.85, 1.15)
 """The allowed area of a notch outside its cavity, as a share of a half disc's."""
 _FINS = 1.6
-"""The allowed area of thin fins beside a notch, as a multiple of what two right corners give."""
+"""The allowed area of thin fins beside a notch, in multiples of the area that the test for fins
+finds at two right-angled corners."""
 _OVERLAP = 0.001
 """The overlap of a notch with its cavity, in metres, so that no thin skin is left between them."""
 
@@ -138,7 +139,7 @@ def _notch(cavity: Cavity, disc: CrossSection, radius: float, wall: float) -> Cr
     share = beside.area() / (math.pi * radius**2 / 2)
     if len(beside.decompose()) != 1 or not _SHARES[0] <= share <= _SHARES[1]:
         return None
-    # A morphological closing fills thin parts: a little at two right corners, more at fins.
+    # A morphological closing fills thin gaps: little at two right-angled corners, more beside fins.
     x_min, y_min, x_max, y_max = disc.bounds()
     near = CrossSection.square((x_max - x_min + 4 * wall, y_max - y_min + 4 * wall)).translate(
         (x_min - 2 * wall, y_min - 2 * wall)

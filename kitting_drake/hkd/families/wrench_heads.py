@@ -29,14 +29,14 @@ class Head:
     # - spike: a taper to align holes;
     # - bar: a handle or striking block across the end.
     kind: str = "open"
-    # The hexagon's size across flats. Other kinds have another size here:
+    # The hexagon's size across flats. For other kinds this field is another size:
     # - adjustable, pipe: the opening of the jaws;
     # - tail: the diameter of the hole;
     # - hook: the length of its nose;
     # - spike: its length;
     # - bar: its depth along the shank.
     size_mm: float = 17.0
-    # The head's diameter. Other kinds have another size here:
+    # The head's diameter. For other kinds this field is another size:
     # - adjustable, pipe: the width across the head;
     # - spike: the diameter of its foot;
     # - bar: its length.

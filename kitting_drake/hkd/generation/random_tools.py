@@ -68,8 +68,8 @@ def draw_tool(entries: Sequence[ToolEntry], rng: np.random.Generator, name: str)
 
     Args:
         entries: the designs to vary.
-        rng: for all draws.
-        name: of the tool.
+        rng: the random generator of all draws.
+        name: the name of the tool.
 
     Raises:
         UserError: no attempt gave a usable tool.

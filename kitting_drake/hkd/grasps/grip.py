@@ -38,10 +38,10 @@ def find_grip(triangles: Array, x: float, y: float, theta: float, length: float)
 
     Args:
         triangles: (n, 3, 3) the surface of a tool in its frame T.
-        x: of the middle of the pads in T.
+        x: x of the middle of the pads in T.
         y: the same.
         theta: the rotation of the hand about T's z, in radians; at zero the jaws close along y.
-        length: of the pads, perpendicular to the closing direction.
+        length: the length of the pads, perpendicular to the closing direction.
 
     Returns:
         The grip, or None if nothing is between the pads.

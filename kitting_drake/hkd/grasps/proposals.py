@@ -278,7 +278,7 @@ def _hold(
     `find_grip` measures only the distance between the pads; this also measures their contact.
 
     Args:
-        reach: of the tool.
+        reach: the reach of the tool.
         centre: the pads' middle is at the lower edge of this column.
         levels: the heights of the slices.
         touch: a pad touches the surface that lies less than this behind the foremost surface.

@@ -112,12 +112,12 @@ def _check_size(solid: Manifold) -> None:
     if height < THINNEST_MM:
         raise UserError(
             f"at a length of {length:.0f} mm it is {height:.1f} mm thick (the hand needs "
-            f"{THINNEST_MM:.0f} mm)"
+            f"at least {THINNEST_MM:.0f} mm)"
         )
     if height > HIGHEST_MM:
         raise UserError(
-            f"at a length of {length:.0f} mm it is {height:.0f} mm high at rest (a kit takes "
-            f"{HIGHEST_MM:.0f} mm)"
+            f"at a length of {length:.0f} mm it is {height:.0f} mm high at rest (a kit has room "
+            f"for {HIGHEST_MM:.0f} mm)"
         )
 
 
@@ -139,7 +139,7 @@ def _tool(
     if not proposals:
         raise UserError(
             f"at a length of {1e3 * length:.0f} mm the hand cannot hold it from above (the jaws "
-            f"take {1e3 * WIDEST:.0f} mm)"
+            f"hold at most {1e3 * WIDEST:.0f} mm)"
         )
     return Tool(
         directory=directory,

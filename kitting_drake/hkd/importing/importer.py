@@ -165,7 +165,7 @@ def _remove_abandoned(folder: Path) -> None:
 
 def _check_height(request: ImportRequest) -> None:
     if is_outline(request.mesh) and request.height_mm is None:
-        raise UserError(f"{request.mesh} is an outline: give its height by --height_mm")
+        raise UserError(f"{request.mesh} is an outline: give its height with --height_mm")
     if not is_outline(request.mesh) and request.height_mm is not None:
         raise UserError(f"--height_mm is for outlines (SVG, DXF), and {request.mesh} is a mesh")
 

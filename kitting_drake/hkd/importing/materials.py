@@ -33,8 +33,8 @@ def bodies_of(solid: Manifold, category: str, density: float | None = None) -> l
 
     Args:
         solid: in mm, with the working end toward +x.
-        category: of the tool.
-        density: of the whole tool, in kg/m^3; by default that of the category.
+        category: the category of the tool.
+        density: the density of the whole tool, in kg/m^3; by default that of the category.
     """
     if density is None and category in ("hammer", "screwdriver"):
         border = _border(solid, category)

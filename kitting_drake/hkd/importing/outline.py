@@ -54,7 +54,7 @@ def read_outline(path: Path) -> CrossSection:
     joined where their ends meet.
 
     Args:
-        path: of the drawing.
+        path: the path of the drawing.
 
     Raises:
         UserError: the file is missing or not a drawing, a curve is open, or the drawing is not the

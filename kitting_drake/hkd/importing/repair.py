@@ -25,7 +25,8 @@ NOMINAL_MM = 180.0
 
 # Vertices in the same cell of this grid are merged.
 _MERGE_MM = 1e-3
-# Bodies further apart than this are separate things; a thing below this share of volume is dirt.
+# Bodies further apart than this are separate objects. An object with less than this share of the
+# volume is dirt.
 _GAP_MM, _DIRT = 1.5, 0.02
 # The share of any of its three projections that a repaired mesh may lose.
 _LOST = 0.03

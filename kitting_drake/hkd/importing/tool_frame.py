@@ -12,11 +12,13 @@ from kitting_drake.hkd.tools.stable_pose import StablePose, stable_poses
 
 Array = NDArray[np.float64]
 
-# Stable poses whose centres of mass are this close to the lowest count as equal. The one with the
-# broadest support, rounded to this step, is chosen. Both are for a solid about 180 mm long.
+# For a solid about 180 mm long. Stable poses count as equally low if their centre of mass is less
+# than the first number higher than in the lowest pose. Of these, the pose with the broadest support
+# is chosen; supports are compared in steps of the second number.
 _EQUAL_HEIGHT_MM, _MARGIN_STEP_MM = 0.3, 0.5
-# The largest angle between the length and the axis of least inertia. Edges vote for directions: the
-# weight of a vote is a Gaussian of the angle between edge and direction, with this deviation.
+# The largest angle between the direction of the length and the axis of least inertia; and the
+# standard deviation of the votes. Each edge votes for all directions, with a weight that is a
+# Gaussian of the angle between edge and direction.
 _SIDEWAYS_DEG, _LIKE_DEG = 25.0, 6.0
 _END = 0.3
 """The share of the length that counts as an end."""
@@ -73,7 +75,7 @@ def size(solid: Manifold) -> Array:
 
 
 def _lowest_pose(vertices: Array, com: Array) -> StablePose:
-    """The stable pose with the lowest centre of mass; of equal ones, that with broadest support.
+    """The stable pose with the lowest centre of mass; of equally low ones, the broadest support.
 
     Raises:
         UserError: there is no stable pose.

@@ -144,7 +144,7 @@ def build_block(cavities: Sequence[Cavity], parameters: KitParameters) -> Manifo
 
     Args:
         cavities: the cavities to cut.
-        parameters: of the kit; their length and width are the block's.
+        parameters: the parameters of the kit; their length and width are the block's.
     """
     size = (parameters.length, parameters.width, parameters.height)
     block = Manifold.cube(size, True).translate((0, 0, parameters.height / 2))

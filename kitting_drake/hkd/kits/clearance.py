@@ -34,8 +34,8 @@ def measure_clearance(
     Args:
         block: the kit's, in frame K.
         tool: the tool to seat.
-        parameters: of the kit.
-        pose: of the seated tool; by default the slot of its category.
+        parameters: the parameters of the kit.
+        pose: the pose of the seated tool; by default the slot of its category.
 
     Raises:
         ValueError: the seated tool is not inside a cavity.

@@ -202,8 +202,8 @@ def kit_cavities(
 
     Args:
         tools: the kit's.
-        parameters: of the kit.
-        poses: of the seated tools; by default those of `layout_kit`.
+        parameters: the parameters of the kit.
+        poses: the poses of the seated tools; by default those of `layout_kit`.
 
     Raises:
         UserError: the tools do not fit; see `layout_kit`.

@@ -82,7 +82,7 @@ def measure_rotation(
 
     Args:
         triangles: (n, 3, 3) the surface in frame T, in metres.
-        order: of the symmetry; 2 is a half turn.
+        order: the order of the symmetry; 2 is a half turn.
         complete: compare the surfaces even if the outlines differ too much.
     """
     outline = footprint(triangles).scale((1e3, 1e3))

@@ -153,7 +153,7 @@ def merge_demonstrations(
     Args:
         path: the file; may be one of the sources.
         sources: pairs of a file and the seed of a demonstration in it.
-        origin: of the new file.
+        origin: the origin of the new file.
         rejected: the rejected seeds.
 
     Raises:

@@ -87,7 +87,7 @@ class LabelledImage:
         Args:
             index: 0 for the pick, 1 + i for other pick i.
             pixel: the centre of the crop, near that pick.
-            side: of the crop, odd, in pixels.
+            side: the side of the crop, odd, in pixels.
 
         Returns:
             (channels, side, side).
@@ -124,9 +124,9 @@ def make_action(
     Args:
         observation: o_t.
         pick: (row, col).
-        theta: of the gripper at the pick, in radians.
+        theta: the angle of the gripper at the pick, in radians.
         place: (row, col).
-        rotation: of the object from pick to place, in radians.
+        rotation: the rotation of the object from pick to place, in radians.
     """
     grid = observation.grid
     pick_x, pick_y = grid.to_world(pick)
@@ -217,7 +217,7 @@ def move(sample: LabelledImage, angle: float, shift: NDArray[np.float64]) -> Lab
 
     Args:
         sample: the sample.
-        angle: of the rotation about the image's centre, counter-clockwise, in radians.
+        angle: the angle of the rotation about the image's centre, counter-clockwise, in radians.
         shift: (row, col), in pixels.
     """
     return _moved(sample, Motion(sample.image, angle, np.asarray(shift, float)))
@@ -271,7 +271,7 @@ def augment(
 
     Args:
         sample: the sample.
-        random: for all draws.
+        random: the random generator of all draws.
         curvature: also draw curvatures (see `LabelledImage.curved_crop`), to learn pick angles from
             bent objects. Not in the paper.
         reflection: reflect every other sample first. Not in the paper.

@@ -35,7 +35,7 @@ def observed(image: Image, grid: PixelGrid) -> Observation:
 
     Args:
         image: (4, rows, cols). In an all-black image unseen pixels have been filled in.
-        grid: of the image.
+        grid: the pixel grid of the image.
     """
     valid = None if image[:3].any() else np.ones(image.shape[1:], bool)
     return Observation(image, grid, valid)  # type: ignore[arg-type]
@@ -68,8 +68,8 @@ def scenes(
     """Every observation of some demonstrations with something to pick.
 
     Args:
-        demonstrations: of an expert.
-        grid: of their observations.
+        demonstrations: the demonstrations of an expert.
+        grid: the pixel grid of their observations.
         later_picks_possible: whether the expert's later actions are already possible (see
             `Learning`).
     """

@@ -44,7 +44,7 @@ _NO_SCENE = (
     *("tries", "random_order", "distractors"),
     *("success_threshold", "position_threshold", "angle_threshold_deg"),
 )
-"""Task fields that do not affect the scene, except for distractors."""
+"""Task fields that do not affect the scene. (`distractors` adds boxes to it, but moves nothing.)"""
 
 
 @dataclass(frozen=True)

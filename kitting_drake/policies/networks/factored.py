@@ -206,7 +206,7 @@ class Networks(nn.Module):
         Args:
             sample: the training sample.
             pixels: the centres of the crops, near the pick and each of the other picks.
-            random: for all further draws.
+            random: the random generator of all further draws.
         """
         raise NotImplementedError
 
@@ -215,7 +215,7 @@ class Networks(nn.Module):
 
         Args:
             image: the observation.
-            random: for all draws.
+            random: the random generator of all draws.
         """
         raise NotImplementedError
 
@@ -225,7 +225,7 @@ class Networks(nn.Module):
         Args:
             sample: the training sample.
             pixel: the centre of the crop, near the pick.
-            seed: of all random draws.
+            seed: the seed of all random draws.
         """
         goal = sample.place_of(np.array(pixel, float))
         return place_loss(

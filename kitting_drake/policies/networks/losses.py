@@ -74,7 +74,8 @@ def log_odds(logits: Tensor, orientations: int = 1) -> Tensor:
     """The log-odds that there is something to pick, against the class "nothing to pick".
 
     Args:
-        logits: of all actions: (rows, cols), or (orientations, rows, cols) for a joint prediction.
+        logits: the logits of all actions, (rows, cols), or (orientations, rows, cols) if they are
+            predicted jointly.
         orientations: the number of orientations in `logits`; the odds are corrected for it.
     """
     return logits.flatten().logsumexp(0) - math.log(orientations) - NOTHING_LOGIT

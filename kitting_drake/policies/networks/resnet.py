@@ -50,7 +50,7 @@ class Bottleneck(nn.Module):
             channels_in: the number of input channels.
             width: the number of hidden channels.
             channels: the number of output channels.
-            stride: of the first convolution and of the shortcut.
+            stride: the stride of the first convolution and of the shortcut.
             identity: whether the shortcut is the input itself instead of a convolution.
             gain: a factor of the output's initial scale.
         """

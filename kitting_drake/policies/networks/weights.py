@@ -137,7 +137,7 @@ def load_networks(path: Path, compute_type: torch.dtype = torch.float32) -> Netw
 
     Args:
         path: a file that `save_weights` wrote.
-        compute_type: of the convolutions; the weights are cast to it once.
+        compute_type: the type of the convolutions; the weights are cast to it once.
 
     Raises:
         UserError: the file is unreadable or not a weights file, or its weights do not fit its
@@ -177,8 +177,8 @@ def load_trainable(
         path: a file that `save_weights` wrote.
         fresh_angle_at: N of the result. Its pick-angle network then has untrained weights, because
             its architecture may depend on N. None keeps the file's N and all its weights.
-        preset: of the result, whose U-nets must have the same size (`NetworkConfig.has_unets_of`).
-            None for the file's.
+        preset: the preset of the result. Its U-nets must have the same size
+            (`NetworkConfig.has_unets_of`). None keeps the file's.
 
     Raises:
         UserError: as `load_networks`.

@@ -134,11 +134,11 @@ class TrainingRun:
     ) -> None:
         """
         Args:
-            settings: of the run.
+            settings: the settings of the run.
             learned: the training data.
             held_out: the validation data, by which a checkpoint is chosen.
-            folder: of its files.
-            console: for progress.
+            folder: the folder of the run's files.
+            console: where to show progress.
             start: weights to start from; None for untrained ones.
 
         Raises:

@@ -77,10 +77,10 @@ class Trainer:
     ) -> None:
         """
         Args:
-            networks: to train.
-            seed: of all random draws.
+            networks: the networks to train.
+            seed: the seed of all random draws.
             steps: the total number of steps.
-            learning_rate: of Adam.
+            learning_rate: the learning rate of Adam.
             decay: let the learning rate decay to zero (`decayed`) instead of keeping it constant.
             curvature: see `augment`.
             reflection: see `augment`.

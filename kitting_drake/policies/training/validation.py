@@ -140,7 +140,7 @@ def mean_loss(networks: Networks, samples: Sequence[LabelledImage]) -> float:
     """The mean over samples of the sum of all losses, in nats.
 
     Args:
-        networks: of any method, for inference.
+        networks: the networks of any method, for inference.
         samples: at least one, prepared as for training.
     """
     values = [
@@ -158,7 +158,7 @@ def _stop_report(
     Args:
         present: the log-odds of scenes with something to pick.
         absent: the log-odds of final observations.
-        displacements: of the scenes, in mm.
+        displacements: the displacements of the scenes, in mm.
     """
     threshold = choose_stop_threshold(present, absent)
     assert threshold is not None

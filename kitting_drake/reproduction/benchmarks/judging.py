@@ -21,10 +21,10 @@ Array = NDArray[np.float64]
 _SPACING = 0.002
 """The distance between points of an outline, in metres."""
 _TOUCHED, _HELD = 4e-6, 2e-5
-"""A finger touches something if it overlaps with more than this, and holds what overlaps with more
-than this between the pads, in square metres."""
+"""Areas of overlap in square metres, seen from above. A finger touches an object if the two overlap
+by more than the first. The jaws hold an object if more than the second lies between the pads."""
 PLACE_OFF = 0.0035
-"""A place is right if 95 % of the outline lie this near to where they belong, in metres."""
+"""A place is right if 95 % of the outline lies this close to the outline at the goal, in metres."""
 
 
 def judge(action: PickPlaceAction, loose: Sequence[LooseTool]) -> str:
@@ -35,8 +35,8 @@ def judge(action: PickPlaceAction, loose: Sequence[LooseTool]) -> str:
         loose: the tools that belong into a cavity.
 
     Returns:
-        `right`, `no tool` (nothing that belongs into a cavity is picked), `grasp` (the hand cannot
-        hold it there), or `place`.
+        `right`, `no tool` (the action picks nothing that belongs into a cavity), `grasp` (the hand
+        cannot hold the tool there), or `place` (the place is wrong).
     """
     picked = _picked(action, loose)
     if picked is None:
@@ -53,7 +53,8 @@ def judge(action: PickPlaceAction, loose: Sequence[LooseTool]) -> str:
 
 
 def covering(action: PickPlaceAction, loose: Sequence[LooseTool]) -> list[PlanarPose]:
-    """Picks all over the tool that an action picks, so that a policy takes another one next."""
+    """Picks that cover the tool of an action. A policy that gets them as failed picks takes another
+    tool next."""
     picked = _picked(action, loose)
     if picked is None:
         return [action.pick]

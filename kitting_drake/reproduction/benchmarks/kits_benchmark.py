@@ -22,7 +22,7 @@ def benchmark_kits(count: int | None, console: Console) -> dict[str, Any]:
 
     Args:
         count: the number of kits of each split; None for all.
-        console: for progress.
+        console: where to show progress.
     """
     build_times, triangles, medians, minima = [], [], [], []
     chosen = [names for split in PAPER_SPLITS for names in toolsets(split)[:count]]

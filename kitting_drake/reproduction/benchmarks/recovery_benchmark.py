@@ -220,8 +220,8 @@ def benchmark_recovery(
     Args:
         chosen: the scenario with the tested policy.
         episodes: the number with each disturbance.
-        seed: of the first episode; the others follow.
-        console: for progress.
+        seed: the seed of the first episode; the others follow.
+        console: where to show progress.
 
     Returns:
         The counts, and a PNG with the frames of one episode per disturbance: the one that recovered

@@ -48,7 +48,7 @@ _RANDOM_VIEWS = 0.7
 _WITHOUT_KIT = 0.1
 """The share of scenes without a kit."""
 _DECISIONS = 3
-"""The most decisions of a policy in a scene; each avoids the tools of those before."""
+"""The most decisions of a policy in a scene; each avoids the tools of earlier decisions."""
 _BINS = 10
 _SHRINKAGE = 1e-3
 """The weight of the squared coefficients in the fit."""
@@ -62,7 +62,7 @@ class Judged:
     """`networks` or `shape_matching`."""
     scene: int
     verdict: str
-    """As of `judge`; `stop` if the policy did not act."""
+    """The result of `judge`; `stop` if the policy did not act."""
     evidence: Evidence
     cameras: int
     """Their number; zero for the default ones."""
@@ -140,7 +140,7 @@ def draw_judged(first_seed: int, count: int, weights: Path | None = None) -> Ite
     """Decides on scenes, and judges the decisions.
 
     Args:
-        first_seed: of the scenes.
+        first_seed: the seed of the first scene.
         count: the number of scenes.
         weights: of the networks; None for the generalist.
     """
@@ -184,7 +184,7 @@ def _scenes(first_seed: int) -> Iterator[DrawnScene]:
                 continue
             scene = replace(scene, noise=_draw_noise(rng))
             if rng.random() < _WITHOUT_KIT:
-                # The kit is the first body. Without it, nothing belongs anywhere.
+                # The kit is the first body. Without it, no tool has a goal.
                 scene = replace(scene, bodies=scene.bodies[1:], loose=())
             yield scene
         seed += 1
@@ -211,8 +211,7 @@ def _draw_noise(rng: np.random.Generator) -> SensorNoiseParameters:
 def fit(judged: list[Judged]) -> Reliability:
     """Fits the regression of one policy, and the threshold.
 
-    The threshold refuses as few right decisions as possible, such that at most 1 % of those that
-    are left are wrong.
+    The threshold is the lowest at which at most 1 % of the accepted decisions are wrong.
     """
     acted = [item for item in judged if item.verdict != "stop"]
     names = sorted(acted[0].evidence)

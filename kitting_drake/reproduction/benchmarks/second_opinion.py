@@ -54,9 +54,9 @@ def ask_mujoco(
 
     Args:
         placements: how many to compare.
-        seed: of the first episode.
+        seed: the seed of the first episode.
         orientations: those of a quantized oracle, which misses more often; None for the oracle.
-        console: for the progress bar.
+        console: where to show the progress bar.
 
     Returns:
         The record of `benchmark mujoco`: the share of equal verdicts, and each placement.

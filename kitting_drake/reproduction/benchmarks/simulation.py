@@ -34,8 +34,8 @@ def benchmark_simulation(episodes: int, seed: int, console: Console) -> dict[str
 
     Args:
         episodes: the number of episodes of each of the oracle and the learned policy.
-        seed: of the first episode; the others follow.
-        console: for progress.
+        seed: the seed of the first episode; the others follow.
+        console: where to show progress.
     """
     # Set before PyTorch is loaded: one thread, as for each worker of `evaluate`.
     os.environ["OMP_NUM_THREADS"] = "1"

@@ -40,7 +40,7 @@ def benchmark_networks(plan: Plan, console: Console) -> dict[str, Any]:
 
     Args:
         plan: what to measure.
-        console: for progress.
+        console: where to show progress.
 
     Raises:
         UserError: the demonstrations are unusable.

@@ -64,7 +64,7 @@ class Convolutions:
         """The total time of all calls.
 
         Args:
-            timings: of each function of `alone`.
+            timings: the timings of each function of `alone`.
         """
         return sum(count * timings[call].seconds for call, count in self.calls.items())
 

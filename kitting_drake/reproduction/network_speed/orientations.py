@@ -222,7 +222,7 @@ def growth(rows: list[dict[str, Any]], orientations: tuple[int, ...]) -> list[di
     """The cost at the largest N relative to that at the smallest.
 
     Args:
-        rows: from `measure_pick_angles` or `measure_decisions`.
+        rows: the rows of `measure_pick_angles` or `measure_decisions`.
         orientations: N.
 
     Returns:

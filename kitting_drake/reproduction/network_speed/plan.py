@@ -120,7 +120,7 @@ class SpeedSetup:
 
         Args:
             outlined: the networks, on the meta device.
-            operations: of one run.
+            operations: the number of operations of one run.
         """
         seconds = operations / (_EXPECTED_SHARE * self.peak[preferred_type()]["best"])
         if seconds > self.plan.budget:

@@ -58,7 +58,7 @@ def time_each(
 
     Args:
         functions: the functions.
-        device: on which they compute.
+        device: the device on which they compute.
         repeats: the number of timings of each, after warming up.
         budget: the time in seconds after which a function is not run again.
     """
@@ -111,9 +111,9 @@ def measure_peak(type_: torch.dtype, device: torch.device, *, side: int) -> dict
     """The machine's peak, in operations per second.
 
     Args:
-        type_: to compute in.
-        device: to compute on.
-        side: of the matrices; the convolution has an eighth as many channels.
+        type_: the type to compute in.
+        device: the device to compute on.
+        side: the side of the matrices; the convolution has an eighth as many channels.
 
     Returns:
         `matmul`, the rate of a product of large square matrices; `convolution`, that of a wide 3x3

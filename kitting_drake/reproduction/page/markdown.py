@@ -15,7 +15,7 @@ def markdown_table(
     """A table with an aligned source.
 
     Args:
-        headings: of the columns.
+        headings: the headings of the columns.
         rows: cells.
         left_columns: the number of leading columns that are aligned left; the others are aligned
             right.

@@ -53,12 +53,12 @@ def paired_difference(
 def mean_paired_difference(
     pairs: Sequence[tuple[Mapping[str, Any], Mapping[str, Any]]], rate: str
 ) -> Estimate | None:
-    """The mean over several pairs of runs of how much better the first of each pair is.
+    """How much better the first run of each pair is than the second, on average over the pairs.
 
     Episodes are resampled jointly over all runs, because they share their scenes.
 
     Args:
-        pairs: of summaries, as in `paired_difference`.
+        pairs: pairs of summaries, as in `paired_difference`.
         rate: `STRICT` or `OWN`.
 
     Returns:
@@ -92,7 +92,7 @@ def over_tools(outcomes: Sequence[Mapping[str, Any]], rate: str) -> Estimate | N
     This interval applies to other tools of the same kind, unlike intervals over objects.
 
     Args:
-        outcomes: of a summary.
+        outcomes: the outcomes of a summary.
         rate: `STRICT` or `OWN`.
 
     Returns:

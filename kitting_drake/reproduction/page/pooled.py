@@ -61,7 +61,7 @@ def shipped_policies() -> dict[str, Policy]:
     """The policies that need no training, by their names in tables."""
     return {
         "generalist": Learned(weights=""),
-        "of 100 demonstrations": load_scenario(SCENARIOS / "paper/kitting_unseen.yaml").policy,
+        "from 100 demonstrations": load_scenario(SCENARIOS / "paper/kitting_unseen.yaml").policy,
         "shape matching": ShapeMatching(),
     }
 

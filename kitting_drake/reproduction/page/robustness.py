@@ -20,7 +20,7 @@ _UNSEEN = SCENARIOS / "paper/kitting_unseen.yaml"
 _BEGIN, _END = "<!-- figures -->\n", "<!-- end of figures -->\n"
 _UNPERTURBED = "unperturbed"
 _COLUMNS = {
-    "so2": "of 100 demonstrations",
+    "so2": "from 100 demonstrations",
     "generalist": "generalist",
     "shape_matching": "shape matching",
 }

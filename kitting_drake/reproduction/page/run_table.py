@@ -50,8 +50,8 @@ def add_run(folder: Path, name: str, summary: Mapping[str, Any]) -> None:
     """Adds a run to both files, creating them if necessary.
 
     Args:
-        folder: of the files.
-        name: of the run.
+        folder: the folder of the files.
+        name: the name of the run.
         summary: from `evaluate`.
 
     Raises:

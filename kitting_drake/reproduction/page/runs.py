@@ -57,8 +57,8 @@ _HAND = (
     "planner.search.speed",
 )
 _EARLIER_HAND = "an earlier hand"
-"""The label of runs that lack these fields. That hand did not grip heavy objects more firmly, press
-or search in a spiral, and a grasp under 3 mm of width counted as failed."""
+"""The label of runs that lack these fields. In them the hand did not grip heavy objects more
+firmly, press objects down or search in a spiral. Grasps narrower than 3 mm counted as failed."""
 
 _MOST_SHOWN = 4
 """The most differences of one run that are listed; further ones are counted."""
@@ -118,10 +118,10 @@ class Run:
 
     @cached_property
     def departures(self) -> list[str]:
-        """The fields in which the run's scenario differs from the expected one, without the policy.
+        """Where the run's scenario differs from the expected one: its fields, without the policy.
 
-        Expected is the scenario of the paper's or the Ravens task of its kind. For any other task
-        it is the default scenario, and the task is not compared.
+        For a task of the paper, Ravens tasks included, the expected scenario is the project's own
+        for that task. For any other task it is the default scenario, and the task is not compared.
         """
         found = self.summary["resolved_scenario"]
         for task in PAPER_TASKS.values():

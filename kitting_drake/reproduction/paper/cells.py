@@ -19,10 +19,12 @@ ORIENTATIONS = (180, 36, 72, 120)
 """N of figure 6, in order of importance."""
 PRESET = "small"
 LEARNING_RATES = (1e-3, 3e-4, 3e-3)
-"""Those to try. Each baseline uses the best on validation scenes, the SO(2) method the first."""
+"""The learning rates to try. The SO(2) method uses the first one, and each baseline the one that is
+best on validation scenes."""
 VALIDATE_EVERY = 250
 _EARLIER_RELEASE = ("planner.release_clearance: 0.006", "planner.open_width: 0.08")
-"""Fields of older runs of Ravens tasks. Their jaws opened wider, and demonstrators differed."""
+"""Fields of older runs of Ravens tasks, in which the jaws opened wider and the demonstrators were
+others."""
 _NO_SEARCH = "planner: {search: {amplitude: 0.0, reach: 0.0}}"
 
 
@@ -95,9 +97,10 @@ TASKS = {
                 earlier=earlier,
             )
             # Palletizing has eighteen decisions per episode, so few episodes suffice for
-            # validation. Its many equally good places take more steps to learn.
-            # On the pyramid and align-box-corner a baseline underperforms at the learning rate of
-            # figure 6, so these tasks choose their own. Palletizing takes that of the pyramid.
+            # validation. It has many equally good places, which take more steps to learn.
+            # At the learning rate of figure 6, a baseline does worse on the pyramid and on
+            # align-box-corner. So these two tasks have their own learning rates. Palletizing has
+            # that of the pyramid.
             for name, scenario, episodes, steps, validation, rates_from, earlier in (
                 ("block_insertion", "BlockInsertion", 100, 1000, 24, "unseen", _EARLIER_RELEASE),
                 (
@@ -144,8 +147,8 @@ class Training:
     demonstrations: int
     seed: int = 0
     learning_rate: float | None = None
-    """None for the first of `LEARNING_RATES` (SO(2)) or the best one for `reference` (baselines).
-    """
+    """If None, the SO(2) method uses the first of `LEARNING_RATES`, and a baseline the best one for
+    its `reference`."""
     taken_only: bool = True
     """Whether only the taken action is a label, as in the paper."""
     rigid: bool = True
@@ -226,7 +229,7 @@ class Cell:
     end_at_success: bool = False
     """Whether the episode ends as soon as the task is done, as in the paper."""
     recover: bool = False
-    """Whether failed insertions are mended, with two actions per object."""
+    """Whether the policy corrects failed insertions, with two actions per object."""
     avoid_failed_picks: bool = False
     """Whether failed picks are avoided; not in the paper."""
 

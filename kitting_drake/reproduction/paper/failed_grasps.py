@@ -24,13 +24,13 @@ _MOST_ACTIONS = {
     "!PalletizingBoxes": 30,
     "!StackBlockPyramid": 12,
 }
-"""The most actions of an episode in runs that do not count the actions after a failed grasp. On any
-other task it is one per object."""
+"""The most actions of an episode, by task, for runs that do not count the actions after a failed
+grasp. On any other task it is one action per object."""
 
 
 @dataclass(frozen=True)
 class Changeable:
-    """The number of actions that the memory can have changed, and of all actions."""
+    """How many actions the memory of failed grasps can have changed, and how many there were."""
 
     at_least: int
     at_most: int
@@ -52,16 +52,18 @@ class Changeable:
 
 
 def changeable(summary: Mapping[str, Any]) -> Changeable:
-    """The actions after a failed grasp of their episode.
+    """Counts the actions that follow a failed grasp of the same episode, or bounds their number.
 
-    If a summary does not count them, bounds follow from F failed grasps in E episodes. At most
-    min(F, E) episodes have a failed grasp, and all but the first of each episode come after one.
-    The upper bound assumes that each of these episodes began with a failed grasp, and that these
-    are the episodes with the fewest placed objects, because each placed object took an action.
+    Newer summaries have this count. An older one has only the number of failed grasps, F, in E
+    episodes. At most n = min(F, E) of these episodes have a failed grasp. The bounds are:
+
+    - At least F - n: in each episode, every failed grasp after the first one counts.
+    - At most: all actions of n episodes but their first ones, which failed. These are the episodes
+      with the fewest placed objects, because each placed object of the others took an action.
 
     Args:
-        summary: from `evaluate`, of a learned policy. Without a count of actions, the task's
-            largest number is used.
+        summary: of a learned policy, from `evaluate`. If it does not count its actions, each
+            episode is assumed to have used as many as the task allows.
     """
     episodes = [item["objects"] for item in summary["outcomes"]]
     tag = summary["resolved_scenario"]["task"]["_tag"]

@@ -41,7 +41,7 @@ _STYLE = {
 }
 """Readable at half the size of the picture."""
 _TOP = 102.5
-"""The upper end of an axis of percents: a marker at 100 is whole."""
+"""The upper end of an axis in percent. It is above 100, so that a marker at 100 is not cut off."""
 
 
 def draw_figure_6(task: str, results: Mapping[str, Result]) -> bytes:

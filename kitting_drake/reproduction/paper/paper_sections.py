@@ -45,7 +45,7 @@ def paper_sections(
     """The sections of the page; none without results.
 
     Args:
-        results: of `cell_results`.
+        results: the results of `cell_results`.
         efficiency: the result of `benchmark networks`; None without one.
         to_run_again: the names of the cells whose runs are set aside.
     """
@@ -161,7 +161,7 @@ def fresh_tools(results: Sequence[Result], again: Collection[str] = ()) -> list[
     """The section on the ten fresh tools; nothing without a result on them.
 
     Args:
-        results: of `cell_results`.
+        results: the results of `cell_results`.
         again: the names of the cells whose runs are set aside.
     """
     by_name = {result.cell.name: result for result in results}

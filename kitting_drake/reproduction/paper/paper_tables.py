@@ -179,7 +179,7 @@ def _every_chance() -> list[Cell]:
             )
             for task in ("unseen", "stack_block_pyramid", "palletizing_boxes")
         ),
-        # All but the angle network are those of the paper's cell.
+        # The networks are those of the paper's cell, except for the pick-angle network.
         Training("unseen", "equivariant_transporter", 36, 100, angle_only=True, preset=MATCHED),
     ]
     return [

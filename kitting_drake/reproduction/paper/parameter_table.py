@@ -20,15 +20,19 @@ _TEXT = f"""\
 Trainable parameters at N = {ORIENTATIONS}, counted from the networks. The Transporter's one picking
 network, f_pick, stands under alpha. The last column is the share of the original's parameters.
 
-The preset `matched` is `small` with larger baselines: the Transporter keeps as large a share of the
-original's parameters as ours does, and the Equivariant Transporter's pick-angle network (beta) has
-as many as that of ours.
+The presets `small` and `matched` differ in the baselines only. In `matched`, the Transporter keeps
+the same share of its original's parameters as our method does. The pick-angle network (beta) of the
+Equivariant Transporter has as many parameters as ours.
 
-The originals are counted as follows. Our method: the authors' code. The Equivariant Transporter:
-the paper gives 4.54 M for alpha, and phi and psi are the same U-net; the authors' pick-angle
-network has 0.90 M at N = {ORIENTATIONS}. The Transporter: the paper does not count it, so its
-original is the preset `paper` here, with the published widths of ResNets of 43 layers. The shares
-of both baselines refer to the preset `paper`.
+The parameters of the originals come from these sources:
+
+- Our method: the authors' code.
+- The Equivariant Transporter: the paper gives 4.54 M for alpha, and phi and psi are the same U-net.
+  The authors' pick-angle network has 0.90 M at N = {ORIENTATIONS}.
+- The Transporter: the paper does not count its parameters. Our preset `paper` has the published
+  widths of its ResNets of 43 layers.
+
+For both baselines the last column compares with the preset `paper`.
 """
 
 

@@ -59,7 +59,7 @@ def protocol_sections(
     """The sections of the protocol; none without results.
 
     Args:
-        results: of `cell_results`.
+        results: the results of `cell_results`.
         rates: the cost of each learning rate of each baseline on validation scenes.
         to_run_again: the names of the cells whose runs are set aside.
     """

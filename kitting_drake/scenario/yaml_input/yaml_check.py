@@ -14,7 +14,7 @@ from typing import Any
 
 from kitting_drake.scenario.yaml_input.drake_configs import struct_fields
 
-_NAMES = {float: "a number", int: "a whole number", bool: "true or false", str: "a text"}
+_NAMES = {float: "a number", int: "a whole number", bool: "true or false", str: "a string"}
 
 
 def check_yaml(schema: Any, value: Any, where: str) -> None:
@@ -120,7 +120,7 @@ def _check_scalar(schema: Any, value: Any, where: str) -> None:
 
 
 def _float_advice(value: Any) -> str:
-    """Says how to write a number that YAML takes for a text, such as 1e-3."""
+    """Says how to write a number that YAML reads as a string, such as 1e-3."""
     try:
         number = float(value) if isinstance(value, str) else math.nan
     except ValueError:

@@ -94,7 +94,7 @@ def _check_names(node: yaml.Node | None) -> None:
             if key.tag == _MERGE:
                 continue
             if key.tag != _TEXT:
-                raise ValueError(f"the name on line {line} must be a text")
+                raise ValueError(f"the name on line {line} must be a string")
             if key.value == "_tag":
                 raise ValueError(
                     f"'_tag' on line {line} is not a field: write !Name before the value"

@@ -53,9 +53,9 @@ def find_cause(
 
     Args:
         scene: the episode's.
-        index: of the tool among the scene's objects.
+        index: the index of the tool among the scene's objects.
         X_WB: its final pose.
-        placement: of the tool, with respect to the goal assigned to it.
+        placement: the placement of the tool, with respect to the goal assigned to it.
         records: the episode's actions.
     """
     item = scene.objects[index]

@@ -290,7 +290,7 @@ def kitting_scene(
         X_WKit: its pose.
         X_WTools: the initial pose of each tool.
         order: the expert's order, as indices into the kit's tools.
-        threshold: of ADD-S, in metres.
+        threshold: the threshold of ADD-S, in metres.
     """
     tools = [kit.tools[index] for index in order]
     names = _unique_names(tools)

@@ -124,7 +124,7 @@ def draw_poses(
         grid: the workspace.
         spacing: least distance between any two, in metres.
         yaw_range_deg: rotations are drawn within plus or minus this, in degrees.
-        rng: for all draws.
+        rng: the random generator of all draws.
 
     Returns:
         X_WKit, and X_WT of each tool.
@@ -216,7 +216,7 @@ def draw_boxes(
         tools: the tools.
         X_WTools: their poses.
         grid: the workspace.
-        rng: for all draws.
+        rng: the random generator of all draws.
     """
     room = _rectangle((grid.x_min, grid.y_min), (grid.x_max, grid.y_max)) ^ _rectangle(*TABLE)
     placed = [_Footprint(block_outline(kit), CrossSection(), CrossSection()).moved(_pose(X_WKit))]

@@ -181,7 +181,7 @@ BAD = {
     "boolean for a number": ("A: {random_seed: true}", ["random_seed", "whole"]),
     "number for a boolean": ("A: {sleep: {enabled: 1}}", ["sleep.enabled", "true or false"]),
     "text for a list": ("A: {task: !Kitting {tools: hammer}}", ["task.tools", "list"]),
-    "number in a list of texts": ("A: {task: !Kitting {tools: [1]}}", ["task.tools[0]", "text"]),
+    "number among strings": ("A: {task: !Kitting {tools: [1]}}", ["task.tools[0]", "string"]),
     "list for a mapping": ("A: {cameras: [1]}", ["cameras", "mapping"]),
     "text for a section": ("A: {policy: Oracle}", ["policy", "mapping"]),
     # Values.

@@ -46,7 +46,7 @@ def test_the_hand_needs_free_space_at_a_grasp():
 
 def test_a_workspace_without_free_space_raises():
     footprints = [Footprint((rectangle(0.1, 0.1),))] * 3
-    with pytest.raises(UserError, match=r"no free space .* 3 things"):
+    with pytest.raises(UserError, match=r"no free space .* 3 objects"):
         draw_poses(footprints, grid=PixelGrid(rows=40, cols=80), rng=np.random.default_rng(0))
     # The workspace is beside the table.
     with pytest.raises(UserError, match="no free space"):

@@ -137,7 +137,7 @@ def expand_kernel(weights: Tensor, basis: Tensor, dtype: torch.dtype = torch.flo
     Args:
         weights: (out fields, in fields, D).
         basis: (D, out channels, in channels, size, size), from one field to one field.
-        dtype: of the kernel.
+        dtype: the type of the kernel.
 
     Returns:
         (out fields * out channels, in fields * in channels, size, size), in channels_last.
