@@ -8,15 +8,15 @@ from typing import Any
 
 from kitting_drake.real_camera.calibrations.calibration import Calibration
 from kitting_drake.real_camera.checking.table_check import check_table
-from kitting_drake.real_camera.deciders import BenchPolicy, Choice
-from kitting_drake.real_camera.frames import Frame
-from kitting_drake.real_camera.views import (
+from kitting_drake.real_camera.checking.views import (
     CalibrationError,
     check_frames,
     check_views,
     observe,
     seen_share,
 )
+from kitting_drake.real_camera.deciders import BenchPolicy, Choice
+from kitting_drake.real_camera.frames import Frame
 from systems.motion_heights import MotionHeights, motion_heights
 from systems.pick_place_parameters import PickPlaceParameters
 from systems.signals import (

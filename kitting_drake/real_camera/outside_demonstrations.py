@@ -28,9 +28,9 @@ from kitting_drake.real_camera.calibrations.calibration import (
     calibration_record,
 )
 from kitting_drake.real_camera.checking.table_check import check_table
+from kitting_drake.real_camera.checking.views import check_frames, check_views, observe
 from kitting_drake.real_camera.frames import Frame, read_frames
 from kitting_drake.real_camera.step_actions import StepAction, read_action
-from kitting_drake.real_camera.views import check_frames, check_views, observe
 from systems.signals import Observation
 
 TASK = "bench"

@@ -16,8 +16,13 @@ from kitting_drake.common.errors import UserError
 from kitting_drake.real_camera.calibrations.calibration import BenchCamera, Calibration, with_poses
 from kitting_drake.real_camera.checking.kit_block import Block, SeenBlock, see_block
 from kitting_drake.real_camera.checking.planes import FARTHEST, Plane, fit_plane, table_points
+from kitting_drake.real_camera.checking.views import (
+    check_frames,
+    check_views,
+    make_views,
+    table_depth,
+)
 from kitting_drake.real_camera.frames import Frame
-from kitting_drake.real_camera.views import check_frames, check_views, make_views, table_depth
 from systems.heightmap import project
 from systems.signals import PixelGrid
 

@@ -13,8 +13,8 @@ from scipy.spatial.transform import Rotation
 
 from kitting_drake.real_camera.calibrations.calibration import BenchCamera, Calibration
 from kitting_drake.real_camera.checking.planes import Plane, find_planes, refit
+from kitting_drake.real_camera.checking.views import CalibrationError
 from kitting_drake.real_camera.frames import Frame
-from kitting_drake.real_camera.views import CalibrationError
 from systems.signals import PixelGrid
 
 Array = NDArray[np.float64]
