@@ -58,7 +58,7 @@ def covering(action: PickPlaceAction, loose: Sequence[LooseTool]) -> list[Planar
     picked = _picked(action, loose)
     if picked is None:
         return [action.pick]
-    points = _outline(picked.tool.footprint, picked.X_WT)[::3]
+    points = _outline(picked.tool.footprint, picked.X_WT)[::6]
     return [action.pick, *(PlanarPose(float(x), float(y)) for x, y in points)]
 
 

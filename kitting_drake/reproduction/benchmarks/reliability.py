@@ -45,10 +45,16 @@ _CAMERAS = {
 }
 _RANDOM_VIEWS = 0.7
 """The share of scenes with random cameras; the others have the default cameras."""
+_EVERY = 4
+"""Of the scenes of a seed, which share their tools, every fourth is used."""
 _WITHOUT_KIT = 0.1
 """The share of scenes without a kit."""
 _DECISIONS = 3
 """The most decisions of a policy in a scene; each avoids the tools of earlier decisions."""
+_MOST_WRONG = 0.02
+"""The largest share of wrong decisions among those above the threshold."""
+_FOLDS, _FOLD = 6, 10
+"""The number of parts in cross-validation, and how many successive scenes stay together."""
 _BINS = 10
 _SHRINKAGE = 1e-3
 """The weight of the squared coefficients in the fit."""
@@ -116,24 +122,45 @@ def summarize_all(
         fitted: the folder for `confidence.json`, fitted to these decisions; None to use the one
             that is fitted already.
     """
-    found = {
-        policy: fit([item for item in judged if item.policy == policy])
-        if fitted
-        else read_reliability(policy, weights)
-        for policy in POLICIES
-    }
+    found, summaries = {}, {}
+    for policy in POLICIES:
+        chosen = [item for item in judged if item.policy == policy]
+        if fitted is None:
+            found[policy] = read_reliability(policy, weights)
+            confidences = [_confidence(found[policy], item) for item in chosen]
+        else:
+            confidences = _cross_validated(chosen)
+            found[policy] = replace(fit(chosen), threshold=_threshold(chosen, confidences))
+        summaries[policy] = _by_cameras(chosen, confidences, found[policy].threshold)
     if fitted is not None:
         write_json(fitted / "confidence.json", {k: asdict(item) for k, item in found.items()})
-    return {policy: _by_cameras(judged, policy, item) for policy, item in found.items()}
-
-
-def _by_cameras(judged: list[Judged], policy: str, reliability: Reliability) -> dict[str, Any]:
-    summaries: dict[str, Any] = {"threshold": reliability.threshold}
-    for name, cameras in _CAMERAS.items():
-        chosen = [item for item in judged if item.policy == policy and item.cameras in cameras]
-        if any(item.verdict != "stop" for item in chosen):
-            summaries[name] = asdict(summarize(chosen, reliability))
     return summaries
+
+
+def _by_cameras(judged: list[Judged], confidences: list[float], threshold: float) -> dict[str, Any]:
+    summaries: dict[str, Any] = {"threshold": threshold}
+    for name, cameras in _CAMERAS.items():
+        chosen = [k for k, item in enumerate(judged) if item.cameras in cameras]
+        if any(judged[k].verdict != "stop" for k in chosen):
+            part = [judged[k] for k in chosen], [confidences[k] for k in chosen]
+            summaries[name] = asdict(summarize(*part, threshold))
+    return summaries
+
+
+def _confidence(reliability: Reliability, item: Judged) -> float:
+    return reliability.confidence(item.evidence) if item.evidence else 0.0
+
+
+def _cross_validated(judged: list[Judged]) -> list[float]:
+    """The confidences of decisions, each by a regression that was fitted to the other scenes."""
+    confidences = [0.0] * len(judged)
+    for fold in range(_FOLDS):
+        inside = [item.scene // _FOLD % _FOLDS == fold for item in judged]
+        others = [item for item, out in zip(judged, inside, strict=True) if not out]
+        reliability = fit(others)
+        for k in np.flatnonzero(inside):
+            confidences[k] = _confidence(reliability, judged[k])
+    return confidences
 
 
 def draw_judged(first_seed: int, count: int, weights: Path | None = None) -> Iterator[Judged]:
@@ -177,12 +204,12 @@ def _scenes(first_seed: int) -> Iterator[DrawnScene]:
     seed = first_seed
     while True:
         rng = np.random.default_rng([seed, 3])
-        for number, scene in enumerate(
-            draw_scenes(seed, random_views=rng.random() < _RANDOM_VIEWS)
-        ):
-            if number % 2:
+        for number, scene in enumerate(draw_scenes(seed, random_views=True)):
+            if number % _EVERY:
                 continue
             scene = replace(scene, noise=_draw_noise(rng))
+            if rng.random() >= _RANDOM_VIEWS:
+                scene = replace(scene, cameras=dict(Scenario().cameras))
             if rng.random() < _WITHOUT_KIT:
                 # The kit is the first body. Without it, no tool has a goal.
                 scene = replace(scene, bodies=scene.bodies[1:], loose=())
@@ -209,10 +236,7 @@ def _draw_noise(rng: np.random.Generator) -> SensorNoiseParameters:
 
 
 def fit(judged: list[Judged]) -> Reliability:
-    """Fits the regression of one policy, and the threshold.
-
-    The threshold is the lowest at which at most 1 % of the accepted decisions are wrong.
-    """
+    """Fits the regression of one policy; its threshold is 0."""
     acted = [item for item in judged if item.verdict != "stop"]
     names = sorted(acted[0].evidence)
     facts = np.array([[item.evidence[name] for name in names] for item in acted])
@@ -232,17 +256,18 @@ def fit(judged: list[Judged]) -> Reliability:
     weights = found[:-1] / spread
     constant = float(found[-1] - weights @ middle)
     plain = dict(zip(names, map(float, weights), strict=True)) | {"": constant}
-    reliability = Reliability(plain, 0.0)
-    confidence = np.array([reliability.confidence(item.evidence) for item in acted])
-    return replace(reliability, threshold=_threshold(confidence, right))
+    return Reliability(plain, 0.0)
 
 
-def _threshold(confidence: Array, right: NDArray[np.bool_]) -> float:
-    """The least threshold above which at most 1 % are wrong."""
+def _threshold(judged: list[Judged], confidences: list[float]) -> float:
+    """The least threshold above which at most `_MOST_WRONG` of the decisions are wrong."""
+    acted = [k for k, item in enumerate(judged) if item.verdict != "stop"]
+    confidence = np.array([confidences[k] for k in acted])
+    right = np.array([judged[k].verdict == "right" for k in acted])
     order = np.argsort(-confidence)
     wrong = np.cumsum(~right[order]) / np.arange(1, len(order) + 1)
-    good = np.flatnonzero(wrong <= 0.01)
-    return float(confidence[order[good[-1]]]) if len(good) else 1.0
+    good = np.flatnonzero(wrong <= _MOST_WRONG)
+    return round(float(confidence[order[good[-1]]]), 3) if len(good) else 1.0
 
 
 @dataclass(frozen=True)
@@ -262,11 +287,19 @@ class ReliabilitySummary:
     """Mean confidence, share of right decisions and number of decisions."""
 
 
-def summarize(judged: list[Judged], reliability: Reliability) -> ReliabilitySummary:
-    """Summarizes decisions by a regression that was fitted to others."""
-    acted = [item for item in judged if item.verdict != "stop"]
-    right = np.array([item.verdict == "right" for item in acted])
-    confidence = np.array([reliability.confidence(item.evidence) for item in acted])
+def summarize(
+    judged: list[Judged], confidences: list[float], threshold: float
+) -> ReliabilitySummary:
+    """Summarizes decisions.
+
+    Args:
+        judged: the decisions, of one policy.
+        confidences: those of the decisions, from 0 to 1.
+        threshold: the least confidence with which to act.
+    """
+    acted = [k for k, item in enumerate(judged) if item.verdict != "stop"]
+    right = np.array([judged[k].verdict == "right" for k in acted])
+    confidence = np.array([confidences[k] for k in acted])
     bins = []
     for low in np.arange(_BINS) / _BINS:
         inside = (confidence >= low) & (confidence < low + 1 / _BINS + (low > 0.89))
@@ -275,7 +308,7 @@ def summarize(judged: list[Judged], reliability: Reliability) -> ReliabilitySumm
                 (float(confidence[inside].mean()), float(right[inside].mean()), int(inside.sum()))
             )
     error = sum(abs(mean - share) * count for mean, share, count in bins) / len(acted)
-    answered = confidence >= reliability.threshold
+    answered = confidence >= threshold
     return ReliabilitySummary(
         decisions=len(acted),
         right=float(right.mean()),
