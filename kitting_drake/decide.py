@@ -17,6 +17,7 @@ from kitting_drake.common.errors import MachineError, UserError
 from kitting_drake.common.files import require_folder, write_atomically, write_json
 from kitting_drake.real_camera import (
     BenchPolicy,
+    Calibration,
     ShapeMatching,
     decide,
     load_policy,
@@ -27,10 +28,14 @@ from kitting_drake.real_camera.checking.check import check_cameras
 from kitting_drake.real_camera.checking.kit_block import Block
 from kitting_drake.real_camera.checking.report import (
     CHECK_FILES,
+    FOUND_FILES,
     print_check,
     print_decision,
+    print_found,
     save_check,
+    save_found,
 )
+from kitting_drake.real_camera.checking.table_finding import find_table
 from kitting_drake.real_camera.markers.board_calibration import calibrate_cameras
 from kitting_drake.real_camera.markers.board_report import (
     clear_earlier,
@@ -38,6 +43,7 @@ from kitting_drake.real_camera.markers.board_report import (
     save_calibrated,
 )
 from kitting_drake.real_camera.markers.boards import read_board
+from kitting_drake.real_camera.views import check_frames, observe
 from systems.signals import PixelGrid
 
 
@@ -49,14 +55,16 @@ def main() -> int:
     if arguments.calibrate is not None:
         _calibrate(arguments, folder, console)
         return 0
+    if arguments.find:
+        _find(arguments, folder, console)
+        return 0
     action, picture = folder / "action.json", folder / "decision.png"
     # Remove stale files: after a failure, nobody must use the action of an earlier frame.
     earlier = [folder / name for name in CHECK_FILES] if arguments.check else [action, picture]
     if not arguments.check:
         _check_decided(action)
     for path in earlier:
-        if path.resolve() != arguments.camera.resolve():
-            _remove(path)
+        _remove(path, arguments.camera)
     calibration = read_calibration(arguments.camera, table_height=arguments.table_height)
     block = _block(arguments, calibration.grid)
     frames = read_frames(arguments.frames, calibration, time=arguments.time)
@@ -87,7 +95,11 @@ def main() -> int:
 
 
 def _calibrate(arguments: argparse.Namespace, folder: Path, console: Console) -> None:
-    for flag, given in (("--check", arguments.check), ("--time", arguments.time is not None)):
+    for flag, given in (
+        ("--check", arguments.check),
+        ("--find", arguments.find),
+        ("--time", arguments.time is not None),
+    ):
         if given:
             raise UserError(f"{flag} cannot be combined with --calibrate")
     path = clear_earlier(folder, arguments.camera)
@@ -97,6 +109,21 @@ def _calibrate(arguments: argparse.Namespace, folder: Path, console: Console) ->
     save_calibrated(path, calibrated)
     print_calibrated(console, calibrated)
     console.print(f"calibration: {path}", highlight=False, markup=False)
+
+
+def _find(arguments: argparse.Namespace, folder: Path, console: Console) -> None:
+    for flag, given in (("--check", arguments.check), ("--kit_size_mm", arguments.kit_size_mm)):
+        if given:
+            raise UserError(f"{flag} cannot be combined with --find")
+    for name in FOUND_FILES:
+        _remove(folder / name, arguments.camera)
+    calibration = read_calibration(arguments.camera)
+    frames = read_frames(arguments.frames, calibration, time=arguments.time)
+    found = find_table(frames, calibration)
+    around = Calibration(found.calibration.cameras, found.around)
+    save_found(folder, found, observe(check_frames(frames, around), around))
+    print_found(console, found)
+    console.print(f"files: {folder}/", highlight=False, markup=False)
 
 
 def _check_decided(action: Path) -> None:
@@ -111,9 +138,11 @@ def _check_decided(action: Path) -> None:
         raise UserError(f"{action} was not written by decide: give another --output")
 
 
-def _remove(path: Path) -> None:
+def _remove(path: Path, camera: Path) -> None:
+    """Removes a file of an earlier run, unless it is the given calibration."""
     try:
-        path.unlink(missing_ok=True)
+        if path.resolve() != camera.resolve():
+            path.unlink(missing_ok=True)
     except OSError as error:
         raise MachineError(f"cannot remove {path}: {error.strerror}") from error
 
@@ -176,6 +205,11 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument(
         "--check", action="store_true", help="check the calibration by frames of the empty table"
+    )
+    parser.add_argument(
+        "--find",
+        action="store_true",
+        help="propose the table's height, the workspace and the region by one frame",
     )
     parser.add_argument(
         "--kit_size_mm",

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import io
 import math
+import textwrap
 from typing import TYPE_CHECKING
 
 import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.patches import Patch
 from numpy.typing import NDArray
 
 from systems.signals import Observation, PickPlaceAction, PixelGrid
@@ -20,12 +22,25 @@ if TYPE_CHECKING:
 _JAWS = 0.04
 """Half the opening of the jaws in the drawing, in metres."""
 _PICK, _PLACE = "#e4572e", "#1b998b"
+_UNSEEN, _STRIPE = (0.80, 0.72, 0.86), (0.68, 0.57, 0.78)
+"""Stripes of pixels that a camera looks at but has no depth of."""
+_OUTSIDE = (0.90, 0.90, 0.90)
+"""Pixels that no camera looks at."""
+_STRIPES = 6
+"""Width of a pair of stripes, in pixels."""
+_MOST_LETTERS = 150
+"""Of a line of the title."""
 
 
-def draw_decision(observation: Observation, decision: Decision) -> bytes:
+def draw_decision(observation: Observation, decision: Decision, *, title: str = "") -> bytes:
     """Draws the observation with both gripper poses, and the three maps.
 
     If the policy stops, no gripper is drawn, and the maps are those of the rejected action.
+
+    Args:
+        observation: the observation decided on.
+        decision: of a learned policy.
+        title: of the picture; empty for the kind of action.
 
     Returns:
         A PNG.
@@ -35,9 +50,7 @@ def draw_decision(observation: Observation, decision: Decision) -> bytes:
         [["colour", "height"], ["pick", "place"], ["angle", "angle"]],
         height_ratios=[1, 1, 0.45],
     )
-    title = _title(decision)
-    if title:
-        figure.suptitle(title, x=0.01, horizontalalignment="left", fontsize=11)
+    _entitle(figure, title or _title(decision))
     colours = np.clip(observation.rgb.transpose(1, 2, 0), 0, 1)
     _draw_observation(axes["colour"], axes["height"], observation)
     if not decision.stop:
@@ -48,8 +61,13 @@ def draw_decision(observation: Observation, decision: Decision) -> bytes:
     return _as_png(figure)
 
 
-def draw_action(observation: Observation, action: PickPlaceAction) -> bytes:
+def draw_action(observation: Observation, action: PickPlaceAction, *, title: str = "") -> bytes:
     """Draws the observation with both gripper poses, for a decision without maps.
+
+    Args:
+        observation: the observation decided on.
+        action: the decision.
+        title: of the picture; empty for the kind of action.
 
     Returns:
         A PNG.
@@ -57,9 +75,7 @@ def draw_action(observation: Observation, action: PickPlaceAction) -> bytes:
     figure = Figure(figsize=(12, 3.5), layout="constrained", dpi=110)
     axes = figure.subplot_mosaic([["colour", "height"]])
     said = "press" if action.press else "pick and place"
-    figure.suptitle(
-        "stop" if action.stop else said, x=0.01, horizontalalignment="left", fontsize=11
-    )
+    _entitle(figure, title or ("stop" if action.stop else said))
     _draw_observation(axes["colour"], axes["height"], observation)
     if not action.stop:
         for axis in axes.values():
@@ -99,11 +115,43 @@ def _as_png(figure: Figure) -> bytes:
     return buffer.getvalue()
 
 
+def _entitle(figure: Figure, title: str) -> None:
+    if title:
+        wrapped = textwrap.fill(title, _MOST_LETTERS)
+        figure.suptitle(wrapped, x=0.01, horizontalalignment="left", fontsize=11)
+
+
 def _draw_observation(colour: Axes, height: Axes, observation: Observation) -> None:
     _show(colour, "observation: colour")
     colour.imshow(np.clip(observation.rgb.transpose(1, 2, 0), 0, 1))
     _show(height, "observation: height")
     height.imshow(1e3 * observation.height, cmap="viridis")
+    outside = ~observation.in_view & ~observation.valid
+    unseen = ~observation.valid & ~outside
+    rows, cols = np.indices(unseen.shape)
+    striped = (rows + cols) % _STRIPES < _STRIPES // 2
+    cover = np.zeros((*unseen.shape, 4))
+    for where, tint in ((unseen, _UNSEEN), (unseen & striped, _STRIPE), (outside, _OUTSIDE)):
+        cover[where] = (*tint, 1.0)
+    for axes in (colour, height):
+        axes.imshow(cover, interpolation="nearest")
+    handles = []
+    if unseen.any():
+        handles.append(
+            Patch(facecolor=_UNSEEN, edgecolor=_STRIPE, hatch="/////", lw=0, label="not seen")
+        )
+    if outside.any():
+        handles.append(Patch(facecolor=_OUTSIDE, edgecolor="0.7", lw=0.5, label="out of view"))
+    if handles:
+        height.legend(
+            handles=handles,
+            loc="lower right",
+            bbox_to_anchor=(1.0, 1.0),
+            borderaxespad=0.2,
+            ncols=2,
+            frameon=False,
+            fontsize=9,
+        )
 
 
 def _title(decision: Decision) -> str:

@@ -24,6 +24,14 @@ from systems.pick_place_parameters import PickPlaceParameters
 from systems.signals import Observation, PickPlaceAction, PixelGrid, PlanarPose
 
 
+Draw = Callable[[str], bytes]
+"""Draws a decision with a title as a PNG."""
+
+
+def _draw_nothing(title: str) -> bytes:
+    return b""
+
+
 @dataclass(frozen=True)
 class Choice:
     """A policy's choice: an action with its confidence."""
@@ -33,8 +41,8 @@ class Choice:
     """From 0 to 1; None for a rule of geometry without confidence."""
     parts: dict[str, float] = field(default_factory=dict)
     """The networks' certainty, by part; see `certainty`."""
-    draw: Callable[[], bytes] = bytes
-    """Draws the decision as a PNG."""
+    draw: Draw = _draw_nothing
+    """Draws the decision as a PNG; an empty title stands for the action's own word."""
     reason: str = ""
     """A sentence on why it acts or stops; empty if the action's own word says enough."""
 
@@ -42,7 +50,7 @@ class Choice:
     def stopped(cls, observation: Observation) -> Choice:
         """A stop without a decision."""
         action = PickPlaceAction(stop=True)
-        return cls(action, None, draw=lambda: _draw_action(observation, action))
+        return cls(action, None, draw=partial(_draw_action, observation, action))
 
 
 class BenchPolicy(Protocol):
@@ -114,11 +122,11 @@ class _Networks:
             return Choice(action, None, draw=partial(_draw_action, observation, action))
         parts = certainty(decision, observation.grid.resolution)
 
-        def draw() -> bytes:
+        def draw(title: str) -> bytes:
             # Import matplotlib lazily.
             from kitting_drake.evaluation.decision_figure import draw_decision
 
-            return draw_decision(observation, decision)
+            return draw_decision(observation, decision, title=title)
 
         if decision.kit_seen is False:
             stop = PickPlaceAction(stop=True, reason="no kit seen")
@@ -136,7 +144,7 @@ def _if_sure(
     least: float | None,
     action: PickPlaceAction,
     parts: dict[str, float],
-    draw: Callable[[], bytes],
+    draw: Draw,
 ) -> Choice:
     """The action with its confidence, or a stop if that is too low."""
     confidence = reliability.confidence(evidence)
@@ -184,7 +192,7 @@ def load_policy(
     return _Networks(loaded, least_confidence)
 
 
-def _draw_action(observation: Observation, action: PickPlaceAction) -> bytes:
+def _draw_action(observation: Observation, action: PickPlaceAction, title: str) -> bytes:
     from kitting_drake.evaluation.decision_figure import draw_action
 
-    return draw_action(observation, action)
+    return draw_action(observation, action, title=title)

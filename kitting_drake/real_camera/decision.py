@@ -114,7 +114,7 @@ class BenchDecision:
 
     def draw(self) -> bytes:
         """Draws the decision as a PNG."""
-        return self.choice.draw()
+        return self.choice.draw(f"{self.result}: {self.reason}" if self.reason else self.result)
 
 
 def decide(

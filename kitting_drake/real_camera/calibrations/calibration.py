@@ -37,6 +37,11 @@ from kitting_drake.real_camera.calibrations.lens_files import (
 )
 from kitting_drake.real_camera.calibrations.pose_values import pose_of_value
 from kitting_drake.real_camera.calibrations.poses import POSE_FIELDS, has_pose, read_pose
+from kitting_drake.real_camera.calibrations.table_outline import (
+    OUTLINE_FIELDS,
+    TableOutline,
+    read_outline,
+)
 from kitting_drake.real_camera.calibrations.yaml_values import (
     matrix,
     number,
@@ -57,7 +62,7 @@ _LENS_FILES = ("camera_info", "intrinsics")
 """Fields that name a file of intrinsics."""
 _FILE_FIELDS = (*_LENS_FILES, "stream", "resolution")
 _COLOR_FIELDS = (*_FILE_FIELDS, *OWN_INTRINSICS, "depth_to_color")
-_BENCH_FIELDS = ("table_height", "workspace")
+_BENCH_FIELDS = ("table_height", "workspace", *OUTLINE_FIELDS)
 _GRID_FIELDS = ("x_min", "y_min", "resolution", "rows", "cols", "max_height")
 
 
@@ -118,6 +123,29 @@ class Calibration:
     cameras: tuple[BenchCamera, ...]
     grid: PixelGrid
     """The pixels of o_t; `z_min` is the height of the table in the base frame."""
+    outline: TableOutline = dataclasses.field(default_factory=TableOutline)
+    """What of the workspace is table."""
+
+    @cached_property
+    def region(self) -> NDArray[np.bool_] | None:
+        """(rows, cols): the pixels of o_t that are table; None if all are.
+
+        Raises:
+            UserError: the outline misses the workspace.
+        """
+        return self.outline.inside(self.grid)
+
+    def contains(self, xy: Array) -> NDArray[np.bool_]:
+        """(...): whether points (..., 2) in the base frame are in the workspace and over the table,
+        at any height."""
+        inside = self.grid.contains(xy)
+        if self.region is None:
+            return inside
+        inside = np.array(inside)
+        row, col = np.moveaxis(np.rint(self.grid.to_pixel(xy[inside])).astype(int), -1, 0)
+        row, col = np.clip(row, 0, self.grid.rows - 1), np.clip(col, 0, self.grid.cols - 1)
+        inside[inside] = self.region[row, col]
+        return inside
 
     @property
     def table_height(self) -> float:
@@ -166,7 +194,8 @@ def read_calibration(
         height = number(content.get("table_height", 0.0), f"{path}: table_height")
     else:
         height = number(table_height, "table_height")
-    return Calibration(cameras, _read_grid(path, content.get("workspace", {}), height))
+    grid = _read_grid(path, content.get("workspace", {}), height)
+    return Calibration(cameras, grid, read_outline(content, path, grid))
 
 
 def _read_camera(
@@ -289,6 +318,7 @@ def calibration_record(calibration: Calibration) -> dict[str, Any]:
             **{key: getattr(grid, key) for key in ("x_min", "y_min", "resolution", "rows", "cols")},
             "max_height": float(grid.z_max - grid.z_min),
         },
+        **calibration.outline.record(),
         "cameras": {},
     }
     for camera in calibration.cameras:
@@ -328,7 +358,10 @@ def calibration_digest(calibration: Calibration) -> str:
     Numbers are rounded to nine decimals, because the same rotation as a quaternion and as a matrix
     may differ in the last bit.
     """
-    text = json.dumps(_rounded(calibration_record(calibration)), sort_keys=True)
+    record = _rounded(calibration_record(calibration))
+    if calibration.outline.mask:
+        record["region_mask"] = calibration.outline.mask_digest()
+    text = json.dumps(record, sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 

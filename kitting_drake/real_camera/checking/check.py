@@ -110,24 +110,25 @@ def check_cameras(
     maps: dict[str, NDArray[np.float32]] = {}
     for camera in calibration.cameras:
         frame = frames[camera.name]
-        points = table_points(frame, camera, camera.X_BC, grid)
+        points = table_points(frame, camera, camera.X_BC, calibration)
         plane = _plane_of(points, camera)
         poses[camera.name] = levelled(camera.X_BC, plane, grid)
         seen = None
         if block is not None:
-            level = table_points(frame, camera, poses[camera.name], grid)
+            level = table_points(frame, camera, poses[camera.name], calibration)
             seen = see_block(level, camera, poses[camera.name], block, grid.z_min, plane.noise)
-        found[camera.name] = _check_camera(camera, points, plane, grid, seen)
+        found[camera.name] = _check_camera(camera, points, plane, calibration, seen)
         maps[camera.name] = _height_map(points, grid)
     if block is not None:
         seen_by = {name: item.block for name, item in found.items() if item.block is not None}
         poses = _aligned(poses, seen_by, block)
     # Include heights below the table, which o_t itself would clip.
-    fused = project(views, dataclasses.replace(grid, z_min=grid.z_min - FARTHEST))
+    deep = dataclasses.replace(grid, z_min=grid.z_min - FARTHEST)
+    fused = project(views, deep, calibration.region)
     maps[""] = np.where(fused.valid, fused.height - FARTHEST, np.nan).astype(np.float32)
     return Check(
         cameras=found,
-        together=_check_together(maps[""], found, grid),
+        together=_check_together(maps[""], calibration),
         disagreements=_disagreements(maps),
         block_shifts={
             (one, other): a.middle - b.middle
@@ -170,9 +171,14 @@ def _plane_of(points: Array, camera: BenchCamera) -> Plane:
 
 
 def _check_camera(
-    camera: BenchCamera, points: Array, plane: Plane, grid: PixelGrid, block: SeenBlock | None
+    camera: BenchCamera,
+    points: Array,
+    plane: Plane,
+    calibration: Calibration,
+    block: SeenBlock | None,
 ) -> CameraCheck:
-    expected = table_depth(camera, camera.X_BC, grid)
+    grid = calibration.grid
+    expected = table_depth(camera, calibration)
     towards = np.isfinite(expected)
     has_point = np.isfinite(points[..., 2])
     holes = 1 - (has_point & towards).sum() / max(towards.sum(), 1)
@@ -211,13 +217,12 @@ def _height_map(points: Array, grid: PixelGrid) -> NDArray[np.float32]:
     return mean.reshape(grid.shape).astype(np.float32)
 
 
-def _check_together(
-    height: NDArray[np.float32], found: dict[str, CameraCheck], grid: PixelGrid
-) -> TableCheck:
+def _check_together(height: NDArray[np.float32], calibration: Calibration) -> TableCheck:
+    grid, region = calibration.grid, calibration.region
     rows, cols = np.nonzero(np.isfinite(height))
     xy = grid.to_world(np.column_stack([rows, cols]))
     plane = fit_plane(np.column_stack([xy, height[rows, cols]]))
-    seen = len(rows) / height.size
+    seen = len(rows) / (height.size if region is None else int(region.sum()))
     return TableCheck(plane.tilt, float(plane.height(middle_of(grid))), plane.noise, 1 - seen)
 
 

@@ -9,9 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from kitting_drake.real_camera.calibrations.calibration import BenchCamera
+from kitting_drake.real_camera.calibrations.calibration import BenchCamera, Calibration
 from kitting_drake.real_camera.frames import Frame
-from systems.signals import PixelGrid
 
 Array = NDArray[np.float64]
 
@@ -65,9 +64,9 @@ class Plane:
         return Rotation.from_rotvec([*-self.tilt, 0.0]).as_matrix()
 
 
-def table_points(frame: Frame, camera: BenchCamera, X_BC: Array, grid: PixelGrid) -> Array:
+def table_points(frame: Frame, camera: BenchCamera, X_BC: Array, calibration: Calibration) -> Array:
     """(height, width, 3): the point of each pixel in the base frame; NaN without depth, outside the
-    workspace, or far from the table."""
+    workspace's table, or far above or below it."""
     rays, depth = camera.rays, frame.depth
     with np.errstate(invalid="ignore"):
         good = np.isfinite(depth) & (depth >= rays.min_depth) & (depth <= rays.max_depth)
@@ -75,7 +74,8 @@ def table_points(frame: Frame, camera: BenchCamera, X_BC: Array, grid: PixelGrid
     p_C = np.stack([rays.u * z, rays.v * z, z], axis=-1)
     p_B = p_C @ X_BC[:3, :3].T + X_BC[:3, 3]
     with np.errstate(invalid="ignore"):
-        inside = grid.contains(p_B[..., :2]) & (np.abs(p_B[..., 2] - grid.z_min) < FARTHEST)
+        inside = calibration.contains(p_B[..., :2])
+        inside &= np.abs(p_B[..., 2] - calibration.table_height) < FARTHEST
     return np.where(inside[..., None], p_B, np.nan)
 
 

@@ -14,9 +14,13 @@ from kitting_drake.common.files import write_atomically, write_json
 from kitting_drake.real_camera.calibrations.calibration import write_calibration
 from kitting_drake.real_camera.checking.check import Check, TableCheck
 from kitting_drake.real_camera.checking.meaning import BAD, GOOD, findings, offset, scales
+from kitting_drake.real_camera.checking.table_finding import MOST_TILT, FoundTable
+from systems.signals import Observation
 
 CHECK_FILES = ("check.json", "corrected.yaml", "check.png")
 """The files that `save_check` writes."""
+FOUND_FILES = ("found.yaml", "found.png")
+"""The files that `save_found` writes."""
 _WELL_SEEN = 0.9
 """A smaller seen share of the workspace in view is reported."""
 
@@ -118,6 +122,53 @@ def print_check(console: Console, check: Check) -> None:
         last = line.who
     console.print(table, highlight=False)
     console.print("corrected poses: corrected.yaml", highlight=False)
+
+
+def save_found(folder: Path, found: FoundTable, observation: Observation) -> None:
+    """Writes the proposed calibration `found.yaml`, and the picture `found.png`.
+
+    Args:
+        folder: for the files.
+        found: the proposal.
+        observation: of `found.around`.
+
+    Raises:
+        UserError: a file cannot be written.
+    """
+    # Import matplotlib lazily.
+    from kitting_drake.evaluation.found_figure import draw_found
+
+    calibration, picture = (folder / name for name in FOUND_FILES)
+    write_calibration(calibration, found.calibration)
+    outline = found.calibration.outline
+    drawn = draw_found(observation, found.calibration.grid, outline.region, outline.ignore)
+    write_atomically(picture, drawn)
+
+
+def print_found(console: Console, found: FoundTable) -> None:
+    """Prints the table, the workspace and the region, a line each."""
+    grid, outline = found.calibration.grid, found.calibration.outline
+    x, y = found.extent
+    region = found.calibration.region
+    covered = 100.0 if region is None else 100 * float(region.mean())
+    lines = [
+        f"table      z {grid.z_min:.4f} m, tilted by {math.degrees(found.tilt):.2f} degrees, "
+        f"{x:.2f} x {y:.2f} m in view",
+        f"workspace  x {grid.x_min:.3f} to {grid.x_max:.3f}, y {grid.y_min:+.3f} to "
+        f"{grid.y_max:+.3f} m, {grid.rows} x {grid.cols} pixels: {found.chosen}",
+        f"region     {len(outline.region)} corners, {covered:.0f} % of the workspace"
+        + (f"; {len(outline.ignore)} tall things are ignored" if outline.ignore else ""),
+    ]
+    for line in lines:
+        console.print(line, highlight=False, markup=False, soft_wrap=True)
+    if found.tilt > MOST_TILT:
+        console.print(
+            f"The table is tilted by more than {math.degrees(MOST_TILT):.1f} degrees, which decide "
+            "refuses: correct the pose with --check first",
+            highlight=False,
+            style="yellow",
+            soft_wrap=True,
+        )
 
 
 def _table(table: TableCheck) -> dict[str, Any]:

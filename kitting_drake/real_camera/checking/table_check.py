@@ -77,11 +77,11 @@ def check_table(frames: Mapping[str, Frame], calibration: Calibration) -> list[s
     warnings = []
     for camera in calibration.cameras:
         depth = frames[camera.name].depth
-        fit = _fit(camera, camera.X_BC, depth, calibration.grid)
+        fit = _fit(camera, camera.X_BC, depth, calibration)
         if fit is None or fit.is_refused:
-            hint = _hint(camera, depth, calibration.grid, fit)
+            hint = _hint(camera, depth, calibration, fit)
             raise CalibrationError(f"camera {camera.name} {_said(fit, calibration.grid)}: {hint}")
-        if _is_range(camera, depth, calibration.grid, fit):
+        if _is_range(camera, depth, calibration, fit):
             raise CalibrationError(
                 f"camera {camera.name} sees a curved table: its depths are distances from the "
                 "camera; give depths along the optical axis"
@@ -106,10 +106,11 @@ def _said(fit: TableFit | None, grid: PixelGrid) -> str:
 
 
 def _fit(
-    camera: BenchCamera, X_BC: Array, depth: NDArray[np.float32], grid: PixelGrid
+    camera: BenchCamera, X_BC: Array, depth: NDArray[np.float32], calibration: Calibration
 ) -> TableFit | None:
     """The plane that is most probably the table; None if there is none."""
-    points = _points(camera, X_BC, depth, grid)
+    grid = calibration.grid
+    points = _points(camera, X_BC, depth, calibration)
     expected = refit(points, np.array([0.0, 0.0, grid.z_min]))
     local = None if expected is None else _measured(expected, points, grid)
     if local is not None and (local.is_refused or local.support < _LEAST):
@@ -134,8 +135,10 @@ def _measured(plane: Plane, points: Array, grid: PixelGrid) -> TableFit:
     return TableFit(off, float(np.linalg.norm(plane.tilt)), plane, int(near.sum()))
 
 
-def _points(camera: BenchCamera, X_BC: Array, depth: NDArray[np.float32], grid: PixelGrid) -> Array:
-    """(n, 3): points in the base frame above or below the workspace, not far from the table."""
+def _points(
+    camera: BenchCamera, X_BC: Array, depth: NDArray[np.float32], calibration: Calibration
+) -> Array:
+    """(n, 3): points in the base frame above or below the workspace's table, not far from it."""
     rays = camera.rays
     u, v = (item[::_STEP, ::_STEP] for item in np.broadcast_arrays(rays.u, rays.v))
     z = depth[::_STEP, ::_STEP].astype(float)
@@ -144,18 +147,19 @@ def _points(camera: BenchCamera, X_BC: Array, depth: NDArray[np.float32], grid: 
     z = z[good]
     p_C = np.stack([u[good] * z, v[good] * z, z], axis=-1)
     p_B = p_C @ X_BC[:3, :3].T + X_BC[:3, 3]
-    inside = grid.contains(p_B[:, :2]) & (np.abs(p_B[:, 2] - grid.z_min) < _FARTHEST)
+    near = np.abs(p_B[:, 2] - calibration.table_height) < _FARTHEST
+    inside = calibration.contains(p_B[:, :2]) & near
     return np.asarray(p_B[inside])
 
 
 def _is_range(
-    camera: BenchCamera, depth: NDArray[np.float32], grid: PixelGrid, fit: TableFit
+    camera: BenchCamera, depth: NDArray[np.float32], calibration: Calibration, fit: TableFit
 ) -> bool:
     """Whether the table is flat only if depths are taken for distances from the camera."""
     if fit.plane.noise < _FLAT / 4:
         return False
-    points = _points(camera, camera.X_BC, _as_depth(camera, depth), grid)
-    other = refit(points, np.array([0.0, 0.0, grid.z_min])) or next(
+    points = _points(camera, camera.X_BC, _as_depth(camera, depth), calibration)
+    other = refit(points, np.array([0.0, 0.0, calibration.table_height])) or next(
         iter(find_planes(points, 1)), None
     )
     return other is not None and other.noise < _CURVED * fit.plane.noise
@@ -168,17 +172,18 @@ def _as_depth(camera: BenchCamera, distance: NDArray[np.float32]) -> NDArray[np.
 
 
 def _hint(
-    camera: BenchCamera, depth: NDArray[np.float32], grid: PixelGrid, fit: TableFit | None
+    camera: BenchCamera, depth: NDArray[np.float32], calibration: Calibration, fit: TableFit | None
 ) -> str:
     """What would agree with the frame."""
     for text, other, X_BC, image in _suppositions(camera, depth):
-        found = _fit(other, X_BC, image, grid)
+        found = _fit(other, X_BC, image, calibration)
         if found is not None and not found.is_doubtful:
             return text
     if fit is None:
         return "check the pose and table_height"
     if fit.tilt <= _REFUSED_TILT:
-        return f"table_height: {grid.z_min + fit.off:.3f} would agree, or correct the camera's pose"
+        height = calibration.table_height + fit.off
+        return f"table_height: {height:.3f} would agree, or correct the camera's pose"
     about_x, about_y = np.degrees(fit.plane.tilt)
     return (
         f"the rotation of the pose is wrong by {about_x:.1f} degrees about base x and "

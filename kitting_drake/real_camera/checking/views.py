@@ -64,7 +64,7 @@ def check_views(frames: Mapping[str, Frame], calibration: Calibration) -> None:
     """
     for camera in calibration.cameras:
         _check_pose(camera, calibration.grid)
-        _check_depth(frames[camera.name], camera, calibration.grid)
+        _check_depth(frames[camera.name], camera, calibration)
 
 
 def observe(frames: Mapping[str, Frame], calibration: Calibration) -> Observation:
@@ -74,7 +74,7 @@ def observe(frames: Mapping[str, Frame], calibration: Calibration) -> Observatio
         frames: as `check_frames` returns them.
         calibration: of the cameras.
     """
-    return project(make_views(frames, calibration), calibration.grid)
+    return project(make_views(frames, calibration), calibration.grid, calibration.region)
 
 
 def make_views(frames: Mapping[str, Frame], calibration: Calibration) -> list[View]:
@@ -87,17 +87,19 @@ def make_views(frames: Mapping[str, Frame], calibration: Calibration) -> list[Vi
 
 
 def table_depth(
-    camera: BenchCamera, X_BC: Array, grid: PixelGrid, step: int = 1
+    camera: BenchCamera, calibration: Calibration, step: int = 1
 ) -> NDArray[np.float64]:
     """(height, width): the depth of the table by the camera's pose alone, for pixels that look at
-    the workspace, in metres; NaN elsewhere. Only every `step`th pixel along rows and columns."""
+    the workspace's table, in metres; NaN elsewhere. Only every `step`th pixel along rows and
+    columns."""
+    X_BC, grid = camera.X_BC, calibration.grid
     rays = camera.rays
     u, v = (item[::step, ::step] for item in np.broadcast_arrays(rays.u, rays.v))
     directions = np.stack([u, v, np.ones_like(u)], axis=-1) @ X_BC[:3, :3].T
     with np.errstate(divide="ignore", invalid="ignore"):
         depth = (grid.z_min - X_BC[2, 3]) / directions[..., 2]
         xy = X_BC[:2, 3] + depth[..., None] * directions[..., :2]
-        seen = (depth > 0) & grid.contains(xy)
+        seen = (depth > 0) & calibration.contains(xy)
     return np.where(seen, depth, np.nan)
 
 
@@ -158,8 +160,8 @@ def _check_pose(camera: BenchCamera, grid: PixelGrid) -> None:
     )
 
 
-def _check_depth(frame: Frame, camera: BenchCamera, grid: PixelGrid) -> None:
-    expected = table_depth(camera, camera.X_BC, grid, _STEP)
+def _check_depth(frame: Frame, camera: BenchCamera, calibration: Calibration) -> None:
+    expected = table_depth(camera, calibration, _STEP)
     towards = np.isfinite(expected)
     if not towards.any():
         raise CalibrationError(
