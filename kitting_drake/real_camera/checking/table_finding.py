@@ -17,8 +17,8 @@ from kitting_drake.real_camera.calibrations.calibration import Calibration
 from kitting_drake.real_camera.calibrations.table_outline import Polygon, TableOutline
 from kitting_drake.real_camera.checking.outline_tracing import disc, largest_part, trace
 from kitting_drake.real_camera.checking.planes import Plane, find_planes
+from kitting_drake.real_camera.checking.views import check_frames
 from kitting_drake.real_camera.frames import Frame
-from kitting_drake.real_camera.views import check_frames
 from systems.signals import PixelGrid
 
 Array = NDArray[np.float64]
