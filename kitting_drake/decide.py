@@ -36,6 +36,7 @@ from kitting_drake.real_camera.checking.report import (
     save_found,
 )
 from kitting_drake.real_camera.checking.table_finding import find_table
+from kitting_drake.real_camera.checking.views import check_frames, observe
 from kitting_drake.real_camera.markers.board_calibration import calibrate_cameras
 from kitting_drake.real_camera.markers.board_report import (
     clear_earlier,
@@ -43,7 +44,6 @@ from kitting_drake.real_camera.markers.board_report import (
     save_calibrated,
 )
 from kitting_drake.real_camera.markers.boards import read_board
-from kitting_drake.real_camera.views import check_frames, observe
 from systems.signals import PixelGrid
 
 

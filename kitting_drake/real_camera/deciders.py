@@ -23,7 +23,6 @@ from kitting_drake.policies.matching.evidence import Evidence
 from systems.pick_place_parameters import PickPlaceParameters
 from systems.signals import Observation, PickPlaceAction, PixelGrid, PlanarPose
 
-
 Draw = Callable[[str], bytes]
 """Draws a decision with a title as a PNG."""
 

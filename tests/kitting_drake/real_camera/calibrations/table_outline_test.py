@@ -19,8 +19,8 @@ from kitting_drake.real_camera.calibrations.calibration import (
 from kitting_drake.real_camera.calibrations.table_outline import TableOutline
 from kitting_drake.real_camera.checking.check import check_cameras
 from kitting_drake.real_camera.checking.table_check import check_table
+from kitting_drake.real_camera.checking.views import check_frames, observe, seen_share
 from kitting_drake.real_camera.frames import Frame
-from kitting_drake.real_camera.views import check_frames, observe, seen_share
 from kitting_drake.scenario.schema import Scenario
 from tests.kitting_drake.real_camera.frames import calibration_of, cast
 
