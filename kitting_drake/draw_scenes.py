@@ -59,7 +59,7 @@ def main() -> int:
     require_rendering()
     folder = require_folder(arguments.output)
     with alone_in(folder):
-        drawn_by = _drawn_by()
+        drawn_by = _drawn_by(arguments.random_views)
         identity = {"seed": arguments.seed, **drawn_by}
         claim_folder(folder, "settings.json", identity, of="set of scenes")
         path = folder / "scenes.h5"
@@ -76,10 +76,11 @@ def main() -> int:
     return 0
 
 
-def _drawn_by() -> dict[str, str]:
-    """The versions, sources and designs that decide how the scene of a seed looks."""
+def _drawn_by(random_views: bool = False) -> dict[str, str]:
+    """The versions, sources, designs and cameras that decide how the scene of a seed looks."""
+    views = {"cameras": "random"} if random_views else {}
     catalogue = hashlib.sha256(_CATALOGUE.read_bytes()).hexdigest()[:16]
-    return {**versions(), "code": source_digest(*_DRAWN_BY), "catalogue": catalogue}
+    return {**versions(), "code": source_digest(*_DRAWN_BY), "catalogue": catalogue, **views}
 
 
 class _Parts:
@@ -188,7 +189,7 @@ def _draw_part(path: Path, seed: int, drawn_by: dict[str, str]) -> int:
     scenes: list[StaticScene] = []
     counter = path.with_suffix(_DRAWN)
     try:
-        for scene in draw_batch(seed):
+        for scene in draw_batch(seed, random_views="cameras" in drawn_by):
             scenes.append(scene)
             counter.write_text(str(len(scenes)))
     finally:
@@ -223,6 +224,11 @@ def _parse() -> argparse.Namespace:
     )
     parser.add_argument("--scenes", type=count_type, default=3000, help="number of scenes (3000)")
     parser.add_argument("--seed", type=seed_type, default=0, help="seed of all draws (0)")
+    parser.add_argument(
+        "--random_views",
+        action="store_true",
+        help="one to three cameras at random poses, instead of the default ones",
+    )
     parser.add_argument(
         "--workers", type=count_type, help=f"number of parallel processes ({os.cpu_count()})"
     )

@@ -62,7 +62,7 @@ _LENS_FILES = ("camera_info", "intrinsics")
 """Fields that name a file of intrinsics."""
 _FILE_FIELDS = (*_LENS_FILES, "stream", "resolution")
 _COLOR_FIELDS = (*_FILE_FIELDS, *OWN_INTRINSICS, "depth_to_color")
-_BENCH_FIELDS = ("table_height", "workspace", *OUTLINE_FIELDS)
+_BENCH_FIELDS = ("table_height", "workspace", "verified", *OUTLINE_FIELDS)
 _GRID_FIELDS = ("x_min", "y_min", "resolution", "rows", "cols", "max_height")
 
 
@@ -125,6 +125,9 @@ class Calibration:
     """The pixels of o_t; `z_min` is the height of the table in the base frame."""
     outline: TableOutline = dataclasses.field(default_factory=TableOutline)
     """What of the workspace is table."""
+    verified: bool = False
+    """Whether x, y, yaw and the image's orientation were checked, which a bare table does not
+    show."""
 
     @cached_property
     def region(self) -> NDArray[np.bool_] | None:
@@ -195,7 +198,10 @@ def read_calibration(
     else:
         height = number(table_height, "table_height")
     grid = _read_grid(path, content.get("workspace", {}), height)
-    return Calibration(cameras, grid, read_outline(content, path, grid))
+    verified = content.get("verified", False)
+    if not isinstance(verified, bool):
+        raise UserError(f"{path}: verified must be true or false, not {verified!r}")
+    return Calibration(cameras, grid, read_outline(content, path, grid), verified)
 
 
 def _read_camera(
@@ -319,6 +325,7 @@ def calibration_record(calibration: Calibration) -> dict[str, Any]:
             "max_height": float(grid.z_max - grid.z_min),
         },
         **calibration.outline.record(),
+        **({"verified": True} if calibration.verified else {}),
         "cameras": {},
     }
     for camera in calibration.cameras:
@@ -358,7 +365,7 @@ def calibration_digest(calibration: Calibration) -> str:
     Numbers are rounded to nine decimals, because the same rotation as a quaternion and as a matrix
     may differ in the last bit.
     """
-    record = _rounded(calibration_record(calibration))
+    record = _rounded(calibration_record(dataclasses.replace(calibration, verified=False)))
     if calibration.outline.mask:
         record["region_mask"] = calibration.outline.mask_digest()
     text = json.dumps(record, sort_keys=True)

@@ -138,9 +138,16 @@ def check_cameras(
             if a is not None and b is not None
         },
         block=block,
-        corrected=with_poses(calibration, poses),
+        corrected=dataclasses.replace(
+            with_poses(calibration, poses), verified=calibration.verified or _is_verified(block)
+        ),
         heights=maps,
     )
+
+
+def _is_verified(block: Block | None) -> bool:
+    """Whether the cameras now see a block where it is known to be."""
+    return block is not None and block.pose is not None
 
 
 def levelled(X_BC: Array, plane: Plane, grid: PixelGrid) -> Array:

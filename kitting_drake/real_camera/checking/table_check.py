@@ -19,6 +19,11 @@ from systems.signals import PixelGrid
 
 Array = NDArray[np.float64]
 
+UNVERIFIED = (
+    "a table shows neither x, y and yaw of a camera nor a mirrored image: check them once with a "
+    "block (--check --kit_size_mm --kit_pose) or markers (--calibrate); these write verified: true"
+)
+"""The warning of a calibration that was not verified."""
 _REFUSED_OFF, _REFUSED_TILT = 0.010, math.radians(1.3)
 """A table that is farther off, in metres, or tilted by more cannot be picked from."""
 _WARNED_OFF, _WARNED_TILT = 0.005, math.radians(0.65)
@@ -74,7 +79,7 @@ def check_table(frames: Mapping[str, Frame], calibration: Calibration) -> list[s
         CalibrationError: a camera sees the table more than 10 mm off, or tilted by more than 1.3
             degrees, or sees no table. The error says what would agree.
     """
-    warnings = []
+    warnings = [] if calibration.verified else [UNVERIFIED]
     for camera in calibration.cameras:
         depth = frames[camera.name].depth
         fit = _fit(camera, camera.X_BC, depth, calibration)

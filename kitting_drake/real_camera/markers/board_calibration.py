@@ -75,7 +75,9 @@ def calibrate_cameras(board: Board, paths: Sequence[Path], lenses: Calibration) 
     grid = calibration.grid
     height = grid.z_max - grid.z_min
     grid = dataclasses.replace(grid, z_min=board.table_height, z_max=board.table_height + height)
-    return Calibrated(board, tuple(results), dataclasses.replace(calibration, grid=grid))
+    return Calibrated(
+        board, tuple(results), dataclasses.replace(calibration, grid=grid, verified=True)
+    )
 
 
 def _images(paths: Sequence[Path], camera: BenchCamera, lenses: Calibration) -> list[Path]:

@@ -69,7 +69,9 @@ def scenes(tools: list[RandomTool]) -> list[StaticScene]:
         pytest.skip("images cannot be rendered here")
     rng = np.random.default_rng(1)
     kit = static_scenes._draw_kit(tools, rng)
-    return [static_scenes._draw_scene(kit, tools, (), rng, seed) for seed in range(6)]
+    return [
+        static_scenes._draw_scene(kit, tools, (), rng, seed).static_scene() for seed in range(6)
+    ]
 
 
 def test_picks_are_on_tools_and_places_are_in_cavities(scenes: list[StaticScene]):
@@ -95,7 +97,7 @@ def test_an_action_moves_the_tool_into_a_cavity_of_its_shape(tools: list[RandomT
     kit = static_scenes._draw_kit(tools, rng)
     free = 0
     while not free:
-        scene = static_scenes._draw_scene(kit, tools, (), rng, 0)
+        scene = static_scenes._draw_scene(kit, tools, (), rng, 0).static_scene()
         if len(np.unique(scene.actions[:, 0])) < 2:
             continue
         height = scene.image[3]

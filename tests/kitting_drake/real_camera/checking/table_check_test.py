@@ -9,7 +9,11 @@ from scipy.spatial.transform import Rotation
 
 from kitting_drake.real_camera import Calibration, Frame, ShapeMatching, decide
 from kitting_drake.real_camera.checking.kit_block import Block
-from kitting_drake.real_camera.checking.table_check import CalibrationError, check_table
+from kitting_drake.real_camera.checking.table_check import (
+    UNVERIFIED,
+    CalibrationError,
+    check_table,
+)
 from kitting_drake.scenario.cameras import LookAt
 from kitting_drake.scenario.schema import Scenario
 from tests.kitting_drake.real_camera.frames import calibration_of, cast
@@ -111,18 +115,18 @@ def test_moderate_errors_are_no_reason(frames: Frames, seed: int):
     axis, aside = random.standard_normal((2, 3))
     X = turned(0.24, (axis / np.linalg.norm(axis)).tolist()).cameras[0].X_BC
     X[:3, 3] += 0.0028 * aside / np.linalg.norm(aside)
-    assert check_table(frames, posed(X)) == []
+    assert check_table(frames, posed(X)) == [UNVERIFIED]
 
 
 def test_doubts_are_warnings(frames: Frames):
-    [warning] = check_table(frames, raised(0.007))
+    [_, warning] = check_table(frames, raised(0.007))
     assert "7 mm lower" in warning and "--check" in warning
 
 
 def test_large_objects_before_the_table_are_no_reason():
     """A near camera sees mostly the tops of boxes."""
     frames = cast(SLANTED, Block((0.45, 0.8, 0.12), (0.5, 0.0, 0.0)))
-    assert check_table(frames, SLANTED) == []
+    assert check_table(frames, dataclasses.replace(SLANTED, verified=True)) == []
 
 
 def test_a_lower_and_larger_plane_is_the_table():

@@ -1,0 +1,44 @@
+"""Refined grasps stay near the predicted ones."""
+
+import numpy as np
+import pytest
+
+from kitting_drake.policies.matching.jaw_clearance import jaw_grasps
+from kitting_drake.policies.matching.refinement import refine_grasp
+from kitting_drake.policies.matching.segmentation import Segmentation, segment
+from systems.pick_place_parameters import PickPlaceParameters
+from systems.signals import Observation, PixelGrid
+
+GRID, PLANNER = PixelGrid(), PickPlaceParameters()
+
+
+def bar(blocked: float) -> Segmentation:
+    """A bar of 240 mm along x, hemmed in by blocks over a share of its length from its low end."""
+    image = np.full((4, *GRID.shape), 0.5, np.float32)
+    image[3] = 0
+    first, last = 30, 107
+    end = first + round(blocked * (last - first))
+    image[3, first:last, 157:164] = 0.014
+    if blocked:
+        image[3, first - 2 : end, 167:180] = 0.05
+        image[3, first - 2 : end, 141:154] = 0.05
+    return segment(Observation(image, GRID))
+
+
+@pytest.mark.parametrize(
+    ("row", "blocked", "moves"),
+    [(60, 0.0, 0), (60, 0.45, 1), (40, 0.45, None)],
+)
+def test_a_refined_grasp_is_near_the_predicted_one(row: int, blocked: float, moves: int | None):
+    """It stays where the jaws have room, moves along the bar, or is left to the network."""
+    found, pick = bar(blocked), np.array([row, 160.0])
+    [region] = [item for item in found.objects if item.mask[100, 160]]
+    assert jaw_grasps(found, region, GRID.resolution, PLANNER)
+    grasp = refine_grasp(found, pick, 0.0, GRID.resolution, PLANNER)
+    if moves is None:
+        assert grasp is None
+        return
+    assert grasp is not None
+    moved = np.linalg.norm(grasp.pick - pick) * GRID.resolution
+    assert (moved > 0.003) == bool(moves) and moved <= 0.04
+    assert found.relief[tuple(np.rint(grasp.pick).astype(int))] == pytest.approx(0.014, abs=1e-3)
