@@ -25,7 +25,7 @@ _PICK, _PLACE = "#e4572e", "#1b998b"
 _UNSEEN, _STRIPE = (0.80, 0.72, 0.86), (0.68, 0.57, 0.78)
 """Stripes of pixels that a camera looks at but has no depth of."""
 _OUTSIDE = (0.90, 0.90, 0.90)
-"""Pixels that no camera looks at."""
+"""Pixels that no camera looks at, or outside the region of interest."""
 _STRIPES = 6
 """Width of a pair of stripes, in pixels."""
 _MOST_LETTERS = 150
@@ -141,7 +141,9 @@ def _draw_observation(colour: Axes, height: Axes, observation: Observation) -> N
             Patch(facecolor=_UNSEEN, edgecolor=_STRIPE, hatch="/////", lw=0, label="not seen")
         )
     if outside.any():
-        handles.append(Patch(facecolor=_OUTSIDE, edgecolor="0.7", lw=0.5, label="out of view"))
+        handles.append(
+            Patch(facecolor=_OUTSIDE, edgecolor="0.7", lw=0.5, label="out of view or region")
+        )
     if handles:
         height.legend(
             handles=handles,

@@ -46,7 +46,7 @@ _LEAST_POINTS = 500
 """... the least number of them."""
 _ABOVE_FLOOR = 0.25
 """A level plane this far above the largest is a table above the floor, in metres, ..."""
-_TABLE_SHARE = 0.2
+_TABLE_SHARE = 0.1
 """... if it has this share of the largest's points."""
 _BAND = 0.006
 """Points this near to the plane lie on it, in metres, or within three times the noise."""
@@ -202,9 +202,11 @@ def _extent(points: Array, plane: Plane, grid: PixelGrid) -> tuple[Mask, Mask]:
     thick = ndimage.binary_opening(ndimage.binary_fill_holes(low), disc(_cells(_KIT)))
     table = ndimage.binary_closing(near | thick, disc(_cells(_CLOSED)))
     table = ndimage.binary_fill_holes(largest_part(table))
-    # Only what stands on the table is ignored, not what stands beside it.
-    tall = ndimage.binary_dilation(tall, disc(_cells(_AROUND))) & table
-    return largest_part(table), tall
+    labels, count = ndimage.label(ndimage.binary_dilation(tall, disc(_cells(_AROUND))))
+    # Only what stands on the table, or at its edge, is ignored.
+    on_table = np.isin(np.arange(count + 1), labels[table])
+    on_table[0] = False
+    return largest_part(table), np.asarray(on_table[labels])
 
 
 def _cells(metres: float) -> float:

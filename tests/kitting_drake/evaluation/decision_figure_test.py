@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from kitting_drake.evaluation.decision_figure import draw_decision, draw_maps
+from kitting_drake.evaluation.decision_figure import draw_action, draw_decision, draw_maps
 from kitting_drake.policies.data.images import make_action
 from kitting_drake.policies.learned_policy import Decision
 from systems.signals import Observation, PickPlaceAction, PixelGrid
@@ -62,6 +62,23 @@ def test_no_gripper_is_drawn_if_the_policy_stops(observation: Observation):
         counts = [int((picture == colour).all(axis=2).sum()) for picture in pictures]
         assert counts[0] > counts[1]
         assert (counts[1] > 0) == shown_in_curve
+
+
+def test_pictures_show_what_is_not_seen(observation: Observation):
+    """Out of view is grey, and unseen in view is striped; both in two panels."""
+    valid, in_view = np.ones((2, *GRID.shape), bool)
+    valid[:, 10:], in_view[:, 30:] = False, False
+    partly = dataclasses.replace(observation, valid=valid, in_view=in_view)
+    stop = PickPlaceAction(stop=True)
+    pictures = []
+    for item, title in ((observation, ""), (partly, ""), (partly, "not seen: " + 40 * "word ")):
+        with Image.open(io.BytesIO(draw_action(item, stop, title=title))) as picture:
+            pictures.append(np.asarray(picture.convert("RGB")))
+    grey, stripe = (230, 230, 230), (173, 145, 199)
+    for colour in (grey, stripe):
+        counts = [int((np.abs(one - np.array(colour)) < 2).all(axis=2).sum()) for one in pictures]
+        assert counts[0] < 200 and min(counts[1:]) > 10_000
+    assert pictures[1].shape == pictures[2].shape and (pictures[1] != pictures[2]).any()
 
 
 def test_draw_decision_of_an_empty_observation_with_certain_maps():

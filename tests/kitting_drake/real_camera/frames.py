@@ -12,9 +12,9 @@ from pydrake.math import RigidTransform
 from pydrake.multibody.plant import AddMultibodyPlantSceneGraph
 from pydrake.systems.framework import Context, DiagramBuilder
 
+from docs.examples.make_sample_frame import calibration_of, take_frames
 from kitting_drake.common.rendering import add_observation_renderer
-from kitting_drake.real_camera.calibrations.calibration import BenchCamera, Calibration, with_poses
-from kitting_drake.real_camera.calibrations.layouts import Intrinsics
+from kitting_drake.real_camera.calibrations.calibration import Calibration, with_poses
 from kitting_drake.real_camera.checking.kit_block import Block
 from kitting_drake.real_camera.frames import Frame
 from kitting_drake.scenario.cameras import camera_pose, depth_camera
@@ -49,14 +49,7 @@ def render(scenario: Scenario, seed: int, *, rig: Rig | None = None) -> Rendered
     """The frames that the cell's policy would see first."""
     rig = rig or build_rig(scenario, seed=seed, base=ROOT / "scenarios")
     context = rig.diagram.CreateDefaultContext()
-    frames, poses = {}, {}
-    for name in scenario.cameras:
-        color, depth, X_WB = (
-            rig.port(f"{port}_{name}", context)
-            for port in ("color_image", "depth_image", "camera_pose")
-        )
-        frames[name] = Frame(color.data[:, :, :3].copy(), depth.data[:, :, 0].copy())
-        poses[name] = X_WB.GetAsMatrix4()
+    frames, poses = take_frames(rig.station, rig.station.GetMyContextFromRoot(context))
     calibration = with_poses(calibration_of(scenario), poses)
     return Rendered(frames, calibration, rig, context)
 
@@ -89,23 +82,6 @@ def difference(one: PickPlaceAction, other: PickPlaceAction) -> NDArray[np.float
             math.degrees(abs(math.remainder(turned - other_turned, math.tau))),
         ]
     )
-
-
-def calibration_of(scenario: Scenario) -> Calibration:
-    """The true calibration of a scenario's cameras."""
-    cameras = tuple(
-        BenchCamera(
-            name,
-            Intrinsics(
-                (config.width, config.height),
-                (config.focal_length, config.focal_length),
-                (config.width / 2 - 0.5, config.height / 2 - 0.5),
-            ),
-            camera_pose(config).GetAsMatrix4(),
-        )
-        for name, config in scenario.cameras.items()
-    )
-    return Calibration(cameras, scenario.heightmap.grid())
 
 
 def cast(calibration: Calibration, block: Block | None = None) -> dict[str, Frame]:
