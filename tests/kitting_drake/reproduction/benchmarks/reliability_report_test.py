@@ -52,7 +52,9 @@ def test_a_fit_is_cross_validated_and_reported(tmp_path: Path):
     # The fitted file serves the weights that it lies beside.
     (tmp_path / "confidence.json").rename(tmp_path / "own.confidence.json")
     own = read_reliability("networks", tmp_path / "own.safetensors")
-    assert own.threshold == measured["networks"]["threshold"] != read_reliability("networks").threshold
+    assert (
+        own.threshold == measured["networks"]["threshold"] != read_reliability("networks").threshold
+    )
 
     console = Console(file=io.StringIO(), width=140)
     console.print(reliability_table(measured))
