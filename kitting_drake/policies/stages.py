@@ -194,6 +194,9 @@ class StopRule:
         if odds >= threshold:
             return dataclasses.replace(draft, stop=False)
         reason = why_stop(draft.look.segmentation) if self.kit else "done"
+        if reason == "nothing fits" and odds < (draft.look.networks.stop_threshold or 0.0):
+            # The networks see nothing to pick, whatever the outlines are.
+            reason = "done"
         return dataclasses.replace(draft, stop=True, reason=reason)
 
 

@@ -46,6 +46,8 @@ _CLEARLY = 2.0
 The few noisy pixels beyond it are isolated. A larger value would cut off an object's flat ends,
 which distinguish it from its half turn.
 """
+_OBJECT_SEEN, _RECESS_SEEN = 0.5, 0.3
+"""The least seen shares of an object, and of a free recess."""
 _GAP = 1.5
 """The gap around an object in its recess is less than this far from its edges, in pixels."""
 _NEIGHBOURS = np.ones((3, 3), bool)
@@ -93,8 +95,13 @@ class Segmentation:
 
     @property
     def free_recesses(self) -> tuple[Region, ...]:
-        """The recesses that are not just the gaps around objects in them."""
-        return tuple(item for item in self.recesses if _inner_radius(item.mask) > _GAP)
+        """The recesses that are seen, and not just the gaps around objects in them."""
+        return tuple(
+            item
+            for item in self.recesses
+            if _inner_radius(item.mask) > _GAP
+            and self.visibility.seen[item.mask].mean() > _RECESS_SEEN
+        )
 
 
 def segment(observation: Observation) -> Segmentation:
@@ -137,7 +144,12 @@ def segment(observation: Observation) -> Segmentation:
     deep = depth > max(_RECESS_DEPTH, _CLEARLY * noise)
     return Segmentation(
         fixture=fixture,
-        objects=_regions(loose, relief, resolution),
+        objects=tuple(
+            item
+            for item in _regions(loose, relief, resolution)
+            # In the shadow of a block, stray depths are filled in to the shape of an object.
+            if observation.valid[item.mask].mean() > _OBJECT_SEEN
+        ),
         recesses=_regions(deep | hidden, depth, resolution, core=deep),
         protruding=tuple(
             sorted(
