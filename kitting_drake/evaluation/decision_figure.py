@@ -39,8 +39,8 @@ def draw_decision(observation: Observation, decision: Decision, *, title: str = 
 
     Args:
         observation: the observation decided on.
-        decision: of a learned policy.
-        title: of the picture; empty for the kind of action.
+        decision: the decision of a learned policy.
+        title: the title of the picture; empty for the kind of action.
 
     Returns:
         A PNG.
@@ -67,7 +67,7 @@ def draw_action(observation: Observation, action: PickPlaceAction, *, title: str
     Args:
         observation: the observation decided on.
         action: the decision.
-        title: of the picture; empty for the kind of action.
+        title: the title of the picture; empty for the kind of action.
 
     Returns:
         A PNG.

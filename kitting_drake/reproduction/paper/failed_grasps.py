@@ -62,8 +62,8 @@ def changeable(summary: Mapping[str, Any]) -> Changeable:
       with the fewest placed objects, because each placed object of the others took an action.
 
     Args:
-        summary: of a learned policy, from `evaluate`. If it does not count its actions, each
-            episode is assumed to have used as many as the task allows.
+        summary: the summary that `evaluate` wrote of a learned policy. If it has no number of
+            actions, each episode is assumed to have used as many as the task allows.
     """
     episodes = [item["objects"] for item in summary["outcomes"]]
     tag = summary["resolved_scenario"]["task"]["_tag"]
