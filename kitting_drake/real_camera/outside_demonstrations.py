@@ -60,7 +60,7 @@ class Summary:
     demonstrations: int
     steps: int
     finals: int
-    """Demonstrations that end with an observation with nothing left to do."""
+    """The number of demonstrations whose last observation shows that nothing is left to do."""
 
 
 def find_demonstrations(folder: Path) -> list[list[StepFolder]]:
@@ -161,7 +161,7 @@ def convert(folder: Path, calibration: Calibration, learning: Learning, path: Pa
 
     Args:
         folder: see `find_demonstrations`.
-        calibration: of the cameras, one for all demonstrations.
+        calibration: the cameras' calibration, one for all demonstrations.
         learning: the assumptions that training may make.
         path: the file.
 
@@ -176,7 +176,7 @@ def convert(folder: Path, calibration: Calibration, learning: Learning, path: Pa
         scenario={
             "task": TASK,
             "calibration": calibration_record(calibration),
-            # The seeds identify the frames, and this digest the actions: together all the content.
+            # The seeds identify the frames, and this digest the actions.
             "actions": hashlib.sha256(json.dumps(actions).encode()).hexdigest(),
         },
         grid=calibration.grid,

@@ -25,7 +25,7 @@ Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 _RESOLUTION = 0.003125
-"""Of o_t, in metres; networks are trained at it."""
+"""The side of o_t's pixels, in metres. Networks are trained with this size."""
 _CELL = 2 * _RESOLUTION
 """Side of a cell in which the table's extent is found, in metres."""
 _SIDES = (160, 320)
@@ -41,9 +41,9 @@ _STEP = 2
 _REACH = 2.0
 """The table is sought within this distance of the robot's base, along x and y, in metres."""
 _LEAST_SHARE = 0.1
-"""The least share of the points on the table, and ..."""
+"""The least share of the points that must lie on the table, and ..."""
 _LEAST_POINTS = 500
-"""... the least number of them."""
+"""... the least number of points."""
 _ABOVE_FLOOR = 0.25
 """A level plane this far above the largest is a table above the floor, in metres, ..."""
 _TABLE_SHARE = 0.1
@@ -93,8 +93,8 @@ def find_table(frames: Mapping[str, Frame], calibration: Calibration) -> FoundTa
     ignored.
 
     Args:
-        frames: of each camera by its name. Kit and tools may stand on the table.
-        calibration: of the cameras.
+        frames: each camera's frame by its name. Kit and tools may stand on the table.
+        calibration: the cameras' calibration.
 
     Raises:
         UserError: no level plane is seen.
@@ -181,7 +181,7 @@ def _coarse_grid(points: Array, plane: Plane) -> PixelGrid:
 
 
 def _extent(points: Array, plane: Plane, grid: PixelGrid) -> tuple[Mask, Mask]:
-    """(rows, cols): the table's extent, with what lies on it; and what is too tall to lie on it."""
+    """Two masks (rows, cols): the table with its objects, and things too tall to be objects."""
     above = points[:, 2] - plane.height(points[:, :2])
     cells = np.rint(grid.to_pixel(points[:, :2])).astype(int)
     inside = ((cells >= 0) & (cells < grid.shape)).all(axis=1)
@@ -249,8 +249,12 @@ def _workspace(table: Mask, grid: PixelGrid) -> tuple[PixelGrid, str]:
 
 
 def _best_centre(table: Mask, grid: PixelGrid, size: Array, centre: Array, fits: Mask) -> Array:
-    """(2,): the centre, in metres, of the window that holds nearly the most table, and is nearest
-    to the base but not too near. Along an axis where all of the table fits, it is centred."""
+    """(2,): the centre of the best window, in metres.
+
+    Of the windows that hold nearly the most table, it is the nearest to the base. Windows that are
+    too near the base count only if the others hold much less table. Along an axis on which the
+    whole table fits, the window is at `centre`.
+    """
     window = np.rint(size / _CELL).astype(int)
     sums = np.pad(table.astype(np.int64).cumsum(0).cumsum(1), ((1, 0), (1, 0)))
     counts = [max(grid.shape[k] - window[k], 0) + 1 for k in (0, 1)]
