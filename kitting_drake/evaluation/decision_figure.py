@@ -29,7 +29,7 @@ _OUTSIDE = (0.90, 0.90, 0.90)
 _STRIPES = 6
 """Width of a pair of stripes, in pixels."""
 _MOST_LETTERS = 150
-"""Of a line of the title."""
+"""The most letters in a line of the title."""
 
 
 def draw_decision(observation: Observation, decision: Decision, *, title: str = "") -> bytes:
