@@ -131,11 +131,11 @@ def check_action(step: StepFolder, action: StepAction, calibration: Calibration)
     if action.action.stop and not step.is_last:
         raise UserError(
             f"{step.name} says that nothing is left to do, but steps come after it: only the last "
-            "step of a demonstration may"
+            "step of a demonstration may say so"
         )
     if action.calibration not in (None, calibration_digest(calibration)):
         raise UserError(
-            f"{step.name} was clicked by another calibration: give that one with --camera, or "
+            f"{step.name} was clicked with another calibration: give that one with --camera, or "
             "click it again"
         )
 
@@ -199,7 +199,7 @@ def _labelled(
         labelled.append((step, action))
     if labelled[0][1].action.stop:
         raise UserError(
-            f"{steps[0].path.parent} holds no steps but the last, in which nothing is left to do: "
+            f"{steps[0].path.parent} holds only a last step, in which nothing is left to do: "
             "there is nothing to learn from it"
         )
     return labelled

@@ -131,8 +131,8 @@ def register(
     """The best fit of an object's outline to a recess's.
 
     Args:
-        outline: the object's, closed.
-        recess: the recess's.
+        outline: the outline of the object, closed.
+        recess: the outline of the recess.
         starts: initial rotations and shifts. Without any, the best of many rotations about the
             centroids are refined.
     """

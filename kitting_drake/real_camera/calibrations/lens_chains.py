@@ -51,8 +51,8 @@ def with_chained_poses(entries: dict[str, Any], path: Path) -> dict[str, Any]:
             continue
         if len(others) > 1:
             raise UserError(
-                f"{path}: camera {name} has no pose, and {' and '.join(others)} of its camchain "
-                "have: leave the pose of one of them"
+                f"{path}: camera {name} has no pose, but several of its camchain do "
+                f"({', '.join(others)}): keep the pose of only one of them"
             )
         ((other, entry),) = others.items()
         X_BO = read_pose(entry, f"{path}: camera {other}", path.parent)

@@ -141,7 +141,7 @@ def _read_value(value: Any, where: str, folder: Path, names: FrameNames) -> Foun
         pairs = ", ".join(f"{pose.parent} to {pose.child}" for pose in poses)
         raise UserError(
             f"{folder / value} has {len(poses)} transforms ({pairs}), and {len(ends)} of them are "
-            "of a camera in the base or the hand: leave one"
+            "of a camera in the base or the hand: keep only one"
         )
     return ends[0]
 

@@ -20,8 +20,9 @@ from systems.signals import PixelGrid
 Array = NDArray[np.float64]
 
 UNVERIFIED = (
-    "a table shows neither x, y and yaw of a camera nor a mirrored image: check them once with a "
-    "block (--check --kit_size_mm --kit_pose) or markers (--calibrate); these write verified: true"
+    "a bare table does not show errors of x, y and yaw, or a mirrored image: check these once with "
+    "a block (--check --kit_size_mm --kit_pose) or markers (--calibrate); either writes "
+    "verified: true"
 )
 """The warning of a calibration that was not verified."""
 _REFUSED_OFF, _REFUSED_TILT = 0.010, math.radians(1.3)

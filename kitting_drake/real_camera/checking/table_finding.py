@@ -33,7 +33,7 @@ _SIDES = (160, 320)
 _MULTIPLE = 16
 """Rows and cols are multiples of this."""
 _TILTED = math.radians(10)
-"""A plane that is tilted by more is not level, nor a table in a nearly correct pose."""
+"""A plane that is tilted by more than this is no table, even with a slightly wrong pose."""
 MOST_TILT = math.radians(1.3)
 """`decide` refuses a table that is tilted by more."""
 _STEP = 2
@@ -51,13 +51,13 @@ _TABLE_SHARE = 0.1
 _BAND = 0.006
 """Points this near to the plane lie on it, in metres, or within three times the noise."""
 _LOW, _TALL = 0.12, 1.2
-"""Things lower than the first, in metres, are objects on the table; others are no table, such as
-the robot. Nothing above the second counts."""
+"""Things lower than the first, in metres, are objects on the table. Taller things, such as the
+robot, are not part of it. Points above the second are ignored."""
 _CLOSED = 0.035
-"""Gaps of the table up to twice this are closed, in metres: tools and the shadows of objects."""
+"""Gaps in the table (from objects and shadows) narrower than twice this are closed, in metres."""
 _KIT = 0.03
-"""An object at the table's edge belongs to it if it is twice as thick as this, in metres; profiles
-along the edge are thinner."""
+"""An object at the table's edge is taken as part of the table if it is at least twice this wide, in
+metres; profiles along the edge are narrower."""
 _LEAST_TALL = 0.02
 """Tall things thinner than this are noise, in metres."""
 _AROUND = 0.02

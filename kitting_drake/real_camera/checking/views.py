@@ -199,6 +199,6 @@ def _check_limits(depth: NDArray[np.float32], camera: BenchCamera) -> None:
     low, high = camera.min_depth, camera.max_depth
     if ((depth >= low) & (depth <= high)).mean() < _LEAST_DEPTH:
         raise CalibrationError(
-            f"the median depth of camera {camera.name} is {np.median(depth):.3g} m, and by its "
-            f"min_depth {low:g} and max_depth {high:g} almost none is used: give these in metres"
+            f"the median depth of camera {camera.name} is {np.median(depth):.3g} m, and almost no "
+            f"depth is between its min_depth {low:g} and max_depth {high:g}: give these in metres"
         )

@@ -136,7 +136,7 @@ class Run:
 
     @property
     def paper_task(self) -> str | None:
-        """The title of the paper's task; None if more than the policy differs from it."""
+        """The title of the paper's task; None if anything but the policy differs from that task."""
         task = self.summary["task"]
         return task if task in PAPER_TASKS and not self.departures else None
 
