@@ -112,7 +112,11 @@ def _calibrate(arguments: argparse.Namespace, folder: Path, console: Console) ->
 
 
 def _find(arguments: argparse.Namespace, folder: Path, console: Console) -> None:
-    for flag, given in (("--check", arguments.check), ("--kit_size_mm", arguments.kit_size_mm)):
+    for flag, given in (
+        ("--check", arguments.check),
+        ("--kit_size_mm", arguments.kit_size_mm is not None),
+        ("--table_height", arguments.table_height is not None),
+    ):
         if given:
             raise UserError(f"{flag} cannot be combined with --find")
     for name in FOUND_FILES:

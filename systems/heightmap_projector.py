@@ -42,11 +42,14 @@ class HeightmapProjector(LeafSystem):
       `p_WP = X_WB X_BD (depth * ((u + 1/2 - cx)/fx, (v + 1/2 - cy)/fy, 1))`. Drake's VTK engine
       renders the same way, to a hundredth of a pixel. NaN and depths outside the camera's
       DepthRange, such as Drake's too close (0) and too far (infinity), are ignored.
-    - Points off the grid or above `z_max` are dropped; points below `z_min` get height 0. In each
-      grid pixel, a camera's highest point determines height and colour.
+    - Points off the grid, above `z_max`, or more than 5 cm below `z_min` are dropped. In each grid
+      pixel, a camera's highest point determines height and colour.
     - The fused height is the maximum over the cameras. The fused colour is the mean over the
       cameras that see the top surface, i.e. whose height is within SAME_SURFACE (1 cm) of it. The
       others see a side, or the ground in front.
+    - A table that seems tilted by up to 2 degrees, or up to 1 cm off `z_min`, is levelled: its
+      plane is subtracted (`table_plane.find_table`). What is then below the table gets height 0.
+    - A pixel is `in_view` if it is in some camera's image at the height `z_min`.
     - A camera's samples can be farther apart than grid pixels. An unseen pixel is interpolated if
       both of its neighbours along x or along y are seen, with heights within SAME_SURFACE of each
       other. It gets the mean of the two, or of the higher pair. Wider gaps (shadows) remain zero

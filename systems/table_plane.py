@@ -99,11 +99,7 @@ def _lowest_mode(values: NDArray[np.float64]) -> float:
     """The lowest frequent height."""
     counts = np.bincount(((values + _FAR) / _BIN).astype(int), minlength=int(2 * _FAR / _BIN) + 1)
     smooth = np.convolve(counts, np.ones(5), "same")
-    peaks = np.flatnonzero(smooth >= 0.5 * smooth.max())
-    return float((peaks[0] + _argmax_run(smooth, peaks[0]) + 0.5) * _BIN - _FAR)
-
-
-def _argmax_run(counts: NDArray[np.float64], first: int) -> int:
-    """How far the first peak's maximum lies beyond its first bin."""
-    run = counts[first : first + 5]
-    return int(run.argmax())
+    first = int(np.flatnonzero(smooth >= 0.5 * smooth.max())[0])
+    # The peak's maximum is at most a kernel's width beyond its rise.
+    highest = first + int(smooth[first : first + 5].argmax())
+    return (highest + 0.5) * _BIN - _FAR

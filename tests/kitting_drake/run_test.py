@@ -42,6 +42,7 @@ KEYS = {
     "point_contact_pairs",
     "failure",
     "timed_out",
+    "stop_reason",
 }
 OBJECT_KEYS = {
     "name",

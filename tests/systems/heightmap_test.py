@@ -35,7 +35,7 @@ def test_pixels_outside_all_images_are_out_of_view():
     assert 0.1 < seen.in_view.mean() < 0.7
     assert seen.valid[seen.in_view].mean() > 0.99
     # At an image's edge, the heights of the box itself may be seen beyond.
-    assert not seen.valid[~seen.in_view].mean() > 0.01
+    assert seen.valid[~seen.in_view].mean() < 0.03
     middle = tuple(np.rint(GRID.to_pixel((0.5, 0.0))).astype(int))
     assert seen.in_view[middle]
 

@@ -78,6 +78,7 @@ def grasp_to_release() -> tuple[EpisodeResult, Sequence[Seen]]:
 def test_the_oracle_kits_one_tool(grasp_to_release: tuple[EpisodeResult, Sequence[Seen]]):
     result, _ = grasp_to_release
     assert (result.failure, result.timed_out, result.interrupted) == (None, False, False)
+    assert result.stop_reason in ("done", "actions spent")
     (item,) = result.objects
     assert (item.name, item.category) == ("combination_wrench", "wrench")
     assert (item.success, item.strict_success, item.cause) == (True, True, None)
@@ -127,7 +128,7 @@ def test_an_episode_that_times_out_has_no_reward():
     rig = build()
     observer = Observer(rig)
     result = rig.run(observer.observe, seconds=0.5)
-    assert (result.timed_out, result.failure) == (True, None)
+    assert (result.timed_out, result.failure, result.stop_reason) == (True, None, "time")
     assert (result.success_rate, result.strict_success_rate) == (0.0, 0.0)
     assert result.sim_seconds == pytest.approx(0.5)
     assert (result.objects[0].success, result.objects[0].cause) == (False, "never picked")
@@ -163,6 +164,7 @@ def test_end_at_success_ends_the_episode_without_another_action():
         modes = told.setdefault(ends, [])
         result = rig.run(lambda event, modes=modes: modes.append(event.mode), seconds=30.0)
         assert (result.strict_success_rate, result.actions, result.timed_out) == (1.0, 1, False)
+        assert result.stop_reason == "done"
     assert Mode.DONE in told[False]
     assert Mode.DONE not in told[True]
 
@@ -182,6 +184,7 @@ def test_a_failing_simulation_ends_the_episode_with_its_error():
     result = rig.run(fails, told.observe, seconds=5.0)
     assert result.failure is not None
     assert "the solver did not converge" in result.failure
+    assert result.stop_reason == "failure"
     assert (result.success_rate, result.strict_success_rate) == (0.0, 0.0)
     assert (result.interrupted, result.timed_out) == (False, False)
     assert result.sim_seconds < 1.0
@@ -195,7 +198,7 @@ def test_a_failing_simulation_ends_the_episode_with_its_error():
 def test_an_interrupted_episode_has_a_result():
     result = build().run(raise_at(Mode.APPROACH, KeyboardInterrupt()), seconds=5.0)
     assert result.interrupted
-    assert result.failure is None
+    assert (result.failure, result.stop_reason) == (None, "interrupted")
     assert result.sim_seconds < 1.0
 
 

@@ -111,7 +111,7 @@ OUTLINE = TableOutline(tuple(map(tuple, LEFT)))
 
 def test_only_the_region_is_observed():
     frames, front = beside_a_drop()
-    outlined = dataclasses.replace(front, outline=OUTLINE)
+    outlined = dataclasses.replace(front, outline=OUTLINE, verified=True)
     checked = check_frames(frames, outlined)
     observation = observe(checked, outlined)
     assert observation.height.max() < 1e-4 < 0.05 < observe(checked, front).height.max()
