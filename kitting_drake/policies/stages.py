@@ -16,6 +16,7 @@ from kitting_drake.policies.draft import Draft, Stage, expected_position
 from kitting_drake.policies.matching.recovery import recovery_action
 from kitting_drake.policies.matching.refinement import nearest_region, refine_grasp, refine_place
 from kitting_drake.policies.matching.release_clearance import blocked_at_place
+from kitting_drake.policies.matching.segmentation import Region
 from kitting_drake.policies.matching.shape_matching import belonging, certain_fits, why_stop
 from kitting_drake.policies.matching.visibility import Visibility
 from systems.pick_place_parameters import PickPlaceParameters
@@ -65,7 +66,7 @@ def make_stages(
     if recover:
         stages.append(BelongingFirst())
     if may_stop:
-        stages.append(StopRule(ask_outlines=recover))
+        stages.append(StopRule(ask_outlines=recover, kit=outlines))
     if outlines and may_stop and not recover:
         stages.append(CertainFits())
     if continuous:
@@ -181,6 +182,8 @@ class StopRule:
 
     ask_outlines: bool = False
     """Whether the outlines shift the threshold."""
+    kit: bool = False
+    """Whether objects belong into the recesses of a kit, which may then be full or missing."""
 
     def refine(self, draft: Draft) -> Draft:
         odds, threshold = draft.look.picking.log_odds, draft.look.networks.stop_threshold
@@ -190,7 +193,8 @@ class StopRule:
             threshold += _SOMETHING_FITS if draft.belongs else _NOTHING_FITS
         if odds >= threshold:
             return dataclasses.replace(draft, stop=False)
-        return dataclasses.replace(draft, stop=True, reason=why_stop(draft.look.segmentation))
+        reason = why_stop(draft.look.segmentation) if self.kit else "done"
+        return dataclasses.replace(draft, stop=True, reason=reason)
 
 
 @dataclass(frozen=True)
@@ -219,7 +223,7 @@ class SeenOnly:
         visibility = Visibility.of(draft.look.observation)
         allowed = visibility.pickable
         found: Draft | None = draft
-        for _ in range(_TRIES):
+        for number in range(_TRIES):
             if found is None or found.stop:
                 break
             if allowed[found.pixel] and self._is_seen(found, visibility):
@@ -227,6 +231,10 @@ class SeenOnly:
             rows, cols = np.indices(allowed.shape)
             away = np.hypot(rows - found.pixel[0], cols - found.pixel[1])
             allowed = allowed & (away * found.look.resolution > _ANOTHER)
+            region = self._region(found)
+            if number % 2 and region is not None:
+                # Another pick of the same object did not help: try another object.
+                allowed = allowed & ~region.mask
             found = draft.among(allowed)
         if draft.stop:
             return draft
@@ -236,11 +244,15 @@ class SeenOnly:
         picks = draft.pick[None], np.array([draft.theta])
         if not visibility.picks_are_seen(*picks, self.planner.open_width).all():
             return False
-        region = None
-        if self.outlines:
-            region = nearest_region(draft.look.segmentation.objects, draft.pick)
+        region = self._region(draft)
         footprint = None if region is None else region.pixels.astype(float)
         return visibility.place_is_seen(footprint, draft.pick, draft.rotation, draft.place)
+
+    def _region(self, draft: Draft) -> Region | None:
+        """The object under the pick, if objects are told apart."""
+        if not self.outlines:
+            return None
+        return nearest_region(draft.look.segmentation.objects, draft.pick)
 
 
 @dataclass(frozen=True)

@@ -172,11 +172,11 @@ def test_stops_when_the_log_odds_are_below_the_threshold(
         found.place_pixel, GOAL + rotated((0.3, 0.4), ROTATION * BIN), atol=0.1
     )
     action = policy(observation())
-    assert action == (PickPlaceAction(stop=True) if stop else found.action)
+    assert action == (PickPlaceAction(stop=True, reason="done") if stop else found.action)
     assert action.heights is None
     # Where the episode ends by itself it is not asked.
     unasked = LearnedPolicy(networks, orientations=N, stages=[SubPixel()])
-    assert unasked(observation()) == dataclasses.replace(found.action, stop=False)
+    assert unasked(observation()) == dataclasses.replace(found.action, stop=False, reason="")
 
 
 @pytest.mark.parametrize(
