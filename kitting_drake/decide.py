@@ -131,7 +131,7 @@ def _find(arguments: argparse.Namespace, folder: Path, console: Console) -> None
 
 
 def _check_decided(action: Path) -> None:
-    """Raises UserError if `action.json` is not from this command, e.g. a demonstration's."""
+    """Raises UserError if `action.json` is not from this command, but e.g. a demonstration's."""
     try:
         record = json.loads(action.read_text())
     except FileNotFoundError:

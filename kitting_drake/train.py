@@ -158,9 +158,9 @@ def _check_validation(settings: Settings, held_out: TrainingData, path: Path) ->
     _require_picks(held_out, path, "for validation")
     if settings.stop and not held_out.finals(1):
         raise UserError(
-            f"the policy cannot learn from {path} when to stop: none of the {held_out.count} "
-            f"{held_out.kind} for validation ends with nothing left to pick; {held_out.made} more, "
-            "or give other data with --validation"
+            f"{path}: none of the {held_out.count} {held_out.kind} for validation ends with "
+            "nothing left to pick, so the policy cannot learn when to stop: "
+            f"{held_out.made} more, or give other data with --validation"
         )
 
 

@@ -116,7 +116,7 @@ def looks_at(view: View, grid: PixelGrid) -> NDArray[np.bool_]:
     rays, X_WD = view.rays, view.X_WD
     corner = grid.to_world((0, 0))
     steps = grid.resolution * np.arange(max(grid.shape))
-    # The camera's coordinates of a pixel are the sum of a part of its row and one of its column.
+    # A pixel's position in the camera's frame is linear in its row and column: sum the two parts.
     offset = X_WD[:3, :3].T @ (np.array([*corner, grid.z_min]) - X_WD[:3, 3])
     x, y, z = (
         offset[k] + X_WD[0, k] * steps[: grid.rows, None] + X_WD[1, k] * steps[None, : grid.cols]
@@ -165,10 +165,11 @@ def _see(view: View, grid: PixelGrid) -> NDArray[np.float32]:
     row, col, z = (values.ravel()[point] for values in (row, col, z))
     cell = row.astype(np.int64) * grid.cols + col.astype(np.int64)
 
-    # Points of the table itself, lower by rounding alone, tie; the last of them gives the colour.
-    z = np.where((z < 0) & (z > -_ROUNDING), 0, z) + np.float32(0)  # Adding 0 turns -0 into +0.
-    # With the sign folded in, the bits of a float32 sort like its value. With these bits above the
-    # point's index in one integer, a single maximum finds the highest point and its colour.
+    # Rounding may put points of the table slightly below it. They get height 0, so that all points
+    # of the table are equally high; the last one gives the colour. Adding 0 turns -0 into +0.
+    z = np.where((z < 0) & (z > -_ROUNDING), 0, z) + np.float32(0)
+    # `_sortable` gives integers in the order of the heights. They become the upper bits of a key,
+    # and the point's index the lower ones. The maximum key then has the highest point's colour.
     key = (_sortable(z).astype(np.int64) << 32) | point
     unseen = np.iinfo(np.int64).min
     highest = np.full(grid.rows * grid.cols, unseen, np.int64)

@@ -376,7 +376,7 @@ def _measure(
 def complete_stages(
     goals: Sequence[Goal], placements: Sequence[Placement], kept: Set[int] = frozenset()
 ) -> frozenset[int]:
-    """The goals that are prerequisites of others and were once all filled together.
+    """The goals that are prerequisites of others and were once all filled at the same time.
 
     As in the Ravens benchmark, their reward is kept even if the objects move later.
 

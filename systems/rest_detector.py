@@ -94,12 +94,12 @@ class RestDetector(LeafSystem):
     - No mover, and no object that is awake, is within `wake_distance` of it. Distances are those
       of the oriented boxes around the collision geometry, which are lower bounds.
 
-    It wakes when something comes within `wake_distance`. An object that left the cell, `GONE` or
-    more from the world's origin, rests at once: a body that spins forever would overflow its
-    quaternion.
+    It wakes when something comes within `wake_distance`. An object that has left the cell (it is
+    `GONE` or farther from the world's origin) rests at once, because a body that spins forever
+    would overflow its quaternion.
 
-    State (discrete): for each object the pose that it stays near, for how long it has (s), and
-    whether it rests.
+    State (discrete): for each object the pose that it stays near, the time that it has stayed
+    there (s), and whether it rests.
     """
 
     def __init__(

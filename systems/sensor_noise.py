@@ -335,7 +335,7 @@ def _unit_field(
 
 
 def _upper_quantile(share: NDArray[np.float32]) -> NDArray[np.float32]:
-    """The value that a share of standard normal values exceeds."""
+    """The value that a given share of standard normal values exceeds."""
     # Import SciPy lazily.
     from scipy.special import ndtri
 

@@ -196,7 +196,7 @@ class SurfaceHeights:
     table: float = 0.0
     """The table; nothing goes below it."""
     doubt: float = 0.0
-    """Uncertainty of the differences of these heights; zero if o_t has neither noise nor tilt."""
+    """The uncertainty of differences between these heights; zero if o_t has no noise or tilt."""
 
 
 STOP_REASONS = {

@@ -38,7 +38,7 @@ _NOISY_FLOOR_SHARE, _NOISY_FLOOR_BIAS = 25.0, -0.67
 """Percentile of the heights at a place that estimates its floor's height, and its bias in standard
 deviations."""
 _SUNK = 0.003
-"""A table that looks lower than expected by more than this is lower, in metres."""
+"""A table that looks too low by more than this is taken to be lower, in metres."""
 _TILT_DOUBT, _MOST_DOUBT = 0.3, 0.0025
 """Uncertainty after levelling: this share of the table's deviation, and its maximum in metres."""
 
@@ -51,16 +51,17 @@ def read_surface_heights(
     - Unseen pixels are filled in (`fill_unseen`).
     - An object's support is a low percentile of the heights around it. An object in the middle of
       others is thus assumed to stand on the same surface.
-    - Tops are maxima over a few pixels; the floor of a place is the minimum over the seen ones. If
-      o_t is noisy, they are medians and percentiles instead, corrected for their bias.
-    - The table is assumed to be level and at the bottom of the grid. A tilt or offset in o_t, which
-      `project` subtracts, is a calibration error, but for a table that looks more than 3 mm lower
-      than expected: guarded motions may go too low, but not end too high.
+    - Tops are maxima over a few pixels. The floor of a place is the minimum over the seen pixels.
+      If o_t is noisy, medians and percentiles are used instead, corrected for their bias.
+    - The table is assumed to be level and at the bottom of the grid. If it looks tilted or shifted
+      in o_t, this counts as a calibration error, and `project` has subtracted it.
+    - A table that looks more than 3 mm too low is an exception: it is taken to be lower. Guarded
+      motions stop at a contact, so they may aim too low, but must not end too high.
 
     Args:
         observation: o_t.
-        pick: of the gripper, in the world.
-        place: of the gripper, in the world. Off the grid, its heights are zero.
+        pick: the gripper's pose at the pick, in the world.
+        place: the gripper's pose at the place, in the world. Off the grid, heights are zero.
     """
     grid = observation.grid
     reach = {
@@ -132,7 +133,7 @@ def _noise(height: NDArray[np.float32]) -> float:
     away = np.abs(height - ndimage.uniform_filter(height, _SMOOTHED, mode="nearest"))
     highest = ndimage.maximum_filter(height, _SMOOTHED, mode="nearest")
     flat = highest - ndimage.minimum_filter(height, _SMOOTHED, mode="nearest") < _FLAT
-    # Flat squares are a biased sample (the calmest), so they only decide whether there is noise.
+    # Flat squares have less noise than average, so they only tell whether there is any.
     if flat.sum() >= _LEAST_FLAT and 1.4826 * np.median(away[flat]) < _CLEAN:
         return 0.0
     noise = 1.4826 * float(np.median(away))

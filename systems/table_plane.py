@@ -20,7 +20,7 @@ _FITS = 8
 _LEVEL = 0.0003
 """A table with smaller deviations counts as level, in metres."""
 _MOST_OFF, _STEEPEST = 0.010, 0.035
-"""A larger offset in metres, or slope, is no error of calibration, and is not corrected."""
+"""A larger offset (in metres) or slope cannot be an error of calibration, and is not corrected."""
 
 
 def level(
@@ -31,7 +31,7 @@ def level(
     Args:
         height: (rows, cols), in metres above the bottom of the grid; may be negative.
         seen: (rows, cols), the pixels that may belong to the table.
-        resolution: of a pixel, in metres.
+        resolution: the side of a pixel, in metres.
 
     Returns:
         (rows, cols): the heights above the table.
@@ -57,7 +57,7 @@ def find_table(
     Args:
         height: (rows, cols), in metres above the bottom of the grid; may be negative.
         seen: (rows, cols), the pixels to use.
-        resolution: of a pixel, in metres.
+        resolution: the side of a pixel, in metres.
     """
     none = (0.0, 0.0, 0.0)
     some = seen[::_STEP, ::_STEP]

@@ -72,7 +72,7 @@ def take_frames(station, context):
 def truth(scene):
     """The true poses (x, y, yaw) of the tools and of their places, in metres and radians, as JSON.
 
-    A tool's points are some of its surface in its own frame: x, y, in metres. A rotation by
+    A tool's points are a sample of its surface, in its own frame: x, y, in metres. A rotation by
     2 pi / symmetry changes nothing.
     """
     tools = {}

@@ -25,7 +25,7 @@ def nearest_object(station: KittingStation, poses: list[RigidTransform], pick: P
     """The index of the object whose surface is nearest to a pick, seen from above.
 
     Args:
-        station: the episode's.
+        station: the station of the episode.
         poses: X_WB of each object.
         pick: the gripper's pose at the pick, in the world.
     """
@@ -42,7 +42,7 @@ class ActionLog:
     def __init__(self, station: KittingStation) -> None:
         """
         Args:
-            station: the episode's.
+            station: the station of the episode.
         """
         self._station = station
         self._before: list[RigidTransform] = []

@@ -245,7 +245,7 @@ def object_results(
     """The results of all objects that can fill a goal, in the scene's order.
 
     Args:
-        station: the episode's.
+        station: the station of the episode.
         root_context: the root context of the outermost Diagram.
         placements: the placements of the scene's objects, in order.
         records: the actions so far.

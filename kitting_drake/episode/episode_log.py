@@ -84,7 +84,7 @@ class EpisodeLog:
     def __init__(self, station: KittingStation) -> None:
         """
         Args:
-            station: the episode's.
+            station: the station of the episode.
         """
         self._station = station
         self._samples: dict[str, list[NDArray[np.float64]]] = {name: [] for name in _SAMPLED}

@@ -41,7 +41,7 @@ class ActionStrip:
     def __init__(self, station: KittingStation) -> None:
         """
         Args:
-            station: the episode's, with cameras.
+            station: the station of the episode, with cameras.
         """
         self._station = station
         self.frames: list[StripFrame] = []

@@ -29,7 +29,7 @@ _OUTSIDE = (0.90, 0.90, 0.90)
 _STRIPES = 6
 """Width of a pair of stripes, in pixels."""
 _MOST_LETTERS = 150
-"""Of a line of the title."""
+"""The most letters in a line of the title."""
 
 
 def draw_decision(observation: Observation, decision: Decision, *, title: str = "") -> bytes:
@@ -39,8 +39,8 @@ def draw_decision(observation: Observation, decision: Decision, *, title: str = 
 
     Args:
         observation: the observation decided on.
-        decision: of a learned policy.
-        title: of the picture; empty for the kind of action.
+        decision: the decision of a learned policy.
+        title: the title of the picture; empty for the kind of action.
 
     Returns:
         A PNG.
@@ -67,7 +67,7 @@ def draw_action(observation: Observation, action: PickPlaceAction, *, title: str
     Args:
         observation: the observation decided on.
         action: the decision.
-        title: of the picture; empty for the kind of action.
+        title: the title of the picture; empty for the kind of action.
 
     Returns:
         A PNG.

@@ -32,7 +32,7 @@ def draw_found(
     """Draws colour and height from above, with the outlines of workspace and region.
 
     Args:
-        observation: of the table in view.
+        observation: the heightmap of the table in view.
         workspace: the proposed pixels of o_t.
         region: corners (x, y) in the base frame, in metres.
         ignore: polygons of the same kind.

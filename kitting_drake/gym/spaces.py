@@ -67,7 +67,7 @@ def as_observation(arrays: dict[str, Any], grid: PixelGrid) -> Observation:
 
     Args:
         arrays: an environment's observation.
-        grid: the scenario's: `environment.unwrapped.grid`.
+        grid: the pixel grid of the scenario, `environment.unwrapped.grid`.
     """
     rgb = np.moveaxis(np.asarray(arrays["colour"], np.float32) / np.float32(255), -1, 0)
     image = np.concatenate([rgb, np.asarray(arrays["height"], np.float32)[None]])

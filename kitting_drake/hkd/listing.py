@@ -49,7 +49,7 @@ def print_tools(models: Path, entries: list[ToolEntry], names: list[str], consol
 
     Args:
         models: the folder with `tools/`.
-        entries: the catalogue's.
+        entries: the entries of the catalogue.
         names: the tools to print; all of them if empty.
         console: widened to the table's width.
 

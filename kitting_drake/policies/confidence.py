@@ -56,8 +56,8 @@ def read_reliability(policy: str, weights: Path | None = None) -> Reliability:
 
     Args:
         policy: `networks` or `shape_matching`.
-        weights: of the networks. If a file of that name with the ending `.confidence.json` lies
-            beside them, it holds their own regression.
+        weights: the networks' file. If a file with the same name and the ending `.confidence.json`
+            lies beside it, that file holds their own regression.
     """
     own = None if weights is None else weights.with_suffix(".confidence.json")
     return _read(FILE if own is None or not own.exists() else own, policy)
@@ -73,7 +73,7 @@ def _read(path: Path, policy: str) -> Reliability:
 
 
 def evidence_of_networks(observation: Observation, decision: Decision) -> Evidence:
-    """The facts about a decision of networks that acts."""
+    """The facts about a networks' decision that is not a stop."""
     parts = certainty(decision, observation.grid.resolution)
     return {
         "something_to_pick": float(np.clip(decision.log_odds or 0.0, -8, 8)),
@@ -89,7 +89,8 @@ def evidence_of_networks(observation: Observation, decision: Decision) -> Eviden
 def certainty(decision: Decision, resolution: float) -> dict[str, float]:
     """The networks' certainty in a decision, as shares of their own probabilities.
 
-    - `something_to_pick`, or `nothing_to_pick` for a stop, by alpha's stop class, if it has one;
+    - `something_to_pick`, or for a stop `nothing_to_pick`: the probability by alpha's stop class,
+      if it has one;
     - `pick`: of alpha's probability within 6 cm of the pick, the share within 1 cm. Other objects
       that could be picked as well do not lower it;
     - `angle`: beta's probability within 10 degrees of the pick's angle.

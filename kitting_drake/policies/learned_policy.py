@@ -184,7 +184,7 @@ def _told(draft: Draft) -> dict[str, Any]:
 
 
 def _place_margin(draft: Draft) -> float:
-    """How much worse the networks score the best place more than `_ELSEWHERE` away, in nats."""
+    """How much worse the best place elsewhere (more than `_ELSEWHERE` away) scores, in nats."""
     candidates = draft.placing.candidates
     best, _, row, col = candidates[0].best()
     others = [

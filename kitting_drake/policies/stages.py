@@ -26,9 +26,9 @@ _AS_GOOD = 2.0
 _SAME_PLACE = 4.0
 """... if their places are at most this far apart, in pixels."""
 _TRIES = 4
-"""The number of picks that are tried for one that is seen."""
+"""How many picks are tried, at most, to find one that is seen."""
 _ANOTHER = 0.010
-"""The next pick is farther than this from the last one, in metres."""
+"""The next pick to try is farther than this from the last one, in metres."""
 _SOMETHING_FITS, _NOTHING_FITS = -1.0, 2.0
 """The shift of the stop threshold when the outlines show a fitting object, or none, in nats.
 
@@ -159,7 +159,7 @@ class ReleaseRoom:
                 look.image[3], look.resolution, pixel, draft.theta, *placement, self.planner
             )
 
-        # `min` returns the first of equals, which has the best score.
+        # Candidates are in order of their scores, and `min` returns the first of equals.
         rotation, goal = min(as_good, key=blocked)
         return dataclasses.replace(draft, rotation=rotation, goal=goal)
 

@@ -45,7 +45,7 @@ _HOST = "127.0.0.1"
 _LONGEST = 100_000
 """The largest size of an action, in bytes."""
 _LEAST_RANGE = 0.02
-"""White is at least this height, in metres, to keep noise on an empty table dark."""
+"""White stands for at least this height, in metres, so that noise on an empty table stays dark."""
 _UNSEEN = np.array([60, 0, 90], np.uint8)
 """The colour of pixels that no camera sees."""
 
@@ -57,8 +57,8 @@ class AnnotationServer(ThreadingHTTPServer):
         """
         Args:
             steps: the steps to annotate, at least one.
-            calibration: of the cameras.
-            port: of 127.0.0.1; 0 for any free port.
+            calibration: the cameras' calibration.
+            port: the port on 127.0.0.1; 0 for any free one.
 
         Raises:
             UserError: the first step's frames are unusable, or the port is taken.

@@ -81,7 +81,7 @@ class ShapeMatchingDecider:
     parameters: PickPlaceParameters = field(default_factory=PickPlaceParameters)
     """How the robot picks and places; give `decide` the same."""
     least_confidence: float | None = None
-    """It does not act with less confidence, from 0 to 1; None for the fitted threshold."""
+    """The least confidence with which it acts, from 0 to 1; None for the fitted threshold."""
 
     @property
     def name(self) -> str:
@@ -169,12 +169,13 @@ def load_policy(
     Args:
         weights: a file that `train` wrote; None for the generalist.
         orientations: N.
-        fit_outlines: for tasks with insertion: refine places by outlines, and grasps by the jaws'
-            room. Otherwise choose, among equivalent rotations of a place, one with room to let go.
+        fit_outlines: True, for tasks with insertion, refines places by outlines and grasps by the
+            jaws' room. False chooses, among equivalent rotations of a place, one that leaves the
+            fingers room to let go.
         recover: mend failed insertions; see `Recovery`.
         parameters: how the robot picks and places; None for the cell's defaults. Give `decide` the
             same.
-        least_confidence: it does not act with less confidence, from 0 to 1; None for the fitted
+        least_confidence: the least confidence with which it acts, from 0 to 1; None for the fitted
             threshold.
 
     Raises:

@@ -30,7 +30,7 @@ from systems.signals import (
 from systems.surface_heights import read_surface_heights
 
 _SEEN_TO_STOP = 0.7
-"""With a smaller share of pixels seen, an object may be hidden, and nothing is done."""
+"""If a smaller share of the pixels is seen, an object may be hidden: the policy does nothing."""
 
 
 @dataclass(frozen=True)
@@ -66,8 +66,11 @@ class BenchDecision:
 
     @property
     def place_height(self) -> float:
-        """The height of the fingertips when the object stands at its place, in metres: as far above
-        the floor there, seen in o_t, as they were above its support at the pick."""
+        """The height of the fingertips when the object stands at its place, in metres.
+
+        They are then as far above the floor of the place, as o_t shows it, as they were above the
+        object's support at the pick.
+        """
         hanging = max(self.heights.grasp - self.surfaces.support, 0.0)
         return max(self.surfaces.place_floor + hanging, self._lowest)
 
@@ -131,11 +134,11 @@ def decide(
     place, and if the action is likely to succeed.
 
     Args:
-        frames: of each camera by its name.
-        calibration: of the cameras.
+        frames: each camera's frame by its name.
+        calibration: the cameras' calibration.
         policy: `load_policy()` or `ShapeMatching()`; make it once.
         failed_picks: where grasps failed before, in the base frame; it avoids them.
-        parameters: of the motion, for its heights; None for the cell's.
+        parameters: the motion's parameters, which determine its heights; None for the cell's.
 
     Raises:
         UserError: frames, calibration and policy do not fit together.

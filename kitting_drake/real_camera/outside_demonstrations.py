@@ -60,7 +60,7 @@ class Summary:
     demonstrations: int
     steps: int
     finals: int
-    """Demonstrations that end with an observation with nothing left to do."""
+    """The number of demonstrations whose last observation shows that nothing is left to do."""
 
 
 def find_demonstrations(folder: Path) -> list[list[StepFolder]]:
@@ -131,11 +131,11 @@ def check_action(step: StepFolder, action: StepAction, calibration: Calibration)
     if action.action.stop and not step.is_last:
         raise UserError(
             f"{step.name} says that nothing is left to do, but steps come after it: only the last "
-            "step of a demonstration may"
+            "step of a demonstration may say so"
         )
     if action.calibration not in (None, calibration_digest(calibration)):
         raise UserError(
-            f"{step.name} was clicked by another calibration: give that one with --camera, or "
+            f"{step.name} was clicked with another calibration: give that one with --camera, or "
             "click it again"
         )
 
@@ -161,7 +161,7 @@ def convert(folder: Path, calibration: Calibration, learning: Learning, path: Pa
 
     Args:
         folder: see `find_demonstrations`.
-        calibration: of the cameras, one for all demonstrations.
+        calibration: the cameras' calibration, one for all demonstrations.
         learning: the assumptions that training may make.
         path: the file.
 
@@ -176,7 +176,7 @@ def convert(folder: Path, calibration: Calibration, learning: Learning, path: Pa
         scenario={
             "task": TASK,
             "calibration": calibration_record(calibration),
-            # The seeds identify the frames, and this digest the actions: together all the content.
+            # The seeds identify the frames, and this digest the actions.
             "actions": hashlib.sha256(json.dumps(actions).encode()).hexdigest(),
         },
         grid=calibration.grid,
@@ -199,7 +199,7 @@ def _labelled(
         labelled.append((step, action))
     if labelled[0][1].action.stop:
         raise UserError(
-            f"{steps[0].path.parent} holds no steps but the last, in which nothing is left to do: "
+            f"{steps[0].path.parent} holds only a last step, in which nothing is left to do: "
             "there is nothing to learn from it"
         )
     return labelled

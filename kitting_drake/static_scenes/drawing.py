@@ -119,7 +119,7 @@ def draw_scenes(seed: int, *, random_views: bool = False) -> Iterator[DrawnScene
     """Draws the scenes of a seed.
 
     Args:
-        seed: of all draws. Different seeds share neither tools nor kits.
+        seed: the seed of all draws. Different seeds share neither tools nor kits.
         random_views: one to three cameras at random poses (`draw_views`) instead of the default
             cameras.
 
@@ -135,7 +135,7 @@ def draw_scenes(seed: int, *, random_views: bool = False) -> Iterator[DrawnScene
         count = 1 + int(rng.choice(len(_COUNTS), p=_COUNTS / _COUNTS.sum()))
         chosen = [tools[i] for i in rng.choice(len(tools), count, replace=False)]
         if rng.random() < 0.5:
-            # Tools of one category are nested; four of different ones take a toolset's slots.
+            # Tools of one category are nested. Four of different categories take a toolset's slots.
             chosen = [replace(tool, category="drawn") for tool in chosen]
         try:
             kit = _draw_kit(chosen, rng)
@@ -288,9 +288,9 @@ def render(
 
     Args:
         bodies: on the table, the plane z = 0.
-        grid: of the observation.
-        noise: of the cameras.
-        seed: of the noise.
+        grid: the pixels of the observation.
+        noise: the noise of the cameras.
+        seed: the seed of the noise.
         views: the cameras by name.
     """
     builder = DiagramBuilder()

@@ -176,7 +176,7 @@ def grasp_along(size: tuple[float, float, float], axis: str, offset: float) -> G
     Args:
         size: the size of the box, in metres.
         axis: the axis of the centre line, `x` or `y`.
-        offset: from the middle along the line, in metres.
+        offset: the distance from the middle along the line, in metres.
     """
     x, y, z = size
     if axis == "x":

@@ -56,7 +56,7 @@ class PythonTask(TaskConfig):
     config: TaskConfig
     """The instance."""
     folder: Path = field(default=Path(), metadata={"described": False})
-    """Of the scenario's file."""
+    """The folder of the scenario's file."""
 
     @property
     def causes(self) -> tuple[str, ...]:  # type: ignore[override]

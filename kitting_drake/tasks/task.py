@@ -161,7 +161,7 @@ class TaskConfig:
 
     @property
     def title(self) -> str:
-        """The task's name in results: the literature's if all parameters are default."""
+        """The task's name in results. With default parameters it is the name in the literature."""
         raise NotImplementedError
 
     @property
@@ -199,7 +199,7 @@ class TaskConfig:
         """Why an object is not a success: one of `causes`.
 
         Args:
-            scene: the episode's.
+            scene: the scene of the episode.
             index: the index of the object.
             X_WB: final poses of all objects.
             placement: the placement of the object.

@@ -365,7 +365,7 @@ def test_depths_of_32_bits_do_not_overflow(tmp_path: Path):
 @pytest.mark.parametrize(
     ("camera", "grid", "message"),
     [
-        ({"max_depth": 0.3}, {}, "is 0.831 m, the median, and by its min_depth 0.01 and max_depth"),
+        ({"max_depth": 0.3}, {}, "no depth is between its min_depth 0.01 and max_depth 0.3"),
         ({}, {"rows": 1, "cols": 1}, "the workspace is too small for camera"),
     ],
 )

@@ -239,11 +239,11 @@ def only_stop(folder: Path) -> None:
         (action("demo1/step9", {**POSES, "object": 3}), "object must be a text, not 3"),
         (action("demo1/step9", {**POSES, "object": "a\0b"}), "must be of printable characters"),
         (action("demo1/step9", {"stop": True}), "demo1/step9 says that nothing is left to do, but"),
-        (action("demo1/step9", {**POSES, "calibration": "0"}), "clicked by another calibration"),
+        (action("demo1/step9", {**POSES, "calibration": "0"}), "clicked with another calibration"),
         (small, "demo2/step1: .* but camera front was calibrated at 640x480"),
         (empty, "demo3 holds no steps"),
         (copied, "demo2 and demo3 hold the same frames"),
-        (only_stop, "demo3 holds no steps but the last"),
+        (only_stop, "demo3 holds only a last step"),
     ],
 )
 def test_invalid_demonstrations_are_refused(

@@ -70,7 +70,7 @@ def engrave_labels(
 
     Args:
         kit: the kit; its tools' names are engraved.
-        cavities: the tools', in their order.
+        cavities: the cavities of the tools, in the tools' order.
         taken: the recesses cut so far; labels keep their distance from them.
 
     Returns:

@@ -37,7 +37,7 @@ def cut_notches(
 
     Args:
         kit: the kit.
-        cavities: the tools', in their order.
+        cavities: the cavities of the tools, in the tools' order.
         taken: the recesses cut so far; notches keep their distance from them.
 
     Returns:

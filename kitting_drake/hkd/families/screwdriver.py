@@ -203,7 +203,8 @@ def _handle_section(p: ScrewdriverParameters, x: float, width: float, flute: flo
     """A square (n, 3) with round corners and a flute of depth `flute` in each corner."""
     profile = rounded_rectangle(width, width, p.corner_radius_mm * width / p.handle_width_mm, 8)
     angle = np.arctan2(profile[:, 1], profile[:, 0])
-    # cos(4 angle) is -1 on the diagonals; the square keeps the flutes off the flats.
+    # -cos(4 angle) is 1 on the diagonals, where the corners are. Squaring it narrows the flutes, so
+    # that they leave the flat sides alone.
     depth = flute * np.clip(-np.cos(4 * angle), 0.0, 1.0) ** 2
     reach = np.linalg.norm(profile, axis=1, keepdims=True)
     return across_x(profile * (1 - depth[:, None] / reach), x)

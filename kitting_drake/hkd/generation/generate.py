@@ -189,7 +189,7 @@ def _tool_frame(
     """R_TD, p_T (mm), and the union of the parts (mm) in the tool frame T.
 
     Args:
-        entry: the tool's.
+        entry: the tool's entry in the catalogue.
         parts: in the design frame D.
         center: (3,) the centre of mass in D, in metres.
 

@@ -29,7 +29,7 @@ _DECIMATION_TOLERANCES_MM, _ENOUGH_TRIANGLES = (0.01, 0.02, 0.04), 10_000
 
 
 def guess_unit(length: float) -> str | None:
-    """The unit in which a hand tool has this length: mm, m, cm or inches; None if in none of them.
+    """The unit in which this length is that of a hand tool: mm, m, cm or inches; None if none fits.
 
     Inches and centimetres overlap: a length of at most 12 is taken as inches, above as centimetres.
     """

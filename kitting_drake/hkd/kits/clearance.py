@@ -32,7 +32,7 @@ def measure_clearance(
     wall. This includes points in notches of the tool, which the cavity bridges.
 
     Args:
-        block: the kit's, in frame K.
+        block: the kit's block, in frame K.
         tool: the tool to seat.
         parameters: the parameters of the kit.
         pose: the pose of the seated tool; by default the slot of its category.

@@ -201,7 +201,7 @@ def kit_cavities(
     """The cavity of each tool.
 
     Args:
-        tools: the kit's.
+        tools: the tools of the kit.
         parameters: the parameters of the kit.
         poses: the poses of the seated tools; by default those of `layout_kit`.
 

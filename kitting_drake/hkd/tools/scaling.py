@@ -24,8 +24,8 @@ _DRAKE = "http://drake.mit.edu"
 def scaled_tool(tool: Tool, length: float) -> Tool:
     """The tool scaled uniformly to a length in metres; the same tool if it has that length.
 
-    The scaled tool has its own SDFormat file in the cache, which scales the original's meshes. Its
-    name and all else stay the original's.
+    The scaled tool has its own SDFormat file in the cache, which scales the original's meshes. It
+    keeps the name and everything else of the original.
 
     Raises:
         UserError: the length is not positive, the model cannot be scaled, or the cache cannot be

@@ -60,7 +60,7 @@ def tool_sdf(
     The OBJ files lie beside the SDFormat file, which names them relatively.
 
     Args:
-        name: the model's.
+        name: the name of the model.
         mass: in kg.
         center: (3,) the centre of mass in m.
         inertia: (3, 3) about the centre of mass, in kg m^2.

@@ -32,7 +32,7 @@ class Stored:
 
     @classmethod
     def of(cls, dataset: h5py.Dataset, row: int | None = None) -> Stored:
-        """A dataset or a row of it."""
+        """The stored array of a dataset, or of one row of it."""
         shape = dataset.shape if row is None else dataset.shape[1:]
         return cls(dataset.file, dataset.name, shape, dataset.dtype, row)
 

@@ -34,9 +34,9 @@ def geometric_evidence(
     """The facts about a pick and place that o_t shows.
 
     Args:
-        segmentation: of o_t.
+        segmentation: the segmentation of o_t.
         pick: (row, col).
-        rotation: of the object, in radians.
+        rotation: the rotation of the object, in radians.
         place: (row, col).
         fit_cost: the mean difference of the outlines of object and recess, in metres; None if they
             do not fit.

@@ -37,11 +37,11 @@ come down on either side."""
 _NARROWEST = 0.003
 """The least width of a grasp, in metres."""
 _LOWEST = 0.003
-"""Anything lower than this above its support is no obstacle, in metres."""
+"""Anything that rises by less than this above its support is no obstacle, in metres."""
 _FINGER_MARGIN = 0.003
 """The clearance kept outside the fingers of the open jaws, in metres."""
 _STRAIGHT = 0.003
-"""A face recessed by less than this along the pads touches them, in metres."""
+"""A part of a face touches the pads if it is recessed by less than this, in metres."""
 
 
 @dataclass(frozen=True)
@@ -62,7 +62,7 @@ def untried(grasps: Sequence[JawGrasp], failed: Array, resolution: float) -> lis
     Args:
         grasps: candidates.
         failed: (n, 2), the (row, col) of the failed grasps.
-        resolution: of a pixel, in metres.
+        resolution: the side of a pixel, in metres.
     """
     return [
         grasp
@@ -83,9 +83,9 @@ def jaw_grasps(
     """The grasps of an object, best first; empty if there is none.
 
     Args:
-        segmentation: of the observation.
+        segmentation: the segmentation of the observation.
         region: the object.
-        resolution: of a pixel, in metres.
+        resolution: the side of a pixel, in metres.
         planner: how deep the fingertips go, and how wide the jaws open.
         support: height of the object's support above the table, in metres.
     """
@@ -131,8 +131,8 @@ def tip_height(top: Array, support: float, planner: PickPlaceParameters) -> Arra
     It follows `motion_heights`, but stays clear of the support.
 
     Args:
-        top: of the object, in metres above the table.
-        support: of the object's support, in metres above the table.
+        top: the height of the object's top, in metres above the table.
+        support: the height of the object's support, in metres above the table.
         planner: the depth of the fingertips and their clearance above the table.
     """
     share = planner.grasp_depth_share * (top - support)
@@ -187,7 +187,7 @@ def _grip(
     if not fits.any():
         return []
 
-    # How straight the faces are along the pads, from each line's own run about the centre.
+    # How straight the faces are along the pads, from where each line enters and leaves the object.
     inside = occupied & own[:, None, :]
     low = np.where(inside.any(axis=2), s[inside.argmax(axis=2)], np.nan)
     high = np.where(inside.any(axis=2), s[len(s) - 1 - inside[:, :, ::-1].argmax(axis=2)], np.nan)

@@ -41,7 +41,7 @@ def recovery_action(
 
     Args:
         observation: o_t.
-        segmentation: of o_t.
+        segmentation: the segmentation of o_t.
         planner: how the hand will pick.
         tried: poses of earlier failed grasps and presses.
     """

@@ -1,9 +1,9 @@
 """Refinement of a network's prediction by the geometry of o_t: its place and its grasp.
 
-The place is refined by fitting the object's outline to the recess, the grasp by the jaws' room. The
-fit corrects millimetres and degrees, and resolves the half turn, which only an object's ends
-distinguish. A prediction stays as it is where the outlines disagree, as with a hidden recess or
-without insertion. This is not in the paper.
+The place is refined by fitting the object's outline to the recess, and the grasp by the room for
+the jaws. The fit corrects errors of millimetres and degrees. It also tells an object from its half
+turn, although they may differ only at the ends. If the outlines do not agree, for instance because
+the recess is hidden or there is none, the prediction stays as it is. This is not in the paper.
 """
 
 from __future__ import annotations
@@ -75,11 +75,11 @@ def refine_place(
     """A refined place; None where the outlines do not determine it.
 
     Args:
-        segmentation: of o_t.
+        segmentation: the segmentation of o_t.
         pick: (row, col).
         rotation: predicted rotation of the object, in radians.
         place: (row, col) predicted for the object's point under the pick.
-        resolution: of a pixel, in metres.
+        resolution: the side of a pixel, in metres.
     """
     taken = nearest_region(segmentation.objects, pick)
     if taken is None:
@@ -136,7 +136,7 @@ def _better_elsewhere(
         target: its outline.
         fit: the registration of `outline` to `target`.
         others: the other recesses.
-        resolution: of a pixel, in metres.
+        resolution: the side of a pixel, in metres.
     """
     best, least = None, _RIVAL_GAIN * mismatch(fit, taken, recess)
     enough = _PROMISING * coarse_cost(outline, target)
@@ -187,10 +187,10 @@ def refine_grasp(
     None if there is no feasible grasp.
 
     Args:
-        segmentation: of o_t.
+        segmentation: the segmentation of o_t.
         pick: (row, col) predicted.
         theta: predicted angle of the gripper, in radians.
-        resolution: of a pixel, in metres.
+        resolution: the side of a pixel, in metres.
         planner: how the hand will pick.
         failed: (n, 2), the (row, col) of failed grasps, which are avoided.
     """

@@ -5,9 +5,9 @@ outline, closed and grown by a clearance (see `kitting_drake.hkd.kits.layout`). 
 is therefore closed first. The remaining offset is fitted: it is the clearance plus half a pixel,
 because a view from above makes objects wider and recesses narrower.
 
-The cost is the mean of a robust function of the difference of the signed distances about the
-object's outline. Gauss-Newton minimizes it over (rotation, row, col, offset), from the best of many
-rotations.
+At points near the object's outline, the signed distances from the two outlines are compared. The
+cost is the mean of a robust function of their differences. Gauss-Newton minimizes it over
+(rotation, row, col, offset), starting from the best of many rotations.
 """
 
 from __future__ import annotations
@@ -91,7 +91,7 @@ def trace_outline(mask: Mask, resolution: float, *, close: bool = False) -> Outl
 
     Args:
         mask: (rows, cols) with at least one True.
-        resolution: of its pixels, in metres.
+        resolution: the side of its pixels, in metres.
         close: bridge narrow notches, which the object's recess does not have.
     """
     margin = math.ceil((_FARTHEST + _CLOSING_RADIUS) / resolution) + 1
@@ -131,8 +131,8 @@ def register(
     """The best fit of an object's outline to a recess's.
 
     Args:
-        outline: the object's, closed.
-        recess: the recess's.
+        outline: the outline of the object, closed.
+        recess: the outline of the recess.
         starts: initial rotations and shifts. Without any, the best of many rotations about the
             centroids are refined.
     """
@@ -164,17 +164,17 @@ def _compared(outline: Outline, recess: Outline, fit: Registration) -> tuple[Arr
     """Compares an object's outline, fitted to a recess, with that recess.
 
     Returns:
-        (p,): the recess's signed distances at the fitted points of the object's outline, less the
-            offset of the outlines.
-        (p,): the same, less the signed distances of the object's own outline.
+        (p,): the signed distances of the fitted points from the recess's outline, minus the offset
+            between the outlines.
+        (p,): these values, minus the signed distances of the points from the object's own outline.
     """
     there, offset = _brought(outline, recess, fit)
     return there - offset, there - offset - outline.values
 
 
 def _brought(outline: Outline, recess: Outline, fit: Registration) -> tuple[Array, float]:
-    """(p,): the recess's signed distances at the fitted points of an object's outline, and the
-    offset of the outlines."""
+    """(p,): the signed distances of an object's fitted points from the recess's outline; and the
+    offset between the outlines, in metres."""
     positions = outline.points @ rotation_matrix(fit.rotation).T + fit.shift
     there = recess.sample(recess.distance, positions, _FARTHEST)
     offset = float(np.median(there - outline.values))

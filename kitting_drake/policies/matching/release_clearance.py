@@ -29,7 +29,7 @@ _SUPPORT_REACH, _SUPPORT_SHARE = 0.06, 10.0
 _UNDER = 0.009
 """The support at the place is the highest point within this distance, in metres."""
 _LEAST = 0.004
-"""Anything lower than this above the fingertips is no obstacle, in metres."""
+"""Anything that rises by less than this above the fingertips is no obstacle, in metres."""
 
 
 def blocked_at_place(
@@ -45,10 +45,10 @@ def blocked_at_place(
 
     Args:
         height: (rows, cols) of o_t, in metres.
-        resolution: of a pixel, in metres.
+        resolution: the side of a pixel, in metres.
         pick: (row, col) where the object is gripped.
-        theta: of the gripper there, in radians.
-        rotation: of the object from pick to place, in radians.
+        theta: the angle of the gripper there, in radians.
+        rotation: the rotation of the object from pick to place, in radians.
         place: (row, col) where the gripper releases it.
         planner: the depth of the fingertips, and how far the jaws open at release.
     """

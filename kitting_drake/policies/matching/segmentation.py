@@ -35,16 +35,16 @@ _PROTRUSION = 0.002
 _LEAST_AREA = 0.0004
 """Smaller regions are ignored as noise, in square metres."""
 _LEAST_PROTRUDING = 0.00012
-"""The same for protruding objects, of which only one end may protrude."""
+"""The same for protruding objects. It is smaller, because perhaps only one end protrudes."""
 _FIXTURE_MARGIN = 0.006
 """Pixels closer to the fixture's outline than this are neither table nor recess, in metres."""
 _CLEAN = 0.0005
 """Heights with less noise than this are not filtered, in metres."""
 _CLEARLY = 2.0
-"""Heights that differ by more standard deviations than this are signal.
+"""A height that differs by more standard deviations than this is not noise.
 
-The few noisy pixels beyond it are isolated. A larger value would cut off an object's flat ends,
-which distinguish it from its half turn.
+The few noisy pixels that do are isolated. A larger value would cut off an object's flat ends, by
+which it is told from its half turn.
 """
 _OBJECT_SEEN, _RECESS_SEEN = 0.5, 0.3
 """The least seen shares of an object, and of a free recess."""
@@ -86,7 +86,7 @@ class Segmentation:
     relief: NDArray[np.float32]
     """(rows, cols): height above the table plane in metres; unseen pixels are filled in."""
     visibility: Visibility
-    """What is seen of it."""
+    """Which of its pixels are seen."""
 
     @property
     def kit_seen(self) -> bool:
@@ -258,7 +258,7 @@ def _regions(
     Args:
         mask: (rows, cols).
         relief: the heights, measured within the core.
-        resolution: of a pixel, in metres.
+        resolution: the side of a pixel, in metres.
         least: the least area within the core, in square metres.
         core: the part of the mask that counts; None for all of it.
     """

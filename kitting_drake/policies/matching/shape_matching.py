@@ -108,7 +108,7 @@ class ShapeMatchingPolicy:
 
 
 def why_stop(segmentation: Segmentation) -> str:
-    """The reason for which a policy stops that finds nothing to pick; see `STOP_REASONS`."""
+    """Why a policy stops if it finds nothing to pick; see `STOP_REASONS`."""
     if not segmentation.kit_seen:
         return "no kit seen"
     left = segmentation.objects and segmentation.free_recesses
@@ -138,8 +138,8 @@ def match(segmentation: Segmentation, resolution: float) -> list[tuple[int, Regi
     """The indices of the loose objects and their fits into recesses, best fit first.
 
     Args:
-        segmentation: of an observation.
-        resolution: of its pixels, in metres.
+        segmentation: the segmentation of an observation.
+        resolution: the side of its pixels, in metres.
     """
     objects, regions = segmentation.objects, segmentation.recesses
     if not objects or not regions:

@@ -1,8 +1,8 @@
 """Where o_t shows enough to pick and place.
 
-A robot must not reach where no camera looks. It may reach into a small shadow: one camera sees no
-object from all sides. So the pick itself must be seen, and most of what the jaws sweep; nothing of
-it may be outside all views.
+A robot must not reach where no camera looks. It may reach into a small shadow, because one camera
+sees no object from all sides. So the pick itself and most of what the jaws sweep must be seen, and
+no part of this may be outside all views.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ class Visibility:
 
     @classmethod
     def of(cls, observation: Observation) -> Visibility:
-        """That of an observation."""
+        """The visibility of an observation."""
         grid: PixelGrid = observation.grid
         return cls(observation.valid, observation.in_view, grid.resolution)
 
@@ -70,12 +70,12 @@ class Visibility:
         return pickable
 
     def picks_are_seen(self, pixels: Array, thetas: Array, open_width: float) -> Mask:
-        """(n,): whether the pixels of picks are seen, and what the jaws sweep.
+        """(n,): whether enough is seen of each pick's pixel and of what the jaws sweep there.
 
         Args:
             pixels: (n, 2), row and column.
             thetas: (n,), of the gripper, in radians.
-            open_width: of the jaws before they close, in metres.
+            open_width: the opening of the jaws before they close, in metres.
         """
         if self.seen.all() and self.in_view.all():
             return np.ones(len(pixels), bool)
@@ -102,7 +102,7 @@ class Visibility:
         Args:
             footprint: (n, 2), the pixels of the object where it lies; None if they are unknown.
             pick: (row, col) at which it is gripped.
-            rotation: of the object from pick to place, in radians.
+            rotation: the rotation of the object from pick to place, in radians.
             place: (row, col) to which that point goes.
         """
         if footprint is None:

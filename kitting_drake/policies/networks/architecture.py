@@ -62,9 +62,9 @@ PRESETS = {
     "paper": Preset(),
     # For machines without an accelerator: each U-net has 0.2 M parameters.
     "small": _SMALL,
-    # "small" with baselines reduced like the SO(2) networks. The Transporter keeps the same share
-    # of the original's parameters, 1/25. At N = 36 the Equivariant Transporter's angle network has
-    # as many parameters as beta.
+    # "small", with baselines that are reduced by the same factor as the SO(2) networks: the
+    # Transporter has 1/25 of the original's parameters. At N = 36 the Equivariant Transporter's
+    # angle network has as many parameters as beta.
     "matched": dataclasses.replace(
         _SMALL,
         group_angle=AngleNetSize(

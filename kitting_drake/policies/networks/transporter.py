@@ -242,7 +242,7 @@ def draw_bins(
     Args:
         labels: bins to include.
         bins: the total number of bins, over half a rotation or a full one.
-        step: between neighbours, in radians.
+        step: the angle between neighbours, in radians.
         random: draws the other bins.
         rotations: the number of bins to return, including the labels. Half of the drawn bins are
             near a label, if there are enough. None draws two per stratum, the minimum.

@@ -84,8 +84,8 @@ class Trainer:
             decay: let the learning rate decay to zero (`decayed`) instead of keeping it constant.
             curvature: see `augment`.
             reflection: see `augment`.
-            only: the single loss to train, while other modules keep their weights; None trains all.
-                Its steps are the same as in a training of all losses.
+            only: the one loss to train; None trains all. The modules of other losses keep their
+                weights. The given loss takes the same steps as if all were trained.
         """
         self.networks = networks
         self.seed = seed

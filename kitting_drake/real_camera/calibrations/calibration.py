@@ -56,7 +56,7 @@ Array = NDArray[np.float64]
 _HEIGHT = PixelGrid().z_max - PixelGrid().z_min
 """The default of `max_height`: points higher above the table are ignored, in metres."""
 _MOST_PIXELS = 10_000_000
-"""A workspace with more pixels has its resolution in a wrong unit."""
+"""If a workspace has more pixels, its resolution is probably given in a wrong unit."""
 _DEPTH_FIELDS = ("depth_scale", "min_depth", "max_depth")
 _LENS_FILES = ("camera_info", "intrinsics")
 """Fields that name a file of intrinsics."""
@@ -77,8 +77,11 @@ class ColorLens:
 
 @dataclass(frozen=True)
 class BenchCamera:
-    """An RGB-D camera. Depth is registered to colour, so one lens describes both, unless `color`
-    has another for colour."""
+    """An RGB-D camera.
+
+    Usually depth is registered to colour, and one lens describes both. Otherwise `color` has the
+    lens of colour.
+    """
 
     name: str
     intrinsics: Intrinsics
@@ -92,7 +95,7 @@ class BenchCamera:
     color: ColorLens | None = None
     """The colour's own lens; None if depth is registered to colour."""
     topics: tuple[str, str] | None = None
-    """The topics of colour and depth in recordings; None if their names tell."""
+    """The topics of colour and depth in recordings; None to find them by their names."""
 
     @cached_property
     def rays(self) -> DepthRays:
@@ -126,8 +129,8 @@ class Calibration:
     outline: TableOutline = dataclasses.field(default_factory=TableOutline)
     """What of the workspace is table."""
     verified: bool = False
-    """Whether x, y, yaw and the image's orientation were checked, which a bare table does not
-    show."""
+    """Whether x, y, yaw and the orientation of the image were checked. A bare table does not show
+    errors of these."""
 
     @cached_property
     def region(self) -> NDArray[np.bool_] | None:
@@ -163,8 +166,9 @@ def read_calibration(
 
     Args:
         path: the file.
-        table_height: of the table in the base frame, in metres; None for the file's, or zero.
-        poses: whether cameras must have poses. Without, a missing pose is the identity.
+        table_height: the table's height in the base frame, in metres. None takes it from the file;
+            if the file has none, it is zero.
+        poses: whether cameras must have poses. If not, a missing pose becomes the identity.
 
     Raises:
         UserError: a field is missing or invalid; names the file and the field.

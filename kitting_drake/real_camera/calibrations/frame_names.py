@@ -1,4 +1,4 @@
-"""Which of two frames is the base, the hand or the camera, by their names in ROS."""
+"""Tells from ROS's frame names which of two frames is the base, the hand or the camera."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ class FoundPose:
 
 @dataclass(frozen=True)
 class FrameNames:
-    """The frames' names that a user gives, where names alone do not tell; empty if not given."""
+    """The frames' names that a user gives if a file's are ambiguous; empty if not given."""
 
     base: str = ""
     camera: str = ""
@@ -73,8 +73,8 @@ class FrameNames:
 def directed(found: FoundPose, names: FrameNames) -> FoundPose:
     """The pose of the camera, in the base or the hand: inverted if its frames' names say so.
 
-    Without names it is believed to be the pose of the camera in the base. A hand-eye calibration
-    itself says what it is of.
+    If there are no names, it is taken as the pose of the camera in the base. A hand-eye calibration
+    says itself which pose it holds.
 
     Raises:
         UserError: the names do not tell, or neither frame is a camera.

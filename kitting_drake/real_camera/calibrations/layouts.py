@@ -150,7 +150,7 @@ def get(node: dict[str, Any], key: str, where: str) -> Any:
 
 
 def refuse_two(node: dict[str, Any], keys: tuple[str, ...], where: str) -> str | None:
-    """The only given one of some fields, or None; raises UserError if there are several."""
+    """The one of some fields that is given, or None; raises UserError if several are."""
     given = [key for key in keys if key in node]
     if len(given) > 1:
         raise UserError(f"{where} has {' and '.join(given)}: give one of them")

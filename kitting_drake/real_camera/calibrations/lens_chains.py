@@ -20,15 +20,18 @@ _LENS_FILES = ("camera_info", "intrinsics")
 
 
 def with_chained_poses(entries: dict[str, Any], path: Path) -> dict[str, Any]:
-    """The entries of a calibration, with `camera_to_base` for each that has no pose, but is in the
-    same camchain of kalibr as one that has.
+    """The entries of a calibration, with poses for more cameras.
+
+    A camera without a pose gets `camera_to_base` if another camera of the same kalibr camchain has
+    a pose.
 
     Args:
         entries: the cameras' entries by name.
-        path: of the calibration.
+        path: the calibration's file.
 
     Raises:
-        UserError: the chain is broken, or two cameras of it have poses that need not agree.
+        UserError: the chain is broken, or several of its cameras have poses, which might contradict
+            one another.
     """
     lacking = [
         name
@@ -48,8 +51,8 @@ def with_chained_poses(entries: dict[str, Any], path: Path) -> dict[str, Any]:
             continue
         if len(others) > 1:
             raise UserError(
-                f"{path}: camera {name} has no pose, and {' and '.join(others)} of its camchain "
-                "have: leave the pose of one of them"
+                f"{path}: camera {name} has no pose, but several of its camchain do "
+                f"({', '.join(others)}): keep the pose of only one of them"
             )
         ((other, entry),) = others.items()
         X_BO = read_pose(entry, f"{path}: camera {other}", path.parent)

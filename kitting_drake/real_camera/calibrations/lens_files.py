@@ -34,8 +34,8 @@ def read_lens_file(path: Path, stream: str, resolution: tuple[int, int] | None) 
 
     Args:
         path: the file, or a recording with a CameraInfo.
-        stream: which of several lenses: kalibr's cam1, RealSense's Color, or a topic; or the name
-            of the camera, which counts only if it fits one of them.
+        stream: which lens to take if there are several: kalibr's cam1, RealSense's Color, or a
+            topic. The name of the camera is also possible; it counts only if it fits one of them.
         resolution: (width, height) of RealSense's streams, in pixels; None if there is only one.
 
     Raises:
@@ -56,7 +56,9 @@ def read_lens_file(path: Path, stream: str, resolution: tuple[int, int] | None) 
 
 
 def lens_of_mapping(content: dict[str, Any], where: str, stream: str = "") -> dict[str, Any]:
-    """The same mapping, or its intrinsics as fields that `read_intrinsics` knows.
+    """The intrinsics in a mapping, as fields that `read_intrinsics` knows.
+
+    A mapping that is not in the layout of another tool is returned unchanged.
 
     Raises:
         UserError: the layout has several lenses, or a lens that is not a pinhole's.
@@ -66,7 +68,7 @@ def lens_of_mapping(content: dict[str, Any], where: str, stream: str = "") -> di
     if content.get("class_name") == "PinholeCameraTrajectory":
         parameters = content.get("parameters")
         if not isinstance(parameters, list) or len(parameters) != 1:
-            raise UserError(f"{where} has the cameras of several times: save one's parameters")
+            raise UserError(f"{where} has cameras at several times: save the parameters of one")
         content = parameters[0]
     if "intrinsic" in content or "intrinsic_matrix" in content:
         return _open3d(content, where)
@@ -83,7 +85,7 @@ def lens_of_mapping(content: dict[str, Any], where: str, stream: str = "") -> di
 
 
 def kalibr_cameras(content: dict[str, Any]) -> dict[str, dict[str, Any]]:
-    """The cameras of kalibr's camchain, by name; empty if the file is another."""
+    """The cameras of kalibr's camchain, by name; empty if the content is no camchain."""
     return {
         str(name): node
         for name, node in content.items()
@@ -94,10 +96,10 @@ def kalibr_cameras(content: dict[str, Any]) -> dict[str, dict[str, Any]]:
 
 
 def kalibr_stream(cameras: dict[str, dict[str, Any]], where: str, stream: str) -> str:
-    """Which of kalibr's cameras is meant: by its name, or as a part of its topic.
+    """The kalibr camera that `stream` names, or whose topic has `stream` as a part.
 
     Raises:
-        UserError: none or several are.
+        UserError: no single camera fits.
     """
     if stream in cameras:
         return stream
@@ -131,7 +133,7 @@ def _kalibr(content: dict[str, Any], where: str, stream: str) -> dict[str, Any]:
 
 
 def _open3d(content: dict[str, Any], where: str) -> dict[str, Any]:
-    """Of PinholeCameraIntrinsic, PinholeCameraParameters, or a recorder of Open3D."""
+    """Open3D's intrinsics: PinholeCameraIntrinsic, PinholeCameraParameters, or a recorder's."""
     inner = content.get("intrinsic", content)
     if not isinstance(inner, dict):
         raise UserError(f"{where}: intrinsic must have width, height and intrinsic_matrix")
@@ -150,7 +152,7 @@ def _open3d(content: dict[str, Any], where: str) -> dict[str, Any]:
 def _realsense_text(
     text: str, path: Path, stream: str, resolution: tuple[int, int] | None
 ) -> dict[str, Any]:
-    """Of `rs-enumerate-devices -c`, which has a block for each stream and resolution."""
+    """The intrinsics from `rs-enumerate-devices -c`: a block for each stream and resolution."""
     heads = list(_REALSENSE.finditer(text))
     names = {head.group(1) for head in heads}
     wanted = stream if stream in names else "Color"

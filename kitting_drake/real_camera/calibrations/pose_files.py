@@ -29,10 +29,10 @@ from kitting_drake.real_camera.calibrations.yaml_values import (
 Array = NDArray[np.float64]
 
 _ROUNDED = 2e-3
-"""A quaternion of tf2_echo has three decimals."""
+"""The tolerance for a quaternion of tf2_echo, which has three decimals."""
 _STILL = 2e-3
-"""Repeated lines of tf2_echo that differ by more are of a moving frame, in metres or as numbers of
-a quaternion."""
+"""If repeated lines of tf2_echo differ by more, the frame moves; in metres, or in the numbers of a
+quaternion."""
 _NUMBERS = r"\[\s*([^\]]*?)\s*\]"
 _ECHO = re.compile(rf"Translation:\s*{_NUMBERS}.*?in Quaternion(?:\s*\(xyzw\))?\s*{_NUMBERS}", re.S)
 _ECHO_CALL = re.compile(r"\btf2?_echo[ \t]+([\w/.-]+)[ \t]+([\w/.-]+)")
@@ -44,7 +44,7 @@ _KNOWN = (
 
 
 def read_pose_file(path: Path) -> list[FoundPose]:
-    """The poses in a file; several only if it is of static publishers or of /tf_static.
+    """The poses in a file. Only files of static publishers and /tf_static can hold several.
 
     Raises:
         UserError: the file is unreadable, incomplete, or of an unknown layout.
@@ -115,7 +115,7 @@ def _poses_of_mapping(content: dict[str, Any], where: str) -> list[FoundPose]:
     parameters = content.get("parameters")
     if content.get("class_name") == "PinholeCameraTrajectory":
         if not isinstance(parameters, list) or len(parameters) != 1:
-            raise UserError(f"{where} has the poses of several times: save one camera's parameters")
+            raise UserError(f"{where} has poses at several times: save the parameters of one")
         content = parameters[0] if isinstance(parameters[0], dict) else {}
     if "extrinsic" in content:
         return [FoundPose(open3d_pose(content, where), where)]
@@ -132,8 +132,8 @@ def _poses_of_mapping(content: dict[str, Any], where: str) -> list[FoundPose]:
 
 
 def open3d_pose(content: dict[str, Any], where: str) -> Array:
-    """(4, 4): the pose of the camera, from Open3D's `extrinsic`: column by column, and from the
-    world to the camera."""
+    """(4, 4): the pose of the camera, from Open3D's `extrinsic`, which maps from the world to the
+    camera and is stored column by column."""
     value = content["extrinsic"]
     if isinstance(value, list) and any(isinstance(item, list) for item in value):
         raise UserError(
@@ -145,7 +145,7 @@ def open3d_pose(content: dict[str, Any], where: str) -> Array:
 
 
 def _easy_handeye(content: dict[str, Any], where: str) -> FoundPose:
-    """Of easy_handeye for ROS 1, whose older versions have no `parameters`."""
+    """The pose in a file of easy_handeye for ROS 1, whose older versions have no `parameters`."""
     inner = content.get("parameters", content)
     if not isinstance(inner, dict) or not isinstance(inner.get("eye_on_hand"), bool):
         raise UserError(f"{where} lacks eye_on_hand: true or false")

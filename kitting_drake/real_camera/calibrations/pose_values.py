@@ -19,7 +19,7 @@ Array = NDArray[np.float64]
 _ORTHOGONAL = 1e-3
 """The largest difference of an entry of R^T R from the identity's."""
 _FARTHEST = 20.0
-"""A camera farther from the base has its position in another unit, in metres."""
+"""If a camera is farther from the base, its position is not in metres; in metres."""
 _POSITIONS = ("position", "translation")
 _ROTATIONS = ("orientation", "quaternion_xyzw", "rotation", "rpy_deg", "rvec")
 _MOST_ENVELOPES = 4

@@ -48,11 +48,11 @@ def read_pose(node: dict[str, Any], where: str, folder: Path) -> Array:
     Args:
         node: the camera's entry.
         where: the beginning of errors.
-        folder: of files that the entry names.
+        folder: the folder of the files that the entry names.
 
     Raises:
-        UserError: there is not exactly one pose, its rotation is invalid, or it is that of a camera
-            on the hand and the hand's is missing; names the field.
+        UserError: there is not exactly one pose, its rotation is invalid, or the camera is on the
+            hand and the hand's pose is missing; names the field.
     """
     found = _given_pose(node, where, folder)
     if "optical_to_link" in node:
@@ -71,14 +71,14 @@ def read_pose(node: dict[str, Any], where: str, folder: Path) -> Array:
     if not found.in_hand:
         if "hand_to_base" in node:
             raise UserError(
-                f"{where} has hand_to_base, but {found.where} is not of a camera on the hand: "
+                f"{where} has hand_to_base, but {found.where} is the pose of a fixed camera: "
                 "remove hand_to_base, or call the pose camera_to_hand"
             )
         return X
     if "hand_to_base" not in node:
         raise UserError(
-            f"{found.where} is of a camera on the hand (eye in hand): give hand_to_base, the "
-            "hand's pose in the base when the frame was taken"
+            f"{found.where} is the pose of a camera on the hand (eye in hand): give hand_to_base, "
+            "the hand's pose in the base when the frame was taken"
         )
     return _hand_pose(node, found, where, folder) @ X
 
@@ -141,7 +141,7 @@ def _read_value(value: Any, where: str, folder: Path, names: FrameNames) -> Foun
         pairs = ", ".join(f"{pose.parent} to {pose.child}" for pose in poses)
         raise UserError(
             f"{folder / value} has {len(poses)} transforms ({pairs}), and {len(ends)} of them are "
-            "of a camera in the base or the hand: leave one"
+            "of a camera in the base or the hand: keep only one"
         )
     return ends[0]
 

@@ -25,18 +25,18 @@ Polygon = tuple[tuple[float, float], ...]
 
 OUTLINE_FIELDS = ("region", "ignore", "region_mask")
 _INLINE = "data:image/png;base64,"
-"""Begins an image that stands in the YAML itself, as `write_calibration` writes it."""
+"""How an image begins that the YAML itself contains, as `write_calibration` writes it."""
 _NOT_AN_IMAGE = (OSError, SyntaxError, ValueError, TypeError, Image.DecompressionBombError)
 
 
 @dataclass(frozen=True)
 class TableOutline:
-    """What is table and what is not, such as the robot's base, profiles or the floor."""
+    """Which areas are table and which are not, such as the robot's base, profiles or the floor."""
 
     region: Polygon = ()
-    """Only inside it is table; empty for everywhere."""
+    """The table is only inside this polygon; empty for everywhere."""
     ignore: tuple[Polygon, ...] = ()
-    """What lies inside one of these is no table."""
+    """The areas inside these polygons are not table."""
     mask: tuple[bytes, ...] = ()
     """A byte for each pixel of each row of the workspace, 1 for table; empty for everywhere."""
 
@@ -101,7 +101,7 @@ def read_outline(node: dict[str, Any], path: Path, grid: PixelGrid) -> TableOutl
 
     Args:
         node: the calibration's fields.
-        path: of its file; a mask's path is relative to it.
+        path: the calibration's file; a mask's path is relative to its folder.
         grid: the pixels of the workspace.
 
     Raises:

@@ -94,8 +94,8 @@ def check_cameras(
     the given one, or else the mean of what they see.
 
     Args:
-        frames: of each camera by its name, with nothing but the block on the table.
-        calibration: of the cameras.
+        frames: each camera's frame by its name, with nothing but the block on the table.
+        calibration: the cameras' calibration.
         block: the block on the table, if any.
 
     Raises:
@@ -151,7 +151,7 @@ def _is_verified(block: Block | None) -> bool:
 
 
 def levelled(X_BC: Array, plane: Plane, grid: PixelGrid) -> Array:
-    """(4, 4): the corrected pose of a camera, which makes the plane that it sees the table."""
+    """(4, 4): a camera's pose, corrected so that the plane that it sees becomes the table."""
     R = plane.levelling()
     corrected = X_BC.copy()
     corrected[:3, :3] = R @ X_BC[:3, :3]

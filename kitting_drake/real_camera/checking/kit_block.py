@@ -19,8 +19,8 @@ _LEAST_PIXELS = 400
 _CLEAN = 0.0005
 """Heights with more noise than this are filtered, in metres."""
 _LEAST_BAND = 0.001
-"""Points within this distance of the top's height belong to it, in metres, or three times the
-noise if that is more."""
+"""Points within this distance of the top's height belong to the top, in metres. If three times the
+noise is more, that counts instead."""
 
 
 @dataclass(frozen=True)
@@ -59,10 +59,11 @@ def see_block(
 ) -> SeenBlock:
     """Measures the block in a camera's image.
 
-    Depth only selects the pixels of the top. Their rays are intersected with the plane of the top,
-    and the moments of the areas that they cover give the centre, direction and sides without bias.
-    Visible walls add a strip as high as the band of depths around the top; its width is computed
-    and subtracted. Recesses within the outline do not matter, but notches in it do.
+    Depth only selects the pixels of the top. Their rays are intersected with the plane of the top.
+    The moments of the areas that the pixels cover there give the centre, direction and sides
+    without bias. Pixels near the top count as the top, and some of them may be of a visible wall.
+    They add a strip, whose width is computed and subtracted. Recesses inside the outline do not
+    matter, but notches in the outline do.
 
     Args:
         points: (height, width, 3) in the base frame, as `table_points` gives them.
@@ -70,7 +71,7 @@ def see_block(
         X_BC: its pose.
         block: the block to find.
         table: height of the table, in metres.
-        noise: of the heights, in metres.
+        noise: the standard deviation of the heights, in metres.
 
     Raises:
         UserError: the camera does not see such a block.
@@ -156,8 +157,8 @@ def _least_rectangle(points: Array) -> Array:
 
 
 def _side_angles(local: Array) -> tuple[float, float]:
-    """The rotations of the sides along x and of those along y from these axes, in radians,
-    counter-clockwise, for the outline (n, 2) of a rectangle about the origin."""
+    """How far a rectangle's sides are rotated from the axes, in radians, counter-clockwise: first
+    the sides along x, then those along y. Its outline (n, 2) is centred on the origin."""
     half = np.abs(local).max(axis=0)
     angles = []
     for along in (0, 1):

@@ -17,7 +17,7 @@ GOOD, TIGHT, BAD = "good", "tight", "too much"
 _HALF_KIT = 0.1
 """The distance from a kit's centre to its edge, in metres."""
 _OUT_OF_SCALE = 0.008
-"""A smaller error of the scale may be noise."""
+"""Errors of the scale below this may be noise."""
 _HALF_WORKSPACE = 0.5
 """In metres."""
 _LEVEL = math.radians(0.02)
@@ -47,7 +47,7 @@ def findings(check: Check, planner: PickPlaceParameters | None = None) -> list[F
     """All lines of a report, camera by camera.
 
     Args:
-        check: of the cameras.
+        check: the check of the cameras.
         planner: how the robot picks and places; None for the cell's defaults.
     """
     planner = PickPlaceParameters() if planner is None else planner

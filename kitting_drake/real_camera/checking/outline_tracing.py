@@ -21,14 +21,14 @@ _INSIDE = 0.010
 
 
 def disc(radius: float) -> Mask:
-    """(n, n): a disc for morphology, of a radius in cells."""
+    """(n, n): a disc for morphology; the radius is in cells."""
     reach = max(1, int(np.ceil(radius)))
     rows, cols = np.mgrid[-reach : reach + 1, -reach : reach + 1]
     return np.asarray(rows**2 + cols**2 <= max(radius, 1.0) ** 2)
 
 
 def largest_part(mask: Mask) -> Mask:
-    """The largest connected part of a mask (rows, cols) that is not empty."""
+    """The largest connected part of a mask (rows, cols), which must not be empty."""
     labels, found = ndimage.label(mask)
     if found <= 1:
         return mask
@@ -39,11 +39,11 @@ def trace(mask: Mask, grid: PixelGrid) -> Polygon:
     """The outline of a mask, slightly inside it, with at most 12 corners in the base frame.
 
     Args:
-        mask: (rows, cols), one part without holes, that does not touch the border.
+        mask: (rows, cols), one connected part without holes. It must not touch the border.
         grid: its cells.
     """
     inner = ndimage.binary_erosion(mask, disc(_INSIDE / grid.resolution))
-    # Spikes of the outline, such as between two objects at the edge, are no table for tools.
+    # Narrow spikes, such as between two objects at the table's edge, have no room for a tool.
     smooth = ndimage.binary_opening(inner, disc(2 * _INSIDE / grid.resolution))
     for candidate in (smooth, inner, mask):
         if candidate.any():

@@ -109,7 +109,7 @@ def fit_plane(points: Array, steepest: float = 0.3) -> Plane:
 
 
 def find_planes(points: Array, most: int = 3) -> list[Plane]:
-    """The planes with most points, largest first; each is sought among the points off the others.
+    """The planes with most points, largest first. Points on a plane are ignored for the next ones.
 
     Args:
         points: (n, 3).
@@ -131,7 +131,7 @@ def refit(points: Array, plane: Array) -> Plane | None:
 
     Args:
         points: (n, 3).
-        plane: (3,), to begin with.
+        plane: (3,), the plane to start from.
     """
     design = np.column_stack([points[:, :2], np.ones(len(points))])
     noise = _BAND

@@ -130,7 +130,7 @@ def save_found(folder: Path, found: FoundTable, observation: Observation) -> Non
     Args:
         folder: for the files.
         found: the proposal.
-        observation: of `found.around`.
+        observation: the heightmap over `found.around`.
 
     Raises:
         UserError: a file cannot be written.

@@ -20,8 +20,9 @@ from systems.signals import PixelGrid
 Array = NDArray[np.float64]
 
 UNVERIFIED = (
-    "a table shows neither x, y and yaw of a camera nor a mirrored image: check them once with a "
-    "block (--check --kit_size_mm --kit_pose) or markers (--calibrate); these write verified: true"
+    "a bare table does not show errors of x, y and yaw, or a mirrored image: check these once with "
+    "a block (--check --kit_size_mm --kit_pose) or markers (--calibrate); either writes "
+    "verified: true"
 )
 """The warning of a calibration that was not verified."""
 _REFUSED_OFF, _REFUSED_TILT = 0.010, math.radians(1.3)
@@ -32,12 +33,13 @@ _STEP = 4
 _FARTHEST = 0.35
 """Planes are sought within this distance of the table's height, in metres."""
 _LEAST = 150
-"""The least number of such pixels on a plane."""
+"""The least number of these pixels on a plane."""
 _BELOW, _ABOVE = 0.5, 0.08
 """The plane at the table's height is not the table if it has less than this share of the pixels of
 a plane below it, or above it. Large objects may hide most of a table."""
 _CURVED = 0.5
-"""Depths are distances if the table is flatter than this share when they are taken for such."""
+"""The depths are distances from the camera if taking them as such reduces the table's noise to less
+than this share."""
 _FLAT = 0.002
 """A table with less noise than this is flat, in metres."""
 
@@ -69,8 +71,8 @@ def check_table(frames: Mapping[str, Frame], calibration: Calibration) -> list[s
     """Checks that every camera sees the table at its height, and level.
 
     Args:
-        frames: of each camera by its name, checked by `check_frame`.
-        calibration: of the cameras.
+        frames: each camera's frame by its name, checked by `check_frame`.
+        calibration: the cameras' calibration.
 
     Returns:
         Warnings, a sentence each.
@@ -171,7 +173,7 @@ def _is_range(
 
 
 def _as_depth(camera: BenchCamera, distance: NDArray[np.float32]) -> NDArray[np.float32]:
-    """The depths along the optical axis of distances from the camera."""
+    """Converts distances from the camera to depths along the optical axis."""
     rays = camera.rays
     return (distance / np.sqrt(1 + rays.u**2 + rays.v**2)).astype(np.float32)
 
@@ -179,7 +181,7 @@ def _as_depth(camera: BenchCamera, distance: NDArray[np.float32]) -> NDArray[np.
 def _hint(
     camera: BenchCamera, depth: NDArray[np.float32], calibration: Calibration, fit: TableFit | None
 ) -> str:
-    """What would agree with the frame."""
+    """A hint for the user: which change of the calibration would agree with the frame."""
     for text, other, X_BC, image in _suppositions(camera, depth):
         found = _fit(other, X_BC, image, calibration)
         if found is not None and not found.is_doubtful:

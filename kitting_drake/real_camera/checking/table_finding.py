@@ -25,7 +25,7 @@ Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 _RESOLUTION = 0.003125
-"""Of o_t, in metres; networks are trained at it."""
+"""The side of o_t's pixels, in metres. Networks are trained with this size."""
 _CELL = 2 * _RESOLUTION
 """Side of a cell in which the table's extent is found, in metres."""
 _SIDES = (160, 320)
@@ -33,7 +33,7 @@ _SIDES = (160, 320)
 _MULTIPLE = 16
 """Rows and cols are multiples of this."""
 _TILTED = math.radians(10)
-"""A plane that is tilted by more is not level, nor a table in a nearly correct pose."""
+"""A plane that is tilted by more than this is no table, even with a slightly wrong pose."""
 MOST_TILT = math.radians(1.3)
 """`decide` refuses a table that is tilted by more."""
 _STEP = 2
@@ -41,9 +41,9 @@ _STEP = 2
 _REACH = 2.0
 """The table is sought within this distance of the robot's base, along x and y, in metres."""
 _LEAST_SHARE = 0.1
-"""The least share of the points on the table, and ..."""
+"""The least share of the points that must lie on the table, and ..."""
 _LEAST_POINTS = 500
-"""... the least number of them."""
+"""... the least number of points."""
 _ABOVE_FLOOR = 0.25
 """A level plane this far above the largest is a table above the floor, in metres, ..."""
 _TABLE_SHARE = 0.1
@@ -51,13 +51,13 @@ _TABLE_SHARE = 0.1
 _BAND = 0.006
 """Points this near to the plane lie on it, in metres, or within three times the noise."""
 _LOW, _TALL = 0.12, 1.2
-"""Things lower than the first, in metres, are objects on the table; others are no table, such as
-the robot. Nothing above the second counts."""
+"""Things lower than the first, in metres, are objects on the table. Taller things, such as the
+robot, are not part of it. Points above the second are ignored."""
 _CLOSED = 0.035
-"""Gaps of the table up to twice this are closed, in metres: tools and the shadows of objects."""
+"""Gaps in the table (from objects and shadows) narrower than twice this are closed, in metres."""
 _KIT = 0.03
-"""An object at the table's edge belongs to it if it is twice as thick as this, in metres; profiles
-along the edge are thinner."""
+"""An object at the table's edge is taken as part of the table if it is at least twice this wide, in
+metres; profiles along the edge are narrower."""
 _LEAST_TALL = 0.02
 """Tall things thinner than this are noise, in metres."""
 _AROUND = 0.02
@@ -93,8 +93,8 @@ def find_table(frames: Mapping[str, Frame], calibration: Calibration) -> FoundTa
     ignored.
 
     Args:
-        frames: of each camera by its name. Kit and tools may stand on the table.
-        calibration: of the cameras.
+        frames: each camera's frame by its name. Kit and tools may stand on the table.
+        calibration: the cameras' calibration.
 
     Raises:
         UserError: no level plane is seen.
@@ -181,7 +181,7 @@ def _coarse_grid(points: Array, plane: Plane) -> PixelGrid:
 
 
 def _extent(points: Array, plane: Plane, grid: PixelGrid) -> tuple[Mask, Mask]:
-    """(rows, cols): the table's extent, with what lies on it; and what is too tall to lie on it."""
+    """Two masks (rows, cols): the table with its objects, and things too tall to be objects."""
     above = points[:, 2] - plane.height(points[:, :2])
     cells = np.rint(grid.to_pixel(points[:, :2])).astype(int)
     inside = ((cells >= 0) & (cells < grid.shape)).all(axis=1)
@@ -249,8 +249,12 @@ def _workspace(table: Mask, grid: PixelGrid) -> tuple[PixelGrid, str]:
 
 
 def _best_centre(table: Mask, grid: PixelGrid, size: Array, centre: Array, fits: Mask) -> Array:
-    """(2,): the centre, in metres, of the window that holds nearly the most table, and is nearest
-    to the base but not too near. Along an axis where all of the table fits, it is centred."""
+    """(2,): the centre of the best window, in metres.
+
+    Of the windows that hold nearly the most table, it is the nearest to the base. Windows that are
+    too near the base count only if the others hold much less table. Along an axis on which the
+    whole table fits, the window is at `centre`.
+    """
     window = np.rint(size / _CELL).astype(int)
     sums = np.pad(table.astype(np.int64).cumsum(0).cumsum(1), ((1, 0), (1, 0)))
     counts = [max(grid.shape[k] - window[k], 0) + 1 for k in (0, 1)]

@@ -17,7 +17,7 @@ from systems.signals import Observation, PixelGrid
 Array = NDArray[np.float64]
 
 _LEAST_SEEN = 0.01
-"""A camera that sees a smaller share of the workspace has a wrong pose."""
+"""If a camera sees a smaller share of the workspace, its pose is wrong."""
 _LEAST_DEPTH = 0.01
 """The least share of pixels towards the workspace with any depth."""
 _NEAREST, _FARTHEST = 0.8, 1.25
@@ -37,8 +37,8 @@ def check_frames(frames: Mapping[str, Frame], calibration: Calibration) -> dict[
     """The frames of all cameras, with contiguous arrays.
 
     Args:
-        frames: of each camera by its name.
-        calibration: of the cameras.
+        frames: each camera's frame by its name.
+        calibration: the cameras' calibration.
 
     Raises:
         UserError: a camera has no frame, or one of a wrong size or type.
@@ -57,7 +57,7 @@ def check_views(frames: Mapping[str, Frame], calibration: Calibration) -> None:
 
     Args:
         frames: as `check_frames` returns them.
-        calibration: of the cameras.
+        calibration: the cameras' calibration.
 
     Raises:
         CalibrationError: a camera does not look at the workspace, or its depths are implausible.
@@ -72,7 +72,7 @@ def observe(frames: Mapping[str, Frame], calibration: Calibration) -> Observatio
 
     Args:
         frames: as `check_frames` returns them.
-        calibration: of the cameras.
+        calibration: the cameras' calibration.
     """
     return project(make_views(frames, calibration), calibration.grid, calibration.region)
 
@@ -199,6 +199,6 @@ def _check_limits(depth: NDArray[np.float32], camera: BenchCamera) -> None:
     low, high = camera.min_depth, camera.max_depth
     if ((depth >= low) & (depth <= high)).mean() < _LEAST_DEPTH:
         raise CalibrationError(
-            f"depth of camera {camera.name} is {np.median(depth):.3g} m, the median, and by its "
-            f"min_depth {low:g} and max_depth {high:g} almost none is used: give these in metres"
+            f"the median depth of camera {camera.name} is {np.median(depth):.3g} m, and almost no "
+            f"depth is between its min_depth {low:g} and max_depth {high:g}: give these in metres"
         )

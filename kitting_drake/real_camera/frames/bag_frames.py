@@ -28,13 +28,13 @@ from kitting_drake.real_camera.recordings.recording import (
 Images = tuple[NDArray[np.uint8], NDArray[np.float32]]
 
 _TOGETHER = 0.05
-"""Images farther apart are not of one frame, in seconds."""
+"""Images farther apart in time than this do not form a frame, in seconds."""
 _ALIGNED = re.compile(r"aligned_depth_to_color|depth_registered|depth_to_rgb|registered_depth")
 _COLOUR = re.compile(r"colou?r|rgb")
 _REALSENSE = re.compile(r"/device_\d+/sensor_\d+/")
 _DIFFERENT = 0.02
-"""Intrinsics of the calibration and of a CameraInfo that differ by more are of two lenses, as a
-share of the focal length or of the width."""
+"""If the intrinsics of the calibration and of a CameraInfo differ by more than this, as a share of
+the focal length or of the width, they are of two lenses."""
 _UNITS = "std_msgs/msg/Float32"
 
 
@@ -42,8 +42,8 @@ def read_bag_frames(path: Path, calibration: Calibration, time: float | None) ->
     """Colour and depth of each camera from the same recording, by the cameras' names.
 
     Args:
-        path: of the recording.
-        calibration: of the cameras.
+        path: the recording's path.
+        calibration: the cameras' calibration.
         time: how long after the start of the recording, in seconds; None for the first images.
 
     Raises:
@@ -94,14 +94,14 @@ def _topics(recording: Recording, camera: BenchCamera, alone: bool) -> tuple[str
 
 
 def _uncompressed(topics: Sequence[str]) -> list[str]:
-    """Without compressed copies of other topics."""
+    """The topics that are not compressed copies of others."""
     return [topic for topic in topics if topic.rpartition("/")[0] not in topics]
 
 
 def _first_pair(
     recording: Recording, topics: tuple[str, str], time: float | None
 ) -> tuple[RecordedMessage, RecordedMessage]:
-    """The first image of depth with one of colour at the same time, and the latter."""
+    """The colour image and the depth image of the first moment that has both."""
     colors: list[RecordedMessage] = []
     depths: list[RecordedMessage] = []
     for message in recording.messages(topics):
@@ -124,7 +124,8 @@ def _first_pair(
 def _settled(
     colors: list[RecordedMessage], depths: list[RecordedMessage], ended: bool
 ) -> tuple[RecordedMessage, RecordedMessage] | None:
-    """A pair, once no later colour can be nearer; forgets images that cannot have a pair."""
+    """A pair, as soon as no later colour image can be nearer in time. Removes images that cannot
+    belong to any pair."""
     while depths and colors:
         first = depths[0]
         if not ended and colors[-1].stamp < first.stamp:
@@ -168,7 +169,7 @@ def _check_lenses(recording: Recording, topics: tuple[str, str], camera: BenchCa
 
 
 def _sibling(recording: Recording, topic: str) -> str | None:
-    """The CameraInfo's topic of an image's."""
+    """The topic of the CameraInfo that belongs to an image's topic."""
     parts, infos = topic.split("/"), recording.topics(CAMERA_INFO)
     for count in (1, 2):
         stem = "/".join(parts[:-count])
@@ -183,7 +184,7 @@ def _compare(message: RecordedMessage, lens: Intrinsics, camera: BenchCamera, pa
     if not any(fields["k"]):
         return
     where = f"{path}: {message.topic}"
-    # The distortion of another model is no matter here.
+    # Distortion is not compared, so its model does not matter.
     told = read_intrinsics({**fields, "d": [], "distortion_model": ""}, where)
     values: list[tuple[str, Any, Any, float]] = [
         (name, told_value, value, _DIFFERENT * scale)

@@ -14,13 +14,13 @@ def register_color(
 ) -> NDArray[np.uint8]:
     """(height, width, 3): the colour of each point that the depth camera sees.
 
-    Pixels without depth, and points out of the colour camera's sight, are black. A point that
-    another one hides from the colour camera gets the colour of the latter.
+    Pixels without depth, and points out of the colour camera's sight, are black. A point that is
+    hidden from the colour camera gets the colour of what hides it.
 
     Args:
         color: (height, width, 3), of the camera's colour lens.
         depth: (height, width), in metres.
-        camera: with a lens for colour; without, the image is returned as it is.
+        camera: the camera. If it has no separate lens for colour, the image is returned unchanged.
 
     Raises:
         UserError: the distortion of the depth's lens cannot be inverted.

@@ -26,7 +26,7 @@ def check_frame(frame: Frame, camera: BenchCamera) -> Frame:
     """Checks the sizes and types of a frame that did not come from files.
 
     Raises:
-        UserError: one is wrong.
+        UserError: a size or type is wrong.
     """
     for what, image in (("colour", frame.color), ("depth", frame.depth)):
         check_size(
@@ -50,7 +50,7 @@ def check_size(
 
     Args:
         shape: (height, width, ...) of the image.
-        lens: of the image.
+        lens: the image's lens.
         camera: for the message.
         what: the image, for the message.
         advice: the end of the message.

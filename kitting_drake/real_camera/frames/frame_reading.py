@@ -61,7 +61,7 @@ def read_frames(
             folder holds `NAME_color.png` and `NAME_depth.png` (or another ending), or `NAME.npz`,
             or a folder NAME with `color.png` and `depth.png`. A single camera may also have just
             `color.png` and `depth.png`.
-        calibration: of the cameras.
+        calibration: the cameras' calibration.
         time: in a recording, how long after its start, in seconds; None for its first images.
 
     Raises:

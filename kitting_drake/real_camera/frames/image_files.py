@@ -66,7 +66,7 @@ def read_depth(path: Path, depth_scale: float) -> NDArray[np.float32]:
     """(height, width), in metres.
 
     Args:
-        path: of the image or array.
+        path: the file of the image or array.
         depth_scale: metres per step of an image or array of whole numbers.
 
     Raises:

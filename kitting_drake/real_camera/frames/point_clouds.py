@@ -19,9 +19,10 @@ Array = NDArray[np.float64]
 
 CLOUD_ENDINGS = (".ply", ".pcd")
 _OFF = 2.0
-"""By more pixels, in the median, the points of an organised cloud are of another lens."""
+"""If the points of an organised cloud are off by more in the median, in pixels, the lens is another
+one."""
 _METRES = 50.0
-"""Depths beyond are in millimetres."""
+"""If depths are larger, they are probably in millimetres; in metres."""
 
 
 def read_cloud(
@@ -30,8 +31,8 @@ def read_cloud(
     """Colour (height, width, 3), None if the cloud has no colours, and depth (height, width).
 
     The points are in the camera's optical frame (x right, y down, z forward), in metres. A cloud
-    with one point for each pixel, in rows, is taken as it is. The points of others are projected
-    through the camera's lens, where the nearest one counts.
+    with one point for each pixel, in rows, is taken as it is. The points of any other cloud are
+    projected through the camera's lens. In each pixel the nearest point counts.
 
     Raises:
         UserError: the file is damaged, or its points are not in the camera's frame.
@@ -55,7 +56,7 @@ def read_cloud(
             "down, z forward"
         )
     if not seen.any():
-        raise UserError(f"{path} holds no point before the camera")
+        raise UserError(f"{path} holds no point in front of the camera")
     middle = float(np.median(points[seen, 2]))
     if middle > _METRES:
         raise UserError(
@@ -78,7 +79,7 @@ def read_cloud(
 
 
 def project_points(points: Array, lens: Intrinsics) -> tuple[Array, Array]:
-    """Where a lens images points (n, 3) before it: column and row, from pixel centres."""
+    """Where a lens images points (n, 3) in front of it: column and row, from pixel centres."""
     x, y = points[:, 0] / points[:, 2], points[:, 1] / points[:, 2]
     if lens.distortion:
         x, y = distort(x, y, lens.model, lens.distortion)
@@ -98,7 +99,7 @@ def _rendered(
     if not inside.any():
         raise UserError(f"camera {camera.name} would see no point of its cloud: check its pose")
     cells = np.rint(row[inside]).astype(int), np.rint(col[inside]).astype(int)
-    # The last assignment counts, which is that of the nearest point.
+    # In each pixel the last assignment counts. It is that of the nearest point.
     order = np.argsort(-points[inside, 2], kind="stable")
     cells = cells[0][order], cells[1][order]
     depth[cells] = points[inside, 2][order]

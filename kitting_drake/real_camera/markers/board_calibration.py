@@ -23,7 +23,7 @@ from kitting_drake.real_camera.markers.board_poses import BoardFit, fit_board
 from kitting_drake.real_camera.markers.boards import Board, SeenBoard, find_corners
 
 _MOVED = 0.5
-"""If all images together err by so much more than each alone, something moved, in pixels."""
+"""If all images together err by this much more than each alone, in pixels, something moved."""
 
 
 @dataclass(frozen=True)
@@ -61,8 +61,8 @@ def calibrate_cameras(board: Board, paths: Sequence[Path], lenses: Calibration) 
         lenses: the cameras' intrinsics; their poses are ignored.
 
     Raises:
-        UserError: an image is missing, or shows too little of the board, too obliquely, or with two
-            explanations.
+        UserError: an image is missing, shows too little of the board or shows it too obliquely, or
+            two poses explain it.
     """
     results, poses = [], {}
     for camera in lenses.cameras:

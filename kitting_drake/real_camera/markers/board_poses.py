@@ -22,15 +22,15 @@ Array = NDArray[np.float64]
 _STEEPEST = math.radians(70)
 """A board seen at a larger angle from its normal gives poor corners."""
 _SAME = math.radians(1)
-"""Poses that differ by less are one."""
+"""Poses that differ by less than this count as the same."""
 _CLEARER = 16.0
-"""By so many variances of a corner must the squared errors of a second pose exceed the first's."""
+"""The squared errors of a second pose must exceed the first's by so many variances of a corner."""
 _LIKELY = 0.2
 """The error of corners that is to be expected in a real image, in pixels."""
 _NOISE = 0.05
 """The error of corners in a good image, in pixels."""
 _WORST = 3.0
-"""With a larger error the lens is another one, or the board moved, in pixels."""
+"""If the error is larger than this, in pixels, the lens is another one or the board moved."""
 
 
 @dataclass(frozen=True)
@@ -44,7 +44,7 @@ class BoardFit:
     angle: float
     """Between the board's normal and the line of sight to its middle, in radians."""
     focal_ratio: float
-    """By what factor the focal length would explain the corners best."""
+    """The factor of the focal length that would explain the corners best."""
     focal_error: float
     """The standard deviation of this factor."""
 
@@ -55,11 +55,11 @@ def fit_board(points: Array, pixels: Array, lens: Intrinsics, where: str) -> Boa
     Args:
         points: (n, 3) in the board's frame, in metres.
         pixels: (n, 2) column and row, from pixel centres.
-        lens: of the image.
+        lens: the image's lens.
         where: the beginning of errors.
 
     Raises:
-        UserError: the corners do not fit, are seen too obliquely, or have two explanations.
+        UserError: the corners do not fit, are seen too obliquely, or two poses explain them.
     """
     starts = _starts(points, pixels, lens, where)
     fits = sorted(

@@ -21,7 +21,7 @@ from kitting_drake.real_camera.markers.board_calibration import Calibrated, Cali
 _GOOD, _FAIR = 0.5, 1.5
 """Errors of corners up to these are good and fair, in pixels."""
 _TOLD = 0.01
-"""A focal ratio with a larger deviation tells nothing."""
+"""A focal ratio whose deviation is larger than this tells nothing."""
 _AXES = ((230, 40, 40), (40, 180, 40), (60, 90, 255))
 
 
@@ -30,7 +30,7 @@ def clear_earlier(folder: Path, source: Path) -> Path:
     file of the new calibration.
 
     Args:
-        folder: of the files.
+        folder: the folder of the files.
         source: the file of the intrinsics.
 
     Raises:
@@ -50,7 +50,7 @@ def clear_earlier(folder: Path, source: Path) -> Path:
 
 
 def save_calibrated(path: Path, calibrated: Calibrated) -> None:
-    """Writes the calibration to a file, and `calibrate.json` and a picture of each camera beside.
+    """Writes the calibration to a file; beside it, `calibrate.json` and a picture of each camera.
 
     Raises:
         UserError: a file cannot be written.
@@ -123,8 +123,8 @@ def _record(calibrated: Calibrated) -> dict[str, Any]:
 
 
 def _draw(result: CalibratedCamera, camera: BenchCamera, calibrated: Calibrated) -> bytes:
-    """A PNG of the first image: circles at the corners seen, crosses where the pose has them, and
-    the board's axes."""
+    """A PNG of the first image: circles at the corners seen, crosses where the pose predicts them,
+    and the board's axes."""
     lens = camera.intrinsics if camera.color is None else camera.color.intrinsics
     X = result.fit.X_KM
     image = Image.fromarray(result.image)

@@ -31,15 +31,15 @@ _FIELDS = (
 )
 _CORNERS = ("bottom_left", "bottom_right", "top_left")
 _NEEDED = 12
-"""A pose needs so many corners."""
+"""A pose needs at least this many corners."""
 _SHIFT = 0.42
 """About the shift of OpenCV's refinement of AprilTags, in pixels."""
 _LEVEL = math.radians(3)
-"""A board that tilts more does not lie on the table."""
+"""A board that is tilted by more than this does not lie on the table."""
 _TOUCHED = 0.003
 """The largest error of the distance between touched corners, in metres."""
 _LARGEST = 2.0
-"""A larger board has its sizes in millimetres, in metres."""
+"""If a board is larger than this, in metres, its sizes are probably in millimetres."""
 
 
 @dataclass(frozen=True)
@@ -185,7 +185,7 @@ def find_corners(board: Board, image: NDArray[np.uint8], where: str) -> SeenBoar
 def _find_markers(cv2: Any, board: Board, gray: Any) -> tuple[dict[int, Array], list[int]]:
     """The corners (4, 2) of the board's markers by number, and the numbers of other markers."""
     parameters = cv2.aruco.DetectorParameters()
-    # It fits lines to the sides, so a corner errs by a quarter of what other refinements do.
+    # It fits lines to the sides, so its corners err only a quarter as much as other refinements'.
     parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_APRILTAG
     detector = cv2.aruco.ArucoDetector(board.pattern.getDictionary(), parameters)
     corners, numbers, _ = detector.detectMarkers(gray)
@@ -203,8 +203,8 @@ def _find_markers(cv2: Any, board: Board, gray: Any) -> tuple[dict[int, Array], 
 def _centred(cv2: Any, gray: Any, quads: list[Array]) -> list[Array]:
     """The same corners of markers, counted from pixel centres.
 
-    The refinement shifts all corners by about 0.4 pixels. Another one, which errs more, but not to
-    one side, tells by how much.
+    The refinement shifts all corners by about 0.4 pixels. A second refinement, which is noisier but
+    without such a bias, tells by how much.
     """
     if not quads:
         return []

@@ -85,7 +85,7 @@ def camera_info_of(path: Path, stream: str) -> dict[str, Any]:
     """The first CameraInfo of a recording, as its fields in ROS 2.
 
     Args:
-        path: of the recording.
+        path: the recording's path.
         stream: the topic, a part of it, or a name that counts only if it is a part of one.
 
     Raises:

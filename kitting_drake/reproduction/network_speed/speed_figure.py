@@ -143,7 +143,7 @@ def _label(
     quantity: str,
     text: Callable[[float], str],
 ) -> None:
-    """Writes the value of a point: below the lowest of several points at one N, else above it."""
+    """Writes the value of a point above it, or below it if it is the lowest of several at one N."""
     there = [other[quantity] for other in rows if other["orientations"] == row["orientations"]]
     below = len(there) > 1 and row[quantity] == min(there)
     axis.annotate(

@@ -118,10 +118,10 @@ class Run:
 
     @cached_property
     def departures(self) -> list[str]:
-        """Where the run's scenario differs from the expected one: its fields, without the policy.
+        """The fields, other than the policy, in which the run's scenario is not the expected one.
 
-        For a task of the paper, Ravens tasks included, the expected scenario is the project's own
-        for that task. For any other task it is the default scenario, and the task is not compared.
+        For a task of the paper (the Ravens tasks included), this project's scenario for that task
+        is expected. For any other task the default scenario is, and the task is not compared.
         """
         found = self.summary["resolved_scenario"]
         for task in PAPER_TASKS.values():
@@ -136,7 +136,7 @@ class Run:
 
     @property
     def paper_task(self) -> str | None:
-        """The title of the paper's task; None if more than the policy differs from it."""
+        """The title of the paper's task; None if anything but the policy differs from that task."""
         task = self.summary["task"]
         return task if task in PAPER_TASKS and not self.departures else None
 

@@ -52,7 +52,7 @@ class Task:
     rates_from: str = "unseen"
     """The task on which the baselines' learning rates are chosen."""
     earlier: tuple[str, ...] = ()
-    """Differences that a run's scenario may have; see `Cell.is_earlier`."""
+    """Differences from the present scenario that a run may have; see `Cell.is_earlier`."""
 
 
 TASKS = {
@@ -347,7 +347,7 @@ class Cell:
         elif training.method == "so2":
             wanted["learning_rate"] = LEARNING_RATES[0]
         if learned_at.table == "6":
-            # For tasks of the other tables the task itself determines these two.
+            # For tasks of the other tables, the task determines these two.
             wanted |= {"taken_only": training.taken_only, "rigid": training.rigid}
         return wanted
 

@@ -57,13 +57,14 @@ def changeable(summary: Mapping[str, Any]) -> Changeable:
     Newer summaries have this count. An older one has only the number of failed grasps, F, in E
     episodes. At most n = min(F, E) of these episodes have a failed grasp. The bounds are:
 
-    - At least F - n: in each episode, every failed grasp after the first one counts.
-    - At most: all actions of n episodes but their first ones, which failed. These are the episodes
-      with the fewest placed objects, because each placed object of the others took an action.
+    - At least F - n actions: in each episode, every failed grasp after the first one counts.
+    - At most all actions of n episodes, except for the first action of each, which failed. In the
+      other episodes each placed object took an action, so the n episodes are those with the fewest
+      placed objects.
 
     Args:
-        summary: of a learned policy, from `evaluate`. If it does not count its actions, each
-            episode is assumed to have used as many as the task allows.
+        summary: the summary that `evaluate` wrote of a learned policy. If it has no number of
+            actions, each episode is assumed to have used as many as the task allows.
     """
     episodes = [item["objects"] for item in summary["outcomes"]]
     tag = summary["resolved_scenario"]["task"]["_tag"]

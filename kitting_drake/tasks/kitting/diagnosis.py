@@ -52,7 +52,7 @@ def find_cause(
     - `misplaced`: anywhere else.
 
     Args:
-        scene: the episode's.
+        scene: the scene of the episode.
         index: the index of the tool among the scene's objects.
         X_WB: its final pose.
         placement: the placement of the tool, with respect to the goal assigned to it.

@@ -169,8 +169,8 @@ class ToolsetKitting(_DrawnKitting):
     # Alternatively, a custom pool of names or paths of tool folders; one of each category is drawn.
     pool: list[str] = field(default_factory=list)
 
-    # Whether tool lengths are drawn from tool_length in m (section IV-B.2); else they are those of
-    # the dataset.
+    # Whether to draw tool lengths from the range tool_length, in m (section IV-B.2). If not, tools
+    # have the lengths of the dataset.
     random_lengths: bool = True
     tool_length: list[float] = bounded([0.15, 0.20], 0.05, 0.30)
 

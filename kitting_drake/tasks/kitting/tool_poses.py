@@ -96,7 +96,7 @@ def check_arrangement(
         if (outline - table).area() > 1e-9:
             (x_min, y_min), (x_max, y_max) = TABLE
             raise UserError(
-                f"{name} is not whole on the table: choose x from {x_min:g} to {x_max:g} m and "
+                f"{name} extends beyond the table: choose x from {x_min:g} to {x_max:g} m and "
                 f"y from {y_min:g} to {y_max:g} m"
             )
         for other, standing in placed.items():

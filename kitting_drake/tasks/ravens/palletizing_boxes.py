@@ -132,7 +132,7 @@ def layer_poses(level: int, pitch: float, *, across: bool = False) -> list[Rigid
 
     Args:
         level: 0 for the lowest layer.
-        pitch: between lines, in metres.
+        pitch: the distance between lines, in metres.
         across: whether the lines are along y instead of x.
     """
     X_StackLayer = RigidTransform(

@@ -46,7 +46,7 @@ class PlaceRedInGreen(RavensTask):
     # Cubes and bowls of other colours.
     distractors: int = bounded(10, 0, 12)
 
-    # A cube within this horizontal distance of a bowl's middle is in it, in m.
+    # A cube is in a bowl if its horizontal distance from the bowl's middle is at most this, in m.
     position_threshold: float = bounded(0.05, 0.001, 0.06)
 
     @property

@@ -236,7 +236,7 @@ class Candidate:
         return score, self.first_bin + rotation, self.corner[0] + row, self.corner[1] + col
 
     def known_neighbours(self) -> int:
-        """The number of the maximum's 27 neighbours, itself included, within the window."""
+        """How many of the maximum's 27 neighbours (itself included) lie within the window."""
         at = _argmax(self.scores)
         return math.prod(
             min(i + 2, n) - max(i - 1, 0) for i, n in zip(at, self.scores.shape, strict=True)

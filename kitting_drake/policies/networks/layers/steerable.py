@@ -80,7 +80,7 @@ class ExpandedConv2d(nn.Module):
         raise NotImplementedError
 
     def kernel(self, dtype: torch.dtype = torch.float32) -> Tensor:
-        """(out channels, in channels, size, size), in channels_last: the plain kernel."""
+        """The plain kernel: (out channels, in channels, size, size), in channels_last."""
         raise NotImplementedError
 
     def fit(self, kernel: Tensor) -> None:

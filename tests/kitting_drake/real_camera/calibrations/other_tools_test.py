@@ -123,7 +123,7 @@ def test_a_camera_on_the_hand_needs_the_hand(tmp_path: Path, text: str):
 
 
 def test_a_hand_is_refused_where_it_is_not_needed(tmp_path: Path):
-    with pytest.raises(UserError, match=r"front\.calib is not of a camera on the hand"):
+    with pytest.raises(UserError, match=r"front\.calib is the pose of a fixed camera"):
         entry = f"{texts.LENS}    pose: front.calib\n    {HAND}"
         read(tmp_path, entry, front__calib=texts.EASY_HANDEYE2)
     R, t = "[0, -1, 0, -1, 0, 0, 0, 0, -1]", "[0.5, 0.1, 0.9]"

@@ -105,8 +105,8 @@ def test_an_error_without_free_space_names_the_fields_to_change():
 @pytest.mark.parametrize(
     ("kit_x", "tools", "words"),
     [
-        (0.9, {"claw_hammer": TablePose(x=0.3, y=0.4)}, "task.kit_pose is not whole"),
-        (0.6, {"claw_hammer": TablePose(x=0.3, y=0.8)}, "task.tools.claw_hammer is not whole"),
+        (0.9, {"claw_hammer": TablePose(x=0.3, y=0.4)}, "task.kit_pose extends beyond"),
+        (0.6, {"claw_hammer": TablePose(x=0.3, y=0.8)}, "task.tools.claw_hammer extends beyond"),
         (
             0.2,
             {"claw_hammer": TablePose(x=0.6, y=0.4)},
