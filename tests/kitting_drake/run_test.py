@@ -264,8 +264,8 @@ def test_saves_a_picture_of_each_decision(
     assert (out / "decisions" / "decision_01.png").read_bytes().startswith(b"\x89PNG")
     results = json.loads((out / "results.json").read_text())
     assert (results["policy"], results["failure"]) == ("learned", None)
-    # The episode ends during the first action.
-    assert results["actions"] == 1
+    # The episode ends during the first action, or untrained networks pick where nothing is seen.
+    assert results["stop_reason"] == ("time" if results["actions"] else "not seen")
 
 
 @pytest.mark.parametrize(

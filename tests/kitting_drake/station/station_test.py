@@ -18,6 +18,7 @@ from kitting_drake.common.paths import MODELS, SCENARIOS
 from kitting_drake.policies.learned_policy import LearnedPolicy
 from kitting_drake.policies.networks.device import preferred_type
 from kitting_drake.policies.networks.weights import load_networks
+from kitting_drake.policies.stages import make_stages
 from kitting_drake.scenario import Scenario, load_scenario
 from kitting_drake.scenario.cameras import Pinhole
 from kitting_drake.scenario.policies import (
@@ -34,6 +35,7 @@ from kitting_drake.tasks import Kitting
 from kitting_drake.tasks.ravens.palletizing_boxes import PalletizingBoxes
 from kitting_drake.tasks.task import TABLE
 from systems.hand_geometry import JOINT_LIMITS
+from systems.pick_place_parameters import PickPlaceParameters
 from systems.placement import Placement
 from systems.sensor_noise import SensorNoiseParameters
 from systems.signals import Observation
@@ -312,8 +314,9 @@ def test_a_learned_policy_acts_on_the_observation(weights_file: Path):
     assert observation.height.any()
     assert not told
     found = rig.port("action", context)
-    policy = LearnedPolicy(load_networks(weights_file, preferred_type()), orientations=36)
-    assert found == policy(observation)
+    stages = make_stages(PickPlaceParameters(), insertion=True)
+    networks = load_networks(weights_file, preferred_type())
+    assert found == LearnedPolicy(networks, orientations=36, stages=stages)(observation)
     (seen,) = told
     np.testing.assert_array_equal(seen.image, observation.image)
     # The inputs are unchanged, so the policy is not called again.
