@@ -60,7 +60,7 @@ OBJECT_KEYS = {
 MORE_OF_THE_SAME = (
     *("SevenTools", "TwelveTools", "FreshToolsets", "OwnToolsets", "Training"),
     *("KittingSeenToolset", "TwoTools", "BlockInsertion", "PlaceRedInGreen", "StackBlockPyramid"),
-    "PalletizingBoxes",
+    *("PalletizingBoxes", "OneCamera30", "OneCamera60", "WristCamera"),
 )
 """Suffixes of the names of scenarios that resemble others; these tests are slow."""
 
