@@ -71,7 +71,7 @@ def _whole_episodes(
     for number in track(
         range(episodes), path.stem, console=console, transient=True, disable=console.quiet
     ):
-        station = build_station(scenario, seed + number, SCENARIOS)
+        station = build_station(scenario, seed + number, path.parent)
         diagram = with_policy(station)
         stopwatch.start()
         result = run_episode(

@@ -1,7 +1,11 @@
+from pathlib import Path
+
 import pytest
 from rich.console import Console
 
+from kitting_drake.reproduction.benchmarks import simulation
 from kitting_drake.reproduction.benchmarks.simulation import PhaseStopwatch, simulation_tables
+from kitting_drake.scenario import load_scenario
 from kitting_drake.scenario.schema import Scenario
 from tests.kitting_drake.rig import build_rig
 
@@ -21,6 +25,13 @@ def test_phases_sum_to_their_episodes():
     assert sum(phase[0] for phase in stopwatch.phases.values()) == pytest.approx(simulated)
     assert sum(phase[1] for phase in stopwatch.phases.values()) == pytest.approx(wall, rel=0.5)
     assert all(phase[0] > 0 for phase in stopwatch.phases.values())
+
+
+@pytest.mark.parametrize("path", [simulation._SCENARIO, simulation._LEARNED])
+def test_the_measured_scenarios_find_their_files(path: Path):
+    """Weights and tools are sought beside the scenario's file."""
+    policy = load_scenario(path).policy
+    assert policy.digest(path.parent) is None or policy.details(path.parent)
 
 
 def test_terminal_tables():
