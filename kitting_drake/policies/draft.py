@@ -80,11 +80,6 @@ class Look:
         """The segmentation of o_t by height."""
         return segment(self.observation)
 
-    @property
-    def kit_seen(self) -> bool | None:
-        """Whether o_t shows a kit; None if no stage asked for the segmentation."""
-        return self.segmentation.kit_seen if "segmentation" in self.__dict__ else None
-
     @cached_property
     def failed_pixels(self) -> Array:
         """(n, 2): the (row, col) of each failed pick."""
@@ -132,6 +127,8 @@ class Draft:
     """The predicted (row, col) of the place for `pixel`."""
     continuous: bool = False
     """Whether positions and angles are refined beyond pixels and bins."""
+    outlined: bool = False
+    """Whether a stage compared the outlines of object and recess."""
     grasp_cost: float | None = None
     """See `JawGrasp.cost`; None if no feasible grasp is known."""
     fit_cost: float | None = None

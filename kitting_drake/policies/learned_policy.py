@@ -157,7 +157,7 @@ def _decision(draft: Draft) -> Decision:
         place_pixel=draft.place,
         log_odds=draft.look.picking.log_odds,
         belongs=draft.belongs,
-        kit_seen=draft.look.kit_seen,
+        kit_seen=draft.look.segmentation.kit_seen if draft.outlined else None,
         place_margin=_place_margin(draft),
         **_told(draft),
     )
@@ -165,7 +165,7 @@ def _decision(draft: Draft) -> Decision:
 
 def _told(draft: Draft) -> dict[str, Any]:
     """How far the stages moved an action, and what o_t tells about it."""
-    if draft.stop or draft.look.kit_seen is None:
+    if draft.stop or not draft.outlined:
         return {}
     millimetres = 1e3 * draft.look.resolution
     predicted = draft.goal + rotation_matrix(draft.rotation) @ (draft.pick - np.array(draft.pixel))

@@ -122,6 +122,7 @@ class OutlinePlace:
         fitted = refine_place(
             look.segmentation, draft.pick, draft.rotation, draft.place, look.resolution
         )
+        draft = dataclasses.replace(draft, outlined=True)
         if fitted is None:
             return draft
         return dataclasses.replace(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import partial
@@ -9,7 +10,6 @@ from pathlib import Path
 from typing import Protocol
 
 from kitting_drake.policies.confidence import (
-    Reliability,
     certainty,
     evidence_of_networks,
     read_reliability,
@@ -19,7 +19,6 @@ from kitting_drake.policies.factory import (
     load_learned_policy,
     make_shape_matching,
 )
-from kitting_drake.policies.matching.evidence import Evidence
 from systems.pick_place_parameters import PickPlaceParameters
 from systems.signals import Observation, PickPlaceAction, PixelGrid, PlanarPose
 
@@ -96,9 +95,9 @@ class ShapeMatchingDecider:
         draw = partial(_draw_action, observation, matched.action)
         if matched.geometry is None:
             return Choice(matched.action, None, draw=draw)
-        least = self.least_confidence
         reliability = read_reliability("shape_matching")
-        return _if_sure(reliability, matched.geometry, least, matched.action, {}, draw)
+        least = reliability.threshold if self.least_confidence is None else self.least_confidence
+        return _if_sure(reliability.confidence(matched.geometry), least, matched.action, {}, draw)
 
 
 @dataclass(frozen=True)
@@ -132,22 +131,26 @@ class _Networks:
             return Choice(stop, None, parts, draw)
         if action.stop:
             return Choice(action, parts.get("nothing_to_pick"), parts, draw)
+        if decision.kit_seen is None:
+            # The regression is of decisions by outlines. Without them, the networks' own certainty
+            # counts, and nothing is refused unless the caller says so.
+            return _if_sure(
+                math.prod(parts.values()), self.least_confidence or 0.0, action, parts, draw
+            )
         evidence = evidence_of_networks(observation, decision)
         reliability = read_reliability("networks", self.loaded.path)
-        return _if_sure(reliability, evidence, self.least_confidence, action, parts, draw)
+        least = reliability.threshold if self.least_confidence is None else self.least_confidence
+        return _if_sure(reliability.confidence(evidence), least, action, parts, draw)
 
 
 def _if_sure(
-    reliability: Reliability,
-    evidence: Evidence,
-    least: float | None,
+    confidence: float,
+    least: float,
     action: PickPlaceAction,
     parts: dict[str, float],
     draw: Draw,
 ) -> Choice:
     """The action with its confidence, or a stop if that is too low."""
-    confidence = reliability.confidence(evidence)
-    least = reliability.threshold if least is None else least
     if confidence >= least:
         said = f"the probability of success is {confidence:.2f}"
         return Choice(action, confidence, parts, draw, said)

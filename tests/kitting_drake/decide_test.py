@@ -472,6 +472,15 @@ def test_frames_may_be_pairs_of_files(bench: Path):
         read_frames([bench / "nowhere"], TRUE)
 
 
+def test_without_outlines_the_networks_certainty_counts(scene: Rendered):
+    """The fitted confidence is of decisions by outlines. Nothing is refused without being asked."""
+    found = load_policy(fit_outlines=False).choose(scene.observation)
+    assert not found.action.stop
+    assert found.confidence == pytest.approx(np.prod(list(found.parts.values())))
+    strict = load_policy(fit_outlines=False, least_confidence=0.999).choose(scene.observation)
+    assert strict.action.stop and strict.action.reason == "not sure"
+
+
 def test_networks_need_their_own_pixel_size(weights_file: Path):
     coarse = dataclasses.replace(TRUE, grid=dataclasses.replace(TRUE.grid, resolution=0.004))
     policy = load_policy(weights_file, orientations=36)
