@@ -10,7 +10,7 @@ import numpy as np
 from pydrake.common.value import AbstractValue, Value
 from pydrake.systems.framework import Context, LeafSystem
 
-from systems.signals import Observation, PickPlaceAction, PlanarPose
+from systems.signals import STOP_REASONS, Observation, PickPlaceAction, PlanarPose
 from systems.weak_calc import weak_calc
 
 
@@ -95,8 +95,13 @@ class PickPlacePolicy(LeafSystem):
 
         Raises:
             TypeError: a pose is not of numbers.
-            ValueError: a pose is not finite.
+            ValueError: a pose is not finite, or the reason is not a word of `STOP_REASONS`.
         """
+        if action.reason and action.reason not in STOP_REASONS:
+            raise ValueError(
+                f"the policy {self._policy!r} must return as reason one of "
+                f"{', '.join(STOP_REASONS)}, not {action.reason!r}"
+            )
         numbers: dict[str, Any] = {}
         for name, pose in action.poses.items():
             if not isinstance(pose, PlanarPose):

@@ -60,9 +60,10 @@ def test_a_result_of_the_wrong_type_raises():
         (PickPlaceAction(pick=(0.3, 0, 0)), TypeError, "PlanarPose as pick"),
         (PickPlaceAction(place=PlanarPose("0.3")), TypeError, "place"),
         (PickPlaceAction(place=PlanarPose(np.nan)), ValueError, "finite"),
+        (PickPlaceAction(stop=True, reason="finished"), ValueError, "one of done, nothing fits"),
     ],
 )
-def test_invalid_poses_raise(answer, error: type, message: str):
+def test_invalid_actions_raise(answer, error: type, message: str):
     policy = PickPlacePolicy(policy=lambda *_: answer)
     context = policy.CreateDefaultContext()
     policy.GetInputPort("observation").FixValue(context, Value(Observation()))

@@ -89,10 +89,9 @@ class Visibility:
         for offsets, share in parts:
             s = offsets[None, :, None]
             positions = pixels[:, None, None] + (along * u + across * s) / self.resolution
-            seen, in_view = self._at(positions)
-            good &= (seen.mean(axis=(1, 2)) >= share) & in_view.all(axis=(1, 2))
-        pickable, _ = Visibility(self.pickable, self.in_view, self.resolution)._at(pixels)
-        return good & pickable
+            good &= _at(self.seen, positions).mean(axis=(1, 2)) >= share
+            good &= _at(self.in_view, positions).all(axis=(1, 2))
+        return good & _at(self.pickable, pixels)
 
     def place_is_seen(
         self, footprint: Array | None, pick: Array, rotation: float, place: Array
@@ -126,10 +125,10 @@ class Visibility:
             and self.seen[mask].mean() >= _PLACE_SEEN
         )
 
-    def _at(self, positions: Array) -> tuple[Mask, Mask]:
-        """Whether positions (..., 2) are seen, and in view; True beyond the workspace."""
-        row, col = np.moveaxis(np.rint(positions).astype(int), -1, 0)
-        rows, cols = self.seen.shape
-        outside = (row < 0) | (row >= rows) | (col < 0) | (col >= cols)
-        at = np.clip(row, 0, rows - 1), np.clip(col, 0, cols - 1)
-        return self.seen[at] | outside, self.in_view[at] | outside
+
+def _at(mask: Mask, positions: Array) -> Mask:
+    """The values of a mask at positions (..., 2); True beyond the workspace."""
+    row, col = np.moveaxis(np.rint(positions).astype(int), -1, 0)
+    rows, cols = mask.shape
+    outside = (row < 0) | (row >= rows) | (col < 0) | (col >= cols)
+    return mask[np.clip(row, 0, rows - 1), np.clip(col, 0, cols - 1)] | outside

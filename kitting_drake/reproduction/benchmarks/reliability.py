@@ -323,9 +323,3 @@ def as_lines(judged: Iterable[Judged]) -> Iterator[str]:
     """Decisions as lines of JSON."""
     for item in judged:
         yield json.dumps(item.__dict__)
-
-
-def from_lines(path: Path) -> list[Judged]:
-    """The inverse of `as_lines`."""
-    records: list[dict[str, Any]] = [json.loads(line) for line in path.read_text().splitlines()]
-    return [Judged(**record) for record in records]

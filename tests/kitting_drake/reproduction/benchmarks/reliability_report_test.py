@@ -1,6 +1,7 @@
 """The table and diagram of `benchmark reliability`, from decisions that were drawn."""
 
 import io
+import json
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +13,6 @@ from kitting_drake.reproduction.benchmarks.reliability import (
     POLICIES,
     Judged,
     as_lines,
-    from_lines,
     summarize_all,
 )
 from kitting_drake.reproduction.benchmarks.reliability_report import (
@@ -41,7 +41,8 @@ def test_a_fit_is_cross_validated_and_reported(tmp_path: Path):
     judged = [item for number, policy in enumerate(POLICIES) for item in drawn(policy, number)]
     path = tmp_path / "decisions.jsonl"
     path.write_text("".join(line + "\n" for line in as_lines(judged)))
-    assert from_lines(path) == judged
+    lines = path.read_text().splitlines()
+    assert [Judged(**json.loads(line)) for line in lines] == judged
 
     measured = summarize_all(judged, None, tmp_path)
     for policy in POLICIES:
