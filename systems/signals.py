@@ -93,6 +93,8 @@ class Observation:
     table: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """The table's plane, which was subtracted from the heights: at (row, col) it lay
     `table @ (row, col, 1)` metres above `grid.z_min`."""
+    history: tuple[Attempt, ...] = ()
+    """The earlier actions of the episode, oldest first; empty where nobody records them."""
 
     def __post_init__(self) -> None:
         if self.valid is None:
@@ -227,6 +229,10 @@ class PickPlaceAction:
     """Why it stops, a word of `STOP_REASONS`; empty if unknown."""
     press: bool = False
     """True: only push down at the pick with closed jaws; the place is ignored."""
+    aside: bool = False
+    """True: the object is laid on a free part of the table, not into its goal."""
+    left_over: LeftOver | None = None
+    """What a stopping policy still sees; None if it does not tell."""
     heights: SurfaceHeights | None = None
     """None: the planner reads the heights off its own o_t."""
 
@@ -236,6 +242,33 @@ class PickPlaceAction:
         if self.stop:
             return {}
         return {"pick": self.pick} if self.press else {"pick": self.pick, "place": self.place}
+
+
+@dataclass(frozen=True)
+class LeftOver:
+    """What a policy sees when it stops: objects that are not placed, cavities that are not filled."""
+
+    objects: tuple[tuple[float, float], ...] = ()
+    """World (x, y) of each object's middle, in metres."""
+    cavities: tuple[tuple[float, float], ...] = ()
+    """World (x, y) of each cavity's middle, in metres."""
+
+
+OUTCOMES = ("placed", "missed", "dropped", "pressed", "stopped")
+"""How an action may end: the object was let go at its place, nothing was grasped, the object was
+lost on the way, it was pressed down, or a contact force above the limit ended the action."""
+
+
+@dataclass(frozen=True)
+class Attempt:
+    """An earlier action and how it ended, as the robot itself can tell."""
+
+    action: PickPlaceAction
+    """Without heights."""
+    outcome: str
+    """A word of `OUTCOMES`."""
+    peak_force: float = 0.0
+    """The largest contact force on the hand, in N, without the weight of the held object."""
 
 
 def wrap_to_pi(angle: float) -> float:
