@@ -16,8 +16,9 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from kitting_drake.policies.data.images import Image, rotation_matrix
+from kitting_drake.policies.matching.inventory import Inventory
 from kitting_drake.policies.matching.jaw_clearance import RETRY_DISTANCE
-from kitting_drake.policies.matching.segmentation import Segmentation, segment
+from kitting_drake.policies.matching.segmentation import Segmentation
 from kitting_drake.policies.networks.factored import AnglePrediction, Networks, PlacePrediction
 from kitting_drake.policies.networks.layers.correlation import Candidate
 from systems.signals import (
@@ -76,9 +77,14 @@ class Look:
         return self.observation.grid.resolution
 
     @cached_property
+    def inventory(self) -> Inventory:
+        """The objects and recesses of o_t, and which belong together."""
+        return Inventory.of(self.observation)
+
+    @property
     def segmentation(self) -> Segmentation:
-        """The segmentation of o_t by height."""
-        return segment(self.observation)
+        """The segmentation of o_t by height, with touching objects told apart."""
+        return self.inventory.segmentation
 
     @cached_property
     def failed_pixels(self) -> Array:

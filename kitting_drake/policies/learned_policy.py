@@ -18,7 +18,7 @@ from kitting_drake.policies.draft import Draft, Look, Stage, make_draft, network
 from kitting_drake.policies.matching.evidence import Evidence, geometric_evidence
 from kitting_drake.policies.networks.factored import Networks
 from kitting_drake.policies.stages import StopRule, SubPixel
-from systems.signals import Observation, PickPlaceAction, PlanarPose
+from systems.signals import LeftOver, Observation, PickPlaceAction, PlanarPose
 
 _ELSEWHERE = 8.0
 """Places farther apart than this are different, in pixels."""
@@ -120,7 +120,9 @@ class LearnedPolicy:
         if self._watch is not None:
             self._watch(observation, decision)
         if decision.stop:
-            return PickPlaceAction(stop=True, reason=decision.action.reason), decision
+            action = decision.action
+            stop = PickPlaceAction(stop=True, reason=action.reason, left_over=action.left_over)
+            return stop, decision
         return decision.action, decision
 
     def decide(self, observation: Observation, failed_picks: Sequence[PlanarPose] = ()) -> Decision:
@@ -149,7 +151,9 @@ def _decision(draft: Draft) -> Decision:
         draft.look.observation, draft.pick, draft.theta, draft.place, draft.rotation
     )
     return Decision(
-        action=dataclasses.replace(action, stop=draft.stop, reason=draft.reason),
+        action=dataclasses.replace(
+            action, stop=draft.stop, reason=draft.reason, left_over=_left_over(draft)
+        ),
         pick_map=F.softmax(logits.flatten(), 0).view(logits.shape).float().cpu().numpy(),
         angle_curve=F.softmax(draft.angles.logits, 0).float().cpu().numpy(),
         place_map=(scores - scores.max()).float().cpu().numpy(),
@@ -161,6 +165,11 @@ def _decision(draft: Draft) -> Decision:
         place_margin=_place_margin(draft),
         **_told(draft),
     )
+
+
+def _left_over(draft: Draft) -> LeftOver | None:
+    """What a stopping policy still sees; None if it goes on, or does not look at outlines."""
+    return draft.look.inventory.left_over if draft.stop and draft.outlined else None
 
 
 def _told(draft: Draft) -> dict[str, Any]:

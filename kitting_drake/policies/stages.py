@@ -13,13 +13,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kitting_drake.policies.draft import Draft, Stage, expected_position
+from kitting_drake.policies.matching.inventory import mask_of
 from kitting_drake.policies.matching.recovery import recovery_action
 from kitting_drake.policies.matching.refinement import nearest_region, refine_grasp, refine_place
 from kitting_drake.policies.matching.release_clearance import blocked_at_place
 from kitting_drake.policies.matching.segmentation import Region
-from kitting_drake.policies.matching.shape_matching import belonging, certain_fits, why_stop
+from kitting_drake.policies.matching.separating import separating_action
 from kitting_drake.policies.matching.visibility import Visibility
 from systems.pick_place_parameters import PickPlaceParameters
+from systems.signals import wrap_to_pi
 
 _AS_GOOD = 2.0
 """Rotations within this of the best score count as equally good, in nats, ..."""
@@ -29,8 +31,8 @@ _TRIES = 4
 """How many picks are tried, at most, to find one that is seen."""
 _ANOTHER = 0.010
 """The next pick to try is farther than this from the last one, in metres."""
-_SOMETHING_FITS, _NOTHING_FITS = -1.0, 2.0
-"""The shift of the stop threshold when the outlines show a fitting object, or none, in nats.
+_NOTHING_FITS = 2.0
+"""The shift of the stop threshold when the outlines show nothing worth a try, in nats.
 
 Networks and outlines both err among distractors, but seldom at the same time.
 """
@@ -60,15 +62,11 @@ def make_stages(
     if continuous:
         stages.append(SubPixel())
     if outlines:
-        stages += [JawRoom(planner), OutlinePlace()]
+        stages += [JawRoom(planner), OutlinePlace(), BelongingFirst()]
     elif continuous and fit_outlines:
         stages.append(ReleaseRoom(planner))
-    if recover:
-        stages.append(BelongingFirst())
     if may_stop:
-        stages.append(StopRule(ask_outlines=recover, kit=outlines))
-    if outlines and may_stop and not recover:
-        stages.append(CertainFits())
+        stages.append(OutlineStop() if outlines else StopRule())
     if continuous:
         stages.append(SeenOnly(planner, outlines))
     if recover:
@@ -115,21 +113,35 @@ class JawRoom:
 
 @dataclass(frozen=True)
 class OutlinePlace:
-    """Fits the place to the outlines of object and recess where they agree (`refine_place`)."""
+    """Fits the place to the outlines of object and recess where they agree.
+
+    It begins at the networks' place (`refine_place`). Where that leads nowhere, it takes the recess
+    into which the object fits (`Inventory.pairs`), if there is one.
+    """
 
     def refine(self, draft: Draft) -> Draft:
         look = draft.look
+        draft = dataclasses.replace(draft, outlined=True)
         fitted = refine_place(
             look.segmentation, draft.pick, draft.rotation, draft.place, look.resolution
         )
-        draft = dataclasses.replace(draft, outlined=True)
-        if fitted is None:
+        if fitted is not None:
+            return dataclasses.replace(
+                draft,
+                rotation=fitted.rotation,
+                fitted=fitted.place,
+                fit_cost=fitted.cost,
+                belongs=True,
+            )
+        region = nearest_region(look.segmentation.objects, draft.pick)
+        pair = None if region is None else look.inventory.pair_of(region)
+        if pair is None:
             return draft
         return dataclasses.replace(
             draft,
-            rotation=fitted.rotation,
-            fitted=fitted.place,
-            fit_cost=fitted.cost,
+            rotation=wrap_to_pi(pair.fit.rotation),
+            fitted=pair.fit.moved(draft.pick),
+            fit_cost=pair.fit.cost,
             belongs=True,
         )
 
@@ -167,52 +179,61 @@ class ReleaseRoom:
 
 @dataclass(frozen=True)
 class BelongingFirst:
-    """Picks first what belongs into a recess (`belonging`)."""
+    """Picks first what belongs into a recess (`Inventory.pairs`), then what was not tried yet."""
 
     def refine(self, draft: Draft) -> Draft:
-        if draft.belongs:
+        inventory = draft.look.inventory
+        objects, shape = inventory.segmentation.objects, draft.look.observation.grid.shape
+        region = nearest_region(objects, draft.pick)
+        if draft.belongs and draft.grasp_cost is not None and not inventory.is_tried(region):
             return draft
-        mask = belonging(draft.look.segmentation, draft.look.resolution)
-        found = None if mask is None else draft.among(mask)
-        return draft if found is None else dataclasses.replace(found, belongs=True)
+        pairs = tuple(objects[pair.item] for pair in inventory.pairs)
+        for regions in (pairs, inventory.worth_a_try):
+            while regions:
+                found = draft.among(mask_of(regions, shape))
+                if found is None:
+                    break
+                if found.grasp_cost is not None:
+                    return found
+                # The jaws have no room at this object.
+                blocked = nearest_region(regions, found.pick)
+                regions = tuple(item for item in regions if item is not blocked)
+        return draft
 
 
 @dataclass(frozen=True)
 class StopRule:
     """Stops when the networks' log-odds of something to pick are below their threshold."""
 
-    ask_outlines: bool = False
-    """Whether the outlines shift the threshold."""
-    kit: bool = False
-    """Whether objects belong into the recesses of a kit, which may then be full or missing."""
-
     def refine(self, draft: Draft) -> Draft:
         odds, threshold = draft.look.picking.log_odds, draft.look.networks.stop_threshold
-        if odds is None or threshold is None:
+        if odds is None or threshold is None or odds >= threshold:
             return draft
-        if self.ask_outlines and draft.look.segmentation.fixture.any():
-            threshold += _SOMETHING_FITS if draft.belongs else _NOTHING_FITS
-        if odds >= threshold:
-            return dataclasses.replace(draft, stop=False)
-        reason = why_stop(draft.look.segmentation) if self.kit else "done"
-        if reason == "nothing fits" and odds < (draft.look.networks.stop_threshold or 0.0):
-            # The networks see nothing to pick, whatever the outlines are.
-            reason = "done"
-        return dataclasses.replace(draft, stop=True, reason=reason)
+        return dataclasses.replace(draft, stop=True, reason="done")
 
 
 @dataclass(frozen=True)
-class CertainFits:
-    """Overrules a stop when an object certainly fits into a recess, and picks that object.
+class OutlineStop:
+    """Stops when nothing is left to do, by the networks and by the outlines.
 
-    The networks may fail to see an object that its outline shows.
+    - An object that fits into a recess is picked, whatever the networks say.
+    - One that was not tried yet and may hide something that fits is picked if the networks see
+      something to pick: their log-odds are above the threshold.
+    - Anything else is picked only if they are much above it.
     """
 
     def refine(self, draft: Draft) -> Draft:
-        if not draft.stop:
+        inventory = draft.look.inventory
+        region = nearest_region(inventory.segmentation.objects, draft.pick)
+        if draft.belongs and not inventory.is_tried(region):
             return draft
-        found = draft.among(certain_fits(draft.look.segmentation, draft.look.resolution))
-        return draft if found is None else dataclasses.replace(found, stop=False, reason="")
+        odds, threshold = draft.look.picking.log_odds, draft.look.networks.stop_threshold
+        new = region is not None and any(item is region for item in inventory.worth_a_try)
+        if odds is not None and threshold is not None:
+            margin = 0.0 if new or not inventory.segmentation.fixture.any() else _NOTHING_FITS
+            if odds >= threshold + margin and not inventory.is_tried(region):
+                return draft
+        return dataclasses.replace(draft, stop=True, reason=inventory.why_stop)
 
 
 @dataclass(frozen=True)
@@ -261,19 +282,22 @@ class SeenOnly:
 
 @dataclass(frozen=True)
 class Recovery:
-    """Mends a failed insertion (`recovery_action`).
+    """Mends a failed insertion (`recovery_action`), and takes heaps apart (`separating_action`).
 
-    It presses a protruding object down at once. It takes an object out only when nothing else
-    belongs into a recess, because that may fail again and the number of actions is limited.
+    It presses a protruding object down at once. It separates, and takes an object out, only when
+    nothing else belongs into a recess, because that costs actions.
     """
 
     planner: PickPlaceParameters
 
     def refine(self, draft: Draft) -> Draft:
         look = draft.look
-        mending = recovery_action(
-            look.observation, look.segmentation, self.planner, look.failed_picks
-        )
-        if mending is None or not (mending.press or draft.stop or not draft.belongs):
+        mending = recovery_action(look.inventory, self.planner, look.failed_picks)
+        if mending is not None and mending.press:
+            return dataclasses.replace(draft, mending=mending)
+        if draft.belongs and not draft.stop:
             return draft
-        return dataclasses.replace(draft, mending=mending)
+        separating = None
+        if draft.stop:
+            separating = separating_action(look.inventory, self.planner, tuple(look.failed_picks))
+        return dataclasses.replace(draft, mending=separating or mending)

@@ -18,6 +18,7 @@ from PIL import Image
 from kitting_drake import decide as decide_command
 from kitting_drake.common.errors import UserError
 from kitting_drake.policies.factory import load_learned_policy
+from kitting_drake.policies.matching.inventory import Inventory
 from kitting_drake.policies.matching.recovery import recovery_action
 from kitting_drake.policies.matching.segmentation import segment
 from kitting_drake.real_camera import Frame, ShapeMatching, decide, load_policy, read_frames
@@ -84,7 +85,7 @@ def test_recovers_when_the_cell_does(high: float, scene: Rendered):
     row, col = int(rows.mean()), cols.min() + 3
     image[3, row : row + 4, col : col + 26] = top + high
     seen = dataclasses.replace(seen, image=image)
-    assert recovery_action(seen, segment(seen), PickPlaceParameters()) is not None
+    assert recovery_action(Inventory.of(seen), PickPlaceParameters()) is not None
     # Few orientations are faster.
     few: dict[str, Any] = {"orientations": 36, "recover": True}
     cells = load_learned_policy(None, PickPlaceParameters(), insertion=True, **few).function

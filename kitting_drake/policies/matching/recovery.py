@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from kitting_drake.policies.data.images import make_action
+from kitting_drake.policies.matching.inventory import Inventory
 from kitting_drake.policies.matching.jaw_clearance import jaw_grasps
 from kitting_drake.policies.matching.segmentation import Mask, Region, Segmentation
 from systems.pick_place_parameters import PickPlaceParameters
@@ -32,25 +33,26 @@ _ROOM = 0.045
 
 
 def recovery_action(
-    observation: Observation,
-    segmentation: Segmentation,
-    planner: PickPlaceParameters,
-    tried: Sequence[PlanarPose] = (),
+    inventory: Inventory, planner: PickPlaceParameters, tried: Sequence[PlanarPose] = ()
 ) -> PickPlaceAction | None:
     """The recovery of the worst-seated object; None if all are seated or no recovery is feasible.
 
+    An object that was taken out from the same place before stays where it is.
+
     Args:
-        observation: o_t.
-        segmentation: the segmentation of o_t.
+        inventory: objects and recesses.
         planner: how the hand will pick.
         tried: poses of earlier failed grasps and presses.
     """
+    observation, segmentation = inventory.observation, inventory.segmentation
     pickable = segmentation.visibility.pickable
     for region in segmentation.protruding:
         if region.height <= _PRESSED and pickable[region.mask].any():
             pressed = _press(observation, segmentation, region, pickable)
             if not _is_near(pressed.pick, tried):
                 return pressed
+        if inventory.removals(region):
+            continue
         taken = _take_out(observation, segmentation, region, planner, tried)
         if taken is not None:
             return taken
@@ -85,7 +87,7 @@ def _take_out(
     for grasp in jaw_grasps(segmentation, region, resolution, planner, support=top):
         action = make_action(observation, grasp.pixel, grasp.theta, free, 0.0)
         if not _is_near(action.pick, tried):
-            return action
+            return replace(action, aside=True)
     return None
 
 

@@ -39,6 +39,8 @@ _WORST_REVERSE = 0.0025
 """The largest mean distance of a recess's outline from the object's for a match, in metres."""
 _LARGEST_OFFSET = 0.004
 """The offset of the outlines is clipped to plus or minus this, in metres."""
+_OFFSET_WITHIN = 0.0025
+"""The same for an outline of several objects, where a larger offset could hide a wrong pose."""
 _HEIGHT_WEIGHT = 0.1
 """The weight in a mismatch of the difference of object height and recess depth."""
 _POINTS, _COARSE_POINTS = 700, 160
@@ -80,6 +82,8 @@ class Registration:
     """(row, col), in pixels."""
     cost: float
     """The mean robust difference of the outlines, in metres."""
+    offset: float = 0.0
+    """By how much the signed distance from the recess's outline exceeds the object's, in metres."""
 
     def moved(self, pixel: Array) -> Array:
         """The new position of a point (row, col) of the object."""
@@ -103,8 +107,7 @@ def trace_outline(mask: Mask, resolution: float, *, close: bool = False) -> Outl
     fine = ndimage.zoom(crop, _SUBSAMPLING, order=1, mode="nearest", grid_mode=True) > 0.5
     step = resolution / _SUBSAMPLING
     if close:
-        grown = ndimage.distance_transform_edt(~fine) * step <= _CLOSING_RADIUS
-        fine = ndimage.distance_transform_edt(grown) * step > _CLOSING_RADIUS
+        fine = closed(fine, step)
     outside = ndimage.distance_transform_edt(~fine)
     distance = (outside - ndimage.distance_transform_edt(fine)) * step
     # The outline runs between a pixel inside and one outside.
@@ -125,8 +128,18 @@ def trace_outline(mask: Mask, resolution: float, *, close: bool = False) -> Outl
     )
 
 
+def closed(mask: Mask, resolution: float) -> Mask:
+    """The mask with narrow notches filled, as in an object's recess; padded masks only."""
+    grown = ndimage.distance_transform_edt(~mask) * resolution <= _CLOSING_RADIUS
+    return np.asarray(ndimage.distance_transform_edt(grown) * resolution > _CLOSING_RADIUS)
+
+
 def register(
-    outline: Outline, recess: Outline, *, starts: tuple[tuple[float, Array], ...] = ()
+    outline: Outline,
+    recess: Outline,
+    *,
+    starts: tuple[tuple[float, Array], ...] = (),
+    within: bool = False,
 ) -> Registration:
     """The best fit of an object's outline to a recess's.
 
@@ -135,9 +148,11 @@ def register(
         recess: the outline of the recess.
         starts: initial rotations and shifts. Without any, the best of many rotations about the
             centroids are refined.
+        within: the second outline is of several touching objects, so that parts of the first have
+            no counterpart: they have little weight, and the offset is almost none.
     """
     begins = starts or _coarse_starts(outline, recess)
-    found = [_refine(outline, recess, rotation, shift) for rotation, shift in begins]
+    found = [_refine(outline, recess, rotation, shift, within) for rotation, shift in begins]
     return min(found, key=lambda item: item.cost)
 
 
@@ -179,6 +194,15 @@ def _brought(outline: Outline, recess: Outline, fit: Registration) -> tuple[Arra
     there = recess.sample(recess.distance, positions, _FARTHEST)
     offset = float(np.median(there - outline.values))
     return there, float(np.clip(offset, -_LARGEST_OFFSET, _LARGEST_OFFSET))
+
+
+def residuals(outline: Outline, recess: Outline, fit: Registration) -> Array:
+    """(p,): the differences of the outlines' signed distances at the fitted points, in metres.
+
+    The fit's offset is subtracted.
+    """
+    positions = outline.points @ rotation_matrix(fit.rotation).T + fit.shift
+    return recess.sample(recess.distance, positions, _FARTHEST) - outline.values - fit.offset
 
 
 def is_covered(outline: Outline, recess: Outline, fit: Registration) -> bool:
@@ -230,25 +254,30 @@ def _coarse_starts(outline: Outline, recess: Outline) -> list[tuple[float, Array
     ]
 
 
-def _refine(outline: Outline, recess: Outline, rotation: float, shift: Array) -> Registration:
+def _refine(
+    outline: Outline, recess: Outline, rotation: float, shift: Array, within: bool
+) -> Registration:
     """Reweighted Gauss-Newton over (rotation about the object's centroid, row, col, offset)."""
     arms = outline.points - outline.middle
     place = rotation_matrix(rotation) @ outline.middle + shift
     offset, cost = 0.0, math.inf
-    best = (rotation, place)
+    largest = _OFFSET_WITHIN if within else _LARGEST_OFFSET
+    best = (rotation, place, offset)
     for _ in range(_ITERATIONS):
         turned = arms @ rotation_matrix(rotation).T
         positions = turned + place
         there = recess.sample(recess.distance, positions, _FARTHEST)
         residual = there - outline.values
         if not np.isfinite(cost):
-            offset = float(np.clip(np.median(residual), -_LARGEST_OFFSET, _LARGEST_OFFSET))
+            offset = float(np.clip(np.median(residual), -largest, largest))
         residual = residual - offset
         weight = 1 / np.maximum(1, np.abs(residual) / _ROBUST)
+        if within:
+            weight **= 2
         now = float((weight * np.abs(residual)).mean())
         if now < cost:
             improved = cost - now
-            cost, best = now, (rotation, place)
+            cost, best = now, (rotation, place, offset)
             if improved < 1e-6:
                 break
         by_row = recess.sample(recess.gradient[0], positions, 0.0) * _SUBSAMPLING
@@ -261,6 +290,7 @@ def _refine(outline: Outline, recess: Outline, rotation: float, shift: Array) ->
         step = np.linalg.solve(normal, -weighted.T @ residual)
         rotation += float(np.clip(step[0], -0.1, 0.1))
         place = place + np.clip(step[1:3], -3, 3)
-        offset = float(np.clip(offset + step[3], -_LARGEST_OFFSET, _LARGEST_OFFSET))
-    rotation, place = best
-    return Registration(rotation, place - rotation_matrix(rotation) @ outline.middle, cost)
+        offset = float(np.clip(offset + step[3], -largest, largest))
+    rotation, place, offset = best
+    shift = place - rotation_matrix(rotation) @ outline.middle
+    return Registration(rotation, shift, cost, offset)

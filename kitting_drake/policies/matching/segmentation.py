@@ -50,6 +50,8 @@ _OBJECT_SEEN, _RECESS_SEEN = 0.5, 0.3
 """The least seen shares of an object, and of a free recess."""
 _GAP = 1.5
 """The gap around an object in its recess is less than this far from its edges, in pixels."""
+_FLAT, _FLAT_SHARE = 0.0006, 0.7
+"""This share of a free recess's floor is within this of one height, in metres, or within noise."""
 _NEIGHBOURS = np.ones((3, 3), bool)
 _CROSS = ndimage.generate_binary_structure(2, 1)
 
@@ -87,6 +89,8 @@ class Segmentation:
     """(rows, cols): height above the table plane in metres; unseen pixels are filled in."""
     visibility: Visibility
     """Which of its pixels are seen."""
+    noise: float = 0.0
+    """The standard deviation of the heights' noise, in metres."""
 
     @property
     def kit_seen(self) -> bool:
@@ -95,13 +99,22 @@ class Segmentation:
 
     @property
     def free_recesses(self) -> tuple[Region, ...]:
-        """The recesses that are seen, and not just the gaps around objects in them."""
+        """The recesses that are seen and have a flat floor.
+
+        The gaps around an object in its recess are narrow, and the object itself is not flat.
+        """
         return tuple(
             item
             for item in self.recesses
             if _inner_radius(item.mask) > _GAP
             and self.visibility.seen[item.mask].mean() > _RECESS_SEEN
+            and self._is_flat(item)
         )
+
+    def _is_flat(self, recess: Region) -> bool:
+        floor = self.relief[recess.mask & self.visibility.seen]
+        away = np.abs(floor - np.median(floor))
+        return bool((away < max(_FLAT, 2 * self.noise)).mean() > _FLAT_SHARE)
 
 
 def segment(observation: Observation) -> Segmentation:
@@ -159,6 +172,7 @@ def segment(observation: Observation) -> Segmentation:
         ),
         relief=relief,
         visibility=Visibility.of(observation),
+        noise=noise,
     )
 
 

@@ -3,6 +3,7 @@ import math
 import numpy as np
 import pytest
 
+from kitting_drake.policies.matching.inventory import Inventory
 from kitting_drake.policies.matching.recovery import recovery_action
 from kitting_drake.policies.matching.segmentation import segment
 from systems.pick_place_parameters import PickPlaceParameters
@@ -26,7 +27,7 @@ def observed(rise: float = 0.0) -> Observation:
 
 
 def mending(observation: Observation, tried=()):
-    return recovery_action(observation, segment(observation), PickPlaceParameters(), tried)
+    return recovery_action(Inventory.of(observation), PickPlaceParameters(), tried)
 
 
 def is_on_object(action) -> bool:

@@ -1,0 +1,66 @@
+"""Assigns loose objects to recesses by their outlines."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.optimize import linear_sum_assignment
+
+from kitting_drake.policies.matching.registration import (
+    Registration,
+    coarse_cost,
+    is_covered,
+    mismatch,
+    register,
+    trace_outline,
+)
+from kitting_drake.policies.matching.segmentation import Segmentation
+
+_WORST_COST = 0.0019
+"""The largest mean difference of an outline and its recess, in metres."""
+_PROMISING = 2.0
+"""A recess is registered if its coarse cost is at most this multiple of the object's least."""
+
+
+@dataclass(frozen=True)
+class Pair:
+    """An object and the recess into which it fits."""
+
+    item: int
+    """The index of the object in `Segmentation.objects`."""
+    recess: int
+    """The index of the recess in `Segmentation.recesses`."""
+    fit: Registration
+    """Of the object's outline to the recess's."""
+    mismatch: float
+    """See `registration.mismatch`, in metres."""
+
+
+def match(segmentation: Segmentation, resolution: float) -> list[Pair]:
+    """Pairs of loose objects and recesses, best fit first; each occurs at most once.
+
+    Args:
+        segmentation: the segmentation of an observation.
+        resolution: the side of its pixels, in metres.
+    """
+    objects, regions = segmentation.objects, segmentation.recesses
+    if not objects or not regions:
+        return []
+    outlines = [trace_outline(item.mask, resolution, close=True) for item in objects]
+    recesses = [trace_outline(item.mask, resolution) for item in regions]
+    coarse = np.array([[coarse_cost(o, c) for c in recesses] for o in outlines])
+    fits: dict[tuple[int, int], Registration] = {}
+    costs = np.full(coarse.shape, 10 * _WORST_COST)
+    for i, j in np.argwhere(coarse <= _PROMISING * coarse.min(axis=1, keepdims=True)).tolist():
+        fits[i, j] = register(outlines[i], recesses[j])
+        if is_covered(outlines[i], recesses[j], fits[i, j]):
+            costs[i, j] = mismatch(fits[i, j], objects[i], regions[j])
+    # Costs are clipped, so that one hopeless pair does not outweigh all others.
+    rows, cols = linear_sum_assignment(np.minimum(costs, _WORST_COST))
+    pairs = [
+        Pair(i, j, fits[i, j], float(costs[i, j]))
+        for i, j in zip(rows.tolist(), cols.tolist(), strict=True)
+        if costs[i, j] < _WORST_COST
+    ]
+    return sorted(pairs, key=lambda pair: pair.mismatch)

@@ -1,0 +1,149 @@
+"""What o_t shows of a kit and its objects, together with what was tried before."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kitting_drake.policies.matching.assignment import Pair, match
+from kitting_drake.policies.matching.segmentation import Region, Segmentation, segment
+from kitting_drake.policies.matching.splitting import split_touching
+from systems.signals import Attempt, LeftOver, Observation, PlanarPose
+
+_THERE = 0.015
+"""An object within this distance of an earlier pick or place is the one that was moved, in metres.
+"""
+_MOST_TRIES = 3
+"""An object that fits is tried this many times; one that fits nowhere, once."""
+_LEAST_SHARE, _LARGEST_SHARE = 0.5, 1.6
+"""A region may hold objects of recesses if its area is at least this share of the smallest one's,
+and at most this share of the areas of all."""
+
+
+@dataclass(frozen=True)
+class Inventory:
+    """The objects and recesses of an observation, and which belong together."""
+
+    observation: Observation
+    segmentation: Segmentation
+    """With touching objects told apart, where the recesses show how."""
+
+    @classmethod
+    def of(cls, observation: Observation) -> Inventory:
+        """The inventory of an observation."""
+        segmentation = segment(observation)
+        return cls(observation, split_touching(segmentation, observation.grid.resolution))
+
+    @cached_property
+    def pairs(self) -> tuple[Pair, ...]:
+        """Objects and the recesses into which they fit, best fit first; without those that were
+        tried too often."""
+        return tuple(
+            pair
+            for pair in match(self.segmentation, self.observation.grid.resolution)
+            if self.tries(self.segmentation.objects[pair.item]) < _MOST_TRIES
+        )
+
+    @property
+    def open_recesses(self) -> tuple[Region, ...]:
+        """The free recesses into which no object is known to fit."""
+        recesses = self.segmentation.recesses
+        known = {id(recesses[pair.recess]) for pair in self.pairs}
+        return tuple(item for item in self.segmentation.free_recesses if id(item) not in known)
+
+    @property
+    def strangers(self) -> tuple[Region, ...]:
+        """The objects that fit into no recess and were not tried before, largest first.
+
+        One of them may be several objects, or one that lies so that its outline does not show.
+        """
+        paired = {pair.item for pair in self.pairs}
+        objects = enumerate(self.segmentation.objects)
+        return tuple(
+            item for index, item in objects if index not in paired and not self.tries(item)
+        )
+
+    @property
+    def worth_a_try(self) -> tuple[Region, ...]:
+        """The strangers of a size that may hold objects of the open recesses."""
+        areas = [int(item.mask.sum()) for item in self.open_recesses]
+        if not areas:
+            return ()
+        least, most = _LEAST_SHARE * min(areas), _LARGEST_SHARE * sum(areas)
+        return tuple(item for item in self.strangers if least <= item.mask.sum() <= most)
+
+    @property
+    def left_over(self) -> LeftOver:
+        """The objects that are not seated, and the recesses that are free."""
+        seen = self.segmentation
+        return LeftOver(
+            objects=tuple(self._middle(item) for item in (*seen.objects, *seen.protruding)),
+            cavities=tuple(self._middle(item) for item in seen.free_recesses),
+        )
+
+    @property
+    def why_stop(self) -> str:
+        """Why a policy stops if it finds nothing to do; a word of `STOP_REASONS`."""
+        seen = self.segmentation
+        if not seen.kit_seen:
+            return "no kit seen"
+        if not seen.objects and not seen.protruding:
+            return "done"
+        tried = any(self.tries(item) for item in (*seen.objects, *seen.protruding))
+        if (seen.free_recesses or seen.protruding) and tried:
+            return "gave up"
+        return "nothing fits" if seen.objects and seen.free_recesses else "done"
+
+    def pair_of(self, region: Region) -> Pair | None:
+        """The pair of an object of the segmentation; None if it has none."""
+        objects = self.segmentation.objects
+        return next((pair for pair in self.pairs if objects[pair.item] is region), None)
+
+    def is_tried(self, region: Region | None) -> bool:
+        """Whether an object was tried as often as is worth it; False for None."""
+        if region is None:
+            return False
+        most = 1 if self.pair_of(region) is None else _MOST_TRIES
+        return self.tries(region) >= most
+
+    def tries(self, region: Region) -> int:
+        """How many earlier actions moved this object here, or failed to move it away."""
+        return sum(self._is_there(_left_at(attempt), region) for attempt in self._history)
+
+    def removals(self, region: Region) -> int:
+        """How many earlier actions took an object out from here."""
+        return sum(
+            self._is_there(attempt.action.pick, region)
+            for attempt in self._history
+            if attempt.action.aside and attempt.outcome == "placed"
+        )
+
+    @property
+    def _history(self) -> tuple[Attempt, ...]:
+        return self.observation.history
+
+    def _is_there(self, pose: PlanarPose, region: Region) -> bool:
+        grid = self.observation.grid
+        pixel = grid.to_pixel((pose.x, pose.y))
+        away = np.linalg.norm(region.pixels - pixel, axis=1).min() * grid.resolution
+        return bool(away < _THERE)
+
+    def _middle(self, region: Region) -> tuple[float, float]:
+        x, y = self.observation.grid.to_world(region.pixels.mean(axis=0))
+        return float(x), float(y)
+
+
+def _left_at(attempt: Attempt) -> PlanarPose:
+    """Where an action left its object, as far as the robot knows."""
+    return attempt.action.place if attempt.outcome == "placed" else attempt.action.pick
+
+
+def mask_of(regions: tuple[Region, ...], shape: tuple[int, int]) -> NDArray[np.bool_]:
+    """(rows, cols): the pixels of all regions."""
+    mask = np.zeros(shape, bool)
+    for region in regions:
+        mask |= region.mask
+    return mask

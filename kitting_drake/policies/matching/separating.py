@@ -1,0 +1,140 @@
+"""Takes a heap apart: picks the topmost object and lays it on a free part of the table.
+
+Where objects lie on or against each other and their outlines cannot be told apart, they are moved
+apart first. This is not in the paper.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from kitting_drake.policies.data.images import make_action, rotation_matrix
+from kitting_drake.policies.matching.inventory import Inventory
+from kitting_drake.policies.matching.jaw_clearance import jaw_grasps, untried
+from kitting_drake.policies.matching.segmentation import Mask, Region, Segmentation
+from systems.pick_place_parameters import PickPlaceParameters
+from systems.signals import PickPlaceAction, PlanarPose
+
+Array = NDArray[np.float64]
+
+_LAYERS = (0.008, 0.014, 0.022, math.inf)
+"""The topmost object is what lies this far below the top, in metres; tried in this order."""
+_LEAST_LAYER = 12
+"""A layer of fewer pixels is no object."""
+_REACH = 0.030
+"""An object extends this far beyond its topmost layer, in metres."""
+_ROOMS = (0.030, 0.015, 0.008)
+"""The room around a free place, in metres; tried in this order."""
+_TURNS = 12
+"""The number of directions in which an object is laid down."""
+_GRASPS = 6
+"""How many grasps of a layer are tried."""
+
+
+def separating_action(
+    inventory: Inventory, planner: PickPlaceParameters, failed_picks: tuple[PlanarPose, ...] = ()
+) -> PickPlaceAction | None:
+    """Lays the topmost part of the first stranger that can be gripped on a free place.
+
+    Args:
+        inventory: objects and recesses.
+        planner: how the hand will pick.
+        failed_picks: poses at which a grasp failed before; it avoids them.
+
+    Returns:
+        The action; None if there is no stranger, grasp or room.
+    """
+    observation, segmentation = inventory.observation, inventory.segmentation
+    resolution = observation.grid.resolution
+    places = np.array([(pick.x, pick.y) for pick in failed_picks]).reshape(-1, 2)
+    failed = observation.grid.to_pixel(places)
+    strangers = sorted(inventory.worth_a_try, key=lambda item: -item.height)
+    for stranger in strangers:
+        for layer in _layers(segmentation, stranger):
+            grasps = jaw_grasps(segmentation, layer, resolution, planner)
+            for grasp in untried(grasps, failed, resolution)[:_GRASPS]:
+                found = _free_pose(segmentation, stranger, layer, grasp.pixel, resolution)
+                if found is None:
+                    continue
+                place, rotation = found
+                action = make_action(observation, grasp.pixel, grasp.theta, place, rotation)
+                return replace(action, aside=True)
+    return None
+
+
+def _layers(segmentation: Segmentation, region: Region) -> list[Region]:
+    """The topmost layers of a region, thinnest first; the last is the whole region."""
+    relief = segmentation.relief
+    top = float(np.percentile(relief[region.mask], 99))
+    layers = []
+    for depth in _LAYERS:
+        labels, count = ndimage.label(region.mask & (relief > top - depth), np.ones((3, 3)))
+        sizes = np.bincount(labels.ravel(), minlength=count + 1)[1:]
+        for number in np.argsort(-sizes):
+            if sizes[number] < _LEAST_LAYER:
+                break
+            mask = labels == number + 1
+            layers.append(Region(mask, float(np.percentile(relief[mask], 90))))
+    return layers
+
+
+def _free_pose(
+    segmentation: Segmentation, region: Region, layer: Region, pick: Array, resolution: float
+) -> tuple[Array, float] | None:
+    """A place (row, col) of the pick and a rotation with room for the object; None without room.
+
+    The nearest place of those with the most room.
+    """
+    within = ndimage.distance_transform_edt(~layer.mask) * resolution < _REACH
+    footprint = np.argwhere(region.mask & within) - pick
+    taken = _taken(segmentation, region)
+    distance = ndimage.distance_transform_edt(~np.pad(taken, 1, constant_values=True))
+    distance = distance[1:-1, 1:-1] * resolution
+    for room in _ROOMS:
+        best: tuple[float, Array, float] | None = None
+        for angle in np.arange(_TURNS) * math.tau / _TURNS - math.pi + math.tau / _TURNS:
+            free = _free_pixels(distance >= room, footprint @ rotation_matrix(float(angle)).T)
+            if free is None:
+                continue
+            away = np.linalg.norm(free - pick, axis=1) * resolution
+            # A turn of the wrist costs time, too.
+            index = int(away.argmin())
+            cost = float(away[index] + 0.05 * abs(angle))
+            if best is None or cost < best[0]:
+                best = cost, free[index], float(angle)
+        if best is not None:
+            return best[1], best[2]
+    return None
+
+
+def _taken(segmentation: Segmentation, region: Region) -> Mask:
+    """(rows, cols): where nothing can be laid down, including where the object came from."""
+    visibility = segmentation.visibility
+    taken = segmentation.fixture | ~visibility.in_view
+    # Single holes are noise.
+    taken |= ndimage.binary_opening(~visibility.seen, iterations=2)
+    for item in segmentation.objects:
+        taken |= item.mask
+    return taken | region.mask
+
+
+def _free_pixels(free: Mask, footprint: Array) -> Array | None:
+    """(n, 2): the pixels about which all of a footprint (m, 2) is free; None without any."""
+    cells = np.unique(np.rint(footprint).astype(int), axis=0)
+    low, high = cells.min(axis=0), cells.max(axis=0)
+    kernel = np.zeros(high - low + 1)
+    kernel[tuple((cells - low).T)] = 1
+    size = tuple(int(n) for n in np.array(free.shape) + kernel.shape)
+    blocked = np.fft.irfft2(
+        np.fft.rfft2((~free).astype(float), size) * np.conj(np.fft.rfft2(kernel, size)), size
+    )
+    rows, cols = (int(n) for n in np.array(free.shape) - kernel.shape + 1)
+    if rows <= 0 or cols <= 0:
+        return None
+    corners = np.argwhere(blocked[:rows, :cols] < 0.5)
+    return (corners - low).astype(float) if len(corners) else None

@@ -1,0 +1,236 @@
+"""Tells touching objects apart: finds the outlines of free recesses within a region.
+
+Objects that touch are one region of o_t, and its outline fits no recess. But each recess shows the
+outline of one object. Its best pose within the region, where it covers nothing else and where much
+of its outline is also the region's, cuts that object out of the region.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from kitting_drake.policies.data.images import rotation_matrix
+from kitting_drake.policies.matching.assignment import match
+from kitting_drake.policies.matching.registration import (
+    Outline,
+    Registration,
+    closed,
+    register,
+    residuals,
+    trace_outline,
+)
+from kitting_drake.policies.matching.segmentation import Mask, Region, Segmentation
+
+Array = NDArray[np.float64]
+
+_ANGLES = 72
+_STARTS = 5
+"""Rotations tried at first, and poses refined."""
+_OUTSIDE, _NOTCH, _RIM = 3.0, 0.3, 1.5
+"""In the search a pixel of the region counts 1, one in a narrow notch `_NOTCH`, one outside
+`-_OUTSIDE`, and the outline `_RIM` if all of it is also the region's."""
+_INSIDE = 0.94
+"""The least share of a recess within the region."""
+_NEAR = 0.0025
+"""A point of the outline is on the region's if it is this close, in metres."""
+_SHARED, _COST = 0.45, 0.0010
+"""The least share of such points, and the largest mean of their distances, in metres."""
+_CLEARLY, _UNEXPLAINED = 0.65, 0.15
+"""If more than the second share of a region is no object of a free recess, each outline found in it
+needs a larger share of such points."""
+_LEAST_PART = 0.35
+"""A region smaller than this share of a recess's area holds no object of that recess."""
+_SLIVER = 1
+"""What is left of a region is thinned by this many pixels, to drop slivers."""
+_LEAST_REST = 0.0002
+"""What is left of a region is no object below this area, in square metres."""
+
+
+@dataclass(frozen=True)
+class _Found:
+    """A recess's outline within a region."""
+
+    recess: int
+    mask: Mask
+    """(rows, cols): the object."""
+    shared: float
+    """The share of its outline that is also the region's."""
+    cost: float
+    """The mean distance of that share, in metres."""
+
+
+def split_touching(segmentation: Segmentation, resolution: float) -> Segmentation:
+    """The segmentation with regions of touching objects split, where the free recesses tell how.
+
+    Args:
+        segmentation: the segmentation of o_t.
+        resolution: the side of a pixel, in metres.
+    """
+    objects = segmentation.objects
+    pairs = match(segmentation, resolution)
+    matched = {pair.item for pair in pairs}
+    filled = {id(segmentation.recesses[pair.recess]) for pair in pairs}
+    recesses = [item for item in segmentation.free_recesses if id(item) not in filled]
+    if len(matched) == len(objects) or not recesses:
+        return segmentation
+    result: list[Region] = []
+    taken: set[int] = set()
+    for index, region in enumerate(objects):
+        if index in matched:
+            result.append(region)
+            continue
+        result += _split(region, recesses, taken, segmentation.relief, resolution)
+    if len(result) == len(objects):
+        return segmentation
+    result.sort(key=lambda item: -int(item.mask.sum()))
+    return replace(segmentation, objects=tuple(result))
+
+
+def _split(
+    region: Region,
+    recesses: Sequence[Region],
+    taken: set[int],
+    relief: NDArray[np.float32],
+    resolution: float,
+) -> list[Region]:
+    """The objects of a region, or the region itself. Adds the recesses found to `taken`."""
+    parts: list[_Found] = []
+    rest = region.mask
+    while True:
+        found = [
+            item
+            for index, recess in enumerate(recesses)
+            if index not in taken and rest.sum() > _LEAST_PART * recess.mask.sum()
+            for item in [_find(index, recess, rest, resolution)]
+            if item is not None
+        ]
+        if not found:
+            break
+        best = max(found, key=lambda item: item.shared - 100 * item.cost)
+        taken.add(best.recess)
+        parts.append(best)
+        rest = rest & ~best.mask
+    unexplained = rest.sum() > _UNEXPLAINED * region.mask.sum()
+    if unexplained and any(item.shared < _CLEARLY for item in parts):
+        # A large box contains the outlines of many recesses.
+        taken -= {item.recess for item in parts}
+        parts = []
+    if not parts:
+        return [region]
+    return [_region(item.mask, relief) for item in parts] + _rest(rest, relief, resolution)
+
+
+def _rest(rest: Mask, relief: NDArray[np.float32], resolution: float) -> list[Region]:
+    """What is left of a region, without slivers."""
+    core = ndimage.binary_erosion(rest, iterations=_SLIVER)
+    labels, count = ndimage.label(ndimage.binary_propagation(core, mask=rest))
+    regions = (labels == number for number in range(1, count + 1))
+    return [_region(mask, relief) for mask in regions if mask.sum() * resolution**2 >= _LEAST_REST]
+
+
+def _region(mask: Mask, relief: NDArray[np.float32]) -> Region:
+    return Region(mask, float(np.percentile(relief[mask], 90)))
+
+
+def _find(number: int, recess: Region, region: Mask, resolution: float) -> _Found | None:
+    """The best pose of a recess's outline within a region; None if there is none."""
+    template = trace_outline(recess.mask, resolution)
+    around = trace_outline(region, resolution, close=True)
+    best: _Found | None = None
+    for start in _starts(recess.mask, region, template, resolution):
+        fit = register(template, around, starts=(start,), within=True)
+        found = _judge(number, template, around, fit, region, resolution)
+        if found is not None and (best is None or found.shared > best.shared):
+            best = found
+    return best
+
+
+def _judge(
+    number: int,
+    template: Outline,
+    around: Outline,
+    fit: Registration,
+    region: Mask,
+    resolution: float,
+) -> _Found | None:
+    """The object at a fit; None if the outlines do not agree well enough."""
+    rows, cols = np.indices(region.shape)
+    positions = np.stack([rows, cols], axis=-1).reshape(-1, 2)
+    back = (positions - fit.shift) @ rotation_matrix(fit.rotation)
+    distance = template.sample(template.distance, back, math.inf).reshape(region.shape)
+    covered = distance < -fit.offset
+    # Notches are closed in a recess, so they are closed in the region, too.
+    filled = closed(region, resolution)
+    if not covered.any() or filled[covered].mean() < _INSIDE:
+        return None
+    near = np.abs(template.values) < resolution
+    away = np.abs(residuals(template, around, fit)[near])
+    shared = away < _NEAR
+    if shared.mean() < _SHARED or away[shared].mean() > _COST:
+        return None
+    mask = region & (distance < resolution / 2 - fit.offset)
+    return _Found(number, mask, float(shared.mean()), float(away[shared].mean()))
+
+
+def _starts(
+    recess: Mask, region: Mask, template: Outline, resolution: float
+) -> list[tuple[float, Array]]:
+    """Rotations and shifts at which most of a recess lies within a region, by correlation."""
+    shape = _crop(recess)
+    rows, cols = np.nonzero(region)
+    half = math.ceil(math.hypot(*shape.shape) / 2) + 1
+    low = np.array([rows.min(), cols.min()]) - half
+    high = np.array([rows.max(), cols.max()]) + half + 1
+    own = np.zeros(high - low, bool)
+    own[rows - low[0], cols - low[1]] = True
+    field = np.where(own, 1.0, np.where(closed(own, resolution), _NOTCH, -_OUTSIDE))
+    edge = ndimage.gaussian_filter(_edge(own).astype(float), 1.0)
+    size = tuple(int(n) for n in np.array(field.shape) + 2 * half + 1)
+    # One transform for both: the field counts the inside, the edge the outline.
+    spectra = np.fft.rfft2(field, size) / shape.sum(), np.fft.rfft2(edge, size)
+    middle = (np.array(shape.shape) - 1) / 2
+    centre = np.argwhere(recess).min(axis=0) + middle
+    found: list[tuple[float, float, Array]] = []
+    for angle in np.arange(_ANGLES) * math.tau / _ANGLES:
+        turn = rotation_matrix(float(angle))
+        kernel = ndimage.affine_transform(
+            shape.astype(np.float32),
+            turn.T,
+            offset=middle - turn.T @ (half, half),
+            output_shape=(2 * half + 1, 2 * half + 1),
+            order=1,
+        )
+        rim = _edge(kernel > 0.5)
+        product = spectra[0] * np.conj(np.fft.rfft2(kernel, size))
+        product += spectra[1] * np.conj(np.fft.rfft2(rim, size)) * (_RIM / max(rim.sum(), 1))
+        scores = np.fft.irfft2(product, size)
+        scores = scores[: field.shape[0] - 2 * half, : field.shape[1] - 2 * half]
+        row, col = np.unravel_index(int(scores.argmax()), scores.shape)
+        there = low + (row, col) + half
+        found.append((float(scores[row, col]), float(angle), there - turn @ centre))
+    found.sort(key=lambda item: -item[0])
+    return [(angle, shift) for _, angle, shift in _distinct(found)]
+
+
+def _distinct(found: list[tuple[float, float, Array]]) -> list[tuple[float, float, Array]]:
+    """The best starts that are not neighbours in rotation."""
+    kept: list[tuple[float, float, Array]] = []
+    for item in found:
+        if all(abs(math.remainder(item[1] - other[1], math.tau)) > 0.2 for other in kept):
+            kept.append(item)
+    return kept[:_STARTS]
+
+
+def _edge(mask: Mask) -> Mask:
+    return mask & ~ndimage.binary_erosion(mask)
+
+
+def _crop(mask: Mask) -> Mask:
+    rows, cols = np.nonzero(mask)
+    return mask[rows.min() : rows.max() + 1, cols.min() : cols.max() + 1]
