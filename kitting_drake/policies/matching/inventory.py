@@ -30,20 +30,25 @@ class Inventory:
     observation: Observation
     segmentation: Segmentation
     """With touching objects told apart, where the recesses show how."""
+    matches: tuple[Pair, ...]
+    """All objects and recesses that fit, best fit first."""
 
     @classmethod
     def of(cls, observation: Observation) -> Inventory:
         """The inventory of an observation."""
-        segmentation = segment(observation)
-        return cls(observation, split_touching(segmentation, observation.grid.resolution))
+        segmentation, resolution = segment(observation), observation.grid.resolution
+        pairs = match(segmentation, resolution)
+        split = split_touching(segmentation, pairs, resolution)
+        if split is not segmentation:
+            pairs = match(split, resolution)
+        return cls(observation, split, tuple(pairs))
 
     @cached_property
     def pairs(self) -> tuple[Pair, ...]:
-        """Objects and the recesses into which they fit, best fit first; without those that were
-        tried too often."""
+        """The matches without objects that were tried too often."""
         return tuple(
             pair
-            for pair in match(self.segmentation, self.observation.grid.resolution)
+            for pair in self.matches
             if self.tries(self.segmentation.objects[pair.item]) < _MOST_TRIES
         )
 

@@ -13,10 +13,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import ndimage
+from scipy import fft, ndimage
 
 from kitting_drake.policies.data.images import rotation_matrix
-from kitting_drake.policies.matching.assignment import match
+from kitting_drake.policies.matching.assignment import Pair
 from kitting_drake.policies.matching.registration import (
     Outline,
     Registration,
@@ -65,15 +65,20 @@ class _Found:
     """The mean distance of that share, in metres."""
 
 
-def split_touching(segmentation: Segmentation, resolution: float) -> Segmentation:
+def split_touching(
+    segmentation: Segmentation, pairs: Sequence[Pair], resolution: float
+) -> Segmentation:
     """The segmentation with regions of touching objects split, where the free recesses tell how.
 
     Args:
         segmentation: the segmentation of o_t.
+        pairs: the objects that fit into a recess as they are; see `match`.
         resolution: the side of a pixel, in metres.
+
+    Returns:
+        The same object if nothing is split.
     """
     objects = segmentation.objects
-    pairs = match(segmentation, resolution)
     matched = {pair.item for pair in pairs}
     filled = {id(segmentation.recesses[pair.recess]) for pair in pairs}
     recesses = [item for item in segmentation.free_recesses if id(item) not in filled]
@@ -102,14 +107,14 @@ def _split(
     """The objects of a region, or the region itself. Adds the recesses found to `taken`."""
     parts: list[_Found] = []
     rest = region.mask
-    while True:
-        found = [
-            item
+    while rest.any():
+        around = trace_outline(rest, resolution, close=True)
+        tried = [
+            _find(index, recess, rest, around, resolution)
             for index, recess in enumerate(recesses)
             if index not in taken and rest.sum() > _LEAST_PART * recess.mask.sum()
-            for item in [_find(index, recess, rest, resolution)]
-            if item is not None
         ]
+        found = [item for item in tried if item is not None]
         if not found:
             break
         best = max(found, key=lambda item: item.shared - 100 * item.cost)
@@ -138,10 +143,11 @@ def _region(mask: Mask, relief: NDArray[np.float32]) -> Region:
     return Region(mask, float(np.percentile(relief[mask], 90)))
 
 
-def _find(number: int, recess: Region, region: Mask, resolution: float) -> _Found | None:
+def _find(
+    number: int, recess: Region, region: Mask, around: Outline, resolution: float
+) -> _Found | None:
     """The best pose of a recess's outline within a region; None if there is none."""
     template = trace_outline(recess.mask, resolution)
-    around = trace_outline(region, resolution, close=True)
     best: _Found | None = None
     for start in _starts(recess.mask, region, template, resolution):
         fit = register(template, around, starts=(start,), within=True)
@@ -190,10 +196,12 @@ def _starts(
     own = np.zeros(high - low, bool)
     own[rows - low[0], cols - low[1]] = True
     field = np.where(own, 1.0, np.where(closed(own, resolution), _NOTCH, -_OUTSIDE))
-    edge = ndimage.gaussian_filter(_edge(own).astype(float), 1.0)
-    size = tuple(int(n) for n in np.array(field.shape) + 2 * half + 1)
+    edge = ndimage.gaussian_filter(_edge(own).astype(np.float32), 1.0)
+    # Wrapped sums are wrong only where they are cut off below.
+    size = tuple(fft.next_fast_len(n, real=True) for n in field.shape)
     # One transform for both: the field counts the inside, the edge the outline.
-    spectra = np.fft.rfft2(field, size) / shape.sum(), np.fft.rfft2(edge, size)
+    inside = fft.rfft2((field / shape.sum()).astype(np.float32), size)
+    outline = fft.rfft2(edge, size)
     middle = (np.array(shape.shape) - 1) / 2
     centre = np.argwhere(recess).min(axis=0) + middle
     found: list[tuple[float, float, Array]] = []
@@ -207,9 +215,10 @@ def _starts(
             order=1,
         )
         rim = _edge(kernel > 0.5)
-        product = spectra[0] * np.conj(np.fft.rfft2(kernel, size))
-        product += spectra[1] * np.conj(np.fft.rfft2(rim, size)) * (_RIM / max(rim.sum(), 1))
-        scores = np.fft.irfft2(product, size)
+        product = inside * np.conj(fft.rfft2(kernel, size))
+        weight = np.float32(_RIM / max(rim.sum(), 1))
+        product += outline * np.conj(fft.rfft2(rim.astype(np.float32), size)) * weight
+        scores = fft.irfft2(product, size)
         scores = scores[: field.shape[0] - 2 * half, : field.shape[1] - 2 * half]
         row, col = np.unravel_index(int(scores.argmax()), scores.shape)
         there = low + (row, col) + half
