@@ -129,9 +129,13 @@ def trace_outline(mask: Mask, resolution: float, *, close: bool = False) -> Outl
 
 
 def closed(mask: Mask, resolution: float) -> Mask:
-    """The mask with narrow notches filled, as in an object's recess; padded masks only."""
+    """The mask with narrow notches and all holes filled, as in an object's recess.
+
+    The mask must be padded.
+    """
     grown = ndimage.distance_transform_edt(~mask) * resolution <= _CLOSING_RADIUS
-    return np.asarray(ndimage.distance_transform_edt(grown) * resolution > _CLOSING_RADIUS)
+    whole = ndimage.distance_transform_edt(grown) * resolution > _CLOSING_RADIUS
+    return np.asarray(ndimage.binary_fill_holes(whole))
 
 
 def register(
