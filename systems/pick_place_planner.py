@@ -1,6 +1,7 @@
 """The pick-and-place motion primitive: a state machine with smooth, limited motions."""
 
 import dataclasses
+import functools
 import math
 from collections.abc import Callable
 
@@ -15,6 +16,8 @@ from pydrake.systems.framework import (
     LeafSystem,
 )
 
+from systems.attempt_history import AttemptHistory, LeftOverVector
+from systems.contact_guard import ContactGuard
 from systems.hand_geometry import check_reach
 from systems.hand_motion import shortest_yaws
 from systems.motion_heights import motion_heights
@@ -30,8 +33,8 @@ from systems.signals import (
 from systems.surface_heights import read_surface_heights
 from systems.weak_calc import weak_calc
 
-_MOST_FAILED = 16
-"""How many failed picks are remembered."""
+_HOLDING = (Mode.LIFT, Mode.CARRY, Mode.LOWER, Mode.SEARCH, Mode.RELEASE)
+"""The modes in which an object may be in the hand."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -66,6 +69,8 @@ class PickPlacePlanner(LeafSystem):
         - mode
         - counts
         - failed_picks
+        - history
+        - peak_force
         - asks
         - accepted_action
 
@@ -80,12 +85,18 @@ class PickPlacePlanner(LeafSystem):
     - `desired_opening` (2): the opening between the pads in m, and its rate.
     - `closing_force` (1): additional force of each pad, in N.
     - `mode` (1): a `Mode`.
-    - `counts` (3): actions begun, grasps missed, objects dropped.
+    - `counts` (4): actions begun, grasps missed, objects dropped, actions stopped by the guard.
     - `failed_picks` (abstract, a tuple of `PlanarPose`): the last 16 picks where a grasp was missed
-      or lost, or an object pressed down, latest last. A policy can use it to try another.
+      or lost, an object pressed down, or the action stopped, latest last. A policy can use it to
+      try another.
+    - `history` (abstract, a tuple of `Attempt`): the last 64 actions whose outcome is decided,
+      oldest first.
+    - `peak_force` (3): the largest vertical and lateral contact force on the hand in the present or
+      last action, without the weight of the held object, in N; and the `Mode` in which the larger
+      of the two rose. Every step of the plant is looked at.
     - `asks` (1): 1 if the next update, due at the context's time, evaluates `action`; else 0.
     - `accepted_action` (abstract, `PickPlaceAction`): the last action begun, with the hand's actual
-      yaws and without heights.
+      yaws and without heights; or the stop, with up to 24 objects and cavities of `left_over`.
 
     Motions are smooth and as short as the limits on speed and acceleration allow (see
     `systems.hand_motion`). In the plane they are straight lines; height and yaw have their own time
@@ -95,17 +106,20 @@ class PickPlacePlanner(LeafSystem):
     - `APPROACH`, `CARRY`: near its goal, the hand sinks to just above the surfaces there.
     - `DESCEND`, `LOWER`: guarded motions. They stop dead when the vertical contact force exceeds
       the payload's weight by `contact_threshold`. The heights of table, kit and cavity need not be
-      known.
+      known, but where o_t shows a surface the hand slows down first, because the force of an impact
+      is proportional to the speed.
     - `CHECK`: a grasp is good if the pads are further apart than `minimum_width` and both feel at
       least half of the grasp force. If it is not, or is lost later, the hand retreats and observes
       again. The attempt counts as an action.
     - `LIFT`, `CARRY`: a load above `heavy_load` is gripped more firmly.
     - `SEARCH`: in tasks that insert, if the object stands on the rim around its place, the hand
       searches for the cavity. It lowers again once the resistance ends.
-    - An action with `press` ends with `DESCEND`, with closed jaws, at the speed of `LOWER`, until
+    - An action with `press` ends with `DESCEND`, with closed jaws, at `touch_speed`, until
       `press_force` is reached.
+    - In all modes, a contact force beyond `force_limit` ends the action (see `ContactGuard`): the
+      hand stops dead, lets go of what it holds, and retreats. It counts as a failed pick.
 
-    State (discrete): one vector, and the failed picks.
+    State (discrete): one vector, the history, and what a stopping policy left over.
     """
 
     def __init__(
@@ -115,6 +129,7 @@ class PickPlacePlanner(LeafSystem):
         max_actions: int,
         insertion: bool = False,
         period: float = 1 / 64,
+        force_period: float = 1 / 128,
     ) -> None:
         """
         Args:
@@ -122,6 +137,7 @@ class PickPlacePlanner(LeafSystem):
             max_actions: stop after this many actions, unless `parameters.max_actions` overrides it.
             insertion: whether to search for a cavity when a place is blocked.
             period: update period of the state machine, in s.
+            force_period: period at which the contact force is looked at, in s: the plant's step.
         """
         super().__init__()
         self._parameters = parameters
@@ -130,7 +146,12 @@ class PickPlacePlanner(LeafSystem):
         self._search_steps = parameters.search.steps if insertion else 0
         self._motion = PickPlaceMotion(parameters)
         self._state_index = self.DeclareDiscreteState(self._motion.initial_state())
+        self._history_index = self.DeclareDiscreteState(np.full(AttemptHistory.size, np.nan))
+        self._left_over_index = self.DeclareDiscreteState(np.zeros(LeftOverVector.size))
+        self._guard = ContactGuard(parameters.force_limit, force_period)
         self._period = period
+        # At times that they share, the first one declared comes first.
+        self.DeclarePeriodicDiscreteUpdateEvent(force_period, 0.0, self._feel)
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
 
         self._hand_state = self.DeclareVectorInputPort("hand_state", 12)
@@ -138,27 +159,31 @@ class PickPlacePlanner(LeafSystem):
         self._action = self.DeclareAbstractInputPort("action", Value(PickPlaceAction()))
         self._observation = self.DeclareAbstractInputPort("observation", Value(Observation()))
         state_and_time = {self.discrete_state_ticket(self._state_index), self.time_ticket()}
-        self.DeclareVectorOutputPort("desired_motion", 12, self._calc_motion, state_and_time)
+        self._motion_port = self.DeclareVectorOutputPort(
+            "desired_motion", 12, self._calc_motion, state_and_time
+        )
         self.DeclareVectorOutputPort("desired_opening", 2, self._calc_opening, state_and_time)
         self.DeclareVectorOutputPort("closing_force", 1, self._calc_force, state_and_time)
         state_only = {self.discrete_state_ticket(self._state_index)}
         self.DeclareVectorOutputPort("mode", 1, self._calc_mode, state_only)
-        self.DeclareVectorOutputPort("counts", 3, self._calc_counts, state_only)
-        # Rows of x, y, theta; NaN after the last.
-        self._failed_index = self.DeclareDiscreteState(np.full(3 * _MOST_FAILED, np.nan))
-        self.DeclareAbstractOutputPort(
-            "failed_picks",
-            lambda: Value(()),
-            weak_calc(self._calc_failed_picks),
-            {self.discrete_state_ticket(self._failed_index)},
-        )
+        self.DeclareVectorOutputPort("counts", 4, self._calc_counts, state_only)
+        self.DeclareVectorOutputPort("peak_force", 3, self._calc_peak_force, state_only)
         self.DeclareVectorOutputPort("asks", 1, self._calc_asks, state_and_time)
-        self.DeclareAbstractOutputPort(
-            "accepted_action",
-            lambda: Value(PickPlaceAction()),
-            weak_calc(self._calc_accepted_action),
-            state_only,
-        )
+        history = {self.discrete_state_ticket(self._history_index)}
+        left_over = {self.discrete_state_ticket(self._left_over_index)}
+        for name, empty, calc, tickets in (
+            ("failed_picks", (), self._calc_failed_picks, history),
+            ("history", (), self._calc_history, history),
+            (
+                "accepted_action",
+                PickPlaceAction(),
+                self._calc_accepted_action,
+                state_only | left_over,
+            ),
+        ):
+            self.DeclareAbstractOutputPort(
+                name, functools.partial(Value, empty), weak_calc(calc), tickets
+            )
 
     def _state(self, context: Context) -> PlannerState:
         return PlannerState(context.get_discrete_state(self._state_index).get_value())
@@ -181,12 +206,20 @@ class PickPlacePlanner(LeafSystem):
 
     def _calc_counts(self, context: Context, output: BasicVector) -> None:
         state = self._state(context)
-        output.SetFromVector([state.actions, state.missed, state.dropped])
+        output.SetFromVector([state.actions, state.missed, state.dropped, state.stopped])
+
+    def _calc_peak_force(self, context: Context, output: BasicVector) -> None:
+        state = self._state(context)
+        output.SetFromVector([state.peak_vertical, state.peak_lateral, state.peak_mode])
 
     def _calc_failed_picks(self, context: Context, output: AbstractValue) -> None:
-        rows = context.get_discrete_state(self._failed_index).get_value().reshape(-1, 3)
-        kept = rows[~np.isnan(rows[:, 0])].tolist()
-        output.set_value(tuple(PlanarPose(*row) for row in kept))
+        output.set_value(self._history(context).failed_picks())
+
+    def _calc_history(self, context: Context, output: AbstractValue) -> None:
+        output.set_value(self._history(context).attempts())
+
+    def _history(self, context: Context) -> AttemptHistory:
+        return AttemptHistory(context.get_discrete_state(self._history_index).get_value())
 
     def _calc_asks(self, context: Context, output: BasicVector) -> None:
         state, time = self._state(context), context.get_time()
@@ -199,14 +232,40 @@ class PickPlacePlanner(LeafSystem):
         output.SetFromVector([asks])
 
     def _calc_accepted_action(self, context: Context, output: AbstractValue) -> None:
-        state = self._state(context)
-        pick, place = (PlanarPose(*map(float, pose)) for pose in (state.pick, state.place))
-        reason = list(STOP_REASONS)[int(state.stop) - 1] if state.stop else ""
-        output.set_value(
-            PickPlaceAction(
-                pick, place, stop=bool(state.stop), reason=reason, press=bool(state.press)
-            )
+        action = _action_of(self._state(context))
+        if action.stop:
+            kept = context.get_discrete_state(self._left_over_index).get_value()
+            action = dataclasses.replace(action, left_over=LeftOverVector(kept).read())
+        output.set_value(action)
+
+    # The force guard.
+
+    def _feel(self, context: Context, discrete_state: DiscreteValues) -> EventStatus:
+        state = PlannerState(discrete_state.get_mutable_value(self._state_index))
+        mode = state.mode
+        if mode in (Mode.OBSERVE, Mode.DONE):
+            return EventStatus.DidNothing()
+        hand = self._hand_state.Eval(context)
+        motion = self._motion_port.Eval(context)
+        peak = max(state.peak_vertical, state.peak_lateral)
+        must_stop = self._guard.feel(
+            state, self._contact_force.Eval(context), float(hand[2]), motion[8:11]
         )
+        if must_stop and not state.stops:
+            self._stop(state, context.get_time(), hand)
+            self._conclude(mode, state, discrete_state)
+        if state.mode == Mode.RETREAT and max(state.peak_vertical, state.peak_lateral) > peak:
+            self._amend(state, discrete_state)
+        return EventStatus.Succeeded()
+
+    def _stop(self, state: PlannerState, time: float, hand: NDArray[np.float64]) -> None:
+        """Stops dead, lets go of what is in the hand, and retreats."""
+        state.stopped, state.stops = state.stopped + 1, 1
+        retreats, holds = state.mode == Mode.RETREAT, state.mode in _HOLDING
+        self._motion.begin(state, Mode.RELEASE if holds else Mode.RETREAT, time, at=hand[:4])
+        if retreats:
+            # The jaws drag something along.
+            state.goal_opening = self._parameters.open_width
 
     # The state machine.
 
@@ -217,12 +276,32 @@ class PickPlacePlanner(LeafSystem):
         contact = self._contact_force.Eval(context)
         mode = Mode(int(state.mode))
         if mode != Mode.DONE:
-            failed = state.missed + state.dropped
             self._step(mode)(_Moment(context, state, time, hand, contact))
-            has_pressed = mode == Mode.DESCEND and state.mode == Mode.RETREAT
-            if has_pressed or state.missed + state.dropped > failed:
-                self._remember_failed(state, discrete_state)
+            self._conclude(mode, state, discrete_state)
+        if mode == Mode.OBSERVE and state.mode == Mode.DONE and state.actions < self._max_actions:
+            kept = discrete_state.get_mutable_value(self._left_over_index)
+            LeftOverVector(kept).write(self._action.Eval(context).left_over)
         return EventStatus.Succeeded()
+
+    def _conclude(
+        self, before: float, state: PlannerState, discrete_state: DiscreteValues
+    ) -> None:
+        """Writes an action into the history when the hand begins to retreat."""
+        if state.mode != Mode.RETREAT:
+            return
+        if before == Mode.RETREAT:
+            if state.stops:
+                self._amend(state, discrete_state)
+            return
+        history = AttemptHistory(discrete_state.get_mutable_value(self._history_index))
+        peak = max(state.peak_vertical, state.peak_lateral)
+        history.append(_action_of(state), _outcome(before, state), peak)
+
+    def _amend(self, state: PlannerState, discrete_state: DiscreteValues) -> None:
+        """Updates the latest attempt of the history while the hand retreats."""
+        history = AttemptHistory(discrete_state.get_mutable_value(self._history_index))
+        outcome = "stopped" if state.stops else history.attempts()[-1].outcome
+        history.amend(outcome, max(state.peak_vertical, state.peak_lateral))
 
     def _step(self, mode: Mode) -> Callable[[_Moment], None]:
         steps: dict[Mode, Callable[[_Moment], None]] = {
@@ -236,13 +315,6 @@ class PickPlacePlanner(LeafSystem):
             Mode.SEARCH: self._search,
         }
         return steps.get(mode, self._follow)
-
-    def _remember_failed(self, state: PlannerState, discrete_state: DiscreteValues) -> None:
-        rows = discrete_state.get_mutable_value(self._failed_index).reshape(-1, 3)
-        free = np.flatnonzero(np.isnan(rows[:, 0]))
-        if not len(free):
-            rows[:-1] = rows[1:].copy()
-        rows[free[0] if len(free) else -1] = state.pick
 
     def _observe(self, moment: _Moment) -> None:
         context, state, time = moment.context, moment.state, moment.time
@@ -264,8 +336,10 @@ class PickPlacePlanner(LeafSystem):
         state.pick = (action.pick.x, action.pick.y, pick_yaw)
         state.place = (action.place.x, action.place.y, place_yaw)
         self._set_heights(state, self._heights(context, action))
-        state.search_step, state.press = 0, action.press
+        state.search_step, state.press, state.aside = 0, action.press, action.aside
+        state.stops = 0
         state.actions += 1
+        self._guard.reset(state)
         self._motion.begin(state, Mode.APPROACH, time)
 
     def _has_settled(self, state: PlannerState, time: float) -> bool:
@@ -288,6 +362,7 @@ class PickPlacePlanner(LeafSystem):
         state.table_z, state.support_z = heights.table, heights.support
         # An object slightly below an uncertain rim may stand on it.
         state.rim_z = heights.place_rim - heights.doubt
+        state.floor_z, state.doubt = heights.place_floor, heights.doubt
         state.clear_z, state.travel_z = motion.clear, motion.travel
         state.pick_hover_z, state.place_hover_z = motion.pick_hover, motion.place_hover
 
@@ -350,7 +425,7 @@ class PickPlacePlanner(LeafSystem):
             if self._motion.brakes_above(state, time, state.travel_z):
                 self._motion.begin(state, Mode.CARRY, time)
         elif time >= self._motion.arrival(state) + self._parameters.tare_settle:
-            state.payload = contact[2]
+            self._guard.tare(state, contact, self._parameters.contact_threshold)
             self._motion.begin(state, Mode.LOWER, time)
 
     def _lower(self, moment: _Moment) -> None:
@@ -393,3 +468,24 @@ class PickPlacePlanner(LeafSystem):
         # Contact pushes the fingers apart, along their positive axes.
         pressed = contact[4:6].min() > self._parameters.grasp_force / 2
         return bool(pressed and hand[4] + hand[5] > self._parameters.minimum_width)
+
+
+def _action_of(state: PlannerState) -> PickPlaceAction:
+    """The last action begun, or the stop, without heights."""
+    pick, place = (PlanarPose(*map(float, pose)) for pose in (state.pick, state.place))
+    return PickPlaceAction(
+        pick,
+        place,
+        stop=bool(state.stop),
+        reason=list(STOP_REASONS)[int(state.stop) - 1] if state.stop else "",
+        press=bool(state.press),
+        aside=bool(state.aside),
+    )
+
+
+def _outcome(before: float, state: PlannerState) -> str:
+    """How an action has ended, by the mode before `RETREAT`."""
+    if state.stops:
+        return "stopped"
+    by_mode = {Mode.DESCEND: "pressed", Mode.CHECK: "missed", Mode.RELEASE: "placed"}
+    return by_mode.get(Mode(int(before)), "dropped")

@@ -24,7 +24,8 @@ from systems.signals import (
 PICK, PLACE = PlanarPose(0.4, 0.3, 0.5), PlanarPose(0.55, -0.2, -0.8)
 HEIGHTS = SurfaceHeights(pick_top=0.05, highest=0.06)
 ACTION = PickPlaceAction(PICK, PLACE, heights=HEIGHTS)
-PARAMETERS = PickPlaceParameters(grasp_depth_share=0.0)
+# The PerfectHand is far stiffer than a real one, so the limit is high.
+PARAMETERS = PickPlaceParameters(grasp_depth_share=0.0, force_limit=140.0)
 TEN = 10
 """Number of actions in most tests."""
 GRASP_Z = 0.05 - PARAMETERS.grasp_depth
@@ -70,7 +71,7 @@ class PerfectHand(LeafSystem):
             ("desired_opening", 2),
             ("closing_force", 1),
             ("mode", 1),
-            ("counts", 3),
+            ("counts", 4),
         ):
             self.DeclareVectorInputPort(name, size)
         self.DeclareVectorOutputPort("hand_state", 12, self._calc_state)
@@ -102,7 +103,8 @@ class PerfectHand(LeafSystem):
         side = self._world.touch_pick if q[1] > 0 else place
         touch = max(side - q[2], 0.0) * self._world.stiffness
         in_the_air = self._eval(context, "mode")[0] >= Mode.CARRY
-        load = -WEIGHT if in_the_air and press > 0 and pad > 0 else 0.0
+        heavier = 1 + self._eval(context, "desired_motion")[10] / 9.81
+        load = -WEIGHT * heavier if in_the_air and press > 0 and pad > 0 else 0.0
         output.SetFromVector([0, 0, touch + load, 0, pad, pad])
 
 
@@ -187,7 +189,7 @@ class Run:
     @property
     def counts(self) -> list[float]:
         """Actions begun, grasps missed, objects dropped."""
-        return self.output("counts").tolist()
+        return self.output("counts").tolist()[:3]
 
 
 def test_ports():
@@ -202,12 +204,14 @@ def test_ports():
         "desired_opening": 2,
         "closing_force": 1,
         "mode": 1,
-        "counts": 3,
+        "counts": 4,
+        "peak_force": 3,
         "asks": 1,
     }
-    assert planner.num_output_ports() == len(outputs) + 2
+    assert planner.num_output_ports() == len(outputs) + 3
     context = planner.CreateDefaultContext()
     assert planner.GetOutputPort("failed_picks").Eval(context) == ()
+    assert planner.GetOutputPort("history").Eval(context) == ()
     assert not planner.GetOutputPort("accepted_action").Eval(context).press
     for name, size in outputs.items():
         assert planner.GetOutputPort(name).size() == size
@@ -259,7 +263,7 @@ def test_the_hand_reaches_the_commanded_poses():
     )
 
 
-@pytest.mark.parametrize(("heavy_load", "firm"), [(WEIGHT - 0.5, True), (WEIGHT + 0.5, False)])
+@pytest.mark.parametrize(("heavy_load", "firm"), [(WEIGHT - 0.5, True), (2 * WEIGHT, False)])
 def test_a_heavy_object_is_gripped_more_firmly_until_its_release(heavy_load: float, firm: bool):
     parameters = dataclasses.replace(PARAMETERS, heavy_load=heavy_load)
     run = Run(parameters=parameters).until(Mode.LIFT)
@@ -619,7 +623,7 @@ def test_motion_is_smooth_and_within_the_limits_of_its_mode(answer: PickPlaceAct
         assert abs(a[3]) <= p.yaw_acceleration * 1.0001
         turning = max(turning, abs(v[3]))
     # The limits are reached.
-    assert fastest[Mode.LOWER] == pytest.approx(p.lower_speed, rel=1e-2)
+    assert fastest[Mode.LOWER] > 1.2 * p.contact_speed
     if answer is FAR:
         assert fastest[Mode.CARRY] == pytest.approx(p.carry_speed, rel=1e-2)
     else:
@@ -652,7 +656,7 @@ def test_an_object_is_pressed_down_with_closed_jaws():
     assert run.sequence == [Mode.OBSERVE, Mode.APPROACH, Mode.DESCEND, Mode.RETREAT]
     # 30 N at 10 kN/m, and at most one period more.
     z = run.output("desired_motion")[2]
-    assert 0.047 - 0.003 - PARAMETERS.descend_speed / 64 - 1e-3 < z < 0.047 - 0.003
+    assert z == pytest.approx(0.047 - 0.003, abs=PARAMETERS.touch_speed / 64 + 1e-4)
     assert run.finish().counts == [1, 0, 0]
     assert run.output("failed_picks") == (PICK,)
 

@@ -17,7 +17,7 @@ def test_ports(heights_only: bool):
     policy = PickPlacePolicy(policy=lambda *_: ACTION, heights_only=heights_only)
     name = "observation_heights" if heights_only else "observation"
     ports = [policy.get_input_port(i).get_name() for i in range(policy.num_input_ports())]
-    assert ports == [name, "failed_picks"]
+    assert ports == [name, "failed_picks", "history"]
     assert policy.num_output_ports() == 1
     assert isinstance(policy.GetInputPort(name).Allocate().get_value(), Observation)
     assert isinstance(policy.GetOutputPort("action").Allocate().get_value(), PickPlaceAction)
