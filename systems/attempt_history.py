@@ -1,5 +1,5 @@
-"""The planner's memory of its earlier actions, and of what a stopping policy reported, as vectors of
-discrete state."""
+"""The planner's memory, as vectors of discrete state: its earlier actions, and what a stopping policy
+reported."""
 
 from __future__ import annotations
 

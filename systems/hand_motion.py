@@ -193,9 +193,7 @@ def motion_at(
             position[i] += rate * braking * (s - s**3 + s**4 / 2)
             velocity[i] += rate * (1 - s**2 * (3 - 2 * s))
             acceleration[i] -= rate * 6 * s * (1 - s) / braking
-    for part, delta, distance, limit, delay in _ways(
-        start, goal, start_rate, limits, delays, legs
-    ):
+    for part, delta, distance, limit, delay in _ways(start, goal, start_rate, limits, delays, legs):
         if distance > 0:
             gone, rate, change = travel(distance, *limit, elapsed - delay)
             for i, way in zip(part, delta, strict=True):

@@ -88,8 +88,8 @@ class PickPlaceParameters:
     # A vertical contact force above the payload's weight that counts as contact, in N.
     contact_threshold: float = bounded(4.0, 0.5, 100.0)
 
-    # A contact force on the hand beyond this, in N, vertical without the payload or lateral, ends the
-    # action: the hand stops, lets go and rises. See `ContactGuard`.
+    # A contact force on the hand beyond this, in N, ends the action: the hand stops, lets go and
+    # rises. The vertical force without the payload counts, and the lateral one: `ContactGuard`.
     force_limit: float = bounded(30.0, 5.0, 140.0)
 
     # Highest linear speed (m/s) and acceleration (m/s^2) in free space, for (x, y) and z each. The

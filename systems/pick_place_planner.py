@@ -283,9 +283,7 @@ class PickPlacePlanner(LeafSystem):
             LeftOverVector(kept).write(self._action.Eval(context).left_over)
         return EventStatus.Succeeded()
 
-    def _conclude(
-        self, before: float, state: PlannerState, discrete_state: DiscreteValues
-    ) -> None:
+    def _conclude(self, before: float, state: PlannerState, discrete_state: DiscreteValues) -> None:
         """Writes an action into the history when the hand begins to retreat."""
         if state.mode != Mode.RETREAT:
             return

@@ -246,7 +246,7 @@ class PickPlaceAction:
 
 @dataclass(frozen=True)
 class LeftOver:
-    """What a policy sees when it stops: objects that are not placed, cavities that are not filled."""
+    """What a policy sees when it stops: objects not placed, and cavities not filled."""
 
     objects: tuple[tuple[float, float], ...] = ()
     """World (x, y) of each object's middle, in metres."""

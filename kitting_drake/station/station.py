@@ -190,6 +190,10 @@ class KittingStation(Diagram):
         """The port `reward`: the task's reward so far, 0 to 1."""
         return self._monitor.reward(self._monitor.GetMyContextFromRoot(root_context))
 
+    def kept_goals(self, root_context: Context) -> frozenset[int]:
+        """The port `kept_goals`: indices of goals that count as filled from now on."""
+        return frozenset(np.flatnonzero(self._eval(root_context, "kept_goals")).tolist())
+
     def at_rest(self, root_context: Context) -> NDArray[np.bool_]:
         """(n,) which of the scene's objects are at rest: the port `at_rest`."""
         return self._rest_detector.at_rest(self._rest_detector.GetMyContextFromRoot(root_context))

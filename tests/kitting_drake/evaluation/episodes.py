@@ -64,6 +64,7 @@ def make_result(seed: int, objects: list[ObjectResult], **fields: Any) -> Episod
         actions=len(objects),
         missed_grasps=0,
         dropped_objects=0,
+        stopped_actions=0,
         actions_taken=[_make_action(item) for item in objects],
         point_contact_pairs=0,
         interrupted=False,
