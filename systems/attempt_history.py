@@ -1,5 +1,5 @@
-"""The planner's memory, as vectors of discrete state: its earlier actions, and what a stopping policy
-reported."""
+"""The planner's memory as vectors of discrete state: its earlier actions, and a stopping policy's
+report."""
 
 from __future__ import annotations
 

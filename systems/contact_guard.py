@@ -7,15 +7,15 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from systems.pick_place_motion import PlannerState
+from systems.pick_place_motion import RECENT, PlannerState
 from systems.pick_place_parameters import Mode
 
 _GRAVITY = 9.81
 HEAVIEST = 3.0
 """The payload of a Franka Hand, in kg. What pulls harder is not a weight."""
 _LASTING = 1 / 64
-"""In modes that expect contact, a force above the limit must last this long, in s. An impact passes
-before the hand can react to it, a jam does not."""
+"""Peaks are means over this time, in s. In modes that expect contact, a force above the limit must
+last this long: an impact passes before the hand can react to it, a jam does not."""
 _WEIGHINGS = 16
 """The payload is averaged over about this many samples."""
 _CLEAR = 0.001
@@ -46,6 +46,10 @@ class ContactGuard:
     The guard acts if the vertical or the lateral force exceeds the limit: at once in `APPROACH` and
     `CARRY`, where nothing should touch, else after 1/64 s. A push from below does not count while
     the hand rises, nor while it presses an object down, where `press_force` rules.
+
+    A peak is the largest mean over 1/64 s, as a wrist sensor would show it. In a shorter time the
+    force of an impact is its impulse divided by the plant's step, and so depends on the step. If
+    the guard acts, the force at that moment counts, too.
     """
 
     def __init__(self, limit: float, step: float) -> None:
@@ -55,11 +59,13 @@ class ContactGuard:
             step: the time between two calls of `feel`, in s.
         """
         self._limit, self._step = limit, step
+        self._samples = min(max(round(_LASTING / step), 1), RECENT)
 
     def reset(self, state: PlannerState) -> None:
         """Forgets the peaks and the payload of the last action."""
         state.payload = state.weighings = state.beyond = 0.0
         state.peak_vertical = state.peak_lateral = 0.0
+        state.recent = np.zeros(3 * RECENT)
         state.peak_mode = state.mode
 
     def feel(
@@ -92,14 +98,21 @@ class ContactGuard:
         vertical = f_z + mass * pull
         if mode in _LETS_GO:
             vertical = f_z - min(max(f_z, -mass * pull), 0.0)
-        lateral = math.hypot(f_x + mass * a_x, f_y + mass * a_y)
-        self._keep_peaks(state, abs(vertical), lateral)
+        side_x, side_y = f_x + mass * a_x, f_y + mass * a_y
+        lateral = math.hypot(side_x, side_y)
+        state.recent[3:] = state.recent[:-3].copy()
+        state.recent[:3] = side_x, side_y, vertical
+        mean = state.recent[: 3 * self._samples].reshape(-1, 3).mean(axis=0).tolist()
+        self._keep_peaks(state, abs(mean[2]), math.hypot(*mean[:2]))
         push = max(-vertical, 0.0) if mode in _RISES else abs(vertical)
         if mode == Mode.DESCEND and state.press:
             push = 0.0
         is_beyond = max(push, lateral) > self._limit
         state.beyond = state.beyond + self._step if is_beyond else 0.0
-        return is_beyond and (mode in _IN_THE_AIR or state.beyond > _LASTING)
+        must_stop = is_beyond and (mode in _IN_THE_AIR or state.beyond > _LASTING)
+        if must_stop:
+            self._keep_peaks(state, abs(vertical), lateral)
+        return must_stop
 
     def tare(self, state: PlannerState, contact: NDArray[np.float64], threshold: float) -> None:
         """Sets the payload to the force at rest, unless something else touches already.

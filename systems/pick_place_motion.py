@@ -21,6 +21,10 @@ X, Y, Z, YAW = range(4)
 """Indices of the hand's axes in `PlannerState.start` and `goal`."""
 
 
+RECENT = 16
+"""How many contact forces the state keeps."""
+
+
 class PlannerState(VectorView):
     """The planner's state vector, in SI units."""
 
@@ -68,6 +72,8 @@ class PlannerState(VectorView):
     """How many samples the payload is the mean of."""
     beyond = Number()
     """For how long the contact force has been beyond the limit, in s."""
+    recent = Array(3 * RECENT)
+    """x, y and z of the last contact forces without the payload, latest first, in N."""
     peak_vertical = Number()
     """The largest contact forces of the action, in N."""
     peak_lateral = Number()

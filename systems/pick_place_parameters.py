@@ -107,14 +107,14 @@ class PickPlaceParameters:
 
     # Highest speeds of the guarded motions (DESCEND and LOWER), in m/s: above all surfaces near the
     # goal, below them, where something may be touched, and where contact is expected. An impact's
-    # force is proportional to the speed: about 15 N at 0.02 m/s.
+    # force is proportional to the speed: about 10 N at 0.015 m/s.
     descend_speed: float = bounded(0.20, 0.005, 1.0)
     lower_speed: float = bounded(0.20, 0.005, 1.0)
     contact_speed: float = bounded(0.05, 0.005, 1.0)
-    touch_speed: float = bounded(0.02, 0.002, 1.0)
+    touch_speed: float = bounded(0.015, 0.002, 1.0)
 
     # The hand slows down this far above such a surface, in m, plus the doubt of its height.
-    slow_margin: float = bounded(0.0015, 0.0, 0.02)
+    slow_margin: float = bounded(0.001, 0.0, 0.02)
 
     # The search when an insertion is blocked. Used only in tasks that insert.
     search: InsertionSearch = field(default_factory=InsertionSearch)

@@ -92,8 +92,8 @@ class PickPlacePlanner(LeafSystem):
     - `history` (abstract, a tuple of `Attempt`): the last 64 actions whose outcome is decided,
       oldest first.
     - `peak_force` (3): the largest vertical and lateral contact force on the hand in the present or
-      last action, without the weight of the held object, in N; and the `Mode` in which the larger
-      of the two rose. Every step of the plant is looked at.
+      last action, without the weight of the held object, in N, as means over 1/64 s; and the
+      `Mode` in which the larger of the two rose. See `ContactGuard`.
     - `asks` (1): 1 if the next update, due at the context's time, evaluates `action`; else 0.
     - `accepted_action` (abstract, `PickPlaceAction`): the last action begun, with the hand's actual
       yaws and without heights; or the stop, with up to 24 objects and cavities of `left_over`.

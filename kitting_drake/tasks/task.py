@@ -113,7 +113,7 @@ class Scene:
 @dataclass(frozen=True)
 class PeakForce:
     """The largest contact force on the hand during an action, without the weight of the held
-    object. Every step of the plant is looked at."""
+    object, as means over 1/64 s. See `systems.contact_guard.ContactGuard`."""
 
     vertical: float
     """In N."""
