@@ -52,12 +52,14 @@ class AttemptHistory:
         row = _Row(self._rows[count])
         row.pick, row.place = action.pick.as_array(), action.place.as_array()
         row.press, row.aside = action.press, action.aside
-        self.amend(outcome, peak_force, index=count)
+        self.amend(outcome, peak_force)
 
-    def amend(self, outcome: str, peak_force: float, index: int | None = None) -> None:
-        """Corrects outcome and peak force of the latest attempt, or of that of an index."""
-        row = _Row(self._rows[self._count() - 1 if index is None else index])
-        row.outcome, row.peak_force = OUTCOMES.index(outcome), peak_force
+    def amend(self, outcome: str | None, peak_force: float) -> None:
+        """Corrects the peak force of the latest attempt and, unless None, its outcome."""
+        row = _Row(self._rows[self._count() - 1])
+        row.peak_force = peak_force
+        if outcome is not None:
+            row.outcome = OUTCOMES.index(outcome)
 
     def attempts(self) -> tuple[Attempt, ...]:
         """The attempts, oldest first."""

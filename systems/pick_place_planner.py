@@ -3,10 +3,8 @@
 import dataclasses
 import functools
 import math
-from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.common.value import AbstractValue, Value
 from pydrake.systems.framework import (
     BasicVector,
@@ -21,8 +19,9 @@ from systems.contact_guard import ContactGuard
 from systems.hand_geometry import check_reach
 from systems.hand_motion import shortest_yaws
 from systems.motion_heights import motion_heights
-from systems.pick_place_motion import YAW, YAW_LIMIT, PickPlaceMotion, PlannerState, Z
+from systems.pick_place_motion import YAW, YAW_LIMIT, PickPlaceMotion, PlannerState
 from systems.pick_place_parameters import Mode, PickPlaceParameters
+from systems.pick_place_steps import Moment, PickPlaceSteps
 from systems.signals import (
     STOP_REASONS,
     Observation,
@@ -32,23 +31,6 @@ from systems.signals import (
 )
 from systems.surface_heights import read_surface_heights
 from systems.weak_calc import weak_calc
-
-_HOLDING = (Mode.LIFT, Mode.CARRY, Mode.LOWER, Mode.SEARCH, Mode.RELEASE)
-"""The modes in which an object may be in the hand."""
-
-
-@dataclasses.dataclass(frozen=True)
-class _Moment:
-    """The inputs of one step of the state machine."""
-
-    context: Context
-    state: PlannerState
-    """The state, which the step modifies."""
-    time: float
-    hand: NDArray[np.float64]
-    """The port `hand_state`."""
-    contact: NDArray[np.float64]
-    """The port `hand_contact_force`."""
 
 
 class PickPlacePlanner(LeafSystem):
@@ -137,18 +119,20 @@ class PickPlacePlanner(LeafSystem):
             max_actions: stop after this many actions, unless `parameters.max_actions` overrides it.
             insertion: whether to search for a cavity when a place is blocked.
             period: update period of the state machine, in s.
-            force_period: period at which the contact force is looked at, in s: the plant's step.
+            force_period: period of the force guard and of the guarded motions, in s: the plant's
+                step.
         """
         super().__init__()
         self._parameters = parameters
         given = parameters.max_actions
         self._max_actions = max_actions if given is None else given
-        self._search_steps = parameters.search.steps if insertion else 0
         self._motion = PickPlaceMotion(parameters)
         self._state_index = self.DeclareDiscreteState(self._motion.initial_state())
         self._history_index = self.DeclareDiscreteState(np.full(AttemptHistory.size, np.nan))
         self._left_over_index = self.DeclareDiscreteState(np.zeros(LeftOverVector.size))
         self._guard = ContactGuard(parameters.force_limit, force_period)
+        search_steps = parameters.search.steps if insertion else 0
+        self._steps = PickPlaceSteps(parameters, self._motion, self._guard, search_steps)
         self._period = period
         # At times that they share, the first one declared comes first.
         self.DeclarePeriodicDiscreteUpdateEvent(force_period, 0.0, self._feel)
@@ -241,81 +225,48 @@ class PickPlacePlanner(LeafSystem):
     # The force guard.
 
     def _feel(self, context: Context, discrete_state: DiscreteValues) -> EventStatus:
-        state = PlannerState(discrete_state.get_mutable_value(self._state_index))
-        mode = state.mode
-        if mode in (Mode.OBSERVE, Mode.DONE):
+        moment = self._moment(context, discrete_state)
+        state = moment.state
+        if state.mode in (Mode.OBSERVE, Mode.DONE):
             return EventStatus.DidNothing()
-        hand = self._hand_state.Eval(context)
-        motion = self._motion_port.Eval(context)
-        peak = max(state.peak_vertical, state.peak_lateral)
-        must_stop = self._guard.feel(
-            state, self._contact_force.Eval(context), float(hand[2]), motion[8:11]
-        )
-        if must_stop and not state.stops:
-            self._stop(state, context.get_time(), hand)
-            self._conclude(mode, state, discrete_state)
-        if state.mode == Mode.RETREAT and max(state.peak_vertical, state.peak_lateral) > peak:
-            self._amend(state, discrete_state)
+        before = state.mode, state.stops, _peak(state)
+        self._steps.feel(moment, self._motion_port.Eval(context)[8:11])
+        self._conclude(before[0], state, discrete_state)
+        if before[0] == Mode.RETREAT and before[1:] != (state.stops, _peak(state)):
+            history = AttemptHistory(discrete_state.get_mutable_value(self._history_index))
+            history.amend("stopped" if state.stops else None, _peak(state))
         return EventStatus.Succeeded()
 
-    def _stop(self, state: PlannerState, time: float, hand: NDArray[np.float64]) -> None:
-        """Stops dead, lets go of what is in the hand, and retreats."""
-        state.stopped, state.stops = state.stopped + 1, 1
-        retreats, holds = state.mode == Mode.RETREAT, state.mode in _HOLDING
-        self._motion.begin(state, Mode.RELEASE if holds else Mode.RETREAT, time, at=hand[:4])
-        if retreats:
-            # The jaws drag something along.
-            state.goal_opening = self._parameters.open_width
+    def _moment(self, context: Context, discrete_state: DiscreteValues) -> Moment:
+        return Moment(
+            PlannerState(discrete_state.get_mutable_value(self._state_index)),
+            context.get_time(),
+            self._hand_state.Eval(context),
+            self._contact_force.Eval(context),
+        )
 
     # The state machine.
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> EventStatus:
-        state = PlannerState(discrete_state.get_mutable_value(self._state_index))
-        time = context.get_time()
-        hand = self._hand_state.Eval(context)
-        contact = self._contact_force.Eval(context)
-        mode = Mode(int(state.mode))
-        if mode != Mode.DONE:
-            self._step(mode)(_Moment(context, state, time, hand, contact))
+        moment = self._moment(context, discrete_state)
+        state, mode = moment.state, moment.state.mode
+        if mode == Mode.OBSERVE:
+            self._observe(context, state, discrete_state)
+        elif mode != Mode.DONE:
+            self._steps.step(moment)
             self._conclude(mode, state, discrete_state)
-        if mode == Mode.OBSERVE and state.mode == Mode.DONE and state.actions < self._max_actions:
-            kept = discrete_state.get_mutable_value(self._left_over_index)
-            LeftOverVector(kept).write(self._action.Eval(context).left_over)
         return EventStatus.Succeeded()
 
     def _conclude(self, before: float, state: PlannerState, discrete_state: DiscreteValues) -> None:
         """Writes an action into the history when the hand begins to retreat."""
-        if state.mode != Mode.RETREAT:
-            return
-        if before == Mode.RETREAT:
-            if state.stops:
-                self._amend(state, discrete_state)
-            return
-        history = AttemptHistory(discrete_state.get_mutable_value(self._history_index))
-        peak = max(state.peak_vertical, state.peak_lateral)
-        history.append(_action_of(state), _outcome(before, state), peak)
+        if state.mode == Mode.RETREAT and before != Mode.RETREAT:
+            history = AttemptHistory(discrete_state.get_mutable_value(self._history_index))
+            history.append(_action_of(state), _outcome(before, state), _peak(state))
 
-    def _amend(self, state: PlannerState, discrete_state: DiscreteValues) -> None:
-        """Updates the latest attempt of the history while the hand retreats."""
-        history = AttemptHistory(discrete_state.get_mutable_value(self._history_index))
-        outcome = "stopped" if state.stops else history.attempts()[-1].outcome
-        history.amend(outcome, max(state.peak_vertical, state.peak_lateral))
-
-    def _step(self, mode: Mode) -> Callable[[_Moment], None]:
-        steps: dict[Mode, Callable[[_Moment], None]] = {
-            Mode.OBSERVE: self._observe,
-            Mode.DESCEND: self._descend,
-            Mode.CLOSE: self._close,
-            Mode.CHECK: self._check,
-            Mode.LIFT: self._hold,
-            Mode.CARRY: self._hold,
-            Mode.LOWER: self._lower,
-            Mode.SEARCH: self._search,
-        }
-        return steps.get(mode, self._follow)
-
-    def _observe(self, moment: _Moment) -> None:
-        context, state, time = moment.context, moment.state, moment.time
+    def _observe(
+        self, context: Context, state: PlannerState, discrete_state: DiscreteValues
+    ) -> None:
+        time = context.get_time()
         if not self._has_settled(state, time):
             return
         spent = state.actions >= self._max_actions
@@ -323,6 +274,8 @@ class PickPlacePlanner(LeafSystem):
         action: PickPlaceAction = stop if spent else self._action.Eval(context)
         if action.stop:
             state.stop = 1 + list(STOP_REASONS).index(action.reason or "done")
+            kept = discrete_state.get_mutable_value(self._left_over_index)
+            LeftOverVector(kept).write(action.left_over)
             self._motion.begin(state, Mode.DONE, time)
             return
         check_reach(action)
@@ -364,109 +317,6 @@ class PickPlacePlanner(LeafSystem):
         state.clear_z, state.travel_z = motion.clear, motion.travel
         state.pick_hover_z, state.place_hover_z = motion.pick_hover, motion.place_hover
 
-    def _follow(self, moment: _Moment) -> None:
-        state, time = moment.state, moment.time
-        if time >= self._motion.arrival(state):
-            following = Mode.OBSERVE if state.mode == Mode.RETREAT else Mode(int(state.mode) + 1)
-            self._motion.begin(state, following, time)
-
-    def _descend(self, moment: _Moment) -> None:
-        state, time, hand, contact = moment.state, moment.time, moment.hand, moment.contact
-        if state.press:
-            if contact[2] > self._parameters.press_force:
-                # Stop dead: braking would press harder.
-                self._motion.begin(state, Mode.RETREAT, time, z=hand[2])
-            elif time >= self._motion.arrival(state):
-                self._motion.begin(state, Mode.RETREAT, time)
-        elif contact[2] > self._parameters.contact_threshold:
-            self._motion.begin(state, Mode.CLOSE, time, z=hand[2])
-            # Back off a little: the jaws cannot close while the fingertips press.
-            state.goal[Z] += self._parameters.floor_clearance
-            self._motion.set_times(state)
-        elif time >= self._motion.arrival(state):
-            self._motion.begin(state, Mode.CLOSE, time)
-
-    def _close(self, moment: _Moment) -> None:
-        state, time, hand = moment.state, moment.time, moment.hand
-        opening, rate = hand[4] + hand[5], hand[10] + hand[11]
-        moving_for = time - state.start_time
-        # Stalled jaws lag behind the command by the deflection of the fingers' spring.
-        commanded, _ = self._motion.opening_at(state, time)
-        stalled = moving_for > 0.1 and abs(rate) < 2e-3 and commanded < opening - 1e-3
-        if stalled or commanded <= 0.0:
-            self._motion.begin(state, Mode.CHECK, time, opening=opening)
-
-    def _check(self, moment: _Moment) -> None:
-        state, time, hand, contact = moment.state, moment.time, moment.hand, moment.contact
-        if time < self._motion.arrival(state) + self._parameters.tare_settle:
-            return
-        if self._is_held(hand, contact):
-            state.hold_z = hand[2]
-            # Gripped higher than planned, the object hangs lower.
-            higher = max(hand[2] - state.grasp_z, 0.0)
-            state.travel_z += higher
-            state.place_hover_z += higher
-            self._motion.begin(state, Mode.LIFT, time)
-        else:
-            state.missed += 1
-            self._motion.begin(state, Mode.RETREAT, time)
-
-    def _hold(self, moment: _Moment) -> None:
-        state, time, hand, contact = moment.state, moment.time, moment.hand, moment.contact
-        if -contact[2] > self._parameters.heavy_load:
-            firm = max(state.goal_force, self._parameters.firm_grasp_force)
-            self._motion.set_force(state, time, firm)
-        if not self._is_held(hand, contact):
-            state.dropped += 1
-            self._motion.begin(state, Mode.RETREAT, time)
-        elif state.mode == Mode.LIFT:
-            if self._motion.brakes_above(state, time, state.travel_z):
-                self._motion.begin(state, Mode.CARRY, time)
-        elif time >= self._motion.arrival(state) + self._parameters.tare_settle:
-            self._guard.tare(state, contact, self._parameters.contact_threshold)
-            self._motion.begin(state, Mode.LOWER, time)
-
-    def _lower(self, moment: _Moment) -> None:
-        state, time, hand, contact = moment.state, moment.time, moment.hand, moment.contact
-        if not self._is_held(hand, contact):
-            state.dropped += 1
-            self._motion.begin(state, Mode.RETREAT, time)
-        elif contact[2] - state.payload > self._parameters.contact_threshold:
-            if self._is_blocked(state, hand):
-                state.touch_z = hand[2]
-                self._motion.begin(state, Mode.SEARCH, time, z=hand[2])
-            else:
-                self._motion.begin(state, Mode.RELEASE, time, z=hand[2])
-        elif time >= self._motion.arrival(state):
-            self._motion.begin(state, Mode.RELEASE, time)
-
-    def _search(self, moment: _Moment) -> None:
-        state, time, hand, contact = moment.state, moment.time, moment.hand, moment.contact
-        free = contact[2] - state.payload < self._parameters.contact_threshold / 2
-        if not self._is_held(hand, contact):
-            state.dropped += 1
-            self._motion.begin(state, Mode.RETREAT, time)
-        elif free and self._parameters.search.has_slipped_in(hand[2], state.touch_z):
-            # The object has found its cavity: stop here without braking, and lower it.
-            self._motion.begin(state, Mode.LOWER, time, z=hand[2])
-        elif time >= self._motion.arrival(state):
-            state.search_step += 1
-            if state.search_step < self._search_steps:
-                self._motion.begin(state, Mode.SEARCH, time)
-            else:
-                self._motion.begin(state, Mode.RELEASE, time, z=hand[2])
-
-    def _is_blocked(self, state: PlannerState, hand: NDArray[np.float64]) -> bool:
-        bottom = hand[2] - state.hold_z + state.support_z
-        left = state.search_step < self._search_steps
-        search, rim, table = self._parameters.search, float(state.rim_z), float(state.table_z)
-        return left and search.is_on_rim(float(bottom), rim, table)
-
-    def _is_held(self, hand: NDArray[np.float64], contact: NDArray[np.float64]) -> bool:
-        # Contact pushes the fingers apart, along their positive axes.
-        pressed = contact[4:6].min() > self._parameters.grasp_force / 2
-        return bool(pressed and hand[4] + hand[5] > self._parameters.minimum_width)
-
 
 def _action_of(state: PlannerState) -> PickPlaceAction:
     """The last action begun, or the stop, without heights."""
@@ -487,3 +337,7 @@ def _outcome(before: float, state: PlannerState) -> str:
         return "stopped"
     by_mode = {Mode.DESCEND: "pressed", Mode.CHECK: "missed", Mode.RELEASE: "placed"}
     return by_mode.get(Mode(int(before)), "dropped")
+
+
+def _peak(state: PlannerState) -> float:
+    return max(state.peak_vertical, state.peak_lateral)
