@@ -263,6 +263,7 @@ def _lost_episode(chosen: ChosenScenario, seed: int, failure: str, seconds: floa
         actions=0,
         missed_grasps=0,
         dropped_objects=0,
+        stopped_actions=0,
         actions_taken=[],
         sim_seconds=0.0,
         wall_seconds=seconds,

@@ -1,7 +1,7 @@
 """Smooth motions of the hand in (x, y, z, yaw), as fast as the limits allow."""
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -29,6 +29,54 @@ class MotionLimits:
         """(speed, acceleration) of each of the `PARTS`."""
         linear = (self.speed, self.acceleration)
         return (linear, linear, (self.yaw_speed, self.yaw_acceleration))
+
+
+@dataclass(frozen=True)
+class Leg:
+    """A part of a way along z with a speed of its own."""
+
+    way: float
+    """Signed, in m."""
+    speed: float
+    """In m/s."""
+    delay: float
+    """When it begins, in s after the start of the motion."""
+
+
+def blended_legs(
+    ways: Sequence[float], speeds: Sequence[float], acceleration: float
+) -> tuple[Leg, ...]:
+    """Legs of one way with different speeds, without stops between them.
+
+    Each leg begins when the one before begins to brake. The sum of two such `travel`s changes its
+    speed from the one to the other. A leg is shortened so that its speed has gone where it should
+    end; if it is too short for that, the next leg covers its way, too.
+
+    Args:
+        ways: the lengths of the legs, in order, in m; all of one sign, or zero.
+        speeds: the speed of each, in m/s.
+        acceleration: the limit, in m/s^2.
+
+    Returns:
+        One for each way; its way is zero if the others cover it.
+    """
+    legs = [Leg(0.0, speed, 0.0) for speed in speeds]
+    used = [index for index, way in enumerate(ways) if way]
+    delay, left = 0.0, 0.0
+    for index, following in zip(used, [*used[1:], None], strict=True):
+        length, speed = abs(ways[index]) + left, speeds[index]
+        left = 0.0
+        if following is not None:
+            # By the time at which this leg has stopped, the next one has come so far.
+            stopping = min(speed, math.sqrt(length * acceleration)) / acceleration + SMOOTHING
+            ahead = travel(abs(ways[following]), speeds[following], acceleration, stopping)
+            left = min(ahead[0], length)
+        length -= left
+        if length > 0:
+            legs[index] = Leg(math.copysign(length, ways[index]), speed, delay)
+            top = min(speed, math.sqrt(length * acceleration))
+            delay += travel_time(length, speed, acceleration) - top / acceleration - SMOOTHING
+    return tuple(legs)
 
 
 def travel(
@@ -117,6 +165,7 @@ def motion_at(
     limits: MotionLimits,
     delays: NDArray[np.float64],
     elapsed: float,
+    legs: Sequence[Leg] = (),
 ) -> NDArray[np.float64]:
     """State at a time of the motion from a start with a given velocity to rest at a goal.
 
@@ -130,6 +179,7 @@ def motion_at(
         limits: the limits of each of the `PARTS`.
         delays: (3) when the `travel` of each part begins, in s after the start.
         elapsed: time since the start, in s.
+        legs: if given, the ways of z, instead of one `travel`.
 
     Returns:
         (12) position, velocity, acceleration.
@@ -143,7 +193,7 @@ def motion_at(
             position[i] += rate * braking * (s - s**3 + s**4 / 2)
             velocity[i] += rate * (1 - s**2 * (3 - 2 * s))
             acceleration[i] -= rate * 6 * s * (1 - s) / braking
-    for part, delta, distance, limit, delay in _ways(start, goal, start_rate, limits, delays):
+    for part, delta, distance, limit, delay in _ways(start, goal, start_rate, limits, delays, legs):
         if distance > 0:
             gone, rate, change = travel(distance, *limit, elapsed - delay)
             for i, way in zip(part, delta, strict=True):
@@ -159,11 +209,12 @@ def motion_duration(
     start_rate: NDArray[np.float64],
     limits: MotionLimits,
     delays: NDArray[np.float64],
+    legs: Sequence[Leg] = (),
 ) -> float:
     """Duration of `motion_at`, in s."""
     ends = [
         delay + travel_time(distance, *limit)
-        for _, _, distance, limit, delay in _ways(start, goal, start_rate, limits, delays)
+        for _, _, distance, limit, delay in _ways(start, goal, start_rate, limits, delays, legs)
         if distance > 0
     ]
     return max(ends + [braking_time(start_rate, limits)])
@@ -175,11 +226,16 @@ def _ways(
     start_rate: NDArray[np.float64],
     limits: MotionLimits,
     delays: NDArray[np.float64],
+    legs: Sequence[Leg],
 ) -> Iterator[tuple[list[int], list[float], float, tuple[float, float], float]]:
-    """For each part: its axes, its displacement after braking, the length of this displacement, its
-    limits and its delay."""
+    """For each part, or leg: its axes, its displacement after braking, the length of this
+    displacement, its limits and its delay."""
     ways = (goal - start - start_rate * braking_time(start_rate, limits) / 2).tolist()
     for part, limit, delay in zip(PARTS, limits.of_parts(), delays.tolist(), strict=True):
+        if legs and part == PARTS[1]:
+            for leg in legs:
+                yield part, [leg.way], abs(leg.way), (leg.speed, limits.acceleration), leg.delay
+            continue
         way = [ways[i] for i in part]
         yield part, way, math.hypot(*way), limit, delay
 

@@ -5,7 +5,9 @@ from numpy.typing import NDArray
 
 from systems.hand_motion import (
     PARTS,
+    Leg,
     MotionLimits,
+    blended_legs,
     braking_time,
     motion_at,
     motion_duration,
@@ -17,6 +19,10 @@ from systems.vector_view import Array, Number, VectorView
 
 X, Y, Z, YAW = range(4)
 """Indices of the hand's axes in `PlannerState.start` and `goal`."""
+
+
+RECENT = 16
+"""How many contact forces the state keeps."""
 
 
 class PlannerState(VectorView):
@@ -33,6 +39,9 @@ class PlannerState(VectorView):
     """The velocities at its start."""
     delays = Array(3)
     """When each of the motion's `PARTS` begins, after `start_time`."""
+    leg_ways = Array(3)
+    """The ways of a guarded motion along z, in order; zero if there is none."""
+    leg_delays = Array(3)
     start_opening = Number()
     goal_opening = Number()
     start_force = Number()
@@ -50,17 +59,36 @@ class PlannerState(VectorView):
     table_z = Number()
     support_z = Number()
     rim_z = Number()
+    floor_z = Number()
+    doubt = Number()
+    """The uncertainty of these heights."""
     hold_z = Number()
     """Height of the hand when it gripped; `touch_z`: when the object touched a cavity's rim."""
     touch_z = Number()
     search_step = Number()
     payload = Number()
     """The vertical force of the payload, in N."""
+    weighings = Number()
+    """How many samples the payload is the mean of."""
+    beyond = Number()
+    """For how long the contact force has been beyond the limit, in s."""
+    recent = Array(3 * RECENT)
+    """x, y and z of the last contact forces without the payload, latest first, in N."""
+    peak_vertical = Number()
+    """The largest contact forces of the action, in N."""
+    peak_lateral = Number()
+    peak_mode = Number()
+    """The mode in which the larger one rose."""
     actions = Number()
     missed = Number()
     dropped = Number()
+    stopped = Number()
+    stops = Number()
+    """1 if the force guard has ended the action, else 0."""
     press = Number()
     """1 if the action presses, else 0."""
+    aside = Number()
+    """1 if the action lays the object aside, else 0."""
     stop = Number()
     """0 while there are actions; then 1 plus the index of the reason in `STOP_REASONS`."""
 
@@ -100,6 +128,7 @@ class PickPlaceMotion:
         time: float,
         z: float | None = None,
         opening: float | None = None,
+        at: NDArray[np.float64] | None = None,
     ) -> None:
         """Starts a mode from the present commands.
 
@@ -109,12 +138,15 @@ class PickPlaceMotion:
             time: the present time, in s.
             z: stop the fingertips at this height, in m.
             opening: stop the jaws at this opening, in m.
+            at: (4) stop the hand at this x, y, z and yaw.
         """
         now, rate, _ = np.split(self.motion_at(state, time), 3)
         now_opening, _ = self.opening_at(state, time)
         if z is not None:
             now[2] = z
             rate = np.zeros(4)
+        if at is not None:
+            now, rate = np.array(at), np.zeros(4)
         if opening is not None:
             now_opening = opening
         state.mode = mode
@@ -187,13 +219,49 @@ class PickPlaceMotion:
             rises = height - (state.goal[Z] - state.travel_z)
             delays[0] = max(delays[0], delays[1] + time_to_reach(rises, height, *of_height))
         state.delays = delays
-        state.duration = motion_duration(state.start, state.goal, rate, limits, delays)
+        state.leg_ways = state.leg_delays = np.zeros(3)
+        if mode in (Mode.DESCEND, Mode.LOWER):
+            self._set_legs(state, mode)
+        legs = self._legs(state)
+        state.duration = motion_duration(state.start, state.goal, rate, limits, delays, legs)
+
+    def _set_legs(self, state: PlannerState, mode: Mode) -> None:
+        """Divides a guarded motion: fast above all surfaces, then slower, and slowest where contact
+        is expected."""
+        parameters = self._parameters
+        margin = parameters.slow_margin + state.doubt
+        hover = state.pick_hover_z if mode == Mode.DESCEND else state.place_hover_z
+        first = hover - parameters.hover_clearance + margin
+        # Either the object reaches its floor, or the fingertips beside it the rim.
+        hanging = state.hold_z - state.support_z
+        expected = max(state.floor_z + hanging, state.rim_z + state.doubt) + margin
+        if mode == Mode.DESCEND:
+            # The jaws should touch nothing, except to press.
+            expected = state.pick_top_z + margin if state.press else state.goal[Z]
+        marks = [float(state.start[Z])]
+        for mark in (first, expected, float(state.goal[Z])):
+            marks.append(max(min(mark, marks[-1]), float(state.goal[Z])))
+        legs = blended_legs(np.diff(marks), self._leg_speeds(mode), self._limits[mode].acceleration)
+        for index, leg in enumerate(legs):
+            state.leg_ways[index], state.leg_delays[index] = leg.way, leg.delay
+
+    def _leg_speeds(self, mode: Mode) -> tuple[float, float, float]:
+        parameters, fast = self._parameters, self._limits[mode].speed
+        return fast, min(fast, parameters.contact_speed), min(fast, parameters.touch_speed)
+
+    def _legs(self, state: PlannerState) -> tuple[Leg, ...]:
+        speeds = self._leg_speeds(Mode(int(state.mode)))
+        return tuple(
+            Leg(way, speed, delay)
+            for way, speed, delay in zip(
+                state.leg_ways.tolist(), speeds, state.leg_delays.tolist(), strict=True
+            )
+            if way
+        )
 
     def _limits_of(self, state: PlannerState) -> MotionLimits:
         """The limits of the present mode's motion."""
-        mode = Mode(int(state.mode))
-        # Press no faster than LOWER: the force would overshoot too far within one period.
-        return self._limits[Mode.LOWER if state.press and mode == Mode.DESCEND else mode]
+        return self._limits[Mode(int(state.mode))]
 
     def set_force(self, state: PlannerState, time: float, force: float) -> None:
         """Ramps the closing force from its present value to another."""
@@ -212,6 +280,7 @@ class PickPlaceMotion:
             self._limits_of(state),
             state.delays,
             time - state.start_time,
+            self._legs(state),
         )
 
     def opening_at(self, state: PlannerState, time: float) -> tuple[float, float]:

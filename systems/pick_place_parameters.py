@@ -80,13 +80,17 @@ class PickPlaceParameters:
     minimum_width: float = bounded(0.0015, 0.0, 0.08)
 
     # To seat an object that sticks out, closed jaws press it down with this force, in N, and go at
-    # most this far below its top, in m. They descend at `lower_speed`. First contact alone causes
-    # about 25 N, and the force overshoots by about 5 N.
+    # most this far below its top, in m. They touch it at `touch_speed`; the force overshoots by
+    # about 5 N.
     press_force: float = bounded(30.0, 1.0, 140.0)
     press_depth: float = bounded(0.020, 0.001, 0.05)
 
     # A vertical contact force above the payload's weight that counts as contact, in N.
     contact_threshold: float = bounded(4.0, 0.5, 100.0)
+
+    # A contact force on the hand beyond this, in N, ends the action: the hand stops, lets go and
+    # rises. The vertical force without the payload counts, and the lateral one: `ContactGuard`.
+    force_limit: float = bounded(30.0, 5.0, 140.0)
 
     # Highest linear speed (m/s) and acceleration (m/s^2) in free space, for (x, y) and z each. The
     # joint limits of an arm are not considered.
@@ -101,9 +105,16 @@ class PickPlaceParameters:
     yaw_speed: float = bounded(2.5, 0.01, 2.5)
     yaw_acceleration: float = bounded(20.0, 0.1, 25.0)
 
-    # Highest speed of the two guarded motions (DESCEND and LOWER), in m/s.
+    # Highest speeds of the guarded motions (DESCEND and LOWER), in m/s: above all surfaces near the
+    # goal, below them, where something may be touched, and where contact is expected. An impact's
+    # force is proportional to the speed: about 10 N at 0.015 m/s.
     descend_speed: float = bounded(0.20, 0.005, 1.0)
-    lower_speed: float = bounded(0.08, 0.005, 1.0)
+    lower_speed: float = bounded(0.20, 0.005, 1.0)
+    contact_speed: float = bounded(0.05, 0.005, 1.0)
+    touch_speed: float = bounded(0.015, 0.002, 1.0)
+
+    # The hand slows down this far above such a surface, in m, plus the doubt of its height.
+    slow_margin: float = bounded(0.001, 0.0, 0.02)
 
     # The search when an insertion is blocked. Used only in tasks that insert.
     search: InsertionSearch = field(default_factory=InsertionSearch)
@@ -133,7 +144,7 @@ class PickPlaceParameters:
         limits[Mode.LOWER] = replace(carry, speed=self.lower_speed)
         limits[Mode.SEARCH] = replace(
             limits[Mode.LOWER],
-            speed=min(self.search.speed, self.lower_speed),
+            speed=min(self.search.speed, self.contact_speed),
             yaw_speed=min(self.search.yaw_speed, self.yaw_speed),
         )
         return limits

@@ -23,7 +23,7 @@ class PolicyFunction(Protocol):
         """Returns the action for an observation.
 
         Args:
-            observation: o_t.
+            observation: o_t, and the `history` of the episode.
             failed_picks: poses of failed grasps in the world, latest last.
         """
         ...
@@ -42,6 +42,7 @@ class PickPlacePolicy(LeafSystem):
         input_ports:
         - observation (or observation_heights)
         - failed_picks (optional)
+        - history (optional)
         output_ports:
         - action
 
@@ -49,6 +50,8 @@ class PickPlacePolicy(LeafSystem):
       `observation_heights` instead, whose colours may be missing.
     - `failed_picks` (abstract, a tuple of `PlanarPose`): poses of failed grasps; empty if not
       connected.
+    - `history` (abstract, a tuple of `Attempt`): the earlier actions, passed to the policy as
+      `observation.history`. If not connected, the observation's own history stays.
     - `action` (abstract, `PickPlaceAction`): the policy's action.
 
     Evaluating the port calls the policy once for each new input. The policy must be stateless: the
@@ -68,17 +71,20 @@ class PickPlacePolicy(LeafSystem):
         name = "observation_heights" if heights_only else "observation"
         self._observation = self.DeclareAbstractInputPort(name, Value(Observation()))
         self._failed_picks = self.DeclareAbstractInputPort("failed_picks", Value(()))
+        self._history = self.DeclareAbstractInputPort("history", Value(()))
         self.DeclareAbstractOutputPort(
             "action",
             lambda: Value(PickPlaceAction()),
             weak_calc(self._calc_action),
-            {self._observation.ticket(), self._failed_picks.ticket()},
+            {port.ticket() for port in (self._observation, self._failed_picks, self._history)},
         )
 
     def _calc_action(self, context: Context, output: AbstractValue) -> None:
         given = self._failed_picks.HasValue(context)
         failed_picks = self._failed_picks.Eval(context) if given else ()
         observation = self._observation.Eval(context)
+        if self._history.HasValue(context):
+            observation = dataclasses.replace(observation, history=self._history.Eval(context))
         try:
             action = self._policy(observation, failed_picks)
         except (Exception, SystemExit) as error:

@@ -11,7 +11,7 @@ from pydrake.math import RigidTransform, RollPitchYaw
 
 from kitting_drake.episode.events import ModeChange
 from kitting_drake.station import KittingStation
-from kitting_drake.tasks.task import ActionRecord
+from kitting_drake.tasks.task import ActionRecord, PeakForce
 from systems.oracle_policy import gripper_pose
 from systems.pick_place_parameters import Mode
 from systems.placement import Goal, PlacedObject, displacement, heading
@@ -46,12 +46,21 @@ class ActionLog:
         """
         self._station = station
         self._before: list[RigidTransform] = []
+        self._stopped = 0
         self.records: list[ActionRecord] = []
 
     def observe(self, event: ModeChange) -> None:
         """Updates the records for an event."""
-        if event.is_last:
-            return
+        if not event.is_last:
+            self._follow(event)
+        if self.records:
+            vertical, lateral, mode = self._station.peak_force(event.root_context)
+            self.records[-1].peak_force_n = PeakForce(vertical, lateral, mode.name)
+            stopped = self._station.counts(event.root_context)[3]
+            if stopped > self._stopped:
+                self.records[-1].outcome, self._stopped = "stopped", stopped
+
+    def _follow(self, event: ModeChange) -> None:
         if event.is_action_start:
             self._before = self._station.object_poses(event.root_context)
             action = self._station.accepted_action(event.root_context)
@@ -59,6 +68,8 @@ class ActionLog:
             self.records.append(self._record(index, action.pick, action.place))
         elif event.mode == Mode.CARRY:
             self._find_lifted(event)
+        elif self.records and self.records[-1].outcome == "stopped":
+            return
         elif event.mode == Mode.RELEASE:
             self.records[-1].outcome = "placed"
         elif event.mode == Mode.RETREAT and event.previous == Mode.DESCEND:

@@ -10,6 +10,7 @@ from typing import Any
 from pydrake.systems.framework import Context, Diagram, EventStatus
 
 from kitting_drake.episode.action_log import ActionLog
+from kitting_drake.episode.ending import Remainder, find_left_over, is_right
 from kitting_drake.episode.episode_log import EpisodeLog
 from kitting_drake.episode.events import EpisodeObserver, ModeChange
 from kitting_drake.station import KittingStation
@@ -59,6 +60,8 @@ class EpisodeResult:
     actions: int
     missed_grasps: int
     dropped_objects: int
+    stopped_actions: int
+    """Actions that a contact force beyond `planner.force_limit` ended."""
     actions_taken: list[ActionRecord]
     """The policy's actions and their outcomes."""
     sim_seconds: float
@@ -76,6 +79,10 @@ class EpisodeResult:
     stop_reason: str
     """Why no more actions followed: a word of `STOP_REASONS`, `time`, `failure` or `interrupted`;
     empty before the end."""
+    stop_reason_right: bool | None = None
+    """Whether the true state bears it out (see `ending.is_right`); None if it is not judged."""
+    left_over: Remainder = dataclasses.field(default_factory=Remainder)
+    """Objects that are not placed and cavities that are not filled."""
 
     def as_dict(self) -> dict[str, Any]:
         """As plain values for JSON."""
@@ -205,6 +212,7 @@ class Episode:
         counts = station.counts(context)
         lost = self._failure is not None or self.timed_out
         at_rest = station.at_rest(context)
+        reason = self._stop_reason()
         return EpisodeResult(
             **self._names,  # type: ignore[arg-type]
             objects=object_results(station, context, placements, records),
@@ -213,6 +221,7 @@ class Episode:
             actions=counts[0],
             missed_grasps=counts[1],
             dropped_objects=counts[2],
+            stopped_actions=counts[3],
             actions_taken=records,
             sim_seconds=context.get_time(),
             wall_seconds=self._wall_seconds,
@@ -223,7 +232,9 @@ class Episode:
             failure=self._failure,
             timed_out=self.timed_out,
             interrupted=self.interrupted,
-            stop_reason=self._stop_reason(),
+            stop_reason=reason,
+            stop_reason_right=is_right(reason, station, context),
+            left_over=find_left_over(station, context),
         )
 
     def _stop_reason(self) -> str:

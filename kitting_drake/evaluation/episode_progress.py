@@ -36,7 +36,7 @@ class EpisodeProgress:
     def observe(self, event: ModeChange) -> None:
         """Shows the planner's present mode."""
         self.last_context = event.root_context
-        actions, _, _ = self._station.counts(event.root_context)
+        actions, *_ = self._station.counts(event.root_context)
         finished = actions - (event.mode not in (Mode.OBSERVE, Mode.DONE))
         self._progress.update(
             self._task,

@@ -32,8 +32,8 @@ AMBIGUITIES = {
 """Reasons why a success is not strict: an error that the task's success predicate tolerates, and
 its limit. The angle is modulo the object's declared symmetry."""
 
-_FAILED_GRASPS = ("missed", "dropped")
-"""The outcomes of an action whose grasp was missed or lost."""
+_FAILED_GRASPS = ("missed", "dropped", "stopped")
+"""The outcomes of an action whose grasp was missed or lost, or that the force guard stopped."""
 
 ERRORS = ("add_s_mm", "position_error_mm", "angle_error_deg", "height_error_mm")
 """The errors of an object's final pose."""
@@ -89,7 +89,7 @@ def summarise(
         "episodes": len(episodes),
         "failed_episodes": sum(bool(episode["failure"]) for episode in episodes),
         "timed_out_episodes": sum(episode["timed_out"] for episode in episodes),
-        "stop_reasons": dict(Counter(episode.get("stop_reason", "") for episode in episodes)),
+        "stop_reasons": _stop_reasons(episodes),
         **_rates(episodes, objects_of, chosen.scenario.task.objects_are_independent),
         **_statistics(objects, actions, causes),
         "categories": {
@@ -109,6 +109,8 @@ def summarise(
         "actions_after_failed_grasps": sum(map(actions_after_failed_grasp, episodes)),
         "missed_grasps": sum(episode["missed_grasps"] for episode in episodes),
         "dropped_objects": sum(episode["dropped_objects"] for episode in episodes),
+        "stopped_actions": sum(episode.get("stopped_actions", 0) for episode in episodes),
+        "peak_force_n": _describe(peak_forces(episodes), "force"),
         "moving_at_end": sum(len(episode["moving_at_end"]) for episode in episodes),
         "point_contact_pairs": max(episode["point_contact_pairs"] for episode in episodes),
         "sim_seconds": sum(episode["sim_seconds"] for episode in episodes),
@@ -125,6 +127,25 @@ def _commits(episodes: Sequence[Episode]) -> str | None:
     Defaults to the present one for episodes without a commit."""
     found = dict.fromkeys(str(episode["commit"]) for episode in episodes if episode.get("commit"))
     return ", ".join(found) or commit()
+
+
+def _stop_reasons(episodes: Sequence[Episode]) -> dict[str, dict[str, int]]:
+    """For each reason, how often it was right and wrong; see `kitting_drake.episode.ending`."""
+    found: dict[str, dict[str, int]] = {}
+    for episode in episodes:
+        verdict = episode.get("stop_reason_right")
+        if verdict is not None:
+            counts = found.setdefault(episode["stop_reason"], {"right": 0, "wrong": 0})
+            counts["right" if verdict else "wrong"] += 1
+    return found
+
+
+def peak_forces(episodes: Sequence[Episode]) -> list[Entry]:
+    """The larger of the vertical and the lateral peak force of each action, in N, as `force`."""
+    peaks = [
+        action.get("peak_force_n") for episode in episodes for action in episode["actions_taken"]
+    ]
+    return [{"force": max(peak["vertical"], peak["lateral"])} for peak in peaks if peak]
 
 
 def needless_actions(episode: Episode) -> int:

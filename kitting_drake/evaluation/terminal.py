@@ -9,7 +9,12 @@ from rich.table import Table
 
 from kitting_drake.episode import EpisodeResult
 from kitting_drake.episode.episode import ObjectResult
-from kitting_drake.evaluation.summary import ACTION_ERRORS, ERRORS, find_ambiguities
+from kitting_drake.evaluation.summary import (
+    ACTION_ERRORS,
+    ERRORS,
+    find_ambiguities,
+    peak_forces,
+)
 
 _ERROR_HEADINGS = ("ADD-S mm", "position mm", "angle deg", "height mm")
 
@@ -51,11 +56,12 @@ def print_episode(console: Console, result: EpisodeResult) -> None:
     console.print(episode_table(result))
     rate = result.sim_seconds / result.wall_seconds if result.wall_seconds else 0.0
     console.print(
-        f"{result.stop_reason}: {result.strict_success_rate:.0%} strict success, "
+        f"{result.strict_success_rate:.0%} strict success, "
         f"{result.success_rate:.0%} by the task's measure, in {result.actions} actions, "
         f"{result.sim_seconds:.1f} s simulated in {result.wall_seconds:.1f} s ({rate:.1f}x), "
         f"{result.point_contact_pairs} point contacts"
     )
+    console.print(_ending(result), highlight=False, markup=False)
     causes = [
         f"{item.name} ({item.cause})"
         for item in result.objects
@@ -63,9 +69,10 @@ def print_episode(console: Console, result: EpisodeResult) -> None:
     ]
     if causes:
         console.print(f"no success: {escape(', '.join(causes))}", highlight=False)
-    if result.missed_grasps or result.dropped_objects:
+    if result.missed_grasps or result.dropped_objects or result.stopped_actions:
         console.print(
-            f"{result.missed_grasps} missed grasps, {result.dropped_objects} dropped objects"
+            f"{result.missed_grasps} missed grasps, {result.dropped_objects} dropped objects, "
+            f"{result.stopped_actions} actions stopped by a contact force"
         )
     if result.moving_at_end:
         moving = escape(", ".join(result.moving_at_end))
@@ -81,6 +88,17 @@ def print_episode(console: Console, result: EpisodeResult) -> None:
         )
     if result.interrupted:
         console.print("[yellow]interrupted:[/] the result covers the episode so far")
+
+
+def _ending(result: EpisodeResult) -> str:
+    """Why the episode ended, what is left over, and the largest contact force, in one line."""
+    verdict = " (wrong)" if result.stop_reason_right is False else ""
+    left = result.left_over.text or "nothing"
+    line = f"stopped: {result.stop_reason}{verdict}; left over: {left}"
+    peaks = peak_forces([result.as_dict()])
+    if peaks:
+        line += f"; peak force {max(item['force'] for item in peaks):.0f} N"
+    return line
 
 
 def summary_table(summary: dict[str, Any]) -> Table:
@@ -141,6 +159,18 @@ def summary_notes(summary: dict[str, Any]) -> str:
         f"actions, median error: pick {pick_position} mm {pick_angle} deg, "
         f"place {place_position} mm {place_angle} deg",
     ]
+    if summary["stop_reasons"]:
+        counts = [
+            f"{word} {count['right'] + count['wrong']}"
+            + (f" ({count['wrong']} wrong)" if count["wrong"] else "")
+            for word, count in summary["stop_reasons"].items()
+        ]
+        lines.append(f"stopped: {', '.join(counts)}")
+    peak = summary["peak_force_n"]
+    lines.append(
+        f"peak force of an action: 95 % below {number(peak['p95'], '.0f')} N, "
+        f"at most {number(peak['max'], '.0f')} N; {summary['stopped_actions']} stopped"
+    )
     if summary["needless_actions"]:
         lines.append(
             f"actions on objects that have no goal: {summary['needless_actions']} of "

@@ -43,7 +43,8 @@ class KittingEnvironment(gymnasium.Env[dict[str, Any], NDArray[Any]]):
     - Terminated: the agent stopped, or every goal is filled. Truncated: no actions or no time are
       left, or the simulation failed (`info["failure"]`).
     - `info`: the present values of the keys of `results.json`, without `wall_seconds`, which would
-      not be reproducible; and `failed_picks`, (x, y, theta) of each failed grasp.
+      not be reproducible; `failed_picks`, (x, y, theta) of each failed grasp; and `history`, the
+      earlier actions as dicts: `action`, `outcome`, `peak_force` (N).
     - `reset(seed=N)` makes the scene of seed N, as in `evaluate` and `run`; without a seed, a
       random one. `info["seed"]` holds it.
     """
@@ -224,6 +225,7 @@ class KittingEnvironment(gymnasium.Env[dict[str, Any], NDArray[Any]]):
     def _info(self, result: EpisodeResult) -> dict[str, Any]:
         failed = self._eval("failed_picks")
         picks = tuple((pick.x, pick.y, pick.theta) for pick in failed)
-        info = {**result.as_dict(), "failed_picks": picks}
+        history = tuple(dataclasses.asdict(attempt) for attempt in self._eval("history"))
+        info = {**result.as_dict(), "failed_picks": picks, "history": history}
         del info["wall_seconds"]
         return info

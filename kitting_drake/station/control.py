@@ -12,6 +12,8 @@ from systems.trajectory_controller import TrajectoryController
 
 _EXPORTED = {
     "failed_picks": "failed_picks",
+    "history": "history",
+    "peak_force": "peak_force",
     "accepted_action": "accepted_action",
     "asks": "asks",
     "mode": "mode",
@@ -46,6 +48,7 @@ def add_control(
             parameters=scenario.planner,
             max_actions=scene.max_actions,
             insertion=any(goal.rim_height is not None for goal in scene.goals),
+            force_period=plant.time_step(),
         ),
     )
     controller = builder.AddNamedSystem("controller", _make_controller(scenario, plant))

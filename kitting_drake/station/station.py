@@ -43,6 +43,8 @@ class KittingStation(Diagram):
         - observation
         - observation_heights
         - failed_picks
+        - history
+        - peak_force
         - accepted_action
         - asks
         - mode
@@ -72,7 +74,8 @@ class KittingStation(Diagram):
     - `observation` (abstract, `Observation`): o_t. `observation_heights`: o_t without colours;
       evaluating it renders no colour images. These and the camera ports exist only if the scenario
       has cameras and the machine can render.
-    - `failed_picks`, `accepted_action`, `asks`, `mode`, `counts`: the `PickPlacePlanner`'s.
+    - `failed_picks`, `history`, `peak_force`, `accepted_action`, `asks`, `mode`, `counts`: the
+      `PickPlacePlanner`'s.
     - `robot_state` (12): positions, then velocities of x, y, z, yaw and both fingers; m, rad, s.
     - `wrist_force` (6): contact forces on x, y, z (N), about z (N m), and on each finger (N).
     - `actuation` (6): actuation of x, y, z (N), yaw (N m) and each finger (N).
@@ -187,6 +190,10 @@ class KittingStation(Diagram):
         """The port `reward`: the task's reward so far, 0 to 1."""
         return self._monitor.reward(self._monitor.GetMyContextFromRoot(root_context))
 
+    def kept_goals(self, root_context: Context) -> frozenset[int]:
+        """The port `kept_goals`: indices of goals that count as filled from now on."""
+        return frozenset(np.flatnonzero(self._eval(root_context, "kept_goals")).tolist())
+
     def at_rest(self, root_context: Context) -> NDArray[np.bool_]:
         """(n,) which of the scene's objects are at rest: the port `at_rest`."""
         return self._rest_detector.at_rest(self._rest_detector.GetMyContextFromRoot(root_context))
@@ -203,10 +210,15 @@ class KittingStation(Diagram):
         """The port `observation`: o_t, rendered now."""
         return self._eval(root_context, "observation")
 
-    def counts(self, root_context: Context) -> tuple[int, int, int]:
-        """The port `counts`: actions begun, grasps missed, objects dropped."""
-        actions, missed, dropped = map(int, self._eval(root_context, "counts"))
-        return actions, missed, dropped
+    def counts(self, root_context: Context) -> tuple[int, int, int, int]:
+        """The port `counts`: actions begun, grasps missed, objects dropped, actions stopped."""
+        actions, missed, dropped, stopped = map(int, self._eval(root_context, "counts"))
+        return actions, missed, dropped, stopped
+
+    def peak_force(self, root_context: Context) -> tuple[float, float, Mode]:
+        """The port `peak_force`: vertical and lateral in N, and the mode of the larger one."""
+        vertical, lateral, mode = self._eval(root_context, "peak_force").tolist()
+        return vertical, lateral, Mode(int(mode))
 
     def point_contact_pairs(self, root_context: Context) -> int:
         """Number of pairs in point contact; 0 if contact is strictly hydroelastic."""

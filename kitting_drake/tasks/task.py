@@ -25,6 +25,8 @@ MISSED_GRASP = "missed grasp"
 SLIPPED = "slipped"
 MISPLACED = "misplaced"
 
+_EMPTY_MODES = ("APPROACH", "DESCEND", "CLOSE")
+
 TABLE = ((0.0, -0.75), (1.0, 0.75))
 """Lower and upper (x, y) corner of the table in the world, in metres; its top is at z = 0."""
 
@@ -108,6 +110,19 @@ class Scene:
         return tuple(sorted({index for goal in self.goals for index in goal.objects}))
 
 
+@dataclass(frozen=True)
+class PeakForce:
+    """The largest contact force on the hand during an action, without the weight of the held
+    object, as means over 1/64 s. See `systems.contact_guard.ContactGuard`."""
+
+    vertical: float
+    """In N."""
+    lateral: float
+    """In N."""
+    mode: str
+    """The mode of the planner in which the larger of the two rose."""
+
+
 @dataclass
 class ActionRecord:
     """A pick and place and its errors with respect to the expert's. Keys of `results.json`."""
@@ -117,8 +132,8 @@ class ActionRecord:
     category: str
     """The object's category."""
     outcome: str
-    """`placed`, `missed` (nothing grasped), `dropped` (lost on the way), `pressed` (pushed down)
-    or `unfinished`."""
+    """`placed`, `missed` (nothing grasped), `dropped` (lost on the way), `pressed` (pushed down),
+    `stopped` (by a contact force beyond `planner.force_limit`) or `unfinished`."""
     pick: PlanarPose
     place: PlanarPose
     pick_position_error_mm: float | None
@@ -130,6 +145,8 @@ class ActionRecord:
     object can fill no goal."""
     place_angle_error_deg: float | None
     """Heading error after that motion, modulo the object's symmetry: 0 to 180."""
+    peak_force_n: PeakForce | None = None
+    """None before the first contact force is known."""
 
 
 class TaskConfig:
@@ -215,7 +232,13 @@ def last_action_on(name: str, records: Sequence[ActionRecord]) -> ActionRecord |
     """The last action that held an object; if there is none, the cause."""
     grasped = [item for item in records if item.outcome not in ("unfinished", "pressed")]
     own = [item for item in grasped if item.object == name]
-    held = [item for item in own if item.outcome != "missed"]
+    held = [item for item in own if item.outcome != "missed" and not _stopped_empty(item)]
     if held:
         return held[-1]
     return MISSED_GRASP if own else NEVER_PICKED
+
+
+def _stopped_empty(record: ActionRecord) -> bool:
+    """Whether the force guard stopped the hand before it grasped."""
+    peak = record.peak_force_n
+    return record.outcome == "stopped" and peak is not None and peak.mode in _EMPTY_MODES

@@ -14,6 +14,7 @@ from systems.insertion_search import InsertionSearch
 from systems.pick_place_parameters import Mode, PickPlaceParameters
 from systems.pick_place_planner import PickPlacePlanner
 from systems.signals import (
+    LeftOver,
     Observation,
     PickPlaceAction,
     PixelGrid,
@@ -24,7 +25,8 @@ from systems.signals import (
 PICK, PLACE = PlanarPose(0.4, 0.3, 0.5), PlanarPose(0.55, -0.2, -0.8)
 HEIGHTS = SurfaceHeights(pick_top=0.05, highest=0.06)
 ACTION = PickPlaceAction(PICK, PLACE, heights=HEIGHTS)
-PARAMETERS = PickPlaceParameters(grasp_depth_share=0.0)
+# The PerfectHand is far stiffer than a real one, so the limit is high.
+PARAMETERS = PickPlaceParameters(grasp_depth_share=0.0, force_limit=140.0)
 TEN = 10
 """Number of actions in most tests."""
 GRASP_Z = 0.05 - PARAMETERS.grasp_depth
@@ -59,6 +61,14 @@ class World:
     width: Callable[[int, Mode], float] = lambda attempt, mode: WIDTH
 
 
+@dataclasses.dataclass
+class Jam(World):
+    """Adds a force (x, y, z) in N to what the hand feels in one mode."""
+
+    mode: Mode = Mode.CARRY
+    force: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+
 class PerfectHand(LeafSystem):
     """Follows the desired motion exactly, stops the jaws at the object, and feels the World."""
 
@@ -70,7 +80,7 @@ class PerfectHand(LeafSystem):
             ("desired_opening", 2),
             ("closing_force", 1),
             ("mode", 1),
-            ("counts", 3),
+            ("counts", 4),
         ):
             self.DeclareVectorInputPort(name, size)
         self.DeclareVectorOutputPort("hand_state", 12, self._calc_state)
@@ -102,8 +112,14 @@ class PerfectHand(LeafSystem):
         side = self._world.touch_pick if q[1] > 0 else place
         touch = max(side - q[2], 0.0) * self._world.stiffness
         in_the_air = self._eval(context, "mode")[0] >= Mode.CARRY
-        load = -WEIGHT if in_the_air and press > 0 and pad > 0 else 0.0
-        output.SetFromVector([0, 0, touch + load, 0, pad, pad])
+        # Weight and inertia of the held object.
+        mass = WEIGHT / 9.81 if in_the_air and press > 0 and pad > 0 else 0.0
+        load = -mass * (self._eval(context, "desired_motion")[8:11] + [0, 0, 9.81])
+        force = np.array([*load, 0, pad, pad]) + [0, 0, touch, 0, 0, 0]
+        world = self._world
+        if isinstance(world, Jam) and self._eval(context, "mode")[0] == world.mode:
+            force[:3] += world.force
+        output.SetFromVector(force)
 
 
 class StubPolicy(LeafSystem):
@@ -187,7 +203,7 @@ class Run:
     @property
     def counts(self) -> list[float]:
         """Actions begun, grasps missed, objects dropped."""
-        return self.output("counts").tolist()
+        return self.output("counts").tolist()[:3]
 
 
 def test_ports():
@@ -202,12 +218,14 @@ def test_ports():
         "desired_opening": 2,
         "closing_force": 1,
         "mode": 1,
-        "counts": 3,
+        "counts": 4,
+        "peak_force": 3,
         "asks": 1,
     }
-    assert planner.num_output_ports() == len(outputs) + 2
+    assert planner.num_output_ports() == len(outputs) + 3
     context = planner.CreateDefaultContext()
     assert planner.GetOutputPort("failed_picks").Eval(context) == ()
+    assert planner.GetOutputPort("history").Eval(context) == ()
     assert not planner.GetOutputPort("accepted_action").Eval(context).press
     for name, size in outputs.items():
         assert planner.GetOutputPort(name).size() == size
@@ -259,7 +277,7 @@ def test_the_hand_reaches_the_commanded_poses():
     )
 
 
-@pytest.mark.parametrize(("heavy_load", "firm"), [(WEIGHT - 0.5, True), (WEIGHT + 0.5, False)])
+@pytest.mark.parametrize(("heavy_load", "firm"), [(WEIGHT - 0.5, True), (2 * WEIGHT, False)])
 def test_a_heavy_object_is_gripped_more_firmly_until_its_release(heavy_load: float, firm: bool):
     parameters = dataclasses.replace(PARAMETERS, heavy_load=heavy_load)
     run = Run(parameters=parameters).until(Mode.LIFT)
@@ -619,7 +637,7 @@ def test_motion_is_smooth_and_within_the_limits_of_its_mode(answer: PickPlaceAct
         assert abs(a[3]) <= p.yaw_acceleration * 1.0001
         turning = max(turning, abs(v[3]))
     # The limits are reached.
-    assert fastest[Mode.LOWER] == pytest.approx(p.lower_speed, rel=1e-2)
+    assert fastest[Mode.LOWER] > 1.2 * p.contact_speed
     if answer is FAR:
         assert fastest[Mode.CARRY] == pytest.approx(p.carry_speed, rel=1e-2)
     else:
@@ -652,7 +670,7 @@ def test_an_object_is_pressed_down_with_closed_jaws():
     assert run.sequence == [Mode.OBSERVE, Mode.APPROACH, Mode.DESCEND, Mode.RETREAT]
     # 30 N at 10 kN/m, and at most one period more.
     z = run.output("desired_motion")[2]
-    assert 0.047 - 0.003 - PARAMETERS.descend_speed / 64 - 1e-3 < z < 0.047 - 0.003
+    assert z == pytest.approx(0.047 - 0.003, abs=PARAMETERS.touch_speed / 64 + 1e-4)
     assert run.finish().counts == [1, 0, 0]
     assert run.output("failed_picks") == (PICK,)
 
@@ -661,3 +679,91 @@ def test_a_press_without_contact_ends_at_its_depth():
     run = Run(answer=dataclasses.replace(ACTION, press=True), actions=1).until(Mode.RETREAT)
     z = run.output("desired_motion")[2]
     assert z == pytest.approx(HEIGHTS.pick_top - PARAMETERS.press_depth, abs=2e-3)
+
+
+GUARDED = dataclasses.replace(PARAMETERS, force_limit=30.0)
+SOFT = 2000.0
+LATERAL, PUSH = (0.0, 31.0, 0.0), (0.0, 0.0, 31.0)
+
+
+@pytest.mark.parametrize(
+    ("mode", "force"),
+    [
+        (Mode.APPROACH, PUSH),
+        (Mode.APPROACH, LATERAL),
+        (Mode.DESCEND, LATERAL),
+        (Mode.CLOSE, PUSH),
+        (Mode.LIFT, LATERAL),
+        (Mode.CARRY, LATERAL),
+        (Mode.LOWER, LATERAL),
+        (Mode.RELEASE, LATERAL),
+        (Mode.RETREAT, (0.0, 0.0, -31.0 - WEIGHT)),
+    ],
+)
+def test_a_contact_force_beyond_the_limit_stops_the_action(mode: Mode, force: tuple):
+    run = Run(Jam(mode=mode, force=force, stiffness=SOFT), parameters=GUARDED).finish()
+    after = run.sequence[run.sequence.index(mode) + 1 :]
+    holds = Mode.LIFT <= mode < Mode.RELEASE
+    assert after[:2] == [Mode.RELEASE, Mode.RETREAT] if holds else Mode.RETREAT in [mode, after[0]]
+    assert run.output("counts").tolist() == [1, 0, 0, 1]
+    (attempt,) = run.output("history")
+    assert (attempt.outcome, attempt.action.pick) == ("stopped", PICK)
+    assert 30.5 < attempt.peak_force < 37.5
+    vertical, lateral, where = run.output("peak_force")
+    assert Mode(int(where)) == mode
+    assert max(vertical, lateral) == attempt.peak_force
+    assert run.output("failed_picks") == (PICK,)
+
+
+@pytest.mark.parametrize("force", [(0.0, 29.0, 0.0), (0.0, 0.0, 0.0)])
+def test_the_guard_lets_a_smaller_force_pass(force: tuple):
+    run = Run(Jam(mode=Mode.CARRY, force=force, stiffness=SOFT), parameters=GUARDED).finish()
+    assert run.counts == [1, 0, 0]
+    (attempt,) = run.output("history")
+    assert (attempt.outcome, attempt.action.place.x) == ("placed", PLACE.x)
+    assert run.output("failed_picks") == ()
+
+
+def test_a_load_pressed_at_the_end_of_a_carry_is_no_payload():
+    """The object touches before it should: it is let go there, and not pressed further."""
+    touched = HANGING + GUARDED.hover_clearance + 0.002
+    run = Run(World(touch_place=touched, stiffness=SOFT), parameters=GUARDED).until(Mode.RELEASE)
+    assert run.output("desired_motion")[2] == pytest.approx(touched - 0.002, abs=1e-3)
+    # 2 mm at 2 kN/m, without the payload.
+    assert run.output("peak_force")[0] == pytest.approx(4.0, abs=0.5)
+
+
+def test_what_a_stopping_policy_left_over_is_kept():
+    run = Run(actions=1)
+    points = tuple((0.3 + 0.001 * number, 0.1) for number in range(30))
+    report = LeftOver(objects=points, cavities=((0.5, -0.2),))
+    stop = PickPlaceAction(stop=True, reason="nothing fits", left_over=report)
+    run.policy.answers.append(stop)
+    accepted = run.finish().output("accepted_action")
+    assert (accepted.stop, accepted.reason) == (True, "nothing fits")
+    assert accepted.left_over == LeftOver(points[:24], report.cavities)
+
+
+def test_a_policy_that_reports_nothing_leaves_no_report():
+    assert Run().finish().output("accepted_action").left_over is None
+
+
+def test_aside_is_part_of_the_history():
+    run = Run(answer=dataclasses.replace(ACTION, aside=True)).finish()
+    assert [attempt.action.aside for attempt in run.output("history")] == [True]
+    assert [attempt.outcome for attempt in run.output("history")] == ["placed"]
+
+
+def test_the_hand_slows_down_where_contact_is_expected():
+    heights = dataclasses.replace(HEIGHTS, place_rim=0.03, near_place=0.03, place_floor=0.02)
+    run = Run(answer=dataclasses.replace(ACTION, heights=heights)).until(Mode.LOWER)
+    speeds: dict[float, float] = {}
+    while run.sequence[-1] == Mode.LOWER:
+        z, vz = run.output("desired_motion")[[2, 6]]
+        speeds[round(1e3 * (z - HANGING - 0.02), 2)] = -vz
+        run.simulator.AdvanceTo(run.simulator.get_context().get_time() + 1 / 128)
+    slow = {above: speed for above, speed in speeds.items() if above < 1e3 * PARAMETERS.slow_margin}
+    on_the_way = [speed for above, speed in speeds.items() if 2.5 < above < 11.5]
+    assert max(slow.values()) <= PARAMETERS.touch_speed + 1e-6
+    assert max(on_the_way) <= PARAMETERS.contact_speed + 1e-6
+    assert max(speeds.values()) > 2 * PARAMETERS.contact_speed

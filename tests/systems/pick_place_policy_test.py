@@ -3,7 +3,7 @@ import pytest
 from pydrake.common.value import Value
 
 from systems.pick_place_policy import PickPlacePolicy, PolicyError
-from systems.signals import Observation, PickPlaceAction, PlanarPose
+from systems.signals import Attempt, Observation, PickPlaceAction, PlanarPose
 
 ACTION = PickPlaceAction(PlanarPose(0.4, 0.1, 0.2), PlanarPose(0.5, -0.1, 1.0))
 
@@ -17,7 +17,7 @@ def test_ports(heights_only: bool):
     policy = PickPlacePolicy(policy=lambda *_: ACTION, heights_only=heights_only)
     name = "observation_heights" if heights_only else "observation"
     ports = [policy.get_input_port(i).get_name() for i in range(policy.num_input_ports())]
-    assert ports == [name, "failed_picks"]
+    assert ports == [name, "failed_picks", "history"]
     assert policy.num_output_ports() == 1
     assert isinstance(policy.GetInputPort(name).Allocate().get_value(), Observation)
     assert isinstance(policy.GetOutputPort("action").Allocate().get_value(), PickPlaceAction)
@@ -112,6 +112,25 @@ def test_failed_picks_are_passed_to_the_policy():
         assert port.Eval(context) == ACTION
     # Empty if not connected.
     assert given == [(), (), (PlanarPose(0.4, 0.1, 0.2),)]
+
+
+def test_the_history_is_part_of_the_observation():
+    given = []
+
+    def answer(o: Observation, _) -> PickPlaceAction:
+        given.append(o.history)
+        return ACTION
+
+    policy = PickPlacePolicy(policy=answer)
+    context = policy.CreateDefaultContext()
+    attempt = Attempt(ACTION, "missed", 3.0)
+    policy.GetInputPort("observation").FixValue(context, Value(Observation(history=(attempt,))))
+    port = policy.GetOutputPort("action")
+    port.Eval(context)
+    for history in ((), (attempt, attempt)):
+        policy.GetInputPort("history").FixValue(context, Value(history))
+        port.Eval(context)
+    assert given == [(attempt,), (), (attempt, attempt)]
 
 
 @pytest.mark.parametrize("number", [np.nan, np.inf])

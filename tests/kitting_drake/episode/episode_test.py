@@ -111,7 +111,7 @@ def test_observers_get_the_modes_in_order(grasp_to_release: tuple[EpisodeResult,
     assert not last.is_action_start
     assert not last.is_stop
     # The first event already counts the action.
-    assert [event.counts for event in seen] == [(1.0, 0.0, 0.0)] * len(seen)
+    assert [event.counts for event in seen] == [(1.0, 0.0, 0.0, 0.0)] * len(seen)
 
 
 def test_a_tool_sleeps_until_the_hand_arrives(

@@ -7,7 +7,7 @@ from kitting_drake.episode import EpisodeResult
 from kitting_drake.episode.episode import ObjectResult
 from kitting_drake.scenario.choosing import ChosenScenario
 from kitting_drake.scenario.schema import Scenario
-from kitting_drake.tasks.task import MISPLACED, ActionRecord
+from kitting_drake.tasks.task import MISPLACED, ActionRecord, PeakForce
 from systems.placement import AddS
 from systems.signals import PlanarPose
 
@@ -64,6 +64,7 @@ def make_result(seed: int, objects: list[ObjectResult], **fields: Any) -> Episod
         actions=len(objects),
         missed_grasps=0,
         dropped_objects=0,
+        stopped_actions=0,
         actions_taken=[_make_action(item) for item in objects],
         point_contact_pairs=0,
         interrupted=False,
@@ -95,4 +96,5 @@ def _make_action(item: ObjectResult) -> ActionRecord:
         pick_angle_error_deg=2.0,
         place_position_error_mm=None if error is None else 2 * error,
         place_angle_error_deg=None if error is None else 3 * error,
+        peak_force_n=PeakForce(12.0, 3.0, "LOWER"),
     )

@@ -1,5 +1,6 @@
 from rich.console import Console
 
+from kitting_drake.episode.ending import Position, Remainder
 from kitting_drake.evaluation.summary import summarise
 from kitting_drake.evaluation.terminal import (
     episode_table,
@@ -70,10 +71,19 @@ def test_the_lines_below_the_table_of_an_episode():
         [make_object("cup", 1.0), make_object("ring", 9.0)],
         timed_out=True,
         moving_at_end=["cup", "ring[/]"],
+        stop_reason="time",
+        stop_reason_right=False,
+        left_over=Remainder(
+            (Position(0.4, 0.1),), (Position(0.5, -0.2), Position(0.6, -0.2)), "policy"
+        ),
     )
     with console.capture() as shown:
         print_episode(console, result)
     assert "no success: ring (misplaced)" in shown.get()
+    assert (
+        "stopped: time (wrong); left over: 1 object at (0.40, 0.10) and "
+        "2 cavities at (0.50, -0.20), (0.60, -0.20); peak force 12 N"
+    ) in shown.get()
     assert "timed out: the scenario's time_limit was reached" in shown.get()
     assert "still moving at the end: cup, ring[/]" in shown.get()
 
@@ -93,6 +103,9 @@ def test_the_summary_table_starts_with_the_strict_rate():
         make_episode(1, [1.0, 9.0], moving_at_end=["bolt"]),
         make_episode(2, [1.0, 9.0], timed_out=True),
     ]
+    verdicts = [("done", True), ("done", False), ("time", True)]
+    for episode, (reason, is_right) in zip(episodes, verdicts, strict=True):
+        episode |= {"stop_reason": reason, "stop_reason_right": is_right}
     summary = summarise(episodes, CHOSEN, ADD_S, wall_seconds_total=1.0)
     shown = captured(summary_table(summary))
     assert "3 episodes, 0 failed, 1 timed out" in shown
@@ -106,5 +119,7 @@ def test_the_summary_table_starts_with_the_strict_rate():
         "no success: 1 misplaced, 2 timed out",
         "success, but not strict: 1 protruding",
         "actions, median error: pick 1.00 mm 2.00 deg, place 2.00 mm 3.00 deg",
+        "stopped: done 2 (1 wrong), time 1",
+        "peak force of an action: 95 % below 12 N, at most 12 N; 0 stopped",
         "still moving at the end: 1 objects",
     ]

@@ -136,6 +136,7 @@ def test_an_episode_equals_that_of_evaluate(small: Path, monkeypatch: pytest.Mon
     assert expected["missed_grasps"] == 1
     assert total == expected["success_rate"] == 1.0
     assert len(info["failed_picks"]) == 1
+    assert [attempt["outcome"] for attempt in info["history"]] == ["missed", "placed"]
     # Every goal is filled, so the agent need not stop.
     assert {key for key in expected if info.get(key) != expected[key]} == {"policy", "wall_seconds"}
 

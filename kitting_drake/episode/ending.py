@@ -1,0 +1,118 @@
+"""What is left over at the end of an episode, and whether the reason for stopping is right.
+
+It uses true poses, which policies cannot see.
+"""
+
+import math
+from dataclasses import dataclass
+
+from pydrake.systems.framework import Context
+
+from kitting_drake.station import KittingStation
+from systems.placement import GONE
+
+_NOTHING_TO_DO = ("done", "nothing fits")
+"""The reasons that claim that nothing is left to do."""
+_UNJUDGED = ("", "interrupted")
+
+
+@dataclass(frozen=True)
+class Position:
+    """A place on the table, in metres in the world."""
+
+    x: float
+    y: float
+
+
+@dataclass(frozen=True)
+class Remainder:
+    """The key `left_over` of `results.json`."""
+
+    objects: tuple[Position, ...] = ()
+    """The middles of the objects that are not placed."""
+    cavities: tuple[Position, ...] = ()
+    """The middles of the goals that are not filled."""
+    source: str = "state"
+    """`policy`: what the stopping policy reported. `state`: the objects that could fill a goal, and
+    the goals, in the true state."""
+
+    @property
+    def text(self) -> str:
+        """In words; empty if nothing is left over."""
+        parts = [
+            f"{len(points)} {name if len(points) == 1 else plural} at "
+            + ", ".join(f"({point.x:.2f}, {point.y:.2f})" for point in points)
+            for name, plural, points in (
+                ("object", "objects", self.objects),
+                ("cavity", "cavities", self.cavities),
+            )
+            if points
+        ]
+        return " and ".join(parts)
+
+
+def find_left_over(station: KittingStation, root_context: Context) -> Remainder:
+    """What is left over: as the stopping policy reported it, else in the true state."""
+    action = station.accepted_action(root_context)
+    if action.stop and action.left_over is not None:
+        seen = action.left_over
+        objects, cavities = (
+            tuple(Position(float(x), float(y)) for x, y in points)
+            for points in (seen.objects, seen.cavities)
+        )
+        return Remainder(objects, cavities, "policy")
+    goals, objects = station.scene.goals, station.objects
+    loose, free = _loose_and_free(station, root_context)
+    poses = station.object_poses(root_context)
+    counted = set(station.scene.goal_objects)
+    points = [poses[i] @ objects[i].p_BMiddle for i in loose if i in counted]
+    places = [goals[i].poses[0] @ objects[goals[i].objects[0]].p_BMiddle for i in free]
+    return Remainder(
+        tuple(Position(*map(float, point[:2])) for point in points),
+        tuple(Position(*map(float, place[:2])) for place in places),
+    )
+
+
+def is_right(reason: str, station: KittingStation, root_context: Context) -> bool | None:
+    """Whether the reason for stopping is right, judged by the true state.
+
+    Something is left to do if an unfilled goal accepts an object that lies in the cell and fills no
+    goal. Filled means success by the task's measure.
+
+    - `done`: right if nothing is left to do.
+    - `nothing fits`: right if nothing is left to do, but an object or a goal is left.
+    - All others (`gave up`, `not sure`, `not seen`, `no kit seen`, `actions spent`, `time`,
+      `failure`): right if something is left to do.
+
+    Args:
+        reason: a `stop_reason`.
+        station: the station of the episode.
+        root_context: the root context of the outermost Diagram, at the end.
+
+    Returns:
+        None for `interrupted`, and before the end.
+    """
+    if reason in _UNJUDGED:
+        return None
+    loose, free = _loose_and_free(station, root_context)
+    goals = station.scene.goals
+    is_left = any(index in goals[goal].objects for goal in free for index in loose)
+    if reason not in _NOTHING_TO_DO:
+        return is_left
+    return not is_left and (reason == "done" or bool(loose or free))
+
+
+def _loose_and_free(station: KittingStation, root_context: Context) -> tuple[list[int], list[int]]:
+    """The objects in the cell that fill no goal, and the goals that are not filled."""
+    placements = station.placements(root_context)
+    kept = station.kept_goals(root_context)
+    filled = {item.goal for item in placements if item.success} | kept
+    loose = []
+    for index, (item, X_WB) in enumerate(
+        zip(placements, station.object_poses(root_context), strict=True)
+    ):
+        distance = math.hypot(*X_WB.translation())
+        # Also false for NaN.
+        if not item.success and distance < GONE:
+            loose.append(index)
+    return loose, [index for index in range(len(station.scene.goals)) if index not in filled]

@@ -1,0 +1,120 @@
+"""The planner's memory as vectors of discrete state: its earlier actions, and a stopping policy's
+report."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from systems.signals import OUTCOMES, Attempt, LeftOver, PickPlaceAction, PlanarPose
+from systems.vector_view import Array, Number, VectorView
+
+MOST_ATTEMPTS = 64
+"""How many actions are remembered."""
+MOST_FAILED = 16
+"""How many failed picks are remembered."""
+MOST_LEFT_OVER = 24
+"""How many objects, and how many cavities, of a `LeftOver` are kept."""
+
+
+class _Row(VectorView):
+    """One attempt. A row of NaN is free."""
+
+    pick = Array(3)
+    """x, y, theta."""
+    place = Array(3)
+    press = Number()
+    aside = Number()
+    outcome = Number()
+    """An index in `OUTCOMES`."""
+    peak_force = Number()
+
+
+class AttemptHistory:
+    """The last `MOST_ATTEMPTS` actions, in a vector that the caller owns."""
+
+    size = MOST_ATTEMPTS * _Row.size
+    """Number of elements of the vector."""
+
+    def __init__(self, vector: NDArray[np.float64]) -> None:
+        """
+        Args:
+            vector: (size,), at first all NaN; `append` and `amend` modify it.
+        """
+        self._rows = vector.reshape(-1, _Row.size)
+
+    def append(self, action: PickPlaceAction, outcome: str, peak_force: float) -> None:
+        """Adds an attempt; the oldest one is forgotten if there is no room."""
+        count = self._count()
+        if count == MOST_ATTEMPTS:
+            self._rows[:-1] = self._rows[1:].copy()
+            count -= 1
+        row = _Row(self._rows[count])
+        row.pick, row.place = action.pick.as_array(), action.place.as_array()
+        row.press, row.aside = action.press, action.aside
+        self.amend(outcome, peak_force)
+
+    def amend(self, outcome: str | None, peak_force: float) -> None:
+        """Corrects the peak force of the latest attempt and, unless None, its outcome."""
+        row = _Row(self._rows[self._count() - 1])
+        row.peak_force = peak_force
+        if outcome is not None:
+            row.outcome = OUTCOMES.index(outcome)
+
+    def attempts(self) -> tuple[Attempt, ...]:
+        """The attempts, oldest first."""
+        found = []
+        for values in self._rows[: self._count()]:
+            row = _Row(values)
+            pick, place = (PlanarPose(*pose.tolist()) for pose in (row.pick, row.place))
+            action = PickPlaceAction(pick, place, press=bool(row.press), aside=bool(row.aside))
+            found.append(Attempt(action, OUTCOMES[int(row.outcome)], row.peak_force))
+        return tuple(found)
+
+    def failed_picks(self) -> tuple[PlanarPose, ...]:
+        """The last `MOST_FAILED` picks of actions that did not place their object, latest last."""
+        failed = [item.action.pick for item in self.attempts() if item.outcome != "placed"]
+        return tuple(failed[-MOST_FAILED:])
+
+    def _count(self) -> int:
+        return int(np.count_nonzero(~np.isnan(self._rows[:, 0])))
+
+
+class LeftOverVector:
+    """A `LeftOver`, or None, in a vector that the caller owns."""
+
+    size = 1 + 4 * MOST_LEFT_OVER
+    """Number of elements of the vector: whether there is one, then x and y of each object and each
+    cavity; NaN after the last."""
+
+    def __init__(self, vector: NDArray[np.float64]) -> None:
+        """
+        Args:
+            vector: (size,), at first all zero; `write` modifies it.
+        """
+        self._vector = vector
+
+    def write(self, left_over: LeftOver | None) -> None:
+        """Keeps the first `MOST_LEFT_OVER` objects and cavities."""
+        self._vector[:] = np.nan
+        self._vector[0] = left_over is not None
+        if left_over is None:
+            return
+        for kept, points in zip(
+            self._points(), (left_over.objects, left_over.cavities), strict=True
+        ):
+            given = np.array(points[:MOST_LEFT_OVER], float).reshape(-1, 2)
+            kept[: len(given)] = given
+
+    def read(self) -> LeftOver | None:
+        """What was written."""
+        if not self._vector[0]:
+            return None
+        objects, cavities = (
+            tuple((x, y) for x, y in kept[~np.isnan(kept[:, 0])].tolist())
+            for kept in self._points()
+        )
+        return LeftOver(objects, cavities)
+
+    def _points(self) -> NDArray[np.float64]:
+        return self._vector[1:].reshape(2, MOST_LEFT_OVER, 2)

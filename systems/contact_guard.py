@@ -1,0 +1,147 @@
+"""Watches the contact force on the hand: weighs the payload, keeps peaks, and enforces a limit."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from systems.pick_place_motion import RECENT, PlannerState
+from systems.pick_place_parameters import Mode
+
+_GRAVITY = 9.81
+HEAVIEST = 3.0
+"""The payload of a Franka Hand, in kg. What pulls harder is not a weight."""
+_LASTING = 1 / 64
+"""Peaks are means over this time, in s. In modes that expect contact, a force above the limit must
+last this long: an impact passes before the hand can react to it, a jam does not."""
+_WEIGHINGS = 16
+"""The payload is averaged over about this many samples."""
+_CLEAR = 0.001
+"""The payload is weighed from this far below the travel height on, in m."""
+
+_UNWEIGHED = (Mode.LIFT, Mode.CARRY)
+"""The modes in which an object of unknown weight may be in the hand."""
+_LETS_GO = (Mode.RELEASE, Mode.RETREAT)
+_RISES = (Mode.LIFT, Mode.RETREAT)
+_IN_THE_AIR = (Mode.APPROACH, Mode.CARRY)
+_AT_REST = (Mode.OBSERVE, Mode.DONE)
+
+
+class ContactGuard:
+    r"""The law of the force guard.
+
+    Let f be the contact force on the hand, m the mass of the held object, a the commanded
+    acceleration and g gravity. The contact force without the payload is
+
+        vertical = f_z + m (g + a_z),    lateral = |f_xy + m a_xy|.
+
+    - m is zero while the hand is empty.
+    - `LIFT`, and `CARRY` until the object is weighed: m is what explains f_z, at most `HEAVIEST`.
+    - `CARRY`, while the hand is above the travel height, weighs the object: m is the mean of
+      -f_z / (g + a_z). Contact further down therefore does not count as payload.
+    - `RELEASE`, `RETREAT`: f_z may be anything between the object's weight and zero.
+
+    The guard acts if the vertical or the lateral force exceeds the limit: at once in `APPROACH` and
+    `CARRY`, where nothing should touch, else after 1/64 s. A push from below does not count while
+    the hand rises, nor while it presses an object down, where `press_force` rules.
+
+    A peak is the largest mean over 1/64 s, as a wrist sensor would show it. In a shorter time the
+    force of an impact is its impulse divided by the plant's step, and so depends on the step. If
+    the guard acts, the force at that moment counts, too.
+    """
+
+    def __init__(self, limit: float, step: float) -> None:
+        """
+        Args:
+            limit: the largest contact force, in N.
+            step: the time between two calls of `feel`, in s.
+        """
+        self._limit, self._step = limit, step
+        self._samples = min(max(round(_LASTING / step), 1), RECENT)
+
+    def reset(self, state: PlannerState) -> None:
+        """Forgets the peaks and the payload of the last action."""
+        state.payload = state.weighings = state.beyond = 0.0
+        state.peak_vertical = state.peak_lateral = 0.0
+        state.recent = np.zeros(3 * RECENT)
+        state.peak_mode = state.mode
+
+    def feel(
+        self,
+        state: PlannerState,
+        contact: NDArray[np.float64],
+        height: float,
+        acceleration: NDArray[np.float64],
+    ) -> bool:
+        """Takes one sample of the contact force; to be called in all modes.
+
+        Args:
+            state: the planner's state; its payload and its peaks are updated.
+            contact: (6) the port `hand_contact_force`.
+            height: the height of the fingertips, in m.
+            acceleration: (3) commanded, in m/s^2.
+
+        Returns:
+            Whether the hand must stop.
+        """
+        mode = Mode(int(state.mode))
+        if mode in _AT_REST:
+            return False
+        f_x, f_y, f_z = contact[:3].tolist()
+        a_x, a_y, a_z = acceleration.tolist()
+        pull = max(_GRAVITY + a_z, 1.0)
+        if mode == Mode.CARRY:
+            self._weigh(state, -f_z / pull, height)
+        mass = self._mass(state, mode, -f_z / pull)
+        vertical = f_z + mass * pull
+        if mode in _LETS_GO:
+            vertical = f_z - min(max(f_z, -mass * pull), 0.0)
+        side_x, side_y = f_x + mass * a_x, f_y + mass * a_y
+        lateral = math.hypot(side_x, side_y)
+        state.recent[3:] = state.recent[:-3].copy()
+        state.recent[:3] = side_x, side_y, vertical
+        mean = state.recent[: 3 * self._samples].reshape(-1, 3).mean(axis=0).tolist()
+        self._keep_peaks(state, abs(mean[2]), math.hypot(*mean[:2]))
+        push = max(-vertical, 0.0) if mode in _RISES else abs(vertical)
+        if mode == Mode.DESCEND and state.press:
+            push = 0.0
+        is_beyond = max(push, lateral) > self._limit
+        state.beyond = state.beyond + self._step if is_beyond else 0.0
+        must_stop = is_beyond and (mode in _IN_THE_AIR or state.beyond > _LASTING)
+        if must_stop:
+            self._keep_peaks(state, abs(vertical), lateral)
+        return must_stop
+
+    def tare(self, state: PlannerState, contact: NDArray[np.float64], threshold: float) -> None:
+        """Sets the payload to the force at rest, unless something else touches already.
+
+        Args:
+            state: the planner's state, at the end of `CARRY`.
+            contact: (6) the port `hand_contact_force`.
+            threshold: a vertical force that counts as contact, in N.
+        """
+        felt, weighed = float(contact[2]), float(state.payload)
+        if not state.weighings or abs(felt - weighed) < threshold / 2 - 0.1 * weighed:
+            state.payload = min(felt, 0.0)
+
+    def _weigh(self, state: PlannerState, apparent: float, height: float) -> None:
+        if height >= state.travel_z - _CLEAR:
+            state.weighings = min(state.weighings + 1, _WEIGHINGS)
+            mass = min(max(apparent, 0.0), HEAVIEST)
+            state.payload += (-_GRAVITY * mass - state.payload) / state.weighings
+
+    @staticmethod
+    def _mass(state: PlannerState, mode: Mode, apparent: float) -> float:
+        if mode in _UNWEIGHED and not state.weighings:
+            return min(max(apparent, 0.0), HEAVIEST)
+        holds = mode in (Mode.CARRY, Mode.LOWER, Mode.SEARCH, *_LETS_GO)
+        return -state.payload / _GRAVITY if holds else 0.0
+
+    @staticmethod
+    def _keep_peaks(state: PlannerState, vertical: float, lateral: float) -> None:
+        if max(vertical, lateral) > max(state.peak_vertical, state.peak_lateral):
+            state.peak_mode = state.mode
+        state.peak_vertical = max(state.peak_vertical, vertical)
+        state.peak_lateral = max(state.peak_lateral, lateral)

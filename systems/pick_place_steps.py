@@ -1,0 +1,199 @@
+"""The steps of the pick-and-place state machine once an action has begun."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from systems.contact_guard import ContactGuard
+from systems.pick_place_motion import PickPlaceMotion, PlannerState, Z
+from systems.pick_place_parameters import Mode, PickPlaceParameters
+
+_HOLDING = (Mode.LIFT, Mode.CARRY, Mode.LOWER, Mode.SEARCH, Mode.RELEASE)
+"""The modes in which an object may be in the hand."""
+
+
+@dataclass(frozen=True)
+class Moment:
+    """The inputs of one step."""
+
+    state: PlannerState
+    """The state, which the step modifies."""
+    time: float
+    hand: NDArray[np.float64]
+    """(12) the port `hand_state`."""
+    contact: NDArray[np.float64]
+    """(6) the port `hand_contact_force`."""
+
+
+class PickPlaceSteps:
+    """The steps from `APPROACH` to `RETREAT`; see `PickPlacePlanner` for their law."""
+
+    def __init__(
+        self,
+        parameters: PickPlaceParameters,
+        motion: PickPlaceMotion,
+        guard: ContactGuard,
+        search_steps: int,
+    ) -> None:
+        """
+        Args:
+            parameters: heights, speeds, thresholds.
+            motion: begins the motion of a mode.
+            guard: weighs the payload.
+            search_steps: how many offsets to try when a place is blocked.
+        """
+        self._parameters, self._motion, self._guard = parameters, motion, guard
+        self._search_steps = search_steps
+        self._steps = {
+            Mode.DESCEND: self.descend,
+            Mode.CLOSE: self.close,
+            Mode.CHECK: self.check,
+            Mode.LIFT: self.hold,
+            Mode.CARRY: self.hold,
+            Mode.LOWER: self.lower,
+            Mode.SEARCH: self.search,
+        }
+
+    def step(self, moment: Moment) -> None:
+        """Takes the step of the present mode."""
+        self._steps.get(Mode(int(moment.state.mode)), self.follow)(moment)
+
+    def feel(self, moment: Moment, acceleration: NDArray[np.float64]) -> None:
+        """Watches the contact force; to be called at every step of the plant.
+
+        The guarded motions, `DESCEND` and `LOWER`, take their step here, so that they stop early.
+
+        Args:
+            moment: the inputs.
+            acceleration: (3) commanded, in m/s^2.
+        """
+        state, hand = moment.state, moment.hand
+        must_stop = self._guard.feel(state, moment.contact, float(hand[2]), acceleration)
+        if must_stop and not state.stops:
+            self.stop(moment)
+        elif state.mode in (Mode.DESCEND, Mode.LOWER):
+            self.step(moment)
+
+    def stop(self, moment: Moment) -> None:
+        """Stops dead, lets go of what is in the hand, and retreats."""
+        state = moment.state
+        state.stopped, state.stops = state.stopped + 1, 1
+        retreats, holds = state.mode == Mode.RETREAT, state.mode in _HOLDING
+        following = Mode.RELEASE if holds else Mode.RETREAT
+        self._motion.begin(state, following, moment.time, at=moment.hand[:4])
+        if retreats:
+            # The jaws drag something along.
+            state.goal_opening = self._parameters.open_width
+
+    def follow(self, moment: Moment) -> None:
+        """Goes on to the next mode when this one's motion has arrived."""
+        state, time = moment.state, moment.time
+        if time >= self._motion.arrival(state):
+            following = Mode.OBSERVE if state.mode == Mode.RETREAT else Mode(int(state.mode) + 1)
+            self._motion.begin(state, following, time)
+
+    def descend(self, moment: Moment) -> None:
+        """Stops at contact; to press, at the press force."""
+        state, time, hand, contact = moment.state, moment.time, moment.hand, moment.contact
+        if state.press:
+            if contact[2] > self._parameters.press_force:
+                # Stop dead: braking would press harder.
+                self._motion.begin(state, Mode.RETREAT, time, z=hand[2])
+            elif time >= self._motion.arrival(state):
+                self._motion.begin(state, Mode.RETREAT, time)
+        elif contact[2] > self._parameters.contact_threshold:
+            self._motion.begin(state, Mode.CLOSE, time, z=hand[2])
+            # Back off a little: the jaws cannot close while the fingertips press.
+            state.goal[Z] += self._parameters.floor_clearance
+            self._motion.set_times(state)
+        elif time >= self._motion.arrival(state):
+            self._motion.begin(state, Mode.CLOSE, time)
+
+    def close(self, moment: Moment) -> None:
+        """Stops the jaws when they stall."""
+        state, time, hand = moment.state, moment.time, moment.hand
+        opening, rate = hand[4] + hand[5], hand[10] + hand[11]
+        moving_for = time - state.start_time
+        # Stalled jaws lag behind the command by the deflection of the fingers' spring.
+        commanded, _ = self._motion.opening_at(state, time)
+        stalled = moving_for > 0.1 and abs(rate) < 2e-3 and commanded < opening - 1e-3
+        if stalled or commanded <= 0.0:
+            self._motion.begin(state, Mode.CHECK, time, opening=opening)
+
+    def check(self, moment: Moment) -> None:
+        """Lifts what is between the pads, or retreats."""
+        state, time, hand, contact = moment.state, moment.time, moment.hand, moment.contact
+        if time < self._motion.arrival(state) + self._parameters.tare_settle:
+            return
+        if self._is_held(hand, contact):
+            state.hold_z = hand[2]
+            # Gripped higher than planned, the object hangs lower.
+            higher = max(hand[2] - state.grasp_z, 0.0)
+            state.travel_z += higher
+            state.place_hover_z += higher
+            self._motion.begin(state, Mode.LIFT, time)
+        else:
+            state.missed += 1
+            self._motion.begin(state, Mode.RETREAT, time)
+
+    def hold(self, moment: Moment) -> None:
+        """Lifts and carries while an object is held."""
+        state, time, hand, contact = moment.state, moment.time, moment.hand, moment.contact
+        if -contact[2] > self._parameters.heavy_load:
+            firm = max(state.goal_force, self._parameters.firm_grasp_force)
+            self._motion.set_force(state, time, firm)
+        if not self._is_held(hand, contact):
+            state.dropped += 1
+            self._motion.begin(state, Mode.RETREAT, time)
+        elif state.mode == Mode.LIFT:
+            if self._motion.brakes_above(state, time, state.travel_z):
+                self._motion.begin(state, Mode.CARRY, time)
+        elif time >= self._motion.arrival(state) + self._parameters.tare_settle:
+            self._guard.tare(state, contact, self._parameters.contact_threshold)
+            self._motion.begin(state, Mode.LOWER, time)
+
+    def lower(self, moment: Moment) -> None:
+        """Stops at contact, and searches if the object stands on a rim."""
+        state, time, hand, contact = moment.state, moment.time, moment.hand, moment.contact
+        if not self._is_held(hand, contact):
+            state.dropped += 1
+            self._motion.begin(state, Mode.RETREAT, time)
+        elif contact[2] - state.payload > self._parameters.contact_threshold:
+            if self._is_blocked(state, hand):
+                state.touch_z = hand[2]
+                self._motion.begin(state, Mode.SEARCH, time, z=hand[2])
+            else:
+                self._motion.begin(state, Mode.RELEASE, time, z=hand[2])
+        elif time >= self._motion.arrival(state):
+            self._motion.begin(state, Mode.RELEASE, time)
+
+    def search(self, moment: Moment) -> None:
+        """Tries one offset after the other until the object slips in."""
+        state, time, hand, contact = moment.state, moment.time, moment.hand, moment.contact
+        free = contact[2] - state.payload < self._parameters.contact_threshold / 2
+        if not self._is_held(hand, contact):
+            state.dropped += 1
+            self._motion.begin(state, Mode.RETREAT, time)
+        elif free and self._parameters.search.has_slipped_in(hand[2], state.touch_z):
+            # The object has found its cavity: stop here without braking, and lower it.
+            self._motion.begin(state, Mode.LOWER, time, z=hand[2])
+        elif time >= self._motion.arrival(state):
+            state.search_step += 1
+            if state.search_step < self._search_steps:
+                self._motion.begin(state, Mode.SEARCH, time)
+            else:
+                self._motion.begin(state, Mode.RELEASE, time, z=hand[2])
+
+    def _is_blocked(self, state: PlannerState, hand: NDArray[np.float64]) -> bool:
+        bottom = hand[2] - state.hold_z + state.support_z
+        left = state.search_step < self._search_steps
+        search, rim, table = self._parameters.search, float(state.rim_z), float(state.table_z)
+        return left and search.is_on_rim(float(bottom), rim, table)
+
+    def _is_held(self, hand: NDArray[np.float64], contact: NDArray[np.float64]) -> bool:
+        # Contact pushes the fingers apart, along their positive axes.
+        pressed = contact[4:6].min() > self._parameters.grasp_force / 2
+        return bool(pressed and hand[4] + hand[5] > self._parameters.minimum_width)

@@ -1,0 +1,31 @@
+import numpy as np
+
+from systems.attempt_history import MOST_ATTEMPTS, AttemptHistory, LeftOverVector
+from systems.signals import LeftOver, PickPlaceAction, PlanarPose
+
+
+def action(number: int) -> PickPlaceAction:
+    return PickPlaceAction(PlanarPose(number, 0.1, 0.2), PlanarPose(0.5, -0.1, 1.0), press=True)
+
+
+def test_attempts_come_back_in_order_and_the_oldest_are_forgotten():
+    history = AttemptHistory(np.full(AttemptHistory.size, np.nan))
+    assert history.attempts() == history.failed_picks() == ()
+    for number in range(MOST_ATTEMPTS + 3):
+        history.append(action(number), "placed" if number % 2 else "missed", float(number))
+    found = history.attempts()
+    assert [item.action for item in found] == [action(3 + n) for n in range(MOST_ATTEMPTS)]
+    assert [item.peak_force for item in found] == [3.0 + n for n in range(MOST_ATTEMPTS)]
+    assert [pick.x for pick in history.failed_picks()] == list(range(36, 67, 2))
+    history.amend("stopped", 40.0)
+    last = history.attempts()[-1]
+    assert (last.outcome, last.peak_force) == ("stopped", 40.0)
+
+
+def test_a_report_comes_back():
+    vector = np.zeros(LeftOverVector.size)
+    kept = LeftOverVector(vector)
+    assert kept.read() is None
+    for report in (LeftOver(((0.4, 0.1), (0.5, 0.2)), ((0.6, -0.3),)), LeftOver(), None):
+        kept.write(report)
+        assert LeftOverVector(vector.copy()).read() == report
