@@ -49,12 +49,17 @@ class PlacedObject:
     """(m, 3) points sampled uniformly by area from the object's surface, in metres."""
     symmetry: int = 1
     """Order of the rotational symmetry about body z; 1 for none. Declared with the object."""
+    axis: tuple[float, float] | None = None
+    """(x, y) of the axis of symmetry in B, in metres; None: the middle of the points' bounding
+    box. The two differ if the order is odd, as of a triangle."""
 
     @cached_property
     def p_BMiddle(self) -> NDArray[np.float64]:
-        """(3,) the middle of the points' bounding box, where positions are compared. Unlike the
-        origin of B, it lies on the axis of a round object and stays there as the object rolls."""
-        return (self.p_BPoints.min(axis=0) + self.p_BPoints.max(axis=0)) / 2
+        """(3,) the point where positions are compared: the middle of the points' bounding box, or
+        the same height on the `axis`. Unlike the origin of B, it lies on the axis of a round object
+        and stays there as the object rolls."""
+        middle = (self.p_BPoints.min(axis=0) + self.p_BPoints.max(axis=0)) / 2
+        return middle if self.axis is None else np.array([*self.axis, middle[2]])
 
     @cached_property
     def p_BCorners(self) -> NDArray[np.float64]:
@@ -161,20 +166,26 @@ class AddS:
 
 @dataclass(frozen=True)
 class PoseWithin:
-    """Success as in Ravens: pose errors below thresholds; heights are not compared."""
+    """Success as in Ravens: pose errors below thresholds."""
 
     position: float = 0.01
     """Horizontal, in metres."""
     angle: float = math.radians(15.0)
     """Modulo the object's symmetry, in radians."""
+    height: float | None = None
+    """In metres; None: heights are not compared."""
 
     @property
     def description(self) -> str:
-        return f"within {1e3 * self.position:g} mm and {math.degrees(self.angle):g} degrees"
+        position, angle = f"{1e3 * self.position:g} mm", f"{math.degrees(self.angle):g} degrees"
+        if self.height is None:
+            return f"within {position} and {angle}"
+        return f"within {position}, {angle} and {1e3 * self.height:g} mm in height"
 
     def share(self, placement: Placement, X_WB: RigidTransform) -> float:
         near = placement.position_error < self.position
-        return float(near and abs(placement.angle_error) < self.angle)
+        high = self.height is not None and not abs(placement.height_error) < self.height
+        return float(near and abs(placement.angle_error) < self.angle and not high)
 
 
 @dataclass(frozen=True)

@@ -41,6 +41,9 @@ class ObjectResult:
     height_error_mm: float | None
     cause: str | None
     """Why the object failed, one of the task's `causes`; None for a success."""
+    measures: dict[str, bool] = dataclasses.field(default_factory=dict)
+    """Whether it is a success by each of the scene's other `measures`, and by `strict`; empty for a
+    task without any."""
 
 
 @dataclasses.dataclass
@@ -269,12 +272,22 @@ def object_results(
         cause = None
         if not placement.success:
             cause = task.find_cause(scene, index, poses, placement, records)
-        results.append(_object_result(item.name, item.category, placement, cause))
+        measures = {
+            name: measure.share(placement, poses[index]) > ALL
+            for name, measure in scene.measures.items()
+        }
+        if measures:
+            measures["strict"] = placement.strict_success
+        results.append(_object_result(item.name, item.category, placement, cause, measures))
     return results
 
 
 def _object_result(
-    name: str, category: str, placement: Placement, cause: str | None
+    name: str,
+    category: str,
+    placement: Placement,
+    cause: str | None,
+    measures: dict[str, bool],
 ) -> ObjectResult:
     def finite(value: float) -> float | None:
         return value if math.isfinite(value) else None
@@ -289,6 +302,7 @@ def _object_result(
         angle_error_deg=finite(math.degrees(placement.angle_error)),
         height_error_mm=finite(1e3 * placement.height_error),
         cause=cause,
+        measures=measures,
     )
 
 

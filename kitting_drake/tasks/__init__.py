@@ -3,6 +3,7 @@
 from kitting_drake.tasks.kitting.kitting import ArrangedKitting, Kitting, ToolsetKitting
 from kitting_drake.tasks.python_task import PythonTask
 from kitting_drake.tasks.ravens.align_box_corner import AlignBoxCorner
+from kitting_drake.tasks.ravens.assembling_kits import AssemblingKits
 from kitting_drake.tasks.ravens.block_insertion import BlockInsertion
 from kitting_drake.tasks.ravens.palletizing_boxes import PalletizingBoxes
 from kitting_drake.tasks.ravens.place_red_in_green import PlaceRedInGreen
@@ -17,6 +18,7 @@ Task = (
     | PlaceRedInGreen
     | StackBlockPyramid
     | PalletizingBoxes
+    | AssemblingKits
     | PythonTask
 )
 """The variants of a scenario's `task:`; the first is the default."""

@@ -6,7 +6,7 @@ only on this interface.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -49,6 +49,8 @@ class SceneObject:
     """In B, best first; may be empty if the object can fill no goal."""
     symmetry: int = 1
     """Order of the rotational symmetry about B's z; 1 for none."""
+    axis: tuple[float, float] | None = None
+    """(x, y) of the axis of symmetry in B, in metres; None: the middle of the bounding box."""
 
 
 @dataclass(frozen=True)
@@ -98,6 +100,9 @@ class Scene:
     """The episode ends after this many actions."""
     arrivals: Arrivals | None = None
     """Objects that appear later; None: all are present initially."""
+    measures: Mapping[str, SuccessPredicate] = field(default_factory=dict)
+    """Other measures of success by name. Results report them beside `success`, and `strict`; they
+    change neither the reward nor the expert."""
 
     def __post_init__(self) -> None:
         names = [item.name for item in self.objects] + [item.name for item in self.fixtures]

@@ -40,8 +40,13 @@ _COARSE_TOUCH = 0.0008
 _FINGER_RECESS = 0.003
 # Faces that narrow upward at more than this angle slip out of the pads.
 _STEEPEST = np.radians(28.0)
-# The least share of the pads' length that touches on both sides.
+# The least share of the pads' length that touches on both sides, except in a grasp by a corner.
 _LEAST_CONTACT = 0.15
+# A corner is held steadily opposite a face that supports the pad this far to either side of it.
+# Opposite another corner it may be off by the second length.
+_CORNER_MARGIN, _CORNER_OFFSET = 0.002, 0.0005
+# The costs of holding a corner against a face, and against another corner, where the tool may turn.
+_CORNER_COST, _TWO_CORNERS_COST = 0.5, 2.5
 # The distance from the middle of a tool in its kit to a neighbour.
 _LANE = 0.040
 
@@ -81,15 +86,33 @@ class GraspProposal(Grasp):
 
 
 def propose_grasps(
-    triangles: Array, center_of_mass: Array, planner: PickPlaceParameters = PLANNER
+    triangles: Array,
+    center_of_mass: Array,
+    planner: PickPlaceParameters = PLANNER,
+    *,
+    corners: bool = False,
 ) -> list[GraspProposal]:
     """Grasps from above, best first; empty if the hand cannot hold the tool.
+
+    A triangle, a pentagon or a star has no two faces for the pads. It is held at a corner: a soft
+    pad yields to the corner, and the face (or the two points) under the other pad keeps the tool
+    from turning.
 
     Args:
         triangles: (n, 3, 3) the surface in frame T, in metres, with the table at z = 0.
         center_of_mass: (2,) or (3,) in T, in metres.
         planner: gives the pads' depth, their clearance to the table, and the release clearance.
+        corners: whether grasps at a corner compete with those between faces. If not, they are
+            proposed only for a tool without any other.
     """
+    found = _propose(triangles, center_of_mass, planner, corners=corners)
+    return found or _propose(triangles, center_of_mass, planner, corners=True)
+
+
+def _propose(
+    triangles: Array, center_of_mass: Array, planner: PickPlaceParameters, *, corners: bool
+) -> list[GraspProposal]:
+    """`propose_grasps`, with or without grasps at a corner."""
     height = float(triangles[:, :, 2].max())
     if not height > planner.floor_clearance:
         return []
@@ -102,14 +125,16 @@ def propose_grasps(
     # A rotation by pi swaps the two jaws, which are alike.
     found: list[GraspProposal] = []
     for theta in np.radians(np.arange(-90.0, 90.0, _COARSE_DEG)):
-        found += _search(points, level, levels, com, float(theta), _COARSE_TOUCH, planner)
+        found += _search(points, level, levels, com, float(theta), _COARSE_TOUCH, planner, corners)
     fine = np.radians(np.arange(-_COARSE_DEG / 2, _COARSE_DEG / 2 + 1e-9, _FINE_DEG))
     result = []
     for coarse in _distinct(found):
         place = np.array([coarse.x, coarse.y])
         near: list[GraspProposal] = []
         for theta in coarse.theta + fine:
-            near += _search(points, level, levels, com, float(theta), _TOUCH, planner, place)
+            near += _search(
+                points, level, levels, com, float(theta), _TOUCH, planner, corners, place
+            )
         if near:
             result.append(min(near, key=lambda p: p.cost))
     # The slices know heights only to their spacing.
@@ -177,6 +202,8 @@ class _Hold:
     overhang: float
     twist: float
     """The distance along the pads between the two pads' mean points of contact."""
+    corner: float = 0.0
+    """The cost of holding a corner; 0 between two faces."""
 
 
 # Columns to either side of the middle.
@@ -208,6 +235,7 @@ def _search(
     theta: float,
     touch: float,
     planner: PickPlaceParameters,
+    corners: bool,
     near: Array | None = None,
 ) -> list[GraspProposal]:
     """The acceptable grasps at one rotation of the hand, along the whole tool or close to `near`.
@@ -224,7 +252,7 @@ def _search(
         centres = centres[(centres >= first) & (centres < last)]
     result = []
     for centre in centres:
-        hold = _hold(reach, int(centre), levels, touch, planner)
+        hold = _hold(reach, int(centre), levels, touch, planner, corners)
         if hold is not None:
             result.append(_proposal(hold, reach.u_min + centre * _BIN, theta, com, planner))
     return result
@@ -255,6 +283,8 @@ def _proposal(
         "wide": max(0.0, hold.width - 0.030) / 0.015,
         "neighbour in the kit": max(0.0, fingers - _LANE) / 0.015,
     }
+    if hold.corner:
+        penalties["corner"] = hold.corner
     return GraspProposal(
         x=float(x),
         y=float(y),
@@ -271,7 +301,12 @@ def _proposal(
 
 
 def _hold(
-    reach: _Reach, centre: int, levels: Array, touch: float, planner: PickPlaceParameters
+    reach: _Reach,
+    centre: int,
+    levels: Array,
+    touch: float,
+    planner: PickPlaceParameters,
+    corners: bool,
 ) -> _Hold | None:
     """How two pads hold the tool when they are centred on a column; None if they cannot.
 
@@ -283,6 +318,7 @@ def _hold(
         levels: the heights of the slices.
         touch: a pad touches the surface that lies less than this behind the foremost surface.
         planner: gives the pads' depth and their clearance to the table.
+        corners: whether a corner may be held.
     """
     fingers = slice(centre - _FINGER_COLUMNS, centre + _FINGER_COLUMNS)
     finger_left, finger_right = reach.left[fingers], reach.right[fingers]
@@ -310,11 +346,19 @@ def _hold(
     )
     slope = max(_lean(left.max(axis=0), step), _lean(-right.min(axis=0), step))
     touch_left, touch_right = left >= furthest_left - touch, right <= furthest_right + touch
-    both = touch_left.any(axis=1) & touch_right.any(axis=1)
-    contact = float(both.mean())
-    if overhang > _FINGER_RECESS or slope > _STEEPEST or contact < _LEAST_CONTACT:
+    columns_left, columns_right = touch_left.any(axis=1), touch_right.any(axis=1)
+    both = columns_left & columns_right
+    contact, corner = float(both.mean()), 0.0
+    if overhang > _FINGER_RECESS or slope > _STEEPEST:
         return None
-    rows = (touch_left[both].mean(axis=0) + touch_right[both].mean(axis=0)) / 2
+    if contact < _LEAST_CONTACT:
+        found = _corner_cost(left, right, touch) if corners else None
+        if found is None:
+            return None
+        corner = found
+    else:
+        columns_left = columns_right = both
+    rows = (touch_left[columns_left].mean(axis=0) + touch_right[columns_right].mean(axis=0)) / 2
     places = np.arange(len(left)) * _BIN
     twist = np.average(places, weights=touch_left.sum(axis=1)) - np.average(
         places, weights=touch_right.sum(axis=1)
@@ -328,7 +372,29 @@ def _hold(
         slope=slope,
         overhang=float(overhang),
         twist=float(abs(twist)),
+        corner=corner,
     )
+
+
+def _corner_cost(left: Array, right: Array, touch: float) -> float | None:
+    """The cost of holding a corner; None if the tool would turn out of the pads.
+
+    The pads push along one line only if the corner is between the ends of the other pad's contact.
+
+    Args:
+        left: (columns, levels) the surface under the left pad.
+        right: the same for the right one.
+        touch: see `_hold`. A corner sinks in as far as in the coarse search.
+    """
+    behind = [(left.max() - left).min(axis=1), (right - right.min()).min(axis=1)]
+    spans = [_BIN * np.flatnonzero(depth <= _COARSE_TOUCH) for depth in behind]
+    narrow, wide = sorted(spans, key=np.ptp)
+    corner = (narrow[0] + narrow[-1]) / 2
+    if min(corner - wide[0], wide[-1] - corner) >= _CORNER_MARGIN:
+        # Prefer a pad that lies flat on a face.
+        return _CORNER_COST * (2.0 - max(float((depth <= touch).mean()) for depth in behind))
+    offset = abs(corner - (wide[0] + wide[-1]) / 2)
+    return _TWO_CORNERS_COST if offset <= _CORNER_OFFSET else None
 
 
 def _lean(profile: Array, step: float) -> float:

@@ -57,19 +57,32 @@ class Kit:
         return self.layout.poses[index]
 
 
-def make_kit(tools: Sequence[Tool], parameters: KitParameters) -> Kit:
+def make_kit(
+    tools: Sequence[Tool], parameters: KitParameters, poses: Sequence[CavityPose] = ()
+) -> Kit:
     """Makes a kit for tools, or loads it from the cache.
 
-    The cache key is the content of the tools and parameters. A kit appears in the cache atomically,
-    so processes may build the same one concurrently.
+    The cache key is the content of the tools, parameters and poses. A kit appears in the cache
+    atomically, so processes may build the same one concurrently.
+
+    Args:
+        tools: the tools.
+        parameters: the template.
+        poses: where the tools are seated, in their order; empty: `layout_kit` chooses.
 
     Raises:
         UserError: the tools do not fit (see `layout_kit`), or the cache cannot be written.
     """
+
+    def layout() -> KitLayout:
+        if poses:
+            return KitLayout(parameters, tuple(poses))
+        return layout_kit(tools, parameters)
+
     folder = cached_folder(
-        cache_directory() / "kits" / _content_key(tools, parameters),
+        cache_directory() / "kits" / _content_key(tools, parameters, poses),
         _FILES,
-        lambda scratch: _write(tools, layout_kit(tools, parameters), scratch),
+        lambda scratch: _write(tools, layout(), scratch),
     )
     return Kit(folder / "kit.sdf", tuple(tools), _read_layout(folder, parameters))
 
@@ -85,8 +98,11 @@ def _read_layout(folder: Path, parameters: KitParameters) -> KitLayout:
         raise UserError(f"{folder / _LAYOUT} is damaged: delete {folder}") from error
 
 
-def _content_key(tools: Sequence[Tool], parameters: KitParameters) -> str:
-    digest = hashlib.sha256(f"{_FORMAT_VERSION} {parameters}".encode())
+def _content_key(
+    tools: Sequence[Tool], parameters: KitParameters, poses: Sequence[CavityPose]
+) -> str:
+    placed = f" {tuple(poses)}" if poses else ""
+    digest = hashlib.sha256(f"{_FORMAT_VERSION} {parameters}{placed}".encode())
     for tool in tools:
         digest.update(f"{tool.category} {tool.height!r} {tool.scale!r} {tool.grasp}".encode())
         for path in tool.visual_meshes:

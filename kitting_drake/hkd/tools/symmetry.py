@@ -23,7 +23,7 @@ MOST_SURFACE_DISTANCE_MM = 0.5
 MOST_OUTLINE_DEVIATION_MM = 2.0
 """The upper limit of the largest distance between their outlines: a cavity's clearance."""
 
-ORDERS = (24, 12, 8, 6, 5, 4, 3, 2)
+ORDERS = (24, 12, 10, 9, 8, 7, 6, 5, 4, 3, 2)
 """The orders to try, largest first; the first stands for round tools."""
 
 _SAMPLES, _DENSE_SAMPLES = 4000, 400_000

@@ -86,6 +86,16 @@ class Tool:
         """The outline seen from above, in T, in metres."""
         return footprint(self.triangles)
 
+    @property
+    def axis(self) -> tuple[float, float] | None:
+        """(x, y) of the axis of symmetry in T, in metres; None: the middle of the bounding box.
+
+        It is the footprint's centroid if the order is odd.
+        """
+        if self.symmetry < 3 or self.symmetry % 2 == 0:
+            return None
+        return centroid(self.footprint)
+
     def surface_points(self, count: int, seed: int = 0) -> NDArray[np.float64]:
         """(count, 3) points spread over the surface by area, in T, in metres; deterministic."""
         # Import trimesh lazily.
@@ -118,6 +128,19 @@ def footprint(triangles: NDArray[np.float64]) -> CrossSection:
     area = edge_1[:, 0] * edge_2[:, 1] - edge_1[:, 1] * edge_2[:, 0]
     flat[area < 0] = flat[area < 0, ::-1]
     return CrossSection(list(flat[np.abs(area) > 1e-12]), FillRule.NonZero)
+
+
+def centroid(outline: CrossSection) -> tuple[float, float]:
+    """The centroid of the area that an outline encloses."""
+    area, moment = 0.0, np.zeros(2)
+    for loop in outline.to_polygons():
+        start = np.asarray(loop, dtype=float)
+        end = np.roll(start, -1, axis=0)
+        cross = start[:, 0] * end[:, 1] - start[:, 1] * end[:, 0]
+        area += cross.sum() / 2
+        moment += ((start + end) * cross[:, None]).sum(axis=0) / 6
+    x, y = (moment / area).tolist()
+    return x, y
 
 
 def load_tool(name: str, base: Path | None = None) -> Tool:

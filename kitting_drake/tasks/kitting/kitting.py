@@ -319,6 +319,7 @@ def kitting_scene(
                 p_BPoints=tool.surface_points(_SURFACE_POINTS),
                 grasps=(tool.grasp,),
                 symmetry=tool.symmetry,
+                axis=tool.axis,
             )
             for name, tool, index in zip(names, tools, order, strict=True)
         ),
