@@ -31,6 +31,8 @@ WIDEST_MM = 70.0
 """The largest width between the jaws; they open to 80 mm."""
 
 _BEVEL = 0.4
+_FRAME = 5.0
+"""The thickness of a board: bare ones of 1.6 mm are too thin for pads 1.5 mm above the table."""
 _SEGMENTS = 36
 _SECTORS = 12
 _ROUND = 24
@@ -127,20 +129,20 @@ def plate_part(length: float, width: float, height: float) -> PartDesign:
 
 
 def board(length: float, width: float, height: float) -> PartDesign:
-    """A circuit board of 4 mm, with parts on it that end at `height`."""
-    if height < THINNEST_MM + 1.0:
-        raise PartError(f"a board with its parts must be {THINNEST_MM + 1:g} mm high or more")
-    base = _prism(_rectangle(length, width), THINNEST_MM)
+    """A circuit board in a frame of 5 mm, with parts on it that end at `height`."""
+    if height < _FRAME + 1.0:
+        raise PartError(f"a board with its parts must be {_FRAME + 1:g} mm high or more")
+    base = _prism(_rectangle(length, width), _FRAME)
     parts = [Part("board", "green_grip", base.solid, base.hulls)]
     # A connector at one end, a chip and a smaller part: none of them symmetric.
     for number, (x, y, long, wide, share) in enumerate(
         ((0.36, 0.0, 0.16, 0.7, 1.0), (-0.15, 0.12, 0.28, 0.4, 0.45), (-0.38, -0.3, 0.1, 0.16, 0.7))
     ):
-        top = THINNEST_MM + share * (height - THINNEST_MM)
+        top = _FRAME + share * (height - _FRAME)
         box = _rectangle(long * length, wide * width) + (x * length, y * width)
-        item = plate(box, THINNEST_MM - 0.5, top, 0.2, [CrossSection([box])])
+        item = plate(box, _FRAME - 0.5, top, 0.2, [CrossSection([box])])
         parts.append(Part(f"part_{number}", "black_rubber", item.solid, item.hulls))
-    return PartDesign(parts, PartGrasp(width, THINNEST_MM), 1)
+    return PartDesign(parts, PartGrasp(width, _FRAME), 1)
 
 
 def bolt(length: float, diameter: float) -> PartDesign:
@@ -315,7 +317,7 @@ PART_KINDS: dict[str, PartKind] = {
         lambda length, u, v: (
             length,
             _width(length, 0.5, 0.8, u),
-            min(_height(length, 0.15, 0.3, v), 16.0),
+            min(_height(length, 0.15, 0.3, v) + 2.0, 16.0),
         ),
     ),
     "bolt": PartKind(

@@ -24,7 +24,10 @@ from kitting_drake.hkd.tools.sdf import tool_sdf
 from kitting_drake.hkd.tools.solids import MATERIALS
 from kitting_drake.hkd.tools.tool import Tool, load_tool, tool_names, user_tool_names
 
-_FORMAT_VERSION = "1"
+_MODULUS = 2e7
+"""The hydroelastic modulus in Pa. The pads' 30 N press on few square millimetres of a small part,
+and would squeeze a softer one by millimetres."""
+_FORMAT_VERSION = "3"
 """Part of the cache's paths. Change it when equal names give other models."""
 _CREASE_ANGLE_DEG = 35.0
 _NAME = re.compile(r"([a-z]+)(?:_(\d+(?:\.\d+)?(?:x\d+(?:\.\d+)?)*))?")
@@ -127,7 +130,7 @@ def _write(name: str, kind: str, design: PartDesign, directory: Path) -> None:
         meshes.write_convex_obj(directory / collisions[-1], hull + origin)
     center = center + 1e-3 * origin
     (directory / f"{name}.sdf").write_text(
-        tool_sdf(name, mass, center, inertia, visuals, collisions)
+        tool_sdf(name, mass, center, inertia, visuals, collisions, _MODULUS)
     )
     record = _record(name, kind, design, box, origin, mass)
     (directory / "tool.yaml").write_text(yaml.safe_dump(record, sort_keys=False))

@@ -58,12 +58,6 @@ class KitPose(TablePose):
     roll_deg: float = bounded(0.0, -MOST_TILT_DEG, MOST_TILT_DEG)
     pitch_deg: float = bounded(0.0, -MOST_TILT_DEG, MOST_TILT_DEG)
 
-    @property
-    def stand(self) -> "KitStand":
-        """The stand that gives the kit this height and tilt."""
-        tilt = RollPitchYaw(math.radians(self.roll_deg), math.radians(self.pitch_deg), 0)
-        return KitStand(self.riser, tilt.ToRotationMatrix())
-
 
 @dataclass(frozen=True)
 class KitStand:
@@ -113,6 +107,14 @@ class KitStand:
         ) * (length, width, height)
         moved = (self.R_KLevelK.matrix() @ corners.T).T
         return np.abs(moved) - np.abs(corners)
+
+
+def stand_of(pose: TablePose) -> KitStand:
+    """The stand of a kit at a pose."""
+    if not isinstance(pose, KitPose):
+        return KitStand(0.0, RotationMatrix())
+    tilt = RollPitchYaw(math.radians(pose.roll_deg), math.radians(pose.pitch_deg), 0)
+    return KitStand(pose.riser, tilt.ToRotationMatrix())
 
 
 def draw_stand(riser: list[float], tilt_deg: list[float], rng: np.random.Generator) -> KitStand:

@@ -20,7 +20,13 @@ from kitting_drake.policies.data.learning import Learning
 from kitting_drake.tasks.boxes import box_object
 from kitting_drake.tasks.kitting import diagnosis
 from kitting_drake.tasks.kitting.kit_scene import PosedKit, kitting_scene
-from kitting_drake.tasks.kitting.kit_stands import MOST_RISER, MOST_TILT_DEG, KitPose, draw_stand
+from kitting_drake.tasks.kitting.kit_stands import (
+    MOST_RISER,
+    MOST_TILT_DEG,
+    KitPose,
+    draw_stand,
+    stand_of,
+)
 from kitting_drake.tasks.kitting.tool_poses import (
     TablePose,
     check_arrangement,
@@ -242,7 +248,7 @@ class ToolsetKitting(_DrawnKitting):
             tools = self._drawn_lengths(names, seed, base)
             advice = "set random_lengths: false, or another tool_length"
         else:
-            advice = _ANNOTATE
+            tools, advice = _load_tools(names, base), _ANNOTATE
         _check_grasps(tools, advice)
         return self._draw_scene(tools, grid, seed)
 
@@ -318,7 +324,7 @@ class ArrangedKitting(_KittingTask):
             self.kit_pose,
             dict(zip(self.tools, zip(tools, poses, strict=True), strict=True)),
         )
-        stand, X_WLevel = self.kit_pose.stand, self.kit_pose.transform()
+        stand, X_WLevel = stand_of(self.kit_pose), self.kit_pose.transform()
         posed = PosedKit(
             kit,
             stand.lifted(kit, X_WLevel),
