@@ -24,6 +24,7 @@ from systems.placement import (
     displacement,
     evaluate_placements,
     heading,
+    is_tilted,
 )
 from systems.signals import PickPlaceAction, PlanarPose, SurfaceHeights, wrap_to_pi
 from systems.weak_calc import weak_calc
@@ -34,10 +35,18 @@ _SAME_HEIGHT = 0.005
 """Objects within this height difference are equally high, in metres."""
 
 
-def gripper_pose(X_WB: RigidTransform, grasp: PlanarPose | Grasp) -> PlanarPose:
-    """The gripper pose in the world that holds an object at X_WB by a grasp."""
+def gripper_pose(
+    X_WB: RigidTransform, grasp: PlanarPose | Grasp, height: float = 0.0
+) -> PlanarPose:
+    """The gripper pose in the world that holds an object at X_WB by a grasp.
+
+    Args:
+        X_WB: the object's pose.
+        grasp: the grasp, in B.
+        height: z in B of the point of a tilted object that is above the grasp, in metres.
+    """
     yaw = heading(X_WB)
-    x, y, _ = X_WB @ np.array([grasp.x, grasp.y, 0.0])
+    x, y, _ = X_WB @ np.array([grasp.x, grasp.y, height])
     return PlanarPose(x, y, yaw + grasp.theta)
 
 
@@ -264,7 +273,9 @@ class OraclePolicy(LeafSystem):
         if quantizer is not None:
             pick = PlanarPose(*quantizer.position(pick.x, pick.y), quantizer.angle(pick.theta))
             held = grasp_taken(X_WB, pick)
-        place = gripper_pose(plan.X_WGoal, held)
+        # A level object that is let into a tilted cavity meets it halfway up.
+        height = plan.grasp.surface_height / 2 if is_tilted(plan.X_WGoal) else 0.0
+        place = gripper_pose(plan.X_WGoal, held, height)
         theta = wrap_to_pi(pick.theta)
         rotation = wrap_to_pi(place.theta - pick.theta)
         if quantizer is not None:
@@ -283,7 +294,8 @@ class OraclePolicy(LeafSystem):
         ]
         rim = plan.goal.rim_height
         bottom = poses[plan.index].translation()[2]
-        highest = max(*tops, *([] if rim is None else [rim]), 0.0)
+        rims = [goal.highest or goal.rim_height for goal in self._goals]
+        highest = max(*tops, *(height for height in rims if height is not None), 0.0)
         return SurfaceHeights(
             pick_top=bottom + plan.grasp.surface_height,
             support=bottom,

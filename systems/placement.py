@@ -93,7 +93,12 @@ class Goal:
     any_heading: bool = False
     """Whether the object's rotation about world z is ignored."""
     rim_height: float | None = None
-    """World z of the rim of the cavity that the object goes into, in metres; None: no cavity."""
+    """World z of the rim of the cavity that the object goes into, in metres; None: no cavity. Of a
+    tilted cavity: at its middle."""
+    highest: float | None = None
+    """World z of the highest point of a tilted cavity's fixture, in metres; None: not tilted."""
+    fixture: int = 0
+    """The fixture with the cavity, as index into the scene's."""
 
 
 @dataclass(frozen=True)
@@ -107,7 +112,8 @@ class Placement:
     add_s: float = math.inf
     """Equation 9 of the paper, in metres."""
     position_error: float = math.inf
-    """Horizontal distance between the middles (`PlacedObject.p_BMiddle`), in metres."""
+    """Horizontal distance between the middles (`PlacedObject.p_BMiddle`), in metres. This and the
+    errors below are measured in the frame of the goal: of a tilted cavity, along its floor."""
     angle_error: float = math.inf
     """Heading error about world z, modulo the object's symmetry, in radians; zero if the goal
     accepts any heading."""
@@ -216,6 +222,11 @@ def heading(X_WB: RigidTransform) -> float:
     """The direction of body x seen from above, about world +z, in radians."""
     x_axis = X_WB.rotation().col(0)
     return float(np.arctan2(x_axis[1], x_axis[0]))
+
+
+def is_tilted(X_WB: RigidTransform) -> bool:
+    """Whether body z is not upright, by more than rounding."""
+    return bool(X_WB.rotation().matrix()[2, 2] < 1 - 1e-9)
 
 
 def add_s(points: NDArray[np.float64], X_WGoal: RigidTransform, X_WActual: RigidTransform) -> float:
@@ -368,9 +379,16 @@ def _measure(
 ) -> Placement:
     X_WGoal = goal.poses[pose_index]
     offset = X_WB @ item.p_BMiddle - X_WGoal @ item.p_BMiddle
+    tilted = is_tilted(X_WGoal)
+    if tilted:
+        offset = X_WGoal.rotation().matrix().T @ offset
     angle = 0.0
     if not goal.any_heading:
-        angle = wrap_to_pi(heading(X_WB) - heading(X_WGoal))
+        angle = (
+            heading(X_WGoal.InvertAndCompose(X_WB))
+            if tilted
+            else wrap_to_pi(heading(X_WB) - heading(X_WGoal))
+        )
         if item.symmetry > 1:
             angle = math.remainder(angle, math.tau / item.symmetry)
     measured = Placement(

@@ -202,7 +202,7 @@ def _draw_scene(
         yaw_range_deg=180.0,
         rng=rng,
     )
-    boxes = draw_boxes(box_count, kit, X_WKit, lying, X_WTools, grid=grid, rng=rng)
+    boxes = draw_boxes(box_count, [(kit, X_WKit)], lying, X_WTools, grid=grid, rng=rng)
     X_WGoals = []
     for index in range(len(tools)):
         pose = kit.goal(index)

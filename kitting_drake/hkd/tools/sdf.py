@@ -54,6 +54,7 @@ def tool_sdf(
     inertia: np.ndarray,
     visuals: Sequence[tuple[str, str]],
     collisions: Sequence[str],
+    modulus: float = HYDROELASTIC_MODULUS,
 ) -> str:
     """The SDFormat of a tool: one free link named `tool`, whose frame is the tool frame T.
 
@@ -66,6 +67,7 @@ def tool_sdf(
         inertia: (3, 3) about the centre of mass, in kg m^2.
         visuals: pairs of OBJ file and key of MATERIALS.
         collisions: OBJ files of convex hulls.
+        modulus: Drake's hydroelastic modulus, in Pa.
     """
     moments = "".join(
         f"<i{'xyz'[i]}{'xyz'[j]}>{inertia[i, j]:.9g}</i{'xyz'[i]}{'xyz'[j]}>"
@@ -73,7 +75,7 @@ def tool_sdf(
         for j in range(i, 3)
     )
     contact = {
-        "hydroelastic_modulus": HYDROELASTIC_MODULUS,
+        "hydroelastic_modulus": modulus,
         "hunt_crossley_dissipation": HUNT_CROSSLEY_DISSIPATION,
         "hydroelastic_margin": HYDROELASTIC_MARGIN,
         "mu_static": FRICTION,

@@ -102,12 +102,18 @@ def _is_over(p_WMiddle: np.ndarray, X_WB: RigidTransform, X_WGoal: RigidTransfor
 
 
 def _is_over_kit(scene: Scene, p_WPoint: np.ndarray) -> bool:
-    """Whether a point is over the kit, i.e. the bounding box of all seated tools in its frame."""
-    X_KW = scene.fixtures[0].X_WF.inverse()
+    """Whether a point is over a kit, i.e. the bounding box of all seated tools in its frame."""
+    return any(_is_over_one(scene, kit, p_WPoint) for kit in {goal.fixture for goal in scene.goals})
+
+
+def _is_over_one(scene: Scene, kit: int, p_WPoint: np.ndarray) -> bool:
+    """Whether a point is over one kit, given as an index into the scene's fixtures."""
+    X_KW = scene.fixtures[kit].X_WF.inverse()
     seated = np.concatenate(
         [
             (X_KW @ goal.poses[0]).multiply(scene.objects[goal.objects[0]].p_BPoints.T).T
             for goal in scene.goals
+            if goal.fixture == kit
         ]
     )
     low, high = seated.min(axis=0)[:2] - _BORDER, seated.max(axis=0)[:2] + _BORDER

@@ -2,37 +2,49 @@
 
 import dataclasses
 import itertools
-import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
-from pydrake.math import RigidTransform, RollPitchYaw
+from pydrake.math import RigidTransform
 
 from kitting_drake.common.errors import UserError
+from kitting_drake.hkd.generation.part_models import is_part_kind, load_named, sized_part
 from kitting_drake.hkd.kits.kit import Kit, make_kit
 from kitting_drake.hkd.kits.parameters import KitParameters
 from kitting_drake.hkd.tools.scaling import scaled_tool
-from kitting_drake.hkd.tools.tool import Tool, load_tool
+from kitting_drake.hkd.tools.tool import Tool
 from kitting_drake.hkd.tools.toolsets import SPLITS, toolsets
 from kitting_drake.policies.data.learning import Learning
 from kitting_drake.tasks.boxes import box_object
 from kitting_drake.tasks.kitting import diagnosis
+from kitting_drake.tasks.kitting.kit_scene import PosedKit, kitting_scene
+from kitting_drake.tasks.kitting.kit_stands import (
+    MOST_RISER,
+    MOST_TILT_DEG,
+    KitPose,
+    draw_stand,
+    stand_of,
+)
 from kitting_drake.tasks.kitting.tool_poses import (
     TablePose,
     check_arrangement,
     draw_boxes,
-    draw_poses,
+    draw_kit_poses,
 )
-from kitting_drake.tasks.task import ActionRecord, Fixture, Scene, SceneObject, TaskConfig
+from kitting_drake.tasks.task import ActionRecord, Scene, TaskConfig
 from systems.bounds import bounded
 from systems.hand_geometry import MAX_OPENING
-from systems.placement import AddS, Goal, Placement
+from systems.placement import Placement
 from systems.signals import PixelGrid
 
-_SURFACE_POINTS = 2000
 _MOST_TOOLS = 12
+_MOST_KITS = 4
+_MOST_MASS = 3.0
+"""The hand's payload, in kg."""
+_JAW_MARGIN = 0.012
+"""The open jaws are wider than a scaled tool by this, in metres."""
 _ANNOTATE = "save another grasp by `hkd annotate`"
 
 SEEN = "kitting-seen-toolset"
@@ -96,22 +108,35 @@ class _DrawnKitting(_KittingTask):
     # Number of boxes without a cavity, as clutter; fewer if there is no room.
     distractors: int = bounded(0, 0, 12)
 
+    # Number of kits. The tools are shared out between them at random, as evenly as possible.
+    kits: int = bounded(1, 1, _MOST_KITS)
+
+    # Each kit is on a riser of a height drawn from this range, in m.
+    riser: list[float] = bounded([0.0, 0.0], 0.0, MOST_RISER)
+
+    # Each kit is tilted by an angle drawn from this range, in degrees, in any direction.
+    tilt_deg: list[float] = bounded([0.0, 0.0], 0.0, MOST_TILT_DEG)
+
     def _draw_scene(self, tools: list[Tool], grid: PixelGrid, seed: int) -> Scene:
-        kit = self._kit_of(tools)
+        # Streams of their own: with one level kit, the poses are those of a seed without them.
+        shares = self._shares(len(tools), np.random.default_rng([seed, 6]))
+        kits = [self._kit_of([tools[index] for index in share]) for share in shares]
+        stand_rng = np.random.default_rng([seed, 7])
+        stands = [draw_stand(self.riser, self.tilt_deg, stand_rng) for _ in kits]
         rng = np.random.default_rng(seed)
-        X_WKit, X_WTools = draw_poses(
-            kit,
+        X_WLevels, X_WTools = draw_kit_poses(
+            kits,
             tools,
             grid=grid,
             spacing=self.spacing,
             yaw_range_deg=self.yaw_range_deg,
             rng=rng,
+            margins=[stand.margin(kit) for stand, kit in zip(stands, kits, strict=True)],
         )
         order = rng.permutation(len(tools)) if self.random_order else np.arange(len(tools))
         boxes = draw_boxes(
             self.distractors,
-            kit,
-            X_WKit,
+            list(zip(kits, X_WLevels, strict=True)),
             tools,
             X_WTools,
             grid=grid,
@@ -121,19 +146,50 @@ class _DrawnKitting(_KittingTask):
             box_object(f"distractor_{number}", "distractor", box.size, box.colour, box.X_WB)
             for number, box in enumerate(boxes, start=1)
         ]
-        scene = kitting_scene(kit, X_WKit, X_WTools, order, self.success_threshold)
+        posed = [
+            PosedKit(
+                kit,
+                stand.lifted(kit, X_WLevel),
+                share,
+                stand.fixture("riser" if number == 1 else f"riser_{number}", kit, X_WLevel),
+            )
+            for number, (kit, stand, X_WLevel, share) in enumerate(
+                zip(kits, stands, X_WLevels, shares, strict=True), start=1
+            )
+        ]
+        scene = kitting_scene(posed, tools, X_WTools, order, self.success_threshold)
         return dataclasses.replace(
             scene,
             objects=(*scene.objects, *distractors),
             max_actions=self.tries * len(tools),
         )
 
+    def _shares(self, count: int, rng: np.random.Generator) -> list[tuple[int, ...]]:
+        """The tools of each kit, as indices."""
+        if count < self.kits:
+            raise UserError(f"task.kits is {self.kits}, but there are only {count} tools")
+        if count > _MOST_TOOLS * self.kits:
+            raise UserError(
+                f"task: {count} tools need more than {self.kits} kits of up to {_MOST_TOOLS}"
+            )
+        if self.kits == 1:
+            return [tuple(range(count))]
+        mixed = rng.permutation(count).tolist()
+        return [tuple(sorted(mixed[number :: self.kits])) for number in range(self.kits)]
+
+    def validate(self) -> None:
+        for name in ("riser", "tilt_deg"):
+            least, greatest = getattr(self, name)
+            if least > greatest:
+                raise ValueError(f"task.{name} must be [least, greatest]")
+
 
 @dataclass
 class Kitting(_DrawnKitting):
     """A kit and its tools in random poses: kitting-seen-toolset."""
 
-    # 1 to 12 tools, repetitions allowed: names under models/tools, or paths of tool folders.
+    # 1 to 12 tools for each kit, repetitions allowed: names under models/tools, paths of tool
+    # folders, or simple parts such as ring_40x20x10 (docs/sizes.md).
     tools: list[str] = field(
         default_factory=lambda: [
             "claw_hammer",
@@ -156,7 +212,8 @@ class Kitting(_DrawnKitting):
         return _tool_files(self.tools, base)
 
     def validate(self) -> None:
-        _check_count(len(self.tools))
+        super().validate()
+        _check_count(len(self.tools), self.kits)
 
 
 @dataclass
@@ -166,13 +223,19 @@ class ToolsetKitting(_DrawnKitting):
     # The pool: train or test (section IV-B.1 of the paper), or fresh, which is disjoint from both.
     split: str = "test"
 
-    # Alternatively, a custom pool of names or paths of tool folders; one of each category is drawn.
+    # Alternatively, a custom pool of names or paths of tool folders, or of kinds of simple parts
+    # such as ring (docs/sizes.md). One of each category is drawn.
     pool: list[str] = field(default_factory=list)
 
+    # Draw this many tools from all of the pool or split, whatever their categories; 0: one of each
+    # category. None occurs twice unless the pool is too small.
+    count: int = bounded(0, 0, _MOST_TOOLS * _MOST_KITS)
+
     # Whether to draw tool lengths from the range tool_length, in m (section IV-B.2). If not, tools
-    # have the lengths of the dataset.
+    # have their own lengths. A tool that would be too wide for the jaws, too high for the kit or
+    # heavier than 3 kg is made as long as it may be. Parts also get random proportions.
     random_lengths: bool = True
-    tool_length: list[float] = bounded([0.15, 0.20], 0.05, 0.30)
+    tool_length: list[float] = bounded([0.15, 0.20], 0.015, 0.35)
 
     @property
     def title(self) -> str:
@@ -180,23 +243,41 @@ class ToolsetKitting(_DrawnKitting):
         return _TITLES.get(self.split, "kitting") if unchanged else "kitting"
 
     def make_scene(self, *, grid: PixelGrid, seed: int, base: Path) -> Scene:
-        choices = self._toolsets(base)
-        # Separate streams: the poses depend neither on the number of toolsets nor on lengths.
-        names = choices[np.random.default_rng([seed, 1]).integers(len(choices))]
-        tools = _load_tools(names, base)
+        names = self._draw_names(seed, base)
         if self.random_lengths:
-            least, greatest = self.tool_length
-            rng = np.random.default_rng([seed, 2])
-            lengths = rng.uniform(least, greatest, len(tools))
-            tools = [
-                scaled_tool(tool, float(length))
-                for tool, length in zip(tools, lengths, strict=True)
-            ]
+            tools = self._drawn_lengths(names, seed, base)
             advice = "set random_lengths: false, or another tool_length"
         else:
-            advice = _ANNOTATE
+            tools, advice = _load_tools(names, base), _ANNOTATE
         _check_grasps(tools, advice)
         return self._draw_scene(tools, grid, seed)
+
+    def _draw_names(self, seed: int, base: Path) -> list[str]:
+        # Separate streams: the poses depend neither on the number of toolsets nor on lengths.
+        rng = np.random.default_rng([seed, 1])
+        if not self.count:
+            choices = self._toolsets(base)
+            return list(choices[rng.integers(len(choices))])
+        pool = self.pool or sorted({name for names in toolsets(self.split) for name in names})
+        rounds = -(-self.count // len(pool))
+        return [pool[i] for _ in range(rounds) for i in rng.permutation(len(pool))][: self.count]
+
+    def _drawn_lengths(self, names: list[str], seed: int, base: Path) -> list[Tool]:
+        """The tools with random lengths; parts with random proportions, too."""
+        least, greatest = self.tool_length
+        lengths = np.random.default_rng([seed, 2]).uniform(least, greatest, len(names))
+        shapes = np.random.default_rng([seed, 8]).uniform(size=(len(names), 2))
+        whole = _load_tools([name for name in names if not is_part_kind(name)], base)
+        loaded = iter(whole)
+        tools = []
+        for name, length, (u, v) in zip(names, lengths.tolist(), shapes.tolist(), strict=True):
+            if is_part_kind(name):
+                tools.append(sized_part(name, length, (u, v)))
+                continue
+            tool = next(loaded)
+            longest = _longest(tool, self.kit)
+            tools.append(scaled_tool(tool, longest if least <= longest < length else length))
+        return tools
 
     def _toolsets(self, base: Path) -> list[tuple[str, ...]]:
         if not self.pool:
@@ -210,6 +291,7 @@ class ToolsetKitting(_DrawnKitting):
         return _tool_files(self.pool, base)
 
     def validate(self) -> None:
+        super().validate()
         if self.split not in SPLITS:
             raise ValueError(f"task.split must be one of {', '.join(SPLITS)}, not '{self.split}'")
         if self.tool_length[0] > self.tool_length[1]:
@@ -226,7 +308,7 @@ class ArrangedKitting(_KittingTask):
     )
 
     # The kit's pose.
-    kit_pose: TablePose = field(default_factory=lambda: TablePose(x=0.5, y=-0.1))
+    kit_pose: KitPose = field(default_factory=lambda: KitPose(x=0.5, y=-0.1))
 
     @property
     def title(self) -> str:
@@ -242,9 +324,16 @@ class ArrangedKitting(_KittingTask):
             self.kit_pose,
             dict(zip(self.tools, zip(tools, poses, strict=True), strict=True)),
         )
-        scene = kitting_scene(
+        stand, X_WLevel = stand_of(self.kit_pose), self.kit_pose.transform()
+        posed = PosedKit(
             kit,
-            self.kit_pose.transform(),
+            stand.lifted(kit, X_WLevel),
+            tuple(range(len(tools))),
+            stand.fixture("riser", kit, X_WLevel),
+        )
+        scene = kitting_scene(
+            [posed],
+            tools,
             [pose.transform() for pose in poses],
             np.arange(len(tools)),
             self.success_threshold,
@@ -274,77 +363,6 @@ class ArrangedKitting(_KittingTask):
         _check_count(len(self.tools))
 
 
-def kitting_scene(
-    kit: Kit,
-    X_WKit: RigidTransform,
-    X_WTools: Sequence[RigidTransform],
-    order: Sequence[int] | np.ndarray,
-    threshold: float,
-) -> Scene:
-    """Makes the scene of a kit and its tools, with a goal for each cavity.
-
-    Identical tools may fill each other's cavities.
-
-    Args:
-        kit: the kit and its tools.
-        X_WKit: its pose.
-        X_WTools: the initial pose of each tool.
-        order: the expert's order, as indices into the kit's tools.
-        threshold: the threshold of ADD-S, in metres.
-    """
-    tools = [kit.tools[index] for index in order]
-    names = _unique_names(tools)
-    rim = float(X_WKit.translation()[2]) + kit.size[2]
-    goals = []
-    for name, tool, index in zip(names, tools, order, strict=True):
-        pose = kit.goal(int(index))
-        X_KGoal = RigidTransform(RollPitchYaw(0, 0, pose.yaw), [pose.x, pose.y, pose.z])
-        alike = tuple(i for i, other in enumerate(tools) if _are_alike(tool, other))
-        goals.append(
-            Goal(
-                name=f"cavity of {name}",
-                objects=alike,
-                poses=(X_WKit @ X_KGoal,),
-                reward=1 / len(tools),
-                rim_height=rim,
-            )
-        )
-    return Scene(
-        objects=tuple(
-            SceneObject(
-                name=name,
-                category=tool.category,
-                model=tool.sdf,
-                X_WB=X_WTools[index],
-                p_BPoints=tool.surface_points(_SURFACE_POINTS),
-                grasps=(tool.grasp,),
-                symmetry=tool.symmetry,
-                axis=tool.axis,
-            )
-            for name, tool, index in zip(names, tools, order, strict=True)
-        ),
-        fixtures=(Fixture("kit", kit.sdf, X_WKit),),
-        goals=tuple(goals),
-        success=AddS(threshold),
-        max_actions=len(tools),
-    )
-
-
-def _are_alike(tool: Tool, other: Tool) -> bool:
-    return tool.directory == other.directory and tool.length == other.length
-
-
-def _unique_names(tools: Sequence[Tool]) -> list[str]:
-    names: list[str] = []
-    for tool in tools:
-        name, number = tool.name, 2
-        # Other bodies in the scene have these names.
-        while name in names or re.fullmatch(r"kit|distractor_\d+", name):
-            name, number = f"{tool.name}_{number}", number + 1
-        names.append(name)
-    return names
-
-
 def _check_grasps(tools: Sequence[Tool], advice: str) -> None:
     """Raises UserError, with advice, if a tool's grasp is wider than the open jaws."""
     for tool in tools:
@@ -356,6 +374,16 @@ def _check_grasps(tools: Sequence[Tool], advice: str) -> None:
             )
 
 
+def _longest(tool: Tool, kit: KitParameters) -> float:
+    """The greatest length to which a tool can be scaled and still be held and kitted, in metres."""
+    factor = min(
+        (MAX_OPENING - _JAW_MARGIN) / tool.grasp.width,
+        (kit.height - kit.minimum_wall) / tool.height,
+        (_MOST_MASS / tool.mass) ** (1 / 3),
+    )
+    return 0.999 * factor * tool.length
+
+
 def _load_tools(
     names: Sequence[str] | dict[str, TablePose], base: Path, field: str = "task.tools"
 ) -> list[Tool]:
@@ -365,7 +393,7 @@ def _load_tools(
 
 def _load_tool(name: str, base: Path, field: str) -> Tool:
     try:
-        return load_tool(name, base)
+        return load_named(name, base)
     except UserError as error:
         raise type(error)(f"{field}: {error}") from error
 
@@ -375,8 +403,8 @@ def _tool_files(names: Sequence[str] | dict[str, TablePose], base: Path) -> list
     return [path for folder in folders for path in sorted(folder.iterdir()) if path.is_file()]
 
 
-def _check_count(count: int) -> None:
+def _check_count(count: int, kits: int = 1) -> None:
     if not count:
         raise ValueError("task.tools is empty: name at least one tool")
-    if count > _MOST_TOOLS:
+    if count > kits * _MOST_TOOLS:
         raise ValueError(f"task.tools has {count} tools: a kit holds up to {_MOST_TOOLS}")

@@ -1,5 +1,6 @@
 """Draws poses of kit and tools on the table, or checks given ones."""
 
+import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -114,57 +115,89 @@ def draw_poses(
     yaw_range_deg: float,
     rng: np.random.Generator,
 ) -> tuple[RigidTransform, list[RigidTransform]]:
-    """Draws poses of the kit and the tools, within the workspace and on the table.
+    """Draws poses of one kit and its tools: `draw_kit_poses` with a single kit."""
+    X_WKits, X_WTools = draw_kit_poses(
+        [kit], tools, grid=grid, spacing=spacing, yaw_range_deg=yaw_range_deg, rng=rng
+    )
+    return X_WKits[0], X_WTools
+
+
+def draw_kit_poses(
+    kits: Sequence[Kit],
+    tools: Sequence[Tool],
+    *,
+    grid: PixelGrid,
+    spacing: float,
+    yaw_range_deg: float,
+    rng: np.random.Generator,
+    margins: Sequence[float] = (),
+) -> tuple[list[RigidTransform], list[RigidTransform]]:
+    """Draws poses of kits and tools, within the workspace and on the table.
 
     Nothing overlaps, and the open hand at each tool's grasp touches no other tool and no kit.
 
     Args:
-        kit: the kit.
+        kits: the kits.
         tools: the tools.
         grid: the workspace.
         spacing: least distance between any two, in metres.
         yaw_range_deg: rotations are drawn within plus or minus this, in degrees.
         rng: the random generator of all draws.
+        margins: how far each kit reaches beyond its outline because it is tilted, in metres; by
+            default not at all.
 
     Returns:
-        X_WKit, and X_WT of each tool.
+        X_WKit of each kit, and X_WT of each tool.
 
     Raises:
         UserError: no free space was found.
     """
     seen = _rectangle((grid.x_min, grid.y_min), (grid.x_max, grid.y_max))
     room = seen ^ _rectangle(*TABLE)
-    shapes = [_Footprint(block_outline(kit), CrossSection(), CrossSection())]
+    shapes = [
+        _Footprint(_grown_block(kit, margin), CrossSection(), CrossSection())
+        for kit, margin in itertools.zip_longest(kits, margins, fillvalue=0.0)
+    ]
     shapes += [_tool_footprint(tool) for tool in tools]
     order = list(range(len(shapes)))
     if len(tools) > _MANY:
-        order.sort(key=lambda index: (index > 0, -shapes[index].outline.area()))
+        order.sort(key=lambda index: (index >= len(kits), -shapes[index].outline.area()))
 
     def draw(index: int, placed: list[_Drawn]) -> _Drawn | None:
         others = [footprint for _, footprint in placed]
-        return _draw_pose(shapes[index], others, room, grid, spacing, yaw_range_deg, rng)
+        blocks = others[: len(kits)]
+        return _draw_pose(shapes[index], others, blocks, room, grid, spacing, yaw_range_deg, rng)
 
     found = draw_in_turn(order, draw, restarts=_RESTARTS)
     if found is None:
         raise UserError(
-            f"there is no free space in the workspace for the kit and {len(tools)} tools: "
+            "there is no free space in the workspace for the "
+            + ("kit" if len(kits) == 1 else f"{len(kits)} kits")
+            + f" and {len(tools)} tools: "
             "enlarge heightmap.rows and heightmap.cols, or reduce task.spacing"
         )
     drawn = {index: pose for index, (pose, _) in zip(order, found, strict=True)}
     transforms = [drawn[index].transform() for index in range(len(shapes))]
-    return transforms[0], transforms[1:]
+    return transforms[: len(kits)], transforms[len(kits) :]
+
+
+def _grown_block(kit: Kit, margin: float) -> CrossSection:
+    """The outline of a kit block, with a margin for its tilt, in its frame, in metres."""
+    length, width, _ = kit.size
+    return CrossSection.square((length + 2 * margin, width + 2 * margin), True)
 
 
 def _draw_pose(
     shape: _Footprint,
     placed: list[_Footprint],
+    blocks: list[_Footprint],
     room: CrossSection,
     grid: PixelGrid,
     spacing: float,
     yaw_range_deg: float,
     rng: np.random.Generator,
 ) -> _Drawn | None:
-    """Draws a free pose; None if none was found. The first placed thing is the kit."""
+    """Draws a free pose; None if none was found. The kit blocks are among what is placed."""
     for _ in range(_TRIES):
         x, y = rng.uniform((grid.x_min, grid.y_min), (grid.x_max, grid.y_max))
         pose = TablePose(x=x, y=y, yaw_deg=rng.uniform(-yaw_range_deg, yaw_range_deg))
@@ -178,7 +211,7 @@ def _draw_pose(
             or _overlap(candidate.outline, other.fingers)
             for other in placed
         )
-        if not blocked and not (placed and _overlap(candidate.palm, placed[0].outline)):
+        if not blocked and not any(_overlap(candidate.palm, block.outline) for block in blocks):
             return pose, candidate
     return None
 
@@ -196,8 +229,7 @@ class DrawnBox:
 
 def draw_boxes(
     count: int,
-    kit: Kit,
-    X_WKit: RigidTransform,
+    kits: Sequence[tuple[Kit, RigidTransform]],
     tools: Sequence[Tool],
     X_WTools: Sequence[RigidTransform],
     *,
@@ -211,15 +243,18 @@ def draw_boxes(
 
     Args:
         count: largest number.
-        kit: the kit.
-        X_WKit: its pose.
+        kits: the kits and their poses.
         tools: the tools.
         X_WTools: their poses.
         grid: the workspace.
         rng: the random generator of all draws.
     """
     room = _rectangle((grid.x_min, grid.y_min), (grid.x_max, grid.y_max)) ^ _rectangle(*TABLE)
-    placed = [_Footprint(block_outline(kit), CrossSection(), CrossSection()).moved(_pose(X_WKit))]
+    placed = [
+        _Footprint(block_outline(kit), CrossSection(), CrossSection()).moved(_pose(X_WKit))
+        for kit, X_WKit in kits
+    ]
+    blocks = list(placed)
     placed += [
         _tool_footprint(tool).moved(_pose(X)) for tool, X in zip(tools, X_WTools, strict=True)
     ]
@@ -229,7 +264,7 @@ def draw_boxes(
         red, green, blue = rng.uniform(0.05, 0.95, 3).tolist()
         outline = CrossSection.square((length, width), True)
         shape = _Footprint(outline, CrossSection(), CrossSection())
-        found = _draw_pose(shape, placed, room, grid, _DISTRACTOR_SPACING, 180.0, rng)
+        found = _draw_pose(shape, placed, blocks, room, grid, _DISTRACTOR_SPACING, 180.0, rng)
         if found is None:
             continue
         pose, footprint = found

@@ -1,0 +1,452 @@
+"""Simple parts beside hand tools: rings, discs, plates, boards, bolts and the like.
+
+A part is a kind and its dimensions, such as `ring_40x20x10`: the name says all. A bare kind has
+default dimensions. Each part lies as it rests on the table, z up, with z = 0 at its bottom and the
+origin in the middle of its bounding box. Lengths are in mm.
+"""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from manifold3d import CrossSection
+
+from kitting_drake.hkd.tools.mass import mass_properties
+from kitting_drake.hkd.tools.solids import (
+    MATERIALS,
+    Part,
+    Shape,
+    across_x,
+    circle,
+    loft,
+    plate,
+)
+
+SHORTEST_MM, LONGEST_MM = 15.0, 350.0
+"""The range of a part's length."""
+THINNEST_MM = 4.0
+"""The least height of a part: the pads end 1.5 mm above the table."""
+WIDEST_MM = 70.0
+"""The largest width between the jaws; they open to 80 mm."""
+
+_BEVEL = 0.4
+_FRAME = 5.0
+"""The thickness of a board: bare ones of 1.6 mm are too thin for pads 1.5 mm above the table."""
+_SEGMENTS = 36
+_SECTORS = 12
+_ROUND = 24
+"""The order of symmetry that stands for a round part."""
+_PAD = 17.6
+"""The length of the jaws' pads."""
+_INNER_REACH = 58.0
+"""How far the open jaw's inner finger reaches from the grasp, with a margin of 3 mm."""
+_HEX = 2 / math.sqrt(3)
+"""The ratio of a hexagon's width across corners to that across flats."""
+
+
+@dataclass(frozen=True)
+class PartGrasp:
+    """A grasp in the part's frame: the jaws close along +y rotated by theta about +z."""
+
+    width_mm: float
+    top_mm: float
+    """The part's height at the grasp."""
+    x_mm: float = 0.0
+    y_mm: float = 0.0
+    theta_deg: float = 0.0
+
+
+@dataclass(frozen=True)
+class PartDesign:
+    """The geometry of a part."""
+
+    parts: list[Part]
+    grasp: PartGrasp
+    symmetry: int
+    """The order of the rotational symmetry about z; 24 for a round part."""
+
+
+class PartError(ValueError):
+    """The dimensions make no part that the hand can hold; the message says why."""
+
+
+def ring(outer: float, inner: float, height: float) -> PartDesign:
+    """A bearing or a washer. Up to 70 mm it is held across its outside, above across its rim."""
+    if not 2.0 <= inner <= outer - 4.0:
+        raise PartError(f"the bore must be 2 to {outer - 4:g} mm wide, not {inner:g}")
+    big, small = outer / 2, inner / 2
+    profile = CrossSection([circle(big, segments=_SEGMENTS)]) - CrossSection(
+        [circle(small, segments=_SEGMENTS)]
+    )
+    solid = plate(profile, 0.0, height, _BEVEL).solid
+    hulls = plate(
+        CrossSection([circle(big, segments=_SEGMENTS)]), 0.0, height, _BEVEL, _sectors(big, small)
+    ).hulls
+    if outer <= WIDEST_MM:
+        return PartDesign(
+            [Part("ring", "polished_steel", solid, hulls)], PartGrasp(outer, height), _ROUND
+        )
+    if small <= _PAD or (big + small) / 2 - _INNER_REACH < -math.sqrt(small**2 - 110.0):
+        raise PartError(
+            f"a ring of more than {WIDEST_MM:g} mm is held across its rim, and a bore of {inner:g} "
+            "mm leaves the finger no room"
+        )
+    # The inner pad touches the bore with its two ends.
+    chord = math.sqrt(small**2 - (_PAD / 2) ** 2)
+    grasp = PartGrasp(big - chord, height, (big + chord) / 2, 0.0, 90.0)
+    return PartDesign([Part("ring", "amber_plastic", solid, hulls)], grasp, _ROUND)
+
+
+def disc(diameter: float, height: float) -> PartDesign:
+    """A round plate, or a cylinder that stands on its end."""
+    shape = _prism(circle(diameter / 2, segments=_SEGMENTS), height)
+    return PartDesign(
+        [Part("disc", "steel", shape.solid, shape.hulls)], PartGrasp(diameter, height), _ROUND
+    )
+
+
+def rod(length: float, diameter: float) -> PartDesign:
+    """A cylinder that lies on its side, on one of 24 narrow flats."""
+    section = circle(diameter / 2 / math.cos(math.pi / 24), segments=24)
+    section = section @ _turn(math.pi / 24) + (0.0, diameter / 2)
+    shape = loft([across_x(section, -length / 2), across_x(section, length / 2)])
+    return PartDesign(
+        [Part("rod", "polished_steel", shape.solid, shape.hulls)],
+        PartGrasp(diameter, diameter),
+        2,
+    )
+
+
+def plate_part(length: float, width: float, height: float) -> PartDesign:
+    """A rectangular plate or block."""
+    shape = _prism(_rectangle(length, width), height)
+    return PartDesign(
+        [Part("plate", _light(length), shape.solid, shape.hulls)],
+        PartGrasp(width, height),
+        4 if math.isclose(length, width) else 2,
+    )
+
+
+def board(length: float, width: float, height: float) -> PartDesign:
+    """A circuit board in a frame of 5 mm, with parts on it that end at `height`."""
+    if height < _FRAME + 1.0:
+        raise PartError(f"a board with its parts must be {_FRAME + 1:g} mm high or more")
+    base = _prism(_rectangle(length, width), _FRAME)
+    parts = [Part("board", "green_grip", base.solid, base.hulls)]
+    # A connector at one end, a chip and a smaller part: none of them symmetric.
+    for number, (x, y, long, wide, share) in enumerate(
+        ((0.36, 0.0, 0.16, 0.7, 1.0), (-0.15, 0.12, 0.28, 0.4, 0.45), (-0.38, -0.3, 0.1, 0.16, 0.7))
+    ):
+        top = _FRAME + share * (height - _FRAME)
+        box = _rectangle(long * length, wide * width) + (x * length, y * width)
+        item = plate(box, _FRAME - 0.5, top, 0.2, [CrossSection([box])])
+        parts.append(Part(f"part_{number}", "black_rubber", item.solid, item.hulls))
+    return PartDesign(parts, PartGrasp(width, _FRAME), 1)
+
+
+def bolt(length: float, diameter: float) -> PartDesign:
+    """A bolt with a hexagonal head that stands on the head; `length` is its whole height.
+
+    A bolt that lies on its side is a `pin`.
+    """
+    # The fingertips reach 10 mm below the top, and the head stays below them.
+    head = min(0.65 * diameter, length - 11.0)
+    if head < 2.0:
+        raise PartError(f"a standing bolt must be 13 mm long or more, not {length:g}")
+    hexagon = _hexagon(1.6 * diameter)
+    shank = circle(diameter / 2, segments=24)
+    lower, upper = _prism(hexagon, head), plate(shank, head - 0.2, length, _BEVEL, [_around(shank)])
+    return PartDesign(
+        [
+            Part("head", "dark_steel", lower.solid, lower.hulls),
+            Part("shank", "steel", upper.solid, upper.hulls),
+        ],
+        PartGrasp(diameter, length),
+        6,
+    )
+
+
+def pin(length: float, diameter: float) -> PartDesign:
+    """A lying pin with a square collar at one end, on which and on its shank it is level."""
+    section = circle(diameter / 2 / math.cos(math.pi / 24), segments=24)
+    section = section @ _turn(math.pi / 24) + (0.0, diameter / 2)
+    collar = 0.18 * length
+    shank = loft([across_x(section, -length / 2), across_x(section, length / 2)])
+    wide = _rectangle(collar, 1.7 * diameter) + (length / 2 - collar / 2, 0.0)
+    block = plate(wide, 0.0, diameter, _BEVEL, [CrossSection([wide])])
+    parts = [
+        Part("collar", "dark_steel", block.solid, block.hulls),
+        Part("shank", "steel", shank.solid, shank.hulls),
+    ]
+    x = _middle_of_mass(parts)[0]
+    # The pads of a short pin touch the collar, which is wider.
+    on_collar = x + _PAD / 2 > length / 2 - collar
+    return PartDesign(parts, PartGrasp((1.7 if on_collar else 1.0) * diameter, diameter, x), 1)
+
+
+def socket(diameter: float, height: float) -> PartDesign:
+    """A socket of a ratchet that stands on its drive: a collar, and a narrower, hexagonal mouth."""
+    neck = 0.55 * height
+    low, high = (circle(s * diameter / 2, segments=_SEGMENTS) for s in (1.0, 0.86))
+    base = plate(low, 0.0, neck, _BEVEL, [_around(low)])
+    mouth = plate(high, neck - 0.2, height, _BEVEL, [_around(high)])
+    bore = CrossSection([_hexagon(0.5 * diameter)]).extrude(height).translate((0, 0, 0.4 * height))
+    return PartDesign(
+        [
+            Part("collar", "polished_steel", base.solid - bore, base.hulls),
+            Part("mouth", "polished_steel", mouth.solid - bore, mouth.hulls),
+        ],
+        PartGrasp(diameter if neck > height - 8.0 else 0.86 * diameter, height),
+        6,
+    )
+
+
+def bit(length: float, flats: float) -> PartDesign:
+    """A lying screwdriver bit: a hexagonal shank and a narrower, flattened tip."""
+    # The hexagon lies on a flat, and its corners point to the jaws.
+    section = _hexagon(flats) + (0.0, flats / 2)
+    start, end = -length / 2, length / 2
+    shoulder = start + 0.68 * length
+    tip = np.array([1.0, 0.55]) * (section - (0.0, flats / 2)) * 0.6 + (0.0, flats / 2)
+    shape = loft(
+        [across_x(section, start), across_x(section, shoulder), across_x(tip, end)],
+    )
+    return PartDesign(
+        [Part("bit", "dark_steel", shape.solid, shape.hulls)],
+        PartGrasp(flats * _HEX, flats, start + 0.42 * length),
+        1,
+    )
+
+
+def bracket(length: float, width: float, height: float) -> PartDesign:
+    """An L from above: a long leg along x and a short one along y, each `width / 3` thick."""
+    thick = max(width / 3, THINNEST_MM)
+    long_leg = _rectangle(length, thick) + (0.0, (thick - width) / 2)
+    short_leg = _rectangle(thick, width) + ((length - thick) / 2, 0.0)
+    profile = CrossSection([long_leg]) + CrossSection([short_leg])
+    cells = [CrossSection([leg]) for leg in (long_leg, short_leg)]
+    shape = plate(profile, 0.0, height, _BEVEL, cells)
+    parts = [Part("bracket", _light(length), shape.solid, shape.hulls)]
+    # The fingers stay beside the short leg.
+    x = min(_middle_of_mass(parts)[0], length / 2 - thick - 12.0)
+    if x < -length / 2:
+        raise PartError("its long leg is too short for the jaws")
+    return PartDesign(parts, PartGrasp(thick, height, x, (thick - width) / 2), 1)
+
+
+@dataclass(frozen=True)
+class PartKind:
+    """A kind of part: its design, and its proportions."""
+
+    design: Callable[..., PartDesign]
+    dimensions: str
+    """The names of the dimensions."""
+    default: tuple[float, ...]
+    scaled: Callable[[float, float, float], tuple[float, ...]]
+    """The dimensions of a part of a length, given two numbers from 0 to 1 that vary its shape."""
+    longest: float = LONGEST_MM
+
+
+def _between(low: float, high: float, share: float) -> float:
+    return low + share * (high - low)
+
+
+def _scaled_ring(length: float, u: float, v: float) -> tuple[float, ...]:
+    if length <= WIDEST_MM:
+        return length, _between(0.35, 0.6, u) * length, _height(length, 0.2, 0.4, v)
+    rim = _between(8.0, 13.0, u)
+    return length, length - 2 * rim, _between(8.0, 14.0, v)
+
+
+def _height(length: float, low: float, high: float, share: float) -> float:
+    """A height in proportion to the length, but neither too thin nor too high for a kit."""
+    return min(max(_between(low, high, share) * length, THINNEST_MM + 1.0), 30.0)
+
+
+def _width(length: float, low: float, high: float, share: float) -> float:
+    return min(max(_between(low, high, share) * length, 8.0), 60.0)
+
+
+PART_KINDS: dict[str, PartKind] = {
+    "ring": PartKind(ring, "outer x inner x height", (40.0, 20.0, 12.0), _scaled_ring),
+    "disc": PartKind(
+        disc,
+        "diameter x height",
+        (35.0, 10.0),
+        lambda length, u, v: (length, _height(length, 0.2, 0.45, v)),
+        longest=WIDEST_MM,
+    ),
+    "cylinder": PartKind(
+        disc,
+        "diameter x height",
+        (30.0, 40.0),
+        lambda length, u, v: (length, min(_between(0.8, 1.3, v) * length, 40.0)),
+        longest=50.0,
+    ),
+    "rod": PartKind(
+        rod,
+        "length x diameter",
+        (100.0, 14.0),
+        lambda length, u, v: (length, min(max(_between(0.12, 0.3, u) * length, 6.0), 25.0)),
+    ),
+    "plate": PartKind(
+        plate_part,
+        "length x width x height",
+        (100.0, 50.0, 6.0),
+        lambda length, u, v: (
+            length,
+            _width(length, 0.4, 0.8, u),
+            min(_height(length, 0.05, 0.12, v), 10.0),
+        ),
+    ),
+    "block": PartKind(
+        plate_part,
+        "length x width x height",
+        (40.0, 25.0, 20.0),
+        lambda length, u, v: (
+            length,
+            min(_width(length, 0.5, 0.9, u), 40.0),
+            _height(length, 0.3, 0.6, v),
+        ),
+    ),
+    "board": PartKind(
+        board,
+        "length x width x height",
+        (85.0, 56.0, 16.0),
+        lambda length, u, v: (
+            length,
+            _width(length, 0.5, 0.8, u),
+            min(_height(length, 0.15, 0.3, v) + 2.0, 16.0),
+        ),
+    ),
+    "bolt": PartKind(
+        bolt,
+        "length x diameter",
+        (30.0, 10.0),
+        lambda length, u, v: (min(length, 45.0), max(_between(0.35, 0.6, u) * length, 6.0)),
+        longest=45.0,
+    ),
+    "pin": PartKind(
+        pin,
+        "length x diameter",
+        (40.0, 8.0),
+        lambda length, u, v: (length, min(max(_between(0.15, 0.28, u) * length, 5.0), 20.0)),
+    ),
+    "socket": PartKind(
+        socket,
+        "diameter x height",
+        (22.0, 26.0),
+        lambda length, u, v: (length, min(max(_between(0.7, 1.2, v) * length, 10.0), 40.0)),
+        longest=55.0,
+    ),
+    "bit": PartKind(
+        bit,
+        "length x flats",
+        (25.0, 6.35),
+        lambda length, u, v: (length, min(max(_between(0.2, 0.3, u) * length, 6.0), 12.0)),
+        longest=100.0,
+    ),
+    "bracket": PartKind(
+        bracket,
+        "length x width x height",
+        (60.0, 36.0, 12.0),
+        lambda length, u, v: (
+            length,
+            max(min(_between(0.5, 0.8, u) * length, 90.0), 12.0),
+            min(_height(length, 0.15, 0.35, v), 16.0),
+        ),
+    ),
+}
+"""The kinds of parts by name."""
+
+
+def design_part(kind: str, dimensions: tuple[float, ...]) -> PartDesign:
+    """Designs a part.
+
+    Args:
+        kind: a key of `PART_KINDS`.
+        dimensions: in mm, in the order of `PartKind.dimensions`.
+
+    Raises:
+        PartError: the dimensions do not make a part that the hand can hold.
+    """
+    known = PART_KINDS[kind]
+    if len(dimensions) != len(known.default):
+        raise PartError(f"give {known.dimensions} in mm")
+    if not all(2.0 <= value <= LONGEST_MM for value in dimensions):
+        raise PartError(f"each dimension must be 2 to {LONGEST_MM:g} mm")
+    design = known.design(*dimensions)
+    top = max(float(hull[:, 2].max()) for part in design.parts for hull in part.hulls)
+    if top < THINNEST_MM - 1e-6:
+        raise PartError(f"it is {top:g} mm high, but the hand needs at least {THINNEST_MM:g} mm")
+    if not 3.0 <= design.grasp.width_mm <= WIDEST_MM:
+        raise PartError(
+            f"it is {design.grasp.width_mm:.1f} mm wide where it is held; the jaws hold 3 to "
+            f"{WIDEST_MM:g} mm"
+        )
+    return design
+
+
+def _light(length: float) -> str:
+    """The material of a solid part: steel, or aluminium if that would be heavy."""
+    return "red_enamel" if length > 60 else "steel"
+
+
+def _middle_of_mass(parts: list[Part]) -> np.ndarray:
+    """(3,) the centre of mass of parts, in mm."""
+    return (
+        1e3 * mass_properties([(part.solid, MATERIALS[part.material].density) for part in parts])[1]
+    )
+
+
+def _prism(profile: np.ndarray, height: float) -> Shape:
+    """A bevelled prism over a convex profile."""
+    return plate(profile, 0.0, height, min(_BEVEL, height / 5), [_around(profile)])
+
+
+def _around(profile: np.ndarray) -> CrossSection:
+    """A square that contains a profile about the origin: one hull for all of it."""
+    return CrossSection.square((2 * LONGEST_MM, 2 * LONGEST_MM), True)
+
+
+def _rectangle(length: float, width: float) -> np.ndarray:
+    return np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)]) * (length / 2, width / 2)
+
+
+def _hexagon(flats: float) -> np.ndarray:
+    """A hexagon with its first corner toward +x."""
+    return circle(flats * _HEX / 2, segments=6)
+
+
+def _turn(angle: float) -> np.ndarray:
+    """(2, 2) that turns row vectors counter-clockwise by an angle in radians."""
+    cos, sin = math.cos(angle), math.sin(angle)
+    return np.array([[cos, sin], [-sin, cos]])
+
+
+def _sectors(outer: float, inner: float) -> list[CrossSection]:
+    """Cells that divide a ring; their inner edges are chords of the bore."""
+    angles = 2 * np.pi * np.arange(_SECTORS + 1) / _SECTORS
+    # Chords that touch the bore from outside would fill it: set the corners on the circle.
+    unit = np.column_stack([np.cos(angles), np.sin(angles)])
+    middle = np.column_stack(
+        [np.cos(angles[:-1] + np.pi / _SECTORS), np.sin(angles[:-1] + np.pi / _SECTORS)]
+    )
+    far = 1.2 * outer
+    return [
+        CrossSection(
+            [
+                np.array(
+                    [
+                        inner * unit[i],
+                        far * unit[i],
+                        far * middle[i],
+                        far * unit[i + 1],
+                        inner * unit[i + 1],
+                    ]
+                )
+            ]
+        )
+        for i in range(_SECTORS)
+    ]
