@@ -18,6 +18,7 @@ from kitting_drake.policies.factory import load_learned_policy, make_shape_match
 from kitting_drake.tasks.task import Scene
 from systems.action_quantizer import ActionQuantizer
 from systems.bounds import bounded
+from systems.cluttered_table import ClutteredTable
 from systems.oracle_policy import OraclePolicy
 from systems.pick_place_parameters import PickPlaceParameters
 from systems.pick_place_policy import PickPlacePolicy
@@ -359,6 +360,24 @@ def _make_oracle(site: PolicySite, quantizer: ActionQuantizer | None) -> OracleP
         release_clearance=site.planner.release_clearance,
         open_width=site.planner.open_width,
         brings_heights=not site.has_cameras,
+        table=_cluttered_table(site),
+    )
+
+
+def _cluttered_table(site: PolicySite) -> ClutteredTable | None:
+    scene = site.scene
+    if scene.laying_area is None:
+        return None
+    return ClutteredTable(
+        objects=site.objects,
+        grasps=[item.grasps for item in scene.objects],
+        area=scene.laying_area,
+        fixtures=[
+            item.X_WF.multiply(item.p_FPoints.T).T
+            for item in scene.fixtures
+            if item.p_FPoints is not None
+        ],
+        planner=site.planner,
     )
 
 

@@ -19,6 +19,8 @@ from kitting_drake.hkd.tools.toolsets import SPLITS, toolsets
 from kitting_drake.policies.data.learning import Learning
 from kitting_drake.tasks.boxes import box_object
 from kitting_drake.tasks.kitting import diagnosis
+from kitting_drake.tasks.kitting.start_groups import START_KINDS
+from kitting_drake.tasks.kitting.starts import APART, FACES, cluttered_scene, draw_start
 from kitting_drake.tasks.kitting.tool_poses import (
     TablePose,
     check_arrangement,
@@ -96,8 +98,22 @@ class _DrawnKitting(_KittingTask):
     # Number of boxes without a cavity, as clutter; fewer if there is no room.
     distractors: int = bounded(0, 0, 12)
 
+    # How the tools lie at the start: apart, touching (side by side, 0 to 3 mm apart), crossed (one
+    # across another), leaning (half of them on the kit block's sides), or heap (fallen from about
+    # 150 mm). All but apart come to rest by physics.
+    start: str = APART
+
+    # Whether the tools start in a shallow tray.
+    tray: bool = False
+
+    # as_drawn: all tools rest on the face that lies down in their cavities. any: in a heap, tools
+    # may come to rest on another face.
+    faces: str = "as_drawn"
+
     def _draw_scene(self, tools: list[Tool], grid: PixelGrid, seed: int) -> Scene:
         kit = self._kit_of(tools)
+        if self.start != APART or self.tray:
+            return self._draw_settled(kit, tools, grid, seed)
         rng = np.random.default_rng(seed)
         X_WKit, X_WTools = draw_poses(
             kit,
@@ -128,6 +144,38 @@ class _DrawnKitting(_KittingTask):
             max_actions=self.tries * len(tools),
         )
 
+    def _draw_settled(self, kit: Kit, tools: list[Tool], grid: PixelGrid, seed: int) -> Scene:
+        rng = np.random.default_rng([seed, 4])
+        start = draw_start(
+            kit,
+            tools,
+            [tool.sdf for tool in tools],
+            kind=self.start,
+            tray=self.tray,
+            faces=self.faces,
+            grid=grid,
+            spacing=self.spacing,
+            yaw_range_deg=self.yaw_range_deg,
+            rng=rng,
+        )
+        order = rng.permutation(len(tools)) if self.random_order else np.arange(len(tools))
+        scene = kitting_scene(kit, start.X_WKit, start.X_WTools, order, self.success_threshold)
+        return cluttered_scene(
+            scene, kit, [tools[i] for i in order], start, grid, self.tries * len(tools)
+        )
+
+    def _check_start(self) -> None:
+        """Raises ValueError for unknown words and for combinations that do not exist."""
+        for name, words in (("start", START_KINDS), ("faces", FACES)):
+            if getattr(self, name) not in words:
+                raise ValueError(
+                    f"task.{name} must be one of {', '.join(words)}, not '{getattr(self, name)}'"
+                )
+        if self.tray and self.start == "leaning":
+            raise ValueError("task.tray must be false if task.start is leaning")
+        if self.distractors and (self.tray or self.start != APART):
+            raise ValueError("task.distractors must be 0 unless task.start is apart, without a tray")
+
 
 @dataclass
 class Kitting(_DrawnKitting):
@@ -157,6 +205,7 @@ class Kitting(_DrawnKitting):
 
     def validate(self) -> None:
         _check_count(len(self.tools))
+        self._check_start()
 
 
 @dataclass
@@ -214,6 +263,7 @@ class ToolsetKitting(_DrawnKitting):
             raise ValueError(f"task.split must be one of {', '.join(SPLITS)}, not '{self.split}'")
         if self.tool_length[0] > self.tool_length[1]:
             raise ValueError("task.tool_length must be [least, greatest]")
+        self._check_start()
 
 
 @dataclass

@@ -1,0 +1,263 @@
+"""What lies on what, and which grasps are free, from true poses: for the oracle in clutter."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+from pydrake.math import RigidTransform
+
+from systems.free_area import find_free_pose
+from systems.grasp import Grasp
+from systems.hand_geometry import (
+    FINGER_BASE_DISTANCE,
+    FINGER_DEPTH,
+    FINGER_LENGTH,
+    FINGERTIP_DEPTH,
+    FINGERTIP_DISTANCE,
+    PAD_LENGTH,
+    PALM_SIZE,
+)
+from systems.motion_heights import motion_heights
+from systems.pick_place_parameters import PickPlaceParameters
+from systems.placement import PlacedObject, heading
+from systems.signals import PlanarPose, SurfaceHeights, wrap_to_pi
+
+Points = NDArray[np.float64]
+
+_CELL = 0.004
+"""Side of the squares in which objects are compared, in metres."""
+_ABOVE = 0.002
+"""An object lies on another if it is above it, to within this, in metres."""
+_LEAST_SQUARES = 2
+"""It covers the other if it is above it in so many squares."""
+_FLAT = math.radians(2.5)
+"""An object tilted less lies flat."""
+_STEEPEST = math.radians(25.0)
+"""Jaws do not hold faces that lean further than this."""
+_SLENDER = 0.020
+"""Height of a finger's slender tip, in metres."""
+_PALM_HEIGHT = FINGERTIP_DISTANCE - FINGER_BASE_DISTANCE - 0.003
+"""Height of the palm above the fingertips, less a margin, in metres."""
+_MARGIN = 0.001
+"""Least clearance of the fingers, in metres."""
+_SAME_PLACE, _SAME_ANGLE = 0.006, math.radians(15.0)
+"""A grasp this close to one that failed is the same."""
+
+
+@dataclass(frozen=True)
+class HeldFromAbove:
+    """A grasp of an object that may lie tilted."""
+
+    grasp: Grasp
+    gripper: PlanarPose
+    """The gripper's pose in the world."""
+    top: float
+    """World z of the object's top between the pads, in metres; `bottom`, `lowest` likewise."""
+    bottom: float
+    lowest: float
+    """World z of the whole object's lowest point."""
+    obstruction: int
+    """How many points of other things are in the way of the open hand."""
+
+    def heights(self, highest: float, rim: float) -> SurfaceHeights:
+        """The surfaces for the planner.
+
+        Args:
+            highest: world z of the highest surface, in metres.
+            rim: world z of the rim of the place, in metres; 0 for the table.
+        """
+        # The object hangs lower than where it is gripped.
+        highest += self.bottom - self.lowest
+        return SurfaceHeights(
+            pick_top=self.top,
+            support=self.bottom,
+            place_rim=rim,
+            near_pick=highest,
+            near_place=highest,
+            highest=highest,
+        )
+
+
+@dataclass(frozen=True)
+class ClutteredTable:
+    """The objects, what stands between them, and the hand."""
+
+    objects: Sequence[PlacedObject]
+    grasps: Sequence[Sequence[Grasp]]
+    """The grasps of each object, best first."""
+    area: tuple[tuple[float, float], tuple[float, float]]
+    """Where objects may be laid aside: lower and upper (x, y) corner, in metres."""
+    fixtures: Sequence[Points] = ()
+    """(m, 3) points in the world of each thing that never moves."""
+    planner: PickPlaceParameters = field(default_factory=PickPlaceParameters)
+
+    def points(self, poses: Sequence[RigidTransform]) -> list[Points]:
+        """(m, 3) the points of each object in the world."""
+        return [
+            X_WB.multiply(item.p_BPoints.T).T
+            for item, X_WB in zip(self.objects, poses, strict=True)
+        ]
+
+    def covered(self, points: Sequence[Points]) -> list[set[int]]:
+        """For each object, those that lie on it."""
+        squares = [_squares(item) for item in points]
+        return [
+            {
+                other
+                for other, above in enumerate(squares)
+                if other != index and _is_on(above, below)
+            }
+            for index, below in enumerate(squares)
+        ]
+
+    def is_flat(self, X_WB: RigidTransform) -> bool:
+        """Whether an object lies flat and the right way up."""
+        return tilt(X_WB) < _FLAT
+
+    def holds(
+        self,
+        index: int,
+        poses: Sequence[RigidTransform],
+        points: Sequence[Points],
+        failed: Sequence[PlanarPose] = (),
+        *,
+        ignores_fixtures: bool = False,
+    ) -> list[HeldFromAbove]:
+        """The grasps of an object, best first; without those that failed or would slip.
+
+        Args:
+            index: the object.
+            poses: X_WB of each object.
+            points: the points of each object in the world.
+            failed: earlier picks in the world that held nothing.
+            ignores_fixtures: whether fixtures are never in the way, as for an object in a cavity.
+        """
+        around = [item for other, item in enumerate(points) if other != index]
+        if not ignores_fixtures:
+            around += list(self.fixtures)
+        others = np.concatenate([np.zeros((0, 3)), *around])
+        near = np.linalg.norm((others - poses[index].translation())[:, :2], axis=1) < 0.35
+        found = []
+        for grasp in self.grasps[index]:
+            gripper = _gripper_pose(poses[index], grasp)
+            if gripper is None or any(_is_same(gripper, other) for other in failed):
+                continue
+            hold = self._hold(grasp, gripper, points[index], others[near])
+            if hold is not None:
+                found.append(hold)
+        return found
+
+    def _hold(
+        self, grasp: Grasp, gripper: PlanarPose, own: Points, others: Points
+    ) -> HeldFromAbove | None:
+        along, across = _in_hand(own, gripper)
+        between = (np.abs(along) < PAD_LENGTH / 2) & (np.abs(across) < grasp.width / 2 + 0.003)
+        if not between.any():
+            return None
+        heights = own[between, 2]
+        top, bottom = float(heights.max()), float(heights.min())
+        surfaces = SurfaceHeights(pick_top=top, support=bottom)
+        tip = motion_heights(surfaces, self.planner).grasp
+        half = self.planner.open_width / 2
+        count = in_the_way(others, gripper, tip + _MARGIN, (grasp.width / 2, half))
+        lowest = float(own[:, 2].min())
+        return HeldFromAbove(grasp, gripper, top, bottom, lowest, count)
+
+    def aside(
+        self, index: int, hold: HeldFromAbove, poses: Sequence[RigidTransform], points: Sequence[Points]
+    ) -> PlanarPose | None:
+        """Where the gripper lets go of an object to lay it on a free part of the table.
+
+        None if no part is free.
+        """
+        item, X_WB = self.objects[index], poses[index]
+        outline = item.p_BPoints[:: max(1, len(item.p_BPoints) // 400), :2]
+        occupied = [other[:, :2] for k, other in enumerate(points) if k != index]
+        occupied += [other[:, :2] for other in self.fixtures]
+        found = find_free_pose(
+            outline,
+            np.concatenate([np.zeros((0, 2)), *occupied]),
+            self.area,
+            near=X_WB.translation()[:2],
+            yaw=heading(X_WB),
+        )
+        if found is None:
+            return None
+        grasp, yaw = hold.grasp, found.theta
+        cos, sin = math.cos(yaw), math.sin(yaw)
+        theta = hold.gripper.theta + wrap_to_pi(yaw - heading(X_WB))
+        return PlanarPose(
+            found.x + cos * grasp.x - sin * grasp.y, found.y + sin * grasp.x + cos * grasp.y, theta
+        )
+
+
+def tilt(X_WB: RigidTransform) -> float:
+    """The angle between body z and world z, in radians."""
+    return math.acos(float(np.clip(X_WB.rotation().matrix()[2, 2], -1.0, 1.0)))
+
+
+def in_the_way(
+    points: Points, gripper: PlanarPose, tip: float, halves: tuple[float, float]
+) -> int:
+    """How many points lie where the hand moves as it comes down with open jaws and closes them.
+
+    Args:
+        points: (m, 3) in the world, in metres.
+        gripper: the gripper's pose.
+        tip: world z of the fingertips, in metres.
+        halves: half of the opening with the jaws closed and open, in metres.
+    """
+    along, across = _in_hand(points, gripper)
+    along, across, z = np.abs(along), np.abs(across), points[:, 2]
+    closed, opened = halves
+    in_fingers = (along < FINGER_LENGTH / 2 + _MARGIN) & (across > closed) & (z > tip)
+    reach = np.where(z > tip + _SLENDER, FINGER_DEPTH, FINGERTIP_DEPTH) + _MARGIN
+    in_fingers &= across < opened + reach
+    in_palm = (along < PALM_SIZE[0] / 2) & (across < PALM_SIZE[1] / 2) & (z > tip + _PALM_HEIGHT)
+    return int((in_fingers | in_palm).sum())
+
+
+def _in_hand(points: Points, gripper: PlanarPose) -> tuple[Points, Points]:
+    """Coordinates along the pads and across them, in metres."""
+    cos, sin = math.cos(gripper.theta), math.sin(gripper.theta)
+    dx, dy = points[:, 0] - gripper.x, points[:, 1] - gripper.y
+    return cos * dx + sin * dy, cos * dy - sin * dx
+
+
+def _gripper_pose(X_WB: RigidTransform, grasp: Grasp) -> PlanarPose | None:
+    """The gripper's pose in the world; None if the gripped faces lean too far."""
+    R = X_WB.rotation().matrix()
+    across = R @ np.array([-math.sin(grasp.theta), math.cos(grasp.theta), 0.0])
+    if abs(across[2]) > math.sin(_STEEPEST):
+        return None
+    x, y, _ = X_WB @ np.array([grasp.x, grasp.y, grasp.surface_height / 2])
+    theta = math.atan2(-across[0], across[1])
+    return PlanarPose(float(x), float(y), theta)
+
+
+def _is_same(gripper: PlanarPose, other: PlanarPose) -> bool:
+    turn = abs(math.remainder(gripper.theta - other.theta, math.pi))
+    return (
+        math.hypot(gripper.x - other.x, gripper.y - other.y) < _SAME_PLACE and turn < _SAME_ANGLE
+    )
+
+
+Squares = dict[tuple[int, int], tuple[float, float]]
+
+
+def _squares(points: Points) -> Squares:
+    """Lowest and highest z of points (m, 3) in each square of the table that has some."""
+    keys, where = np.unique(np.floor(points[:, :2] / _CELL).astype(int), axis=0, return_inverse=True)
+    low, high = np.full(len(keys), np.inf), np.full(len(keys), -np.inf)
+    np.minimum.at(low, where.reshape(-1), points[:, 2])
+    np.maximum.at(high, where.reshape(-1), points[:, 2])
+    return {tuple(key): (a, b) for key, a, b in zip(keys.tolist(), low, high, strict=True)}
+
+
+def _is_on(above: Squares, below: Squares) -> bool:
+    shared = above.keys() & below.keys()
+    return sum(above[key][0] > below[key][1] - _ABOVE for key in shared) >= _LEAST_SQUARES
