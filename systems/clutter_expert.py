@@ -7,7 +7,13 @@ from collections.abc import Sequence
 
 from pydrake.math import RigidTransform
 
-from systems.cluttered_table import ClutteredTable, HeldFromAbove, in_the_way
+from systems.cluttered_table import (
+    ClutteredTable,
+    HeldFromAbove,
+    in_the_way,
+    middle,
+    moved_gripper,
+)
 from systems.grasp import Grasp
 from systems.placement import displacement, heading
 from systems.signals import PickPlaceAction, PlanarPose, wrap_to_pi
@@ -53,7 +59,7 @@ class ClutterExpert:
             X_WGoal: its goal pose.
             rim: world z of the cavity's rim, in metres.
         """
-        if self._covered[index] or not self._table.is_flat(self._poses[index]):
+        if self._covered[index] or not self._table.is_flat(index, self._poses[index]):
             return None
         best = self._table.grasps[index][0]
         for hold in self._holds(index, X_WGoal):
@@ -91,10 +97,10 @@ class ClutterExpert:
         return holds or self._table.holds(*arguments, ignores_fixtures=in_cavity)
 
     def _place(self, index: int, hold: HeldFromAbove, X_WGoal: RigidTransform) -> PlanarPose:
-        grasp, X_WB = hold.grasp, self._poses[index]
-        x, y, _ = X_WGoal @ [grasp.x, grasp.y, grasp.surface_height / 2]
-        theta = hold.gripper.theta + wrap_to_pi(heading(X_WGoal) - heading(X_WB))
-        return PlanarPose(float(x), float(y), theta)
+        yaw = heading(self._poses[index])
+        x, y, _ = X_WGoal @ self._table.objects[index].p_BMiddle
+        goal = PlanarPose(float(x), float(y), heading(X_WGoal))
+        return moved_gripper(hold.gripper, middle(self._points[index], yaw), yaw, goal)
 
     def _may_let_go(self, index: int, grasp: Grasp, place: PlanarPose, rim: float) -> bool:
         """Whether no other object is under the hand as it opens."""

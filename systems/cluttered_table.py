@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
-from pydrake.math import RigidTransform
+from pydrake.math import RigidTransform, RollPitchYaw
 
 from systems.free_area import find_free_pose
 from systems.grasp import Grasp
@@ -21,10 +21,11 @@ from systems.hand_geometry import (
     PAD_LENGTH,
     PALM_SIZE,
 )
+from systems.ledge import Ledge
 from systems.motion_heights import motion_heights
 from systems.pick_place_parameters import PickPlaceParameters
 from systems.placement import PlacedObject, heading
-from systems.signals import PlanarPose, SurfaceHeights, wrap_to_pi
+from systems.signals import PlanarPose, SurfaceHeights
 
 Points = NDArray[np.float64]
 
@@ -36,6 +37,14 @@ _LEAST_SQUARES = 2
 """It covers the other if it is above it in so many squares."""
 _FLAT = math.radians(2.5)
 """An object tilted less lies flat."""
+_SAME_SHAPE = 0.0008
+"""Mean distance of the surfaces of an object and of itself turned over that is none, in metres."""
+_UPSIDE_DOWN = math.radians(120.0)
+"""An object tilted further lies the wrong way up."""
+_ON_EDGE = math.radians(60.0)
+"""An object tilted further, and not upside down, stands on its edge."""
+_ALONG_EDGE = (0.0, 0.02, -0.02, 0.04, -0.04)
+"""Where an object that stands on its edge is gripped, along it from its centre, in metres."""
 _STEEPEST = math.radians(25.0)
 """Jaws do not hold faces that lean further than this."""
 _SLENDER = 0.020
@@ -94,6 +103,8 @@ class ClutteredTable:
     fixtures: Sequence[Points] = ()
     """(m, 3) points in the world of each thing that never moves."""
     planner: PickPlaceParameters = field(default_factory=PickPlaceParameters)
+    ledge: Ledge | None = None
+    """A block over whose edges objects can be turned."""
 
     def points(self, poses: Sequence[RigidTransform]) -> list[Points]:
         """(m, 3) the points of each object in the world."""
@@ -114,9 +125,22 @@ class ClutteredTable:
             for index, below in enumerate(squares)
         ]
 
-    def is_flat(self, X_WB: RigidTransform) -> bool:
-        """Whether an object lies flat and the right way up."""
-        return tilt(X_WB) < _FLAT
+    def is_flat(self, index: int, X_WB: RigidTransform) -> bool:
+        """Whether an object lies as it should lie in its cavity, apart from its heading.
+
+        It lies flat and the right way up, or its shape does not tell the difference.
+        """
+        if tilt(X_WB) < _FLAT:
+            return True
+        item = self.objects[index]
+        if abs(math.asin(float(np.clip(X_WB.rotation().matrix()[2, 0], -1, 1)))) > _FLAT:
+            return False
+        R = RollPitchYaw(0, 0, -heading(X_WB)).ToRotationMatrix() @ X_WB.rotation()
+        points = item.p_BPoints @ R.matrix().T
+        low, high = points.min(axis=0), points.max(axis=0)
+        own_low, own_high = item.p_BPoints.min(axis=0), item.p_BPoints.max(axis=0)
+        points = points + (own_low + own_high - low - high) / 2
+        return float(item.tree.query(points)[0].mean()) < _SAME_SHAPE
 
     def holds(
         self,
@@ -142,13 +166,29 @@ class ClutteredTable:
         others = np.concatenate([np.zeros((0, 3)), *around])
         near = np.linalg.norm((others - poses[index].translation())[:, :2], axis=1) < 0.35
         found = []
-        for grasp in self.grasps[index]:
-            gripper = _gripper_pose(poses[index], grasp)
+        for grasp, gripper in self._grippers(index, poses[index]):
             if gripper is None or any(_is_same(gripper, other) for other in failed):
                 continue
             hold = self._hold(grasp, gripper, points[index], others[near])
             if hold is not None:
                 found.append(hold)
+        return found
+
+    def _grippers(self, index: int, X_WB: RigidTransform) -> list[tuple[Grasp, PlanarPose | None]]:
+        """The grasps, and the gripper's pose in the world for each."""
+        if not _ON_EDGE < tilt(X_WB) < _UPSIDE_DOWN:
+            return [(grasp, _gripper_pose(X_WB, grasp)) for grasp in self.grasps[index]]
+        # The jaws close along z of B, across the object's thickness.
+        item = self.objects[index]
+        z_axis = X_WB.rotation().matrix()[:, 2]
+        theta = math.atan2(-z_axis[0], z_axis[1])
+        height = float(np.ptp(item.p_BPoints[:, 2]))
+        found: list[tuple[Grasp, PlanarPose | None]] = []
+        for offset in _ALONG_EDGE:
+            p_B = np.array([item.p_BCenter[0] + offset, item.p_BCenter[1], item.p_BMiddle[2]])
+            x, y, _ = (X_WB @ p_B).tolist()
+            grasp = Grasp(float(p_B[0]), float(p_B[1]), 0.0, height, height)
+            found.append((grasp, PlanarPose(x, y, theta)))
         return found
 
     def _hold(
@@ -168,18 +208,31 @@ class ClutteredTable:
         return HeldFromAbove(grasp, gripper, top, bottom, lowest, count)
 
     def aside(
-        self, index: int, hold: HeldFromAbove, poses: Sequence[RigidTransform], points: Sequence[Points]
+        self,
+        index: int,
+        hold: HeldFromAbove,
+        poses: Sequence[RigidTransform],
+        points: Sequence[Points],
     ) -> PlanarPose | None:
-        """Where the gripper lets go of an object to lay it on a free part of the table.
+        """Where the gripper lets go of an object to lay it aside; None if there is no room.
 
-        None if no part is free.
+        It is a free part of the table. For an object that lies the wrong way up, it is the edge of
+        the ledge: released there with its centre of mass outside, the object turns over.
         """
         item, X_WB = self.objects[index], poses[index]
-        outline = item.p_BPoints[:: max(1, len(item.p_BPoints) // 400), :2]
-        occupied = [other[:, :2] for k, other in enumerate(points) if k != index]
-        occupied += [other[:, :2] for other in self.fixtures]
+        others = [other for k, other in enumerate(points) if k != index]
+        if self.ledge is not None and tilt(X_WB) > _UPSIDE_DOWN:
+            yaw, p_WCenter = heading(X_WB), X_WB @ item.p_BCenter
+            cos, sin = math.cos(yaw), math.sin(yaw)
+            outline = (points[index] - p_WCenter)[:, :2] @ np.array([[cos, -sin], [sin, cos]])
+            turned = self.ledge.turning_pose(
+                outline, p_WCenter, np.concatenate([np.zeros((0, 3)), *others]), self.area
+            )
+            if turned is not None:
+                return moved_gripper(hold.gripper, p_WCenter, yaw, turned)
+        occupied = [other[:, :2] for other in (*others, *self.fixtures)]
         found = find_free_pose(
-            outline,
+            (item.p_BPoints - item.p_BMiddle)[:: max(1, len(item.p_BPoints) // 400), :2],
             np.concatenate([np.zeros((0, 2)), *occupied]),
             self.area,
             near=X_WB.translation()[:2],
@@ -187,12 +240,38 @@ class ClutteredTable:
         )
         if found is None:
             return None
-        grasp, yaw = hold.grasp, found.theta
-        cos, sin = math.cos(yaw), math.sin(yaw)
-        theta = hold.gripper.theta + wrap_to_pi(yaw - heading(X_WB))
-        return PlanarPose(
-            found.x + cos * grasp.x - sin * grasp.y, found.y + sin * grasp.x + cos * grasp.y, theta
+        return moved_gripper(
+            hold.gripper, middle(points[index], heading(X_WB)), heading(X_WB), found
         )
+
+
+def moved_gripper(
+    gripper: PlanarPose, p_WHeld: NDArray[np.float64], yaw: float, goal: PlanarPose
+) -> PlanarPose:
+    """The gripper's pose after it has carried an object.
+
+    Args:
+        gripper: its pose before.
+        p_WHeld: a point of the object before.
+        yaw: the object's heading before, in radians.
+        goal: the point and the heading afterwards.
+    """
+    turn = goal.theta - yaw
+    dx, dy = gripper.x - p_WHeld[0], gripper.y - p_WHeld[1]
+    cos, sin = math.cos(turn), math.sin(turn)
+    return PlanarPose(
+        float(goal.x + cos * dx - sin * dy),
+        float(goal.y + sin * dx + cos * dy),
+        gripper.theta + turn,
+    )
+
+
+def middle(points: Points, yaw: float) -> NDArray[np.float64]:
+    """(2,) the middle of the bounding box of points (m, 3), with a side in the direction `yaw`."""
+    cos, sin = math.cos(yaw), math.sin(yaw)
+    along, across = points[:, :2] @ [cos, sin], points[:, :2] @ [-sin, cos]
+    u, v = (along.min() + along.max()) / 2, (across.min() + across.max()) / 2
+    return np.array([cos * u - sin * v, sin * u + cos * v])
 
 
 def tilt(X_WB: RigidTransform) -> float:
@@ -200,9 +279,7 @@ def tilt(X_WB: RigidTransform) -> float:
     return math.acos(float(np.clip(X_WB.rotation().matrix()[2, 2], -1.0, 1.0)))
 
 
-def in_the_way(
-    points: Points, gripper: PlanarPose, tip: float, halves: tuple[float, float]
-) -> int:
+def in_the_way(points: Points, gripper: PlanarPose, tip: float, halves: tuple[float, float]) -> int:
     """How many points lie where the hand moves as it comes down with open jaws and closes them.
 
     Args:
@@ -241,9 +318,7 @@ def _gripper_pose(X_WB: RigidTransform, grasp: Grasp) -> PlanarPose | None:
 
 def _is_same(gripper: PlanarPose, other: PlanarPose) -> bool:
     turn = abs(math.remainder(gripper.theta - other.theta, math.pi))
-    return (
-        math.hypot(gripper.x - other.x, gripper.y - other.y) < _SAME_PLACE and turn < _SAME_ANGLE
-    )
+    return math.hypot(gripper.x - other.x, gripper.y - other.y) < _SAME_PLACE and turn < _SAME_ANGLE
 
 
 Squares = dict[tuple[int, int], tuple[float, float]]
@@ -251,7 +326,9 @@ Squares = dict[tuple[int, int], tuple[float, float]]
 
 def _squares(points: Points) -> Squares:
     """Lowest and highest z of points (m, 3) in each square of the table that has some."""
-    keys, where = np.unique(np.floor(points[:, :2] / _CELL).astype(int), axis=0, return_inverse=True)
+    keys, where = np.unique(
+        np.floor(points[:, :2] / _CELL).astype(int), axis=0, return_inverse=True
+    )
     low, high = np.full(len(keys), np.inf), np.full(len(keys), -np.inf)
     np.minimum.at(low, where.reshape(-1), points[:, 2])
     np.maximum.at(high, where.reshape(-1), points[:, 2])

@@ -69,5 +69,6 @@ def find_free_pose(
         score[clearance < _LEAST] = -np.inf
         index = int(np.argmax(score))
         if np.isfinite(score[index]) and (best is None or score[index] > best[0]):
-            best = float(score[index]), PlanarPose(*free[index].tolist(), theta)
+            x, y = free[index].tolist()
+            best = float(score[index]), PlanarPose(x, y, theta)
     return None if best is None else best[1]

@@ -73,12 +73,15 @@ class OraclePolicy(LeafSystem):
         input_ports:
         - body_poses
         - kept_goals
+        - failed_picks
         output_ports:
         - action
 
     - `body_poses` (abstract, list of RigidTransform by body index): the plant's port of that name.
     - `kept_goals` (one for each goal): the `PlacementMonitor`'s port of that name. If it is not
       connected, no goal is kept.
+    - `failed_picks` (abstract, a tuple of `PlanarPose`): the planner's port of that name. Used only
+      where objects lie on each other; optional.
     - `action` (abstract, `PickPlaceAction`): moves an object to a goal; `stop` when every goal is
       filled.
 
@@ -95,6 +98,9 @@ class OraclePolicy(LeafSystem):
     rounded annotated grasp. The place is the gripper pose that brings the object, held by the
     *rounded* pick, to its goal. Its position and the rotation are then rounded, too. A place
     network whose crop is centred on the pick needs these labels (section III-C.2).
+
+    Where objects touch or lie on each other (`table`), `ClutterExpert` chooses the object and the
+    grasp, and lays aside what is in the way. Its actions are not rounded and carry heights.
 
     Stateless: after a failed grasp, it returns the same object again.
     """
@@ -164,7 +170,9 @@ class OraclePolicy(LeafSystem):
         placements = evaluate_placements(self._objects, self._goals, self._success, poses, kept)
         action: PickPlaceAction | None = None
         if self._table is not None:
-            failed = self._failed_picks.Eval(context) if self._failed_picks.HasValue(context) else ()
+            failed = (
+                self._failed_picks.Eval(context) if self._failed_picks.HasValue(context) else ()
+            )
             action = self._act_in_clutter(self._table, poses, placements, kept, failed)
         else:
             plan = self._plan(poses, placements, kept)

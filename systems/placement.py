@@ -49,6 +49,13 @@ class PlacedObject:
     """(m, 3) points sampled uniformly by area from the object's surface, in metres."""
     symmetry: int = 1
     """Order of the rotational symmetry about body z; 1 for none. Declared with the object."""
+    p_BCom: NDArray[np.float64] | None = None
+    """(3,) the centre of mass, in metres; None: unknown."""
+
+    @property
+    def p_BCenter(self) -> NDArray[np.float64]:
+        """(3,) the centre of mass or, if it is unknown, the middle of the surface."""
+        return self.p_BPoints.mean(axis=0) if self.p_BCom is None else self.p_BCom
 
     @cached_property
     def p_BMiddle(self) -> NDArray[np.float64]:

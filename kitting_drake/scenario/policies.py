@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 from pydrake.systems.framework import LeafSystem
 
 from kitting_drake.common.errors import UserError
@@ -19,6 +20,7 @@ from kitting_drake.tasks.task import Scene
 from systems.action_quantizer import ActionQuantizer
 from systems.bounds import bounded
 from systems.cluttered_table import ClutteredTable
+from systems.ledge import Ledge
 from systems.oracle_policy import OraclePolicy
 from systems.pick_place_parameters import PickPlaceParameters
 from systems.pick_place_policy import PickPlacePolicy
@@ -378,7 +380,17 @@ def _cluttered_table(site: PolicySite) -> ClutteredTable | None:
             if item.p_FPoints is not None
         ],
         planner=site.planner,
+        ledge=_ledge(scene),
     )
+
+
+def _ledge(scene: Scene) -> Ledge | None:
+    """The first fixture that the hand keeps clear of: the kit's block."""
+    for item in scene.fixtures:
+        if item.p_FPoints is not None:
+            length, width, _ = np.ptp(item.p_FPoints, axis=0).tolist()
+            return Ledge(item.X_WF, (length, width))
+    return None
 
 
 def _digest(path: Path) -> str:

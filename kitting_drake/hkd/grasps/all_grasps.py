@@ -45,7 +45,9 @@ def all_grasps(tool: Tool) -> tuple[Grasp, ...]:
     except (OSError, ValueError, TypeError) as error:
         raise UserError(f"{folder / _FILE} is damaged: delete {folder}") from error
     s = tool.scale
-    proposed = [Grasp(s * g.x, s * g.y, g.theta, s * g.width, s * g.surface_height) for g in unscaled]
+    proposed = [
+        Grasp(s * g.x, s * g.y, g.theta, s * g.width, s * g.surface_height) for g in unscaled
+    ]
     return (tool.grasp, *(grasp for grasp in proposed if grasp.width <= WIDEST))
 
 

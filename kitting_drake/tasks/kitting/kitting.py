@@ -11,6 +11,7 @@ import numpy as np
 from pydrake.math import RigidTransform, RollPitchYaw
 
 from kitting_drake.common.errors import UserError
+from kitting_drake.hkd.grasps.all_grasps import all_grasps
 from kitting_drake.hkd.kits.kit import Kit, make_kit
 from kitting_drake.hkd.kits.parameters import KitParameters
 from kitting_drake.hkd.tools.scaling import scaled_tool
@@ -19,8 +20,7 @@ from kitting_drake.hkd.tools.toolsets import SPLITS, toolsets
 from kitting_drake.policies.data.learning import Learning
 from kitting_drake.tasks.boxes import box_object
 from kitting_drake.tasks.kitting import diagnosis
-from kitting_drake.tasks.kitting.start_groups import START_KINDS
-from kitting_drake.tasks.kitting.starts import APART, FACES, cluttered_scene, draw_start
+from kitting_drake.tasks.kitting.starts import APART, check_start, cluttered_scene, draw_start
 from kitting_drake.tasks.kitting.tool_poses import (
     TablePose,
     check_arrangement,
@@ -146,10 +146,12 @@ class _DrawnKitting(_KittingTask):
 
     def _draw_settled(self, kit: Kit, tools: list[Tool], grid: PixelGrid, seed: int) -> Scene:
         rng = np.random.default_rng([seed, 4])
+        grasps = [all_grasps(tool) for tool in tools]
         start = draw_start(
             kit,
             tools,
             [tool.sdf for tool in tools],
+            grasps,
             kind=self.start,
             tray=self.tray,
             faces=self.faces,
@@ -161,20 +163,8 @@ class _DrawnKitting(_KittingTask):
         order = rng.permutation(len(tools)) if self.random_order else np.arange(len(tools))
         scene = kitting_scene(kit, start.X_WKit, start.X_WTools, order, self.success_threshold)
         return cluttered_scene(
-            scene, kit, [tools[i] for i in order], start, grid, self.tries * len(tools)
+            scene, kit, [grasps[i] for i in order], start, grid, self.tries * len(tools)
         )
-
-    def _check_start(self) -> None:
-        """Raises ValueError for unknown words and for combinations that do not exist."""
-        for name, words in (("start", START_KINDS), ("faces", FACES)):
-            if getattr(self, name) not in words:
-                raise ValueError(
-                    f"task.{name} must be one of {', '.join(words)}, not '{getattr(self, name)}'"
-                )
-        if self.tray and self.start == "leaning":
-            raise ValueError("task.tray must be false if task.start is leaning")
-        if self.distractors and (self.tray or self.start != APART):
-            raise ValueError("task.distractors must be 0 unless task.start is apart, without a tray")
 
 
 @dataclass
@@ -205,7 +195,7 @@ class Kitting(_DrawnKitting):
 
     def validate(self) -> None:
         _check_count(len(self.tools))
-        self._check_start()
+        check_start(self.start, self.tray, self.faces, self.distractors)
 
 
 @dataclass
@@ -263,7 +253,7 @@ class ToolsetKitting(_DrawnKitting):
             raise ValueError(f"task.split must be one of {', '.join(SPLITS)}, not '{self.split}'")
         if self.tool_length[0] > self.tool_length[1]:
             raise ValueError("task.tool_length must be [least, greatest]")
-        self._check_start()
+        check_start(self.start, self.tray, self.faces, self.distractors)
 
 
 @dataclass

@@ -29,8 +29,8 @@ from pydrake.systems.framework import DiagramBuilder
 from kitting_drake.common.sdformat import model_text
 from kitting_drake.hkd.tools.sdf import FRICTION, HUNT_CROSSLEY_DISSIPATION, HYDROELASTIC_MODULUS
 
-# The contact of episodes, so that what has settled stays at rest when the episode begins. Contact at
-# points does not come to rest on a few convex pieces, and longer steps tumble.
+# The contact of episodes, so that what has settled stays at rest when the episode begins. With
+# contact at points nothing comes to rest, and longer steps are no faster.
 _CONTACT = MultibodyPlantConfig(
     time_step=1 / 128, contact_model="hydroelastic", discrete_contact_approximation="lagged"
 )
@@ -139,8 +139,7 @@ def settle(
 def _is_near(X_WB: RigidTransform, other: RigidTransform) -> bool:
     X = X_WB.InvertAndCompose(other)
     return bool(
-        np.linalg.norm(X.translation()) < _POSITION
-        and X.rotation().ToAngleAxis().angle() < _ANGLE
+        np.linalg.norm(X.translation()) < _POSITION and X.rotation().ToAngleAxis().angle() < _ANGLE
     )
 
 
@@ -151,7 +150,9 @@ def _add(plant: MultibodyPlant, parser: Parser, model: SettlingModel, number: in
     unit = UnitInertia().SetFromRotationalInertia(inertia, model.mass)
     body = plant.AddRigidBody(
         f"settling_{number}",
-        SpatialInertia(model.mass, model.center_of_mass, unit.ShiftFromCenterOfMass(-model.center_of_mass)),
+        SpatialInertia(
+            model.mass, model.center_of_mass, unit.ShiftFromCenterOfMass(-model.center_of_mass)
+        ),
     )
     properties = ProximityProperties()
     AddCompliantHydroelasticProperties(_SIZE_HINT, HYDROELASTIC_MODULUS, properties)
@@ -160,7 +161,11 @@ def _add(plant: MultibodyPlant, parser: Parser, model: SettlingModel, number: in
     )
     for index, points in enumerate(model.pieces):
         plant.RegisterCollisionGeometry(
-            body, RigidTransform(), Convex(points.T, f"piece_{index}"), f"{number}_{index}", properties
+            body,
+            RigidTransform(),
+            Convex(points.T, f"piece_{index}"),
+            f"{number}_{index}",
+            properties,
         )
     return body
 

@@ -17,7 +17,7 @@ KIT = -1
 
 _GAP = 0.003
 """Largest gap between touching tools, in metres."""
-_ALONGSIDE = 0.04
+_ALONGSIDE = 0.10
 """Touching tools are shifted along each other by up to this, in metres."""
 _SPLAY = math.radians(6.0)
 """Touching tools differ in direction by up to this."""
@@ -83,9 +83,7 @@ def _alone(index: int, tool: Tool) -> Group:
     return Group({index: RigidTransform()}, tool.footprint.hull())
 
 
-def _apart(
-    block: Group, kit: Kit, tools: Sequence[Tool], rng: np.random.Generator
-) -> list[Group]:
+def _apart(block: Group, kit: Kit, tools: Sequence[Tool], rng: np.random.Generator) -> list[Group]:
     return [block, *(_alone(index, tool) for index, tool in enumerate(tools))]
 
 

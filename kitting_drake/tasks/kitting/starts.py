@@ -14,44 +14,30 @@ from numpy.typing import NDArray
 from pydrake.math import RigidTransform, RollPitchYaw
 
 from kitting_drake.common.errors import UserError
-from kitting_drake.common.paths import MODELS
-from kitting_drake.hkd.grasps.all_grasps import all_grasps
 from kitting_drake.hkd.kits.kit import Kit
 from kitting_drake.hkd.tools.tool import Tool
-from kitting_drake.tasks.boxes import box_points
 from kitting_drake.tasks.footprints import draw_in_turn
 from kitting_drake.tasks.kitting.settling import SettlingModel, Still, StillBlock, settle
-from kitting_drake.tasks.kitting.start_groups import KIT, Group, projected, start_groups
+from kitting_drake.tasks.kitting.start_checks import (
+    FACES,
+    TRAY,
+    TRAY_SIZE,
+    Start,
+    StartCheck,
+    surface_of_box,
+)
+from kitting_drake.tasks.kitting.start_groups import KIT, START_KINDS, Group, start_groups
 from kitting_drake.tasks.task import TABLE, Fixture, Scene
+from systems.grasp import Grasp
 from systems.signals import PixelGrid
 
 APART = "apart"
-FACES = ("as_drawn", "any")
-TRAY = MODELS / "tray" / "tray.sdf"
-"""The model of the tray."""
-TRAY_SIZE = (0.380, 0.290, 0.020)
-"""Outer extents along x, y and z of the tray's frame, whose origin is the middle of its bottom."""
-_TRAY_WALL, _TRAY_FLOOR = 0.004, 0.003
+"""The kind of start that is drawn without physics."""
 
+_TRAY_WALL, _TRAY_FLOOR = 0.004, 0.003
 _REDRAWS = 40
 """How often a start is drawn and settled again."""
 _TRIES, _RESTARTS = 200, 20
-_UPRIGHT = math.cos(math.radians(60.0))
-"""A tool tilted further lies on another face than the one that was drawn."""
-_ON_KIT = 0.002
-"""A point this far inside the block's outline is on the kit, in metres."""
-_LEANS = math.radians(5.0)
-"""A tool tilted further leans."""
-
-
-@dataclass(frozen=True)
-class Start:
-    """The poses at the start of an episode, at rest."""
-
-    X_WKit: RigidTransform
-    X_WTools: tuple[RigidTransform, ...]
-    X_WTray: RigidTransform | None
-    """None without a tray."""
 
 
 @dataclass(frozen=True)
@@ -76,6 +62,7 @@ def draw_start(
     kit: Kit,
     tools: Sequence[Tool],
     models: Sequence[SettlingModel],
+    grasps: Sequence[Sequence[Grasp]],
     *,
     kind: str,
     tray: bool,
@@ -95,6 +82,7 @@ def draw_start(
         kit: the kit.
         tools: the tools.
         models: their models for the physics, in the same order.
+        grasps: the grasps of each, best first.
         kind: one of `START_KINDS`.
         tray: whether the tools lie in a tray. It is `TRAY`.
         faces: `as_drawn`, every tool rests on the face that lies down in its cavity; `any`, tools
@@ -110,14 +98,14 @@ def draw_start(
     """
     if kind in ("touching", "crossed") and len(tools) < 2:
         raise UserError(f"task.start: '{kind}' needs at least two tools")
-    if tray and kind == "leaning":
-        raise UserError("task.start: tools in a tray cannot lean on the kit: set task.tray: false")
     room = _Room(grid, spacing, math.radians(yaw_range_deg))
     for _ in range(_REDRAWS):
         drawn = _draw(kit, tools, kind, tray, room, rng)
         if drawn is None:
             continue
-        check = _Check(kit, tools, kind, faces, room, drawn)
+        check = StartCheck(kit, tools, grasps, kind, faces, grid, drawn)
+        if not check.may_settle(drawn.X_WTools):
+            continue
         still: list[Still] = [
             (kit.sdf, drawn.X_WKit) if kit_model else StillBlock(kit.size, drawn.X_WKit)
         ]
@@ -133,10 +121,21 @@ def draw_start(
     )
 
 
+def check_start(start: str, tray: bool, faces: str, distractors: int) -> None:
+    """Raises ValueError for unknown words, and for combinations that do not exist."""
+    for name, word, words in (("start", start, START_KINDS), ("faces", faces, FACES)):
+        if word not in words:
+            raise ValueError(f"task.{name} must be one of {', '.join(words)}, not '{word}'")
+    if tray and start == "leaning":
+        raise ValueError("task.tray must be false if task.start is leaning")
+    if distractors and (tray or start != APART):
+        raise ValueError("task.distractors must be 0 unless task.start is apart, without a tray")
+
+
 def cluttered_scene(
     scene: Scene,
     kit: Kit,
-    tools: Sequence[Tool],
+    grasps: Sequence[tuple[Grasp, ...]],
     start: Start,
     grid: PixelGrid,
     max_actions: int,
@@ -146,21 +145,18 @@ def cluttered_scene(
     Args:
         scene: of the kit and its tools, in the expert's order.
         kit: the kit.
-        tools: the tools of the scene's objects.
+        grasps: the grasps of the scene's objects, best first.
         start: the poses.
         grid: the workspace; tools are laid aside in it.
         max_actions: the episode ends after this many.
     """
     (fixture,) = scene.fixtures
-    fixtures = [replace(fixture, p_FPoints=_box_points(kit.size))]
+    fixtures = [replace(fixture, p_FPoints=surface_of_box(kit.size))]
     if start.X_WTray is not None:
         fixtures.append(Fixture("tray", TRAY, start.X_WTray, _tray_points()))
     lower = np.maximum((grid.x_min, grid.y_min), TABLE[0])
     upper = np.minimum((grid.x_max, grid.y_max), TABLE[1])
-    objects = [
-        replace(item, grasps=all_grasps(tool))
-        for item, tool in zip(scene.objects, tools, strict=True)
-    ]
+    objects = [replace(item, grasps=own) for item, own in zip(scene.objects, grasps, strict=True)]
     return replace(
         scene,
         objects=tuple(objects),
@@ -178,12 +174,7 @@ def _tray_points() -> NDArray[np.float64]:
     for sign in (-1, 1):
         parts.append(((wall, width, height), (sign * (length - wall) / 2, 0.0)))
         parts.append(((length, wall, height), (0.0, sign * (width - wall) / 2)))
-    return np.concatenate([_box_points(size) + (x, y, 0.0) for size, (x, y) in parts])
-
-
-def _box_points(size: Sequence[float]) -> NDArray[np.float64]:
-    length, width, height = size
-    return box_points((length, width, height))
+    return np.concatenate([surface_of_box(size) + (x, y, 0.0) for size, (x, y) in parts])
 
 
 def _draw(
@@ -212,7 +203,10 @@ def _draw(
 
 
 def _start(
-    groups: Sequence[Group], placed: Sequence[RigidTransform], count: int, X_WTray: RigidTransform | None
+    groups: Sequence[Group],
+    placed: Sequence[RigidTransform],
+    count: int,
+    X_WTray: RigidTransform | None,
 ) -> Start:
     poses = {
         index: X_WGroup @ X
@@ -242,77 +236,3 @@ def _place(
 
     found = draw_in_turn(groups, draw, restarts=_RESTARTS)
     return None if found is None else [X for X, _ in found]
-
-
-class _Check:
-    """Whether settled tools lie as they should."""
-
-    def __init__(
-        self, kit: Kit, tools: Sequence[Tool], kind: str, faces: str, room: _Room, drawn: Start
-    ) -> None:
-        self._kind, self._faces, self._drawn = kind, faces, drawn
-        self._points = [np.unique(tool.triangles.reshape(-1, 3), axis=0) for tool in tools]
-        self._kit_half = np.array(kit.size[:2]) / 2 - _ON_KIT
-        self._grid = room.grid
-        self._leaning = {
-            index
-            for index, X in enumerate(drawn.X_WTools)
-            if kind == "leaning" and _tilt(X) > _LEANS
-        }
-
-    def may_go_on(self, X_WTools: Sequence[RigidTransform]) -> bool:
-        """Whether the origins of all tools are still in the workspace and off the kit."""
-        for index, X in enumerate(X_WTools):
-            p_W = X.translation()
-            on_kit = np.abs((self._drawn.X_WKit.inverse() @ p_W)[:2]) < self._kit_half
-            if not self._grid.contains(p_W[:2]) or on_kit.all() or p_W[2] < -0.02:
-                return False
-        return True
-
-    def is_good(self, X_WTools: Sequence[RigidTransform]) -> bool:
-        """Whether the tools at rest make a start of this kind."""
-        (x_low, y_low), (x_high, y_high) = TABLE
-        X_KW = self._drawn.X_WKit.inverse()
-        for index, (points, X) in enumerate(zip(self._points, X_WTools, strict=True)):
-            p_W = X.multiply(points.T)
-            inside = self._grid.contains(p_W[:2].T).all()
-            inside &= bool((p_W[0] > x_low).all() and (p_W[0] < x_high).all())
-            inside &= bool((p_W[1] > y_low).all() and (p_W[1] < y_high).all())
-            p_K = X_KW.multiply(p_W)[:2]
-            on_kit = (np.abs(p_K) < self._kit_half[:, None]).all(axis=0).any()
-            if not inside or (on_kit and index not in self._leaning):
-                return False
-            if self._faces == FACES[0] and X.rotation().matrix()[2, 2] < _UPRIGHT:
-                return False
-        return self._is_in_tray(X_WTools) and self._is_of_kind(X_WTools)
-
-    def _is_in_tray(self, X_WTools: Sequence[RigidTransform]) -> bool:
-        if self._drawn.X_WTray is None:
-            return True
-        half = np.array(TRAY_SIZE[:2]) / 2
-        X_TW = self._drawn.X_WTray.inverse()
-        return all(
-            bool((np.abs((X_TW @ X).multiply(points.T)[:2]) < half[:, None]).all())
-            for points, X in zip(self._points, X_WTools, strict=True)
-        )
-
-    def _is_of_kind(self, X_WTools: Sequence[RigidTransform]) -> bool:
-        if self._kind == "leaning":
-            return all(_tilt(X_WTools[index]) > _LEANS for index in self._leaning)
-        if self._kind in ("crossed", "heap"):
-            outlines = [
-                projected(points, X) for points, X in zip(self._points, X_WTools, strict=True)
-            ]
-            pairs = [
-                (i, j)
-                for j in range(len(outlines))
-                for i in range(j)
-                if (outlines[i] ^ outlines[j]).area() > 1e-5
-            ]
-            return len(pairs) >= (len(outlines) // 2 if self._kind == "crossed" else 1)
-        return True
-
-
-def _tilt(X: RigidTransform) -> float:
-    """The angle between body z and world z, in rad."""
-    return math.acos(np.clip(X.rotation().matrix()[2, 2], -1.0, 1.0))
