@@ -13,6 +13,8 @@ from pydrake.math import RigidTransform
 from pydrake.systems.framework import Context, LeafSystem
 
 from systems.action_quantizer import ActionQuantizer
+from systems.clutter_expert import ClutterExpert
+from systems.cluttered_table import ClutteredTable
 from systems.grasp import Grasp
 from systems.hand_geometry import FINGER_LENGTH, FINGERTIP_DEPTH, MAX_OPENING
 from systems.placement import (
@@ -80,12 +82,15 @@ class OraclePolicy(LeafSystem):
         input_ports:
         - body_poses
         - kept_goals
+        - failed_picks
         output_ports:
         - action
 
     - `body_poses` (abstract, list of RigidTransform by body index): the plant's port of that name.
     - `kept_goals` (one for each goal): the `PlacementMonitor`'s port of that name. If it is not
       connected, no goal is kept.
+    - `failed_picks` (abstract, a tuple of `PlanarPose`): the planner's port of that name. Used only
+      where objects lie on each other; optional.
     - `action` (abstract, `PickPlaceAction`): moves an object to a goal; `stop` when every goal is
       filled.
 
@@ -103,6 +108,9 @@ class OraclePolicy(LeafSystem):
     *rounded* pick, to its goal. Its position and the rotation are then rounded, too. A place
     network whose crop is centred on the pick needs these labels (section III-C.2).
 
+    Where objects touch or lie on each other (`table`), `ClutterExpert` chooses the object and the
+    grasp, and lays aside what is in the way. Its actions are not rounded and carry heights.
+
     Stateless: after a failed grasp, it returns the same object again.
     """
 
@@ -118,6 +126,7 @@ class OraclePolicy(LeafSystem):
         release_clearance: float = 0.006,
         open_width: float = MAX_OPENING,
         brings_heights: bool = True,
+        table: ClutteredTable | None = None,
     ) -> None:
         """
         Args:
@@ -130,6 +139,7 @@ class OraclePolicy(LeafSystem):
             release_clearance: how far each jaw opens to release an object, in m.
             open_width: opening of the jaws before a grasp, in m.
             brings_heights: whether actions carry heights; else the planner reads them off o_t.
+            table: where objects may lie on each other; None: they lie apart.
 
         Raises:
             ValueError: there are no goals, or an object of a goal has no grasp.
@@ -147,11 +157,17 @@ class OraclePolicy(LeafSystem):
         self._open_width = open_width
         self._body_poses = self.DeclareAbstractInputPort("body_poses", Value([RigidTransform()]))
         self._kept_goals = self.DeclareVectorInputPort("kept_goals", len(goals))
+        self._failed_picks = self.DeclareAbstractInputPort("failed_picks", Value(()))
+        self._table = table
         self.DeclareAbstractOutputPort(
             "action",
             lambda: Value(PickPlaceAction()),
             weak_calc(self._calc_action),
-            {self._body_poses.ticket(), self._kept_goals.ticket()},
+            {
+                self._body_poses.ticket(),
+                self._kept_goals.ticket(),
+                self._failed_picks.ticket(),
+            },
         )
 
     def _calc_action(self, context: Context, output: AbstractValue) -> None:
@@ -161,9 +177,17 @@ class OraclePolicy(LeafSystem):
         if self._kept_goals.HasValue(context):
             kept = frozenset(np.flatnonzero(self._kept_goals.Eval(context)).tolist())
         placements = evaluate_placements(self._objects, self._goals, self._success, poses, kept)
-        plan = self._plan(poses, placements, kept)
-        if plan is not None:
-            output.set_value(self._action(plan, poses))
+        action: PickPlaceAction | None = None
+        if self._table is not None:
+            failed = (
+                self._failed_picks.Eval(context) if self._failed_picks.HasValue(context) else ()
+            )
+            action = self._act_in_clutter(self._table, poses, placements, kept, failed)
+        else:
+            plan = self._plan(poses, placements, kept)
+            action = None if plan is None else self._action(plan, poses)
+        if action is not None:
+            output.set_value(action)
             return
         filled = {item.goal for item in placements if item.success}
         reason = "done" if len(filled - {None}) >= len(self._goals) else "gave up"
@@ -173,6 +197,19 @@ class OraclePolicy(LeafSystem):
         self, poses: list[RigidTransform], placements: list[Placement], kept: frozenset[int]
     ) -> _Plan | None:
         """The next move; None if every goal is filled, or no goal can be filled."""
+        for index in self._open_goals(poses, placements, kept):
+            goal = self._goals[index]
+            item = self._choose_object(index, poses, placements)
+            if item is not None:
+                X_WGoal = self._choose_pose(goal, item, poses)
+                grasp = self._choose_grasp(item, X_WGoal, poses)
+                return _Plan(item, grasp, X_WGoal, goal)
+        return None
+
+    def _open_goals(
+        self, poses: list[RigidTransform], placements: list[Placement], kept: frozenset[int]
+    ) -> list[int]:
+        """The goals that may be filled now, those with a misplaced object last."""
         filled = kept | {item.goal for item in placements if item.success}
         failed_there = {
             item.goal
@@ -184,14 +221,31 @@ class OraclePolicy(LeafSystem):
             for index, goal in enumerate(self._goals)
             if index not in filled and filled.issuperset(goal.after)
         ]
-        for index in sorted(open_goals, key=lambda index: index in failed_there):
+        return sorted(open_goals, key=lambda index: index in failed_there)
+
+    def _act_in_clutter(
+        self,
+        table: ClutteredTable,
+        poses: list[RigidTransform],
+        placements: list[Placement],
+        kept: frozenset[int],
+        failed: Sequence[PlanarPose],
+    ) -> PickPlaceAction | None:
+        """The next action where objects lie on each other; None if nothing is left to do."""
+        clutter = ClutterExpert(table, poses, failed)
+        options = [
+            (item, goal)
+            for goal in self._open_goals(poses, placements, kept)
+            for item in [self._choose_object(goal, poses, placements)]
+            if item is not None
+        ]
+        for item, index in options:
             goal = self._goals[index]
-            item = self._choose_object(index, poses, placements)
-            if item is not None:
-                X_WGoal = self._choose_pose(goal, item, poses)
-                grasp = self._choose_grasp(item, X_WGoal, poses)
-                return _Plan(item, grasp, X_WGoal, goal)
-        return None
+            X_WGoal = self._choose_pose(goal, item, poses)
+            action = clutter.to_goal(item, X_WGoal, goal.rim_height or 0.0)
+            if action is not None:
+                return action
+        return clutter.aside([item for item, _ in options])
 
     def _is_near(self, index: int, placement: Placement, X_WB: RigidTransform) -> bool:
         assert placement.goal is not None

@@ -52,6 +52,13 @@ class PlacedObject:
     axis: tuple[float, float] | None = None
     """(x, y) of the axis of symmetry in B, in metres; None: the middle of the points' bounding
     box. The two differ if the order is odd, as of a triangle."""
+    p_BCom: NDArray[np.float64] | None = None
+    """(3,) the centre of mass, in metres; None: unknown."""
+
+    @property
+    def p_BCenter(self) -> NDArray[np.float64]:
+        """(3,) the centre of mass or, if it is unknown, the middle of the surface."""
+        return self.p_BPoints.mean(axis=0) if self.p_BCom is None else self.p_BCom
 
     @cached_property
     def p_BMiddle(self) -> NDArray[np.float64]:

@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 from pydrake.systems.framework import LeafSystem
 
 from kitting_drake.common.errors import UserError
@@ -18,6 +19,8 @@ from kitting_drake.policies.factory import load_learned_policy, make_shape_match
 from kitting_drake.tasks.task import Scene
 from systems.action_quantizer import ActionQuantizer
 from systems.bounds import bounded
+from systems.cluttered_table import ClutteredTable
+from systems.ledge import Ledge
 from systems.oracle_policy import OraclePolicy
 from systems.pick_place_parameters import PickPlaceParameters
 from systems.pick_place_policy import PickPlacePolicy
@@ -359,7 +362,35 @@ def _make_oracle(site: PolicySite, quantizer: ActionQuantizer | None) -> OracleP
         release_clearance=site.planner.release_clearance,
         open_width=site.planner.open_width,
         brings_heights=not site.has_cameras,
+        table=_cluttered_table(site),
     )
+
+
+def _cluttered_table(site: PolicySite) -> ClutteredTable | None:
+    scene = site.scene
+    if scene.laying_area is None:
+        return None
+    return ClutteredTable(
+        objects=site.objects,
+        grasps=[item.grasps for item in scene.objects],
+        area=scene.laying_area,
+        fixtures=[
+            item.X_WF.multiply(item.p_FPoints.T).T
+            for item in scene.fixtures
+            if item.p_FPoints is not None
+        ],
+        planner=site.planner,
+        ledge=_ledge(scene),
+    )
+
+
+def _ledge(scene: Scene) -> Ledge | None:
+    """The first fixture that the hand keeps clear of: the kit's block."""
+    for item in scene.fixtures:
+        if item.p_FPoints is not None:
+            length, width, _ = np.ptp(item.p_FPoints, axis=0).tolist()
+            return Ledge(item.X_WF, (length, width))
+    return None
 
 
 def _digest(path: Path) -> str:

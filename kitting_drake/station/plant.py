@@ -67,8 +67,11 @@ def add_models(
     objects = []
     for item in scene.objects:
         body = add(item.model)
+        com = np.asarray(body.default_com())
         objects.append(
-            PlacedObject(item.name, body.index(), item.p_BPoints, item.symmetry, item.axis)
+            PlacedObject(
+                item.name, body.index(), item.p_BPoints, item.symmetry, item.axis, p_BCom=com
+            )
         )
     _add_model(parser, MODELS / "franka_hand" / "franka_hand.sdf")
     return tuple(objects), tuple(body.index() for body in still)

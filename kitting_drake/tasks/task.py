@@ -62,6 +62,9 @@ class Fixture:
     """SDFormat file of one link."""
     X_WF: RigidTransform
     """Pose of the link's frame."""
+    p_FPoints: NDArray[np.float64] | None = field(default=None, repr=False)
+    """(m, 3) points of its surface in its frame, in metres, that the expert's hand keeps clear of;
+    None: it is never in the way."""
 
 
 @dataclass(frozen=True)
@@ -103,6 +106,9 @@ class Scene:
     measures: Mapping[str, SuccessPredicate] = field(default_factory=dict)
     """Other measures of success by name. Results report them beside `success`, and `strict`; they
     change neither the reward nor the expert."""
+    laying_area: tuple[tuple[float, float], tuple[float, float]] | None = None
+    """Lower and upper (x, y) corner of the part of the table on which the expert may lay objects
+    that are in the way, in metres; None: objects lie apart, and it never does."""
 
     def __post_init__(self) -> None:
         names = [item.name for item in self.objects] + [item.name for item in self.fixtures]

@@ -11,6 +11,7 @@ from pydrake.math import RigidTransform
 
 from kitting_drake.common.errors import UserError
 from kitting_drake.hkd.generation.part_models import is_part_kind, load_named, sized_part
+from kitting_drake.hkd.grasps.all_grasps import all_grasps
 from kitting_drake.hkd.kits.kit import Kit, make_kit
 from kitting_drake.hkd.kits.parameters import KitParameters
 from kitting_drake.hkd.tools.scaling import scaled_tool
@@ -27,6 +28,7 @@ from kitting_drake.tasks.kitting.kit_stands import (
     draw_stand,
     stand_of,
 )
+from kitting_drake.tasks.kitting.starts import APART, check_start, cluttered_scene, draw_start
 from kitting_drake.tasks.kitting.tool_poses import (
     TablePose,
     check_arrangement,
@@ -117,7 +119,21 @@ class _DrawnKitting(_KittingTask):
     # Each kit is tilted by an angle drawn from this range, in degrees, in any direction.
     tilt_deg: list[float] = bounded([0.0, 0.0], 0.0, MOST_TILT_DEG)
 
+    # How the tools lie at the start: apart, touching (side by side, 0 to 3 mm apart), crossed (one
+    # across another), leaning (half of them on the kit block's sides), or heap (fallen from about
+    # 150 mm). All but apart come to rest by physics.
+    start: str = APART
+
+    # Whether the tools start in a shallow tray.
+    tray: bool = False
+
+    # as_drawn: all tools rest on the face that lies down in their cavities. any: in a heap, tools
+    # may come to rest on another face.
+    faces: str = "as_drawn"
+
     def _draw_scene(self, tools: list[Tool], grid: PixelGrid, seed: int) -> Scene:
+        if self.start != APART or self.tray:
+            return self._draw_settled(self._kit_of(tools), tools, grid, seed)
         # Streams of their own: with one level kit, the poses are those of a seed without them.
         shares = self._shares(len(tools), np.random.default_rng([seed, 6]))
         kits = [self._kit_of([tools[index] for index in share]) for share in shares]
@@ -177,11 +193,39 @@ class _DrawnKitting(_KittingTask):
         mixed = rng.permutation(count).tolist()
         return [tuple(sorted(mixed[number :: self.kits])) for number in range(self.kits)]
 
+    def _draw_settled(self, kit: Kit, tools: list[Tool], grid: PixelGrid, seed: int) -> Scene:
+        rng = np.random.default_rng([seed, 4])
+        grasps = [all_grasps(tool) for tool in tools]
+        start = draw_start(
+            kit,
+            tools,
+            [tool.sdf for tool in tools],
+            grasps,
+            kind=self.start,
+            tray=self.tray,
+            faces=self.faces,
+            grid=grid,
+            spacing=self.spacing,
+            yaw_range_deg=self.yaw_range_deg,
+            rng=rng,
+        )
+        order = rng.permutation(len(tools)) if self.random_order else np.arange(len(tools))
+        posed = PosedKit(kit, start.X_WKit, tuple(range(len(tools))))
+        scene = kitting_scene([posed], tools, start.X_WTools, order, self.success_threshold)
+        return cluttered_scene(
+            scene, kit, [grasps[i] for i in order], start, grid, self.tries * len(tools)
+        )
+
     def validate(self) -> None:
         for name in ("riser", "tilt_deg"):
             least, greatest = getattr(self, name)
             if least > greatest:
                 raise ValueError(f"task.{name} must be [least, greatest]")
+        check_start(self.start, self.tray, self.faces, self.distractors)
+        if (self.start != APART or self.tray) and (
+            self.kits > 1 or any(self.riser + self.tilt_deg)
+        ):
+            raise ValueError("task.kits, riser and tilt_deg need task.start: apart, without a tray")
 
 
 @dataclass
@@ -296,6 +340,7 @@ class ToolsetKitting(_DrawnKitting):
             raise ValueError(f"task.split must be one of {', '.join(SPLITS)}, not '{self.split}'")
         if self.tool_length[0] > self.tool_length[1]:
             raise ValueError("task.tool_length must be [least, greatest]")
+        check_start(self.start, self.tray, self.faces, self.distractors)
 
 
 @dataclass

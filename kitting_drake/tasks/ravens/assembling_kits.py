@@ -27,7 +27,7 @@ from kitting_drake.hkd.tools.tool import Tool
 from kitting_drake.policies.data.learning import Learning
 from kitting_drake.tasks.footprints import draw_in_turn
 from kitting_drake.tasks.kitting import diagnosis
-from kitting_drake.tasks.kitting.kitting import kitting_scene
+from kitting_drake.tasks.kitting.kit_scene import PosedKit, kitting_scene
 from kitting_drake.tasks.kitting.tool_poses import draw_poses
 from kitting_drake.tasks.ravens.ravens_task import PoseTask
 from kitting_drake.tasks.task import ActionRecord, Scene
@@ -100,7 +100,8 @@ class AssemblingKits(PoseTask):
             kit, tools, grid=grid, spacing=self.spacing, yaw_range_deg=180.0, rng=rng
         )
         order = rng.permutation(len(tools))
-        scene = kitting_scene(kit, X_WKit, X_WShapes, order, _ADD_S.threshold)
+        posed = PosedKit(kit, X_WKit, tuple(range(len(tools))))
+        scene = kitting_scene([posed], tools, X_WShapes, order, _ADD_S.threshold)
         return self._scored(scene, [tools[index] for index in order])
 
     def _scored(self, scene: Scene, tools: Sequence[Tool]) -> Scene:

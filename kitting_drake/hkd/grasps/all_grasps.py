@@ -1,0 +1,65 @@
+"""All grasps of a tool: the annotated one, and those that its surface proposes."""
+
+import hashlib
+import json
+import xml.etree.ElementTree as ElementTree
+from dataclasses import astuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kitting_drake.common.cached_folder import cached_folder
+from kitting_drake.common.errors import UserError
+from kitting_drake.common.paths import cache_directory
+from kitting_drake.hkd.grasps.proposals import WIDEST, propose_grasps
+from kitting_drake.hkd.tools.tool import Tool
+from systems.grasp import Grasp
+
+_FORMAT_VERSION = "1"
+"""Part of the cache key. Change it when equal tools give other grasps."""
+_FILE = "grasps.json"
+_WORST = 12.5
+"""Proposals of a higher cost are left out."""
+
+
+def all_grasps(tool: Tool) -> tuple[Grasp, ...]:
+    """The annotated grasp, then the proposals, best first.
+
+    Proposals take a second or two, and are kept in the cache. Those of a scaled tool are scaled.
+
+    Raises:
+        UserError: a mesh or the model cannot be read, or the cache cannot be written.
+    """
+    com = _center_of_mass(tool) / tool.scale
+    digest = hashlib.sha256(f"{_FORMAT_VERSION} {com.round(9).tolist()}".encode())
+    for path in tool.visual_meshes:
+        digest.update(path.read_bytes())
+    folder = cached_folder(
+        cache_directory() / "grasps" / digest.hexdigest()[:24],
+        [_FILE],
+        lambda scratch: (scratch / _FILE).write_text(json.dumps(_proposals(tool, com))),
+    )
+    try:
+        rows = json.loads((folder / _FILE).read_text())
+        unscaled = [Grasp(*map(float, row)) for row in rows]
+    except (OSError, ValueError, TypeError) as error:
+        raise UserError(f"{folder / _FILE} is damaged: delete {folder}") from error
+    s = tool.scale
+    proposed = [
+        Grasp(s * g.x, s * g.y, g.theta, s * g.width, s * g.surface_height) for g in unscaled
+    ]
+    return (tool.grasp, *(grasp for grasp in proposed if grasp.width <= WIDEST))
+
+
+def _proposals(tool: Tool, com: NDArray[np.float64]) -> list[list[float]]:
+    proposals = propose_grasps(tool.triangles / tool.scale, com)
+    return [list(astuple(item.grasp)) for item in proposals if item.cost <= _WORST]
+
+
+def _center_of_mass(tool: Tool) -> NDArray[np.float64]:
+    """(3,) in T, in metres."""
+    try:
+        pose = ElementTree.parse(tool.sdf).getroot().findtext(".//inertial/pose", "0 0 0")
+        return np.array([float(word) for word in pose.split()[:3]])
+    except (OSError, ElementTree.ParseError, ValueError) as error:
+        raise UserError(f"{tool.sdf} cannot be read: {error}") from error

@@ -1,0 +1,124 @@
+"""The oracle's next action where objects touch, or lie on each other."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+from pydrake.math import RigidTransform
+
+from systems.cluttered_table import (
+    ClutteredTable,
+    HeldFromAbove,
+    in_the_way,
+    middle,
+    moved_gripper,
+)
+from systems.grasp import Grasp
+from systems.placement import displacement, heading
+from systems.signals import PickPlaceAction, PlanarPose, wrap_to_pi
+
+_NEAR_BEST = 0.035
+"""A grasp further from the best one than this is used only to lay an object aside, in metres."""
+_IN_CAVITY = 0.03
+"""An object displaced less from its goal lies in or over its cavity, in metres."""
+
+
+class ClutterExpert:
+    """Chooses actions for one state of the table.
+
+    An object that lies flat, the right way up and under nothing, and that can be gripped near its
+    best grasp, goes to its goal. If there is none, an object under nothing is laid aside on a free
+    part of the table. It then lies flat and free, or is laid aside again.
+    """
+
+    def __init__(
+        self,
+        table: ClutteredTable,
+        poses: Sequence[RigidTransform],
+        failed: Sequence[PlanarPose] = (),
+    ) -> None:
+        """
+        Args:
+            table: the objects and their grasps.
+            poses: X_WB of each object.
+            failed: earlier picks in the world that held nothing.
+        """
+        self._table, self._poses, self._failed = table, list(poses), failed
+        self._points = table.points(poses)
+        self._covered = table.covered(self._points)
+        self._highest = max(
+            [float(points[:, 2].max()) for points in (*self._points, *table.fixtures)]
+        )
+
+    def to_goal(self, index: int, X_WGoal: RigidTransform, rim: float) -> PickPlaceAction | None:
+        """The action that brings an object to its goal; None if it must be laid aside first.
+
+        Args:
+            index: the object.
+            X_WGoal: its goal pose.
+            rim: world z of the cavity's rim, in metres.
+        """
+        if self._covered[index] or not self._table.is_flat(index, self._poses[index]):
+            return None
+        best = self._table.grasps[index][0]
+        for hold in self._holds(index, X_WGoal):
+            near = math.hypot(hold.grasp.x - best.x, hold.grasp.y - best.y) < _NEAR_BEST
+            place = self._place(index, hold, X_WGoal)
+            if near and not hold.obstruction and self._may_let_go(index, hold.grasp, place, rim):
+                return self._action(hold, place, rim)
+        return None
+
+    def aside(self, items: Sequence[int]) -> PickPlaceAction | None:
+        """The action that lays one of some objects aside; None if none can be.
+
+        Of the objects under nothing, it takes the one whose grasp is least obstructed, and of these
+        the highest.
+        """
+        choices = [index for index in items if not self._covered[index]] or list(items)
+        found = []
+        for index in choices:
+            for rank, hold in enumerate(self._holds(index, None)):
+                found.append((hold.obstruction, -hold.top, rank, index, hold))
+        for _, _, _, index, hold in sorted(found, key=lambda row: row[:4]):
+            place = self._table.aside(index, hold, self._poses, self._points)
+            if place is not None:
+                return self._action(hold, place, 0.0, aside=True)
+        return None
+
+    def _holds(self, index: int, X_WGoal: RigidTransform | None) -> list[HeldFromAbove]:
+        in_cavity = False
+        if X_WGoal is not None:
+            item = self._table.objects[index]
+            in_cavity = displacement(item, X_WGoal, self._poses[index]) < _IN_CAVITY
+        arguments = (index, self._poses, self._points)
+        holds = self._table.holds(*arguments, self._failed, ignores_fixtures=in_cavity)
+        # When every grasp has failed, they are tried again.
+        return holds or self._table.holds(*arguments, ignores_fixtures=in_cavity)
+
+    def _place(self, index: int, hold: HeldFromAbove, X_WGoal: RigidTransform) -> PlanarPose:
+        yaw = heading(self._poses[index])
+        x, y, _ = X_WGoal @ self._table.objects[index].p_BMiddle
+        goal = PlanarPose(float(x), float(y), heading(X_WGoal))
+        return moved_gripper(hold.gripper, middle(self._points[index], yaw), yaw, goal)
+
+    def _may_let_go(self, index: int, grasp: Grasp, place: PlanarPose, rim: float) -> bool:
+        """Whether no other object is under the hand as it opens."""
+        halves = (grasp.width / 2, grasp.width / 2 + self._table.planner.release_clearance)
+        return not any(
+            in_the_way(points, place, rim + 0.003, halves)
+            for other, points in enumerate(self._points)
+            if other != index
+        )
+
+    def _action(
+        self, hold: HeldFromAbove, place: PlanarPose, rim: float, *, aside: bool = False
+    ) -> PickPlaceAction:
+        theta = wrap_to_pi(hold.gripper.theta)
+        turn = wrap_to_pi(place.theta - hold.gripper.theta)
+        return PickPlaceAction(
+            pick=PlanarPose(hold.gripper.x, hold.gripper.y, theta),
+            place=PlanarPose(place.x, place.y, theta + turn),
+            heights=hold.heights(self._highest, rim),
+            aside=aside,
+        )

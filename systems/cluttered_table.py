@@ -1,0 +1,340 @@
+"""What lies on what, and which grasps are free, from true poses: for the oracle in clutter."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+from pydrake.math import RigidTransform, RollPitchYaw
+
+from systems.free_area import find_free_pose
+from systems.grasp import Grasp
+from systems.hand_geometry import (
+    FINGER_BASE_DISTANCE,
+    FINGER_DEPTH,
+    FINGER_LENGTH,
+    FINGERTIP_DEPTH,
+    FINGERTIP_DISTANCE,
+    PAD_LENGTH,
+    PALM_SIZE,
+)
+from systems.ledge import Ledge
+from systems.motion_heights import motion_heights
+from systems.pick_place_parameters import PickPlaceParameters
+from systems.placement import PlacedObject, heading
+from systems.signals import PlanarPose, SurfaceHeights
+
+Points = NDArray[np.float64]
+
+_CELL = 0.004
+"""Side of the squares in which objects are compared, in metres."""
+_ABOVE = 0.002
+"""An object lies on another if it is above it, to within this, in metres."""
+_LEAST_SQUARES = 2
+"""It covers the other if it is above it in so many squares."""
+_FLAT = math.radians(2.5)
+"""An object tilted less lies flat."""
+_SAME_SHAPE = 0.0008
+"""Mean distance of the surfaces of an object and of itself turned over that is none, in metres."""
+_UPSIDE_DOWN = math.radians(120.0)
+"""An object tilted further lies the wrong way up."""
+_ON_EDGE = math.radians(60.0)
+"""An object tilted further, and not upside down, stands on its edge."""
+_ALONG_EDGE = (0.0, 0.02, -0.02, 0.04, -0.04)
+"""Where an object that stands on its edge is gripped, along it from its centre, in metres."""
+_STEEPEST = math.radians(25.0)
+"""Jaws do not hold faces that lean further than this."""
+_SLENDER = 0.020
+"""Height of a finger's slender tip, in metres."""
+_PALM_HEIGHT = FINGERTIP_DISTANCE - FINGER_BASE_DISTANCE - 0.003
+"""Height of the palm above the fingertips, less a margin, in metres."""
+_MARGIN = 0.001
+"""Least clearance of the fingers, in metres."""
+_SAME_PLACE, _SAME_ANGLE = 0.006, math.radians(15.0)
+"""A grasp this close to one that failed is the same."""
+
+
+@dataclass(frozen=True)
+class HeldFromAbove:
+    """A grasp of an object that may lie tilted."""
+
+    grasp: Grasp
+    gripper: PlanarPose
+    """The gripper's pose in the world."""
+    top: float
+    """World z of the object's top between the pads, in metres; `bottom`, `lowest` likewise."""
+    bottom: float
+    lowest: float
+    """World z of the whole object's lowest point."""
+    obstruction: int
+    """How many points of other things are in the way of the open hand."""
+
+    def heights(self, highest: float, rim: float) -> SurfaceHeights:
+        """The surfaces for the planner.
+
+        Args:
+            highest: world z of the highest surface, in metres.
+            rim: world z of the rim of the place, in metres; 0 for the table.
+        """
+        # The object hangs lower than where it is gripped.
+        highest += self.bottom - self.lowest
+        return SurfaceHeights(
+            pick_top=self.top,
+            support=self.bottom,
+            place_rim=rim,
+            near_pick=highest,
+            near_place=highest,
+            highest=highest,
+        )
+
+
+@dataclass(frozen=True)
+class ClutteredTable:
+    """The objects, what stands between them, and the hand."""
+
+    objects: Sequence[PlacedObject]
+    grasps: Sequence[Sequence[Grasp]]
+    """The grasps of each object, best first."""
+    area: tuple[tuple[float, float], tuple[float, float]]
+    """Where objects may be laid aside: lower and upper (x, y) corner, in metres."""
+    fixtures: Sequence[Points] = ()
+    """(m, 3) points in the world of each thing that never moves."""
+    planner: PickPlaceParameters = field(default_factory=PickPlaceParameters)
+    ledge: Ledge | None = None
+    """A block over whose edges objects can be turned."""
+
+    def points(self, poses: Sequence[RigidTransform]) -> list[Points]:
+        """(m, 3) the points of each object in the world."""
+        return [
+            X_WB.multiply(item.p_BPoints.T).T
+            for item, X_WB in zip(self.objects, poses, strict=True)
+        ]
+
+    def covered(self, points: Sequence[Points]) -> list[set[int]]:
+        """For each object, those that lie on it."""
+        squares = [_squares(item) for item in points]
+        return [
+            {
+                other
+                for other, above in enumerate(squares)
+                if other != index and _is_on(above, below)
+            }
+            for index, below in enumerate(squares)
+        ]
+
+    def is_flat(self, index: int, X_WB: RigidTransform) -> bool:
+        """Whether an object lies as it should lie in its cavity, apart from its heading.
+
+        It lies flat and the right way up, or its shape does not tell the difference.
+        """
+        if tilt(X_WB) < _FLAT:
+            return True
+        item = self.objects[index]
+        if abs(math.asin(float(np.clip(X_WB.rotation().matrix()[2, 0], -1, 1)))) > _FLAT:
+            return False
+        R = RollPitchYaw(0, 0, -heading(X_WB)).ToRotationMatrix() @ X_WB.rotation()
+        points = item.p_BPoints @ R.matrix().T
+        low, high = points.min(axis=0), points.max(axis=0)
+        own_low, own_high = item.p_BPoints.min(axis=0), item.p_BPoints.max(axis=0)
+        points = points + (own_low + own_high - low - high) / 2
+        return float(item.tree.query(points)[0].mean()) < _SAME_SHAPE
+
+    def holds(
+        self,
+        index: int,
+        poses: Sequence[RigidTransform],
+        points: Sequence[Points],
+        failed: Sequence[PlanarPose] = (),
+        *,
+        ignores_fixtures: bool = False,
+    ) -> list[HeldFromAbove]:
+        """The grasps of an object, best first; without those that failed or would slip.
+
+        Args:
+            index: the object.
+            poses: X_WB of each object.
+            points: the points of each object in the world.
+            failed: earlier picks in the world that held nothing.
+            ignores_fixtures: whether fixtures are never in the way, as for an object in a cavity.
+        """
+        around = [item for other, item in enumerate(points) if other != index]
+        if not ignores_fixtures:
+            around += list(self.fixtures)
+        others = np.concatenate([np.zeros((0, 3)), *around])
+        near = np.linalg.norm((others - poses[index].translation())[:, :2], axis=1) < 0.35
+        found = []
+        for grasp, gripper in self._grippers(index, poses[index]):
+            if gripper is None or any(_is_same(gripper, other) for other in failed):
+                continue
+            hold = self._hold(grasp, gripper, points[index], others[near])
+            if hold is not None:
+                found.append(hold)
+        return found
+
+    def _grippers(self, index: int, X_WB: RigidTransform) -> list[tuple[Grasp, PlanarPose | None]]:
+        """The grasps, and the gripper's pose in the world for each."""
+        if not _ON_EDGE < tilt(X_WB) < _UPSIDE_DOWN:
+            return [(grasp, _gripper_pose(X_WB, grasp)) for grasp in self.grasps[index]]
+        # The jaws close along z of B, across the object's thickness.
+        item = self.objects[index]
+        z_axis = X_WB.rotation().matrix()[:, 2]
+        theta = math.atan2(-z_axis[0], z_axis[1])
+        height = float(np.ptp(item.p_BPoints[:, 2]))
+        found: list[tuple[Grasp, PlanarPose | None]] = []
+        for offset in _ALONG_EDGE:
+            p_B = np.array([item.p_BCenter[0] + offset, item.p_BCenter[1], item.p_BMiddle[2]])
+            x, y, _ = (X_WB @ p_B).tolist()
+            grasp = Grasp(float(p_B[0]), float(p_B[1]), 0.0, height, height)
+            found.append((grasp, PlanarPose(x, y, theta)))
+        return found
+
+    def _hold(
+        self, grasp: Grasp, gripper: PlanarPose, own: Points, others: Points
+    ) -> HeldFromAbove | None:
+        along, across = _in_hand(own, gripper)
+        between = (np.abs(along) < PAD_LENGTH / 2) & (np.abs(across) < grasp.width / 2 + 0.003)
+        if not between.any():
+            return None
+        heights = own[between, 2]
+        top, bottom = float(heights.max()), float(heights.min())
+        surfaces = SurfaceHeights(pick_top=top, support=bottom)
+        tip = motion_heights(surfaces, self.planner).grasp
+        half = self.planner.open_width / 2
+        count = in_the_way(others, gripper, tip + _MARGIN, (grasp.width / 2, half))
+        lowest = float(own[:, 2].min())
+        return HeldFromAbove(grasp, gripper, top, bottom, lowest, count)
+
+    def aside(
+        self,
+        index: int,
+        hold: HeldFromAbove,
+        poses: Sequence[RigidTransform],
+        points: Sequence[Points],
+    ) -> PlanarPose | None:
+        """Where the gripper lets go of an object to lay it aside; None if there is no room.
+
+        It is a free part of the table. For an object that lies the wrong way up, it is the edge of
+        the ledge: released there with its centre of mass outside, the object turns over.
+        """
+        item, X_WB = self.objects[index], poses[index]
+        others = [other for k, other in enumerate(points) if k != index]
+        if self.ledge is not None and tilt(X_WB) > _UPSIDE_DOWN:
+            yaw, p_WCenter = heading(X_WB), X_WB @ item.p_BCenter
+            cos, sin = math.cos(yaw), math.sin(yaw)
+            outline = (points[index] - p_WCenter)[:, :2] @ np.array([[cos, -sin], [sin, cos]])
+            turned = self.ledge.turning_pose(
+                outline, p_WCenter, np.concatenate([np.zeros((0, 3)), *others]), self.area
+            )
+            if turned is not None:
+                return moved_gripper(hold.gripper, p_WCenter, yaw, turned)
+        occupied = [other[:, :2] for other in (*others, *self.fixtures)]
+        found = find_free_pose(
+            (item.p_BPoints - item.p_BMiddle)[:: max(1, len(item.p_BPoints) // 400), :2],
+            np.concatenate([np.zeros((0, 2)), *occupied]),
+            self.area,
+            near=X_WB.translation()[:2],
+            yaw=heading(X_WB),
+        )
+        if found is None:
+            return None
+        return moved_gripper(
+            hold.gripper, middle(points[index], heading(X_WB)), heading(X_WB), found
+        )
+
+
+def moved_gripper(
+    gripper: PlanarPose, p_WHeld: NDArray[np.float64], yaw: float, goal: PlanarPose
+) -> PlanarPose:
+    """The gripper's pose after it has carried an object.
+
+    Args:
+        gripper: its pose before.
+        p_WHeld: a point of the object before.
+        yaw: the object's heading before, in radians.
+        goal: the point and the heading afterwards.
+    """
+    turn = goal.theta - yaw
+    dx, dy = gripper.x - p_WHeld[0], gripper.y - p_WHeld[1]
+    cos, sin = math.cos(turn), math.sin(turn)
+    return PlanarPose(
+        float(goal.x + cos * dx - sin * dy),
+        float(goal.y + sin * dx + cos * dy),
+        gripper.theta + turn,
+    )
+
+
+def middle(points: Points, yaw: float) -> NDArray[np.float64]:
+    """(2,) the middle of the bounding box of points (m, 3), with a side in the direction `yaw`."""
+    cos, sin = math.cos(yaw), math.sin(yaw)
+    along, across = points[:, :2] @ [cos, sin], points[:, :2] @ [-sin, cos]
+    u, v = (along.min() + along.max()) / 2, (across.min() + across.max()) / 2
+    return np.array([cos * u - sin * v, sin * u + cos * v])
+
+
+def tilt(X_WB: RigidTransform) -> float:
+    """The angle between body z and world z, in radians."""
+    return math.acos(float(np.clip(X_WB.rotation().matrix()[2, 2], -1.0, 1.0)))
+
+
+def in_the_way(points: Points, gripper: PlanarPose, tip: float, halves: tuple[float, float]) -> int:
+    """How many points lie where the hand moves as it comes down with open jaws and closes them.
+
+    Args:
+        points: (m, 3) in the world, in metres.
+        gripper: the gripper's pose.
+        tip: world z of the fingertips, in metres.
+        halves: half of the opening with the jaws closed and open, in metres.
+    """
+    along, across = _in_hand(points, gripper)
+    along, across, z = np.abs(along), np.abs(across), points[:, 2]
+    closed, opened = halves
+    in_fingers = (along < FINGER_LENGTH / 2 + _MARGIN) & (across > closed) & (z > tip)
+    reach = np.where(z > tip + _SLENDER, FINGER_DEPTH, FINGERTIP_DEPTH) + _MARGIN
+    in_fingers &= across < opened + reach
+    in_palm = (along < PALM_SIZE[0] / 2) & (across < PALM_SIZE[1] / 2) & (z > tip + _PALM_HEIGHT)
+    return int((in_fingers | in_palm).sum())
+
+
+def _in_hand(points: Points, gripper: PlanarPose) -> tuple[Points, Points]:
+    """Coordinates along the pads and across them, in metres."""
+    cos, sin = math.cos(gripper.theta), math.sin(gripper.theta)
+    dx, dy = points[:, 0] - gripper.x, points[:, 1] - gripper.y
+    return cos * dx + sin * dy, cos * dy - sin * dx
+
+
+def _gripper_pose(X_WB: RigidTransform, grasp: Grasp) -> PlanarPose | None:
+    """The gripper's pose in the world; None if the gripped faces lean too far."""
+    R = X_WB.rotation().matrix()
+    across = R @ np.array([-math.sin(grasp.theta), math.cos(grasp.theta), 0.0])
+    if abs(across[2]) > math.sin(_STEEPEST):
+        return None
+    x, y, _ = X_WB @ np.array([grasp.x, grasp.y, grasp.surface_height / 2])
+    theta = math.atan2(-across[0], across[1])
+    return PlanarPose(float(x), float(y), theta)
+
+
+def _is_same(gripper: PlanarPose, other: PlanarPose) -> bool:
+    turn = abs(math.remainder(gripper.theta - other.theta, math.pi))
+    return math.hypot(gripper.x - other.x, gripper.y - other.y) < _SAME_PLACE and turn < _SAME_ANGLE
+
+
+Squares = dict[tuple[int, int], tuple[float, float]]
+
+
+def _squares(points: Points) -> Squares:
+    """Lowest and highest z of points (m, 3) in each square of the table that has some."""
+    keys, where = np.unique(
+        np.floor(points[:, :2] / _CELL).astype(int), axis=0, return_inverse=True
+    )
+    low, high = np.full(len(keys), np.inf), np.full(len(keys), -np.inf)
+    np.minimum.at(low, where.reshape(-1), points[:, 2])
+    np.maximum.at(high, where.reshape(-1), points[:, 2])
+    return {tuple(key): (a, b) for key, a, b in zip(keys.tolist(), low, high, strict=True)}
+
+
+def _is_on(above: Squares, below: Squares) -> bool:
+    shared = above.keys() & below.keys()
+    return sum(above[key][0] > below[key][1] - _ABOVE for key in shared) >= _LEAST_SQUARES

@@ -1,0 +1,74 @@
+"""Finds a free part of the table for an object."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from systems.signals import PlanarPose
+
+_CELL = 0.005
+"""Side of the squares that are free or occupied, in metres."""
+_STEP = 0.015
+"""Distance of the places that are tried, in metres."""
+_YAWS = 8
+"""The number of headings that are tried, over a full turn."""
+_LEAST = 0.010
+"""Least clearance of the object, in metres."""
+_AMPLE = 0.060
+"""More clearance than this is not better: the open hand has room."""
+_WAY = 0.02
+"""Clearance that makes up for a way of one metre, in metres."""
+
+
+def find_free_pose(
+    outline: NDArray[np.float64],
+    occupied: NDArray[np.float64],
+    area: tuple[tuple[float, float], tuple[float, float]],
+    *,
+    near: NDArray[np.float64],
+    yaw: float,
+) -> PlanarPose | None:
+    """The pose of an object at which it has the most clearance; None if it fits nowhere.
+
+    Args:
+        outline: (k, 2) points that cover the object, in its frame, in metres.
+        occupied: (m, 2) points that cover everything else, in the world.
+        area: lower and upper corner of the table's part, in the world.
+        near: (2,) of equally good places, the one nearest to this point is chosen.
+        yaw: the headings that are tried include this one, in radians.
+    """
+    # Import SciPy lazily.
+    from scipy import ndimage
+
+    low, high = np.array(area[0]), np.array(area[1])
+    shape = np.maximum(np.ceil((high - low) / _CELL).astype(int), 1)
+    taken = np.zeros(shape, bool)
+    cells = np.floor((occupied - low) / _CELL).astype(int)
+    inside = ((cells >= 0) & (cells < shape)).all(axis=1)
+    taken[tuple(cells[inside].T)] = True
+    taken = ndimage.binary_closing(np.pad(taken, 2), np.ones((3, 3)))[2:-2, 2:-2] | taken
+    room = ndimage.distance_transform_edt(~taken) * _CELL
+    axes = [np.arange(a + _STEP, b, _STEP) for a, b in zip(low, high, strict=True)]
+    places = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2)
+    best: tuple[float, PlanarPose] | None = None
+    for turn in range(_YAWS):
+        theta = yaw + turn * math.tau / _YAWS
+        cos, sin = math.cos(theta), math.sin(theta)
+        turned = outline @ np.array([[cos, sin], [-sin, cos]])
+        fits = (places + turned.min(axis=0) >= low + _LEAST).all(axis=1)
+        fits &= (places + turned.max(axis=0) <= high - _LEAST).all(axis=1)
+        if not fits.any():
+            continue
+        free = places[fits]
+        where = np.floor((free[:, None] + turned[None] - low) / _CELL).astype(int)
+        clearance = room[where[..., 0], where[..., 1]].min(axis=1)
+        score = np.minimum(clearance, _AMPLE) - _WAY * np.linalg.norm(free - near, axis=1)
+        score[clearance < _LEAST] = -np.inf
+        index = int(np.argmax(score))
+        if np.isfinite(score[index]) and (best is None or score[index] > best[0]):
+            x, y = free[index].tolist()
+            best = float(score[index]), PlanarPose(x, y, theta)
+    return None if best is None else best[1]
