@@ -73,7 +73,8 @@ class PlannerState(VectorView):
     beyond = Number()
     """For how long the contact force has been beyond the limit, in s."""
     recent = Array(3 * RECENT)
-    """x, y and z of the last contact forces without the payload, latest first, in N."""
+    """x, y and z of the last contact forces, latest first, without weight and inertia of the held
+    object, in N."""
     peak_vertical = Number()
     """The largest contact forces of the action, in N."""
     peak_lateral = Number()

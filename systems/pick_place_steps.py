@@ -161,7 +161,7 @@ class PickPlaceSteps:
         if not self._is_held(hand, contact):
             state.dropped += 1
             self._motion.begin(state, Mode.RETREAT, time)
-        elif contact[2] - state.payload > self._parameters.contact_threshold:
+        elif state.recent[Z] > self._parameters.contact_threshold:
             if self._is_blocked(state, hand):
                 state.touch_z = hand[2]
                 self._motion.begin(state, Mode.SEARCH, time, z=hand[2])
@@ -173,7 +173,7 @@ class PickPlaceSteps:
     def search(self, moment: Moment) -> None:
         """Tries one offset after the other until the object slips in."""
         state, time, hand, contact = moment.state, moment.time, moment.hand, moment.contact
-        free = contact[2] - state.payload < self._parameters.contact_threshold / 2
+        free = state.recent[Z] < self._parameters.contact_threshold / 2
         if not self._is_held(hand, contact):
             state.dropped += 1
             self._motion.begin(state, Mode.RETREAT, time)
