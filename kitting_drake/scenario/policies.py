@@ -5,7 +5,7 @@ Drake's YAML loader needs evaluated annotations, hence no `from __future__ impor
 
 import hashlib
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -217,7 +217,7 @@ class Learned(PolicyConfig):
         heights_only = not loaded.colour and site.observer is None
         function = loaded.function
         return PickPlacePolicy(
-            policy=function if self.avoid_failed_picks else _OfObservationAlone(function),
+            policy=function if self.avoid_failed_picks else _Forgetful(function),
             heights_only=heights_only,
         )
 
@@ -342,6 +342,21 @@ class _OfObservationAlone:
         self, observation: Observation, failed_picks: Sequence[PlanarPose] = ()
     ) -> PickPlaceAction:
         return self.function(observation)
+
+    def __repr__(self) -> str:
+        return repr(self.function)
+
+
+@dataclass(frozen=True)
+class _Forgetful:
+    """Wraps a policy; it knows neither failed picks nor earlier actions."""
+
+    function: Callable[[Observation], PickPlaceAction]
+
+    def __call__(
+        self, observation: Observation, failed_picks: Sequence[PlanarPose] = ()
+    ) -> PickPlaceAction:
+        return self.function(replace(observation, history=()))
 
     def __repr__(self) -> str:
         return repr(self.function)

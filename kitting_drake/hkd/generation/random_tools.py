@@ -1,8 +1,9 @@
 """Random tools for training: shapes that are not in the catalogue.
 
-Most are designs of the training split with random proportions. The others are composed of simple
-solids, like mallets, keys, scrapers and chisels. All are randomly stretched, splayed, bent and
-mirrored. They have surfaces and grasps, but no collision geometry and no files.
+Many are designs of the training split with random proportions. Others are composed of simple
+solids, like mallets, keys, scrapers and chisels, or are simple parts (`random_parts`). All are
+randomly stretched, splayed, bent and mirrored. They have surfaces and grasps, but no collision
+geometry and no files.
 """
 
 import copy
@@ -25,6 +26,7 @@ from kitting_drake.hkd.generation.generate import (
     homogeneous,
     rest_rotation,
 )
+from kitting_drake.hkd.generation.random_parts import draw_solid
 from kitting_drake.hkd.grasps.proposals import GraspProposal, propose_grasps
 from kitting_drake.hkd.tools.mass import mass_properties
 from kitting_drake.hkd.tools.meshes import vertices_and_faces
@@ -32,12 +34,13 @@ from kitting_drake.hkd.tools.tool import Tool
 
 Array = NDArray[np.float64]
 
-_LENGTHS = (0.11, 0.23)
-"""The range of the tools' lengths, in metres."""
+_LENGTHS, _SHORT, _LONG = (0.11, 0.23), (0.05, 0.11), (0.23, 0.32)
+"""Ranges of the tools' lengths, in metres: of most, and of `_UNUSUAL` each."""
+_UNUSUAL = 0.12
 _HIGHEST = 0.046
 """The largest height that fits into a kit's block, in metres."""
-_COMPOSED = 0.25
-"""The share of tools composed of simple solids."""
+_COMPOSED, _PARTS = 0.2, 0.3
+"""The shares of tools composed of simple solids, and of simple parts."""
 _JITTER = 0.22
 """The logarithm of the largest factor on each length and angle of a design."""
 _REFINED = 6.0
@@ -88,8 +91,13 @@ def draw_tool(entries: Sequence[ToolEntry], rng: np.random.Generator, name: str)
 def _attempt(
     entries: Sequence[ToolEntry], rng: np.random.Generator, name: str
 ) -> RandomTool | None:
-    if rng.random() < _COMPOSED:
+    kind = rng.random()
+    length: float | None = _draw_length(rng)
+    if kind < _COMPOSED:
         category, whole = "composed", _composed(rng)
+        center = _centroid(whole)
+    elif kind < _COMPOSED + _PARTS:
+        category, whole, length = "part", draw_solid(rng), None
         center = _centroid(whole)
     else:
         entry = entries[int(rng.integers(len(entries)))]
@@ -109,7 +117,7 @@ def _attempt(
     vertices, center = vertices @ rotation.T, rotation @ center
     low, high = vertices.min(axis=0), vertices.max(axis=0)
     origin = np.append((low + high)[:2] / 2, low[2])
-    scale = rng.uniform(*_LENGTHS) / float((high - low)[:2].max())
+    scale = 1e-3 if length is None else length / float((high - low)[:2].max())
     vertices, center = (vertices - origin) * scale, (center - origin) * scale
     size = (high - low) * scale
     if size[2] > _HIGHEST or size[2] < 0.005:
@@ -132,6 +140,13 @@ def _attempt(
         surface=triangles,
         grasps=tuple(grasps),
     )
+
+
+def _draw_length(rng: np.random.Generator) -> float:
+    """A tool's length, in metres."""
+    kind = rng.random()
+    ranges = _SHORT if kind < _UNUSUAL else _LONG if kind > 1 - _UNUSUAL else _LENGTHS
+    return float(rng.uniform(*ranges))
 
 
 def _varied(entry: ToolEntry, rng: np.random.Generator) -> ToolEntry:
