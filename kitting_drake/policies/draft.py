@@ -36,14 +36,25 @@ _NEVER = -math.inf
 """The logit of a pixel that must not be chosen."""
 
 
-def network_input(networks: Networks, observation: Observation) -> Image:
+def network_input(
+    networks: Networks, observation: Observation, resolution: float | None = None
+) -> Image:
     """The networks' input: (4, rows, cols).
 
-    Networks that see heights alone get unseen pixels filled in.
+    Networks that see heights alone get unseen pixels filled in. If their pixels in training had
+    another size, heights are scaled with the pixels: a scene of half the size, seen with pixels of
+    half the size, then looks the same.
+
+    Args:
+        networks: for inference.
+        observation: o_t.
+        resolution: the side of a pixel in training, in metres; None if unknown.
     """
     if networks.config.colour:
         return observation.image
     filled = observation.filled_height
+    if resolution is not None and not math.isclose(resolution, observation.grid.resolution):
+        filled = filled * np.float32(resolution / observation.grid.resolution)
     return np.concatenate([observation.rgb, filled[None]])
 
 
@@ -56,6 +67,7 @@ class Look:
         orientations: int,
         observation: Observation,
         failed_picks: Sequence[PlanarPose],
+        resolution: float | None = None,
     ) -> None:
         """
         Args:
@@ -63,12 +75,13 @@ class Look:
             orientations: N.
             observation: o_t.
             failed_picks: poses at which a grasp failed before.
+            resolution: the side of a pixel in training, in metres; None if unknown.
         """
         self.networks = networks
         self.orientations = orientations
         self.observation = observation
         self.failed_picks = failed_picks
-        self.image = network_input(networks, observation)
+        self.image = network_input(networks, observation, resolution)
         self.picking = networks.predict_pick(self.image, orientations)
 
     @property

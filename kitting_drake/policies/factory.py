@@ -18,6 +18,10 @@ if TYPE_CHECKING:
     from kitting_drake.policies.matching.shape_matching import ShapeMatchingPolicy
 
 
+_LARGEST_RATIO = 3.0
+"""Pixels may be this much larger or smaller than in training."""
+
+
 @dataclass(frozen=True)
 class LoadedPolicy:
     """A learned policy and the metadata of its weights file."""
@@ -31,20 +35,30 @@ class LoadedPolicy:
     """Whether it sees colours; otherwise heights alone."""
 
     def check_grid(self, grid: PixelGrid, field: str) -> None:
-        """Checks that the pixels have the size that the policy was trained with.
+        """Checks that the policy can use observations of this grid.
+
+        Networks that see heights alone can use pixels of another size than in training (see
+        `network_input`), others cannot.
 
         Args:
             grid: the pixel grid of the observations.
             field: the caller's name of the grid's resolution, for the error.
 
         Raises:
-            UserError: the sizes differ.
+            UserError: the policy cannot use it.
         """
         learned, given = self.resolution, grid.resolution
-        if learned is not None and not math.isclose(given, learned, rel_tol=1e-6):
+        if learned is None or math.isclose(given, learned, rel_tol=1e-6):
+            return
+        advice = f"but the policy in {self.path.name} learned from pixels of {learned:g} m"
+        if self.colour:
             raise UserError(
-                f"{field} is {given:g} m, but the policy in {self.path.name} "
-                f"learned from pixels of {learned:g} m: use that size, or train another policy"
+                f"{field} is {given:g} m, {advice}: use that size, or train another policy"
+            )
+        if not 1 / _LARGEST_RATIO <= given / learned <= _LARGEST_RATIO:
+            raise UserError(
+                f"{field} is {given:g} m, {advice}: use a size from "
+                f"{learned / _LARGEST_RATIO:.4g} to {learned * _LARGEST_RATIO:.4g} m"
             )
 
 
@@ -85,6 +99,7 @@ def load_learned_policy(
     from kitting_drake.policies.stages import make_stages
 
     path = GENERALIST if weights is None else weights
+    resolution = read_weights_file(path).card.get("resolution")
     networks = load_networks(path, preferred_type()).to(preferred_device())
     stages = make_stages(
         planner,
@@ -95,10 +110,15 @@ def load_learned_policy(
         may_stop=may_stop,
     )
     try:
-        function = LearnedPolicy(networks, orientations=orientations, stages=stages, watch=watch)
+        function = LearnedPolicy(
+            networks,
+            orientations=orientations,
+            stages=stages,
+            resolution=resolution,
+            watch=watch,
+        )
     except ValueError as error:
         raise UserError(f"{orientations_field}: {error}") from error
-    resolution = read_weights_file(path).card.get("resolution")
     return LoadedPolicy(function, path, resolution, networks.config.colour)
 
 

@@ -76,6 +76,7 @@ class LearnedPolicy:
         *,
         orientations: int = 180,
         stages: Sequence[Stage] = DEFAULT_STAGES,
+        resolution: float | None = None,
         watch: Callable[[Observation, Decision], None] | None = None,
     ) -> None:
         """
@@ -84,6 +85,7 @@ class LearnedPolicy:
             orientations: N.
             stages: applied in order (see `make_stages`). With no stages this is the paper's
                 policy, whose actions are pixels and bins.
+            resolution: the side of a pixel in training, in metres; None if unknown.
             watch: called with each observation and decision.
 
         Raises:
@@ -93,6 +95,7 @@ class LearnedPolicy:
         self._networks = networks
         self._orientations = orientations
         self._stages = tuple(stages)
+        self._resolution = resolution
         self._watch = watch
 
     def __call__(
@@ -135,12 +138,12 @@ class LearnedPolicy:
     @torch.inference_mode()
     def log_odds(self, observation: Observation) -> float | None:
         """The log-odds that there is something to pick; None if the networks do not predict it."""
-        image = network_input(self._networks, observation)
+        image = network_input(self._networks, observation, self._resolution)
         return self._networks.predict_pick(image, self._orientations).log_odds
 
     @torch.inference_mode()
     def _draft(self, observation: Observation, failed_picks: Sequence[PlanarPose]) -> Draft:
-        look = Look(self._networks, self._orientations, observation, failed_picks)
+        look = Look(self._networks, self._orientations, observation, failed_picks, self._resolution)
         return make_draft(look, look.first_logits(), self._stages)
 
 

@@ -77,7 +77,8 @@ def _letter(rng: np.random.Generator) -> CrossSection:
     for _ in range(int(rng.integers(1, 4))):
         length = rng.uniform(0.4, 1.0)
         arm = CrossSection.square((length, width * rng.uniform(0.8, 1.2)), True)
-        arm = arm.translate((length / 2 - width / 2, 0)).rotate(float(rng.choice([45, 60, 90, -90])))
+        angle = float(rng.choice([45, 60, 90, -90]))
+        arm = arm.translate((length / 2 - width / 2, 0)).rotate(angle)
         whole += arm.translate((float(rng.choice([-0.5, 0.0, 0.5])) * (1 - width), 0))
     return whole
 
