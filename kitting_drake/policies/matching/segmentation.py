@@ -51,7 +51,10 @@ _OBJECT_SEEN, _RECESS_SEEN = 0.5, 0.3
 _GAP = 1.5
 """The gap around an object in its recess is less than this far from its edges, in pixels."""
 _FLAT, _FLAT_SHARE = 0.0006, 0.7
-"""This share of a free recess's floor is within this of one height, in metres, or within noise."""
+"""More than this share of a free recess's floor is within this of one height, in metres, or within
+noise."""
+_NOISY = 0.001
+"""With more noise than this a floor cannot be told from an object, in metres."""
 _NEIGHBOURS = np.ones((3, 3), bool)
 _CROSS = ndimage.generate_binary_structure(2, 1)
 
@@ -90,7 +93,7 @@ class Segmentation:
     visibility: Visibility
     """Which of its pixels are seen."""
     noise: float = 0.0
-    """The standard deviation of the heights' noise, in metres."""
+    """The standard deviation of the table's heights, in metres."""
 
     @property
     def kit_seen(self) -> bool:
@@ -112,7 +115,11 @@ class Segmentation:
         )
 
     def _is_flat(self, recess: Region) -> bool:
-        floor = self.relief[recess.mask & self.visibility.seen]
+        if self.noise > _NOISY:
+            return True
+        # Heights at the walls are those of the wall or of the floor.
+        core = ndimage.binary_erosion(recess.mask) & self.visibility.seen
+        floor = self.relief[core if core.any() else recess.mask]
         away = np.abs(floor - np.median(floor))
         return bool((away < max(_FLAT, 2 * self.noise)).mean() > _FLAT_SHARE)
 
@@ -172,7 +179,7 @@ def segment(observation: Observation) -> Segmentation:
         ),
         relief=relief,
         visibility=Visibility.of(observation),
-        noise=noise,
+        noise=_noise(relief),
     )
 
 
