@@ -246,10 +246,9 @@ class OraclePolicy(LeafSystem):
         ]
 
         def order(index: int) -> tuple[bool, float]:
-            item = None if tried is None else self._choose_object(index, poses, placements)
-            return index in failed_there, 0.0 if item is None or tried is None else float(
-                tried[item]
-            )
+            item = self._choose_object(index, poses, placements)
+            attempts = 0.0 if tried is None or item is None else float(tried[item])
+            return index in failed_there, attempts
 
         return sorted(open_goals, key=order)
 
