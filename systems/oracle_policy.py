@@ -13,6 +13,7 @@ from pydrake.math import RigidTransform
 from pydrake.systems.framework import Context, LeafSystem
 
 from systems.action_quantizer import ActionQuantizer
+from systems.attempt_memory import AttemptMemory
 from systems.clutter_expert import ClutterExpert
 from systems.cluttered_table import ClutteredTable
 from systems.grasp import Grasp
@@ -83,6 +84,8 @@ class OraclePolicy(LeafSystem):
         - body_poses
         - kept_goals
         - failed_picks
+        - mode (optional)
+        - accepted_action (optional)
         output_ports:
         - action
 
@@ -91,17 +94,21 @@ class OraclePolicy(LeafSystem):
       connected, no goal is kept.
     - `failed_picks` (abstract, a tuple of `PlanarPose`): the planner's port of that name. Used only
       where objects lie on each other; optional.
+    - `mode` (1) and `accepted_action` (abstract, `PickPlaceAction`): the planner's ports of those
+      names, by which the oracle remembers what it tried (see `AttemptMemory`).
     - `action` (abstract, `PickPlaceAction`): moves an object to a goal; `stop` when every goal is
       filled.
 
     The law chooses, in this order:
 
     1. The goal: the first that is not filled and whose prerequisites are filled or kept. Goals
-       that already have a misplaced object come last.
+       that already have a misplaced object come last. An object that was tried already comes after
+       the others, so that a tool that slips does not cost the others their actions.
     2. The object: the highest one in the cell that may fill the goal and fills no other, since
        nothing lies on it. Of equally high ones, the one that `evaluate_placements` assigned.
     3. The goal pose: the free one that rotates the object least.
     4. The grasp: the first that keeps the fingers clear of other objects at the pick and the place.
+       Of those, one that was tried least often: after a slip, the next.
 
     With a quantizer, the action is the best that a policy of the paper can choose. The pick is the
     rounded annotated grasp. The place is the gripper pose that brings the object, held by the
@@ -111,7 +118,7 @@ class OraclePolicy(LeafSystem):
     Where objects touch or lie on each other (`table`), `ClutterExpert` chooses the object and the
     grasp, and lays aside what is in the way. Its actions are not rounded and carry heights.
 
-    Stateless: after a failed grasp, it returns the same object again.
+    State: the number of attempts by object and grasp.
     """
 
     def __init__(
@@ -159,6 +166,9 @@ class OraclePolicy(LeafSystem):
         self._kept_goals = self.DeclareVectorInputPort("kept_goals", len(goals))
         self._failed_picks = self.DeclareAbstractInputPort("failed_picks", Value(()))
         self._table = table
+        self._memory = AttemptMemory(
+            self, objects=self._objects, grasps=self._grasps, body_poses=self._body_poses
+        )
         self.DeclareAbstractOutputPort(
             "action",
             lambda: Value(PickPlaceAction()),
@@ -167,6 +177,7 @@ class OraclePolicy(LeafSystem):
                 self._body_poses.ticket(),
                 self._kept_goals.ticket(),
                 self._failed_picks.ticket(),
+                self._memory.ticket,
             },
         )
 
@@ -184,7 +195,7 @@ class OraclePolicy(LeafSystem):
             )
             action = self._act_in_clutter(self._table, poses, placements, kept, failed)
         else:
-            plan = self._plan(poses, placements, kept)
+            plan = self._plan(poses, placements, kept, self._memory.attempts(context))
             action = None if plan is None else self._action(plan, poses)
         if action is not None:
             output.set_value(action)
@@ -194,22 +205,34 @@ class OraclePolicy(LeafSystem):
         output.set_value(PickPlaceAction(stop=True, reason=reason))
 
     def _plan(
-        self, poses: list[RigidTransform], placements: list[Placement], kept: frozenset[int]
+        self,
+        poses: list[RigidTransform],
+        placements: list[Placement],
+        kept: frozenset[int],
+        attempts: NDArray[np.float64],
     ) -> _Plan | None:
         """The next move; None if every goal is filled, or no goal can be filled."""
-        for index in self._open_goals(poses, placements, kept):
+        tried = attempts.sum(axis=1)
+        for index in self._open_goals(poses, placements, kept, tried):
             goal = self._goals[index]
             item = self._choose_object(index, poses, placements)
             if item is not None:
                 X_WGoal = self._choose_pose(goal, item, poses)
-                grasp = self._choose_grasp(item, X_WGoal, poses)
+                grasp = self._choose_grasp(item, X_WGoal, poses, attempts[item])
                 return _Plan(item, grasp, X_WGoal, goal)
         return None
 
     def _open_goals(
-        self, poses: list[RigidTransform], placements: list[Placement], kept: frozenset[int]
+        self,
+        poses: list[RigidTransform],
+        placements: list[Placement],
+        kept: frozenset[int],
+        tried: NDArray[np.float64] | None = None,
     ) -> list[int]:
-        """The goals that may be filled now, those with a misplaced object last."""
+        """The goals that may be filled now, those with a misplaced object last.
+
+        Otherwise those come first whose objects were tried least often; `tried` is (n,).
+        """
         filled = kept | {item.goal for item in placements if item.success}
         failed_there = {
             item.goal
@@ -221,7 +244,13 @@ class OraclePolicy(LeafSystem):
             for index, goal in enumerate(self._goals)
             if index not in filled and filled.issuperset(goal.after)
         ]
-        return sorted(open_goals, key=lambda index: index in failed_there)
+
+        def order(index: int) -> tuple[bool, float]:
+            item = self._choose_object(index, poses, placements)
+            attempts = 0.0 if tried is None or item is None else float(tried[item])
+            return index in failed_there, attempts
+
+        return sorted(open_goals, key=order)
 
     def _act_in_clutter(
         self,
@@ -285,7 +314,11 @@ class OraclePolicy(LeafSystem):
         )
 
     def _choose_grasp(
-        self, item: int, X_WGoal: RigidTransform, poses: list[RigidTransform]
+        self,
+        item: int,
+        X_WGoal: RigidTransform,
+        poses: list[RigidTransform],
+        tried: NDArray[np.float64],
     ) -> Grasp:
         grasps = self._grasps[item]
         if len(grasps) == 1:
@@ -317,7 +350,12 @@ class OraclePolicy(LeafSystem):
                 )
             )
 
-        return min(grasps, key=obstruction)
+        obstructions = [obstruction(grasp) for grasp in grasps]
+        best = min(
+            range(len(grasps)),
+            key=lambda index: (obstructions[index] > 0, tried[index], obstructions[index]),
+        )
+        return grasps[best]
 
     def _action(self, plan: _Plan, poses: list[RigidTransform]) -> PickPlaceAction:
         X_WB = poses[plan.index]

@@ -70,14 +70,17 @@ class PickPlaceParameters:
     # Force of each pad on the held object, in N.
     grasp_force: float = bounded(30.0, 1.0, 140.0)
 
-    # Force of each pad on an object whose measured load exceeds `heavy_load`, both in N. A heavy
-    # object that is gripped beside its centre of mass would rotate between the pads. 70 N is the
-    # continuous grasping force of a Franka Hand.
+    # The grip is firmer the more an object weighs, because one that is gripped beside its centre of
+    # mass turns between the pads: `firm_grasp_force` at `heavy_load`, `peak_grasp_force` at
+    # `heaviest_load`, all in N (see `grip_force`). A Franka Hand grips with 70 N continuously and
+    # with up to 140 N for a short time.
     firm_grasp_force: float = bounded(70.0, 1.0, 140.0)
     heavy_load: float = bounded(5.0, 0.5, 100.0)
+    peak_grasp_force: float = bounded(140.0, 1.0, 140.0)
+    heaviest_load: float = bounded(20.0, 0.5, 100.0)
 
     # Below this width between the squeezing pads the grasp counts as empty, in m.
-    minimum_width: float = bounded(0.0015, 0.0, 0.08)
+    minimum_width: float = bounded(0.0005, 0.0, 0.08)
 
     # To seat an object that sticks out, closed jaws press it down with this force, in N, and go at
     # most this far below its top, in m. They touch it at `touch_speed`; the force overshoots by

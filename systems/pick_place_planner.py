@@ -93,7 +93,8 @@ class PickPlacePlanner(LeafSystem):
     - `CHECK`: a grasp is good if the pads are further apart than `minimum_width` and both feel at
       least half of the grasp force. If it is not, or is lost later, the hand retreats and observes
       again. The attempt counts as an action.
-    - `LIFT`, `CARRY`: a load above `heavy_load` is gripped more firmly.
+    - `LIFT`, `CARRY`: the more the object weighs, the more firmly it is gripped (`grip_force`). A
+      heavy object is lifted only once the grip is firm.
     - `SEARCH`: in tasks that insert, if the object stands on the rim around its place, the hand
       searches for the cavity. It lowers again once the resistance ends.
     - An action with `press` ends with `DESCEND`, with closed jaws, at `touch_speed`, until

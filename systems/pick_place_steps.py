@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from systems.contact_guard import ContactGuard
+from systems.grip_force import felt_weight, grip_force, lifts_too_early
 from systems.pick_place_motion import PickPlaceMotion, PlannerState, Z
 from systems.pick_place_parameters import Mode, PickPlaceParameters
 
@@ -142,9 +143,12 @@ class PickPlaceSteps:
     def hold(self, moment: Moment) -> None:
         """Lifts and carries while an object is held."""
         state, time, hand, contact = moment.state, moment.time, moment.hand, moment.contact
-        if -contact[2] > self._parameters.heavy_load:
-            firm = max(state.goal_force, self._parameters.firm_grasp_force)
-            self._motion.set_force(state, time, firm)
+        weight = felt_weight(contact[2], self._motion.motion_at(state, time)[8 + Z])
+        force = grip_force(weight, float(state.goal_force), self._parameters)
+        self._motion.set_force(state, time, force)
+        if state.mode == Mode.LIFT and lifts_too_early(force, self._motion.force_at(state, time)):
+            # Brake, and go on when the grip is firm.
+            self._motion.begin(state, Mode.LIFT, time)
         if not self._is_held(hand, contact):
             state.dropped += 1
             self._motion.begin(state, Mode.RETREAT, time)

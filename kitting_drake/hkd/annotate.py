@@ -83,6 +83,8 @@ def save_grasp(tool: Tool, grasp: Grasp, models: Path = MODELS) -> None:
         record_path = tool.directory / "tool.yaml"
         record = yaml.safe_load(record_path.read_text())
         record["grasp"] = {key: round(value, 6) for key, value in dataclasses.asdict(grasp).items()}
+        # The others were proposed for another first one.
+        record.pop("other_grasps", None)
         # A repeated import keeps an annotated grasp.
         record["annotated"] = True
         write_atomically(record_path, yaml.safe_dump(record, sort_keys=False))

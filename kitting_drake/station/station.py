@@ -16,6 +16,7 @@ from kitting_drake.common.errors import UserError
 from kitting_drake.common.rendering import can_render
 from kitting_drake.scenario.schema import Scenario
 from kitting_drake.station.control import add_control
+from kitting_drake.station.mass_centres import correct_drift
 from kitting_drake.station.paint import paint_surfaces
 from kitting_drake.station.plant import add_models, add_plant, bounded_body, set_initial_poses
 from kitting_drake.station.sensing import add_cameras
@@ -256,6 +257,7 @@ class KittingStation(Diagram):
         simulator = Simulator(self if diagram is None else diagram)
 
         def step(root_context: Context) -> EventStatus:
+            self._correct_drift(root_context)
             self._let_appear(root_context)
             self._apply_sleep(root_context)
             return EventStatus.DidNothing() if monitor is None else monitor(root_context)
@@ -263,8 +265,15 @@ class KittingStation(Diagram):
         simulator.set_monitor(step)
         return simulator
 
-    # The simulator's monitor calls these two, because a LeafSystem cannot change the context of
+    # The simulator's monitor calls these three, because a LeafSystem cannot change the context of
     # another system.
+
+    def _correct_drift(self, root_context: Context) -> None:
+        """Calls `correct_drift` if the plant has just made a step."""
+        steps = root_context.get_time() / self.plant.time_step()
+        if steps == round(steps):
+            context = self.plant.GetMyMutableContextFromRoot(root_context)
+            correct_drift(self.plant, context, self._bodies)
 
     def _let_appear(self, root_context: Context) -> None:
         """Moves the next object to its place of appearance, if one is to appear; it wakes there."""

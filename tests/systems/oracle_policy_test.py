@@ -66,7 +66,7 @@ def test_ports():
     oracle = OraclePolicy(
         objects=[HAMMER], grasps=[(HAMMER_GRASP,)], goals=[HAMMER_GOAL], success=AddS()
     )
-    assert (oracle.num_input_ports(), oracle.num_output_ports()) == (3, 1)
+    assert (oracle.num_input_ports(), oracle.num_output_ports()) == (5, 1)
     assert oracle.GetInputPort("kept_goals").size() == 1
     assert oracle.GetInputPort("body_poses").Allocate().get_value() is not None
     assert oracle.GetOutputPort("action").Allocate().get_value() == PickPlaceAction()

@@ -277,9 +277,11 @@ def test_the_hand_reaches_the_commanded_poses():
     )
 
 
-@pytest.mark.parametrize(("heavy_load", "firm"), [(WEIGHT - 0.5, True), (2 * WEIGHT, False)])
+@pytest.mark.parametrize(("heavy_load", "firm"), [(WEIGHT - 0.5, True), (8 * WEIGHT, False)])
 def test_a_heavy_object_is_gripped_more_firmly_until_its_release(heavy_load: float, firm: bool):
-    parameters = dataclasses.replace(PARAMETERS, heavy_load=heavy_load)
+    parameters = dataclasses.replace(
+        PARAMETERS, heavy_load=heavy_load, peak_grasp_force=PARAMETERS.firm_grasp_force
+    )
     run = Run(parameters=parameters).until(Mode.LIFT)
     assert run.output("closing_force")[0] == parameters.grasp_force
     run.until(Mode.LOWER)
@@ -469,7 +471,12 @@ def test_an_object_gripped_higher_than_planned_clears_the_rim(higher: float):
 
 @pytest.mark.parametrize("ramp", [0.05, 0.4])
 def test_the_closing_force_is_continuous_up_to_a_firm_grip(ramp: float):
-    parameters = dataclasses.replace(PARAMETERS, force_ramp=ramp, heavy_load=WEIGHT - 0.5)
+    parameters = dataclasses.replace(
+        PARAMETERS,
+        force_ramp=ramp,
+        heavy_load=WEIGHT - 0.5,
+        peak_grasp_force=PARAMETERS.firm_grasp_force,
+    )
     run = Run(parameters=parameters).until(Mode.CHECK)
     forces, step = [run.output("closing_force")[0]], ramp / 16
     while run.sequence[-1] != Mode.RELEASE:

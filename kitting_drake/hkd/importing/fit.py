@@ -5,7 +5,7 @@ from pathlib import Path
 from manifold3d import Manifold
 
 from kitting_drake.common.errors import UserError
-from kitting_drake.hkd.grasps.proposals import WIDEST, propose_grasps
+from kitting_drake.hkd.grasps.proposals import WIDEST, GraspProposal, propose_grasps
 from kitting_drake.hkd.importing.materials import bodies_of
 from kitting_drake.hkd.importing.tool_frame import centred, size
 from kitting_drake.hkd.kits.layout import layout_kit
@@ -13,6 +13,7 @@ from kitting_drake.hkd.kits.parameters import KitParameters
 from kitting_drake.hkd.tools import meshes
 from kitting_drake.hkd.tools.mass import mass_properties
 from kitting_drake.hkd.tools.tool import Tool
+from systems.grasp import Grasp
 
 SCALED_LENGTHS_MM = (180.0, 170.0, 160.0, 150.0)
 """Lengths to try; the tool gets the first at which it can be held and kitted."""
@@ -21,6 +22,9 @@ KEPT_LENGTHS_MM = (150.0, 200.0)
 POSSIBLE_LENGTHS_MM = (50.0, 600.0)
 """The range of lengths of hand tools, for guessing a file's unit."""
 THINNEST_MM, HIGHEST_MM = 4.0, 45.0
+
+# The number of other grasps to keep, and how much more they may cost than the best.
+_OTHERS, _MUCH_WORSE = 3, 2.0
 
 _UNITS = {"mm": 1.0, "m": 1000.0, "cm": 10.0, "inches": 25.4}
 _CREASE_ANGLE_DEG = 35.0
@@ -152,4 +156,23 @@ def _tool(
         mass=0.0,
         grasp=proposals[0].grasp,
         visual_meshes=(visual,),
+        other_grasps=other_grasps(proposals),
     )
+
+
+def other_grasps(proposals: list[GraspProposal]) -> tuple[Grasp, ...]:
+    """The grasps to try after the first of `propose_grasps`, best first.
+
+    The nearest to the centre of mass is always among them, for a tool that turns between the pads.
+    """
+    usable = [item for item in proposals[1:] if item.cost < proposals[0].cost + _MUCH_WORSE]
+    chosen = usable[:_OTHERS]
+    nearest = min(usable, key=lambda item: item.offset, default=None)
+    if nearest is not None and nearest not in chosen:
+        chosen[-1] = nearest
+    return tuple(item.grasp for item in chosen)
+
+
+def grasp_record(grasp: Grasp) -> dict[str, float]:
+    """A grasp as in `tool.yaml`."""
+    return {key: round(float(value), 6) for key, value in vars(grasp).items()}

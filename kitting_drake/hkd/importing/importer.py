@@ -33,6 +33,7 @@ from kitting_drake.hkd.importing.fit import (
     HIGHEST_MM,
     THINNEST_MM,
     fit,
+    grasp_record,
     lengths_to_try,
     material_of,
 )
@@ -70,6 +71,9 @@ _MOST_MEMORY = 12 * 2**30
 _SAME_POSE_DEG, _LAYINGS = 2.0, 3
 # A tool that tips over when the table tilts by this, in degrees, is not stable.
 _TIPS_DEG = 10.0
+# The hydroelastic modulus, in Pa. The catalogue's would let the pads sink so far into a thin blade
+# that they seem to hold nothing, and up a round handle's slope.
+_MODULUS = 8e6
 # A larger deviation of the collision hulls from the outline is reported.
 _TRUE_OUTLINE_MM = 0.35
 _FRONTS = {"hammer": "its head", "screwdriver": "its blade"}
@@ -384,6 +388,7 @@ def _write(
         inertia,
         [(tool.visual_meshes[0].name, material)],
         collisions,
+        modulus=_MODULUS,
     )
     (directory / f"{name}.sdf").write_text(
         re.sub(r"<!--.*?-->", f"<!-- Made by `hkd import` of {_safe(request.mesh.name)}. -->", text)
@@ -398,7 +403,8 @@ def _write(
         "mass": round(float(mass), 6),
         "center_of_mass": [round(float(v), 6) + 0.0 for v in center],
         "symmetry": symmetry_order(1e-3 * vertices[faces]),
-        "grasp": {key: round(float(value), 6) for key, value in vars(tool.grasp).items()},
+        "grasp": grasp_record(tool.grasp),
+        "other_grasps": [grasp_record(grasp) for grasp in tool.other_grasps],
         "visual_meshes": [path.name for path in tool.visual_meshes],
         "imported": {
             "file": request.mesh.name,

@@ -1,4 +1,4 @@
-"""Scaled tools: section IV-B.2 of the paper scales the tools of a toolset at random.
+"""Scaled and weighted tools: section IV-B.2 of the paper scales a toolset's tools at random.
 
 A uniform scale s at constant density multiplies the mass by s^3, the moments of inertia by s^5 and
 all lengths by s.
@@ -6,17 +6,26 @@ all lengths by s.
 
 import dataclasses
 import hashlib
+import math
 import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 
 from kitting_drake.common.cached_folder import cached_folder
 from kitting_drake.common.errors import UserError
 from kitting_drake.common.paths import cache_directory
+from kitting_drake.common.sdformat import model_text
 from kitting_drake.hkd.tools.tool import Tool
+from systems.grasp import Grasp
+from systems.grip_force import GRAVITY
+from systems.hand_geometry import MAX_OPENING
 
 _FORMAT_VERSION = "1"
 """Part of the cache key. Change it when equal inputs give other files."""
 _SAME_LENGTH = 1e-9
+_EASY_MOMENT = 0.2
+"""A moment about the axis of the pads that they hold easily, in N m."""
+_WIDEST = MAX_OPENING - 0.015
+"""The greatest width of `other_grasps`, in metres."""
 
 _DRAKE = "http://drake.mit.edu"
 
@@ -36,12 +45,15 @@ def scaled_tool(tool: Tool, length: float) -> Tool:
     if abs(length - tool.length) <= _SAME_LENGTH:
         return tool
     factor = length / tool.length
-    grasp = dataclasses.replace(
-        tool.grasp,
-        x=factor * tool.grasp.x,
-        y=factor * tool.grasp.y,
-        width=factor * tool.grasp.width,
-        surface_height=factor * tool.grasp.surface_height,
+    grasp, *others = (
+        dataclasses.replace(
+            grasp,
+            x=factor * grasp.x,
+            y=factor * grasp.y,
+            width=factor * grasp.width,
+            surface_height=factor * grasp.surface_height,
+        )
+        for grasp in tool.grasps
     )
     return dataclasses.replace(
         tool,
@@ -51,8 +63,48 @@ def scaled_tool(tool: Tool, length: float) -> Tool:
         height=factor * tool.height,
         mass=factor**3 * tool.mass,
         grasp=grasp,
+        other_grasps=tuple(item for item in others if item.width <= _WIDEST),
         scale=factor * tool.scale,
     )
+
+
+def weighted_tool(tool: Tool, mass: float) -> Tool:
+    """The tool with another mass in kg, distributed as before; the same tool if it has that mass.
+
+    The contact stiffness changes with the mass, so that the tool rests as before. Grasps by which a
+    heavy tool would turn between the pads come last.
+
+    Raises:
+        UserError: the mass is not positive, the model is not valid, or the cache cannot be written.
+    """
+    if not 0.0 < mass < float("inf"):
+        raise UserError(f"the tool '{tool.name}' cannot have a mass of {mass:g} kg")
+    if mass == tool.mass:
+        return tool
+    text = model_text(tool.sdf, mass=mass / tool.mass)
+    assert text is not None
+    root = ElementTree.fromstring(text)
+    for modulus in root.iter(f"{{{_DRAKE}}}hydroelastic_modulus"):
+        _scale_numbers(modulus, [mass / tool.mass])
+    text = '<?xml version="1.0"?>\n' + ElementTree.tostring(root, encoding="unicode") + "\n"
+    key = f"{_FORMAT_VERSION} mass {text}".encode()
+    folder = cached_folder(
+        cache_directory() / "tools" / hashlib.sha256(key).hexdigest()[:24],
+        [tool.sdf.name],
+        lambda made: (made / tool.sdf.name).write_text(text),
+    )
+    grasp, *others = sorted(tool.grasps, key=lambda item: _excess_moment(item, root, mass))
+    return dataclasses.replace(
+        tool, directory=folder, mass=mass, grasp=grasp, other_grasps=tuple(others)
+    )
+
+
+def _excess_moment(grasp: Grasp, root: ElementTree.Element, mass: float) -> float:
+    """The moment of the weight about the axis of the pads beyond what they hold easily, in N m."""
+    pose = root.findtext(".//inertial/pose") or "0 0"
+    x, y, *_ = map(float, pose.split())
+    lever = (x - grasp.x) * math.cos(grasp.theta) + (y - grasp.y) * math.sin(grasp.theta)
+    return max(GRAVITY * mass * abs(lever) - _EASY_MOMENT, 0.0)
 
 
 def _scaled_model(tool: Tool, factor: float) -> Path:

@@ -5,6 +5,7 @@ import difflib
 import math
 import os
 import re
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from pathlib import Path
@@ -54,6 +55,13 @@ class Tool:
     half turn in its cavity is the same placement."""
     scale: float = 1.0
     """The factor by which the visual meshes' files are scaled."""
+    other_grasps: tuple[Grasp, ...] = ()
+    """More grasps, best first, for when the first one fails."""
+
+    @property
+    def grasps(self) -> tuple[Grasp, ...]:
+        """All grasps, best first."""
+        return (self.grasp, *self.other_grasps)
 
     @property
     def sdf(self) -> Path:
@@ -177,9 +185,10 @@ def load_tool(name: str, base: Path | None = None) -> Tool:
             width=float(record["width"]),
             height=float(record["height"]),
             mass=float(record["mass"]),
-            grasp=Grasp(**{key: float(value) for key, value in record["grasp"].items()}),
+            grasp=_read_grasp(record["grasp"]),
             visual_meshes=tuple(directory / str(path) for path in record["visual_meshes"]),
             symmetry=int(record.get("symmetry", 1)),
+            other_grasps=tuple(map(_read_grasp, record.get("other_grasps", ()))),
         )
     except yaml.YAMLError as error:
         mark = getattr(error, "problem_mark", None)
@@ -196,16 +205,20 @@ def load_tool(name: str, base: Path | None = None) -> Tool:
         raise UserError(f"{record_path}: {error}") from error
     sizes = {
         **{name: getattr(tool, name) for name in ("length", "width", "height", "mass")},
-        "grasp.width": tool.grasp.width,
+        "grasp.width": min(grasp.width for grasp in tool.grasps),
     }
     for name, value in sizes.items():
         if not 0 < value < math.inf:
             raise UserError(f"{record_path}: {name} is {value:g}; it must be positive")
-    if not all(map(math.isfinite, dataclasses.astuple(tool.grasp))):
+    if not np.isfinite([dataclasses.astuple(grasp) for grasp in tool.grasps]).all():
         raise UserError(f"{record_path}: grasp must consist of finite numbers")
     if tool.symmetry < 1:
         raise UserError(f"{record_path}: symmetry is {tool.symmetry}; it must be 1 or more")
     return _shared(tool, tuple(path.stat().st_mtime_ns for path in tool.visual_meshes))
+
+
+def _read_grasp(record: Mapping[str, float]) -> Grasp:
+    return Grasp(**{key: float(value) for key, value in record.items()})
 
 
 @lru_cache(maxsize=32)

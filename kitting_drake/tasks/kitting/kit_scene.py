@@ -65,7 +65,7 @@ def kitting_scene(
                 model=tool.sdf,
                 X_WB=X_WTools[index],
                 p_BPoints=tool.surface_points(_SURFACE_POINTS),
-                grasps=(tool.grasp,),
+                grasps=tool.grasps,
                 symmetry=tool.symmetry,
                 axis=tool.axis,
             )

@@ -14,7 +14,7 @@ from kitting_drake.hkd.generation.part_models import is_part_kind, load_named, s
 from kitting_drake.hkd.grasps.all_grasps import all_grasps
 from kitting_drake.hkd.kits.kit import Kit, make_kit
 from kitting_drake.hkd.kits.parameters import KitParameters
-from kitting_drake.hkd.tools.scaling import scaled_tool
+from kitting_drake.hkd.tools.scaling import scaled_tool, weighted_tool
 from kitting_drake.hkd.tools.tool import Tool
 from kitting_drake.hkd.tools.toolsets import SPLITS, toolsets
 from kitting_drake.policies.data.learning import Learning
@@ -110,6 +110,9 @@ class _DrawnKitting(_KittingTask):
     # Number of boxes without a cavity, as clutter; fewer if there is no room.
     distractors: int = bounded(0, 0, 12)
 
+    # Each tool's mass is drawn from this range, in kg; [0, 0]: it has its own.
+    tool_mass: list[float] = bounded([0.0, 0.0], 0.0, 3.0)
+
     # Number of kits. The tools are shared out between them at random, as evenly as possible.
     kits: int = bounded(1, 1, _MOST_KITS)
 
@@ -132,6 +135,7 @@ class _DrawnKitting(_KittingTask):
     faces: str = "as_drawn"
 
     def _draw_scene(self, tools: list[Tool], grid: PixelGrid, seed: int) -> Scene:
+        tools = self._weighted(tools, seed)
         if self.start != APART or self.tray:
             return self._draw_settled(self._kit_of(tools), tools, grid, seed)
         # Streams of their own: with one level kit, the poses are those of a seed without them.
@@ -180,6 +184,17 @@ class _DrawnKitting(_KittingTask):
             max_actions=self.tries * len(tools),
         )
 
+    def _weighted(self, tools: list[Tool], seed: int) -> list[Tool]:
+        """The tools with their drawn masses. Identical tools have the same mass."""
+        least, greatest = self.tool_mass
+        if not greatest:
+            return tools
+        masses = np.random.default_rng([seed, 9]).uniform(least, greatest, len(tools)).tolist()
+        drawn = {
+            (tool.directory, tool.length): mass for tool, mass in zip(tools, masses, strict=True)
+        }
+        return [weighted_tool(tool, drawn[tool.directory, tool.length]) for tool in tools]
+
     def _shares(self, count: int, rng: np.random.Generator) -> list[tuple[int, ...]]:
         """The tools of each kit, as indices."""
         if count < self.kits:
@@ -217,10 +232,13 @@ class _DrawnKitting(_KittingTask):
         )
 
     def validate(self) -> None:
-        for name in ("riser", "tilt_deg"):
+        for name in ("riser", "tilt_deg", "tool_mass"):
             least, greatest = getattr(self, name)
             if least > greatest:
                 raise ValueError(f"task.{name} must be [least, greatest]")
+        least, greatest = self.tool_mass
+        if (least == 0) != (greatest == 0):
+            raise ValueError("task.tool_mass must be [least, greatest], both positive, or [0, 0]")
         check_start(self.start, self.tray, self.faces, self.distractors)
         if (self.start != APART or self.tray) and (
             self.kits > 1 or any(self.riser + self.tilt_deg)

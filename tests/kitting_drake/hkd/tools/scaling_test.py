@@ -1,3 +1,4 @@
+import dataclasses
 import threading
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -10,7 +11,7 @@ from pydrake.multibody.plant import AddMultibodyPlantSceneGraph
 from pydrake.systems.framework import DiagramBuilder
 
 from kitting_drake.common.errors import UserError
-from kitting_drake.hkd.tools.scaling import scaled_sdf, scaled_tool
+from kitting_drake.hkd.tools.scaling import scaled_sdf, scaled_tool, weighted_tool
 from kitting_drake.hkd.tools.tool import Tool, load_tool
 
 
@@ -123,3 +124,29 @@ def test_concurrent_scalings_of_the_same_tool_all_succeed(cache: Path):
         made = list(pool.map(scale, range(4)))
     assert len({one.sdf for one in made}) == 1
     assert list(cache.iterdir()) == [made[0].directory]
+
+
+def test_a_heavier_tool_has_scaled_inertia_and_stiffness(cache: Path):
+    tool = load_tool("claw_hammer")
+    heavy = weighted_tool(scaled_tool(tool, 0.19), 2.0)
+    (old, _, before), (new, _, after) = loaded(scaled_tool(tool, 0.19)), loaded(heavy)
+    factor = 2.0 / old.default_mass()
+    assert new.default_mass() == pytest.approx(heavy.mass, rel=1e-5)
+    inertias = [body.default_spatial_inertia().CopyToFullMatrix6() for body in (old, new)]
+    np.testing.assert_allclose(inertias[1], factor * inertias[0], rtol=1e-5, atol=1e-9)
+    moduli = [
+        properties[0].GetProperty("hydroelastic", "hydroelastic_modulus")
+        for properties in (before, after)
+    ]
+    assert moduli[1] == pytest.approx(factor * moduli[0], rel=1e-5)
+    assert weighted_tool(tool, tool.mass) is tool
+    with pytest.raises(UserError, match="cannot have a mass"):
+        weighted_tool(tool, 0.0)
+
+
+def test_a_heavy_tool_is_first_gripped_where_it_does_not_turn(cache: Path):
+    tool = load_tool("combination_wrench")
+    far = dataclasses.replace(tool.grasp, x=tool.grasp.x + 0.05)
+    tool = dataclasses.replace(tool, grasp=far, other_grasps=(tool.grasp,))
+    assert weighted_tool(tool, 0.15).grasps == tool.grasps
+    assert weighted_tool(tool, 2.0).grasps == tool.grasps[::-1]

@@ -1,4 +1,5 @@
 import shutil
+import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 
 import numpy as np
@@ -200,6 +201,18 @@ def test_lengths_are_drawn_only_with_random_lengths():
     # The seed draws the same tools with and without random lengths.
     assert scaled.keys() == as_made.keys()
     assert scaled != as_made
+
+
+def test_drawn_masses_change_nothing_but_the_models():
+    plain, heavy = draw(0, ToolsetKitting()), draw(0, ToolsetKitting(tool_mass=[1.0, 2.0]))
+    assert poses(plain) == poses(heavy)
+    for item, other in zip(plain.objects, heavy.objects, strict=True):
+        assert (item.name, item.grasps) == (other.name, other.grasps)
+        mass = float(ElementTree.parse(other.model).findtext(".//mass") or 0)
+        assert 1.0 <= mass <= 2.0
+    for wrong in ([2.0, 1.0], [0.0, 1.0]):
+        with pytest.raises(ValueError, match=r"task\.tool_mass must be"):
+            Kitting(tool_mass=wrong).validate()
 
 
 def test_only_default_parameters_have_the_papers_title():

@@ -1,0 +1,113 @@
+"""The oracle's memory: which object was picked how often, and by which of its grasps."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+from pydrake.common.value import Value
+from pydrake.math import RigidTransform
+from pydrake.systems.framework import Context, DiscreteValues, EventStatus, InputPort, LeafSystem
+
+from systems.grasp import Grasp
+from systems.pick_place_parameters import Mode
+from systems.placement import PlacedObject, heading
+from systems.signals import PickPlaceAction, PlanarPose
+
+_PERIOD = 1 / 64
+"""The planner's period, in s."""
+
+
+class AttemptMemory:
+    """Counts an oracle's attempts by object and grasp, in the state of the oracle's system.
+
+    It adds two optional input ports to the system:
+
+    - `mode` (1): the `PickPlacePlanner`'s; an action begins with `APPROACH`.
+    - `accepted_action` (abstract, `PickPlaceAction`): the planner's, the last action begun.
+
+    The object is the one whose grasp is nearest to the pick when the action begins. If the ports
+    are not connected, nothing is counted.
+    """
+
+    def __init__(
+        self,
+        system: LeafSystem,
+        *,
+        objects: Sequence[PlacedObject],
+        grasps: Sequence[Sequence[Grasp]],
+        body_poses: InputPort,
+    ) -> None:
+        """
+        Args:
+            system: the oracle; gets two ports, a state and a periodic event.
+            objects: n of them.
+            grasps: n, the grasps of each object.
+            body_poses: the oracle's port of that name.
+        """
+        self._objects, self._grasps, self._body_poses = objects, grasps, body_poses
+        self._most = max((len(choices) for choices in grasps), default=0)
+        self._mode = system.DeclareVectorInputPort("mode", 1)
+        self._accepted = system.DeclareAbstractInputPort(
+            "accepted_action", Value(PickPlaceAction())
+        )
+        # The last mode, then n rows of attempts.
+        self._index = system.DeclareDiscreteState(np.zeros(1 + len(objects) * self._most))
+        self.ticket = system.discrete_state_ticket(self._index)
+        """The ticket of outputs that depend on `attempts`."""
+        system.DeclarePeriodicDiscreteUpdateEvent(_PERIOD, 0.0, self._update)
+
+    def attempts(self, context: Context) -> NDArray[np.float64]:
+        """(n, g): how often each grasp of each object was tried; g is the most grasps of any."""
+        values = context.get_discrete_state(self._index).get_value()
+        return values[1:].reshape(len(self._objects), self._most)
+
+    def _update(self, context: Context, discrete_state: DiscreteValues) -> EventStatus:
+        if not self._mode.HasValue(context) or not self._accepted.HasValue(context):
+            return EventStatus.DidNothing()
+        mode = self._mode.Eval(context)[0]
+        state = discrete_state.get_mutable_value(self._index)
+        if mode == state[0]:
+            return EventStatus.DidNothing()
+        state[0] = mode
+        if mode != Mode.APPROACH:
+            return EventStatus.Succeeded()
+        action = self._accepted.Eval(context)
+        if not action.press:
+            bodies = self._body_poses.Eval(context)
+            poses = [bodies[int(item.body)] for item in self._objects]
+            found = nearest_grasp(self._grasps, poses, action.pick)
+            if found is not None:
+                index, grasp = found
+                state[1:].reshape(len(self._objects), self._most)[index, grasp] += 1
+        return EventStatus.Succeeded()
+
+
+def nearest_grasp(
+    grasps: Sequence[Sequence[Grasp]], poses: Sequence[RigidTransform], pick: PlanarPose
+) -> tuple[int, int] | None:
+    """The object and the index of its grasp that are nearest to a pick.
+
+    Grasps at one point differ by their angles.
+
+    Args:
+        grasps: n, the grasps of each object, in B.
+        poses: n, X_WB of each object.
+        pick: the gripper's pose in the world.
+
+    Returns:
+        Both indices; None if no object has a grasp.
+    """
+    best: tuple[float, int, int] | None = None
+    for index, (choices, X_WB) in enumerate(zip(grasps, poses, strict=True)):
+        yaw = heading(X_WB)
+        for number, grasp in enumerate(choices):
+            x, y, _ = X_WB @ np.array([grasp.x, grasp.y, 0.0])
+            turn = math.remainder(pick.theta - yaw - grasp.theta, math.pi)
+            # A tenth of a radian counts like a millimetre.
+            cost = math.hypot(pick.x - x, pick.y - y) + 0.01 * abs(turn)
+            if best is None or cost < best[0]:
+                best = cost, index, number
+    return None if best is None else best[1:]

@@ -1,0 +1,60 @@
+"""The force of the pads, chosen by the weight that the hand feels."""
+
+import numpy as np
+
+from systems.pick_place_parameters import PickPlaceParameters
+
+GRAVITY = 9.81
+"""In m/s^2."""
+
+_TOO_EARLY = 1.5
+"""A grip that is weaker than it should be by this factor must be firm before the object is lifted.
+"""
+_LEAST_CHANGE = 1.05
+"""The force rises in steps of at least this factor, so that its ramp is not restarted for noise."""
+
+
+def felt_weight(contact_force: float, acceleration: float) -> float:
+    """The weight of what the hand holds, in N.
+
+    Args:
+        contact_force: the vertical contact force on the hand, in N; negative for a load.
+        acceleration: the hand's vertical acceleration, in m/s^2.
+    """
+    # The hand never falls freely, but an odd parameter must not divide by zero.
+    return -contact_force / max(1 + acceleration / GRAVITY, 0.1)
+
+
+def grip_force(weight: float, present: float, parameters: PickPlaceParameters) -> float:
+    """The force of each pad on an object of a given weight, in N.
+
+    It is proportional to the weight up to `firm_grasp_force` at `heavy_load`, but at least
+    `grasp_force`. Above, it rises linearly to `peak_grasp_force` at `heaviest_load`. It never
+    falls while the object is held: what has begun to turn between the pads must not go on.
+
+    Args:
+        weight: what the hand feels, in N.
+        present: the present force, in N.
+        parameters: the forces and loads.
+    """
+    heavy, heaviest = parameters.heavy_load, max(parameters.heaviest_load, parameters.heavy_load)
+    firm = max(parameters.firm_grasp_force, parameters.grasp_force)
+    peak = max(parameters.peak_grasp_force, firm)
+    force = float(
+        np.interp(
+            weight,
+            [heavy * parameters.grasp_force / firm, heavy, heaviest],
+            [parameters.grasp_force, firm, peak],
+        )
+    )
+    return force if force > _LEAST_CHANGE * present or force == peak > present else present
+
+
+def lifts_too_early(wanted: float, present: float) -> bool:
+    """Whether the pads press far less than they should, so that the object would turn between them.
+
+    Args:
+        wanted: the force of `grip_force`, in N.
+        present: the force of the pads now, in N.
+    """
+    return wanted > _TOO_EARLY * present
