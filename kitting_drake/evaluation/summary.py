@@ -64,6 +64,7 @@ def summarise(
       success), 1 (success) or 0. It allows paired comparisons of runs with the same seeds.
     - Errors include all objects and actions of completed episodes, failures too. Objects for which
       no goal was left are excluded.
+    - `measures` holds the rate of success by each other measure of the task, over objects.
 
     Args:
         episodes: at least one.
@@ -91,6 +92,7 @@ def summarise(
         "timed_out_episodes": sum(episode["timed_out"] for episode in episodes),
         "stop_reasons": _stop_reasons(episodes),
         **_rates(episodes, objects_of, chosen.scenario.task.objects_are_independent),
+        "measures": _measures(objects),
         **_statistics(objects, actions, causes),
         "categories": {
             name: _summarise_category(
@@ -257,6 +259,22 @@ def _rates(
     }
 
 
+def _measures(objects: Sequence[Entry]) -> dict[str, dict[str, Any]]:
+    """The rates by the task's other measures. A lost object is no success by any of them."""
+    names = dict.fromkeys(name for item in objects for name in item.get("measures") or {})
+    counts = {
+        name: sum((item.get("measures") or {}).get(name, False) for item in objects)
+        for name in names
+    }
+    return {
+        name: {
+            "success_rate": count / len(objects),
+            "ci95": proportion_interval(count, len(objects)),
+        }
+        for name, count in counts.items()
+    }
+
+
 def _summarise_category(
     objects: list[Entry], actions: list[Entry], causes: Sequence[str]
 ) -> dict[str, Any]:
@@ -270,6 +288,7 @@ def _summarise_category(
         "ci95": proportion_interval(successes, len(objects)),
         "strict_success_rate": strict_successes / len(objects),
         "strict_ci95": proportion_interval(strict_successes, len(objects)),
+        "measures": _measures(objects),
         **_statistics(objects, actions, causes),
     }
 

@@ -62,6 +62,7 @@ def print_episode(console: Console, result: EpisodeResult) -> None:
         f"{result.point_contact_pairs} point contacts"
     )
     console.print(_ending(result), highlight=False, markup=False)
+    _print_measures(console, result)
     causes = [
         f"{item.name} ({item.cause})"
         for item in result.objects
@@ -99,6 +100,18 @@ def _ending(result: EpisodeResult) -> str:
     if peaks:
         line += f"; peak force {max(item['force'] for item in peaks):.0f} N"
     return line
+
+
+def _print_measures(console: Console, result: EpisodeResult) -> None:
+    """Prints the successes by each of the task's other measures, if it has any."""
+    names = list(dict.fromkeys(name for item in result.objects for name in item.measures))
+    if names:
+        counts = [sum(item.measures.get(name, False) for item in result.objects) for name in names]
+        rates = [
+            f"{name} {count}/{len(result.objects)}"
+            for name, count in zip(names, counts, strict=True)
+        ]
+        console.print(f"success by each measure: {', '.join(rates)}", highlight=False)
 
 
 def summary_table(summary: dict[str, Any]) -> Table:
@@ -153,7 +166,9 @@ def summary_notes(summary: dict[str, Any]) -> str:
     pick_position, pick_angle, place_position, place_angle = (
         number(summary["action_errors"][key]["median"]) for key in ACTION_ERRORS
     )
-    lines = [
+    measures = [f"{name} {row['success_rate']:.1%}" for name, row in summary["measures"].items()]
+    lines = [f"success by each measure: {', '.join(measures)}"] if measures else []
+    lines += [
         f"no success: {', '.join(causes) or 'none'}",
         f"success, but not strict: {', '.join(ambiguous) or 'none'}",
         f"actions, median error: pick {pick_position} mm {pick_angle} deg, "

@@ -17,6 +17,7 @@ SCENARIOS = {
     "PlaceRedInGreen": ("ravens.yaml", "PlaceRedInGreen"),
     "StackBlockPyramid": ("ravens.yaml", "StackBlockPyramid"),
     "PalletizingBoxes": ("ravens.yaml", "PalletizingBoxes"),
+    "AssemblingKits": ("assembling_kits.yaml", "Train"),
 }
 """The file and the scenario of each environment, except for `Scenario`, which gets them by
 argument."""

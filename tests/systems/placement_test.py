@@ -131,6 +131,9 @@ def test_pose_within_thresholds():
     assert place(bar(), goal(0), GOAL @ planar(0.009, 0, 0.25, 0.1), success).success
     assert not place(bar(), goal(0), GOAL @ planar(0.011, 0), success).success
     assert not place(bar(), goal(0), GOAL @ planar(0, 0, 0.27), success).success
+    level = PoseWithin(height=0.003)
+    assert place(bar(), goal(0), GOAL @ planar(0, 0, 0, 0.002), level).success
+    assert not place(bar(), goal(0), GOAL @ planar(0, 0, 0, -0.004), level).success
     anyhow = goal(0, any_heading=True)
     assert place(bar(), anyhow, GOAL @ planar(0, 0, 2.0), success).strict_success
 

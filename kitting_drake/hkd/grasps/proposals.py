@@ -11,6 +11,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from kitting_drake.hkd.grasps.corners import corner_cost
 from kitting_drake.hkd.grasps.grip import find_grip, jaw_axes
 from systems.grasp import Grasp
 from systems.hand_geometry import FINGER_LENGTH, FINGERTIP_DEPTH, MAX_OPENING, PAD_LENGTH
@@ -42,11 +43,6 @@ _FINGER_RECESS = 0.003
 _STEEPEST = np.radians(28.0)
 # The least share of the pads' length that touches on both sides, except in a grasp by a corner.
 _LEAST_CONTACT = 0.15
-# A corner is held steadily opposite a face that supports the pad this far to either side of it.
-# Opposite another corner it may be off by the second length.
-_CORNER_MARGIN, _CORNER_OFFSET = 0.002, 0.0005
-# The costs of holding a corner against a face, and against another corner, where the tool may turn.
-_CORNER_COST, _TWO_CORNERS_COST = 0.5, 2.5
 # The distance from the middle of a tool in its kit to a neighbour.
 _LANE = 0.040
 
@@ -351,13 +347,13 @@ def _hold(
     contact, corner = float(both.mean()), 0.0
     if overhang > _FINGER_RECESS or slope > _STEEPEST:
         return None
-    if contact < _LEAST_CONTACT:
-        found = _corner_cost(left, right, touch) if corners else None
-        if found is None:
-            return None
-        corner = found
-    else:
+    if contact >= _LEAST_CONTACT:
         columns_left = columns_right = both
+    else:
+        held_there = corner_cost(left, right, _BIN, touch) if corners else None
+        if held_there is None:
+            return None
+        corner = held_there
     rows = (touch_left[columns_left].mean(axis=0) + touch_right[columns_right].mean(axis=0)) / 2
     places = np.arange(len(left)) * _BIN
     twist = np.average(places, weights=touch_left.sum(axis=1)) - np.average(
@@ -374,27 +370,6 @@ def _hold(
         twist=float(abs(twist)),
         corner=corner,
     )
-
-
-def _corner_cost(left: Array, right: Array, touch: float) -> float | None:
-    """The cost of holding a corner; None if the tool would turn out of the pads.
-
-    The pads push along one line only if the corner is between the ends of the other pad's contact.
-
-    Args:
-        left: (columns, levels) the surface under the left pad.
-        right: the same for the right one.
-        touch: see `_hold`. A corner sinks in as far as in the coarse search.
-    """
-    behind = [(left.max() - left).min(axis=1), (right - right.min()).min(axis=1)]
-    spans = [_BIN * np.flatnonzero(depth <= _COARSE_TOUCH) for depth in behind]
-    narrow, wide = sorted(spans, key=np.ptp)
-    corner = (narrow[0] + narrow[-1]) / 2
-    if min(corner - wide[0], wide[-1] - corner) >= _CORNER_MARGIN:
-        # Prefer a pad that lies flat on a face.
-        return _CORNER_COST * (2.0 - max(float((depth <= touch).mean()) for depth in behind))
-    offset = abs(corner - (wide[0] + wide[-1]) / 2)
-    return _TWO_CORNERS_COST if offset <= _CORNER_OFFSET else None
 
 
 def _lean(profile: Array, step: float) -> float:

@@ -16,7 +16,7 @@ from manifold3d import CrossSection, JoinType, Manifold
 from kitting_drake.common.cached_folder import cached_folder
 from kitting_drake.common.errors import UserError
 from kitting_drake.common.paths import cache_directory
-from kitting_drake.hkd.grasps.proposals import WIDEST, propose_grasps
+from kitting_drake.hkd.grasps.proposals import WIDEST, GraspProposal, propose_grasps
 from kitting_drake.hkd.importing.convex_cover import convex_cover
 from kitting_drake.hkd.importing.convex_decomposition import decompose
 from kitting_drake.hkd.importing.fit import HIGHEST_MM, THINNEST_MM
@@ -52,6 +52,8 @@ _PRISM = 0.01
 # its holes, and that for thinning vertices.
 _OUTLINES_MM, _HOLE_MM, _VERTEX_MM = (0.12, 0.2, 0.3), 0.8, 0.08
 _MOST_HULLS = 12
+_BESIDE = 0.025
+"""A grasp this far beside the centre of mass costs 1 more, in metres."""
 
 
 def shapes_of(split: str) -> list[OutlinedShape]:
@@ -169,7 +171,7 @@ def _write(
         raise UserError(
             f"the hand cannot hold it from above (the jaws hold at most {1e3 * WIDEST:.0f} mm)"
         )
-    grasp = proposals[0].grasp
+    grasp = min(proposals, key=_rank).grasp
     meshes.write_smooth_obj(folder / f"{colour}.obj", solid, _CREASE_DEG)
     collisions = []
     for index, hull in enumerate(_hulls(solid, grasp)):
@@ -192,6 +194,16 @@ def _write(
         "visual_meshes": [f"{colour}.obj"],
     }
     (folder / "tool.yaml").write_text(yaml.safe_dump(record, sort_keys=False))
+
+
+def _rank(proposal: GraspProposal) -> float:
+    """The cost of a grasp of a shape.
+
+    The places of shapes are far apart, so neighbours in the kit do not matter. The centre of mass
+    matters more than in a hand tool, because a shape has no handle: its ends hardly fill the pads.
+    """
+    beside = proposal.offset / _BESIDE
+    return proposal.cost - proposal.penalties["neighbour in the kit"] + beside
 
 
 def _check(solid: Manifold) -> None:

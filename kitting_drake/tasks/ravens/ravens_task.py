@@ -1,4 +1,4 @@
-"""The base of the five Ravens tasks."""
+"""The base of the Ravens tasks."""
 
 import math
 import re

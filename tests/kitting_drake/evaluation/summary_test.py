@@ -5,6 +5,7 @@ import pytest
 
 from kitting_drake.evaluation.intervals import mean_interval, proportion_interval
 from kitting_drake.evaluation.summary import summarise
+from kitting_drake.evaluation.terminal import summary_notes
 from kitting_drake.scenario.schema import Scenario
 from kitting_drake.tasks import StackBlockPyramid
 from systems.placement import PoseWithin
@@ -117,6 +118,22 @@ def test_categories_add_up_to_the_whole():
     assert bolt["causes"] == CAUSES | {"misplaced": 1, "failed episode": 2}
     for cause, count in summary["causes"].items():
         assert count == sum(row["causes"][cause] for row in summary["categories"].values())
+
+
+def test_other_measures_have_rates():
+    near, far = {"loose": True, "tight": True}, {"loose": True, "tight": False}
+    objects = [
+        dataclasses.replace(make_object("cup", 1.0), measures=near),
+        dataclasses.replace(make_object("bolt", 2.0), measures=far),
+    ]
+    lost = make_result(1, objects, timed_out=True).as_dict()
+    summary = summarised([make_result(0, objects).as_dict(), lost])
+    rates = {name: row["success_rate"] for name, row in summary["measures"].items()}
+    assert rates == {"loose": 0.5, "tight": 0.25}
+    assert summary["measures"]["tight"]["ci95"] == pytest.approx(proportion_interval(1, 4))
+    assert summary["categories"]["bolt"]["measures"]["tight"]["success_rate"] == 0
+    assert "success by each measure: loose 50.0%, tight 25.0%" in summary_notes(summary)
+    assert summarised([make_episode(0, [1.0])])["measures"] == {}
 
 
 def test_ambiguous_successes_are_not_strict():

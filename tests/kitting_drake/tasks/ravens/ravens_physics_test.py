@@ -3,7 +3,7 @@
 import pytest
 
 from kitting_drake.scenario.schema import Scenario
-from kitting_drake.tasks import BlockInsertion, StackBlockPyramid
+from kitting_drake.tasks import AssemblingKits, BlockInsertion, StackBlockPyramid
 from kitting_drake.tasks.task import TaskConfig
 from systems.pick_place_parameters import PickPlaceParameters
 from tests.kitting_drake.rig import build_rig
@@ -22,3 +22,13 @@ def test_the_expert_succeeds_at_the_first_action(task: TaskConfig, share: float)
     assert result.strict_success_rate == pytest.approx(share)
     assert result.point_contact_pairs == 0
     assert result.moving_at_end == []
+
+
+@pytest.mark.parametrize("split", ["train", "test"])
+def test_the_expert_assembles_a_kit(split: str):
+    scenario = Scenario(task=AssemblingKits(split=split), cameras={})
+    result = build_rig(scenario).run(seconds=90.0)
+    assert (result.failure, result.timed_out, result.actions) == (None, False, 5)
+    told = [(item.name, item.measures, item.cause) for item in result.objects]
+    assert all(all(item.measures.values()) for item in result.objects), told
+    assert result.point_contact_pairs == 0
