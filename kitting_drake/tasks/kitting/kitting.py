@@ -134,6 +134,11 @@ class _DrawnKitting(_KittingTask):
     # may come to rest on another face.
     faces: str = "as_drawn"
 
+    @property
+    def not_perturbed(self) -> tuple[str, ...]:  # type: ignore[override]
+        """Boxes are drawn only around tools that lie apart on the table."""
+        return () if self.start == APART and not self.tray else ("distractors",)
+
     def _draw_scene(self, tools: list[Tool], grid: PixelGrid, seed: int) -> Scene:
         tools = self._weighted(tools, seed)
         if self.start != APART or self.tray:

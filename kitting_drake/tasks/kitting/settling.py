@@ -96,7 +96,8 @@ def settle(
         goes_on: is given the poses from time to time and returns whether to continue.
 
     Returns:
-        X_WB of each body; None if they did not come to rest, or `goes_on` returned False.
+        X_WB of each body; None if they did not come to rest, if the contact solver did not
+        converge, or if `goes_on` returned False.
     """
     builder = DiagramBuilder()
     plant, _ = AddMultibodyPlant(_CONTACT, builder)
@@ -121,8 +122,9 @@ def settle(
     for check in range(1, round(longest / _CHECKS) + 1):
         try:
             simulator.AdvanceTo(check * _CHECKS)
-        except RuntimeError:
-            # The contact solver did not converge.
+        except RuntimeError as error:
+            if "converge" not in str(error):
+                raise
             return None
         now = [body.EvalPoseInWorld(context) for body in bodies]
         if not goes_on(now):

@@ -3,12 +3,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from pydrake.math import RigidTransform
 
 from kitting_drake.common.errors import UserError
 from kitting_drake.common.paths import SCENARIOS
+from kitting_drake.hkd.tools.tool import load_tool
 from kitting_drake.scenario import load_scenario
 from kitting_drake.tasks import Kitting, ToolsetKitting
 from kitting_drake.tasks.kitting import settling
+from kitting_drake.tasks.kitting.convex_bodies import convex_body
 from kitting_drake.tasks.kitting.start_groups import START_KINDS, projected
 from kitting_drake.tasks.kitting.starts import TRAY_SIZE
 from kitting_drake.tasks.task import Scene
@@ -65,6 +68,18 @@ def test_a_leaning_tool_rests_on_the_block():
     top = float(leaning.X_WB.multiply(leaning.p_BPoints.T)[2].max())
     assert top > 0.05
     assert kit.p_FPoints is not None
+
+
+def test_a_tool_settles_as_convex_pieces():
+    tool = load_tool("combination_wrench")
+    body = convex_body(tool)
+    assert body.mass == pytest.approx(tool.mass)
+    np.testing.assert_allclose(
+        np.ptp(np.concatenate(body.pieces), axis=0)[0], tool.length, atol=1e-3
+    )
+    (X_WT,) = settling.settle([body], [RigidTransform([0.5, 0.0, 0.005])], []) or [None]
+    assert X_WT is not None and tilt(X_WT) < 0.02
+    assert abs(X_WT.translation()[2]) < 1e-3
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,58 @@
+"""Tools without files as convex pieces, so that they can settle by physics."""
+
+import itertools
+
+import numpy as np
+import trimesh
+from manifold3d import Manifold, Mesh
+from numpy.typing import NDArray
+
+from kitting_drake.hkd.tools.collision import thinned
+from kitting_drake.hkd.tools.tool import Tool
+from kitting_drake.tasks.kitting.settling import ConvexBody
+
+_SLAB = 0.02
+"""Greatest thickness of the slabs along x into which a tool is cut, in metres."""
+_LEAST_VOLUME = 1e-9
+"""Smaller pieces are left out, in m^3."""
+_THINNED_MM = 0.2
+"""Tolerance of the pieces' corners, in mm."""
+_MASS = 0.1
+"""The mass of a tool that has none, in kg. Where it rests hardly depends on it."""
+
+
+def convex_body(tool: Tool) -> ConvexBody:
+    """A tool cut into slabs along its length; each connected part of a slab is a convex piece.
+
+    Pieces are convex hulls: notches along a slab, narrower than it is thick, are filled.
+    """
+    mesh = trimesh.Trimesh(
+        tool.triangles.reshape(-1, 3), np.arange(3 * len(tool.triangles)).reshape(-1, 3)
+    )
+    mesh.merge_vertices(digits_vertex=7)
+    solid = Manifold(Mesh(np.asarray(mesh.vertices, np.float32), np.asarray(mesh.faces, np.uint32)))
+    low, high = mesh.bounds[:, 0]
+    edges = np.linspace(low, high, max(1, round((high - low) / _SLAB)) + 1)
+    hulls = []
+    for start, end in itertools.pairwise(edges.tolist()):
+        slab = solid.trim_by_plane((1, 0, 0), float(start)).trim_by_plane((-1, 0, 0), -float(end))
+        for part in slab.decompose():
+            hull = part.hull()
+            if hull.volume() > _LEAST_VOLUME:
+                hulls.append(_thinned(np.asarray(hull.to_mesh().vert_properties, float)[:, :3]))
+    if not hulls:
+        hulls = [_thinned(np.asarray(mesh.vertices, float))]
+    parts = [trimesh.Trimesh(points).convex_hull for points in hulls]
+    whole = trimesh.util.concatenate(parts)
+    whole.density = (tool.mass or _MASS) / sum(part.volume for part in parts)
+    return ConvexBody(
+        tuple(np.asarray(part.vertices, float) for part in parts),
+        mass=float(whole.mass),
+        center_of_mass=np.asarray(whole.center_mass, float),
+        inertia=np.asarray(whole.moment_inertia, float),
+    )
+
+
+def _thinned(points: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(m, 3) the corners of a hull without slivers, on which contact fails."""
+    return thinned(1e3 * points, _THINNED_MM) / 1e3
