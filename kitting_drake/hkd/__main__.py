@@ -14,8 +14,9 @@ from kitting_drake.common.errors import UserError
 from kitting_drake.common.paths import MODELS
 from kitting_drake.hkd.generation.catalogue import ToolEntry, load_catalogue
 from kitting_drake.hkd.generation.generate import generate_tool
+from kitting_drake.hkd.generation.part_models import load_named
 from kitting_drake.hkd.listing import chosen_entries, chosen_with_own, print_tools, size_text
-from kitting_drake.hkd.tools.tool import CATEGORIES, load_tool
+from kitting_drake.hkd.tools.tool import CATEGORIES
 from kitting_drake.hkd.tools.toolsets import SPLITS, toolsets
 
 
@@ -51,12 +52,12 @@ def sheet(args: argparse.Namespace, entries: list[ToolEntry]) -> None:
         if args.names:
             raise UserError(f"--kits draws kits, not '{args.names[0]}': leave out one of the two")
         chosen = toolsets(args.split)[: args.kits]
-        kits = [make_kit([load_tool(name) for name in names], KitParameters()) for names in chosen]
+        kits = [make_kit([load_named(name) for name in names], KitParameters()) for names in chosen]
         subjects = [kit_subject(f"{args.split} {i:03d}", kit) for i, kit in enumerate(kits)]
     else:
         shown, own = chosen_with_own(entries, args.names)
         names = [*(entry.name for entry in shown), *own]
-        subjects = [tool_subject(load_tool(name)) for name in names]
+        subjects = [tool_subject(load_named(name)) for name in names]
     with Progress(console=Console(stderr=True, quiet=args.quiet), transient=True) as progress:
         write_sheet(progress.track(subjects, description="drawing"), len(subjects), args.output)
 

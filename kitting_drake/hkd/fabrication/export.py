@@ -20,10 +20,11 @@ from kitting_drake.hkd.fabrication.block_files import stl_bytes, threemf_bytes
 from kitting_drake.hkd.fabrication.design import Design, design_kit, solid
 from kitting_drake.hkd.fabrication.drawings import dxf_text, svg_text
 from kitting_drake.hkd.fabrication.picture import picture_png
+from kitting_drake.hkd.generation.part_models import load_named
 from kitting_drake.hkd.kits.kit import make_kit
 from kitting_drake.hkd.kits.layout import MOST_TOOLS
 from kitting_drake.hkd.kits.parameters import KitParameters
-from kitting_drake.hkd.tools.tool import Tool, load_tool, tool_names
+from kitting_drake.hkd.tools.tool import Tool, tool_names
 
 RECORD = "kit.json"
 """The file that marks a folder as a kit's."""
@@ -64,7 +65,7 @@ def export_kit(request: KitRequest) -> Design:
     if not 1 <= len(request.tools) <= MOST_TOOLS:
         raise UserError(f"a kit holds 1 to {MOST_TOOLS} tools, not {len(request.tools)}")
     parameters = _parameters(request)
-    loaded = {name: load_tool(name) for name in dict.fromkeys(request.tools)}
+    loaded = {name: load_named(name) for name in dict.fromkeys(request.tools)}
     tools = [loaded[name] for name in request.tools]
     folder = request.output
     _check_replaceable(folder)

@@ -246,6 +246,7 @@ class PartKind:
     scaled: Callable[[float, float, float], tuple[float, ...]]
     """The dimensions of a part of a length, given two numbers from 0 to 1 that vary its shape."""
     longest: float = LONGEST_MM
+    shortest: float = SHORTEST_MM
 
 
 def _between(low: float, high: float, share: float) -> float:
@@ -356,6 +357,7 @@ PART_KINDS: dict[str, PartKind] = {
             max(min(_between(0.5, 0.8, u) * length, 90.0), 12.0),
             min(_height(length, 0.15, 0.35, v), 16.0),
         ),
+        shortest=20.0,
     ),
 }
 """The kinds of parts by name."""

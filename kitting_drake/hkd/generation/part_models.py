@@ -13,7 +13,6 @@ from kitting_drake.common.errors import UserError
 from kitting_drake.common.paths import cache_directory
 from kitting_drake.hkd.families.parts import (
     PART_KINDS,
-    SHORTEST_MM,
     PartDesign,
     PartError,
     design_part,
@@ -58,14 +57,14 @@ def sized_part(kind: str, length: float, shares: tuple[float, float]) -> Tool:
 
     Args:
         kind: a key of `PART_KINDS`.
-        length: in metres. A kind that does not come so long gets its greatest length.
+        length: in metres. A kind that does not come so short or long gets the nearest length.
         shares: two numbers from 0 to 1 that vary its proportions.
 
     Raises:
         UserError: there is no such part.
     """
     known = PART_KINDS[kind]
-    length_mm = min(max(1e3 * length, SHORTEST_MM), known.longest)
+    length_mm = min(max(1e3 * length, known.shortest), known.longest)
     return make_part(kind, tuple(round(v, 1) for v in known.scaled(length_mm, *shares)))
 
 

@@ -22,8 +22,12 @@ CELL = 0.0015
 PREFERRED_SIDE = 0.42
 """The longest side of a rectangle, in metres, unless the shapes need a longer one."""
 
-LONGEST_SIDES = (0.48, 0.95)
-"""The largest sides of any rectangle, in metres: the workspace of 0.5 by 1 m with a margin."""
+USUAL_SIDES = (0.48, 0.95)
+"""The largest sides, in metres, unless the shapes need more: the usual workspace of 0.5 by 1 m with
+a margin."""
+
+LONGEST_SIDES = (0.90, 1.20)
+"""The largest sides of any rectangle, in metres: most of the table of 1.0 by 1.5 m."""
 
 _YAWS_DEG = (0, 90, 180, 270)
 _WIDTHS = (1.0, 0.9, 1.1, 0.8, 1.25, 1.45)
@@ -75,8 +79,8 @@ class Nesting:
 def nest(shapes: Sequence[NestedShape], wall: float) -> Nesting | None:
     """Places shapes on the best rectangle found, or returns None if none is large enough.
 
-    The best rectangle is small and nearly square, and exceeds `PREFERRED_SIDE` only if it must. The
-    result is deterministic.
+    The best rectangle is small and nearly square, and exceeds `PREFERRED_SIDE` and `USUAL_SIDES`
+    only if it must. The result is deterministic.
 
     Args:
         shapes: at least one.
@@ -87,7 +91,7 @@ def nest(shapes: Sequence[NestedShape], wall: float) -> Nesting | None:
     order = sorted(range(len(shapes)), key=lambda i: -sizes[i])
     side = math.sqrt(sum(sizes) / _EXPECTED_USE)
     narrowest = max(min(part.size[1] for part in rotated) for rotated in parts)
-    for longest in ((PREFERRED_SIDE, PREFERRED_SIDE), LONGEST_SIDES):
+    for longest in ((PREFERRED_SIDE, PREFERRED_SIDE), USUAL_SIDES, LONGEST_SIDES):
         columns, rows = (int(length / CELL) for length in longest)
         widths = [min(columns, max(narrowest, round(share * side))) for share in _WIDTHS]
         best, lowest_cost = None, math.inf

@@ -6,6 +6,7 @@ that rises beside it is a loose object; anything below its top is a recess or a 
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -25,7 +26,7 @@ _PLANE_BAND = 0.004
 _LEAST_FIXTURE_HEIGHT = 0.015
 """The least height of a fixture above the table, in metres."""
 _LEAST_FIXTURE_AREA = 0.003
-"""The least area of a fixture, in square metres."""
+"""The least area of a fixture, in square metres; less with small pixels (`_AreaLimits`)."""
 _OBJECT_HEIGHT = 0.003
 """Anything that rises by more than this above the table is an object, in metres."""
 _RECESS_DEPTH = 0.003
@@ -33,9 +34,16 @@ _RECESS_DEPTH = 0.003
 _PROTRUSION = 0.002
 """An object that rises by more than this above the fixture is not seated, in metres."""
 _LEAST_AREA = 0.0004
-"""Smaller regions are ignored as noise, in square metres."""
+"""Smaller regions are ignored as noise, in square metres; less with small pixels."""
+_LEAST_CLEAN_AREA = 0.00008
+"""The same for objects on a table without noise, where only the edges of things are doubtful."""
 _LEAST_PROTRUDING = 0.00012
 """The same for protruding objects. It is smaller, because perhaps only one end protrudes."""
+_USUAL_PIXEL = 0.003125
+"""The side of the pixels, in metres, for which the areas above are meant. Noise makes regions of a
+number of pixels, so with smaller ones the areas are smaller by the same factor."""
+_CLOSING = 0.0094
+"""Gaps of a plateau up to twice this wide do not divide it, in metres."""
 _FIXTURE_MARGIN = 0.006
 """Pixels closer to the fixture's outline than this are neither table nor recess, in metres."""
 _CLEAN = 0.0005
@@ -48,15 +56,41 @@ which it is told from its half turn.
 """
 _OBJECT_SEEN, _RECESS_SEEN = 0.5, 0.3
 """The least seen shares of an object, and of a free recess."""
-_GAP = 1.5
-"""The gap around an object in its recess is less than this far from its edges, in pixels."""
+_GAP, _LEAST_GAP = 1.5, 0.003
+"""The gap around an object in its recess is less than this far from its edges: in pixels, and in
+metres if that is more."""
 _FLAT, _FLAT_SHARE = 0.0006, 0.7
 """More than this share of a free recess's floor is within this of one height, in metres, or within
 noise."""
 _NOISY = 0.001
 """With more noise than this a floor cannot be told from an object, in metres."""
+_LEVEL, _TILT_ROUNDS = math.tan(math.radians(0.7)), 3
+"""A plateau with a smaller slope is level. A steeper one is followed in so many rounds."""
 _NEIGHBOURS = np.ones((3, 3), bool)
 _CROSS = ndimage.generate_binary_structure(2, 1)
+
+
+@dataclass(frozen=True)
+class _AreaLimits:
+    """The least areas of what is not noise, in square metres."""
+
+    fixture: float
+    recess: float
+    object: float
+    protruding: float
+
+    @classmethod
+    def of(cls, resolution: float, noise: float = math.inf) -> _AreaLimits:
+        """The limits for pixels of a side in metres and noise of a standard deviation in metres."""
+        scale = min(1.0, (resolution / _USUAL_PIXEL) ** 2)
+        least = scale * _LEAST_AREA
+        clean = noise <= _CLEAN
+        return cls(
+            fixture=scale * _LEAST_FIXTURE_AREA,
+            recess=least,
+            object=min(least, _LEAST_CLEAN_AREA) if clean else least,
+            protruding=scale * _LEAST_PROTRUDING,
+        )
 
 
 @dataclass(frozen=True)
@@ -90,6 +124,8 @@ class Segmentation:
     """
     relief: NDArray[np.float32]
     """(rows, cols): height above the table plane in metres; unseen pixels are filled in."""
+    depth: NDArray[np.float32]
+    """(rows, cols): depth below the plane of the fixture's top in metres; zero outside."""
     visibility: Visibility
     """Which of its pixels are seen."""
     noise: float = 0.0
@@ -109,7 +145,7 @@ class Segmentation:
         return tuple(
             item
             for item in self.recesses
-            if _inner_radius(item.mask) > _GAP
+            if _inner_radius(item.mask) > max(_GAP, _LEAST_GAP / self.visibility.resolution)
             and self.visibility.seen[item.mask].mean() > _RECESS_SEEN
             and self._is_flat(item)
         )
@@ -117,9 +153,10 @@ class Segmentation:
     def _is_flat(self, recess: Region) -> bool:
         if self.noise > _NOISY:
             return True
-        # Heights at the walls are those of the wall or of the floor.
+        # Heights at the walls are those of the wall or of the floor. Measured from the fixture's
+        # top, the floor of a tilted fixture is flat, too.
         core = ndimage.binary_erosion(recess.mask) & self.visibility.seen
-        floor = self.relief[core if core.any() else recess.mask]
+        floor = self.depth[core if core.any() else recess.mask]
         away = np.abs(floor - np.median(floor))
         return bool((away < max(_FLAT, 2 * self.noise)).mean() > _FLAT_SHARE)
 
@@ -145,7 +182,7 @@ def segment(observation: Observation) -> Segmentation:
         relief = ndimage.median_filter(relief, footprint=_CROSS, mode="nearest")
         fixture, top = _find_fixture(height, relief, resolution)
         noise = _noise_of(height, relief, fixture, top)
-    margin = _FIXTURE_MARGIN / resolution
+    margin, areas = _FIXTURE_MARGIN / resolution, _AreaLimits.of(resolution, noise)
     outside = ndimage.distance_transform_edt(~fixture) if fixture.any() else None
     least = max(_OBJECT_HEIGHT, _CLEARLY * noise)
     loose = relief > least
@@ -166,18 +203,19 @@ def segment(observation: Observation) -> Segmentation:
         fixture=fixture,
         objects=tuple(
             item
-            for item in _regions(loose, relief, resolution)
+            for item in _regions(loose, relief, resolution, areas.object)
             # In the shadow of a block, stray depths are filled in to the shape of an object.
             if observation.valid[item.mask].mean() > _OBJECT_SEEN
         ),
-        recesses=_regions(deep | hidden, depth, resolution, core=deep),
+        recesses=_regions(deep | hidden, depth, resolution, areas.recess, core=deep),
         protruding=tuple(
             sorted(
-                _regions(rise > max(_PROTRUSION, 4 * noise), rise, resolution, _LEAST_PROTRUDING),
+                _regions(rise > max(_PROTRUSION, 4 * noise), rise, resolution, areas.protruding),
                 key=lambda region: -region.height,
             )
         ),
         relief=relief,
+        depth=depth,
         visibility=Visibility.of(observation),
         noise=_noise(relief),
     )
@@ -242,19 +280,22 @@ def _find_fixture(
     """The convex hull of the largest plateau, and the plane of its top."""
     none = np.zeros(height.shape, bool), np.zeros(3)
     high = relief > _LEAST_FIXTURE_HEIGHT
-    if high.sum() * resolution**2 < _LEAST_FIXTURE_AREA:
+    least = _AreaLimits.of(resolution).fixture
+    if high.sum() * resolution**2 < least:
         return none
     level = _mode(relief[high])
     plateau = ndimage.binary_opening(np.abs(relief - level) < _PLANE_BAND, _NEIGHBOURS)
     # Close gaps, so that a recess from rim to rim does not cut the plateau in two.
-    labels, count = ndimage.label(ndimage.binary_closing(plateau, _NEIGHBOURS, 3), _NEIGHBOURS)
+    closed = ndimage.binary_closing(plateau, _NEIGHBOURS, max(1, round(_CLOSING / resolution)))
+    labels, count = ndimage.label(closed, _NEIGHBOURS)
     if not count:
         return none
     sizes = np.bincount(labels[plateau], minlength=count + 1)
     sizes[0] = 0
     plateau &= labels == sizes.argmax()
-    if plateau.sum() * resolution**2 < _LEAST_FIXTURE_AREA:
+    if plateau.sum() * resolution**2 < least:
         return none
+    plateau = _along_tilt(plateau, height, high, resolution)
     try:
         hull = ConvexHull(np.argwhere(plateau))
     except QhullError:
@@ -267,11 +308,31 @@ def _find_fixture(
     return fixture, _fit_plane(height, start, plateau)
 
 
+def _along_tilt(plateau: Mask, height: NDArray[np.float32], high: Mask, resolution: float) -> Mask:
+    """The whole of a tilted plateau, of which a level band was found; a level one as it is."""
+    for _ in range(_TILT_ROUNDS):
+        plane = _fit_plane(height, float(np.median(height[plateau])), plateau)
+        if math.hypot(plane[0], plane[1]) < _LEVEL * resolution:
+            return plateau
+        near = high & (np.abs(height - _plane_heights(plane, height.shape)) < _PLANE_BAND)
+        near = ndimage.binary_opening(near, _NEIGHBOURS)
+        labels, count = ndimage.label(
+            ndimage.binary_closing(near, _NEIGHBOURS, max(1, round(_CLOSING / resolution))),
+            _NEIGHBOURS,
+        )
+        sizes = np.bincount(labels[near & plateau], minlength=count + 1)
+        sizes[0] = 0
+        if not sizes.any():
+            return plateau
+        plateau = near & (labels == sizes.argmax())
+    return plateau
+
+
 def _regions(
     mask: Mask,
     relief: NDArray[np.float32],
     resolution: float,
-    least: float = _LEAST_AREA,
+    least: float,
     core: Mask | None = None,
 ) -> tuple[Region, ...]:
     """The connected regions of a mask with enough area, largest first.

@@ -46,7 +46,14 @@ def kitting_scene(
         threshold: the threshold of ADD-S, in metres.
     """
     sorted_tools = [tools[index] for index in order]
-    names = _unique_names(sorted_tools)
+    fixtures = (
+        *(
+            Fixture("kit" if n == 1 else f"kit_{n}", posed.kit.sdf, posed.X_WKit)
+            for n, posed in enumerate(kits, start=1)
+        ),
+        *(posed.riser for posed in kits if posed.riser is not None),
+    )
+    names = _unique_names(sorted_tools, {fixture.name for fixture in fixtures})
     place = {
         tool: (number, slot)
         for number, posed in enumerate(kits)
@@ -71,13 +78,7 @@ def kitting_scene(
             )
             for name, tool, index in zip(names, sorted_tools, order, strict=True)
         ),
-        fixtures=(
-            *(
-                Fixture("kit" if n == 1 else f"kit_{n}", posed.kit.sdf, posed.X_WKit)
-                for n, posed in enumerate(kits, start=1)
-            ),
-            *(posed.riser for posed in kits if posed.riser is not None),
-        ),
+        fixtures=fixtures,
         goals=tuple(goals),
         success=AddS(threshold),
         max_actions=len(tools),
@@ -114,12 +115,12 @@ def _are_alike(tool: Tool, other: Tool) -> bool:
     return tool.directory == other.directory and tool.length == other.length
 
 
-def _unique_names(tools: Sequence[Tool]) -> list[str]:
+def _unique_names(tools: Sequence[Tool], taken: set[str]) -> list[str]:
     names: list[str] = []
     for tool in tools:
         name, number = tool.name, 2
         # Other bodies in the scene have these names.
-        while name in names or re.fullmatch(r"(kit|riser)(_\d+)?|distractor_\d+", name):
+        while name in names or name in taken or re.fullmatch(r"distractor_\d+", name):
             name, number = f"{tool.name}_{number}", number + 1
         names.append(name)
     return names

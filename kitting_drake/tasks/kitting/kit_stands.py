@@ -125,8 +125,11 @@ def draw_stand(riser: list[float], tilt_deg: list[float], rng: np.random.Generat
         tilt_deg: least and greatest tilt, in degrees.
         rng: the random generator of all draws.
     """
-    height = float(rng.uniform(*riser))
-    tilt, direction = math.radians(rng.uniform(*tilt_deg)), rng.uniform(-math.pi, math.pi)
+    height = float(rng.uniform(riser[0], riser[1]))
+    tilt, direction = (
+        math.radians(rng.uniform(tilt_deg[0], tilt_deg[1])),
+        rng.uniform(-math.pi, math.pi),
+    )
     axis = np.array([math.cos(direction), math.sin(direction), 0.0])
     return KitStand(height, RotationMatrix(AngleAxis(tilt, axis)))
 

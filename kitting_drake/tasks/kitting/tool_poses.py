@@ -1,6 +1,5 @@
 """Draws poses of kit and tools on the table, or checks given ones."""
 
-import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -156,7 +155,7 @@ def draw_kit_poses(
     room = seen ^ _rectangle(*TABLE)
     shapes = [
         _Footprint(_grown_block(kit, margin), CrossSection(), CrossSection())
-        for kit, margin in itertools.zip_longest(kits, margins, fillvalue=0.0)
+        for kit, margin in zip(kits, margins or [0.0] * len(kits), strict=True)
     ]
     shapes += [_tool_footprint(tool) for tool in tools]
     order = list(range(len(shapes)))

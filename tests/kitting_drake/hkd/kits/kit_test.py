@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from kitting_drake.common.errors import UserError
 from kitting_drake.hkd.kits import kit as kit_module
+from kitting_drake.hkd.kits import nesting
 from kitting_drake.hkd.kits.block import Cavity, build_block, contact_surfaces
 from kitting_drake.hkd.kits.clearance import measure_clearance
 from kitting_drake.hkd.kits.kit import make_kit
@@ -388,7 +389,8 @@ def test_a_scaled_tool_has_another_kit(tools: list[Tool], cache: Path):
     assert x_max - x_min == pytest.approx(0.16 + 0.004, abs=4e-4)
 
 
-def test_tools_that_fit_no_block_are_rejected():
+def test_tools_that_fit_no_block_are_rejected(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(nesting, "LONGEST_SIDES", nesting.USUAL_SIDES)
     hammers = [scaled_tool(load_tool("claw_hammer"), 0.5)] * 5
     with pytest.raises(UserError, match=r"^'claw_hammer', "):
         layout_kit(hammers, KitParameters(height=0.1))

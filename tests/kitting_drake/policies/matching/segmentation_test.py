@@ -33,3 +33,18 @@ def test_flat_objects_and_cavities_are_whole_in_noise(noise: float, height: floa
             share = (regions[0].mask & whole).sum() / (regions[0].mask | whole).sum()
             assert share > (0.8 if noise else 0.99)
         assert not found.protruding
+
+
+def test_parts_of_one_square_centimetre_are_seen_and_noise_is_not():
+    for resolution, noise, expected in ((0.0015, 0.0, 1), (0.0015, 0.001, 1), (0.003125, 0.0, 1)):
+        grid = PixelGrid(resolution=resolution)
+        side = round(0.0105 / resolution)
+        true = np.zeros(grid.shape)
+        true[50:130, 190:280] = 0.05
+        true[30 : 30 + side, 60 : 60 + side] = 0.01
+        for seed in range(3):
+            field = np.random.default_rng(seed).normal(size=grid.shape)
+            field = ndimage.gaussian_filter(field, 0.7)
+            image = np.full((4, *grid.shape), 0.5, np.float32)
+            image[3] = np.maximum(true + noise * field / field.std(), 0)
+            assert len(segment(Observation(image, grid)).objects) == expected
