@@ -242,7 +242,8 @@ class PickPlaceMotion:
         marks = [float(state.start[Z])]
         for mark in (first, expected, float(state.goal[Z])):
             marks.append(max(min(mark, marks[-1]), float(state.goal[Z])))
-        legs = blended_legs(np.diff(marks), self._leg_speeds(mode), self._limits[mode].acceleration)
+        ways = np.diff(marks).tolist()
+        legs = blended_legs(ways, self._leg_speeds(mode), self._limits[mode].acceleration)
         for index, leg in enumerate(legs):
             state.leg_ways[index], state.leg_delays[index] = leg.way, leg.delay
 

@@ -56,11 +56,9 @@ def find_left_over(station: KittingStation, root_context: Context) -> Remainder:
     action = station.accepted_action(root_context)
     if action.stop and action.left_over is not None:
         seen = action.left_over
-        objects, cavities = (
-            tuple(Position(float(x), float(y)) for x, y in points)
-            for points in (seen.objects, seen.cavities)
-        )
-        return Remainder(objects, cavities, "policy")
+        lists = (seen.objects, seen.cavities)
+        left, open_ = (tuple(Position(float(x), float(y)) for x, y in points) for points in lists)
+        return Remainder(left, open_, "policy")
     goals, objects = station.scene.goals, station.objects
     loose, free = _loose_and_free(station, root_context)
     poses = station.object_poses(root_context)

@@ -216,7 +216,7 @@ def _starts(
         )
         rim = _edge(kernel > 0.5)
         product = inside * np.conj(fft.rfft2(kernel, size))
-        weight = np.float32(_RIM / max(rim.sum(), 1))
+        weight = np.float32(_RIM / max(int(rim.sum()), 1))
         product += outline * np.conj(fft.rfft2(rim.astype(np.float32), size)) * weight
         scores = fft.irfft2(product, size)
         scores = scores[: field.shape[0] - 2 * half, : field.shape[1] - 2 * half]
