@@ -6,7 +6,7 @@ own. Its collision hulls follow its outline and keep its holes.
 
 import hashlib
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -138,7 +138,7 @@ def _solid(path: Path, scale: Sequence[float]) -> Manifold:
     return solid.scale([1 / factor] * 3)
 
 
-def _cached(key: str, name: str, colour: str, write) -> Tool:  # type: ignore[no-untyped-def]
+def _cached(key: str, name: str, colour: str, write: Callable[[Path], None]) -> Tool:
     key = hashlib.sha256(f"{_FORMAT_VERSION} {key}".encode()).hexdigest()[:24]
     files = (f"{name}.sdf", "tool.yaml", f"{colour}.obj")
     folder = cached_folder(cache_directory() / "shapes" / key, files, write)
