@@ -121,8 +121,8 @@ def test_a_tool_the_wrong_way_up_is_turned_over_the_block():
 def test_a_turned_tool_of_the_same_shape_need_not_be_turned():
     rod = PlacedObject("rod", BodyIndex(1), box_points(0.18, 0.02, 0.012))
     table = ClutteredTable(objects=[rod], grasps=[GRASPS], area=AREA)
-    assert table.is_flat(0, pose(0.5, 0.2, roll=math.pi, z=0.012))
-    assert not table.is_flat(0, pose(0.5, 0.2, roll=0.3))
+    assert table.flat_heading(0, pose(0.5, 0.2, 0.4, roll=math.pi)) == pytest.approx(0.4)
+    assert table.flat_heading(0, pose(0.5, 0.2, roll=0.3)) is None
 
 
 def test_the_hand_keeps_clear():
