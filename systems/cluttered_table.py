@@ -39,6 +39,8 @@ _FLAT = math.radians(2.5)
 """An object tilted less lies flat."""
 _SAME_SHAPE = 0.0003
 """Mean distance, beyond their spacing, of points of two surfaces that count as equal, in metres."""
+_ROLLED = math.radians(20.0)
+"""A round object that rolled is tilted further; other tilts are not by rolling."""
 _ROLLED_PITCH = math.radians(10.0)
 """The axis of a round object deviates less than this from x of B."""
 _UPSIDE_DOWN = math.radians(120.0)
@@ -136,7 +138,8 @@ class ClutteredTable:
         yaw = heading(X_WB)
         if tilt(X_WB) < _FLAT:
             return yaw
-        if abs(X_WB.rotation().matrix()[2, 0]) > math.sin(_ROLLED_PITCH):
+        pitch = math.asin(float(np.clip(X_WB.rotation().matrix()[2, 0], -1, 1)))
+        if tilt(X_WB) < _ROLLED or abs(pitch) > _ROLLED_PITCH:
             return None
         item = self.objects[index]
         points = item.p_BPoints @ X_WB.rotation().matrix().T
@@ -221,17 +224,25 @@ class ClutteredTable:
     ) -> PlanarPose | None:
         """Where the gripper lets go of an object to lay it aside; None if there is no room.
 
-        It is a free part of the table. For an object that lies the wrong way up, it is the edge of
-        the ledge: released there with its centre of mass outside, the object turns over.
+        It is a free part of the table. For an object that lies the wrong way up or stands on its
+        edge, it is the edge of the ledge: released there with its centre of mass outside, the
+        object turns over.
         """
         item, X_WB = self.objects[index], poses[index]
         others = [other for k, other in enumerate(points) if k != index]
-        if self.ledge is not None and tilt(X_WB) > _UPSIDE_DOWN:
+        if self.ledge is not None and tilt(X_WB) > _ON_EDGE:
             yaw, p_WCenter = heading(X_WB), X_WB @ item.p_BCenter
             cos, sin = math.cos(yaw), math.sin(yaw)
             outline = (points[index] - p_WCenter)[:, :2] @ np.array([[cos, -sin], [sin, cos]])
+            # An object on its edge falls on the side that faces outward: its lower side.
+            on_edge = tilt(X_WB) < _UPSIDE_DOWN
+            z_left = float(X_WB.rotation().matrix()[:2, 2] @ [-sin, cos])
             turned = self.ledge.turning_pose(
-                outline, p_WCenter, np.concatenate([np.zeros((0, 3)), *others]), self.area
+                outline,
+                p_WCenter,
+                np.concatenate([np.zeros((0, 3)), *others]),
+                self.area,
+                inner_side=(1 if z_left > 0 else -1) if on_edge else 0,
             )
             if turned is not None:
                 return moved_gripper(hold.gripper, p_WCenter, yaw, turned)
