@@ -59,12 +59,13 @@ class ClutterExpert:
             X_WGoal: its goal pose.
             rim: world z of the cavity's rim, in metres.
         """
-        if self._covered[index] or not self._table.is_flat(index, self._poses[index]):
+        yaw = self._table.flat_heading(index, self._poses[index])
+        if self._covered[index] or yaw is None:
             return None
         best = self._table.grasps[index][0]
         for hold in self._holds(index, X_WGoal):
             near = math.hypot(hold.grasp.x - best.x, hold.grasp.y - best.y) < _NEAR_BEST
-            place = self._place(index, hold, X_WGoal)
+            place = self._place(index, hold, X_WGoal, yaw)
             if near and not hold.obstruction and self._may_let_go(index, hold.grasp, place, rim):
                 return self._action(hold, place, rim)
         return None
@@ -96,8 +97,9 @@ class ClutterExpert:
         # When every grasp has failed, they are tried again.
         return holds or self._table.holds(*arguments, ignores_fixtures=in_cavity)
 
-    def _place(self, index: int, hold: HeldFromAbove, X_WGoal: RigidTransform) -> PlanarPose:
-        yaw = heading(self._poses[index])
+    def _place(
+        self, index: int, hold: HeldFromAbove, X_WGoal: RigidTransform, yaw: float
+    ) -> PlanarPose:
         x, y, _ = X_WGoal @ self._table.objects[index].p_BMiddle
         goal = PlanarPose(float(x), float(y), heading(X_WGoal))
         return moved_gripper(hold.gripper, middle(self._points[index], yaw), yaw, goal)

@@ -37,8 +37,12 @@ _LEAST_SQUARES = 2
 """It covers the other if it is above it in so many squares."""
 _FLAT = math.radians(2.5)
 """An object tilted less lies flat."""
-_SAME_SHAPE = 0.0008
-"""Mean distance of the surfaces of an object and of itself turned over that is none, in metres."""
+_SAME_SHAPE = 0.0003
+"""Mean distance, beyond their spacing, of points of two surfaces that count as equal, in metres."""
+_ROLLED = math.radians(20.0)
+"""A round object that rolled is tilted further; other tilts are not by rolling."""
+_ROLLED_PITCH = math.radians(10.0)
+"""The axis of a round object deviates less than this from x of B."""
 _UPSIDE_DOWN = math.radians(120.0)
 """An object tilted further lies the wrong way up."""
 _ON_EDGE = math.radians(60.0)
@@ -125,22 +129,26 @@ class ClutteredTable:
             for index, below in enumerate(squares)
         ]
 
-    def is_flat(self, index: int, X_WB: RigidTransform) -> bool:
-        """Whether an object lies as it should lie in its cavity, apart from its heading.
+    def flat_heading(self, index: int, X_WB: RigidTransform) -> float | None:
+        """The heading of an object that lies as it should lie in its cavity; else None.
 
-        It lies flat and the right way up, or its shape does not tell the difference.
+        It lies flat and the right way up, or its shape does not tell the difference: a round handle
+        may have rolled. The heading is then that of the shape.
         """
+        yaw = heading(X_WB)
         if tilt(X_WB) < _FLAT:
-            return True
+            return yaw
+        pitch = math.asin(float(np.clip(X_WB.rotation().matrix()[2, 0], -1, 1)))
+        if tilt(X_WB) < _ROLLED or abs(pitch) > _ROLLED_PITCH:
+            return None
         item = self.objects[index]
-        if abs(math.asin(float(np.clip(X_WB.rotation().matrix()[2, 0], -1, 1)))) > _FLAT:
-            return False
-        R = RollPitchYaw(0, 0, -heading(X_WB)).ToRotationMatrix() @ X_WB.rotation()
-        points = item.p_BPoints @ R.matrix().T
-        low, high = points.min(axis=0), points.max(axis=0)
-        own_low, own_high = item.p_BPoints.min(axis=0), item.p_BPoints.max(axis=0)
-        points = points + (own_low + own_high - low - high) / 2
-        return float(item.tree.query(points)[0].mean()) < _SAME_SHAPE
+        points = item.p_BPoints @ X_WB.rotation().matrix().T
+        yaws = yaw + np.linspace(-_ROLLED_PITCH, _ROLLED_PITCH, 21)
+        deviations = [_deviation(item, points, float(angle)) for angle in yaws]
+        best = int(np.argmin(deviations))
+        # Two samples of the same surface are as far apart as the points of one.
+        spacing = float(item.tree.query(item.p_BPoints, k=2)[0][:, 1].mean())
+        return float(yaws[best]) if deviations[best] < 1.1 * spacing + _SAME_SHAPE else None
 
     def holds(
         self,
@@ -216,17 +224,25 @@ class ClutteredTable:
     ) -> PlanarPose | None:
         """Where the gripper lets go of an object to lay it aside; None if there is no room.
 
-        It is a free part of the table. For an object that lies the wrong way up, it is the edge of
-        the ledge: released there with its centre of mass outside, the object turns over.
+        It is a free part of the table. For an object that lies the wrong way up or stands on its
+        edge, it is the edge of the ledge: released there with its centre of mass outside, the
+        object turns over.
         """
         item, X_WB = self.objects[index], poses[index]
         others = [other for k, other in enumerate(points) if k != index]
-        if self.ledge is not None and tilt(X_WB) > _UPSIDE_DOWN:
+        if self.ledge is not None and tilt(X_WB) > _ON_EDGE:
             yaw, p_WCenter = heading(X_WB), X_WB @ item.p_BCenter
             cos, sin = math.cos(yaw), math.sin(yaw)
             outline = (points[index] - p_WCenter)[:, :2] @ np.array([[cos, -sin], [sin, cos]])
+            # An object on its edge falls on the side that faces outward: its lower side.
+            on_edge = tilt(X_WB) < _UPSIDE_DOWN
+            z_left = float(X_WB.rotation().matrix()[:2, 2] @ [-sin, cos])
             turned = self.ledge.turning_pose(
-                outline, p_WCenter, np.concatenate([np.zeros((0, 3)), *others]), self.area
+                outline,
+                p_WCenter,
+                np.concatenate([np.zeros((0, 3)), *others]),
+                self.area,
+                inner_side=(1 if z_left > 0 else -1) if on_edge else 0,
             )
             if turned is not None:
                 return moved_gripper(hold.gripper, p_WCenter, yaw, turned)
@@ -243,6 +259,14 @@ class ClutteredTable:
         return moved_gripper(
             hold.gripper, middle(points[index], heading(X_WB)), heading(X_WB), found
         )
+
+
+def _deviation(item: PlacedObject, points: Points, yaw: float) -> float:
+    """Mean distance of points (m, 3), rotated by -yaw and moved, from an object, in metres."""
+    turned = points @ RollPitchYaw(0, 0, -yaw).ToRotationMatrix().matrix().T
+    own = item.p_BPoints
+    shift = own.min(axis=0) + own.max(axis=0) - turned.min(axis=0) - turned.max(axis=0)
+    return float(item.tree.query(turned + shift / 2)[0].mean())
 
 
 def moved_gripper(

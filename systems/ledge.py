@@ -43,6 +43,8 @@ class Ledge:
         p_WCenter: NDArray[np.float64],
         others: NDArray[np.float64],
         area: tuple[tuple[float, float], tuple[float, float]],
+        *,
+        inner_side: int = 0,
     ) -> PlanarPose | None:
         """Where to let go of an object so that it tips over an edge and turns over.
 
@@ -53,6 +55,7 @@ class Ledge:
                 failure, the object lies elsewhere, and is let go differently.
             others: (m, 3) points of everything that may be in the way, in the world.
             area: where the object may land: lower and upper (x, y) corner.
+            inner_side: which side lies on the block: 1 the left, -1 the right, 0 the wider one.
 
         Returns:
             The point of its centre of mass and its heading; None if all edges are obstructed.
@@ -62,7 +65,8 @@ class Ledge:
         length = float(np.ptp(outline[:, 0]))
         # Its left side, or after half a turn its right side, lies on the block.
         left, right = _inside(outline), _inside(-outline)
-        inside, half_turn = max((left, 0.0), (right, math.pi))
+        options = {1: (left, 0.0), -1: (right, math.pi)}
+        inside, half_turn = options.get(inner_side, max(options.values()))
         least, most = _OUTSIDE
         varied = 1e3 * float(p_WCenter[0] + p_WCenter[1]) % 1.0
         outside = min((least + (most - least) * varied) * inside, _MOST_OUTSIDE)

@@ -19,10 +19,10 @@ X_WGOAL = RigidTransform([0.5, -0.3, 0.035])
 RIM = 0.05
 
 
-def box_points(length: float, width: float, height: float) -> np.ndarray:
-    """Points every 4 mm on the surface of a box that stands on its origin."""
+def box_points(length: float, width: float, height: float, spacing: float = 0.004) -> np.ndarray:
+    """Points on the surface of a box that stands on its origin."""
     x, y, z = (
-        np.linspace(low, high, max(2, round((high - low) / 0.004) + 1))
+        np.linspace(low, high, max(2, round((high - low) / spacing) + 1))
         for low, high in ((-length / 2, length / 2), (-width / 2, width / 2), (0, height))
     )
     grid = np.stack(np.meshgrid(x, y, z), axis=-1).reshape(-1, 3)
@@ -119,10 +119,10 @@ def test_a_tool_the_wrong_way_up_is_turned_over_the_block():
 
 
 def test_a_turned_tool_of_the_same_shape_need_not_be_turned():
-    rod = PlacedObject("rod", BodyIndex(1), box_points(0.18, 0.02, 0.012))
+    rod = PlacedObject("rod", BodyIndex(1), box_points(0.18, 0.02, 0.012, spacing=0.0015))
     table = ClutteredTable(objects=[rod], grasps=[GRASPS], area=AREA)
-    assert table.is_flat(0, pose(0.5, 0.2, roll=math.pi, z=0.012))
-    assert not table.is_flat(0, pose(0.5, 0.2, roll=0.3))
+    assert table.flat_heading(0, pose(0.5, 0.2, 0.4, roll=math.pi)) == pytest.approx(0.4)
+    assert table.flat_heading(0, pose(0.5, 0.2, roll=0.8)) is None
 
 
 def test_the_hand_keeps_clear():
