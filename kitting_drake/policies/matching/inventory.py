@@ -93,7 +93,7 @@ class Inventory:
     def why_stop(self) -> str:
         """Why a policy stops if it finds nothing to do; a word of `STOP_REASONS`."""
         seen = self.segmentation
-        if not seen.kit_seen:
+        if not seen.kit_seen and not self._has_filled:
             return "no kit seen"
         if not seen.objects and not seen.protruding:
             return "done"
@@ -125,6 +125,18 @@ class Inventory:
             for attempt in self._history
             if attempt.action.aside and attempt.outcome == "placed"
         )
+
+    @property
+    def _has_filled(self) -> bool:
+        """Whether an earlier action placed an object in what looks like a plain block now."""
+        grid, fixture = self.observation.grid, self.segmentation.fixture
+        for attempt in self._history:
+            place = attempt.action.place
+            if attempt.outcome == "placed" and grid.contains((place.x, place.y)):
+                row, col = np.rint(grid.to_pixel((place.x, place.y))).astype(int)
+                if fixture[row, col]:
+                    return True
+        return False
 
     @property
     def _history(self) -> tuple[Attempt, ...]:

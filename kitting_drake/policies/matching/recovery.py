@@ -28,6 +28,8 @@ _PRESSED = 0.012
 """An object that protrudes by more than this is taken out rather than pressed, in metres."""
 _TRIED = 0.020
 """A press or grasp within this distance of an earlier one counts as the same, in metres."""
+_NEARBY = 12
+"""The fixture's top beside an object is measured within this many pixels."""
 _ROOM = 0.045
 """The least distance between an object laid down and everything else, in metres."""
 
@@ -83,7 +85,8 @@ def _take_out(
     free = _free_place(segmentation, resolution)
     if free is None:
         return None
-    top = float(np.median(segmentation.relief[segmentation.fixture]))
+    around = ndimage.binary_dilation(region.mask, iterations=_NEARBY) & segmentation.fixture
+    top = float(np.median(segmentation.relief[around & ~region.mask]))
     for grasp in jaw_grasps(segmentation, region, resolution, planner, support=top):
         action = make_action(observation, grasp.pixel, grasp.theta, free, 0.0)
         if not _is_near(action.pick, tried):

@@ -21,6 +21,11 @@ Mask = NDArray[np.bool_]
 Plane = NDArray[np.float64]
 """(3,): the height at (row, col) is `plane @ (row, col, 1)`, in metres."""
 
+_Fixture = tuple[Mask, Plane]
+"""The convex hull of a fixture (rows, cols), and the plane of its top."""
+
+_MOST_FIXTURES, _COMPARABLE = 4, 0.3
+"""The largest number of fixtures; all others have at least this share of the largest one's area."""
 _PLANE_BAND = 0.004
 """Pixels within this distance of a plane belong to it, in metres."""
 _LEAST_FIXTURE_HEIGHT = 0.015
@@ -168,36 +173,37 @@ def segment(observation: Observation) -> Segmentation:
         observation: o_t.
 
     Returns:
-        The segmentation. Without a plateau there are neither a fixture nor recesses.
+        The segmentation. Without a plateau there are neither a fixture nor recesses. Several kits
+        are one fixture.
     """
     resolution = observation.grid.resolution
     height = observation.filled_height
     table = _fit_table(height)
     relief = (height - _plane_heights(table, height.shape)).astype(np.float32)
-    fixture, top = _find_fixture(height, relief, resolution)
-    noise = _noise_of(height, relief, fixture, top)
+    fixtures = _find_fixtures(height, relief, resolution)
+    noise = _noise_of(height, relief, fixtures)
     if noise > _CLEAN:
         # A median filter erases details one pixel wide, so use it only on noisy heights.
         height = ndimage.median_filter(height, footprint=_CROSS, mode="nearest")
         relief = ndimage.median_filter(relief, footprint=_CROSS, mode="nearest")
-        fixture, top = _find_fixture(height, relief, resolution)
-        noise = _noise_of(height, relief, fixture, top)
+        fixtures = _find_fixtures(height, relief, resolution)
+        noise = _noise_of(height, relief, fixtures)
     margin, areas = _FIXTURE_MARGIN / resolution, _AreaLimits.of(resolution, noise)
-    outside = ndimage.distance_transform_edt(~fixture) if fixture.any() else None
+    fixture = np.zeros(relief.shape, bool)
+    depth = np.zeros_like(relief)
+    for mask, top in fixtures:
+        depth[mask] = (_plane_heights(top, height.shape) - height)[mask]
+        fixture |= mask
     least = max(_OBJECT_HEIGHT, _CLEARLY * noise)
     loose = relief > least
-    if outside is not None:
-        loose &= outside > margin
-    depth = np.zeros_like(relief)
-    rise = np.zeros_like(relief)
+    rise = -depth
     hidden = np.zeros(relief.shape, bool)
-    if fixture.any():
-        depth = (_plane_heights(top, height.shape) - height).astype(np.float32)
+    if fixtures:
+        loose &= ndimage.distance_transform_edt(~fixture) > margin
         inside = ndimage.distance_transform_edt(fixture) > margin / 2
         depth[~inside] = 0
         # An unseen region belongs to the recess that it touches.
         hidden = inside & ~observation.valid
-        rise[fixture] = -depth[fixture]
     deep = depth > max(_RECESS_DEPTH, _CLEARLY * noise)
     return Segmentation(
         fixture=fixture,
@@ -227,13 +233,16 @@ def _inner_radius(mask: Mask) -> float:
 
 
 def _noise_of(
-    height: NDArray[np.float32], relief: NDArray[np.float32], fixture: Mask, top: Plane
+    height: NDArray[np.float32], relief: NDArray[np.float32], fixtures: list[_Fixture]
 ) -> float:
-    """The standard deviation of the noise of the table or the fixture's top, whichever is larger.
+    """The standard deviation of the noise of the table or of a fixture's top, the largest.
 
     The table's noise can be underestimated, because heights below the grid are clipped.
     """
-    return max(_noise(relief), _noise((height - _plane_heights(top, height.shape))[fixture]))
+    tops = [
+        _noise((height - _plane_heights(plane, height.shape))[mask]) for mask, plane in fixtures
+    ]
+    return max([_noise(relief), *tops])
 
 
 def _noise(relief: NDArray[np.floating]) -> float:
@@ -274,32 +283,63 @@ def _fit_table(height: NDArray[np.float32]) -> Plane:
     return _fit_plane(height, _mode(low), np.ones(height.shape, bool))
 
 
-def _find_fixture(
+def _find_fixtures(
     height: NDArray[np.float32], relief: NDArray[np.float32], resolution: float
-) -> tuple[Mask, Plane]:
-    """The convex hull of the largest plateau, and the plane of its top."""
-    none = np.zeros(height.shape, bool), np.zeros(3)
+) -> list[_Fixture]:
+    """The largest plateau, and other large ones if they have recesses."""
     high = relief > _LEAST_FIXTURE_HEIGHT
+    found: list[_Fixture] = []
+    largest = 0
+    for _ in range(_MOST_FIXTURES):
+        fixture = _find_fixture(height, relief, high, resolution)
+        if fixture is None:
+            break
+        mask, plane = fixture
+        size = int(mask.sum())
+        if found:
+            depth = _plane_heights(plane, height.shape) - height
+            if size < _COMPARABLE * largest or not _has_recess(mask, depth, resolution):
+                break
+        largest = max(largest, size)
+        found.append(fixture)
+        high = high & ~ndimage.binary_dilation(mask, iterations=2)
+    return found
+
+
+def _has_recess(fixture: Mask, depth: NDArray[np.float64], resolution: float) -> bool:
+    """Whether a fixture has a recess that it encloses. The hull of a tool is open to its sides."""
+    labels, count = ndimage.label(fixture & (depth > _RECESS_DEPTH), _NEIGHBOURS)
+    sizes = np.bincount(labels.ravel(), minlength=count + 1)
+    rim = fixture & ~ndimage.binary_erosion(fixture, iterations=2)
+    sizes[np.unique(labels[rim])] = 0
+    sizes[0] = 0
+    return bool(sizes.max() * resolution**2 >= _AreaLimits.of(resolution).recess)
+
+
+def _find_fixture(
+    height: NDArray[np.float32], relief: NDArray[np.float32], high: Mask, resolution: float
+) -> _Fixture | None:
+    """The convex hull of the largest plateau among the high pixels, and the plane of its top."""
     least = _AreaLimits.of(resolution).fixture
     if high.sum() * resolution**2 < least:
-        return none
+        return None
     level = _mode(relief[high])
-    plateau = ndimage.binary_opening(np.abs(relief - level) < _PLANE_BAND, _NEIGHBOURS)
+    plateau = ndimage.binary_opening(high & (np.abs(relief - level) < _PLANE_BAND), _NEIGHBOURS)
     # Close gaps, so that a recess from rim to rim does not cut the plateau in two.
     closed = ndimage.binary_closing(plateau, _NEIGHBOURS, max(1, round(_CLOSING / resolution)))
     labels, count = ndimage.label(closed, _NEIGHBOURS)
     if not count:
-        return none
+        return None
     sizes = np.bincount(labels[plateau], minlength=count + 1)
     sizes[0] = 0
     plateau &= labels == sizes.argmax()
     if plateau.sum() * resolution**2 < least:
-        return none
+        return None
     plateau = _along_tilt(plateau, height, high, resolution)
     try:
         hull = ConvexHull(np.argwhere(plateau))
     except QhullError:
-        return none
+        return None
     rows, cols = np.indices(height.shape)
     fixture = np.ones(height.shape, bool)
     for a, b, offset in hull.equations:
