@@ -42,6 +42,9 @@ from kitting_drake.scenario.cameras import Camera, camera_pose, depth_camera
 from kitting_drake.scenario.schema import Scenario
 from kitting_drake.static_scenes.random_views import draw_views
 from kitting_drake.tasks.footprints import OPEN_FINGERS
+from kitting_drake.tasks.kitting.convex_bodies import convex_body
+from kitting_drake.tasks.kitting.start_groups import projected
+from kitting_drake.tasks.kitting.starts import draw_start, draw_unsettled
 from kitting_drake.tasks.kitting.tool_poses import (
     DrawnBox,
     block_outline,
@@ -67,6 +70,11 @@ _CLUTTERED = 0.5
 """Share of scenes with clutter, i.e. objects without a cavity."""
 _MOST_STRANGERS, _MOST_BOXES = 2, 6
 """Largest numbers of other tools and of boxes in the clutter."""
+_STARTS = {"apart": 0.6, "touching": 0.28, "crossed": 0.04, "leaning": 0.04, "heap": 0.04}
+"""How the loose tools lie, with the share of scenes."""
+_FLAT, _ON_TABLE = np.cos(np.radians(2.0)), 0.001
+"""A tool lies flat if the cosine of its tilt is above this, and its origin is this near the table,
+in metres."""
 _WALL = 0.003
 _IN_CAVITY = 0.0008
 """Standard deviation of a seated tool's position in its cavity, in metres."""
@@ -218,9 +226,7 @@ def _draw_scene(
     noise = _draw_noise(rng)
 
     standing = [outline_at(block_outline(kit), X_WKit)]
-    standing += [
-        outline_at(tool.footprint.hull(), X) for tool, X in zip(lying, X_WTools, strict=True)
-    ]
+    standing += [_outline(tool, X) for tool, X in zip(lying, X_WTools, strict=True)]
     standing += [outline_at(CrossSection.square(box.size[:2], True), box.X_WB) for box in boxes]
     found = []
     for place, index in enumerate(loose):
@@ -228,6 +234,52 @@ def _draw_scene(
         found.append(LooseTool(tools[index], X_WTools[place], X_WGoals[index], around))
     cameras = dict(Scenario().cameras)
     return DrawnScene(tuple(bodies), tuple(found), cameras, noise, noise_seed)
+
+
+def _draw_poses(
+    kit: Kit, tools: Sequence[RandomTool], grid: PixelGrid, rng: np.random.Generator
+) -> tuple[RigidTransform, Sequence[RigidTransform]]:
+    """X_W of the kit and of loose tools, which may touch or lie on each other.
+
+    Raises:
+        UserError: there is no room.
+    """
+    spacing = float(rng.uniform(0.004, 0.02))
+    kind = str(rng.choice(list(_STARTS), p=list(_STARTS.values())))
+    if len(tools) < 2 and kind in ("touching", "crossed"):
+        kind = "apart"
+    if kind == "apart":
+        return draw_poses(kit, tools, grid=grid, spacing=spacing, yaw_range_deg=180.0, rng=rng)
+    if kind == "touching":
+        start = draw_unsettled(kit, tools, kind=kind, grid=grid, spacing=spacing, rng=rng)
+    else:
+        start = draw_start(
+            kit,
+            tools,
+            [convex_body(tool) for tool in tools],
+            [[item.grasp for item in tool.grasps] for tool in tools],
+            kind=kind,
+            tray=False,
+            faces="any",
+            grid=grid,
+            spacing=spacing,
+            yaw_range_deg=180.0,
+            rng=rng,
+            kit_model=False,
+        )
+    return start.X_WKit, start.X_WTools
+
+
+def _lies_flat(X_WT: RigidTransform) -> bool:
+    upright = X_WT.rotation().matrix()[2, 2] > _FLAT
+    return bool(upright and abs(X_WT.translation()[2]) < _ON_TABLE)
+
+
+def _outline(tool: RandomTool, X_WT: RigidTransform) -> CrossSection:
+    """The outline from above; that of the hull for a tool that does not lie flat."""
+    if _lies_flat(X_WT):
+        return outline_at(tool.footprint, X_WT)
+    return projected(tool.triangles.reshape(-1, 3), X_WT)
 
 
 def _draw_loose(count: int, rng: np.random.Generator) -> list[int]:
@@ -243,6 +295,9 @@ def _actions(number: int, loose: LooseTool) -> list[tuple[float, ...]]:
     """The rows of `StaticScene.actions` of one loose tool."""
     rows: list[tuple[float, ...]] = []
     X_WT, X_WGoal = loose.X_WT, loose.X_WGoal
+    if not _lies_flat(X_WT):
+        # It must be laid aside first.
+        return rows
     yaw = RollPitchYaw(X_WT.rotation()).yaw_angle()
     rotation = RollPitchYaw(X_WGoal.rotation()).yaw_angle() - yaw
     for grasp in loose.tool.grasps:

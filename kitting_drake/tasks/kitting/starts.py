@@ -121,6 +121,28 @@ def draw_start(
     )
 
 
+def draw_unsettled(
+    kit: Kit,
+    tools: Sequence[Tool],
+    *,
+    kind: str,
+    grid: PixelGrid,
+    spacing: float,
+    rng: np.random.Generator,
+) -> Start:
+    """Draws a start without physics. Tools side by side lie as they would come to rest.
+
+    The arguments are those of `draw_start`.
+
+    Raises:
+        UserError: there is no room.
+    """
+    drawn = _draw(kit, tools, kind, False, _Room(grid, spacing, math.pi), rng)
+    if drawn is None:
+        raise UserError(f"task.start: there is no room for {len(tools)} tools")
+    return drawn
+
+
 def check_start(start: str, tray: bool, faces: str, distractors: int) -> None:
     """Raises ValueError for unknown words, and for combinations that do not exist."""
     for name, word, words in (("start", start, START_KINDS), ("faces", faces, FACES)):
