@@ -20,6 +20,8 @@ from systems.signals import PickPlaceAction, PlanarPose, wrap_to_pi
 
 _NEAR_BEST = 0.035
 """A grasp further from the best one than this is used only to lay an object aside, in metres."""
+_ANY = math.radians(65.0)
+"""The lean of faces that are gripped if no others are left."""
 _IN_CAVITY = 0.03
 """An object displaced less from its goal lies in or over its cavity, in metres."""
 
@@ -94,8 +96,13 @@ class ClutterExpert:
             in_cavity = displacement(item, X_WGoal, self._poses[index]) < _IN_CAVITY
         arguments = (index, self._poses, self._points)
         holds = self._table.holds(*arguments, self._failed, ignores_fixtures=in_cavity)
-        # When every grasp has failed, they are tried again.
-        return holds or self._table.holds(*arguments, ignores_fixtures=in_cavity)
+        # When every grasp has failed, they are tried again; then those that may slip, which at least
+        # move the object.
+        return (
+            holds
+            or self._table.holds(*arguments, ignores_fixtures=in_cavity)
+            or self._table.holds(*arguments, ignores_fixtures=in_cavity, steepest=_ANY)
+        )
 
     def _place(
         self, index: int, hold: HeldFromAbove, X_WGoal: RigidTransform, yaw: float

@@ -158,6 +158,7 @@ class ClutteredTable:
         failed: Sequence[PlanarPose] = (),
         *,
         ignores_fixtures: bool = False,
+        steepest: float = _STEEPEST,
     ) -> list[HeldFromAbove]:
         """The grasps of an object, best first; without those that failed or would slip.
 
@@ -166,6 +167,7 @@ class ClutteredTable:
             poses: X_WB of each object.
             points: the points of each object in the world.
             failed: earlier picks in the world that held nothing.
+            steepest: grasps whose faces lean further are left out, in radians.
             ignores_fixtures: whether fixtures are never in the way, as for an object in a cavity.
         """
         around = [item for other, item in enumerate(points) if other != index]
@@ -174,7 +176,7 @@ class ClutteredTable:
         others = np.concatenate([np.zeros((0, 3)), *around])
         near = np.linalg.norm((others - poses[index].translation())[:, :2], axis=1) < 0.35
         found = []
-        for grasp, gripper in self._grippers(index, poses[index]):
+        for grasp, gripper in self._grippers(index, poses[index], steepest):
             if gripper is None or any(_is_same(gripper, other) for other in failed):
                 continue
             hold = self._hold(grasp, gripper, points[index], others[near])
@@ -182,10 +184,12 @@ class ClutteredTable:
                 found.append(hold)
         return found
 
-    def _grippers(self, index: int, X_WB: RigidTransform) -> list[tuple[Grasp, PlanarPose | None]]:
+    def _grippers(
+        self, index: int, X_WB: RigidTransform, steepest: float
+    ) -> list[tuple[Grasp, PlanarPose | None]]:
         """The grasps, and the gripper's pose in the world for each."""
         if not _ON_EDGE < tilt(X_WB) < _UPSIDE_DOWN:
-            return [(grasp, _gripper_pose(X_WB, grasp)) for grasp in self.grasps[index]]
+            return [(grasp, _gripper_pose(X_WB, grasp, steepest)) for grasp in self.grasps[index]]
         # The jaws close along z of B, across the object's thickness.
         item = self.objects[index]
         z_axis = X_WB.rotation().matrix()[:, 2]
@@ -329,11 +333,11 @@ def _in_hand(points: Points, gripper: PlanarPose) -> tuple[Points, Points]:
     return cos * dx + sin * dy, cos * dy - sin * dx
 
 
-def _gripper_pose(X_WB: RigidTransform, grasp: Grasp) -> PlanarPose | None:
+def _gripper_pose(X_WB: RigidTransform, grasp: Grasp, steepest: float) -> PlanarPose | None:
     """The gripper's pose in the world; None if the gripped faces lean too far."""
     R = X_WB.rotation().matrix()
     across = R @ np.array([-math.sin(grasp.theta), math.cos(grasp.theta), 0.0])
-    if abs(across[2]) > math.sin(_STEEPEST):
+    if abs(across[2]) > math.sin(steepest):
         return None
     x, y, _ = X_WB @ np.array([grasp.x, grasp.y, grasp.surface_height / 2])
     theta = math.atan2(-across[0], across[1])
