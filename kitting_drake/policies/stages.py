@@ -123,7 +123,12 @@ class OutlinePlace:
         look = draft.look
         draft = dataclasses.replace(draft, outlined=True)
         fitted = refine_place(
-            look.segmentation, draft.pick, draft.rotation, draft.place, look.resolution
+            look.segmentation,
+            draft.pick,
+            draft.rotation,
+            draft.place,
+            look.resolution,
+            look.inventory.pairs,
         )
         if fitted is not None:
             return dataclasses.replace(

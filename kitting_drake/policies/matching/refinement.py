@@ -9,12 +9,14 @@ the recess is hidden or there is none, the prediction stays as it is. This is no
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from kitting_drake.policies.data.images import rotation_matrix
+from kitting_drake.policies.matching.assignment import Pair
 from kitting_drake.policies.matching.jaw_clearance import JawGrasp, jaw_grasps, untried
 from kitting_drake.policies.matching.registration import (
     Outline,
@@ -70,7 +72,12 @@ class RefinedPlace:
 
 
 def refine_place(
-    segmentation: Segmentation, pick: Array, rotation: float, place: Array, resolution: float
+    segmentation: Segmentation,
+    pick: Array,
+    rotation: float,
+    place: Array,
+    resolution: float,
+    pairs: Sequence[Pair] = (),
 ) -> RefinedPlace | None:
     """A refined place; None where the outlines do not determine it.
 
@@ -80,6 +87,8 @@ def refine_place(
         rotation: predicted rotation of the object, in radians.
         place: (row, col) predicted for the object's point under the pick.
         resolution: the side of a pixel, in metres.
+        pairs: the objects and recesses that fit; see `match`. Such a fit is taken if it is better
+            than the one that begins at the prediction, as for a square that is almost an L.
     """
     taken = nearest_region(segmentation.objects, pick)
     if taken is None:
@@ -104,6 +113,14 @@ def refine_place(
         best is None or preference(outline, target, reverse, best) > _HALF_TURN_GAIN
     ):
         best = reverse
+    for pair in pairs:
+        same = segmentation.objects[pair.item] is taken and (
+            segmentation.recesses[pair.recess] is recess
+        )
+        if same and (
+            best is None or preference(outline, target, pair.fit, best) > _HALF_TURN_GAIN
+        ):
+            best = pair.fit
     if best is None or best.cost > _WORST_COST:
         return None
     others = [other for other in segmentation.recesses if other is not recess]
