@@ -10,6 +10,9 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
+LEAST_WIDTH = 0.008
+"""The smallest width to hold at a corner, in metres: a thinner tool would turn."""
+
 # How far a corner sinks into a pad, in metres.
 _SOFT = 0.0008
 # A corner is held steadily opposite a face that supports the pad this far to either side of it.

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from kitting_drake.hkd.grasps.corners import corner_cost
+from kitting_drake.hkd.grasps.corners import LEAST_WIDTH, corner_cost
 from kitting_drake.hkd.grasps.grip import find_grip, jaw_axes
 from systems.grasp import Grasp
 from systems.hand_geometry import FINGER_LENGTH, FINGERTIP_DEPTH, MAX_OPENING, PAD_LENGTH
@@ -350,7 +350,8 @@ def _hold(
     if contact >= _LEAST_CONTACT:
         columns_left = columns_right = both
     else:
-        held_there = corner_cost(left, right, _BIN, touch) if corners else None
+        allowed = corners and width >= LEAST_WIDTH
+        held_there = corner_cost(left, right, _BIN, touch) if allowed else None
         if held_there is None:
             return None
         corner = held_there
