@@ -53,6 +53,8 @@ _FARTHEST_GRASP = 0.04
 """A refined grasp is at most this far from the predicted one, in metres."""
 _POOR = 0.03
 """A grasp cost of one weighs as much as this distance, in metres."""
+_MUCH_WORSE = 0.5
+"""A predicted grasp is replaced by one that costs less by more than this; see `JawGrasp.cost`."""
 _SAME_PLACE, _SAME_ANGLE = 0.008, math.radians(8)
 """Grasps closer than this, in metres and radians, count as the same."""
 _NEAR = 6.0
@@ -199,7 +201,7 @@ def refine_grasp(
     failed: Array | None = None,
 ) -> RefinedGrasp | None:
     """A feasible grasp of the same object within 4 cm of a predicted one, or the predicted one
-    itself if it is feasible.
+    itself if it is feasible and not much worse.
 
     None if there is no feasible grasp.
 
@@ -228,12 +230,13 @@ def refine_grasp(
         return distance + _LEVER * turned + _POOR * grasp.cost
 
     grasps = jaw_grasps(segmentation, taken, resolution, planner)
-    # The network knows more about a grasp than the jaws' room, so keep it where it is feasible.
-    same = min((g.cost for g in grasps if is_same(*away(g))), default=None)
-    if same is not None:
-        return RefinedGrasp(pick, theta, same)
-    if failed is not None:
-        grasps = untried(grasps, failed, resolution)
     near = [grasp for grasp in grasps if away(grasp)[0] <= _FARTHEST_GRASP]
+    if failed is not None:
+        near = untried(near, failed, resolution)
+    least = min((grasp.cost for grasp in near), default=math.inf)
+    # The network knows more about a grasp than the jaws' room, so keep it unless it is much worse.
+    same = min((g.cost for g in grasps if is_same(*away(g))), default=None)
+    if same is not None and same < least + _MUCH_WORSE:
+        return RefinedGrasp(pick, theta, same)
     best = min(near, key=departure, default=None)
     return None if best is None else RefinedGrasp(best.pixel, best.theta, best.cost)
