@@ -17,7 +17,7 @@ _THERE = 0.015
 """An object within this distance of an earlier pick or place is the one that was moved, in metres.
 """
 _MOST_TRIES = 3
-"""An object that fits is tried this many times; one that fits nowhere, once."""
+"""An object is tried at most this many times."""
 _LEAST_SHARE, _LARGEST_SHARE = 0.5, 1.6
 """A region may hold objects of recesses if its area is at least this share of the smallest one's,
 and at most this share of the areas of all."""
@@ -61,14 +61,14 @@ class Inventory:
 
     @property
     def strangers(self) -> tuple[Region, ...]:
-        """The objects that fit into no recess and were not tried before, largest first.
+        """The objects that fit into no recess and are worth a try, largest first.
 
         One of them may be several objects, or one that lies so that its outline does not show.
         """
         paired = {pair.item for pair in self.pairs}
         objects = enumerate(self.segmentation.objects)
         return tuple(
-            item for index, item in objects if index not in paired and not self.tries(item)
+            item for index, item in objects if index not in paired and not self.is_tried(item)
         )
 
     @property
@@ -108,11 +108,17 @@ class Inventory:
         return next((pair for pair in self.pairs if objects[pair.item] is region), None)
 
     def is_tried(self, region: Region | None) -> bool:
-        """Whether an object was tried as often as is worth it; False for None."""
+        """Whether an object was tried as often as is worth it; False for None.
+
+        An object that fits nowhere is left alone where an earlier action has laid it.
+        """
         if region is None:
             return False
-        most = 1 if self.pair_of(region) is None else _MOST_TRIES
-        return self.tries(region) >= most
+        laid = self.pair_of(region) is None and any(
+            attempt.outcome == "placed" and self._is_there(attempt.action.place, region)
+            for attempt in self._history
+        )
+        return laid or self.tries(region) >= _MOST_TRIES
 
     def tries(self, region: Region) -> int:
         """How many earlier actions moved this object here, or failed to move it away."""
