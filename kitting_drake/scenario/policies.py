@@ -176,8 +176,8 @@ class Learned(PolicyConfig):
     # Refine actions by the geometry of o_t. Needs `continuous`; the paper does none of this.
     # - The place: fit the object's outline to that of the recess, if the two agree.
     # - The pick: move the grasp to where the jaws have clearance.
-    # - Stopping: continue while an object clearly fits into a recess. With `recover`, recovery
-    #   decides instead.
+    # - Touching objects: tell them apart by the outlines of the free recesses.
+    # - Stopping: continue while an object fits into a recess, or one that was not tried yet may.
     # - In tasks without insertion: among rotations that score equally well, choose one with
     #   clearance for the opening fingers.
     fit_outlines: bool = True
@@ -185,9 +185,10 @@ class Learned(PolicyConfig):
     # Do not pick again within 10 mm of a failed grasp. The paper has no such memory.
     avoid_failed_picks: bool = True
 
-    # Recover from failed insertions that o_t shows. Press down protruding objects; first pick
-    # objects that fit into a recess; finally take out objects that do not go down, and retry.
-    # Recovery needs extra actions: see the task's `tries`.
+    # Recover from failed insertions that o_t shows, and take heaps apart. Press down protruding
+    # objects; then pick objects that fit into a recess; then lay what lies on others on the table;
+    # finally take out objects that do not go down, and retry. Nothing is moved twice in vain. This
+    # needs extra actions: see the task's `tries`.
     recover: bool = False
 
     def make_system(self, site: PolicySite) -> LeafSystem:

@@ -46,6 +46,9 @@ _CLEARLY, _UNEXPLAINED = 0.65, 0.15
 needs a larger share of such points."""
 _LEAST_PART = 0.35
 """A region smaller than this share of a recess's area holds no object of that recess."""
+_HIGHER, _ACROSS = 0.006, 6
+"""What is higher than an object's middle by this, in metres, and has this many pixels on both sides
+of its outline, lies on it."""
 _SLIVER = 1
 """What is left of a region is thinned by this many pixels, to drop slivers."""
 _LEAST_REST = 0.0002
@@ -110,7 +113,7 @@ def _split(
     while rest.any():
         around = trace_outline(rest, resolution, close=True)
         tried = [
-            _find(index, recess, rest, around, resolution)
+            _find(index, recess, rest, relief, around, resolution)
             for index, recess in enumerate(recesses)
             if index not in taken and rest.sum() > _LEAST_PART * recess.mask.sum()
         ]
@@ -144,14 +147,19 @@ def _region(mask: Mask, relief: NDArray[np.float32]) -> Region:
 
 
 def _find(
-    number: int, recess: Region, region: Mask, around: Outline, resolution: float
+    number: int,
+    recess: Region,
+    region: Mask,
+    relief: NDArray[np.float32],
+    around: Outline,
+    resolution: float,
 ) -> _Found | None:
     """The best pose of a recess's outline within a region; None if there is none."""
     template = trace_outline(recess.mask, resolution)
     best: _Found | None = None
     for start in _starts(recess.mask, region, template, resolution):
         fit = register(template, around, starts=(start,), within=True)
-        found = _judge(number, template, around, fit, region, resolution)
+        found = _judge(number, template, around, fit, region, relief, resolution)
         if found is not None and (best is None or found.shared > best.shared):
             best = found
     return best
@@ -163,6 +171,7 @@ def _judge(
     around: Outline,
     fit: Registration,
     region: Mask,
+    relief: NDArray[np.float32],
     resolution: float,
 ) -> _Found | None:
     """The object at a fit; None if the outlines do not agree well enough."""
@@ -181,7 +190,20 @@ def _judge(
     if shared.mean() < _SHARED or away[shared].mean() > _COST:
         return None
     mask = region & (distance < resolution / 2 - fit.offset)
+    if _is_under_another(mask, region, relief):
+        return None
     return _Found(number, mask, float(shared.mean()), float(away[shared].mean()))
+
+
+def _is_under_another(mask: Mask, region: Mask, relief: NDArray[np.float32]) -> bool:
+    """Whether something higher reaches across an object's outline."""
+    high = region & (relief > np.median(relief[mask]) + _HIGHER)
+    inside, outside = ndimage.binary_erosion(mask), ~ndimage.binary_dilation(mask)
+    labels, count = ndimage.label(high)
+    parts = (labels == number for number in range(1, count + 1))
+    return any(
+        (part & inside).sum() >= _ACROSS and (part & outside).sum() >= _ACROSS for part in parts
+    )
 
 
 def _starts(

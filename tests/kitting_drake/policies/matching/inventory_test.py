@@ -1,0 +1,122 @@
+"""Touching objects are told apart, heaps are taken apart, and nothing is tried in vain."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from kitting_drake.policies.matching.inventory import Inventory
+from kitting_drake.policies.matching.separating import separating_action
+from kitting_drake.policies.matching.shape_matching import ShapeMatchingPolicy
+from systems.pick_place_parameters import PickPlaceParameters
+from systems.signals import Attempt, Observation, PickPlaceAction, PixelGrid, PlanarPose
+
+GRID = PixelGrid()
+PLANNER = PickPlaceParameters()
+
+
+def hammer(rows: int, cols: int) -> NDArray[np.bool_]:
+    """A T of 50 by 24 pixels with its corner at (rows, cols)."""
+    mask = np.zeros(GRID.shape, bool)
+    mask[rows + 8 : rows + 15, cols : cols + 50] = True
+    mask[rows : rows + 24, cols + 42 : cols + 50] = True
+    return mask
+
+
+def bar(rows: int, cols: int) -> NDArray[np.bool_]:
+    mask = np.zeros(GRID.shape, bool)
+    mask[rows : rows + 7, cols : cols + 44] = True
+    return mask
+
+
+def scene(*objects: tuple[NDArray[np.bool_], float], filled: bool = False) -> Observation:
+    """A kit with recesses for a hammer and a bar, and objects of given heights on the table."""
+    height = np.zeros(GRID.shape, np.float32)
+    height[20:110, 20:110] = 0.05
+    for recess in (hammer(30, 35), bar(75, 40)):
+        height[recess] = 0.05 if filled else 0.035
+    for mask, top in objects:
+        height[mask] = np.maximum(height[mask], top)
+    image = np.full((4, *GRID.shape), 0.5, np.float32)
+    image[3] = height
+    return Observation(image, GRID)
+
+
+def placed_at(pixel: tuple[float, float], *, aside: bool = True, pick: bool = False) -> Attempt:
+    """An earlier action that laid an object at a pixel, or picked it there."""
+    x, y = GRID.to_world(pixel)
+    here, away = PlanarPose(float(x), float(y)), PlanarPose(0.3, -0.45)
+    poses = (here, away) if pick else (away, here)
+    return Attempt(PickPlaceAction(*poses, aside=aside), "placed")
+
+
+TOUCHING = scene((hammer(60, 180), 0.015), (bar(75, 179), 0.015))
+
+
+def test_touching_objects_are_told_apart_by_the_recesses():
+    found = Inventory.of(TOUCHING)
+    sizes = [int(item.mask.sum()) for item in found.segmentation.objects]
+    assert sizes == pytest.approx([hammer(0, 0).sum(), bar(0, 0).sum()], rel=0.2)
+    assert {(pair.item, pair.recess) for pair in found.pairs} == {(0, 0), (1, 1)}
+
+
+def test_a_box_that_contains_the_outline_of_a_recess_is_not_split():
+    box = np.zeros(GRID.shape, bool)
+    box[60:90, 180:240] = True
+    found = Inventory.of(scene((box, 0.015)))
+    assert [int(item.mask.sum()) for item in found.segmentation.objects] == [box.sum()]
+    assert not found.pairs
+
+
+def crossed() -> Observation:
+    """A bar under a longer and wider one, which fits nowhere."""
+    upright = np.zeros(GRID.shape, bool)
+    upright[36:92, 215:226] = True
+    return scene((bar(60, 200), 0.015), (upright, 0.030))
+
+
+def test_a_heap_is_taken_apart_from_the_top():
+    observation = crossed()
+    action = separating_action(Inventory.of(observation), PLANNER)
+    assert action is not None and action.aside
+    row, col = np.rint(GRID.to_pixel((action.pick.x, action.pick.y))).astype(int)
+    assert observation.height[row, col] == pytest.approx(0.030)
+    row, col = np.rint(GRID.to_pixel((action.place.x, action.place.y))).astype(int)
+    assert observation.height[row - 3 : row + 4, col - 3 : col + 4].max() == 0
+    # Only `recover` spends actions on it.
+    assert ShapeMatchingPolicy(PLANNER)(observation).reason == "nothing fits"
+    assert ShapeMatchingPolicy(PLANNER, recover=True)(observation) == action
+
+
+def test_what_was_laid_aside_and_fits_nowhere_is_left_alone():
+    observation = dataclasses.replace(crossed(), history=(placed_at((62.0, 218.0)),))
+    action = ShapeMatchingPolicy(PLANNER, recover=True)(observation)
+    assert action.stop and action.reason == "gave up"
+    assert action.left_over is not None
+    assert len(action.left_over.objects) == 1 and len(action.left_over.cavities) == 2
+
+
+def test_an_object_that_fits_is_tried_again_but_not_forever():
+    missed = dataclasses.replace(placed_at((71.0, 200.0), pick=True, aside=False), outcome="missed")
+    policy = ShapeMatchingPolicy(PLANNER)
+    alone = scene((hammer(60, 180), 0.015))
+    assert not policy(dataclasses.replace(alone, history=(missed,) * 2)).stop
+    assert policy(dataclasses.replace(alone, history=(missed,) * 3)).reason == "gave up"
+
+
+def test_a_full_kit_is_no_missing_kit():
+    full = scene(filled=True)
+    assert Inventory.of(full).why_stop == "no kit seen"
+    kitted = dataclasses.replace(full, history=(placed_at((42.0, 60.0), aside=False),))
+    assert Inventory.of(kitted).why_stop == "done"
+
+
+def test_two_kits_are_seen():
+    height = scene((hammer(60, 180), 0.015)).height.copy()
+    height[20:110, 250:310] = 0.04
+    height[30:100, 270:277] = 0.03
+    image = np.full((4, *GRID.shape), 0.5, np.float32)
+    image[3] = height
+    found = Inventory.of(Observation(image, GRID)).segmentation
+    assert len(found.free_recesses) == 3 and len(found.objects) == 1
