@@ -13,12 +13,11 @@ from pydrake.math import RigidTransform, RollPitchYaw
 from systems.free_area import find_free_pose
 from systems.grasp import Grasp
 from systems.hand_geometry import (
-    FINGER_BASE_DISTANCE,
     FINGER_DEPTH,
     FINGER_LENGTH,
     FINGERTIP_DEPTH,
-    FINGERTIP_DISTANCE,
     PAD_LENGTH,
+    PALM_HEIGHT,
     PALM_SIZE,
 )
 from systems.ledge import Ledge
@@ -53,7 +52,7 @@ _STEEPEST = math.radians(25.0)
 """Jaws do not hold faces that lean further than this."""
 _SLENDER = 0.020
 """Height of a finger's slender tip, in metres."""
-_PALM_HEIGHT = FINGERTIP_DISTANCE - FINGER_BASE_DISTANCE - 0.003
+_PALM_ROOM = PALM_HEIGHT - 0.003
 """Height of the palm above the fingertips, less a margin, in metres."""
 _MARGIN = 0.001
 """Least clearance of the fingers, in metres."""
@@ -322,7 +321,7 @@ def in_the_way(points: Points, gripper: PlanarPose, tip: float, halves: tuple[fl
     in_fingers = (along < FINGER_LENGTH / 2 + _MARGIN) & (across > closed) & (z > tip)
     reach = np.where(z > tip + _SLENDER, FINGER_DEPTH, FINGERTIP_DEPTH) + _MARGIN
     in_fingers &= across < opened + reach
-    in_palm = (along < PALM_SIZE[0] / 2) & (across < PALM_SIZE[1] / 2) & (z > tip + _PALM_HEIGHT)
+    in_palm = (along < PALM_SIZE[0] / 2) & (across < PALM_SIZE[1] / 2) & (z > tip + _PALM_ROOM)
     return int((in_fingers | in_palm).sum())
 
 

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from kitting_drake.policies.matching.segmentation import Region, Segmentation
-from systems.hand_geometry import FINGERTIP_DEPTH, PAD_LENGTH
+from systems.hand_geometry import FINGERTIP_DEPTH, PAD_LENGTH, PALM_HEIGHT, PALM_SIZE
 from systems.pick_place_parameters import PickPlaceParameters
 
 Array = NDArray[np.float64]
@@ -210,7 +210,45 @@ def _grip(
         + np.maximum(0.0, width - 0.035) / 0.015
     )
     fits &= contact > 0
+    chosen = np.flatnonzero(fits)
+    fits[chosen] = _palm_is_free(
+        raised, centres[chosen], along[chosen], across[chosen], tip[chosen], resolution
+    )
     return [JawGrasp(centres[i], float(thetas[i]), float(cost[i])) for i in np.flatnonzero(fits)]
+
+
+def _palm_is_free(
+    raised: NDArray[np.float32],
+    centres: Array,
+    along: Array,
+    across: Array,
+    tip: Array,
+    resolution: float,
+) -> NDArray[np.bool_]:
+    """(n,): whether nothing under the palm is as high as the palm.
+
+    Args:
+        raised: (rows, cols), heights above the table, in metres.
+        centres: (n, 2), row and column midway between the pads.
+        along: (n, 2), the direction of the pads' length.
+        across: (n, 2), the direction in which the jaws close.
+        tip: (n,), the height of the fingertips, in metres.
+        resolution: the side of a pixel, in metres.
+    """
+    u, s = (
+        np.linspace(-side / 2, side / 2, count)
+        for side, count in zip(PALM_SIZE, (7, 19), strict=True)
+    )
+    positions = (
+        centres[:, None, None]
+        + along[:, None, None] * (u / resolution)[:, None, None]
+        + across[:, None, None] * (s / resolution)[None, :, None]
+    )
+    index = np.moveaxis(np.rint(positions).astype(int), -1, 0)
+    rows, cols = raised.shape
+    row, col = np.clip(index[0], 0, rows - 1), np.clip(index[1], 0, cols - 1)
+    highest = raised[row, col].max(axis=(1, 2), initial=0.0)
+    return np.asarray(highest < tip + PALM_HEIGHT - _LOWEST)
 
 
 def _run(occupied: NDArray[np.bool_]) -> NDArray[np.intp]:
