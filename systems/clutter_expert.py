@@ -96,8 +96,8 @@ class ClutterExpert:
             in_cavity = displacement(item, X_WGoal, self._poses[index]) < _IN_CAVITY
         arguments = (index, self._poses, self._points)
         holds = self._table.holds(*arguments, self._failed, ignores_fixtures=in_cavity)
-        # When every grasp has failed, they are tried again; then those that may slip, which at least
-        # move the object.
+        # When every grasp has failed, they are tried again; then those that may slip, which at
+        # least move the object.
         return (
             holds
             or self._table.holds(*arguments, ignores_fixtures=in_cavity)

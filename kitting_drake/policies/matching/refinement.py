@@ -119,9 +119,7 @@ def refine_place(
         same = segmentation.objects[pair.item] is taken and (
             segmentation.recesses[pair.recess] is recess
         )
-        if same and (
-            best is None or preference(outline, target, pair.fit, best) > _HALF_TURN_GAIN
-        ):
+        if same and (best is None or preference(outline, target, pair.fit, best) > _HALF_TURN_GAIN):
             best = pair.fit
     if best is None or best.cost > _WORST_COST:
         return None
