@@ -67,7 +67,8 @@ def add_models(
     objects = []
     for item in scene.objects:
         body = add(item.model)
-        com = np.asarray(body.default_com())
+        # A copy: a view would keep the plant in memory.
+        com = np.array(body.default_com())
         objects.append(
             PlacedObject(
                 item.name, body.index(), item.p_BPoints, item.symmetry, item.axis, p_BCom=com

@@ -183,6 +183,24 @@ def test_a_field_that_a_run_did_not_have_is_a_difference(tmp_path: Path):
     assert (run.paper_task, run.departures) == (None, ["task.random_lengths: not there"])
 
 
+@pytest.mark.parametrize(
+    ("lower_speed", "departures"), [(0.08, []), (0.07, ["planner.lower_speed: 0.07"])]
+)
+def test_runs_from_before_contact_forces_were_limited_are_of_the_same_task(
+    lower_speed: float, departures: list[str], tmp_path: Path
+):
+    write(tmp_path, "run", Scenario(task=Kitting()), [1.0])
+    found = read_summaries(tmp_path)["run"]["resolved_scenario"]
+    for name in ("force_limit", "contact_speed", "touch_speed", "slow_margin"):
+        del found["planner"][name]
+    for name in ("start", "tray", "faces", "kits", "riser", "tilt_deg", "tool_mass"):
+        del found["task"][name]
+    found["planner"] |= {"lower_speed": lower_speed, "minimum_width": 0.0015}
+    spoil(tmp_path, "run", resolved_scenario=found)
+    (run,) = read_runs(tmp_path)
+    assert run.departures == departures
+
+
 def test_the_most_tested_network_and_all_causes(folder: Path):
     found = tables(page(folder))
     placed, acted = found[

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from kitting_drake.reproduction.page.markdown import markdown_table
 from kitting_drake.reproduction.page.paired import OWN, paired_difference, points_text
 from kitting_drake.reproduction.page.prose import prose
+from kitting_drake.reproduction.page.runs import has_unlimited_hand
 from kitting_drake.reproduction.paper.cell_results import Result
 from kitting_drake.reproduction.paper.cells import PRESET
 from kitting_drake.reproduction.paper.failed_grasps import changeable, is_as_in_the_paper
@@ -99,7 +100,9 @@ def departures(results: Mapping[str, Result]) -> str:
     headings = ["what", "in the paper", "here"]
     with_effect = markdown_table([*headings, "effect"], measured, left_columns=4)
     without = markdown_table(headings, _NOT_MEASURED, left_columns=3)
-    return f"{prose('departures')}\n{with_effect}\n{prose('departures_not_measured')}\n{without}"
+    measured_text = f"{prose('departures')}\n{with_effect}"
+    others_text = f"{prose('departures_not_measured')}\n{without}"
+    return f"{measured_text}\n{others_text}{_earlier_hand(results)}"
 
 
 def _compared(
@@ -113,6 +116,14 @@ def _compared(
             if points is not None:
                 found.append(f"{label}: {points_text(points)}")
     return f"{what}:<br>{'<br>'.join(found)}" if found else "not yet measured"
+
+
+def _earlier_hand(results: Mapping[str, Result]) -> str:
+    """A paragraph on the cells that were run before contact forces were limited, if there are."""
+    found = [has_unlimited_hand(item.summary["resolved_scenario"]) for item in results.values()]
+    if not any(found):
+        return ""
+    return f"\n{prose('unlimited_hand', older=sum(found), all=len(found))}"
 
 
 def _memory(results: Mapping[str, Result]) -> str:

@@ -192,7 +192,8 @@ def test_a_failing_simulation_ends_the_episode_with_its_error():
     assert [event.is_last for event in told.seen] == [True]
     # JSON needs plain Python numbers.
     kinds = {type(value) for item in result.objects for value in vars(item).values()}
-    assert kinds == {str, float, bool}
+    assert kinds == {str, float, bool, dict}
+    assert result.objects[0].measures == {}
 
 
 def test_an_interrupted_episode_has_a_result():

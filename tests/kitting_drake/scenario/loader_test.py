@@ -8,7 +8,7 @@ from kitting_drake.scenario import load_scenario
 from kitting_drake.scenario.cameras import LookAt, Pinhole
 from kitting_drake.scenario.policies import Learned, PythonPolicy
 from kitting_drake.tasks import ArrangedKitting, Kitting, ToolsetKitting
-from kitting_drake.tasks.kitting.tool_poses import TablePose
+from kitting_drake.tasks.kitting.kit_stands import KitPose
 from systems.insertion_search import InsertionSearch
 
 TEST_SCENARIOS = Path(__file__).parent / "test_scenarios.yaml"
@@ -116,7 +116,7 @@ def test_text_can_choose_another_variant(tmp_path: Path):
     path = write(tmp_path, "A: {task: !Kitting {spacing: 0.02}}")
     text = "{task: !ArrangedKitting {kit_pose: {x: 0.6}}, policy: !PythonPolicy {function: 'a:b'}}"
     merged = load_scenario(path, text=text)
-    assert merged.task == ArrangedKitting(kit_pose=TablePose(x=0.6, y=-0.1))
+    assert merged.task == ArrangedKitting(kit_pose=KitPose(x=0.6, y=-0.1))
     assert merged.policy == PythonPolicy(function="a:b")
     merged = load_scenario(path, text="{task: !ArrangedKitting {tools: {flat_screwdriver: {}}}}")
     assert list(merged.task.tools) == ["flat_screwdriver"]

@@ -161,7 +161,7 @@ def test_the_action_port_can_be_fixed(rig: Rig):
     root = simulator.get_mutable_context()
     station.GetInputPort("action").FixValue(root, Value(action))
     simulator.AdvanceTo(1.0)
-    assert station.counts(root) == (1, 0, 0)
+    assert station.counts(root) == (1, 0, 0, 0)
     accepted = station.accepted_action(root)
     assert (accepted.pick.x, accepted.place.y) == (action.pick.x, action.place.y)
     assert station.at_rest(root).sum() >= 3
