@@ -212,6 +212,7 @@ def segment(observation: Observation) -> Segmentation:
             for item in _regions(loose, relief, resolution, areas.object)
             # In the shadow of a block, stray depths are filled in to the shape of an object.
             if observation.valid[item.mask].mean() > _OBJECT_SEEN
+            and not _is_corner(item, fixture, float(relief[fixture].max(initial=0)), resolution)
         ),
         recesses=_regions(deep | hidden, depth, resolution, areas.recess, core=deep),
         protruding=tuple(
@@ -225,6 +226,14 @@ def segment(observation: Observation) -> Segmentation:
         visibility=Visibility.of(observation),
         noise=_noise(relief),
     )
+
+
+def _is_corner(item: Region, fixture: Mask, top: float, resolution: float) -> bool:
+    """Whether a small region is a corner of the fixture that its hull cuts off."""
+    if item.mask.sum() * resolution**2 >= _LEAST_AREA or item.height < top - _PLANE_BAND:
+        return False
+    near = ndimage.binary_dilation(item.mask, iterations=round(2 * _FIXTURE_MARGIN / resolution))
+    return bool((near & fixture).any())
 
 
 def _inner_radius(mask: Mask) -> float:
