@@ -257,10 +257,12 @@ class KittingStation(Diagram):
         simulator = Simulator(self if diagram is None else diagram)
 
         def step(root_context: Context) -> EventStatus:
-            self._correct_drift(root_context)
             self._let_appear(root_context)
             self._apply_sleep(root_context)
-            return EventStatus.DidNothing() if monitor is None else monitor(root_context)
+            status = EventStatus.DidNothing() if monitor is None else monitor(root_context)
+            # Last, so that the monitor sees the bodies where the planner's update saw them.
+            self._correct_drift(root_context)
+            return status
 
         simulator.set_monitor(step)
         return simulator

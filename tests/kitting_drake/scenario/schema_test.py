@@ -13,7 +13,7 @@ from kitting_drake.scenario import Scenario, load_scenario
 from kitting_drake.scenario.description import describe
 from kitting_drake.scenario.policies import Learned, Policy
 from kitting_drake.scenario.yaml_input.drake_configs import struct_fields
-from kitting_drake.tasks import PythonTask, Task
+from kitting_drake.tasks import Kitting, PythonTask, Task, ToolsetKitting
 from systems.bounds import check_bounds
 
 TEST_SCENARIOS = Path(__file__).parent / "test_scenarios.yaml"
@@ -22,8 +22,9 @@ ONE_OF_EVERYTHING = [
 ]
 
 
-APART = {Learned: {"avoid_failed_picks"}}
-"""Fields that exclude others. `policies_test` covers them."""
+SETTLED = {"start", "tray", "faces"}
+APART = {Learned: {"avoid_failed_picks"}, Kitting: SETTLED, ToolsetKitting: SETTLED}
+"""Fields that exclude others. `policies_test` and `starts_test` cover them."""
 
 
 def reachable(kind: Any) -> set[type]:

@@ -30,6 +30,7 @@ needs_renderer = pytest.mark.skipif(not can_render(), reason="images cannot be r
 
 @pytest.fixture(scope="module")
 def tools() -> list[RandomTool]:
+    """A composed tool, one of a design, and a simple part."""
     return [draw_tool(ENTRIES, np.random.default_rng(seed), str(seed)) for seed in (3, 9, 12)]
 
 
@@ -39,10 +40,12 @@ def test_random_tools_are_valid_and_distinct(tools: list[RandomTool]):
         np.testing.assert_allclose(low[2], 0, atol=1e-9)
         np.testing.assert_allclose(low[:2], -high[:2], atol=1e-9)
         np.testing.assert_allclose(high - low, (tool.length, tool.width, tool.height), atol=1e-9)
-        assert 0.1 < max(tool.length, tool.width) < 0.24
+        shortest = 0.012 if tool.category == "part" else 0.045
+        assert shortest < max(tool.length, tool.width) < 0.35
         assert tool.grasps
         assert all(0.003 <= grasp.width <= 0.07 for grasp in tool.grasps)
         assert tool.footprint.area() > 0
+    assert [tool.category for tool in tools] == ["composed", "wrench", "part"]
     assert len({round(tool.footprint.area(), 9) for tool in tools}) == len(tools)
     again = draw_tool(ENTRIES, np.random.default_rng(12), "12")
     np.testing.assert_array_equal(again.triangles, tools[2].triangles)

@@ -10,8 +10,9 @@ from kitting_drake.common.paths import SCENARIOS
 from kitting_drake.hkd.tools.tool import load_tool
 from kitting_drake.scenario import load_scenario
 from kitting_drake.tasks import Kitting, ToolsetKitting
-from kitting_drake.tasks.kitting import settling
+from kitting_drake.tasks.kitting import settling, starts
 from kitting_drake.tasks.kitting.convex_bodies import convex_body
+from kitting_drake.tasks.kitting.start_checks import FACES
 from kitting_drake.tasks.kitting.start_groups import START_KINDS, projected
 from kitting_drake.tasks.kitting.starts import TRAY_SIZE
 from kitting_drake.tasks.task import Scene
@@ -97,7 +98,8 @@ def test_unknown_starts_raise(fields: dict, reason: str):
             task.validate()
 
 
-def test_an_impossible_start_raises():
+def test_an_impossible_start_raises(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(starts, "_REDRAWS", 2)
     with pytest.raises(UserError, match=r"^task\.start: 'crossed' needs at least two tools$"):
         draw(0, tools=TWO[:1], start="crossed")
     small = PixelGrid(rows=100, cols=110)
@@ -113,8 +115,9 @@ def test_every_row_has_a_scenario():
 
 
 @pytest.mark.slow
-def test_a_heap_in_a_tray_stays_in_it():
-    scene = draw(1, start="heap", tray=True, tools=Kitting().tools)
+@pytest.mark.parametrize("faces", FACES)
+def test_a_heap_in_a_tray_stays_in_it(faces: str):
+    scene = draw(1, start="heap", tray=True, faces=faces, tools=Kitting().tools)
     tray = scene.fixtures[1]
     for item in scene.objects:
         points = (tray.X_WF.inverse() @ item.X_WB).multiply(item.p_BPoints.T)
