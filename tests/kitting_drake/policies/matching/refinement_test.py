@@ -30,7 +30,7 @@ def bar(blocked: float) -> Segmentation:
     [(66, 0.0, 0), (60, 0.0, 1), (60, 0.45, 1), (40, 0.45, None)],
 )
 def test_a_refined_grasp_is_near_the_predicted_one(row: int, blocked: float, moves: int | None):
-    """It stays where it is nearly as good as any, moves along the bar, or is left to the network."""
+    """It stays where it is nearly as good as any, moves along the bar, or is the network's own."""
     found, pick = bar(blocked), np.array([row, 160.0])
     [region] = [item for item in found.objects if item.mask[100, 160]]
     assert jaw_grasps(found, region, GRID.resolution, PLANNER)
