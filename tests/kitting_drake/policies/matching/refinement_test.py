@@ -20,8 +20,8 @@ def bar(blocked: float) -> Segmentation:
     end = first + round(blocked * (last - first))
     image[3, first:last, 157:164] = 0.014
     if blocked:
-        image[3, first - 2 : end, 167:180] = 0.05
-        image[3, first - 2 : end, 141:154] = 0.05
+        image[3, first - 2 : end, 167:180] = 0.04
+        image[3, first - 2 : end, 141:154] = 0.04
     return segment(Observation(image, GRID))
 
 
