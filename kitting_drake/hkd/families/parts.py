@@ -129,7 +129,10 @@ def plate_part(length: float, width: float, height: float) -> PartDesign:
 
 
 def board(length: float, width: float, height: float) -> PartDesign:
-    """A circuit board in a frame of 5 mm, with parts on it that end at `height`."""
+    """A circuit board in a frame of 5 mm, with parts on it that end at `height`.
+
+    Its cavity is a rectangle, in which half a turn is the same placement.
+    """
     if height < _FRAME + 1.0:
         raise PartError(f"a board with its parts must be {_FRAME + 1:g} mm high or more")
     base = _prism(_rectangle(length, width), _FRAME)
@@ -142,7 +145,7 @@ def board(length: float, width: float, height: float) -> PartDesign:
         box = _rectangle(long * length, wide * width) + (x * length, y * width)
         item = plate(box, _FRAME - 0.5, top, 0.2, [CrossSection([box])])
         parts.append(Part(f"part_{number}", "black_rubber", item.solid, item.hulls))
-    return PartDesign(parts, PartGrasp(width, _FRAME), 1)
+    return PartDesign(parts, PartGrasp(width, _FRAME), 2)
 
 
 def bolt(length: float, diameter: float) -> PartDesign:
