@@ -1,4 +1,4 @@
-"""What lies on what, and which grasps are free, from true poses: for the oracle in clutter."""
+"""Finds, from true poses, which objects lie on others and which grasps are free."""
 
 from __future__ import annotations
 

@@ -7,10 +7,10 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from systems.grip_force import GRAVITY
 from systems.pick_place_motion import RECENT, PlannerState
 from systems.pick_place_parameters import Mode
 
-_GRAVITY = 9.81
 HEAVIEST = 3.0
 """The payload of a Franka Hand, in kg. What pulls harder is not a weight."""
 _LASTING = 1 / 64
@@ -91,7 +91,7 @@ class ContactGuard:
             return False
         f_x, f_y, f_z = contact[:3].tolist()
         a_x, a_y, a_z = acceleration.tolist()
-        pull = max(_GRAVITY + a_z, 1.0)
+        pull = max(GRAVITY + a_z, 1.0)
         if mode == Mode.CARRY:
             self._weigh(state, -f_z / pull, height)
         mass = self._mass(state, mode, -f_z / pull)
@@ -130,14 +130,14 @@ class ContactGuard:
         if height >= state.travel_z - _CLEAR:
             state.weighings = min(state.weighings + 1, _WEIGHINGS)
             mass = min(max(apparent, 0.0), HEAVIEST)
-            state.payload += (-_GRAVITY * mass - state.payload) / state.weighings
+            state.payload += (-GRAVITY * mass - state.payload) / state.weighings
 
     @staticmethod
     def _mass(state: PlannerState, mode: Mode, apparent: float) -> float:
         if mode in _UNWEIGHED and not state.weighings:
             return min(max(apparent, 0.0), HEAVIEST)
         holds = mode in (Mode.CARRY, Mode.LOWER, Mode.SEARCH, *_LETS_GO)
-        return -state.payload / _GRAVITY if holds else 0.0
+        return -state.payload / GRAVITY if holds else 0.0
 
     @staticmethod
     def _keep_peaks(state: PlannerState, vertical: float, lateral: float) -> None:

@@ -19,7 +19,7 @@ MAX_OPENING = 0.080
 """Distance between the pads of the open jaws."""
 PALM_SIZE = (0.064, 0.209)
 """Extents of the palm along G's x and y."""
-PALM_HEIGHT = 0.0463
+PALM_HEIGHT = 0.0461
 """Height of the palm's underside above the fingertip ends."""
 FINGERTIP_DISTANCE = 0.1121
 """Distance from the hand's flange to the fingertip ends, along G's z."""

@@ -27,6 +27,7 @@ API = {
             "kitting_drake.scenario.appearance",
             "kitting_drake.scenario.loader",
             "kitting_drake.tasks.kitting.kitting",
+            "kitting_drake.tasks.kitting.arranged",
             "kitting_drake.hkd.kits.parameters",
         ],
     ),

@@ -218,7 +218,9 @@ class Learned(PolicyConfig):
         heights_only = not loaded.colour and site.observer is None
         function = loaded.function
         return PickPlacePolicy(
-            policy=function if self.avoid_failed_picks else _Forgetful(function),
+            policy=function
+            if self.avoid_failed_picks
+            else _OfObservationAlone(function, forgets=True),
             heights_only=heights_only,
         )
 
@@ -338,26 +340,13 @@ class _OfObservationAlone:
     """Wraps a function of an observation; ignores the failed picks."""
 
     function: Callable[[Observation], PickPlaceAction]
+    forgets: bool = False
+    """Whether the observation has no history, either."""
 
     def __call__(
         self, observation: Observation, failed_picks: Sequence[PlanarPose] = ()
     ) -> PickPlaceAction:
-        return self.function(observation)
-
-    def __repr__(self) -> str:
-        return repr(self.function)
-
-
-@dataclass(frozen=True)
-class _Forgetful:
-    """Wraps a policy; it knows neither failed picks nor earlier actions."""
-
-    function: Callable[[Observation], PickPlaceAction]
-
-    def __call__(
-        self, observation: Observation, failed_picks: Sequence[PlanarPose] = ()
-    ) -> PickPlaceAction:
-        return self.function(replace(observation, history=()))
+        return self.function(replace(observation, history=()) if self.forgets else observation)
 
     def __repr__(self) -> str:
         return repr(self.function)

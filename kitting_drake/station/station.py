@@ -1,5 +1,6 @@
 """The station: a Diagram of everything but the policy."""
 
+import math
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -272,8 +273,9 @@ class KittingStation(Diagram):
 
     def _correct_drift(self, root_context: Context) -> None:
         """Calls `correct_drift` if the plant has just made a step."""
-        steps = root_context.get_time() / self.plant.time_step()
-        if steps == round(steps):
+        step = self.plant.time_step()
+        # Times of steps are rounded unless the step is a binary fraction.
+        if abs(math.remainder(root_context.get_time(), step)) < 1e-6 * step:
             context = self.plant.GetMyMutableContextFromRoot(root_context)
             correct_drift(self.plant, context, self._bodies)
 

@@ -1,6 +1,7 @@
 """Tasks: their scenes, goals and success predicates."""
 
-from kitting_drake.tasks.kitting.kitting import ArrangedKitting, Kitting, ToolsetKitting
+from kitting_drake.tasks.kitting.arranged import ArrangedKitting
+from kitting_drake.tasks.kitting.kitting import Kitting, ToolsetKitting
 from kitting_drake.tasks.python_task import PythonTask
 from kitting_drake.tasks.ravens.align_box_corner import AlignBoxCorner
 from kitting_drake.tasks.ravens.assembling_kits import AssemblingKits

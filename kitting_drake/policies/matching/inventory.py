@@ -103,7 +103,7 @@ class Inventory:
         return "nothing fits" if seen.objects and seen.free_recesses else "done"
 
     def pair_of(self, region: Region) -> Pair | None:
-        """The pair of an object of the segmentation; None if it has none."""
+        """The pair of an object of the segmentation; None if the object fits no recess."""
         objects = self.segmentation.objects
         return next((pair for pair in self.pairs if objects[pair.item] is region), None)
 

@@ -187,15 +187,7 @@ def _grip(
     if not fits.any():
         return []
 
-    # How straight the faces are along the pads, from where each line enters and leaves the object.
-    inside = occupied & own[:, None, :]
-    low = np.where(inside.any(axis=2), s[inside.argmax(axis=2)], np.nan)
-    high = np.where(inside.any(axis=2), s[len(s) - 1 - inside[:, :, ::-1].argmax(axis=2)], np.nan)
-    touch = (low < left[:, None] + _STRAIGHT) & (high > right[:, None] - _STRAIGHT)
-    contact = touch.mean(axis=1)
-    with np.errstate(invalid="ignore"):
-        lean = np.nan_to_num(np.abs(_slope(u, low)) + np.abs(_slope(u, high)), nan=1.0)
-        twist = np.nan_to_num(np.abs(_slope(u, low) + _slope(u, high)), nan=1.0)
+    contact, lean, twist = _straightness(occupied & own[:, None, :], s, u, left, right)
     centres = places + across * (shift / resolution)[:, None]
     arm = (centres - middle) * resolution
     lever = np.abs((arm * along).sum(axis=1))
@@ -215,6 +207,31 @@ def _grip(
         raised, centres[chosen], along[chosen], across[chosen], tip[chosen], resolution
     )
     return [JawGrasp(centres[i], float(thetas[i]), float(cost[i])) for i in np.flatnonzero(fits)]
+
+
+def _straightness(
+    inside: NDArray[np.bool_], s: Array, u: Array, left: Array, right: Array
+) -> tuple[Array, Array, Array]:
+    """How straight the gripped faces are along the pads.
+
+    Args:
+        inside: (n, lines, samples), where each line is within the object.
+        s: (samples,), positions across the jaws, in metres.
+        u: (lines,), positions along the pads, in metres.
+        left: (n,), the lowest s within the object.
+        right: (n,), the highest s within it.
+
+    Returns:
+        (n,) each: the share of the lines that touch both pads, and how much the faces
+        lean in all, and in the same direction.
+    """
+    low = np.where(inside.any(axis=2), s[inside.argmax(axis=2)], np.nan)
+    high = np.where(inside.any(axis=2), s[len(s) - 1 - inside[:, :, ::-1].argmax(axis=2)], np.nan)
+    touch = (low < left[:, None] + _STRAIGHT) & (high > right[:, None] - _STRAIGHT)
+    with np.errstate(invalid="ignore"):
+        lean = np.nan_to_num(np.abs(_slope(u, low)) + np.abs(_slope(u, high)), nan=1.0)
+        twist = np.nan_to_num(np.abs(_slope(u, low) + _slope(u, high)), nan=1.0)
+    return touch.mean(axis=1), lean, twist
 
 
 def _palm_is_free(

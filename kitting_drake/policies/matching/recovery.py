@@ -96,14 +96,9 @@ def _take_out(
 
 def _free_place(segmentation: Segmentation, resolution: float) -> Array | None:
     """The (row, col) farthest from everything; None without enough room."""
-    visibility = segmentation.visibility
-    taken = segmentation.fixture | ~visibility.in_view
-    # Single holes are noise.
-    taken |= ndimage.binary_opening(~visibility.seen, iterations=2)
-    for region in segmentation.objects:
-        taken |= region.mask
     # Padding keeps objects within the image.
-    distance = ndimage.distance_transform_edt(~np.pad(taken, 1, constant_values=True))[1:-1, 1:-1]
+    occupied = np.pad(segmentation.occupied, 1, constant_values=True)
+    distance = ndimage.distance_transform_edt(~occupied)[1:-1, 1:-1]
     if distance.max() * resolution < _ROOM:
         return None
     return np.array(np.unravel_index(int(distance.argmax()), distance.shape), float)

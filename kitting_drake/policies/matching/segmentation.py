@@ -155,6 +155,18 @@ class Segmentation:
             and self._is_flat(item)
         )
 
+    @property
+    def occupied(self) -> Mask:
+        """(rows, cols): where no object can be laid down: on something, or where nothing is seen.
+
+        Single holes are noise.
+        """
+        taken = self.fixture | ~self.visibility.in_view
+        taken |= ndimage.binary_opening(~self.visibility.seen, iterations=2)
+        for region in self.objects:
+            taken |= region.mask
+        return np.asarray(taken)
+
     def _is_flat(self, recess: Region) -> bool:
         if self.noise > _NOISY:
             return True

@@ -16,7 +16,7 @@ from scipy import ndimage
 from kitting_drake.policies.data.images import make_action, rotation_matrix
 from kitting_drake.policies.matching.inventory import Inventory
 from kitting_drake.policies.matching.jaw_clearance import jaw_grasps, untried
-from kitting_drake.policies.matching.segmentation import Mask, Region, Segmentation
+from kitting_drake.policies.matching.segmentation import Region, Segmentation
 from systems.pick_place_parameters import PickPlaceParameters
 from systems.signals import PickPlaceAction, PlanarPose
 
@@ -92,9 +92,8 @@ def _free_pose(
     """
     within = ndimage.distance_transform_edt(~layer.mask) * resolution < _REACH
     footprint = np.argwhere(region.mask & within) - pick
-    taken = _taken(segmentation, region)
-    distance = ndimage.distance_transform_edt(~np.pad(taken, 1, constant_values=True))
-    distance = distance[1:-1, 1:-1] * resolution
+    occupied = np.pad(segmentation.occupied, 1, constant_values=True)
+    distance = ndimage.distance_transform_edt(~occupied)[1:-1, 1:-1] * resolution
     for room in _ROOMS:
         best: tuple[float, Array, float] | None = None
         for angle in np.arange(_TURNS) * math.tau / _TURNS - math.pi + math.tau / _TURNS:
@@ -112,18 +111,7 @@ def _free_pose(
     return None
 
 
-def _taken(segmentation: Segmentation, region: Region) -> Mask:
-    """(rows, cols): where nothing can be laid down, including where the object came from."""
-    visibility = segmentation.visibility
-    taken = segmentation.fixture | ~visibility.in_view
-    # Single holes are noise.
-    taken |= ndimage.binary_opening(~visibility.seen, iterations=2)
-    for item in segmentation.objects:
-        taken |= item.mask
-    return taken | region.mask
-
-
-def _free_pixels(free: Mask, footprint: Array) -> Array | None:
+def _free_pixels(free: NDArray[np.bool_], footprint: Array) -> Array | None:
     """(n, 2): the pixels about which all of a footprint (m, 2) is free; None without any."""
     cells = np.unique(np.rint(footprint).astype(int), axis=0)
     low, high = cells.min(axis=0), cells.max(axis=0)

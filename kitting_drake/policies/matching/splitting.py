@@ -154,7 +154,7 @@ def _find(
     around: Outline,
     resolution: float,
 ) -> _Found | None:
-    """The best pose of a recess's outline within a region; None if there is none."""
+    """The best pose of a recess's outline within a region; None if it has no place there."""
     template = trace_outline(recess.mask, resolution)
     best: _Found | None = None
     for start in _starts(recess.mask, region, template, resolution):

@@ -61,7 +61,7 @@ class KitPose(TablePose):
 
 @dataclass(frozen=True)
 class KitStand:
-    """What lifts and tilts a kit."""
+    """A riser and a tilt under a kit."""
 
     riser: float
     """Height of the riser, in metres; 0 for none."""

@@ -10,9 +10,10 @@ import numpy as np
 from pydrake.math import RigidTransform
 
 from kitting_drake.common.errors import UserError
-from kitting_drake.hkd.generation.part_models import is_part_kind, load_named, sized_part
+from kitting_drake.hkd.generation.part_models import is_part_kind, sized_part
 from kitting_drake.hkd.grasps.all_grasps import all_grasps
 from kitting_drake.hkd.kits.kit import Kit, make_kit
+from kitting_drake.hkd.kits.layout import MOST_TOOLS
 from kitting_drake.hkd.kits.parameters import KitParameters
 from kitting_drake.hkd.tools.scaling import scaled_tool, weighted_tool
 from kitting_drake.hkd.tools.tool import Tool
@@ -24,30 +25,27 @@ from kitting_drake.tasks.kitting.kit_scene import PosedKit, kitting_scene
 from kitting_drake.tasks.kitting.kit_stands import (
     MOST_RISER,
     MOST_TILT_DEG,
-    KitPose,
     draw_stand,
-    stand_of,
 )
 from kitting_drake.tasks.kitting.starts import APART, check_start, cluttered_scene, draw_start
-from kitting_drake.tasks.kitting.tool_poses import (
-    TablePose,
-    check_arrangement,
-    draw_boxes,
-    draw_kit_poses,
+from kitting_drake.tasks.kitting.tool_loading import (
+    ANNOTATE,
+    check_count,
+    check_grasps,
+    load_tools,
+    tool_files,
 )
+from kitting_drake.tasks.kitting.tool_poses import draw_boxes, draw_kit_poses
 from kitting_drake.tasks.task import ActionRecord, Scene, TaskConfig
 from systems.bounds import bounded
+from systems.contact_guard import HEAVIEST
 from systems.hand_geometry import MAX_OPENING
 from systems.placement import Placement
 from systems.signals import PixelGrid
 
-_MOST_TOOLS = 12
 _MOST_KITS = 4
-_MOST_MASS = 3.0
-"""The hand's payload, in kg."""
 _JAW_MARGIN = 0.012
 """The open jaws are wider than a scaled tool by this, in metres."""
-_ANNOTATE = "save another grasp by `hkd annotate`"
 
 SEEN = "kitting-seen-toolset"
 UNSEEN = "kitting-unseen-toolsets"
@@ -58,7 +56,7 @@ _TITLES = {"train": "kitting-train-toolsets", "test": UNSEEN, "fresh": "kitting-
 
 
 @dataclass
-class _KittingTask(TaskConfig):
+class KittingTask(TaskConfig):
     """The parameters and scoring shared by all kitting tasks."""
 
     # The kit block and its cavities.
@@ -87,7 +85,8 @@ class _KittingTask(TaskConfig):
     ) -> str:
         return diagnosis.find_cause(scene, index, X_WB[index], placement, records)
 
-    def _kit_of(self, tools: Sequence[Tool]) -> Kit:
+    def kit_of(self, tools: Sequence[Tool]) -> Kit:
+        """The kit of some tools; raises UserError if there is none."""
         try:
             return make_kit(tools, self.kit)
         except UserError as error:
@@ -95,7 +94,7 @@ class _KittingTask(TaskConfig):
 
 
 @dataclass
-class _DrawnKitting(_KittingTask):
+class _DrawnKitting(KittingTask):
     """Kitting tasks that draw the poses of tools and kit from the seed."""
 
     # Least distance between tools and kit, in m.
@@ -142,10 +141,10 @@ class _DrawnKitting(_KittingTask):
     def _draw_scene(self, tools: list[Tool], grid: PixelGrid, seed: int) -> Scene:
         tools = self._weighted(tools, seed)
         if self.start != APART or self.tray:
-            return self._draw_settled(self._kit_of(tools), tools, grid, seed)
+            return self._draw_settled(self.kit_of(tools), tools, grid, seed)
         # Streams of their own: with one level kit, the poses are those of a seed without them.
         shares = self._shares(len(tools), np.random.default_rng([seed, 6]))
-        kits = [self._kit_of([tools[index] for index in share]) for share in shares]
+        kits = [self.kit_of([tools[index] for index in share]) for share in shares]
         stand_rng = np.random.default_rng([seed, 7])
         stands = [draw_stand(self.riser, self.tilt_deg, stand_rng) for _ in kits]
         rng = np.random.default_rng(seed)
@@ -204,9 +203,9 @@ class _DrawnKitting(_KittingTask):
         """The tools of each kit, as indices."""
         if count < self.kits:
             raise UserError(f"task.kits is {self.kits}, but there are only {count} tools")
-        if count > _MOST_TOOLS * self.kits:
+        if count > MOST_TOOLS * self.kits:
             raise UserError(
-                f"task: {count} tools need more than {self.kits} kits of up to {_MOST_TOOLS}"
+                f"task: {count} tools need more than {self.kits} kits of up to {MOST_TOOLS}"
             )
         if self.kits == 1:
             return [tuple(range(count))]
@@ -271,16 +270,16 @@ class Kitting(_DrawnKitting):
         return SEEN if self == Kitting() else "kitting"
 
     def make_scene(self, *, grid: PixelGrid, seed: int, base: Path) -> Scene:
-        tools = _load_tools(self.tools, base)
-        _check_grasps(tools, _ANNOTATE)
+        tools = load_tools(self.tools, base)
+        check_grasps(tools, ANNOTATE)
         return self._draw_scene(tools, grid, seed)
 
     def input_files(self, base: Path) -> list[Path]:
-        return _tool_files(self.tools, base)
+        return tool_files(self.tools, base)
 
     def validate(self) -> None:
         super().validate()
-        _check_count(len(self.tools), self.kits)
+        check_count(len(self.tools), self.kits)
 
 
 @dataclass
@@ -296,7 +295,7 @@ class ToolsetKitting(_DrawnKitting):
 
     # Draw this many tools from all of the pool or split, whatever their categories; 0: one of each
     # category. None occurs twice unless the pool is too small.
-    count: int = bounded(0, 0, _MOST_TOOLS * _MOST_KITS)
+    count: int = bounded(0, 0, MOST_TOOLS * _MOST_KITS)
 
     # Whether to draw tool lengths from the range tool_length, in m (section IV-B.2). If not, tools
     # have their own lengths. A tool that would be too wide for the jaws, too high for the kit or
@@ -315,8 +314,8 @@ class ToolsetKitting(_DrawnKitting):
             tools = self._drawn_lengths(names, seed, base)
             advice = "set random_lengths: false, or another tool_length"
         else:
-            tools, advice = _load_tools(names, base), _ANNOTATE
-        _check_grasps(tools, advice)
+            tools, advice = load_tools(names, base), ANNOTATE
+        check_grasps(tools, advice)
         return self._draw_scene(tools, grid, seed)
 
     def _draw_names(self, seed: int, base: Path) -> list[str]:
@@ -334,7 +333,7 @@ class ToolsetKitting(_DrawnKitting):
         least, greatest = self.tool_length
         lengths = np.random.default_rng([seed, 2]).uniform(least, greatest, len(names))
         shapes = np.random.default_rng([seed, 8]).uniform(size=(len(names), 2))
-        whole = _load_tools([name for name in names if not is_part_kind(name)], base)
+        whole = load_tools([name for name in names if not is_part_kind(name)], base)
         loaded = iter(whole)
         tools = []
         for name, length, (u, v) in zip(names, lengths.tolist(), shapes.tolist(), strict=True):
@@ -350,12 +349,12 @@ class ToolsetKitting(_DrawnKitting):
         if not self.pool:
             return toolsets(self.split)
         kinds: dict[str, list[str]] = {}
-        for name, tool in zip(self.pool, _load_tools(self.pool, base, "task.pool"), strict=True):
+        for name, tool in zip(self.pool, load_tools(self.pool, base, "task.pool"), strict=True):
             kinds.setdefault(tool.category, []).append(name)
         return list(itertools.product(*kinds.values()))
 
     def input_files(self, base: Path) -> list[Path]:
-        return _tool_files(self.pool, base)
+        return tool_files(self.pool, base)
 
     def validate(self) -> None:
         super().validate()
@@ -366,113 +365,11 @@ class ToolsetKitting(_DrawnKitting):
         check_start(self.start, self.tray, self.faces, self.distractors)
 
 
-@dataclass
-class ArrangedKitting(_KittingTask):
-    """Tools and kit in given poses. The oracle takes the tools in the given order."""
-
-    # Tools by name or path, with their poses on the table.
-    tools: dict[str, TablePose] = field(
-        default_factory=lambda: {"claw_hammer": TablePose(x=0.35, y=0.3, yaw_deg=90.0)}
-    )
-
-    # The kit's pose.
-    kit_pose: KitPose = field(default_factory=lambda: KitPose(x=0.5, y=-0.1))
-
-    @property
-    def title(self) -> str:
-        return "arranged"
-
-    def make_scene(self, *, grid: PixelGrid, seed: int, base: Path) -> Scene:
-        tools = _load_tools(self.tools, base)
-        _check_grasps(tools, _ANNOTATE)
-        kit = self._kit_of(tools)
-        poses = list(self.tools.values())
-        check_arrangement(
-            kit,
-            self.kit_pose,
-            dict(zip(self.tools, zip(tools, poses, strict=True), strict=True)),
-        )
-        stand, X_WLevel = stand_of(self.kit_pose), self.kit_pose.transform()
-        posed = PosedKit(
-            kit,
-            stand.lifted(kit, X_WLevel),
-            tuple(range(len(tools))),
-            stand.fixture("riser", kit, X_WLevel),
-        )
-        scene = kitting_scene(
-            [posed],
-            tools,
-            [pose.transform() for pose in poses],
-            np.arange(len(tools)),
-            self.success_threshold,
-        )
-        self._check_workspace(scene, grid)
-        return dataclasses.replace(scene, max_actions=self.tries * len(tools))
-
-    @staticmethod
-    def _check_workspace(scene: Scene, grid: PixelGrid) -> None:
-        """Raises UserError if a pick or place is outside the workspace, where o_t is unknown."""
-        things = {f"task.tools.{item.name}": item.X_WB for item in scene.objects}
-        for goal in scene.goals:
-            name = scene.objects[goal.objects[0]].name
-            things[f"task.kit_pose: the cavity of {name}"] = goal.poses[0]
-        for name, X_WThing in things.items():
-            if not grid.contains(X_WThing.translation()[:2]):
-                raise UserError(
-                    f"{name} is not in the workspace: choose x from {grid.x_min:g} to "
-                    f"{grid.x_max:g} m and y from {grid.y_min:g} to {grid.y_max:g} m, or enlarge "
-                    "heightmap"
-                )
-
-    def input_files(self, base: Path) -> list[Path]:
-        return _tool_files(self.tools, base)
-
-    def validate(self) -> None:
-        _check_count(len(self.tools))
-
-
-def _check_grasps(tools: Sequence[Tool], advice: str) -> None:
-    """Raises UserError, with advice, if a tool's grasp is wider than the open jaws."""
-    for tool in tools:
-        if tool.grasp.width >= MAX_OPENING:
-            raise UserError(
-                f"task: at a length of {1e3 * tool.length:.0f} mm the tool '{tool.name}' is "
-                f"{1e3 * tool.grasp.width:.0f} mm wide where it is held, but the jaws open to "
-                f"{1e3 * MAX_OPENING:.0f} mm only: {advice}"
-            )
-
-
 def _longest(tool: Tool, kit: KitParameters) -> float:
     """The greatest length to which a tool can be scaled and still be held and kitted, in metres."""
     factor = min(
         (MAX_OPENING - _JAW_MARGIN) / tool.grasp.width,
         (kit.height - kit.minimum_wall) / tool.height,
-        (_MOST_MASS / tool.mass) ** (1 / 3),
+        (HEAVIEST / tool.mass) ** (1 / 3),
     )
     return 0.999 * factor * tool.length
-
-
-def _load_tools(
-    names: Sequence[str] | dict[str, TablePose], base: Path, field: str = "task.tools"
-) -> list[Tool]:
-    loaded = {name: _load_tool(name, base, field) for name in dict.fromkeys(names)}
-    return [loaded[name] for name in names]
-
-
-def _load_tool(name: str, base: Path, field: str) -> Tool:
-    try:
-        return load_named(name, base)
-    except UserError as error:
-        raise type(error)(f"{field}: {error}") from error
-
-
-def _tool_files(names: Sequence[str] | dict[str, TablePose], base: Path) -> list[Path]:
-    folders = [tool.directory for tool in _load_tools(names, base)]
-    return [path for folder in folders for path in sorted(folder.iterdir()) if path.is_file()]
-
-
-def _check_count(count: int, kits: int = 1) -> None:
-    if not count:
-        raise ValueError("task.tools is empty: name at least one tool")
-    if count > kits * _MOST_TOOLS:
-        raise ValueError(f"task.tools has {count} tools: a kit holds up to {_MOST_TOOLS}")

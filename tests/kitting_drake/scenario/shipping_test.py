@@ -15,7 +15,7 @@ from kitting_drake.scenario.policies import Learned, PythonPolicy
 from kitting_drake.scenario.schema import Scenario
 from kitting_drake.scenario.shipping import Shipment, pack
 from kitting_drake.tasks import ArrangedKitting, Kitting
-from kitting_drake.tasks.kitting.kitting import TablePose
+from kitting_drake.tasks.kitting.tool_poses import TablePose
 
 WRENCH = MODELS / "tools" / "combination_wrench"
 
