@@ -82,11 +82,17 @@ class Inventory:
 
     @property
     def left_over(self) -> LeftOver:
-        """The objects that are not seated, and the recesses that are free."""
+        """The objects that are not seated, and the recesses that are free.
+
+        A flat tool in its recess looks like the floor. So if nothing is loose, a recess into which
+        an object was placed counts as filled.
+        """
         seen = self.segmentation
+        loose = (*seen.objects, *seen.protruding)
+        free = [item for item in seen.free_recesses if loose or not self._was_filled(item)]
         return LeftOver(
-            objects=tuple(self._middle(item) for item in (*seen.objects, *seen.protruding)),
-            cavities=tuple(self._middle(item) for item in seen.free_recesses),
+            objects=tuple(self._middle(item) for item in loose),
+            cavities=tuple(self._middle(item) for item in free),
         )
 
     @property
@@ -130,6 +136,13 @@ class Inventory:
             self._is_there(attempt.action.pick, region)
             for attempt in self._history
             if attempt.action.aside and attempt.outcome == "placed"
+        )
+
+    def _was_filled(self, recess: Region) -> bool:
+        return any(
+            self._is_there(attempt.action.place, recess)
+            for attempt in self._history
+            if attempt.outcome == "placed" and not attempt.action.aside
         )
 
     @property

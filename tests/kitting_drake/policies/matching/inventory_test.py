@@ -112,6 +112,14 @@ def test_a_full_kit_is_no_missing_kit():
     assert Inventory.of(kitted).why_stop == "done"
 
 
+def test_a_recess_that_was_filled_is_not_left_over():
+    # Nothing is loose, and what lies in the recesses is as flat as their floors.
+    empty = scene()
+    assert len(Inventory.of(empty).left_over.cavities) == 2
+    placed = dataclasses.replace(empty, history=(placed_at((42.0, 60.0), aside=False),))
+    assert len(Inventory.of(placed).left_over.cavities) == 1
+
+
 def test_two_kits_are_seen():
     height = scene((hammer(60, 180), 0.015)).height.copy()
     height[20:110, 250:310] = 0.04
