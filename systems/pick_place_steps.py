@@ -9,8 +9,9 @@ from numpy.typing import NDArray
 
 from systems.contact_guard import ContactGuard
 from systems.grip_force import felt_weight, grip_force, lifts_too_early
-from systems.pick_place_motion import PickPlaceMotion, PlannerState, Z
 from systems.pick_place_parameters import Mode, PickPlaceParameters
+from systems.planner_state import PlannerState, Z
+from systems.robot_motion import RobotMotion
 
 _HOLDING = (Mode.LIFT, Mode.CARRY, Mode.LOWER, Mode.SEARCH, Mode.RELEASE)
 """The modes in which an object may be in the hand."""
@@ -35,7 +36,7 @@ class PickPlaceSteps:
     def __init__(
         self,
         parameters: PickPlaceParameters,
-        motion: PickPlaceMotion,
+        motion: RobotMotion,
         guard: ContactGuard,
         search_steps: int,
     ) -> None:
@@ -94,6 +95,8 @@ class PickPlaceSteps:
         state, time = moment.state, moment.time
         if time >= self._motion.arrival(state):
             following = Mode.OBSERVE if state.mode == Mode.RETREAT else Mode(int(state.mode) + 1)
+            if state.mode == Mode.APPROACH and state.refused:
+                following = Mode.RETREAT
             self._motion.begin(state, following, time)
 
     def descend(self, moment: Moment) -> None:
@@ -108,8 +111,7 @@ class PickPlaceSteps:
         elif contact[2] > self._parameters.contact_threshold:
             self._motion.begin(state, Mode.CLOSE, time, z=hand[2])
             # Back off a little: the jaws cannot close while the fingertips press.
-            state.goal[Z] += self._parameters.floor_clearance
-            self._motion.set_times(state)
+            self._motion.back_off(state, self._parameters.floor_clearance)
         elif time >= self._motion.arrival(state):
             self._motion.begin(state, Mode.CLOSE, time)
 
@@ -143,7 +145,9 @@ class PickPlaceSteps:
     def hold(self, moment: Moment) -> None:
         """Lifts and carries while an object is held."""
         state, time, hand, contact = moment.state, moment.time, moment.hand, moment.contact
-        weight = felt_weight(contact[2], self._motion.motion_at(state, time)[8 + Z])
+        desired = self._motion.motion_at(state, time)
+        acceleration = self._motion.hand_acceleration(state, time, desired)
+        weight = felt_weight(contact[2], acceleration[Z])
         force = grip_force(weight, float(state.goal_force), self._parameters)
         self._motion.set_force(state, time, force)
         if state.mode == Mode.LIFT and lifts_too_early(force, self._motion.force_at(state, time)):

@@ -254,9 +254,10 @@ class LeftOver:
     """World (x, y) of each cavity's middle, in metres."""
 
 
-OUTCOMES = ("placed", "missed", "dropped", "pressed", "stopped")
+OUTCOMES = ("placed", "missed", "dropped", "pressed", "stopped", "unreachable")
 """How an action may end: the object was let go at its place, nothing was grasped, the object was
-lost on the way, it was pressed down, or a contact force above the limit ended the action."""
+lost on the way, it was pressed down, a contact force above the limit ended the action, or the robot
+did not move because it cannot reach the poses."""
 
 
 @dataclass(frozen=True)

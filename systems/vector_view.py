@@ -58,7 +58,7 @@ class VectorView:
     """Number of elements of the vector."""
 
     def __init_subclass__(cls) -> None:
-        cls.size = 0
+        # The fields of a subclass follow those of its base, whose size it inherits.
         for field in vars(cls).values():
             if isinstance(field, Number | Array):
                 field.index = cls.size
