@@ -59,7 +59,7 @@ class VectorView:
 
     def __init_subclass__(cls) -> None:
         # The fields of a subclass follow those of its base, whose size it inherits.
-        for field in vars(cls).values():
+        for field in list(vars(cls).values()):
             if isinstance(field, Number | Array):
                 field.index = cls.size
                 cls.size += field.size
