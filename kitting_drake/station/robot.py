@@ -1,0 +1,144 @@
+"""Adds the robot to the station's plant: the floating hand, or an arm with its hand."""
+
+import math
+import xml.etree.ElementTree as ElementTree
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from pydrake.geometry import Box
+from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
+from pydrake.multibody.parsing import Parser
+from pydrake.multibody.plant import MultibodyPlant
+from pydrake.multibody.tree import FixedOffsetFrame, Frame, PdControllerGains
+
+from kitting_drake.common.paths import MODELS
+from kitting_drake.common.sdformat import model_text
+from kitting_drake.scenario.robots import FrankaArm, Robot
+from systems.hand_geometry import FINGERTIP_DISTANCE
+
+HAND, ARM = "franka_hand", "franka_arm"
+"""Names of the model instances."""
+HAND_JOINTS = ("x", "y", "z", "yaw")
+ARM_JOINTS = tuple(f"joint{number}" for number in range(1, 8))
+FINGER_JOINTS = ("left_finger_slide", "right_finger_slide")
+GRIPPER = "gripper"
+"""Name of the frame G of an `arm_model`, see `systems.hand_geometry`."""
+
+_X_FLANGEHAND = RigidTransform(RollPitchYaw(0, 0, -math.pi / 4), [0, 0, 0])
+_X_HANDG = RigidTransform(RollPitchYaw(math.pi, 0, 0), [0, 0, FINGERTIP_DISTANCE])
+_FLOOR = -0.75
+"""Height of the floor below the table, in m."""
+_PEDESTAL = (0.26, 0.22)
+"""Extents of an arm's pedestal along its x and y, in m; its foot is 0.23 x 0.19 m."""
+_PEDESTAL_MIDDLE = -0.04
+"""Where the middle of the foot is, along the base's x, in m."""
+
+
+def joint_names(robot: Robot) -> tuple[str, ...]:
+    """The names of the joints that move the hand."""
+    return ARM_JOINTS if isinstance(robot, FrankaArm) else HAND_JOINTS
+
+
+def add_robot(plant: MultibodyPlant, robot: Robot) -> None:
+    """Adds the robot to a plant that is not finalized yet."""
+    parser = _parser(plant)
+    hand = MODELS / HAND / f"{HAND}.sdf"
+    if not isinstance(robot, FrankaArm):
+        parser.AddModelsFromString(_text(hand), "sdf")
+        return
+    _add_arm(parser, plant, robot)
+    _add_pedestal(plant, robot)
+    arm = plant.GetModelInstanceByName(ARM)
+    # A Franka compensates the weight of itself and of its hand.
+    for instance in (arm, plant.GetModelInstanceByName(HAND)):
+        plant.set_gravity_enabled(instance, False)
+    for name, stiffness, damping, friction in zip(
+        ARM_JOINTS, robot.stiffness, robot.damping, robot.friction, strict=True
+    ):
+        joint = plant.GetJointByName(name, arm)
+        joint.set_default_damping_vector([friction])
+        actuator = plant.GetJointActuatorByName(name, arm)
+        actuator.set_controller_gains(PdControllerGains(p=stiffness, d=damping))
+
+
+def arm_model(robot: FrankaArm) -> tuple[MultibodyPlant, Frame]:
+    """A plant of nothing but the arm and its hand, without gravity, and its frame G."""
+    plant = MultibodyPlant(time_step=0.0)
+    _add_arm(_parser(plant), plant, robot)
+    hand = plant.GetFrameByName("hand")
+    plant.AddFrame(FixedOffsetFrame(GRIPPER, hand, _X_HANDG))
+    plant.mutable_gravity_field().set_gravity_vector(np.zeros(3))
+    plant.Finalize()
+    return plant, plant.GetFrameByName(GRIPPER)
+
+
+def set_home(plant: MultibodyPlant, joints: Sequence[float], opening: float) -> None:
+    """Sets the plant's default positions of the robot.
+
+    Args:
+        plant: finalized.
+        joints: the positions of the joints that move the hand.
+        opening: the distance between the pads, in m.
+    """
+    names = ARM_JOINTS if plant.HasModelInstanceNamed(ARM) else HAND_JOINTS
+    for name, position in zip(names, joints, strict=True):
+        plant.GetJointByName(name).set_default_positions([position])
+    for name in FINGER_JOINTS:
+        plant.GetJointByName(name).set_default_positions([opening / 2])
+
+
+def _base_pose(robot: FrankaArm) -> RigidTransform:
+    """X_WB of the arm's base."""
+    return RigidTransform(RollPitchYaw(0, 0, math.radians(robot.yaw_deg)), robot.base)
+
+
+def _add_arm(parser: Parser, plant: MultibodyPlant, robot: FrankaArm) -> None:
+    """Adds an arm, and the hand at its flange."""
+    name = f"franka_{robot.model}"
+    parser.AddModelsFromString(_text(MODELS / name / f"{name}.sdf"), "sdf")
+    parser.AddModelsFromString(_without_axes(_text(MODELS / HAND / f"{HAND}.sdf")), "sdf")
+    plant.WeldFrames(plant.world_frame(), plant.GetFrameByName("link0"), _base_pose(robot))
+    plant.WeldFrames(
+        plant.GetFrameByName("link8"), plant.GetFrameByName("hand"), _X_FLANGEHAND
+    )
+
+
+def _add_pedestal(plant: MultibodyPlant, robot: FrankaArm) -> None:
+    """Draws what the arm stands on, from the floor up to its base."""
+    # Just below the base, so that the table covers it.
+    height = robot.base[2] - 0.001 - _FLOOR
+    if height <= 0:
+        return
+    X_BPedestal = RigidTransform(RotationMatrix(), [_PEDESTAL_MIDDLE, 0, -0.001 - height / 2])
+    plant.RegisterVisualGeometry(
+        plant.world_body(),
+        _base_pose(robot) @ X_BPedestal,
+        Box(*_PEDESTAL, height),
+        "pedestal",
+        np.array([0.30, 0.31, 0.33, 1.0]),
+    )
+
+
+def _parser(plant: MultibodyPlant) -> Parser:
+    parser = Parser(plant)
+    parser.package_map().AddPackageXml(str(MODELS / "package.xml"))
+    return parser
+
+
+def _text(model: Path) -> str:
+    text = model_text(model)
+    assert text is not None
+    return text
+
+
+def _without_axes(text: str) -> str:
+    """The floating hand's model without the axes that replace the arm."""
+    root = ElementTree.fromstring(text)
+    model = root.find("model")
+    assert model is not None
+    for element in list(model):
+        name = element.get("name", "")
+        if name in HAND_JOINTS or name.startswith("carriage_"):
+            model.remove(element)
+    return ElementTree.tostring(root, encoding="unicode")
