@@ -7,9 +7,8 @@ from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import MultibodyForces
 from pydrake.systems.framework import BasicVector, Context, LeafSystem
 
+from systems.arm_limits import JOINTS
 from systems.trajectory_controller import FINGERS, FingerLaw
-
-ARM_JOINTS = 7
 
 
 class JointController(LeafSystem):
@@ -39,11 +38,12 @@ class JointController(LeafSystem):
 
         u = clip(u_ff + K (q_n - q) + D (v_n - v), -u_max, u_max),
         u_ff = M(q) a_d + C(q, v) v,
-        v_n = v_d + h a_d,   q_n = q_d + h v_n.
+        v_n = v_d + h a_d / 2,   q_n = q_d + h v_n.
 
     The plant computes the first line itself, with the q and v at the *end* of its step of length h,
     so that stiff joints are stable: give it K and D by `JointActuator.set_controller_gains`, and
-    u_max as effort limit. Hence the desired state is that at the end of the step.
+    u_max as effort limit. Hence q_n is the position at the end of the step, and v_n the velocity
+    with which the plant's integration, q + h v, gets there.
 
     The model's gravity is not compensated here: a Franka compensates its own weight, so the plant's
     arm has no gravity. Neither is the payload, which causes a sag.
@@ -65,12 +65,12 @@ class JointController(LeafSystem):
             ValueError: the plant does not have seven joints and two fingers.
         """
         super().__init__()
-        if arm.num_positions() != ARM_JOINTS + FINGERS:
+        if arm.num_positions() != JOINTS + FINGERS:
             raise ValueError(f"arm must have 9 positions, not {arm.num_positions()}")
         self._arm, self._step, self._fingers = arm, step, fingers
         # Scratch memory: no value outlives the call that sets it.
         self._scratch, self._no_forces = arm.CreateDefaultContext(), MultibodyForces(arm)
-        joints, size = ARM_JOINTS, ARM_JOINTS + FINGERS
+        joints, size = JOINTS, JOINTS + FINGERS
         self._robot_state = self.DeclareVectorInputPort("robot_state", 2 * size)
         self._desired_motion = self.DeclareVectorInputPort("desired_motion", 3 * joints)
         self._desired_opening = self.DeclareVectorInputPort("desired_opening", 2)
@@ -93,24 +93,24 @@ class JointController(LeafSystem):
         )
 
     def _calc_desired(self, context: Context, output: BasicVector) -> None:
-        q, v, a = self._desired_motion.Eval(context).reshape(3, ARM_JOINTS)
-        v_next = v + self._step * a
+        q, v, a = self._desired_motion.Eval(context).reshape(3, JOINTS)
+        v_next = v + self._step / 2 * a
         output.SetFromVector(np.concatenate([q + self._step * v_next, v_next]))
 
     def _calc_feedforward(self, context: Context, output: BasicVector) -> None:
         arm, scratch = self._arm, self._scratch
-        a_d = self._desired_motion.Eval(context)[2 * ARM_JOINTS :]
+        a_d = self._desired_motion.Eval(context)[2 * JOINTS :]
         arm.SetPositionsAndVelocities(scratch, self._robot_state.Eval(context))
         wanted = np.concatenate([a_d, np.zeros(FINGERS)])
         torque = arm.CalcInverseDynamics(scratch, wanted, self._no_forces)
-        output.SetFromVector(torque[:ARM_JOINTS])
+        output.SetFromVector(torque[:JOINTS])
 
     def _calc_fingers(self, context: Context, output: BasicVector) -> None:
         state = self._robot_state.Eval(context)
-        size = ARM_JOINTS + FINGERS
+        size = JOINTS + FINGERS
         press = self._closing_force.Eval(context)[0] if self._closing_force.HasValue(context) else 0
         force = self._fingers.force(
-            (*state[ARM_JOINTS:size].tolist(), *state[size + ARM_JOINTS :].tolist()),
+            (*state[JOINTS:size].tolist(), *state[size + JOINTS :].tolist()),
             self._desired_opening.Eval(context).tolist(),
             float(press),
         )

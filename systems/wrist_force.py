@@ -7,7 +7,7 @@ from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import Frame, JacobianWrtVariable
 from pydrake.systems.framework import BasicVector, Context, LeafSystem
 
-from systems.joint_controller import ARM_JOINTS
+from systems.arm_limits import JOINTS
 from systems.trajectory_controller import FINGERS
 
 _STREAM = 17
@@ -60,9 +60,9 @@ class WristForce(LeafSystem):
         # Scratch memory: no value outlives the call that sets it.
         self._scratch = arm.CreateDefaultContext()
         self._noise, self._seed = noise, seed
-        size = ARM_JOINTS + FINGERS
+        size = JOINTS + FINGERS
         self._robot_state = self.DeclareVectorInputPort("robot_state", 2 * size)
-        self._torque = self.DeclareVectorInputPort("joint_contact_torque", ARM_JOINTS)
+        self._torque = self.DeclareVectorInputPort("joint_contact_torque", JOINTS)
         self._finger_force = self.DeclareVectorInputPort("finger_contact_force", FINGERS)
         tickets = {self.all_input_ports_ticket()}
         if noise > 0:
@@ -75,7 +75,7 @@ class WristForce(LeafSystem):
             # A context's time is a multiple of the plant's step, so that this names the step.
             moment = round(1e6 * context.get_time())
             rng = np.random.default_rng([self._seed, _STREAM, moment])
-            torque = torque + rng.normal(0.0, self._noise, ARM_JOINTS)
+            torque = torque + rng.normal(0.0, self._noise, JOINTS)
         force = [0.0] * 4
         if torque.any():
             force = self._solve(self._robot_state.Eval(context), torque)
@@ -83,11 +83,11 @@ class WristForce(LeafSystem):
 
     def _solve(self, state: np.ndarray, torque: np.ndarray) -> list[float]:
         arm = self._arm
-        arm.SetPositions(self._scratch, state[: ARM_JOINTS + FINGERS])
+        arm.SetPositions(self._scratch, state[: JOINTS + FINGERS])
         world = arm.world_frame()
         jacobian = arm.CalcJacobianSpatialVelocity(
             self._scratch, JacobianWrtVariable.kV, self._gripper, np.zeros(3), world, world
-        )[:, :ARM_JOINTS]
+        )[:, :JOINTS]
         # The normal equations: J has full rank where the hand points down.
         _, _, about_z, x, y, z = np.linalg.solve(jacobian @ jacobian.T, jacobian @ torque).tolist()
         return [x, y, z, about_z]

@@ -3,16 +3,17 @@
 Drake's YAML loader needs evaluated annotations, hence no `from __future__ import annotations`.
 """
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 
 from kitting_drake.tasks.task import TABLE
+from systems.arm_kinematics import ArmBase
+from systems.arm_limits import ARM_LIMITS
 from systems.bounds import bounded
 from systems.signals import PixelGrid
 
-ARM_MODELS = ("fr3", "panda")
-"""The arms in `models/franka_<name>`."""
 _FOOT = 0.08
 """How far the foot of an arm reaches in front of its base, in m."""
 
@@ -64,9 +65,9 @@ class FrankaArm:
         Raises:
             ValueError: the model is unknown, or the base is in the workspace or in the table.
         """
-        if self.model not in ARM_MODELS:
+        if self.model not in ARM_LIMITS:
             raise ValueError(
-                f"robot.model is '{self.model}', an unknown arm: use {' or '.join(ARM_MODELS)}"
+                f"robot.model is '{self.model}', an unknown arm: use {' or '.join(ARM_LIMITS)}"
             )
         base = np.array(self.base[:2])
         at = f"({base[0]:g}, {base[1]:g})"
@@ -83,6 +84,10 @@ class FrankaArm:
             raise ValueError(
                 f"robot.base[2] is {self.base[2]:g}, inside the table at {at}: use at least 0"
             )
+
+    def arm_base(self) -> ArmBase:
+        """Where it stands."""
+        return ArmBase(*self.base, yaw=math.radians(self.yaw_deg))
 
 
 Robot = FloatingHand | FrankaArm

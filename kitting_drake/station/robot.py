@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 from pydrake.geometry import Box
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 from pydrake.multibody.parsing import Parser
@@ -15,13 +16,16 @@ from pydrake.multibody.tree import FixedOffsetFrame, Frame, PdControllerGains
 from kitting_drake.common.paths import MODELS
 from kitting_drake.common.sdformat import model_text
 from kitting_drake.scenario.robots import FrankaArm, Robot
+from kitting_drake.scenario.schema import Scenario
+from systems.arm_kinematics import inverse
+from systems.arm_limits import ARM_LIMITS, JOINTS
 from systems.hand_geometry import FINGERTIP_DISTANCE
 
 HAND, ARM = "franka_hand", "franka_arm"
 """Names of the model instances."""
-HAND_JOINTS = ("x", "y", "z", "yaw")
-ARM_JOINTS = tuple(f"joint{number}" for number in range(1, 8))
-FINGER_JOINTS = ("left_finger_slide", "right_finger_slide")
+HAND_JOINT_NAMES = ("x", "y", "z", "yaw")
+ARM_JOINT_NAMES = tuple(f"joint{number}" for number in range(1, 8))
+_FINGER_NAMES = ("left_finger_slide", "right_finger_slide")
 GRIPPER = "gripper"
 """Name of the frame G of an `arm_model`, see `systems.hand_geometry`."""
 
@@ -37,7 +41,7 @@ _PEDESTAL_MIDDLE = -0.04
 
 def joint_names(robot: Robot) -> tuple[str, ...]:
     """The names of the joints that move the hand."""
-    return ARM_JOINTS if isinstance(robot, FrankaArm) else HAND_JOINTS
+    return ARM_JOINT_NAMES if isinstance(robot, FrankaArm) else HAND_JOINT_NAMES
 
 
 def add_robot(plant: MultibodyPlant, robot: Robot) -> None:
@@ -54,7 +58,7 @@ def add_robot(plant: MultibodyPlant, robot: Robot) -> None:
     for instance in (arm, plant.GetModelInstanceByName(HAND)):
         plant.set_gravity_enabled(instance, False)
     for name, stiffness, damping, friction in zip(
-        ARM_JOINTS, robot.stiffness, robot.damping, robot.friction, strict=True
+        ARM_JOINT_NAMES, robot.stiffness, robot.damping, robot.friction, strict=True
     ):
         joint = plant.GetJointByName(name, arm)
         joint.set_default_damping_vector([friction])
@@ -73,6 +77,22 @@ def arm_model(robot: FrankaArm) -> tuple[MultibodyPlant, Frame]:
     return plant, plant.GetFrameByName(GRIPPER)
 
 
+def home_joints(scenario: Scenario) -> NDArray[np.float64]:
+    """The positions of the joints in which the robot waits."""
+    home = scenario.planner.home
+    if not isinstance(scenario.robot, FrankaArm):
+        return np.array(home)
+    limits = ARM_LIMITS[scenario.robot.model]
+    lower, upper = np.array(limits.lower), np.array(limits.upper)
+    x, y, z, yaw = scenario.robot.arm_base().to_base(home).tolist()
+    sevens = np.linspace(lower[6], upper[6], 121)
+    found = inverse(
+        np.tile([x, y, z], (len(sevens), 1)), sevens, np.full(len(sevens), yaw)
+    ).reshape(-1, JOINTS)
+    room = np.min(np.minimum(found - lower, upper - found) / (upper - lower), axis=1)
+    return found[int(np.argmax(np.where(np.isfinite(room), room, -np.inf)))]
+
+
 def set_home(plant: MultibodyPlant, joints: Sequence[float], opening: float) -> None:
     """Sets the plant's default positions of the robot.
 
@@ -81,16 +101,17 @@ def set_home(plant: MultibodyPlant, joints: Sequence[float], opening: float) -> 
         joints: the positions of the joints that move the hand.
         opening: the distance between the pads, in m.
     """
-    names = ARM_JOINTS if plant.HasModelInstanceNamed(ARM) else HAND_JOINTS
+    names = ARM_JOINT_NAMES if plant.HasModelInstanceNamed(ARM) else HAND_JOINT_NAMES
     for name, position in zip(names, joints, strict=True):
         plant.GetJointByName(name).set_default_positions([position])
-    for name in FINGER_JOINTS:
+    for name in _FINGER_NAMES:
         plant.GetJointByName(name).set_default_positions([opening / 2])
 
 
 def _base_pose(robot: FrankaArm) -> RigidTransform:
     """X_WB of the arm's base."""
-    return RigidTransform(RollPitchYaw(0, 0, math.radians(robot.yaw_deg)), robot.base)
+    base = robot.arm_base()
+    return RigidTransform(RollPitchYaw(0, 0, base.yaw), [base.x, base.y, base.z])
 
 
 def _add_arm(parser: Parser, plant: MultibodyPlant, robot: FrankaArm) -> None:
@@ -139,6 +160,6 @@ def _without_axes(text: str) -> str:
     assert model is not None
     for element in list(model):
         name = element.get("name", "")
-        if name in HAND_JOINTS or name.startswith("carriage_"):
+        if name in HAND_JOINT_NAMES or name.startswith("carriage_"):
             model.remove(element)
     return ElementTree.tostring(root, encoding="unicode")
