@@ -23,13 +23,13 @@ from systems.hand_geometry import FINGERTIP_DISTANCE
 
 _D1, _D3, _D5, _D_FLANGE = 0.333, 0.316, 0.384, 0.107
 _A4, _A7 = 0.0825, 0.088
-_HAND_TURN = -math.pi / 4
+HAND_TURN = -math.pi / 4
 """Rotation of the hand about the flange's z axis, in rad."""
 _A = (0.0, 0.0, 0.0, _A4, -_A4, 0.0, _A7)
 _D = (_D1, 0.0, _D3, 0.0, _D5, 0.0, 0.0)
 _TWIST = (0.0, -1.0, 1.0, 1.0, -1.0, 1.0, 1.0)
 """sin(alpha) of each joint; cos(alpha) is 1 for the first and 0 for the others."""
-_HAND_X = (math.cos(_HAND_TURN), math.sin(_HAND_TURN))
+_HAND_X = (math.cos(HAND_TURN), math.sin(HAND_TURN))
 """The hand's x axis in the flange's x and y."""
 TIP_DISTANCE = _D_FLANGE + FINGERTIP_DISTANCE
 """From the axis of joint 6 to the fingertip ends, along the axis of joint 7, in m."""
@@ -54,6 +54,12 @@ class ArmBase:
         cos, sin = math.cos(self.yaw), math.sin(self.yaw)
         dx, dy = x - self.x, y - self.y
         return np.stack([cos * dx + sin * dy, cos * dy - sin * dx, z - self.z, yaw - self.yaw], -1)
+
+    def to_base_points(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """(..., 3) points in the base instead of the world."""
+        cos, sin = math.cos(self.yaw), math.sin(self.yaw)
+        rotation = np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
+        return (points - (self.x, self.y, self.z)) @ rotation
 
     def to_world(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
         """(..., 3) points in the world instead of the base."""
@@ -151,8 +157,35 @@ def joint_seven(wrist: ArrayLike, yaw: ArrayLike) -> NDArray[np.float64]:
         wrist: azimuth in B from the wrist (joint 6) to the hand's vertical axis, in rad.
         yaw: the hand's yaw in B, in rad.
     """
-    turn = np.asarray(wrist) - np.asarray(yaw) - _HAND_TURN
+    turn = np.asarray(wrist) - np.asarray(yaw) - HAND_TURN
     return np.pi - np.mod(np.pi - turn, math.tau)
+
+
+def planar(tip: NDArray[np.float64], q7: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The joint positions of an arm in the vertical plane through its base and the hand.
+
+    Joints 3 and 5 are at zero. It is one of the solutions of `inverse`, also where that is singular
+    because shoulder and elbow are on a vertical line. Between two such positions, the hand points
+    down all along a straight line in joint space.
+
+    Args:
+        tip: (..., 3) the point midway between the fingertip ends, in B.
+        q7: (...) in rad.
+
+    Returns:
+        (..., 7), NaN where the pose is out of reach. The limits of the joints are not considered.
+    """
+    x, y, z = np.moveaxis(np.asarray(tip), -1, 0)
+    across, up = np.hypot(x, y) - _A7, z + TIP_DISTANCE - _D1
+    square = across**2 + up**2
+    distance = np.sqrt(square)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        at_elbow = np.arccos((_UPPER**2 + _FORE**2 - square) / (2 * _UPPER * _FORE))
+        at_shoulder = np.arccos((_UPPER**2 + square - _FORE**2) / (2 * _UPPER * distance))
+    q4 = at_elbow + math.atan2(_D3, _A4) + math.atan2(_D5, _A4) - math.tau
+    q2 = np.arctan2(across, up) - at_shoulder - math.atan2(_A4, _D3)
+    q1, zero = np.arctan2(y, x), np.zeros_like(q4)
+    return np.stack(np.broadcast_arrays(q1, q2, zero, q4, zero, q2 - q4, q7), -1)
 
 
 def inverse(
@@ -172,7 +205,7 @@ def inverse(
     """
     rotation = np.zeros((*np.shape(q7), 3, 3))
     # The flange's x axis is the hand's, rotated back by the mounting; its z points down.
-    angle = np.asarray(yaw) + _HAND_TURN
+    angle = np.asarray(yaw) + HAND_TURN
     rotation[..., 0, 0] = rotation[..., 1, 1] = np.cos(angle)
     rotation[..., 1, 0] = np.sin(angle)
     rotation[..., 0, 1] = np.sin(angle)

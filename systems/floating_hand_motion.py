@@ -3,6 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
+from systems.guarded_marks import guarded_marks
 from systems.hand_motion import (
     PARTS,
     Leg,
@@ -152,16 +153,7 @@ class HandMotion(JawMotion):
     def _set_legs(self, state: PlannerState, mode: Mode) -> None:
         """Divides a guarded motion: fast above all surfaces, then slower, and slowest where contact
         is expected."""
-        parameters = self._parameters
-        margin = parameters.slow_margin + state.doubt
-        hover = state.pick_hover_z if mode == Mode.DESCEND else state.place_hover_z
-        first = hover - parameters.hover_clearance + margin
-        # Either the object reaches its floor, or the fingertips beside it the rim.
-        hanging = state.hold_z - state.support_z
-        expected = max(state.floor_z + hanging, state.rim_z + state.doubt) + margin
-        if mode == Mode.DESCEND:
-            # The jaws should touch nothing, except to press.
-            expected = state.pick_top_z + margin if state.press else state.goal[Z]
+        first, expected = guarded_marks(state, mode, self._parameters)
         marks = [float(state.start[Z])]
         for mark in (first, expected, float(state.goal[Z])):
             marks.append(max(min(mark, marks[-1]), float(state.goal[Z])))
