@@ -85,9 +85,7 @@ class JointController(LeafSystem):
             )
         )
         self.DeclareVectorOutputPort("desired_state", 2 * joints, self._calc_desired, {motion})
-        self.DeclareVectorOutputPort(
-            "feedforward", joints, self._calc_feedforward, {robot, motion}
-        )
+        self.DeclareVectorOutputPort("feedforward", joints, self._calc_feedforward, {robot, motion})
         self.DeclareVectorOutputPort(
             "finger_force", FINGERS, self._calc_fingers, {robot, opening, closing}
         )

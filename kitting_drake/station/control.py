@@ -9,7 +9,7 @@ from pydrake.systems.primitives import Demultiplexer, Multiplexer
 
 from kitting_drake.scenario.robots import FrankaArm
 from kitting_drake.scenario.schema import Scenario
-from kitting_drake.station.robot import ARM, HAND, HAND_JOINT_NAMES, arm_model
+from kitting_drake.station.robot import ARM, HAND, HAND_JOINT_NAMES, arm_model, make_motion
 from kitting_drake.tasks.task import Scene
 from systems.arm_hand_state import ArmHandState
 from systems.arm_limits import JOINTS
@@ -68,6 +68,7 @@ def add_control(
         PickPlacePlanner(
             parameters=scenario.planner,
             max_actions=scene.max_actions,
+            motion=make_motion(scenario),
             insertion=any(goal.rim_height is not None for goal in scene.goals),
             force_period=plant.time_step(),
         ),
@@ -131,9 +132,7 @@ def _drive_arm(
     for instance, port in ((arm, "joint_contact_torque"), (hand, "finger_contact_force")):
         force = plant.get_generalized_contact_forces_output_port(instance)
         connect(force, wrist.GetInputPort(port))
-    connect(
-        controller.GetOutputPort("desired_state"), plant.get_desired_state_input_port(arm)
-    )
+    connect(controller.GetOutputPort("desired_state"), plant.get_desired_state_input_port(arm))
     connect(controller.GetOutputPort("feedforward"), plant.get_actuation_input_port(arm))
     connect(plant.get_net_actuation_output_port(arm), actuation.get_input_port(0))
     connect(
@@ -152,9 +151,7 @@ def _drive_arm(
 
 def _robot_state(builder: DiagramBuilder, plant: MultibodyPlant) -> OutputPort:
     """Joins the states of arm and hand: positions of joints and fingers, then velocities."""
-    joined = builder.AddNamedSystem(
-        "robot_state", Multiplexer([JOINTS, FINGERS, JOINTS, FINGERS])
-    )
+    joined = builder.AddNamedSystem("robot_state", Multiplexer([JOINTS, FINGERS, JOINTS, FINGERS]))
     for index, (name, size) in enumerate(((ARM, JOINTS), (HAND, FINGERS))):
         halves = builder.AddNamedSystem(f"{name}_state", Demultiplexer([size, size]))
         state = plant.get_state_output_port(plant.GetModelInstanceByName(name))

@@ -13,13 +13,16 @@ from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import FixedOffsetFrame, Frame, PdControllerGains
 
+from kitting_drake.common.errors import UserError
 from kitting_drake.common.paths import MODELS
 from kitting_drake.common.sdformat import model_text
 from kitting_drake.scenario.robots import FrankaArm, Robot
 from kitting_drake.scenario.schema import Scenario
-from systems.arm_kinematics import inverse
-from systems.arm_limits import ARM_LIMITS, JOINTS
+from systems.arm_limits import ARM_LIMITS
+from systems.arm_motion import ArmMotion
+from systems.floating_hand_motion import HandMotion
 from systems.hand_geometry import FINGERTIP_DISTANCE
+from systems.robot_motion import RobotMotion
 
 HAND, ARM = "franka_hand", "franka_arm"
 """Names of the model instances."""
@@ -77,20 +80,27 @@ def arm_model(robot: FrankaArm) -> tuple[MultibodyPlant, Frame]:
     return plant, plant.GetFrameByName(GRIPPER)
 
 
+def make_motion(scenario: Scenario) -> RobotMotion:
+    """What moves the robot's joints.
+
+    Raises:
+        UserError: an arm cannot reach the home pose.
+    """
+    robot = scenario.robot
+    if not isinstance(robot, FrankaArm):
+        return HandMotion(scenario.planner)
+    try:
+        return ArmMotion(scenario.planner, ARM_LIMITS[robot.model], robot.arm_base())
+    except ValueError as error:
+        raise UserError(str(error)) from error
+
+
 def home_joints(scenario: Scenario) -> NDArray[np.float64]:
     """The positions of the joints in which the robot waits."""
-    home = scenario.planner.home
-    if not isinstance(scenario.robot, FrankaArm):
-        return np.array(home)
-    limits = ARM_LIMITS[scenario.robot.model]
-    lower, upper = np.array(limits.lower), np.array(limits.upper)
-    x, y, z, yaw = scenario.robot.arm_base().to_base(home).tolist()
-    sevens = np.linspace(lower[6], upper[6], 121)
-    found = inverse(
-        np.tile([x, y, z], (len(sevens), 1)), sevens, np.full(len(sevens), yaw)
-    ).reshape(-1, JOINTS)
-    room = np.min(np.minimum(found - lower, upper - found) / (upper - lower), axis=1)
-    return found[int(np.argmax(np.where(np.isfinite(room), room, -np.inf)))]
+    motion = make_motion(scenario)
+    if isinstance(motion, ArmMotion):
+        return motion.home_joints
+    return np.array(scenario.planner.home)
 
 
 def set_home(plant: MultibodyPlant, joints: Sequence[float], opening: float) -> None:
@@ -120,9 +130,7 @@ def _add_arm(parser: Parser, plant: MultibodyPlant, robot: FrankaArm) -> None:
     parser.AddModelsFromString(_text(MODELS / name / f"{name}.sdf"), "sdf")
     parser.AddModelsFromString(_without_axes(_text(MODELS / HAND / f"{HAND}.sdf")), "sdf")
     plant.WeldFrames(plant.world_frame(), plant.GetFrameByName("link0"), _base_pose(robot))
-    plant.WeldFrames(
-        plant.GetFrameByName("link8"), plant.GetFrameByName("hand"), _X_FLANGEHAND
-    )
+    plant.WeldFrames(plant.GetFrameByName("link8"), plant.GetFrameByName("hand"), _X_FLANGEHAND)
 
 
 def _add_pedestal(plant: MultibodyPlant, robot: FrankaArm) -> None:
