@@ -42,11 +42,11 @@ class FrankaArm:
     yaw_deg: float = bounded(0.0, -180.0, 180.0)
 
     # Joint impedance, base to flange, in N m/rad and N m s/rad: see `systems.joint_controller`.
-    # The stiffness is that of libfranka's examples.
+    # libfranka offers up to 14250; stiff or damped joints hit harder when the hand touches.
     stiffness: list[float] = bounded(
-        [3000.0, 3000.0, 3000.0, 2500.0, 2500.0, 2000.0, 2000.0], 0.0, 14250.0
+        [1200.0, 1200.0, 1200.0, 1000.0, 1000.0, 800.0, 800.0], 0.0, 14250.0
     )
-    damping: list[float] = bounded([120.0, 160.0, 120.0, 110.0, 45.0, 40.0, 40.0], 0.0, 1000.0)
+    damping: list[float] = bounded([55.0, 75.0, 55.0, 50.0, 22.0, 18.0, 18.0], 0.0, 1000.0)
 
     # Viscous friction of each joint in N m s/rad, which the controller does not know. A real arm
     # compensates most of its friction.

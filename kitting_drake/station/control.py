@@ -9,13 +9,14 @@ from pydrake.systems.primitives import Demultiplexer, Multiplexer
 
 from kitting_drake.scenario.robots import FrankaArm
 from kitting_drake.scenario.schema import Scenario
-from kitting_drake.station.robot import ARM, HAND, HAND_JOINT_NAMES, arm_model, make_motion
+from kitting_drake.station.robot import ARM, HAND, HAND_JOINT_NAMES, arm_model
 from kitting_drake.tasks.task import Scene
 from systems.arm_hand_state import ArmHandState
 from systems.arm_limits import JOINTS
 from systems.heightmap_projector import HeightmapProjector
 from systems.joint_controller import JointController
 from systems.pick_place_planner import PickPlacePlanner
+from systems.robot_motion import RobotMotion
 from systems.trajectory_controller import FINGERS, FingerLaw, TrajectoryController
 from systems.wrist_force import WristForce
 
@@ -50,6 +51,7 @@ def add_control(
     scene: Scene,
     plant: MultibodyPlant,
     projector: HeightmapProjector | None,
+    motion: RobotMotion,
     seed: int,
 ) -> PickPlacePlanner:
     """Adds planner and controller, connects them to the plant, and exports their ports.
@@ -61,6 +63,7 @@ def add_control(
         plant: finalized, with the robot.
         projector: provides o_t, from which the planner reads heights; None if each action carries
             its heights.
+        motion: the robot's.
         seed: the seed of the noise of an arm's wrist force.
     """
     planner = builder.AddNamedSystem(
@@ -68,7 +71,7 @@ def add_control(
         PickPlacePlanner(
             parameters=scenario.planner,
             max_actions=scene.max_actions,
-            motion=make_motion(scenario),
+            motion=motion,
             insertion=any(goal.rim_height is not None for goal in scene.goals),
             force_period=plant.time_step(),
         ),

@@ -2,11 +2,9 @@
 
 import math
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.geometry import Box
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 from pydrake.multibody.parsing import Parser
@@ -95,24 +93,17 @@ def make_motion(scenario: Scenario) -> RobotMotion:
         raise UserError(str(error)) from error
 
 
-def home_joints(scenario: Scenario) -> NDArray[np.float64]:
-    """The positions of the joints in which the robot waits."""
-    motion = make_motion(scenario)
-    if isinstance(motion, ArmMotion):
-        return motion.home_joints
-    return np.array(scenario.planner.home)
-
-
-def set_home(plant: MultibodyPlant, joints: Sequence[float], opening: float) -> None:
-    """Sets the plant's default positions of the robot.
+def set_home(plant: MultibodyPlant, motion: RobotMotion, opening: float) -> None:
+    """Sets the plant's default positions of the robot: at home, with open jaws.
 
     Args:
         plant: finalized.
-        joints: the positions of the joints that move the hand.
+        motion: the robot's.
         opening: the distance between the pads, in m.
     """
     names = ARM_JOINT_NAMES if plant.HasModelInstanceNamed(ARM) else HAND_JOINT_NAMES
-    for name, position in zip(names, joints, strict=True):
+    start = motion.motion_at(motion.view(motion.initial_state()), 0.0)
+    for name, position in zip(names, start[: len(names)].tolist(), strict=True):
         plant.GetJointByName(name).set_default_positions([position])
     for name in _FINGER_NAMES:
         plant.GetJointByName(name).set_default_positions([opening / 2])

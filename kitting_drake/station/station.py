@@ -20,7 +20,7 @@ from kitting_drake.station.control import add_control
 from kitting_drake.station.mass_centres import correct_drift
 from kitting_drake.station.paint import paint_surfaces
 from kitting_drake.station.plant import add_models, add_plant, bounded_body, set_initial_poses
-from kitting_drake.station.robot import add_robot, home_joints, set_home
+from kitting_drake.station.robot import add_robot, make_motion, set_home
 from kitting_drake.station.sensing import add_cameras
 from kitting_drake.tasks.task import Scene
 from systems.object_feeder import ObjectFeeder
@@ -115,7 +115,8 @@ class KittingStation(Diagram):
         add_robot(self.plant, scenario.robot)
         self.plant.Finalize()
         set_initial_poses(self.plant, self.scene, self.objects)
-        set_home(self.plant, home_joints(scenario), scenario.planner.open_width)
+        motion = make_motion(scenario)
+        set_home(self.plant, motion, scenario.planner.open_width)
         groups = _surface_groups(self.scene, self.still_bodies, self.objects)
         paint_surfaces(self.plant, self.scene_graph, scenario.appearance, groups, seed)
         projector = None
@@ -125,7 +126,7 @@ class KittingStation(Diagram):
             builder.ExportOutput(projector.GetOutputPort("heights"), "observation_heights")
         self.has_cameras = projector is not None
         """Whether the port `observation` exists."""
-        planner = add_control(builder, scenario, self.scene, self.plant, projector, seed)
+        planner = add_control(builder, scenario, self.scene, self.plant, projector, motion, seed)
         self._add_score_and_rest(builder)
         self._feeder = self._add_feeder(builder)
         for system in (self._monitor, self._feeder):

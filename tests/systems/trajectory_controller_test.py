@@ -115,7 +115,8 @@ def test_an_array_of_the_wrong_size_raises(name: str):
 
 
 @pytest.mark.parametrize(
-    "limit", [{"force_limit": np.array([1.0, 1.0, 0.0, 1.0])}, {"fingers": FingerLaw(500.0, 10.0, 0.0)}]
+    "limit",
+    [{"force_limit": np.array([1.0, 1.0, 0.0, 1.0])}, {"fingers": FingerLaw(500.0, 10.0, 0.0)}],
 )
 def test_a_force_limit_of_zero_raises(limit: dict[str, Any]):
     with pytest.raises(ValueError, match="limits"):
