@@ -91,6 +91,7 @@ def add_control(
         builder.ExportOutput(planner.GetOutputPort(port), name)
     builder.ExportOutput(driven.actuation, "actuation")
     builder.ExportOutput(driven.robot_state, "robot_state")
+    builder.ExportOutput(driven.hand_state, "hand_state")
     builder.ExportOutput(driven.wrist_force, "wrist_force")
     return planner
 

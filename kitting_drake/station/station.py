@@ -53,6 +53,7 @@ class KittingStation(Diagram):
         - mode
         - counts
         - robot_state
+        - hand_state
         - wrist_force
         - actuation
         - commanded
@@ -79,10 +80,14 @@ class KittingStation(Diagram):
       has cameras and the machine can render.
     - `failed_picks`, `history`, `peak_force`, `accepted_action`, `asks`, `mode`, `counts`: the
       `PickPlacePlanner`'s.
-    - `robot_state` (12): positions, then velocities of x, y, z, yaw and both fingers; m, rad, s.
-    - `wrist_force` (6): contact forces on x, y, z (N), about z (N m), and on each finger (N).
-    - `actuation` (6): actuation of x, y, z (N), yaw (N m) and each finger (N).
-    - `commanded` (12): q_d, v_d, a_d of x, y, z and yaw. `commanded_opening` (2): the opening
+    - `robot_state` (12 or 18): positions, then velocities of the joints and both fingers; m, rad,
+      s. The floating hand's joints are x, y, z, yaw; an arm has seven.
+    - `hand_state` (12): the same for x, y, z, yaw and both fingers, whatever moves the hand.
+    - `wrist_force` (6): contact forces on x, y, z (N), about z (N m), and on each finger (N). An
+      arm computes them from its joint torques: `WristForce`.
+    - `actuation` (6 or 9): actuation of the joints (N, N m) and of each finger (N). An arm's is
+      that of the last step.
+    - `commanded` (12 or 21): q_d, v_d, a_d of the joints. `commanded_opening` (2): the opening
       between the pads in m, and its rate.
     - `body_poses`, `contact_results`: the plant's. `query_object`: the scene graph's.
     - `at_rest` (n): the `RestDetector`'s; 1 for an object at rest.
