@@ -221,7 +221,8 @@ class ArmMotion(JawMotion):
                 return
             goal = np.array(at)
         elif z is not None and abs(z - pose[2]) < _FARTHEST_STOP:
-            goal[2] = z
+            # A payload's sag leaves the hand below its command: to follow it would push.
+            goal[2] = max(z, float(pose[2]))
         else:
             return
         way.line = goal
