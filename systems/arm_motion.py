@@ -229,18 +229,21 @@ class ArmMotion(JawMotion):
 
     def _set_retreat(self, state: ArmState, way: WayVector) -> None:
         """Up, and back to the home's x; the hand need not return to the home's y and yaw."""
-        pose = self.postures.hand_pose(way.start[:JOINTS])
+        now = way.start[:JOINTS]
+        y = float(self.postures.hand_pose(now)[1])
         x, home_y, home_z, yaw = self._parameters.home
         z = max(home_z, float(state.travel_z))
-        middle = way.start[:JOINTS]
-        for share in (1.0, 0.75, 0.5, 0.25, 0.0):
-            y = home_y + share * (float(pose[1]) - home_y)
-            stop = HandStop("home", x, y, yaw, low=z, high=z, surface=state.table_z)
-            found, problem = self.postures.choose([stop], middle)
+        goal = self.home_joints
+        for share in (1.0, 0.75, 0.5, 0.25):
+            between = home_y + share * (y - home_y)
+            stop = HandStop("home", x, between, yaw, low=z, high=z, surface=state.table_z)
+            found, problem = self.postures.choose([stop], now)
             if not problem:
-                way.over, way.clear, way.sink = found[0], state.travel_z, z
-                return
-        way.over, way.clear, way.sink = self.home_joints, state.travel_z, home_z
+                goal = found[0]
+                break
+        way.over, way.clear, way.sink = goal, state.travel_z, z
+        # Joint 7 stays: it alone would take longer.
+        way.over[6] = now[6]
 
     def back_off(self, state: PlannerState, distance: float) -> None:
         """Moves the goal of the present mode, in which the hand only stops, up by a distance."""

@@ -62,6 +62,7 @@ class ArmPostures:
         self._lower = np.array(limits.lower) + MARGIN
         self._upper = np.array(limits.upper) - MARGIN
         self._velocity = np.array(limits.velocity)
+        self._acceleration = np.array(limits.acceleration)
 
     def hand_pose(self, q: NDArray[np.float64]) -> NDArray[np.float64]:
         """(4) x, y, z, yaw of the hand in the world, of joint positions (7)."""
@@ -154,7 +155,10 @@ class ArmPostures:
         return best
 
     def _time(self, start: NDArray[np.float64], end: NDArray[np.float64]) -> float:
-        return float((np.abs(end - start) / self._velocity).max())
+        """About how long a straight way in joint space takes, in s."""
+        way = np.abs(end - start)
+        top = np.minimum(self._velocity, np.sqrt(way * self._acceleration))
+        return float((way / np.maximum(top, 1e-9) + top / self._acceleration).max())
 
     def _options(
         self, stop: HandStop, swivels: NDArray[np.float64]

@@ -18,8 +18,8 @@ _LINE_POINTS = 17
 """Points of a straight line of the hand whose joint positions are computed."""
 _SPACING = 0.012
 """Distance of a path's points, as the time that the fastest joint needs at full speed, in s."""
-_ROUNDING = 0.09
-"""Length of the path over which a corner is rounded, likewise."""
+_ROUNDING, _WIDER = 0.15, 0.3
+"""Length of the path over which corners are rounded, likewise: two of them, and a single one."""
 _FEWEST, _MOST = 24, 200
 _ANY_ACCELERATION = 1e3
 """Of the yaw of a straight line, in rad/s^2: the joints' limits hold anyway."""
@@ -163,12 +163,14 @@ class ArmWay:
         """Up above the clear height, straight in joint space, and down near the goal."""
         over = way.over
         end = self._postures.hand_pose(over)
+        single = self._postures.hand_pose(q)[2] >= way.clear or way.sink >= way.clear
+        rounding = _WIDER if single else _ROUNDING
         raised = 0.0
         path = None
         for _ in range(6):
             pieces = [self._up(q, way.clear + raised)]
             down = self._down(over, end, max(way.clear + raised, way.sink), way.sink)
-            path = self._evenly(np.concatenate([*pieces, down]), _ROUNDING)
+            path = self._evenly(np.concatenate([*pieces, down]), rounding)
             if path is None:
                 break
             missing = self._missing(path, way.clear)
