@@ -79,7 +79,7 @@ class ArmMotion(JawMotion):
         self._limits = parameters.motion_limits()
         self.postures = ArmPostures(limits, base, obstacles)
         x, y, z, yaw = parameters.home
-        home = HandStop("home", x, y, yaw, low=z, high=z, surface=0.0)
+        home = HandStop("home", x, y, yaw, low=z, high=z, surface=base.z - 1.0)
         middle = (np.array(limits.lower) + limits.upper) / 2
         found, problem = self.postures.choose([home], middle)
         if problem:
@@ -241,7 +241,9 @@ class ArmMotion(JawMotion):
             if not problem:
                 goal = found[0]
                 break
-        way.over, way.clear, way.sink = goal, state.travel_z, z
+        way.over, way.sink = goal, z
+        # After a stop the jaws may drag something along.
+        way.clear = state.travel_z if state.stops else state.clear_z
         # Joint 7 stays: it alone would take longer.
         way.over[6] = now[6]
 

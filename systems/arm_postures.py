@@ -25,6 +25,8 @@ MARGIN = 0.03
 _SWIVELS = np.concatenate([sign * np.arange(0.1, 3.15, 0.1) for sign in (1.0, -1.0)])
 """Azimuths of the wrist relative to the hand's that are tried if the vertical plane fails, in rad.
 """
+_CHECKED = 12
+"""Number of points of a way that are checked for collisions."""
 _PLANAR = 1e-6
 """Below this swivel the arm counts as in the vertical plane, in rad."""
 
@@ -123,12 +125,20 @@ class ArmPostures:
             ]
             best = self._fastest(options, now)
             if best:
-                return best, ""
+                return best, self._problem_on_the_way(stops, [now, *best])
         for stop, found in zip(stops, options, strict=True):
             if not found:
                 return [], self._problem(stop)
         names = " and ".join(stop.name for stop in stops)
         return [], f"no turn of the hand keeps joint 7 inside its range at both {names}"
+
+    def _problem_on_the_way(self, stops: Sequence[HandStop], way: list[NDArray[np.float64]]) -> str:
+        share = np.linspace(0.0, 1.0, _CHECKED)[:, None]
+        for stop, start, end in zip(stops, way[:-1], way[1:], strict=True):
+            touched = self._collision(start + share * (end - start), stop)
+            if touched:
+                return f"on the way to {stop.name} the arm would collide with {touched}"
+        return ""
 
     def _fastest(
         self, options: list[list[tuple[int, NDArray[np.float64]]]], now: NDArray[np.float64]
@@ -212,7 +222,7 @@ class ArmPostures:
         if not reached:
             heights = f"between {stop.low:.3f} and {stop.high:.3f} m"
             return f"{where} is out of the arm's reach at heights {heights}"
-        return f"{where} is where the arm would collide with {touched}"
+        return f"for {where} the arm would collide with {touched}"
 
 
 def _wrap(angle: NDArray[np.float64]) -> NDArray[np.float64]:

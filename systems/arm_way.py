@@ -27,6 +27,7 @@ _NEARLY_THERE = 0.02
 """Within this horizontal distance of its end the hand may sink below the clear height, in m."""
 _STRAIGHT_UP = 0.004
 """Within this horizontal distance of its start the hand may still rise, in m."""
+_INSTANT = 1e-9
 _STOP_SHARE = 0.98
 """Share of the limits of acceleration and jerk that a stop uses."""
 
@@ -85,11 +86,13 @@ class ArmWay:
 
     def at(self, time: float) -> NDArray[np.float64]:
         """(21) joint positions, velocities and accelerations."""
+        if time >= self.duration - _INSTANT:
+            goal = self._motion.goal if self._motion else self._rest
+            return np.concatenate([goal, np.zeros(2 * JOINTS)])
         if self._stop is not None and time < self._stopping:
             return np.concatenate(self._stop.at_time(max(time, 0.0)))
-        if self._motion is not None:
-            return self._motion.at(time - self._stopping)
-        return np.concatenate([self._rest, np.zeros(2 * JOINTS)])
+        assert self._motion is not None
+        return self._motion.at(time - self._stopping)
 
     def hand_acceleration(self, time: float) -> NDArray[np.float64]:
         """(3) acceleration of the fingertips in the world, in m/s^2."""
