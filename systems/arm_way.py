@@ -138,6 +138,8 @@ class ArmWay:
         way[3] = np.remainder(way[3] + np.pi, 2 * np.pi) - np.pi
         share = np.linspace(0.0, 1.0, points)[:, None]
         line = self._postures.along(start + share * way, q)
+        if not np.isfinite(line[0]).all():
+            return q[None]
         # After a stop the hand may not point down exactly: correct this on the way.
         line += (1 - share) * (q - line[0])
         inside = self._postures.within(line)
