@@ -5,12 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import ruckig
 from numpy.typing import NDArray
 
 from systems.arm_kinematics import fingertips
-from systems.arm_limits import JOINTS, ArmLimits
+from systems.arm_limits import JOINTS
 from systems.arm_postures import ArmPostures
+from systems.arm_stop import ArmStop
 from systems.path_timing import TICK, RowLimits, SmoothMotion, plan_motion
 from systems.vector_view import Array, Number, VectorView
 
@@ -28,8 +28,6 @@ _NEARLY_THERE = 0.02
 _STRAIGHT_UP = 0.004
 """Within this horizontal distance of its start the hand may still rise, in m."""
 _INSTANT = 1e-9
-_STOP_SHARE = 0.98
-"""Share of the limits of acceleration and jerk that a stop uses."""
 
 
 class WayVector(VectorView):
@@ -76,11 +74,9 @@ class ArmWay:
         self._postures, self._limits = postures, postures.limits
         way = WayVector(vector)
         q, v, a = way.start.reshape(3, -1)
-        self._stop = _stop(q, v, a, self._limits)
-        self._stopping = 0.0 if self._stop is None else self._stop.duration
-        if self._stop is not None:
-            q = np.array(self._stop.at_time(self._stopping)[0])
-        self._rest, self._motion = q, self._plan(way, q)
+        self._stop = ArmStop(q, v, a, self._limits)
+        self._stopping, self._rest = self._stop.duration, self._stop.goal
+        self._motion = self._plan(way, self._rest)
         self.duration = self._stopping + (self._motion.duration if self._motion else 0.0)
         self._accelerations = self._hand_accelerations()
 
@@ -89,8 +85,8 @@ class ArmWay:
         if time >= self.duration - _INSTANT:
             goal = self._motion.goal if self._motion else self._rest
             return np.concatenate([goal, np.zeros(2 * JOINTS)])
-        if self._stop is not None and time < self._stopping:
-            return np.concatenate(self._stop.at_time(max(time, 0.0)))
+        if time < self._stopping:
+            return self._stop.at(time)
         assert self._motion is not None
         return self._motion.at(time - self._stopping)
 
@@ -237,24 +233,3 @@ def _averaged(points: NDArray[np.float64], half: int) -> NDArray[np.float64]:
     mean = (total[width:] - total[:-width]) / width
     mean[0], mean[-1] = points[0], points[-1]
     return np.asarray(mean)
-
-
-def _stop(
-    q: NDArray[np.float64], v: NDArray[np.float64], a: NDArray[np.float64], limits: ArmLimits
-) -> ruckig.Trajectory | None:
-    """The fastest stop from a moving state; None if it rests."""
-    if not v.any() and not a.any():
-        return None
-    given = ruckig.InputParameter(JOINTS)
-    given.control_interface = ruckig.ControlInterface.Velocity
-    given.synchronization = ruckig.Synchronization.Phase
-    given.current_position, given.current_velocity = q.tolist(), v.tolist()
-    given.current_acceleration = a.tolist()
-    given.target_velocity = given.target_acceleration = [0.0] * JOINTS
-    given.max_acceleration = [_STOP_SHARE * limit for limit in limits.acceleration]
-    given.max_jerk = [_STOP_SHARE * limit for limit in limits.jerk]
-    trajectory = ruckig.Trajectory(JOINTS)
-    result = ruckig.Ruckig(JOINTS).calculate(given, trajectory)
-    if result not in (ruckig.Result.Working, ruckig.Result.Finished):
-        raise RuntimeError(f"no stop of the arm was found: {result}")
-    return trajectory
