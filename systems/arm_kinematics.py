@@ -99,8 +99,15 @@ def joint_frames(q: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[n
 
 def fingertips(q: NDArray[np.float64]) -> NDArray[np.float64]:
     """(..., 3) the point midway between the fingertip ends in B, of joint positions (..., 7)."""
-    rotations, origins = joint_frames(q)
-    return origins[..., 6, :] + TIP_DISTANCE * rotations[..., 6, :, 2]
+    x = y = np.zeros(np.shape(q)[:-1])
+    z = x + TIP_DISTANCE
+    cos, sin = np.cos(q), np.sin(q)
+    for i in reversed(range(JOINTS)):
+        c, s = cos[..., i], sin[..., i]
+        x, y, z = c * x - s * y + _A[i], s * x + c * y, z + _D[i]
+        if _TWIST[i]:
+            y, z = -_TWIST[i] * z, _TWIST[i] * y
+    return np.stack([x, y, z], -1)
 
 
 def jacobian(q: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -134,8 +135,12 @@ class ArmPostures:
 
     def _problem_on_the_way(self, stops: Sequence[HandStop], way: list[NDArray[np.float64]]) -> str:
         share = np.linspace(0.0, 1.0, _CHECKED)[:, None]
-        for stop, start, end in zip(stops, way[:-1], way[1:], strict=True):
-            touched = self._collision(start + share * (end - start), stop)
+        ways = [start + share * (end - start) for start, end in itertools.pairwise(way)]
+        highest = max(stops, key=lambda stop: stop.surface)
+        if not self._collision(np.concatenate(ways), highest):
+            return ""
+        for stop, points in zip(stops, ways, strict=True):
+            touched = self._collision(points, stop)
             if touched:
                 return f"on the way to {stop.name} the arm would collide with {touched}"
         return ""
@@ -174,12 +179,16 @@ class ArmPostures:
         self, stop: HandStop, swivels: NDArray[np.float64]
     ) -> list[tuple[int, NDArray[np.float64]]]:
         """(half turn of the jaws, joint positions at the high end) of all possible postures."""
-        found = []
-        for half_turn in (0, 1):
-            for way in self._ways(stop, stop.yaw + half_turn * math.pi, swivels):
-                if self.within(way).all() and not self._collision(way, stop):
-                    found.append((half_turn, way[-1]))
-        return found
+        found = [
+            (half_turn, way)
+            for half_turn in (0, 1)
+            for way in self._ways(stop, stop.yaw + half_turn * math.pi, swivels)
+            if self.within(way).all()
+        ]
+        # Usually nothing collides: ask once for all.
+        if found and self._collision(np.concatenate([way for _, way in found]), stop):
+            found = [(turned, way) for turned, way in found if not self._collision(way, stop)]
+        return [(turned, way[-1]) for turned, way in found]
 
     def _collision(self, way: NDArray[np.float64], stop: HandStop) -> str:
         return collision(way, self.base, stop.surface, self._obstacles)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -28,6 +29,8 @@ _NEARLY_THERE = 0.02
 _STRAIGHT_UP = 0.004
 """Within this horizontal distance of its start the hand may still rise, in m."""
 _INSTANT = 1e-9
+_STRIDE = 4 * TICK
+"""Time between the stored accelerations of the fingertips, in s."""
 
 
 class WayVector(VectorView):
@@ -92,16 +95,27 @@ class ArmWay:
 
     def hand_acceleration(self, time: float) -> NDArray[np.float64]:
         """(3) acceleration of the fingertips in the world, in m/s^2."""
-        index = min(max(round(time / TICK), 0), len(self._accelerations) - 1)
+        index = min(max(round(time / _STRIDE), 0), len(self._accelerations) - 1)
         return self._accelerations[index]
 
     def _hand_accelerations(self) -> NDArray[np.float64]:
-        stopping = [self.at(i * TICK)[:JOINTS] for i in range(round(self._stopping / TICK))]
-        moving = self._motion.samples[:, :JOINTS] if self._motion else self._rest[None]
-        q = np.concatenate([np.reshape(stopping, (-1, JOINTS)), moving, moving[-1:]])
+        """(n, 3) accelerations of the fingertips at every stride."""
+        count = math.ceil(self.duration / _STRIDE) + 2
+        q = np.empty((count, JOINTS))
+        stopping = min(math.ceil(self._stopping / _STRIDE), count)
+        for i in range(stopping):
+            q[i] = self._stop.at(i * _STRIDE)[:JOINTS]
+        q[stopping:] = self._rest
+        if self._motion is not None:
+            # Whole ticks, so that the samples are evenly spaced.
+            first = round((stopping * _STRIDE - self._stopping) / TICK)
+            index = first + round(_STRIDE / TICK) * np.arange(count - stopping)
+            q[stopping:] = self._motion.samples[
+                index.clip(0, len(self._motion.samples) - 1), :JOINTS
+            ]
         tips = self._postures.base.to_world(fingertips(q))
         found = np.zeros_like(tips)
-        found[1:-1] = np.diff(tips, 2, axis=0) / TICK**2
+        found[1:-1] = np.diff(tips, 2, axis=0) / _STRIDE**2
         return found
 
     def _plan(self, way: WayVector, q: NDArray[np.float64]) -> SmoothMotion | None:

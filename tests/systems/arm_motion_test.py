@@ -116,8 +116,24 @@ def test_a_stop_is_continuous_and_short():
     motion.begin(state, Mode.RELEASE, middle)
     np.testing.assert_array_equal(motion.motion_at(state, middle), before)
     assert state.duration < 0.35
-    # A touch at the speed where contact is expected: within a fraction of a millimetre.
-    motion.begin(state, Mode.RETREAT, middle + 1)
+
+
+def test_the_hand_s_acceleration_is_that_of_the_joints():
+    motion = motion_of()
+    state = motion.view(motion.initial_state())
+    set_action(state, (0.6, 0.3, 0.4), (0.5, -0.3, 0.0))
+    assert motion.prepare(state)
+    motion.begin(state, Mode.APPROACH, 0.0)
+    motion.begin(state, Mode.RETREAT, 0.3)
+    for time in (0.32, 0.45, 0.6):
+        step = 2e-3
+        tips = [
+            BASE.to_world(fingertips(motion.motion_at(state, time + i * step)[:7]))
+            for i in (-1, 0, 1)
+        ]
+        expected = (tips[0] - 2 * tips[1] + tips[2]) / step**2
+        found = motion.hand_acceleration(state, time, motion.motion_at(state, time))
+        np.testing.assert_allclose(found, expected, atol=1.5)
 
 
 def test_the_hand_follows_its_heights():
