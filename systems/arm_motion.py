@@ -29,6 +29,11 @@ _ROOM_ABOVE = 0.03
 """How far above the clear height an arm can reach, too, for ways with rounded corners, in m."""
 
 
+_TOUCH_SPEED = 0.011
+"""An arm's limit of `touch_speed`, in m/s. Its hand moves 10 to 25 kg, a floating hand 4 kg,
+and the force of an impact is proportional to mass times speed."""
+
+
 class ArmState(PlannerState):
     """The planner's state with an arm."""
 
@@ -210,7 +215,7 @@ class ArmMotion(JawMotion):
                 if state.press:
                     goal[2] = state.pick_top_z - parameters.press_depth
             way.marks = guarded_marks(state, mode, parameters)
-            way.speeds = limits.speed, slow, min(limits.speed, parameters.touch_speed)
+            way.speeds = limits.speed, slow, min(slow, parameters.touch_speed, _TOUCH_SPEED)
         elif mode == Mode.SEARCH:
             x, y, yaw = parameters.search.offset(int(state.search_step))
             goal[:2] = state.place[0] + x, state.place[1] + y
