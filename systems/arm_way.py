@@ -17,16 +17,16 @@ from systems.vector_view import Array, Number, VectorView
 
 _LINE_POINTS = 17
 """Points of a straight line of the hand whose joint positions are computed."""
-_SPACING = 0.012
+_SPACING = 0.010
 """Distance of a path's points, as the time that the fastest joint needs at full speed, in s."""
 _ROUNDING, _WIDER = 0.15, 0.3
 """Length of the path over which corners are rounded, likewise: two of them, and a single one."""
-_FEWEST, _MOST = 24, 200
+_FEWEST, _MOST = 40, 200
 _ANY_ACCELERATION = 1e3
 """Of the yaw of a straight line, in rad/s^2: the joints' limits hold anyway."""
 _NEARLY_THERE = 0.02
 """Within this horizontal distance of its end the hand may sink below the clear height, in m."""
-_STRAIGHT_UP = 0.004
+_STRAIGHT_UP = 0.006
 """Within this horizontal distance of its start the hand may still rise, in m."""
 _INSTANT = 1e-9
 _STRIDE = 4 * TICK

@@ -26,7 +26,7 @@ TICK = 1 / 1024
 """Time between the samples of a motion, in s."""
 AVERAGED = 6
 """Number of ticks over which the acceleration is averaged."""
-_SHARE = 0.96
+_SHARE = 0.98
 """Share of the limits that a motion uses. Between the path's points it takes a little more."""
 _LEAST, _UNLIMITED = 1e-9, 1e12
 
