@@ -32,6 +32,10 @@ _PLANAR = 1e-6
 """Below this swivel the arm counts as in the vertical plane, in rad."""
 
 
+_JUMP = 1.0
+"""Neighbours on a way that are further apart than this, in rad, have a joint's limit between."""
+
+
 @dataclass(frozen=True)
 class HandStop:
     """A place where the hand goes down and up again, in the world."""
@@ -183,7 +187,7 @@ class ArmPostures:
             (half_turn, way)
             for half_turn in (0, 1)
             for way in self._ways(stop, stop.yaw + half_turn * math.pi, swivels)
-            if self.within(way).all()
+            if self.within(way).all() and np.abs(np.diff(way, axis=0)).max() < _JUMP
         ]
         # Usually nothing collides: ask once for all.
         if found and self._collision(np.concatenate([way for _, way in found]), stop):
@@ -197,7 +201,7 @@ class ArmPostures:
         self, stop: HandStop, yaw: float, swivels: NDArray[np.float64]
     ) -> list[NDArray[np.float64]]:
         """(k, 7) joint positions from the low to the high end, for each posture, maybe NaN."""
-        heights = np.linspace(stop.low, stop.high, 3)
+        heights = np.linspace(stop.low, stop.high, 5)
         poses = np.array([[stop.x, stop.y, z, yaw] for z in heights])
         x, y, z, yaws = np.moveaxis(self.base.to_base(poses), -1, 0)
         tip = np.stack([x, y, z], -1)
