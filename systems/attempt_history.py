@@ -28,6 +28,8 @@ class _Row(VectorView):
     outcome = Number()
     """An index in `OUTCOMES`."""
     peak_force = Number()
+    balance = Array(2)
+    """x, y; NaN if there is none."""
 
 
 class AttemptHistory:
@@ -43,7 +45,13 @@ class AttemptHistory:
         """
         self._rows = vector.reshape(-1, _Row.size)
 
-    def append(self, action: PickPlaceAction, outcome: str, peak_force: float) -> None:
+    def append(
+        self,
+        action: PickPlaceAction,
+        outcome: str,
+        peak_force: float,
+        balance: tuple[float, float] | None = None,
+    ) -> None:
         """Adds an attempt; the oldest one is forgotten if there is no room."""
         count = self._count()
         if count == MOST_ATTEMPTS:
@@ -52,6 +60,7 @@ class AttemptHistory:
         row = _Row(self._rows[count])
         row.pick, row.place = action.pick.as_array(), action.place.as_array()
         row.press, row.aside = action.press, action.aside
+        row.balance = (np.nan, np.nan) if balance is None else balance
         self.amend(outcome, peak_force)
 
     def amend(self, outcome: str | None, peak_force: float) -> None:
@@ -68,7 +77,9 @@ class AttemptHistory:
             row = _Row(values)
             pick, place = (PlanarPose(*pose.tolist()) for pose in (row.pick, row.place))
             action = PickPlaceAction(pick, place, press=bool(row.press), aside=bool(row.aside))
-            found.append(Attempt(action, OUTCOMES[int(row.outcome)], row.peak_force))
+            x, y = row.balance.tolist()
+            balance = None if np.isnan(x) else (x, y)
+            found.append(Attempt(action, OUTCOMES[int(row.outcome)], row.peak_force, balance))
         return tuple(found)
 
     def failed_picks(self) -> tuple[PlanarPose, ...]:

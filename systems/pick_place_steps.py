@@ -8,12 +8,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from systems.contact_guard import ContactGuard
-from systems.grip_force import felt_weight, grip_force, lifts_too_early
+from systems.grip_force import (
+    felt_lever,
+    felt_moment,
+    felt_weight,
+    grip_force,
+    lifts_too_early,
+    turns_in_the_pads,
+)
 from systems.pick_place_motion import PickPlaceMotion, PlannerState, Z
 from systems.pick_place_parameters import Mode, PickPlaceParameters
 
 _HOLDING = (Mode.LIFT, Mode.CARRY, Mode.LOWER, Mode.SEARCH, Mode.RELEASE)
 """The modes in which an object may be in the hand."""
+_RISEN = 0.0005
+"""The hand has begun to lift when it is this far above its grip, in m."""
 
 
 @dataclass(frozen=True)
@@ -27,6 +36,8 @@ class Moment:
     """(12) the port `hand_state`."""
     contact: NDArray[np.float64]
     """(6) the port `hand_contact_force`."""
+    wrist_moment: float = 0.0
+    """The port `wrist_moment`; zero if it is not connected."""
 
 
 class PickPlaceSteps:
@@ -52,7 +63,7 @@ class PickPlaceSteps:
             Mode.DESCEND: self.descend,
             Mode.CLOSE: self.close,
             Mode.CHECK: self.check,
-            Mode.LIFT: self.hold,
+            Mode.LIFT: self.lift,
             Mode.CARRY: self.hold,
             Mode.LOWER: self.lower,
             Mode.SEARCH: self.search,
@@ -140,6 +151,38 @@ class PickPlaceSteps:
             state.missed += 1
             self._motion.begin(state, Mode.RETREAT, time)
 
+    def lift(self, moment: Moment) -> None:
+        """Lifts the object, or sets it down again if it would turn between the pads."""
+        state, time, contact = moment.state, moment.time, moment.contact
+        acceleration = self._motion.motion_at(state, time)[8 + Z]
+        weight = felt_weight(contact[2], acceleration)
+        turning = felt_moment(moment.wrist_moment, acceleration)
+        force = grip_force(weight, float(state.goal_force), self._parameters)
+        turns = turns_in_the_pads(turning, float(state.set_downs))
+        if state.doubts_grip:
+            if time < self._motion.arrival(state) + self._parameters.tare_settle:
+                return
+            if turns:
+                self._set_down(moment, felt_lever(turning, weight))
+            else:
+                state.doubts_grip = 0
+                self._motion.begin(state, Mode.LIFT, time)
+        elif turns and moment.hand[2] > state.hold_z + _RISEN:
+            state.doubts_grip = 1
+            self._motion.set_force(state, time, force)
+            self._motion.begin(state, Mode.LIFT, time)
+        else:
+            self.hold(moment)
+
+    def _set_down(self, moment: Moment, lever: float) -> None:
+        """Lowers the object where it was picked."""
+        state = moment.state
+        state.lever, state.set_downs = lever, state.set_downs + 1
+        self._guard.tare(state, moment.contact, self._parameters.contact_threshold)
+        # It may touch at any height: go slowly, and let go at the first touch.
+        state.floor_z, state.rim_z = state.travel_z, state.table_z
+        self._motion.begin(state, Mode.LOWER, moment.time)
+
     def hold(self, moment: Moment) -> None:
         """Lifts and carries while an object is held."""
         state, time, hand, contact = moment.state, moment.time, moment.hand, moment.contact
@@ -154,6 +197,7 @@ class PickPlaceSteps:
             self._motion.begin(state, Mode.RETREAT, time)
         elif state.mode == Mode.LIFT:
             if self._motion.brakes_above(state, time, state.travel_z):
+                state.set_downs = 0
                 self._motion.begin(state, Mode.CARRY, time)
         elif time >= self._motion.arrival(state) + self._parameters.tare_settle:
             self._guard.tare(state, contact, self._parameters.contact_threshold)

@@ -208,7 +208,7 @@ class Run:
 
 def test_ports():
     planner = PickPlacePlanner(parameters=PARAMETERS, max_actions=TEN)
-    assert planner.num_input_ports() == 4
+    assert planner.num_input_ports() == 5
     assert isinstance(planner.GetInputPort("observation").Allocate().get_value(), Observation)
     assert planner.GetInputPort("hand_state").size() == 12
     assert planner.GetInputPort("hand_contact_force").size() == 6
