@@ -13,6 +13,8 @@ MOST_ATTEMPTS = 64
 """How many actions are remembered."""
 MOST_FAILED = 16
 """How many failed picks are remembered."""
+_SAME_OBJECT = 0.040
+"""A centre of mass this close to a pick is taken for that of the same object, in metres."""
 MOST_LEFT_OVER = 24
 """How many objects, and how many cavities, of a `LeftOver` are kept."""
 
@@ -86,6 +88,12 @@ class AttemptHistory:
         """The last `MOST_FAILED` picks of actions that did not place their object, latest last."""
         failed = [item.action.pick for item in self.attempts() if item.outcome != "placed"]
         return tuple(failed[-MOST_FAILED:])
+
+    def set_downs(self, pick: PlanarPose) -> int:
+        """How many attempts have felt a centre of mass near a pick."""
+        felt = self._rows[: self._count(), -2:]
+        away = np.linalg.norm(felt - (pick.x, pick.y), axis=1)
+        return int(np.count_nonzero(away < _SAME_OBJECT))
 
     def _count(self) -> int:
         return int(np.count_nonzero(~np.isnan(self._rows[:, 0])))

@@ -10,9 +10,9 @@ GRAVITY = 9.81
 _TOO_EARLY = 1.5
 """A grip that is weaker than it should be by this factor must be firm before the object is lifted.
 """
-_EASY_MOMENT = 0.2
+_EASY_MOMENT = 0.18
 """A moment about the axis of the pads that they hold easily, in N m."""
-_INDULGENCE = 0.3
+_INDULGENCE = 0.5
 """After an object was set down, this much more is allowed, as a share, for each time."""
 _LONGEST_LEVER = 0.12
 """In m."""
@@ -56,18 +56,6 @@ def grip_force(weight: float, present: float, parameters: PickPlaceParameters) -
     return force if force > _LEAST_CHANGE * present or force == peak > present else present
 
 
-def felt_moment(moment: float, acceleration: float) -> float:
-    """The moment about the axis of the pads that the object would have at rest, in N m.
-
-    While the hand brakes it is felt as it is: the hand lags behind its command.
-
-    Args:
-        moment: felt at the wrist, in N m.
-        acceleration: the hand's vertical acceleration, in m/s^2.
-    """
-    return moment / max(1 + acceleration / GRAVITY, 1.0)
-
-
 def felt_lever(moment: float, weight: float) -> float:
     """How far the centre of mass lies from the pads' middle along the hand's x axis, in m.
 
@@ -75,7 +63,7 @@ def felt_lever(moment: float, weight: float) -> float:
     since both moment and weight are less then.
 
     Args:
-        moment: of `felt_moment`, in N m.
+        moment: about the axis of the pads while the hand rests, in N m.
         weight: of `felt_weight`, in N.
     """
     return min(max(moment / max(weight, 1e-3), -_LONGEST_LEVER), _LONGEST_LEVER)
@@ -85,9 +73,9 @@ def turns_in_the_pads(moment: float, times: float) -> bool:
     """Whether an object turns between the pads, or is about to.
 
     Args:
-        moment: of `felt_moment`, in N m.
-        times: how often in a row an object was set down because of this. The more often, the more
-            is allowed, so that it comes to an end.
+        moment: about the axis of the pads, in N m. Inertia counts while the hand accelerates.
+        times: how often this object was set down because of this. The more often, the more is
+            allowed, so that it comes to an end.
     """
     return abs(moment) > _EASY_MOMENT * (1 + _INDULGENCE * times)
 

@@ -96,7 +96,7 @@ class PlannerState(VectorView):
     doubts_grip = Number()
     """1 if the object seems to turn between the pads, and is set down again if it does, else 0."""
     set_downs = Number()
-    """How many actions in a row have set their object down."""
+    """How many earlier actions have set this object down."""
     stop = Number()
     """0 while there are actions; then 1 plus the index of the reason in `STOP_REASONS`."""
 

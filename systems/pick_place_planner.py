@@ -303,6 +303,8 @@ class PickPlacePlanner(LeafSystem):
         self._set_heights(state, self._heights(context, action))
         state.search_step, state.press, state.aside = 0, action.press, action.aside
         state.stops = state.doubts_grip = 0
+        kept = AttemptHistory(discrete_state.get_mutable_value(self._history_index))
+        state.set_downs = kept.set_downs(action.pick)
         state.actions += 1
         self._guard.reset(state)
         self._motion.begin(state, Mode.APPROACH, time)
