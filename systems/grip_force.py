@@ -56,6 +56,18 @@ def grip_force(weight: float, present: float, parameters: PickPlaceParameters) -
     return force if force > _LEAST_CHANGE * present or force == peak > present else present
 
 
+def moment_at_rest(moment: float, acceleration: float) -> float:
+    """The moment about the axis of the pads without the part of a rising hand's inertia, in N m.
+
+    A braking hand lags behind its command, so its moment is taken as it is.
+
+    Args:
+        moment: felt at the wrist, in N m.
+        acceleration: the hand's vertical acceleration, in m/s^2.
+    """
+    return moment / max(1 + acceleration / GRAVITY, 1.0)
+
+
 def felt_lever(moment: float, weight: float) -> float:
     """How far the centre of mass lies from the pads' middle along the hand's x axis, in m.
 
@@ -73,7 +85,7 @@ def turns_in_the_pads(moment: float, times: float) -> bool:
     """Whether an object turns between the pads, or is about to.
 
     Args:
-        moment: about the axis of the pads, in N m. Inertia counts while the hand accelerates.
+        moment: about the axis of the pads while the hand rests, in N m.
         times: how often this object was set down because of this. The more often, the more is
             allowed, so that it comes to an end.
     """

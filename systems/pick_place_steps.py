@@ -13,6 +13,7 @@ from systems.grip_force import (
     felt_weight,
     grip_force,
     lifts_too_early,
+    moment_at_rest,
     turns_in_the_pads,
 )
 from systems.pick_place_motion import PickPlaceMotion, PlannerState, Z
@@ -165,7 +166,7 @@ class PickPlaceSteps:
             if time >= self._motion.arrival(state) + self._parameters.tare_settle:
                 self._end_trial(moment, lever, weight)
         elif moment.hand[2] > state.hold_z + _RISEN and turns_in_the_pads(
-            turning, float(state.set_downs)
+            moment_at_rest(turning, acceleration), float(state.set_downs)
         ):
             state.doubts_grip, state.lever = 1, 0.0
             force = grip_force(weight, float(state.goal_force), self._parameters)
