@@ -90,6 +90,13 @@ class PlannerState(VectorView):
     """1 if the action presses, else 0."""
     aside = Number()
     """1 if the action lays the object aside, else 0."""
+    lever = Number()
+    """How far the centre of mass of an object that is set down lies from the pads' middle along
+    them, in m."""
+    doubts_grip = Number()
+    """1 if the object seems to turn between the pads, and is set down again if it does, else 0."""
+    set_downs = Number()
+    """How many earlier actions have set this object down."""
     stop = Number()
     """0 while there are actions; then 1 plus the index of the reason in `STOP_REASONS`."""
 
@@ -98,6 +105,8 @@ YAW_LIMIT = 3.4
 """Largest yaw of the wrist either way, in rad, just short of its joint limit."""
 _NEARLY_THERE = 0.02
 """Within this horizontal distance of its goal, in m, the hand may sink below the clear height."""
+_TRIAL = 0.010
+"""How far an object is lifted to see how it hangs, in m: clear of the table, but not much more."""
 _OVERSHOOT = 0.05
 """How far above the travel height a lift aims, in m, so that the hand passes it without a stop."""
 
@@ -177,7 +186,8 @@ class PickPlaceMotion:
         elif mode == Mode.CLOSE:
             state.goal_opening = 0.0
         elif mode == Mode.LIFT:
-            state.goal[Z] = state.travel_z + _OVERSHOOT
+            trial = max(state.hold_z + _TRIAL, float(state.goal[Z]))
+            state.goal[Z] = trial if state.doubts_grip else state.travel_z + _OVERSHOOT
         elif mode == Mode.CARRY:
             state.goal = (*state.place[:2], state.place_hover_z, state.place[2])
         elif mode == Mode.LOWER:

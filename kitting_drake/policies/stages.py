@@ -98,6 +98,7 @@ class JawRoom:
 
     def refine(self, draft: Draft) -> Draft:
         look = draft.look
+        region = nearest_region(look.segmentation.objects, draft.pick)
         grasp = refine_grasp(
             look.segmentation,
             draft.pick,
@@ -105,6 +106,7 @@ class JawRoom:
             look.resolution,
             self.planner,
             look.failed_pixels,
+            None if region is None else look.inventory.balance(region),
         )
         if grasp is None:
             return draft

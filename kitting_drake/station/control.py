@@ -9,6 +9,7 @@ from kitting_drake.tasks.task import Scene
 from systems.heightmap_projector import HeightmapProjector
 from systems.pick_place_planner import PickPlacePlanner
 from systems.trajectory_controller import TrajectoryController
+from systems.wrist_moment import WristMoment
 
 _EXPORTED = {
     "failed_picks": "failed_picks",
@@ -59,6 +60,13 @@ def add_control(
         builder.Connect(projector.GetOutputPort("heights"), planner.GetInputPort("observation"))
     builder.Connect(state, planner.GetInputPort("hand_state"))
     builder.Connect(force, planner.GetInputPort("hand_contact_force"))
+    reactions = plant.get_reaction_forces_output_port()
+    wrist = builder.AddNamedSystem(
+        "wrist_moment",
+        WristMoment(reactions, plant.GetJointIndices().index(plant.GetJointByName("yaw").index())),
+    )
+    builder.Connect(reactions, wrist.get_input_port())
+    builder.Connect(wrist.get_output_port(), planner.GetInputPort("wrist_moment"))
     builder.Connect(state, controller.GetInputPort("hand_state"))
     for port in ("desired_motion", "desired_opening", "closing_force"):
         builder.Connect(planner.GetOutputPort(port), controller.GetInputPort(port))

@@ -157,6 +157,13 @@ class Inventory:
                 return True
         return False
 
+    def balance(self, region: Region) -> NDArray[np.float64] | None:
+        """(row, col) of an object's centre of mass, if the hand felt it here; else None."""
+        for attempt in reversed(self._history):
+            if attempt.balance is not None and self._is_there(attempt.action.pick, region):
+                return np.asarray(self.observation.grid.to_pixel(attempt.balance))
+        return None
+
     def _was_filled(self, recess: Region) -> bool:
         return any(
             self._is_there(attempt.action.place, recess)

@@ -89,7 +89,9 @@ class ShapeMatchingPolicy:
         for pair in inventory.pairs:
             reason, fit = "not seen", pair.fit
             region = segmentation.objects[pair.item]
-            grasps = jaw_grasps(segmentation, region, resolution, self._planner)
+            grasps = jaw_grasps(
+                segmentation, region, resolution, self._planner, balance=inventory.balance(region)
+            )
             grasps = untried(grasps, failed, resolution)
             if not grasps:
                 reason = "not sure"
