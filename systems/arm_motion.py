@@ -15,6 +15,7 @@ from systems.arm_limits import JOINTS, ArmLimits
 from systems.arm_postures import ArmPostures, HandStop
 from systems.arm_reach import hand_stops
 from systems.arm_way import ArmWay, WayVector
+from systems.floating_hand_motion import TRIAL
 from systems.guarded_marks import guarded_marks
 from systems.jaw_motion import JawMotion
 from systems.motion_heights import MotionHeights
@@ -185,6 +186,11 @@ class ArmMotion(JawMotion):
         if mode == Mode.APPROACH:
             if not state.refused:
                 way.over, way.clear, way.sink = state.pick_joints, state.clear_z, state.pick_hover_z
+        elif mode == Mode.LIFT and state.doubts_grip:
+            # A trial, to see how the object hangs.
+            way.line = self.postures.hand_pose(now[:JOINTS])
+            way.line[2] = max(state.hold_z + TRIAL, float(way.line[2]))
+            way.speeds, way.yaw_speed = limits.speed, limits.yaw_speed
         elif mode in (Mode.LIFT, Mode.CARRY):
             way.over, way.clear, way.sink = state.place_joints, state.travel_z, state.place_hover_z
         elif mode == Mode.RETREAT:

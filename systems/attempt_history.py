@@ -13,6 +13,8 @@ MOST_ATTEMPTS = 64
 """How many actions are remembered."""
 MOST_FAILED = 16
 """How many failed picks are remembered."""
+_SAME_OBJECT = 0.040
+"""A centre of mass this close to a pick is taken for that of the same object, in metres."""
 MOST_LEFT_OVER = 24
 """How many objects, and how many cavities, of a `LeftOver` are kept."""
 
@@ -28,6 +30,8 @@ class _Row(VectorView):
     outcome = Number()
     """An index in `OUTCOMES`."""
     peak_force = Number()
+    balance = Array(2)
+    """x, y; NaN if there is none."""
 
 
 class AttemptHistory:
@@ -43,7 +47,13 @@ class AttemptHistory:
         """
         self._rows = vector.reshape(-1, _Row.size)
 
-    def append(self, action: PickPlaceAction, outcome: str, peak_force: float) -> None:
+    def append(
+        self,
+        action: PickPlaceAction,
+        outcome: str,
+        peak_force: float,
+        balance: tuple[float, float] | None = None,
+    ) -> None:
         """Adds an attempt; the oldest one is forgotten if there is no room."""
         count = self._count()
         if count == MOST_ATTEMPTS:
@@ -52,6 +62,7 @@ class AttemptHistory:
         row = _Row(self._rows[count])
         row.pick, row.place = action.pick.as_array(), action.place.as_array()
         row.press, row.aside = action.press, action.aside
+        row.balance = (np.nan, np.nan) if balance is None else balance
         self.amend(outcome, peak_force)
 
     def amend(self, outcome: str | None, peak_force: float) -> None:
@@ -68,13 +79,21 @@ class AttemptHistory:
             row = _Row(values)
             pick, place = (PlanarPose(*pose.tolist()) for pose in (row.pick, row.place))
             action = PickPlaceAction(pick, place, press=bool(row.press), aside=bool(row.aside))
-            found.append(Attempt(action, OUTCOMES[int(row.outcome)], row.peak_force))
+            x, y = row.balance.tolist()
+            balance = None if np.isnan(x) else (x, y)
+            found.append(Attempt(action, OUTCOMES[int(row.outcome)], row.peak_force, balance))
         return tuple(found)
 
     def failed_picks(self) -> tuple[PlanarPose, ...]:
         """The last `MOST_FAILED` picks of actions that did not place their object, latest last."""
         failed = [item.action.pick for item in self.attempts() if item.outcome != "placed"]
         return tuple(failed[-MOST_FAILED:])
+
+    def set_downs(self, pick: PlanarPose) -> int:
+        """How many attempts have felt a centre of mass near a pick."""
+        felt = self._rows[: self._count(), -2:]
+        away = np.linalg.norm(felt - (pick.x, pick.y), axis=1)
+        return int(np.count_nonzero(away < _SAME_OBJECT))
 
     def _count(self) -> int:
         return int(np.count_nonzero(~np.isnan(self._rows[:, 0])))

@@ -12,9 +12,9 @@ from systems.cluttered_table import (
     HeldFromAbove,
     in_the_way,
     middle,
-    moved_gripper,
 )
 from systems.grasp import Grasp
+from systems.ledge import moved_gripper
 from systems.placement import displacement, heading
 from systems.signals import PickPlaceAction, PlanarPose, wrap_to_pi
 

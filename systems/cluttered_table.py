@@ -20,7 +20,7 @@ from systems.hand_geometry import (
     PALM_HEIGHT,
     PALM_SIZE,
 )
-from systems.ledge import Ledge
+from systems.ledge import Ledge, moved_gripper
 from systems.motion_heights import motion_heights
 from systems.pick_place_parameters import PickPlaceParameters
 from systems.placement import PlacedObject, heading
@@ -270,27 +270,6 @@ def _deviation(item: PlacedObject, points: Points, yaw: float) -> float:
     own = item.p_BPoints
     shift = own.min(axis=0) + own.max(axis=0) - turned.min(axis=0) - turned.max(axis=0)
     return float(item.tree.query(turned + shift / 2)[0].mean())
-
-
-def moved_gripper(
-    gripper: PlanarPose, p_WHeld: NDArray[np.float64], yaw: float, goal: PlanarPose
-) -> PlanarPose:
-    """The gripper's pose after it has carried an object.
-
-    Args:
-        gripper: its pose before.
-        p_WHeld: a point of the object before.
-        yaw: the object's heading before, in radians.
-        goal: the point and the heading afterwards.
-    """
-    turn = goal.theta - yaw
-    dx, dy = gripper.x - p_WHeld[0], gripper.y - p_WHeld[1]
-    cos, sin = math.cos(turn), math.sin(turn)
-    return PlanarPose(
-        float(goal.x + cos * dx - sin * dy),
-        float(goal.y + sin * dx + cos * dy),
-        gripper.theta + turn,
-    )
 
 
 def middle(points: Points, yaw: float) -> NDArray[np.float64]:

@@ -23,6 +23,8 @@ YAW_LIMIT = 3.4
 """Largest yaw of the wrist either way, in rad, just short of its joint limit."""
 _NEARLY_THERE = 0.02
 """Within this horizontal distance of its goal, in m, the hand may sink below the clear height."""
+TRIAL = 0.010
+"""How far an object is lifted to see how it hangs, in m: clear of the table, but not much more."""
 _OVERSHOOT = 0.05
 """How far above the travel height a lift aims, in m, so that the hand passes it without a stop."""
 
@@ -105,7 +107,8 @@ class HandMotion(JawMotion):
             if state.press:
                 state.goal[Z] = state.pick_top_z - parameters.press_depth
         elif mode == Mode.LIFT:
-            state.goal[Z] = state.travel_z + _OVERSHOOT
+            trial = max(state.hold_z + TRIAL, float(state.goal[Z]))
+            state.goal[Z] = trial if state.doubts_grip else state.travel_z + _OVERSHOOT
         elif mode == Mode.CARRY:
             state.goal = (*state.place[:2], state.place_hover_z, state.place[2])
         elif mode == Mode.LOWER:

@@ -7,9 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from pydrake.math import RigidTransform
 
-from systems.placement import heading
 from systems.signals import PlanarPose
 
 _OUTSIDE = (0.15, 0.6)
@@ -32,10 +30,10 @@ _ROOM = 0.015
 class Ledge:
     """A block on the table."""
 
-    X_WF: RigidTransform
-    """Pose of the middle of its bottom."""
+    pose: PlanarPose
+    """Its middle and its heading in the world."""
     size: tuple[float, float]
-    """Extents along x and y of F, in metres."""
+    """Extents along its heading and across it, in metres."""
 
     def turning_pose(
         self,
@@ -61,7 +59,7 @@ class Ledge:
             The point of its centre of mass and its heading; None if all edges are obstructed.
         """
         low, high = np.array(area[0]), np.array(area[1])
-        yaw = heading(self.X_WF)
+        middle = np.array([self.pose.x, self.pose.y])
         length = float(np.ptp(outline[:, 0]))
         # Its left side, or after half a turn its right side, lies on the block.
         left, right = _inside(outline), _inside(-outline)
@@ -73,12 +71,12 @@ class Ledge:
         best: tuple[tuple[int, bool], PlanarPose] | None = None
         for quarter in range(4):
             half, other_half = np.roll(np.array(self.size) / 2, quarter)
-            outward = yaw + quarter * math.pi / 2
+            outward = self.pose.theta + quarter * math.pi / 2
             normal = np.array([math.cos(outward), math.sin(outward)])
             along = np.array([-normal[1], normal[0]])
             for end in (-1, 1):
                 distance = end * max(other_half - _FROM_CORNER, 0.0)
-                edge = self.X_WF.translation()[:2] + half * normal + distance * along
+                edge = middle + half * normal + distance * along
                 corners = [
                     edge + u * along + v * normal
                     for u in (-length / 2, length / 2)
@@ -104,3 +102,24 @@ def _inside(outline: NDArray[np.float64]) -> float:
     reach = u.max() - u.min()
     sides = [(sign * u > _BESIDE) & (sign * u < 0.3 * reach) for sign in (-1, 1)]
     return min(float(v[side].max(initial=0.0)) for side in sides)
+
+
+def moved_gripper(
+    gripper: PlanarPose, p_WHeld: NDArray[np.float64], yaw: float, goal: PlanarPose
+) -> PlanarPose:
+    """The gripper's pose after it has carried an object.
+
+    Args:
+        gripper: its pose before.
+        p_WHeld: a point of the object before.
+        yaw: the object's heading before, in radians.
+        goal: the point and the heading afterwards.
+    """
+    turn = goal.theta - yaw
+    dx, dy = gripper.x - p_WHeld[0], gripper.y - p_WHeld[1]
+    cos, sin = math.cos(turn), math.sin(turn)
+    return PlanarPose(
+        float(goal.x + cos * dx - sin * dy),
+        float(goal.y + sin * dx + cos * dy),
+        gripper.theta + turn,
+    )

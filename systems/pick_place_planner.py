@@ -45,6 +45,7 @@ class PickPlacePlanner(LeafSystem):
         - hand_contact_force
         - action
         - observation (optional)
+        - wrist_moment (optional)
         output_ports:
         - desired_motion
         - desired_opening
@@ -64,6 +65,9 @@ class PickPlacePlanner(LeafSystem):
       cameras' sight, needs an action. Policy and cameras are not evaluated at other times.
     - `observation` (abstract, `Observation`): o_t, evaluated together with the action if the
       action carries no heights. They are then read off o_t.
+    - `wrist_moment` (1): the moment of the contact forces about the hand's y axis, along which the
+      jaws close, in N m, as a force-torque sensor at the wrist measures it while the hand moves
+      vertically. It is positive if a load hangs beyond +x of the hand. Evaluated in `LIFT` only.
     - `desired_motion` (12): q_d, v_d, a_d of (x, y, z, yaw).
     - `desired_opening` (2): the opening between the pads in m, and its rate.
     - `closing_force` (1): additional force of each pad, in N.
@@ -96,6 +100,9 @@ class PickPlacePlanner(LeafSystem):
       again. The attempt counts as an action.
     - `LIFT`, `CARRY`: the more the object weighs, the more firmly it is gripped (`grip_force`). A
       heavy object is lifted only once the grip is firm.
+    - `LIFT`: if the moment of the object's weight about the axis of the pads is more than they hold
+      (`turns_in_the_pads`), the object is set down again. The history then tells where its centre
+      of mass is, for a policy to grip it there.
     - `SEARCH`: in tasks that insert, if the object stands on the rim around its place, the hand
       searches for the cavity. It lowers again once the resistance ends.
     - An action with `press` ends with `DESCEND`, with closed jaws, at `touch_speed`, until
@@ -147,6 +154,7 @@ class PickPlacePlanner(LeafSystem):
         self._contact_force = self.DeclareVectorInputPort("hand_contact_force", 6)
         self._action = self.DeclareAbstractInputPort("action", Value(PickPlaceAction()))
         self._observation = self.DeclareAbstractInputPort("observation", Value(Observation()))
+        self._wrist_moment = self.DeclareVectorInputPort("wrist_moment", 1)
         state_and_time = {self.discrete_state_ticket(self._state_index), self.time_ticket()}
         self._motion_port = self.DeclareVectorOutputPort(
             "desired_motion", self._motion.size, self._calc_motion, state_and_time
@@ -245,11 +253,14 @@ class PickPlacePlanner(LeafSystem):
         return EventStatus.Succeeded()
 
     def _moment(self, context: Context, discrete_state: DiscreteValues) -> Moment:
+        state = self._motion.view(discrete_state.get_mutable_value(self._state_index))
+        feels = state.mode == Mode.LIFT and self._wrist_moment.HasValue(context)
         return Moment(
-            self._motion.view(discrete_state.get_mutable_value(self._state_index)),
+            state,
             context.get_time(),
             self._hand_state.Eval(context),
             self._contact_force.Eval(context),
+            float(self._wrist_moment.Eval(context)[0]) if feels else 0.0,
         )
 
     # The state machine.
@@ -268,7 +279,9 @@ class PickPlacePlanner(LeafSystem):
         """Writes an action into the history when the hand begins to retreat."""
         if state.mode == Mode.RETREAT and before != Mode.RETREAT:
             history = AttemptHistory(discrete_state.get_mutable_value(self._history_index))
-            history.append(_action_of(state), _outcome(before, state), _peak(state))
+            outcome = _outcome(before, state)
+            balance = _balance(state) if outcome == "set down" else None
+            history.append(_action_of(state), outcome, _peak(state), balance)
 
     def _observe(
         self, context: Context, state: PlannerState, discrete_state: DiscreteValues
@@ -290,7 +303,9 @@ class PickPlacePlanner(LeafSystem):
             action = dataclasses.replace(action, place=action.pick)
         self._set_heights(state, self._heights(context, action))
         state.search_step, state.press, state.aside = 0, action.press, action.aside
-        state.stops = 0
+        state.stops = state.doubts_grip = 0
+        kept = AttemptHistory(discrete_state.get_mutable_value(self._history_index))
+        state.set_downs = kept.set_downs(action.pick)
         state.actions += 1
         self._guard.reset(state)
         state.pick, state.place = action.pick.as_array(), action.place.as_array()
@@ -341,8 +356,16 @@ def _outcome(before: float, state: PlannerState) -> str:
         return "unreachable"
     if state.stops:
         return "stopped"
+    if state.doubts_grip and before == Mode.RELEASE:
+        return "set down"
     by_mode = {Mode.DESCEND: "pressed", Mode.CHECK: "missed", Mode.RELEASE: "placed"}
     return by_mode.get(Mode(int(before)), "dropped")
+
+
+def _balance(state: PlannerState) -> tuple[float, float]:
+    """World (x, y) of the felt centre of mass, in m."""
+    x, y, yaw = state.pick.tolist()
+    return x + state.lever * math.cos(yaw), y + state.lever * math.sin(yaw)
 
 
 def _peak(state: PlannerState) -> float:

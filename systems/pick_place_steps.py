@@ -8,13 +8,24 @@ import numpy as np
 from numpy.typing import NDArray
 
 from systems.contact_guard import ContactGuard
-from systems.grip_force import felt_weight, grip_force, lifts_too_early
+from systems.grip_force import (
+    felt_lever,
+    felt_weight,
+    grip_force,
+    lifts_too_early,
+    moment_at_rest,
+    turns_in_the_pads,
+)
 from systems.pick_place_parameters import Mode, PickPlaceParameters
 from systems.planner_state import PlannerState, Z
 from systems.robot_motion import RobotMotion
 
 _HOLDING = (Mode.LIFT, Mode.CARRY, Mode.LOWER, Mode.SEARCH, Mode.RELEASE)
 """The modes in which an object may be in the hand."""
+_STEADY = 0.6
+"""An object that hangs still keeps at least this share of its moment about the pads."""
+_RISEN = 0.0005
+"""The hand has begun to lift when it is this far above its grip, in m."""
 
 
 @dataclass(frozen=True)
@@ -28,6 +39,8 @@ class Moment:
     """(12) the port `hand_state`."""
     contact: NDArray[np.float64]
     """(6) the port `hand_contact_force`."""
+    wrist_moment: float = 0.0
+    """The port `wrist_moment`; zero if it is not connected."""
 
 
 class PickPlaceSteps:
@@ -53,7 +66,7 @@ class PickPlaceSteps:
             Mode.DESCEND: self.descend,
             Mode.CLOSE: self.close,
             Mode.CHECK: self.check,
-            Mode.LIFT: self.hold,
+            Mode.LIFT: self.lift,
             Mode.CARRY: self.hold,
             Mode.LOWER: self.lower,
             Mode.SEARCH: self.search,
@@ -141,6 +154,58 @@ class PickPlaceSteps:
         else:
             state.missed += 1
             self._motion.begin(state, Mode.RETREAT, time)
+
+    def lift(self, moment: Moment) -> None:
+        """Lifts the object, or sets it down again if it would turn between the pads."""
+        state, time = moment.state, moment.time
+        desired = self._motion.motion_at(state, time)
+        acceleration = float(self._motion.hand_acceleration(state, time, desired)[Z])
+        weight = felt_weight(moment.contact[2], acceleration)
+        turning = moment.wrist_moment
+        if state.doubts_grip:
+            lever = felt_lever(turning, weight)
+            if acceleration <= 0 and abs(lever) > abs(state.lever):
+                state.lever = lever
+            if time >= self._motion.arrival(state) + self._parameters.tare_settle:
+                self._end_trial(moment, lever, weight)
+        elif moment.hand[2] > state.hold_z + _RISEN and turns_in_the_pads(
+            moment_at_rest(turning, acceleration), float(state.set_downs)
+        ):
+            state.doubts_grip, state.lever = 1, 0.0
+            force = grip_force(weight, float(state.goal_force), self._parameters)
+            self._motion.set_force(state, time, force)
+            self._motion.begin(state, Mode.LIFT, time)
+        else:
+            self.hold(moment)
+
+    def _end_trial(self, moment: Moment, lever: float, weight: float) -> None:
+        """Goes on with the lift if the object hangs still, else sets it down.
+
+        Args:
+            moment: the inputs, after the hand has rested.
+            lever: of `felt_lever` now, in m.
+            weight: in N.
+        """
+        state = moment.state
+        # An object that turns until it leans on the table takes the moment off the pads.
+        has_turned = abs(lever) < _STEADY * abs(state.lever)
+        lever = float(state.lever) if has_turned else lever
+        # There is no indulgence for one that does turn.
+        times = 0.0 if has_turned else float(state.set_downs)
+        if turns_in_the_pads(lever * weight, times):
+            state.lever = lever
+            self._set_down(moment)
+        else:
+            state.doubts_grip = 0
+            self._motion.begin(state, Mode.LIFT, moment.time)
+
+    def _set_down(self, moment: Moment) -> None:
+        """Lowers the object where it was picked."""
+        state = moment.state
+        self._guard.tare(state, moment.contact, self._parameters.contact_threshold)
+        # It may touch at any height: go slowly, and let go at the first touch.
+        state.floor_z, state.rim_z = state.travel_z, state.table_z
+        self._motion.begin(state, Mode.LOWER, moment.time)
 
     def hold(self, moment: Moment) -> None:
         """Lifts and carries while an object is held."""

@@ -77,5 +77,12 @@ class PlannerState(VectorView):
     """1 if the action presses, else 0."""
     aside = Number()
     """1 if the action lays the object aside, else 0."""
+    lever = Number()
+    """How far the centre of mass of an object that is set down lies from the pads' middle along
+    them, in m."""
+    doubts_grip = Number()
+    """1 if the object seems to turn between the pads, and is set down again if it does, else 0."""
+    set_downs = Number()
+    """How many earlier actions have set this object down."""
     stop = Number()
     """0 while there are actions; then 1 plus the index of the reason in `STOP_REASONS`."""

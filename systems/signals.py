@@ -254,10 +254,11 @@ class LeftOver:
     """World (x, y) of each cavity's middle, in metres."""
 
 
-OUTCOMES = ("placed", "missed", "dropped", "pressed", "stopped", "unreachable")
+OUTCOMES = ("placed", "missed", "dropped", "pressed", "stopped", "set down", "unreachable")
 """How an action may end: the object was let go at its place, nothing was grasped, the object was
-lost on the way, it was pressed down, a contact force above the limit ended the action, or the robot
-did not move because it cannot reach the poses."""
+lost on the way, it was pressed down, a contact force above the limit ended the action, the object
+was set down at the pick because it would have turned between the pads, or the robot did not move
+because it cannot reach the poses."""
 
 
 @dataclass(frozen=True)
@@ -270,6 +271,9 @@ class Attempt:
     """A word of `OUTCOMES`."""
     peak_force: float = 0.0
     """The largest contact force on the hand, in N, without the weight of the held object."""
+    balance: tuple[float, float] | None = None
+    """World (x, y) of the centre of mass along the pads that the hand felt before it set the object
+    down, in metres; None for any other outcome."""
 
 
 def wrap_to_pi(angle: float) -> float:

@@ -72,6 +72,8 @@ class ActionLog:
             return
         elif event.mode == Mode.RELEASE:
             self.records[-1].outcome = "placed"
+        elif event.mode == Mode.RETREAT and event.previous == Mode.RELEASE:
+            self._note_set_down(event)
         elif event.mode == Mode.RETREAT and event.previous == Mode.DESCEND:
             self.records[-1] = dataclasses.replace(
                 self.records[-1],
@@ -84,6 +86,13 @@ class ActionLog:
         elif event.mode == Mode.RETREAT and event.previous != Mode.RELEASE:
             by_mode = {Mode.APPROACH: "unreachable", Mode.CHECK: "missed"}
             self.records[-1].outcome = by_mode.get(event.previous, "dropped")
+
+    def _note_set_down(self, event: ModeChange) -> None:
+        station = self._station
+        context = station.GetMyContextFromRoot(event.root_context)
+        history = station.GetOutputPort("history").Eval(context)
+        if history and history[-1].outcome == "set down" and self.records:
+            self.records[-1].outcome = "set down"
 
     def _find_lifted(self, event: ModeChange) -> None:
         now = self._station.object_poses(event.root_context)

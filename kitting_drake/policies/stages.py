@@ -18,7 +18,7 @@ from kitting_drake.policies.matching.recovery import recovery_action
 from kitting_drake.policies.matching.refinement import nearest_region, refine_grasp, refine_place
 from kitting_drake.policies.matching.release_clearance import blocked_at_place
 from kitting_drake.policies.matching.segmentation import Region
-from kitting_drake.policies.matching.separating import separating_action
+from kitting_drake.policies.matching.separating import separating_action, turning_action
 from kitting_drake.policies.matching.visibility import Visibility
 from systems.pick_place_parameters import PickPlaceParameters
 from systems.signals import wrap_to_pi
@@ -98,6 +98,7 @@ class JawRoom:
 
     def refine(self, draft: Draft) -> Draft:
         look = draft.look
+        region = nearest_region(look.segmentation.objects, draft.pick)
         grasp = refine_grasp(
             look.segmentation,
             draft.pick,
@@ -105,6 +106,7 @@ class JawRoom:
             look.resolution,
             self.planner,
             look.failed_pixels,
+            None if region is None else look.inventory.balance(region),
         )
         if grasp is None:
             return draft
@@ -122,6 +124,9 @@ class OutlinePlace:
     def refine(self, draft: Draft) -> Draft:
         look = draft.look
         draft = dataclasses.replace(draft, outlined=True)
+        region = nearest_region(look.segmentation.objects, draft.pick)
+        if look.inventory.is_reversed(region):
+            return draft
         fitted = refine_place(
             look.segmentation,
             draft.pick,
@@ -138,7 +143,6 @@ class OutlinePlace:
                 fit_cost=fitted.cost,
                 belongs=True,
             )
-        region = nearest_region(look.segmentation.objects, draft.pick)
         pair = None if region is None else look.inventory.pair_of(region)
         if pair is None:
             return draft
@@ -224,7 +228,8 @@ class OutlineStop:
     - An object that fits into a recess is picked, whatever the networks say.
     - One that was not tried yet and may hide something that fits is picked if the networks see
       something to pick: their log-odds are above the threshold.
-    - Anything else is picked only if they are much above it.
+    - Anything else is picked only if they are much above it, and never an object that lies on the
+      wrong face.
     """
 
     def refine(self, draft: Draft) -> Draft:
@@ -232,6 +237,8 @@ class OutlineStop:
         region = nearest_region(inventory.segmentation.objects, draft.pick)
         if draft.belongs and not inventory.is_tried(region):
             return draft
+        if inventory.is_reversed(region):
+            return dataclasses.replace(draft, stop=True, reason=inventory.why_stop)
         odds, threshold = draft.look.picking.log_odds, draft.look.networks.stop_threshold
         new = region is not None and any(item is region for item in inventory.worth_a_try)
         if odds is not None and threshold is not None:
@@ -287,10 +294,11 @@ class SeenOnly:
 
 @dataclass(frozen=True)
 class Recovery:
-    """Mends a failed insertion (`recovery_action`), and takes heaps apart (`separating_action`).
+    """Mends a failed insertion (`recovery_action`), takes heaps apart (`separating_action`), and
+    turns objects over (`turning_action`).
 
-    It presses a protruding object down at once. It separates, and takes an object out, only when
-    nothing else belongs into a recess, because that costs actions.
+    It presses a protruding object down at once. It does the others only when nothing else belongs
+    into a recess, because they cost actions.
     """
 
     planner: PickPlaceParameters
@@ -302,7 +310,7 @@ class Recovery:
             return dataclasses.replace(draft, mending=mending)
         if draft.belongs and not draft.stop:
             return draft
-        separating = None
         if draft.stop:
-            separating = separating_action(look.inventory, self.planner, tuple(look.failed_picks))
-        return dataclasses.replace(draft, mending=separating or mending)
+            arguments = look.inventory, self.planner, tuple(look.failed_picks)
+            mending = separating_action(*arguments) or mending or turning_action(*arguments)
+        return dataclasses.replace(draft, mending=mending)

@@ -24,7 +24,7 @@ from systems.ledge import Ledge
 from systems.oracle_policy import OraclePolicy
 from systems.pick_place_parameters import PickPlaceParameters
 from systems.pick_place_policy import PickPlacePolicy
-from systems.placement import PlacedObject
+from systems.placement import PlacedObject, heading
 from systems.signals import Observation, PickPlaceAction, PixelGrid, PlanarPose
 
 if TYPE_CHECKING:
@@ -394,7 +394,8 @@ def _ledge(scene: Scene) -> Ledge | None:
     for item in scene.fixtures:
         if item.p_FPoints is not None:
             length, width, _ = np.ptp(item.p_FPoints, axis=0).tolist()
-            return Ledge(item.X_WF, (length, width))
+            x, y = item.X_WF.translation()[:2].tolist()
+            return Ledge(PlanarPose(x, y, heading(item.X_WF)), (length, width))
     return None
 
 

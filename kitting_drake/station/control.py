@@ -19,6 +19,7 @@ from systems.pick_place_planner import PickPlacePlanner
 from systems.robot_motion import RobotMotion
 from systems.trajectory_controller import FINGERS, FingerLaw, TrajectoryController
 from systems.wrist_force import WristForce
+from systems.wrist_moment import WristMoment
 
 _EXPORTED = {
     "failed_picks": "failed_picks",
@@ -85,6 +86,10 @@ def add_control(
         builder.Connect(projector.GetOutputPort("heights"), planner.GetInputPort("observation"))
     builder.Connect(driven.hand_state, planner.GetInputPort("hand_state"))
     builder.Connect(driven.wrist_force, planner.GetInputPort("hand_contact_force"))
+    reactions = plant.get_reaction_forces_output_port()
+    wrist = builder.AddNamedSystem("wrist_moment", WristMoment(reactions, _wrist_joint(plant)))
+    builder.Connect(reactions, wrist.get_input_port())
+    builder.Connect(wrist.get_output_port(), planner.GetInputPort("wrist_moment"))
     for port in ("desired_motion", "desired_opening", "closing_force"):
         builder.Connect(planner.GetOutputPort(port), driven.controller.GetInputPort(port))
     for port, name in _EXPORTED.items():
@@ -94,6 +99,12 @@ def add_control(
     builder.ExportOutput(driven.hand_state, "hand_state")
     builder.ExportOutput(driven.wrist_force, "wrist_force")
     return planner
+
+
+def _wrist_joint(plant: MultibodyPlant) -> int:
+    """The place, among the plant's joints, of the one that holds the hand."""
+    joints = [plant.get_joint(index) for index in plant.GetJointIndices()]
+    return next(i for i, joint in enumerate(joints) if joint.child_body().name() == "hand")
 
 
 def _drive_hand(builder: DiagramBuilder, scenario: Scenario, plant: MultibodyPlant) -> _Driven:

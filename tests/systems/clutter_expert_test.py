@@ -55,7 +55,7 @@ def expert(*poses: RigidTransform, failed: tuple[PlanarPose, ...] = ()) -> Clutt
         grasps=(GRASPS, GRASPS)[: len(poses)],
         area=AREA,
         fixtures=[KIT.multiply(box_points(0.28, 0.26, 0.05).T).T],
-        ledge=Ledge(KIT, (0.28, 0.26)),
+        ledge=Ledge(PlanarPose(0.5, -0.3, 0.0), (0.28, 0.26)),
     )
     return ClutterExpert(table, poses, failed)
 

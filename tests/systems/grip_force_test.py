@@ -1,6 +1,12 @@
 import pytest
 
-from systems.grip_force import felt_weight, grip_force, lifts_too_early
+from systems.grip_force import (
+    felt_lever,
+    felt_weight,
+    grip_force,
+    lifts_too_early,
+    turns_in_the_pads,
+)
 from systems.pick_place_parameters import PickPlaceParameters
 
 PARAMETERS = PickPlaceParameters()
@@ -33,3 +39,13 @@ def test_the_weight_does_not_depend_on_the_acceleration():
 def test_only_a_heavy_object_waits_for_a_firm_grip():
     assert not lifts_too_early(grip_force(2.5, 30.0, PARAMETERS), 30.0)
     assert lifts_too_early(grip_force(6.0, 30.0, PARAMETERS), 30.0)
+
+
+def test_the_lever_is_moment_over_weight_and_bounded_for_what_weighs_nothing():
+    assert felt_lever(-0.5, 20.0) == pytest.approx(-0.025)
+    assert abs(felt_lever(0.5, 0.0)) < 0.2
+
+
+def test_what_was_set_down_before_may_hang_farther_from_the_pads():
+    assert turns_in_the_pads(-0.25, 0) and not turns_in_the_pads(-0.25, 1)
+    assert not turns_in_the_pads(0.15, 0) and turns_in_the_pads(0.6, 2)

@@ -52,6 +52,7 @@ class World:
         cavity: (lowest yaw, highest yaw, height) of a cavity on the place side.
         stiffness: of the surfaces, in N/m.
         width: of the object between the pads in m, by attempt (from 1) and mode.
+        levers: how far the object hangs from the pads along them in m, by attempt, else zero.
     """
 
     touch_pick: float = NO_TOUCH
@@ -59,6 +60,7 @@ class World:
     cavity: tuple[float, float, float] = (0.0, 0.0, 0.0)
     stiffness: float = 1e5
     width: Callable[[int, Mode], float] = lambda attempt, mode: WIDTH
+    levers: tuple[float, ...] = ()
 
 
 @dataclasses.dataclass
@@ -85,6 +87,7 @@ class PerfectHand(LeafSystem):
             self.DeclareVectorInputPort(name, size)
         self.DeclareVectorOutputPort("hand_state", 12, self._calc_state)
         self.DeclareVectorOutputPort("hand_contact_force", 6, self._calc_contact)
+        self.DeclareVectorOutputPort("wrist_moment", 1, self._calc_moment)
 
     def _eval(self, context: Context, name: str) -> NDArray:
         return self.GetInputPort(name).Eval(context)
@@ -92,6 +95,14 @@ class PerfectHand(LeafSystem):
     def _width(self, context: Context) -> float:
         attempt, mode = self._eval(context, "counts")[0], self._eval(context, "mode")[0]
         return self._world.width(int(attempt), Mode(int(mode)))
+
+    def _lever(self, context: Context) -> float:
+        levers = dict(enumerate(self._world.levers, start=1))
+        return levers.get(int(self._eval(context, "counts")[0]), 0.0)
+
+    def _calc_moment(self, context, output) -> None:
+        pull = 1 + self._eval(context, "desired_motion")[10] / 9.81
+        output.SetFromVector([WEIGHT * pull * self._lever(context)])
 
     def _calc_state(self, context, output) -> None:
         q, v, _ = np.split(self._eval(context, "desired_motion"), 3)
@@ -111,7 +122,8 @@ class PerfectHand(LeafSystem):
         place = floor if first < q[3] < last else self._world.touch_place
         side = self._world.touch_pick if q[1] > 0 else place
         touch = max(side - q[2], 0.0) * self._world.stiffness
-        in_the_air = self._eval(context, "mode")[0] >= Mode.CARRY
+        first_in_the_air = Mode.LIFT if self._world.levers else Mode.CARRY
+        in_the_air = self._eval(context, "mode")[0] >= first_in_the_air
         # Weight and inertia of the held object.
         mass = WEIGHT / 9.81 if in_the_air and press > 0 and pad > 0 else 0.0
         load = -mass * (self._eval(context, "desired_motion")[8:11] + [0, 0, 9.81])
@@ -160,7 +172,7 @@ class Run:
         hand = builder.AddSystem(PerfectHand(world or World()))
         for port in ("desired_motion", "desired_opening", "closing_force", "mode", "counts"):
             builder.Connect(self.planner.GetOutputPort(port), hand.GetInputPort(port))
-        for port in ("hand_state", "hand_contact_force"):
+        for port in ("hand_state", "hand_contact_force", "wrist_moment"):
             builder.Connect(hand.GetOutputPort(port), self.planner.GetInputPort(port))
         builder.Connect(self.policy.get_output_port(), self.planner.GetInputPort("action"))
         self.log = LogVectorOutput(self.planner.GetOutputPort("desired_motion"), builder, 1 / 128)
@@ -208,7 +220,7 @@ class Run:
 
 def test_ports():
     planner = PickPlacePlanner(parameters=PARAMETERS, max_actions=TEN)
-    assert planner.num_input_ports() == 4
+    assert planner.num_input_ports() == 5
     assert isinstance(planner.GetInputPort("observation").Allocate().get_value(), Observation)
     assert planner.GetInputPort("hand_state").size() == 12
     assert planner.GetInputPort("hand_contact_force").size() == 6
@@ -291,6 +303,29 @@ def test_a_heavy_object_is_gripped_more_firmly_until_its_release(heavy_load: flo
     assert run.output("closing_force")[0] == 0
     run.finish()
     assert run.sequence == [*PICK_AND_PLACE, Mode.OBSERVE, Mode.DONE]
+
+
+@pytest.mark.parametrize("lever", [-0.05, 0.05])
+def test_an_object_that_would_turn_is_set_down_where_it_was_and_its_balance_is_told(lever: float):
+    run = Run(World(levers=(lever,), touch_place=0.0), actions=2).until(Mode.RELEASE)
+    assert Mode.CARRY not in run.sequence
+    here = run.output("desired_motion")
+    np.testing.assert_allclose(here[:2], [PICK.x, PICK.y], atol=1e-9)
+    assert here[2] < GRASP_Z
+    run.finish()
+    set_down, placed = run.output("history")
+    assert (set_down.outcome, placed.outcome) == ("set down", "placed")
+    assert placed.balance is None
+    # The hand may have turned by a further pi.
+    theta = set_down.action.pick.theta
+    felt = np.array(set_down.balance) - (PICK.x, PICK.y)
+    np.testing.assert_allclose(felt, lever * np.array([np.cos(theta), np.sin(theta)]), atol=1e-3)
+    assert run.counts == [2, 0, 0]
+
+
+def test_an_object_that_hangs_near_the_pads_is_carried_at_once():
+    run = Run(World(levers=(0.02,), touch_place=0.0)).finish()
+    assert [item.outcome for item in run.output("history")] == ["placed"]
 
 
 @pytest.mark.parametrize("height", [0.02, 0.045])

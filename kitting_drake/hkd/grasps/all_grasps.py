@@ -14,10 +14,13 @@ from kitting_drake.common.paths import cache_directory
 from kitting_drake.hkd.grasps.proposals import WIDEST, propose_grasps
 from kitting_drake.hkd.tools.tool import Tool
 from systems.grasp import Grasp
+from systems.grip_force import GRAVITY
 
 _FORMAT_VERSION = "1"
 """Part of the cache key. Change it when equal tools give other grasps."""
 _FILE = "grasps.json"
+_EASY_MOMENT = 0.18
+"""A moment about the axis of the pads that they hold easily, in N m."""
 _WORST = 12.5
 """Proposals of a higher cost are left out."""
 
@@ -49,6 +52,26 @@ def all_grasps(tool: Tool) -> tuple[Grasp, ...]:
         Grasp(s * g.x, s * g.y, g.theta, s * g.width, s * g.surface_height) for g in unscaled
     ]
     return (tool.grasp, *(grasp for grasp in proposed if grasp.width <= WIDEST))
+
+
+def carrying_grasps(tool: Tool) -> tuple[Grasp, ...]:
+    """The tool's own grasps, unless it would turn between the pads in the first of them.
+
+    Then all its grasps, those first in which the moment of its weight is easily held.
+
+    Raises:
+        UserError: as `all_grasps`.
+    """
+    com = _center_of_mass(tool)
+
+    def excess(grasp: Grasp) -> float:
+        along = np.array([np.cos(grasp.theta), np.sin(grasp.theta)])
+        lever = abs(float((com[:2] - (grasp.x, grasp.y)) @ along))
+        return max(GRAVITY * tool.mass * lever - _EASY_MOMENT, 0.0)
+
+    if not excess(tool.grasp):
+        return tool.grasps
+    return tuple(sorted(all_grasps(tool), key=excess))
 
 
 def _proposals(tool: Tool, com: NDArray[np.float64]) -> list[list[float]]:

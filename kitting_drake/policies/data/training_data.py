@@ -191,7 +191,10 @@ def read_training_data(path: Path) -> TrainingData:
             scenario=STATIC,
             origin={"task": STATIC},
             grid=content.grid,
-            learning=Learning(later_picks_possible=True, curvature=True, reflection=True),
+            # Parts may be symmetric.
+            learning=Learning(
+                later_picks_possible=True, curvature=True, reflection=True, many_answers=True
+            ),
             colour=False,
             seeds=(content.first_seed,),
             items=content,

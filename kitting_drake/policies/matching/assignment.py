@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,10 +16,13 @@ from kitting_drake.policies.matching.registration import (
     register,
     trace_outline,
 )
-from kitting_drake.policies.matching.segmentation import Segmentation
+from kitting_drake.policies.matching.segmentation import Region, Segmentation
 
 _WORST_COST = 0.0019
 """The largest mean difference of an outline and its recess, in metres."""
+_GOOD, _CLEARLY_BETTER = 0.0005, 0.75
+"""An object is reversed if its outline fits worse than this, in metres, and the mirror image's
+mismatch is less than this share of its own."""
 _PROMISING = 2.0
 """A recess is registered if its coarse cost is at most this multiple of the object's least."""
 
@@ -64,3 +68,41 @@ def match(segmentation: Segmentation, resolution: float) -> list[Pair]:
         if costs[i, j] < _WORST_COST
     ]
     return sorted(pairs, key=lambda pair: pair.mismatch)
+
+
+def reversed_objects(
+    segmentation: Segmentation, pairs: Sequence[Pair], resolution: float
+) -> tuple[int, ...]:
+    """The objects that lie on the wrong face: their outlines fit free recesses as mirror images.
+
+    Args:
+        segmentation: the segmentation of an observation.
+        pairs: see `match`. The mirror image of a paired object must fit clearly better.
+        resolution: the side of its pixels, in metres.
+
+    Returns:
+        Indices in `Segmentation.objects`.
+    """
+    objects, regions = segmentation.objects, segmentation.recesses
+    known = {pair.item: pair for pair in pairs}
+    filled = {pair.recess for pair in pairs}
+    free = [
+        j for j, item in enumerate(regions) if any(item is r for r in segmentation.free_recesses)
+    ]
+    traced = {j: trace_outline(regions[j].mask, resolution) for j in free}
+    found = []
+    for i, item in enumerate(objects):
+        pair = known.get(i)
+        own = _WORST_COST if pair is None else pair.mismatch
+        choices = [j for j in free if j not in filled or (pair is not None and j == pair.recess)]
+        if own < _GOOD or not choices:
+            continue
+        mirrored = Region(item.mask[:, ::-1], item.height)
+        outline = trace_outline(mirrored.mask, resolution, close=True)
+        coarse = {j: coarse_cost(outline, traced[j]) for j in choices}
+        j = min(choices, key=lambda choice: coarse[choice])
+        fit = register(outline, traced[j])
+        better = mismatch(fit, mirrored, regions[j]) < _CLEARLY_BETTER * own
+        if better and is_covered(outline, traced[j], fit):
+            found.append(i)
+    return tuple(found)

@@ -8,7 +8,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from kitting_drake.policies.matching.assignment import Pair, match
+from kitting_drake.policies.matching.assignment import Pair, match, reversed_objects
 from kitting_drake.policies.matching.segmentation import Region, Segmentation, segment
 from kitting_drake.policies.matching.splitting import split_touching
 from systems.signals import Attempt, LeftOver, Observation, PlanarPose
@@ -32,6 +32,8 @@ class Inventory:
     """With touching objects told apart, where the recesses show how."""
     matches: tuple[Pair, ...]
     """All objects and recesses that fit, best fit first."""
+    reversed_items: tuple[Region, ...] = ()
+    """The objects that must be turned over before they fit."""
 
     @classmethod
     def of(cls, observation: Observation) -> Inventory:
@@ -41,7 +43,13 @@ class Inventory:
         split = split_touching(segmentation, pairs, resolution)
         if split is not segmentation:
             pairs = match(split, resolution)
-        return cls(observation, split, tuple(pairs))
+        wrong = reversed_objects(split, pairs, resolution)
+        return cls(
+            observation,
+            split,
+            tuple(pair for pair in pairs if pair.item not in wrong),
+            tuple(split.objects[index] for index in wrong),
+        )
 
     @cached_property
     def pairs(self) -> tuple[Pair, ...]:
@@ -68,7 +76,9 @@ class Inventory:
         paired = {pair.item for pair in self.pairs}
         objects = enumerate(self.segmentation.objects)
         return tuple(
-            item for index, item in objects if index not in paired and not self.is_tried(item)
+            item
+            for index, item in objects
+            if index not in paired and not self.is_reversed(item) and not self.is_tried(item)
         )
 
     @property
@@ -113,6 +123,10 @@ class Inventory:
         objects = self.segmentation.objects
         return next((pair for pair in self.pairs if objects[pair.item] is region), None)
 
+    def is_reversed(self, region: Region | None) -> bool:
+        """Whether an object must be turned over before it fits; False for None."""
+        return any(item is region for item in self.reversed_items)
+
     def is_tried(self, region: Region | None) -> bool:
         """Whether an object was tried as often as is worth it; False for None.
 
@@ -120,7 +134,8 @@ class Inventory:
         """
         if region is None:
             return False
-        laid = self.pair_of(region) is None and any(
+        fits_nowhere = self.pair_of(region) is None and not self.is_reversed(region)
+        laid = fits_nowhere and any(
             attempt.outcome == "placed" and self._is_there(attempt.action.place, region)
             for attempt in self._history
         )
@@ -130,13 +145,24 @@ class Inventory:
         """How many earlier actions moved this object here, or failed to move it away."""
         return sum(self._is_there(_left_at(attempt), region) for attempt in self._history)
 
-    def removals(self, region: Region) -> int:
-        """How many earlier actions took an object out from here."""
-        return sum(
-            self._is_there(attempt.action.pick, region)
-            for attempt in self._history
-            if attempt.action.aside and attempt.outcome == "placed"
-        )
+    def was_removed(self, region: Region) -> bool:
+        """Whether an object was taken out from here, and one was placed here again."""
+        removed = False
+        for attempt in self._history:
+            if attempt.outcome != "placed":
+                continue
+            if attempt.action.aside:
+                removed |= self._is_there(attempt.action.pick, region)
+            elif removed and self._is_there(attempt.action.place, region):
+                return True
+        return False
+
+    def balance(self, region: Region) -> NDArray[np.float64] | None:
+        """(row, col) of an object's centre of mass, if the hand felt it here; else None."""
+        for attempt in reversed(self._history):
+            if attempt.balance is not None and self._is_there(attempt.action.pick, region):
+                return np.asarray(self.observation.grid.to_pixel(attempt.balance))
+        return None
 
     def _was_filled(self, recess: Region) -> bool:
         return any(

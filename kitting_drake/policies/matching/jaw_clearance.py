@@ -79,6 +79,7 @@ def jaw_grasps(
     planner: PickPlaceParameters,
     *,
     support: float = 0.0,
+    balance: Array | None = None,
 ) -> list[JawGrasp]:
     """The grasps of an object, best first; empty if there is none.
 
@@ -88,11 +89,13 @@ def jaw_grasps(
         resolution: the side of a pixel, in metres.
         planner: how deep the fingertips go, and how wide the jaws open.
         support: height of the object's support above the table, in metres.
+        balance: (row, col) of its centre of mass, if known; else that of the volume below its
+            surface counts.
     """
     relief = segmentation.relief
     pixels = region.pixels
     weights = np.maximum(relief[region.mask] - support, 1e-3)
-    middle = np.average(pixels, axis=0, weights=weights)
+    middle = np.average(pixels, axis=0, weights=weights) if balance is None else balance
     distance = np.linalg.norm(pixels - middle, axis=1) * resolution
     near = pixels[distance < max(_REACH, distance.min() + resolution)]
     places = near[:: max(1, math.ceil(len(near) / _MOST_PLACES))].astype(float)

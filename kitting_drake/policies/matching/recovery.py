@@ -39,7 +39,7 @@ def recovery_action(
 ) -> PickPlaceAction | None:
     """The recovery of the worst-seated object; None if all are seated or no recovery is feasible.
 
-    An object that was taken out from the same place before stays where it is.
+    An object that was taken out, and placed there again, stays where it is.
 
     Args:
         inventory: objects and recesses.
@@ -53,7 +53,7 @@ def recovery_action(
             pressed = _press(observation, segmentation, region, pickable)
             if not _is_near(pressed.pick, tried):
                 return pressed
-        if inventory.removals(region):
+        if inventory.was_removed(region):
             continue
         taken = _take_out(observation, segmentation, region, planner, tried)
         if taken is not None:

@@ -197,6 +197,7 @@ def refine_grasp(
     resolution: float,
     planner: PickPlaceParameters,
     failed: Array | None = None,
+    balance: Array | None = None,
 ) -> RefinedGrasp | None:
     """A feasible grasp of the same object within 4 cm of a predicted one, or the predicted one
     itself if it is feasible and not much worse.
@@ -210,6 +211,8 @@ def refine_grasp(
         resolution: the side of a pixel, in metres.
         planner: how the hand will pick.
         failed: (n, 2), the (row, col) of failed grasps, which are avoided.
+        balance: (row, col) of the object's centre of mass, if the hand has felt it. The best grasp
+            with respect to it is taken, however far from the predicted one.
     """
     taken = nearest_region(segmentation.objects, pick)
     if taken is None:
@@ -227,7 +230,10 @@ def refine_grasp(
         distance, turned = away(grasp)
         return distance + _LEVER * turned + _POOR * grasp.cost
 
-    grasps = jaw_grasps(segmentation, taken, resolution, planner)
+    grasps = jaw_grasps(segmentation, taken, resolution, planner, balance=balance)
+    if balance is not None:
+        grasps = grasps if failed is None else untried(grasps, failed, resolution)
+        return RefinedGrasp(grasps[0].pixel, grasps[0].theta, grasps[0].cost) if grasps else None
     near = [grasp for grasp in grasps if away(grasp)[0] <= _FARTHEST_GRASP]
     if failed is not None:
         near = untried(near, failed, resolution)

@@ -1,7 +1,8 @@
-"""Takes a heap apart: picks the topmost object and lays it on a free part of the table.
+"""Prepares objects that cannot be placed yet. This is not in the paper.
 
-Where objects lie on or against each other and their outlines cannot be told apart, they are moved
-apart first. This is not in the paper.
+- Where objects lie on or against each other and their outlines cannot be told apart, the topmost
+  one is laid on a free part of the table.
+- An object that lies on the wrong face is turned over an edge of the kit's block.
 """
 
 from __future__ import annotations
@@ -12,13 +13,15 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
+from scipy.spatial import ConvexHull
 
 from kitting_drake.policies.data.images import make_action, rotation_matrix
 from kitting_drake.policies.matching.inventory import Inventory
 from kitting_drake.policies.matching.jaw_clearance import jaw_grasps, untried
 from kitting_drake.policies.matching.segmentation import Region, Segmentation
+from systems.ledge import Ledge, moved_gripper
 from systems.pick_place_parameters import PickPlaceParameters
-from systems.signals import PickPlaceAction, PlanarPose
+from systems.signals import PickPlaceAction, PixelGrid, PlanarPose
 
 Array = NDArray[np.float64]
 
@@ -65,6 +68,73 @@ def separating_action(
                 action = make_action(observation, grasp.pixel, grasp.theta, place, rotation)
                 return replace(action, aside=True)
     return None
+
+
+def turning_action(
+    inventory: Inventory, planner: PickPlaceParameters, failed_picks: tuple[PlanarPose, ...] = ()
+) -> PickPlaceAction | None:
+    """Lets go of an object that lies on the wrong face so that it tips over the edge of a block.
+
+    Args:
+        inventory: objects and recesses.
+        planner: how the hand will pick.
+        failed_picks: poses at which a grasp failed before; it avoids them.
+
+    Returns:
+        The action; None if no object lies on the wrong face, or none has a grasp and a free edge.
+    """
+    segmentation, grid = inventory.segmentation, inventory.observation.grid
+    places = np.array([(pick.x, pick.y) for pick in failed_picks]).reshape(-1, 2)
+    failed = grid.to_pixel(places)
+    corners = np.array([[0, 0], [grid.rows - 1, grid.cols - 1]])
+    low, high = (tuple(corner) for corner in grid.to_world(corners).tolist())
+    for region in inventory.reversed_items:
+        if inventory.is_tried(region):
+            continue
+        # The centre of its volume stands for its centre of mass.
+        weights = segmentation.relief[region.mask]
+        points = grid.to_world(region.pixels)
+        center = np.average(points, axis=0, weights=weights)
+        along = np.linalg.eigh(np.cov((points - center).T))[1][:, 1]
+        yaw = math.atan2(along[1], along[0])
+        outline = (points - center) @ np.array([[along[0], -along[1]], [along[1], along[0]]])
+        others = segmentation.occupied & ~region.mask & ~segmentation.fixture
+        pixels = np.argwhere(others)
+        around = np.column_stack([grid.to_world(pixels), segmentation.relief[others]])
+        for ledge in _ledges(segmentation, grid):
+            turned = ledge.turning_pose(outline, center, around, (low, high))
+            if turned is None:
+                continue
+            grasps = jaw_grasps(segmentation, region, grid.resolution, planner)
+            for grasp in untried(grasps, failed, grid.resolution)[:1]:
+                x, y = grid.to_world(grasp.pixel).tolist()
+                pick = PlanarPose(x, y, grasp.theta)
+                place = moved_gripper(pick, center, yaw, turned)
+                return PickPlaceAction(pick=pick, place=place, aside=True)
+    return None
+
+
+def _ledges(segmentation: Segmentation, grid: PixelGrid) -> list[Ledge]:
+    """The blocks: the smallest rectangle around each fixture."""
+    labels, count = ndimage.label(segmentation.fixture)
+    found = []
+    for number in range(1, count + 1):
+        corners = grid.to_world(np.argwhere(labels == number))
+        corners = corners[ConvexHull(corners).vertices]
+        best: tuple[float, Ledge] | None = None
+        for side in np.roll(corners, -1, axis=0) - corners:
+            yaw = math.atan2(side[1], side[0])
+            cos, sin = math.cos(yaw), math.sin(yaw)
+            turned = corners @ np.array([[cos, -sin], [sin, cos]])
+            low, high = turned.min(axis=0), turned.max(axis=0)
+            u, v = ((low + high) / 2).tolist()
+            size = (high - low + grid.resolution).tolist()
+            if best is None or size[0] * size[1] < best[0]:
+                pose = PlanarPose(cos * u - sin * v, sin * u + cos * v, yaw)
+                best = size[0] * size[1], Ledge(pose, (size[0], size[1]))
+        if best is not None:
+            found.append(best[1])
+    return found
 
 
 def _layers(segmentation: Segmentation, region: Region) -> list[Region]:

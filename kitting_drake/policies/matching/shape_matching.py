@@ -12,7 +12,7 @@ from kitting_drake.policies.matching.evidence import Evidence, geometric_evidenc
 from kitting_drake.policies.matching.inventory import Inventory
 from kitting_drake.policies.matching.jaw_clearance import jaw_grasps, untried
 from kitting_drake.policies.matching.recovery import recovery_action
-from kitting_drake.policies.matching.separating import separating_action
+from kitting_drake.policies.matching.separating import separating_action, turning_action
 from systems.pick_place_parameters import PickPlaceParameters
 from systems.signals import Observation, PickPlaceAction, PlanarPose
 
@@ -40,7 +40,8 @@ class ShapeMatchingPolicy:
             planner: how the hand will pick and place.
             recover: press protruding objects down at once. If nothing fits, take heaps apart
                 (`separating_action`), then take out what could not be pressed down
-                (`recovery_action`).
+                (`recovery_action`), then turn over what lies on the wrong face
+                (`turning_action`).
         """
         self._planner = planner
         self._recover = recover
@@ -68,10 +69,11 @@ class ShapeMatchingPolicy:
         if matched is not None:
             return matched
         if self._recover:
-            separating = separating_action(inventory, self._planner, tuple(failed_picks))
-            # Taking out comes last: it may fail again, and the number of actions is limited.
-            if separating is not None or mending is not None:
-                return Matched(separating or mending or PickPlaceAction(stop=True))
+            arguments = inventory, self._planner, tuple(failed_picks)
+            # What may fail again comes last, because the number of actions is limited.
+            prepared = separating_action(*arguments) or mending or turning_action(*arguments)
+            if prepared is not None:
+                return Matched(prepared)
         reason = reason or inventory.why_stop
         return Matched(PickPlaceAction(stop=True, reason=reason, left_over=inventory.left_over))
 
@@ -87,7 +89,9 @@ class ShapeMatchingPolicy:
         for pair in inventory.pairs:
             reason, fit = "not seen", pair.fit
             region = segmentation.objects[pair.item]
-            grasps = jaw_grasps(segmentation, region, resolution, self._planner)
+            grasps = jaw_grasps(
+                segmentation, region, resolution, self._planner, balance=inventory.balance(region)
+            )
             grasps = untried(grasps, failed, resolution)
             if not grasps:
                 reason = "not sure"

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from pydrake.math import RigidTransform, RollPitchYaw
 
+from kitting_drake.hkd.grasps.all_grasps import carrying_grasps
 from kitting_drake.hkd.kits.kit import Kit
 from kitting_drake.hkd.tools.tool import Tool
 from kitting_drake.tasks.task import Fixture, Scene, SceneObject
@@ -72,7 +73,7 @@ def kitting_scene(
                 model=tool.sdf,
                 X_WB=X_WTools[index],
                 p_BPoints=tool.surface_points(_SURFACE_POINTS),
-                grasps=tool.grasps,
+                grasps=carrying_grasps(tool),
                 symmetry=tool.symmetry,
                 axis=tool.axis,
             )

@@ -7,7 +7,7 @@ import pytest
 from numpy.typing import NDArray
 
 from kitting_drake.policies.matching.inventory import Inventory
-from kitting_drake.policies.matching.separating import separating_action
+from kitting_drake.policies.matching.separating import separating_action, turning_action
 from kitting_drake.policies.matching.shape_matching import ShapeMatchingPolicy
 from systems.pick_place_parameters import PickPlaceParameters
 from systems.signals import Attempt, Observation, PickPlaceAction, PixelGrid, PlanarPose
@@ -128,3 +128,44 @@ def test_two_kits_are_seen():
     image[3] = height
     found = Inventory.of(Observation(image, GRID)).segmentation
     assert len(found.free_recesses) == 3 and len(found.objects) == 1
+
+
+def angle(rows: int, cols: int, *, mirrored: bool = False) -> NDArray[np.bool_]:
+    """An L of 50 by 24 pixels, which is not its own mirror image."""
+    mask = np.zeros(GRID.shape, bool)
+    mask[rows : rows + 8, cols : cols + 50] = True
+    arm = slice(rows, rows + 24) if not mirrored else slice(rows - 16, rows + 8)
+    mask[arm, cols + 42 : cols + 50] = True
+    return mask
+
+
+def with_angle_recess(item: NDArray[np.bool_]) -> Observation:
+    height = scene((item, 0.015)).height.copy()
+    height[20:110, 20:110] = 0.05
+    height[angle(50, 40)] = 0.035
+    image = np.full((4, *GRID.shape), 0.5, np.float32)
+    image[3] = height
+    return Observation(image, GRID)
+
+
+def test_an_object_on_its_wrong_face_is_turned_over_the_block_s_edge():
+    right = Inventory.of(with_angle_recess(angle(60, 200)))
+    assert right.pairs and not right.reversed_items
+    wrong = with_angle_recess(angle(60, 200, mirrored=True))
+    found = Inventory.of(wrong)
+    assert len(found.reversed_items) == 1 and not found.pairs
+    action = turning_action(found, PLANNER)
+    assert action is not None and action.aside
+    # It is let go above the edge of the block, which spans 90 pixels.
+    row, col = GRID.to_pixel((action.place.x, action.place.y))
+    assert min(abs(row - 19.5), abs(row - 109.5), abs(col - 19.5), abs(col - 109.5)) < 8
+    assert ShapeMatchingPolicy(PLANNER)(wrong).reason == "nothing fits"
+    assert ShapeMatchingPolicy(PLANNER, recover=True)(wrong) == action
+
+
+def test_what_lies_on_a_cleared_place_is_taken_out_but_not_twice():
+    region = Inventory.of(scene((bar(60, 200), 0.015))).segmentation.objects[0]
+    out, back = placed_at((63.0, 220.0), pick=True), placed_at((63.0, 220.0), aside=False)
+    for history, removed in (((out,), False), ((back, out), False), ((out, back), True)):
+        observation = dataclasses.replace(scene((bar(60, 200), 0.015)), history=history)
+        assert Inventory.of(observation).was_removed(region) is removed

@@ -42,3 +42,10 @@ def test_a_refined_grasp_is_near_the_predicted_one(row: int, blocked: float, mov
     moved = np.linalg.norm(grasp.pick - pick) * GRID.resolution
     assert (moved > 0.003) == bool(moves) and moved <= 0.04
     assert found.relief[tuple(np.rint(grasp.pick).astype(int))] == pytest.approx(0.014, abs=1e-3)
+
+
+def test_a_grasp_goes_to_the_centre_of_mass_that_the_hand_has_felt():
+    found, pick, felt = bar(0.0), np.array([66.0, 160.0]), np.array([90.0, 160.0])
+    grasp = refine_grasp(found, pick, 0.0, GRID.resolution, PLANNER, balance=felt)
+    assert grasp is not None
+    assert np.linalg.norm(grasp.pick - felt) * GRID.resolution < 0.008
