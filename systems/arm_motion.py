@@ -13,11 +13,14 @@ from systems.arm_collisions import Capsule
 from systems.arm_kinematics import ArmBase
 from systems.arm_limits import JOINTS, ArmLimits
 from systems.arm_postures import ArmPostures, HandStop
+from systems.arm_reach import hand_stops
 from systems.arm_way import ArmWay, WayVector
 from systems.guarded_marks import guarded_marks
 from systems.jaw_motion import JawMotion
+from systems.motion_heights import MotionHeights
 from systems.pick_place_parameters import Mode, PickPlaceParameters
 from systems.planner_state import PlannerState
+from systems.signals import PlanarPose
 from systems.vector_view import Array, Number
 
 _KEPT = 8
@@ -25,9 +28,6 @@ _KEPT = 8
 _FARTHEST_STOP = 0.02
 """A hand that is further away from its command than this stays at its command, in m."""
 _SAME_HEIGHT = 0.003
-_ROOM_ABOVE = 0.03
-"""How far above the clear height an arm can reach, too, for ways with rounded corners, in m."""
-
 
 _TOUCH_SPEED = 0.011
 """An arm's limit of `touch_speed`, in m/s. Its hand moves 10 to 25 kg, a floating hand 4 kg,
@@ -117,19 +117,17 @@ class ArmMotion(JawMotion):
 
     def stops(self, state: PlannerState) -> list[HandStop]:
         """Where the hand goes down in an action."""
-        floor = state.table_z + self._parameters.floor_clearance
-        low = floor
-        if not state.press:
-            low = min(float(state.grasp_z), float(state.pick_hover_z))
-        high = max(float(state.clear_z), float(state.pick_hover_z)) + _ROOM_ABOVE
-        x, y, yaw = state.pick.tolist()
-        highest = state.clear_z - self._parameters.travel_clearance
-        stops = [HandStop("the pick", x, y, yaw, low, high, highest)]
-        if not state.press:
-            x, y, yaw = state.place.tolist()
-            high = max(float(state.travel_z), float(state.place_hover_z)) + _ROOM_ABOVE
-            stops.append(HandStop("the place", x, y, yaw, floor, high, highest))
-        return stops
+        heights = MotionHeights(
+            grasp=state.grasp_z,
+            clear=state.clear_z,
+            travel=state.travel_z,
+            pick_hover=state.pick_hover_z,
+            place_hover=state.place_hover_z,
+        )
+        pick, place = (PlanarPose(*pose.tolist()) for pose in (state.pick, state.place))
+        return hand_stops(
+            pick, None if state.press else place, heights, state.table_z, self._parameters
+        )
 
     def reach_problem(self, state: PlannerState) -> str:
         """A sentence that says why the arm cannot do the action in the state; empty if it can."""

@@ -236,20 +236,3 @@ class ArmPostures:
 
 def _wrap(angle: NDArray[np.float64]) -> NDArray[np.float64]:
     return angle - math.tau * np.round(angle / math.tau)
-
-
-def reach_problem(
-    postures: ArmPostures,
-    stops: Sequence[HandStop],
-    now: NDArray[np.float64] | None = None,
-) -> str:
-    """Why an arm cannot bring its hand to the stops of an action; empty if it can.
-
-    Args:
-        postures: of the arm.
-        stops: one to press, two to pick and place, whose yaws belong together.
-        now: (7) present joint positions; None: the middle of their ranges.
-    """
-    if now is None:
-        now = (np.array(postures.limits.lower) + postures.limits.upper) / 2
-    return postures.choose(stops, now)[1]

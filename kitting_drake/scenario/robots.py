@@ -87,7 +87,8 @@ class FrankaArm:
 
     def arm_base(self) -> ArmBase:
         """Where it stands."""
-        return ArmBase(*self.base, yaw=math.radians(self.yaw_deg))
+        x, y, z = self.base
+        return ArmBase(x, y, z, math.radians(self.yaw_deg))
 
 
 Robot = FloatingHand | FrankaArm

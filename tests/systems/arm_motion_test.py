@@ -9,7 +9,8 @@ from systems.arm_collisions import Capsule
 from systems.arm_kinematics import ArmBase, fingertips, hand_state, joint_frames
 from systems.arm_limits import ARM_LIMITS, FR3, PANDA, ArmLimits
 from systems.arm_motion import ArmMotion, ArmState
-from systems.arm_postures import MARGIN, ArmPostures, HandStop, reach_problem
+from systems.arm_postures import MARGIN, ArmPostures, HandStop
+from systems.arm_reach import reach_problem
 from systems.pick_place_parameters import Mode, PickPlaceParameters
 
 BASE = ArmBase(0.1, 0.0, 0.0)
