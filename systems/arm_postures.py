@@ -28,6 +28,8 @@ _SWIVELS = np.concatenate([sign * np.arange(0.1, 3.15, 0.1) for sign in (1.0, -1
 """
 _CHECKED = 12
 """Number of points of a way that are checked for collisions."""
+_JUMP = 1.5
+"""Largest change of a joint on a straight line up or down, in rad."""
 _PLANAR = 1e-6
 """Below this swivel the arm counts as in the vertical plane, in rad."""
 
@@ -183,12 +185,22 @@ class ArmPostures:
             (half_turn, way)
             for half_turn in (0, 1)
             for way in self._ways(stop, stop.yaw + half_turn * math.pi, swivels)
-            if self.within(way).all()
+            if self.within(way).all() and self._is_continuous(way)
         ]
         # Usually nothing collides: ask once for all.
         if found and self._collision(np.concatenate([way for _, way in found]), stop):
             found = [(turned, way) for turned, way in found if not self._collision(way, stop)]
         return [(turned, way[-1]) for turned, way in found]
+
+    def _is_continuous(self, way: NDArray[np.float64]) -> bool:
+        """Whether the arm can move on a straight line from the high to the low end of a way."""
+        if not way[:, [2, 4]].any():
+            return True
+        if np.abs(way[-1] - way[0]).max() > _JUMP:
+            return False
+        top, bottom = self.hand_pose(way[-1]), self.hand_pose(way[0])
+        line = self.along(np.linspace(top, bottom, _CHECKED), way[-1])
+        return bool(self.within(line).all())
 
     def _collision(self, way: NDArray[np.float64], stop: HandStop) -> str:
         return collision(way, self.base, stop.surface, self._obstacles)
