@@ -15,12 +15,14 @@ from pydrake.systems.framework import Context, Diagram, DiagramBuilder, EventSta
 
 from kitting_drake.common.errors import UserError
 from kitting_drake.common.rendering import can_render
+from kitting_drake.scenario.robots import FrankaArm
 from kitting_drake.scenario.schema import Scenario
 from kitting_drake.station.control import add_control
+from kitting_drake.station.held_bodies import ArmPath
 from kitting_drake.station.mass_centres import correct_drift
 from kitting_drake.station.paint import paint_surfaces
 from kitting_drake.station.plant import add_models, add_plant, bounded_body, set_initial_poses
-from kitting_drake.station.robot import add_robot, make_motion, set_home
+from kitting_drake.station.robot import add_robot, arm_model, make_motion, set_home
 from kitting_drake.station.sensing import add_cameras
 from kitting_drake.tasks.task import Scene
 from systems.object_feeder import ObjectFeeder
@@ -121,6 +123,9 @@ class KittingStation(Diagram):
         self.plant.Finalize()
         set_initial_poses(self.plant, self.scene, self.objects)
         motion = make_motion(scenario)
+        self._arm_path: ArmPath | None = None
+        if isinstance(scenario.robot, FrankaArm):
+            self._arm_path = ArmPath(*arm_model(scenario.robot), self.plant.time_step())
         set_home(self.plant, motion, scenario.planner.open_width)
         groups = _surface_groups(self.scene, self.still_bodies, self.objects)
         paint_surfaces(self.plant, self.scene_graph, scenario.appearance, groups, seed)
@@ -287,6 +292,9 @@ class KittingStation(Diagram):
         if abs(math.remainder(root_context.get_time(), step)) < 1e-6 * step:
             context = self.plant.GetMyMutableContextFromRoot(root_context)
             correct_drift(self.plant, context, self._bodies)
+            if self._arm_path is not None:
+                state = self._eval(root_context, "robot_state")
+                self._arm_path.correct(self.plant, context, state, self._bodies)
 
     def _let_appear(self, root_context: Context) -> None:
         """Moves the next object to its place of appearance, if one is to appear; it wakes there."""
