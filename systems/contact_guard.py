@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from systems.grip_force import GRAVITY
-from systems.pick_place_motion import RECENT, PlannerState
 from systems.pick_place_parameters import Mode
+from systems.planner_state import RECENT, PlannerState
 
 HEAVIEST = 3.0
 """The payload of a Franka Hand, in kg. What pulls harder is not a weight."""

@@ -16,12 +16,13 @@ from pydrake.systems.framework import (
 
 from systems.attempt_history import AttemptHistory, LeftOverVector
 from systems.contact_guard import ContactGuard
+from systems.floating_hand_motion import HandMotion
 from systems.hand_geometry import check_reach
-from systems.hand_motion import shortest_yaws
 from systems.motion_heights import motion_heights
-from systems.pick_place_motion import YAW, YAW_LIMIT, PickPlaceMotion, PlannerState
 from systems.pick_place_parameters import Mode, PickPlaceParameters
 from systems.pick_place_steps import Moment, PickPlaceSteps
+from systems.planner_state import PlannerState
+from systems.robot_motion import RobotMotion
 from systems.signals import (
     STOP_REASONS,
     Observation,
@@ -106,6 +107,7 @@ class PickPlacePlanner(LeafSystem):
       searches for the cavity. It lowers again once the resistance ends.
     - An action with `press` ends with `DESCEND`, with closed jaws, at `touch_speed`, until
       `press_force` is reached.
+    - An action that the robot cannot reach ends before anything moves, as "unreachable".
     - In all modes, a contact force beyond `force_limit` ends the action (see `ContactGuard`): the
       hand stops dead, lets go of what it holds, and retreats. It counts as a failed pick.
 
@@ -117,6 +119,7 @@ class PickPlacePlanner(LeafSystem):
         *,
         parameters: PickPlaceParameters,
         max_actions: int,
+        motion: RobotMotion | None = None,
         insertion: bool = False,
         period: float = 1 / 64,
         force_period: float = 1 / 128,
@@ -125,6 +128,7 @@ class PickPlacePlanner(LeafSystem):
         Args:
             parameters: heights, speeds, thresholds.
             max_actions: stop after this many actions, unless `parameters.max_actions` overrides it.
+            motion: moves the hand; None: `HandMotion`.
             insertion: whether to search for a cavity when a place is blocked.
             period: update period of the state machine, in s.
             force_period: period of the force guard and of the guarded motions, in s: the plant's
@@ -134,7 +138,7 @@ class PickPlacePlanner(LeafSystem):
         self._parameters = parameters
         given = parameters.max_actions
         self._max_actions = max_actions if given is None else given
-        self._motion = PickPlaceMotion(parameters)
+        self._motion = motion or HandMotion(parameters)
         self._state_index = self.DeclareDiscreteState(self._motion.initial_state())
         self._history_index = self.DeclareDiscreteState(np.full(AttemptHistory.size, np.nan))
         self._left_over_index = self.DeclareDiscreteState(np.zeros(LeftOverVector.size))
@@ -153,7 +157,7 @@ class PickPlacePlanner(LeafSystem):
         self._wrist_moment = self.DeclareVectorInputPort("wrist_moment", 1)
         state_and_time = {self.discrete_state_ticket(self._state_index), self.time_ticket()}
         self._motion_port = self.DeclareVectorOutputPort(
-            "desired_motion", 12, self._calc_motion, state_and_time
+            "desired_motion", self._motion.size, self._calc_motion, state_and_time
         )
         self.DeclareVectorOutputPort("desired_opening", 2, self._calc_opening, state_and_time)
         self.DeclareVectorOutputPort("closing_force", 1, self._calc_force, state_and_time)
@@ -179,7 +183,7 @@ class PickPlacePlanner(LeafSystem):
             )
 
     def _state(self, context: Context) -> PlannerState:
-        return PlannerState(context.get_discrete_state(self._state_index).get_value())
+        return self._motion.view(context.get_discrete_state(self._state_index).get_value())
 
     # Outputs.
 
@@ -239,7 +243,9 @@ class PickPlacePlanner(LeafSystem):
         if state.mode in (Mode.OBSERVE, Mode.DONE):
             return EventStatus.DidNothing()
         before = state.mode, state.stops, _peak(state)
-        self._steps.feel(moment, self._motion_port.Eval(context)[8:11])
+        desired = self._motion_port.Eval(context)
+        acceleration = self._motion.hand_acceleration(state, moment.time, desired)
+        self._steps.feel(moment, acceleration)
         self._conclude(before[0], state, discrete_state)
         if before[0] == Mode.RETREAT and before[1:] != (state.stops, _peak(state)):
             history = AttemptHistory(discrete_state.get_mutable_value(self._history_index))
@@ -247,7 +253,7 @@ class PickPlacePlanner(LeafSystem):
         return EventStatus.Succeeded()
 
     def _moment(self, context: Context, discrete_state: DiscreteValues) -> Moment:
-        state = PlannerState(discrete_state.get_mutable_value(self._state_index))
+        state = self._motion.view(discrete_state.get_mutable_value(self._state_index))
         feels = state.mode == Mode.LIFT and self._wrist_moment.HasValue(context)
         return Moment(
             state,
@@ -295,11 +301,6 @@ class PickPlacePlanner(LeafSystem):
         check_reach(action)
         if action.press:
             action = dataclasses.replace(action, place=action.pick)
-        pick_yaw, place_yaw = shortest_yaws(
-            action.pick.theta, action.place.theta, float(state.goal[YAW]), YAW_LIMIT
-        )
-        state.pick = (action.pick.x, action.pick.y, pick_yaw)
-        state.place = (action.place.x, action.place.y, place_yaw)
         self._set_heights(state, self._heights(context, action))
         state.search_step, state.press, state.aside = 0, action.press, action.aside
         state.stops = state.doubts_grip = 0
@@ -307,6 +308,8 @@ class PickPlacePlanner(LeafSystem):
         state.set_downs = kept.set_downs(action.pick)
         state.actions += 1
         self._guard.reset(state)
+        state.pick, state.place = action.pick.as_array(), action.place.as_array()
+        state.refused = not self._motion.prepare(state)
         self._motion.begin(state, Mode.APPROACH, time)
 
     def _has_settled(self, state: PlannerState, time: float) -> bool:
@@ -349,6 +352,8 @@ def _action_of(state: PlannerState) -> PickPlaceAction:
 
 def _outcome(before: float, state: PlannerState) -> str:
     """How an action has ended, by the mode before `RETREAT`."""
+    if state.refused:
+        return "unreachable"
     if state.stops:
         return "stopped"
     if state.doubts_grip and before == Mode.RELEASE:

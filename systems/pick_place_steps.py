@@ -16,8 +16,9 @@ from systems.grip_force import (
     moment_at_rest,
     turns_in_the_pads,
 )
-from systems.pick_place_motion import PickPlaceMotion, PlannerState, Z
 from systems.pick_place_parameters import Mode, PickPlaceParameters
+from systems.planner_state import PlannerState, Z
+from systems.robot_motion import RobotMotion
 
 _HOLDING = (Mode.LIFT, Mode.CARRY, Mode.LOWER, Mode.SEARCH, Mode.RELEASE)
 """The modes in which an object may be in the hand."""
@@ -48,7 +49,7 @@ class PickPlaceSteps:
     def __init__(
         self,
         parameters: PickPlaceParameters,
-        motion: PickPlaceMotion,
+        motion: RobotMotion,
         guard: ContactGuard,
         search_steps: int,
     ) -> None:
@@ -107,6 +108,8 @@ class PickPlaceSteps:
         state, time = moment.state, moment.time
         if time >= self._motion.arrival(state):
             following = Mode.OBSERVE if state.mode == Mode.RETREAT else Mode(int(state.mode) + 1)
+            if state.mode == Mode.APPROACH and state.refused:
+                following = Mode.RETREAT
             self._motion.begin(state, following, time)
 
     def descend(self, moment: Moment) -> None:
@@ -121,8 +124,7 @@ class PickPlaceSteps:
         elif contact[2] > self._parameters.contact_threshold:
             self._motion.begin(state, Mode.CLOSE, time, z=hand[2])
             # Back off a little: the jaws cannot close while the fingertips press.
-            state.goal[Z] += self._parameters.floor_clearance
-            self._motion.set_times(state)
+            self._motion.back_off(state, self._parameters.floor_clearance)
         elif time >= self._motion.arrival(state):
             self._motion.begin(state, Mode.CLOSE, time)
 
@@ -156,7 +158,8 @@ class PickPlaceSteps:
     def lift(self, moment: Moment) -> None:
         """Lifts the object, or sets it down again if it would turn between the pads."""
         state, time = moment.state, moment.time
-        acceleration = float(self._motion.motion_at(state, time)[8 + Z])
+        desired = self._motion.motion_at(state, time)
+        acceleration = float(self._motion.hand_acceleration(state, time, desired)[Z])
         weight = felt_weight(moment.contact[2], acceleration)
         turning = moment.wrist_moment
         if state.doubts_grip:
@@ -207,7 +210,9 @@ class PickPlaceSteps:
     def hold(self, moment: Moment) -> None:
         """Lifts and carries while an object is held."""
         state, time, hand, contact = moment.state, moment.time, moment.hand, moment.contact
-        weight = felt_weight(contact[2], self._motion.motion_at(state, time)[8 + Z])
+        desired = self._motion.motion_at(state, time)
+        acceleration = self._motion.hand_acceleration(state, time, desired)
+        weight = felt_weight(contact[2], acceleration[Z])
         force = grip_force(weight, float(state.goal_force), self._parameters)
         self._motion.set_force(state, time, force)
         if state.mode == Mode.LIFT and lifts_too_early(force, self._motion.force_at(state, time)):

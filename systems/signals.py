@@ -254,10 +254,11 @@ class LeftOver:
     """World (x, y) of each cavity's middle, in metres."""
 
 
-OUTCOMES = ("placed", "missed", "dropped", "pressed", "stopped", "set down")
+OUTCOMES = ("placed", "missed", "dropped", "pressed", "stopped", "set down", "unreachable")
 """How an action may end: the object was let go at its place, nothing was grasped, the object was
-lost on the way, it was pressed down, a contact force above the limit ended the action, or the
-object was set down at the pick because it would have turned between the pads."""
+lost on the way, it was pressed down, a contact force above the limit ended the action, the object
+was set down at the pick because it would have turned between the pads, or the robot did not move
+because it cannot reach the poses."""
 
 
 @dataclass(frozen=True)

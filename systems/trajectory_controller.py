@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 from pydrake.systems.framework import BasicVector, Context, LeafSystem
@@ -9,6 +12,42 @@ from pydrake.systems.framework import BasicVector, Context, LeafSystem
 HAND_AXES = 4
 """x, y, z and yaw of the point midway between the fingertips."""
 FINGERS = 2
+
+
+@dataclass(frozen=True)
+class FingerLaw:
+    """The force of each finger's drive.
+
+    With the opening w = q_L + q_R (closed at zero), the desired one w_d and the closing force f,
+
+        u_finger = clip(k_w (w_d - w)/2 + d_w (w_d' - w')/2 - f, -f_max, f_max).
+
+    The plant's mimic constraint centres the pair.
+    """
+
+    stiffness: float
+    """k_w, in N/m."""
+    damping: float
+    """d_w, in N s/m."""
+    force_limit: float
+    """f_max, in N."""
+
+    def force(self, state: Sequence[float], opening: Sequence[float], closing: float) -> float:
+        """u_finger in N.
+
+        Args:
+            state: q_L, q_R and their rates, in m and m/s.
+            opening: w_d and its rate, in m and m/s.
+            closing: f, in N.
+        """
+        left, right, left_rate, right_rate = state
+        wanted, rate = opening
+        force = (
+            self.stiffness * (wanted - left - right) / 2
+            + self.damping * (rate - left_rate - right_rate) / 2
+            - closing
+        )
+        return min(max(force, -self.force_limit), self.force_limit)
 
 
 class TrajectoryController(LeafSystem):
@@ -40,11 +79,7 @@ class TrajectoryController(LeafSystem):
     with M the effective inertia of each axis and g the hand's own weight on z. The payload is
     unknown and causes a sag of payload weight / k_p.
 
-    The fingers (q_L, q_R; opening w = q_L + q_R, closed at zero) follow
-
-        u_finger = clip(k_w (w_d - w)/2 + d_w (w_d' - w')/2 - f, -f_max, f_max)
-
-    each. The plant's mimic constraint centres the pair.
+    The fingers follow the `FingerLaw`.
 
     Stateless.
     """
@@ -57,9 +92,7 @@ class TrajectoryController(LeafSystem):
         stiffness: NDArray[np.float64],
         damping: NDArray[np.float64],
         force_limit: NDArray[np.float64],
-        finger_stiffness: float,
-        finger_damping: float,
-        finger_force_limit: float,
+        fingers: FingerLaw,
     ) -> None:
         """All arrays are (4): x, y, z, yaw.
 
@@ -69,9 +102,7 @@ class TrajectoryController(LeafSystem):
             stiffness: k_p, in N/m and N m/rad.
             damping: k_d, in N s/m and N m s/rad.
             force_limit: u_max, in N and N m.
-            finger_stiffness: k_w, in N/m.
-            finger_damping: d_w, in N s/m.
-            finger_force_limit: f_max of each finger, in N.
+            fingers: the law of the fingers.
 
         Raises:
             ValueError: an array has the wrong size, or a limit is not positive.
@@ -85,7 +116,7 @@ class TrajectoryController(LeafSystem):
         }.items():
             if np.shape(value) != (HAND_AXES,):
                 raise ValueError(f"{name} must hold {HAND_AXES} numbers, not {np.shape(value)}")
-        if np.any(np.asarray(force_limit) <= 0) or finger_force_limit <= 0:
+        if np.any(np.asarray(force_limit) <= 0) or fingers.force_limit <= 0:
             raise ValueError("force limits must be positive")
         # For each axis: inertia, weight, stiffness, damping, force limit.
         self._axes = [
@@ -94,9 +125,7 @@ class TrajectoryController(LeafSystem):
                 inertia, (0.0, 0.0, weight, 0.0), stiffness, damping, force_limit, strict=True
             )
         ]
-        self._finger_stiffness = finger_stiffness
-        self._finger_damping = finger_damping
-        self._finger_force_limit = finger_force_limit
+        self._fingers = fingers
 
         self._hand_state = self.DeclareVectorInputPort("hand_state", 2 * (HAND_AXES + FINGERS))
         self._desired_motion = self.DeclareVectorInputPort("desired_motion", 3 * HAND_AXES)
@@ -117,13 +146,8 @@ class TrajectoryController(LeafSystem):
                 + damping * (desired[HAND_AXES + i] - state[HAND_AXES + FINGERS + i])
             )
             forces.append(min(max(force, -limit), limit))
-        opening, opening_rate = self._desired_opening.Eval(context).tolist()
         press = self._closing_force.Eval(context)[0] if self._closing_force.HasValue(context) else 0
-        finger = (
-            self._finger_stiffness * (opening - state[4] - state[5]) / 2
-            + self._finger_damping * (opening_rate - state[10] - state[11]) / 2
-            - press
+        finger = self._fingers.force(
+            (*state[4:6], *state[10:12]), self._desired_opening.Eval(context).tolist(), float(press)
         )
-        limit = self._finger_force_limit
-        finger = min(max(finger, -limit), limit)
         output.SetFromVector([*forces, *[finger] * FINGERS])

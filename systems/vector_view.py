@@ -58,8 +58,8 @@ class VectorView:
     """Number of elements of the vector."""
 
     def __init_subclass__(cls) -> None:
-        cls.size = 0
-        for field in vars(cls).values():
+        # The fields of a subclass follow those of its base, whose size it inherits.
+        for field in list(vars(cls).values()):
             if isinstance(field, Number | Array):
                 field.index = cls.size
                 cls.size += field.size

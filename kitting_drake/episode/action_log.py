@@ -84,7 +84,8 @@ class ActionLog:
                 place_angle_error_deg=None,
             )
         elif event.mode == Mode.RETREAT and event.previous != Mode.RELEASE:
-            self.records[-1].outcome = "missed" if event.previous == Mode.CHECK else "dropped"
+            by_mode = {Mode.APPROACH: "unreachable", Mode.CHECK: "missed"}
+            self.records[-1].outcome = by_mode.get(event.previous, "dropped")
 
     def _note_set_down(self, event: ModeChange) -> None:
         station = self._station

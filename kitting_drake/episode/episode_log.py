@@ -18,13 +18,11 @@ from kitting_drake.common.extras import import_extra
 from kitting_drake.common.files import write_atomically
 from kitting_drake.episode.mcap_messages import definition, mcap_messages
 from kitting_drake.station import KittingStation
+from kitting_drake.station.robot import joint_names
 from systems.pick_place_parameters import Mode
 
 ENDINGS = (".npz", ".mcap")
-JOINTS = ("x", "y", "z", "yaw")
-"""The log's names of the floating hand's joints."""
-
-_SAMPLED = ("time", "state", "torque", "wrist", "commanded", "opening", "mode")
+_SAMPLED = ("time", "state", "hand", "torque", "wrist", "commanded", "opening", "mode")
 
 Arrays = dict[str, NDArray[Any]]
 
@@ -104,6 +102,7 @@ class EpisodeLog:
         for key, value in (
             ("time", np.array(root_context.get_time())),
             ("state", port("robot_state")),
+            ("hand", port("hand_state")[:4]),
             ("torque", port("actuation")),
             ("wrist", port("wrist_force")),
             ("commanded", port("commanded")),
@@ -131,10 +130,12 @@ class EpisodeLog:
             For each step:
 
             - `time` (n); `mode` (n), a `Mode`;
-            - `joint_position`, `joint_velocity`, `joint_torque` (n, 4), of x, y, z, yaw;
+            - `joint_position`, `joint_velocity`, `joint_torque` (n, j), of the robot's joints: x,
+              y, z and yaw of the floating hand, or the seven of an arm;
+            - `hand_pose` (n, 4), x, y, z and yaw of the hand;
             - `finger_position`, `finger_force` (n, 2), the force of the actuators;
             - `wrist_force` (n, 6), contact on x, y, z, about z, and on each finger;
-            - `commanded_position`, `commanded_velocity`, `commanded_acceleration` (n, 4);
+            - `commanded_position`, `commanded_velocity`, `commanded_acceleration` (n, j);
             - `commanded_opening` (n, 2), value and rate;
             - `object_poses` (n, objects, 3, 4), X_WB.
 
@@ -147,21 +148,24 @@ class EpisodeLog:
             Texts: `joint_names`, `mode_names`, `object_names`.
         """
         found = {key: np.array(values) for key, values in self._samples.items()}
+        names = joint_names(self._station.scenario.robot)
+        j = len(names)
         state, torque, commanded = found["state"], found["torque"], found["commanded"]
         times = np.array([action[0] for action in self._actions])
         picks = np.array([action[1] for action in self._actions]).reshape(-1, 3)
         places = np.array([action[2] for action in self._actions]).reshape(-1, 3)
         arrays: Arrays = {
             "time": found["time"],
-            "joint_position": state[:, :4],
-            "joint_velocity": state[:, 6:10],
-            "joint_torque": torque[:, :4],
-            "finger_position": state[:, 4:6],
-            "finger_force": torque[:, 4:],
+            "joint_position": state[:, :j],
+            "joint_velocity": state[:, j + 2 : 2 * j + 2],
+            "joint_torque": torque[:, :j],
+            "finger_position": state[:, j : j + 2],
+            "finger_force": torque[:, j:],
+            "hand_pose": found["hand"],
             "wrist_force": found["wrist"],
-            "commanded_position": commanded[:, :4],
-            "commanded_velocity": commanded[:, 4:8],
-            "commanded_acceleration": commanded[:, 8:],
+            "commanded_position": commanded[:, :j],
+            "commanded_velocity": commanded[:, j : 2 * j],
+            "commanded_acceleration": commanded[:, 2 * j :],
             "commanded_opening": found["opening"],
             "mode": found["mode"].astype(np.int8),
             "object_poses": np.array(self._poses),
@@ -169,7 +173,7 @@ class EpisodeLog:
             "pick": picks,
             "place": places,
             "press": np.array([action[3] for action in self._actions], bool),
-            "joint_names": np.array(JOINTS),
+            "joint_names": np.array(names),
             "mode_names": np.array([mode.name for mode in Mode]),
             "object_names": np.array([item.name for item in self._station.objects]),
         }

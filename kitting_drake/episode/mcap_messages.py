@@ -144,7 +144,7 @@ def _action(arrays: Mapping[str, NDArray[Any]], index: int, time: float) -> Iter
 def _transforms(
     arrays: Mapping[str, NDArray[Any]], index: int, time: float
 ) -> Iterator[dict[str, Any]]:
-    x, y, z, yaw = arrays["joint_position"][index].tolist()
+    x, y, z, yaw = arrays["hand_pose"][index].tolist()
     frames = [("hand", (x, y, z), _yaw(yaw))]
     for name, X_WB in zip(
         arrays["object_names"].tolist(), arrays["object_poses"][index], strict=True

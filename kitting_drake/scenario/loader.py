@@ -87,7 +87,7 @@ def _onto(raw: dict, defaults: Scenario) -> tuple[dict, Scenario]:
     variant. If a tag selects another variant, the mappings given replace its default mappings.
     """
     tagged = dict(raw)
-    for name in ("task", "policy"):
+    for name in ("task", "policy", "robot"):
         if name in raw:
             tagged[name] = _of_variant(raw[name], getattr(defaults, name))
     task = tagged.get("task")
@@ -206,6 +206,7 @@ def _check_meaning(scenario: Scenario) -> None:
         )
     if scenario.heightmap.z_max <= scenario.heightmap.z_min:
         raise ValueError("heightmap.z_max must be above heightmap.z_min")
+    scenario.robot.validate(scenario.heightmap.grid())
     scenario.task.validate()
     scenario.appearance.validate()
     for key, camera in scenario.cameras.items():

@@ -17,6 +17,7 @@ from pydrake.multibody.plant import MultibodyPlantConfig
 from kitting_drake.scenario.appearance import Appearance
 from kitting_drake.scenario.cameras import Camera, Pinhole
 from kitting_drake.scenario.policies import Oracle, Policy
+from kitting_drake.scenario.robots import FloatingHand, Robot
 from kitting_drake.tasks import Kitting, Task
 from systems.bounds import bounded
 from systems.pick_place_parameters import PickPlaceParameters
@@ -138,6 +139,9 @@ class Scenario:
 
     # The policy's observation.
     heightmap: Heightmap = dc.field(default_factory=Heightmap)
+
+    # !FloatingHand, or !FrankaArm for a whole arm: see robots.py.
+    robot: Robot = dc.field(default_factory=FloatingHand)
 
     # The motion of the hand, and its control.
     planner: PickPlaceParameters = dc.field(default_factory=PickPlaceParameters)

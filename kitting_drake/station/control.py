@@ -1,14 +1,24 @@
-"""Adds the planner and the hand's controller to the station."""
+"""Adds the planner and the robot's controller to the station."""
+
+from dataclasses import dataclass
 
 import numpy as np
 from pydrake.multibody.plant import MultibodyPlant
-from pydrake.systems.framework import DiagramBuilder
+from pydrake.systems.framework import DiagramBuilder, InputPort, OutputPort
+from pydrake.systems.primitives import Demultiplexer, Multiplexer
 
+from kitting_drake.scenario.robots import FrankaArm
 from kitting_drake.scenario.schema import Scenario
+from kitting_drake.station.robot import ARM, HAND, HAND_JOINT_NAMES, arm_model
 from kitting_drake.tasks.task import Scene
+from systems.arm_hand_state import ArmHandState
+from systems.arm_limits import JOINTS
 from systems.heightmap_projector import HeightmapProjector
+from systems.joint_controller import JointController
 from systems.pick_place_planner import PickPlacePlanner
-from systems.trajectory_controller import TrajectoryController
+from systems.robot_motion import RobotMotion
+from systems.trajectory_controller import FINGERS, FingerLaw, TrajectoryController
+from systems.wrist_force import WristForce
 from systems.wrist_moment import WristMoment
 
 _EXPORTED = {
@@ -25,12 +35,27 @@ _EXPORTED = {
 """Names of the planner's output ports, and the station's names for them."""
 
 
+@dataclass(frozen=True)
+class _Driven:
+    """A robot with its controller, in the Diagram."""
+
+    controller: JointController | TrajectoryController
+    robot_state: OutputPort
+    hand_state: OutputPort
+    wrist_force: OutputPort
+    actuation: OutputPort
+    wrist_moment: OutputPort | None = None
+    """None for an arm."""
+
+
 def add_control(
     builder: DiagramBuilder,
     scenario: Scenario,
     scene: Scene,
     plant: MultibodyPlant,
     projector: HeightmapProjector | None,
+    motion: RobotMotion,
+    seed: int,
 ) -> PickPlacePlanner:
     """Adds planner and controller, connects them to the plant, and exports their ports.
 
@@ -38,52 +63,136 @@ def add_control(
         builder: the builder of the station.
         scenario: configures planner and controller.
         scene: says how many actions there are, and whether objects are inserted.
-        plant: finalized, with the hand.
+        plant: finalized, with the robot.
         projector: provides o_t, from which the planner reads heights; None if each action carries
             its heights.
+        motion: the robot's.
+        seed: the seed of the noise of an arm's wrist force.
     """
-    hand = plant.GetModelInstanceByName("franka_hand")
     planner = builder.AddNamedSystem(
         "planner",
         PickPlacePlanner(
             parameters=scenario.planner,
             max_actions=scene.max_actions,
+            motion=motion,
             insertion=any(goal.rim_height is not None for goal in scene.goals),
             force_period=plant.time_step(),
         ),
     )
-    controller = builder.AddNamedSystem("controller", _make_controller(scenario, plant))
-    state = plant.get_state_output_port(hand)
-    force = plant.get_generalized_contact_forces_output_port(hand)
+    if isinstance(scenario.robot, FrankaArm):
+        driven = _drive_arm(builder, scenario, scenario.robot, plant, seed)
+    else:
+        driven = _drive_hand(builder, scenario, plant)
     builder.ExportInput(planner.GetInputPort("action"), "action")
     if projector is not None:
         builder.Connect(projector.GetOutputPort("heights"), planner.GetInputPort("observation"))
-    builder.Connect(state, planner.GetInputPort("hand_state"))
-    builder.Connect(force, planner.GetInputPort("hand_contact_force"))
-    reactions = plant.get_reaction_forces_output_port()
-    wrist = builder.AddNamedSystem(
-        "wrist_moment",
-        WristMoment(reactions, plant.GetJointIndices().index(plant.GetJointByName("yaw").index())),
-    )
-    builder.Connect(reactions, wrist.get_input_port())
-    builder.Connect(wrist.get_output_port(), planner.GetInputPort("wrist_moment"))
-    builder.Connect(state, controller.GetInputPort("hand_state"))
+    builder.Connect(driven.hand_state, planner.GetInputPort("hand_state"))
+    builder.Connect(driven.wrist_force, planner.GetInputPort("hand_contact_force"))
+    if driven.wrist_moment is not None:
+        builder.Connect(driven.wrist_moment, planner.GetInputPort("wrist_moment"))
     for port in ("desired_motion", "desired_opening", "closing_force"):
-        builder.Connect(planner.GetOutputPort(port), controller.GetInputPort(port))
-    builder.Connect(controller.get_output_port(), plant.get_actuation_input_port(hand))
+        builder.Connect(planner.GetOutputPort(port), driven.controller.GetInputPort(port))
     for port, name in _EXPORTED.items():
         builder.ExportOutput(planner.GetOutputPort(port), name)
-    builder.ExportOutput(controller.get_output_port(), "actuation")
-    builder.ExportOutput(state, "robot_state")
-    builder.ExportOutput(force, "wrist_force")
+    builder.ExportOutput(driven.actuation, "actuation")
+    builder.ExportOutput(driven.robot_state, "robot_state")
+    builder.ExportOutput(driven.hand_state, "hand_state")
+    builder.ExportOutput(driven.wrist_force, "wrist_force")
     return planner
 
 
-def _make_controller(scenario: Scenario, plant: MultibodyPlant) -> TrajectoryController:
+def _drive_hand(builder: DiagramBuilder, scenario: Scenario, plant: MultibodyPlant) -> _Driven:
+    """Adds the controller of the floating hand."""
+    hand = plant.GetModelInstanceByName(HAND)
+    state = plant.get_state_output_port(hand)
+    controller = builder.AddNamedSystem("controller", _hand_controller(scenario, plant))
+    builder.Connect(state, controller.GetInputPort("hand_state"))
+    builder.Connect(controller.get_output_port(), plant.get_actuation_input_port(hand))
+    force = plant.get_generalized_contact_forces_output_port(hand)
+    reactions = plant.get_reaction_forces_output_port()
+    yaw = plant.GetJointByName("yaw").index()
+    moment = builder.AddNamedSystem(
+        "wrist_moment", WristMoment(reactions, plant.GetJointIndices().index(yaw))
+    )
+    builder.Connect(reactions, moment.get_input_port())
+    return _Driven(
+        controller,
+        state,
+        state,
+        force,
+        controller.get_output_port(),
+        wrist_moment=moment.get_output_port(),
+    )
+
+
+def _drive_arm(
+    builder: DiagramBuilder, scenario: Scenario, robot: FrankaArm, plant: MultibodyPlant, seed: int
+) -> _Driven:
+    """Adds the controller of an arm, and what it senses."""
+    arm, hand = (plant.GetModelInstanceByName(name) for name in (ARM, HAND))
+    model, gripper = arm_model(robot)
+    controller = builder.AddNamedSystem(
+        "controller",
+        JointController(arm=model, step=plant.time_step(), fingers=_finger_law(scenario)),
+    )
+    robot_state = _robot_state(builder, plant)
+    wrist = builder.AddNamedSystem(
+        "wrist_force",
+        WristForce(arm=model, gripper=gripper, noise=robot.torque_noise, seed=seed),
+    )
+    hand_state = builder.AddNamedSystem("hand_state", ArmHandState(robot.arm_base()))
+    actuation = builder.AddNamedSystem("actuation", Multiplexer([JOINTS, FINGERS]))
+
+    def connect(source: OutputPort, *targets: InputPort) -> None:
+        for target in targets:
+            builder.Connect(source, target)
+
+    connect(
+        robot_state,
+        *(it.GetInputPort("robot_state") for it in (controller, wrist, hand_state)),
+    )
+    for instance, port in ((arm, "joint_contact_torque"), (hand, "finger_contact_force")):
+        force = plant.get_generalized_contact_forces_output_port(instance)
+        connect(force, wrist.GetInputPort(port))
+    connect(controller.GetOutputPort("desired_state"), plant.get_desired_state_input_port(arm))
+    connect(controller.GetOutputPort("feedforward"), plant.get_actuation_input_port(arm))
+    connect(plant.get_net_actuation_output_port(arm), actuation.get_input_port(0))
+    connect(
+        controller.GetOutputPort("finger_force"),
+        plant.get_actuation_input_port(hand),
+        actuation.get_input_port(1),
+    )
+    return _Driven(
+        controller,
+        robot_state,
+        hand_state.get_output_port(),
+        wrist.get_output_port(),
+        actuation.get_output_port(),
+    )
+
+
+def _robot_state(builder: DiagramBuilder, plant: MultibodyPlant) -> OutputPort:
+    """Joins the states of arm and hand: positions of joints and fingers, then velocities."""
+    joined = builder.AddNamedSystem("robot_state", Multiplexer([JOINTS, FINGERS, JOINTS, FINGERS]))
+    for index, (name, size) in enumerate(((ARM, JOINTS), (HAND, FINGERS))):
+        halves = builder.AddNamedSystem(f"{name}_state", Demultiplexer([size, size]))
+        state = plant.get_state_output_port(plant.GetModelInstanceByName(name))
+        builder.Connect(state, halves.get_input_port())
+        for half in range(2):
+            builder.Connect(halves.get_output_port(half), joined.get_input_port(2 * half + index))
+    return joined.get_output_port()
+
+
+def _finger_law(scenario: Scenario) -> FingerLaw:
+    config = scenario.controller
+    return FingerLaw(config.finger_stiffness, config.finger_damping, config.finger_force_limit)
+
+
+def _hand_controller(scenario: Scenario, plant: MultibodyPlant) -> TrajectoryController:
     config = scenario.controller
     context = plant.CreateDefaultContext()
-    hand = plant.GetModelInstanceByName("franka_hand")
-    joints = [plant.GetJointByName(name) for name in ("x", "y", "z", "yaw")]
+    hand = plant.GetModelInstanceByName(HAND)
+    joints = [plant.GetJointByName(name) for name in HAND_JOINT_NAMES]
     indices = [joint.velocity_start() for joint in joints]
     inertia = plant.CalcMassMatrix(context).diagonal()[indices]
     gravity = plant.CalcGravityGeneralizedForces(context)
@@ -94,7 +203,5 @@ def _make_controller(scenario: Scenario, plant: MultibodyPlant) -> TrajectoryCon
         stiffness=np.array(config.stiffness),
         damping=np.array(config.damping),
         force_limit=np.array(config.force_limit),
-        finger_stiffness=config.finger_stiffness,
-        finger_damping=config.finger_damping,
-        finger_force_limit=config.finger_force_limit,
+        fingers=_finger_law(scenario),
     )

@@ -1,4 +1,4 @@
-"""Builds the station's plant: table, fixtures, objects and hand."""
+"""Builds the station's plant: table, fixtures and objects; see `robot` for the robot."""
 
 from pathlib import Path
 
@@ -32,12 +32,12 @@ def add_plant(builder: DiagramBuilder, scenario: Scenario) -> tuple[MultibodyPla
 def add_models(
     plant: MultibodyPlant, scene: Scene, variation: Variation, seed: int
 ) -> tuple[tuple[PlacedObject, ...], tuple[BodyIndex, ...]]:
-    """Adds the table, the scene's fixtures and objects, and the hand.
+    """Adds the table, and the scene's fixtures and objects.
 
     Args:
         plant: not finalized yet.
         scene: the scene of the episode.
-        variation: ranges of friction and mass; the hand's are not varied.
+        variation: ranges of friction and mass.
         seed: the seed of the draws.
 
     Returns:
@@ -74,7 +74,6 @@ def add_models(
                 item.name, body.index(), item.p_BPoints, item.symmetry, item.axis, p_BCom=com
             )
         )
-    _add_model(parser, MODELS / "franka_hand" / "franka_hand.sdf")
     return tuple(objects), tuple(body.index() for body in still)
 
 
@@ -103,15 +102,11 @@ def _add_body(
 
 
 def set_initial_poses(
-    plant: MultibodyPlant, scenario: Scenario, scene: Scene, objects: tuple[PlacedObject, ...]
+    plant: MultibodyPlant, scene: Scene, objects: tuple[PlacedObject, ...]
 ) -> None:
-    """Sets the plant's default state: the scene's poses, and the open hand at home."""
+    """Sets the default poses of the objects: those of the scene."""
     for placed, item in zip(objects, scene.objects, strict=True):
         plant.SetDefaultFloatingBaseBodyPose(plant.get_body(placed.body), item.X_WB)
-    for joint, position in zip(("x", "y", "z", "yaw"), scenario.planner.home, strict=True):
-        plant.GetJointByName(joint).set_default_positions([position])
-    for joint in ("left_finger_slide", "right_finger_slide"):
-        plant.GetJointByName(joint).set_default_positions([scenario.planner.open_width / 2])
 
 
 def bounded_body(plant: MultibodyPlant, scene_graph: SceneGraph, body: RigidBody) -> BoundedBody:

@@ -15,11 +15,14 @@ from pydrake.systems.framework import Context, Diagram, DiagramBuilder, EventSta
 
 from kitting_drake.common.errors import UserError
 from kitting_drake.common.rendering import can_render
+from kitting_drake.scenario.robots import FrankaArm
 from kitting_drake.scenario.schema import Scenario
 from kitting_drake.station.control import add_control
+from kitting_drake.station.held_bodies import ArmPath
 from kitting_drake.station.mass_centres import correct_drift
 from kitting_drake.station.paint import paint_surfaces
 from kitting_drake.station.plant import add_models, add_plant, bounded_body, set_initial_poses
+from kitting_drake.station.robot import add_robot, arm_model, make_motion, set_home
 from kitting_drake.station.sensing import add_cameras
 from kitting_drake.tasks.task import Scene
 from systems.object_feeder import ObjectFeeder
@@ -34,7 +37,7 @@ Monitor = Callable[[Context], EventStatus]
 
 
 class KittingStation(Diagram):
-    """A table with objects, a robot hand, cameras and controllers. The policy is connected outside.
+    """A table with objects, a robot, cameras and controllers. The policy is connected outside.
 
     .. pydrake_system::
 
@@ -52,6 +55,7 @@ class KittingStation(Diagram):
         - mode
         - counts
         - robot_state
+        - hand_state
         - wrist_force
         - actuation
         - commanded
@@ -78,10 +82,14 @@ class KittingStation(Diagram):
       has cameras and the machine can render.
     - `failed_picks`, `history`, `peak_force`, `accepted_action`, `asks`, `mode`, `counts`: the
       `PickPlacePlanner`'s.
-    - `robot_state` (12): positions, then velocities of x, y, z, yaw and both fingers; m, rad, s.
-    - `wrist_force` (6): contact forces on x, y, z (N), about z (N m), and on each finger (N).
-    - `actuation` (6): actuation of x, y, z (N), yaw (N m) and each finger (N).
-    - `commanded` (12): q_d, v_d, a_d of x, y, z and yaw. `commanded_opening` (2): the opening
+    - `robot_state` (12 or 18): positions, then velocities of the joints and both fingers; m, rad,
+      s. The floating hand's joints are x, y, z, yaw; an arm has seven.
+    - `hand_state` (12): the same for x, y, z, yaw and both fingers, whatever moves the hand.
+    - `wrist_force` (6): contact forces on x, y, z (N), about z (N m), and on each finger (N). An
+      arm computes them from its joint torques: `WristForce`.
+    - `actuation` (6 or 9): actuation of the joints (N, N m) and of each finger (N). An arm's is
+      that of the last step.
+    - `commanded` (12 or 21): q_d, v_d, a_d of the joints. `commanded_opening` (2): the opening
       between the pads in m, and its rate.
     - `body_poses`, `contact_results`: the plant's. `query_object`: the scene graph's.
     - `at_rest` (n): the `RestDetector`'s; 1 for an object at rest.
@@ -111,8 +119,14 @@ class KittingStation(Diagram):
         )
         """The scene's objects with their bodies, and the bodies of table and fixtures. Held as
         indices: a body would keep the plant, and with it the station, alive forever."""
+        add_robot(self.plant, scenario.robot)
         self.plant.Finalize()
-        set_initial_poses(self.plant, scenario, self.scene, self.objects)
+        set_initial_poses(self.plant, self.scene, self.objects)
+        motion = make_motion(scenario)
+        self._arm_path: ArmPath | None = None
+        if isinstance(scenario.robot, FrankaArm):
+            self._arm_path = ArmPath(*arm_model(scenario.robot), self.plant.time_step())
+        set_home(self.plant, motion, scenario.planner.open_width)
         groups = _surface_groups(self.scene, self.still_bodies, self.objects)
         paint_surfaces(self.plant, self.scene_graph, scenario.appearance, groups, seed)
         projector = None
@@ -122,7 +136,7 @@ class KittingStation(Diagram):
             builder.ExportOutput(projector.GetOutputPort("heights"), "observation_heights")
         self.has_cameras = projector is not None
         """Whether the port `observation` exists."""
-        planner = add_control(builder, scenario, self.scene, self.plant, projector)
+        planner = add_control(builder, scenario, self.scene, self.plant, projector, motion, seed)
         self._add_score_and_rest(builder)
         self._feeder = self._add_feeder(builder)
         for system in (self._monitor, self._feeder):
@@ -278,6 +292,9 @@ class KittingStation(Diagram):
         if abs(math.remainder(root_context.get_time(), step)) < 1e-6 * step:
             context = self.plant.GetMyMutableContextFromRoot(root_context)
             correct_drift(self.plant, context, self._bodies)
+            if self._arm_path is not None:
+                state = self._eval(root_context, "robot_state")
+                self._arm_path.correct(self.plant, context, state, self._bodies)
 
     def _let_appear(self, root_context: Context) -> None:
         """Moves the next object to its place of appearance, if one is to appear; it wakes there."""

@@ -2,8 +2,8 @@ import numpy as np
 import pytest
 
 from systems.contact_guard import ContactGuard
-from systems.pick_place_motion import PlannerState
 from systems.pick_place_parameters import Mode
+from systems.planner_state import PlannerState
 
 STEP = 1 / 128
 GRAVITY = 9.81

@@ -5,7 +5,7 @@ import pytest
 from numpy.typing import NDArray
 from pydrake.systems.framework import Context
 
-from systems.trajectory_controller import TrajectoryController
+from systems.trajectory_controller import FingerLaw, TrajectoryController
 
 INERTIA = np.array([2.0, 2.0, 1.5, 0.01])
 WEIGHT = 12.0
@@ -18,9 +18,7 @@ PARAMETERS: dict[str, Any] = {
     "stiffness": STIFFNESS,
     "damping": DAMPING,
     "force_limit": LIMIT,
-    "finger_stiffness": 500.0,
-    "finger_damping": 10.0,
-    "finger_force_limit": 40.0,
+    "fingers": FingerLaw(stiffness=500.0, damping=10.0, force_limit=40.0),
 }
 
 Q, V = np.array([0.4, 0.1, 0.2, 0.3]), np.array([0.1, -0.2, 0.05, 0.5])
@@ -117,7 +115,8 @@ def test_an_array_of_the_wrong_size_raises(name: str):
 
 
 @pytest.mark.parametrize(
-    "limit", [{"force_limit": np.array([1.0, 1.0, 0.0, 1.0])}, {"finger_force_limit": 0.0}]
+    "limit",
+    [{"force_limit": np.array([1.0, 1.0, 0.0, 1.0])}, {"fingers": FingerLaw(500.0, 10.0, 0.0)}],
 )
 def test_a_force_limit_of_zero_raises(limit: dict[str, Any]):
     with pytest.raises(ValueError, match="limits"):

@@ -1,8 +1,9 @@
-"""The hand's motion in each mode of the pick-and-place motion primitive."""
+"""The floating hand's motion in each mode of the pick-and-place motion primitive."""
 
 import numpy as np
 from numpy.typing import NDArray
 
+from systems.guarded_marks import guarded_marks
 from systems.hand_motion import (
     PARTS,
     Leg,
@@ -11,95 +12,12 @@ from systems.hand_motion import (
     braking_time,
     motion_at,
     motion_duration,
-    ramp,
+    shortest_yaws,
     time_to_reach,
 )
+from systems.jaw_motion import JawMotion
 from systems.pick_place_parameters import Mode, PickPlaceParameters
-from systems.vector_view import Array, Number, VectorView
-
-X, Y, Z, YAW = range(4)
-"""Indices of the hand's axes in `PlannerState.start` and `goal`."""
-
-
-RECENT = 16
-"""How many contact forces the state keeps."""
-
-
-class PlannerState(VectorView):
-    """The planner's state vector, in SI units."""
-
-    mode = Number()
-    start_time = Number()
-    duration = Number()
-    start = Array(4)
-    """x, y, z and yaw at the start of the present motion."""
-    goal = Array(4)
-    """x, y, z and yaw at its end."""
-    start_rate = Array(4)
-    """The velocities at its start."""
-    delays = Array(3)
-    """When each of the motion's `PARTS` begins, after `start_time`."""
-    leg_ways = Array(3)
-    """The ways of a guarded motion along z, in order; zero if there is none."""
-    leg_delays = Array(3)
-    start_opening = Number()
-    goal_opening = Number()
-    start_force = Number()
-    goal_force = Number()
-    force_start_time = Number()
-    pick = Array(3)
-    """x, y and yaw of the hand at the pick. Likewise `place`."""
-    place = Array(3)
-    grasp_z = Number()
-    travel_z = Number()
-    clear_z = Number()
-    pick_top_z = Number()
-    pick_hover_z = Number()
-    place_hover_z = Number()
-    table_z = Number()
-    support_z = Number()
-    rim_z = Number()
-    floor_z = Number()
-    doubt = Number()
-    """The uncertainty of these heights."""
-    hold_z = Number()
-    """Height of the hand when it gripped; `touch_z`: when the object touched a cavity's rim."""
-    touch_z = Number()
-    search_step = Number()
-    payload = Number()
-    """The vertical force of the payload, in N."""
-    weighings = Number()
-    """How many samples the payload is the mean of."""
-    beyond = Number()
-    """For how long the contact force has been beyond the limit, in s."""
-    recent = Array(3 * RECENT)
-    """x, y and z of the last contact forces, latest first, without weight and inertia of the held
-    object, in N."""
-    peak_vertical = Number()
-    """The largest contact forces of the action, in N."""
-    peak_lateral = Number()
-    peak_mode = Number()
-    """The mode in which the larger one rose."""
-    actions = Number()
-    missed = Number()
-    dropped = Number()
-    stopped = Number()
-    stops = Number()
-    """1 if the force guard has ended the action, else 0."""
-    press = Number()
-    """1 if the action presses, else 0."""
-    aside = Number()
-    """1 if the action lays the object aside, else 0."""
-    lever = Number()
-    """How far the centre of mass of an object that is set down lies from the pads' middle along
-    them, in m."""
-    doubts_grip = Number()
-    """1 if the object seems to turn between the pads, and is set down again if it does, else 0."""
-    set_downs = Number()
-    """How many earlier actions have set this object down."""
-    stop = Number()
-    """0 while there are actions; then 1 plus the index of the reason in `STOP_REASONS`."""
-
+from systems.planner_state import YAW, PlannerState, X, Y, Z
 
 YAW_LIMIT = 3.4
 """Largest yaw of the wrist either way, in rad, just short of its joint limit."""
@@ -111,15 +29,18 @@ _OVERSHOOT = 0.05
 """How far above the travel height a lift aims, in m, so that the hand passes it without a stop."""
 
 
-class PickPlaceMotion:
-    """Motions, jaw openings and closing forces of all modes, as functions of the state."""
+class HandMotion(JawMotion):
+    """Motions, jaw openings and closing forces of all modes, as functions of the state. See
+    `RobotMotion`."""
+
+    size = 12
 
     def __init__(self, parameters: PickPlaceParameters) -> None:
         """
         Args:
             parameters: heights, speeds, forces.
         """
-        self._parameters = parameters
+        super().__init__(parameters)
         self._limits = parameters.motion_limits()
 
     def initial_state(self) -> NDArray[np.float64]:
@@ -127,9 +48,19 @@ class PickPlaceMotion:
         vector = np.zeros(PlannerState.size)
         state = PlannerState(vector)
         state.start = state.goal = self._parameters.home
-        state.start_opening = state.goal_opening = self._parameters.open_width
-        state.force_start_time = -self._parameters.force_ramp
+        self.open(state)
         return vector
+
+    def view(self, vector: NDArray[np.float64]) -> PlannerState:
+        """The fields of a state vector."""
+        return PlannerState(vector)
+
+    def prepare(self, state: PlannerState) -> bool:
+        """Chooses the equivalent yaws that rotate the wrist least."""
+        state.pick[2], state.place[2] = shortest_yaws(
+            float(state.pick[2]), float(state.place[2]), float(state.goal[YAW]), YAW_LIMIT
+        )
+        return True
 
     def begin(
         self,
@@ -151,26 +82,19 @@ class PickPlaceMotion:
             at: (4) stop the hand at this x, y, z and yaw.
         """
         now, rate, _ = np.split(self.motion_at(state, time), 3)
-        now_opening, _ = self.opening_at(state, time)
         if z is not None:
             now[2] = z
             rate = np.zeros(4)
         if at is not None:
             now, rate = np.array(at), np.zeros(4)
-        if opening is not None:
-            now_opening = opening
+        self.begin_jaws(state, mode, time, opening)
         state.mode = mode
         state.start_time = time
         state.start = now
         state.start_rate = rate
         # Default: brake to rest.
         state.goal = now + rate * braking_time(rate, self._limits_of(state)) / 2
-        state.start_opening = state.goal_opening = now_opening
         self._set_goals(state, mode)
-        if mode == Mode.CHECK:
-            self.set_force(state, time, self._parameters.grasp_force)
-        elif mode in (Mode.RELEASE, Mode.RETREAT):
-            self.set_force(state, time, 0.0)
         self.set_times(state)
 
     def _set_goals(self, state: PlannerState, mode: Mode) -> None:
@@ -178,13 +102,10 @@ class PickPlaceMotion:
         parameters = self._parameters
         if mode == Mode.APPROACH:
             state.goal = (*state.pick[:2], state.pick_hover_z, state.pick[2])
-            state.goal_opening = 0.0 if state.press else parameters.open_width
         elif mode == Mode.DESCEND:
             state.goal[Z] = state.grasp_z
             if state.press:
                 state.goal[Z] = state.pick_top_z - parameters.press_depth
-        elif mode == Mode.CLOSE:
-            state.goal_opening = 0.0
         elif mode == Mode.LIFT:
             trial = max(state.hold_z + _TRIAL, float(state.goal[Z]))
             state.goal[Z] = trial if state.doubts_grip else state.travel_z + _OVERSHOOT
@@ -197,10 +118,6 @@ class PickPlaceMotion:
             state.goal[X], state.goal[Y] = state.place[0] + x, state.place[1] + y
             state.goal[YAW] = min(max(state.place[2] + yaw, -YAW_LIMIT), YAW_LIMIT)
             state.goal[Z] = state.touch_z - parameters.search.press
-        elif mode == Mode.RELEASE:
-            state.goal_opening = min(
-                state.start_opening + 2 * parameters.release_clearance, parameters.open_width
-            )
         elif mode == Mode.RETREAT:
             state.goal[X], _, home_z, _ = parameters.home
             state.goal[Z] = max(home_z, state.travel_z)
@@ -239,16 +156,7 @@ class PickPlaceMotion:
     def _set_legs(self, state: PlannerState, mode: Mode) -> None:
         """Divides a guarded motion: fast above all surfaces, then slower, and slowest where contact
         is expected."""
-        parameters = self._parameters
-        margin = parameters.slow_margin + state.doubt
-        hover = state.pick_hover_z if mode == Mode.DESCEND else state.place_hover_z
-        first = hover - parameters.hover_clearance + margin
-        # Either the object reaches its floor, or the fingertips beside it the rim.
-        hanging = state.hold_z - state.support_z
-        expected = max(state.floor_z + hanging, state.rim_z + state.doubt) + margin
-        if mode == Mode.DESCEND:
-            # The jaws should touch nothing, except to press.
-            expected = state.pick_top_z + margin if state.press else state.goal[Z]
+        first, expected = guarded_marks(state, mode, self._parameters)
         marks = [float(state.start[Z])]
         for mark in (first, expected, float(state.goal[Z])):
             marks.append(max(min(mark, marks[-1]), float(state.goal[Z])))
@@ -275,11 +183,10 @@ class PickPlaceMotion:
         """The limits of the present mode's motion."""
         return self._limits[Mode(int(state.mode))]
 
-    def set_force(self, state: PlannerState, time: float, force: float) -> None:
-        """Ramps the closing force from its present value to another."""
-        if force != state.goal_force:
-            state.start_force = self.force_at(state, time)
-            state.goal_force, state.force_start_time = force, time
+    def back_off(self, state: PlannerState, distance: float) -> None:
+        """Moves the goal of the present mode up by a distance, in m."""
+        state.goal[Z] += distance
+        self.set_times(state)
 
     def motion_at(self, state: PlannerState, time: float) -> NDArray[np.float64]:
         """q_d, v_d, a_d (12) of the present mode's motion."""
@@ -295,30 +202,15 @@ class PickPlaceMotion:
             self._legs(state),
         )
 
-    def opening_at(self, state: PlannerState, time: float) -> tuple[float, float]:
-        """The opening between the pads in m, and its rate."""
-        return ramp(
-            state.start_opening,
-            state.goal_opening,
-            2 * self._parameters.finger_speed,
-            time - state.start_time,
-        )
-
-    def force_at(self, state: PlannerState, time: float) -> float:
-        """The closing force, in N."""
-        fraction = 1.0
-        if self._parameters.force_ramp > 0:
-            elapsed = time - state.force_start_time
-            fraction = min(max(elapsed / self._parameters.force_ramp, 0.0), 1.0)
-        return float(state.start_force + fraction * (state.goal_force - state.start_force))
+    def hand_acceleration(
+        self, state: PlannerState, time: float, desired: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        """(3) of the motion `desired`, which is that of `motion_at`, in m/s^2."""
+        return desired[8:11]
 
     def arrival(self, state: PlannerState) -> float:
         """When motion, jaws and force of the present mode have all arrived, in s."""
-        opening_time = abs(state.goal_opening - state.start_opening) / (
-            2 * self._parameters.finger_speed
-        )
-        moved = state.start_time + max(state.duration, opening_time)
-        return float(max(moved, state.force_start_time + self._parameters.force_ramp))
+        return self.jaws_arrival(state, state.start_time + state.duration)
 
     def brakes_above(self, state: PlannerState, time: float, height: float) -> bool:
         """Whether the hand would stop above a height if it began to brake now."""

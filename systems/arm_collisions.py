@@ -1,0 +1,113 @@
+"""Where a Franka arm would collide: capsules around its links and its hand."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from systems.arm_kinematics import HAND_TURN, ArmBase, joint_frames
+from systems.hand_geometry import PALM_SIZE
+
+
+@dataclass(frozen=True)
+class Capsule:
+    """All points within a radius of a line segment; in metres."""
+
+    start: tuple[float, float, float]
+    end: tuple[float, float, float]
+    radius: float
+
+
+@dataclass(frozen=True)
+class _Link:
+    """A capsule in the frame of a joint (from 0); frame 7 is the flange's."""
+
+    frame: int
+    capsule: Capsule
+
+
+_COS, _SIN = float(np.cos(HAND_TURN)), float(np.sin(HAND_TURN))
+_HALF_PALM = PALM_SIZE[1] / 2 - PALM_SIZE[0] / 2
+
+# The links of a Franka, by their drawings and meshes: no point of a mesh is outside of its capsule
+# by more than 15 mm.
+_BASE = (
+    Capsule((-0.10, 0.0, 0.06), (0.0, 0.0, 0.06), 0.09),
+    Capsule((0.0, 0.0, 0.06), (0.0, 0.0, 0.333), 0.08),
+)
+_FOREARM = _Link(4, Capsule((0.0, 0.0, -0.26), (0.0, 0.05, -0.08), 0.06))
+_WRIST = _Link(5, Capsule((0.0, 0.0, -0.06), (0.0, 0.0, 0.02), 0.06))
+_LAST = _Link(6, Capsule((0.0, 0.0, -0.02), (0.0, 0.0, 0.06), 0.055))
+_HAND = _Link(
+    7,
+    Capsule(
+        (_HALF_PALM * _SIN, -_HALF_PALM * _COS, 0.035),
+        (-_HALF_PALM * _SIN, _HALF_PALM * _COS, 0.035),
+        0.035,
+    ),
+)
+_UPPER_ARM = _Link(2, Capsule((0.0, 0.0, -0.20), (0.0, 0.0, -0.06), 0.06))
+_ELBOW = _Link(3, Capsule((0.0, 0.0, -0.06), (0.0, 0.0, 0.06), 0.06))
+_ABOVE = (_ELBOW, _FOREARM, _WRIST, _LAST)
+"""What may come down onto the surfaces, besides the hand."""
+_OUTER = (_FOREARM, _WRIST, _LAST, _HAND)
+"""What may come back to the arm's own base."""
+_LEAST = 0.01
+"""Least distance, in m."""
+
+
+def collision(
+    q: NDArray[np.float64], base: ArmBase, surface: float, obstacles: Sequence[Capsule] = ()
+) -> str:
+    """What the arm collides with at one of several joint positions; empty if with nothing.
+
+    Args:
+        q: (n, 7).
+        base: where the arm stands.
+        surface: height of the highest surface around the hand in the world, in m. The hand itself
+            is not compared: fingers must go below it.
+        obstacles: bodies that do not move, in the world.
+    """
+    rotations, origins = joint_frames(q)
+
+    def ends(link: _Link) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        R, p = rotations[:, link.frame], origins[:, link.frame]
+        start, end = (p + R @ np.array(point) for point in (link.capsule.start, link.capsule.end))
+        return start, end
+
+    placed = {link: ends(link) for link in (*_ABOVE, _HAND, _UPPER_ARM)}
+    for link in _ABOVE:
+        lowest = np.minimum(*(end[:, 2] for end in placed[link])) - link.capsule.radius
+        if lowest.min() < surface - base.z + _LEAST:
+            return "what lies around the hand"
+    own = [(np.array(it.start), np.array(it.end), it.radius) for it in _BASE]
+    own.append((*placed[_UPPER_ARM], _UPPER_ARM.capsule.radius))
+    for link in _OUTER:
+        for start, end, radius in own if link is not _FOREARM else own[:2]:
+            apart = _distances(*placed[link], start, end) - link.capsule.radius - radius
+            if apart.min() < _LEAST:
+                return "itself"
+    for obstacle in obstacles:
+        start, end = base.to_base_points(np.array([obstacle.start, obstacle.end]))
+        for link in (*_OUTER, _ELBOW, _UPPER_ARM):
+            apart = _distances(*placed[link], start, end) - link.capsule.radius - obstacle.radius
+            if apart.min() < _LEAST:
+                return "something fixed"
+    return ""
+
+
+def _distances(
+    a: NDArray[np.float64], b: NDArray[np.float64], c: NDArray[np.float64], d: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """(n) distances between the segments a to b and c to d, each (n, 3) or (3)."""
+    u, v, w = b - a, d - c, a - c
+    uu, vv, uv = np.sum(u * u, -1), np.sum(v * v, -1), np.sum(u * v, -1)
+    uw, vw = np.sum(u * w, -1), np.sum(v * w, -1)
+    tiny = 1e-12
+    s = np.clip((uv * vw - vv * uw) / np.maximum(uu * vv - uv * uv, tiny), 0.0, 1.0)
+    t = np.clip((uv * s + vw) / np.maximum(vv, tiny), 0.0, 1.0)
+    s = np.clip((uv * t - uw) / np.maximum(uu, tiny), 0.0, 1.0)
+    return np.asarray(np.linalg.norm(w + s[..., None] * u - t[..., None] * v, axis=-1))

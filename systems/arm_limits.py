@@ -1,0 +1,102 @@
+"""What the joints of a Franka arm can do, as its maker publishes it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+JOINTS = 7
+
+_Seven = tuple[float, float, float, float, float, float, float]
+
+
+def _all(value: float) -> _Seven:
+    return (value,) * 7
+
+
+@dataclass(frozen=True)
+class VelocityEnvelope:
+    """Lower velocity limits near the ends of a joint's range.
+
+    A joint at q may move towards the end q_max no faster than
+
+        max(0, sqrt(2 d (q_max - q)) - offset),
+
+    and likewise towards q_min.
+    """
+
+    lower: _Seven
+    """q_min, in rad."""
+    upper: _Seven
+    """q_max, in rad."""
+    offset: _Seven
+    """In rad/s."""
+    deceleration: _Seven
+    """d, in rad/s^2."""
+
+
+@dataclass(frozen=True)
+class ArmLimits:
+    """Limits of the seven joints, base to flange, in SI units."""
+
+    lower: _Seven
+    upper: _Seven
+    velocity: _Seven
+    acceleration: _Seven
+    jerk: _Seven
+    torque: _Seven
+    torque_rate: _Seven
+    envelope: VelocityEnvelope | None = None
+    """None: the velocity limits do not depend on the position."""
+
+    def velocity_bounds(
+        self, q: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """The lowest and highest velocity at joint positions (..., 7), in rad/s."""
+        high = np.broadcast_to(np.array(self.velocity), np.shape(q))
+        if self.envelope is None:
+            return -high, high
+        ends = self.envelope
+        offset, twice = np.array(ends.offset), 2 * np.array(ends.deceleration)
+        to_upper = np.sqrt(np.maximum(twice * (ends.upper - q), 0.0)) - offset
+        to_lower = np.sqrt(np.maximum(twice * (q - ends.lower), 0.0)) - offset
+        return -np.clip(to_lower, 0.0, high), np.clip(to_upper, 0.0, high)
+
+
+PANDA = ArmLimits(
+    lower=(-2.8973, -1.7628, -2.8973, -3.0718, -2.8973, -0.0175, -2.8973),
+    upper=(2.8973, 1.7628, 2.8973, -0.0698, 2.8973, 3.7525, 2.8973),
+    velocity=(2.175, 2.175, 2.175, 2.175, 2.61, 2.61, 2.61),
+    acceleration=(15.0, 7.5, 10.0, 12.5, 15.0, 20.0, 20.0),
+    jerk=(7500.0, 3750.0, 5000.0, 6250.0, 7500.0, 10000.0, 10000.0),
+    torque=(87.0, 87.0, 87.0, 87.0, 12.0, 12.0, 12.0),
+    torque_rate=_all(1000.0),
+)
+"""Franka Emika Robot (Panda). Source: Franka's FCI documentation, "Robot and interface
+specifications", section "Limits for Panda"; accelerations and jerks also in libfranka 0.9,
+`rate_limiting.h`."""
+
+FR3 = ArmLimits(
+    lower=(-2.7437, -1.7837, -2.9007, -3.0421, -2.8065, 0.5445, -3.0159),
+    upper=(2.7437, 1.7837, 2.9007, -0.1518, 2.8065, 4.5169, 3.0159),
+    velocity=(2.62, 2.62, 2.62, 2.62, 5.26, 4.18, 5.26),
+    acceleration=_all(10.0),
+    jerk=_all(5000.0),
+    torque=(87.0, 87.0, 87.0, 87.0, 12.0, 12.0, 12.0),
+    torque_rate=_all(1000.0),
+    envelope=VelocityEnvelope(
+        lower=(-2.7501, -1.7918, -2.9065, -3.0481, -2.8101, 0.54092, -3.0196),
+        upper=(2.7501, 1.7918, 2.9065, -0.1458, 2.8101, 4.5205, 3.0196),
+        offset=(0.30, 0.20, 0.20, 0.30, 0.35, 0.35, 0.35),
+        deceleration=(6.0, 2.585, 3.5, 4.0, 17.0, 5.5, 17.0),
+    ),
+)
+"""Franka Research 3. Source: Franka's FCI documentation, "Robot and interface specifications",
+section "Limits for Franka Research 3": ranges and torques, and the velocity limits that depend on
+the position; the same in libfranka 0.13, `rate_limiting.h`, and in franka_description,
+`robots/fr3/joint_limits.yaml`."""
+
+ARM_LIMITS = {"fr3": FR3, "panda": PANDA}
+"""By the name of the model."""

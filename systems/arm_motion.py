@@ -1,0 +1,282 @@
+"""A Franka arm's motion in each mode of the pick-and-place motion primitive."""
+
+from __future__ import annotations
+
+import functools
+import math
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from systems.arm_collisions import Capsule
+from systems.arm_kinematics import ArmBase
+from systems.arm_limits import JOINTS, ArmLimits
+from systems.arm_postures import ArmPostures, HandStop
+from systems.arm_reach import hand_stops
+from systems.arm_way import ArmWay, WayVector
+from systems.guarded_marks import guarded_marks
+from systems.jaw_motion import JawMotion
+from systems.motion_heights import MotionHeights
+from systems.pick_place_parameters import Mode, PickPlaceParameters
+from systems.planner_state import PlannerState
+from systems.signals import PlanarPose
+from systems.vector_view import Array, Number
+
+_KEPT = 8
+"""How many ways are kept in memory."""
+_FARTHEST_STOP = 0.02
+"""A hand that is further away from its command than this stays at its command, in m."""
+_SAME_HEIGHT = 0.003
+
+_TOUCH_SPEED = 0.011
+"""An arm's limit of `touch_speed`, in m/s. Its hand moves 10 to 25 kg, a floating hand 4 kg,
+and the force of an impact is proportional to mass times speed."""
+
+
+class ArmState(PlannerState):
+    """The planner's state with an arm."""
+
+    way = Array(WayVector.size)
+    """The present `WayVector`; it began at `way_start`."""
+    way_start = Number()
+    pick_joints = Array(JOINTS)
+    """Joint positions above the pick. Likewise above the place."""
+    place_joints = Array(JOINTS)
+
+
+class ArmMotion(JawMotion):
+    """Motions of an arm, jaw openings and closing forces, as functions of the state. See
+    `RobotMotion`.
+
+    - `APPROACH`, `LIFT` with `CARRY`, `RETREAT`: ways in joint space, as fast as the joints'
+      limits and the parameters' linear speed and acceleration allow. The hand rises straight up to
+      the clear height, travels above it, and sinks near its goal only, with rounded corners.
+    - `DESCEND`, `LOWER`, `SEARCH`: straight lines of the hand, with the parameters' speeds.
+    - What begins while the arm moves begins with the fastest stop that the limits of acceleration
+      and jerk allow, except `CARRY` after `LIFT`: these two are one way.
+
+    Position, velocity, acceleration and jerk of all joints are within their limits at all times.
+
+    A way is a pure function of the `WayVector` in the state; the last ones are kept in memory.
+    """
+
+    size = 3 * JOINTS
+
+    def __init__(
+        self,
+        parameters: PickPlaceParameters,
+        limits: ArmLimits,
+        base: ArmBase,
+        obstacles: Sequence[Capsule] = (),
+    ) -> None:
+        """
+        Args:
+            parameters: heights, speeds, forces.
+            limits: of the joints.
+            base: where the arm stands.
+            obstacles: fixed bodies that the arm must not touch, in the world.
+
+        Raises:
+            ValueError: the arm cannot reach the home pose.
+        """
+        super().__init__(parameters)
+        self._limits = parameters.motion_limits()
+        self.postures = ArmPostures(limits, base, obstacles)
+        x, y, z, yaw = parameters.home
+        home = HandStop("home", x, y, yaw, low=z, high=z, surface=base.z - 1.0)
+        middle = (np.array(limits.lower) + limits.upper) / 2
+        found, problem = self.postures.choose([home], middle)
+        if problem:
+            raise ValueError(f"planner.home: {problem}")
+        self.home_joints = found[0]
+        """(7) where the arm waits at first."""
+        self._way_of = functools.lru_cache(maxsize=_KEPT)(self._make_way)
+
+    def initial_state(self) -> NDArray[np.float64]:
+        """A state in which the arm waits at home with open jaws."""
+        vector = np.zeros(ArmState.size)
+        state = ArmState(vector)
+        state.way = np.nan
+        WayVector(state.way).start = [*self.home_joints, *[0.0] * (2 * JOINTS)]
+        self.open(state)
+        return vector
+
+    def view(self, vector: NDArray[np.float64]) -> ArmState:
+        """The fields of a state vector."""
+        return ArmState(vector)
+
+    def _make_way(self, vector: bytes) -> ArmWay:
+        return ArmWay(np.frombuffer(vector), self.postures)
+
+    def _way(self, state: PlannerState) -> ArmWay:
+        assert isinstance(state, ArmState)
+        return self._way_of(state.way.tobytes())
+
+    # Before an action.
+
+    def stops(self, state: PlannerState) -> list[HandStop]:
+        """Where the hand goes down in an action."""
+        heights = MotionHeights(
+            grasp=state.grasp_z,
+            clear=state.clear_z,
+            travel=state.travel_z,
+            pick_hover=state.pick_hover_z,
+            place_hover=state.place_hover_z,
+        )
+        pick, place = (PlanarPose(*pose.tolist()) for pose in (state.pick, state.place))
+        return hand_stops(
+            pick, None if state.press else place, heights, state.table_z, self._parameters
+        )
+
+    def reach_problem(self, state: PlannerState) -> str:
+        """A sentence that says why the arm cannot do the action in the state; empty if it can."""
+        return self._choose(state)[1]
+
+    def _choose(self, state: PlannerState) -> tuple[list[NDArray[np.float64]], str]:
+        assert isinstance(state, ArmState)
+        return self.postures.choose(self.stops(state), self._way(state).at(math.inf)[:JOINTS])
+
+    def prepare(self, state: PlannerState) -> bool:
+        """Chooses the joint positions at pick and place for the whole action."""
+        assert isinstance(state, ArmState)
+        found, problem = self._choose(state)
+        if problem:
+            return False
+        state.pick_joints, state.place_joints = found[0], found[-1]
+        state.pick[2] = self.postures.hand_pose(found[0])[3]
+        state.place[2] = self.postures.hand_pose(found[-1])[3]
+        return True
+
+    # Modes.
+
+    def begin(
+        self,
+        state: PlannerState,
+        mode: Mode,
+        time: float,
+        z: float | None = None,
+        opening: float | None = None,
+        at: NDArray[np.float64] | None = None,
+    ) -> None:
+        """Starts a mode from the present commands. See `RobotMotion`."""
+        assert isinstance(state, ArmState)
+        goes_on = mode == Mode.CARRY and state.mode == Mode.LIFT
+        now = self.motion_at(state, time)
+        self.begin_jaws(state, mode, time, opening)
+        state.mode, state.start_time = mode, time
+        if not goes_on:
+            state.way_start = time
+            self._set_way(state, mode, now, z, at)
+        state.duration = state.way_start + self._way(state).duration - time
+
+    def _set_way(
+        self,
+        state: ArmState,
+        mode: Mode,
+        now: NDArray[np.float64],
+        z: float | None,
+        at: NDArray[np.float64] | None,
+    ) -> None:
+        state.way = np.nan
+        way, limits = WayVector(state.way), self._limits[mode]
+        way.start = now
+        way.speed, way.acceleration = limits.speed, limits.acceleration
+        if mode == Mode.APPROACH:
+            if not state.refused:
+                way.over, way.clear, way.sink = state.pick_joints, state.clear_z, state.pick_hover_z
+        elif mode in (Mode.LIFT, Mode.CARRY):
+            way.over, way.clear, way.sink = state.place_joints, state.travel_z, state.place_hover_z
+        elif mode == Mode.RETREAT:
+            self._set_retreat(state, way)
+        else:
+            self._set_line(state, way, mode, z, at)
+
+    def _set_line(
+        self,
+        state: ArmState,
+        way: WayVector,
+        mode: Mode,
+        z: float | None,
+        at: NDArray[np.float64] | None,
+    ) -> None:
+        """A straight line of the hand from where it will have stopped."""
+        parameters, limits = self._parameters, self._limits[mode]
+        pose = self.postures.hand_pose(way.start[:JOINTS])
+        goal = np.array(pose)
+        slow = min(limits.speed, parameters.contact_speed)
+        way.speeds, way.yaw_speed = slow, limits.yaw_speed
+        if mode in (Mode.DESCEND, Mode.LOWER):
+            goal[2] = state.table_z + parameters.floor_clearance
+            if mode == Mode.DESCEND:
+                goal[2] = state.grasp_z
+                if state.press:
+                    goal[2] = state.pick_top_z - parameters.press_depth
+            way.marks = guarded_marks(state, mode, parameters)
+            way.speeds = limits.speed, slow, min(slow, parameters.touch_speed, _TOUCH_SPEED)
+        elif mode == Mode.SEARCH:
+            x, y, yaw = parameters.search.offset(int(state.search_step))
+            goal[:2] = state.place[0] + x, state.place[1] + y
+            goal[3] = state.place[2] + yaw
+            goal[2] = state.touch_z - parameters.search.press
+        elif at is not None:
+            if np.linalg.norm(at[:3] - pose[:3]) > _FARTHEST_STOP:
+                return
+            goal = np.array(at)
+        elif z is not None and abs(z - pose[2]) < _FARTHEST_STOP:
+            # A payload's sag leaves the hand below its command: to follow it would push.
+            goal[2] = max(z, float(pose[2]))
+        else:
+            return
+        way.line = goal
+
+    def _set_retreat(self, state: ArmState, way: WayVector) -> None:
+        """Up, and back to the home's x; the hand need not return to the home's y and yaw."""
+        now = way.start[:JOINTS]
+        y = float(self.postures.hand_pose(now)[1])
+        x, home_y, home_z, yaw = self._parameters.home
+        z = max(home_z, float(state.travel_z))
+        goal = self.home_joints
+        for share in (1.0, 0.75, 0.5, 0.25):
+            between = home_y + share * (y - home_y)
+            stop = HandStop("home", x, between, yaw, low=z, high=z, surface=state.table_z)
+            found, problem = self.postures.choose([stop], now)
+            if not problem:
+                goal = found[0]
+                break
+        way.over, way.sink = goal, z
+        # After a stop the jaws may drag something along.
+        way.clear = state.travel_z if state.stops else state.clear_z
+        # Joint 7 stays: it alone would take longer.
+        way.over[6] = now[6]
+
+    def back_off(self, state: PlannerState, distance: float) -> None:
+        """Moves the goal of the present mode, in which the hand only stops, up by a distance."""
+        assert isinstance(state, ArmState)
+        way = WayVector(state.way)
+        if np.isfinite(way.line[2]):
+            way.line[2] += distance
+        state.duration = self._way(state).duration
+
+    def motion_at(self, state: PlannerState, time: float) -> NDArray[np.float64]:
+        """(21) q_d, v_d, a_d of the joints."""
+        assert isinstance(state, ArmState)
+        return self._way(state).at(time - state.way_start)
+
+    def hand_acceleration(
+        self, state: PlannerState, time: float, desired: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        """(3) of the fingertips in the world, in m/s^2."""
+        assert isinstance(state, ArmState)
+        return self._way(state).hand_acceleration(time - state.way_start)
+
+    def arrival(self, state: PlannerState) -> float:
+        """When motion, jaws and force of the present mode have all arrived, in s."""
+        assert isinstance(state, ArmState)
+        return self.jaws_arrival(state, state.way_start + self._way(state).duration)
+
+    def brakes_above(self, state: PlannerState, time: float, height: float) -> bool:
+        """Whether the hand is above a height; it goes on in `CARRY`."""
+        q = self.motion_at(state, time)[:JOINTS]
+        arrived = time >= self.arrival(state)
+        return bool(arrived or self.postures.hand_pose(q)[2] >= height - _SAME_HEIGHT)

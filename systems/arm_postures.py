@@ -1,0 +1,250 @@
+"""How a Franka arm stands when its hand, pointing down, is at a pose."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from systems.arm_collisions import Capsule, collision
+from systems.arm_kinematics import (
+    HAND_TURN,
+    ArmBase,
+    hand_state,
+    inverse,
+    joint_seven,
+    planar,
+)
+from systems.arm_limits import JOINTS, ArmLimits
+
+MARGIN = 0.03
+"""How far a posture keeps from the ends of the joints' ranges, in rad."""
+_SWIVELS = np.concatenate([sign * np.arange(0.1, 3.15, 0.1) for sign in (1.0, -1.0)])
+"""Azimuths of the wrist relative to the hand's that are tried if the vertical plane fails, in rad.
+"""
+_CHECKED = 12
+"""Number of points of a way that are checked for collisions."""
+_JUMP = 1.5
+"""Largest change of a joint on a straight line up or down, in rad."""
+_PLANAR = 1e-6
+"""Below this swivel the arm counts as in the vertical plane, in rad."""
+
+
+@dataclass(frozen=True)
+class HandStop:
+    """A place where the hand goes down and up again, in the world."""
+
+    name: str
+    x: float
+    y: float
+    yaw: float
+    low: float
+    """Lowest height of the fingertips, in m; likewise `high`."""
+    high: float
+    surface: float
+    """Height of the highest surface around, in m."""
+
+
+class ArmPostures:
+    """Chooses among the joint positions that bring the hand to a pose.
+
+    The arm stands in the vertical plane through its base and the hand, if it can. Otherwise the
+    wrist stands beside this plane, by the *swivel*: an angle about the hand's vertical axis.
+    """
+
+    def __init__(self, limits: ArmLimits, base: ArmBase, obstacles: Sequence[Capsule] = ()) -> None:
+        """
+        Args:
+            limits: of the joints.
+            base: where the arm stands.
+            obstacles: fixed bodies that it must not touch, in the world.
+        """
+        self.limits, self.base, self._obstacles = limits, base, tuple(obstacles)
+        self._lower = np.array(limits.lower) + MARGIN
+        self._upper = np.array(limits.upper) - MARGIN
+        self._velocity = np.array(limits.velocity)
+        self._acceleration = np.array(limits.acceleration)
+
+    def hand_pose(self, q: NDArray[np.float64]) -> NDArray[np.float64]:
+        """(4) x, y, z, yaw of the hand in the world, of joint positions (7)."""
+        return np.array(hand_state(q.tolist(), [0.0] * JOINTS, self.base)[:4])
+
+    def within(self, q: NDArray[np.float64]) -> NDArray[np.bool_]:
+        """(...) whether joint positions (..., 7) exist and are within the range less the margin."""
+        with np.errstate(invalid="ignore"):
+            return np.asarray(((q >= self._lower) & (q <= self._upper)).all(-1))
+
+    def along(self, poses: NDArray[np.float64], near: NDArray[np.float64]) -> NDArray[np.float64]:
+        """(n, 7) joint positions along a way of the hand, NaN where it is out of reach.
+
+        Args:
+            poses: (n, 4) close to each other; all with the swivel of `near`.
+            near: (7) joint positions close to those of the first pose.
+        """
+        x, y, z, yaw = np.moveaxis(self.base.to_base(poses), -1, 0)
+        azimuth = np.arctan2(y, x)
+        swivel = self._swivel(near)
+        q7 = near[6] + _wrap(joint_seven(azimuth + swivel, yaw) - near[6])
+        tip = np.stack([x, y, z], -1)
+        if abs(swivel) < _PLANAR:
+            return planar(tip, q7)
+        found = inverse(tip, q7, yaw)
+        way = np.empty((len(found), JOINTS))
+        for i, solutions in enumerate(found):
+            apart = np.abs(solutions - near).max(-1)
+            # A jump to another branch is no way.
+            best = int(np.argmin(np.where(np.isfinite(apart), apart, np.inf)))
+            near = way[i] = solutions[best] if apart[best] < 0.5 else np.full(JOINTS, np.nan)
+        return way
+
+    def _swivel(self, q: NDArray[np.float64]) -> float:
+        x, y, _, yaw = self.base.to_base(self.hand_pose(q)).tolist()
+        swivel = math.remainder(q[6] + yaw + HAND_TURN - math.atan2(y, x), math.tau)
+        return 0.0 if abs(swivel) < _PLANAR else swivel
+
+    def choose(
+        self, stops: Sequence[HandStop], now: NDArray[np.float64]
+    ) -> tuple[list[NDArray[np.float64]], str]:
+        """The postures at the high ends of one or more stops, for the whole way from `now` on.
+
+        The jaws are symmetric: the yaws of all stops may be rotated by pi together.
+
+        Args:
+            stops: in the order of the way.
+            now: (7) present joint positions.
+
+        Returns:
+            (7) joint positions for each stop, and a sentence that says why there are none.
+        """
+        options: list[list[tuple[int, NDArray[np.float64]]]] = []
+        for swivels in (np.zeros(1), _SWIVELS):
+            options = [
+                (options[i] if options else []) + self._options(stop, swivels)
+                for i, stop in enumerate(stops)
+            ]
+            best = self._fastest(options, now)
+            if best:
+                return best, self._problem_on_the_way(stops, [now, *best])
+        for stop, found in zip(stops, options, strict=True):
+            if not found:
+                return [], self._problem(stop)
+        names = " and ".join(stop.name for stop in stops)
+        return [], f"no turn of the hand keeps joint 7 inside its range at both {names}"
+
+    def _problem_on_the_way(self, stops: Sequence[HandStop], way: list[NDArray[np.float64]]) -> str:
+        share = np.linspace(0.0, 1.0, _CHECKED)[:, None]
+        ways = [start + share * (end - start) for start, end in itertools.pairwise(way)]
+        highest = max(stops, key=lambda stop: stop.surface)
+        if not self._collision(np.concatenate(ways), highest):
+            return ""
+        for stop, points in zip(stops, ways, strict=True):
+            touched = self._collision(points, stop)
+            if touched:
+                return f"on the way to {stop.name} the arm would collide with {touched}"
+        return ""
+
+    def _fastest(
+        self, options: list[list[tuple[int, NDArray[np.float64]]]], now: NDArray[np.float64]
+    ) -> list[NDArray[np.float64]]:
+        best: list[NDArray[np.float64]] = []
+        least = math.inf
+        for half_turn in (0, 1):
+            # The fastest way to each option of a stop.
+            ways = [(0.0, [now])]
+            for found in options:
+                following = []
+                for turned, q in found:
+                    if turned == half_turn:
+                        time, way = min(
+                            ((t + self._time(w[-1], q), w) for t, w in ways), key=lambda it: it[0]
+                        )
+                        following.append((time, [*way, q]))
+                ways = following
+                if not ways:
+                    break
+            for time, way in ways:
+                if time < least - 1e-9:
+                    least, best = time, way[1:]
+        return best
+
+    def _time(self, start: NDArray[np.float64], end: NDArray[np.float64]) -> float:
+        """About how long a straight way in joint space takes, in s."""
+        way = np.abs(end - start)
+        top = np.minimum(self._velocity, np.sqrt(way * self._acceleration))
+        return float((way / np.maximum(top, 1e-9) + top / self._acceleration).max())
+
+    def _options(
+        self, stop: HandStop, swivels: NDArray[np.float64]
+    ) -> list[tuple[int, NDArray[np.float64]]]:
+        """(half turn of the jaws, joint positions at the high end) of all possible postures."""
+        found = [
+            (half_turn, way)
+            for half_turn in (0, 1)
+            for way in self._ways(stop, stop.yaw + half_turn * math.pi, swivels)
+            if self.within(way).all() and self._is_continuous(way)
+        ]
+        # Usually nothing collides: ask once for all.
+        if found and self._collision(np.concatenate([way for _, way in found]), stop):
+            found = [(turned, way) for turned, way in found if not self._collision(way, stop)]
+        return [(turned, way[-1]) for turned, way in found]
+
+    def _is_continuous(self, way: NDArray[np.float64]) -> bool:
+        """Whether the arm can move on a straight line from the high to the low end of a way."""
+        if not way[:, [2, 4]].any():
+            return True
+        if np.abs(way[-1] - way[0]).max() > _JUMP:
+            return False
+        top, bottom = self.hand_pose(way[-1]), self.hand_pose(way[0])
+        line = self.along(np.linspace(top, bottom, _CHECKED), way[-1])
+        return bool(self.within(line).all())
+
+    def _collision(self, way: NDArray[np.float64], stop: HandStop) -> str:
+        return collision(way, self.base, stop.surface, self._obstacles)
+
+    def _ways(
+        self, stop: HandStop, yaw: float, swivels: NDArray[np.float64]
+    ) -> list[NDArray[np.float64]]:
+        """(k, 7) joint positions from the low to the high end, for each posture, maybe NaN."""
+        heights = np.linspace(stop.low, stop.high, 3)
+        poses = np.array([[stop.x, stop.y, z, yaw] for z in heights])
+        x, y, z, yaws = np.moveaxis(self.base.to_base(poses), -1, 0)
+        tip = np.stack([x, y, z], -1)
+        azimuth = math.atan2(y[0], x[0])
+        ways = []
+        for swivel in swivels.tolist():
+            turned = float(joint_seven(azimuth + swivel, yaws[0]))
+            sevens = [turned + k * math.tau for k in (-1, 0, 1)]
+            inside = [q7 for q7 in sevens if self._lower[6] <= q7 <= self._upper[6]]
+            for q7 in inside:
+                seven = np.full(len(heights), q7)
+                if swivel == 0.0:
+                    ways.append(planar(tip, seven))
+                else:
+                    ways.extend(np.moveaxis(inverse(tip, seven, yaws), 1, 0))
+        return ways
+
+    def _problem(self, stop: HandStop) -> str:
+        """Why there is no posture at a stop."""
+        every = np.concatenate([np.zeros(1), _SWIVELS])
+        where = f"{stop.name} at ({stop.x:.3f}, {stop.y:.3f}) m"
+        # The yaw matters to joint 7 only.
+        reached, touched = False, ""
+        for yaw in np.linspace(0.0, math.pi, 5)[:-1]:
+            for way in self._ways(stop, float(yaw), every):
+                if self.within(way).all():
+                    reached = True
+                    touched = self._collision(way, stop)
+                    if not touched:
+                        return f"{where} would take joint 7 out of its range"
+        if not reached:
+            heights = f"between {stop.low:.3f} and {stop.high:.3f} m"
+            return f"{where} is out of the arm's reach at heights {heights}"
+        return f"for {where} the arm would collide with {touched}"
+
+
+def _wrap(angle: NDArray[np.float64]) -> NDArray[np.float64]:
+    return angle - math.tau * np.round(angle / math.tau)

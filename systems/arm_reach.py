@@ -1,0 +1,61 @@
+"""Whether a Franka arm can do an action, said before anything moves."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from systems.arm_postures import ArmPostures, HandStop
+from systems.motion_heights import MotionHeights
+from systems.pick_place_parameters import PickPlaceParameters
+from systems.signals import PlanarPose
+
+_ROOM_ABOVE = 0.03
+"""How far above the clear height an arm can reach, too, for ways with rounded corners, in m."""
+
+
+def hand_stops(
+    pick: PlanarPose,
+    place: PlanarPose | None,
+    heights: MotionHeights,
+    table: float,
+    parameters: PickPlaceParameters,
+) -> list[HandStop]:
+    """Where the hand goes down in an action.
+
+    Args:
+        pick: pose of the hand at the pick.
+        place: likewise at the place; None to press.
+        heights: of the motion.
+        table: height of the table, in m.
+        parameters: of the motion primitive.
+    """
+    floor = table + parameters.floor_clearance
+    highest = heights.clear - parameters.travel_clearance
+    # A press may go down to the table.
+    low = floor if place is None else min(heights.grasp, heights.pick_hover)
+    high = max(heights.clear, heights.pick_hover) + _ROOM_ABOVE
+    stops = [HandStop("the pick", pick.x, pick.y, pick.theta, low, high, highest)]
+    if place is not None:
+        high = max(heights.travel, heights.place_hover) + _ROOM_ABOVE
+        stops.append(HandStop("the place", place.x, place.y, place.theta, floor, high, highest))
+    return stops
+
+
+def reach_problem(
+    postures: ArmPostures,
+    stops: Sequence[HandStop],
+    now: NDArray[np.float64] | None = None,
+) -> str:
+    """Why an arm cannot bring its hand to the stops of an action; empty if it can.
+
+    Args:
+        postures: of the arm.
+        stops: as `hand_stops` returns them; the jaws' half turns of all of them belong together.
+        now: (7) present joint positions; None: the middle of their ranges.
+    """
+    if now is None:
+        now = (np.array(postures.limits.lower) + postures.limits.upper) / 2
+    return postures.choose(stops, now)[1]

@@ -1,0 +1,85 @@
+"""The fastest stop of a Franka arm."""
+
+from __future__ import annotations
+
+import bisect
+import itertools
+
+import numpy as np
+import ruckig
+from numpy.typing import NDArray
+
+from systems.arm_limits import JOINTS, ArmLimits
+
+_SHARE = 0.98
+"""Share of the limits of acceleration and jerk that a stop uses."""
+_RESTS = 1e-9
+"""Below this velocity and acceleration the arm rests, in SI units."""
+
+
+class ArmStop:
+    """Brings all joints to rest, in the direction in which they move; by Ruckig.
+
+    The jerk is constant between a few points in time.
+    """
+
+    def __init__(
+        self,
+        q: NDArray[np.float64],
+        v: NDArray[np.float64],
+        a: NDArray[np.float64],
+        limits: ArmLimits,
+    ) -> None:
+        """
+        Args:
+            q: (7) joint positions at the beginning. Likewise velocities `v`, accelerations `a`.
+            limits: of the joints; only those of acceleration and jerk matter.
+        """
+        self.goal, self.duration = q, 0.0
+        """(7) where the joints come to rest, after how many seconds."""
+        if np.abs(v).max() < _RESTS and np.abs(a).max() < _RESTS:
+            return
+        found = _calculate(q, v, a, limits)
+        # Keep numbers only: Ruckig's own objects complain when they outlive the interpreter.
+        self.duration = found.duration
+        switches = {0.0, found.duration}
+        for profile in found.profiles[0]:
+            steps = [*profile.brake.t, *profile.t]
+            switches.update(np.clip(np.cumsum(steps), 0.0, found.duration).tolist())
+        times = sorted(switches)
+        self._times = [t for t, u in itertools.pairwise(times) if u - t > 1e-9]
+        self._times.append(found.duration)
+        self._states = np.array([found.at_time(time) for time in self._times])
+        self.goal = self._states[-1, 0].copy()
+
+    def at(self, time: float) -> NDArray[np.float64]:
+        """(21) joint positions, velocities and accelerations, before the end."""
+        index = min(max(bisect.bisect_right(self._times, time) - 1, 0), len(self._times) - 2)
+        h, lasts = time - self._times[index], self._times[index + 1] - self._times[index]
+        q, v, a = self._states[index]
+        jerk = (self._states[index + 1, 2] - a) / lasts
+        return np.concatenate(
+            [
+                q + h * (v + h * (a / 2 + h / 6 * jerk)),
+                v + h * (a + h / 2 * jerk),
+                a + h * jerk,
+            ]
+        )
+
+
+def _calculate(
+    q: NDArray[np.float64], v: NDArray[np.float64], a: NDArray[np.float64], limits: ArmLimits
+) -> ruckig.Trajectory:
+    given = ruckig.InputParameter(JOINTS)
+    given.control_interface = ruckig.ControlInterface.Velocity
+    given.synchronization = ruckig.Synchronization.Phase
+    given.current_position, given.current_velocity = q.tolist(), v.tolist()
+    given.current_acceleration = a.tolist()
+    given.target_velocity = given.target_acceleration = [0.0] * JOINTS
+    given.max_acceleration = [_SHARE * limit for limit in limits.acceleration]
+    given.max_jerk = [_SHARE * limit for limit in limits.jerk]
+    trajectory = ruckig.Trajectory(JOINTS)
+    result = ruckig.Ruckig(JOINTS).calculate(given, trajectory)
+    if result not in (ruckig.Result.Working, ruckig.Result.Finished):
+        raise RuntimeError(f"no stop of the arm was found: {result}")
+    return trajectory

@@ -1,0 +1,249 @@
+"""One way of a Franka arm: a stop, then a motion along a path."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from systems.arm_kinematics import fingertips
+from systems.arm_limits import JOINTS
+from systems.arm_postures import ArmPostures
+from systems.arm_stop import ArmStop
+from systems.path_timing import TICK, RowLimits, SmoothMotion, plan_motion
+from systems.vector_view import Array, Number, VectorView
+
+_LINE_POINTS = 17
+"""Points of a straight line of the hand whose joint positions are computed."""
+_SPACING = 0.010
+"""Distance of a path's points, as the time that the fastest joint needs at full speed, in s."""
+_ROUNDING, _WIDER = 0.15, 0.3
+"""Length of the path over which corners are rounded, likewise: two of them, and a single one."""
+_FEWEST, _MOST = 40, 200
+_ANY_ACCELERATION = 1e3
+"""Of the yaw of a straight line, in rad/s^2: the joints' limits hold anyway."""
+_NEARLY_THERE = 0.02
+"""Within this horizontal distance of its end the hand may sink below the clear height, in m."""
+_STRAIGHT_UP = 0.006
+"""Within this horizontal distance of its start the hand may still rise, in m."""
+_INSTANT = 1e-9
+_STRIDE = 4 * TICK
+"""Time between the stored accelerations of the fingertips, in s."""
+
+
+class WayVector(VectorView):
+    """All that a way depends on, in SI units. What is absent is NaN."""
+
+    start = Array(3 * JOINTS)
+    """Joint positions, velocities and accelerations at the beginning."""
+    line = Array(4)
+    """Goal of a straight line of the hand: x, y, z, yaw in the world."""
+    marks = Array(2)
+    """Heights below which the line slows down, and slows down further."""
+    speeds = Array(3)
+    """Speeds of the line: above, between and below the marks."""
+    yaw_speed = Number()
+    """Of the line."""
+    over = Array(JOINTS)
+    """Goal of a way across: joint positions at the clear height, or at the goal if it is higher."""
+    clear = Number()
+    """Height of the fingertips above which the hand may travel."""
+    sink = Number()
+    """Height to which the hand sinks at the end of a way across."""
+    speed = Number()
+    """Highest linear speed of a way across. Likewise `acceleration`, of all ways."""
+    acceleration = Number()
+
+
+@dataclass(frozen=True)
+class _Path:
+    """(n, 7) evenly spaced points, and the fingertips there in the world, (n, 3)."""
+
+    points: NDArray[np.float64]
+    tips: NDArray[np.float64]
+
+
+class ArmWay:
+    """A way as a function of the time since its beginning."""
+
+    def __init__(self, vector: NDArray[np.float64], postures: ArmPostures) -> None:
+        """
+        Args:
+            vector: a `WayVector`.
+            postures: of the arm.
+        """
+        self._postures, self._limits = postures, postures.limits
+        way = WayVector(vector)
+        q, v, a = way.start.reshape(3, -1)
+        self._stop = ArmStop(q, v, a, self._limits)
+        self._stopping, self._rest = self._stop.duration, self._stop.goal
+        self._motion = self._plan(way, self._rest)
+        self.duration = self._stopping + (self._motion.duration if self._motion else 0.0)
+        self._accelerations = self._hand_accelerations()
+
+    def at(self, time: float) -> NDArray[np.float64]:
+        """(21) joint positions, velocities and accelerations."""
+        if time >= self.duration - _INSTANT:
+            goal = self._motion.goal if self._motion else self._rest
+            return np.concatenate([goal, np.zeros(2 * JOINTS)])
+        if time < self._stopping:
+            return self._stop.at(time)
+        assert self._motion is not None
+        return self._motion.at(time - self._stopping)
+
+    def hand_acceleration(self, time: float) -> NDArray[np.float64]:
+        """(3) acceleration of the fingertips in the world, in m/s^2."""
+        index = min(max(round(time / _STRIDE), 0), len(self._accelerations) - 1)
+        return self._accelerations[index]
+
+    def _hand_accelerations(self) -> NDArray[np.float64]:
+        """(n, 3) accelerations of the fingertips at every stride."""
+        count = math.ceil(self.duration / _STRIDE) + 2
+        q = np.empty((count, JOINTS))
+        stopping = min(math.ceil(self._stopping / _STRIDE), count)
+        for i in range(stopping):
+            q[i] = self._stop.at(i * _STRIDE)[:JOINTS]
+        q[stopping:] = self._rest
+        if self._motion is not None:
+            # Whole ticks, so that the samples are evenly spaced.
+            first = round((stopping * _STRIDE - self._stopping) / TICK)
+            index = first + round(_STRIDE / TICK) * np.arange(count - stopping)
+            q[stopping:] = self._motion.samples[
+                index.clip(0, len(self._motion.samples) - 1), :JOINTS
+            ]
+        tips = self._postures.base.to_world(fingertips(q))
+        found = np.zeros_like(tips)
+        found[1:-1] = np.diff(tips, 2, axis=0) / _STRIDE**2
+        return found
+
+    def _plan(self, way: WayVector, q: NDArray[np.float64]) -> SmoothMotion | None:
+        if np.isfinite(way.over).all():
+            path = self._across(way, q)
+            count = len(path.points)
+            high = np.full((count, 3), way.speed)
+            return self._timed(path.points, path.tips, high, np.full(3, way.acceleration))
+        if np.isfinite(way.line).all():
+            return self._straight(way, q)
+        return None
+
+    def _timed(
+        self,
+        points: NDArray[np.float64],
+        rows: NDArray[np.float64],
+        high: NDArray[np.float64],
+        acceleration: NDArray[np.float64],
+    ) -> SmoothMotion:
+        return plan_motion(points, self._limits, rows, RowLimits(-high, high, acceleration))
+
+    # Straight lines of the hand.
+
+    def _line(
+        self, q: NDArray[np.float64], goal: NDArray[np.float64], points: int = _LINE_POINTS
+    ) -> NDArray[np.float64]:
+        """(n, 7) joint positions on a straight line of the hand, as far as it can be reached."""
+        start = self._postures.hand_pose(q)
+        way = goal - start
+        way[3] = np.remainder(way[3] + np.pi, 2 * np.pi) - np.pi
+        share = np.linspace(0.0, 1.0, points)[:, None]
+        line = self._postures.along(start + share * way, q)
+        if not np.isfinite(line[0]).all():
+            return q[None]
+        # After a stop the hand may not point down exactly: correct this on the way.
+        line += (1 - share) * (q - line[0])
+        inside = self._postures.within(line)
+        beyond = np.flatnonzero(~inside)
+        return line[: max(int(beyond[0]), 1)] if len(beyond) else line
+
+    def _straight(self, way: WayVector, q: NDArray[np.float64]) -> SmoothMotion | None:
+        line = self._line(q, way.line)
+        path = self._evenly(line, rounding=0.0)
+        if path is None:
+            return None
+        poses = np.array([self._postures.hand_pose(point) for point in path.points])
+        yaw = np.unwrap(poses[:, 3])
+        fast, middle, slow = way.speeds.tolist()
+        # A point is as slow as its lower neighbour.
+        below = np.minimum(poses[:, 2], np.append(poses[1:, 2], poses[-1, 2]))
+        limit = np.where(below < way.marks[1], slow, np.where(below < way.marks[0], middle, fast))
+        high = np.column_stack([np.repeat(limit[:, None], 3, 1), np.full(len(yaw), way.yaw_speed)])
+        rows = np.column_stack([path.tips, yaw])
+        acceleration = np.array([*[way.acceleration] * 3, _ANY_ACCELERATION])
+        return self._timed(path.points, rows, high, acceleration)
+
+    # Ways across.
+
+    def _across(self, way: WayVector, q: NDArray[np.float64]) -> _Path:
+        """Up above the clear height, straight in joint space, and down near the goal."""
+        over = way.over
+        end = self._postures.hand_pose(over)
+        single = self._postures.hand_pose(q)[2] >= way.clear or way.sink >= way.clear
+        rounding = _WIDER if single else _ROUNDING
+        raised = 0.0
+        path = None
+        for _ in range(6):
+            pieces = [self._up(q, way.clear + raised)]
+            down = self._down(over, end, max(way.clear + raised, way.sink), way.sink)
+            path = self._evenly(np.concatenate([*pieces, down]), rounding)
+            if path is None:
+                break
+            missing = self._missing(path, way.clear)
+            if missing <= 0.001:
+                return path
+            raised += missing + 0.005
+        if path is None:
+            # Nothing to do: stay.
+            points = np.repeat(q[None], 3, axis=0)
+            return _Path(points, self._postures.base.to_world(fingertips(points)))
+        return path
+
+    def _up(self, q: NDArray[np.float64], height: float) -> NDArray[np.float64]:
+        pose = self._postures.hand_pose(q)
+        if pose[2] >= height:
+            return q[None]
+        pose[2] = height
+        return self._line(q, pose)
+
+    def _down(
+        self, over: NDArray[np.float64], end: NDArray[np.float64], top: float, bottom: float
+    ) -> NDArray[np.float64]:
+        high, low = end.copy(), end.copy()
+        high[2], low[2] = top, bottom
+        above = self._line(over, high)
+        below = self._line(above[-1], low)
+        return below if len(below) > 1 else above[-1:]
+
+    def _missing(self, path: _Path, clear: float) -> float:
+        """How much too low the hand is between start and end, in m."""
+        tips = path.tips
+        away = np.linalg.norm(tips[:, :2] - tips[0, :2], axis=1) > _STRAIGHT_UP
+        before = np.linalg.norm(tips[:, :2] - tips[-1, :2], axis=1) > _NEARLY_THERE
+        crossing = tips[away & before, 2]
+        return float(clear - crossing.min()) if len(crossing) else 0.0
+
+    def _evenly(self, corners: NDArray[np.float64], rounding: float) -> _Path | None:
+        """The path through points, with rounded corners; None if it has no length."""
+        steps = np.abs(np.diff(corners, axis=0)) / self._limits.velocity
+        along = np.concatenate([[0.0], np.cumsum(steps.max(axis=1, initial=0.0))])
+        if along[-1] < 1e-7:
+            return None
+        count = int(np.clip(np.ceil(along[-1] / _SPACING) + 1, _FEWEST, _MOST))
+        grid = np.linspace(0.0, along[-1], count)
+        points = np.stack([np.interp(grid, along, column) for column in corners.T], -1)
+        half = round(rounding / 4 / (along[-1] / (count - 1)))
+        for _ in range(2):
+            points = _averaged(points, max(half, 1))
+        return _Path(points, self._postures.base.to_world(fingertips(points)))
+
+
+def _averaged(points: NDArray[np.float64], half: int) -> NDArray[np.float64]:
+    """Each point as mean over itself and `half` neighbours at each side; the ends stay."""
+    half = min(half, len(points) - 1)
+    before = 2 * points[0] - points[half:0:-1]
+    after = 2 * points[-1] - points[-2 : -half - 2 : -1]
+    total = np.cumsum(np.concatenate([0 * points[:1], before, points, after]), axis=0)
+    width = 2 * half + 1
+    mean = (total[width:] - total[:-width]) / width
+    mean[0], mean[-1] = points[0], points[-1]
+    return np.asarray(mean)

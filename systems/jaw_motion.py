@@ -1,0 +1,80 @@
+"""Opening and closing force of the jaws in each mode of the motion primitive."""
+
+from systems.hand_motion import ramp
+from systems.pick_place_parameters import Mode, PickPlaceParameters
+from systems.planner_state import PlannerState
+
+
+class JawMotion:
+    """Jaw openings and closing forces of all modes, as functions of the state."""
+
+    def __init__(self, parameters: PickPlaceParameters) -> None:
+        """
+        Args:
+            parameters: openings, speeds, forces.
+        """
+        self._parameters = parameters
+
+    def open(self, state: PlannerState) -> None:
+        """Sets open jaws without force."""
+        state.start_opening = state.goal_opening = self._parameters.open_width
+        state.force_start_time = -self._parameters.force_ramp
+
+    def begin_jaws(
+        self, state: PlannerState, mode: Mode, time: float, opening: float | None
+    ) -> None:
+        """Starts opening and force of a mode, while the state is still that of the previous mode.
+
+        Args:
+            state: the planner's state; modified.
+            mode: the mode to begin.
+            time: the present time, in s.
+            opening: stop the jaws at this opening, in m; None: at the present command.
+        """
+        parameters = self._parameters
+        if opening is None:
+            opening, _ = self.opening_at(state, time)
+        state.start_opening = state.goal_opening = opening
+        if mode == Mode.APPROACH:
+            state.goal_opening = 0.0 if state.press else parameters.open_width
+        elif mode == Mode.CLOSE:
+            state.goal_opening = 0.0
+        elif mode == Mode.RELEASE:
+            state.goal_opening = min(
+                state.start_opening + 2 * parameters.release_clearance, parameters.open_width
+            )
+        if mode == Mode.CHECK:
+            self.set_force(state, time, parameters.grasp_force)
+        elif mode in (Mode.RELEASE, Mode.RETREAT):
+            self.set_force(state, time, 0.0)
+
+    def set_force(self, state: PlannerState, time: float, force: float) -> None:
+        """Ramps the closing force from its present value to another."""
+        if force != state.goal_force:
+            state.start_force = self.force_at(state, time)
+            state.goal_force, state.force_start_time = force, time
+
+    def opening_at(self, state: PlannerState, time: float) -> tuple[float, float]:
+        """The opening between the pads in m, and its rate."""
+        return ramp(
+            state.start_opening,
+            state.goal_opening,
+            2 * self._parameters.finger_speed,
+            time - state.start_time,
+        )
+
+    def force_at(self, state: PlannerState, time: float) -> float:
+        """The closing force, in N."""
+        fraction = 1.0
+        if self._parameters.force_ramp > 0:
+            elapsed = time - state.force_start_time
+            fraction = min(max(elapsed / self._parameters.force_ramp, 0.0), 1.0)
+        return float(state.start_force + fraction * (state.goal_force - state.start_force))
+
+    def jaws_arrival(self, state: PlannerState, moved: float) -> float:
+        """When jaws and force of the present mode have arrived, but not before `moved`, in s."""
+        opening_time = abs(state.goal_opening - state.start_opening) / (
+            2 * self._parameters.finger_speed
+        )
+        moved = max(moved, state.start_time + opening_time)
+        return float(max(moved, state.force_start_time + self._parameters.force_ramp))

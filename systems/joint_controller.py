@@ -1,0 +1,115 @@
+"""Controls a Franka arm and its hand along a desired motion of the joints."""
+
+from __future__ import annotations
+
+import numpy as np
+from pydrake.multibody.plant import MultibodyPlant
+from pydrake.multibody.tree import MultibodyForces
+from pydrake.systems.framework import BasicVector, Context, LeafSystem
+
+from systems.arm_limits import JOINTS
+from systems.trajectory_controller import FINGERS, FingerLaw
+
+
+class JointController(LeafSystem):
+    r"""Joint impedance with computed torque, as libfranka offers it, and the fingers' force.
+
+    .. pydrake_system::
+
+        name: JointController
+        input_ports:
+        - robot_state
+        - desired_motion
+        - desired_opening
+        - closing_force (optional)
+        output_ports:
+        - desired_state
+        - feedforward
+        - finger_force
+
+    - `robot_state` (18): positions of the seven joints and both fingers, then their velocities.
+    - `desired_motion` (21): q_d, v_d, a_d of the joints, in rad and s.
+    - `desired_opening` (2), `closing_force` (1): as in `TrajectoryController`.
+    - `desired_state` (14): q_n, v_n, for the plant's port of that name.
+    - `feedforward` (7): u_ff, for the plant's actuation port, in N m.
+    - `finger_force` (2): actuation of the fingers, in N.
+
+    The arm's torque is
+
+        u = clip(u_ff + K (q_n - q) + D (v_n - v), -u_max, u_max),
+        u_ff = M(q) a_d + C(q, v) v,
+        v_n = v_d + h a_d / 2,   q_n = q_d + h v_n.
+
+    The plant computes the first line itself, with the q and v at the *end* of its step of length h,
+    so that stiff joints are stable: give it K and D by `JointActuator.set_controller_gains`, and
+    u_max as effort limit. Hence q_n is the position at the end of the step, and v_n the velocity
+    with which the plant's integration, q + h v, gets there.
+
+    The model's gravity is not compensated here: a Franka compensates its own weight, so the plant's
+    arm has no gravity. Neither is the payload, which causes a sag.
+
+    The fingers follow the `FingerLaw`.
+
+    Stateless.
+    """
+
+    def __init__(self, *, arm: MultibodyPlant, step: float, fingers: FingerLaw) -> None:
+        """
+        Args:
+            arm: a plant of nothing but the arm and its hand, without gravity; the joints come
+                before the fingers.
+            step: h, the time step of the plant that is controlled, in s.
+            fingers: the law of the fingers.
+
+        Raises:
+            ValueError: the plant does not have seven joints and two fingers.
+        """
+        super().__init__()
+        if arm.num_positions() != JOINTS + FINGERS:
+            raise ValueError(f"arm must have 9 positions, not {arm.num_positions()}")
+        self._arm, self._step, self._fingers = arm, step, fingers
+        # Scratch memory: no value outlives the call that sets it.
+        self._scratch, self._no_forces = arm.CreateDefaultContext(), MultibodyForces(arm)
+        joints, size = JOINTS, JOINTS + FINGERS
+        self._robot_state = self.DeclareVectorInputPort("robot_state", 2 * size)
+        self._desired_motion = self.DeclareVectorInputPort("desired_motion", 3 * joints)
+        self._desired_opening = self.DeclareVectorInputPort("desired_opening", 2)
+        self._closing_force = self.DeclareVectorInputPort("closing_force", 1)
+        robot, motion, opening, closing = (
+            self.input_port_ticket(port.get_index())
+            for port in (
+                self._robot_state,
+                self._desired_motion,
+                self._desired_opening,
+                self._closing_force,
+            )
+        )
+        self.DeclareVectorOutputPort("desired_state", 2 * joints, self._calc_desired, {motion})
+        self.DeclareVectorOutputPort("feedforward", joints, self._calc_feedforward, {robot, motion})
+        self.DeclareVectorOutputPort(
+            "finger_force", FINGERS, self._calc_fingers, {robot, opening, closing}
+        )
+
+    def _calc_desired(self, context: Context, output: BasicVector) -> None:
+        q, v, a = self._desired_motion.Eval(context).reshape(3, JOINTS)
+        v_next = v + self._step / 2 * a
+        output.SetFromVector(np.concatenate([q + self._step * v_next, v_next]))
+
+    def _calc_feedforward(self, context: Context, output: BasicVector) -> None:
+        arm, scratch = self._arm, self._scratch
+        a_d = self._desired_motion.Eval(context)[2 * JOINTS :]
+        arm.SetPositionsAndVelocities(scratch, self._robot_state.Eval(context))
+        wanted = np.concatenate([a_d, np.zeros(FINGERS)])
+        torque = arm.CalcInverseDynamics(scratch, wanted, self._no_forces)
+        output.SetFromVector(torque[:JOINTS])
+
+    def _calc_fingers(self, context: Context, output: BasicVector) -> None:
+        state = self._robot_state.Eval(context)
+        size = JOINTS + FINGERS
+        press = self._closing_force.Eval(context)[0] if self._closing_force.HasValue(context) else 0
+        force = self._fingers.force(
+            (*state[JOINTS:size].tolist(), *state[size + JOINTS :].tolist()),
+            self._desired_opening.Eval(context).tolist(),
+            float(press),
+        )
+        output.SetFromVector([force] * FINGERS)

@@ -1,0 +1,205 @@
+r"""Moves along a path in joint space, as fast as the joints' limits allow.
+
+`fastest_times` solves the time-optimal path parameterization by the reachability analysis of Pham
+and Pham, "A new approach to time-optimal path parameterization based on reachability analysis",
+IEEE T-RO 34 (2018): with x = (ds/dt)^2 and u = d2s/dt2 each limit of acceleration is linear in x
+and u. One pass backwards finds the largest x from which the end can be reached, one pass forwards
+takes the largest u.
+
+`SmoothMotion` averages such a motion over the last few milliseconds. This limits the jerk. All
+other limits still hold, because they are convex: an average of states within limits of position
+and acceleration, and of velocity limits that are concave in the position, is within them, too.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import CubicSpline
+
+from systems.arm_limits import ArmLimits
+
+TICK = 1 / 1024
+"""Time between the samples of a motion, in s."""
+AVERAGED = 6
+"""Number of ticks over which the acceleration is averaged."""
+_SHARE = 0.98
+"""Share of the limits that a motion uses. Between the path's points it takes a little more."""
+_LEAST, _UNLIMITED = 1e-9, 1e12
+
+
+@dataclass(frozen=True)
+class RowLimits:
+    """Limits along a path: of its joints, and of other quantities that depend on them."""
+
+    low: NDArray[np.float64]
+    """(n, rows) lowest velocities at the path's points; negative. Likewise `high`."""
+    high: NDArray[np.float64]
+    acceleration: NDArray[np.float64]
+    """(rows) largest accelerations; finite."""
+
+
+def fastest_times(
+    points: NDArray[np.float64], limits: RowLimits
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """When, and how fast, to pass the points of a path, from rest to rest.
+
+    Args:
+        points: (n, rows) at least 3, evenly spaced in the path's parameter.
+        limits: of each row.
+
+    Returns:
+        (n) times in s, from zero, and (n) rates ds/dt, where s counts the points.
+    """
+    spline = CubicSpline(np.arange(len(points)), points)
+    slopes = spline.c[2]
+    first = np.vstack([slopes, spline(len(points) - 1, 1)])
+    second = spline(np.arange(len(points)), 2)
+    # u may be between -b - k x and b - k x in each row.
+    steep = np.where(np.abs(first) < _LEAST, _LEAST, first)
+    b, k = limits.acceleration / np.abs(steep), second / steep
+    speed = np.where(steep > 0, limits.high, limits.low) / steep
+    highest = np.minimum(speed.min(axis=1) ** 2, _solvable(b, k))
+    highest[0] = highest[-1] = 0.0
+    x = _largest(highest.tolist(), b, k)
+    rates = np.sqrt(np.maximum(x, 0.0))
+    steps = 2 / np.maximum(rates[:-1] + rates[1:], _LEAST)
+    return np.concatenate([[0.0], np.cumsum(steps)]), rates
+
+
+def _solvable(b: NDArray[np.float64], k: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(n) the largest x for which some u satisfies all rows."""
+    gap = k[:, :, None] - k[:, None, :]
+    room = b[:, :, None] + b[:, None, :]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        bound = np.where(gap > _LEAST, room / gap, np.inf)
+    return np.asarray(bound.min(axis=(1, 2)))
+
+
+def _largest(
+    highest: list[float], b: NDArray[np.float64], k: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """(n) the profile x, by one pass backwards and one forwards."""
+    # Before a point with x at most e, x (1 - 2 k) must be at most e + 2 b in each row.
+    with np.errstate(divide="ignore"):
+        gain = np.where(1 - 2 * k > 0, 1 / (1 - 2 * k), _UNLIMITED)
+    rise = 2 * b * gain
+    x = list(highest)
+    for i in range(len(x) - 2, -1, -1):
+        x[i] = min(x[i], float((gain[i] * x[i + 1] + rise[i]).min()))
+    for i in range(len(x) - 1):
+        most = x[i] + 2 * float((b[i] - k[i] * x[i]).min())
+        x[i + 1] = min(x[i + 1], max(most, 0.0))
+    return np.array(x)
+
+
+class SmoothMotion:
+    """A motion of the joints from rest to rest, sampled at every `TICK`.
+
+    Between samples the jerk is constant.
+    """
+
+    def __init__(self, position: NDArray[np.float64]) -> None:
+        """
+        Args:
+            position: (n, joints) a motion from rest to rest at every tick, before averaging.
+        """
+        rest = [position[:1]] * 2, [position[-1:]] * (AVERAGED + 2)
+        padded = np.concatenate([*rest[0], position, *rest[1]])
+        raw = np.diff(padded, 2, axis=0) / TICK**2
+        total = np.cumsum(raw, axis=0)
+        total[AVERAGED:] -= total[:-AVERAGED].copy()
+        acceleration = total / AVERAGED
+        acceleration[-1] = 0.0
+        velocity = np.zeros_like(acceleration)
+        np.cumsum((acceleration[1:] + acceleration[:-1]) * (TICK / 2), axis=0, out=velocity[1:])
+        moved = velocity[:-1] * TICK + (2 * acceleration[:-1] + acceleration[1:]) * (TICK**2 / 6)
+        place = np.concatenate([position[:1], position[:1] + np.cumsum(moved, axis=0)])
+        self.samples = np.hstack([place, velocity, acceleration])
+        """(n, 3 joints) position, velocity, acceleration."""
+        self.goal = position[-1]
+        self.duration = (len(self.samples) - 1) * TICK
+
+    def at(self, time: float) -> NDArray[np.float64]:
+        """(3 joints) position, velocity and acceleration; at rest before and after the motion."""
+        if time <= 0:
+            return self._rest(self.samples[0, : len(self.goal)])
+        if time >= self.duration:
+            return self._rest(self.goal)
+        index = int(time / TICK)
+        h = time - index * TICK
+        q, v, a = self.samples[index].reshape(3, -1)
+        jerk = (self.samples[index + 1, 2 * len(q) :] - a) / TICK
+        change = a + h * jerk
+        return np.concatenate(
+            [q + h * (v + h * (a / 2 + h / 6 * jerk)), v + h * (a + h / 2 * jerk), change]
+        )
+
+    def _rest(self, position: NDArray[np.float64]) -> NDArray[np.float64]:
+        return np.concatenate([position, np.zeros(2 * len(position))])
+
+    def excess(self, limits: ArmLimits) -> float:
+        """By which factor the motion must be slower to stay within the limits; 1 if it is."""
+        q, v, a = np.split(self.samples, 3, axis=1)
+        low, high = braking_bounds(limits, q)
+        speed = np.maximum(v / np.maximum(high, _LEAST), v / np.minimum(low, -_LEAST))
+        change = np.abs(a) / limits.acceleration
+        jerk = np.abs(np.diff(a, axis=0)) / TICK / limits.jerk
+        return max(1.0, speed.max(), math.sqrt(change.max()), float(np.cbrt(jerk.max())))
+
+
+def braking_bounds(
+    limits: ArmLimits, q: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """As `ArmLimits.velocity_bounds`, and never so fast that a joint cannot stop in its range."""
+    low, high = limits.velocity_bounds(q)
+    # Half of the acceleration: a stop begins with a little jerk.
+    brakes = np.array(limits.acceleration)
+    return (
+        np.maximum(low, -np.sqrt(np.maximum(brakes * (q - limits.lower), 0.0))),
+        np.minimum(high, np.sqrt(np.maximum(brakes * (np.array(limits.upper) - q), 0.0))),
+    )
+
+
+def plan_motion(
+    points: NDArray[np.float64], limits: ArmLimits, extra: NDArray[np.float64], bounds: RowLimits
+) -> SmoothMotion:
+    """The fastest motion along a path, from rest to rest.
+
+    Args:
+        points: (n, 7) joint positions, evenly spaced in the path's parameter, at least 3.
+        limits: of the joints; they hold exactly.
+        extra: (n, rows) other quantities that are limited along the path, such as a height.
+        bounds: limits of these rows, which hold up to a few percent.
+    """
+    low, high = braking_bounds(limits, points)
+    rows = RowLimits(
+        low=_SHARE * np.hstack([low, bounds.low]),
+        high=_SHARE * np.hstack([high, bounds.high]),
+        acceleration=_SHARE * np.concatenate([limits.acceleration, bounds.acceleration]),
+    )
+    times, rates = fastest_times(np.hstack([points, extra]), rows)
+    spline = CubicSpline(np.arange(len(points)), points)
+    slower = 1.0
+    for _ in range(8):
+        motion = SmoothMotion(_sample(spline, times * slower, rates / slower))
+        excess = motion.excess(limits)
+        if excess <= 1.0:
+            return motion
+        slower *= 1.001 * excess
+    raise RuntimeError("no motion along the path keeps the limits of the joints")
+
+
+def _sample(
+    spline: CubicSpline, times: NDArray[np.float64], rates: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """(n, 7) joint positions at every tick, with constant d2s/dt2 between the path's points."""
+    ticks = np.arange(math.ceil(times[-1] / TICK)) * TICK
+    index = np.clip(np.searchsorted(times, ticks, side="right") - 1, 0, len(times) - 2)
+    since = ticks - times[index]
+    change = (rates[index + 1] - rates[index]) / (times[index + 1] - times[index])
+    s = index + since * (rates[index] + since * change / 2)
+    return np.asarray(spline(np.append(np.minimum(s, len(times) - 1), len(times) - 1)))

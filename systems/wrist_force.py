@@ -1,0 +1,93 @@
+"""Estimates the contact force on a Franka's hand from its joint torques."""
+
+from __future__ import annotations
+
+import numpy as np
+from pydrake.multibody.plant import MultibodyPlant
+from pydrake.multibody.tree import Frame, JacobianWrtVariable
+from pydrake.systems.framework import BasicVector, Context, LeafSystem
+
+from systems.arm_limits import JOINTS
+from systems.trajectory_controller import FINGERS
+
+_STREAM = 17
+"""Random stream of the seed, used by nothing else."""
+
+
+class WristForce(LeafSystem):
+    r"""The contact force on the hand, from external joint torques.
+
+    .. pydrake_system::
+
+        name: WristForce
+        input_ports:
+        - robot_state
+        - joint_contact_torque
+        - finger_contact_force
+        output_ports:
+        - wrist_force
+
+    - `robot_state` (18): as in `JointController`.
+    - `joint_contact_torque` (7): tau, the torques that contacts cause in the joints, in N m. A
+      Franka estimates them: measured torques less those that its model explains.
+    - `finger_contact_force` (2): the contact forces on the fingers' joints, in N.
+    - `wrist_force` (6): contact forces on x, y, z (N), about z (N m), and on each finger (N), at
+      the gripper frame G and in the world's axes: the `PickPlacePlanner`'s `hand_contact_force`.
+
+    The spatial force F on the hand at G solves, in the sense of least squares,
+
+        J(q)^T F = tau + n,
+
+    with J the Jacobian of G and n white noise, drawn anew at each time. F is exact without noise,
+    if nothing touches the arm itself. It includes the weight of a held object.
+
+    Stateless: the noise is a function of seed and time.
+    """
+
+    def __init__(
+        self, *, arm: MultibodyPlant, gripper: Frame, noise: float = 0.0, seed: int = 0
+    ) -> None:
+        """
+        Args:
+            arm: a plant of nothing but the arm and its hand, at its place in the world; the joints
+                come before the fingers.
+            gripper: G, a frame of that plant.
+            noise: the standard deviation of n, in N m.
+            seed: the seed of the noise.
+        """
+        super().__init__()
+        self._arm, self._gripper = arm, gripper
+        # Scratch memory: no value outlives the call that sets it.
+        self._scratch = arm.CreateDefaultContext()
+        self._noise, self._seed = noise, seed
+        size = JOINTS + FINGERS
+        self._robot_state = self.DeclareVectorInputPort("robot_state", 2 * size)
+        self._torque = self.DeclareVectorInputPort("joint_contact_torque", JOINTS)
+        self._finger_force = self.DeclareVectorInputPort("finger_contact_force", FINGERS)
+        tickets = {self.all_input_ports_ticket()}
+        if noise > 0:
+            tickets.add(self.time_ticket())
+        self.DeclareVectorOutputPort("wrist_force", 4 + FINGERS, self._calc_force, tickets)
+
+    def _calc_force(self, context: Context, output: BasicVector) -> None:
+        torque = self._torque.Eval(context)
+        if self._noise > 0:
+            # A context's time is a multiple of the plant's step, so that this names the step.
+            moment = round(1e6 * context.get_time())
+            rng = np.random.default_rng([self._seed, _STREAM, moment])
+            torque = torque + rng.normal(0.0, self._noise, JOINTS)
+        force = [0.0] * 4
+        if torque.any():
+            force = self._solve(self._robot_state.Eval(context), torque)
+        output.SetFromVector([*force, *self._finger_force.Eval(context).tolist()])
+
+    def _solve(self, state: np.ndarray, torque: np.ndarray) -> list[float]:
+        arm = self._arm
+        arm.SetPositions(self._scratch, state[: JOINTS + FINGERS])
+        world = arm.world_frame()
+        jacobian = arm.CalcJacobianSpatialVelocity(
+            self._scratch, JacobianWrtVariable.kV, self._gripper, np.zeros(3), world, world
+        )[:, :JOINTS]
+        # The normal equations: J has full rank where the hand points down.
+        _, _, about_z, x, y, z = np.linalg.solve(jacobian @ jacobian.T, jacobian @ torque).tolist()
+        return [x, y, z, about_z]

@@ -1,0 +1,274 @@
+import math
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.optimize import least_squares
+
+from systems.arm_collisions import Capsule
+from systems.arm_kinematics import ArmBase, fingertips, hand_state, joint_frames
+from systems.arm_limits import ARM_LIMITS, FR3, PANDA, ArmLimits
+from systems.arm_motion import ArmMotion, ArmState
+from systems.arm_postures import MARGIN, ArmPostures, HandStop
+from systems.arm_reach import reach_problem
+from systems.pick_place_parameters import Mode, PickPlaceParameters
+
+BASE = ArmBase(0.1, 0.0, 0.0)
+PARAMETERS = PickPlaceParameters()
+WAYS = (Mode.APPROACH, Mode.DESCEND, Mode.LIFT, Mode.LOWER, Mode.SEARCH, Mode.RETREAT)
+HIGHEST = 0.05
+
+
+def motion_of(limits: ArmLimits = FR3, obstacles: tuple[Capsule, ...] = ()) -> ArmMotion:
+    return ArmMotion(PARAMETERS, limits, BASE, obstacles)
+
+
+def set_action(state: ArmState, pick: tuple, place: tuple) -> None:
+    """A tool of 25 mm height on the table goes into a kit of 50 mm."""
+    state.pick, state.place = pick, place
+    state.grasp_z, state.pick_top_z, state.table_z = 0.015, 0.025, 0.0
+    state.clear_z = HIGHEST + PARAMETERS.travel_clearance
+    state.travel_z = state.clear_z + 0.015
+    state.pick_hover_z, state.place_hover_z = 0.035, 0.075
+    state.floor_z, state.rim_z, state.hold_z, state.touch_z = 0.02, 0.05, 0.015, 0.06
+
+
+def random_action(rng: np.random.Generator) -> tuple[tuple, tuple]:
+    pick = (rng.uniform(0.3, 0.68), rng.uniform(0.0, 0.4), rng.uniform(-math.pi, math.pi))
+    place = (rng.uniform(0.35, 0.65), rng.uniform(-0.38, 0), rng.uniform(-math.pi, math.pi))
+    return pick, place
+
+
+def states(motion: ArmMotion, state: ArmState, start: float, end: float) -> NDArray:
+    """(n, 21) at every millisecond."""
+    times = start + np.arange(math.ceil(1000 * (end - start))) / 1000
+    return np.array([motion.motion_at(state, time) for time in times])
+
+
+def check_limits(limits: ArmLimits, samples: NDArray) -> None:
+    """Checks every limit, and that velocities and accelerations are derivatives."""
+    q, v, a = np.split(samples, 3, axis=1)
+    low, high = limits.velocity_bounds(q)
+    assert (q >= limits.lower).all()
+    assert (q <= limits.upper).all()
+    assert (v >= low).all()
+    assert (v <= high).all()
+    assert (np.abs(a) <= limits.acceleration).all()
+    jerk = np.diff(a, axis=0) / 1e-3
+    assert (np.abs(jerk) <= limits.jerk).all()
+    # Within what the jerk allows between two samples.
+    allowed = 1e-3 * np.array(limits.jerk) * 1e-3 / 2
+    assert (np.abs(np.diff(v, axis=0) / 1e-3 - a[:-1]) <= 1e-3 * np.array(limits.jerk)).all()
+    assert (np.abs(np.diff(q, axis=0) / 1e-3 - (v[:-1] + v[1:]) / 2) <= allowed).all()
+
+
+def check_random_ways(model: str, actions: int, seed: int) -> int:
+    """All ways of some actions, some of them cut short by a stop; returns how many."""
+    limits, rng = ARM_LIMITS[model], np.random.default_rng(seed)
+    motion, time, ways = motion_of(limits), 1.0, 0
+    state = motion.view(motion.initial_state())
+    samples = [motion.motion_at(state, time)[None]]
+    for _ in range(actions):
+        set_action(state, *random_action(rng))
+        if not motion.prepare(state):
+            continue
+        for mode in WAYS:
+            motion.begin(state, mode, time)
+            lasts = motion.arrival(state) - time
+            ways += 1
+            if rng.random() < 0.3:
+                # Stop on the way.
+                later = time + rng.uniform(0.0, lasts)
+                samples.append(states(motion, state, time, later))
+                hand = motion.postures.hand_pose(motion.motion_at(state, later)[:7])
+                motion.begin(state, Mode.RELEASE, later, z=float(hand[2]))
+                time, lasts, ways = later, motion.arrival(state) - later, ways + 1
+            samples.append(states(motion, state, time, time + lasts))
+            time += lasts
+            at_rest = motion.motion_at(state, time)
+            np.testing.assert_allclose(at_rest[7:], 0.0, atol=1e-12)
+    # Successive ways do not begin at whole milliseconds: check each on its own.
+    for part in samples:
+        if len(part) > 2:
+            check_limits(limits, part)
+    return ways
+
+
+@pytest.mark.parametrize("model", ["fr3", "panda"])
+def test_all_limits_hold_at_every_millisecond_also_when_stopped(model: str):
+    assert check_random_ways(model, actions=5, seed=3) > 20
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("model", ["fr3", "panda"])
+def test_all_limits_hold_on_hundreds_of_ways(model: str):
+    assert check_random_ways(model, actions=60, seed=4) > 300
+
+
+def test_a_stop_is_continuous_and_short():
+    motion = motion_of()
+    state = motion.view(motion.initial_state())
+    set_action(state, (0.6, 0.3, 0.4), (0.5, -0.3, 0.0))
+    assert motion.prepare(state)
+    motion.begin(state, Mode.APPROACH, 0.0)
+    middle = motion.arrival(state) / 2
+    before = motion.motion_at(state, middle)
+    assert np.abs(before[7:14]).max() > 0.5
+    motion.begin(state, Mode.RELEASE, middle)
+    np.testing.assert_array_equal(motion.motion_at(state, middle), before)
+    assert state.duration < 0.35
+
+
+def test_the_hand_s_acceleration_is_that_of_the_joints():
+    motion = motion_of()
+    state = motion.view(motion.initial_state())
+    set_action(state, (0.6, 0.3, 0.4), (0.5, -0.3, 0.0))
+    assert motion.prepare(state)
+    motion.begin(state, Mode.APPROACH, 0.0)
+    motion.begin(state, Mode.RETREAT, 0.3)
+    for time in (0.32, 0.45, 0.6):
+        step = 2e-3
+        tips = [
+            BASE.to_world(fingertips(motion.motion_at(state, time + i * step)[:7]))
+            for i in (-1, 0, 1)
+        ]
+        expected = (tips[0] - 2 * tips[1] + tips[2]) / step**2
+        found = motion.hand_acceleration(state, time, motion.motion_at(state, time))
+        np.testing.assert_allclose(found, expected, atol=1.5)
+
+
+def test_the_hand_follows_its_heights():
+    motion = motion_of()
+    state = motion.view(motion.initial_state())
+    set_action(state, (0.6, 0.3, 0.4), (0.5, -0.3, 2.0))
+    assert motion.prepare(state)
+    time = 0.0
+    tips, downs = {}, {}
+    for mode in (Mode.APPROACH, Mode.DESCEND, Mode.LIFT, Mode.LOWER):
+        motion.begin(state, mode, time)
+        q = states(motion, state, time, motion.arrival(state))[:, :7]
+        tips[mode] = BASE.to_world(fingertips(q))
+        downs[mode] = joint_frames(q)[0][:, 7, 2, 2]
+        time = motion.arrival(state)
+    hand = motion.postures.hand_pose(motion.motion_at(state, time)[:7])
+    np.testing.assert_allclose(hand[:3], [0.5, -0.3, PARAMETERS.floor_clearance], atol=1e-6)
+    turn = math.remainder(float(hand[3]) - 2.0, math.pi)
+    assert abs(turn) < 1e-6
+    # The hand points down, also on the way.
+    assert max(down.max() for down in downs.values()) < -0.9999
+    lift = tips[Mode.LIFT]
+    away = np.linalg.norm(lift[:, :2] - (0.6, 0.3), axis=1)
+    near = np.linalg.norm(lift[:, :2] - (0.5, -0.3), axis=1)
+    assert lift[(away > 0.007) & (near > 0.021), 2].min() > state.travel_z - 0.004
+    assert lift[-1, 2] == pytest.approx(state.place_hover_z)
+    for mode, goal in ((Mode.DESCEND, (0.6, 0.3)), (Mode.LOWER, (0.5, -0.3))):
+        assert np.abs(tips[mode][:, :2] - goal).max() < 1e-4
+    # As slow as a floating hand where something is touched.
+    slow = tips[Mode.LOWER][tips[Mode.LOWER][:, 2] < 0.049, 2]
+    assert np.abs(np.diff(slow) / 1e-3).max() <= 1.05 * PARAMETERS.touch_speed
+
+
+def test_equal_states_give_equal_motions_in_any_order():
+    first, second = motion_of(), motion_of()
+    seen = []
+    for motion in (first, second):
+        state = motion.view(motion.initial_state())
+        set_action(state, (0.6, 0.3, 0.4), (0.5, -0.3, 2.0))
+        motion.prepare(state)
+        motion.begin(state, Mode.APPROACH, 0.0)
+        motion.begin(state, Mode.RETREAT, 0.3)
+        seen.append(state)
+    np.testing.assert_array_equal(seen[0].vector, seen[1].vector)
+    backwards = [second.motion_at(seen[1], t) for t in (0.9, 0.5, 0.31)]
+    forwards = [first.motion_at(seen[0], t) for t in (0.31, 0.5, 0.9)]
+    np.testing.assert_array_equal(backwards[::-1], forwards)
+
+
+def test_joint_seven_stays_in_its_range_for_every_turn_of_an_object():
+    for limits in (FR3, PANDA):
+        motion = motion_of(limits)
+        state = motion.view(motion.initial_state())
+        for pick_yaw in np.linspace(-3.1, 3.1, 9):
+            for turn in np.linspace(-3.1, 3.1, 9):
+                set_action(state, (0.5, 0.2, pick_yaw), (0.5, -0.2, pick_yaw + turn))
+                assert motion.prepare(state), motion.reach_problem(state)
+                turned = state.place[2] - state.pick[2]
+                assert abs(math.remainder(turned - turn, math.tau)) < 1e-9
+
+
+def test_what_cannot_be_reached_is_said():
+    postures = ArmPostures(FR3, BASE)
+
+    def problem(x: float, y: float, **kwargs) -> str:
+        stop = HandStop("the pick", x, y, 0.3, **({"low": 0.02, "high": 0.1} | kwargs), surface=0.0)
+        return reach_problem(postures, [stop])
+
+    assert problem(0.5, 0.2) == ""
+    assert "out of the arm's reach" in problem(0.95, 0.3)
+    assert "out of the arm's reach" in problem(0.5, 0.0, high=1.2)
+    # The forearm would lie in a wall of bins.
+    deep = HandStop("the place", 0.5, 0.2, 0.3, low=-0.2, high=0.1, surface=0.0)
+    assert "collide" in reach_problem(postures, [deep])
+    post = Capsule((0.6, 0.0, -0.5), (0.6, 0.0, 0.3), 0.02)
+    motion = motion_of(obstacles=(post,))
+    state = motion.view(motion.initial_state())
+    set_action(state, (0.5, 0.3, 0.0), (0.5, -0.3, 0.0))
+    assert not motion.prepare(state)
+    assert "on the way to the place" in motion.reach_problem(state)
+
+
+def numerically_reached(postures: ArmPostures, pose: NDArray, rng: np.random.Generator) -> bool:
+    """Whether a bounded least-squares search brings the hand to a pose, at one of both yaws."""
+    lower = np.array(postures.limits.lower) + MARGIN
+    upper = np.array(postures.limits.upper) - MARGIN
+    x, y, z, yaw = postures.base.to_base(pose).tolist()
+
+    def error(q: NDArray) -> NDArray:
+        rotations, origins = joint_frames(q)
+        axis, mount = (
+            rotations[7, :, 2],
+            rotations[7] @ [math.cos(0.25 * math.pi), -math.sin(0.25 * math.pi), 0],
+        )
+        tip = origins[7] + 0.1121 * axis
+        turned = math.cos(yaw) * mount[1] - math.sin(yaw) * mount[0]
+        return np.array([*(tip - (x, y, z)), *(0.3 * axis[:2]), 0.3 * (axis[2] + 1), 0.3 * turned])
+
+    for _ in range(20):
+        found = least_squares(error, rng.uniform(lower, upper), bounds=(lower, upper), xtol=1e-10)
+        if np.abs(found.fun).max() < 1e-5:
+            return True
+    return False
+
+
+def check_reach(limits: ArmLimits, poses: int, seed: int) -> None:
+    rng, postures = np.random.default_rng(seed), ArmPostures(limits, BASE)
+    reached = 0
+    for _ in range(poses):
+        x, y, z = rng.uniform((0.2, -0.65, 0.0), (0.9, 0.65, 0.5))
+        yaw = rng.uniform(-math.pi, math.pi)
+        stop = HandStop("the pick", x, y, yaw, low=z, high=z, surface=-1.0)
+        problem = reach_problem(postures, [stop])
+        # The search knows of no collisions.
+        expected = numerically_reached(postures, np.array([x, y, z, yaw]), rng)
+        assert expected == (not problem or "collide" in problem), (x, y, z, yaw, problem)
+        reached += expected
+    assert 0.1 * poses < reached < 0.95 * poses
+
+
+def test_reach_agrees_with_a_numerical_search():
+    check_reach(FR3, poses=6, seed=1)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("limits", [FR3, PANDA])
+def test_reach_agrees_with_a_numerical_search_at_a_thousand_poses(limits: ArmLimits):
+    check_reach(limits, poses=500, seed=2)
+
+
+def test_the_hand_s_state_of_the_home_is_the_home():
+    motion = motion_of()
+    home = hand_state(motion.home_joints.tolist(), [0.0] * 7, BASE)
+    np.testing.assert_allclose(home[:3], PARAMETERS.home[:3], atol=1e-9)
+    np.testing.assert_array_equal(
+        motion.motion_at(motion.view(motion.initial_state()), 5.0), [*motion.home_joints, *[0] * 14]
+    )

@@ -1,0 +1,126 @@
+"""The planner with an arm that follows exactly."""
+
+import numpy as np
+from pydrake.common.value import Value
+from pydrake.systems.analysis import Simulator
+from pydrake.systems.framework import DiagramBuilder, EventStatus, LeafSystem
+
+from systems.arm_kinematics import ArmBase, hand_state
+from systems.arm_limits import FR3
+from systems.arm_motion import ArmMotion
+from systems.pick_place_parameters import Mode, PickPlaceParameters
+from systems.pick_place_planner import PickPlacePlanner
+from systems.signals import PickPlaceAction, PlanarPose, SurfaceHeights
+
+BASE = ArmBase(0.1, 0.0, 0.0)
+PARAMETERS = PickPlaceParameters(force_limit=140.0)
+PICK, PLACE = PlanarPose(0.5, 0.3, 0.5), PlanarPose(0.55, -0.2, -0.8)
+TOO_FAR = PlanarPose(0.95, -0.6, 0.0)
+HEIGHTS = SurfaceHeights(pick_top=0.03, place_rim=0.05, place_floor=0.0, highest=0.05)
+WIDTH, FLOOR = 0.02, 0.004
+"""Of the object; height of the fingertips when it touches its floor."""
+
+
+class PerfectArm(LeafSystem):
+    """Follows the desired motion, stops the jaws at the object, and feels pads and floor."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        for name, size in (("motion", 21), ("opening", 2), ("force", 1), ("mode", 1)):
+            self.DeclareVectorInputPort(name, size)
+        self.DeclareVectorOutputPort("hand_state", 12, self._calc_state)
+        self.DeclareVectorOutputPort("contact", 6, self._calc_contact)
+
+    def _hand(self, context) -> list[float]:
+        q, v, _ = np.split(self.GetInputPort("motion").Eval(context), 3)
+        return hand_state(q.tolist(), v.tolist(), BASE)
+
+    def _calc_state(self, context, output) -> None:
+        hand = self._hand(context)
+        opening, rate = self.GetInputPort("opening").Eval(context)
+        if opening < WIDTH:
+            opening, rate = WIDTH, 0.0
+        fingers, rates = [opening / 2] * 2, [rate / 2] * 2
+        output.SetFromVector([*hand[:4], *fingers, *hand[4:], *rates])
+
+    def _calc_contact(self, context, output) -> None:
+        z, mode = self._hand(context)[2], self.GetInputPort("mode").Eval(context)[0]
+        opening, press = self.GetInputPort("opening").Eval(context)[0], self.GetInputPort("force")
+        pad = press.Eval(context)[0] + 400 * (WIDTH - opening) if opening <= WIDTH else 0.0
+        touch = 1e4 * max(FLOOR - z, 0.0) if mode >= Mode.LOWER else 0.0
+        output.SetFromVector([0, 0, touch, 0, pad, pad])
+
+
+class TwoActions(LeafSystem):
+    """One action that is out of reach, one that is not, then a stop."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._answers = [
+            PickPlaceAction(PICK, TOO_FAR, heights=HEIGHTS),
+            PickPlaceAction(PICK, PLACE, heights=HEIGHTS),
+            PickPlaceAction(stop=True),
+        ]
+        self.DeclareVectorInputPort("counts", 4)
+        self.DeclareAbstractOutputPort("action", lambda: Value(PickPlaceAction()), self._calc)
+
+    def _calc(self, context, output) -> None:
+        output.set_value(self._answers[int(self.GetInputPort("counts").Eval(context)[0])])
+
+
+def run() -> tuple[list[Mode], tuple, np.ndarray]:
+    """Modes, attempts, and the commanded motion at each step."""
+    builder = DiagramBuilder()
+    planner = builder.AddSystem(
+        PickPlacePlanner(
+            parameters=PARAMETERS, max_actions=5, motion=ArmMotion(PARAMETERS, FR3, BASE)
+        )
+    )
+    arm, policy = builder.AddSystem(PerfectArm()), builder.AddSystem(TwoActions())
+    for source, target in (
+        ("desired_motion", "motion"),
+        ("desired_opening", "opening"),
+        ("closing_force", "force"),
+        ("mode", "mode"),
+    ):
+        builder.Connect(planner.GetOutputPort(source), arm.GetInputPort(target))
+    builder.Connect(arm.GetOutputPort("hand_state"), planner.GetInputPort("hand_state"))
+    builder.Connect(arm.GetOutputPort("contact"), planner.GetInputPort("hand_contact_force"))
+    builder.Connect(planner.GetOutputPort("counts"), policy.get_input_port())
+    builder.Connect(policy.get_output_port(), planner.GetInputPort("action"))
+    simulator = Simulator(builder.Build())
+    modes: list[Mode] = []
+    motions = []
+
+    def look(root) -> EventStatus:
+        context = planner.GetMyContextFromRoot(root)
+        mode = Mode(int(planner.GetOutputPort("mode").Eval(context)[0]))
+        if not modes or modes[-1] != mode:
+            modes.append(mode)
+        motions.append(planner.GetOutputPort("desired_motion").Eval(context))
+        if mode == Mode.DONE:
+            return EventStatus.ReachedTermination(planner, "done")
+        return EventStatus.DidNothing()
+
+    simulator.set_monitor(look)
+    simulator.AdvanceTo(30.0)
+    context = planner.GetMyContextFromRoot(simulator.get_context())
+    history = planner.GetOutputPort("history").Eval(context)
+    return modes, history, np.array(motions)
+
+
+def test_an_arm_does_what_it_can_reach_and_refuses_the_rest():
+    modes, history, motions = run()
+    refused = [Mode.OBSERVE, Mode.APPROACH, Mode.RETREAT]
+    assert modes == [
+        *refused,
+        *[mode for mode in Mode if mode < Mode.DONE],
+        Mode.OBSERVE,
+        Mode.DONE,
+    ]
+    assert [attempt.outcome for attempt in history] == ["unreachable", "placed"]
+    # Nothing moves before the second action.
+    moving = np.flatnonzero(np.abs(motions[:, 7:14]).max(axis=1) > 0)
+    assert moving[0] / 128 > 0.2
+    again = run()
+    np.testing.assert_array_equal(again[2], motions)
