@@ -37,8 +37,9 @@ class FrankaArm:
     model: str = "fr3"
 
     # Where it stands: x, y, z in m, and its rotation about the world's z. At zero it faces +x.
-    # From (0.1, 0, 0) it reaches 98 % of the default workspace.
-    base: list[float] = bounded([0.1, 0.0, 0.0], -3.0, 3.0)
+    # From here it reaches 99 % of the tools and cavities of the default kitting scenes, all of them
+    # with the arm in a vertical plane.
+    base: list[float] = bounded([-0.02, 0.0, 0.0], -3.0, 3.0)
     yaw_deg: float = bounded(0.0, -180.0, 180.0)
 
     # Joint impedance, base to flange, in N m/rad and N m s/rad: see `systems.joint_controller`.
