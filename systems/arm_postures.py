@@ -229,21 +229,24 @@ class ArmPostures:
 
     def _problem(self, stop: HandStop) -> str:
         """Why there is no posture at a stop."""
-        every = np.concatenate([np.zeros(1), _SWIVELS])
         where = f"{stop.name} at ({stop.x:.3f}, {stop.y:.3f}) m"
+        every = np.concatenate([np.zeros(1), _SWIVELS])
+
+        def reached(*yaws: float) -> list[NDArray[np.float64]]:
+            ways = [way for yaw in yaws for way in self._ways(stop, yaw, every)]
+            return [way for way in ways if self.within(way).all()]
+
+        found = reached(stop.yaw, stop.yaw + math.pi)
+        touched = [self._collision(way, stop) for way in found]
+        if found and all(touched):
+            return f"for {where} the arm would collide with {touched[0]}"
+        if found:
+            return f"{where} is where the arm cannot lower its hand straight"
         # The yaw matters to joint 7 only.
-        reached, touched = False, ""
-        for yaw in np.linspace(0.0, math.pi, 5)[:-1]:
-            for way in self._ways(stop, float(yaw), every):
-                if self.within(way).all():
-                    reached = True
-                    touched = self._collision(way, stop)
-                    if not touched:
-                        return f"{where} would take joint 7 out of its range"
-        if not reached:
-            heights = f"between {stop.low:.3f} and {stop.high:.3f} m"
-            return f"{where} is out of the arm's reach at heights {heights}"
-        return f"for {where} the arm would collide with {touched}"
+        if reached(*np.linspace(0.0, math.pi, 5)[:-1].tolist()):
+            return f"{where} would take joint 7 out of its range"
+        heights = f"between {stop.low:.3f} and {stop.high:.3f} m"
+        return f"{where} is out of the arm's reach at heights {heights}"
 
 
 def _wrap(angle: NDArray[np.float64]) -> NDArray[np.float64]:
