@@ -138,7 +138,13 @@ def _drive_arm(
     robot_state = _robot_state(builder, plant)
     wrist = builder.AddNamedSystem(
         "wrist_force",
-        WristForce(arm=model, gripper=gripper, noise=robot.torque_noise, seed=seed),
+        WristForce(
+            arm=model,
+            gripper=gripper,
+            step=plant.time_step(),
+            noise=robot.torque_noise,
+            seed=seed,
+        ),
     )
     hand_state = builder.AddNamedSystem("hand_state", ArmHandState(robot.arm_base()))
     actuation = builder.AddNamedSystem("actuation", Multiplexer([JOINTS, FINGERS]))
