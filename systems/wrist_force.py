@@ -36,22 +36,30 @@ class WristForce(LeafSystem):
 
     The spatial force F on the hand at G solves, in the sense of least squares,
 
-        J(q)^T F = tau + n,
+        J(q - h v)^T F = tau + n,
 
-    with J the Jacobian of G and n white noise, drawn anew at each time. F is exact without noise,
-    if nothing touches the arm itself. It includes the weight of a held object.
+    with J the Jacobian of G and n white noise, drawn anew at each time. The plant's contacts are
+    those at the beginning of its last step, of length h, when the joints were at q - h v. F is
+    exact without noise, if nothing touches the arm itself. It includes the weight of a held object.
 
     Stateless: the noise is a function of seed and time.
     """
 
     def __init__(
-        self, *, arm: MultibodyPlant, gripper: Frame, noise: float = 0.0, seed: int = 0
+        self,
+        *,
+        arm: MultibodyPlant,
+        gripper: Frame,
+        step: float,
+        noise: float = 0.0,
+        seed: int = 0,
     ) -> None:
         """
         Args:
             arm: a plant of nothing but the arm and its hand, at its place in the world; the joints
                 come before the fingers.
             gripper: G, a frame of that plant.
+            step: h, in s.
             noise: the standard deviation of n, in N m.
             seed: the seed of the noise.
         """
@@ -59,7 +67,7 @@ class WristForce(LeafSystem):
         self._arm, self._gripper = arm, gripper
         # Scratch memory: no value outlives the call that sets it.
         self._scratch = arm.CreateDefaultContext()
-        self._noise, self._seed = noise, seed
+        self._step, self._noise, self._seed = step, noise, seed
         size = JOINTS + FINGERS
         self._robot_state = self.DeclareVectorInputPort("robot_state", 2 * size)
         self._torque = self.DeclareVectorInputPort("joint_contact_torque", JOINTS)
@@ -83,7 +91,8 @@ class WristForce(LeafSystem):
 
     def _solve(self, state: np.ndarray, torque: np.ndarray) -> list[float]:
         arm = self._arm
-        arm.SetPositions(self._scratch, state[: JOINTS + FINGERS])
+        q, v = state[: JOINTS + FINGERS], state[JOINTS + FINGERS :]
+        arm.SetPositions(self._scratch, q - self._step * v)
         world = arm.world_frame()
         jacobian = arm.CalcJacobianSpatialVelocity(
             self._scratch, JacobianWrtVariable.kV, self._gripper, np.zeros(3), world, world

@@ -44,6 +44,8 @@ class _Driven:
     hand_state: OutputPort
     wrist_force: OutputPort
     actuation: OutputPort
+    wrist_moment: OutputPort | None = None
+    """None for an arm."""
 
 
 def add_control(
@@ -86,10 +88,8 @@ def add_control(
         builder.Connect(projector.GetOutputPort("heights"), planner.GetInputPort("observation"))
     builder.Connect(driven.hand_state, planner.GetInputPort("hand_state"))
     builder.Connect(driven.wrist_force, planner.GetInputPort("hand_contact_force"))
-    reactions = plant.get_reaction_forces_output_port()
-    wrist = builder.AddNamedSystem("wrist_moment", WristMoment(reactions, _wrist_joint(plant)))
-    builder.Connect(reactions, wrist.get_input_port())
-    builder.Connect(wrist.get_output_port(), planner.GetInputPort("wrist_moment"))
+    if driven.wrist_moment is not None:
+        builder.Connect(driven.wrist_moment, planner.GetInputPort("wrist_moment"))
     for port in ("desired_motion", "desired_opening", "closing_force"):
         builder.Connect(planner.GetOutputPort(port), driven.controller.GetInputPort(port))
     for port, name in _EXPORTED.items():
@@ -101,12 +101,6 @@ def add_control(
     return planner
 
 
-def _wrist_joint(plant: MultibodyPlant) -> int:
-    """The place, among the plant's joints, of the one that holds the hand."""
-    joints = [plant.get_joint(index) for index in plant.GetJointIndices()]
-    return next(i for i, joint in enumerate(joints) if joint.child_body().name() == "hand")
-
-
 def _drive_hand(builder: DiagramBuilder, scenario: Scenario, plant: MultibodyPlant) -> _Driven:
     """Adds the controller of the floating hand."""
     hand = plant.GetModelInstanceByName(HAND)
@@ -115,7 +109,20 @@ def _drive_hand(builder: DiagramBuilder, scenario: Scenario, plant: MultibodyPla
     builder.Connect(state, controller.GetInputPort("hand_state"))
     builder.Connect(controller.get_output_port(), plant.get_actuation_input_port(hand))
     force = plant.get_generalized_contact_forces_output_port(hand)
-    return _Driven(controller, state, state, force, controller.get_output_port())
+    reactions = plant.get_reaction_forces_output_port()
+    yaw = plant.GetJointByName("yaw").index()
+    moment = builder.AddNamedSystem(
+        "wrist_moment", WristMoment(reactions, plant.GetJointIndices().index(yaw))
+    )
+    builder.Connect(reactions, moment.get_input_port())
+    return _Driven(
+        controller,
+        state,
+        state,
+        force,
+        controller.get_output_port(),
+        wrist_moment=moment.get_output_port(),
+    )
 
 
 def _drive_arm(
@@ -131,7 +138,13 @@ def _drive_arm(
     robot_state = _robot_state(builder, plant)
     wrist = builder.AddNamedSystem(
         "wrist_force",
-        WristForce(arm=model, gripper=gripper, noise=robot.torque_noise, seed=seed),
+        WristForce(
+            arm=model,
+            gripper=gripper,
+            step=plant.time_step(),
+            noise=robot.torque_noise,
+            seed=seed,
+        ),
     )
     hand_state = builder.AddNamedSystem("hand_state", ArmHandState(robot.arm_base()))
     actuation = builder.AddNamedSystem("actuation", Multiplexer([JOINTS, FINGERS]))

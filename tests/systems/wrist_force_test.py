@@ -12,6 +12,8 @@ from systems.wrist_force import WristForce
 # The hand points down, 50 mm above the table; the arm faces 30 degrees away from +x.
 Q = np.array([0.4, 0.57, 0.2, -2.0, -0.1, 2.6, 1.1])
 ROBOT = FrankaArm(base=[0.1, 0.0, 0.0], yaw_deg=30.0)
+V = np.linspace(1.0, -1.5, 7)
+STEP = 1 / 128
 FORCE, TORQUE = np.array([3.0, -4.0, 20.0]), np.array([0.2, -0.3, 0.7])
 Model = tuple[MultibodyPlant, Frame]
 
@@ -41,10 +43,11 @@ def estimate(
     model: Model, torque: NDArray[np.float64], *, noise: float = 0.0, seed: int = 0, time: float = 0
 ) -> NDArray[np.float64]:
     plant, gripper = model
-    system = WristForce(arm=plant, gripper=gripper, noise=noise, seed=seed)
+    system = WristForce(arm=plant, gripper=gripper, step=STEP, noise=noise, seed=seed)
     context = system.CreateDefaultContext()
     context.SetTime(time)
-    state = np.concatenate([Q, [0.01, 0.01], np.zeros(9)])
+    # The torques are those before the last step.
+    state = np.concatenate([Q + STEP * V, [0.01, 0.01], V, [0.0, 0.0]])
     system.GetInputPort("robot_state").FixValue(context, state)
     system.GetInputPort("joint_contact_torque").FixValue(context, torque)
     system.GetInputPort("finger_contact_force").FixValue(context, [5.0, -6.0])
@@ -53,7 +56,7 @@ def estimate(
 
 def test_ports(model: Model):
     plant, gripper = model
-    system = WristForce(arm=plant, gripper=gripper)
+    system = WristForce(arm=plant, gripper=gripper, step=STEP)
     inputs = {"robot_state": 18, "joint_contact_torque": 7, "finger_contact_force": 2}
     assert system.num_input_ports() == len(inputs)
     for name, size in inputs.items():
