@@ -128,6 +128,7 @@ class PickPlacePlanner(LeafSystem):
         Args:
             parameters: heights, speeds, thresholds.
             max_actions: stop after this many actions, unless `parameters.max_actions` overrides it.
+                Actions that set the object down again do not count.
             motion: moves the hand; None: `HandMotion`.
             insertion: whether to search for a cavity when a place is blocked.
             period: update period of the state machine, in s.
@@ -222,7 +223,7 @@ class PickPlacePlanner(LeafSystem):
         state, time = self._state(context), context.get_time()
         asks = (
             state.mode == Mode.OBSERVE
-            and state.actions < self._max_actions
+            and not self._has_spent(state)
             and self._has_settled(state, time)
             and math.remainder(time, self._period) == 0.0
         )
@@ -282,6 +283,7 @@ class PickPlacePlanner(LeafSystem):
             outcome = _outcome(before, state)
             balance = _balance(state) if outcome == "set down" else None
             history.append(_action_of(state), outcome, _peak(state), balance)
+            state.free_actions += outcome == "set down"
 
     def _observe(
         self, context: Context, state: PlannerState, discrete_state: DiscreteValues
@@ -289,9 +291,8 @@ class PickPlacePlanner(LeafSystem):
         time = context.get_time()
         if not self._has_settled(state, time):
             return
-        spent = state.actions >= self._max_actions
         stop = PickPlaceAction(stop=True, reason="actions spent")
-        action: PickPlaceAction = stop if spent else self._action.Eval(context)
+        action: PickPlaceAction = stop if self._has_spent(state) else self._action.Eval(context)
         if action.stop:
             state.stop = 1 + list(STOP_REASONS).index(action.reason or "done")
             kept = discrete_state.get_mutable_value(self._left_over_index)
@@ -311,6 +312,10 @@ class PickPlacePlanner(LeafSystem):
         state.pick, state.place = action.pick.as_array(), action.place.as_array()
         state.refused = not self._motion.prepare(state)
         self._motion.begin(state, Mode.APPROACH, time)
+
+    def _has_spent(self, state: PlannerState) -> bool:
+        """Whether no action is left. One that sets the object down where it lay does not count."""
+        return bool(state.actions - state.free_actions >= self._max_actions)
 
     def _has_settled(self, state: PlannerState, time: float) -> bool:
         """Whether the hand has rested out of sight for long enough to observe."""

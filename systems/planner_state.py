@@ -84,5 +84,7 @@ class PlannerState(VectorView):
     """1 if the object seems to turn between the pads, and is set down again if it does, else 0."""
     set_downs = Number()
     """How many earlier actions have set this object down."""
+    free_actions = Number()
+    """How many actions do not count against the limit, because they set the object down."""
     stop = Number()
     """0 while there are actions; then 1 plus the index of the reason in `STOP_REASONS`."""
