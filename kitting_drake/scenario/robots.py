@@ -39,7 +39,7 @@ class FrankaArm:
     # Where it stands: x, y, z in m, and its rotation about the world's z. At zero it faces +x.
     # From here it reaches 99 % of the tools and cavities of the default kitting scenes, all of them
     # with the arm in a vertical plane.
-    base: list[float] = bounded([-0.02, 0.0, 0.0], -3.0, 3.0)
+    base: list[float] = bounded([0.04, 0.0, 0.0], -3.0, 3.0)
     yaw_deg: float = bounded(0.0, -180.0, 180.0)
 
     # Joint impedance, base to flange, in N m/rad and N m s/rad: see `systems.joint_controller`.
