@@ -179,12 +179,17 @@ def render_picture(
     return np.array(image.data[:, :, :3])
 
 
+def png_bytes(pixels: NDArray[np.uint8]) -> bytes:
+    """An image (height, width, 3) as a PNG."""
+    buffer = io.BytesIO()
+    Image.fromarray(pixels).save(buffer, "PNG")
+    return buffer.getvalue()
+
+
 def save_png(pixels: NDArray[np.uint8], path: Path) -> None:
     """Writes an image (height, width, 3) to a PNG file, atomically.
 
     Raises:
         MachineError: writing fails.
     """
-    buffer = io.BytesIO()
-    Image.fromarray(pixels).save(buffer, "PNG")
-    write_atomically(path, buffer.getvalue())
+    write_atomically(path, png_bytes(pixels))

@@ -112,32 +112,53 @@ def import_mesh(args: argparse.Namespace, entries: list[ToolEntry]) -> None:
 
 def kit(args: argparse.Namespace, entries: list[ToolEntry]) -> None:
     """Makes a kit of 1 to 12 tools: to print (STL, 3MF), to cut (DXF, SVG) and to simulate."""
-    from kitting_drake.hkd.fabrication.export import KitRequest, export_kit
+    from kitting_drake.hkd.fabrication.export import FITS, KitRequest, export_kit
 
     request = KitRequest(
         tools=tuple(args.tools),
         output=args.output,
-        clearance_mm=args.clearance_mm,
+        clearance_mm=args.clearance_mm if args.fit is None else FITS[args.fit],
+        compensate_mm=args.compensate_mm,
+        lead_in_mm=args.lead_in_mm,
         wall_mm=args.wall_mm,
         block_mm=tuple(args.block_mm) if args.block_mm else None,
         notches=args.notches,
         labels=args.labels,
     )
+    if args.prove:
+        # Import Drake lazily, and fail early.
+        from kitting_drake.common.rendering import require_rendering
+
+        require_rendering()
     with Console(stderr=True, quiet=args.quiet).status("making the kit"):
         design = export_kit(request)
-    if args.quiet:
-        return
-    console = Console(highlight=False, markup=False)
+    console = Console(quiet=args.quiet, highlight=False, markup=False)
     size = " x ".join(f"{side:g}" for side in design.size_mm)
     files = "kit.stl, kit.3mf, cavities.dxf, cavities.svg, kit.png"
     console.print(f"a block of {size} mm in {args.output}/: {files}", soft_wrap=True)
     for note in design.notes:
         console.print(f"  {note}", soft_wrap=True)
-    _check_scenario(args.output / "scenario.yaml", console)
+    has_room = _check_scenario(args.output / "scenario.yaml", console)
+    if args.prove and has_room:
+        _prove(args.output, args.prove, console)
 
 
-def _check_scenario(path: Path, console: Console) -> None:
-    """Prints how to run a kit's scenario, or that the simulated table is too small for it."""
+def _prove(folder: Path, episodes: int, console: Console) -> None:
+    # Import Drake lazily.
+    from kitting_drake.evaluation.kit_proof import prove_kit
+
+    with Console(stderr=True, quiet=console.quiet).status("proving the kit") as status:
+
+        def progress(what: str, done: int, total: int) -> None:
+            status.update(f"proving the kit: {what}, {done} of {total} episodes")
+
+        verdict = prove_kit(folder, episodes, progress)
+    console.print(f"{verdict}\nproof: {folder}/proof.html", soft_wrap=True)
+
+
+def _check_scenario(path: Path, console: Console) -> bool:
+    """Prints how to run a kit's scenario, or that the simulated table is too small for it; returns
+    whether it can be run."""
     # The loader is slow to import, and the other verbs do not need it.
     from kitting_drake.scenario.loader import load_scenario
     from systems.signals import PixelGrid
@@ -151,10 +172,9 @@ def _check_scenario(path: Path, console: Console) -> None:
             "or use fewer tools to `run` it",
             soft_wrap=True,
         )
-    else:
-        console.print(
-            f"try it: python -m kitting_drake.run {shlex.quote(str(path))}", soft_wrap=True
-        )
+        return False
+    console.print(f"try it: python -m kitting_drake.run {shlex.quote(str(path))}", soft_wrap=True)
+    return True
 
 
 def main() -> int:
@@ -235,9 +255,23 @@ def _describe_import(importer: argparse.ArgumentParser) -> None:
 def _describe_kit(maker: argparse.ArgumentParser) -> None:
     maker.add_argument("tools", nargs="+", metavar="TOOL", help="names or folders of tools")
     maker.add_argument("--output", type=Path, required=True, metavar="DIR", help="the kit's folder")
-    maker.add_argument(
+    room = maker.add_mutually_exclusive_group()
+    room.add_argument(
         "--clearance_mm", type=float, help="between a tool and its cavity's wall (default: 2)"
     )
+    room.add_argument(
+        "--fit",
+        choices=("snug", "easy", "loose"),
+        help="the same by name: 0.15, 0.35 or 0.75 mm a side",
+    )
+    maker.add_argument(
+        "--compensate_mm",
+        type=float,
+        default=0.0,
+        help="by how much your printer or router makes cavities too narrow, a side: half of what "
+        "the hole of test_piece.stl lacks to 20 mm (default: 0)",
+    )
+    maker.add_argument("--lead_in_mm", type=float, help="the bevel of the rims (default: 1)")
     maker.add_argument("--wall_mm", type=float, help="between and around the cavities (default: 6)")
     maker.add_argument(
         "--block_mm",
@@ -245,6 +279,14 @@ def _describe_kit(maker: argparse.ArgumentParser) -> None:
         nargs=3,
         metavar=("LENGTH", "WIDTH", "HEIGHT"),
         help="the block's size (default: as small as possible, 50 high)",
+    )
+    maker.add_argument(
+        "--prove",
+        type=count_type,
+        nargs="?",
+        const=10,
+        metavar="N",
+        help="kit it N (10) times in simulation, with a printer's errors, and write proof.html",
     )
     maker.add_argument("--notches", action="store_true", help="add finger notches")
     maker.add_argument("--labels", action="store_true", help="engrave the tools' names")

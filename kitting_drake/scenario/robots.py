@@ -37,8 +37,8 @@ class FrankaArm:
     model: str = "fr3"
 
     # Where it stands: x, y, z in m, and its rotation about the world's z. At zero it faces +x.
-    # From here it reaches 99 % of the tools and cavities of the default kitting scenes, all of them
-    # with the arm in a vertical plane.
+    # From here it reaches all of the default kitting scenes, nearly all with the arm in a vertical
+    # plane.
     base: list[float] = bounded([0.04, 0.0, 0.0], -3.0, 3.0)
     yaw_deg: float = bounded(0.0, -180.0, 180.0)
 

@@ -144,7 +144,9 @@ class ActionRecord:
     """The object's category."""
     outcome: str
     """`placed`, `missed` (nothing grasped), `dropped` (lost on the way), `pressed` (pushed down),
-    `stopped` (by a contact force beyond `planner.force_limit`) or `unfinished`."""
+    `stopped` (by a contact force beyond `planner.force_limit`), `set down` (where it was picked,
+    because it would have turned between the pads), `unreachable` (the robot did not move) or
+    `unfinished`."""
     pick: PlanarPose
     place: PlanarPose
     pick_position_error_mm: float | None

@@ -1,20 +1,23 @@
 """The design of a kit's block to print or mill: the simulated kit with notches and labels."""
 
+import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from manifold3d import CrossSection, Manifold
+from manifold3d import CrossSection, JoinType, Manifold
 from numpy.typing import NDArray
 
 from kitting_drake.hkd.fabrication.labels import engrave_labels
 from kitting_drake.hkd.fabrication.notches import cut_notches
 from kitting_drake.hkd.fabrication.recess import Recess
-from kitting_drake.hkd.kits.block import Cavity, build_block
+from kitting_drake.hkd.kits.block import ARC_SEGMENTS, Cavity, build_block
 from kitting_drake.hkd.kits.kit import Kit
 from kitting_drake.hkd.kits.layout import kit_cavities
 from kitting_drake.hkd.kits.parameters import KitParameters
 
+TEST_HOLE_MM = 20.0
+"""The side of the hole of `test_piece`."""
 _ABOVE = 0.01
 """The distance by which cutters stick out of the block, in metres."""
 _FINEST = 2e-6
@@ -33,6 +36,8 @@ class Design:
     """All recesses: first the cavities, in the tools' order."""
     notes: tuple[str, ...]
     """A sentence on each notch or label that found no room."""
+    compensation: float = 0.0
+    """By how much the cavities are wider than those of `kit`, on each side, in metres."""
 
     @property
     def size_mm(self) -> tuple[float, float, float]:
@@ -45,9 +50,28 @@ class Design:
         return round(1e3 * (self.kit.parameters.height - recess.floor), 2)
 
 
-def design_kit(kit: Kit, *, notches: bool = False, labels: bool = False) -> Design:
-    """Designs the block of a kit, with notches and labels on request where they fit."""
-    cavities = tuple(kit_cavities(kit.tools, kit.parameters, kit.layout.poses))
+def design_kit(
+    kit: Kit, *, notches: bool = False, labels: bool = False, compensation: float = 0.0
+) -> Design:
+    """Designs the block of a kit, with notches and labels on request where they fit.
+
+    Args:
+        kit: the simulated kit.
+        notches: whether to add finger notches.
+        labels: whether to engrave the tools' names.
+        compensation: see `Design.compensation`.
+    """
+    cavities = tuple(
+        dataclasses.replace(
+            cavity,
+            outline=cavity.outline.offset(
+                compensation, JoinType.Round, circular_segments=ARC_SEGMENTS
+            )
+            if compensation
+            else cavity.outline,
+        )
+        for cavity in kit_cavities(kit.tools, kit.parameters, kit.layout.poses)
+    )
     recesses = [
         Recess("cavity", tool.name, cavity.outline, cavity.floor)
         for tool, cavity in zip(kit.tools, cavities, strict=True)
@@ -58,7 +82,7 @@ def design_kit(kit: Kit, *, notches: bool = False, labels: bool = False) -> Desi
             added, refused = cut(kit, cavities, tuple(recesses))
             recesses += added
             notes += refused
-    return Design(kit, cavities, tuple(recesses), tuple(notes))
+    return Design(kit, cavities, tuple(recesses), tuple(notes), compensation)
 
 
 def solid(design: Design) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
@@ -81,6 +105,19 @@ def solid(design: Design) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     faces = index.reshape(-1)[np.asarray(mesh.tri_verts, dtype=np.int64)]
     a, b, c = faces.T
     return vertices, faces[(a != b) & (b != c) & (c != a)]
+
+
+def test_piece() -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """A small plate with a square hole, to measure what a printer makes of it; see `solid`.
+
+    Half of what the printed hole lacks to `TEST_HOLE_MM` is the compensation.
+    """
+    hole = TEST_HOLE_MM
+    plate = Manifold.cube((hole + 12.0, hole + 12.0, 8.0))
+    plate -= Manifold.cube((hole, hole, 10.0)).translate((6.0, 6.0, -1.0))
+    mesh = plate.to_mesh64()
+    vertices = np.asarray(mesh.vert_properties, dtype=float)[:, :3]
+    return vertices, np.asarray(mesh.tri_verts, dtype=np.int64)
 
 
 def in_block(points: NDArray[np.float64], parameters: KitParameters) -> NDArray[np.float64]:

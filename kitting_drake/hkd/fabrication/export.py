@@ -17,7 +17,7 @@ import kitting_drake
 from kitting_drake.common.errors import UserError
 from kitting_drake.common.files import replace_folder, write_json
 from kitting_drake.hkd.fabrication.block_files import stl_bytes, threemf_bytes
-from kitting_drake.hkd.fabrication.design import Design, design_kit, solid
+from kitting_drake.hkd.fabrication.design import Design, design_kit, solid, test_piece
 from kitting_drake.hkd.fabrication.drawings import dxf_text, svg_text
 from kitting_drake.hkd.fabrication.picture import picture_png
 from kitting_drake.hkd.generation.part_models import load_named
@@ -25,6 +25,9 @@ from kitting_drake.hkd.kits.kit import make_kit
 from kitting_drake.hkd.kits.layout import MOST_TOOLS
 from kitting_drake.hkd.kits.parameters import KitParameters
 from kitting_drake.hkd.tools.tool import Tool, tool_names
+
+FITS = {"snug": 0.15, "easy": 0.35, "loose": 0.75}
+"""Clearances by name, as for foam and printed holders, in mm a side."""
 
 RECORD = "kit.json"
 """The file that marks a folder as a kit's."""
@@ -48,6 +51,12 @@ class KitRequest:
     """Names of tools, or paths of tool folders."""
     output: Path
     clearance_mm: float | None = None
+    """Between a tool and its cavity's wall. None: the template's 2."""
+    compensate_mm: float = 0.0
+    """By how much the printer or the router makes cavities too narrow, on each side. The files to
+    print and to cut have cavities wider by this; the simulated kit has not."""
+    lead_in_mm: float | None = None
+    """The bevel of the rims. None: the template's 1."""
     wall_mm: float | None = None
     block_mm: tuple[float, float, float] | None = None
     """Length, width and height. None: as small as possible, with the template's height."""
@@ -70,7 +79,12 @@ def export_kit(request: KitRequest) -> Design:
     folder = request.output
     _check_replaceable(folder)
     kit = make_kit(tools, parameters)
-    design = design_kit(kit, notches=request.notches, labels=request.labels)
+    design = design_kit(
+        kit,
+        notches=request.notches,
+        labels=request.labels,
+        compensation=1e-3 * request.compensate_mm,
+    )
     new_folders = [p for p in folder.parents if not p.exists()]
     try:
         folder.parent.mkdir(parents=True, exist_ok=True)
@@ -98,6 +112,8 @@ def _parameters(request: KitRequest) -> KitParameters:
     for flag, value, low, high in (
         ("--clearance_mm", request.clearance_mm, 0.0, 10.0),
         ("--wall_mm", request.wall_mm, 2.0, 50.0),
+        ("--lead_in_mm", request.lead_in_mm, 0.0, 5.0),
+        ("--compensate_mm", request.compensate_mm, -1.0, 1.0),
     ):
         if value is not None and not low <= value <= high:
             raise UserError(f"{flag} {value:g} is out of range: give {low:g} to {high:g}")
@@ -106,6 +122,8 @@ def _parameters(request: KitRequest) -> KitParameters:
         # The outline's simplification must not use up a small clearance.
         finest = max(parameters.clearance / 20, 1e-6)
         parameters.tolerance = min(parameters.tolerance, finest)
+    if request.lead_in_mm is not None:
+        parameters.lead_in = round(1e-3 * request.lead_in_mm, 7)
     if request.wall_mm is not None:
         parameters.nested_wall = round(1e-3 * request.wall_mm, 7)
     if request.block_mm is not None:
@@ -152,6 +170,7 @@ def _write(folder: Path, design: Design, parameters: KitParameters) -> None:
     _check_closed(stl)
     (folder / "kit.stl").write_bytes(stl)
     (folder / "kit.3mf").write_bytes(threemf_bytes(surface, title))
+    (folder / "test_piece.stl").write_bytes(stl_bytes(test_piece()))
     (folder / "cavities.dxf").write_text(dxf_text(design))
     (folder / "cavities.svg").write_text(svg_text(design))
     (folder / "kit.png").write_bytes(picture_png(design))
@@ -207,6 +226,7 @@ def _record(design: Design, names: Sequence[str]) -> dict[str, Any]:
         "made_by": f"kitting_drake {kitting_drake.__version__}",
         "units": "millimetres; the origin is the lower left corner of the block's bottom",
         "block": list(design.size_mm),
+        "compensate_mm": round(1e3 * design.compensation, 4),
         "kit_parameters_m": dataclasses.asdict(design.kit.parameters),
         "tools": [
             {

@@ -379,3 +379,26 @@ def test_the_written_scenario_succeeds(
     done = verb("run", plain / "scenario.yaml", "--no-meshcat", "--output", tmp_path)
     assert done.returncode == 0, done.stderr
     assert json.loads((tmp_path / "results.json").read_text())["strict_success_rate"] == 1.0
+
+
+def test_compensation_widens_what_is_cut_but_not_what_is_simulated(bar: Path, tmp_path: Path):
+    def cut(compensate_mm: float) -> tuple[float, dict[str, object]]:
+        folder = tmp_path / f"{compensate_mm:g}"
+        request = KitRequest(
+            (str(bar),), folder, clearance_mm=0.5, compensate_mm=compensate_mm
+        )
+        export_kit(request)
+        drawing = ezdxf.readfile(folder / "cavities.dxf").modelspace()
+        widths = [
+            np.ptp(np.array(item.get_points("xy")), axis=0).min()
+            for item in drawing.query("LWPOLYLINE")
+            if item.dxf.layer.startswith("CAVITIES")
+        ]
+        return min(widths), json.loads((folder / "kit.json").read_text())
+
+    (plain, record), (wider, compensated) = cut(0.0), cut(0.1)
+    assert plain == pytest.approx(15.0, abs=0.02)
+    assert wider - plain == pytest.approx(0.2, abs=0.005)
+    assert record["kit_parameters_m"] == compensated["kit_parameters_m"]
+    hole = trimesh.load_mesh(tmp_path / "0.1" / "test_piece.stl")
+    assert hole.is_watertight and hole.volume == pytest.approx(8 * (32**2 - 20**2))

@@ -1,0 +1,243 @@
+"""Proves a kit before it is cut, in simulation, with the printer's tolerance drawn."""
+
+import base64
+import html
+import json
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from kitting_drake.common.errors import UserError
+from kitting_drake.common.files import write_atomically, write_json
+from kitting_drake.common.rendering import add_picture_renderer, png_bytes, render_picture
+from kitting_drake.episode.chosen import build_chosen, run_chosen
+from kitting_drake.evaluation.intervals import proportion_interval
+from kitting_drake.scenario.choosing import find_scenario
+
+TOLERANCE_MM = 0.1
+"""The standard deviation of a printed cavity's width, on each side."""
+GOOD = 0.95
+"""The share of tools that a kit which fits must reach."""
+_WIDER = (1.5, 2.25)
+"""Clearances that are tried for a kit that does not fit, as multiples of its own."""
+_LEAST_WIDER_MM = 0.2
+_FILES = ("proof.html", "proof.json")
+
+_PAGE = """<!doctype html><meta charset="utf-8"><title>Proof of a kit</title>
+<style>
+body {{ font: 15px/1.45 sans-serif; max-width: 880px; margin: 2em auto; color: #222 }}
+table {{ border-collapse: collapse }}
+td, th {{ padding: .25em 1em .25em 0; text-align: left; border-bottom: 1px solid #ddd }}
+h2 {{ font-size: 1.1em }}
+@media print {{ body {{ margin: 0 }} }}
+</style>
+<h1>Proof of a kit</h1>
+<p><strong>{verdict}</strong></p>
+<p>In each simulated episode the tools lie elsewhere on the table, and all cavities are wider or
+narrower by a random error with a standard deviation of {tolerance:g} mm. Kitted means: within
+3.5 mm of its place by ADD-S, 2 mm of its height and 20 degrees of its heading. The largest force is
+that of all contacts on the hand while it handled the tool.</p>
+<p>{kit}</p><p>{pictures}</p>
+{tables}
+"""
+
+Progress = Callable[[str, int, int], None]
+"""Called with what is proved, the episodes done, and their number."""
+
+
+@dataclass
+class ToolProof:
+    """What happened to one tool, over all episodes."""
+
+    name: str
+    kitted: int = 0
+    tried: int = 0
+    peak_force_n: float = 0.0
+    causes: Counter[str] = field(default_factory=Counter)
+    """Why it was not kitted, by the words of `results.json`."""
+
+    def as_dict(self) -> dict[str, Any]:
+        """For JSON."""
+        return {
+            "name": self.name,
+            "kitted": self.kitted,
+            "tried": self.tried,
+            "peak_force_n": round(self.peak_force_n, 1),
+            "causes": dict(self.causes),
+        }
+
+
+@dataclass
+class KitProof:
+    """The episodes of one clearance."""
+
+    clearance_mm: float
+    tools: dict[str, ToolProof] = field(default_factory=dict)
+    pictures: list[bytes] = field(default_factory=list)
+    """PNGs of the first episode's start and end."""
+
+    @property
+    def kitted(self) -> int:
+        """How often a tool was kitted, strictly."""
+        return sum(tool.kitted for tool in self.tools.values())
+
+    @property
+    def tried(self) -> int:
+        """Tools times episodes."""
+        return sum(tool.tried for tool in self.tools.values())
+
+    @property
+    def fits(self) -> bool:
+        """Whether enough tools were kitted."""
+        return self.kitted >= GOOD * self.tried
+
+
+def prove_kit(folder: Path, episodes: int, progress: Progress) -> str:
+    """Kits a kit in simulation, and writes `proof.html` and `proof.json` into its folder.
+
+    The policy is that of the kit's scenario. In each episode the tools lie elsewhere, and all
+    cavities are wider or narrower by a common random error of `TOLERANCE_MM`. A kit that does not
+    fit is tried again with wider cavities.
+
+    Args:
+        folder: a folder of `hkd kit`.
+        episodes: how often to kit it.
+        progress: called before each episode and at the end.
+
+    Returns:
+        The verdict, in a sentence or two.
+
+    Raises:
+        UserError: the table has no room for the kit and its tools.
+    """
+    record = json.loads((folder / "kit.json").read_text())
+    own = 1e3 * float(record["kit_parameters_m"]["clearance"])
+    proof = _prove(folder, own, episodes, progress)
+    wider: list[KitProof] = []
+    for factor in () if proof.fits else _WIDER:
+        clearance = round(max(factor * own, own + _LEAST_WIDER_MM * (len(wider) + 1)), 2)
+        wider.append(_prove(folder, clearance, episodes, progress))
+        if wider[-1].fits:
+            break
+    verdict = _verdict(proof, wider)
+    # Written before the files, so that a later `hkd kit` may replace them.
+    record["files"] = sorted({*record["files"], *_FILES})
+    write_json(folder / "kit.json", record)
+    write_json(
+        folder / "proof.json",
+        {
+            "verdict": verdict,
+            "tolerance_mm": TOLERANCE_MM,
+            "clearances": [
+                {
+                    "clearance_mm": item.clearance_mm,
+                    "kitted": item.kitted,
+                    "tried": item.tried,
+                    "tools": [tool.as_dict() for tool in item.tools.values()],
+                }
+                for item in (proof, *wider)
+            ],
+        },
+    )
+    write_atomically(folder / "proof.html", _page(folder, proof, wider, verdict))
+    return verdict
+
+
+def _prove(folder: Path, clearance_mm: float, episodes: int, progress: Progress) -> KitProof:
+    proof = KitProof(clearance_mm)
+    for seed in range(episodes):
+        progress(f"clearance {clearance_mm:g} mm", seed, episodes)
+        error = float(np.random.default_rng([seed, 23]).normal(0.0, TOLERANCE_MM))
+        drawn = max(1e-3 * (clearance_mm + error), 0.0)
+        text = f"task: {{kit: {{clearance: {drawn:.6f}}}}}"
+        chosen = find_scenario(folder / "scenario.yaml", None, text, None)
+        diagram, station = build_chosen(chosen, seed=seed)
+        pictured = seed == 0
+        if pictured:
+            add_picture_renderer(station.scene_graph)
+        frames: list[bytes] = []
+
+        def observe(event: Any, station: Any = station, frames: list[bytes] = frames) -> None:
+            if not frames or event.is_stop:
+                context = station.scene_graph.GetMyContextFromRoot(event.root_context)
+                frames.append(png_bytes(render_picture(station.scene_graph, context)))
+
+        result = run_chosen(chosen, diagram, station, observers=[observe] if pictured else [])
+        if result.failure:
+            raise UserError(f"the kit cannot be proved: {result.failure}")
+        if pictured:
+            proof.pictures = [frames[0], frames[-1]]
+        for item in result.objects:
+            tool = proof.tools.setdefault(item.name, ToolProof(item.name))
+            tool.tried += 1
+            tool.kitted += item.strict_success
+            if not item.strict_success:
+                tool.causes[item.cause or "not as it should lie"] += 1
+        for action in result.actions_taken:
+            force = action.peak_force_n
+            if action.object in proof.tools and force is not None:
+                tool = proof.tools[action.object]
+                tool.peak_force_n = max(tool.peak_force_n, force.vertical, force.lateral)
+    progress(f"clearance {clearance_mm:g} mm", episodes, episodes)
+    return proof
+
+
+def _verdict(proof: KitProof, wider: list[KitProof]) -> str:
+    counted = (
+        f"{proof.kitted} of {proof.tried} tools were kitted at {proof.clearance_mm:g} mm a side"
+    )
+    force = max((tool.peak_force_n for tool in proof.tools.values()), default=0.0)
+    if proof.fits:
+        return f"It fits: {counted}, with at most {force:.0f} N."
+    worst = min(proof.tools.values(), key=lambda tool: tool.kitted / max(tool.tried, 1))
+    trouble = f"the trouble is {worst.name} ({worst.tried - worst.kitted} of {worst.tried}"
+    if worst.causes:
+        trouble += f", mostly {worst.causes.most_common(1)[0][0]}"
+    cure = next((item for item in wider if item.fits), None)
+    if cure is None:
+        tried = " or ".join(f"{item.clearance_mm:g}" for item in wider)
+        advice = f"A clearance of {tried} mm does not mend it."
+    else:
+        advice = (
+            f"A clearance of {cure.clearance_mm:g} mm would mend it: {cure.kitted} of {cure.tried}."
+        )
+    return f"It does not fit well: {counted}; {trouble}). {advice}"
+
+
+def _page(folder: Path, proof: KitProof, wider: list[KitProof], verdict: str) -> str:
+    """The proof as a page that needs no other file."""
+
+    def picture(data: bytes, width: int) -> str:
+        encoded = base64.b64encode(data).decode()
+        return f'<img width="{width}" src="data:image/png;base64,{encoded}">'
+
+    pictures = [picture(data, 420) for data in proof.pictures]
+    tables = []
+    for item in (proof, *wider):
+        low, high = proportion_interval(item.kitted, item.tried)
+        rows = ""
+        for tool in item.tools.values():
+            causes = ", ".join(f"{why} {count}" for why, count in tool.causes.items())
+            cells = (
+                tool.name,
+                f"{tool.kitted} of {tool.tried}",
+                f"{tool.peak_force_n:.0f} N",
+                causes,
+            )
+            rows += f"<tr>{''.join(f'<td>{html.escape(cell)}</td>' for cell in cells)}</tr>"
+        tables.append(
+            f"<h2>{item.clearance_mm:g} mm a side: {item.kitted} of {item.tried} "
+            f"({100 * low:.0f} to {100 * high:.0f} %)</h2><table><tr><th>tool</th><th>kitted</th>"
+            f"<th>largest force</th><th>else</th></tr>{rows}</table>"
+        )
+    return _PAGE.format(
+        verdict=html.escape(verdict),
+        tolerance=TOLERANCE_MM,
+        kit=picture((folder / "kit.png").read_bytes(), 860),
+        pictures=" ".join(pictures),
+        tables="".join(tables),
+    )
