@@ -397,7 +397,7 @@ def test_compensation_widens_what_is_cut_but_not_what_is_simulated(bar: Path, tm
         return min(widths), json.loads((folder / "kit.json").read_text())
 
     (plain, record), (wider, compensated) = cut(0.0), cut(0.1)
-    assert plain == pytest.approx(15.0, abs=0.02)
+    assert plain == pytest.approx(15.0, abs=0.06)
     assert wider - plain == pytest.approx(0.2, abs=0.005)
     assert record["kit_parameters_m"] == compensated["kit_parameters_m"]
     hole = trimesh.load_mesh(tmp_path / "0.1" / "test_piece.stl")
