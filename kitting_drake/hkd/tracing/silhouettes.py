@@ -1,0 +1,111 @@
+"""The silhouettes of tools on a rectified photo, in mm."""
+
+from typing import Any
+
+import numpy as np
+from manifold3d import CrossSection
+from numpy.typing import NDArray
+
+from kitting_drake.hkd.tracing.ground_light import flattened, log_light
+from kitting_drake.hkd.tracing.plane_view import RectifiedPhoto
+from kitting_drake.hkd.tracing.soft_outline import contours, soft_mask
+from kitting_drake.hkd.tracing.tool_mask import tool_mask
+
+Array = NDArray[Any]
+
+_RIM_MM = 1.2
+"""The rim of a sheet, where its edge casts a shadow, is not looked at."""
+_LEAST_LOOP_MM2 = 4.0
+_LEAST_TOOL_MM2 = 60.0
+_FLAT_MM = 0.03
+
+
+def find_silhouettes(
+    cv2: Any, photo: RectifiedPhoto, sheet: Array | None, hidden: tuple[Array, ...]
+) -> tuple[CrossSection, float]:
+    """The area that tools cover, and the width of its border's blur, in mm.
+
+    Args:
+        cv2: OpenCV.
+        photo: the plane from above.
+        sheet: (2,) the size of the sheet, whose lower left corner is the origin; tools lie on it
+            and may stick out. None: all of the photo is ground.
+        hidden: polygons to leave out.
+    """
+    ppm = photo.px_per_mm
+    logs = log_light(photo.pixels)
+    ground = photo.seen.copy()
+    if sheet is not None:
+        ground &= _polygon(cv2, photo, _rectangle(_RIM_MM, sheet - _RIM_MM))
+    for polygon in hidden:
+        ground &= ~_polygon(cv2, photo, polygon)
+    ratio, spread = flattened(cv2, logs, ground, ppm)
+    mask = tool_mask(cv2, ratio, ground, spread, ppm)
+    if sheet is not None:
+        mask = _with_overhangs(cv2, photo, logs, mask, sheet, hidden)
+    if not mask.any():
+        return CrossSection(), 0.0
+    soft = soft_mask(cv2, photo, mask)
+    area = _cleaned(contours(photo, soft))
+    return area, _blur_mm(cv2, soft, mask, ppm)
+
+
+def _rectangle(low: Array | float, high: Array) -> Array:
+    (x0, y0), (x1, y1) = np.broadcast_to(low, 2), high
+    return np.array([[x0, y0], [x1, y0], [x1, y1], [x0, y1]])
+
+
+def _polygon(cv2: Any, photo: RectifiedPhoto, polygon: Array) -> Array:
+    mask = np.zeros(photo.shape, np.uint8)
+    cv2.fillPoly(mask, [np.round(photo.to_px(polygon)).astype(np.int32)], 1)
+    return mask > 0
+
+
+def _with_overhangs(
+    cv2: Any, photo: RectifiedPhoto, logs: Array, mask: Array, sheet: Array, hidden: tuple
+) -> Array:
+    """Adds the parts of tools that stick out of the sheet."""
+    ppm = photo.px_per_mm
+    near = ~_polygon(cv2, photo, _rectangle(_RIM_MM + 0.5, sheet - _RIM_MM - 0.5))
+    if not (mask.astype(bool) & near).any():
+        return mask
+    desk = photo.seen & ~_polygon(cv2, photo, _rectangle(-_RIM_MM, sheet + _RIM_MM))
+    for polygon in hidden:
+        desk &= ~_polygon(cv2, photo, polygon)
+    if desk.mean() < 0.02:
+        return mask
+    ratio, spread = flattened(cv2, logs, desk, ppm)
+    outside = tool_mask(cv2, ratio, desk, spread, ppm)
+    both = mask | outside
+    seam = ~_polygon(cv2, photo, _rectangle(_RIM_MM, sheet - _RIM_MM)) & ~desk & photo.seen
+    reach = int(2 * np.ceil(1.3 * _RIM_MM * ppm) + 1)
+    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (reach, reach))
+    joined = cv2.morphologyEx(both, cv2.MORPH_CLOSE, disc)
+    both = np.where(seam, joined, both).astype(np.uint8)
+    # What lies on the desk alone is not a tool on the sheet.
+    _, labels = cv2.connectedComponents(both)
+    known = np.unique(labels[mask > 0])
+    table = np.zeros(labels.max() + 1, np.uint8)
+    table[known[known > 0]] = 1
+    return table[labels]
+
+
+def _cleaned(area: CrossSection) -> CrossSection:
+    """Without specks and tiny holes."""
+    result = CrossSection()
+    for part in area.decompose():
+        loops = [np.asarray(loop) for loop in part.to_polygons()]
+        sizes = [CrossSection([loop]).area() or CrossSection([loop[::-1]]).area() for loop in loops]
+        if max(sizes, default=0) < _LEAST_TOOL_MM2:
+            continue
+        kept = [loop for loop, size in zip(loops, sizes, strict=True) if size >= _LEAST_LOOP_MM2]
+        result += CrossSection(kept)
+    return result.simplify(_FLAT_MM)
+
+
+def _blur_mm(cv2: Any, soft: Array, mask: Array, ppm: float) -> float:
+    """The median width over which the silhouettes' border rises from 0 to 1."""
+    x = cv2.Sobel(soft, cv2.CV_32F, 1, 0, scale=ppm / 8)
+    y = cv2.Sobel(soft, cv2.CV_32F, 0, 1, scale=ppm / 8)
+    slope = np.hypot(x, y)[(soft > 0.35) & (soft < 0.65)]
+    return float(1 / max(np.median(slope), 1e-3)) if slope.size else 0.0

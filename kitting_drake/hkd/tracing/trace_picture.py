@@ -1,0 +1,76 @@
+"""The picture of a trace: the photo from above, silhouettes, outlines, rulers and a scale bar."""
+
+from typing import Any
+
+import numpy as np
+from manifold3d import CrossSection
+from numpy.typing import NDArray
+
+from kitting_drake.hkd.tracing.plane_view import RectifiedPhoto
+
+_LONG_SIDE = 1800
+_SILHOUETTE, _OUTLINE, _INK = (255, 0, 200), (0, 150, 60), (20, 20, 20)
+_EDGE = 46
+"""The width of the rulers, in pixels."""
+_BAR_MM = 50
+
+
+def trace_png(
+    cv2: Any,
+    photo: RectifiedPhoto,
+    silhouette: CrossSection,
+    outlines: dict[str, CrossSection],
+    caption: str,
+) -> bytes:
+    """A PNG; the rulers along its sides give the places for `--points`, in mm."""
+    scale = _LONG_SIDE / max(photo.shape)
+    resized = cv2.resize(photo.pixels, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+    image = cv2.copyMakeBorder(
+        resized, 2 * _EDGE, _EDGE, _EDGE, 8, cv2.BORDER_CONSTANT, value=(255, 255, 255)
+    )
+
+    def place(points: Any) -> NDArray[np.float64]:
+        return (photo.to_px(np.asarray(points)) + 0.5) * scale - 0.5 + (_EDGE, 2 * _EDGE)
+
+    def draw(area: CrossSection, colour: tuple[int, int, int]) -> None:
+        for loop in area.to_polygons():
+            line = np.round(16 * place(loop)).astype(np.int32)
+            cv2.polylines(image, [line], True, colour, 1, cv2.LINE_AA, 4)
+
+    def write(text: str, where: tuple[int, int], size: float = 0.45) -> None:
+        cv2.putText(image, text, where, cv2.FONT_HERSHEY_SIMPLEX, size, _INK, 1, cv2.LINE_AA)
+
+    draw(silhouette, _SILHOUETTE)
+    for name, outline in outlines.items():
+        draw(outline, _OUTLINE)
+        x_low, _, _, y_high = outline.bounds()
+        u, v = np.round(place([(x_low, y_high)])[0]).astype(int).tolist()
+        write(name, (u, v - 6), 0.55)
+    _draw_rulers(cv2, image, photo, place, write)
+    bottom = image.shape[0] - _EDGE - 16
+    start, end = place([(photo.low[0] + 10, 0), (photo.low[0] + 10 + _BAR_MM, 0)])[:, 0]
+    start, end = round(float(start)), round(float(end))
+    cv2.rectangle(image, (start - 6, bottom - 22), (end + 6, bottom + 10), (255, 255, 255), -1)
+    cv2.rectangle(image, (start, bottom), (end, bottom + 5), _INK, -1)
+    write(f"{_BAR_MM} mm", (start, bottom - 6), 0.5)
+    write(caption, (_EDGE, 24), 0.55)
+    write("pink: the edge seen in the photo; green: the outline", (_EDGE, 48), 0.5)
+    _, data = cv2.imencode(".png", image[..., ::-1], [cv2.IMWRITE_PNG_COMPRESSION, 3])
+    return data.tobytes()
+
+
+def _draw_rulers(cv2: Any, image: Any, photo: RectifiedPhoto, place: Any, write: Any) -> None:
+    bottom = image.shape[0] - _EDGE
+    low, high = np.ceil(photo.low / 10) * 10, photo.high
+    for x in np.arange(low[0], high[0], 10):
+        u = round(float(place([(x, photo.low[1])])[0, 0]))
+        long = x % 50 == 0
+        cv2.line(image, (u, bottom), (u, bottom + (10 if long else 5)), _INK, 1)
+        if long:
+            write(f"{x:.0f}", (u - 10, bottom + 26))
+    for y in np.arange(low[1], high[1], 10):
+        v = round(float(place([(photo.low[0], y)])[0, 1]))
+        long = y % 50 == 0
+        cv2.line(image, (_EDGE - (10 if long else 5), v), (_EDGE, v), _INK, 1)
+        if long:
+            write(f"{y:.0f}", (4, v + 4))
