@@ -31,7 +31,7 @@ class Corrections:
 
 
 def read_corrections(path: Path) -> Corrections:
-    """Reads a YAML list of `add: [[x, y], ...]`, `remove: [[x, y], ...]` and `sheet: [[u, v], ...]`.
+    """Reads a YAML list of items `add: [[x, y], ...]`, `remove: [[x, y], ...]` and `sheet: ...`.
 
     Raises:
         UserError: the file is missing or not such a list; names the item.

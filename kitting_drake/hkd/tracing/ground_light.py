@@ -17,7 +17,8 @@ _FIT_POINTS = 20_000
 
 def log_light(pixels: Array) -> Array:
     """(rows, columns, 3) logarithms of linear light."""
-    return np.log(linear(pixels) + np.float32(_FLOOR))
+    codes = np.arange(256, dtype=np.uint8)
+    return np.log(linear(codes) + np.float32(_FLOOR))[pixels]
 
 
 def flattened(cv2: Any, logs: Array, ground: Array, px_per_mm: float) -> tuple[Array, float]:
@@ -48,7 +49,7 @@ def flattened(cv2: Any, logs: Array, ground: Array, px_per_mm: float) -> tuple[A
     near = np.abs(residual).max(axis=1) < 0.15
     spread = 1.4826 * float(np.median(np.abs(residual[near]))) if near.sum() > 50 else 0.15
     # What the polynomial leaves of the light, where the ground is seen.
-    plain = (ground & (np.abs(ratio).max(axis=2) < max(0.06, 3 * spread))).astype(np.float32)
+    plain = (ground & (_largest(ratio) < max(0.06, 3 * spread))).astype(np.float32)
     step = max(1, int(px_per_mm))
     small = cv2.resize(plain, None, fx=1 / step, fy=1 / step, interpolation=cv2.INTER_AREA)
     sigma = _SMOOTH_MM * px_per_mm / step
@@ -60,6 +61,12 @@ def flattened(cv2: Any, logs: Array, ground: Array, px_per_mm: float) -> tuple[A
         rest = cv2.GaussianBlur(part, (0, 0), sigma) / np.maximum(weight, 1e-3)
         ratio[..., k] -= cv2.resize(rest, (columns, rows), interpolation=cv2.INTER_LINEAR)
     return ratio, spread
+
+
+def _largest(ratio: Array) -> Array:
+    """The largest size of the three values of each pixel."""
+    a, b, c = (np.abs(ratio[..., k]) for k in range(3))
+    return np.maximum(np.maximum(a, b), c)
 
 
 def _terms(x: Array, y: Array) -> Array:

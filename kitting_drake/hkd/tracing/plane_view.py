@@ -165,5 +165,7 @@ def rectify(
     flags = cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP
     image = cv2.warpPerspective(pixels, H, (columns, rows), flags=flags)
     inside = np.full(pixels.shape[:2], 255, np.uint8)
-    seen = cv2.warpPerspective(inside, H, (columns, rows), flags=cv2.WARP_INVERSE_MAP) > 250
-    return RectifiedPhoto(image, seen, px_per_mm, np.asarray(low, float))
+    seen = cv2.warpPerspective(inside, H, (columns, rows), flags=cv2.WARP_INVERSE_MAP)
+    # The photo's very edge is mixed with what is beyond it.
+    seen = cv2.erode(seen, np.ones((7, 7), np.uint8), borderType=cv2.BORDER_CONSTANT, borderValue=0)
+    return RectifiedPhoto(image, seen > 250, px_per_mm, np.asarray(low, float))

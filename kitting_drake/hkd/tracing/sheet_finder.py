@@ -1,6 +1,5 @@
 """Finds the edges of a sheet of paper in a photo, to a fraction of a pixel."""
 
-import itertools
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
@@ -195,6 +194,8 @@ def _edge(
         offset = steps[peak] + np.clip(0.5 * (a - c) / bend, -1, 1)
         points = (where + offset[:, None] * normal)[keep]
         line, close = _robust_line(shares[keep], offset[keep])
+        if not close.any():
+            continue
         support = close.sum() / len(shares)
         if best is None or support > best[1]:
             ends = [start + s * along + (line[0] + line[1] * s) * normal for s in (0.0, 1.0)]
@@ -207,19 +208,17 @@ def _robust_line(shares: Array, offsets: Array) -> tuple[Array, Array]:
     """(offset, slope) of the line that most points lie close to, and which these are."""
     rng = np.random.default_rng(0)
     design = np.c_[np.ones_like(shares), shares]
-    best = np.zeros(len(shares), bool)
-    for _ in range(150):
-        i, j = rng.choice(len(shares), 2, replace=False)
-        if abs(shares[i] - shares[j]) < 0.1:
-            continue
-        line = np.linalg.solve(design[[i, j]], offsets[[i, j]])
-        close = np.abs(offsets - design @ line) < _CLOSE_PX
-        if close.sum() > best.sum():
-            best = close
+    first, second = rng.integers(0, len(shares), (2, 200))
+    apart = np.abs(shares[first] - shares[second]) > 0.1
+    first, second = first[apart], second[apart]
+    slopes = (offsets[second] - offsets[first]) / (shares[second] - shares[first])
+    starts = offsets[first] - slopes * shares[first]
+    close = np.abs(offsets - starts[:, None] - slopes[:, None] * shares) < _CLOSE_PX
+    best = close[np.argmax(close.sum(axis=1))] if len(close) else np.zeros(len(shares), bool)
     line = np.zeros(2)
-    for limit in itertools.chain([_CLOSE_PX] * 3):
+    for _ in range(3):
         if best.sum() < 2:
             break
         line = np.linalg.lstsq(design[best], offsets[best], rcond=None)[0]
-        best = np.abs(offsets - design @ line) < limit
+        best = np.abs(offsets - design @ line) < _CLOSE_PX
     return line, best

@@ -29,6 +29,7 @@ _GIVEN_ASPECT_ERROR = 0.06
 _FOCALS_35MM = (22.0, 24.0, 26.0, 28.0, 31.0)
 """Focal lengths of phones, for photos that do not tell theirs."""
 _FOCAL_RANGE_35MM = (18.0, 90.0)
+_MARGIN_MM = 8.0
 _BOW_MM = 0.3
 """A smaller bow of the sheet's edges is not corrected."""
 
@@ -48,6 +49,8 @@ class Plane:
     hidden: tuple[Array, ...]
     """Polygons that hold no tools, in mm."""
     notes: list[str]
+    blur_mm: float = 0.0
+    """The width of the sheet's edges; 0 if not known."""
 
 
 def plane_of_sheet(
@@ -93,8 +96,8 @@ def plane_of_sheet(
             homography, sides = _oriented(photo, again[0].corners if again else flat, size)
     view = view_of(homography, focal, photo.center)
     notes = [f"a sheet of {sides[0]:g} x {sides[1]:g} mm", told, *notes]
-    margin = 0.25 * max(sides)
-    return Plane(view, pixels, -np.full(2, margin), sides + margin, sides, (), notes)
+    blur = quad.width_px / view.px_per_mm(sides / 2) if quad else 0.0
+    return Plane(view, pixels, np.full(2, -_MARGIN_MM), sides + _MARGIN_MM, sides, (), notes, blur)
 
 
 def _oriented(photo: Photo, corners: Array, size: tuple[float, float]) -> tuple[Array, Array]:

@@ -21,9 +21,15 @@ _FLAT_MM = 0.03
 
 
 def find_silhouettes(
-    cv2: Any, photo: RectifiedPhoto, sheet: Array | None, hidden: tuple[Array, ...]
-) -> tuple[CrossSection, float]:
+    cv2: Any,
+    photo: RectifiedPhoto,
+    sheet: Array | None,
+    hidden: tuple[Array, ...],
+    wide: bool,
+) -> tuple[CrossSection, float] | None:
     """The area that tools cover, and the width of its border's blur, in mm.
+
+    None: a tool sticks out of the sheet, and `wide` is false.
 
     Args:
         cv2: OpenCV.
@@ -31,6 +37,7 @@ def find_silhouettes(
         sheet: (2,) the size of the sheet, whose lower left corner is the origin; tools lie on it
             and may stick out. None: all of the photo is ground.
         hidden: polygons to leave out.
+        wide: whether the photo shows enough of the desk to look for tools that stick out.
     """
     ppm = photo.px_per_mm
     logs = log_light(photo.pixels)
@@ -41,7 +48,11 @@ def find_silhouettes(
         ground &= ~_polygon(cv2, photo, polygon)
     ratio, spread = flattened(cv2, logs, ground, ppm)
     mask = tool_mask(cv2, ratio, ground, spread, ppm)
-    if sheet is not None:
+    if sheet is not None and not wide:
+        inner = _polygon(cv2, photo, _rectangle(_RIM_MM + 0.5, sheet - _RIM_MM - 0.5))
+        if (mask[~inner] > 0).any():
+            return None
+    elif sheet is not None:
         mask = _with_overhangs(cv2, photo, logs, mask, sheet, hidden)
     if not mask.any():
         return CrossSection(), 0.0
@@ -66,9 +77,6 @@ def _with_overhangs(
 ) -> Array:
     """Adds the parts of tools that stick out of the sheet."""
     ppm = photo.px_per_mm
-    near = ~_polygon(cv2, photo, _rectangle(_RIM_MM + 0.5, sheet - _RIM_MM - 0.5))
-    if not (mask.astype(bool) & near).any():
-        return mask
     desk = photo.seen & ~_polygon(cv2, photo, _rectangle(-_RIM_MM, sheet + _RIM_MM))
     for polygon in hidden:
         desk &= ~_polygon(cv2, photo, polygon)

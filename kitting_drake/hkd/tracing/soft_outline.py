@@ -25,17 +25,33 @@ def soft_mask(cv2: Any, photo: RectifiedPhoto, mask: Array) -> Array:
     shadow beside a tool counts as ground.
     """
     ppm = photo.px_per_mm
-    light = linear(photo.pixels)
+    u, v, width, height = cv2.boundingRect(mask)
+    margin = int(4 * ppm)
+    box = (
+        slice(max(0, v - margin), v + height + margin),
+        slice(max(0, u - margin), u + width + margin),
+    )
+    whole = np.zeros(mask.shape, np.float32)
+    whole[box] = _soft(cv2, linear(photo.pixels[box]), mask[box], ppm)
+    return whole
+
+
+def _soft(cv2: Any, light: Array, mask: Array, ppm: float) -> Array:
+    # Blur is at least a pixel or two wide.
+    skip = max(_SKIP_MM, 1.5 / ppm)
     inside = cv2.distanceTransform(mask, cv2.DIST_L2, 5) / ppm
     outside = cv2.distanceTransform(1 - mask, cv2.DIST_L2, 5) / ppm
-    tool = _spread_colour(cv2, light, (inside > _SKIP_MM) & (inside < 2.0), ppm)
-    ground = _spread_colour(cv2, light, (outside > _SKIP_MM) & (outside < 1.6), ppm)
-    along = tool[..., :3] - ground[..., :3]
-    contrast = (along**2).sum(axis=2)
-    share = ((light - ground[..., :3]) * along).sum(axis=2) / np.maximum(contrast, 1e-6)
-    hard = mask.astype(np.float32)
-    unsure = (np.sqrt(contrast) < _LEAST_CONTRAST) | (tool[..., 3] < 1e-3) | (ground[..., 3] < 1e-3)
-    share[unsure] = cv2.GaussianBlur(hard, (0, 0), 0.2 * ppm)[unsure]
+    tool = _spread_colour(cv2, light, (inside > skip) & (inside < 2.0), ppm)
+    ground = _spread_colour(cv2, light, (outside > skip) & (outside < 1.6), ppm)
+    contrast = np.zeros_like(inside)
+    share = np.zeros_like(inside)
+    for k in range(3):
+        along = tool[..., k] - ground[..., k]
+        contrast += along * along
+        share += (light[..., k] - ground[..., k]) * along
+    share /= np.maximum(contrast, 1e-6)
+    unsure = (contrast < _LEAST_CONTRAST**2) | (tool[..., 3] < 1e-3) | (ground[..., 3] < 1e-3)
+    share[unsure] = cv2.GaussianBlur(mask.astype(np.float32), (0, 0), 0.2 * ppm)[unsure]
     share = np.clip(share, 0, 1)
     share[inside > _BAND_MM] = 1
     share[outside > _BAND_MM] = 0
@@ -44,9 +60,14 @@ def soft_mask(cv2: Any, photo: RectifiedPhoto, mask: Array) -> Array:
 
 def _spread_colour(cv2: Any, light: Array, where: Array, ppm: float) -> Array:
     """(rows, columns, 4) the mean colour of the nearby pixels `where`, and their weight."""
-    weight = where.astype(np.float32)
-    stacked = np.dstack([light * weight[..., None], weight])
-    stacked = cv2.GaussianBlur(stacked, (0, 0), _NEAR_MM * ppm)
+    stacked = np.empty((*where.shape, 4), np.float32)
+    stacked[..., :3] = light
+    stacked[..., 3] = 1
+    stacked[~where] = 0
+    # Three box filters are close to a Gaussian, and faster.
+    side = 2 * round(0.85 * _NEAR_MM * ppm) + 1
+    for _ in range(3):
+        stacked = cv2.blur(stacked, (side, side))
     stacked[..., :3] /= np.maximum(stacked[..., 3:], 1e-6)
     return stacked
 

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from kitting_drake.hkd.tracing.plane_view import RectifiedPhoto
 
-_LONG_SIDE = 1800
+_LONG_SIDE = 1500
 _SILHOUETTE, _OUTLINE, _INK = (255, 0, 200), (0, 150, 60), (20, 20, 20)
 _EDGE = 46
 """The width of the rulers, in pixels."""
@@ -55,7 +55,7 @@ def trace_png(
     write(f"{_BAR_MM} mm", (start, bottom - 6), 0.5)
     write(caption, (_EDGE, 24), 0.55)
     write("pink: the edge seen in the photo; green: the outline", (_EDGE, 48), 0.5)
-    _, data = cv2.imencode(".png", image[..., ::-1], [cv2.IMWRITE_PNG_COMPRESSION, 3])
+    _, data = cv2.imencode(".png", image[..., ::-1], [cv2.IMWRITE_PNG_COMPRESSION, 1])
     return data.tobytes()
 
 

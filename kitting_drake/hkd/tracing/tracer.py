@@ -6,7 +6,6 @@ the photo is rectified (`plane_view`). Tools are told from the ground and from s
 is corrected for the tool's height (`tool_height`).
 """
 
-import dataclasses
 import math
 import re
 from dataclasses import dataclass
@@ -15,7 +14,6 @@ from typing import Any
 
 import numpy as np
 from manifold3d import CrossSection
-from numpy.typing import NDArray
 
 from kitting_drake.common.errors import UserError
 from kitting_drake.common.extras import import_extra
@@ -34,9 +32,11 @@ _STEEPEST = math.radians(30)
 _MOST_PX_PER_MM = 5.0
 _MOST_PIXELS = 4e6
 _BLURRED_MM = 1.6
-"""The border of a tool in a sharp photo is narrower."""
+"""The edges of tools and sheet in a sharp photo are narrower."""
 _HEIGHTS_MM = (0.5, 100.0)
 _CAMERAS_MM = (100.0, 3000.0)
+_OVERHANG_MM = 110.0
+"""Tools may stick out of the sheet by about this."""
 _SHARE_OF_HEIGHT = 0.5
 
 
@@ -113,11 +113,11 @@ def trace(request: TraceRequest) -> TraceReport:
         else plane_of_sheet(cv2, photo, request.sheet_mm, corrections.corners, request.camera_mm)
     )
     _check_view(photo, plane)
-    seen = _rectified(cv2, plane)
-    silhouette, blur = find_silhouettes(cv2, seen, plane.sheet, plane.hidden)
+    seen, silhouette, blur = _look(cv2, plane)
     silhouette = corrections.applied(silhouette)
-    parts = sorted(silhouette.decompose(), key=lambda part: part.bounds()[0])
-    _check_parts(photo, parts, seen, blur)
+    parts = [part for part in silhouette.decompose() if part.area() > 0]
+    parts.sort(key=lambda part: part.bounds()[0])
+    _check_parts(photo, parts, seen, max(blur, plane.blur_mm))
     heights = _heights(request, len(parts))
     names = [name] if len(parts) == 1 else [f"{name}_{i + 1}" for i in range(len(parts))]
     tools = []
@@ -155,15 +155,27 @@ def _check_view(photo: Photo, plane: Plane) -> None:
         )
 
 
-def _rectified(cv2: Any, plane: Plane) -> RectifiedPhoto:
-    middle = (plane.low + plane.high) / 2
-    size = plane.high - plane.low
+def _look(cv2: Any, plane: Plane) -> tuple[RectifiedPhoto, CrossSection, float]:
+    """The photo from above, the tools' silhouettes and their blur in mm."""
+    seen = _rectified(cv2, plane, 0.0)
+    found = find_silhouettes(cv2, seen, plane.sheet, plane.hidden, wide=False)
+    if found is None:
+        seen = _rectified(cv2, plane, _OVERHANG_MM)
+        found = find_silhouettes(cv2, seen, plane.sheet, plane.hidden, wide=True)
+    assert found is not None
+    return (seen, *found)
+
+
+def _rectified(cv2: Any, plane: Plane, margin: float) -> RectifiedPhoto:
+    low, high = plane.low - margin, plane.high + margin
+    middle = (low + high) / 2
+    size = high - low
     px_per_mm = min(
         _MOST_PX_PER_MM,
         plane.view.px_per_mm(middle),
         math.sqrt(_MOST_PIXELS / float(size[0] * size[1])),
     )
-    return rectify(cv2, plane.pixels, plane.view, plane.low, plane.high, px_per_mm)
+    return rectify(cv2, plane.pixels, plane.view, low, high, px_per_mm)
 
 
 def _check_parts(
@@ -176,18 +188,15 @@ def _check_parts(
         )
     if blur > _BLURRED_MM:
         raise UserError(
-            f"{photo.path} is blurred: the tools' edges are {blur:.1f} mm wide; take it again, "
+            f"{photo.path} is blurred: its edges are {blur:.1f} mm wide; take it again, "
             "with more light or a steadier hand"
         )
     for part in parts:
         for loop in part.to_polygons():
             u, v = np.round(seen.to_px(np.asarray(loop))).astype(int).T
             rows, columns = seen.shape
-            off = (u <= 2) | (v <= 2) | (u >= columns - 3) | (v >= rows - 3)
-            u, v = np.clip(u, 3, columns - 4), np.clip(v, 3, rows - 4)
-            if off.any() or not all(
-                seen.seen[v + dv, u + du].all() for du in (-3, 3) for dv in (-3, 3)
-            ):
+            u, v = np.clip(u, 2, columns - 3), np.clip(v, 2, rows - 3)
+            if not all(seen.seen[v + dv, u + du].all() for du in (-2, 2) for dv in (-2, 2)):
                 raise UserError(
                     f"{photo.path}: a tool touches the photo's edge: show all of it, and some "
                     "ground around it"

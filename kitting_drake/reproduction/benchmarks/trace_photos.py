@@ -22,6 +22,8 @@ Array = NDArray[Any]
 _DIAGONAL_35MM = math.hypot(36, 24)
 _FOCAL_35MM = 26
 _SHADOW_PX_PER_MM = 2.0
+_SHADOW_MARGIN_MM = 50.0
+_PIECE_MM = 1.2
 _EXIF_IFD, _EXIF_FOCAL_35MM = 0x8769, 0xA405
 PAINTS = {
     "black": (0.02, 0.02, 0.022),
@@ -87,6 +89,17 @@ class PlacedTool:
 
 
 @dataclass(frozen=True)
+class PlacedPrint:
+    """A printed picture on the sheet."""
+
+    pixels: Array
+    """(rows, columns) gray."""
+    low: tuple[float, float]
+    """The lower left corner."""
+    size: tuple[float, float]
+
+
+@dataclass(frozen=True)
 class _Camera:
     K: Array
     R: Array
@@ -103,12 +116,16 @@ class _Camera:
         return np.column_stack([M[:, 0], M[:, 1], M @ (np.array([0, 0, z]) - self.C)])
 
 
-def draw_photo(tools: list[PlacedTool], spec: PhotoSpec) -> bytes:
+def draw_photo(
+    tools: list[PlacedTool], spec: PhotoSpec, printed: PlacedPrint | None = None
+) -> bytes:
     """A photo of tools on a sheet, as a JPEG."""
     cv2 = import_extra("cv2", purpose="benchmark trace", extra="camera")
     rng = np.random.default_rng(spec.seed)
     camera = _camera(spec)
     picture = _ground(cv2, camera, spec, rng)
+    if printed is not None:
+        _paint_print(cv2, picture, printed, camera, spec)
     picture *= _light_on_ground(cv2, tools, camera, spec)[..., None]
     for tool in tools:
         _paint_tool(cv2, picture, tool, camera, spec, rng)
@@ -176,31 +193,52 @@ def _ground(cv2: Any, camera: _Camera, spec: PhotoSpec, rng: np.random.Generator
 
 def _light_on_ground(cv2: Any, tools: list[PlacedTool], camera: _Camera, spec: PhotoSpec) -> Array:
     """The share of light that reaches the ground at each pixel."""
-    reach = 450.0
-    side = int(2 * reach * _SHADOW_PX_PER_MM)
-    x, y = spec.sheet[0] / 2 - reach, spec.sheet[1] / 2 - reach
-    hidden = np.zeros((side, side), np.float32)
+    low = np.full(2, -_SHADOW_MARGIN_MM)
+    columns, rows = ((np.array(spec.sheet) - 2 * low) * _SHADOW_PX_PER_MM).astype(int).tolist()
+    hidden = np.zeros((rows, columns), np.float32)
     rng = np.random.default_rng(spec.seed + 1)
     lamps = np.array(spec.light) + spec.softness * rng.normal(0, 1, (24, 2))
     for lamp in lamps:
-        mask = np.zeros((side, side), np.uint8)
+        mask = np.zeros((rows, columns), np.uint8)
         for tool in tools:
             steps = max(2, int(2 * tool.height * np.linalg.norm(lamp)))
             for share in np.linspace(0, 1, steps):
                 moved = tool.outline.translate(tuple(share * tool.height * lamp))
-                loops = [(np.asarray(p) - (x, y)) * _SHADOW_PX_PER_MM for p in moved.to_polygons()]
+                loops = [(np.asarray(p) - low) * _SHADOW_PX_PER_MM for p in moved.to_polygons()]
                 layer = np.zeros_like(mask)
                 cv2.fillPoly(layer, [np.round(16 * p).astype(np.int32) for p in loops], 1, 8, 4)
                 mask |= layer
         hidden += mask / len(lamps)
-    to_plane = np.array([[1 / _SHADOW_PX_PER_MM, 0, x], [0, 1 / _SHADOW_PX_PER_MM, y], [0, 0, 1.0]])
+    to_plane = np.array(
+        [[1 / _SHADOW_PX_PER_MM, 0, low[0]], [0, 1 / _SHADOW_PX_PER_MM, low[1]], [0, 0, 1.0]]
+    )
     # Ambient light is blocked close to the tool, too.
     near = cv2.GaussianBlur((hidden > 0.9).astype(np.float32), (0, 0), 3 * _SHADOW_PX_PER_MM)
     light = (1 - spec.shadow * hidden) * (1 - 0.25 * near)
-    ramp = np.linspace(-1, 1, side, dtype=np.float32) * reach / spec.sheet[0]
-    light *= 1 - spec.falloff * (ramp[None] * 0.8 + ramp[:, None] * 0.6)
+    across = np.linspace(-1, 1, columns, dtype=np.float32)
+    along = np.linspace(-1, 1, rows, dtype=np.float32)
+    light *= 1 - spec.falloff * (0.8 * across[None] + 0.6 * along[:, None])
     H = camera.homography(0) @ to_plane
     return cv2.warpPerspective(light, H, spec.size, borderMode=cv2.BORDER_REPLICATE)
+
+
+def _paint_print(
+    cv2: Any, picture: Array, printed: PlacedPrint, camera: _Camera, spec: PhotoSpec
+) -> None:
+    rows, columns = printed.pixels.shape
+    x, y = printed.size[0] / columns, printed.size[1] / rows
+    to_plane = np.array(
+        [
+            [x, 0, printed.low[0] + x / 2],
+            [0, -y, printed.low[1] + printed.size[1] - y / 2],
+            [0, 0, 1.0],
+        ]
+    )
+    H = camera.homography(0) @ to_plane
+    shown = cv2.warpPerspective(printed.pixels.astype(np.float32) / 255, H, spec.size)
+    mask = cv2.warpPerspective(np.ones(printed.pixels.shape, np.float32), H, spec.size)
+    picture *= (1 - mask)[..., None]
+    picture += (0.02 * mask + 0.78 * shown)[..., None]
 
 
 def _paint_tool(
@@ -226,14 +264,19 @@ def _paint_tool(
         for i in range(len(loop)):
             j = (i + 1) % len(loop)
             along = loop[j] - loop[i]
-            length = np.linalg.norm(along)
+            length = float(np.linalg.norm(along))
             if length < 1e-9:
                 continue
             normal = np.array([along[1], -along[0]]) / length
             shade = 0.55 + 0.35 * float(normal @ [-0.6, -0.4])
             distance = float(np.linalg.norm(loop[i] - camera.C[:2]))
-            quad = np.array([foot[i], foot[j], top[j], top[i]])
-            sides.append((distance, quad, shade, loop[i]))
+            # Short pieces of uneven shade: sides have a texture, too.
+            cuts = np.linspace(0, 1, max(1, round(length / _PIECE_MM)) + 1)
+            for start, end in zip(cuts[:-1], cuts[1:], strict=True):
+                low_edge = foot[i] + np.outer((start, end), foot[j] - foot[i])
+                high_edge = top[i] + np.outer((end, start), top[j] - top[i])
+                quad = np.concatenate([low_edge, high_edge])
+                sides.append((distance, quad, shade * rng.uniform(0.8, 1.2), loop[i]))
     paints = np.array([PAINTS[name] for name in tool.paints])
     x_low, _, x_high, _ = tool.outline.bounds()
     middle = (x_low + x_high) / 2
@@ -274,7 +317,7 @@ def _skin(
     # Metal mirrors a lamp in a few bands.
     for _ in range(2):
         where, wide = rng.uniform(x_low, x_high), rng.uniform(2, 6)
-        shine = 0.5 * np.exp(-(((along - where) / wide) ** 2))
+        shine = rng.uniform(0.2, 1.0) * np.exp(-(((along - where) / wide) ** 2))
         metal = np.array(["steel" in name for name in tool.paints])[np.where(along > middle, 0, 1)]
         colour += (shine * np.where(metal, 1.0, 0.1))[None, :, None].astype(np.float32)
     return (255 * np.sqrt(np.clip(colour, 0, 1))).astype(np.uint8)
@@ -312,7 +355,7 @@ def _srgb(linear: Array) -> Array:
 def placed_outline(
     outline: CrossSection, spec: PhotoSpec, angle: float, shift: tuple[float, float]
 ) -> CrossSection:
-    """An outline whose bounds' middle lies at the sheet's middle plus `shift`, turned by degrees."""
+    """An outline whose bounds' middle lies at the sheet's middle plus `shift`, turned."""
     outline = outline.rotate(angle)
     x_low, y_low, x_high, y_high = outline.bounds()
     x = spec.sheet[0] / 2 + shift[0] - (x_low + x_high) / 2
