@@ -142,29 +142,37 @@ def _crossing(first: Array, second: Array) -> Array | None:
 
 
 def _refined(cv2: Any, gray: Any, corners: Array) -> SheetQuad | None:
-    """The quadrilateral with its edges at the steepest change of lightness."""
+    """The quadrilateral with its edges at the steepest change of lightness.
+
+    A sheet is lighter than the desk all round, or darker all round.
+    """
+    quads = [quad for sign in (1, -1) if (quad := _refined_as(cv2, gray, corners, sign))]
+    return max(quads, key=lambda quad: float(quad.support.sum()), default=None)
+
+
+def _refined_as(cv2: Any, gray: Any, corners: Array, sign: int) -> SheetQuad | None:
     for reach in (0.012, 0.005):
-        lines, supports, points, widths = [], [], [], []
-        for i in range(4):
-            fit = _edge(cv2, gray, corners[i], corners[(i + 1) % 4], reach * max(gray.shape))
-            if fit is None:
-                return None
-            line, support, on_edge, width = fit
-            lines.append(line)
-            supports.append(support)
-            points.append(on_edge)
-            widths.append(width)
-        crossings = [_crossing(lines[i - 1], lines[i]) for i in range(4)]
-        if any(crossing is None for crossing in crossings):
+        edges = [
+            _edge(cv2, gray, corners[i], corners[(i + 1) % 4], reach * max(gray.shape), sign)
+            for i in range(4)
+        ]
+        fits = [edge for edge in edges if edge is not None]
+        if len(fits) < 4:
             return None
-        corners = np.array(crossings)
-    if min(supports) < _LEAST_SUPPORT:
+        crossings = [_crossing(fits[i - 1][0], fits[i][0]) for i in range(4)]
+        met = [crossing for crossing in crossings if crossing is not None]
+        if len(met) < 4:
+            return None
+        corners = np.array(met)
+    support = np.array([fit[1] for fit in fits])
+    if support.min() < _LEAST_SUPPORT:
         return None
-    return SheetQuad(corners, np.array(supports), tuple(points), float(np.median(widths)))
+    width = float(np.median([fit[3] for fit in fits]))
+    return SheetQuad(corners, support, tuple(fit[2] for fit in fits), width)
 
 
 def _edge(
-    cv2: Any, gray: Any, start: Array, end: Array, reach: float
+    cv2: Any, gray: Any, start: Array, end: Array, reach: float, sign: int
 ) -> tuple[Array, float, Array, float] | None:
     """A line through the steepest changes near a segment, its support, points and blur."""
     along = end - start
@@ -172,36 +180,30 @@ def _edge(
     shares = np.linspace(0.03, 0.97, _SAMPLES)
     steps = np.arange(-np.ceil(reach), np.ceil(reach) + 1)
     where = start + shares[:, None] * along
-    grid = where[:, None] + steps[None, :, None] * normal
-    grid = grid.astype(np.float32)
+    grid = (where[:, None] + steps[None, :, None] * normal).astype(np.float32)
     profiles = cv2.remap(
         gray, grid[..., 0], grid[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
     ).astype(float)
     rows, columns = gray.shape
     inside = ((where >= 2) & (where <= (columns - 3, rows - 3))).all(axis=1)
-    slopes = np.gradient(profiles, axis=1)
-    best = None
-    for sign in (1, -1):
-        # Peaks of one direction: a sheet is lighter than the desk all round, or darker.
-        peak = np.argmax(sign * slopes, axis=1)
-        index = np.arange(len(peak))
-        height = (sign * slopes)[index, peak]
-        keep = inside & (peak > 0) & (peak < len(steps) - 1) & (height > 1.5)
-        if keep.sum() < 20:
-            continue
-        a, b, c = ((sign * slopes)[index, np.clip(peak + k, 0, len(steps) - 1)] for k in (-1, 0, 1))
-        bend = np.minimum(a - 2 * b + c, -1e-6)
-        offset = steps[peak] + np.clip(0.5 * (a - c) / bend, -1, 1)
-        points = (where + offset[:, None] * normal)[keep]
-        line, close = _robust_line(shares[keep], offset[keep])
-        if not close.any():
-            continue
-        support = close.sum() / len(shares)
-        if best is None or support > best[1]:
-            ends = [start + s * along + (line[0] + line[1] * s) * normal for s in (0.0, 1.0)]
-            step = np.ptp(profiles[keep][close], axis=1) / np.maximum(height[keep][close], 1e-6)
-            best = (_line(*ends), float(support), points[close], float(np.median(step)))
-    return best
+    slopes = sign * np.gradient(profiles, axis=1)
+    peak = np.argmax(slopes, axis=1)
+    index = np.arange(len(peak))
+    height = slopes[index, peak]
+    keep = inside & (peak > 0) & (peak < len(steps) - 1) & (height > 1.5)
+    if keep.sum() < 20:
+        return None
+    a, b, c = (slopes[index, np.clip(peak + k, 0, len(steps) - 1)] for k in (-1, 0, 1))
+    bend = np.minimum(a - 2 * b + c, -1e-6)
+    offset = steps[peak] + np.clip(0.5 * (a - c) / bend, -1, 1)
+    line, close = _robust_line(shares[keep], offset[keep])
+    if not close.any():
+        return None
+    points = (where + offset[:, None] * normal)[keep]
+    ends = [start + s * along + (line[0] + line[1] * s) * normal for s in (0.0, 1.0)]
+    rise = np.ptp(profiles[keep][close], axis=1) / np.maximum(height[keep][close], 1e-6)
+    support = float(close.sum()) / len(shares)
+    return _line(*ends), support, points[close], float(np.median(rise))
 
 
 def _robust_line(shares: Array, offsets: Array) -> tuple[Array, Array]:

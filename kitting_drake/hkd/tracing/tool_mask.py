@@ -21,7 +21,7 @@ _ROUGH = 0.022
 _MOST_FINE = 0.1
 _HOLE_BALL_MM = 0.6
 _STRIP_MM = 1.2
-_EDGE_MM = 1.6
+_EDGE_MM = 2.3
 _SHINE_STEEP = 0.6
 """The edge of shine is less steep."""
 _BAY_MM = 8.0
@@ -135,7 +135,7 @@ def _shaded_holes(cv2: Any, even: Array, like_ground: Array, px_per_mm: float) -
     alike = np.bincount(labels[like_ground], minlength=count) / np.maximum(area, 1)
     inner = cv2.distanceTransform(room, cv2.DIST_L2, 3) > _STRIP_MM * px_per_mm
     wide = np.bincount(labels[inner], minlength=count) > 0
-    table = (alike > 0.9) & (area > 1.5 * px_per_mm**2)
+    table = (alike > 0.8) & (area > 1.5 * px_per_mm**2)
     table &= ~wide | (area < _LARGEST_HOLE_MM2 * px_per_mm**2)
     table[0] = False
     return cv2.dilate(table[labels].astype(np.uint8), disc) > 0
@@ -152,7 +152,7 @@ def _without_shine(cv2: Any, tool: Array, steep: Array, px_per_mm: float) -> Arr
     small = cv2.morphologyEx(small, cv2.MORPH_CLOSE, _disc(cv2, _BAY_MM * px_per_mm / factor))
     small = small[margin:-margin, margin:-margin].astype(np.float32)
     closed = cv2.resize(small, (columns, rows), interpolation=cv2.INTER_LINEAR) > 0.5
-    peak = cv2.dilate(steep, _disc(cv2, 0.4 * px_per_mm))
+    peak = cv2.dilate(steep, _disc(cv2, 0.7 * px_per_mm))
     rim = (tool > 0) & (cv2.erode(tool, _disc(cv2, 1)) == 0)
     bays = (closed & (tool == 0)).astype(np.uint8)
     count, labels, stats, _ = cv2.connectedComponentsWithStats(bays, connectivity=4)
