@@ -15,6 +15,8 @@ _LEAST_SHARE = 0.04
 _SAMPLES = 400
 _LEAST_SUPPORT = 0.4
 """At least this share of each edge must be seen."""
+_REACHES = ((0.012, 0.005), (0.05, 0.012, 0.005))
+"""How far from a rough edge to look, as shares of the photo: a tool may hide the true edge."""
 _CLOSE_PX = 2.5
 _SAME_QUAD = 0.02
 
@@ -43,7 +45,7 @@ def find_quads(cv2: Any, pixels: Any) -> list[SheetQuad]:
             if not any(np.abs(quad - other).max() < _SAME_QUAD * _SMALL_SIDE for other in rough):
                 rough.append(quad)
     gray = cv2.GaussianBlur(cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY), (0, 0), 1.0)
-    found = []
+    found: list[SheetQuad] = []
     for quad in rough:
         refined = _refined(cv2, gray, (quad + 0.5) / scale - 0.5)
         if refined is not None and not any(
@@ -146,12 +148,19 @@ def _refined(cv2: Any, gray: Any, corners: Array) -> SheetQuad | None:
 
     A sheet is lighter than the desk all round, or darker all round.
     """
-    quads = [quad for sign in (1, -1) if (quad := _refined_as(cv2, gray, corners, sign))]
+    quads = [
+        quad
+        for sign in (1, -1)
+        for reaches in _REACHES
+        if (quad := _refined_as(cv2, gray, corners, sign, reaches))
+    ]
     return max(quads, key=lambda quad: float(quad.support.sum()), default=None)
 
 
-def _refined_as(cv2: Any, gray: Any, corners: Array, sign: int) -> SheetQuad | None:
-    for reach in (0.012, 0.005):
+def _refined_as(
+    cv2: Any, gray: Any, corners: Array, sign: int, reaches: tuple[float, ...]
+) -> SheetQuad | None:
+    for reach in reaches:
         edges = [
             _edge(cv2, gray, corners[i], corners[(i + 1) % 4], reach * max(gray.shape), sign)
             for i in range(4)

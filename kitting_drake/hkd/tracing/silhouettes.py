@@ -6,6 +6,7 @@ import numpy as np
 from manifold3d import CrossSection
 from numpy.typing import NDArray
 
+from kitting_drake.common.errors import UserError
 from kitting_drake.hkd.tracing.ground_light import flattened, log_light
 from kitting_drake.hkd.tracing.plane_view import RectifiedPhoto
 from kitting_drake.hkd.tracing.soft_outline import contours, soft_mask
@@ -25,19 +26,18 @@ def find_silhouettes(
     photo: RectifiedPhoto,
     sheet: Array | None,
     hidden: tuple[Array, ...],
-    wide: bool,
-) -> tuple[CrossSection, float] | None:
+) -> tuple[CrossSection, float]:
     """The area that tools cover, and the width of its border's blur, in mm.
-
-    None: a tool sticks out of the sheet, and `wide` is false.
 
     Args:
         cv2: OpenCV.
         photo: the plane from above.
-        sheet: (2,) the size of the sheet, whose lower left corner is the origin; tools lie on it
-            and may stick out. None: all of the photo is ground.
+        sheet: (2,) the size of the sheet, whose lower left corner is the origin; tools lie on it.
+            None: all of the photo is ground.
         hidden: polygons to leave out.
-        wide: whether the photo shows enough of the desk to look for tools that stick out.
+
+    Raises:
+        UserError: a tool reaches over the sheet's edge.
     """
     ppm = photo.px_per_mm
     logs = log_light(photo.pixels)
@@ -48,12 +48,13 @@ def find_silhouettes(
         ground &= ~_polygon(cv2, photo, polygon)
     ratio, spread = flattened(cv2, logs, ground, ppm)
     mask = tool_mask(cv2, ratio, ground, spread, ppm)
-    if sheet is not None and not wide:
+    if sheet is not None:
         inner = _polygon(cv2, photo, _rectangle(_RIM_MM + 0.5, sheet - _RIM_MM - 0.5))
-        if (mask[~inner] > 0).any():
-            return None
-    elif sheet is not None:
-        mask = _with_overhangs(cv2, photo, logs, mask, sheet, hidden)
+        if mask[~inner].any():
+            raise UserError(
+                "a tool reaches over the sheet's edge: lay it wholly on the sheet, or use a "
+                "larger one (--sheet LENGTH WIDTH)"
+            )
     if not mask.any():
         return CrossSection(), 0.0
     soft = soft_mask(cv2, photo, mask)
@@ -70,32 +71,6 @@ def _polygon(cv2: Any, photo: RectifiedPhoto, polygon: Array) -> Array:
     mask = np.zeros(photo.shape, np.uint8)
     cv2.fillPoly(mask, [np.round(photo.to_px(polygon)).astype(np.int32)], 1)
     return mask > 0
-
-
-def _with_overhangs(
-    cv2: Any, photo: RectifiedPhoto, logs: Array, mask: Array, sheet: Array, hidden: tuple
-) -> Array:
-    """Adds the parts of tools that stick out of the sheet."""
-    ppm = photo.px_per_mm
-    desk = photo.seen & ~_polygon(cv2, photo, _rectangle(-_RIM_MM, sheet + _RIM_MM))
-    for polygon in hidden:
-        desk &= ~_polygon(cv2, photo, polygon)
-    if desk.mean() < 0.02:
-        return mask
-    ratio, spread = flattened(cv2, logs, desk, ppm)
-    outside = tool_mask(cv2, ratio, desk, spread, ppm)
-    both = mask | outside
-    seam = ~_polygon(cv2, photo, _rectangle(_RIM_MM, sheet - _RIM_MM)) & ~desk & photo.seen
-    reach = int(2 * np.ceil(1.3 * _RIM_MM * ppm) + 1)
-    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (reach, reach))
-    joined = cv2.morphologyEx(both, cv2.MORPH_CLOSE, disc)
-    both = np.where(seam, joined, both).astype(np.uint8)
-    # What lies on the desk alone is not a tool on the sheet.
-    _, labels = cv2.connectedComponents(both)
-    known = np.unique(labels[mask > 0])
-    table = np.zeros(labels.max() + 1, np.uint8)
-    table[known[known > 0]] = 1
-    return table[labels]
 
 
 def _cleaned(area: CrossSection) -> CrossSection:

@@ -35,8 +35,6 @@ _BLURRED_MM = 1.6
 """The edges of tools and sheet in a sharp photo are narrower."""
 _HEIGHTS_MM = (0.5, 100.0)
 _CAMERAS_MM = (100.0, 3000.0)
-_OVERHANG_MM = 110.0
-"""Tools may stick out of the sheet by about this."""
 _SHARE_OF_HEIGHT = 0.5
 
 
@@ -113,7 +111,7 @@ def trace(request: TraceRequest) -> TraceReport:
         else plane_of_sheet(cv2, photo, request.sheet_mm, corrections.corners, request.camera_mm)
     )
     _check_view(photo, plane)
-    seen, silhouette, blur = _look(cv2, plane)
+    seen, silhouette, blur = _look(cv2, photo, plane)
     silhouette = corrections.applied(silhouette)
     parts = [part for part in silhouette.decompose() if part.area() > 0]
     parts.sort(key=lambda part: part.bounds()[0])
@@ -155,19 +153,17 @@ def _check_view(photo: Photo, plane: Plane) -> None:
         )
 
 
-def _look(cv2: Any, plane: Plane) -> tuple[RectifiedPhoto, CrossSection, float]:
+def _look(cv2: Any, photo: Photo, plane: Plane) -> tuple[RectifiedPhoto, CrossSection, float]:
     """The photo from above, the tools' silhouettes and their blur in mm."""
-    seen = _rectified(cv2, plane, 0.0)
-    found = find_silhouettes(cv2, seen, plane.sheet, plane.hidden, wide=False)
-    if found is None:
-        seen = _rectified(cv2, plane, _OVERHANG_MM)
-        found = find_silhouettes(cv2, seen, plane.sheet, plane.hidden, wide=True)
-    assert found is not None
-    return (seen, *found)
+    seen = _rectified(cv2, plane)
+    try:
+        return (seen, *find_silhouettes(cv2, seen, plane.sheet, plane.hidden))
+    except UserError as error:
+        raise UserError(f"{photo.path}: {error}") from error
 
 
-def _rectified(cv2: Any, plane: Plane, margin: float) -> RectifiedPhoto:
-    low, high = plane.low - margin, plane.high + margin
+def _rectified(cv2: Any, plane: Plane) -> RectifiedPhoto:
+    low, high = plane.low, plane.high
     middle = (low + high) / 2
     size = high - low
     px_per_mm = min(

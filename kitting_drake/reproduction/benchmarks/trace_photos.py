@@ -6,6 +6,7 @@ its origin in the sheet's lower left corner, x to the right, y up and z towards 
 """
 
 import io
+import itertools
 import math
 from dataclasses import dataclass
 from typing import Any
@@ -272,7 +273,7 @@ def _paint_tool(
             distance = float(np.linalg.norm(loop[i] - camera.C[:2]))
             # Short pieces of uneven shade: sides have a texture, too.
             cuts = np.linspace(0, 1, max(1, round(length / _PIECE_MM)) + 1)
-            for start, end in zip(cuts[:-1], cuts[1:], strict=True):
+            for start, end in itertools.pairwise(cuts):
                 low_edge = foot[i] + np.outer((start, end), foot[j] - foot[i])
                 high_edge = top[i] + np.outer((end, start), top[j] - top[i])
                 quad = np.concatenate([low_edge, high_edge])
