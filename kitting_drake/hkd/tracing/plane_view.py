@@ -9,7 +9,6 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-_FOCAL_RANGE_35MM = (18.0, 90.0)
 _TELLING_TILT = math.radians(14)
 """The perspective of a sheet tells the focal length only if it is seen more obliquely."""
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from kitting_drake.common.errors import UserError
 from kitting_drake.hkd.tracing.photo_file import ASSUMED_FOCAL_35MM, Photo
 from kitting_drake.hkd.tracing.plane_view import PlaneView, focal_of_homography, view_of
-from kitting_drake.hkd.tracing.sheet_plane import Plane
+from kitting_drake.hkd.tracing.sheet_plane import GroundPlane
 
 Array = NDArray[np.float64]
 
@@ -38,7 +38,7 @@ class Scale:
     """Of the board's markers."""
 
 
-def plane_of_scale(cv2: Any, photo: Photo, scale: Scale, camera_mm: float | None) -> Plane:
+def plane_of_scale(cv2: Any, photo: Photo, scale: Scale, camera_mm: float | None) -> GroundPlane:
     """The plane by a scale. A ruler and a disc need a photo from straight above.
 
     Raises:
@@ -78,7 +78,7 @@ def _focal(photo: Photo, px_per_mm: float, camera_mm: float | None) -> float:
 
 def _straight_down(
     photo: Photo, px_per_mm: float, focal: float, notes: list[str], hidden_px: Array | None
-) -> Plane:
+) -> GroundPlane:
     """The plane seen from straight above; the photo's lower left corner is the origin."""
     width, height = photo.size
     homography = np.array([[px_per_mm, 0, -0.5], [0, -px_per_mm, height - 0.5], [0, 0, 1.0]])
@@ -91,7 +91,7 @@ def _straight_down(
     ]
     hidden = () if hidden_px is None else (view.to_plane(hidden_px),)
     high = np.array([width, height]) / px_per_mm
-    return Plane(view, photo.pixels, np.zeros(2), high, None, hidden, notes)
+    return GroundPlane(view, photo.pixels, np.zeros(2), high, None, hidden, notes)
 
 
 def _center(photo: Photo, px_per_mm: float) -> Array:
@@ -160,7 +160,7 @@ def _refined_disc(cv2: Any, photo: Photo, center: Array, radius: float) -> tuple
     return np.array([x, y]), math.sqrt(c + x * x + y * y)
 
 
-def _by_board(cv2: Any, photo: Photo, scale: Scale, camera_mm: float | None) -> Plane:
+def _by_board(cv2: Any, photo: Photo, scale: Scale, camera_mm: float | None) -> GroundPlane:
     assert scale.board is not None
     columns, rows, square, marker = scale.board
     dictionary = getattr(cv2.aruco, scale.dictionary.upper(), None)
@@ -206,4 +206,4 @@ def _by_board(cv2: Any, photo: Photo, scale: Scale, camera_mm: float | None) -> 
     frame = np.array([[0, 0], [1, 0], [1, 1], [0, 1]]) * (np.array(photo.size) - 1.0)
     reach = view.to_plane(frame)
     low, high = reach.min(axis=0), reach.max(axis=0)
-    return Plane(view, image, low, high, None, (border + outward,), [*notes, told])
+    return GroundPlane(view, image, low, high, None, (border + outward,), [*notes, told])

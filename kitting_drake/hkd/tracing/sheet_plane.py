@@ -13,7 +13,6 @@ from kitting_drake.hkd.tracing.plane_view import (
     PlaneView,
     aspect_of_quad,
     focal_of_homography,
-    mapped,
     square_to,
     view_of,
 )
@@ -35,7 +34,7 @@ _BOW_MM = 0.3
 
 
 @dataclass(frozen=True)
-class Plane:
+class GroundPlane:
     """The plane that the tools lie on."""
 
     view: PlaneView
@@ -59,7 +58,7 @@ def plane_of_sheet(
     size: tuple[float, float] | None,
     corners: Array | None = None,
     camera_mm: float | None = None,
-) -> Plane:
+) -> GroundPlane:
     """Finds the sheet and the camera above it.
 
     Args:
@@ -97,7 +96,9 @@ def plane_of_sheet(
     view = view_of(homography, focal, photo.center)
     notes = [f"a sheet of {sides[0]:g} x {sides[1]:g} mm", told, *notes]
     blur = quad.width_px / view.px_per_mm(sides / 2) if quad else 0.0
-    return Plane(view, pixels, np.full(2, -_MARGIN_MM), sides + _MARGIN_MM, sides, (), notes, blur)
+    return GroundPlane(
+        view, pixels, np.full(2, -_MARGIN_MM), sides + _MARGIN_MM, sides, (), notes, blur
+    )
 
 
 def _oriented(photo: Photo, corners: Array, size: tuple[float, float]) -> tuple[Array, Array]:
@@ -212,8 +213,3 @@ def _lens_of_edges(
     if min(cost) < 0.15 * cost[120] and abs(best) < 0.29:
         return best, f"lens distortion of {before:.1f} mm at the sheet's edges corrected"
     return 0.0, f"the sheet is not flat: its edges are bowed by {before:.1f} mm"
-
-
-def polygon_px(plane: Plane, polygon: Array) -> Array:
-    """A polygon of the plane in the undistorted photo's pixels."""
-    return mapped(plane.view.homography, polygon)

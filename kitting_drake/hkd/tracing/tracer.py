@@ -23,7 +23,7 @@ from kitting_drake.hkd.tracing.outline_drawings import outlines_dxf, outlines_sv
 from kitting_drake.hkd.tracing.photo_file import Photo, read_photo
 from kitting_drake.hkd.tracing.plane_view import RectifiedPhoto, rectify
 from kitting_drake.hkd.tracing.scales import Scale, plane_of_scale
-from kitting_drake.hkd.tracing.sheet_plane import Plane, plane_of_sheet
+from kitting_drake.hkd.tracing.sheet_plane import GroundPlane, plane_of_sheet
 from kitting_drake.hkd.tracing.silhouettes import find_silhouettes
 from kitting_drake.hkd.tracing.tool_height import outline_of_silhouette
 from kitting_drake.hkd.tracing.trace_picture import trace_png
@@ -124,7 +124,7 @@ def trace(request: TraceRequest) -> TraceReport:
         if height is not None:
             outline = _corrected(photo, part, plane, height, request.edges)
         tools.append(TracedTool(own, outline, height, request.output / f"{own}.svg"))
-    notes = [*plane.notes, *_view_notes(plane, request)]
+    notes = [*plane.notes, *_view_notes(plane, request, len(parts))]
     _write(cv2, request, tools, notes, seen, silhouette, plane)
     return TraceReport(tools, notes)
 
@@ -144,7 +144,7 @@ def _checked(request: TraceRequest) -> str:
     return name
 
 
-def _check_view(photo: Photo, plane: Plane) -> None:
+def _check_view(photo: Photo, plane: GroundPlane) -> None:
     view = plane.view
     if view.tilt > _STEEPEST:
         raise UserError(
@@ -153,7 +153,7 @@ def _check_view(photo: Photo, plane: Plane) -> None:
         )
 
 
-def _look(cv2: Any, photo: Photo, plane: Plane) -> tuple[RectifiedPhoto, CrossSection, float]:
+def _look(cv2: Any, photo: Photo, plane: GroundPlane) -> tuple[RectifiedPhoto, CrossSection, float]:
     """The photo from above, the tools' silhouettes and their blur in mm."""
     seen = _rectified(cv2, plane)
     try:
@@ -162,7 +162,7 @@ def _look(cv2: Any, photo: Photo, plane: Plane) -> tuple[RectifiedPhoto, CrossSe
         raise UserError(f"{photo.path}: {error}") from error
 
 
-def _rectified(cv2: Any, plane: Plane) -> RectifiedPhoto:
+def _rectified(cv2: Any, plane: GroundPlane) -> RectifiedPhoto:
     low, high = plane.low, plane.high
     middle = (low + high) / 2
     size = high - low
@@ -214,7 +214,7 @@ def _heights(request: TraceRequest, count: int) -> list[float | None]:
 
 
 def _corrected(
-    photo: Photo, part: CrossSection, plane: Plane, height: float, edges: str
+    photo: Photo, part: CrossSection, plane: GroundPlane, height: float, edges: str
 ) -> CrossSection:
     camera = plane.view.camera
     if height > _SHARE_OF_HEIGHT * camera[2]:
@@ -232,12 +232,14 @@ def _corrected(
     return parts[0]
 
 
-def _view_notes(plane: Plane, request: TraceRequest) -> list[str]:
+def _view_notes(plane: GroundPlane, request: TraceRequest, count: int) -> list[str]:
     view = plane.view
     where = f"camera {view.camera[2]:.0f} mm above, {math.degrees(view.tilt):.0f} degrees tilted"
     if not request.heights_mm:
         return [where, "not corrected for the tools' height: give --height_mm"]
     at = {"upright": "from foot to top", "round": "at half the height"}[request.edges]
+    if count > 1:
+        where += f"; {count} tools (shine across a tool may have split it)"
     return [where, f"corrected for the tools' height, with the sides {at}"]
 
 
@@ -248,7 +250,7 @@ def _write(
     notes: list[str],
     seen: RectifiedPhoto,
     silhouette: CrossSection,
-    plane: Plane,
+    plane: GroundPlane,
 ) -> None:
     outlines = {tool.name: tool.outline for tool in tools}
     files: dict[str, str | bytes] = {}
