@@ -2,7 +2,7 @@
 
 The plane that the tools lie on is found by something of known size (`sheet_plane`, `scales`), and
 the photo is rectified (`plane_view`). Tools are told from the ground and from shadows
-(`tool_mask`), their border is found to a fraction of a pixel (`soft_outline`), and the silhouette
+(`tool_mask`), their border is found to a fraction of a pixel (`silhouettes`), and the silhouette
 is corrected for the tool's height (`tool_height`).
 """
 
@@ -19,14 +19,13 @@ from kitting_drake.common.errors import UserError
 from kitting_drake.common.extras import import_extra
 from kitting_drake.common.files import require_folder, write_atomically, write_json
 from kitting_drake.hkd.tracing.corrections import Corrections, read_corrections
-from kitting_drake.hkd.tracing.outline_drawings import outlines_dxf, outlines_svg
 from kitting_drake.hkd.tracing.photo_file import Photo, read_photo
 from kitting_drake.hkd.tracing.plane_view import RectifiedPhoto, rectify
 from kitting_drake.hkd.tracing.scales import Scale, plane_of_scale
 from kitting_drake.hkd.tracing.sheet_plane import GroundPlane, plane_of_sheet
 from kitting_drake.hkd.tracing.silhouettes import find_silhouettes
 from kitting_drake.hkd.tracing.tool_height import outline_of_silhouette
-from kitting_drake.hkd.tracing.trace_picture import trace_png
+from kitting_drake.hkd.tracing.trace_files import outlines_dxf, outlines_svg, trace_png
 
 _STEEPEST = math.radians(30)
 _MOST_PX_PER_MM = 5.0
