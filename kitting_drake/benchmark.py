@@ -1,6 +1,6 @@
 """`python -m kitting_drake.benchmark NAME`: measures, prints tables and saves them.
 
-NAME is simulation, networks, kits, recovery, reliability, mujoco or paper.
+NAME is simulation, networks, kits, recovery, reliability, mujoco, trace or paper.
 """
 
 import argparse
@@ -31,6 +31,7 @@ def main() -> int:
         "kits": _kits,
         "mujoco": _mujoco,
         "reliability": _reliability,
+        "trace": _trace,
     }[arguments.benchmark]
     for table in measure(arguments, console, folder):
         console.print(table)
@@ -105,6 +106,16 @@ def _parser() -> argparse.ArgumentParser:
         action="store_true",
         help="fit the confidence to these decisions: writes confidence.json",
     )
+    tracing = benchmarks.add_parser(
+        "trace", help="error of the outlines that `hkd trace` finds in drawn photos of tools"
+    )
+    tracing.add_argument(
+        "--tools", nargs="+", metavar="NAME", help="tools, three photos of each (default: 20)"
+    )
+    tracing.add_argument(
+        "--no-exif", action="store_true", help="the photos do not tell their focal length"
+    )
+    tracing.add_argument("--keep", action="store_true", help="keep the photos and the pictures")
     paper = benchmarks.add_parser(
         "paper", help="collect, train and evaluate for the cells of the paper's tables; takes days"
     )
@@ -123,7 +134,7 @@ def _parser() -> argparse.ArgumentParser:
         help="folder of the table of runs, which finished cells are added to (docs/results)",
     )
     paper.add_argument("--workers", type=count_type, default=1, help="parallel episodes (1)")
-    for benchmark in (simulation, networks, kits, recovery, opinion, reliability, paper):
+    for benchmark in (simulation, networks, kits, recovery, opinion, reliability, tracing, paper):
         benchmark.add_argument(
             "--output", type=Path, default=Path("output/benchmark"), help="folder for the files"
         )
@@ -203,6 +214,23 @@ def _reliability(arguments: argparse.Namespace, console: Console, folder: Path) 
     write_json(folder / "reliability.json", measured)
     write_atomically(folder / "reliability.png", draw_reliability(measured))
     return [reliability_table(measured)]
+
+
+def _trace(arguments: argparse.Namespace, console: Console, folder: Path) -> list[Table]:
+    from kitting_drake.reproduction.benchmarks.trace_benchmark import (
+        TOOLS,
+        benchmark_trace,
+        trace_table,
+    )
+
+    measured = benchmark_trace(
+        arguments.tools or TOOLS,
+        console,
+        folder / "photos" if arguments.keep else None,
+        exif=not arguments.no_exif,
+    )
+    write_json(folder / "trace.json", measured)
+    return [trace_table(measured)]
 
 
 def _mujoco(arguments: argparse.Namespace, console: Console, folder: Path) -> list[Table]:

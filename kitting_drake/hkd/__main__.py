@@ -18,6 +18,7 @@ from kitting_drake.hkd.generation.part_models import load_named
 from kitting_drake.hkd.listing import chosen_entries, chosen_with_own, print_tools, size_text
 from kitting_drake.hkd.tools.tool import CATEGORIES
 from kitting_drake.hkd.tools.toolsets import SPLITS, toolsets
+from kitting_drake.hkd.tracing.command import describe_trace, trace_photo
 
 
 def list_tools(args: argparse.Namespace, entries: list[ToolEntry]) -> None:
@@ -108,6 +109,11 @@ def import_mesh(args: argparse.Namespace, entries: list[ToolEntry]) -> None:
         console.print(f"  {note}")
     named = d["name"] if args.output is None else report.directory.resolve()
     console.print(f"files: {report.directory}/; name it '{named}' in a scenario", soft_wrap=True)
+
+
+def trace(args: argparse.Namespace, entries: list[ToolEntry]) -> None:
+    """Makes outlines (SVG, DXF), and tools, from a photo of tools on a sheet of paper."""
+    trace_photo(args)
 
 
 def kit(args: argparse.Namespace, entries: list[ToolEntry]) -> None:
@@ -215,6 +221,9 @@ def main() -> int:
     annotator.add_argument("name", metavar="NAME", help="a tool's name, or its folder")
     annotator.set_defaults(function=annotate)
     _describe_import(verbs.add_parser("import", help=import_mesh.__doc__))
+    tracer = verbs.add_parser("trace", help=trace.__doc__)
+    describe_trace(tracer)
+    tracer.set_defaults(function=trace)
     _describe_kit(verbs.add_parser("kit", help=kit.__doc__))
     args = parser.parse_args()
     models = getattr(args, "models", MODELS)

@@ -1,0 +1,1 @@
+"""`hkd trace`: outlines of tools from a photo."""

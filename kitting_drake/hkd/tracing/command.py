@@ -1,0 +1,175 @@
+"""The command line of `hkd trace`."""
+
+import argparse
+import shlex
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from rich.console import Console
+from rich.markup import escape
+
+from kitting_drake.common.errors import UserError
+from kitting_drake.hkd.listing import size_text
+
+if TYPE_CHECKING:
+    from kitting_drake.hkd.tracing.scales import Scale
+
+_SHEETS = ("a4", "letter")
+
+
+def describe_trace(tracer: argparse.ArgumentParser) -> None:
+    """Adds the arguments of `hkd trace`."""
+    tracer.add_argument("photo", type=Path, metavar="PHOTO", help="a photo from above (JPEG, PNG)")
+    tracer.add_argument("--output", type=Path, required=True, metavar="DIR", help="the folder")
+    tracer.add_argument(
+        "--sheet",
+        nargs="+",
+        metavar="SIZE",
+        help="a4, letter, or two sides in mm (default: A4 or Letter, as it looks)",
+    )
+    tracer.add_argument(
+        "--height_mm",
+        type=float,
+        nargs="+",
+        metavar="MM",
+        help="height of the tools as they lie: one for all, or one for each from left to right",
+    )
+    tracer.add_argument(
+        "--edges",
+        choices=("upright", "round"),
+        default="upright",
+        help="the tools' sides: upright from foot to top, or round with the edge at half the "
+        "height (default: upright)",
+    )
+    tracer.add_argument(
+        "--camera_mm", type=float, metavar="MM", help="height of the camera (default: by its lens)"
+    )
+    tracer.add_argument(
+        "--points", type=Path, metavar="FILE", help="corrections (YAML): see docs/printing.md"
+    )
+    tracer.add_argument("--name", help="name of the outlines (default: the photo's)")
+    tracer.add_argument(
+        "--category",
+        nargs="+",
+        metavar="NAME",
+        help="also import the outlines as tools of this category, or of one each",
+    )
+    scales = tracer.add_argument_group("scale without a sheet")
+    scales.add_argument(
+        "--scale_px",
+        type=float,
+        nargs=4,
+        metavar=("U1", "V1", "U2", "V2"),
+        help="two points in the photo, for instance on a ruler, in pixels",
+    )
+    scales.add_argument("--scale_mm", type=float, metavar="MM", help="the distance between them")
+    scales.add_argument("--disc_mm", type=float, metavar="MM", help="the diameter of a coin")
+    scales.add_argument(
+        "--board",
+        type=float,
+        nargs=4,
+        metavar=("COLUMNS", "ROWS", "SQUARE_MM", "MARKER_MM"),
+        help="a ChArUco board beside the tools",
+    )
+    scales.add_argument(
+        "--dictionary", default="DICT_4X4_50", help="of the board's markers (DICT_4X4_50)"
+    )
+    tracer.add_argument("--quiet", action="store_true", help="print nothing but errors")
+
+
+def trace_photo(args: argparse.Namespace) -> None:
+    """Traces a photo and prints what was found; imports the tools on request.
+
+    Raises:
+        UserError: the arguments or the photo cannot be used.
+    """
+    # OpenCV and the importer are slow to import, and only this verb needs them.
+    from kitting_drake.hkd.importing.importer import ImportRequest, import_tool
+    from kitting_drake.hkd.tracing.tracer import TraceRequest, trace
+
+    if args.category and not args.height_mm:
+        raise UserError("--category makes tools, whose height is needed: give --height_mm")
+    request = TraceRequest(
+        photo=args.photo,
+        output=args.output,
+        sheet_mm=_sheet(args.sheet),
+        scale=_scale(args),
+        heights_mm=tuple(args.height_mm or ()),
+        edges=args.edges,
+        camera_mm=args.camera_mm,
+        points=args.points,
+        name=args.name,
+    )
+    console = Console(quiet=args.quiet, highlight=False, markup=False)
+    with Console(stderr=True, quiet=args.quiet).status(f"tracing {escape(str(args.photo))}"):
+        report = trace(request)
+    for tool in report.tools:
+        size = " x ".join(f"{side:.1f}" for side in tool.size_mm)
+        holes = "1 hole" if tool.holes == 1 else f"{tool.holes or 'no'} holes"
+        console.print(f"{tool.name}: {size} mm, {holes}")
+    for note in report.notes:
+        console.print(f"  {note}", soft_wrap=True)
+    console.print(f"look at {args.output}/trace.png before you cut", soft_wrap=True)
+    if not args.category:
+        return
+    categories = args.category * len(report.tools) if len(args.category) == 1 else args.category
+    if len(categories) != len(report.tools):
+        raise UserError(
+            f"--category has {len(categories)} names for {len(report.tools)} tools: give one, or "
+            "one for each from left to right"
+        )
+    made = []
+    for tool, category in zip(report.tools, categories, strict=True):
+        with Console(stderr=True, quiet=args.quiet).status(f"importing {tool.name}"):
+            imported = import_tool(
+                ImportRequest(
+                    mesh=tool.svg,
+                    category=category,
+                    name=tool.name,
+                    output=args.output / "tools",
+                    height_mm=tool.height_mm,
+                )
+            )
+        record = imported.record
+        console.print(f"{tool.name}: {size_text(record)} mm, {1e3 * record['mass']:.0f} g")
+        made.append(shlex.quote(str(imported.directory)))
+    console.print(
+        f"next: python -m kitting_drake.hkd kit {' '.join(made)} --output DIR", soft_wrap=True
+    )
+
+
+def _sheet(given: list[str] | None) -> tuple[float, float] | None:
+    from kitting_drake.hkd.tracing.sheet_plane import SHEETS
+
+    if given is None:
+        return None
+    if len(given) == 1 and given[0].lower() in SHEETS:
+        return SHEETS[given[0].lower()]
+    try:
+        length, width = (float(text) for text in given)
+    except ValueError as error:
+        raise UserError(
+            f"--sheet {' '.join(given)} must be {', '.join(_SHEETS)} or two sides in mm"
+        ) from error
+    return length, width
+
+
+def _scale(args: argparse.Namespace) -> "Scale | None":
+    from kitting_drake.hkd.tracing.scales import Scale
+
+    if (args.scale_px is None) != (args.scale_mm is None):
+        raise UserError("--scale_px and --scale_mm belong together: give both")
+    kinds = {"--sheet": args.sheet, "--scale_px": args.scale_px, "--disc_mm": args.disc_mm}
+    given = [flag for flag, value in (kinds | {"--board": args.board}).items() if value is not None]
+    if len(given) > 1:
+        raise UserError(f"{' and '.join(given)} are two scales: give one")
+    if args.scale_px is not None:
+        return Scale(points=tuple(args.scale_px), length_mm=args.scale_mm)
+    if args.disc_mm is not None:
+        if not 5 <= args.disc_mm <= 300:
+            raise UserError(f"--disc_mm {args.disc_mm:g} is out of range: give 5 to 300")
+        return Scale(disc_mm=args.disc_mm)
+    if args.board is not None:
+        columns, rows, square, marker = args.board
+        return Scale(board=(int(columns), int(rows), square, marker), dictionary=args.dictionary)
+    return None

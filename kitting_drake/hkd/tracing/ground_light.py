@@ -1,0 +1,93 @@
+"""Evens out the light on a plain ground, so that what lies on it stands out."""
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kitting_drake.hkd.tracing.photo_file import linear
+
+Array = NDArray[Any]
+
+_FLOOR = 0.012
+"""Added to linear values, so that noise in the dark is not a difference."""
+_SMOOTH_MM = 20.0
+_FIT_POINTS = 20_000
+
+
+def log_light(pixels: Array) -> Array:
+    """(rows, columns, 3) logarithms of linear light."""
+    codes = np.arange(256, dtype=np.uint8)
+    return np.log(linear(codes) + np.float32(_FLOOR))[pixels]
+
+
+def flattened(cv2: Any, logs: Array, ground: Array, px_per_mm: float) -> tuple[Array, float]:
+    """The logarithm of each pixel's ratio to the ground there, and the ground's own spread.
+
+    Args:
+        cv2: OpenCV.
+        logs: (rows, columns, 3) from `log_light`.
+        ground: (rows, columns) where the ground may be seen.
+        px_per_mm: the resolution.
+    """
+    rows, columns = ground.shape
+    v, u = np.nonzero(ground)
+    rng = np.random.default_rng(0)
+    pick = rng.choice(len(u), min(_FIT_POINTS, len(u)), replace=False)
+    u, v = u[pick], v[pick]
+    values = logs[v, u].astype(float)
+    design = _terms(u / columns - 0.5, v / rows - 0.5)
+    coefficients = _robust_fit(design, values)
+    y, x = np.mgrid[0:rows, 0:columns].astype(np.float32)
+    x, y = x / columns - 0.5, y / rows - 0.5
+    ratio = np.empty_like(logs)
+    for k in range(3):
+        a = coefficients[:, k].astype(np.float32)
+        light = a[0] + x * (a[1] + a[3] * x + a[4] * y) + y * (a[2] + a[5] * y)
+        ratio[..., k] = logs[..., k] - light
+    residual = values - design @ coefficients
+    near = np.abs(residual).max(axis=1) < 0.15
+    spread = 1.4826 * float(np.median(np.abs(residual[near]))) if near.sum() > 50 else 0.15
+    # What the polynomial leaves of the light, where the ground is seen.
+    plain = (ground & (_largest(ratio) < max(0.06, 3 * spread))).astype(np.float32)
+    step = max(1, int(px_per_mm))
+    small = cv2.resize(plain, None, fx=1 / step, fy=1 / step, interpolation=cv2.INTER_AREA)
+    sigma = _SMOOTH_MM * px_per_mm / step
+    weight = cv2.GaussianBlur(small, (0, 0), sigma)
+    for k in range(3):
+        part = cv2.resize(
+            ratio[..., k] * plain, None, fx=1 / step, fy=1 / step, interpolation=cv2.INTER_AREA
+        )
+        rest = cv2.GaussianBlur(part, (0, 0), sigma) / np.maximum(weight, 1e-3)
+        ratio[..., k] -= cv2.resize(rest, (columns, rows), interpolation=cv2.INTER_LINEAR)
+    return ratio, spread
+
+
+def _largest(ratio: Array) -> Array:
+    """The largest size of the three values of each pixel."""
+    a, b, c = (np.abs(ratio[..., k]) for k in range(3))
+    return np.maximum(np.maximum(a, b), c)
+
+
+def _terms(x: Array, y: Array) -> Array:
+    return np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=1)
+
+
+def _robust_fit(design: Array, values: Array) -> Array:
+    """(6, 3) coefficients that follow most of the values, by Tukey's weights."""
+    # Start from the most frequent lightness.
+    light = values.mean(axis=1)
+    counts, edges = np.histogram(light, bins=60)
+    counts = np.convolve(counts, [1, 2, 3, 2, 1], mode="same")
+    mode = edges[np.argmax(counts)] + (edges[1] - edges[0]) / 2
+    center = np.median(values[np.abs(light - mode) < 0.15], axis=0)
+    coefficients = np.zeros((6, 3))
+    coefficients[0] = center
+    for width in (0.45, 0.35, 0.25, 0.2, 0.15, 0.12, 0.1, 0.1):
+        residual = np.abs(values - design @ coefficients).max(axis=1)
+        weights = np.clip(1 - (residual / width) ** 2, 0, None) ** 2
+        if (weights > 0).sum() < 50:
+            break
+        root = np.sqrt(weights)[:, None]
+        coefficients = np.linalg.lstsq(design * root, values * root, rcond=None)[0]
+    return coefficients

@@ -1,0 +1,102 @@
+"""Reads a photo and what it says about its lens."""
+
+import math
+import warnings
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image, ImageOps
+
+from kitting_drake.common.errors import UserError
+
+_EXIF_IFD, _FOCAL_35MM, _WIDTH, _HEIGHT = 0x8769, 0xA405, 0xA002, 0xA003
+_DIAGONAL_35MM = math.hypot(36, 24)
+ASSUMED_FOCAL_35MM = 26.0
+"""The main lens of most phones: 24 to 28 mm, as if for film of 35 mm."""
+_LEAST_SIDE = 500
+_MOST_PIXELS = 110_000_000
+
+
+@dataclass(frozen=True)
+class Photo:
+    """A photo, upright."""
+
+    path: Path
+    pixels: NDArray[np.uint8]
+    """(rows, columns, 3) RGB."""
+    focal_35mm: float | None
+    """The focal length that the photo tells, as if for film of 35 mm."""
+    cropped: bool = False
+    """Whether the photo is another shape than the camera says."""
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Width and height in pixels."""
+        return self.pixels.shape[1], self.pixels.shape[0]
+
+    @property
+    def center(self) -> NDArray[np.float64]:
+        """The middle, from pixel centres."""
+        return (np.array(self.size) - 1) / 2
+
+    def focal_px(self, focal_35mm: float) -> float:
+        """A focal length in pixels; the equivalent is by the diagonal (CIPA DCG-001)."""
+        return focal_35mm / _DIAGONAL_35MM * math.hypot(*self.size)
+
+
+def read_photo(path: Path) -> Photo:
+    """Reads a photo, turned upright as its EXIF says.
+
+    Raises:
+        UserError: there is no such file, it is not a picture, or it is too small.
+    """
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            with Image.open(path) as opened:
+                if opened.width * opened.height > _MOST_PIXELS:
+                    raise UserError(
+                        f"{path} has {opened.width} x {opened.height} pixels, more than "
+                        f"{_MOST_PIXELS / 1e6:.0f} million: make it smaller"
+                    )
+                inner = dict(opened.getexif().get_ifd(_EXIF_IFD))
+                upright = ImageOps.exif_transpose(opened)
+                stored = (opened.width, opened.height)
+                pixels = np.asarray(upright.convert("RGB"))
+    except UserError:
+        raise
+    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
+        if not path.exists():
+            raise UserError(f"there is no file {path}: give a photo (JPEG, PNG)") from error
+        raise UserError(
+            f"{path} cannot be read as a photo: give a JPEG or a PNG (convert a HEIC first)"
+        ) from error
+    if min(pixels.shape[:2]) < _LEAST_SIDE:
+        raise UserError(
+            f"{path} has {pixels.shape[1]} x {pixels.shape[0]} pixels: "
+            f"give a photo of at least {_LEAST_SIDE} pixels a side"
+        )
+    focal = _number(inner.get(_FOCAL_35MM))
+    taken = (_number(inner.get(_WIDTH)), _number(inner.get(_HEIGHT)))
+    cropped = False
+    if taken[0] and taken[1]:
+        cropped = abs(math.log(taken[0] / taken[1] * stored[1] / stored[0])) > 0.01
+    return Photo(path, pixels, focal if focal and 5 <= focal <= 400 else None, cropped)
+
+
+def _number(value: Any) -> float | None:
+    try:
+        number = float(value)
+    except (TypeError, ValueError, ZeroDivisionError):
+        return None
+    return number if math.isfinite(number) and number > 0 else None
+
+
+def linear(pixels: NDArray[np.uint8]) -> NDArray[np.float32]:
+    """Linear light, 0 to 1, of sRGB pixels."""
+    codes = np.arange(256, dtype=np.float32) / 255
+    table = np.where(codes <= 0.04045, codes / 12.92, ((codes + 0.055) / 1.055) ** 2.4)
+    return table.astype(np.float32)[pixels]

@@ -1,0 +1,166 @@
+"""The silhouettes of tools on a rectified photo, in mm."""
+
+from typing import Any
+
+import numpy as np
+from manifold3d import CrossSection, FillRule
+from numpy.typing import NDArray
+
+from kitting_drake.common.errors import UserError
+from kitting_drake.hkd.tracing.ground_light import flattened, log_light
+from kitting_drake.hkd.tracing.photo_file import linear
+from kitting_drake.hkd.tracing.plane_view import RectifiedPhoto
+from kitting_drake.hkd.tracing.tool_mask import tool_mask
+
+Array = NDArray[Any]
+
+_RIM_MM = 1.2
+"""The rim of a sheet, where its edge casts a shadow, is not looked at."""
+_LEAST_LOOP_MM2 = 4.0
+_LEAST_TOOL_MM2 = 60.0
+_FLAT_MM = 0.03
+
+
+def find_silhouettes(
+    cv2: Any,
+    photo: RectifiedPhoto,
+    sheet: Array | None,
+    hidden: tuple[Array, ...],
+) -> tuple[CrossSection, float]:
+    """The area that tools cover, and the width of its border's blur, in mm.
+
+    Args:
+        cv2: OpenCV.
+        photo: the plane from above.
+        sheet: (2,) the size of the sheet, whose lower left corner is the origin; tools lie on it.
+            None: all of the photo is ground.
+        hidden: polygons to leave out.
+
+    Raises:
+        UserError: a tool reaches over the sheet's edge.
+    """
+    ppm = photo.px_per_mm
+    logs = log_light(photo.pixels)
+    ground = photo.seen.copy()
+    if sheet is not None:
+        ground &= _polygon(cv2, photo, _rectangle(_RIM_MM, sheet - _RIM_MM))
+    for polygon in hidden:
+        ground &= ~_polygon(cv2, photo, polygon)
+    ratio, spread = flattened(cv2, logs, ground, ppm)
+    mask = tool_mask(cv2, ratio, ground, spread, ppm)
+    if sheet is not None:
+        inner = _polygon(cv2, photo, _rectangle(_RIM_MM + 0.5, sheet - _RIM_MM - 0.5))
+        if mask[~inner].any():
+            raise UserError(
+                "a tool reaches over the sheet's edge: lay it wholly on the sheet, or use a "
+                "larger one (--sheet LENGTH WIDTH)"
+            )
+    if not mask.any():
+        return CrossSection(), 0.0
+    soft = soft_mask(cv2, photo, mask)
+    area = _cleaned(contours(photo, soft))
+    return area, _blur_mm(cv2, soft, mask, ppm)
+
+
+def _rectangle(low: Array | float, high: Array) -> Array:
+    (x0, y0), (x1, y1) = np.broadcast_to(low, 2), high
+    return np.array([[x0, y0], [x1, y0], [x1, y1], [x0, y1]])
+
+
+def _polygon(cv2: Any, photo: RectifiedPhoto, polygon: Array) -> Array:
+    mask = np.zeros(photo.shape, np.uint8)
+    cv2.fillPoly(mask, [np.round(photo.to_px(polygon)).astype(np.int32)], 1)
+    return mask > 0
+
+
+def _cleaned(area: CrossSection) -> CrossSection:
+    """Without specks and tiny holes."""
+    result = CrossSection()
+    for part in area.decompose():
+        loops = [np.asarray(loop) for loop in part.to_polygons()]
+        sizes = [CrossSection([loop]).area() or CrossSection([loop[::-1]]).area() for loop in loops]
+        if max(sizes, default=0) < _LEAST_TOOL_MM2:
+            continue
+        kept = [loop for loop, size in zip(loops, sizes, strict=True) if size >= _LEAST_LOOP_MM2]
+        result += CrossSection(kept)
+    return result.simplify(_FLAT_MM)
+
+
+def _blur_mm(cv2: Any, soft: Array, mask: Array, ppm: float) -> float:
+    """The median width over which the silhouettes' border rises from 0 to 1."""
+    x = cv2.Sobel(soft, cv2.CV_32F, 1, 0, scale=ppm / 8)
+    y = cv2.Sobel(soft, cv2.CV_32F, 0, 1, scale=ppm / 8)
+    slope = np.hypot(x, y)[(soft > 0.35) & (soft < 0.65)]
+    return float(1 / max(np.median(slope), 1e-3)) if slope.size else 0.0
+
+
+_BAND_MM = 0.7
+"""The outline is within this distance of the mask's edge."""
+_SKIP_MM = 0.35
+_NEAR_MM = 0.8
+_LEAST_CONTRAST = 0.03
+
+
+def soft_mask(cv2: Any, photo: RectifiedPhoto, mask: Array) -> Array:
+    """(rows, columns) the share of a tool's light in each pixel near the edge of a mask.
+
+    The tool's and the ground's colours are those a little inside and outside of the edge, so a
+    shadow beside a tool counts as ground.
+    """
+    ppm = photo.px_per_mm
+    u, v, width, height = cv2.boundingRect(mask)
+    margin = int(4 * ppm)
+    box = (
+        slice(max(0, v - margin), v + height + margin),
+        slice(max(0, u - margin), u + width + margin),
+    )
+    whole = np.zeros(mask.shape, np.float32)
+    whole[box] = _soft(cv2, linear(photo.pixels[box]), mask[box], ppm)
+    return whole
+
+
+def _soft(cv2: Any, light: Array, mask: Array, ppm: float) -> Array:
+    # Blur is at least a pixel or two wide.
+    skip = max(_SKIP_MM, 1.5 / ppm)
+    inside = cv2.distanceTransform(mask, cv2.DIST_L2, 5) / ppm
+    outside = cv2.distanceTransform(1 - mask, cv2.DIST_L2, 5) / ppm
+    tool = _spread_colour(cv2, light, (inside > skip) & (inside < 2.0), ppm)
+    ground = _spread_colour(cv2, light, (outside > skip) & (outside < 1.6), ppm)
+    contrast = np.zeros_like(inside)
+    share = np.zeros_like(inside)
+    for k in range(3):
+        along = tool[..., k] - ground[..., k]
+        contrast += along * along
+        share += (light[..., k] - ground[..., k]) * along
+    share /= np.maximum(contrast, 1e-6)
+    unsure = (contrast < _LEAST_CONTRAST**2) | (tool[..., 3] < 1e-3) | (ground[..., 3] < 1e-3)
+    share[unsure] = cv2.GaussianBlur(mask.astype(np.float32), (0, 0), 0.2 * ppm)[unsure]
+    share = np.clip(share, 0, 1)
+    share[inside > _BAND_MM] = 1
+    share[outside > _BAND_MM] = 0
+    return cv2.GaussianBlur(share, (0, 0), 0.12 * ppm + 0.4)
+
+
+def _spread_colour(cv2: Any, light: Array, where: Array, ppm: float) -> Array:
+    """(rows, columns, 4) the mean colour of the nearby pixels `where`, and their weight."""
+    stacked = np.empty((*where.shape, 4), np.float32)
+    stacked[..., :3] = light
+    stacked[..., 3] = 1
+    stacked[~where] = 0
+    # Three box filters are close to a Gaussian, and faster.
+    side = 2 * round(0.85 * _NEAR_MM * ppm) + 1
+    for _ in range(3):
+        stacked = cv2.blur(stacked, (side, side))
+    stacked[..., :3] /= np.maximum(stacked[..., 3:], 1e-6)
+    return stacked
+
+
+def contours(photo: RectifiedPhoto, soft: Array) -> CrossSection:
+    """The area, in mm, where a soft mask is over one half."""
+    # Import lazily: it comes with matplotlib.
+    import contourpy
+
+    padded = np.pad(soft, 1)
+    lines = contourpy.contour_generator(z=padded).lines(0.5)
+    loops = [photo.to_mm(np.asarray(line)[:-1] - 1) for line in lines if len(line) > 8]
+    return CrossSection(loops, FillRule.EvenOdd)

@@ -1,0 +1,288 @@
+"""`hkd trace`: outlines of tools from a photo, as drawings in mm and as tools.
+
+The plane that the tools lie on is found by something of known size (`sheet_plane`, `scales`), and
+the photo is rectified (`plane_view`). Tools are told from the ground and from shadows
+(`tool_mask`), their border is found to a fraction of a pixel (`silhouettes`), and the silhouette
+is corrected for the tool's height (`tool_height`).
+"""
+
+import math
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from manifold3d import CrossSection
+
+from kitting_drake.common.errors import UserError
+from kitting_drake.common.extras import import_extra
+from kitting_drake.common.files import require_folder, write_atomically, write_json
+from kitting_drake.hkd.tracing.corrections import Corrections, read_corrections
+from kitting_drake.hkd.tracing.photo_file import Photo, read_photo
+from kitting_drake.hkd.tracing.plane_view import RectifiedPhoto, rectify
+from kitting_drake.hkd.tracing.scales import Scale, plane_of_scale
+from kitting_drake.hkd.tracing.sheet_plane import GroundPlane, plane_of_sheet
+from kitting_drake.hkd.tracing.silhouettes import find_silhouettes
+from kitting_drake.hkd.tracing.tool_height import outline_of_silhouette
+from kitting_drake.hkd.tracing.trace_files import outlines_dxf, outlines_svg, trace_png
+
+_STEEPEST = math.radians(30)
+_MOST_PX_PER_MM = 5.0
+_MOST_PIXELS = 4e6
+_BLURRED_MM = 1.6
+"""The edges of tools and sheet in a sharp photo are narrower."""
+_HEIGHTS_MM = (0.5, 100.0)
+_CAMERAS_MM = (100.0, 3000.0)
+_SHARE_OF_HEIGHT = 0.5
+
+
+@dataclass(frozen=True)
+class TraceRequest:
+    """A photo to trace, and how to read it."""
+
+    photo: Path
+    output: Path
+    sheet_mm: tuple[float, float] | None = None
+    """The sheet's sides; None: A4 or Letter, whichever it looks like."""
+    scale: Scale | None = None
+    """Something of known size other than a sheet."""
+    heights_mm: tuple[float, ...] = ()
+    """The tools' heights, from left to right, or one for all; empty: not corrected."""
+    edges: str = "upright"
+    """One of `tool_height.EDGES`."""
+    camera_mm: float | None = None
+    """The camera's height above the plane; None: by the focal length."""
+    points: Path | None = None
+    """A file of corrections."""
+    name: str | None = None
+    """Of the outlines; by default the photo's."""
+
+
+@dataclass(frozen=True)
+class TracedTool:
+    """One outline."""
+
+    name: str
+    outline: CrossSection
+    """In mm, in the plane's frame."""
+    height_mm: float | None
+    svg: Path
+
+    @property
+    def holes(self) -> int:
+        """The number of its holes."""
+        return self.outline.num_contour() - 1
+
+    @property
+    def size_mm(self) -> tuple[float, float]:
+        """Length and width of the smallest rectangle around it, by whole degrees."""
+        sizes = []
+        for angle in range(180):
+            x_low, y_low, x_high, y_high = self.outline.rotate(angle).bounds()
+            sizes.append((x_high - x_low, y_high - y_low))
+        length, width = min(sizes, key=lambda size: size[0] * size[1])
+        return max(length, width), min(length, width)
+
+
+@dataclass(frozen=True)
+class TraceReport:
+    """What was traced."""
+
+    tools: list[TracedTool]
+    notes: list[str]
+
+
+def trace(request: TraceRequest) -> TraceReport:
+    """Traces the tools of a photo and writes their outlines and a picture.
+
+    Raises:
+        UserError: the photo cannot be read reliably; nothing was written then.
+        MachineError: OpenCV or ezdxf is missing.
+    """
+    cv2 = import_extra("cv2", purpose="hkd trace", extra="camera")
+    name = _checked(request)
+    corrections = read_corrections(request.points) if request.points else Corrections()
+    photo = read_photo(request.photo)
+    plane = (
+        plane_of_scale(cv2, photo, request.scale, request.camera_mm)
+        if request.scale
+        else plane_of_sheet(cv2, photo, request.sheet_mm, corrections.corners, request.camera_mm)
+    )
+    _check_view(photo, plane)
+    seen, silhouette, blur = _look(cv2, photo, plane)
+    silhouette = corrections.applied(silhouette)
+    parts = [part for part in silhouette.decompose() if part.area() > 0]
+    parts.sort(key=lambda part: part.bounds()[0])
+    _check_parts(photo, parts, seen, max(blur, plane.blur_mm))
+    heights = _heights(request, len(parts))
+    names = [name] if len(parts) == 1 else [f"{name}_{i + 1}" for i in range(len(parts))]
+    tools = []
+    for part, height, own in zip(parts, heights, names, strict=True):
+        outline = part
+        if height is not None:
+            outline = _corrected(photo, part, plane, height, request.edges)
+        tools.append(TracedTool(own, outline, height, request.output / f"{own}.svg"))
+    notes = [*plane.notes, *_view_notes(plane, request, len(parts))]
+    _write(cv2, request, tools, notes, seen, silhouette, plane)
+    return TraceReport(tools, notes)
+
+
+def _checked(request: TraceRequest) -> str:
+    name = request.name or re.sub(r"[^a-z0-9]+", "_", request.photo.stem.lower()).strip("_")[:50]
+    if not re.fullmatch(r"[a-z0-9][a-z0-9_]{0,60}", name):
+        raise UserError("--name must be small letters, digits and underscores")
+    for flag, values, (low, high) in (
+        ("--height_mm", request.heights_mm, _HEIGHTS_MM),
+        ("--camera_mm", (request.camera_mm,) if request.camera_mm else (), _CAMERAS_MM),
+        ("--sheet", request.sheet_mm or (), (50.0, 2000.0)),
+    ):
+        for value in values:
+            if not low <= value <= high:
+                raise UserError(f"{flag} {value:g} is out of range: give {low:g} to {high:g}")
+    return name
+
+
+def _check_view(photo: Photo, plane: GroundPlane) -> None:
+    view = plane.view
+    if view.tilt > _STEEPEST:
+        raise UserError(
+            f"{photo.path}: the camera looks {math.degrees(view.tilt):.0f} degrees from the "
+            f"vertical, more than {math.degrees(_STEEPEST):.0f}: take the photo from above"
+        )
+
+
+def _look(cv2: Any, photo: Photo, plane: GroundPlane) -> tuple[RectifiedPhoto, CrossSection, float]:
+    """The photo from above, the tools' silhouettes and their blur in mm."""
+    seen = _rectified(cv2, plane)
+    try:
+        return (seen, *find_silhouettes(cv2, seen, plane.sheet, plane.hidden))
+    except UserError as error:
+        raise UserError(f"{photo.path}: {error}") from error
+
+
+def _rectified(cv2: Any, plane: GroundPlane) -> RectifiedPhoto:
+    low, high = plane.low, plane.high
+    middle = (low + high) / 2
+    size = high - low
+    px_per_mm = min(
+        _MOST_PX_PER_MM,
+        plane.view.px_per_mm(middle),
+        math.sqrt(_MOST_PIXELS / float(size[0] * size[1])),
+    )
+    return rectify(cv2, plane.pixels, plane.view, low, high, px_per_mm)
+
+
+def _check_parts(
+    photo: Photo, parts: list[CrossSection], seen: RectifiedPhoto, blur: float
+) -> None:
+    if not parts:
+        raise UserError(
+            f"{photo.path}: no tool is seen: it must differ from what it lies on, or be added with "
+            "--points"
+        )
+    if blur > _BLURRED_MM:
+        raise UserError(
+            f"{photo.path} is blurred: its edges are {blur:.1f} mm wide; take it again, "
+            "with more light or a steadier hand"
+        )
+    for part in parts:
+        for loop in part.to_polygons():
+            u, v = np.round(seen.to_px(np.asarray(loop))).astype(int).T
+            rows, columns = seen.shape
+            u, v = np.clip(u, 2, columns - 3), np.clip(v, 2, rows - 3)
+            if not all(seen.seen[v + dv, u + du].all() for du in (-2, 2) for dv in (-2, 2)):
+                raise UserError(
+                    f"{photo.path}: a tool touches the photo's edge: show all of it, and some "
+                    "ground around it"
+                )
+
+
+def _heights(request: TraceRequest, count: int) -> list[float | None]:
+    given = request.heights_mm
+    if not given:
+        return [None] * count
+    if len(given) == 1:
+        return list(given) * count
+    if len(given) != count:
+        raise UserError(
+            f"--height_mm has {len(given)} heights, and {request.photo} shows {count} tools: give "
+            "one for each, from left to right, or one for all"
+        )
+    return list(given)
+
+
+def _corrected(
+    photo: Photo, part: CrossSection, plane: GroundPlane, height: float, edges: str
+) -> CrossSection:
+    camera = plane.view.camera
+    if height > _SHARE_OF_HEIGHT * camera[2]:
+        raise UserError(
+            f"{photo.path}: the camera is {camera[2]:.0f} mm above the tool's ground, too close "
+            f"for a height of {height:g} mm"
+        )
+    outline = outline_of_silhouette(part, camera, height, edges)
+    parts = sorted(outline.decompose(), key=lambda piece: -piece.area())
+    if not parts or parts[0].area() < 0.5 * part.area():
+        raise UserError(
+            f"{photo.path}: a tool {height:g} mm high would be thinner than its sides look: give "
+            "its true height, or take the photo from straight above"
+        )
+    return parts[0]
+
+
+def _view_notes(plane: GroundPlane, request: TraceRequest, count: int) -> list[str]:
+    view = plane.view
+    where = f"camera {view.camera[2]:.0f} mm above, {math.degrees(view.tilt):.0f} degrees tilted"
+    if not request.heights_mm:
+        return [where, "not corrected for the tools' height: give --height_mm"]
+    at = {"upright": "from foot to top", "round": "at half the height"}[request.edges]
+    if count > 1:
+        where += f"; {count} tools (shine across a tool may have split it)"
+    return [where, f"corrected for the tools' height, with the sides {at}"]
+
+
+def _write(
+    cv2: Any,
+    request: TraceRequest,
+    tools: list[TracedTool],
+    notes: list[str],
+    seen: RectifiedPhoto,
+    silhouette: CrossSection,
+    plane: GroundPlane,
+) -> None:
+    outlines = {tool.name: tool.outline for tool in tools}
+    files: dict[str, str | bytes] = {}
+    for name, outline in outlines.items():
+        files[f"{name}.svg"] = outlines_svg({name: outline})
+        files[f"{name}.dxf"] = outlines_dxf({name: outline})
+    if len(tools) > 1:
+        files["all_tools.svg"], files["all_tools.dxf"] = (
+            outlines_svg(outlines),
+            outlines_dxf(outlines),
+        )
+    files["trace.png"] = trace_png(cv2, seen, silhouette, outlines, request.photo.name)
+    folder = require_folder(request.output)
+    for file, content in files.items():
+        write_atomically(folder / file, content)
+    view = plane.view
+    write_json(
+        folder / "trace.json",
+        {
+            "photo": str(request.photo),
+            "notes": notes,
+            "camera_mm": np.round(view.camera, 2).tolist(),
+            "tilt_deg": round(math.degrees(view.tilt), 2),
+            "edges": request.edges,
+            "corrections": str(request.points) if request.points else None,
+            "tools": [
+                {
+                    "name": tool.name,
+                    "size_mm": np.round(tool.size_mm, 2).tolist(),
+                    "holes": tool.holes,
+                    "height_mm": tool.height_mm,
+                }
+                for tool in tools
+            ],
+        },
+    )

@@ -1,0 +1,208 @@
+"""`benchmark trace`: the error of outlines that are traced from drawn photos of known tools."""
+
+import math
+import tempfile
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from manifold3d import CrossSection
+from numpy.typing import NDArray
+from rich.console import Console
+from rich.progress import track
+from rich.table import Table
+from scipy.spatial import cKDTree
+
+from kitting_drake.common.errors import UserError
+from kitting_drake.evaluation.quantities import numbers_table
+from kitting_drake.hkd.tools.tool import load_tool
+from kitting_drake.hkd.tracing.tracer import TraceRequest, trace
+from kitting_drake.reproduction.benchmarks.trace_photos import (
+    PAINTS,
+    PhotoSpec,
+    PlacedTool,
+    draw_photo,
+    placed_outline,
+)
+
+TOOLS = (
+    *("adjustable_wrench", "ball_peen_hammer", "bent_nose_pliers", "cabinet_screwdriver"),
+    *("claw_hammer", "combination_wrench", "diagonal_cutters", "double_box_end_wrench"),
+    *("hook_spanner", "slip_joint_pliers", "angle_wrench", "basin_wrench", "chipping_hammer"),
+    *("circlip_pliers", "end_nippers", "flat_screwdriver", "locking_pliers", "nut_driver"),
+    *("s_wrench", "tack_hammer"),
+)
+"""The first ten were looked at while the tracer was written; the others were not."""
+HEIGHTS_MM = (5.0, 12.0, 20.0)
+TILTS = (4.0, 15.0, 25.0)
+_SAMPLE_MM = 0.25
+
+Points = NDArray[np.float64]
+
+
+def benchmark_trace(
+    names: Sequence[str], console: Console, folder: Path | None = None, exif: bool = True
+) -> dict[str, Any]:
+    """Draws three photos of each tool, traces them and measures the outlines, in mm.
+
+    Args:
+        names: of the tools.
+        console: where to show progress.
+        folder: where to keep photos and pictures; None: nowhere.
+        exif: whether the photos tell their focal length.
+    """
+    photos, pooled = [], []
+    jobs = [(name, k) for name in names for k in range(3)]
+    for index, (name, k) in enumerate(
+        track(jobs, "photos", console=console, transient=True, disable=console.quiet)
+    ):
+        spec, tool = drawn_case(name, index, k, exif)
+        with tempfile.TemporaryDirectory() as scratch:
+            kept = folder / f"{name}_{k}" if folder else Path(scratch)
+            kept.mkdir(parents=True, exist_ok=True)
+            path = kept / "photo.jpg"
+            path.write_bytes(draw_photo([tool], spec))
+            entry: dict[str, Any] = {
+                "tool": name,
+                "height_mm": tool.height,
+                "tilt_deg": spec.tilt,
+                "ground": spec.ground,
+            }
+            start, worked = time.perf_counter(), time.process_time()
+            try:
+                report = trace(TraceRequest(path, kept, heights_mm=(tool.height,), name="traced"))
+                entry["tools"] = len(report.tools)
+                outline = max((t.outline for t in report.tools), key=lambda o: o.area())
+                errors = outline_errors(outline, tool.outline)
+                pooled.append(errors)
+                entry["median_mm"], entry["p95_mm"] = np.percentile(errors, (50, 95)).tolist()
+                entry["length_mm"] = _length(outline) - _length(tool.outline)
+            except UserError as error:
+                entry["refused"] = str(error)
+            entry["seconds"] = time.perf_counter() - start
+            entry["processor_seconds"] = time.process_time() - worked
+        photos.append(entry)
+    return {"photos": photos, **_summary(photos, pooled)}
+
+
+def drawn_case(name: str, index: int, k: int, exif: bool) -> tuple[PhotoSpec, PlacedTool]:
+    """The k-th photo of a tool: three heights and tilts, both grounds, light from all sides."""
+    rng = np.random.default_rng(1000 + index)
+    lamp = rng.uniform(0, 2 * math.pi)
+    length = rng.uniform(0.2, 0.8)
+    letter = bool(rng.random() < 0.3)
+    spec = PhotoSpec(
+        sheet=(279.4, 215.9) if letter else (297.0, 210.0),
+        distance=float(rng.uniform(360, 480)),
+        tilt=TILTS[(index + k) % 3],
+        azimuth=float(rng.uniform(0, 360)),
+        roll=float(rng.uniform(-25, 25)),
+        ground=("dark", "light")[index % 2],
+        shadow=float(rng.uniform(0.2, 0.55)),
+        light=(length * math.cos(lamp), length * math.sin(lamp)),
+        softness=float(rng.uniform(0.08, 0.25)),
+        falloff=float(rng.uniform(0, 0.3)),
+        blur=float(rng.uniform(0.7, 1.8)),
+        noise=float(rng.uniform(0.003, 0.01)),
+        quality=int(rng.integers(82, 95)),
+        exif=exif,
+        seed=index,
+    )
+    footprint = load_tool(name).footprint.scale((1e3, 1e3)).simplify(0.02)
+    shift = (float(rng.uniform(-15, 15)), float(rng.uniform(-12, 12)))
+    outline = placed_outline(footprint, spec, float(rng.uniform(-15, 15)), shift)
+    metal = ("steel", "dark steel")[int(rng.integers(2))]
+    return spec, PlacedTool(
+        outline, HEIGHTS_MM[k], (metal, list(PAINTS)[int(rng.integers(len(PAINTS)))])
+    )
+
+
+def outline_errors(traced: CrossSection, true: CrossSection) -> Points:
+    """Distances (n,) of points on each outline from the other, laid over each other, in mm."""
+    from_points, to_points = _samples(traced), _samples(true)
+    best: Points | None = None
+    for quarter in range(4):
+        moved = _registered(_turned(from_points, quarter * math.pi / 2), to_points)
+        errors = np.concatenate(
+            [cKDTree(to_points).query(moved)[0], cKDTree(moved).query(to_points)[0]]
+        )
+        if best is None or errors.mean() < best.mean():
+            best = errors
+    assert best is not None
+    return best
+
+
+def _samples(outline: CrossSection) -> Points:
+    """Points (n, 2) at even distances along an outline, about its centre."""
+    result = []
+    for loop in outline.to_polygons():
+        closed = np.concatenate([loop, loop[:1]])
+        steps = np.linalg.norm(np.diff(closed, axis=0), axis=1)
+        at = np.concatenate([[0], np.cumsum(steps)])
+        where = np.arange(0, at[-1], _SAMPLE_MM)
+        result.append(np.c_[np.interp(where, at, closed[:, 0]), np.interp(where, at, closed[:, 1])])
+    points = np.concatenate(result)
+    return points - points.mean(axis=0)
+
+
+def _turned(points: Points, angle: float) -> Points:
+    c, s = math.cos(angle), math.sin(angle)
+    return points @ np.array([[c, s], [-s, c]])
+
+
+def _registered(points: Points, target: Points) -> Points:
+    """Points moved rigidly onto a target, by their nearest neighbours."""
+    tree = cKDTree(target)
+    for _ in range(25):
+        _, nearest = tree.query(points)
+        goal = target[nearest]
+        a, b = points - points.mean(axis=0), goal - goal.mean(axis=0)
+        angle = math.atan2(
+            float((a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]).sum()), float((a * b).sum())
+        )
+        points = _turned(a, angle) + goal.mean(axis=0)
+    return points
+
+
+def _length(outline: CrossSection) -> float:
+    """The largest extent in any direction, by half degrees."""
+    points = _samples(outline)
+    angles = np.radians(np.arange(0, 180, 0.5))
+    return float(np.ptp(points @ np.stack([np.cos(angles), np.sin(angles)]), axis=0).max())
+
+
+def _summary(photos: list[dict[str, Any]], pooled: list[Points]) -> dict[str, Any]:
+    traced = [photo for photo in photos if "refused" not in photo]
+    if not traced:
+        return {"traced": 0}
+    errors = np.concatenate(pooled)
+    return {
+        "traced": len(traced),
+        "median_mm": float(np.median(errors)),
+        "p95_mm": float(np.percentile(errors, 95)),
+        "median_within": sum(photo["median_mm"] <= 0.5 for photo in traced),
+        "p95_within": sum(photo["p95_mm"] <= 1.0 for photo in traced),
+        "length_mm": float(np.percentile([abs(photo["length_mm"]) for photo in traced], 95)),
+        "seconds": float(np.median([photo["seconds"] for photo in traced])),
+        "slowest_s": max(photo["seconds"] for photo in traced),
+    }
+
+
+def trace_table(measured: dict[str, Any]) -> Table:
+    """The measurements as a table for the terminal."""
+    photos = measured["photos"]
+    table = numbers_table(f"{len(photos)} photos of 12 megapixels", "what", "measured")
+    table.add_row("traced, refused", f"{measured['traced']}, {len(photos) - measured['traced']}")
+    if not measured["traced"]:
+        return table
+    table.add_row(
+        "outline, mm: median, p95", f"{measured['median_mm']:.2f}, {measured['p95_mm']:.2f}"
+    )
+    within = f"{measured['median_within']}, {measured['p95_within']}"
+    table.add_row("photos with a median of 0.5 mm, a p95 of 1 mm", within)
+    table.add_row("length, mm: p95 of the error", f"{measured['length_mm']:.2f}")
+    times = f"{measured['seconds']:.1f}, {measured['slowest_s']:.1f}"
+    table.add_row("time, s: median, slowest", times)
+    return table

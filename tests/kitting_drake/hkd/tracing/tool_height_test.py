@@ -1,0 +1,29 @@
+import numpy as np
+import pytest
+from manifold3d import CrossSection
+
+from kitting_drake.hkd.tracing.tool_height import outline_of_silhouette
+
+CAMERA = np.array([-60.0, 20.0, 400.0])
+
+
+def silhouette(outline: CrossSection, heights: np.ndarray) -> CrossSection:
+    """The union of an outline's views at some heights."""
+    seen = CrossSection()
+    for height in heights:
+        factor = CAMERA[2] / (CAMERA[2] - height)
+        about = outline.translate((-CAMERA[0], -CAMERA[1])).scale((factor, factor))
+        seen += about.translate((CAMERA[0], CAMERA[1]))
+    return seen
+
+
+@pytest.mark.parametrize(
+    ("edges", "heights"),
+    [("upright", np.linspace(0, 20, 200)), ("round", np.array([10.0]))],
+)
+def test_the_outline_is_found_again(edges: str, heights: np.ndarray):
+    outline = CrossSection.square((80, 30)) - CrossSection.circle(8).translate((20, 15))
+    found = outline_of_silhouette(silhouette(outline, heights), CAMERA, 20.0, edges)
+    assert found.num_contour() == 2
+    wrong = (found - outline).area() + (outline - found).area()
+    assert wrong < 0.02 * outline.area()

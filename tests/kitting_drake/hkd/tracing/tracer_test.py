@@ -1,0 +1,172 @@
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+from manifold3d import CrossSection
+
+from kitting_drake.common.errors import UserError
+from kitting_drake.hkd.importing.outline import read_outline
+from kitting_drake.hkd.tracing.scales import Scale
+from kitting_drake.hkd.tracing.tracer import TraceReport, TraceRequest, trace
+from kitting_drake.reproduction.benchmarks.trace_benchmark import outline_errors
+from kitting_drake.reproduction.benchmarks.trace_photos import (
+    PhotoSpec,
+    PlacedPrint,
+    PlacedTool,
+    draw_photo,
+)
+
+cv2 = pytest.importorskip("cv2")
+
+SMALL = (2000, 1500)
+SPANNER = (
+    CrossSection.square((110, 18)).translate((0, -9))
+    + CrossSection.circle(17, 60)
+    + CrossSection.circle(15, 60).translate((112, 0))
+    - CrossSection.circle(9, 60)
+    - CrossSection.square((22, 12)).translate((110, -6))
+)
+"""A spanner with a ring of 18 mm and a jaw of 12 mm."""
+
+
+def photo_of(folder: Path, *tools: PlacedTool, printed: PlacedPrint | None = None, **spec) -> Path:
+    path = folder / "My Photo.jpg"
+    path.write_bytes(
+        draw_photo(list(tools), PhotoSpec(**{"size": SMALL, "distance": 380.0, **spec}), printed)
+    )
+    return path
+
+
+def spanner(height: float = 12.0, x: float = 90.0, y: float = 100.0) -> PlacedTool:
+    return PlacedTool(SPANNER.translate((x, y)), height, ("dark steel", "blue"))
+
+
+def traced(path: Path, **request) -> TraceReport:
+    return trace(TraceRequest(path, path.parent / "out", **request))
+
+
+@pytest.mark.parametrize(
+    ("ground", "tilt", "height", "exif"),
+    [("dark", 22.0, 14.0, True), ("light", 8.0, 6.0, True), ("dark", 20.0, 14.0, False)],
+)
+def test_an_oblique_photo_gives_the_true_outline(
+    ground: str, tilt: float, height: float, exif: bool, tmp_path: Path
+):
+    path = photo_of(
+        tmp_path, spanner(height), ground=ground, tilt=tilt, azimuth=130, roll=12, exif=exif
+    )
+    report = traced(path, heights_mm=(height,))
+    (tool,) = report.tools
+    median, p95 = np.percentile(outline_errors(tool.outline, SPANNER), (50, 95))
+    assert median < 0.3
+    assert p95 < 0.9
+    assert tool.holes == 1
+    assert tool.size_mm[0] == pytest.approx(142.7, abs=0.6)
+    assert any("EXIF" in note for note in report.notes) == exif
+    for suffix in (".svg", ".dxf"):
+        drawing = read_outline(tool.svg.with_suffix(suffix))
+        assert drawing.area() == pytest.approx(tool.outline.area(), rel=1e-3)
+    assert (path.parent / "out/trace.png").stat().st_size > 10_000
+    assert json.loads((path.parent / "out/trace.json").read_text())["tilt_deg"] == pytest.approx(
+        tilt, abs=1.0
+    )
+
+
+def test_several_tools_are_numbered_from_the_left_and_have_heights_of_their_own(tmp_path: Path):
+    bar = PlacedTool(CrossSection.square((20, 90)).translate((250, 60)), 25, ("red", "red"))
+    path = photo_of(tmp_path, spanner(8), bar, tilt=5)
+    report = traced(path, heights_mm=(8.0, 25.0), name="set")
+    assert [tool.name for tool in report.tools] == ["set_1", "set_2"]
+    assert report.tools[1].size_mm == pytest.approx((90, 20), abs=0.6)
+    with pytest.raises(UserError, match=r"3 heights.*2 tools"):
+        traced(path, heights_mm=(8.0, 25.0, 3.0))
+
+
+def test_a_tool_over_the_edge_of_the_sheet_is_not_cut_off_silently(tmp_path: Path):
+    path = photo_of(tmp_path, spanner(6, x=120, y=2), ground="light", tilt=3, shadow=0.2)
+    with pytest.raises(UserError, match="over the sheet's edge"):
+        traced(path, heights_mm=(6.0,))
+
+
+def test_letter_is_told_from_a4(tmp_path: Path):
+    path = photo_of(tmp_path, spanner(), sheet=(279.4, 215.9), tilt=15)
+    assert "279.4 x 215.9" in traced(path).notes[0]
+    with pytest.raises(UserError, match="sides as"):
+        traced(path, sheet_mm=(297.0, 210.0))
+
+
+@pytest.mark.parametrize(
+    ("spec", "reason"),
+    [
+        ({"tilt": 36.0, "distance": 520.0}, "degrees from the vertical"),
+        ({"blur": 9.0}, "blurred"),
+        ({"sheet": (1500.0, 1200.0)}, "no sheet"),
+        ({"sheet": (210.0, 210.0)}, "sides as"),
+    ],
+)
+def test_a_poor_photo_is_refused_in_a_sentence(spec: dict, reason: str, tmp_path: Path):
+    middle = {"x": 700.0, "y": 600.0} if spec.get("sheet") == (1500.0, 1200.0) else {}
+    path = photo_of(tmp_path, spanner(**middle), **spec)
+    with pytest.raises(UserError, match=reason) as error:
+        traced(path, heights_mm=(12.0,))
+    assert "\n" not in str(error.value)
+    assert not (tmp_path / "out").exists()
+
+
+def test_an_empty_sheet_and_files_that_are_no_photos_are_refused(tmp_path: Path):
+    with pytest.raises(UserError, match="no tool is seen"):
+        traced(photo_of(tmp_path))
+    (tmp_path / "text.jpg").write_text("no photo")
+    with pytest.raises(UserError, match="cannot be read as a photo"):
+        traced(tmp_path / "text.jpg")
+    with pytest.raises(UserError, match="there is no file"):
+        traced(tmp_path / "missing.jpg")
+
+
+def test_points_correct_the_outline(tmp_path: Path):
+    path = photo_of(tmp_path, spanner())
+    points = tmp_path / "points.yaml"
+    # The rulers are the sheet's: close the ring and cut off the jaw.
+    points.write_text(
+        "- add: [[75, 85], [105, 85], [105, 115], [75, 115]]\n"
+        "- remove: [[190, 50], [250, 50], [250, 150], [190, 150]]\n"
+    )
+    (tool,) = traced(path, points=points).tools
+    assert tool.holes == 0
+    assert tool.size_mm[0] < 125
+    points.write_text("- widen: [[1, 2]]\n")
+    with pytest.raises(UserError, match="item 1 must be one of add, remove, sheet"):
+        traced(path, points=points)
+
+
+def test_two_points_or_a_coin_give_the_scale_without_a_sheet(tmp_path: Path):
+    coin = PlacedTool(CrossSection.circle(12.875, 200).translate((380, 280)), 2.0, ("red", "red"))
+    path = photo_of(tmp_path, spanner(x=280, y=330), coin, sheet=(700.0, 600.0), distance=400.0)
+    (tool,) = traced(path, heights_mm=(12.0,), scale=Scale(disc_mm=25.75)).tools
+    assert np.median(outline_errors(tool.outline, SPANNER)) < 0.4
+    # By the camera: 26 mm on the diagonal of 43.27 mm, 400 mm away.
+    px_per_mm = 26 / math.hypot(36, 24) * math.hypot(*SMALL) / 400
+    scale = Scale(points=(100.0, 100.0, 100.0 + 50 * px_per_mm, 100.0), length_mm=50.0)
+    tools = traced(path, heights_mm=(12.0, 2.0), scale=scale).tools
+    assert np.median(outline_errors(tools[0].outline, SPANNER)) < 0.4
+
+
+def test_a_board_gives_the_scale_and_the_pose(tmp_path: Path):
+    dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50)
+    board = cv2.aruco.CharucoBoard((7, 5), 20.0, 15.0, dictionary)
+    printed = PlacedPrint(board.generateImage((1120, 800)), (230.0, 330.0), (140.0, 100.0))
+    path = photo_of(
+        *(tmp_path, spanner(x=300, y=270)),
+        sheet=(700.0, 600.0),
+        tilt=15.0,
+        azimuth=70.0,
+        shadow=0.3,
+        printed=printed,
+    )
+    report = traced(path, heights_mm=(12.0,), scale=Scale(board=(7, 5, 20.0, 15.0)))
+    (tool,) = report.tools
+    assert np.median(outline_errors(tool.outline, SPANNER)) < 0.4
+    with pytest.raises(UserError, match="corners of the board"):
+        traced(path, scale=Scale(board=(7, 5, 20.0, 15.0), dictionary="DICT_6X6_50"))
