@@ -5,11 +5,13 @@ import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 from pydrake.geometry import Box
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import FixedOffsetFrame, Frame, PdControllerGains
+from pydrake.systems.framework import Context
 
 from kitting_drake.common.errors import UserError
 from kitting_drake.common.paths import MODELS
@@ -162,3 +164,11 @@ def _without_axes(text: str) -> str:
         if name in HAND_JOINT_NAMES or name.startswith("carriage_"):
             model.remove(element)
     return ElementTree.tostring(root, encoding="unicode")
+
+
+def robot_state(plant: MultibodyPlant, context: Context) -> NDArray[np.float64]:
+    """(18) positions of an arm's joints and fingers, then their velocities."""
+    instances = [plant.GetModelInstanceByName(name) for name in (ARM, HAND)]
+    positions = [plant.GetPositions(context, instance) for instance in instances]
+    velocities = [plant.GetVelocities(context, instance) for instance in instances]
+    return np.concatenate([*positions, *velocities])

@@ -22,7 +22,13 @@ from kitting_drake.station.held_bodies import ArmPath
 from kitting_drake.station.mass_centres import correct_drift
 from kitting_drake.station.paint import paint_surfaces
 from kitting_drake.station.plant import add_models, add_plant, bounded_body, set_initial_poses
-from kitting_drake.station.robot import add_robot, arm_model, make_motion, set_home
+from kitting_drake.station.robot import (
+    add_robot,
+    arm_model,
+    make_motion,
+    robot_state,
+    set_home,
+)
 from kitting_drake.station.sensing import add_cameras
 from kitting_drake.tasks.task import Scene
 from systems.object_feeder import ObjectFeeder
@@ -293,7 +299,8 @@ class KittingStation(Diagram):
             context = self.plant.GetMyMutableContextFromRoot(root_context)
             correct_drift(self.plant, context, self._bodies)
             if self._arm_path is not None:
-                state = self._eval(root_context, "robot_state")
+                # The port `robot_state`, evaluated here, would keep the Diagram alive forever.
+                state = robot_state(self.plant, context)
                 self._arm_path.correct(self.plant, context, state, self._bodies)
 
     def _let_appear(self, root_context: Context) -> None:

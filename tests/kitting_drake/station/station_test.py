@@ -29,6 +29,7 @@ from kitting_drake.scenario.policies import (
     QuantizedOracle,
     ShapeMatching,
 )
+from kitting_drake.scenario.robots import FloatingHand, FrankaArm, Robot
 from kitting_drake.scenario.schema import Sleep
 from kitting_drake.station import build_station, make_policy
 from kitting_drake.tasks import Kitting
@@ -434,16 +435,19 @@ def test_an_invalid_mesh_raises_user_error(own_tool: Path):
 
 
 @pytest.mark.parametrize(
-    "policy",
+    ("policy", "robot"),
     [
-        pytest.param(Oracle(), marks=pytest.mark.slow),
-        PythonPolicy(function="systems.signals:PickPlaceAction"),
+        pytest.param(Oracle(), FloatingHand(), marks=pytest.mark.slow),
+        (PythonPolicy(function="systems.signals:PickPlaceAction"), FloatingHand()),
+        (PythonPolicy(function="systems.signals:PickPlaceAction"), FrankaArm()),
     ],
 )
 @pytest.mark.usefixtures("rendering", "freed_diagrams")
-def test_unused_stations_are_garbage_collected(policy: PolicyConfig):
+def test_unused_stations_are_garbage_collected(policy: PolicyConfig, robot: Robot):
     """Building stations in a loop does not leak memory."""
-    scenario = Scenario(policy=policy, sensor_noise=SensorNoiseParameters(depth_std=0.001))
+    scenario = Scenario(
+        policy=policy, robot=robot, sensor_noise=SensorNoiseParameters(depth_std=0.001)
+    )
     rig = build(scenario)
     simulator = rig.station.make_simulator(rig.diagram)
     simulator.AdvanceTo(0.01)
