@@ -90,7 +90,9 @@ def main() -> int:
         write_atomically(folder / REPLAY, meshcat.StaticHtml())
     if arguments.picture and progress.last_context is not None:
         context = station.scene_graph.GetMyMutableContextFromRoot(progress.last_context)
-        save_png(render_picture(station.scene_graph, context), arguments.picture)
+        save_png(
+            render_picture(station.scene_graph, context, station.X_WOverview), arguments.picture
+        )
     if video is not None:
         video.Save()
     print_episode(console, result)

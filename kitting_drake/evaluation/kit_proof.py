@@ -164,7 +164,8 @@ def _prove(folder: Path, clearance_mm: float, episodes: int, progress: Progress)
         def observe(event: Any, station: Any = station, frames: list[bytes] = frames) -> None:
             if not frames or event.is_stop:
                 context = station.scene_graph.GetMyContextFromRoot(event.root_context)
-                frames.append(png_bytes(render_picture(station.scene_graph, context)))
+                picture = render_picture(station.scene_graph, context, station.X_WOverview)
+                frames.append(png_bytes(picture))
 
         result = run_chosen(chosen, diagram, station, observers=[observe] if pictured else [])
         if result.failure:

@@ -179,7 +179,7 @@ class KittingEnvironment(gymnasium.Env[dict[str, Any], NDArray[Any]]):
             raise gymnasium.error.ResetNeeded("there is no scene to render: call reset() first")
         scene_graph = self._station.scene_graph
         context = scene_graph.GetMyContextFromRoot(self._episode.context)
-        return render_picture(scene_graph, context)
+        return render_picture(scene_graph, context, self._station.X_WOverview)
 
     def close(self) -> None:
         """Frees the simulation. With Python 3.11, Drake 1.51 leaks about 35 MB nevertheless."""

@@ -14,7 +14,7 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import Context, Diagram, DiagramBuilder, EventStatus
 
 from kitting_drake.common.errors import UserError
-from kitting_drake.common.rendering import can_render
+from kitting_drake.common.rendering import X_WARM_OVERVIEW, X_WOVERVIEW, can_render
 from kitting_drake.scenario.robots import FrankaArm
 from kitting_drake.scenario.schema import Scenario
 from kitting_drake.station.control import add_control
@@ -256,6 +256,11 @@ class KittingStation(Diagram):
 
     def _eval(self, root_context: Context, port: str) -> Any:
         return self.GetOutputPort(port).Eval(self.GetMyContextFromRoot(root_context))
+
+    @property
+    def X_WOverview(self) -> RigidTransform:
+        """Pose of a camera that sees the whole cell."""
+        return X_WOVERVIEW if self._arm_path is None else X_WARM_OVERVIEW
 
     # Sleep.
 

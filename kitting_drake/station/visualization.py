@@ -25,7 +25,7 @@ from pydrake.systems.sensors import RgbdSensor
 
 from kitting_drake.common.errors import UserError
 from kitting_drake.common.files import write_atomically
-from kitting_drake.common.rendering import X_WOVERVIEW, add_film_renderer, picture_camera
+from kitting_drake.common.rendering import add_film_renderer, picture_camera
 from kitting_drake.station.station import KittingStation
 
 if TYPE_CHECKING:
@@ -102,7 +102,7 @@ def add_video(builder: DiagramBuilder, station: KittingStation, path: Path) -> "
         "film_camera",
         RgbdSensor(
             parent_id=station.scene_graph.world_frame_id(),
-            X_PB=X_WOVERVIEW,
+            X_PB=station.X_WOverview,
             color_camera=ColorRenderCamera(core),
             depth_camera=DepthRenderCamera(core, DepthRange(0.05, 10.0)),
         ),

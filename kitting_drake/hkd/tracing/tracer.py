@@ -203,13 +203,13 @@ def _heights(request: TraceRequest, count: int) -> list[float | None]:
     if not given:
         return [None] * count
     if len(given) == 1:
-        return list(given) * count
+        return [given[0]] * count
     if len(given) != count:
         raise UserError(
             f"--height_mm has {len(given)} heights, and {request.photo} shows {count} tools: give "
             "one for each, from left to right, or one for all"
         )
-    return list(given)
+    return [*given]
 
 
 def _corrected(
