@@ -64,8 +64,8 @@ class ArmTrajectory:
     start_width: float = 0.08
     """Opening between the pads at the start, in m."""
     limits_used: tuple[tuple[str, float], ...] = ()
-    """The largest share of each kind of limit that the motion uses, up to 1. That of a position counts
-    from the middle of a joint's range."""
+    """The largest share of each kind of limit that the motion uses, up to 1. Positions count from
+    the middle of a joint's range."""
 
     @property
     def times(self) -> NDArray[np.float64]:
@@ -188,13 +188,15 @@ def plan_action(
     assert not state.refused
     # Check the limits at 1 kHz at least, whatever the rate of the points.
     finer = math.ceil(FASTEST_RATE / rate)
-    recorder = _Recorder(motion, state, parameters, 1 / rate, finer)
+    recorder = _Recorder(motion, state, parameters, rate, finer)
     recorder.record()
     samples = np.array(recorder.samples)
     used = limits_used(samples, motion.postures.limits, rate * finer)
     for name, share in used:
         if share > 1.0:
-            raise RuntimeError(f"the planned trajectory uses {100 * share:.1f} % of the {name} limit")
+            raise RuntimeError(
+                f"the planned trajectory uses {100 * share:.1f} % of the {name} limit"
+            )
     positions, velocities, accelerations = np.split(samples[::finer], 3, axis=1)
     return ArmTrajectory(
         rate,
@@ -260,11 +262,11 @@ class _Recorder:
         motion: ArmMotion,
         state: ArmState,
         parameters: PickPlaceParameters,
-        period: float,
+        rate: float,
         finer: int,
     ) -> None:
         self._motion, self._state, self._parameters = motion, state, parameters
-        self._period, self._finer = period, finer
+        self._rate, self._finer = rate, finer
         self._point = 0
         self.samples: list[NDArray[np.float64]] = []
         self.segments: list[Segment] = []
@@ -288,12 +290,12 @@ class _Recorder:
             self._mode(Mode.LOWER, stop_force=contact)
             self._mode(Mode.RELEASE)
             self._mode(Mode.RETREAT)
-        self.samples.append(self._motion.motion_at(state, self._point * self._period))
+        self.samples.append(self._motion.motion_at(state, self._point / self._rate))
 
     def _mode(self, mode: Mode, settle: float = 0.0, stop_force: float | None = None) -> None:
         """Begins a mode, and samples it until it has arrived and rested for `settle`."""
         state, motion, first = self._state, self._motion, self._point
-        begun = first * self._period
+        begun = first / self._rate
         motion.begin(state, mode, begun)
         if mode == Mode.LOWER:
             # Not to the table, but to the place as o_t shows it.
@@ -306,13 +308,13 @@ class _Recorder:
         self._command_jaws(mode, begun)
         while not self._is_over(mode, settle):
             for fraction in range(self._finer):
-                time = (self._point + fraction / self._finer) * self._period
+                time = (self._point + fraction / self._finer) / self._rate
                 self.samples.append(motion.motion_at(state, time))
             self._point += 1
         self.segments.append(Segment(mode.name, first, self._point, stop_force))
 
     def _is_over(self, mode: Mode, settle: float) -> bool:
-        time = self._point * self._period
+        time = self._point / self._rate
         if mode == Mode.LIFT:
             return self._motion.brakes_above(self._state, time, self._state.travel_z)
         return time >= self._motion.arrival(self._state) + settle

@@ -44,7 +44,7 @@ def play_trajectory(
     *,
     seed: int = 0,
     base: Path | None = None,
-    settle: float = 0.2,
+    seconds: float | None = None,
 ) -> Playback:
     """Plays a trajectory back, into the same controller and plant as the station's.
 
@@ -55,7 +55,7 @@ def play_trajectory(
         trajectory: begins at time zero, where the arm then is.
         seed: of the scene.
         base: base folder of the scenario's relative paths; None: the working directory.
-        settle: simulated time after the end, in s.
+        seconds: simulated time; None: until 0.2 s after the end.
 
     Raises:
         UserError: the scenario's robot is no arm.
@@ -95,7 +95,7 @@ def play_trajectory(
 
     simulator = Simulator(diagram)
     simulator.set_monitor(sample)
-    simulator.AdvanceTo(trajectory.duration + settle)
+    simulator.AdvanceTo(trajectory.duration + 0.2 if seconds is None else seconds)
     context = plant.GetMyContextFromRoot(simulator.get_context())
     poses = tuple(plant.get_body(it.body).EvalPoseInWorld(context) for it in objects)
     time, rest = np.array(samples)[:, 0], np.array(samples)[:, 1:]

@@ -111,9 +111,7 @@ def read_robot(path: Path) -> BenchRobot:
         limits = ARM_LIMITS[model]
         for i, (q, low, high) in enumerate(zip(joints, limits.lower, limits.upper, strict=True)):
             if not low < q < high:
-                raise UserError(
-                    f"{path}: joints[{i}] is {q:g}, outside of {low:g} to {high:g} rad"
-                )
+                raise UserError(f"{path}: joints[{i}] is {q:g}, outside of {low:g} to {high:g} rad")
     rate = check_rate(content.get("rate", FASTEST_RATE), f"{path}: rate")
     return BenchRobot(model, ArmBase(x, y, z, math.radians(yaw)), home, joints, rate)
 

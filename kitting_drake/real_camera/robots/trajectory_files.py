@@ -38,9 +38,7 @@ def save_trajectory(
     write_atomically(as_json, _json_text(trajectory, joint_names, robot))
 
 
-def _json_text(
-    trajectory: ArmTrajectory, joint_names: Sequence[str], robot: dict[str, Any]
-) -> str:
+def _json_text(trajectory: ArmTrajectory, joint_names: Sequence[str], robot: dict[str, Any]) -> str:
     head = {
         "units": "metres, radians, seconds and newtons; docs/bench.md",
         "robot": robot,
