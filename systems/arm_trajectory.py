@@ -87,14 +87,10 @@ class ArmTrajectory:
             end = self.positions[0 if time < 0.0 else -1]
             return np.concatenate([end, np.zeros(2 * JOINTS)])
         index = min(int(time * self.rate), len(self.positions) - 2)
-        return quintic(
-            *(
-                np.stack([it[index], it[index + 1]])
-                for it in (self.positions, self.velocities, self.accelerations)
-            ),
-            step=1 / self.rate,
-            since=time - index / self.rate,
+        q, v, a = (
+            it[index : index + 2] for it in (self.positions, self.velocities, self.accelerations)
         )
+        return quintic(q, v, a, step=1 / self.rate, since=time - index / self.rate)
 
     def width_at(self, time: float) -> tuple[float, float]:
         """The opening between free jaws in m, and its rate in m/s."""

@@ -122,9 +122,12 @@ def load_trajectory(path: Path) -> ArmTrajectory:
             raise ValueError("each point needs seven finite numbers of each kind")
         if len(points) < 2:
             raise ValueError("it has fewer than two points")
+        q, v, a = arrays
         return ArmTrajectory(
             float(content["rate"]),
-            *arrays,
+            q,
+            v,
+            a,
             segments=tuple(
                 Segment(
                     it["name"].upper(), it["first_point"], it["last_point"], it.get("stop_force")
