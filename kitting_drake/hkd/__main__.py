@@ -236,7 +236,8 @@ def _reach_note(scenario: Scenario, base: Path) -> str:
     motion = make_motion(scenario)
     assert isinstance(motion, ArmMotion)
     first, reached = "", 0
-    for seed in range(_SCENES):
+    console = Console(stderr=True)
+    for seed in track(range(_SCENES), "checking the reach", console=console, transient=True):
         scene = scenario.task.make_scene(grid=PixelGrid(), seed=seed, base=base)
         problems = scene_problems(scene, motion, scenario.planner)
         reached += not problems
