@@ -293,11 +293,15 @@ class _Recorder:
         state, motion, first = self._state, self._motion, self._point
         begun = first / self._rate
         motion.begin(state, mode, begun)
+        lowest = state.table_z + self._parameters.floor_clearance
         if mode == Mode.LOWER:
             # Not to the table, but to the place as o_t shows it.
-            lowest = state.table_z + self._parameters.floor_clearance
             hanging = max(state.grasp_z - state.support_z, 0.0)
             motion.back_off(state, max(state.floor_z + hanging - lowest, 0.0))
+        elif mode == Mode.DESCEND and state.press:
+            # Not into the table, if nothing stops the hand.
+            goal = state.pick_top_z - self._parameters.press_depth
+            motion.back_off(state, max(lowest - goal, 0.0))
         elif mode == Mode.RELEASE:
             # The object's width is unknown.
             state.goal_opening = self._parameters.open_width

@@ -86,6 +86,10 @@ def test_segments_and_jaws():
         ("RETREAT", None),
     ]
     assert pressed.width_at(pressed.duration)[0] == 0.0
+    # The press would go on to 20 mm below the top, which is the table.
+    motion = ArmMotion(PARAMETERS, FR3, ArmBase())
+    lowest = motion.postures.hand_pose(pressed.positions[pressed.segments[1].last])[2]
+    assert lowest == pytest.approx(PARAMETERS.floor_clearance, abs=1e-4)
 
 
 def test_it_starts_where_the_arm_is():
