@@ -410,9 +410,7 @@ def test_the_written_scenario_succeeds(
 def test_compensation_widens_what_is_cut_but_not_what_is_simulated(bar: Path, tmp_path: Path):
     def cut(compensate_mm: float) -> tuple[float, dict[str, object]]:
         folder = tmp_path / f"{compensate_mm:g}"
-        request = KitRequest(
-            (str(bar),), folder, clearance_mm=0.5, compensate_mm=compensate_mm
-        )
+        request = KitRequest((str(bar),), folder, clearance_mm=0.5, compensate_mm=compensate_mm)
         export_kit(request)
         drawing = ezdxf.readfile(folder / "cavities.dxf").modelspace()
         widths = [
