@@ -1,6 +1,6 @@
 """`python -m kitting_drake.benchmark NAME`: measures, prints tables and saves them.
 
-NAME is simulation, networks, kits, recovery, reliability, mujoco, trace or paper.
+NAME is simulation, networks, kits, recovery, reliability, reach, mujoco, trace or paper.
 """
 
 import argparse
@@ -32,6 +32,7 @@ def main() -> int:
         "mujoco": _mujoco,
         "reliability": _reliability,
         "trace": _trace,
+        "reach": _reach,
     }[arguments.benchmark]
     for table in measure(arguments, console, folder):
         console.print(table)
@@ -116,6 +117,21 @@ def _parser() -> argparse.ArgumentParser:
         "--no-exif", action="store_true", help="the photos do not tell their focal length"
     )
     tracing.add_argument("--keep", action="store_true", help="keep the photos and the pictures")
+    reach = benchmarks.add_parser(
+        "reach", help="where an arm reaches in a workspace, and the best place for its base"
+    )
+    reach.add_argument(
+        "--robot",
+        type=Path,
+        metavar="ROBOT.yaml",
+        help="model and base of the arm (default: those of !FrankaArm)",
+    )
+    reach.add_argument(
+        "--camera",
+        type=Path,
+        metavar="CALIBRATION.yaml",
+        help="its workspace is used (default: the cell's)",
+    )
     paper = benchmarks.add_parser(
         "paper", help="collect, train and evaluate for the cells of the paper's tables; takes days"
     )
@@ -134,7 +150,8 @@ def _parser() -> argparse.ArgumentParser:
         help="folder of the table of runs, which finished cells are added to (docs/results)",
     )
     paper.add_argument("--workers", type=count_type, default=1, help="parallel episodes (1)")
-    for benchmark in (simulation, networks, kits, recovery, opinion, reliability, tracing, paper):
+    every = (simulation, networks, kits, recovery, opinion, reliability, tracing, reach, paper)
+    for benchmark in every:
         benchmark.add_argument(
             "--output", type=Path, default=Path("output/benchmark"), help="folder for the files"
         )
@@ -198,6 +215,24 @@ def _recovery(arguments: argparse.Namespace, console: Console, folder: Path) -> 
     console.print(f"files: {folder}/", highlight=False, markup=False)
     counts = measured["disturbances"].values()
     return FAILED if all(count["failed"] == arguments.episodes for count in counts) else 0
+
+
+def _reach(arguments: argparse.Namespace, console: Console, folder: Path) -> list[Table]:
+    from kitting_drake.real_camera import BenchRobot, read_calibration, read_robot
+    from kitting_drake.reproduction.benchmarks.reach import draw_reach, measure_reach, reach_table
+    from kitting_drake.scenario.robots import FrankaArm
+    from systems.signals import PixelGrid
+
+    arm, grid = FrankaArm(), PixelGrid()
+    robot = BenchRobot(arm.model, arm.arm_base())
+    if arguments.robot is not None:
+        robot = read_robot(arguments.robot)
+    if arguments.camera is not None:
+        grid = read_calibration(arguments.camera, poses=False).grid
+    measured = measure_reach(robot, grid, console)
+    write_json(folder / "reach.json", measured)
+    write_atomically(folder / "reach.png", draw_reach(measured))
+    return [reach_table(measured)]
 
 
 def _reliability(arguments: argparse.Namespace, console: Console, folder: Path) -> list[Table]:

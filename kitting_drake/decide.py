@@ -5,6 +5,7 @@ docs/bench.md.
 """
 
 import argparse
+import dataclasses
 import json
 import math
 import time
@@ -17,12 +18,15 @@ from kitting_drake.common.errors import MachineError, UserError
 from kitting_drake.common.files import require_folder, write_atomically, write_json
 from kitting_drake.real_camera import (
     BenchPolicy,
+    BenchRobot,
     Calibration,
     ShapeMatching,
     decide,
     load_policy,
     read_calibration,
     read_frames,
+    read_robot,
+    save_trajectory,
 )
 from kitting_drake.real_camera.checking.check import check_cameras
 from kitting_drake.real_camera.checking.kit_block import Block
@@ -44,6 +48,8 @@ from kitting_drake.real_camera.markers.board_report import (
     save_calibrated,
 )
 from kitting_drake.real_camera.markers.boards import read_board
+from kitting_drake.real_camera.robots.bench_robot import check_rate
+from kitting_drake.real_camera.robots.trajectory_files import TRAJECTORY_FILES
 from systems.signals import PixelGrid
 
 
@@ -51,6 +57,7 @@ def main() -> int:
     """Parses the command line, and decides or checks; returns the exit code."""
     arguments = _parser().parse_args()
     console = Console(quiet=arguments.quiet)
+    _check_robot_flags(arguments)
     folder = require_folder(arguments.output)
     if arguments.calibrate is not None:
         _calibrate(arguments, folder, console)
@@ -60,11 +67,12 @@ def main() -> int:
         return 0
     action, picture = folder / "action.json", folder / "decision.png"
     # Remove stale files: after a failure, nobody must use the action of an earlier frame.
-    earlier = [folder / name for name in CHECK_FILES] if arguments.check else [action, picture]
+    names = CHECK_FILES if arguments.check else (action.name, picture.name, *TRAJECTORY_FILES)
     if not arguments.check:
         _check_decided(action)
-    for path in earlier:
-        _remove(path, arguments.camera)
+    for name in names:
+        _remove(folder / name, arguments.camera)
+    robot = _robot(arguments)
     calibration = read_calibration(arguments.camera, table_height=arguments.table_height)
     block = _block(arguments, calibration.grid)
     frames = read_frames(arguments.frames, calibration, time=arguments.time)
@@ -77,7 +85,7 @@ def main() -> int:
 
     policy = _policy(arguments)
     begun = time.perf_counter()
-    decision = decide(frames, calibration, policy)
+    decision = decide(frames, calibration, policy, robot=robot)
     seconds = time.perf_counter() - begun
     record = {
         "units": "metres and radians, in the base frame; docs/bench.md",
@@ -85,6 +93,9 @@ def main() -> int:
         "seconds": round(seconds, 3),
         **decision.as_dict(),
     }
+    if robot is not None and decision.trajectory is not None:
+        save_trajectory(folder, decision.trajectory, robot.joint_names, robot.as_dict())
+        record["trajectory"] = TRAJECTORY_FILES[0]
     write_atomically(picture, decision.draw())
     write_json(action, record)
     if decision.result == "calibration":
@@ -92,6 +103,30 @@ def main() -> int:
     print_decision(console, record)
     console.print(f"files: {folder}/", highlight=False, markup=False)
     return 0
+
+
+def _check_robot_flags(arguments: argparse.Namespace) -> None:
+    """Raises UserError if `--robot` or `--rate` does not go with the other flags."""
+    if arguments.robot is None:
+        if arguments.rate is not None:
+            raise UserError("--rate needs --robot")
+        return
+    for flag, given in (
+        ("--check", arguments.check),
+        ("--find", arguments.find),
+        ("--calibrate", arguments.calibrate is not None),
+    ):
+        if given:
+            raise UserError(f"--robot cannot be combined with {flag}")
+
+
+def _robot(arguments: argparse.Namespace) -> BenchRobot | None:
+    if arguments.robot is None:
+        return None
+    robot = read_robot(arguments.robot)
+    if arguments.rate is None:
+        return robot
+    return dataclasses.replace(robot, rate=check_rate(arguments.rate, "--rate"))
 
 
 def _calibrate(arguments: argparse.Namespace, folder: Path, console: Console) -> None:
@@ -240,6 +275,15 @@ def _parser() -> argparse.ArgumentParser:
         type=float,
         metavar="S",
         help="in a recording, take the frame this long after its start, in s",
+    )
+    parser.add_argument(
+        "--robot",
+        type=Path,
+        metavar="ROBOT.yaml",
+        help="also plan the joint trajectory of a Franka arm, and refuse what it cannot reach",
+    )
+    parser.add_argument(
+        "--rate", type=int, metavar="HZ", help="points of the trajectory in a second (1000)"
     )
     parser.add_argument("--quiet", action="store_true", help="print nothing but errors")
     return parser

@@ -332,14 +332,7 @@ class PickPlacePlanner(LeafSystem):
         return read_surface_heights(observation, action.pick, action.place)
 
     def _set_heights(self, state: PlannerState, heights: SurfaceHeights) -> None:
-        motion = motion_heights(heights, self._parameters)
-        state.grasp_z, state.pick_top_z = motion.grasp, heights.pick_top
-        state.table_z, state.support_z = heights.table, heights.support
-        # An object slightly below an uncertain rim may stand on it.
-        state.rim_z = heights.place_rim - heights.doubt
-        state.floor_z, state.doubt = heights.place_floor, heights.doubt
-        state.clear_z, state.travel_z = motion.clear, motion.travel
-        state.pick_hover_z, state.place_hover_z = motion.pick_hover, motion.place_hover
+        state.set_heights(motion_heights(heights, self._parameters), heights)
 
 
 def _action_of(state: PlannerState) -> PickPlaceAction:

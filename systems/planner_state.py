@@ -1,5 +1,7 @@
 """The state of the pick-and-place motion primitive."""
 
+from systems.motion_heights import MotionHeights
+from systems.signals import SurfaceHeights
 from systems.vector_view import Array, Number, VectorView
 
 X, Y, Z, YAW = range(4)
@@ -88,3 +90,13 @@ class PlannerState(VectorView):
     """How many actions do not count against the limit, because they set the object down."""
     stop = Number()
     """0 while there are actions; then 1 plus the index of the reason in `STOP_REASONS`."""
+
+    def set_heights(self, motion: MotionHeights, surfaces: SurfaceHeights) -> None:
+        """Writes the heights of an action."""
+        self.grasp_z, self.pick_top_z = motion.grasp, surfaces.pick_top
+        self.table_z, self.support_z = surfaces.table, surfaces.support
+        # An object slightly below an uncertain rim may stand on it.
+        self.rim_z = surfaces.place_rim - surfaces.doubt
+        self.floor_z, self.doubt = surfaces.place_floor, surfaces.doubt
+        self.clear_z, self.travel_z = motion.clear, motion.travel
+        self.pick_hover_z, self.place_hover_z = motion.pick_hover, motion.place_hover

@@ -1,8 +1,11 @@
 """Tools and kits of the Hand-tool Kitting Dataset: `python -m kitting_drake.hkd COMMAND`."""
 
+from __future__ import annotations
+
 import argparse
 import shlex
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from rich.console import Console
 from rich.markup import escape
@@ -19,6 +22,9 @@ from kitting_drake.hkd.listing import chosen_entries, chosen_with_own, print_too
 from kitting_drake.hkd.tools.tool import CATEGORIES
 from kitting_drake.hkd.tools.toolsets import SPLITS, toolsets
 from kitting_drake.hkd.tracing.command import describe_trace, trace_photo
+
+if TYPE_CHECKING:
+    from kitting_drake.scenario.schema import Scenario
 
 
 def list_tools(args: argparse.Namespace, entries: list[ToolEntry]) -> None:
@@ -130,6 +136,7 @@ def kit(args: argparse.Namespace, entries: list[ToolEntry]) -> None:
         block_mm=tuple(args.block_mm) if args.block_mm else None,
         notches=args.notches,
         labels=args.labels,
+        robot="" if args.robot is None else _robot_text(args.robot),
     )
     if args.prove:
         # Import Drake lazily, and fail early.
@@ -162,11 +169,36 @@ def _prove(folder: Path, episodes: int, console: Console) -> None:
     console.print(f"{verdict}\nproof: {folder}/proof.html", soft_wrap=True)
 
 
+_SCENES = 20
+"""Number of scenes in which the reach of a robot is checked."""
+
+
+def _robot_text(path: Path) -> str:
+    """Lines of a scenario with the arm of a file.
+
+    Raises:
+        UserError: the file is invalid, or the arm stands in the workspace.
+    """
+    from kitting_drake.real_camera import read_robot
+    from kitting_drake.scenario.robots import FrankaArm
+    from systems.signals import PixelGrid
+
+    record = read_robot(path).as_dict()
+    model, base, yaw_deg = record["model"], record["base"], record["yaw_deg"]
+    try:
+        FrankaArm(model=model, base=base, yaw_deg=yaw_deg).validate(PixelGrid())
+    except ValueError as error:
+        raise UserError(f"{path}: {str(error).removeprefix('robot.')}") from error
+    text = f"  robot: !FrankaArm {{model: {model}, base: {base}, yaw_deg: {yaw_deg:g}}}\n"
+    return text + (f"  planner: {{home: {record['home']}}}\n" if "home" in record else "")
+
+
 def _check_scenario(path: Path, console: Console) -> bool:
-    """Prints how to run a kit's scenario, or that the simulated table is too small for it; returns
-    whether it can be run."""
+    """Prints how to run a kit's scenario, that the simulated table is too small for it, or how
+    often its arm reaches everything; returns whether it can be run."""
     # The loader is slow to import, and the other verbs do not need it.
     from kitting_drake.scenario.loader import load_scenario
+    from kitting_drake.scenario.robots import FrankaArm
     from systems.signals import PixelGrid
 
     scenario = load_scenario(path)
@@ -179,8 +211,39 @@ def _check_scenario(path: Path, console: Console) -> bool:
             soft_wrap=True,
         )
         return False
+    if isinstance(scenario.robot, FrankaArm):
+        try:
+            note = _reach_note(scenario, path.parent)
+        except UserError as error:
+            console.print(f"  the arm cannot kit in the simulated cell: {error}", soft_wrap=True)
+            return False
+        console.print(f"  {note}", soft_wrap=True)
     console.print(f"try it: python -m kitting_drake.run {shlex.quote(str(path))}", soft_wrap=True)
     return True
+
+
+def _reach_note(scenario: Scenario, base: Path) -> str:
+    """In how many scenes an arm reaches all cavities and tools of a kit.
+
+    Raises:
+        UserError: it cannot reach its home.
+    """
+    from kitting_drake.station.robot import make_motion
+    from kitting_drake.station.scene_reach import scene_problems
+    from systems.arm_motion import ArmMotion
+    from systems.signals import PixelGrid
+
+    motion = make_motion(scenario)
+    assert isinstance(motion, ArmMotion)
+    first, reached = "", 0
+    console = Console(stderr=True)
+    for seed in track(range(_SCENES), "checking the reach", console=console, transient=True):
+        scene = scenario.task.make_scene(grid=PixelGrid(), seed=seed, base=base)
+        problems = scene_problems(scene, motion, scenario.planner)
+        reached += not problems
+        first = first or (problems[0] if problems else "")
+    found = f"the arm reaches all cavities and tools in {reached} of {_SCENES} scenes"
+    return f"{found}; in another one {first}" if first else found
 
 
 def main() -> int:
@@ -298,6 +361,12 @@ def _describe_kit(maker: argparse.ArgumentParser) -> None:
         help="kit it N (10) times in simulation, with a printer's errors, and write proof.html",
     )
     maker.add_argument("--notches", action="store_true", help="add finger notches")
+    maker.add_argument(
+        "--robot",
+        type=Path,
+        metavar="ROBOT.yaml",
+        help="the scenario's arm, as for decide; says how often it reaches everything",
+    )
     maker.add_argument("--labels", action="store_true", help="engrave the tools' names")
     maker.add_argument("--quiet", action="store_true", help="print nothing but errors")
     maker.set_defaults(function=kit)

@@ -25,17 +25,23 @@ from kitting_drake.real_camera.deciders import BenchPolicy, load_policy
 from kitting_drake.real_camera.deciders import ShapeMatchingDecider as ShapeMatching
 from kitting_drake.real_camera.decision import BenchDecision, decide
 from kitting_drake.real_camera.frames import Frame, read_frames
+from kitting_drake.real_camera.robots.bench_robot import BenchRobot, read_robot
+from kitting_drake.real_camera.robots.trajectory_files import load_trajectory, save_trajectory
 
 __all__ = [
     "BenchCamera",
     "BenchDecision",
     "BenchPolicy",
+    "BenchRobot",
     "Calibration",
     "Frame",
     "ShapeMatching",
     "decide",
     "load_policy",
+    "load_trajectory",
     "read_calibration",
     "read_frames",
+    "read_robot",
+    "save_trajectory",
     "write_calibration",
 ]

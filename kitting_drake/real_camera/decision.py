@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 from kitting_drake.real_camera.calibrations.calibration import Calibration
@@ -17,6 +17,8 @@ from kitting_drake.real_camera.checking.views import (
 )
 from kitting_drake.real_camera.deciders import BenchPolicy, Choice
 from kitting_drake.real_camera.frames import Frame
+from kitting_drake.real_camera.robots.bench_robot import BenchRobot
+from systems.arm_trajectory import ArmTrajectory
 from systems.motion_heights import MotionHeights, motion_heights
 from systems.pick_place_parameters import PickPlaceParameters
 from systems.signals import (
@@ -53,6 +55,8 @@ class BenchDecision:
     parameters: PickPlaceParameters
     warnings: list[str] = field(default_factory=list)
     """Doubts about the calibration, a sentence each."""
+    trajectory: ArmTrajectory | None = None
+    """The joint trajectory of the action; None without a robot, or to stop."""
 
     @property
     def action(self) -> PickPlaceAction:
@@ -127,11 +131,12 @@ def decide(
     failed_picks: Sequence[PlanarPose] = (),
     *,
     parameters: PickPlaceParameters | None = None,
+    robot: BenchRobot | None = None,
 ) -> BenchDecision:
     """One decision, with the same heightmap and policies as the simulated cell.
 
     It acts only if the cameras see the table where it should be, if enough is seen of pick and
-    place, and if the action is likely to succeed.
+    place, and if the action is likely to succeed. With a robot it also must be in reach.
 
     Args:
         frames: each camera's frame by its name.
@@ -139,9 +144,11 @@ def decide(
         policy: `load_policy()` or `ShapeMatching()`; make it once.
         failed_picks: where grasps failed before, in the base frame; it avoids them.
         parameters: the motion's parameters, which determine its heights; None for the cell's.
+        robot: whose joint trajectory to plan; None: the reach is not checked.
 
     Raises:
-        UserError: frames, calibration and policy do not fit together.
+        UserError: frames, calibration and policy do not fit together, or the robot cannot reach
+            its home.
     """
     policy.check_grid(calibration.grid)
     parameters = PickPlaceParameters() if parameters is None else parameters
@@ -163,6 +170,10 @@ def decide(
         result = action.reason or "done"
         return _stopped(result, said, observation, seen, parameters, choice, warnings)
     surfaces = read_surface_heights(observation, action.pick, action.place)
+    trajectory = None if robot is None else robot.plan(action, surfaces, parameters)
+    if isinstance(trajectory, str):
+        refused = replace(choice, action=PickPlaceAction(stop=True, reason="not sure"))
+        return _stopped("not sure", trajectory, observation, seen, parameters, refused, warnings)
     result = "press" if action.press else "pick and place"
     return BenchDecision(
         result,
@@ -174,6 +185,7 @@ def decide(
         motion_heights(surfaces, parameters),
         parameters,
         warnings,
+        trajectory,
     )
 
 

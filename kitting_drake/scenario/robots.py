@@ -14,7 +14,7 @@ from systems.arm_limits import ARM_LIMITS
 from systems.bounds import bounded
 from systems.signals import PixelGrid
 
-_FOOT = 0.08
+FOOT = 0.08
 """How far the foot of an arm reaches in front of its base, in m."""
 
 
@@ -74,13 +74,13 @@ class FrankaArm:
         at = f"({base[0]:g}, {base[1]:g})"
         lower, upper = (grid.x_min, grid.y_min), (grid.x_max, grid.y_max)
         away = float(np.linalg.norm(base - np.clip(base, lower, upper)))
-        if away < _FOOT:
+        if away < FOOT:
             raise ValueError(
                 f"robot.base is {at}, but there the arm's foot stands in the workspace: keep "
-                f"{_FOOT:g} m from x {lower[0]:g} to {upper[0]:g} and y {lower[1]:g} to "
+                f"{FOOT:g} m from x {lower[0]:g} to {upper[0]:g} and y {lower[1]:g} to "
                 f"{upper[1]:g}"
             )
-        on_table = np.linalg.norm(base - np.clip(base, *TABLE)) < _FOOT
+        on_table = np.linalg.norm(base - np.clip(base, *TABLE)) < FOOT
         if on_table and self.base[2] < 0:
             raise ValueError(
                 f"robot.base[2] is {self.base[2]:g}, inside the table at {at}: use at least 0"

@@ -80,7 +80,7 @@ def add_control(
         ),
     )
     if isinstance(scenario.robot, FrankaArm):
-        driven = _drive_arm(builder, scenario, scenario.robot, plant, seed)
+        driven = drive_arm(builder, scenario, scenario.robot, plant, seed)
     else:
         driven = _drive_hand(builder, scenario, plant)
     builder.ExportInput(planner.GetInputPort("action"), "action")
@@ -125,7 +125,7 @@ def _drive_hand(builder: DiagramBuilder, scenario: Scenario, plant: MultibodyPla
     )
 
 
-def _drive_arm(
+def drive_arm(
     builder: DiagramBuilder, scenario: Scenario, robot: FrankaArm, plant: MultibodyPlant, seed: int
 ) -> _Driven:
     """Adds the controller of an arm, and what it senses."""

@@ -28,7 +28,7 @@ HAND, ARM = "franka_hand", "franka_arm"
 """Names of the model instances."""
 HAND_JOINT_NAMES = ("x", "y", "z", "yaw")
 ARM_JOINT_NAMES = tuple(f"joint{number}" for number in range(1, 8))
-_FINGER_NAMES = ("left_finger_slide", "right_finger_slide")
+FINGER_NAMES = ("left_finger_slide", "right_finger_slide")
 GRIPPER = "gripper"
 """Name of the frame G of an `arm_model`, see `systems.hand_geometry`."""
 
@@ -107,7 +107,7 @@ def set_home(plant: MultibodyPlant, motion: RobotMotion, opening: float) -> None
     start = motion.motion_at(motion.view(motion.initial_state()), 0.0)
     for name, position in zip(names, start[: len(names)].tolist(), strict=True):
         plant.GetJointByName(name).set_default_positions([position])
-    for name in _FINGER_NAMES:
+    for name in FINGER_NAMES:
         plant.GetJointByName(name).set_default_positions([opening / 2])
 
 

@@ -29,6 +29,7 @@ from kitting_drake.station.robot import (
     robot_state,
     set_home,
 )
+from kitting_drake.station.scene_reach import check_scene_reach
 from kitting_drake.station.sensing import add_cameras
 from kitting_drake.tasks.task import Scene
 from systems.object_feeder import ObjectFeeder
@@ -129,6 +130,7 @@ class KittingStation(Diagram):
         self.plant.Finalize()
         set_initial_poses(self.plant, self.scene, self.objects)
         motion = make_motion(scenario)
+        check_scene_reach(self.scene, motion, scenario.planner)
         self._arm_path: ArmPath | None = None
         if isinstance(scenario.robot, FrankaArm):
             self._arm_path = ArmPath(*arm_model(scenario.robot), self.plant.time_step())

@@ -206,6 +206,47 @@ def test_shape_matching_needs_neither_drake_nor_torch(bench: Path):
     assert (bench / "out" / "decision.png").stat().st_size > 10_000
 
 
+SAMPLE = ROOT / "models" / "sample_frame"
+
+
+def decide_sample(folder: Path, robot: str) -> dict[str, Any]:
+    """Decides the sample frame for a robot, in a process without Drake; returns the action."""
+    (folder / "robot.yaml").write_text(robot)
+    arguments = [SAMPLE, "--camera", SAMPLE / "calibration.yaml", "--output", folder / "out"]
+    flags = ["--shape_matching", "--robot", folder / "robot.yaml", "--rate", 500]
+    done = subprocess.run(
+        [sys.executable, "-c", _NO_DRAKE, *map(str, arguments + flags)],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        timeout=300,
+    )
+    assert (done.returncode, done.stderr.strip()) == (0, "False"), done.stderr
+    return json.loads((folder / "out" / "action.json").read_text())
+
+
+def test_writes_the_trajectory_of_a_robot_or_says_what_is_out_of_reach(tmp_path: Path):
+    record = decide_sample(tmp_path, "{model: fr3, base: [0, 0, 0]}")
+    assert record["result"] == "pick and place"
+    content = json.loads((tmp_path / "out" / record["trajectory"]).read_text())
+    message = content["joint_trajectory"]
+    assert message["joint_names"] == [f"fr3_joint{number}" for number in range(1, 8)]
+    assert set(message["points"][0]) == {
+        *("positions", "velocities", "accelerations", "time_from_start")
+    }
+    assert message["points"][501]["time_from_start"] == {"sec": 1, "nanosec": 2_000_000}
+    assert max(content["limits_used"].values()) <= 1.0
+    assert [it["name"] for it in content["segments"] if it["guarded"]] == ["descend", "lower"]
+    rows = (tmp_path / "out" / "trajectory.csv").read_text().splitlines()
+    assert len(rows) == 1 + len(message["points"])
+    assert rows[0].startswith("time_from_start,position_fr3_joint1,")
+    # Far from the table nothing is written that could move an arm.
+    record = decide_sample(tmp_path, "{base: [-0.3, 0.9, 0], home: [-0.3, 0.5, 0.4, 0]}")
+    assert (record["result"], record["stop"]) == ("not sure", True)
+    assert re.match(r"the pick at \(0.480, 0.221\) m is out of the arm's reach", record["reason"])
+    assert {path.name for path in (tmp_path / "out").iterdir()} == {"action.json", "decision.png"}
+
+
 @pytest.mark.slow
 def test_networks_need_no_drake(bench: Path, weights_file: Path):
     done = command(bench, "--weights", weights_file, "--orientations", 36)
@@ -273,6 +314,17 @@ def test_does_not_overwrite_the_action_of_a_demonstration(bench: Path, refusal: 
 def test_flags_of_networks_exclude_shape_matching(refusal: Callable[..., str], flags: tuple):
     sentence = refusal("--shape_matching", *flags)
     assert sentence.startswith(f"{flags[0]} cannot be combined with --shape_matching")
+
+
+@pytest.mark.parametrize(
+    ("flags", "sentence"),
+    [
+        (("--rate", 500), "--rate needs --robot"),
+        (("--robot", "robot.yaml", "--check"), "--robot cannot be combined with --check"),
+    ],
+)
+def test_flags_of_robots(flags: tuple, sentence: str, refusal: Callable[..., str]):
+    assert refusal(*flags) == sentence
 
 
 # Invalid frames.

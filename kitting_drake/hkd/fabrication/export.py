@@ -40,7 +40,7 @@ Kit:
     tries: 2
     kit: {kit}
   policy: !Learned {{recover: true}}
-"""
+{robot}"""
 
 
 @dataclass(frozen=True)
@@ -62,6 +62,8 @@ class KitRequest:
     """Length, width and height. None: as small as possible, with the template's height."""
     notches: bool = False
     labels: bool = False
+    robot: str = ""
+    """Lines of its scenario, in YAML; empty: the default robot."""
 
 
 def export_kit(request: KitRequest) -> Design:
@@ -91,7 +93,7 @@ def export_kit(request: KitRequest) -> Design:
         with tempfile.TemporaryDirectory(dir=folder.parent, prefix=".making-") as scratch:
             made = Path(scratch) / "kit"
             made.mkdir()
-            _write(made, design, parameters)
+            _write(made, design, parameters, request.robot)
             replace_folder(folder, made, Path(scratch) / "replaced")
     except OSError as error:
         raise UserError(f"cannot write {folder}: {error.strerror or error}") from error
@@ -162,7 +164,7 @@ def _check_replaceable(folder: Path) -> None:
         raise UserError(f"{folder} holds {what}, which is not a kit's file: {advice}")
 
 
-def _write(folder: Path, design: Design, parameters: KitParameters) -> None:
+def _write(folder: Path, design: Design, parameters: KitParameters, robot: str) -> None:
     """Writes a kit's files into an empty folder."""
     surface = solid(design)
     title = f"Kit of {', '.join(tool.name for tool in design.kit.tools)}"
@@ -176,7 +178,7 @@ def _write(folder: Path, design: Design, parameters: KitParameters) -> None:
     (folder / "kit.png").write_bytes(picture_png(design))
     shutil.copytree(design.kit.sdf.parent, folder / "sdf")
     names = _bring_tools(design.kit.tools, folder)
-    (folder / "scenario.yaml").write_text(_scenario_text(names, parameters))
+    (folder / "scenario.yaml").write_text(_scenario_text(names, parameters, robot))
     files = sorted(
         path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file()
     )
@@ -209,7 +211,7 @@ def _bring_tools(tools: Sequence[Tool], folder: Path) -> list[str]:
     return [names[tool.directory] for tool in tools]
 
 
-def _scenario_text(names: Sequence[str], parameters: KitParameters) -> str:
+def _scenario_text(names: Sequence[str], parameters: KitParameters, robot: str) -> str:
     defaults = KitParameters()
     changed = {
         key: value
@@ -217,7 +219,7 @@ def _scenario_text(names: Sequence[str], parameters: KitParameters) -> str:
         if value != getattr(defaults, key)
     }
     kit = yaml.safe_dump(changed, default_flow_style=True, width=1000, sort_keys=False).strip()
-    return _SCENARIO.format(tools=", ".join(names), kit=kit)
+    return _SCENARIO.format(tools=", ".join(names), kit=kit, robot=robot)
 
 
 def _record(design: Design, names: Sequence[str]) -> dict[str, Any]:

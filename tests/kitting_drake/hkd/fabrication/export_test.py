@@ -30,6 +30,7 @@ from kitting_drake.hkd.kits.kit import make_kit
 from kitting_drake.hkd.kits.parameters import KitParameters
 from kitting_drake.hkd.tools.tool import load_tool, tool_names
 from kitting_drake.scenario.loader import load_scenario
+from kitting_drake.scenario.robots import FrankaArm
 from systems.signals import PixelGrid
 
 FOUR = ("claw_hammer", "slip_joint_pliers", "combination_wrench", "flat_screwdriver")
@@ -357,6 +358,31 @@ def test_the_command_suggests_a_tool_name(
     assert done.stderr.strip().splitlines()[-1].endswith("did you mean 'claw_hammer'?")
 
 
+def test_a_kit_for_an_arm_says_how_often_it_is_in_reach(
+    verb: Callable[..., subprocess.CompletedProcess[str]],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+):
+    monkeypatch.setattr("kitting_drake.hkd.__main__._SCENES", 3)
+    robot, folder = tmp_path / "robot.yaml", tmp_path / "kit"
+    robot.write_text("{model: panda, base: [-0.25, 0.5, 0], home: [0.3, 0.2, 0.4, 0]}")
+    done = verb("hkd", "kit", "claw_hammer", "--output", folder, "--robot", robot)
+    assert done.returncode == 0, done.stderr
+    note = re.search(r"reaches all cavities and tools in (\d) of 3 scenes; (.*)", done.stdout)
+    assert note is not None
+    assert int(note[1]) < 3
+    assert "claw_hammer at (" in note[2]
+    scenario = load_scenario(folder / "scenario.yaml")
+    assert scenario.robot == FrankaArm(model="panda", base=[-0.25, 0.5, 0.0])
+    assert scenario.planner.home == [0.3, 0.2, 0.4, 0.0]
+    # In the workspace no arm can stand; nothing is made.
+    robot.write_text("{base: [0.5, 0, 0]}")
+    done = verb("hkd", "kit", "claw_hammer", "--output", tmp_path / "other", "--robot", robot)
+    assert done.returncode == 2
+    assert "the arm's foot stands in the workspace" in done.stderr
+    assert not (tmp_path / "other").exists()
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", range(5))
 def test_the_printed_walls_of_random_kits_match(seed: int, own_tool: Path, tmp_path: Path):
@@ -384,9 +410,7 @@ def test_the_written_scenario_succeeds(
 def test_compensation_widens_what_is_cut_but_not_what_is_simulated(bar: Path, tmp_path: Path):
     def cut(compensate_mm: float) -> tuple[float, dict[str, object]]:
         folder = tmp_path / f"{compensate_mm:g}"
-        request = KitRequest(
-            (str(bar),), folder, clearance_mm=0.5, compensate_mm=compensate_mm
-        )
+        request = KitRequest((str(bar),), folder, clearance_mm=0.5, compensate_mm=compensate_mm)
         export_kit(request)
         drawing = ezdxf.readfile(folder / "cavities.dxf").modelspace()
         widths = [

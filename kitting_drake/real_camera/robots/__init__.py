@@ -1,0 +1,1 @@
+"""The arm of a bench, and files of its trajectories."""
