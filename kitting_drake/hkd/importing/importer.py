@@ -38,13 +38,14 @@ from kitting_drake.hkd.importing.fit import (
     material_of,
 )
 from kitting_drake.hkd.importing.materials import bodies_of
+from kitting_drake.hkd.importing.mesh_files import read_mesh
 from kitting_drake.hkd.importing.outline import (
     extruded,
     is_outline,
     laid_along_x,
     read_outline,
 )
-from kitting_drake.hkd.importing.repair import NOMINAL_MM, make_solid, read_mesh
+from kitting_drake.hkd.importing.repair import NOMINAL_MM, make_solid
 from kitting_drake.hkd.importing.resting_pose import resting_tilt
 from kitting_drake.hkd.importing.tool_frame import (
     facing_forward,

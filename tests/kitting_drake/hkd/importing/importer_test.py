@@ -17,7 +17,8 @@ from kitting_drake.hkd.importing import importer
 from kitting_drake.hkd.importing.fit import guess_unit
 from kitting_drake.hkd.importing.importer import ImportRequest, import_tool
 from kitting_drake.hkd.importing.materials import OTHER_DENSITY
-from kitting_drake.hkd.importing.repair import NOMINAL_MM, make_solid, read_mesh
+from kitting_drake.hkd.importing.mesh_files import read_mesh
+from kitting_drake.hkd.importing.repair import NOMINAL_MM, make_solid
 from kitting_drake.hkd.importing.resting_pose import resting_tilt
 from kitting_drake.hkd.importing.tool_frame import size
 from kitting_drake.hkd.kits.layout import layout_kit
@@ -308,7 +309,7 @@ def test_an_invalid_file_is_rejected(tmp_path: Path, monkeypatch: pytest.MonkeyP
         file.truncate(300_000_000)
     with pytest.raises(UserError, match="200 MB"):
         bring(huge, tmp_path / "tools")
-    monkeypatch.setattr("kitting_drake.hkd.importing.repair.MOST_TRIANGLES", 20)
+    monkeypatch.setattr("kitting_drake.hkd.importing.mesh_files.MOST_TRIANGLES", 20)
     with pytest.raises(UserError, match="20"):
         bring(exported(mallet(), tmp_path / "mallet.stl"), tmp_path / "tools")
     assert not (tmp_path / "tools").exists()
