@@ -96,6 +96,9 @@ def import_mesh(args: argparse.Namespace, entries: list[ToolEntry]) -> None:
         category=args.category,
         name=args.name,
         length_mm=args.length_mm,
+        unit=args.unit,
+        mass_g=args.mass_g,
+        material=args.material,
         density=args.density,
         output=args.output,
         height_mm=args.height_mm,
@@ -248,9 +251,15 @@ def _describe_import(importer: argparse.ArgumentParser) -> None:
     importer.add_argument(
         "--length_mm",
         type=float,
-        help="scale to this length (default: an outline's own; a mesh's if 150 to 200, else 180)",
+        help="scale to this length (default: the true length)",
     )
+    importer.add_argument("--unit", help="the file's unit, if it does not say: mm, cm, m or inches")
     importer.add_argument("--height_mm", type=float, help="the height of an extruded outline")
+    importer.add_argument("--mass_g", type=float, help="the tool's mass in grams, as weighed")
+    importer.add_argument(
+        "--material",
+        help="what the whole tool is of: steel, aluminium, brass, titanium, wood, plastic, rubber",
+    )
     importer.add_argument(
         "--density",
         type=float,

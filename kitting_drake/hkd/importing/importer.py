@@ -31,20 +31,28 @@ from kitting_drake.common.files import replace_folder
 from kitting_drake.hkd.importing.convex_decomposition import decompose
 from kitting_drake.hkd.importing.fit import (
     HIGHEST_MM,
+    LONGEST_MM,
+    SHORTEST_MM,
     THINNEST_MM,
+    UNITS_MM,
     fit,
     grasp_record,
-    lengths_to_try,
     material_of,
+    true_length,
 )
-from kitting_drake.hkd.importing.materials import bodies_of
-from kitting_drake.hkd.importing.mesh_files import read_mesh
+from kitting_drake.hkd.importing.materials import (
+    DENSITY_RANGE,
+    MATERIALS,
+    bodies_of,
+    weighed,
+)
 from kitting_drake.hkd.importing.outline import (
     extruded,
     is_outline,
     laid_along_x,
     read_outline,
 )
+from kitting_drake.hkd.importing.reading.mesh_files import read_mesh
 from kitting_drake.hkd.importing.repair import NOMINAL_MM, make_solid
 from kitting_drake.hkd.importing.resting_pose import resting_tilt
 from kitting_drake.hkd.importing.tool_frame import (
@@ -89,13 +97,24 @@ class ImportRequest:
     name: str | None = None
     """The tool's name; by default the file's."""
     length_mm: float | None = None
-    """The length to scale to; see `fit.lengths_to_try` for None."""
+    """The length to scale to; None keeps the true length."""
+    unit: str | None = None
+    """The unit of the file, a key of `fit.UNITS_MM`; None finds it."""
+    mass_g: float | None = None
+    """The mass as weighed; None follows from the densities."""
+    material: str | None = None
+    """The material of the whole tool, a key of `materials.MATERIALS`."""
     density: float | None = None
     """The mean density in kg/m^3; see `materials` for None."""
     output: Path | None = None
     """The folder of tools to write to; by default `user_tools`."""
     height_mm: float | None = None
     """The height of an extruded outline; only for outlines."""
+
+    @property
+    def given_density(self) -> float | None:
+        """The density of the whole tool in kg/m^3, by itself or by the material."""
+        return self.density if self.material is None else MATERIALS[self.material]
 
 
 @dataclass(frozen=True)
@@ -123,13 +142,7 @@ def import_tool(request: ImportRequest, time_limit: float | None = TIME_LIMIT) -
     """
     check_category(request.category)
     name = _checked_name(request)
-    for flag, value, low, high in (
-        ("--length_mm", request.length_mm, 20.0, 250.0),
-        ("--density", request.density, 50.0, 25000.0),
-        ("--height_mm", request.height_mm, THINNEST_MM, HIGHEST_MM),
-    ):
-        if value is not None and not low <= value <= high:
-            raise UserError(f"{flag} {value:g} is out of range: give {low:g} to {high:g}")
+    _check_options(request)
     _check_height(request)
     folder = request.output or user_tools()
     final = folder / name
@@ -166,6 +179,25 @@ def _remove_abandoned(folder: Path) -> None:
         with contextlib.suppress(FileNotFoundError):
             if time.time() - path.stat().st_mtime > 2 * _MOST_WAITING * TIME_LIMIT:
                 shutil.rmtree(path, ignore_errors=True)
+
+
+def _check_options(request: ImportRequest) -> None:
+    for flag, value, low, high in (
+        ("--length_mm", request.length_mm, SHORTEST_MM, LONGEST_MM),
+        ("--density", request.density, *DENSITY_RANGE),
+        ("--mass_g", request.mass_g, 0.1, 10_000.0),
+        ("--height_mm", request.height_mm, THINNEST_MM, HIGHEST_MM),
+    ):
+        if value is not None and not low <= value <= high:
+            raise UserError(f"{flag} {value:g} is out of range: give {low:g} to {high:g}")
+    for flag, name, names in (
+        ("--unit", request.unit, UNITS_MM),
+        ("--material", request.material, MATERIALS),
+    ):
+        if name is not None and name not in names:
+            raise UserError(f"{flag} '{name}' is not known: give {', '.join(names)}")
+    if request.material is not None and request.density is not None:
+        raise UserError("--material and --density both give the density: leave out one")
 
 
 def _check_height(request: ImportRequest) -> None:
@@ -315,22 +347,23 @@ def _prepare(request: ImportRequest, name: str, directory: Path) -> Prepared:
                 f"the tool is {request.height_mm:g} mm high and would tip over: draw it from "
                 "above, as it lies at rest"
             )
-        lengths = [length]
         assumed = f"an outline, {length:.0f} mm long and extruded to {request.height_mm:g} mm"
     else:
-        lengths, assumed = lengths_to_try(length, request.length_mm)
+        length, assumed = true_length(
+            length, size(solid)[2] / nominal, request.unit, request.length_mm
+        )
     notes = [assumed, *notes]
-    first, wanted = solid, lengths
+    first, wanted = solid, length
     laid: list[str] = []
     for _ in range(_LAYINGS):
         _empty(directory)
-        prepared, fitted = _write(request, name, directory, solid, lengths, [*notes, *laid])
+        prepared, fitted = _write(request, name, directory, solid, length, [*notes, *laid])
         tilt = resting_tilt(directory / f"{name}.sdf")
         angle = math.degrees(math.acos(np.clip(tilt[2, 2], -1.0, 1.0)))
         if angle <= _SAME_POSE_DEG:
             return prepared
         solid = fitted.transform(np.column_stack([tilt, np.zeros(3)]))
-        lengths = [request.length_mm or size(solid)[0]]
+        length = request.length_mm or size(solid)[0]
         laid = [f"laid in its resting pose, which is tilted by {angle:.0f} degrees"]
     # No pose is at rest: use the one with the lowest centre of mass.
     _empty(directory)
@@ -357,17 +390,21 @@ def _write(
     name: str,
     directory: Path,
     solid: Manifold,
-    lengths: list[float],
+    length: float,
     notes: list[str],
 ) -> tuple[Prepared, Manifold]:
     """Writes the files of a solid (mm) in the tool frame; also returns the solid as scaled."""
     notes = list(notes)
-    category, density = request.category, request.density
-    tool, solid = fit(category, name, solid, lengths, notes, directory, density)
+    category, density = request.category, request.given_density
+    tool, solid = fit(category, name, solid, length, directory, density)
     bodies = bodies_of(solid, category, density)
+    if request.mass_g is not None:
+        bodies = weighed(bodies, 1e-3 * request.mass_g)
     mass, center, inertia = mass_properties(bodies)
     if len(bodies) > 1:
         notes.append(f"{_FRONTS[category]} taken to be steel, its handle light")
+    if request.mass_g is None and density is None:
+        notes.append("its mass is a guess: give --mass_g, or --material if it is of one")
     vertices, faces = meshes.vertices_and_faces(solid)
     collision = decompose(solid, tool.grasp)
     if not collision.hulls:

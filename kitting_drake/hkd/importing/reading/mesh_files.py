@@ -7,7 +7,7 @@ import trimesh
 from numpy.typing import NDArray
 
 from kitting_drake.common.errors import UserError
-from kitting_drake.hkd.importing.stl import read_stl
+from kitting_drake.hkd.importing.reading.stl import read_stl
 
 FORMATS = (".stl", ".obj", ".ply", ".glb", ".gltf")
 MOST_BYTES = 200_000_000

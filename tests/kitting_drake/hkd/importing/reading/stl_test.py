@@ -6,8 +6,8 @@ import pytest
 import trimesh
 
 from kitting_drake.common.errors import UserError
-from kitting_drake.hkd.importing.mesh_files import read_mesh
-from kitting_drake.hkd.importing.stl import read_stl
+from kitting_drake.hkd.importing.reading.mesh_files import read_mesh
+from kitting_drake.hkd.importing.reading.stl import read_stl
 
 BOX = trimesh.creation.box((160, 20, 10))
 BINARY: bytes = BOX.export(file_type="stl")
