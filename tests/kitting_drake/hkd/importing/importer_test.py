@@ -17,6 +17,7 @@ from kitting_drake.hkd.importing import importer
 from kitting_drake.hkd.importing.fit import true_length
 from kitting_drake.hkd.importing.importer import ImportRequest, import_tool
 from kitting_drake.hkd.importing.materials import OTHER_DENSITY
+from kitting_drake.hkd.importing.prepare import Prepared
 from kitting_drake.hkd.importing.reading.mesh_files import read_mesh
 from kitting_drake.hkd.importing.repair import NOMINAL_MM, make_solid
 from kitting_drake.hkd.importing.resting_pose import resting_tilt
@@ -377,10 +378,10 @@ def test_an_invalid_file_is_rejected(tmp_path: Path, monkeypatch: pytest.MonkeyP
     assert not (tmp_path / "tools").exists()
 
 
-def quickly_made(plain: importer.ImportReport) -> Callable[..., importer.Prepared]:
+def quickly_made(plain: importer.ImportReport) -> Callable[..., Prepared]:
     """A fast stand-in for `prepare_tool`: the mallet with the requested name and length."""
 
-    def prepare(request: ImportRequest, name: str, directory: Path) -> importer.Prepared:
+    def prepare(request: ImportRequest, name: str, directory: Path) -> Prepared:
         for path in plain.directory.iterdir():
             copy = directory / (f"{name}.sdf" if path.suffix == ".sdf" else path.name)
             copy.write_bytes(path.read_bytes())
@@ -440,7 +441,7 @@ def test_numbers_out_of_range(options: dict, tmp_path: Path):
 
 def test_the_child_process(tmp_path: Path):
     path = exported(mallet(), tmp_path / "mallet.stl")
-    with pytest.raises(UserError, match="0 s"):
+    with pytest.raises(UserError, match="0 s of processor time, the last of it while "):
         import_tool(ImportRequest(path, "hammer", output=tmp_path / "tools"), time_limit=0.0)
     assert not (tmp_path / "tools").exists()
     report = import_tool(ImportRequest(path, "hammer", output=tmp_path / "tools"))
