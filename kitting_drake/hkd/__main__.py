@@ -110,6 +110,7 @@ def import_mesh(args: argparse.Namespace, entries: list[ToolEntry]) -> None:
     console.print(f"{d['name']}: {size_text(d)} mm, {1e3 * d['mass']:.0f} g, {held}")
     for note in report.notes:
         console.print(f"  {note}")
+    console.print(f"  see {report.directory}/outline.png", soft_wrap=True)
     named = d["name"] if args.output is None else report.directory.resolve()
     console.print(f"files: {report.directory}/; name it '{named}' in a scenario", soft_wrap=True)
 
@@ -253,7 +254,9 @@ def _describe_import(importer: argparse.ArgumentParser) -> None:
         type=float,
         help="scale to this length (default: the true length)",
     )
-    importer.add_argument("--unit", help="the file's unit, if it does not say: mm, cm, m or inches")
+    importer.add_argument(
+        "--unit", help="the file's unit: mm, cm, m, inches, or an outline's pt (1/72 inch) or px"
+    )
     importer.add_argument("--height_mm", type=float, help="the height of an extruded outline")
     importer.add_argument("--mass_g", type=float, help="the tool's mass in grams, as weighed")
     importer.add_argument(

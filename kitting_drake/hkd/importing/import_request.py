@@ -14,6 +14,7 @@ from kitting_drake.hkd.importing.fit import (
 )
 from kitting_drake.hkd.importing.materials import DENSITY_RANGE, MATERIALS
 from kitting_drake.hkd.importing.outline import is_outline
+from kitting_drake.hkd.importing.reading import drawn_curves
 from kitting_drake.hkd.tools.tool import check_category, tool_names
 
 
@@ -28,7 +29,8 @@ class ImportRequest:
     length_mm: float | None = None
     """The length to scale to; None keeps the true length."""
     unit: str | None = None
-    """The unit of the file, a key of `fit.UNITS_MM`; None finds it."""
+    """The unit of the file, a key of `fit.UNITS_MM` or, for outlines, of `drawn_curves.UNITS_MM`;
+    None finds it."""
     mass_g: float | None = None
     """The mass as weighed; None follows from the densities."""
     material: str | None = None
@@ -61,8 +63,9 @@ def check_request(request: ImportRequest) -> None:
     ):
         if value is not None and not low <= value <= high:
             raise UserError(f"{flag} {value:g} is out of range: give {low:g} to {high:g}")
+    units = drawn_curves.UNITS_MM if is_outline(request.mesh) else UNITS_MM
     for flag, name, names in (
-        ("--unit", request.unit, UNITS_MM),
+        ("--unit", request.unit, units),
         ("--material", request.material, MATERIALS),
     ):
         if name is not None and name not in names:

@@ -28,9 +28,14 @@ from kitting_drake.hkd.importing.outline import (
     extruded,
     is_outline,
     laid_along_x,
-    read_outline,
+    read_drawing,
 )
+from kitting_drake.hkd.importing.reading import drawn_curves
 from kitting_drake.hkd.importing.reading.mesh_files import read_mesh
+from kitting_drake.hkd.importing.reading.outline_picture import (
+    holes_text,
+    write_outline_picture,
+)
 from kitting_drake.hkd.importing.repair import NOMINAL_MM, make_solid
 from kitting_drake.hkd.importing.resting_pose import resting_tilt
 from kitting_drake.hkd.importing.tool_frame import (
@@ -106,7 +111,7 @@ def prepare_tool(
 
 def _prepare(request: ImportRequest, name: str, directory: Path, say: Say) -> Prepared:
     say("reading it")
-    vertices, faces = _surface(request)
+    vertices, faces, found = _surface(request)
     low, high = vertices.min(axis=0), vertices.max(axis=0)
     longest = float((high - low).max())
     if not longest > 1e-12:
@@ -125,7 +130,11 @@ def _prepare(request: ImportRequest, name: str, directory: Path, say: Say) -> Pr
                 f"the tool is {request.height_mm:g} mm high and would tip over: draw it from "
                 "above, as it lies at rest"
             )
-        assumed = f"an outline, {length:.0f} mm long and extruded to {request.height_mm:g} mm"
+        assumed = (
+            f"an outline of {' x '.join(f'{side / nominal:.1f}' for side in size(solid)[:2])} mm "
+            f"with {holes_text(solid.project())}, {found[0]}; {request.height_mm:g} mm high"
+        )
+        notes = [*found[1:], *notes]
     else:
         length, assumed = true_length(
             length, size(solid)[2] / nominal, request.unit, request.length_mm
@@ -150,13 +159,27 @@ def _prepare(request: ImportRequest, name: str, directory: Path, say: Say) -> Pr
     return _write(request, name, directory, first, wanted, notes, say)[0]
 
 
-def _surface(request: ImportRequest) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices (n, 3) and triangles (m, 3): of a mesh in its units, or of an outline in mm."""
+def _surface(request: ImportRequest) -> tuple[np.ndarray, np.ndarray, list[str]]:
+    """Vertices (n, 3) and triangles (m, 3): of a mesh in its units, or of an outline in mm.
+
+    Also notes; for an outline, the first says how it was measured.
+    """
     if not is_outline(request.mesh):
-        return read_mesh(request.mesh)
+        return *read_mesh(request.mesh), []
     assert request.height_mm is not None
-    outline = laid_along_x(read_outline(request.mesh), request.length_mm, str(request.mesh))
-    return extruded(outline, request.height_mm)
+    unit_mm = None if request.unit is None else drawn_curves.UNITS_MM[request.unit]
+    try:
+        drawing = read_drawing(request.mesh, unit_mm)
+    except UserError:
+        # An unknown unit does not matter to what is scaled.
+        if request.length_mm is None or unit_mm is not None:
+            raise
+        drawing = read_drawing(request.mesh, 1.0)
+    outline = laid_along_x(drawing.outline, request.length_mm, str(request.mesh))
+    measured = f"measured {drawing.measured}"
+    if request.length_mm is not None:
+        measured = "scaled as requested"
+    return *extruded(outline, request.height_mm), [measured, *drawing.notes]
 
 
 def _empty(directory: Path) -> None:
@@ -200,6 +223,7 @@ def _write(
     for index, hull in enumerate(collision.hulls):
         collisions.append(f"collision_{index}.obj")
         meshes.write_convex_obj(directory / collisions[-1], hull)
+    write_outline_picture(solid.project(), directory / "outline.png")
     material = material_of(request.category)
     text = tool_sdf(
         name,
