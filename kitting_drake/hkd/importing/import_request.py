@@ -15,6 +15,7 @@ from kitting_drake.hkd.importing.fit import (
 from kitting_drake.hkd.importing.materials import DENSITY_RANGE, MATERIALS
 from kitting_drake.hkd.importing.outline import is_outline
 from kitting_drake.hkd.importing.reading import drawn_curves
+from kitting_drake.hkd.importing.reading.mesh_files import IN_MM
 from kitting_drake.hkd.tools.tool import check_category, tool_names
 
 
@@ -70,6 +71,8 @@ def check_request(request: ImportRequest) -> None:
     ):
         if name is not None and name not in names:
             raise UserError(f"{flag} '{name}' is not known: give {', '.join(names)}")
+    if request.unit is not None and request.mesh.suffix.lower() in IN_MM:
+        raise UserError(f"{request.mesh} names its unit: leave out --unit, or give --length_mm")
     if request.material is not None and request.density is not None:
         raise UserError("--material and --density both give the density: leave out one")
     if is_outline(request.mesh) and request.height_mm is None:

@@ -31,7 +31,7 @@ from kitting_drake.hkd.importing.outline import (
     read_drawing,
 )
 from kitting_drake.hkd.importing.reading import drawn_curves
-from kitting_drake.hkd.importing.reading.mesh_files import read_mesh
+from kitting_drake.hkd.importing.reading.mesh_files import IN_MM, read_mesh
 from kitting_drake.hkd.importing.reading.outline_picture import (
     holes_text,
     write_outline_picture,
@@ -136,9 +136,8 @@ def _prepare(request: ImportRequest, name: str, directory: Path, say: Say) -> Pr
         )
         notes = [*found[1:], *notes]
     else:
-        length, assumed = true_length(
-            length, size(solid)[2] / nominal, request.unit, request.length_mm
-        )
+        unit = "mm" if request.mesh.suffix.lower() in IN_MM else request.unit
+        length, assumed = true_length(length, size(solid)[2] / nominal, unit, request.length_mm)
     notes = [assumed, *notes]
     first, wanted = solid, length
     laid: list[str] = []

@@ -8,8 +8,12 @@ from numpy.typing import NDArray
 
 from kitting_drake.common.errors import UserError
 from kitting_drake.hkd.importing.reading.stl import read_stl
+from kitting_drake.hkd.importing.reading.threemf import read_3mf
 
-FORMATS = (".stl", ".obj", ".ply", ".glb", ".gltf")
+FORMATS = (".stl", ".obj", ".ply", ".glb", ".gltf", ".3mf")
+IN_MM = (".3mf",)
+"""The formats that name their unit; they are read in mm."""
+_SOLIDS = (".step", ".stp", ".iges", ".igs", ".sldprt", ".f3d", ".fcstd", ".scad", ".blend")
 MOST_BYTES = 200_000_000
 MOST_TRIANGLES = 2_000_000
 
@@ -18,7 +22,9 @@ Faces = NDArray[np.int64]
 
 
 def read_mesh(path: Path) -> tuple[Array, Faces]:
-    """The vertices (n, 3), in the file's units, and triangles (m, 3) of all visible meshes.
+    """The vertices (n, 3) and triangles (m, 3) of all visible meshes.
+
+    Vertices are in the file's units, or in mm for the formats `IN_MM`.
 
     Raises:
         UserError: the file is missing, too large or not a mesh.
@@ -30,6 +36,11 @@ def read_mesh(path: Path) -> tuple[Array, Faces]:
         raise UserError(f"there is no file {path}: give a mesh ({kinds})") from error
     if not path.is_file():
         raise UserError(f"{path} is a folder or special file: give a mesh ({kinds})")
+    if path.suffix.lower() in _SOLIDS:
+        raise UserError(
+            f"{path} is a CAD model ({path.suffix[1:].upper().replace('STP', 'STEP')}): export it "
+            "as STL or 3MF from your CAD program, or from FreeCAD, with a deviation of 0.05 mm"
+        )
     if path.suffix.lower() not in FORMATS:
         raise UserError(f"{path} is neither a supported mesh ({kinds}) nor an outline (SVG, DXF)")
     if size == 0:
@@ -39,7 +50,8 @@ def read_mesh(path: Path) -> tuple[Array, Faces]:
             f"{path} has {size / 1e6:.0f} MB, more than the limit of {MOST_BYTES / 1e6:.0f} MB: "
             "decimate the mesh first"
         )
-    vertices, faces = _stl(path) if path.suffix.lower() == ".stl" else _scene(path)
+    read = {".stl": _stl, ".3mf": read_3mf}.get(path.suffix.lower(), _scene)
+    vertices, faces = read(path)
     if len(faces) == 0 or vertices.ndim != 2 or faces.ndim != 2 or faces.shape[1] != 3:
         raise UserError(f"{path} has no triangles: check that the file is complete")
     if len(faces) > MOST_TRIANGLES:
