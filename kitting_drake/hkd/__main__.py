@@ -87,7 +87,7 @@ def annotate(args: argparse.Namespace, entries: list[ToolEntry]) -> None:
 
 
 def import_mesh(args: argparse.Namespace, entries: list[ToolEntry]) -> None:
-    """Makes a tool from a mesh (STL, OBJ, PLY, GLB) or an outline (SVG, DXF)."""
+    """Makes a tool from a mesh (STL, OBJ, PLY, GLB, 3MF) or an outline (SVG, DXF)."""
     from kitting_drake.hkd.importing.importer import ImportRequest, import_tool
 
     console = Console(quiet=args.quiet, highlight=False, markup=False)

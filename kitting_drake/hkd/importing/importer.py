@@ -55,7 +55,8 @@ def import_tool(request: ImportRequest, time_limit: float | None = TIME_LIMIT) -
     name = checked_name(request)
     folder = request.output or user_tools()
     final = folder / name
-    replaced = _check_replaceable(final, request) if final.exists() else None
+    if final.exists():
+        _check_replaceable(final, request)
     new_folders = [p for p in (folder, *folder.parents) if not p.exists()]
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -68,6 +69,8 @@ def import_tool(request: ImportRequest, time_limit: float | None = TIME_LIMIT) -
                 if time_limit is None
                 else prepare_aside(request, name, made, time_limit)
             )
+            # Another run may have made it in the meantime.
+            replaced = _check_replaceable(final, request) if final.exists() else None
             replace_folder(final, made, Path(scratch) / "replaced")
             record, notes, hulls = report
             if replaced is not None:

@@ -145,7 +145,7 @@ def _prepare(request: ImportRequest, name: str, directory: Path, say: Say) -> Pr
         _empty(directory)
         prepared, fitted = _write(request, name, directory, solid, length, [*notes, *laid], say)
         say("letting it come to rest")
-        tilt = resting_tilt(directory / f"{name}.sdf")
+        tilt = resting_tilt(directory / f"{name}.sdf", length)
         angle = math.degrees(math.acos(np.clip(tilt[2, 2], -1.0, 1.0)))
         if angle <= _SAME_POSE_DEG:
             return prepared

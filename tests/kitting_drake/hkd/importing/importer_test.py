@@ -431,6 +431,27 @@ def test_names(plain: importer.ImportReport, tmp_path: Path, monkeypatch: pytest
     assert left_in(tmp_path / "own") == ["mine", "other"]
 
 
+def test_two_runs_into_one_folder(
+    plain: importer.ImportReport, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    """What another run made meanwhile is not overwritten, unless it is of the same file."""
+    make = quickly_made(plain)
+    first = exported(mallet(), tmp_path / "first.stl")
+    second = exported(mallet(), tmp_path / "second.stl")
+
+    def overtaken(request: ImportRequest, name: str, directory: Path) -> Prepared:
+        monkeypatch.setattr(importer, "prepare_tool", make)
+        bring(first, tmp_path / "tools", name="mine")
+        return make(request, name, directory)
+
+    monkeypatch.setattr(importer, "prepare_tool", overtaken)
+    with pytest.raises(UserError, match=r"is the tool of first\.stl"):
+        bring(second, tmp_path / "tools", name="mine")
+    monkeypatch.setattr(importer, "prepare_tool", overtaken)
+    bring(first, tmp_path / "tools", name="mine")
+    assert left_in(tmp_path / "tools") == ["mine"]
+
+
 @pytest.mark.parametrize(
     "options", [{"length_mm": float("nan")}, {"length_mm": -5.0}, {"density": 1e9}]
 )
