@@ -78,6 +78,6 @@ def _scale(ezdxf: Any, document: Any, path: Path, unit_mm: float | None) -> tupl
     given = b"$INSUNITS" in path.read_bytes()
     units = ezdxf.units.InsertUnits(int(document.header.get("$INSUNITS", 0)) if given else 0)
     if units == ezdxf.units.InsertUnits.Unitless:
-        return 1.0, "taken to be in mm, because it names no unit"
+        return 1.0, "in mm, because it names no unit"
     mm = ezdxf.units.conversion_factor(units, ezdxf.units.InsertUnits.Millimeters)
     return mm, f"by its $INSUNITS, {units.name.lower()}"
