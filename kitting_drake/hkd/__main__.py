@@ -93,7 +93,7 @@ def annotate(args: argparse.Namespace, entries: list[ToolEntry]) -> None:
 
 
 def import_mesh(args: argparse.Namespace, entries: list[ToolEntry]) -> None:
-    """Makes a tool from a mesh (STL, OBJ, PLY, GLB) or an outline (SVG, DXF)."""
+    """Makes a tool from a mesh (STL, OBJ, PLY, GLB, 3MF) or an outline (SVG, DXF)."""
     from kitting_drake.hkd.importing.importer import ImportRequest, import_tool
 
     console = Console(quiet=args.quiet, highlight=False, markup=False)
@@ -102,6 +102,9 @@ def import_mesh(args: argparse.Namespace, entries: list[ToolEntry]) -> None:
         category=args.category,
         name=args.name,
         length_mm=args.length_mm,
+        unit=args.unit,
+        mass_g=args.mass_g,
+        material=args.material,
         density=args.density,
         output=args.output,
         height_mm=args.height_mm,
@@ -113,6 +116,7 @@ def import_mesh(args: argparse.Namespace, entries: list[ToolEntry]) -> None:
     console.print(f"{d['name']}: {size_text(d)} mm, {1e3 * d['mass']:.0f} g, {held}")
     for note in report.notes:
         console.print(f"  {note}")
+    console.print(f"  see {report.directory}/outline.png", soft_wrap=True)
     named = d["name"] if args.output is None else report.directory.resolve()
     console.print(f"files: {report.directory}/; name it '{named}' in a scenario", soft_wrap=True)
 
@@ -311,9 +315,17 @@ def _describe_import(importer: argparse.ArgumentParser) -> None:
     importer.add_argument(
         "--length_mm",
         type=float,
-        help="scale to this length (default: an outline's own; a mesh's if 150 to 200, else 180)",
+        help="scale to this length (default: the true length)",
+    )
+    importer.add_argument(
+        "--unit", help="the file's unit: mm, cm, m, inches, or an outline's pt (1/72 inch) or px"
     )
     importer.add_argument("--height_mm", type=float, help="the height of an extruded outline")
+    importer.add_argument("--mass_g", type=float, help="the tool's mass in grams, as weighed")
+    importer.add_argument(
+        "--material",
+        help="what the whole tool is of: steel, aluminium, brass, titanium, wood, plastic, rubber",
+    )
     importer.add_argument(
         "--density",
         type=float,

@@ -1,4 +1,4 @@
-"""Scales an imported tool to a length at which the hand can hold it and a kit can take it."""
+"""Finds the true length of an imported tool, and how the hand holds it."""
 
 from pathlib import Path
 
@@ -15,38 +15,18 @@ from kitting_drake.hkd.tools.mass import mass_properties
 from kitting_drake.hkd.tools.tool import Tool
 from systems.grasp import Grasp
 
-SCALED_LENGTHS_MM = (180.0, 170.0, 160.0, 150.0)
-"""Lengths to try; the tool gets the first at which it can be held and kitted."""
-KEPT_LENGTHS_MM = (150.0, 200.0)
-"""Tools in this range of lengths, that of the dataset, are not scaled."""
-POSSIBLE_LENGTHS_MM = (50.0, 600.0)
-"""The range of lengths of hand tools, for guessing a file's unit."""
+SHORTEST_MM, LONGEST_MM = 15.0, 350.0
+"""The range of lengths of a tool."""
 THINNEST_MM, HIGHEST_MM = 4.0, 45.0
 
 # The number of other grasps to keep, and how much more they may cost than the best.
 _OTHERS, _MUCH_WORSE = 3, 2.0
 
-_UNITS = {"mm": 1.0, "m": 1000.0, "cm": 10.0, "inches": 25.4}
+UNITS_MM = {"mm": 1.0, "cm": 10.0, "m": 1000.0, "inches": 25.4}
+"""The units in which a mesh may be, in mm."""
 _CREASE_ANGLE_DEG = 35.0
 # Decimation tolerances to try until a mesh has few enough triangles.
 _DECIMATION_TOLERANCES_MM, _ENOUGH_TRIANGLES = (0.01, 0.02, 0.04), 10_000
-
-
-def guess_unit(length: float) -> str | None:
-    """The unit in which this length is that of a hand tool: mm, m, cm or inches; None if none fits.
-
-    Inches and centimetres overlap: a length of at most 12 is taken as inches, above as centimetres.
-    """
-    shortest, longest = POSSIBLE_LENGTHS_MM
-    for unit, low, high in (
-        ("mm", shortest, longest),
-        ("m", shortest / 1000, longest / 1000),
-        ("inches", shortest / 25.4, 12.0),
-        ("cm", 12.0, longest / 10),
-    ):
-        if low <= length <= high:
-            return unit
-    return None
 
 
 def material_of(category: str) -> str:
@@ -54,51 +34,68 @@ def material_of(category: str) -> str:
     return "polished_steel" if category == "wrench" else "steel"
 
 
-def lengths_to_try(length: float, wanted_mm: float | None) -> tuple[list[float], str]:
-    """The lengths (mm) to try in order, and a phrase for the user that explains them."""
-    unit = guess_unit(length)
-    if unit is None:
-        assumed, real = f"unit unknown ({length:.4g} long)", 0.0
-    else:
-        real = length * _UNITS[unit]
-        assumed = f"taken to be in {unit}: {real:.0f} mm long"
+def true_length(
+    length: float, height: float, unit: str | None, wanted_mm: float | None
+) -> tuple[float, str]:
+    """The length of a tool in mm, and a phrase for the user that explains it.
+
+    Meshes have no unit. But few units make a tool that the hand can hold and a kit can take.
+
+    Args:
+        length: of the tool at rest, in the unit of its file.
+        height: likewise.
+        unit: a key of `UNITS_MM` that the user or the file gives.
+        wanted_mm: the length to scale to.
+
+    Raises:
+        UserError: several units are possible, or none, or the tool is too short or too long.
+    """
     if wanted_mm is not None:
-        return [wanted_mm], f"{assumed}, scaled as requested"
-    if KEPT_LENGTHS_MM[0] <= real <= KEPT_LENGTHS_MM[1]:
-        return [real], f"{assumed}, kept"
-    return list(SCALED_LENGTHS_MM), f"{assumed}, scaled"
+        return wanted_mm, f"scaled to {wanted_mm:g} mm as requested ({length:.4g} in the file)"
+    if unit is not None:
+        real = length * UNITS_MM[unit]
+        if not SHORTEST_MM <= real <= LONGEST_MM:
+            raise UserError(
+                f"the tool is {real:.4g} mm long ({length:.4g} {unit}), and tools are "
+                f"{SHORTEST_MM:g} to {LONGEST_MM:g} mm long: give another --unit, or --length_mm "
+                "to scale it"
+            )
+        return real, f"in {unit}: {real:.1f} mm long"
+    lengths = {name: length * mm for name, mm in UNITS_MM.items()}
+    units = [name for name, real in lengths.items() if SHORTEST_MM <= real <= LONGEST_MM]
+    # A unit that makes it too thin or too high counts only if no other does better.
+    units = [u for u in units if THINNEST_MM <= height * UNITS_MM[u] <= HIGHEST_MM] or units
+    if len(units) == 1:
+        return lengths[units[0]], f"taken to be in {units[0]}: {lengths[units[0]]:.1f} mm long"
+    if not units:
+        readings = ", ".join(f"{real:.4g} mm long in {name}" for name, real in lengths.items())
+        raise UserError(
+            f"the tool would be {readings}, and tools are {SHORTEST_MM:g} to {LONGEST_MM:g} mm "
+            "long: give --length_mm"
+        )
+    readings = " or ".join(f"{lengths[name]:.0f} mm long (in {name})" for name in units)
+    raise UserError(f"the tool may be {readings}: give --unit, or --length_mm")
 
 
 def fit(
     category: str,
     name: str,
     solid: Manifold,
-    lengths: list[float],
-    notes: list[str],
+    length: float,
     directory: Path,
     density: float | None = None,
 ) -> tuple[Tool, Manifold]:
-    """Makes a tool at the first of `lengths` (mm) that works, and writes its visual mesh.
+    """Makes a tool of a length (mm), and writes its visual mesh.
 
     Raises:
-        UserError: no length works; the message is that of the first one.
+        UserError: the hand cannot hold it, or no kit can take it.
     """
-    refusal: UserError | None = None
-    for length in lengths:
-        factor = length / size(solid)[0]
-        scaled = centred(_decimated(solid.scale((factor, factor, factor))))
-        try:
-            _check_size(scaled)
-            tool = _tool(category, name, scaled, directory, density)
-            layout_kit([tool], KitParameters())
-        except UserError as error:
-            refusal = refusal or error
-            continue
-        if refusal is not None:
-            notes.append(f"made {1e3 * tool.length:.0f} mm long, because {refusal}")
-        return tool, scaled
-    assert refusal is not None
-    raise refusal
+    factor = length / size(solid)[0]
+    scaled = centred(_decimated(solid.scale((factor, factor, factor))))
+    _check_size(scaled)
+    tool = _tool(category, name, scaled, directory, density)
+    layout_kit([tool], KitParameters())
+    return tool, scaled
 
 
 def _decimated(solid: Manifold) -> Manifold:

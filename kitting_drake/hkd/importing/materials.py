@@ -8,15 +8,30 @@ import numpy as np
 from manifold3d import Manifold
 from numpy.typing import NDArray
 
+from kitting_drake.common.errors import UserError
 from kitting_drake.hkd.tools import meshes
-from kitting_drake.hkd.tools.mass import Body
+from kitting_drake.hkd.tools.mass import Body, mass_properties
 
 _STEEL, _HANDLE = 7850.0, 1200.0
+
+MATERIALS = {
+    "steel": _STEEL,
+    "aluminium": 2700.0,
+    "brass": 8500.0,
+    "titanium": 4430.0,
+    "wood": 700.0,
+    "plastic": 1150.0,
+    "rubber": 1200.0,
+}
+"""The densities of the materials that a whole tool may be of, in kg/m^3."""
 
 DENSITIES = {"pliers": 6000.0, "wrench": _STEEL}
 """The mean density of a category's tools with their grips, in kg/m^3."""
 OTHER_DENSITY = 3000.0
 """The mean density of a tool of any other category, in kg/m^3."""
+
+DENSITY_RANGE = (50.0, 25_000.0)
+"""The possible mean densities of a tool, in kg/m^3."""
 
 _SLICES = 60
 _END = 0.3
@@ -43,6 +58,24 @@ def bodies_of(solid: Manifold, category: str, density: float | None = None) -> l
             front, back = solid.split_by_plane((1.0, 0.0, 0.0), border)
             return [(front, _STEEL), (back, _HANDLE)]
     return [(solid, density or DENSITIES.get(category, OTHER_DENSITY))]
+
+
+def weighed(bodies: list[Body], mass: float) -> list[Body]:
+    """The bodies with their densities scaled to a total mass in kg.
+
+    Raises:
+        UserError: no tool of this volume has this mass.
+    """
+    volume = 1e-9 * sum(solid.volume() for solid, _ in bodies)
+    low, high = DENSITY_RANGE
+    if not low * volume <= mass <= high * volume:
+        raise UserError(
+            f"a tool of {1e6 * volume:.3g} cm^3 does not weigh {1e3 * mass:g} g, but "
+            f"{1e3 * low * volume:.1g} to {1e3 * high * volume:.2g} g: check --mass_g and the "
+            "length"
+        )
+    factor = mass / mass_properties(bodies)[0]
+    return [(solid, factor * density) for solid, density in bodies]
 
 
 def _border(solid: Manifold, category: str) -> float | None:

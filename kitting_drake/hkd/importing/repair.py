@@ -1,11 +1,10 @@
-"""Reads any mesh and makes it one solid, the first step of `hkd import`.
+"""Makes any mesh one solid, the first step of `hkd import`.
 
 A watertight mesh is used as it is. Any other is split into connected components. Each is repaired
-alone (winding, then holes, then pymeshfix), and all are united, minus sealed hollows. If that loses
-visible parts, the surface is wrapped instead: filled as voxels and traced.
+alone (winding, then small holes, then flat openings, then pymeshfix), and all are united, minus
+sealed hollows. If that loses visible parts, the surface is wrapped instead: filled as voxels and
+traced.
 """
-
-from pathlib import Path
 
 import numpy as np
 import pymeshfix
@@ -16,10 +15,8 @@ from scipy import ndimage
 from scipy.spatial import cKDTree
 
 from kitting_drake.common.errors import UserError
+from kitting_drake.hkd.importing.closing import capped
 
-FORMATS = (".stl", ".obj", ".ply", ".glb", ".gltf")
-MOST_BYTES = 200_000_000
-MOST_TRIANGLES = 2_000_000
 # Solids are repaired at this size in any unit; the tolerances below are for it.
 NOMINAL_MM = 180.0
 
@@ -44,56 +41,6 @@ _HOLLOW = 0.002
 
 Array = NDArray[np.float64]
 Faces = NDArray[np.int64]
-
-
-def read_mesh(path: Path) -> tuple[Array, Faces]:
-    """The vertices (n, 3), in the file's units, and triangles (m, 3) of all visible meshes.
-
-    Raises:
-        UserError: the file is missing, too large or not a mesh.
-    """
-    kinds = ", ".join(suffix[1:].upper() for suffix in FORMATS)
-    try:
-        size = path.stat().st_size
-    except (OSError, ValueError) as error:
-        raise UserError(f"there is no file {path}: give a mesh ({kinds})") from error
-    if not path.is_file():
-        raise UserError(f"{path} is a folder or special file: give a mesh ({kinds})")
-    if path.suffix.lower() not in FORMATS:
-        raise UserError(f"{path} is neither a supported mesh ({kinds}) nor an outline (SVG, DXF)")
-    if size == 0:
-        raise UserError(f"{path} is empty")
-    if size > MOST_BYTES:
-        raise UserError(
-            f"{path} has {size / 1e6:.0f} MB, more than the limit of {MOST_BYTES / 1e6:.0f} MB: "
-            "decimate the mesh first"
-        )
-    options = {"skip_materials": True} if path.suffix.lower() == ".obj" else {}
-    try:
-        scene = trimesh.load_scene(path, process=False, **options)
-        mesh = scene.to_mesh()
-        vertices, faces = np.array(mesh.vertices, dtype=float), np.array(mesh.faces, dtype=np.int64)
-    except MemoryError:
-        raise
-    except Exception as error:
-        # The readers fail in many ways on broken files.
-        raise UserError(f"{path} cannot be read as {path.suffix[1:].upper()}") from error
-    if len(faces) == 0 or vertices.ndim != 2 or faces.ndim != 2 or faces.shape[1] != 3:
-        raise UserError(f"{path} has no triangles: check that the file is complete")
-    if len(faces) > MOST_TRIANGLES:
-        raise UserError(
-            f"{path} has {len(faces)} triangles, more than the limit of {MOST_TRIANGLES}: decimate "
-            "the mesh first"
-        )
-    whole = ((faces >= 0) & (faces < len(vertices))).all(axis=1)
-    faces = faces[whole]
-    with np.errstate(over="ignore", invalid="ignore"):
-        good = np.isfinite(vertices).all(axis=1) & (np.abs(vertices) < 1e30).all(axis=1)
-    faces = faces[good[faces].all(axis=1)]
-    if len(faces) == 0:
-        raise UserError(f"{path} has no triangle with finite corners")
-    used, faces = np.unique(faces, return_inverse=True)
-    return vertices[used], faces.reshape(-1, 3)
 
 
 def make_solid(vertices: Array, faces: Faces) -> tuple[Manifold, list[str]]:
@@ -218,6 +165,11 @@ def _repaired(vertices: Array, faces: Faces) -> Manifold | None:
     trimesh.repair.fix_winding(mesh)
     if mesh.is_watertight or trimesh.repair.fill_holes(mesh):
         solid = _as_manifold(np.asarray(mesh.vertices), np.asarray(mesh.faces))
+        if solid is not None:
+            return solid
+    whole = capped(np.asarray(mesh.vertices), np.asarray(mesh.faces))
+    if whole is not None:
+        solid = _as_manifold(np.asarray(mesh.vertices), whole)
         if solid is not None:
             return solid
     fixer = pymeshfix.PyTMesh()

@@ -20,7 +20,8 @@ from kitting_drake.hkd.grasps.proposals import WIDEST, GraspProposal, propose_gr
 from kitting_drake.hkd.importing.convex_cover import convex_cover
 from kitting_drake.hkd.importing.convex_decomposition import decompose
 from kitting_drake.hkd.importing.fit import HIGHEST_MM, THINNEST_MM
-from kitting_drake.hkd.importing.repair import FORMATS, NOMINAL_MM, make_solid, read_mesh
+from kitting_drake.hkd.importing.reading.mesh_files import FORMATS, read_mesh
+from kitting_drake.hkd.importing.repair import NOMINAL_MM, make_solid
 from kitting_drake.hkd.importing.tool_frame import centred, size, tipping_deg
 from kitting_drake.hkd.shapes.shape_outlines import HEIGHT_MM, SHAPES, OutlinedShape
 from kitting_drake.hkd.tools import meshes

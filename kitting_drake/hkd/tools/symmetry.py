@@ -28,6 +28,16 @@ ORDERS = (24, 12, 10, 9, 8, 7, 6, 5, 4, 3, 2)
 
 _SAMPLES, _DENSE_SAMPLES = 4000, 400_000
 
+_FAR_MM, _COARSER = 2.0, 20
+"""Distances beyond the first are measured to every so many samples.
+
+A point on the axis of a hollow part is equally far from all of the wall, so that its nearest
+neighbour takes long to find.
+"""
+
+_REACH_MM = 0.75
+"""The shift that best fits the surfaces is within this of the one that best fits the outlines."""
+
 Shift = NDArray[np.float64]
 
 
@@ -38,7 +48,10 @@ class Difference:
     outline_deviation_mm: float
     """The largest distance of a point of one outline from the other, capped at 5 mm."""
     surface_distance_mm: float
-    """The symmetric mean distance of the surfaces; infinite if the outlines differ too much."""
+    """The symmetric mean distance of the surfaces; infinite if the outlines differ too much.
+
+    Unless the comparison is complete, a value above the limit is only a lower bound.
+    """
 
     @property
     def is_symmetric(self) -> bool:
@@ -103,11 +116,17 @@ def measure_rotation(
         outline_deviation = _minimum(deviation, shift, 0.5)[1]
     if not complete and outline_deviation >= MOST_OUTLINE_DEVIATION_MM:
         return Difference(outline_deviation, np.inf)
-    return Difference(outline_deviation, _surface_distance(1e3 * triangles, order, shift))
+    distance = _surface_distance(1e3 * triangles, order, shift, complete=complete)
+    return Difference(outline_deviation, distance)
 
 
-def _surface_distance(triangles: NDArray[np.float64], order: int, start: Shift) -> float:
-    """The mean distance of a surface and its rotated copy, minimized from the shift `start`."""
+def _surface_distance(
+    triangles: NDArray[np.float64], order: int, start: Shift, *, complete: bool
+) -> float:
+    """The mean distance of a surface and its rotated copy, minimized from the shift `start`.
+
+    Unless `complete`, a value of at least `MOST_SURFACE_DISTANCE_MM` may be too low.
+    """
     faces = np.arange(3 * len(triangles)).reshape(-1, 3)
     mesh = trimesh.Trimesh(triangles.reshape(-1, 3), faces, process=False)
     points, _ = trimesh.sample.sample_surface(mesh, _SAMPLES, seed=0)
@@ -117,14 +136,28 @@ def _surface_distance(triangles: NDArray[np.float64], order: int, start: Shift) 
     c, s = np.cos(2 * np.pi / order), np.sin(2 * np.pi / order)
     R = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
 
+    coarse_tree = cKDTree(dense[::_COARSER])
+
+    def mean_to_surface(places: NDArray[np.float64]) -> float:
+        distances, _ = tree.query(places, distance_upper_bound=_FAR_MM)
+        far = np.isinf(distances)
+        if far.any():
+            distances[far], _ = coarse_tree.query(places[far])
+        return float(distances.mean())
+
     # The mean of two directions: from the copy to the original, and from the original to the copy.
     # For a half turn they are equal.
     def mean_distance(shift: Shift) -> float:
         offset = np.append(shift, 0.0)
-        there = tree.query(points @ R.T + offset)[0].mean()
-        back = there if order == 2 else tree.query((points - offset) @ R)[0].mean()
+        there = mean_to_surface(points @ R.T + offset)
+        back = there if order == 2 else mean_to_surface((points - offset) @ R)
         return float(there + back) / 2
 
+    if not complete:
+        # A shift changes the distance by at most its own length.
+        least = mean_distance(start) - _REACH_MM
+        if least >= MOST_SURFACE_DISTANCE_MM:
+            return least
     return _minimum(mean_distance, start, 0.5)[1]
 
 

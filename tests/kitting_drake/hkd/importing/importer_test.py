@@ -14,10 +14,12 @@ from manifold3d import Manifold, OpType
 from kitting_drake.common.errors import UserError
 from kitting_drake.hkd.annotate import save_grasp
 from kitting_drake.hkd.importing import importer
-from kitting_drake.hkd.importing.fit import guess_unit
+from kitting_drake.hkd.importing.fit import true_length
 from kitting_drake.hkd.importing.importer import ImportRequest, import_tool
 from kitting_drake.hkd.importing.materials import OTHER_DENSITY
-from kitting_drake.hkd.importing.repair import NOMINAL_MM, make_solid, read_mesh
+from kitting_drake.hkd.importing.prepare import Prepared
+from kitting_drake.hkd.importing.reading.mesh_files import read_mesh
+from kitting_drake.hkd.importing.repair import NOMINAL_MM, make_solid
 from kitting_drake.hkd.importing.resting_pose import resting_tilt
 from kitting_drake.hkd.importing.tool_frame import size
 from kitting_drake.hkd.kits.layout import layout_kit
@@ -152,9 +154,10 @@ def test_unit_pose_and_format_do_not_matter(
         mesh.apply_translation([900, -400, 100])
     mesh.apply_scale(units_per_mm)
     path = exported(mesh, tmp_path / f"mallet.{suffix}")
-    # An unknown unit needs a length.
+    # An unknown unit needs a length, and an ambiguous one a unit.
     length = 175.0 if units_per_mm == 37.0 else None
-    report = bring(path, tmp_path / "tools", length_mm=length)
+    unit = "inches" if units_per_mm == 1 / 25.4 else None
+    report = bring(path, tmp_path / "tools", length_mm=length, unit=unit)
     for key in ("length", "width", "height"):
         assert report.record[key] == pytest.approx(plain.record[key], abs=2e-4)
     assert report.record["mass"] == pytest.approx(plain.record["mass"], rel=0.005)
@@ -166,21 +169,88 @@ def test_unit_pose_and_format_do_not_matter(
 
 
 @pytest.mark.parametrize(
-    ("length", "unit"),
-    [(180, "mm"), (0.18, "m"), (7.1, "inches"), (18, "cm"), (4000, None), (1e-5, None)],
+    ("length", "height", "mm"),
+    [
+        (203, 20, 203),
+        (330, 30, 330),
+        (37, 8, 37),
+        (0.203, 0.02, 203),
+        (0.0155, 0.006, 15.5),
+        # The other unit would be too long, too thin or too high.
+        (18, 1.2, 180),
+        (25, 22, 25),
+        (12, 0.35, 304.8),
+        (7.1, 1.9, 71),
+    ],
 )
-def test_guess_unit(length: float, unit: str | None):
-    assert guess_unit(length) == unit
+def test_a_mesh_has_its_true_length(length: float, height: float, mm: float):
+    found, phrase = true_length(length, height, None, None)
+    assert found == pytest.approx(mm, abs=0.5)
+    assert f"{mm:.0f}" in phrase or f"{mm:.1f}" in phrase
 
 
-def test_a_long_open_mesh_is_scaled_and_repaired(tmp_path: Path):
+@pytest.mark.parametrize(
+    ("length", "height", "unit", "tokens"),
+    [
+        (7.1, 0.6, None, ("180 mm long (in inches)", "71 mm long (in cm)", "--unit")),
+        (20.0, 4.2, None, ("20 mm long (in mm)", "200 mm long (in cm)")),
+        (4000, 300, None, ("4000 mm long in mm", "--length_mm")),
+        (1e-5, 1e-6, None, ("0.01 mm long in m", "--length_mm")),
+        (420, 30, "mm", ("420 mm", "15 to 350")),
+    ],
+)
+def test_an_ambiguous_length_lists_its_readings(
+    length: float, height: float, unit: str | None, tokens: tuple[str, ...]
+):
+    with pytest.raises(UserError) as refusal:
+        true_length(length, height, unit, None)
+    assert all(token in str(refusal.value) for token in tokens)
+    assert true_length(length, height, unit, 90.0)[0] == 90.0
+
+
+def test_a_long_open_mesh_is_repaired_and_keeps_its_length(tmp_path: Path):
     mesh = mallet()
-    mesh.apply_scale(2.0)
+    mesh.apply_scale(1.9)
     mesh.update_faces(np.arange(len(mesh.faces)) != 3)
     report = bring(exported(mesh, tmp_path / "open.stl"), tmp_path / "tools")
-    assert report.record["length"] == pytest.approx(0.180, abs=1e-6)
-    assert report.record["width"] == pytest.approx(0.180 * 50 / 175, abs=1e-4)
+    assert report.record["length"] == pytest.approx(0.3325, abs=1e-5)
     assert any("repaired" in note for note in report.notes)
+    smaller = bring(tmp_path / "open.stl", tmp_path / "tools", length_mm=180.0)
+    assert smaller.record["length"] == pytest.approx(0.180, abs=1e-6)
+    assert smaller.record["width"] == pytest.approx(0.180 * 50 / 175, abs=1e-4)
+
+
+def test_small_tools_keep_their_length(tmp_path: Path):
+    """A drive socket: round, hollow at both ends, with a hexagon and a square."""
+    socket = Manifold.cylinder(25, 11, circular_segments=48)
+    socket -= Manifold.cylinder(14, 7.5, circular_segments=6).translate((0, 0, 12))
+    socket -= Manifold.cube((9.6, 9.6, 10), True).translate((0, 0, 4))
+    mesh = trimesh.Trimesh(*vertices_and_faces(socket), process=False)
+    path = exported(mesh, tmp_path / "socket.stl")
+    report = bring(path, tmp_path / "tools", category="socket", material="steel")
+    assert report.record["length"] == pytest.approx(0.025, abs=1e-5)
+    assert report.record["mass"] == pytest.approx(7850e-9 * socket.volume(), rel=1e-3)
+
+
+def test_a_tool_weighs_what_the_scale_says(plain: importer.ImportReport, tmp_path: Path):
+    path = exported(mallet(), tmp_path / "mallet.stl")
+    volume = 1e-9 * mallet().volume
+    wooden = bring(path, tmp_path / "tools", material="wood")
+    assert wooden.record["mass"] == pytest.approx(700 * volume, rel=1e-4)
+    assert wooden.record["center_of_mass"][0] < 0.05
+    assert not any("steel" in note or "guess" in note for note in wooden.notes)
+    weighed = bring(path, tmp_path / "tools", mass_g=123.0)
+    assert weighed.record["mass"] == pytest.approx(0.123, abs=1e-6)
+    assert weighed.record["center_of_mass"] == plain.record["center_of_mass"]
+    assert any("guess" in note for note in plain.notes)
+    for options, token in (
+        ({"mass_g": 9000.0}, "does not weigh 9000 g"),
+        ({"material": "cheese"}, "steel, aluminium"),
+        ({"material": "wood", "density": 700.0}, "leave out one"),
+        ({"unit": "ells"}, "mm, cm, m, inches"),
+    ):
+        with pytest.raises(UserError, match=token):
+            bring(path, tmp_path / "tools", name="other", **options)
 
 
 def test_added_surface_is_reported():
@@ -202,13 +272,6 @@ def test_a_broad_tool_keeps_its_length(tmp_path: Path):
     assert report.record["width"] == pytest.approx(0.130, abs=1e-5)
     tools = [load_tool(str(report.directory)), *map(load_tool, ("tin_snips", "s_wrench"))]
     assert len(layout_kit(tools, KitParameters()).poses) == 3
-
-
-def test_a_tool_too_high_for_a_kit_is_scaled_down(tmp_path: Path):
-    mesh = trimesh.creation.box((300, 76, 78))
-    report = bring(exported(mesh, tmp_path / "beam.stl"), tmp_path / "tools")
-    assert report.record["length"] == pytest.approx(0.170, abs=1e-5)
-    assert any(note.startswith("made 170 mm long") for note in report.notes)
 
 
 def test_bodies_are_united_and_triangle_soup_is_wrapped():
@@ -272,6 +335,7 @@ def sheet() -> trimesh.Trimesh:
     [
         (lambda: trimesh.creation.box((180, 20, 2)), "2.0 mm thick"),
         (lambda: trimesh.creation.box((180, 80, 60)), "60 mm high"),
+        (lambda: trimesh.creation.box((300, 76, 78)), "76 mm high"),
         (lambda: trimesh.creation.box((180, 150, 20)), "jaws"),
         (lambda: trimesh.creation.box((160, 150, 10)), "65 mm"),
         (sheet, "no volume"),
@@ -308,16 +372,16 @@ def test_an_invalid_file_is_rejected(tmp_path: Path, monkeypatch: pytest.MonkeyP
         file.truncate(300_000_000)
     with pytest.raises(UserError, match="200 MB"):
         bring(huge, tmp_path / "tools")
-    monkeypatch.setattr("kitting_drake.hkd.importing.repair.MOST_TRIANGLES", 20)
+    monkeypatch.setattr("kitting_drake.hkd.importing.reading.mesh_files.MOST_TRIANGLES", 20)
     with pytest.raises(UserError, match="20"):
         bring(exported(mallet(), tmp_path / "mallet.stl"), tmp_path / "tools")
     assert not (tmp_path / "tools").exists()
 
 
-def quickly_made(plain: importer.ImportReport) -> Callable[..., importer.Prepared]:
+def quickly_made(plain: importer.ImportReport) -> Callable[..., Prepared]:
     """A fast stand-in for `prepare_tool`: the mallet with the requested name and length."""
 
-    def prepare(request: ImportRequest, name: str, directory: Path) -> importer.Prepared:
+    def prepare(request: ImportRequest, name: str, directory: Path) -> Prepared:
         for path in plain.directory.iterdir():
             copy = directory / (f"{name}.sdf" if path.suffix == ".sdf" else path.name)
             copy.write_bytes(path.read_bytes())
@@ -367,6 +431,27 @@ def test_names(plain: importer.ImportReport, tmp_path: Path, monkeypatch: pytest
     assert left_in(tmp_path / "own") == ["mine", "other"]
 
 
+def test_two_runs_into_one_folder(
+    plain: importer.ImportReport, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    """What another run made meanwhile is not overwritten, unless it is of the same file."""
+    make = quickly_made(plain)
+    first = exported(mallet(), tmp_path / "first.stl")
+    second = exported(mallet(), tmp_path / "second.stl")
+
+    def overtaken(request: ImportRequest, name: str, directory: Path) -> Prepared:
+        monkeypatch.setattr(importer, "prepare_tool", make)
+        bring(first, tmp_path / "tools", name="mine")
+        return make(request, name, directory)
+
+    monkeypatch.setattr(importer, "prepare_tool", overtaken)
+    with pytest.raises(UserError, match=r"is the tool of first\.stl"):
+        bring(second, tmp_path / "tools", name="mine")
+    monkeypatch.setattr(importer, "prepare_tool", overtaken)
+    bring(first, tmp_path / "tools", name="mine")
+    assert left_in(tmp_path / "tools") == ["mine"]
+
+
 @pytest.mark.parametrize(
     "options", [{"length_mm": float("nan")}, {"length_mm": -5.0}, {"density": 1e9}]
 )
@@ -377,7 +462,7 @@ def test_numbers_out_of_range(options: dict, tmp_path: Path):
 
 def test_the_child_process(tmp_path: Path):
     path = exported(mallet(), tmp_path / "mallet.stl")
-    with pytest.raises(UserError, match="0 s"):
+    with pytest.raises(UserError, match="0 s of processor time, the last of it while "):
         import_tool(ImportRequest(path, "hammer", output=tmp_path / "tools"), time_limit=0.0)
     assert not (tmp_path / "tools").exists()
     report = import_tool(ImportRequest(path, "hammer", output=tmp_path / "tools"))
@@ -474,7 +559,7 @@ def test_a_broken_file_makes_a_complete_tool_or_none(seed: int, tmp_path: Path):
 def test_real_tools(name: str, tmp_path: Path):
     report = bring(REAL / f"{name}.obj", tmp_path / "tools", category=name.split("/")[0])
     tool = load_tool(str(report.directory))
-    assert 0.1499 < tool.length < 0.2001
+    assert 0.0149 < tool.length < 0.3501
     assert report.collision_hulls <= 16
     assert report.record["imported"]["outline_deviation"] <= 0.00035
     com = yaml.safe_load((tool.directory / "tool.yaml").read_text())["center_of_mass"]

@@ -1,0 +1,1 @@
+"""Reads meshes and drawings as their many programs write them."""

@@ -1,0 +1,177 @@
+"""Joins the curves of a drawing into the outline of one tool."""
+
+from pathlib import Path
+
+import numpy as np
+from manifold3d import CrossSection, FillRule, JoinType
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from kitting_drake.common.errors import UserError
+from kitting_drake.hkd.importing.reading.drawn_curves import FLAT_MM, DrawnCurves
+
+PAPERS_MM = (
+    ("A5", 148.0, 210.0),
+    ("A4", 210.0, 297.0),
+    ("A3", 297.0, 420.0),
+    ("A2", 420.0, 594.0),
+    ("Letter", 215.9, 279.4),
+    ("Legal", 215.9, 355.6),
+    ("Tabloid", 279.4, 431.8),
+)
+"""Names and sides of sheets of paper."""
+
+_JOIN_MM = 0.1
+"""The largest gap between ends of curves that are joined."""
+_SAME_MM = 0.05
+"""Curves within this of another are the same, drawn twice."""
+_LEAST_AREA_MM2 = 1.0
+_LINE_MM = 1.5
+"""Two outlines that are nowhere further apart are the two sides of one thick line."""
+# A rectangle is a page or frame if it has at least the first share of the page's sides, and the
+# next largest curve at least the second share of its length.
+_PAGE, _SPANS = 0.85, 0.4
+
+Points = NDArray[np.float64]
+
+
+def enclosed(drawn: DrawnCurves, path: Path) -> tuple[CrossSection, list[str]]:
+    """The area inside the largest closed curve and outside the others, and notes.
+
+    Raises:
+        UserError: a curve is open, or crosses itself, or is not inside the largest one.
+    """
+    notes: list[str] = []
+    areas = [CrossSection([loop], FillRule.EvenOdd) for loop in _joined(drawn, path, notes)]
+    areas.sort(key=lambda area: -area.area())
+    while len(areas) > 1 and (frame := _as_frame(areas[0], areas[1], drawn.page_mm)):
+        notes.append(f"left out {frame} around it")
+        areas.pop(0)
+    if not areas or areas[0].area() < _LEAST_AREA_MM2:
+        raise UserError(f"{path} has no closed curve that encloses an area")
+    outer, *holes = areas
+    if len(outer.decompose()) > 1:
+        raise UserError(f"{path}: its outline crosses itself")
+    for hole in holes:
+        if (hole - outer).area() > 0.01 * hole.area():
+            raise UserError(
+                f"{path} has a curve outside the largest one: draw the outline of one tool only"
+            )
+    inner = outer.offset(-_LINE_MM, JoinType.Round)
+    for hole in holes:
+        # The same curve drawn twice, as fill and stroke, is not a hole.
+        if hole.area() >= 0.999 * areas[0].area():
+            continue
+        if (inner - hole).area() < 0.001 * inner.area():
+            notes.append("its outline is a thick line, whose outer side counts")
+            continue
+        outer -= hole
+    return outer.simplify(FLAT_MM), notes
+
+
+def _as_frame(
+    area: CrossSection, inside: CrossSection, page_mm: tuple[float, float] | None
+) -> str | None:
+    """What the rectangle around a tool is, in words; None if it is the tool itself."""
+    x_min, y_min, x_max, y_max = area.bounds()
+    sides = np.array([x_max - x_min, y_max - y_min])
+    low = inside.bounds()
+    spans = max(low[2] - low[0], low[3] - low[1]) >= _SPANS * sides.max()
+    if area.area() < 0.999 * sides.prod() or not spans or area.area() < 1.02 * inside.area():
+        return None
+    size = f"a rectangle of {sides[0]:.0f} x {sides[1]:.0f} mm"
+    share = np.array([0.0, 0.0]) if page_mm is None else sides / page_mm
+    if ((share >= _PAGE) & (share <= 1 / _PAGE)).all():
+        return f"{size}, the page,"
+    for name, short, long in PAPERS_MM:
+        if np.abs(np.sort(sides) - (short, long)).max() < 1.0:
+            return f"{size}, a sheet of {name},"
+    return f"{size}, a frame," if sides.max() > 350.0 else None
+
+
+def _joined(drawn: DrawnCurves, path: Path, notes: list[str]) -> list[Points]:
+    """Joins curves whose ends meet into closed curves.
+
+    Raises:
+        UserError: a curve stays open.
+    """
+    # Drop the single points that some programs leave behind.
+    curves = [curve for curve in drawn.curves if np.ptp(curve.points, axis=0).max() > _JOIN_MM]
+    kept = _without_doubles([curve.points for curve in curves])
+    if len(kept) < len(curves):
+        notes.append(f"left out {len(curves) - len(kept)} curves that are drawn twice")
+    curves = [curves[index] for index in kept]
+    loops = [curve.points for curve in curves if _is_closed(curve.points)]
+    chains = [(curve.points, curve.filled) for curve in curves if not _is_closed(curve.points)]
+    while chains:
+        chain, filled = chains.pop()
+        while not _is_closed(chain) and chains:
+            ends = np.array([(other[0], other[-1]) for other, _ in chains])
+            gaps = np.linalg.norm(ends - chain[-1], axis=2)
+            index, end = np.unravel_index(int(np.argmin(gaps)), gaps.shape)
+            if gaps[index, end] > _JOIN_MM:
+                break
+            other, other_filled = chains.pop(int(index))
+            filled = filled and other_filled
+            chain = np.concatenate([chain, other if end == 0 else other[::-1]])
+        if not _is_closed(chain):
+            area = abs(CrossSection([chain], FillRule.EvenOdd).area())
+            if not filled or area < _LEAST_AREA_MM2:
+                raise _gap_error([chain, *(other for other, _ in chains)], drawn, path)
+            gap = float(np.linalg.norm(chain[-1] - chain[0]))
+            notes.append(f"closed a filled curve straight over a gap of {gap:.2f} mm")
+        loops.append(chain)
+    return loops
+
+
+def _gap_error(chains: list[Points], drawn: DrawnCurves, path: Path) -> UserError:
+    """The error of open curves, with the smallest gap between their ends and its place."""
+    ends = np.array([end for chain in chains for end in (chain[0], chain[-1])])
+    gaps = np.linalg.norm(ends[:, None] - ends, axis=2)
+    gaps[gaps <= _JOIN_MM] = np.inf
+    one, other = np.unravel_index(int(np.argmin(gaps)), gaps.shape)
+    x, y = (ends[one] + ends[other]) / 2
+    # SVG has y down, from the page's upper edge.
+    place = f"x = {x:.1f}, y = {y if drawn.page_mm is None else -y:.1f} mm"
+    return UserError(
+        f"{path} has an open curve with a gap of {gaps[one, other]:.2f} mm at {place}: close it, "
+        "or delete what does not belong to the outline"
+    )
+
+
+def _without_doubles(curves: list[Points]) -> list[int]:
+    """The indices, in order, of the curves that do not lie on a longer or earlier one."""
+    if len(curves) < 2:
+        return list(range(len(curves)))
+    lengths = np.array([np.linalg.norm(np.diff(c, axis=0), axis=1).sum() for c in curves])
+    low = np.array([curve.min(axis=0) for curve in curves])
+    high = np.array([curve.max(axis=0) for curve in curves])
+    trees: dict[int, cKDTree] = {}
+    kept: list[int] = []
+    for index in np.argsort(-lengths, kind="stable"):
+        around = np.array(kept, dtype=int)
+        within = (low[around] <= low[index] + _SAME_MM) & (high[around] >= high[index] - _SAME_MM)
+        places = _dense(curves[index], max(_SAME_MM, lengths[index] / 60))
+        for other in around[within.all(axis=1)]:
+            if other not in trees:
+                trees[other] = cKDTree(_dense(curves[other], _SAME_MM))
+            # Half a step of the dense points is added to the distance.
+            if trees[other].query(places)[0].max() <= 1.2 * _SAME_MM:
+                break
+        else:
+            kept.append(int(index))
+    return sorted(kept)
+
+
+def _dense(curve: Points, step: float) -> Points:
+    """Points of a polyline at most `step` apart, its corners among them."""
+    corners = np.linalg.norm(np.diff(curve, axis=0), axis=1)
+    pieces = [
+        start + (end - start) * np.linspace(0, 1, int(np.ceil(length / step)) + 1)[:, None]
+        for start, end, length in zip(curve[:-1], curve[1:], corners, strict=True)
+    ]
+    return np.vstack(pieces)
+
+
+def _is_closed(curve: Points) -> bool:
+    return len(curve) > 2 and bool(np.linalg.norm(curve[-1] - curve[0]) <= _JOIN_MM)

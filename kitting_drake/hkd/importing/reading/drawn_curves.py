@@ -1,0 +1,42 @@
+"""What is read from a drawing."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+FLAT_MM = 0.01
+"""The approximate tolerance of the polylines that replace curves."""
+
+UNITS_MM = {
+    "mm": 1.0,
+    "cm": 10.0,
+    "m": 1000.0,
+    "inches": 25.4,
+    "pt": 25.4 / 72,
+    "px": 25.4 / 96,
+}
+"""The units that a drawing may be in."""
+
+
+@dataclass(frozen=True)
+class Curve:
+    """A curve of a drawing."""
+
+    points: NDArray[np.float64]
+    """(n, 2), in mm, y up."""
+    filled: bool = False
+    """Whether the drawing fills it, and so shows it closed even if it is open."""
+
+
+@dataclass(frozen=True)
+class DrawnCurves:
+    """The curves of a drawing, and how it was measured."""
+
+    curves: list[Curve]
+    measured: str
+    """How lengths were measured, a phrase for the user."""
+    page_mm: tuple[float, float] | None = None
+    """The size of the page, where the drawing has one."""
+    notes: list[str] = field(default_factory=list)
+    """What was left out, a phrase each."""

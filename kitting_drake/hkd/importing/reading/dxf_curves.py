@@ -1,0 +1,83 @@
+"""Reads the curves of DXF."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from kitting_drake.common.errors import UserError
+from kitting_drake.common.extras import import_extra
+from kitting_drake.hkd.importing.reading.drawn_curves import FLAT_MM, Curve, DrawnCurves
+
+_NOTES = ("DIMENSION", "ARC_DIMENSION", "LARGE_RADIAL_DIMENSION", "LEADER", "MULTILEADER")
+"""DXF entities that annotate a drawing, so their lines do not belong to an outline."""
+
+
+def dxf_curves(path: Path, unit_mm: float | None = None) -> DrawnCurves:
+    """The curves in a DXF's model space that are plotted.
+
+    Args:
+        path: the drawing.
+        unit_mm: the length of a unit of the drawing; None follows $INSUNITS, or else is 1 mm.
+
+    Raises:
+        UserError: the file is broken.
+    """
+    ezdxf = import_extra(
+        "ezdxf", "disassemble", "path", "units", purpose="DXF", extra="fabrication"
+    )
+    try:
+        document = ezdxf.readfile(path)
+        mm, measured = _scale(ezdxf, document, path, unit_mm)
+        hidden = {
+            layer.dxf.name.lower()
+            for layer in document.layers
+            if layer.is_off() or layer.is_frozen() or not layer.dxf.get("plot", 1)
+        } | {"defpoints"}
+        unseen = 0
+
+        def is_drawn(entity: Any) -> bool:
+            layer = entity.dxf.get("layer", "0").lower()
+            seen = layer not in hidden and not entity.dxf.get("invisible", 0)
+            nonlocal unseen
+            unseen += not seen
+            return seen and entity.dxftype() not in _NOTES
+
+        whole = filter(is_drawn, document.modelspace())
+        curves = []
+        for entity in filter(is_drawn, ezdxf.disassemble.recursive_decompose(whole)):
+            try:
+                curve = ezdxf.path.make_path(entity)
+            except TypeError:
+                # Not a curve, for instance text.
+                continue
+            for part in curve.sub_paths():
+                points = [(mm * p.x, mm * p.y) for p in part.flattening(FLAT_MM / mm)]
+                curves.append(Curve(np.array(points).reshape(-1, 2)))
+        elsewhere = [name for name in document.layout_names() if name != "Model"]
+        elsewhere = [name for name in elsewhere if len(document.layout(name))]
+    except (MemoryError, UserError):
+        raise
+    except Exception as error:
+        raise UserError(f"{path} cannot be read as DXF") from error
+    if not curves and elsewhere:
+        raise UserError(
+            f"{path} has its curves in paper space ('{elsewhere[0]}'): move them to model space"
+        )
+    notes = []
+    if unseen:
+        notes.append(f"left out {unseen} entities that are hidden or not plotted")
+    return DrawnCurves(curves, measured, None, notes)
+
+
+def _scale(ezdxf: Any, document: Any, path: Path, unit_mm: float | None) -> tuple[float, str]:
+    """The length in mm of a unit, and how it is known."""
+    if unit_mm is not None:
+        return unit_mm, f"by units of {unit_mm:g} mm as requested"
+    # The reader takes files without a header to be in metres.
+    given = b"$INSUNITS" in path.read_bytes()
+    units = ezdxf.units.InsertUnits(int(document.header.get("$INSUNITS", 0)) if given else 0)
+    if units == ezdxf.units.InsertUnits.Unitless:
+        return 1.0, "in mm, because it names no unit"
+    mm = ezdxf.units.conversion_factor(units, ezdxf.units.InsertUnits.Millimeters)
+    return mm, f"by its $INSUNITS, {units.name.lower()}"

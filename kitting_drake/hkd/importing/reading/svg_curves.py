@@ -1,0 +1,192 @@
+"""Reads the curves of SVG."""
+
+import io
+import math
+import re
+import xml.etree.ElementTree as ElementTree
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from kitting_drake.common.errors import UserError
+from kitting_drake.common.extras import import_extra
+from kitting_drake.hkd.importing.reading.closed_curves import PAPERS_MM
+from kitting_drake.hkd.importing.reading.drawn_curves import Curve, DrawnCurves
+
+_RESOLUTIONS = (72, 90, 96, 150, 300)
+_STEP_MM = 0.25
+_MOST_STEPS = 400
+_NUMBER_UNIT = re.compile(r"([0-9.eE+-]+)\s*([a-z]*)")
+_UNITS = ("", "mm", "cm", "in", "pt", "pc", "px")
+_NOT_DRAWN = ("symbol", "mask", "marker", "clipPath", "pattern")
+
+
+def svg_curves(path: Path, unit_mm: float | None = None) -> DrawnCurves:
+    """The curves of an SVG that are drawn.
+
+    Lengths follow from width, height and viewBox. Pixels are 1/72 inch in files of Adobe
+    Illustrator, 1/90 inch in those of Inkscape before 0.92, and else 1/96 inch.
+
+    Args:
+        path: the drawing.
+        unit_mm: the length of a unit of the drawing; None follows the file.
+
+    Raises:
+        UserError: the file is broken, or may be of several sizes.
+    """
+    svgelements = import_extra("svgelements", purpose="SVG", extra="fabrication")
+    try:
+        text = path.read_bytes()
+        root = ElementTree.fromstring(text)
+        if root.tag.rsplit("}", 1)[-1] != "svg":
+            raise ValueError("the root is not an svg element")
+        mm, measured = _scale(root, text, unit_mm)
+        width, height = _settle_size(root)
+        _keep_from_drawing(root)
+        stream = io.StringIO(ElementTree.tostring(root, encoding="unicode"))
+        drawing = svgelements.SVG.parse(stream, width=width, height=height)
+        shapes = [e for e in drawing.elements() if isinstance(e, svgelements.Shape)]
+        shapes = [e for e in shapes if e.values.get("visibility") not in ("hidden", "collapse")]
+        # What has neither fill nor line is not seen. But some programs leave all so.
+        seen = [e for e in shapes if _is_painted(e.fill) or _is_painted(e.stroke)]
+        curves = [
+            Curve(mm * np.array(points) * (1, -1), _is_painted(shape.fill))
+            for shape in seen or shapes
+            # Convert to a path, because svgelements drops rotations of rectangles and ellipses.
+            for part in abs(svgelements.Path(shape)).as_subpaths()
+            if (points := _sampled(svgelements.Path(part), mm))
+        ]
+        page = (mm * float(drawing.width), mm * float(drawing.height))
+    except (MemoryError, UserError):
+        raise
+    except Exception as error:
+        # The reader fails in many ways on broken files.
+        raise UserError(f"{path} cannot be read as SVG") from error
+    return DrawnCurves(curves, measured, page)
+
+
+def _is_painted(colour: Any) -> bool:
+    return colour is not None and colour.value is not None and colour.opacity != 0
+
+
+def _scale(root: ElementTree.Element, text: bytes, unit_mm: float | None) -> tuple[float, str]:
+    """The length in mm of svgelements' pixel (1/96 inch of a length with a unit), and why.
+
+    Raises:
+        UserError: the drawing has no size, and nothing else tells its scale.
+    """
+    if unit_mm is not None:
+        # Without width and height, a pixel is a unit of the drawing.
+        for name in ("width", "height"):
+            root.attrib.pop(name, None)
+        return unit_mm, f"by units of {unit_mm:g} mm as requested"
+    given = [root.get(name, "").strip() for name in ("width", "height")]
+    given = [value for value in given if value not in ("", "auto") and not value.endswith("%")]
+    units = {_length(value, "width")[1] for value in given} - {"", "px"}
+    writer, dpi = _writer(root, text)
+    if units and (dpi != 90 or "viewBox" in root.attrib):
+        return 25.4 / 96, "by its width and height"
+    if writer is not None:
+        return 25.4 / dpi, f"by pixels of 1/{dpi} inch, as {writer} writes them"
+    if given:
+        return 25.4 / 96, "by pixels of 1/96 inch, because it names no unit"
+    box = root.get("viewBox", "").replace(",", " ").split()
+    sides = sorted(map(float, box[2:])) if len(box) == 4 else [0.0, 0.0]
+    for paper, short, long in PAPERS_MM:
+        for unit, mm in (("mm", 1.0), *((f"1/{n} inch", 25.4 / n) for n in _RESOLUTIONS)):
+            if abs(mm * sides[0] - short) < 0.6 and abs(mm * sides[1] - long) < 0.6:
+                return mm, f"by its page, which is {paper} in units of {unit}"
+    readings = ", ".join(
+        f"{mm * sides[1]:.0f} mm in {name}"
+        for name, mm in (("mm", 1.0), ("units of 1/72 inch", 25.4 / 72), ("1/96 inch", 25.4 / 96))
+    )
+    size = f": its page, {sides[1]:g} units long, would be {readings}" if sides[1] else ""
+    raise UserError(
+        f"the drawing gives no size in width and height{size}: set them, or give --unit or "
+        "--length_mm"
+    )
+
+
+def _writer(root: ElementTree.Element, text: bytes) -> tuple[str | None, int]:
+    """The program that wrote an SVG, if its pixels are not 1/96 inch, and its pixels per inch."""
+    head = text[:4000]
+    layers = [e.get("id", "") for e in root.iter() if e.get("data-name") or e is root]
+    illustrator = b"Adobe Illustrator" in head or b"ns.adobe.com/AdobeIllustrator" in head
+    if illustrator or any(re.fullmatch(r"(Layer|Ebene|Calque|Capa)_1", name) for name in layers):
+        return "Adobe Illustrator", 72
+    for name, value in root.attrib.items():
+        if name.endswith("/namespaces/inkscape}version"):
+            version = re.match(r"(\d+)\.(\d+)", value)
+            if version and (int(version[1]), int(version[2])) < (0, 92):
+                return f"Inkscape {version[0]}", 90
+    return None, 96
+
+
+def _settle_size(root: ElementTree.Element) -> tuple[float, float]:
+    """Completes the width and height of the root element; returns the viewBox's size in pixels.
+
+    A root that has only one of the two gets the other from the viewBox's aspect ratio. A root that
+    has neither has the returned size.
+    """
+    box = root.get("viewBox", "0 0 1000 1000").replace(",", " ").split()
+    sides = {"width": float(box[2]), "height": float(box[3])}
+    for name in sides:
+        value = root.get(name, "").strip()
+        if value == "auto" or value.endswith("%"):
+            del root.attrib[name]
+    given = [name for name in sides if name in root.attrib]
+    for name in given:
+        # Normalize lengths, because svgelements reads `200 mm` as pixels.
+        root.set(name, "".join(_length(root.attrib[name], name)))
+    if len(given) == 1 and "viewBox" in root.attrib:
+        (known,) = given
+        (other,) = sides.keys() - {known}
+        number, unit = _length(root.attrib[known], known)
+        root.set(other, f"{float(number) * sides[other] / sides[known]!r}{unit}")
+    return sides["width"], sides["height"]
+
+
+def _length(text: str, name: str) -> tuple[str, str]:
+    """The number and the unit (or "") of a length.
+
+    Raises:
+        UserError: the text is not a length in a known unit.
+    """
+    match = _NUMBER_UNIT.fullmatch(text.strip().lower())
+    if match is None or match[2] not in _UNITS:
+        units = ", ".join(unit for unit in _UNITS if unit)
+        raise UserError(f"its {name} is '{text}': give a number and one of {units}")
+    return match[1], match[2]
+
+
+def _keep_from_drawing(root: ElementTree.Element) -> None:
+    """Moves elements that are drawn only by reference into the definitions."""
+    space = root.tag.rpartition("svg")[0]
+    definitions = ElementTree.Element(f"{space}defs")
+    for parent in list(root.iter()):
+        if parent.tag == f"{space}defs":
+            continue
+        for child in list(parent):
+            if child.tag in [f"{space}{name}" for name in _NOT_DRAWN]:
+                parent.remove(child)
+                definitions.append(child)
+    root.insert(0, definitions)
+
+
+def _sampled(path: Iterable, mm: float) -> list[tuple[float, float]]:
+    """Points of a subpath of svgelements, in its units; one unit is `mm` mm."""
+    points: list[tuple[float, float]] = []
+    for segment in path:
+        if segment.end is None:
+            continue
+        straight = type(segment).__name__ in ("Move", "Line", "Close")
+        steps = 1
+        if not straight:
+            length = mm * segment.length(error=1e-3)
+            steps = min(_MOST_STEPS, max(8, math.ceil(length / _STEP_MM)))
+        for share in np.arange(1, steps + 1) / steps:
+            point = segment.end if straight else segment.point(float(share))
+            points.append((float(point.x), float(point.y)))
+    return points

@@ -1,0 +1,137 @@
+from collections.abc import Callable
+from pathlib import Path
+
+import ezdxf
+import numpy as np
+import pytest
+from ezdxf.layouts import BaseLayout
+
+from kitting_drake.common.errors import UserError
+from kitting_drake.hkd.importing.outline import read_drawing
+
+# A slot of 160 x 20 mm with a hole of 8 mm.
+AREA = 140 * 20 + np.pi * (100 - 16)
+
+
+def slot(space: BaseLayout, scale: float = 1.0, **attributes: object) -> None:
+    k = scale
+    space.add_line((0, 0), (140 * k, 0), attributes)
+    space.add_arc((140 * k, 10 * k), 10 * k, -90, 90, dxfattribs=attributes)
+    space.add_line((140 * k, 20 * k), (0, 20 * k), attributes)
+    space.add_arc((0, 10 * k), 10 * k, 90, 270, dxfattribs=attributes)
+    space.add_circle((0, 10 * k), 4 * k, attributes)
+
+
+def twice(space: BaseLayout) -> None:
+    slot(space)
+    slot(space, layer="copy")
+
+
+def twice_backwards(space: BaseLayout) -> None:
+    slot(space)
+    space.add_line((140, 0), (0, 0))
+    space.add_line((0, 20), (140, 20))
+
+
+def in_pieces(space: BaseLayout) -> None:
+    """The second time in pieces, and a hundredth of a millimetre off."""
+    slot(space)
+    space.add_line((0, 0.01), (70, 0.01))
+    space.add_line((70, 0.01), (140, 0.01))
+    space.add_arc((140, 10), 10, -90, 0)
+    space.add_lwpolyline([(140, 20), (60, 20)])
+
+
+def as_polyline_too(space: BaseLayout) -> None:
+    slot(space)
+    space.add_lwpolyline([(0, 0, 0), (140, 0, 1), (140, 20, 0), (0, 20, 1)], "xyb", close=True)
+
+
+def on_a_sheet(space: BaseLayout) -> None:
+    slot(space)
+    space.add_lwpolyline([(-50, -50), (247, -50), (247, 160), (-50, 160)], close=True)
+
+
+def with_unplotted_layers(space: BaseLayout) -> None:
+    slot(space)
+    layer = space.doc.layers.add("help")
+    layer.dxf.plot = 0
+    for name in ("help", "Defpoints"):
+        space.add_lwpolyline(
+            [(-30, -9), (190, -9), (190, 30), (-30, 30)], close=True, dxfattribs={"layer": name}
+        )
+
+
+def with_a_layout(space: BaseLayout) -> None:
+    slot(space)
+    space.doc.layout("Layout1").add_lwpolyline([(0, 0), (297, 0), (297, 210)], close=True)
+
+
+@pytest.mark.parametrize(
+    ("draw", "said"),
+    [
+        (slot, None),
+        (twice, "drawn twice"),
+        (twice_backwards, "left out 2 curves that are drawn twice"),
+        (in_pieces, "left out 4 curves that are drawn twice"),
+        (as_polyline_too, "drawn twice"),
+        (on_a_sheet, "A4"),
+        (with_unplotted_layers, "2 entities that are hidden or not plotted"),
+        (with_a_layout, None),
+    ],
+)
+def test_the_outline_is_what_is_plotted_once(
+    draw: Callable[[BaseLayout], None], said: str | None, tmp_path: Path
+):
+    document = ezdxf.new("R12" if draw in (twice, twice_backwards) else "R2018", units=4)
+    draw(document.modelspace())
+    document.saveas(tmp_path / "tool.dxf")
+    drawing = read_drawing(tmp_path / "tool.dxf")
+    assert drawing.outline.area() == pytest.approx(AREA, rel=2e-3)
+    assert said is None or said in " ".join(drawing.notes)
+
+
+@pytest.mark.parametrize(
+    ("units", "scale", "said"),
+    [(4, 1, "millimeters"), (5, 0.1, "cent"), (1, 1 / 25.4, "inches"), (6, 0.001, "meters")],
+)
+def test_a_drawing_has_the_unit_that_it_names(units: int, scale: float, said: str, tmp_path: Path):
+    document = ezdxf.new(units=units)
+    slot(document.modelspace(), scale)
+    document.saveas(tmp_path / "tool.dxf")
+    drawing = read_drawing(tmp_path / "tool.dxf")
+    assert drawing.outline.area() == pytest.approx(AREA, rel=2e-3)
+    assert said in drawing.measured
+
+
+@pytest.mark.parametrize("header", ["", "  0\nSECTION\n  2\nHEADER\n  0\nENDSEC\n"])
+def test_a_drawing_without_a_unit_is_in_mm_or_as_asked(header: str, tmp_path: Path):
+    corners = [(0, 0), (160, 0), (160, 20), (0, 20)]
+    lines = "".join(
+        f"  0\nLINE\n  8\n0\n 10\n{a[0]}\n 20\n{a[1]}\n 11\n{b[0]}\n 21\n{b[1]}\n"
+        for a, b in zip(corners, corners[1:] + corners[:1], strict=True)
+    )
+    path = tmp_path / "tool.dxf"
+    path.write_text(f"{header}  0\nSECTION\n  2\nENTITIES\n{lines}  0\nENDSEC\n  0\nEOF\n")
+    drawing = read_drawing(path)
+    assert drawing.outline.bounds() == pytest.approx((0, 0, 160, 20), abs=1e-6)
+    assert "mm, because it names no unit" in drawing.measured
+    assert read_drawing(path, 25.4).outline.area() == pytest.approx(25.4**2 * 3200, rel=1e-6)
+
+
+def test_paper_space_is_named(tmp_path: Path):
+    document = ezdxf.new(units=4)
+    slot(document.layout("Layout1"))
+    document.saveas(tmp_path / "tool.dxf")
+    with pytest.raises(UserError, match=r"paper space \('Layout1'\)"):
+        read_drawing(tmp_path / "tool.dxf")
+
+
+def test_the_smallest_gap_is_told_with_its_place(tmp_path: Path):
+    document = ezdxf.new(units=4)
+    space = document.modelspace()
+    space.add_lwpolyline([(0, 0), (160, 0), (160, 20)])
+    space.add_lwpolyline([(160, 20.3), (0, 20.3), (0, 0)])
+    document.saveas(tmp_path / "tool.dxf")
+    with pytest.raises(UserError, match=r"gap of 0\.30 mm at x = 160\.0, y = 20\.[12]"):
+        read_drawing(tmp_path / "tool.dxf")
