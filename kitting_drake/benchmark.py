@@ -160,7 +160,7 @@ def _add_endurance(benchmarks: Any) -> argparse.ArgumentParser:
         type=_duration,
         default=10.0,
         metavar="SECONDS",
-        help="time in which a person or a conveyor exchanges the kit and brings the next tools (10)",
+        help="time for exchanging the kit and bringing the next tools (10)",
     )
     endurance.add_argument(
         "--seed", type=seed_type, help="seed of the first scene (default: the scenario's)"
