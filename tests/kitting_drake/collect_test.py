@@ -15,11 +15,11 @@ import pytest
 from rich.console import Console
 
 import kitting_drake.collect as collecting
-from kitting_drake.collect import Collection, next_seed
 from kitting_drake.common.errors import UserError
 from kitting_drake.common.files import alone_in
 from kitting_drake.common.processes import LocalWorkers, ProcessCrashed
 from kitting_drake.common.seeds import DEMONSTRATION_SEEDS, TEST_SEEDS, VALIDATION_SEEDS, seeds_from
+from kitting_drake.episode.collection import Collection, next_seed
 from kitting_drake.policies.data.demonstrations import (
     Demonstration,
     Origin,
