@@ -42,7 +42,7 @@ from kitting_drake.policies.data.frames import (
     DEFAULT_WIDTH,
     RATES,
     EpisodeFrames,
-    Recording,
+    FrameSettings,
 )
 from kitting_drake.policies.data.lerobot_export import (
     export_lerobot,
@@ -162,7 +162,7 @@ class _Export:
 
     folder: Path
     frames: Path
-    recording: Recording
+    recording: FrameSettings
     instruction: str
 
     @staticmethod
@@ -173,7 +173,7 @@ class _Export:
             UserError: a flag cannot be used, or pyarrow is not installed.
         """
         require_pyarrow()
-        named = Recording(arguments.fps, arguments.image_width, tuple(arguments.cameras))
+        named = FrameSettings(arguments.fps, arguments.image_width, tuple(arguments.cameras))
         cameras = chosen_cameras(named, chosen.scenario.cameras)
         return _Export(
             folder=folder / "lerobot",
@@ -272,7 +272,7 @@ def _run(
 
 
 def _demonstrate(
-    chosen: ChosenScenario, seed: int, log: Path | None, recording: Recording | None
+    chosen: ChosenScenario, seed: int, log: Path | None, recording: FrameSettings | None
 ) -> tuple[Demonstration | Rejection, EpisodeFrames | None]:
     # Without rendering, the station would have no cameras.
     require_rendering()

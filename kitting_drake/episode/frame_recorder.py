@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 from pydrake.systems.framework import Context
 
 from kitting_drake.episode.joint_view import JointView
-from kitting_drake.policies.data.frames import EpisodeFrames, Recording, encode_png, image_key
+from kitting_drake.policies.data.frames import EpisodeFrames, FrameSettings, encode_png, image_key
 from kitting_drake.station import KittingStation
 from systems.placement import ALL
 
@@ -18,7 +18,7 @@ class FrameRecorder:
     A frame is taken at the step nearest to each multiple of the period.
     """
 
-    def __init__(self, station: KittingStation, recording: Recording) -> None:
+    def __init__(self, station: KittingStation, recording: FrameSettings) -> None:
         """
         Args:
             station: the station of the episode, with cameras.

@@ -9,13 +9,13 @@ from numpy.typing import NDArray
 from pydrake.systems.framework import Context
 
 from kitting_drake.common.errors import UserError
-from kitting_drake.policies.data.frames import GRIPPER, Recording, image_key, reduce_image
+from kitting_drake.policies.data.frames import GRIPPER, FrameSettings, image_key, reduce_image
 from kitting_drake.station import KittingStation
 from kitting_drake.station.robot import joint_names
 from systems.trajectory_controller import FINGERS
 
 
-def chosen_cameras(recording: Recording, cameras: dict[str, Any]) -> tuple[str, ...]:
+def chosen_cameras(recording: FrameSettings, cameras: dict[str, Any]) -> tuple[str, ...]:
     """The names of the recorded cameras: all those of a scenario if the recording names none.
 
     Raises:
@@ -30,7 +30,7 @@ def chosen_cameras(recording: Recording, cameras: dict[str, Any]) -> tuple[str, 
 class JointView:
     """Reads frames off a station."""
 
-    def __init__(self, station: KittingStation, recording: Recording) -> None:
+    def __init__(self, station: KittingStation, recording: FrameSettings) -> None:
         """
         Args:
             station: with the cameras.

@@ -28,7 +28,7 @@ from kitting_drake.policies.data.frames import (
     DEFAULT_WIDTH,
     GRIPPER,
     STATE,
-    Recording,
+    FrameSettings,
     image_key,
 )
 from kitting_drake.scenario.choosing import find_scenario
@@ -85,7 +85,7 @@ class JointEnvironment(gymnasium.Env[dict[str, NDArray[Any]], NDArray[np.float32
         if render_mode not in (None, *self.metadata["render_modes"]):
             raise ValueError(f"render_mode must be rgb_array or None, not {render_mode!r}")
         self._chosen = find_scenario(Path(scenario), scenario_name, scenario_text, perturb)
-        self._recording = Recording(fps, image_width, tuple(cameras))
+        self._recording = FrameSettings(fps, image_width, tuple(cameras))
         self.render_mode = render_mode
         self.metadata = {**self.metadata, "render_fps": fps}
         config = self._chosen.scenario

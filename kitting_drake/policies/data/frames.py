@@ -36,7 +36,7 @@ def image_key(camera: str) -> str:
 
 
 @dataclass(frozen=True)
-class Recording:
+class FrameSettings:
     """How episodes are recorded."""
 
     fps: int = DEFAULT_RATE
@@ -61,7 +61,7 @@ class Recording:
         return max(1, round(scale * width)), max(1, round(scale * height))
 
 
-def reduce_image(image: NDArray[np.uint8], recording: Recording) -> NDArray[np.uint8]:
+def reduce_image(image: NDArray[np.uint8], recording: FrameSettings) -> NDArray[np.uint8]:
     """An image (height, width, 3) at the recorded size; each pixel is the mean of its area."""
     height, width = image.shape[:2]
     size = recording.size(width, height)
