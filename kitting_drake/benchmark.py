@@ -1,9 +1,11 @@
 """`python -m kitting_drake.benchmark NAME`: measures, prints tables and saves them.
 
-NAME is simulation, networks, kits, recovery, reliability, reach, mujoco, trace or paper.
+NAME is simulation, networks, kits, recovery, endurance, reliability, reach, mujoco, trace, fits or
+paper.
 """
 
 import argparse
+import math
 import os
 from pathlib import Path
 from typing import Any
@@ -12,8 +14,11 @@ from rich.console import Console
 from rich.table import Table
 
 from kitting_drake.common.command_line import FAILED, count_type, run_command, seed_type
-from kitting_drake.common.files import require_folder, write_atomically, write_json
+from kitting_drake.common.errors import UserError
+from kitting_drake.common.files import alone_in, require_folder, write_atomically, write_json
+from kitting_drake.common.provenance import uncommitted_note
 from kitting_drake.scenario.choosing import add_scenario_flags, choose_scenario
+from kitting_drake.scenario.workers import add_workers_flags, open_workers
 
 
 def main() -> int:
@@ -25,6 +30,8 @@ def main() -> int:
         return _paper(arguments, console, folder)
     if arguments.benchmark == "recovery":
         return _recovery(arguments, console, folder)
+    if arguments.benchmark == "endurance":
+        return _endurance(arguments, console, folder)
     measure = {
         "simulation": _simulation,
         "networks": _networks,
@@ -77,6 +84,7 @@ def _parser() -> argparse.ArgumentParser:
         "--episodes", type=count_type, default=10, help="episodes per failure (10)"
     )
     recovery.add_argument("--seed", type=seed_type, default=0, help="seed of the first episode (0)")
+    endurance = _add_endurance(benchmarks)
     opinion = benchmarks.add_parser(
         "mujoco", help="compare the resting poses of placed tools in Drake and MuJoCo"
     )
@@ -152,11 +160,54 @@ def _parser() -> argparse.ArgumentParser:
     paper.add_argument("--workers", type=count_type, default=1, help="parallel episodes (1)")
     every = (simulation, networks, kits, recovery, opinion, reliability, tracing, reach, paper)
     for benchmark in every:
+    for benchmark in (
+        simulation,
+        networks,
+        kits,
+        recovery,
+        endurance,
+        opinion,
+        reliability,
+        paper,
+    ):
         benchmark.add_argument(
             "--output", type=Path, default=Path("output/benchmark"), help="folder for the files"
         )
         benchmark.add_argument("--quiet", action="store_true", help="print nothing but errors")
     return parser
+
+
+def _add_endurance(benchmarks: Any) -> argparse.ArgumentParser:
+    endurance = benchmarks.add_parser(
+        "endurance", help="a simulated shift: units an hour, time between assists, cycle times"
+    )
+    add_scenario_flags(endurance)
+    endurance.add_argument(
+        "--hours", type=_duration, default=8.0, help="simulated length of the shift (8)"
+    )
+    endurance.add_argument(
+        "--exchange",
+        type=_duration,
+        default=10.0,
+        metavar="SECONDS",
+        help="time for exchanging the kit and bringing the next tools (10)",
+    )
+    endurance.add_argument(
+        "--seed", type=seed_type, help="seed of the first scene (default: the scenario's)"
+    )
+    add_workers_flags(endurance)
+    return endurance
+
+
+def _duration(text: str) -> float:
+    """Parses a finite duration of at least 0."""
+    try:
+        duration = float(text)
+    except ValueError:
+        duration = -1.0
+    if not 0.0 <= duration < math.inf:
+        raise argparse.ArgumentTypeError(f"'{text}' is not a number of 0 or more")
+    return duration
 
 
 # Each benchmark imports its own modules lazily.
@@ -233,6 +284,42 @@ def _reach(arguments: argparse.Namespace, console: Console, folder: Path) -> lis
     write_json(folder / "reach.json", measured)
     write_atomically(folder / "reach.png", draw_reach(measured))
     return [reach_table(measured)]
+
+
+def _endurance(arguments: argparse.Namespace, console: Console, folder: Path) -> int:
+    """Runs a shift; returns the exit code."""
+    from kitting_drake.episode.chosen import build_any_chosen
+    from kitting_drake.reproduction.benchmarks.endurance import run_shift, summarise_shift
+    from kitting_drake.reproduction.benchmarks.endurance_report import (
+        draw_endurance,
+        endurance_table,
+    )
+
+    chosen = choose_scenario(arguments)
+    seed = chosen.scenario.random_seed if arguments.seed is None else arguments.seed
+    if arguments.hours == 0.0:
+        raise UserError("--hours is 0: use a positive number")
+    if note := uncommitted_note():
+        console.print(f"note: {note}", highlight=False, markup=False)
+    # Fail early if no scene can be built.
+    build_any_chosen(chosen, range(seed, seed + 5))
+    with alone_in(folder), open_workers(arguments, chosen) as (workers, sent):
+        scenes = run_shift(
+            chosen,
+            arguments.hours,
+            arguments.exchange,
+            seed,
+            folder,
+            workers=workers,
+            sent=sent,
+            console=console,
+        )
+        measured = summarise_shift(scenes, chosen, arguments.exchange)
+        write_json(folder / "endurance.json", measured)
+        write_atomically(folder / "endurance.png", draw_endurance(measured, scenes))
+    console.print(endurance_table(measured))
+    console.print(f"files: {folder}/", highlight=False, markup=False)
+    return FAILED if measured["failed_scenes"] == measured["scenes"] else 0
 
 
 def _reliability(arguments: argparse.Namespace, console: Console, folder: Path) -> list[Table]:

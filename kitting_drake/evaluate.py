@@ -6,7 +6,6 @@ import time
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from rich.console import Console
 
@@ -16,7 +15,6 @@ from kitting_drake.common.files import (
     alone_in,
     append_line,
     claim_folder,
-    files_digest,
     read_lines,
     require_folder,
     write_json,
@@ -27,7 +25,7 @@ from kitting_drake.common.processes import (
     counting_bar,
     side_by_side,
 )
-from kitting_drake.common.provenance import commit, uncommitted_note, versions
+from kitting_drake.common.provenance import commit, uncommitted_note
 from kitting_drake.common.seeds import ALL_SEEDS
 from kitting_drake.episode import EpisodeResult
 from kitting_drake.episode.chosen import build_any_chosen, build_chosen, run_chosen
@@ -145,7 +143,7 @@ def evaluate(
     """
     seeds = list(seeds)
     path = folder / "episodes.jsonl"
-    claim_folder(folder, "scenario.json", _identity(chosen), of="scenario, policy or version")
+    claim_folder(folder, "scenario.json", chosen.identity(), of="scenario, policy or version")
     clock = _WallClock(folder / "wall_seconds.json")
     earlier = read_lines(path)
     if not all(isinstance(item, dict) and {"seed", "objects"} <= item.keys() for item in earlier):
@@ -187,19 +185,6 @@ class _WallClock:
         total = self._earlier + time.perf_counter() - self._start
         write_json(self._path, {"wall_seconds_total": total})
         return total
-
-
-def _identity(chosen: ChosenScenario) -> dict[str, Any]:
-    """The identity of an evaluation: the scenario, versions and digests of its input files."""
-    scenario = chosen.scenario
-    return {
-        **chosen.described,
-        "versions": versions(),
-        "policy_digest": scenario.policy.digest(chosen.base),
-        # The type depends on the machine, and results differ between types.
-        "compute_type": scenario.policy.details(chosen.base).get("compute_type"),
-        "task_digest": files_digest(scenario.task.input_files(chosen.base)),
-    }
 
 
 def run_in_worker(

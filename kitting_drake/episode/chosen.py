@@ -4,12 +4,12 @@ import itertools
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
-from pydrake.systems.framework import Diagram
+from pydrake.systems.framework import Context, Diagram
 
 from kitting_drake.common.errors import MachineError, UserError
 from kitting_drake.episode.episode import EpisodeResult, run_episode
 from kitting_drake.episode.episode_log import EpisodeLog
-from kitting_drake.episode.events import EpisodeObserver
+from kitting_drake.episode.events import EpisodeObserver, Sampler
 from kitting_drake.scenario.choosing import ChosenScenario
 from kitting_drake.station import KittingStation, build_station, with_policy
 
@@ -56,10 +56,12 @@ def run_chosen(
     realtime_rate: float = 0.0,
     observers: Sequence[EpisodeObserver] = (),
     log: Path | None = None,
+    sampler: Sampler | None = None,
 ) -> EpisodeResult:
     """Calls `run_episode` with a Diagram fresh from `build_chosen`; writes a log if `log` names a
-    file."""
+    file. The sampler is called after every step."""
     episode_log = None if log is None else EpisodeLog(station)
+    both = [item for item in (episode_log, sampler) if item is not None]
     result = run_episode(
         diagram,
         station,
@@ -67,8 +69,19 @@ def run_chosen(
         policy=chosen.policy,
         realtime_rate=realtime_rate,
         observers=observers,
-        log=episode_log,
+        log=_Samplers(both) if both else None,
     )
     if episode_log is not None and log is not None:
         episode_log.save(log)
     return result
+
+
+class _Samplers:
+    """Several samplers as one."""
+
+    def __init__(self, samplers: Sequence[Sampler]) -> None:
+        self._samplers = samplers
+
+    def sample(self, root_context: Context) -> None:
+        for sampler in self._samplers:
+            sampler.sample(root_context)

@@ -11,8 +11,7 @@ from pydrake.systems.framework import Context, Diagram, EventStatus
 
 from kitting_drake.episode.action_log import ActionLog
 from kitting_drake.episode.ending import Remainder, find_left_over, is_right
-from kitting_drake.episode.episode_log import EpisodeLog
-from kitting_drake.episode.events import EpisodeObserver, ModeChange
+from kitting_drake.episode.events import EpisodeObserver, ModeChange, Sampler
 from kitting_drake.station import KittingStation
 from kitting_drake.tasks.task import ActionRecord
 from systems.pick_place_parameters import Mode
@@ -100,7 +99,7 @@ def run_episode(
     policy: str,
     realtime_rate: float = 0.0,
     observers: Sequence[EpisodeObserver] = (),
-    log: EpisodeLog | None = None,
+    log: Sampler | None = None,
 ) -> EpisodeResult:
     """Runs an episode until the planner is done and the objects rest, or until the time limit.
 
@@ -141,7 +140,7 @@ class Episode:
         policy: str,
         realtime_rate: float = 0.0,
         observers: Sequence[EpisodeObserver] = (),
-        log: EpisodeLog | None = None,
+        log: Sampler | None = None,
         pauses: bool = False,
     ) -> None:
         """
@@ -313,7 +312,7 @@ class _Monitor:
         self,
         station: KittingStation,
         observers: Sequence[EpisodeObserver],
-        log: EpisodeLog | None,
+        log: Sampler | None,
         *,
         pauses: bool,
     ) -> None:

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Protocol
 
 from pydrake.systems.framework import Context
 
@@ -37,3 +38,10 @@ class ModeChange:
 
 EpisodeObserver = Callable[[ModeChange], None]
 """Called with every event, in order."""
+
+
+class Sampler(Protocol):
+    """Called after every step, in order."""
+
+    def sample(self, root_context: Context) -> None:
+        """Reads what it needs from the context of the outermost Diagram, and does not change it."""

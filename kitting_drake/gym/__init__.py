@@ -21,10 +21,18 @@ SCENARIOS = {
 }
 """The file and the scenario of each environment, except for `Scenario`, which gets them by
 argument."""
+JOINTS = "KittingJoint"
+"""The environment that takes joint targets. By default its scenario is that of `KittingUnseen`."""
 
 
 def _register_environments() -> None:
-    """Registers `kitting_drake/NAME-v0` for each of `SCENARIOS` and for `Scenario`."""
+    """Registers `kitting_drake/NAME-v0` for each of `SCENARIOS`, `Scenario` and `JOINTS`."""
+    usual, usual_name = SCENARIOS["KittingUnseen"]
+    gymnasium.register(
+        f"kitting_drake/{JOINTS}-v0",
+        entry_point="kitting_drake.gym.joint_environment:JointEnvironment",
+        kwargs={"scenario": str(paths.SCENARIOS / usual), "scenario_name": usual_name},
+    )
     for name in ("Scenario", *SCENARIOS):
         file, scenario = SCENARIOS.get(name, (None, None))
         gymnasium.register(

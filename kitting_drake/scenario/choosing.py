@@ -8,7 +8,9 @@ from pathlib import Path
 from typing import Any
 
 from kitting_drake.common.errors import UserError
+from kitting_drake.common.files import files_digest
 from kitting_drake.common.paths import SCENARIOS
+from kitting_drake.common.provenance import versions
 from kitting_drake.scenario.description import describe
 from kitting_drake.scenario.loader import load_scenario
 from kitting_drake.scenario.perturbations import LEVELS, NAMES
@@ -86,6 +88,19 @@ class ChosenScenario:
     def described(self) -> dict[str, Any]:
         """The whole scenario with its defaults, as JSON values; variants have a `_tag`."""
         return describe(self.scenario)
+
+    def identity(self) -> dict[str, Any]:
+        """What episodes depend on, and what resumed runs must share: the scenario, versions and
+        digests of its input files."""
+        scenario = self.scenario
+        return {
+            **self.described,
+            "versions": versions(),
+            "policy_digest": scenario.policy.digest(self.base),
+            # The type depends on the machine, and results differ between types.
+            "compute_type": scenario.policy.details(self.base).get("compute_type"),
+            "task_digest": files_digest(scenario.task.input_files(self.base)),
+        }
 
 
 def choose_scenario(arguments: argparse.Namespace) -> ChosenScenario:

@@ -31,6 +31,7 @@ _EXPORTED = {
     "counts": "counts",
     "desired_motion": "commanded",
     "desired_opening": "commanded_opening",
+    "closing_force": "commanded_closing_force",
 }
 """Names of the planner's output ports, and the station's names for them."""
 
@@ -56,6 +57,8 @@ def add_control(
     projector: HeightmapProjector | None,
     motion: RobotMotion,
     seed: int,
+    *,
+    takes_joint_targets: bool = False,
 ) -> PickPlacePlanner:
     """Adds planner and controller, connects them to the plant, and exports their ports.
 
@@ -68,6 +71,8 @@ def add_control(
             its heights.
         motion: the robot's.
         seed: the seed of the noise of an arm's wrist force.
+        takes_joint_targets: whether the controller's inputs are exported, instead of connected to
+            the planner.
     """
     planner = builder.AddNamedSystem(
         "planner",
@@ -91,7 +96,11 @@ def add_control(
     if driven.wrist_moment is not None:
         builder.Connect(driven.wrist_moment, planner.GetInputPort("wrist_moment"))
     for port in ("desired_motion", "desired_opening", "closing_force"):
-        builder.Connect(planner.GetOutputPort(port), driven.controller.GetInputPort(port))
+        target = driven.controller.GetInputPort(port)
+        if takes_joint_targets:
+            builder.ExportInput(target, port)
+        else:
+            builder.Connect(planner.GetOutputPort(port), target)
     for port, name in _EXPORTED.items():
         builder.ExportOutput(planner.GetOutputPort(port), name)
     builder.ExportOutput(driven.actuation, "actuation")

@@ -51,6 +51,9 @@ class KittingStation(Diagram):
         name: KittingStation
         input_ports:
         - action
+        - desired_motion (with takes_joint_targets)
+        - desired_opening (with takes_joint_targets)
+        - closing_force (with takes_joint_targets)
         output_ports:
         - observation
         - observation_heights
@@ -67,6 +70,7 @@ class KittingStation(Diagram):
         - actuation
         - commanded
         - commanded_opening
+        - commanded_closing_force
         - body_poses
         - contact_results
         - query_object
@@ -84,6 +88,8 @@ class KittingStation(Diagram):
         - camera_pose_<camera>
 
     - `action` (abstract, `PickPlaceAction`): evaluated only when the planner needs an action.
+    - `desired_motion` (12 or 21), `desired_opening` (2), `closing_force` (1): the controller's
+      inputs, see `TrajectoryController`. They replace the planner's commands.
     - `observation` (abstract, `Observation`): o_t. `observation_heights`: o_t without colours;
       evaluating it renders no colour images. These and the camera ports exist only if the scenario
       has cameras and the machine can render.
@@ -97,7 +103,7 @@ class KittingStation(Diagram):
     - `actuation` (6 or 9): actuation of the joints (N, N m) and of each finger (N). An arm's is
       that of the last step.
     - `commanded` (12 or 21): q_d, v_d, a_d of the joints. `commanded_opening` (2): the opening
-      between the pads in m, and its rate.
+      between the pads in m, and its rate. `commanded_closing_force` (1): of each pad, in N.
     - `body_poses`, `contact_results`: the plant's. `query_object`: the scene graph's.
     - `at_rest` (n): the `RestDetector`'s; 1 for an object at rest.
     - `placements` to `height_error`: the `PlacementMonitor`'s.
@@ -111,7 +117,9 @@ class KittingStation(Diagram):
     during the episode.
     """
 
-    def __init__(self, scenario: Scenario, *, seed: int, base: Path) -> None:
+    def __init__(
+        self, scenario: Scenario, *, seed: int, base: Path, takes_joint_targets: bool = False
+    ) -> None:
         """See `build_station`."""
         super().__init__()
         self.scenario, self.seed, self.base = scenario, seed, base
@@ -144,7 +152,16 @@ class KittingStation(Diagram):
             builder.ExportOutput(projector.GetOutputPort("heights"), "observation_heights")
         self.has_cameras = projector is not None
         """Whether the port `observation` exists."""
-        planner = add_control(builder, scenario, self.scene, self.plant, projector, motion, seed)
+        planner = add_control(
+            builder,
+            scenario,
+            self.scene,
+            self.plant,
+            projector,
+            motion,
+            seed,
+            takes_joint_targets=takes_joint_targets,
+        )
         self._add_score_and_rest(builder)
         self._feeder = self._add_feeder(builder)
         for system in (self._monitor, self._feeder):
@@ -374,18 +391,26 @@ class KittingStation(Diagram):
         return geometry
 
 
-def build_station(scenario: Scenario, seed: int = 0, base: Path | None = None) -> KittingStation:
+def build_station(
+    scenario: Scenario,
+    seed: int = 0,
+    base: Path | None = None,
+    *,
+    takes_joint_targets: bool = False,
+) -> KittingStation:
     """Builds the station of a scenario.
 
     Args:
         scenario: what to build, except for its policy (see `station.policy`).
         seed: the seed of the scene and of all noise; see `TaskConfig.make_scene`.
         base: base folder of the scenario's relative paths; None: the working directory.
+        takes_joint_targets: whether the caller commands the joints, in place of the planner.
 
     Raises:
         UserError: the scenario is invalid.
     """
-    return KittingStation(scenario, seed=seed, base=Path.cwd() if base is None else base)
+    folder = Path.cwd() if base is None else base
+    return KittingStation(scenario, seed=seed, base=folder, takes_joint_targets=takes_joint_targets)
 
 
 def _check_scene(scenario: Scenario, scene: Scene) -> None:

@@ -15,11 +15,11 @@ import pytest
 from rich.console import Console
 
 import kitting_drake.collect as collecting
-from kitting_drake.collect import Collection, next_seed
 from kitting_drake.common.errors import UserError
 from kitting_drake.common.files import alone_in
 from kitting_drake.common.processes import LocalWorkers, ProcessCrashed
 from kitting_drake.common.seeds import DEMONSTRATION_SEEDS, TEST_SEEDS, VALIDATION_SEEDS, seeds_from
+from kitting_drake.episode.collection import Collection, next_seed
 from kitting_drake.policies.data.demonstrations import (
     Demonstration,
     Origin,
@@ -27,6 +27,7 @@ from kitting_drake.policies.data.demonstrations import (
     read_contents,
     read_demonstrations,
 )
+from kitting_drake.policies.data.frames import EpisodeFrames
 from kitting_drake.policies.data.recorded import DemonstrationStep
 from systems.signals import Observation, PickPlaceAction, PixelGrid, PlanarPose
 
@@ -231,6 +232,23 @@ def test_a_seed_killed_from_outside_is_not_rejected(tmp_path: Path):
     assert collect(tmp_path, 2).asked == [12]
 
 
+class Recorder:
+    """Workers whose oracle demonstrates immediately, with three frames."""
+
+    def __init__(self) -> None:
+        self.recorded: list[int] = []
+
+    def run(self, function, chosen, seed, log, settings):
+        found, frames = Oracle()(seed), None
+        if settings is not None and isinstance(found, Demonstration):
+            self.recorded.append(seed)
+            zeros = np.zeros((3, 5), np.float32)
+            ends = np.array([False, False, True])
+            names = tuple("abcde")
+            frames = EpisodeFrames(seed, settings.fps, names, zeros, zeros, zeros[:, 0], ends)
+        return found, frames
+
+
 def arguments(folder: Path, *more: object) -> list[str]:
     return ["collect", "scenarios/kitting_oracle.yaml", "--output", str(folder), *map(str, more)]
 
@@ -272,7 +290,7 @@ def test_a_finished_collection_is_not_repeated(
     monkeypatch.chdir(ROOT)
     monkeypatch.setattr(collecting, "require_rendering", lambda: None)
     monkeypatch.setattr(collecting, "build_any_chosen", lambda *_, **__: None)
-    monkeypatch.setattr(LocalWorkers, "run", lambda _, __, ___, seed, ____: Oracle()(seed))
+    monkeypatch.setattr(LocalWorkers, "run", Recorder().run)
     monkeypatch.setattr(sys, "argv", arguments(tmp_path, "--demos", 3, "--seed", 10))
     assert collecting.main() == 0
     assert "holds 3 demonstrations, 1 seed rejected; " in capsys.readouterr().out
@@ -302,7 +320,8 @@ def test_demonstrations_are_exported(
     monkeypatch.setattr(sys.modules[__name__], "GRID", PixelGrid())
     monkeypatch.setattr(collecting, "require_rendering", lambda: None)
     monkeypatch.setattr(collecting, "build_any_chosen", lambda *_, **__: None)
-    monkeypatch.setattr(LocalWorkers, "run", lambda _, __, ___, seed, ____: Oracle()(seed))
+    recorder = Recorder()
+    monkeypatch.setattr(LocalWorkers, "run", recorder.run)
 
     def main(demos: int, *more: str) -> str:
         monkeypatch.setattr(sys, "argv", arguments(tmp_path, "--demos", demos, "--seed", 10, *more))
@@ -311,21 +330,29 @@ def test_demonstrations_are_exported(
 
     main(1)
     assert not (tmp_path / "lerobot").exists()
-    # Exports existing demonstrations without collecting; repeating it changes nothing.
+    # Frames that are missing are recorded without collecting; repeating it changes nothing.
     told = main(1, "--export", "lerobot")
     assert told.startswith("nothing to collect: ")
     assert told.endswith(f"as a LeRobotDataset: {tmp_path / 'lerobot'}/\n")
+    assert recorder.recorded == [10]
     before = (tmp_path / "lerobot").stat()
     main(1, "--export", "lerobot")
     assert (tmp_path / "lerobot").stat() == before
     # An export of other demonstrations is refused before collecting.
-    with pytest.raises(UserError, match="lerobot exists"):
+    with pytest.raises(UserError, match="lerobot already exists"):
         main(2, "--export", "lerobot")
+    with pytest.raises(UserError, match=r"frames holds the files of another recording \(fps is 20"):
+        main(2, "--export", "lerobot", "--fps", "20")
     assert len(read_demonstrations(tmp_path / "demonstrations.h5").demonstrations) == 1
     shutil.rmtree(tmp_path / "lerobot")
+    # A rejected episode has no frames.
     assert "holds 2 demonstrations" in main(2, "--export", "lerobot")
+    assert recorder.recorded == [10, 12]
     info = json.loads((tmp_path / "lerobot" / "meta" / "info.json").read_text())
-    assert (info["total_episodes"], info["total_frames"]) == (2, 2)
+    assert (info["total_episodes"], info["total_frames"], info["fps"]) == (2, 6, 16)
+    for flags in (["--fps", "60"], ["--cameras", "rear"]):
+        with pytest.raises(UserError, match=r"fps is 60: use 10 to 30|no camera 'rear'"):
+            main(2, "--export", "lerobot", *flags)
 
 
 ONE_TOOL = """

@@ -1,25 +1,21 @@
-"""Demonstrations as a LeRobotDataset v3.0, which LeRobot loads without conversion.
+"""Frames of episodes as a LeRobotDataset v3.0, which LeRobot loads without conversion.
 
 See docs/learning.md, and https://huggingface.co/docs/lerobot/lerobot-dataset-v3 for the format:
 Parquet files of frames (`data/`) and of episodes (`meta/episodes/`), tasks (`meta/tasks.parquet`),
 statistics (`meta/stats.json`) and features (`meta/info.json`). The export needs pyarrow, but
 neither LeRobot nor torch.
 
-A demonstration is an episode. A frame is a decision, one pick and one place, rather than a time
-step. Colours are PNG and heights are TIFF of float32, both inside the Parquet files, because video
-compression would be lossy. Metadata that LeRobot does not know (grid, seeds, scenario, versions) is
-in `meta/kitting_drake.json`.
+Images are PNG inside the Parquet files: they are small, and video would be lossy. What LeRobot does
+not know (seeds, scenario, versions) is in `meta/kitting_drake.json`.
 """
 
 from __future__ import annotations
 
 import contextlib
-import dataclasses
 import io
 import itertools
 import json
 import os
-import re
 import shutil
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
@@ -32,31 +28,21 @@ from PIL import Image
 
 from kitting_drake.common.errors import UserError
 from kitting_drake.common.extras import import_extra
-from kitting_drake.common.files import write_json
-from kitting_drake.policies.data.demonstrations import (
-    Demonstration,
-    Demonstrations,
-    Origin,
-    content_digest,
-    read_demonstrations,
+from kitting_drake.common.files import files_digest, write_json
+from kitting_drake.policies.data.frames import (
+    ACTION,
+    STATE,
+    EpisodeFrames,
+    image_key,
+    read_frames,
 )
 from kitting_drake.policies.data.lerobot_statistics import aggregate, statistics_of
-from systems.signals import PixelGrid
 
-ACTION = ("pick_x", "pick_y", "pick_theta", "place_x", "place_y", "place_theta", "stop")
-"""The entries of an action as in the Gymnasium environments (`kitting_drake.gym.spaces`): gripper
-poses in the world, in metres and radians, and whether to stop instead (0 or 1)."""
+Track = Callable[[Sequence[Path]], Iterable[Path]]
+"""Iterates over files and shows progress, as `rich.progress.track` does."""
 
-COLOUR = "observation.images.colour"
-HEIGHT = "observation.images.height"
-
-Track = Callable[[Sequence[Demonstration]], Iterable[Demonstration]]
-"""Iterates over demonstrations and shows progress, as `rich.progress.track` does."""
-
-FPS = 1
-"""Decisions per second. It is nominal, because LeRobot requires a value: `timestamp` counts
-decisions."""
-
+_MOST_MEASURED = 50
+"""So many images of an episode enter the statistics, evenly spaced."""
 _MEGABYTES = 100
 """The largest size of a file of frames, LeRobot's default; the next episode begins a new file."""
 _FILES_PER_CHUNK = 1000
@@ -76,38 +62,45 @@ def require_export(folder: Path) -> None:
 
 
 def export_lerobot(
-    source: Path, folder: Path, task: str | None = None, *, track: Track = iter
+    sources: Sequence[Path],
+    folder: Path,
+    task: str,
+    *,
+    robot: str | None = None,
+    about: dict[str, Any] | None = None,
+    track: Track = iter,
 ) -> None:
-    """Writes demonstrations as a LeRobotDataset, episode by episode, atomically.
+    """Writes episodes as a LeRobotDataset, one by one, atomically.
 
     A folder that already holds this export is left unchanged.
 
     Args:
-        source: a file of demonstrations, from `collect` or `demonstrate`.
+        sources: files of `EpisodeFrames`, with equal rates, names and cameras.
         folder: the new dataset.
-        task: the instruction to policies, in words; None for the name of the scenario's task.
-        track: shows progress over the demonstrations.
+        task: the instruction to policies, in words.
+        robot: the robot's name.
+        about: further values for `meta/kitting_drake.json`.
+        track: shows progress over the files.
 
     Raises:
-        UserError: the demonstrations are unusable, the folder holds something else or cannot be
-            written, or pyarrow is not installed.
+        UserError: the episodes are unusable, the folder holds something else or cannot be written,
+            or pyarrow is not installed.
     """
     pyarrow = require_pyarrow()
-    read = read_demonstrations(source)
-    if not read.demonstrations:
-        raise UserError(f"{source} holds no demonstrations: collect some")
-    task = task or _task(read.origin)
-    record = _record(read, task)
+    if not sources:
+        raise UserError(f"{folder}: there are no episodes to export: collect some")
+    described = {"task": task, "content": files_digest(sources), **(about or {})}
+    record = json.loads(json.dumps(described, default=str))
     if folder.exists():
         if _found(folder / _RECORD) == record:
             return
-        raise UserError(f"{folder} exists but is not an export of the current {source}: delete it")
+        raise UserError(f"{folder} exists but is not an export of these episodes: delete it")
     scratch = folder.with_name(f".{folder.name}.scratch")
     try:
         # Remove what a killed process left.
         shutil.rmtree(scratch, ignore_errors=True)
         (scratch / "meta").mkdir(parents=True)
-        _write(pyarrow, scratch, read, task, track)
+        _write(pyarrow, scratch, sources, task, robot, track)
         write_json(scratch / _RECORD, record)
         os.replace(scratch, folder)
     except OSError as error:
@@ -116,12 +109,16 @@ def export_lerobot(
         shutil.rmtree(scratch, ignore_errors=True)
 
 
-def features(grid: PixelGrid) -> dict[str, dict[str, Any]]:
-    """The `features` of `meta/info.json`, which are the columns of a frame."""
+def features(first: EpisodeFrames) -> dict[str, dict[str, Any]]:
+    """The `features` of `meta/info.json`, which are the columns of a frame.
+
+    Args:
+        first: an episode, with at least one frame.
+    """
     sides = ["height", "width", "channels"]
     scalars = {
-        "object": "string",
-        "category": "string",
+        "next.reward": "float32",
+        "next.success": "bool",
         "next.done": "bool",
         "timestamp": "float32",
         "frame_index": "int64",
@@ -129,37 +126,30 @@ def features(grid: PixelGrid) -> dict[str, dict[str, Any]]:
         "index": "int64",
         "task_index": "int64",
     }
-    # LeRobot treats a single channel of metric values as a depth map. These are heights above
-    # `grid.z_min`, not depths below a camera.
-    height = {"is_depth_map": True, "depth_unit": "m"}
+    images = {
+        image_key(camera): {
+            "dtype": "image",
+            "shape": list(decode(pictures[0]).shape),
+            "names": sides,
+        }
+        for camera, pictures in first.images.items()
+    }
+    joints = {"dtype": "float32", "shape": [len(first.names)], "names": list(first.names)}
     return {
-        COLOUR: {"dtype": "image", "shape": [*grid.shape, 3], "names": sides},
-        HEIGHT: {"dtype": "image", "shape": [*grid.shape, 1], "names": sides, "info": height},
-        "action": {"dtype": "float32", "shape": [len(ACTION)], "names": list(ACTION)},
+        **images,
+        STATE: joints,
+        ACTION: joints,
         **{name: {"dtype": kind, "shape": [1], "names": None} for name, kind in scalars.items()},
     }
 
 
+def decode(picture: bytes) -> NDArray[np.uint8]:
+    """(height, width, 3) of a PNG."""
+    return np.asarray(Image.open(io.BytesIO(picture)))
+
+
 def require_pyarrow() -> ModuleType:
     return import_extra("pyarrow", "parquet", purpose="--export lerobot", extra="lerobot")
-
-
-def _task(origin: Origin) -> str:
-    """The task's name in words: `stack block pyramid` for `!StackBlockPyramid`."""
-    task = origin.scenario.get("task", origin.scenario_name)
-    name = str(task["_tag"] if isinstance(task, dict) else task)
-    return re.sub(r"(?<=[a-z])(?=[A-Z])", " ", name.lstrip("!")).lower()
-
-
-def _record(read: Demonstrations, task: str) -> dict[str, Any]:
-    origin = dataclasses.asdict(read.origin)
-    described = {
-        "task": task,
-        "episode_seeds": [item.seed for item in read.demonstrations],
-        "content": content_digest(read.demonstrations),
-        **origin,
-    }
-    return json.loads(json.dumps(described, default=str))
 
 
 def _found(path: Path) -> Any:
@@ -170,22 +160,26 @@ def _found(path: Path) -> Any:
 
 
 def _write(
-    pyarrow: ModuleType, folder: Path, read: Demonstrations, task: str, track: Track
+    pyarrow: ModuleType,
+    folder: Path,
+    sources: Sequence[Path],
+    task: str,
+    robot: str | None,
+    track: Track,
 ) -> None:
-    described = features(read.origin.grid)
+    first = read_frames(sources[0])
+    described = features(first)
     episodes: list[dict[str, Any]] = []
     of_episodes: list[dict[str, Any]] = []
     frames = 0
     with contextlib.closing(_DataFiles(pyarrow, folder, described)) as data:
-        for number, demonstration in enumerate(track(read.demonstrations)):
-            columns = _columns(demonstration, number, frames)
-            count = len(columns["index"])
+        for number, source in enumerate(track(sources)):
+            read = read_frames(source)
+            _check_alike(read, first, source)
+            columns = _columns(read, number, frames)
+            count = len(read)
             chunk, file = data.write(columns)
-            statistics = {
-                name: statistics_of(columns[name], image=described[name]["dtype"] == "image")
-                for name in described
-                if described[name]["dtype"] != "string"
-            }
+            statistics = _statistics(columns, described)
             episode = {
                 "episode_index": number,
                 "tasks": [task],
@@ -213,20 +207,44 @@ def _write(
     write_json(folder / "meta" / "stats.json", aggregated)
     info = {
         "codebase_version": "v3.0",
-        "robot_type": None,
+        "robot_type": robot,
         "total_episodes": len(episodes),
         "total_frames": frames,
         "total_tasks": 1,
         "chunks_size": _FILES_PER_CHUNK,
         "data_files_size_in_mb": _MEGABYTES,
         "video_files_size_in_mb": 200,
-        "fps": FPS,
+        "fps": first.fps,
         "splits": {"train": f"0:{len(episodes)}"},
         "data_path": _DATA,
         "video_path": None,
         "features": described,
     }
     write_json(folder / "meta" / "info.json", info)
+
+
+def _check_alike(read: EpisodeFrames, first: EpisodeFrames, source: Path) -> None:
+    for name in ("fps", "names"):
+        if getattr(read, name) != getattr(first, name):
+            raise UserError(
+                f"{source}: {name} is {getattr(read, name)}, but {getattr(first, name)} in the "
+                "first episode"
+            )
+    if list(read.images) != list(first.images) or not len(read):
+        raise UserError(f"{source}: it has other cameras than the first episode, or no frames")
+
+
+def _statistics(
+    columns: dict[str, Any], described: dict[str, dict[str, Any]]
+) -> dict[str, dict[str, NDArray[Any]]]:
+    found = {}
+    for name, feature in described.items():
+        values = columns[name]
+        if image := feature["dtype"] == "image":
+            chosen = np.linspace(0, len(values) - 1, min(len(values), _MOST_MEASURED)).astype(int)
+            values = np.stack([decode(values[index]) for index in chosen])
+        found[name] = statistics_of(values, image=image)
+    return found
 
 
 def _write_tasks(pyarrow: ModuleType, path: Path, task: str) -> None:
@@ -249,38 +267,27 @@ def _write_tasks(pyarrow: ModuleType, path: Path, task: str) -> None:
     )
 
 
-def _columns(demonstration: Demonstration, number: int, first: int) -> dict[str, Any]:
-    """An episode's frames by feature: one per step, and one for the final observation.
-
-    The final frame is labelled stop and repeats the last step's poses, which keeps placeholders out
-    of the statistics.
+def _columns(read: EpisodeFrames, number: int, first: int) -> dict[str, Any]:
+    """An episode's frames by feature.
 
     Args:
-        demonstration: the episode; without a final observation it has no stop frame.
-        number: the episode's index.
+        read: the episode.
+        number: its index.
         first: the index of its first frame.
     """
-    steps, final = demonstration.steps, demonstration.final
-    seen = [*steps, *([final] if final else [])]
-    poses = np.array([[*step.pick.as_array(), *step.place.as_array()] for step in steps])
-    action = np.zeros((len(seen), len(ACTION)), np.float32)
-    action[: len(steps), :-1] = poses
-    action[len(steps) :, :-1] = poses[-1]
-    action[len(steps) :, -1] = 1.0
-    frame = np.arange(len(seen))
-    nothing = [""] * (len(seen) - len(steps))
+    frame = np.arange(len(read))
     return {
-        COLOUR: np.stack([np.moveaxis(np.asarray(item.rgb), 0, -1) for item in seen]),
-        HEIGHT: np.stack([np.asarray(item.height)[..., None] for item in seen]),
-        "action": action,
-        "object": [*(step.object for step in steps), *nothing],
-        "category": [*(step.category for step in steps), *nothing],
-        "next.done": frame == len(seen) - 1,
-        "timestamp": (frame / FPS).astype(np.float32),
+        **{image_key(camera): pictures for camera, pictures in read.images.items()},
+        STATE: read.state,
+        ACTION: read.action,
+        "next.reward": read.reward,
+        "next.success": read.success,
+        "next.done": frame == len(read) - 1,
+        "timestamp": (frame / read.fps).astype(np.float32),
         "frame_index": frame,
-        "episode_index": np.full(len(seen), number),
+        "episode_index": np.full(len(read), number),
         "index": first + frame,
-        "task_index": np.zeros(len(seen), np.int64),
+        "task_index": np.zeros(len(read), np.int64),
     }
 
 
@@ -335,21 +342,8 @@ class _DataFiles:
 
     def _encoded(self, name: str, values: Any) -> Any:
         if self._described[name]["dtype"] == "image":
-            encode = _tiff if self._described[name]["shape"][-1] == 1 else _png
-            return [{"bytes": encode(image), "path": None} for image in values]
+            return [{"bytes": picture, "path": None} for picture in values]
         return list(values)
-
-
-def _png(image: NDArray[np.uint8]) -> bytes:
-    content = io.BytesIO()
-    Image.fromarray(np.ascontiguousarray(image)).save(content, "PNG")
-    return content.getvalue()
-
-
-def _tiff(image: NDArray[np.float32]) -> bytes:
-    content = io.BytesIO()
-    Image.fromarray(image[..., 0]).save(content, "TIFF", compression="tiff_adobe_deflate")
-    return content.getvalue()
 
 
 def _hugging_face(feature: dict[str, Any]) -> dict[str, Any]:

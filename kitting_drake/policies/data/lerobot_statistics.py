@@ -1,6 +1,7 @@
 """The normalisation statistics of a LeRobotDataset (see `lerobot_export`).
 
-They equal those of `lerobot.datasets.compute_stats`, but use every pixel instead of a subset.
+They equal those of `lerobot.datasets.compute_stats`, but use every pixel of an image instead of a
+subset.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Tests of `kitting_drake.collect.DemonstrationRecorder`."""
+"""Tests of `DemonstrationRecorder`."""
 
 import dataclasses
 import itertools
@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from pydrake.systems.framework import Context
 
-from kitting_drake.collect import DemonstrationRecorder
 from kitting_drake.episode import EpisodeObserver, EpisodeResult, ModeChange
+from kitting_drake.episode.demonstration_recorder import DemonstrationRecorder
 from kitting_drake.policies.data.demonstrations import Demonstration, Rejection
 from kitting_drake.policies.data.recorded import DemonstrationStep
 from kitting_drake.scenario import Scenario

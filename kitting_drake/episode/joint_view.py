@@ -1,0 +1,75 @@
+"""A station as learners of joint motions see it: camera images, state, and joint targets."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pydrake.systems.framework import Context
+
+from kitting_drake.common.errors import UserError
+from kitting_drake.policies.data.frames import GRIPPER, FrameSettings, image_key, reduce_image
+from kitting_drake.station import KittingStation
+from kitting_drake.station.robot import joint_names
+from systems.trajectory_controller import FINGERS
+
+
+def chosen_cameras(recording: FrameSettings, cameras: dict[str, Any]) -> tuple[str, ...]:
+    """The names of the recorded cameras: all those of a scenario if the recording names none.
+
+    Raises:
+        UserError: a name is unknown.
+    """
+    for name in recording.cameras:
+        if name not in cameras:
+            raise UserError(f"there is no camera '{name}': the scenario has {', '.join(cameras)}")
+    return recording.cameras or tuple(cameras)
+
+
+class JointView:
+    """Reads frames off a station."""
+
+    def __init__(self, station: KittingStation, recording: FrameSettings) -> None:
+        """
+        Args:
+            station: with the cameras.
+            recording: chooses cameras and image size.
+
+        Raises:
+            UserError: there is no such camera.
+        """
+        self._station, self._recording = station, recording
+        self.cameras = chosen_cameras(recording, station.scenario.cameras)
+        joints = joint_names(station.scenario.robot)
+        self.names = (*joints, GRIPPER)
+        """Of the entries of state and command."""
+        self._joints = len(joints)
+        self._stiffness = station.scenario.controller.finger_stiffness
+
+    def state(self, root_context: Context) -> NDArray[np.float32]:
+        """(entries) the joints' positions and the opening between the pads, in rad and m."""
+        state, j = self._port(root_context, "robot_state"), self._joints
+        return np.array([*state[:j], sum(state[j : j + FINGERS])], np.float32)
+
+    def command(self, root_context: Context) -> NDArray[np.float32]:
+        """(entries) the planner's present targets. The opening includes the closing force: the
+        fingers' springs pull as hard towards it as towards the planner's opening with that
+        force."""
+        joints = self._port(root_context, "commanded")[: self._joints]
+        opening = self._port(root_context, "commanded_opening")[0]
+        force = self._port(root_context, "commanded_closing_force")[0]
+        # See `FingerLaw`: a force f closes as an opening that is 2 f / k_w smaller.
+        return np.array([*joints, opening - 2 * force / self._stiffness], np.float32)
+
+    def images(self, root_context: Context) -> dict[str, NDArray[np.uint8]]:
+        """By `image_key`, (height, width, 3): what the cameras see, with the scenario's noise."""
+        found = {}
+        for camera in self.cameras:
+            image = self._port(root_context, f"color_image_{camera}").data[:, :, :3]
+            found[image_key(camera)] = reduce_image(np.ascontiguousarray(image), self._recording)
+        return found
+
+    def _port(self, root_context: Context, name: str) -> Any:
+        station = self._station
+        return station.GetOutputPort(name).Eval(station.GetMyContextFromRoot(root_context))

@@ -1,0 +1,153 @@
+"""Episodes as frames at a fixed rate: camera images, joints and commands, for learners of today.
+
+The names are those of LeRobot datasets, and of the environments in `kitting_drake.gym` that take
+joint targets.
+"""
+
+from __future__ import annotations
+
+import io
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from kitting_drake.common.errors import UserError
+from kitting_drake.common.files import write_atomically
+
+STATE = "observation.state"
+ACTION = "action"
+GRIPPER = "gripper"
+"""The last entry of state and action. State: the opening between the pads, in m. Action: the
+opening that the fingers' springs pull towards. Below the width of the held object it grips, and
+negative values grip more firmly."""
+RATES = range(10, 31)
+"""Permitted frames per second."""
+DEFAULT_RATE = 16
+"""Divides the 128 steps of a second, so that frames are equally far apart."""
+DEFAULT_WIDTH = 160
+
+
+def image_key(camera: str) -> str:
+    """The name of a camera's images."""
+    return f"observation.images.{camera}"
+
+
+@dataclass(frozen=True)
+class FrameSettings:
+    """How episodes are recorded."""
+
+    fps: int = DEFAULT_RATE
+    """Frames per simulated second, one of `RATES`."""
+    width: int = DEFAULT_WIDTH
+    """Largest width of the images, in pixels."""
+    cameras: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        """Raises:
+        UserError: the rate or the width cannot be used.
+        """
+        if self.fps not in RATES:
+            raise UserError(f"fps is {self.fps}: use {RATES[0]} to {RATES[-1]}")
+        if self.width < 16:
+            raise UserError(f"image_width is {self.width}: use at least 16")
+
+    def size(self, width: int, height: int) -> tuple[int, int]:
+        """Width and height of the recorded images of a camera, in pixels: the same shape, not
+        enlarged."""
+        scale = min(1.0, self.width / width)
+        return max(1, round(scale * width)), max(1, round(scale * height))
+
+
+def reduce_image(image: NDArray[np.uint8], recording: FrameSettings) -> NDArray[np.uint8]:
+    """An image (height, width, 3) at the recorded size; each pixel is the mean of its area."""
+    height, width = image.shape[:2]
+    size = recording.size(width, height)
+    if size == (width, height):
+        return image
+    return np.asarray(Image.fromarray(image).resize(size, Image.Resampling.BOX))
+
+
+def encode_png(image: NDArray[np.uint8]) -> bytes:
+    """An image (height, width, 3) as PNG."""
+    content = io.BytesIO()
+    Image.fromarray(np.ascontiguousarray(image)).save(content, "PNG")
+    return content.getvalue()
+
+
+@dataclass
+class EpisodeFrames:
+    """The frames of an episode, n of them."""
+
+    seed: int
+    fps: int
+    names: tuple[str, ...]
+    """Of the entries of state and action: the joints that move the hand, then `GRIPPER`."""
+    state: NDArray[np.float32]
+    """(n, entries) measured; m and rad."""
+    action: NDArray[np.float32]
+    """(n, entries) the command that holds when the next frame is taken."""
+    reward: NDArray[np.float32]
+    """(n) the task's reward earned until the next frame."""
+    success: NDArray[np.bool_]
+    """(n) whether every goal is filled at the next frame."""
+    images: dict[str, list[bytes]] = field(default_factory=dict)
+    """By camera, a PNG for each frame."""
+
+    def __len__(self) -> int:
+        return len(self.state)
+
+    def save(self, path: Path) -> None:
+        """Writes a `.npz` file atomically.
+
+        Raises:
+            MachineError: writing fails.
+        """
+        arrays = {
+            "seed": np.array(self.seed),
+            "fps": np.array(self.fps),
+            "names": np.array(self.names),
+            "cameras": np.array(list(self.images), dtype=np.str_),
+            "state": self.state,
+            "action": self.action,
+            "reward": self.reward,
+            "success": self.success,
+        }
+        for camera, pictures in self.images.items():
+            arrays[f"sizes {camera}"] = np.array([len(item) for item in pictures])
+            arrays[f"images {camera}"] = np.frombuffer(b"".join(pictures), np.uint8)
+        buffer = io.BytesIO()
+        np.savez(buffer, allow_pickle=False, **arrays)
+        write_atomically(path, buffer.getvalue())
+
+
+def read_frames(path: Path) -> EpisodeFrames:
+    """Reads a file of `EpisodeFrames.save`.
+
+    Raises:
+        UserError: the file is unusable.
+    """
+    try:
+        with np.load(path) as file:
+            images = {}
+            for camera in file["cameras"].tolist():
+                ends = np.cumsum(file[f"sizes {camera}"]).tolist()
+                content = file[f"images {camera}"].tobytes()
+                starts = [0, *ends[:-1]]
+                images[camera] = [content[a:b] for a, b in zip(starts, ends, strict=True)]
+            return EpisodeFrames(
+                seed=int(file["seed"]),
+                fps=int(file["fps"]),
+                names=tuple(file["names"].tolist()),
+                state=file["state"],
+                action=file["action"],
+                reward=file["reward"],
+                success=file["success"],
+                images=images,
+            )
+    except FileNotFoundError as error:
+        raise UserError(f"there is no file {path}") from error
+    except (OSError, ValueError, KeyError) as error:
+        raise UserError(f"{path} is damaged: delete it, and collect again") from error
