@@ -1,6 +1,6 @@
 """`python -m kitting_drake.benchmark NAME`: measures, prints tables and saves them.
 
-NAME is simulation, networks, kits, recovery, reliability, mujoco or paper.
+NAME is simulation, networks, kits, fits, recovery, reliability, mujoco or paper.
 """
 
 import argparse
@@ -12,7 +12,7 @@ from rich.console import Console
 from rich.table import Table
 
 from kitting_drake.common.command_line import FAILED, count_type, run_command, seed_type
-from kitting_drake.common.files import require_folder, write_atomically, write_json
+from kitting_drake.common.files import alone_in, require_folder, write_atomically, write_json
 from kitting_drake.scenario.choosing import add_scenario_flags, choose_scenario
 
 
@@ -29,6 +29,7 @@ def main() -> int:
         "simulation": _simulation,
         "networks": _networks,
         "kits": _kits,
+        "fits": _fits,
         "mujoco": _mujoco,
         "reliability": _reliability,
     }[arguments.benchmark]
@@ -69,6 +70,13 @@ def _parser() -> argparse.ArgumentParser:
         "kits", help="building time, clearance and size of the dataset's kits"
     )
     kits.add_argument("--kits", type=count_type, help="number of kits of each split (default: all)")
+    fits = benchmarks.add_parser(
+        "fits", help="strict success and peak force against the clearance; resumes"
+    )
+    fits.add_argument(
+        "--episodes", type=count_type, default=5, help="episodes of four tools per condition (5)"
+    )
+    fits.add_argument("--seed", type=seed_type, default=0, help="seed of the first episode (0)")
     recovery = benchmarks.add_parser("recovery", help="a policy's recovery from failed actions")
     add_scenario_flags(recovery)
     recovery.add_argument(
@@ -123,7 +131,7 @@ def _parser() -> argparse.ArgumentParser:
         help="folder of the table of runs, which finished cells are added to (docs/results)",
     )
     paper.add_argument("--workers", type=count_type, default=1, help="parallel episodes (1)")
-    for benchmark in (simulation, networks, kits, recovery, opinion, reliability, paper):
+    for benchmark in (simulation, networks, kits, fits, recovery, opinion, reliability, paper):
         benchmark.add_argument(
             "--output", type=Path, default=Path("output/benchmark"), help="folder for the files"
         )
@@ -153,6 +161,17 @@ def _kits(arguments: argparse.Namespace, console: Console, folder: Path) -> list
     measured = benchmark_kits(arguments.kits, console)
     write_json(folder / "kits.json", measured)
     return [kits_table(measured)]
+
+
+def _fits(arguments: argparse.Namespace, console: Console, folder: Path) -> list[Table]:
+    from kitting_drake.reproduction.benchmarks.fits_benchmark import fits_table, measure_fits
+    from kitting_drake.reproduction.benchmarks.fits_figure import draw_fits
+
+    with alone_in(folder):
+        measured = measure_fits(arguments.episodes, arguments.seed, folder, console)
+        write_json(folder / "fits.json", measured)
+        write_atomically(folder / "fits.png", draw_fits(measured))
+    return [fits_table(measured)]
 
 
 def _networks(arguments: argparse.Namespace, console: Console, folder: Path) -> list[Table]:

@@ -46,7 +46,7 @@ def fine_hulls(
     """
     solid = Manifold.batch_boolean([_solid(part) for part in parts], OpType.Add)
     outline = CrossSection(solid.project().to_polygons())
-    # The grid's steps are large enough for Drake, which refuses facets of less than about 1e-10 m^2.
+    # The grid's steps are large enough for Drake, which refuses facets below about 1e-10 m^2.
     grid = inside / 2
     # The outline is moved inside, simplified to both sides of that, and then loses vertices.
     third = inside / 3

@@ -15,7 +15,7 @@ from kitting_drake.hkd.tools.fine_hulls import INSIDE_MM, NOTCH_MM, fine_hulls
 from kitting_drake.hkd.tools.meshes import write_convex_obj
 from kitting_drake.hkd.tools.tool import Tool
 
-_FORMAT_VERSION = "1"
+_FORMAT_VERSION = "3"
 """Part of the cache keys. Change it when equal inputs give other files."""
 _STIFFER = 25.0
 """The factor of the contact's modulus, so that walls do not sink in by more than the clearance."""
