@@ -36,6 +36,7 @@ def main() -> int:
         "simulation": _simulation,
         "networks": _networks,
         "kits": _kits,
+        "fits": _fits,
         "mujoco": _mujoco,
         "reliability": _reliability,
         "trace": _trace,
@@ -78,13 +79,20 @@ def _parser() -> argparse.ArgumentParser:
         "kits", help="building time, clearance and size of the dataset's kits"
     )
     kits.add_argument("--kits", type=count_type, help="number of kits of each split (default: all)")
+    fits = benchmarks.add_parser(
+        "fits", help="strict success and peak force against the clearance; resumes"
+    )
+    fits.add_argument(
+        "--episodes", type=count_type, default=5, help="episodes of four tools per condition (5)"
+    )
+    fits.add_argument("--seed", type=seed_type, default=0, help="seed of the first episode (0)")
     recovery = benchmarks.add_parser("recovery", help="a policy's recovery from failed actions")
     add_scenario_flags(recovery)
     recovery.add_argument(
         "--episodes", type=count_type, default=10, help="episodes per failure (10)"
     )
     recovery.add_argument("--seed", type=seed_type, default=0, help="seed of the first episode (0)")
-    endurance = _add_endurance(benchmarks)
+    _add_endurance(benchmarks)
     opinion = benchmarks.add_parser(
         "mujoco", help="compare the resting poses of placed tools in Drake and MuJoCo"
     )
@@ -158,18 +166,7 @@ def _parser() -> argparse.ArgumentParser:
         help="folder of the table of runs, which finished cells are added to (docs/results)",
     )
     paper.add_argument("--workers", type=count_type, default=1, help="parallel episodes (1)")
-    every = (simulation, networks, kits, recovery, opinion, reliability, tracing, reach, paper)
-    for benchmark in every:
-    for benchmark in (
-        simulation,
-        networks,
-        kits,
-        recovery,
-        endurance,
-        opinion,
-        reliability,
-        paper,
-    ):
+    for benchmark in benchmarks.choices.values():
         benchmark.add_argument(
             "--output", type=Path, default=Path("output/benchmark"), help="folder for the files"
         )
@@ -177,7 +174,7 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-def _add_endurance(benchmarks: Any) -> argparse.ArgumentParser:
+def _add_endurance(benchmarks: Any) -> None:
     endurance = benchmarks.add_parser(
         "endurance", help="a simulated shift: units an hour, time between assists, cycle times"
     )
@@ -196,7 +193,6 @@ def _add_endurance(benchmarks: Any) -> argparse.ArgumentParser:
         "--seed", type=seed_type, help="seed of the first scene (default: the scenario's)"
     )
     add_workers_flags(endurance)
-    return endurance
 
 
 def _duration(text: str) -> float:
@@ -232,6 +228,17 @@ def _kits(arguments: argparse.Namespace, console: Console, folder: Path) -> list
     measured = benchmark_kits(arguments.kits, console)
     write_json(folder / "kits.json", measured)
     return [kits_table(measured)]
+
+
+def _fits(arguments: argparse.Namespace, console: Console, folder: Path) -> list[Table]:
+    from kitting_drake.reproduction.benchmarks.fits_benchmark import fits_table, measure_fits
+    from kitting_drake.reproduction.benchmarks.fits_figure import draw_fits
+
+    with alone_in(folder):
+        measured = measure_fits(arguments.episodes, arguments.seed, folder, console)
+        write_json(folder / "fits.json", measured)
+        write_atomically(folder / "fits.png", draw_fits(measured))
+    return [fits_table(measured)]
 
 
 def _networks(arguments: argparse.Namespace, console: Console, folder: Path) -> list[Table]:

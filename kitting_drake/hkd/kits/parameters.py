@@ -1,8 +1,13 @@
 """The template of a kit."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from systems.bounds import bounded
+
+TIGHT = 0.001
+"""Cavities with less clearance than this, in metres, need finer contact geometry."""
+_FINEST = 5e-6
+"""The least tolerance of a tight cavity, in metres."""
 
 
 @dataclass
@@ -15,7 +20,9 @@ class KitParameters:
     width: float = bounded(0.260, 0.05, 1.0)
     height: float = bounded(0.050, 0.01, 0.2)
 
-    # Free space between a seated tool's outline and the wall.
+    # Free space between a seated tool's outline and the wall. Below 1 mm, the tools get collision
+    # hulls whose outlines are within 0.05 mm of the true ones, and the tolerance is at most a
+    # twentieth of the clearance.
     clearance: float = bounded(0.002, 0.0, 0.01)
 
     # Radius of the morphological closing: notches narrower than twice this are bridged.
@@ -38,3 +45,13 @@ class KitParameters:
 
     # Give a nested block the length and width above, instead of the smallest size found.
     fixed_size: bool = False
+
+    @property
+    def is_tight(self) -> bool:
+        """Whether the clearance needs finer contact geometry."""
+        return self.clearance < TIGHT
+
+    def with_fine_walls(self) -> "KitParameters":
+        """The parameters with a tolerance that suits a tight clearance."""
+        finest = max(self.clearance / 20, _FINEST)
+        return replace(self, tolerance=min(self.tolerance, finest)) if self.is_tight else self

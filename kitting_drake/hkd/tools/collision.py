@@ -54,7 +54,10 @@ def furthest(inner: CrossSection, outer: CrossSection) -> float:
 
 
 def thinned(
-    points: np.ndarray, tolerance: float, outline_tolerance: float | None = None
+    points: np.ndarray,
+    tolerance: float,
+    outline_tolerance: float | None = None,
+    grid: float = GRID_MM,
 ) -> np.ndarray:
     """Selects vertices (m, 3) whose hull is within about `tolerance` of the hull of `points`.
 
@@ -65,6 +68,7 @@ def thinned(
         points: (n, 3) in mm.
         tolerance: in mm.
         outline_tolerance: a tolerance for the outline from above, in mm; `tolerance` if None.
+        grid: the spacing of the grid in mm.
     """
     points = points[ConvexHull(points).vertices]
     touching = np.flatnonzero(points[:, 2] < 1e-3)
@@ -74,7 +78,7 @@ def thinned(
     if outline_tolerance is not None:
         seeds = _farthest(points[:, :2], seeds, outline_tolerance)
     chosen = points[_farthest(points, seeds, tolerance)]
-    snapped = np.round(np.round(chosen / GRID_MM) * GRID_MM, 3) + 0.0
+    snapped = np.round(np.round(chosen / grid) * grid, 3) + 0.0
     return np.unique(snapped[ConvexHull(snapped).vertices], axis=0)
 
 

@@ -39,7 +39,7 @@ class ArrangedKitting(KittingTask):
         return "arranged"
 
     def make_scene(self, *, grid: PixelGrid, seed: int, base: Path) -> Scene:
-        tools = load_tools(self.tools, base)
+        tools = self.fitted(load_tools(self.tools, base))
         check_grasps(tools, ANNOTATE)
         kit = self.kit_of(tools)
         poses = list(self.tools.values())

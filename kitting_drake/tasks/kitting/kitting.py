@@ -15,6 +15,7 @@ from kitting_drake.hkd.grasps.all_grasps import all_grasps
 from kitting_drake.hkd.kits.kit import Kit, make_kit
 from kitting_drake.hkd.kits.layout import MOST_TOOLS
 from kitting_drake.hkd.kits.parameters import KitParameters
+from kitting_drake.hkd.tools.fine_tool import fine_tool
 from kitting_drake.hkd.tools.scaling import scaled_tool, weighted_tool
 from kitting_drake.hkd.tools.tool import Tool
 from kitting_drake.hkd.tools.toolsets import SPLITS, toolsets
@@ -85,10 +86,20 @@ class KittingTask(TaskConfig):
     ) -> str:
         return diagnosis.find_cause(scene, index, X_WB[index], placement, records)
 
+    def fitted(self, tools: Sequence[Tool]) -> list[Tool]:
+        """The tools with the collision geometry that the kit's clearance needs.
+
+        Raises:
+            UserError: a tool's surface is not closed.
+        """
+        if not self.kit.is_tight:
+            return list(tools)
+        return [fine_tool(tool, self.kit.closing_radius) for tool in tools]
+
     def kit_of(self, tools: Sequence[Tool]) -> Kit:
         """The kit of some tools; raises UserError if there is none."""
         try:
-            return make_kit(tools, self.kit)
+            return make_kit(tools, self.kit.with_fine_walls())
         except UserError as error:
             raise type(error)(f"task.kit: {error}") from error
 
@@ -139,7 +150,7 @@ class _DrawnKitting(KittingTask):
         return () if self.start == APART and not self.tray else ("distractors",)
 
     def _draw_scene(self, tools: list[Tool], grid: PixelGrid, seed: int) -> Scene:
-        tools = self._weighted(tools, seed)
+        tools = self.fitted(self._weighted(tools, seed))
         if self.start != APART or self.tray:
             return self._draw_settled(self.kit_of(tools), tools, grid, seed)
         # Streams of their own: with one level kit, the poses are those of a seed without them.
