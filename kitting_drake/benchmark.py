@@ -296,8 +296,8 @@ def _reach(arguments: argparse.Namespace, console: Console, folder: Path) -> lis
 def _endurance(arguments: argparse.Namespace, console: Console, folder: Path) -> int:
     """Runs a shift; returns the exit code."""
     from kitting_drake.episode.chosen import build_any_chosen
-    from kitting_drake.reproduction.benchmarks.endurance import run_shift, summarise_shift
-    from kitting_drake.reproduction.benchmarks.endurance_report import (
+    from kitting_drake.reproduction.benchmarks.shift.endurance import run_shift, summarise_shift
+    from kitting_drake.reproduction.benchmarks.shift.endurance_report import (
         draw_endurance,
         endurance_table,
     )

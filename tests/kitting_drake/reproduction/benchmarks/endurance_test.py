@@ -11,14 +11,17 @@ from kitting_drake.common.errors import UserError
 from kitting_drake.episode import EpisodeResult
 from kitting_drake.episode.episode import ObjectResult
 from kitting_drake.reproduction.benchmarks import endurance
-from kitting_drake.reproduction.benchmarks.endurance import (
+from kitting_drake.reproduction.benchmarks.shift.endurance import (
     ShiftScene,
     is_on_table,
     run_shift,
     shift_scene,
     summarise_shift,
 )
-from kitting_drake.reproduction.benchmarks.endurance_report import draw_endurance, endurance_table
+from kitting_drake.reproduction.benchmarks.shift.endurance_report import (
+    draw_endurance,
+    endurance_table,
+)
 from kitting_drake.scenario.choosing import ChosenScenario
 from kitting_drake.scenario.schema import Scenario
 from kitting_drake.tasks import Kitting

@@ -10,7 +10,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from rich.table import Table
 
-from kitting_drake.reproduction.benchmarks.endurance import HOUR, ShiftScene
+from kitting_drake.reproduction.benchmarks.shift.endurance import HOUR, ShiftScene
 
 _COLOURS = ("#d55e00", "#cc79a7", "#e69f00", "#8c6d1f", "#56b4e9", "#009e73", "#0072b2")
 _MARKERS = "ov^sDPX*"

@@ -1,0 +1,1 @@
+"""Simulated shifts: running them, their summary and report."""
