@@ -30,6 +30,9 @@ _FARTHEST_STOP = 0.02
 """A hand that is further away from its command than this stays at its command, in m."""
 _SAME_HEIGHT = 0.003
 
+_JAW_ROOM = 0.005
+"""How far each pad stays from an object of known width before a grasp, in m."""
+
 _TOUCH_SPEED = 0.011
 """An arm's limit of `touch_speed`, in m/s. Its hand moves 10 to 25 kg, a floating hand 4 kg,
 and the force of an impact is proportional to mass times speed."""
@@ -63,6 +66,7 @@ class ArmMotion(JawMotion):
     """
 
     size = 3 * JOINTS
+    settles = 0.04
 
     def __init__(
         self,
@@ -70,6 +74,7 @@ class ArmMotion(JawMotion):
         limits: ArmLimits,
         base: ArmBase,
         obstacles: Sequence[Capsule] = (),
+        highest_wait: float = math.inf,
     ) -> None:
         """
         Args:
@@ -77,6 +82,7 @@ class ArmMotion(JawMotion):
             limits: of the joints.
             base: where the arm stands.
             obstacles: fixed bodies that the arm must not touch, in the world.
+            highest_wait: the hand waits at the planner's home, but no higher than this, in m.
 
         Raises:
             ValueError: the arm cannot reach the home pose.
@@ -85,6 +91,7 @@ class ArmMotion(JawMotion):
         self._limits = parameters.motion_limits()
         self.postures = ArmPostures(limits, base, obstacles)
         x, y, z, yaw = parameters.home
+        z = self._wait_height = min(z, highest_wait)
         home = HandStop("home", x, y, yaw, low=z, high=z, surface=base.z - 1.0)
         middle = (np.array(limits.lower) + limits.upper) / 2
         found, problem = self.postures.choose([home], middle)
@@ -150,6 +157,10 @@ class ArmMotion(JawMotion):
         return True
 
     # Modes.
+
+    def wide(self, state: PlannerState) -> float:
+        """The opening before a grasp: as wide as the object, and some room, in m."""
+        return min(self._parameters.open_width, state.width + 2 * _JAW_ROOM)
 
     def begin(
         self,
@@ -240,8 +251,8 @@ class ArmMotion(JawMotion):
         """Up, and back to the home's x; the hand need not return to the home's y and yaw."""
         now = way.start[:JOINTS]
         y = float(self.postures.hand_pose(now)[1])
-        x, home_y, home_z, yaw = self._parameters.home
-        z = max(home_z, float(state.travel_z))
+        x, home_y, _, yaw = self._parameters.home
+        z = max(self._wait_height, float(state.travel_z))
         goal = self.home_joints
         for share in (1.0, 0.75, 0.5, 0.25):
             between = home_y + share * (y - home_y)

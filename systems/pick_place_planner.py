@@ -333,6 +333,7 @@ class PickPlacePlanner(LeafSystem):
         # An object slightly below an uncertain rim may stand on it.
         state.rim_z = heights.place_rim - heights.doubt
         state.floor_z, state.doubt = heights.place_floor, heights.doubt
+        state.width = heights.width
         state.clear_z, state.travel_z = motion.clear, motion.travel
         state.pick_hover_z, state.place_hover_z = motion.pick_hover, motion.place_hover
 

@@ -47,6 +47,8 @@ class PlannerState(VectorView):
     floor_z = Number()
     doubt = Number()
     """The uncertainty of these heights."""
+    width = Number()
+    """The width of the object at the pick; infinite if unknown."""
     hold_z = Number()
     """Height of the hand when it gripped; `touch_z`: when the object touched a cavity's rim."""
     touch_z = Number()

@@ -88,7 +88,12 @@ def make_motion(scenario: Scenario) -> RobotMotion:
     if not isinstance(robot, FrankaArm):
         return HandMotion(scenario.planner)
     try:
-        return ArmMotion(scenario.planner, ARM_LIMITS[robot.model], robot.arm_base())
+        return ArmMotion(
+            scenario.planner,
+            ARM_LIMITS[robot.model],
+            robot.arm_base(),
+            highest_wait=robot.highest_wait,
+        )
     except ValueError as error:
         raise UserError(str(error)) from error
 
