@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from systems.arm_collisions import Capsule
+from systems.arm_inertia import ArmInertia
 from systems.arm_kinematics import ArmBase
 from systems.arm_limits import JOINTS, ArmLimits
 from systems.arm_postures import ArmPostures, HandStop
@@ -75,6 +76,7 @@ class ArmMotion(JawMotion):
         base: ArmBase,
         obstacles: Sequence[Capsule] = (),
         highest_wait: float = math.inf,
+        inertia: ArmInertia | None = None,
     ) -> None:
         """
         Args:
@@ -83,12 +85,13 @@ class ArmMotion(JawMotion):
             base: where the arm stands.
             obstacles: fixed bodies that the arm must not touch, in the world.
             highest_wait: the hand waits at the planner's home, but no higher than this, in m.
+            inertia: of the arm; None: the rates of the torques are not limited.
 
         Raises:
             ValueError: the arm cannot reach the home pose.
         """
         super().__init__(parameters)
-        self._limits = parameters.motion_limits()
+        self._limits, self._inertia = parameters.motion_limits(), inertia
         self.postures = ArmPostures(limits, base, obstacles)
         x, y, z, yaw = parameters.home
         z = self._wait_height = min(z, highest_wait)
@@ -115,7 +118,7 @@ class ArmMotion(JawMotion):
         return ArmState(vector)
 
     def _make_way(self, vector: bytes) -> ArmWay:
-        return ArmWay(np.frombuffer(vector), self.postures)
+        return ArmWay(np.frombuffer(vector), self.postures, self._inertia)
 
     def _way(self, state: PlannerState) -> ArmWay:
         assert isinstance(state, ArmState)
