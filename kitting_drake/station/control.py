@@ -92,6 +92,8 @@ def add_control(
         builder.Connect(driven.wrist_moment, planner.GetInputPort("wrist_moment"))
     for port in ("desired_motion", "desired_opening", "closing_force"):
         builder.Connect(planner.GetOutputPort(port), driven.controller.GetInputPort(port))
+    if isinstance(driven.controller, JointController):
+        builder.Connect(planner.GetOutputPort("payload"), driven.controller.GetInputPort("payload"))
     for port, name in _EXPORTED.items():
         builder.ExportOutput(planner.GetOutputPort(port), name)
     builder.ExportOutput(driven.actuation, "actuation")
