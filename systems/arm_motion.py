@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from systems.arm_collisions import Capsule
+from systems.arm_inertia import ArmInertia
 from systems.arm_kinematics import ArmBase
 from systems.arm_limits import JOINTS, ArmLimits
 from systems.arm_postures import ArmPostures, HandStop
@@ -29,6 +30,9 @@ _KEPT = 8
 _FARTHEST_STOP = 0.02
 """A hand that is further away from its command than this stays at its command, in m."""
 _SAME_HEIGHT = 0.003
+
+_JAW_ROOM = 0.005
+"""How far each pad stays from an object of known width before a grasp, in m."""
 
 _TOUCH_SPEED = 0.011
 """An arm's limit of `touch_speed`, in m/s. Its hand moves 10 to 25 kg, a floating hand 4 kg,
@@ -63,6 +67,7 @@ class ArmMotion(JawMotion):
     """
 
     size = 3 * JOINTS
+    settles = 0.04
 
     def __init__(
         self,
@@ -70,6 +75,8 @@ class ArmMotion(JawMotion):
         limits: ArmLimits,
         base: ArmBase,
         obstacles: Sequence[Capsule] = (),
+        highest_wait: float = math.inf,
+        inertia: ArmInertia | None = None,
     ) -> None:
         """
         Args:
@@ -77,14 +84,17 @@ class ArmMotion(JawMotion):
             limits: of the joints.
             base: where the arm stands.
             obstacles: fixed bodies that the arm must not touch, in the world.
+            highest_wait: the hand waits at the planner's home, but no higher than this, in m.
+            inertia: of the arm; None: the rates of the torques are not limited.
 
         Raises:
             ValueError: the arm cannot reach the home pose.
         """
         super().__init__(parameters)
-        self._limits = parameters.motion_limits()
+        self._limits, self._inertia = parameters.motion_limits(), inertia
         self.postures = ArmPostures(limits, base, obstacles)
         x, y, z, yaw = parameters.home
+        z = self._wait_height = min(z, highest_wait)
         home = HandStop("home", x, y, yaw, low=z, high=z, surface=base.z - 1.0)
         middle = (np.array(limits.lower) + limits.upper) / 2
         found, problem = self.postures.choose([home], middle)
@@ -108,7 +118,7 @@ class ArmMotion(JawMotion):
         return ArmState(vector)
 
     def _make_way(self, vector: bytes) -> ArmWay:
-        return ArmWay(np.frombuffer(vector), self.postures)
+        return ArmWay(np.frombuffer(vector), self.postures, self._inertia)
 
     def _way(self, state: PlannerState) -> ArmWay:
         assert isinstance(state, ArmState)
@@ -150,6 +160,10 @@ class ArmMotion(JawMotion):
         return True
 
     # Modes.
+
+    def wide(self, state: PlannerState) -> float:
+        """The opening before a grasp: as wide as the object, and some room, in m."""
+        return min(self._parameters.open_width, state.width + 2 * _JAW_ROOM)
 
     def begin(
         self,
@@ -240,8 +254,8 @@ class ArmMotion(JawMotion):
         """Up, and back to the home's x; the hand need not return to the home's y and yaw."""
         now = way.start[:JOINTS]
         y = float(self.postures.hand_pose(now)[1])
-        x, home_y, home_z, yaw = self._parameters.home
-        z = max(home_z, float(state.travel_z))
+        x, home_y, _, yaw = self._parameters.home
+        z = max(self._wait_height, float(state.travel_z))
         goal = self.home_joints
         for share in (1.0, 0.75, 0.5, 0.25):
             between = home_y + share * (y - home_y)

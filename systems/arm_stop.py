@@ -9,10 +9,13 @@ import numpy as np
 import ruckig
 from numpy.typing import NDArray
 
+from systems.arm_inertia import ArmInertia
 from systems.arm_limits import JOINTS, ArmLimits
 
 _SHARE = 0.98
 """Share of the limits of acceleration and jerk that a stop uses."""
+_TRIES = 4
+"""How often a stop is tried until the rates of the torques are within their limits."""
 _RESTS = 1e-9
 """Below this velocity and acceleration the arm rests, in SI units."""
 
@@ -29,17 +32,33 @@ class ArmStop:
         v: NDArray[np.float64],
         a: NDArray[np.float64],
         limits: ArmLimits,
+        inertia: ArmInertia | None = None,
     ) -> None:
         """
         Args:
             q: (7) joint positions at the beginning. Likewise velocities `v`, accelerations `a`.
-            limits: of the joints; only those of acceleration and jerk matter.
+            limits: of the joints; only those of acceleration, jerk and torque rate matter.
+            inertia: of the arm; None: the rates of the torques are not limited.
         """
         self.goal, self.duration = q, 0.0
         """(7) where the joints come to rest, after how many seconds."""
         if np.abs(v).max() < _RESTS and np.abs(a).max() < _RESTS:
             return
-        found = _calculate(q, v, a, limits)
+        jerk = _SHARE * np.array(limits.jerk)
+        mass = inertia.mass(q) if inertia else np.zeros((JOINTS, JOINTS))
+        for _ in range(_TRIES):
+            self._tabulate(_calculate(q, v, a, limits, jerk))
+            rate = np.abs(self._jerks() @ mass).max(axis=0) / limits.torque_rate
+            excess = float(rate.max()) / _SHARE
+            if excess <= 1.0:
+                break
+            jerk = np.maximum(jerk / (1.02 * excess), 1.0)
+
+    def _jerks(self) -> NDArray[np.float64]:
+        """(n, 7) between the switches."""
+        return np.asarray(np.diff(self._states[:, 2], axis=0) / np.diff(self._times)[:, None])
+
+    def _tabulate(self, found: ruckig.Trajectory) -> None:
         # Keep numbers only: Ruckig's own objects complain when they outlive the interpreter.
         self.duration = found.duration
         switches = {0.0, found.duration}
@@ -68,7 +87,11 @@ class ArmStop:
 
 
 def _calculate(
-    q: NDArray[np.float64], v: NDArray[np.float64], a: NDArray[np.float64], limits: ArmLimits
+    q: NDArray[np.float64],
+    v: NDArray[np.float64],
+    a: NDArray[np.float64],
+    limits: ArmLimits,
+    jerk: NDArray[np.float64],
 ) -> ruckig.Trajectory:
     given = ruckig.InputParameter(JOINTS)
     given.control_interface = ruckig.ControlInterface.Velocity
@@ -77,7 +100,7 @@ def _calculate(
     given.current_acceleration = a.tolist()
     given.target_velocity = given.target_acceleration = [0.0] * JOINTS
     given.max_acceleration = [_SHARE * limit for limit in limits.acceleration]
-    given.max_jerk = [_SHARE * limit for limit in limits.jerk]
+    given.max_jerk = jerk.tolist()
     trajectory = ruckig.Trajectory(JOINTS)
     result = ruckig.Ruckig(JOINTS).calculate(given, trajectory)
     if result not in (ruckig.Result.Working, ruckig.Result.Finished):

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from systems.arm_inertia import ArmInertia
 from systems.arm_kinematics import fingertips
 from systems.arm_limits import JOINTS
 from systems.arm_postures import ArmPostures
@@ -68,16 +69,23 @@ class _Path:
 class ArmWay:
     """A way as a function of the time since its beginning."""
 
-    def __init__(self, vector: NDArray[np.float64], postures: ArmPostures) -> None:
+    def __init__(
+        self,
+        vector: NDArray[np.float64],
+        postures: ArmPostures,
+        inertia: ArmInertia | None = None,
+    ) -> None:
         """
         Args:
             vector: a `WayVector`.
             postures: of the arm.
+            inertia: of the arm; None: the rates of the torques are not limited.
         """
+        self._inertia = inertia
         self._postures, self._limits = postures, postures.limits
         way = WayVector(vector)
         q, v, a = way.start.reshape(3, -1)
-        self._stop = ArmStop(q, v, a, self._limits)
+        self._stop = ArmStop(q, v, a, self._limits, inertia)
         self._stopping, self._rest = self._stop.duration, self._stop.goal
         self._motion = self._plan(way, self._rest)
         self.duration = self._stopping + (self._motion.duration if self._motion else 0.0)
@@ -135,7 +143,8 @@ class ArmWay:
         high: NDArray[np.float64],
         acceleration: NDArray[np.float64],
     ) -> SmoothMotion:
-        return plan_motion(points, self._limits, rows, RowLimits(-high, high, acceleration))
+        bounds = RowLimits(-high, high, acceleration)
+        return plan_motion(points, self._limits, rows, bounds, self._inertia)
 
     # Straight lines of the hand.
 

@@ -91,6 +91,7 @@ class HeldFromAbove:
             near_pick=highest,
             near_place=highest,
             highest=highest,
+            width=self.width,
         )
 
 

@@ -29,6 +29,13 @@ _IN_THE_AIR = (Mode.APPROACH, Mode.CARRY)
 _AT_REST = (Mode.OBSERVE, Mode.DONE)
 
 
+def known_payload(state: PlannerState) -> float:
+    """The vertical force of the payload while it is carried and lowered, in N; zero before."""
+    mode = Mode(int(state.mode))
+    weighed = mode == Mode.CARRY and state.weighings >= _WEIGHINGS / 2
+    return state.payload if weighed or mode in (Mode.LOWER, Mode.SEARCH) else 0.0
+
+
 class ContactGuard:
     r"""The law of the force guard.
 

@@ -1,5 +1,7 @@
 """Opening and closing force of the jaws in each mode of the motion primitive."""
 
+import math
+
 from systems.hand_motion import ramp
 from systems.pick_place_parameters import Mode, PickPlaceParameters
 from systems.planner_state import PlannerState
@@ -7,6 +9,9 @@ from systems.planner_state import PlannerState
 
 class JawMotion:
     """Jaw openings and closing forces of all modes, as functions of the state."""
+
+    settles = math.inf
+    """See `RobotMotion`: `tare_settle` says how long."""
 
     def __init__(self, parameters: PickPlaceParameters) -> None:
         """
@@ -19,6 +24,10 @@ class JawMotion:
         """Sets open jaws without force."""
         state.start_opening = state.goal_opening = self._parameters.open_width
         state.force_start_time = -self._parameters.force_ramp
+
+    def wide(self, state: PlannerState) -> float:
+        """The opening before a grasp, in m."""
+        return self._parameters.open_width
 
     def begin_jaws(
         self, state: PlannerState, mode: Mode, time: float, opening: float | None
@@ -36,7 +45,7 @@ class JawMotion:
             opening, _ = self.opening_at(state, time)
         state.start_opening = state.goal_opening = opening
         if mode == Mode.APPROACH:
-            state.goal_opening = 0.0 if state.press else parameters.open_width
+            state.goal_opening = 0.0 if state.press else self.wide(state)
         elif mode == Mode.CLOSE:
             state.goal_opening = 0.0
         elif mode == Mode.RELEASE:

@@ -5,10 +5,22 @@ from __future__ import annotations
 import numpy as np
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import MultibodyForces
-from pydrake.systems.framework import BasicVector, Context, LeafSystem
+from pydrake.systems.framework import (
+    BasicVector,
+    Context,
+    DiscreteValues,
+    EventStatus,
+    LeafSystem,
+)
 
+from systems.arm_kinematics import jacobian
 from systems.arm_limits import JOINTS
 from systems.trajectory_controller import FINGERS, FingerLaw
+
+_FOLLOWS = 0.05
+"""Time constant with which the compensated load follows the payload, in s."""
+_EQUAL = 1e-3
+"""In N."""
 
 
 class JointController(LeafSystem):
@@ -22,6 +34,7 @@ class JointController(LeafSystem):
         - desired_motion
         - desired_opening
         - closing_force (optional)
+        - payload (optional)
         output_ports:
         - desired_state
         - feedforward
@@ -30,6 +43,7 @@ class JointController(LeafSystem):
     - `robot_state` (18): positions of the seven joints and both fingers, then their velocities.
     - `desired_motion` (21): q_d, v_d, a_d of the joints, in rad and s.
     - `desired_opening` (2), `closing_force` (1): as in `TrajectoryController`.
+    - `payload` (1): the vertical force of what the hand holds, as it was weighed, in N; negative.
     - `desired_state` (14): q_n, v_n, for the plant's port of that name.
     - `feedforward` (7): u_ff, for the plant's actuation port, in N m.
     - `finger_force` (2): actuation of the fingers, in N.
@@ -37,7 +51,7 @@ class JointController(LeafSystem):
     The arm's torque is
 
         u = clip(u_ff + K (q_n - q) + D (v_n - v), -u_max, u_max),
-        u_ff = M(q) a_d + C(q, v) v,
+        u_ff = M(q) a_d + C(q, v) v - J_z(q)^T f,
         v_n = v_d + h a_d / 2,   q_n = q_d + h v_n.
 
     The plant computes the first line itself, with the q and v at the *end* of its step of length h,
@@ -46,11 +60,12 @@ class JointController(LeafSystem):
     with which the plant's integration, q + h v, gets there.
 
     The model's gravity is not compensated here: a Franka compensates its own weight, so the plant's
-    arm has no gravity. Neither is the payload, which causes a sag.
+    arm has no gravity. Its payload it compensates once it is told, as by libfranka's `setLoad`: f
+    follows `payload` smoothly. J_z is the Jacobian of the fingertips' height.
 
     The fingers follow the `FingerLaw`.
 
-    Stateless.
+    State (discrete): f.
     """
 
     def __init__(self, *, arm: MultibodyPlant, step: float, fingers: FingerLaw) -> None:
@@ -71,10 +86,14 @@ class JointController(LeafSystem):
         # Scratch memory: no value outlives the call that sets it.
         self._scratch, self._no_forces = arm.CreateDefaultContext(), MultibodyForces(arm)
         joints, size = JOINTS, JOINTS + FINGERS
+        self._load_index = self.DeclareDiscreteState(1)
+        self.DeclarePeriodicDiscreteUpdateEvent(step, 0.0, self._follow_payload)
         self._robot_state = self.DeclareVectorInputPort("robot_state", 2 * size)
         self._desired_motion = self.DeclareVectorInputPort("desired_motion", 3 * joints)
         self._desired_opening = self.DeclareVectorInputPort("desired_opening", 2)
         self._closing_force = self.DeclareVectorInputPort("closing_force", 1)
+        self._payload = self.DeclareVectorInputPort("payload", 1)
+        load = self.discrete_state_ticket(self._load_index)
         robot, motion, opening, closing = (
             self.input_port_ticket(port.get_index())
             for port in (
@@ -85,10 +104,22 @@ class JointController(LeafSystem):
             )
         )
         self.DeclareVectorOutputPort("desired_state", 2 * joints, self._calc_desired, {motion})
-        self.DeclareVectorOutputPort("feedforward", joints, self._calc_feedforward, {robot, motion})
+        self.DeclareVectorOutputPort(
+            "feedforward", joints, self._calc_feedforward, {robot, motion, load}
+        )
         self.DeclareVectorOutputPort(
             "finger_force", FINGERS, self._calc_fingers, {robot, opening, closing}
         )
+
+    def _follow_payload(self, context: Context, discrete_state: DiscreteValues) -> EventStatus:
+        load = discrete_state.get_mutable_value(self._load_index)
+        given = self._payload.Eval(context)[0] if self._payload.HasValue(context) else 0.0
+        if given == load[0]:
+            return EventStatus.DidNothing()
+        load[0] += (given - load[0]) * self._step / (self._step + _FOLLOWS)
+        if abs(given - load[0]) < _EQUAL:
+            load[0] = given
+        return EventStatus.Succeeded()
 
     def _calc_desired(self, context: Context, output: BasicVector) -> None:
         q, v, a = self._desired_motion.Eval(context).reshape(3, JOINTS)
@@ -100,8 +131,12 @@ class JointController(LeafSystem):
         a_d = self._desired_motion.Eval(context)[2 * JOINTS :]
         arm.SetPositionsAndVelocities(scratch, self._robot_state.Eval(context))
         wanted = np.concatenate([a_d, np.zeros(FINGERS)])
-        torque = arm.CalcInverseDynamics(scratch, wanted, self._no_forces)
-        output.SetFromVector(torque[:JOINTS])
+        torque = arm.CalcInverseDynamics(scratch, wanted, self._no_forces)[:JOINTS]
+        load = context.get_discrete_state(self._load_index).value()[0]
+        if load:
+            # Heights in the base are those in the world but for a constant.
+            torque = torque - load * jacobian(arm.GetPositions(scratch)[:JOINTS])[5]
+        output.SetFromVector(torque)
 
     def _calc_fingers(self, context: Context, output: BasicVector) -> None:
         state = self._robot_state.Eval(context)

@@ -395,6 +395,7 @@ class OraclePolicy(LeafSystem):
             near_pick=highest,
             near_place=highest,
             highest=highest,
+            width=plan.grasp.width,
         )
 
 

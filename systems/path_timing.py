@@ -20,14 +20,17 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
+from systems.arm_inertia import ArmInertia
 from systems.arm_limits import ArmLimits
 
 TICK = 1 / 1024
 """Time between the samples of a motion, in s."""
-AVERAGED = 6
-"""Number of ticks over which the acceleration is averaged."""
+AVERAGED, _MOST_AVERAGED = 6, 80
+"""Number of ticks over which the acceleration is averaged: at least, at most."""
 _SHARE = 0.98
 """Share of the limits that a motion uses. Between the path's points it takes a little more."""
+_RATE_SHARE = 0.9
+"""Likewise of the limits of the torques' rates: the model of the inertia is not exact."""
 _LEAST, _UNLIMITED = 1e-9, 1e12
 
 
@@ -102,17 +105,18 @@ class SmoothMotion:
     Between samples the jerk is constant.
     """
 
-    def __init__(self, position: NDArray[np.float64]) -> None:
+    def __init__(self, position: NDArray[np.float64], averaged: int = AVERAGED) -> None:
         """
         Args:
             position: (n, joints) a motion from rest to rest at every tick, before averaging.
+            averaged: number of ticks over which the acceleration is averaged.
         """
-        rest = [position[:1]] * 2, [position[-1:]] * (AVERAGED + 2)
+        rest = [position[:1]] * 2, [position[-1:]] * (averaged + 2)
         padded = np.concatenate([*rest[0], position, *rest[1]])
         raw = np.diff(padded, 2, axis=0) / TICK**2
         total = np.cumsum(raw, axis=0)
-        total[AVERAGED:] -= total[:-AVERAGED].copy()
-        acceleration = total / AVERAGED
+        total[averaged:] -= total[:-averaged].copy()
+        acceleration = total / averaged
         acceleration[-1] = 0.0
         velocity = np.zeros_like(acceleration)
         np.cumsum((acceleration[1:] + acceleration[:-1]) * (TICK / 2), axis=0, out=velocity[1:])
@@ -150,6 +154,12 @@ class SmoothMotion:
         jerk = np.abs(np.diff(a, axis=0)) / TICK / limits.jerk
         return max(1.0, speed.max(), math.sqrt(change.max()), float(np.cbrt(jerk.max())))
 
+    def torque_rate(self, limits: ArmLimits, inertia: ArmInertia) -> float:
+        """The largest rate of a torque, as a share of what a motion may use."""
+        q, _, a = np.split(self.samples, 3, axis=1)
+        rates = np.abs(np.diff(inertia.torques(q, a), axis=0)) / TICK
+        return float((rates / limits.torque_rate).max()) / _RATE_SHARE
+
 
 def braking_bounds(
     limits: ArmLimits, q: NDArray[np.float64]
@@ -165,7 +175,11 @@ def braking_bounds(
 
 
 def plan_motion(
-    points: NDArray[np.float64], limits: ArmLimits, extra: NDArray[np.float64], bounds: RowLimits
+    points: NDArray[np.float64],
+    limits: ArmLimits,
+    extra: NDArray[np.float64],
+    bounds: RowLimits,
+    inertia: ArmInertia | None = None,
 ) -> SmoothMotion:
     """The fastest motion along a path, from rest to rest.
 
@@ -174,6 +188,7 @@ def plan_motion(
         limits: of the joints; they hold exactly.
         extra: (n, rows) other quantities that are limited along the path, such as a height.
         bounds: limits of these rows, which hold up to a few percent.
+        inertia: of the arm; None: the rates of the torques are not limited.
     """
     low, high = braking_bounds(limits, points)
     rows = RowLimits(
@@ -183,13 +198,17 @@ def plan_motion(
     )
     times, rates = fastest_times(np.hstack([points, extra]), rows)
     spline = CubicSpline(np.arange(len(points)), points)
-    slower = 1.0
-    for _ in range(8):
-        motion = SmoothMotion(_sample(spline, times * slower, rates / slower))
+    slower, averaged = 1.0, AVERAGED
+    for _ in range(12):
+        motion = SmoothMotion(_sample(spline, times * slower, rates / slower), averaged)
         excess = motion.excess(limits)
-        if excess <= 1.0:
+        if excess > 1.0:
+            slower *= 1.001 * excess
+            continue
+        rate = motion.torque_rate(limits, inertia) if inertia else 0.0
+        if rate <= 1.0 or averaged == _MOST_AVERAGED:
             return motion
-        slower *= 1.001 * excess
+        averaged = min(max(math.ceil(averaged * rate), averaged + 1), _MOST_AVERAGED)
     raise RuntimeError("no motion along the path keeps the limits of the joints")
 
 

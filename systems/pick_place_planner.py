@@ -15,7 +15,7 @@ from pydrake.systems.framework import (
 )
 
 from systems.attempt_history import AttemptHistory, LeftOverVector
-from systems.contact_guard import ContactGuard
+from systems.contact_guard import ContactGuard, known_payload
 from systems.floating_hand_motion import HandMotion
 from systems.hand_geometry import check_reach
 from systems.motion_heights import motion_heights
@@ -55,6 +55,7 @@ class PickPlacePlanner(LeafSystem):
         - failed_picks
         - history
         - peak_force
+        - payload
         - asks
         - accepted_action
 
@@ -81,6 +82,8 @@ class PickPlacePlanner(LeafSystem):
     - `peak_force` (3): the largest vertical and lateral contact force on the hand in the present or
       last action, without the weight of the held object, in N, as means over 1/64 s; and the
       `Mode` in which the larger of the two rose. See `ContactGuard`.
+    - `payload` (1): the vertical force of what the hand carries and lowers, as it was weighed, in
+      N; negative, or zero if nothing is known.
     - `asks` (1): 1 if the next update, due at the context's time, evaluates `action`; else 0.
     - `accepted_action` (abstract, `PickPlaceAction`): the last action begun, with the hand's actual
       yaws and without heights; or the stop, with up to 24 objects and cavities of `left_over`.
@@ -166,6 +169,7 @@ class PickPlacePlanner(LeafSystem):
         self.DeclareVectorOutputPort("mode", 1, self._calc_mode, state_only)
         self.DeclareVectorOutputPort("counts", 4, self._calc_counts, state_only)
         self.DeclareVectorOutputPort("peak_force", 3, self._calc_peak_force, state_only)
+        self.DeclareVectorOutputPort("payload", 1, self._calc_payload, state_only)
         self.DeclareVectorOutputPort("asks", 1, self._calc_asks, state_and_time)
         history = {self.discrete_state_ticket(self._history_index)}
         left_over = {self.discrete_state_ticket(self._left_over_index)}
@@ -218,6 +222,9 @@ class PickPlacePlanner(LeafSystem):
 
     def _history(self, context: Context) -> AttemptHistory:
         return AttemptHistory(context.get_discrete_state(self._history_index).get_value())
+
+    def _calc_payload(self, context: Context, output: BasicVector) -> None:
+        output.SetFromVector([known_payload(self._state(context))])
 
     def _calc_asks(self, context: Context, output: BasicVector) -> None:
         state, time = self._state(context), context.get_time()

@@ -62,6 +62,7 @@ class PickPlaceSteps:
         """
         self._parameters, self._motion, self._guard = parameters, motion, guard
         self._search_steps = search_steps
+        self._settle = min(parameters.tare_settle, motion.settles)
         self._steps = {
             Mode.DESCEND: self.descend,
             Mode.CLOSE: self.close,
@@ -142,7 +143,7 @@ class PickPlaceSteps:
     def check(self, moment: Moment) -> None:
         """Lifts what is between the pads, or retreats."""
         state, time, hand, contact = moment.state, moment.time, moment.hand, moment.contact
-        if time < self._motion.arrival(state) + self._parameters.tare_settle:
+        if time < self._motion.arrival(state) + self._settle:
             return
         if self._is_held(hand, contact):
             state.hold_z = hand[2]
@@ -224,7 +225,7 @@ class PickPlaceSteps:
         elif state.mode == Mode.LIFT:
             if self._motion.brakes_above(state, time, state.travel_z):
                 self._motion.begin(state, Mode.CARRY, time)
-        elif time >= self._motion.arrival(state) + self._parameters.tare_settle:
+        elif time >= self._motion.arrival(state) + self._settle:
             self._guard.tare(state, contact, self._parameters.contact_threshold)
             self._motion.begin(state, Mode.LOWER, time)
 

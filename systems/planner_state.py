@@ -49,6 +49,8 @@ class PlannerState(VectorView):
     floor_z = Number()
     doubt = Number()
     """The uncertainty of these heights."""
+    width = Number()
+    """The width of the object at the pick; infinite if unknown."""
     hold_z = Number()
     """Height of the hand when it gripped; `touch_z`: when the object touched a cavity's rim."""
     touch_z = Number()
@@ -98,5 +100,6 @@ class PlannerState(VectorView):
         # An object slightly below an uncertain rim may stand on it.
         self.rim_z = surfaces.place_rim - surfaces.doubt
         self.floor_z, self.doubt = surfaces.place_floor, surfaces.doubt
+        self.width = surfaces.width
         self.clear_z, self.travel_z = motion.clear, motion.travel
         self.pick_hover_z, self.place_hover_z = motion.pick_hover, motion.place_hover

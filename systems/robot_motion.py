@@ -20,6 +20,8 @@ class RobotMotion(Protocol):
 
     size: int
     """Number of elements of the desired motion."""
+    settles: float
+    """After this time at rest the hand is still; infinite if the parameters say how long."""
 
     def initial_state(self) -> NDArray[np.float64]:
         """A state in which the hand waits at home with open jaws."""

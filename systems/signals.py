@@ -199,6 +199,8 @@ class SurfaceHeights:
     """The table; nothing goes below it."""
     doubt: float = 0.0
     """The uncertainty of differences between these heights; zero if o_t has no noise or tilt."""
+    width: float = math.inf
+    """The width at the pick for which open jaws have to make room; infinite if unknown."""
 
 
 STOP_REASONS = {

@@ -5,6 +5,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from systems.jaw_room import object_width
 from systems.signals import Observation, PlanarPose, SurfaceHeights
 
 _PICK_REACH = 1
@@ -105,6 +106,7 @@ def read_surface_heights(
         highest=grid.z_min + float(height.max(initial=0.0)),
         table=min(pick_z, place_z) + max(table, 0.0),
         doubt=doubt,
+        width=object_width(height, grid, pick, support, pick_top),
     )
 
 

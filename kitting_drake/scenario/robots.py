@@ -53,6 +53,10 @@ class FrankaArm:
     # compensates most of its friction.
     friction: list[float] = bounded([0.003] * 7, 0.0, 100.0)
 
+    # It waits at planner.home, but no higher than this, in m: there it hides nothing from the
+    # default cameras, and heights above 0.28 m are not part of o_t.
+    highest_wait: float = bounded(0.31, 0.0, 2.0)
+
     # Standard deviation of the estimated external joint torques, from which the arm computes the
     # force on its hand, in N m.
     torque_noise: float = bounded(0.0, 0.0, 10.0)

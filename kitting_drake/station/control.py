@@ -101,6 +101,8 @@ def add_control(
             builder.ExportInput(target, port)
         else:
             builder.Connect(planner.GetOutputPort(port), target)
+    if isinstance(driven.controller, JointController):
+        builder.Connect(planner.GetOutputPort("payload"), driven.controller.GetInputPort("payload"))
     for port, name in _EXPORTED.items():
         builder.ExportOutput(planner.GetOutputPort(port), name)
     builder.ExportOutput(driven.actuation, "actuation")

@@ -18,6 +18,7 @@ from kitting_drake.common.paths import MODELS
 from kitting_drake.common.sdformat import model_text
 from kitting_drake.scenario.robots import FrankaArm, Robot
 from kitting_drake.scenario.schema import Scenario
+from systems.arm_inertia import ArmInertia
 from systems.arm_limits import ARM_LIMITS
 from systems.arm_motion import ArmMotion
 from systems.floating_hand_motion import HandMotion
@@ -90,7 +91,13 @@ def make_motion(scenario: Scenario) -> RobotMotion:
     if not isinstance(robot, FrankaArm):
         return HandMotion(scenario.planner)
     try:
-        return ArmMotion(scenario.planner, ARM_LIMITS[robot.model], robot.arm_base())
+        return ArmMotion(
+            scenario.planner,
+            ARM_LIMITS[robot.model],
+            robot.arm_base(),
+            highest_wait=robot.highest_wait,
+            inertia=ArmInertia(arm_model(robot)[0]),
+        )
     except ValueError as error:
         raise UserError(str(error)) from error
 

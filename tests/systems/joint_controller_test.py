@@ -37,7 +37,13 @@ def value(controller: JointController, context: Context, port: str) -> NDArray[n
 
 def test_ports(arm: MultibodyPlant):
     controller, _ = make(arm)
-    inputs = {"robot_state": 18, "desired_motion": 21, "desired_opening": 2, "closing_force": 1}
+    inputs = {
+        "robot_state": 18,
+        "desired_motion": 21,
+        "desired_opening": 2,
+        "closing_force": 1,
+        "payload": 1,
+    }
     outputs = {"desired_state": 14, "feedforward": 7, "finger_force": 2}
     assert controller.num_input_ports() == len(inputs)
     assert controller.num_output_ports() == len(outputs)

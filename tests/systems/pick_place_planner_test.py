@@ -232,6 +232,7 @@ def test_ports():
         "mode": 1,
         "counts": 4,
         "peak_force": 3,
+        "payload": 1,
         "asks": 1,
     }
     assert planner.num_output_ports() == len(outputs) + 3

@@ -1,0 +1,55 @@
+"""How wide an object is between the jaws, from o_t."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from systems.hand_geometry import FINGER_LENGTH, FINGERTIP_DEPTH, MAX_OPENING
+from systems.signals import PixelGrid, PlanarPose
+
+_LEVEL = 0.3
+"""The width is measured at this share of the object's height, below where the pads grip."""
+_ROOM = 0.005
+"""The room beside the object that must be free, too, in m."""
+_LINES = 7
+"""How many lines across the jaws are looked at."""
+
+
+def object_width(
+    height: NDArray[np.float32], grid: PixelGrid, pick: PlanarPose, support: float, top: float
+) -> float:
+    """Twice the distance from the pick to the farther side of the object, along the jaws.
+
+    Args:
+        height: (rows, cols) above the bottom of the grid, in m.
+        grid: of the heights.
+        pick: pose of the hand; the jaws close along its y.
+        support: height of the object's support, in m; likewise its `top`.
+
+    Returns:
+        The width in m. Infinite if the object is not seen at the pick, is wider than open jaws, or
+        if something stands where half-open fingers would go down.
+    """
+    level = support + _LEVEL * (top - support)
+    farthest = MAX_OPENING / 2 + FINGERTIP_DEPTH
+    half = np.arange(0.0, farthest, grid.resolution / 2)
+    along = np.linspace(-FINGER_LENGTH / 2, FINGER_LENGTH / 2, _LINES)
+    across = np.concatenate([half, -half])
+    cos, sin = math.cos(pick.theta), math.sin(pick.theta)
+    u, v = np.meshgrid(along, across)
+    points = np.stack([pick.x + cos * u - sin * v, pick.y + sin * u + cos * v], -1)
+    row, col = np.moveaxis(np.rint(grid.to_pixel(points)).astype(int), -1, 0)
+    inside = (row >= 0) & (row < grid.rows) & (col >= 0) & (col < grid.cols)
+    found = height[row.clip(0, grid.rows - 1), col.clip(0, grid.cols - 1)]
+    high = ((found > level) & inside).any(axis=1).reshape(2, -1).any(axis=0)
+    if not high[0] or high.all():
+        return math.inf
+    side = int(np.argmin(high))
+    # The fingers stand beside it.
+    reach = half[side] + _ROOM + FINGERTIP_DEPTH
+    if reach > farthest or high[side:][half[side:] < reach].any():
+        return math.inf
+    return float(2 * half[side])
