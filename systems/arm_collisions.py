@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from systems.arm_kinematics import HAND_TURN, ArmBase, joint_frames
-from systems.hand_geometry import PALM_SIZE
+from systems.hand_geometry import FINGERTIP_DISTANCE, PALM_SIZE
 
 
 @dataclass(frozen=True)
@@ -60,7 +60,11 @@ _LEAST = 0.01
 
 
 def collision(
-    q: NDArray[np.float64], base: ArmBase, surface: float, obstacles: Sequence[Capsule] = ()
+    q: NDArray[np.float64],
+    base: ArmBase,
+    surface: float,
+    obstacles: Sequence[Capsule] = (),
+    held: float = 0.0,
 ) -> str:
     """What the arm collides with at one of several joint positions; empty if with nothing.
 
@@ -70,6 +74,7 @@ def collision(
         surface: height of the highest surface around the hand in the world, in m. The hand itself
             is not compared: fingers must go below it.
         obstacles: bodies that do not move, in the world.
+        held: how far a held object reaches from the fingertips, in m.
     """
     rotations, origins = joint_frames(q)
 
@@ -78,21 +83,23 @@ def collision(
         start, end = (p + R @ np.array(point) for point in (link.capsule.start, link.capsule.end))
         return start, end
 
-    placed = {link: ends(link) for link in (*_ABOVE, _HAND, _UPPER_ARM)}
+    tip = (0.0, 0.0, FINGERTIP_DISTANCE)
+    outer = (*_OUTER, _Link(7, Capsule(tip, tip, held))) if held else _OUTER
+    placed = {link: ends(link) for link in (*_ABOVE, *outer, _UPPER_ARM)}
     for link in _ABOVE:
         lowest = np.minimum(*(end[:, 2] for end in placed[link])) - link.capsule.radius
         if lowest.min() < surface - base.z + _LEAST:
             return "what lies around the hand"
     own = [(np.array(it.start), np.array(it.end), it.radius) for it in _BASE]
     own.append((*placed[_UPPER_ARM], _UPPER_ARM.capsule.radius))
-    for link in _OUTER:
+    for link in outer:
         for start, end, radius in own if link is not _FOREARM else own[:2]:
             apart = _distances(*placed[link], start, end) - link.capsule.radius - radius
             if apart.min() < _LEAST:
                 return "itself"
     for obstacle in obstacles:
         start, end = base.to_base_points(np.array([obstacle.start, obstacle.end]))
-        for link in (*_OUTER, _ELBOW, _UPPER_ARM):
+        for link in (*outer, _ELBOW, _UPPER_ARM):
             apart = _distances(*placed[link], start, end) - link.capsule.radius - obstacle.radius
             if apart.min() < _LEAST:
                 return "something fixed"

@@ -31,6 +31,8 @@ _FARTHEST_STOP = 0.02
 """A hand that is further away from its command than this stays at its command, in m."""
 _SAME_HEIGHT = 0.003
 
+_HELD_REACH = 0.125
+"""How far a held object reaches from the fingertips, in m: as `read_surface_heights` has it."""
 _JAW_ROOM = 0.005
 """How far each pad stays from an object of known width before a grasp, in m."""
 
@@ -142,7 +144,13 @@ class ArmMotion(JawMotion):
 
     def reach_problem(self, state: PlannerState) -> str:
         """A sentence that says why the arm cannot do the action in the state; empty if it can."""
-        return self._choose(state)[1]
+        assert isinstance(state, ArmState)
+        found, problem = self._choose(state)
+        if problem:
+            return problem
+        trial = self.view(np.array(state.vector))
+        self._set_joints(trial, found)
+        return self._problem_on_the_ways(trial)
 
     def _choose(self, state: PlannerState) -> tuple[list[NDArray[np.float64]], str]:
         assert isinstance(state, ArmState)
@@ -154,10 +162,31 @@ class ArmMotion(JawMotion):
         found, problem = self._choose(state)
         if problem:
             return False
+        self._set_joints(state, found)
+        return not self._problem_on_the_ways(state)
+
+    def _set_joints(self, state: ArmState, found: list[NDArray[np.float64]]) -> None:
         state.pick_joints, state.place_joints = found[0], found[-1]
         state.pick[2] = self.postures.hand_pose(found[0])[3]
         state.place[2] = self.postures.hand_pose(found[-1])[3]
-        return True
+
+    def _problem_on_the_ways(self, state: ArmState) -> str:
+        """What the arm would touch on the ways that it will take; empty if nothing."""
+        trial = self.view(np.array(state.vector))
+        now = self._way(trial).at(math.inf)
+        surface = float(state.clear_z) - self._parameters.travel_clearance
+        ways = [(Mode.APPROACH, "pick"), (Mode.DESCEND, "pick"), (Mode.RETREAT, "home")]
+        if not state.press:
+            ways.insert(2, (Mode.LIFT, "place"))
+        for mode, name in ways:
+            self._set_way(trial, mode, now, None, None)
+            way = self._way(trial)
+            now = way.at(math.inf)
+            held = _HELD_REACH if mode == Mode.LIFT else 0.0
+            touched = self.postures.collision(way.positions(), surface, held)
+            if touched:
+                return f"on the way to the {name} the arm would collide with {touched}"
+        return ""
 
     # Modes.
 

@@ -203,7 +203,11 @@ class ArmPostures:
         return bool(self.within(line).all())
 
     def _collision(self, way: NDArray[np.float64], stop: HandStop) -> str:
-        return collision(way, self.base, stop.surface, self._obstacles)
+        return self.collision(way, stop.surface)
+
+    def collision(self, way: NDArray[np.float64], surface: float, held: float = 0.0) -> str:
+        """What the arm collides with; see `arm_collisions.collision`."""
+        return collision(way, self.base, surface, self._obstacles, held)
 
     def _ways(
         self, stop: HandStop, yaw: float, swivels: NDArray[np.float64]

@@ -30,6 +30,8 @@ _NEARLY_THERE = 0.02
 _STRAIGHT_UP = 0.006
 """Within this horizontal distance of its start the hand may still rise, in m."""
 _INSTANT = 1e-9
+_COARSE = 16
+"""One of so many samples is looked at for collisions."""
 _STRIDE = 4 * TICK
 """Time between the stored accelerations of the fingertips, in s."""
 
@@ -100,6 +102,12 @@ class ArmWay:
             return self._stop.at(time)
         assert self._motion is not None
         return self._motion.at(time - self._stopping)
+
+    def positions(self) -> NDArray[np.float64]:
+        """(n, 7) joint positions along the way."""
+        if self._motion is None:
+            return self._rest[None]
+        return self._motion.samples[::_COARSE, :JOINTS]
 
     def hand_acceleration(self, time: float) -> NDArray[np.float64]:
         """(3) acceleration of the fingertips in the world, in m/s^2."""
