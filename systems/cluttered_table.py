@@ -91,7 +91,6 @@ class HeldFromAbove:
             near_pick=highest,
             near_place=highest,
             highest=highest,
-            width=self.width,
         )
 
 

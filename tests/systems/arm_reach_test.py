@@ -49,9 +49,9 @@ def search(limits: ArmLimits, pose: NDArray, rng: np.random.Generator) -> bool:
         slope = np.einsum("nij,ni->nj", J, error)
         stuck = ((q <= lower) & (slope > 0)) | ((q >= upper) & (slope < 0))
         J = J * ~stuck[:, None]
-        damped = J @ J.swapaxes(1, 2) + (1e-6 + 0.01 * np.sum(error**2, 1))[
-            :, None, None
-        ] * np.eye(7)
+        damped = J @ J.swapaxes(1, 2) + (1e-6 + 0.01 * np.sum(error**2, 1))[:, None, None] * np.eye(
+            7
+        )
         step = np.einsum("nij,ni->nj", J, np.linalg.solve(damped, error[..., None])[..., 0])
         step *= np.minimum(1.0, 0.5 / np.maximum(np.abs(step).max(axis=1, keepdims=True), 1e-9))
         q = np.clip(q - step, lower, upper)
