@@ -92,6 +92,8 @@ def measure_fits(
             if (fit, number) not in done:
                 chosen = fit.choose()
                 result = run_chosen(chosen, *build_chosen(chosen, seed=number))
+                if result.interrupted:
+                    raise KeyboardInterrupt
                 done[fit, number] = result.as_dict()
                 append_line(folder / _LINES, {"fit": asdict(fit), "episode": done[fit, number]})
             progress.advance(bar)
