@@ -4,7 +4,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from kitting_drake.scenario.robots import FrankaArm
+from kitting_drake.station.robot import arm_model
 from systems.arm_collisions import Capsule
+from systems.arm_inertia import ArmInertia
 from systems.arm_kinematics import ArmBase, fingertips, hand_state, joint_frames
 from systems.arm_limits import ARM_LIMITS, FR3, PANDA, ArmLimits
 from systems.arm_motion import ArmMotion, ArmState
@@ -44,7 +47,7 @@ def states(motion: ArmMotion, state: ArmState, start: float, end: float) -> NDAr
     return np.array([motion.motion_at(state, time) for time in times])
 
 
-def check_limits(limits: ArmLimits, samples: NDArray) -> None:
+def check_limits(limits: ArmLimits, samples: NDArray, inertia: ArmInertia) -> None:
     """Checks every limit, and that velocities and accelerations are derivatives."""
     q, v, a = np.split(samples, 3, axis=1)
     low, high = limits.velocity_bounds(q)
@@ -55,6 +58,10 @@ def check_limits(limits: ArmLimits, samples: NDArray) -> None:
     assert (np.abs(a) <= limits.acceleration).all()
     jerk = np.diff(a, axis=0) / 1e-3
     assert (np.abs(jerk) <= limits.jerk).all()
+    torques = np.array([inertia.mass(*it) for it in zip(q, strict=True)])
+    torques = np.einsum("nij,nj->ni", torques, a)
+    assert (np.abs(torques) <= limits.torque).all()
+    assert (np.abs(np.diff(torques, axis=0)) / 1e-3 <= limits.torque_rate).all()
     # Within what the jerk allows between two samples.
     allowed = 1e-3 * np.array(limits.jerk) * 1e-3 / 2
     assert (np.abs(np.diff(v, axis=0) / 1e-3 - a[:-1]) <= 1e-3 * np.array(limits.jerk)).all()
@@ -64,7 +71,8 @@ def check_limits(limits: ArmLimits, samples: NDArray) -> None:
 def check_random_ways(model: str, actions: int, seed: int) -> int:
     """All ways of some actions, some of them cut short by a stop; returns how many."""
     limits, rng = ARM_LIMITS[model], np.random.default_rng(seed)
-    motion, time, ways = motion_of(limits), 1.0, 0
+    inertia = ArmInertia(arm_model(FrankaArm(model=model))[0])
+    motion, time, ways = ArmMotion(PARAMETERS, limits, BASE, inertia=inertia), 1.0, 0
     state = motion.view(motion.initial_state())
     samples = [motion.motion_at(state, time)[None]]
     for _ in range(actions):
@@ -89,7 +97,7 @@ def check_random_ways(model: str, actions: int, seed: int) -> int:
     # Successive ways do not begin at whole milliseconds: check each on its own.
     for part in samples:
         if len(part) > 2:
-            check_limits(limits, part)
+            check_limits(limits, part, inertia)
     return ways
 
 

@@ -14,6 +14,7 @@ from pydrake.systems.analysis import Simulator
 from kitting_drake.common.paths import SCENARIOS
 from kitting_drake.episode import EpisodeResult
 from kitting_drake.scenario import Scenario, load_scenario
+from kitting_drake.scenario.robots import FrankaArm
 from kitting_drake.scenario.schema import Sleep
 from kitting_drake.tasks import ArrangedKitting, Kitting
 from kitting_drake.tasks.kitting.tool_poses import TablePose
@@ -189,3 +190,16 @@ def test_the_search_undoes_a_rotation_by_the_closing_jaws(amplitude: float, kitt
     assert result.success_rate == float(kitted)
     if not kitted:
         assert result.objects[0].cause == "insertion blocked"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("model", ["fr3", "panda"])
+def test_an_arm_searches_too_and_presses_no_harder_than_the_limit(model: str):
+    task = Misjudged(tools={"s_wrench": TablePose(x=0.36, y=0.3, yaw_deg=75.0)})
+    planner = PickPlaceParameters(search=InsertionSearch(amplitude=0.12, reach=0.0), max_actions=1)
+    scenario = Scenario(robot=FrankaArm(model=model), task=task, planner=planner, cameras={})
+    result = run(scenario, time_limit=60.0)
+    assert result.success_rate == 1.0
+    (action,) = result.actions_taken
+    assert action.outcome == "placed"
+    assert max(action.peak_force_n.vertical, action.peak_force_n.lateral) < 30.0

@@ -18,6 +18,7 @@ from systems.arm_limits import ARM_LIMITS
 from tests.kitting_drake.rig import Rig, build_rig
 
 BASE = Path(__file__).parent
+HOME = [*Scenario().planner.home[:2], FrankaArm().highest_wait, 0.0]
 ONE_TOOL = Kitting(tools=["claw_hammer"])
 
 
@@ -60,7 +61,7 @@ def test_ports_and_home(rig: Rig):
     state = rig.port("robot_state", root)
     np.testing.assert_allclose(state[:7], rig.port("commanded", root)[:7], atol=1e-12)
     hand = rig.port("hand_state", root)
-    np.testing.assert_allclose(hand[:6], [*Scenario().planner.home, 0.04, 0.04], atol=1e-6)
+    np.testing.assert_allclose(hand[:6], [*HOME, 0.04, 0.04], atol=1e-6)
     # The hand has none of the floating hand's axes.
     assert rig.plant.num_positions(rig.plant.GetModelInstanceByName(HAND)) == 2
 
@@ -136,9 +137,11 @@ class ForceLog(EpisodeLog):
 
 
 @pytest.mark.slow
-def test_an_episode_is_as_gentle_as_the_floating_hands():
+@pytest.mark.parametrize("model", ARM_LIMITS)
+def test_an_episode_is_as_gentle_as_the_floating_hands(model: str):
     """A set-down once read 143 N, which unloaded a pad so that the tool counted as dropped."""
-    rig = build_rig(Scenario(robot=FrankaArm(), task=Kitting(), cameras={}), base=BASE)
+    scenario = Scenario(robot=FrankaArm(model=model), task=Kitting(), cameras={})
+    rig = build_rig(scenario, base=BASE)
     log = ForceLog(rig)
     result = run_episode(rig.diagram, rig.station, scenario="test", policy="oracle", log=log)
     assert result.strict_success_rate == 1.0
@@ -152,9 +155,12 @@ def test_an_episode_is_as_gentle_as_the_floating_hands():
     vertical = felt[:, 2]
     assert ((vertical[1:] + vertical[:-1]) / 2).max() < 30.0
     assert list(arrays["joint_names"]) == [f"joint{number}" for number in range(1, 8)]
-    limits = ARM_LIMITS["fr3"]
+    limits = ARM_LIMITS[model]
     assert (arrays["joint_position"] > np.array(limits.lower)).all()
     assert (arrays["joint_position"] < np.array(limits.upper)).all()
     assert (np.abs(arrays["joint_velocity"]) <= np.array(limits.velocity)).all()
     assert (np.abs(arrays["joint_torque"]) < np.array(limits.torque)).all()
+    # Contacts included.
+    rates = np.diff(arrays["joint_torque"], axis=0) / np.diff(arrays["time"])[:, None]
+    assert (np.abs(rates) < np.array(limits.torque_rate)).all()
     assert np.abs(arrays["joint_position"] - arrays["commanded_position"]).max() < 0.003
