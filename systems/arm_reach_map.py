@@ -59,7 +59,7 @@ class ReachMap:
         found[:, middle] = planar(tips, q7[:, middle])[:, None, :]
         with np.errstate(invalid="ignore"):
             inside = (found >= self._lower) & (found <= self._upper)
-        return inside[..., 1:6].all(-1), found[..., 0]
+        return np.asarray(inside[..., 1:6].all(-1)), found[..., 0]
 
     def shares(self, base: ArmBase, points: NDArray[np.float64]) -> NDArray[np.float64]:
         """(n, m) the share of all yaws at which the hand can be at points, at each height.

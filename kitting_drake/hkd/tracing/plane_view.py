@@ -34,7 +34,7 @@ class PlaneView:
 
     def to_plane(self, pixels: Array) -> Array:
         """(n, 2) points in mm of pixels (n, 2)."""
-        return mapped(np.linalg.inv(self.homography), pixels)
+        return mapped(np.asarray(np.linalg.inv(self.homography), float), pixels)
 
     def px_per_mm(self, point: Array) -> float:
         """The photo's resolution at a point (2,) of the plane."""
