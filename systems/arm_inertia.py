@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 from numpy.typing import NDArray
-from pydrake.multibody.plant import MultibodyPlant
 
 from systems.arm_limits import JOINTS
+
+if TYPE_CHECKING:
+    # The planning of motions works without Drake.
+    from pydrake.multibody.plant import MultibodyPlant
 
 _POINTS = 9
 """At so many points of a motion the mass matrix is computed; it is interpolated in between."""

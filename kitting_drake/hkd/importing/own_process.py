@@ -70,7 +70,7 @@ def _child(
         import resource
 
         resource.setrlimit(resource.RLIMIT_AS, (_MOST_MEMORY, _MOST_MEMORY))
-        most = math.ceil(time.process_time() + time_limit)
+        most = max(1, math.ceil(time.process_time() + time_limit))
         resource.setrlimit(resource.RLIMIT_CPU, (most, resource.getrlimit(resource.RLIMIT_CPU)[1]))
     except (ImportError, ValueError, OSError):
         pass

@@ -182,7 +182,8 @@ def scenario_differences(found: dict[str, Any], expected: dict[str, Any]) -> lis
 
 
 def _without(scenario: dict[str, Any], *more: str) -> dict[str, Any]:
-    fields = scenario | _translated(scenario.get("plant"))
+    # Older runs have no field `robot`: theirs is the floating hand, the default.
+    fields = {"robot": _defaults()["robot"]} | scenario | _translated(scenario.get("plant"))
     if has_unlimited_hand(fields):
         fields["planner"] = _with_present_hand(fields["planner"])
     return {key: value for key, value in fields.items() if key not in (*_NOT_THE_TASK, *more)}

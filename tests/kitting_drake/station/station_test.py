@@ -137,7 +137,13 @@ def test_exported_ports(
     of_objects = ["success", "add_s", "position_error", "angle_error", "height_error", "at_rest"]
     sizes = {**dict.fromkeys(of_objects, 4), "kept_goals": 4, "reward": 1, "mode": 1, "counts": 4}
     sizes |= {"robot_state": 12, "wrist_force": 6, "commanded": 12, "commanded_opening": 2}
-    sizes |= {"hand_state": 12, "asks": 1, "actuation": 6, "peak_force": 3}
+    sizes |= {
+        "commanded_closing_force": 1,
+        "hand_state": 12,
+        "asks": 1,
+        "actuation": 6,
+        "peak_force": 3,
+    }
     abstract = ["placements", "failed_picks", "history", "accepted_action"]
     abstract += ["body_poses", "contact_results"]
     seen = ["observation", "observation_heights"]

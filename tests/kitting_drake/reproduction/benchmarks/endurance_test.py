@@ -10,7 +10,7 @@ from rich.console import Console
 from kitting_drake.common.errors import UserError
 from kitting_drake.episode import EpisodeResult
 from kitting_drake.episode.episode import ObjectResult
-from kitting_drake.reproduction.benchmarks import endurance
+from kitting_drake.reproduction.benchmarks.shift import endurance
 from kitting_drake.reproduction.benchmarks.shift.endurance import (
     ShiftScene,
     is_on_table,

@@ -203,11 +203,12 @@ def test_lengths_are_drawn_only_with_random_lengths():
     assert scaled != as_made
 
 
-def test_drawn_masses_change_nothing_but_the_models():
+def test_drawn_masses_change_models_and_the_order_of_grasps_only():
     plain, heavy = draw(0, ToolsetKitting()), draw(0, ToolsetKitting(tool_mass=[1.0, 2.0]))
     assert poses(plain) == poses(heavy)
     for item, other in zip(plain.objects, heavy.objects, strict=True):
-        assert (item.name, item.grasps) == (other.name, other.grasps)
+        assert item.name == other.name
+        assert set(item.grasps) <= set(other.grasps)
         mass = float(ElementTree.parse(other.model).findtext(".//mass") or 0)
         assert 1.0 <= mass <= 2.0
     for wrong in ([2.0, 1.0], [0.0, 1.0]):
