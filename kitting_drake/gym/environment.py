@@ -46,7 +46,7 @@ class KittingEnvironment(gymnasium.Env[dict[str, Any], NDArray[Any]]):
       not be reproducible; `failed_picks`, (x, y, theta) of each failed grasp; and `history`, the
       earlier actions as dicts: `action`, `outcome`, `peak_force` (N).
     - `reset(seed=N)` makes the scene of seed N, as in `evaluate` and `run`; without a seed, a
-      random one. `info["seed"]` holds it.
+      random one. `info["seed"]` holds it. It has no `options`, and warns of any that are given.
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 1}  # noqa: RUF012  Gymnasium's own way.
@@ -106,6 +106,11 @@ class KittingEnvironment(gymnasium.Env[dict[str, Any], NDArray[Any]]):
         """
         if seed is not None and not 0 <= seed < ALL_SEEDS.stop:
             raise ValueError(f"seed must be an integer from 0 to {ALL_SEEDS[-1]}, not {seed}")
+        if options:
+            gymnasium.logger.warn(
+                f"reset() ignores its options {', '.join(map(str, options))}: the scene follows "
+                "from the seed alone"
+            )
         super().reset(seed=seed)
         chosen_seed = int(self.np_random.integers(ALL_SEEDS.stop)) if seed is None else int(seed)
         self.close()

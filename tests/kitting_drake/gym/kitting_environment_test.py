@@ -175,7 +175,8 @@ def test_earlier_scenes_are_garbage_collected(small: Path):
 
 def test_termination_and_truncation(small: Path):
     environment = make(small)
-    environment.reset(seed=0)
+    with pytest.warns(UserWarning, match="ignores its options tools"):
+        environment.reset(seed=0, options={"tools": 3})
     *_, terminated, truncated, info = environment.step(STOP)
     assert (terminated, truncated, info["actions"]) == (True, False, 0)
     with pytest.raises(gymnasium.error.ResetNeeded):

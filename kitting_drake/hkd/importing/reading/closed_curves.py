@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from kitting_drake.common.errors import UserError
-from kitting_drake.hkd.importing.reading.drawn_curves import FLAT_MM, DrawnCurves
+from kitting_drake.hkd.importing.reading.drawn_curves import FLAT_MM, Curve, DrawnCurves
 
 PAPERS_MM = (
     ("A5", 148.0, 210.0),
@@ -44,7 +44,7 @@ def enclosed(drawn: DrawnCurves, path: Path) -> tuple[CrossSection, list[str]]:
     notes: list[str] = []
     areas = [CrossSection([loop], FillRule.EvenOdd) for loop in _joined(drawn, path, notes)]
     areas.sort(key=lambda area: -area.area())
-    while len(areas) > 1 and (frame := _as_frame(areas[0], areas[1], drawn.page_mm)):
+    while len(areas) > 1 and (frame := _as_frame(areas, drawn.page_mm)):
         notes.append(f"left out {frame} around it")
         areas.pop(0)
     if not areas or areas[0].area() < _LEAST_AREA_MM2:
@@ -69,10 +69,14 @@ def enclosed(drawn: DrawnCurves, path: Path) -> tuple[CrossSection, list[str]]:
     return outer.simplify(FLAT_MM), notes
 
 
-def _as_frame(
-    area: CrossSection, inside: CrossSection, page_mm: tuple[float, float] | None
-) -> str | None:
-    """What the rectangle around a tool is, in words; None if it is the tool itself."""
+def _as_frame(areas: list[CrossSection], page_mm: tuple[float, float] | None) -> str | None:
+    """What the largest area is, if it is a rectangle around a tool; None if it is the tool itself.
+
+    Args:
+        areas: inside closed curves, the largest first; at least two.
+        page_mm: the size of the page, where the drawing has one.
+    """
+    area, inside, *others = areas
     x_min, y_min, x_max, y_max = area.bounds()
     sides = np.array([x_max - x_min, y_max - y_min])
     low = inside.bounds()
@@ -86,7 +90,13 @@ def _as_frame(
     for name, short, long in PAPERS_MM:
         if np.abs(np.sort(sides) - (short, long)).max() < 1.0:
             return f"{size}, a sheet of {name},"
-    return f"{size}, a frame," if sides.max() > 350.0 else None
+    # A hole has no hole of its own, but the tool in a frame may have one.
+    edge = (area.offset(-_LINE_MM, JoinType.Miter) - inside).area() < 0.001 * area.area()
+    holed = any(
+        other.area() < 0.98 * inside.area() and (other - inside).area() < 0.01 * other.area()
+        for other in others
+    )
+    return f"{size}, a frame," if sides.max() > 350.0 or (holed and not edge) else None
 
 
 def _joined(drawn: DrawnCurves, path: Path, notes: list[str]) -> list[Points]:
@@ -97,10 +107,11 @@ def _joined(drawn: DrawnCurves, path: Path, notes: list[str]) -> list[Points]:
     """
     # Drop the single points that some programs leave behind.
     curves = [curve for curve in drawn.curves if np.ptp(curve.points, axis=0).max() > _JOIN_MM]
-    kept = _without_doubles([curve.points for curve in curves])
-    if len(kept) < len(curves):
-        notes.append(f"left out {len(curves) - len(kept)} curves that are drawn twice")
-    curves = [curves[index] for index in kept]
+    drawn_once = _merged_lines(curves)
+    drawn_once = [drawn_once[k] for k in _without_doubles([c.points for c in drawn_once])]
+    if len(drawn_once) < len(curves):
+        notes.append(f"left out {len(curves) - len(drawn_once)} curves that are drawn twice")
+    curves = drawn_once
     loops = [curve.points for curve in curves if _is_closed(curve.points)]
     chains = [(curve.points, curve.filled) for curve in curves if not _is_closed(curve.points)]
     while chains:
@@ -137,6 +148,39 @@ def _gap_error(chains: list[Points], drawn: DrawnCurves, path: Path) -> UserErro
         f"{path} has an open curve with a gap of {gaps[one, other]:.2f} mm at {place}: close it, "
         "or delete what does not belong to the outline"
     )
+
+
+def _merged_lines(curves: list[Curve]) -> list[Curve]:
+    """Replaces straight lines that overlap in part by one line."""
+    merged = [curve for curve in curves if len(curve.points) != 2]
+    lines = [curve for curve in curves if len(curve.points) == 2]
+    ends = np.array([line.points for line in lines]).reshape(-1, 2, 2)
+    waiting = np.ones(len(lines), dtype=bool)
+    for index, line in enumerate(lines):
+        if not waiting[index]:
+            continue
+        waiting[index], points = False, line.points
+        while True:
+            along = points[1] - points[0]
+            length = float(np.linalg.norm(along))
+            along = along / length
+            offsets = ends - points[0]
+            places = np.sort(offsets @ along, axis=1)
+            overlap = np.minimum(places[:, 1], length) - np.maximum(places[:, 0], 0.0)
+            shorter = np.minimum(places[:, 1] - places[:, 0], length)
+            # Short pieces of a curve are neighbours, not doubles.
+            slack = np.minimum(_SAME_MM, 0.2 * shorter)
+            beside = np.abs(offsets @ np.array([-along[1], along[0]])).max(axis=1)
+            least = np.minimum(2 * _JOIN_MM, 0.5 * shorter)
+            found = np.flatnonzero(waiting & (beside <= slack) & (overlap > least))
+            if not len(found):
+                break
+            first, last = places[found[0]]
+            waiting[found[0]] = False
+            start, end = min(first, 0.0), max(last, length)
+            points = np.array([points[0] + start * along, points[0] + end * along])
+        merged.append(Curve(points, line.filled))
+    return merged
 
 
 def _without_doubles(curves: list[Points]) -> list[int]:

@@ -7,8 +7,10 @@ import numpy as np
 
 from kitting_drake.common.errors import UserError
 from kitting_drake.common.extras import import_extra
-from kitting_drake.hkd.importing.reading.drawn_curves import FLAT_MM, Curve, DrawnCurves
+from kitting_drake.hkd.importing.reading.drawn_curves import FLAT_MM, UNITS_MM, Curve, DrawnCurves
 
+_LENGTHS_MM = (15.0, 350.0)
+"""The range of lengths of a tool."""
 _NOTES = ("DIMENSION", "ARC_DIMENSION", "LARGE_RADIAL_DIMENSION", "LEADER", "MULTILEADER")
 """DXF entities that annotate a drawing, so their lines do not belong to an outline."""
 
@@ -18,17 +20,17 @@ def dxf_curves(path: Path, unit_mm: float | None = None) -> DrawnCurves:
 
     Args:
         path: the drawing.
-        unit_mm: the length of a unit of the drawing; None follows $INSUNITS, or else is 1 mm.
+        unit_mm: the length of a unit of the drawing; None follows $INSUNITS, or else is the only
+            one that makes it a tool.
 
     Raises:
-        UserError: the file is broken.
+        UserError: the file is broken, or its unit is not clear.
     """
     ezdxf = import_extra(
         "ezdxf", "disassemble", "path", "units", purpose="DXF", extra="fabrication"
     )
     try:
         document = ezdxf.readfile(path)
-        mm, measured = _scale(ezdxf, document, path, unit_mm)
         hidden = {
             layer.dxf.name.lower()
             for layer in document.layers
@@ -44,16 +46,21 @@ def dxf_curves(path: Path, unit_mm: float | None = None) -> DrawnCurves:
             return seen and entity.dxftype() not in _NOTES
 
         whole = filter(is_drawn, document.modelspace())
-        curves = []
+        found = []
         for entity in filter(is_drawn, ezdxf.disassemble.recursive_decompose(whole)):
             try:
                 curve = ezdxf.path.make_path(entity)
             except TypeError:
                 # Not a curve, for instance text.
                 continue
-            for part in curve.sub_paths():
-                points = [(mm * p.x, mm * p.y) for p in part.flattening(FLAT_MM / mm)]
-                curves.append(Curve(np.array(points).reshape(-1, 2)))
+            found += curve.sub_paths()
+        box = ezdxf.path.bbox(found, fast=True)
+        extent = max(box.size.x, box.size.y) if box.has_data else 0.0
+        mm, measured = _scale(ezdxf, document, path, unit_mm, extent)
+        curves = [
+            Curve(np.array([(mm * p.x, mm * p.y) for p in part.flattening(FLAT_MM / mm)]))
+            for part in found
+        ]
         elsewhere = [name for name in document.layout_names() if name != "Model"]
         elsewhere = [name for name in elsewhere if len(document.layout(name))]
     except (MemoryError, UserError):
@@ -70,14 +77,39 @@ def dxf_curves(path: Path, unit_mm: float | None = None) -> DrawnCurves:
     return DrawnCurves(curves, measured, None, notes)
 
 
-def _scale(ezdxf: Any, document: Any, path: Path, unit_mm: float | None) -> tuple[float, str]:
-    """The length in mm of a unit, and how it is known."""
+def _scale(
+    ezdxf: Any, document: Any, path: Path, unit_mm: float | None, extent: float
+) -> tuple[float, str]:
+    """The length in mm of a unit, and how it is known.
+
+    Raises:
+        UserError: several units make a drawing of this extent a tool.
+    """
     if unit_mm is not None:
         return unit_mm, f"by units of {unit_mm:g} mm as requested"
     # The reader takes files without a header to be in metres.
     given = b"$INSUNITS" in path.read_bytes()
     units = ezdxf.units.InsertUnits(int(document.header.get("$INSUNITS", 0)) if given else 0)
     if units == ezdxf.units.InsertUnits.Unitless:
-        return 1.0, "in mm, because it names no unit"
+        return _likely(path, document, extent)
     mm = ezdxf.units.conversion_factor(units, ezdxf.units.InsertUnits.Millimeters)
     return mm, f"by its $INSUNITS, {units.name.lower()}"
+
+
+def _likely(path: Path, document: Any, extent: float) -> tuple[float, str]:
+    """The only unit in which a drawing that names none is as long as a tool; mm if there is none.
+
+    Raises:
+        UserError: there are several.
+    """
+    names = ["mm", "inches", "cm", "m"]
+    if b"$MEASUREMENT" in path.read_bytes():
+        metric = int(document.header.get("$MEASUREMENT", 1))
+        names = ["mm", "cm", "m"] if metric else ["mm", "inches"]
+    low, high = _LENGTHS_MM
+    possible = [name for name in names if low <= extent * UNITS_MM[name] <= high]
+    if len(possible) > 1:
+        readings = " or ".join(f"{extent * UNITS_MM[n]:.4g} mm (in {n})" for n in possible)
+        raise UserError(f"{path} names no unit, and may be {readings} long: give --unit")
+    name = possible[0] if possible else "mm"
+    return UNITS_MM[name], f"in {name}, because it names no unit"

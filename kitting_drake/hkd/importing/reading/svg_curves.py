@@ -27,7 +27,8 @@ def svg_curves(path: Path, unit_mm: float | None = None) -> DrawnCurves:
     """The curves of an SVG that are drawn.
 
     Lengths follow from width, height and viewBox. Pixels are 1/72 inch in files of Adobe
-    Illustrator, 1/90 inch in those of Inkscape before 0.92, and else 1/96 inch.
+    Illustrator, 1/90 inch in those of Inkscape before 0.92, else what makes the page a sheet of
+    paper, else 1/96 inch.
 
     Args:
         path: the drawing.
@@ -51,6 +52,7 @@ def svg_curves(path: Path, unit_mm: float | None = None) -> DrawnCurves:
         shapes = [e for e in shapes if e.values.get("visibility") not in ("hidden", "collapse")]
         # What has neither fill nor line is not seen. But some programs leave all so.
         seen = [e for e in shapes if _is_painted(e.fill) or _is_painted(e.stroke)]
+        seen = [e for e in seen if str(e.values.get("opacity", 1)).strip() not in ("0", "0%")]
         curves = [
             Curve(mm * np.array(points) * (1, -1), _is_painted(shape.fill))
             for shape in seen or shapes
@@ -88,16 +90,23 @@ def _scale(root: ElementTree.Element, text: bytes, unit_mm: float | None) -> tup
     writer, dpi = _writer(root, text)
     if units and (dpi != 90 or "viewBox" in root.attrib):
         return 25.4 / 96, "by its width and height"
-    if writer is not None:
-        return 25.4 / dpi, f"by pixels of 1/{dpi} inch, as {writer} writes them"
-    if given:
-        return 25.4 / 96, "by pixels of 1/96 inch, because it names no unit"
     box = root.get("viewBox", "").replace(",", " ").split()
     sides = sorted(map(float, box[2:])) if len(box) == 4 else [0.0, 0.0]
-    for paper, short, long in PAPERS_MM:
-        for unit, mm in (("mm", 1.0), *((f"1/{n} inch", 25.4 / n) for n in _RESOLUTIONS)):
-            if abs(mm * sides[0] - short) < 0.6 and abs(mm * sides[1] - long) < 0.6:
-                return mm, f"by its page, which is {paper} in units of {unit}"
+    if len(given) == 2 and not units:
+        sides = sorted(float(_length(value, "width")[0]) for value in given)
+    paper, paper_mm = _paper(sides)
+    if writer is not None:
+        if paper and abs(25.4 / dpi / paper_mm - 1) > 1e-6:
+            raise UserError(
+                f"{writer} writes pixels of 1/{dpi} inch, but its page is {paper}: give "
+                f"--length_mm, or set width and height in mm ({25.4 / dpi * sides[1]:.0f} mm or "
+                f"{paper_mm * sides[1]:.0f} mm)"
+            )
+        return 25.4 / dpi, f"by pixels of 1/{dpi} inch, as {writer} writes them"
+    if paper:
+        return paper_mm, f"by its page, which is {paper}"
+    if given:
+        return 25.4 / 96, "by pixels of 1/96 inch, because it names no unit"
     readings = ", ".join(
         f"{mm * sides[1]:.0f} mm in {name}"
         for name, mm in (("mm", 1.0), ("units of 1/72 inch", 25.4 / 72), ("1/96 inch", 25.4 / 96))
@@ -109,8 +118,21 @@ def _scale(root: ElementTree.Element, text: bytes, unit_mm: float | None) -> tup
     )
 
 
+def _paper(sides: list[float]) -> tuple[str, float]:
+    """The sheet of paper that a page is, with the unit, and the unit in mm; "" if it is none.
+
+    Args:
+        sides: the page's sides in units, the shorter first.
+    """
+    for paper, short, long in PAPERS_MM:
+        for unit, mm in (("mm", 1.0), *((f"1/{n} inch", 25.4 / n) for n in _RESOLUTIONS)):
+            if abs(mm * sides[0] - short) < 0.6 and abs(mm * sides[1] - long) < 0.6:
+                return f"{paper} in units of {unit}", mm
+    return "", 1.0
+
+
 def _writer(root: ElementTree.Element, text: bytes) -> tuple[str | None, int]:
-    """The program that wrote an SVG, if its pixels are not 1/96 inch, and its pixels per inch."""
+    """The program that wrote an SVG, if it is known, and its pixels per inch."""
     head = text[:4000]
     layers = [e.get("id", "") for e in root.iter() if e.get("data-name") or e is root]
     illustrator = b"Adobe Illustrator" in head or b"ns.adobe.com/AdobeIllustrator" in head
@@ -119,8 +141,9 @@ def _writer(root: ElementTree.Element, text: bytes) -> tuple[str | None, int]:
     for name, value in root.attrib.items():
         if name.endswith("/namespaces/inkscape}version"):
             version = re.match(r"(\d+)\.(\d+)", value)
-            if version and (int(version[1]), int(version[2])) < (0, 92):
-                return f"Inkscape {version[0]}", 90
+            if version:
+                old = (int(version[1]), int(version[2])) < (0, 92)
+                return f"Inkscape {version[0]}", 90 if old else 96
     return None, 96
 
 

@@ -135,3 +135,47 @@ def test_the_smallest_gap_is_told_with_its_place(tmp_path: Path):
     document.saveas(tmp_path / "tool.dxf")
     with pytest.raises(UserError, match=r"gap of 0\.30 mm at x = 160\.0, y = 20\.[12]"):
         read_drawing(tmp_path / "tool.dxf")
+
+
+def box(path: Path, scale: float, measurement: int | None = None) -> Path:
+    """A box of 160 x 20 mm, as R12 without $INSUNITS; its long sides are two overlapping lines."""
+    header = "" if measurement is None else f"9\n$MEASUREMENT\n70\n{measurement}\n"
+    text = f"0\nSECTION\n2\nHEADER\n{header}0\nENDSEC\n" if header else ""
+    lines = [(0, 0, 0, 20), (160, 0, 160, 20)]
+    lines += [line for y in (0, 20) for line in ((0, y, 100, y), (160, y, 60, y))]
+    text += "0\nSECTION\n2\nENTITIES\n"
+    for line in lines:
+        codes = zip((10, 20, 11, 21), line, strict=True)
+        text += "0\nLINE\n8\n0\n" + "".join(f"{code}\n{scale * x}\n" for code, x in codes)
+    path.write_text(text + "0\nENDSEC\n0\nEOF\n")
+    return path
+
+
+@pytest.mark.parametrize(
+    ("unit_mm", "measurement", "said"),
+    [
+        (1.0, None, "in mm"),
+        (1.0, 0, "in mm"),
+        (1.0, 1, "in mm"),
+        (25.4, 0, "in inches"),
+        (10.0, 1, None),
+        (1000.0, None, "in m,"),
+    ],
+)
+def test_a_drawing_that_names_no_unit_has_the_only_possible_one(
+    unit_mm: float, measurement: int | None, said: str | None, tmp_path: Path
+):
+    path = box(tmp_path / "tool.dxf", 1 / unit_mm, measurement)
+    if said is None:
+        with pytest.raises(UserError, match=r"16 mm \(in mm\) or 160 mm \(in cm\)"):
+            read_drawing(path)
+        assert read_drawing(path, unit_mm).outline.area() == pytest.approx(3200, rel=1e-3)
+        return
+    drawing = read_drawing(path)
+    assert drawing.outline.area() == pytest.approx(3200, rel=1e-3)
+    assert said in drawing.measured
+
+
+def test_inches_and_centimetres_without_a_unit_are_a_question(tmp_path: Path):
+    with pytest.raises(UserError, match=r"162\.6 mm \(in inches\) or 64 mm \(in cm\)"):
+        read_drawing(box(tmp_path / "tool.dxf", 0.04))

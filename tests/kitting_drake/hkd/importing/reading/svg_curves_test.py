@@ -46,6 +46,8 @@ MM = 'width="200mm" height="60mm" viewBox="0 0 200 60"'
         (svg(bar(), 'width="100%" height="100%" viewBox="0 0 297 210"'), "A4"),
         (svg(bar(25.4 / 300), 'width="100%" viewBox="0 0 2480 3508"'), "A4"),
         (svg(bar(25.4 / 72), 'viewBox="0 0 612 792"'), "Letter"),
+        (svg(bar(25.4 / 72), 'width="595" height="842"'), "A4 in units of 1/72 inch"),
+        (svg(bar(25.4 / 90), 'width="744.09" height="1052.36" viewBox="0 0 744.09 1052.36"'), "A4"),
         (svg(bar(25.4), 'width="8in" height="2.4in" viewBox="0 0 8 2.4"'), "width and height"),
     ],
 )
@@ -65,6 +67,32 @@ def test_a_drawing_without_a_size_is_refused(root: str, tmp_path: Path):
         read_drawing(path)
     assert "--unit" in str(error.value)
     assert read_drawing(path, 1.0).outline.area() == pytest.approx(AREA, rel=2e-3)
+
+
+@pytest.mark.parametrize(
+    ("root", "before", "sizes"),
+    [
+        # A page of Inkscape 0.91, kept by a newer one; and a page of Inkscape, kept by Illustrator.
+        (f'{INKSCAPE}"1.2" width="744.09" height="1052.36"', "", "278 mm or 297 mm"),
+        ('width="793.7" height="1122.52"', ILLUSTRATOR, "396 mm or 297 mm"),
+    ],
+)
+def test_a_page_that_contradicts_its_writer_is_a_question(
+    root: str, before: str, sizes: str, tmp_path: Path
+):
+    path = tmp_path / "tool.svg"
+    path.write_text(svg(bar(25.4 / 90), root, before))
+    with pytest.raises(UserError, match=sizes):
+        read_drawing(path)
+
+
+def test_a_frame_around_a_tool_with_a_hole_is_left_out(tmp_path: Path):
+    frame = '<rect x="5" y="5" width="190" height="50" fill="none" stroke="#000"/>'
+    unseen = '<rect x="1" y="1" width="150" height="55" opacity="0"/>'
+    (tmp_path / "tool.svg").write_text(svg(frame + unseen + bar(), MM))
+    drawing = read_drawing(tmp_path / "tool.svg")
+    assert drawing.outline.area() == pytest.approx(AREA, rel=2e-3)
+    assert "190 x 50 mm, a frame" in drawing.notes[0]
 
 
 PAGE = '<rect width="200" height="60" fill="#fff"/>'
