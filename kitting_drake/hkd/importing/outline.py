@@ -37,11 +37,6 @@ def is_outline(path: Path) -> bool:
     return path.suffix.lower() in OUTLINE_FORMATS
 
 
-def read_outline(path: Path, unit_mm: float | None = None) -> CrossSection:
-    """The outline of `read_drawing`."""
-    return read_drawing(path, unit_mm).outline
-
-
 def read_drawing(path: Path, unit_mm: float | None = None) -> Drawing:
     """The area inside a drawing's largest closed curve and outside its other curves.
 

@@ -7,7 +7,7 @@ import pytest
 from manifold3d import CrossSection
 
 from kitting_drake.common.errors import UserError
-from kitting_drake.hkd.importing.outline import read_outline
+from kitting_drake.hkd.importing.outline import read_drawing
 from kitting_drake.hkd.tracing.scales import Scale
 from kitting_drake.hkd.tracing.tracer import TraceReport, TraceRequest, trace
 from kitting_drake.reproduction.benchmarks.trace_benchmark import outline_errors
@@ -66,7 +66,7 @@ def test_an_oblique_photo_gives_the_true_outline(
     assert tool.size_mm[0] == pytest.approx(142.7, abs=0.6)
     assert any("EXIF" in note for note in report.notes) == exif
     for suffix in (".svg", ".dxf"):
-        drawing = read_outline(tool.svg.with_suffix(suffix))
+        drawing = read_drawing(tool.svg.with_suffix(suffix)).outline
         assert drawing.area() == pytest.approx(tool.outline.area(), rel=1e-3)
     assert (path.parent / "out/trace.png").stat().st_size > 10_000
     assert json.loads((path.parent / "out/trace.json").read_text())["tilt_deg"] == pytest.approx(
