@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from manifold3d import CrossSection, FillRule
 from numpy.typing import NDArray
-from PIL import Image
+from PIL import ExifTags, Image
 
 from kitting_drake.common.extras import import_extra
 
@@ -25,7 +25,6 @@ _FOCAL_35MM = 26
 _SHADOW_PX_PER_MM = 2.0
 _SHADOW_MARGIN_MM = 50.0
 _PIECE_MM = 1.2
-_EXIF_IFD, _EXIF_FOCAL_35MM = 0x8769, 0xA405
 PAINTS = {
     "black": (0.02, 0.02, 0.022),
     "steel": (0.30, 0.31, 0.33),
@@ -142,7 +141,7 @@ def draw_photo(
     image = Image.fromarray((255 * np.clip(coded, 0, 1) + 0.5).astype(np.uint8))
     exif = Image.Exif()
     if spec.exif:
-        exif.get_ifd(_EXIF_IFD)[_EXIF_FOCAL_35MM] = _FOCAL_35MM
+        exif.get_ifd(ExifTags.IFD.Exif)[ExifTags.Base.FocalLengthIn35mmFilm] = _FOCAL_35MM
     data = io.BytesIO()
     image.save(data, format="JPEG", quality=spec.quality, exif=exif)
     return data.getvalue()
