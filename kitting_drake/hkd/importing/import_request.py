@@ -1,4 +1,4 @@
-"""What a user asks `hkd import` for."""
+"""The request of `hkd import`, and its checks."""
 
 import re
 from dataclasses import dataclass

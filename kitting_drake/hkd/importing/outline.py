@@ -29,7 +29,7 @@ class Drawing:
     measured: str
     """How lengths were measured, a phrase for the user."""
     notes: list[str]
-    """What was left out or closed, one phrase each."""
+    """Phrases for the user on curves that were left out or closed."""
 
 
 def is_outline(path: Path) -> bool:

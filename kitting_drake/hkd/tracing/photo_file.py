@@ -1,4 +1,4 @@
-"""Reads a photo and what it says about its lens."""
+"""Reads a photo and its EXIF data on the lens."""
 
 import math
 import warnings

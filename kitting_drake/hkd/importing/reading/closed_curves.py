@@ -71,7 +71,7 @@ def enclosed(drawn: DrawnCurves, path: Path) -> tuple[CrossSection, list[str]]:
 
 
 def _as_frame(areas: list[CrossSection], page_mm: tuple[float, float] | None) -> str | None:
-    """What the largest area is, if it is a rectangle around a tool; None if it is the tool itself.
+    """Describes the largest area if it is a page or a frame; None if it is the tool itself.
 
     Args:
         areas: inside closed curves, the largest first; at least two.
