@@ -186,7 +186,6 @@ def _by_board(cv2: Any, photo: Photo, scale: Scale, camera_mm: float | None) -> 
     # The board's frame has y down its rows.
     points[:, 1] = rows * square - points[:, 1]
     pixels = corners.reshape(-1, 2).astype(float)
-    image, notes = photo.pixels, [f"a board of {columns} x {rows} squares of {square:g} mm"]
     homography, _ = cv2.findHomography(points, pixels)
     if photo.focal_35mm:
         focal = photo.focal_px(photo.focal_35mm)
@@ -206,4 +205,5 @@ def _by_board(cv2: Any, photo: Photo, scale: Scale, camera_mm: float | None) -> 
     frame = np.array([[0, 0], [1, 0], [1, 1], [0, 1]]) * (np.array(photo.size) - 1.0)
     reach = view.to_plane(frame)
     low, high = reach.min(axis=0), reach.max(axis=0)
-    return GroundPlane(view, image, low, high, None, (border + outward,), [*notes, told])
+    notes = [f"a board of {columns} x {rows} squares of {square:g} mm", told]
+    return GroundPlane(view, photo.pixels, low, high, None, (border + outward,), notes)
