@@ -9,7 +9,12 @@ from numpy.typing import NDArray
 
 from kitting_drake.common.errors import UserError
 from kitting_drake.hkd.tracing.photo_file import ASSUMED_FOCAL_35MM, Photo
-from kitting_drake.hkd.tracing.plane_view import PlaneView, focal_of_homography, view_of
+from kitting_drake.hkd.tracing.plane_view import (
+    PlaneView,
+    focal_of_height,
+    focal_of_homography,
+    view_of,
+)
 from kitting_drake.hkd.tracing.sheet_plane import GroundPlane
 
 Array = NDArray[np.float64]
@@ -196,7 +201,7 @@ def _by_board(cv2: Any, photo: Photo, scale: Scale, camera_mm: float | None) -> 
             "by the board's perspective" if known else "assumed: the photo does not tell"
         )
     if camera_mm is not None:
-        focal *= camera_mm / view_of(homography, focal, photo.center).camera[2]
+        focal = focal_of_height(homography, camera_mm, focal, photo.center)
         told = f"the camera {camera_mm:g} mm above, as given"
     view = view_of(homography, focal, photo.center)
     border = np.array([[0, 0], [1, 0], [1, 1], [0, 1]]) * [columns * square, rows * square]
