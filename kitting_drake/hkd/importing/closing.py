@@ -28,11 +28,10 @@ def capped(vertices: Array, faces: Faces) -> Faces | None:
     if not loops:
         return None
     # The largest first: it sets the plane of those inside it.
-    areas = {id(loop): _area_vector(vertices[loop]) for loop in loops}
-    loops.sort(key=lambda loop: -float(np.linalg.norm(areas[id(loop)])))
+    loops.sort(key=lambda loop: -float(np.linalg.norm(_area_vector(vertices[loop]))))
     caps = [faces]
     while loops:
-        normal = areas[id(loops[0])]
+        normal = _area_vector(vertices[loops[0]])
         size = float(np.linalg.norm(normal))
         if size < 1e-9:
             return None
