@@ -198,8 +198,10 @@ def _robot_text(path: Path) -> str:
 
 
 def _check_scenario(path: Path, console: Console) -> bool:
-    """Prints how to run a kit's scenario, that the simulated table is too small for it, or how
-    often its arm reaches everything; returns whether it can be run."""
+    """Prints how to run a kit's scenario, or why it cannot be run; returns whether it can.
+
+    For an arm, also prints how often it reaches everything.
+    """
     # The loader is slow to import, and the other verbs do not need it.
     from kitting_drake.scenario.loader import load_scenario
     from kitting_drake.scenario.robots import FrankaArm

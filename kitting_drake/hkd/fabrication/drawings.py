@@ -4,13 +4,12 @@ Each layer or group holds the recesses of one kind and one depth below the block
 are drawn along their walls; only the solids have the bevel around the rims.
 """
 
-import io
 from html import escape
 
 import numpy as np
 from numpy.typing import NDArray
 
-from kitting_drake.common.extras import import_extra
+from kitting_drake.hkd.fabrication.closed_lines import add_layer, new_dxf, svg_path, text_of
 from kitting_drake.hkd.fabrication.design import Design, layers, loops_mm
 
 _NAMES = {"cavity": "CAVITIES", "notch": "NOTCHES", "label": "LABELS"}
@@ -28,32 +27,24 @@ def dxf_text(design: Design) -> str:
     """A DXF of release 2010: closed polylines on one layer per depth, and the block on BLOCK.
 
     Raises:
-        UserError: ezdxf is not installed.
+        MachineError: ezdxf is not installed.
     """
-    ezdxf = import_extra("ezdxf", "units", purpose="DXF", extra="fabrication")
-    document = ezdxf.new("R2010", units=ezdxf.units.MM)
-    document.header["$INSUNITS"] = int(ezdxf.units.MM)
-    document.header["$MEASUREMENT"] = 1
-    space = document.modelspace()
-    document.layers.add("BLOCK", color=_BLOCK_COLOUR)
-    space.add_lwpolyline(_block(design).tolist(), close=True, dxfattribs={"layer": "BLOCK"})
+    document = new_dxf()
+    add_layer(document, "BLOCK", _BLOCK_COLOUR, [_block(design)])
     cavities = 0
     for (kind, depth), recesses in layers(design).items():
-        name = layer_name(kind, depth)
         colour = {"notch": _NOTCH_COLOUR, "label": _LABEL_COLOUR}.get(kind)
         if colour is None:
             colour = _CAVITY_COLOURS[cavities % len(_CAVITY_COLOURS)]
             cavities += 1
-        document.layers.add(name, color=colour)
-        for recess in recesses:
-            for loop in loops_mm(recess.outline, design.kit.parameters):
-                space.add_lwpolyline(loop.tolist(), close=True, dxfattribs={"layer": name})
+        loops = [
+            loop for recess in recesses for loop in loops_mm(recess.outline, design.kit.parameters)
+        ]
+        add_layer(document, layer_name(kind, depth), colour, loops)
     length, width, _ = design.size_mm
     document.header["$EXTMIN"], document.header["$EXTMAX"] = (0, 0, 0), (length, width, 0)
     document.set_modelspace_vport(height=1.1 * max(length, width), center=(length / 2, width / 2))
-    text = io.StringIO()
-    document.write(text)
-    return text.getvalue()
+    return text_of(document)
 
 
 def svg_text(design: Design) -> str:
@@ -90,5 +81,4 @@ def _block(design: Design) -> NDArray[np.float64]:
 
 def _path(loop: NDArray[np.float64], width: float) -> str:
     """A closed path, flipped because y points down in SVG."""
-    points = " L ".join(f"{x:.4f} {width - y:.4f}" for x, y in loop)
-    return f"M {points} Z"
+    return svg_path(np.column_stack([loop[:, 0], width - loop[:, 1]]))

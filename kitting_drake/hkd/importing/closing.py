@@ -12,7 +12,7 @@ _FLAT_MM = 2.0
 
 
 def capped(vertices: Array, faces: Faces) -> Faces | None:
-    """The triangles of a surface and of flat caps on its openings.
+    """Closes the openings of a surface with flat caps.
 
     Rims in one plane are closed together, so that a ring stays a ring.
 
@@ -21,17 +21,17 @@ def capped(vertices: Array, faces: Faces) -> Faces | None:
         faces: (m, 3), of consistent winding.
 
     Returns:
-        None if an opening is not flat, or its rim touches itself.
+        The triangles of the surface and the caps, or None if an opening is not flat or its rim
+        touches itself.
     """
     loops = _rims(faces)
     if not loops:
         return None
     # The largest first: it sets the plane of those inside it.
-    areas = {id(loop): _area_vector(vertices[loop]) for loop in loops}
-    loops.sort(key=lambda loop: -float(np.linalg.norm(areas[id(loop)])))
+    loops.sort(key=lambda loop: -float(np.linalg.norm(_area_vector(vertices[loop]))))
     caps = [faces]
     while loops:
-        normal = areas[id(loops[0])]
+        normal = _area_vector(vertices[loops[0]])
         size = float(np.linalg.norm(normal))
         if size < 1e-9:
             return None

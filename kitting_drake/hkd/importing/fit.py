@@ -12,11 +12,9 @@ from kitting_drake.hkd.kits.layout import layout_kit
 from kitting_drake.hkd.kits.parameters import KitParameters
 from kitting_drake.hkd.tools import meshes
 from kitting_drake.hkd.tools.mass import mass_properties
-from kitting_drake.hkd.tools.tool import Tool
+from kitting_drake.hkd.tools.tool import LONGEST_MM, SHORTEST_MM, Tool
 from systems.grasp import Grasp
 
-SHORTEST_MM, LONGEST_MM = 15.0, 350.0
-"""The range of lengths of a tool."""
 THINNEST_MM, HIGHEST_MM = 4.0, 45.0
 
 # The number of other grasps to keep, and how much more they may cost than the best.

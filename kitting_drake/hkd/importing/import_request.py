@@ -1,22 +1,21 @@
-"""What a user asks `hkd import` for."""
+"""The request of `hkd import`, and its checks."""
 
 import re
 from dataclasses import dataclass
 from pathlib import Path
 
 from kitting_drake.common.errors import UserError
-from kitting_drake.hkd.importing.fit import (
-    HIGHEST_MM,
-    LONGEST_MM,
-    SHORTEST_MM,
-    THINNEST_MM,
-    UNITS_MM,
-)
+from kitting_drake.hkd.importing.fit import HIGHEST_MM, THINNEST_MM, UNITS_MM
 from kitting_drake.hkd.importing.materials import DENSITY_RANGE, MATERIALS
 from kitting_drake.hkd.importing.outline import is_outline
 from kitting_drake.hkd.importing.reading import drawn_curves
 from kitting_drake.hkd.importing.reading.mesh_files import IN_MM
-from kitting_drake.hkd.tools.tool import check_category, tool_names
+from kitting_drake.hkd.tools.tool import (
+    LONGEST_MM,
+    SHORTEST_MM,
+    check_category,
+    tool_names,
+)
 
 
 @dataclass(frozen=True)

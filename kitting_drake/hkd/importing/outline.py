@@ -14,10 +14,9 @@ from kitting_drake.hkd.importing.reading.dxf_curves import dxf_curves
 from kitting_drake.hkd.importing.reading.svg_curves import svg_curves
 from kitting_drake.hkd.importing.repair import NOMINAL_MM
 from kitting_drake.hkd.importing.tool_frame import long_direction_deg
+from kitting_drake.hkd.tools.tool import LONGEST_MM, SHORTEST_MM
 
 OUTLINE_FORMATS = (".svg", ".dxf")
-LENGTHS_MM = (15.0, 350.0)
-"""The range of lengths of an imported outline."""
 _MOST_BYTES = 20_000_000
 
 
@@ -30,17 +29,12 @@ class Drawing:
     measured: str
     """How lengths were measured, a phrase for the user."""
     notes: list[str]
-    """What was left out or closed, one phrase each."""
+    """Phrases for the user on curves that were left out or closed."""
 
 
 def is_outline(path: Path) -> bool:
     """Whether a file's suffix is that of a drawing."""
     return path.suffix.lower() in OUTLINE_FORMATS
-
-
-def read_outline(path: Path, unit_mm: float | None = None) -> CrossSection:
-    """The outline of `read_drawing`."""
-    return read_drawing(path, unit_mm).outline
 
 
 def read_drawing(path: Path, unit_mm: float | None = None) -> Drawing:
@@ -87,7 +81,7 @@ def laid_along_x(
         name: the outline's name in messages.
 
     Raises:
-        UserError: `length_mm` is None and the outline's length is not in `LENGTHS_MM`.
+        UserError: `length_mm` is None and the outline's length is not that of a tool.
     """
     x_min, y_min, x_max, y_max = outline.bounds()
     nominal = NOMINAL_MM / max(x_max - x_min, y_max - y_min)
@@ -96,11 +90,10 @@ def laid_along_x(
     length = x_max - x_min
     if length_mm is not None:
         return outline.scale((length_mm / length, length_mm / length))
-    low, high = LENGTHS_MM
-    if not low <= length <= high:
+    if not SHORTEST_MM <= length <= LONGEST_MM:
         raise UserError(
-            f"{name} is {length:.4g} mm long by its own units; the range is {low:g} to {high:g} "
-            "mm: give --unit or --length_mm, or set the drawing's units"
+            f"{name} is {length:.4g} mm long by its own units; the range is {SHORTEST_MM:g} to "
+            f"{LONGEST_MM:g} mm: give --unit or --length_mm, or set the drawing's units"
         )
     return outline
 

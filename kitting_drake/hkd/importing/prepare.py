@@ -10,45 +10,25 @@ from typing import Any
 import numpy as np
 import yaml
 from manifold3d import Manifold
+from numpy.typing import NDArray
 
 from kitting_drake.common.errors import UserError
 from kitting_drake.hkd.importing.convex_decomposition import decompose
-from kitting_drake.hkd.importing.fit import (
-    fit,
-    grasp_record,
-    material_of,
-    true_length,
-)
+from kitting_drake.hkd.importing.fit import fit, grasp_record, material_of, true_length
 from kitting_drake.hkd.importing.import_request import ImportRequest
-from kitting_drake.hkd.importing.materials import (
-    bodies_of,
-    weighed,
-)
-from kitting_drake.hkd.importing.outline import (
-    extruded,
-    is_outline,
-    laid_along_x,
-    read_drawing,
-)
+from kitting_drake.hkd.importing.materials import bodies_of, weighed
+from kitting_drake.hkd.importing.outline import extruded, is_outline, laid_along_x, read_drawing
 from kitting_drake.hkd.importing.reading import drawn_curves
 from kitting_drake.hkd.importing.reading.mesh_files import IN_MM, read_mesh
-from kitting_drake.hkd.importing.reading.outline_picture import (
-    holes_text,
-    write_outline_picture,
-)
+from kitting_drake.hkd.importing.reading.outline_picture import holes_text, write_outline_picture
 from kitting_drake.hkd.importing.repair import NOMINAL_MM, make_solid
 from kitting_drake.hkd.importing.resting_pose import resting_tilt
-from kitting_drake.hkd.importing.tool_frame import (
-    facing_forward,
-    size,
-    tipping_deg,
-    to_tool_frame,
-)
+from kitting_drake.hkd.importing.tool_frame import facing_forward, size, tipping_deg, to_tool_frame
 from kitting_drake.hkd.tools import meshes
 from kitting_drake.hkd.tools.mass import mass_properties
 from kitting_drake.hkd.tools.sdf import tool_sdf
 from kitting_drake.hkd.tools.symmetry import symmetry_order
-from kitting_drake.hkd.tools.tool import load_tool
+from kitting_drake.hkd.tools.tool import Tool, load_tool
 
 # A tool that comes to rest tilted by more than `_SAME_POSE_DEG` is moved to that pose and dropped
 # again, at most `_LAYINGS` times.
@@ -223,13 +203,12 @@ def _write(
         collisions.append(f"collision_{index}.obj")
         meshes.write_convex_obj(directory / collisions[-1], hull)
     write_outline_picture(solid.project(), directory / "outline.png")
-    material = material_of(request.category)
     text = tool_sdf(
         name,
         mass,
         center,
         inertia,
-        [(tool.visual_meshes[0].name, material)],
+        [(tool.visual_meshes[0].name, material_of(category))],
         collisions,
         modulus=_MODULUS,
     )
@@ -238,18 +217,7 @@ def _write(
     )
     say("measuring its symmetry")
     record = {
-        "name": name,
-        "category": request.category,
-        "split": "user",
-        "length": tool.length,
-        "width": tool.width,
-        "height": tool.height,
-        "mass": round(float(mass), 6),
-        "center_of_mass": [round(float(v), 6) + 0.0 for v in center],
-        "symmetry": symmetry_order(1e-3 * vertices[faces]),
-        "grasp": grasp_record(tool.grasp),
-        "other_grasps": [grasp_record(grasp) for grasp in tool.other_grasps],
-        "visual_meshes": [path.name for path in tool.visual_meshes],
+        **_properties(tool, mass, center, symmetry_order(1e-3 * vertices[faces])),
         "imported": {
             "file": request.mesh.name,
             "sha256": digest_of(request.mesh),
@@ -261,6 +229,26 @@ def _write(
     (directory / "tool.yaml").write_text(yaml.safe_dump(record, sort_keys=False))
     load_tool(str(directory))
     return (record, notes, len(collision.hulls)), solid
+
+
+def _properties(
+    tool: Tool, mass: float, center: NDArray[np.float64], symmetry: int
+) -> dict[str, Any]:
+    """A tool's record without its origin."""
+    return {
+        "name": tool.name,
+        "category": tool.category,
+        "split": "user",
+        "length": tool.length,
+        "width": tool.width,
+        "height": tool.height,
+        "mass": round(float(mass), 6),
+        "center_of_mass": [round(float(v), 6) + 0.0 for v in center],
+        "symmetry": symmetry,
+        "grasp": grasp_record(tool.grasp),
+        "other_grasps": [grasp_record(grasp) for grasp in tool.other_grasps],
+        "visual_meshes": [path.name for path in tool.visual_meshes],
+    }
 
 
 def _safe(text: str) -> str:

@@ -43,13 +43,21 @@ def closed(profile: CrossSection, clearance: float) -> CrossSection:
     return grown.offset(-clearance, JoinType.Round, circular_segments=4 * SEGMENTS)
 
 
-def furthest(inner: CrossSection, outer: CrossSection) -> float:
-    """The largest distance of a point of `inner` from `outer`, capped at 5 mm, to 0.01 mm."""
+def furthest(
+    inner: CrossSection, outer: CrossSection, precision: float = 0.01, area: float = _AREA
+) -> float:
+    """The largest distance of a point of `inner` from `outer`, capped at 5 mm.
+
+    Args:
+        inner, outer: in mm.
+        precision: of the distance, in mm.
+        area: parts of `inner` smaller than this (mm^2) do not count.
+    """
     low, high = 0.0, 5.0
-    while high - low > 0.01:
+    while high - low > precision:
         middle = 0.5 * (low + high)
         grown = outer.offset(middle, JoinType.Round, circular_segments=96)
-        low, high = (low, middle) if (inner - grown).area() < 1e-4 else (middle, high)
+        low, high = (low, middle) if (inner - grown).area() < area else (middle, high)
     return high
 
 

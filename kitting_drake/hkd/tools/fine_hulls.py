@@ -10,7 +10,7 @@ import numpy as np
 from manifold3d import CrossSection, Error, JoinType, Manifold, Mesh64, OpType, triangulate
 from numpy.typing import NDArray
 
-from kitting_drake.hkd.tools.collision import projection, thinned
+from kitting_drake.hkd.tools.collision import furthest, projection, thinned
 
 Array = NDArray[np.float64]
 
@@ -76,18 +76,9 @@ def plan_deviation(
     """
     covered = projection(hulls)
     return (
-        _furthest(covered, without_notches(outline, notch)),
-        _furthest(outline, covered),
+        furthest(covered, without_notches(outline, notch), 0.001, _AREA),
+        furthest(outline, covered, 0.001, _AREA),
     )
-
-
-def _furthest(inner: CrossSection, outer: CrossSection) -> float:
-    low, high = 0.0, 5.0
-    while high - low > 0.001:
-        middle = 0.5 * (low + high)
-        grown = outer.offset(middle, JoinType.Round, circular_segments=96)
-        low, high = (low, middle) if (inner - grown).area() < _AREA else (middle, high)
-    return high
 
 
 def _solid(triangles: Array) -> Manifold:

@@ -22,6 +22,8 @@ from systems.grasp import Grasp
 CATEGORIES = ("hammer", "pliers", "wrench", "screwdriver")
 """The four categories of the paper (section IV-B.1). User tools may have others."""
 
+SHORTEST_MM, LONGEST_MM = 15.0, 350.0
+"""The range of lengths of a user's tool."""
 
 # libyaml reads records ten times as fast.
 RecordLoader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)

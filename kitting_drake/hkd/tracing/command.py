@@ -14,8 +14,6 @@ from kitting_drake.hkd.listing import size_text
 if TYPE_CHECKING:
     from kitting_drake.hkd.tracing.scales import Scale
 
-_SHEETS = ("a4", "letter")
-
 
 def describe_trace(tracer: argparse.ArgumentParser) -> None:
     """Adds the arguments of `hkd trace`."""
@@ -149,7 +147,7 @@ def _sheet(given: list[str] | None) -> tuple[float, float] | None:
         length, width = (float(text) for text in given)
     except ValueError as error:
         raise UserError(
-            f"--sheet {' '.join(given)} must be {', '.join(_SHEETS)} or two sides in mm"
+            f"--sheet {' '.join(given)} must be {', '.join(SHEETS)} or two sides in mm"
         ) from error
     return length, width
 

@@ -48,7 +48,7 @@ def flattened(cv2: Any, logs: Array, ground: Array, px_per_mm: float) -> tuple[A
     residual = values - design @ coefficients
     near = np.abs(residual).max(axis=1) < 0.15
     spread = 1.4826 * float(np.median(np.abs(residual[near]))) if near.sum() > 50 else 0.15
-    # What the polynomial leaves of the light, where the ground is seen.
+    # Subtract the light that the polynomial missed, by a blur of the ground that is seen.
     plain = (ground & (_largest(ratio) < max(0.06, 3 * spread))).astype(np.float32)
     step = max(1, int(px_per_mm))
     small = cv2.resize(plain, None, fx=1 / step, fy=1 / step, interpolation=cv2.INTER_AREA)

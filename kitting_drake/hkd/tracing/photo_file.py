@@ -1,4 +1,4 @@
-"""Reads a photo and what it says about its lens."""
+"""Reads a photo and its EXIF data on the lens."""
 
 import math
 import warnings
@@ -8,11 +8,10 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image, ImageOps
+from PIL import ExifTags, Image, ImageOps
 
 from kitting_drake.common.errors import UserError
 
-_EXIF_IFD, _FOCAL_35MM, _WIDTH, _HEIGHT = 0x8769, 0xA405, 0xA002, 0xA003
 _DIAGONAL_35MM = math.hypot(36, 24)
 ASSUMED_FOCAL_35MM = 26.0
 """The main lens of most phones: 24 to 28 mm, as if for film of 35 mm."""
@@ -62,7 +61,7 @@ def read_photo(path: Path) -> Photo:
                         f"{path} has {opened.width} x {opened.height} pixels, more than "
                         f"{_MOST_PIXELS / 1e6:.0f} million: make it smaller"
                     )
-                inner = dict(opened.getexif().get_ifd(_EXIF_IFD))
+                inner = dict(opened.getexif().get_ifd(ExifTags.IFD.Exif))
                 upright = ImageOps.exif_transpose(opened)
                 stored = (opened.width, opened.height)
                 pixels = np.asarray(upright.convert("RGB"))
@@ -79,8 +78,9 @@ def read_photo(path: Path) -> Photo:
             f"{path} has {pixels.shape[1]} x {pixels.shape[0]} pixels: "
             f"give a photo of at least {_LEAST_SIDE} pixels a side"
         )
-    focal = _number(inner.get(_FOCAL_35MM))
-    taken = (_number(inner.get(_WIDTH)), _number(inner.get(_HEIGHT)))
+    tags = ExifTags.Base
+    focal = _number(inner.get(tags.FocalLengthIn35mmFilm))
+    taken = (_number(inner.get(tags.ExifImageWidth)), _number(inner.get(tags.ExifImageHeight)))
     cropped = False
     if taken[0] and taken[1]:
         cropped = abs(math.log(taken[0] / taken[1] * stored[1] / stored[0])) > 0.01

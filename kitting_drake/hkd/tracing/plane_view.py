@@ -89,6 +89,15 @@ def focal_of_homography(homography: Array, center: Array) -> float | None:
     return focal if tilt > _TELLING_TILT else None
 
 
+def focal_of_height(homography: Array, height: float, start_px: float, center: Array) -> float:
+    """The focal length in pixels that puts the camera at a height in mm above the plane."""
+    focal = start_px
+    # Seen squarely, the camera's height grows with the focal length.
+    for _ in range(20):
+        focal *= height / view_of(homography, focal, center).camera[2]
+    return focal
+
+
 def aspect_of_quad(corners: Array, focal_px: float, center: Array) -> float:
     """The ratio of the first side to the second of a rectangle seen as corners (4, 2) in pixels."""
     h = _centred(square_to(corners), center) / np.array([[focal_px], [focal_px], [1.0]])

@@ -9,7 +9,12 @@ from numpy.typing import NDArray
 
 from kitting_drake.common.errors import UserError
 from kitting_drake.hkd.tracing.photo_file import ASSUMED_FOCAL_35MM, Photo
-from kitting_drake.hkd.tracing.plane_view import PlaneView, focal_of_homography, view_of
+from kitting_drake.hkd.tracing.plane_view import (
+    PlaneView,
+    focal_of_height,
+    focal_of_homography,
+    view_of,
+)
 from kitting_drake.hkd.tracing.sheet_plane import GroundPlane
 
 Array = NDArray[np.float64]
@@ -49,14 +54,14 @@ def plane_of_scale(cv2: Any, photo: Photo, scale: Scale, camera_mm: float | None
     if scale.disc_mm is not None:
         center, radius = _find_disc(cv2, photo)
         px_per_mm = 2 * radius / scale.disc_mm
-        focal = _focal(photo, px_per_mm, camera_mm)
+        focal, told = _focal(photo, px_per_mm, camera_mm)
         # The disc's rim is nearer to the camera than the plane.
         camera = focal / px_per_mm + _COIN_MM
         px_per_mm = focal / camera
         note = f"a disc of {scale.disc_mm:g} mm, {_COIN_MM:g} mm high"
         angles = np.linspace(0, 2 * np.pi, 40, endpoint=False)
         ring = center + 1.12 * radius * np.c_[np.cos(angles), np.sin(angles)]
-        return _straight_down(photo, px_per_mm, focal, [note], ring)
+        return _straight_down(photo, px_per_mm, focal, [note, told], ring)
     assert scale.points is not None
     u1, v1, u2, v2 = scale.points
     distance = math.hypot(u2 - u1, v2 - v1)
@@ -65,15 +70,19 @@ def plane_of_scale(cv2: Any, photo: Photo, scale: Scale, camera_mm: float | None
             "--scale_px must be two points at least 20 pixels apart, and --scale_mm their distance"
         )
     px_per_mm = distance / scale.length_mm
-    focal = _focal(photo, px_per_mm, camera_mm)
+    focal, told = _focal(photo, px_per_mm, camera_mm)
     note = f"{px_per_mm:.2f} pixels to the mm, by two points"
-    return _straight_down(photo, px_per_mm, focal, [note], None)
+    return _straight_down(photo, px_per_mm, focal, [note, told], None)
 
 
-def _focal(photo: Photo, px_per_mm: float, camera_mm: float | None) -> float:
+def _focal(photo: Photo, px_per_mm: float, camera_mm: float | None) -> tuple[float, str]:
+    """The focal length in pixels, and a note on it."""
     if camera_mm is not None:
-        return px_per_mm * camera_mm
-    return photo.focal_px(photo.focal_35mm or ASSUMED_FOCAL_35MM)
+        return px_per_mm * camera_mm, f"the camera {camera_mm:g} mm above, as given"
+    equivalent = photo.focal_35mm or ASSUMED_FOCAL_35MM
+    told = "by the photo's EXIF" if photo.focal_35mm else "assumed: the photo does not tell"
+    note = f"focal length {equivalent:.0f} mm (35 mm equivalent), {told}"
+    return photo.focal_px(equivalent), note
 
 
 def _straight_down(
@@ -83,12 +92,7 @@ def _straight_down(
     width, height = photo.size
     homography = np.array([[px_per_mm, 0, -0.5], [0, -px_per_mm, height - 0.5], [0, 0, 1.0]])
     view = PlaneView(homography, focal, np.append(_center(photo, px_per_mm), focal / px_per_mm), 0)
-    told = "by the photo's EXIF" if photo.focal_35mm else "assumed: the photo does not tell"
-    notes = [
-        *notes,
-        "taken to be seen from straight above",
-        f"focal length {focal / photo.focal_px(1.0):.0f} mm (35 mm equivalent), {told}",
-    ]
+    notes = [*notes, "taken to be seen from straight above"]
     hidden = () if hidden_px is None else (view.to_plane(hidden_px),)
     high = np.array([width, height]) / px_per_mm
     return GroundPlane(view, photo.pixels, np.zeros(2), high, None, hidden, notes)
@@ -186,7 +190,6 @@ def _by_board(cv2: Any, photo: Photo, scale: Scale, camera_mm: float | None) -> 
     # The board's frame has y down its rows.
     points[:, 1] = rows * square - points[:, 1]
     pixels = corners.reshape(-1, 2).astype(float)
-    image, notes = photo.pixels, [f"a board of {columns} x {rows} squares of {square:g} mm"]
     homography, _ = cv2.findHomography(points, pixels)
     if photo.focal_35mm:
         focal = photo.focal_px(photo.focal_35mm)
@@ -198,7 +201,7 @@ def _by_board(cv2: Any, photo: Photo, scale: Scale, camera_mm: float | None) -> 
             "by the board's perspective" if known else "assumed: the photo does not tell"
         )
     if camera_mm is not None:
-        focal *= camera_mm / view_of(homography, focal, photo.center).camera[2]
+        focal = focal_of_height(homography, camera_mm, focal, photo.center)
         told = f"the camera {camera_mm:g} mm above, as given"
     view = view_of(homography, focal, photo.center)
     border = np.array([[0, 0], [1, 0], [1, 1], [0, 1]]) * [columns * square, rows * square]
@@ -206,4 +209,5 @@ def _by_board(cv2: Any, photo: Photo, scale: Scale, camera_mm: float | None) -> 
     frame = np.array([[0, 0], [1, 0], [1, 1], [0, 1]]) * (np.array(photo.size) - 1.0)
     reach = view.to_plane(frame)
     low, high = reach.min(axis=0), reach.max(axis=0)
-    return GroundPlane(view, image, low, high, None, (border + outward,), [*notes, told])
+    notes = [f"a board of {columns} x {rows} squares of {square:g} mm", told]
+    return GroundPlane(view, photo.pixels, low, high, None, (border + outward,), notes)

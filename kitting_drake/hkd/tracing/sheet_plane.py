@@ -12,6 +12,7 @@ from kitting_drake.hkd.tracing.photo_file import ASSUMED_FOCAL_35MM, Photo
 from kitting_drake.hkd.tracing.plane_view import (
     PlaneView,
     aspect_of_quad,
+    focal_of_height,
     focal_of_homography,
     square_to,
     view_of,
@@ -158,10 +159,8 @@ def _aspect_error(photo: Photo, corners: Array, size: tuple[float, float]) -> fl
 def _focal(photo: Photo, homography: Array, camera_mm: float | None) -> tuple[float, str]:
     """The focal length in pixels, and where it comes from."""
     if camera_mm is not None:
-        # Seen squarely, the camera's height grows with the focal length.
-        focal = photo.focal_px(ASSUMED_FOCAL_35MM)
-        for _ in range(20):
-            focal *= camera_mm / view_of(homography, focal, photo.center).camera[2]
+        start = photo.focal_px(ASSUMED_FOCAL_35MM)
+        focal = focal_of_height(homography, camera_mm, start, photo.center)
         return focal, f"the camera {camera_mm:g} mm above the sheet, as given"
     if photo.focal_35mm:
         text = f"focal length {photo.focal_35mm:g} mm (35 mm equivalent), by the photo's EXIF"

@@ -38,9 +38,9 @@ _LEAST_HOLE_RADIUS_MM = 0.7
 def tool_mask(cv2: Any, ratio: Array, ground: Array, spread: float, px_per_mm: float) -> Array:
     """(rows, columns) 1 where a tool hides the ground.
 
-    The ground is what looks like it, and what can be reached from there over soft steps through
-    neutral pixels: a shadow. The rest is a tool. Its border is the steepest step between the two,
-    by a watershed.
+    Pixels that look like the ground are ground. So are shadows: neutral pixels that are reached
+    from there over soft steps. The rest is a tool. A watershed puts its border at the steepest step
+    between the two.
 
     Args:
         cv2: OpenCV.
@@ -116,7 +116,7 @@ def _roughness(cv2: Any, light: Array, even: Array, px_per_mm: float) -> Array:
 
 
 def _reached(cv2: Any, even: Array, plain: Array, px_per_mm: float) -> Array:
-    """What a disc covers that rolls over `even` pixels from plain ground."""
+    """The pixels under a disc that rolls over `even` pixels from plain ground."""
     disc = _disc(cv2, _BALL_MM * px_per_mm)
     room = cv2.erode(even.astype(np.uint8), disc)
     count, labels = cv2.connectedComponents(room, connectivity=4)

@@ -3,14 +3,13 @@
 The picture has the photo from above, silhouettes, outlines, rulers and a scale bar.
 """
 
-import io
 from typing import Any
 
 import numpy as np
 from manifold3d import CrossSection
 from numpy.typing import NDArray
 
-from kitting_drake.common.extras import import_extra
+from kitting_drake.hkd.fabrication.closed_lines import add_layer, new_dxf, svg_path, text_of
 from kitting_drake.hkd.tracing.plane_view import RectifiedPhoto
 
 _MARGIN_MM = 5.0
@@ -33,7 +32,7 @@ def outlines_svg(outlines: dict[str, CrossSection]) -> str:
     ]
     for name, outline in outlines.items():
         path = " ".join(
-            "M " + " L ".join(f"{x - low[0]:.4f} {high[1] - y:.4f}" for x, y in loop) + " Z"
+            svg_path(np.column_stack([loop[:, 0] - low[0], high[1] - loop[:, 1]]))
             for loop in _loops(outline)
         )
         lines.append(
@@ -49,19 +48,10 @@ def outlines_dxf(outlines: dict[str, CrossSection]) -> str:
     Raises:
         MachineError: ezdxf is not installed.
     """
-    ezdxf = import_extra("ezdxf", "units", purpose="DXF", extra="fabrication")
-    document = ezdxf.new("R2010", units=ezdxf.units.MM)
-    document.header["$INSUNITS"] = int(ezdxf.units.MM)
-    document.header["$MEASUREMENT"] = 1
-    space = document.modelspace()
+    document = new_dxf()
     for name, outline in outlines.items():
-        layer = name.upper()
-        document.layers.add(layer, color=5)
-        for loop in _loops(outline):
-            space.add_lwpolyline(loop.tolist(), close=True, dxfattribs={"layer": layer})
-    text = io.StringIO()
-    document.write(text)
-    return text.getvalue()
+        add_layer(document, name.upper(), 5, _loops(outline))
+    return text_of(document)
 
 
 _LONG_SIDE = 1500

@@ -87,7 +87,7 @@ class TracedTool:
 
 @dataclass(frozen=True)
 class TraceReport:
-    """What was traced."""
+    """The outlines of a photo, and notes for the user."""
 
     tools: list[TracedTool]
     notes: list[str]

@@ -71,7 +71,7 @@ def measure_fits(
         fits: the conditions.
 
     Returns:
-        The summary; see `summarize_fits`.
+        The commit, the seeds and the summary of each condition; see `summarize_fit`.
 
     Raises:
         UserError: the folder holds other files or the episodes of another version.

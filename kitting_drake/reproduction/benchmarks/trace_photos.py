@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from manifold3d import CrossSection, FillRule
 from numpy.typing import NDArray
-from PIL import Image
+from PIL import ExifTags, Image
 
 from kitting_drake.common.extras import import_extra
 
@@ -25,7 +25,6 @@ _FOCAL_35MM = 26
 _SHADOW_PX_PER_MM = 2.0
 _SHADOW_MARGIN_MM = 50.0
 _PIECE_MM = 1.2
-_EXIF_IFD, _EXIF_FOCAL_35MM = 0x8769, 0xA405
 PAINTS = {
     "black": (0.02, 0.02, 0.022),
     "steel": (0.30, 0.31, 0.33),
@@ -142,7 +141,7 @@ def draw_photo(
     image = Image.fromarray((255 * np.clip(coded, 0, 1) + 0.5).astype(np.uint8))
     exif = Image.Exif()
     if spec.exif:
-        exif.get_ifd(_EXIF_IFD)[_EXIF_FOCAL_35MM] = _FOCAL_35MM
+        exif.get_ifd(ExifTags.IFD.Exif)[ExifTags.Base.FocalLengthIn35mmFilm] = _FOCAL_35MM
     data = io.BytesIO()
     image.save(data, format="JPEG", quality=spec.quality, exif=exif)
     return data.getvalue()
@@ -213,7 +212,7 @@ def _light_on_ground(cv2: Any, tools: list[PlacedTool], camera: _Camera, spec: P
     to_plane = np.array(
         [[1 / _SHADOW_PX_PER_MM, 0, low[0]], [0, 1 / _SHADOW_PX_PER_MM, low[1]], [0, 0, 1.0]]
     )
-    # Ambient light is blocked close to the tool, too.
+    # The tool also blocks ambient light close to it.
     near = cv2.GaussianBlur((hidden > 0.9).astype(np.float32), (0, 0), 3 * _SHADOW_PX_PER_MM)
     light = (1 - spec.shadow * hidden) * (1 - 0.25 * near)
     across = np.linspace(-1, 1, columns, dtype=np.float32)
@@ -271,7 +270,7 @@ def _paint_tool(
             normal = np.array([along[1], -along[0]]) / length
             shade = 0.55 + 0.35 * float(normal @ [-0.6, -0.4])
             distance = float(np.linalg.norm(loop[i] - camera.C[:2]))
-            # Short pieces of uneven shade: sides have a texture, too.
+            # Short pieces of uneven shade, because sides also have a texture.
             cuts = np.linspace(0, 1, max(1, round(length / _PIECE_MM)) + 1)
             for start, end in itertools.pairwise(cuts):
                 low_edge = foot[i] + np.outer((start, end), foot[j] - foot[i])

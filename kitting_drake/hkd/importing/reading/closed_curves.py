@@ -9,6 +9,7 @@ from scipy.spatial import cKDTree
 
 from kitting_drake.common.errors import UserError
 from kitting_drake.hkd.importing.reading.drawn_curves import FLAT_MM, Curve, DrawnCurves
+from kitting_drake.hkd.tools.tool import LONGEST_MM
 
 PAPERS_MM = (
     ("A5", 148.0, 210.0),
@@ -70,7 +71,7 @@ def enclosed(drawn: DrawnCurves, path: Path) -> tuple[CrossSection, list[str]]:
 
 
 def _as_frame(areas: list[CrossSection], page_mm: tuple[float, float] | None) -> str | None:
-    """What the largest area is, if it is a rectangle around a tool; None if it is the tool itself.
+    """Describes the largest area if it is a page or a frame; None if it is the tool itself.
 
     Args:
         areas: inside closed curves, the largest first; at least two.
@@ -96,7 +97,7 @@ def _as_frame(areas: list[CrossSection], page_mm: tuple[float, float] | None) ->
         other.area() < 0.98 * inside.area() and (other - inside).area() < 0.01 * other.area()
         for other in others
     )
-    return f"{size}, a frame," if sides.max() > 350.0 or (holed and not edge) else None
+    return f"{size}, a frame," if sides.max() > LONGEST_MM or (holed and not edge) else None
 
 
 def _joined(drawn: DrawnCurves, path: Path, notes: list[str]) -> list[Points]:

@@ -1,4 +1,4 @@
-"""What is read from a drawing."""
+"""The curves of a drawing."""
 
 from dataclasses import dataclass, field
 
@@ -39,4 +39,4 @@ class DrawnCurves:
     page_mm: tuple[float, float] | None = None
     """The size of the page, where the drawing has one."""
     notes: list[str] = field(default_factory=list)
-    """What was left out, a phrase each."""
+    """Phrases for the user on curves that were left out."""

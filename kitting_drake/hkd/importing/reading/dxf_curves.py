@@ -8,9 +8,8 @@ import numpy as np
 from kitting_drake.common.errors import UserError
 from kitting_drake.common.extras import import_extra
 from kitting_drake.hkd.importing.reading.drawn_curves import FLAT_MM, UNITS_MM, Curve, DrawnCurves
+from kitting_drake.hkd.tools.tool import LONGEST_MM, SHORTEST_MM
 
-_LENGTHS_MM = (15.0, 350.0)
-"""The range of lengths of a tool."""
 _NOTES = ("DIMENSION", "ARC_DIMENSION", "LARGE_RADIAL_DIMENSION", "LEADER", "MULTILEADER")
 """DXF entities that annotate a drawing, so their lines do not belong to an outline."""
 
@@ -106,8 +105,7 @@ def _likely(path: Path, document: Any, extent: float) -> tuple[float, str]:
     if b"$MEASUREMENT" in path.read_bytes():
         metric = int(document.header.get("$MEASUREMENT", 1))
         names = ["mm", "cm", "m"] if metric else ["mm", "inches"]
-    low, high = _LENGTHS_MM
-    possible = [name for name in names if low <= extent * UNITS_MM[name] <= high]
+    possible = [n for n in names if SHORTEST_MM <= extent * UNITS_MM[n] <= LONGEST_MM]
     if len(possible) > 1:
         readings = " or ".join(f"{extent * UNITS_MM[n]:.4g} mm (in {n})" for n in possible)
         raise UserError(f"{path} names no unit, and may be {readings} long: give --unit")

@@ -41,7 +41,7 @@ def read_stl(path: Path) -> NDArray[np.float64]:
         count = present
     if count > present:
         raise UserError(
-            f"{path} is cut short, or no STL: by its header it has {count} triangles, and "
+            f"{path} is cut short or not an STL: by its header it has {count} triangles, and "
             f"{count - present} of them are missing: copy or export it again"
         )
     triangles = np.frombuffer(data, _TRIANGLE, count, _HEADER)

@@ -50,7 +50,7 @@ def svg_curves(path: Path, unit_mm: float | None = None) -> DrawnCurves:
         drawing = svgelements.SVG.parse(stream, width=width, height=height)
         shapes = [e for e in drawing.elements() if isinstance(e, svgelements.Shape)]
         shapes = [e for e in shapes if e.values.get("visibility") not in ("hidden", "collapse")]
-        # What has neither fill nor line is not seen. But some programs leave all so.
+        # Leave out invisible shapes, unless all are: some programs write neither fill nor line.
         seen = [e for e in shapes if _is_painted(e.fill) or _is_painted(e.stroke)]
         seen = [e for e in seen if str(e.values.get("opacity", 1)).strip() not in ("0", "0%")]
         curves = [
@@ -119,7 +119,7 @@ def _scale(root: ElementTree.Element, text: bytes, unit_mm: float | None) -> tup
 
 
 def _paper(sides: list[float]) -> tuple[str, float]:
-    """The sheet of paper that a page is, with the unit, and the unit in mm; "" if it is none.
+    """The sheet of paper and the unit that a page's sides match, and the unit in mm; or "" and 1.
 
     Args:
         sides: the page's sides in units, the shorter first.

@@ -66,7 +66,7 @@ def read_3mf(path: Path) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
         raise UserError(f"{path} cannot be read as 3MF") from error
     mm = _UNITS_MM.get(root.get("unit", "millimeter"))
     if mm is None:
-        raise UserError(f"{path} is in '{root.get('unit')}', which is no unit of 3MF")
+        raise UserError(f"{path} is in '{root.get('unit')}', which is not a unit of 3MF")
     meshes = [
         mesh
         for item in _all(root, "item")

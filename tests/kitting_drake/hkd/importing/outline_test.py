@@ -6,7 +6,7 @@ import pytest
 
 from kitting_drake.common.errors import UserError
 from kitting_drake.hkd.importing.importer import ImportReport, ImportRequest, import_tool
-from kitting_drake.hkd.importing.outline import laid_along_x, read_outline
+from kitting_drake.hkd.importing.outline import laid_along_x, read_drawing
 from kitting_drake.hkd.tools.tool import load_tool
 
 BAR = '<rect x="5" y="10" width="160" height="20"/>'
@@ -37,7 +37,7 @@ def stadium(folder: Path, units: int, scale: float) -> Path:
 
 
 def size(path: Path) -> tuple[float, float]:
-    x_min, y_min, x_max, y_max = read_outline(path).bounds()
+    x_min, y_min, x_max, y_max = read_drawing(path).outline.bounds()
     return x_max - x_min, y_max - y_min
 
 
@@ -60,7 +60,7 @@ def test_an_svg_is_measured_by_its_width(measures: str, mm: float, tmp_path: Pat
 
 def test_an_unknown_unit_is_rejected(tmp_path: Path):
     with pytest.raises(UserError, match=r"width .*'200um'"):
-        read_outline(drawing(tmp_path, BAR, 'width="200um" height="80um"'))
+        read_drawing(drawing(tmp_path, BAR, 'width="200um" height="80um"'))
 
 
 @pytest.mark.parametrize(
@@ -85,7 +85,7 @@ def test_a_symbol_counts_where_it_is_used(tmp_path: Path):
 def test_y_points_up_and_transforms_count(tmp_path: Path):
     # A triangle whose right angle is at the lower left.
     path = drawing(tmp_path, '<path transform="rotate(0) translate(10)" d="M0 70 h150 L0 20 z"/>')
-    assert read_outline(path).bounds() == pytest.approx((10, -70, 160, -20), abs=1e-3)
+    assert read_drawing(path).outline.bounds() == pytest.approx((10, -70, 160, -20), abs=1e-3)
 
 
 @pytest.mark.parametrize(
@@ -93,7 +93,7 @@ def test_y_points_up_and_transforms_count(tmp_path: Path):
 )
 def test_rectangles_and_ellipses_keep_their_transforms(transform: str, tmp_path: Path):
     hole = '<ellipse cx="150" cy="20" rx="6" ry="3"/>'
-    outline = read_outline(drawing(tmp_path, f'<g transform="{transform}">{BAR}{hole}</g>'))
+    outline = read_drawing(drawing(tmp_path, f'<g transform="{transform}">{BAR}{hole}</g>')).outline
     assert outline.area() == pytest.approx(160 * 20 - 18 * np.pi, rel=1e-3)
 
 
@@ -101,7 +101,7 @@ def test_rectangles_and_ellipses_keep_their_transforms(transform: str, tmp_path:
 def test_a_dxf_is_measured_by_its_units_and_its_curves_are_joined(
     units: int, scale: float, tmp_path: Path
 ):
-    outline = read_outline(stadium(tmp_path, units, scale))
+    outline = read_drawing(stadium(tmp_path, units, scale)).outline
     x_min, y_min, x_max, y_max = outline.bounds()
     assert (x_max - x_min, y_max - y_min) == pytest.approx((160, 20), abs=0.02)
     assert outline.area() == pytest.approx(140 * 20 + np.pi * (10**2 - 4**2), rel=1e-3)
@@ -119,7 +119,7 @@ def test_hidden_layers_and_dimensions_do_not_count(tmp_path: Path):
     space.add_line((-50, 10), (250, 10), dxfattribs={"layer": "axes"})
     space.add_linear_dim(base=(0, -30), p1=(-10, 10), p2=(150, 10)).render()
     document.saveas(path)
-    outline = read_outline(path)
+    outline = read_drawing(path).outline
     assert outline.area() == pytest.approx(140 * 20 + np.pi * (10**2 - 4**2), rel=1e-3)
 
 
@@ -129,7 +129,7 @@ def test_splines_and_blocks_are_read(tmp_path: Path):
     block.add_spline([(0, 0), (60, -8), (160, 0), (165, 12), (60, 14), (-8, 11), (0, 0)])
     document.modelspace().add_blockref("TOOL", (100, 0))
     document.saveas(tmp_path / "tool.dxf")
-    x_min, _, x_max, _ = read_outline(tmp_path / "tool.dxf").bounds()
+    x_min, _, x_max, _ = read_drawing(tmp_path / "tool.dxf").outline.bounds()
     assert x_min > 85
     assert 160 < x_max - x_min < 190
 
@@ -147,15 +147,15 @@ def test_splines_and_blocks_are_read(tmp_path: Path):
 )
 def test_an_invalid_svg_is_rejected(content: str, token: str, tmp_path: Path):
     with pytest.raises(UserError, match=token):
-        read_outline(drawing(tmp_path, content))
+        read_drawing(drawing(tmp_path, content))
 
 
 def test_an_invalid_dxf_is_rejected(tmp_path: Path):
     (tmp_path / "tool.dxf").write_text("no drawing")
     with pytest.raises(UserError, match="DXF"):
-        read_outline(tmp_path / "tool.dxf")
+        read_drawing(tmp_path / "tool.dxf")
     with pytest.raises(UserError, match=r"none\.dxf"):
-        read_outline(tmp_path / "none.dxf")
+        read_drawing(tmp_path / "none.dxf")
 
 
 def bring(path: Path, **options: float) -> ImportReport:
@@ -183,7 +183,7 @@ def test_an_outline_must_be_stable_as_drawn(tmp_path: Path):
 def test_the_length_does_not_depend_on_the_drawings_rotation(tmp_path: Path):
     # Its bounding box is 123 mm wide.
     path = drawing(tmp_path, '<rect transform="rotate(45)" width="160" height="14"/>')
-    x_min, y_min, x_max, y_max = laid_along_x(read_outline(path), None, "tool.svg").bounds()
+    x_min, y_min, x_max, y_max = laid_along_x(read_drawing(path).outline, None, "tool.svg").bounds()
     assert (x_max - x_min, y_max - y_min) == pytest.approx((160, 14), abs=0.05)
     tool = load_tool(str(bring(path, height_mm=12.0, length_mm=100.0).directory))
     expected = (0.100, 0.014 * 100 / 160, 0.012)

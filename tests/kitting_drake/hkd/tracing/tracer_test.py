@@ -7,8 +7,9 @@ import pytest
 from manifold3d import CrossSection
 
 from kitting_drake.common.errors import UserError
-from kitting_drake.hkd.importing.outline import read_outline
-from kitting_drake.hkd.tracing.scales import Scale
+from kitting_drake.hkd.importing.outline import read_drawing
+from kitting_drake.hkd.tracing.photo_file import Photo
+from kitting_drake.hkd.tracing.scales import Scale, plane_of_scale
 from kitting_drake.hkd.tracing.tracer import TraceReport, TraceRequest, trace
 from kitting_drake.reproduction.benchmarks.trace_benchmark import outline_errors
 from kitting_drake.reproduction.benchmarks.trace_photos import (
@@ -66,7 +67,7 @@ def test_an_oblique_photo_gives_the_true_outline(
     assert tool.size_mm[0] == pytest.approx(142.7, abs=0.6)
     assert any("EXIF" in note for note in report.notes) == exif
     for suffix in (".svg", ".dxf"):
-        drawing = read_outline(tool.svg.with_suffix(suffix))
+        drawing = read_drawing(tool.svg.with_suffix(suffix)).outline
         assert drawing.area() == pytest.approx(tool.outline.area(), rel=1e-3)
     assert (path.parent / "out/trace.png").stat().st_size > 10_000
     assert json.loads((path.parent / "out/trace.json").read_text())["tilt_deg"] == pytest.approx(
@@ -151,6 +152,17 @@ def test_two_points_or_a_coin_give_the_scale_without_a_sheet(tmp_path: Path):
     scale = Scale(points=(100.0, 100.0, 100.0 + 50 * px_per_mm, 100.0), length_mm=50.0)
     tools = traced(path, heights_mm=(12.0, 2.0), scale=scale).tools
     assert np.median(outline_errors(tools[0].outline, SPANNER)) < 0.4
+
+
+def test_a_camera_height_overrules_the_focal_length(tmp_path: Path):
+    photo = Photo(tmp_path / "photo.jpg", np.zeros((600, 800, 3), np.uint8), 26.0)
+    scale = Scale(points=(0.0, 0.0, 300.0, 0.0), length_mm=100.0)
+    by_lens = plane_of_scale(cv2, photo, scale, None)
+    assert any("26 mm" in note and "EXIF" in note for note in by_lens.notes)
+    given = plane_of_scale(cv2, photo, scale, 500.0)
+    assert given.view.camera[2] == pytest.approx(500.0)
+    assert not any("EXIF" in note for note in given.notes)
+    assert any("500 mm above, as given" in note for note in given.notes)
 
 
 def test_a_board_gives_the_scale_and_the_pose(tmp_path: Path):

@@ -1,0 +1,42 @@
+"""Closed lines in true millimetres, for DXF and SVG."""
+
+import io
+from collections.abc import Iterable
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kitting_drake.common.extras import import_extra
+
+
+def new_dxf() -> Any:
+    """An empty document of ezdxf, of release 2010 and in mm.
+
+    Raises:
+        MachineError: ezdxf is not installed.
+    """
+    ezdxf = import_extra("ezdxf", "units", purpose="DXF", extra="fabrication")
+    document = ezdxf.new("R2010", units=ezdxf.units.MM)
+    document.header["$INSUNITS"] = int(ezdxf.units.MM)
+    document.header["$MEASUREMENT"] = 1
+    return document
+
+
+def add_layer(document: Any, name: str, colour: int, loops: Iterable[NDArray[np.float64]]) -> None:
+    """Adds a layer of closed polylines (n, 2); `colour` is AutoCAD's index."""
+    document.layers.add(name, color=colour)
+    for loop in loops:
+        document.modelspace().add_lwpolyline(loop.tolist(), close=True, dxfattribs={"layer": name})
+
+
+def text_of(document: Any) -> str:
+    """The content of a DXF file."""
+    text = io.StringIO()
+    document.write(text)
+    return text.getvalue()
+
+
+def svg_path(loop: NDArray[np.float64]) -> str:
+    """The `d` of an SVG path through points (n, 2), with y down."""
+    return "M " + " L ".join(f"{x:.4f} {y:.4f}" for x, y in loop) + " Z"
