@@ -51,7 +51,7 @@ Progress = Callable[[str, int, int], None]
 
 @dataclass
 class ToolProof:
-    """What happened to one tool, over all episodes."""
+    """The results of one tool, over all episodes."""
 
     name: str
     kitted: int = 0

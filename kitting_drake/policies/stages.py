@@ -117,8 +117,8 @@ class JawRoom:
 class OutlinePlace:
     """Fits the place to the outlines of object and recess where they agree.
 
-    It begins at the networks' place (`refine_place`). Where that leads nowhere, it takes the recess
-    into which the object fits (`Inventory.pairs`), if there is one.
+    It begins at the networks' place (`refine_place`). If that fails, it takes the recess into
+    which the object fits (`Inventory.pairs`), if there is one.
     """
 
     def refine(self, draft: Draft) -> Draft:

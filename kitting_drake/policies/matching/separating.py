@@ -171,7 +171,7 @@ def _free_pose(
             if free is None:
                 continue
             away = np.linalg.norm(free - pick, axis=1) * resolution
-            # A turn of the wrist costs time, too.
+            # A turn of the wrist also costs time.
             index = int(away.argmin())
             cost = float(away[index] + 0.05 * abs(angle))
             if best is None or cost < best[0]:

@@ -70,7 +70,7 @@ class ShapeMatchingPolicy:
             return matched
         if self._recover:
             arguments = inventory, self._planner, tuple(failed_picks)
-            # What may fail again comes last, because the number of actions is limited.
+            # The riskiest comes last, because the number of actions is limited.
             prepared = separating_action(*arguments) or mending or turning_action(*arguments)
             if prepared is not None:
                 return Matched(prepared)

@@ -213,7 +213,7 @@ def _light_on_ground(cv2: Any, tools: list[PlacedTool], camera: _Camera, spec: P
     to_plane = np.array(
         [[1 / _SHADOW_PX_PER_MM, 0, low[0]], [0, 1 / _SHADOW_PX_PER_MM, low[1]], [0, 0, 1.0]]
     )
-    # Ambient light is blocked close to the tool, too.
+    # Close to the tool, ambient light is also blocked.
     near = cv2.GaussianBlur((hidden > 0.9).astype(np.float32), (0, 0), 3 * _SHADOW_PX_PER_MM)
     light = (1 - spec.shadow * hidden) * (1 - 0.25 * near)
     across = np.linspace(-1, 1, columns, dtype=np.float32)
@@ -271,7 +271,7 @@ def _paint_tool(
             normal = np.array([along[1], -along[0]]) / length
             shade = 0.55 + 0.35 * float(normal @ [-0.6, -0.4])
             distance = float(np.linalg.norm(loop[i] - camera.C[:2]))
-            # Short pieces of uneven shade: sides have a texture, too.
+            # Short pieces of uneven shade give the sides a texture.
             cuts = np.linspace(0, 1, max(1, round(length / _PIECE_MM)) + 1)
             for start, end in itertools.pairwise(cuts):
                 low_edge = foot[i] + np.outer((start, end), foot[j] - foot[i])
