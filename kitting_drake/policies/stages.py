@@ -311,6 +311,6 @@ class Recovery:
         if draft.belongs and not draft.stop:
             return draft
         if draft.stop:
-            arguments = look.inventory, self.planner, tuple(look.failed_picks)
+            arguments = look.inventory, self.planner, look.failed_picks
             mending = separating_action(*arguments) or mending or turning_action(*arguments)
         return dataclasses.replace(draft, mending=mending)
