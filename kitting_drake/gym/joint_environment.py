@@ -261,7 +261,8 @@ class JointEnvironment(gymnasium.Env[dict[str, NDArray[Any]], NDArray[np.float32
         if self._station is None:
             raise gymnasium.error.ResetNeeded("there is no scene to render: call reset() first")
         scene_graph = self._station.scene_graph
-        return render_picture(scene_graph, scene_graph.GetMyContextFromRoot(self._context))
+        context = scene_graph.GetMyContextFromRoot(self._context)
+        return render_picture(scene_graph, context, self._station.X_WOverview)
 
     def close(self) -> None:
         """Frees the simulation."""
