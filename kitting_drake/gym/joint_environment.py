@@ -90,7 +90,7 @@ class JointEnvironment(gymnasium.Env[dict[str, NDArray[Any]], NDArray[np.float32
         self.metadata = {**self.metadata, "render_fps": fps}
         config = self._chosen.scenario
         self.names = (*joint_names(config.robot), GRIPPER)
-        """Of the entries of state and action."""
+        """The names of the entries of state and action."""
         images = {}
         for name in chosen_cameras(self._recording, config.cameras):
             camera = config.cameras[name]

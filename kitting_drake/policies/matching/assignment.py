@@ -36,7 +36,7 @@ class Pair:
     recess: int
     """The index of the recess in `Segmentation.recesses`."""
     fit: Registration
-    """Of the object's outline to the recess's."""
+    """The registration of the object's outline to the recess's."""
     mismatch: float
     """See `registration.mismatch`, in metres."""
 

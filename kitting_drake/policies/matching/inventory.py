@@ -29,7 +29,7 @@ class Inventory:
 
     observation: Observation
     segmentation: Segmentation
-    """With touching objects told apart, where the recesses show how."""
+    """The regions of o_t. Touching objects are separated if the recesses show how."""
     matches: tuple[Pair, ...]
     """All objects and recesses that fit, best fit first."""
     reversed_items: tuple[Region, ...] = ()

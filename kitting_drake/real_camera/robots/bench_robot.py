@@ -43,7 +43,7 @@ class BenchRobot:
 
     @property
     def limits(self) -> ArmLimits:
-        """Of its joints."""
+        """The limits of its joints."""
         return ARM_LIMITS[self.model]
 
     @property

@@ -48,7 +48,7 @@ class PhotoSpec:
     sheet: tuple[float, float] = (297.0, 210.0)
     """The size of the sheet along x and y."""
     distance: float = 430.0
-    """Of the camera from the middle of the sheet."""
+    """The distance of the camera from the middle of the sheet."""
     tilt: float = 0.0
     """The angle between the line of sight and the vertical, in degrees."""
     azimuth: float = 0.0
@@ -66,11 +66,11 @@ class PhotoSpec:
     falloff: float = 0.25
     """The loss of light from one side of the sheet to the other."""
     blur: float = 1.0
-    """In pixels, standard deviation."""
+    """The standard deviation of the blur, in pixels."""
     noise: float = 0.006
-    """Of the picture's values of 0 to 1, standard deviation."""
+    """The standard deviation of the noise; values are from 0 to 1."""
     quality: int = 90
-    """Of the JPEG."""
+    """The quality of the JPEG."""
     distortion: float = 0.0
     """k1 of the lens, in OpenCV's model."""
     exif: bool = True
