@@ -54,6 +54,29 @@ def _parser() -> argparse.ArgumentParser:
         description="Run a benchmark; print and save its tables.",
     )
     benchmarks = parser.add_subparsers(dest="benchmark", required=True)
+    for add in (
+        _add_simulation,
+        _add_networks,
+        _add_kits,
+        _add_fits,
+        _add_recovery,
+        _add_endurance,
+        _add_mujoco,
+        _add_reliability,
+        _add_trace,
+        _add_reach,
+        _add_paper,
+    ):
+        add(benchmarks)
+    for benchmark in benchmarks.choices.values():
+        benchmark.add_argument(
+            "--output", type=Path, default=Path("output/benchmark"), help="folder for the files"
+        )
+        benchmark.add_argument("--quiet", action="store_true", help="print nothing but errors")
+    return parser
+
+
+def _add_simulation(benchmarks: Any) -> None:
     simulation = benchmarks.add_parser(
         "simulation", help="times of an episode's phases, start-up and images"
     )
@@ -61,6 +84,9 @@ def _parser() -> argparse.ArgumentParser:
     simulation.add_argument(
         "--seed", type=seed_type, default=0, help="seed of the first episode (0)"
     )
+
+
+def _add_networks(benchmarks: Any) -> None:
     networks = benchmarks.add_parser(
         "networks",
         help="sizes and run times of the networks, and lower bounds of the times",
@@ -75,10 +101,16 @@ def _parser() -> argparse.ArgumentParser:
     networks.add_argument(
         "--repeats", type=count_type, default=9, help="number of runs; the median is reported (9)"
     )
+
+
+def _add_kits(benchmarks: Any) -> None:
     kits = benchmarks.add_parser(
         "kits", help="building time, clearance and size of the dataset's kits"
     )
     kits.add_argument("--kits", type=count_type, help="number of kits of each split (default: all)")
+
+
+def _add_fits(benchmarks: Any) -> None:
     fits = benchmarks.add_parser(
         "fits", help="strict success and peak force against the clearance; resumes"
     )
@@ -86,92 +118,15 @@ def _parser() -> argparse.ArgumentParser:
         "--episodes", type=count_type, default=5, help="episodes of four tools per condition (5)"
     )
     fits.add_argument("--seed", type=seed_type, default=0, help="seed of the first episode (0)")
+
+
+def _add_recovery(benchmarks: Any) -> None:
     recovery = benchmarks.add_parser("recovery", help="a policy's recovery from failed actions")
     add_scenario_flags(recovery)
     recovery.add_argument(
         "--episodes", type=count_type, default=10, help="episodes per failure (10)"
     )
     recovery.add_argument("--seed", type=seed_type, default=0, help="seed of the first episode (0)")
-    _add_endurance(benchmarks)
-    opinion = benchmarks.add_parser(
-        "mujoco", help="compare the resting poses of placed tools in Drake and MuJoCo"
-    )
-    opinion.add_argument(
-        "--placements", type=count_type, default=50, help="number of placements (50)"
-    )
-    opinion.add_argument("--seed", type=seed_type, default=0, help="seed of the first episode (0)")
-    opinion.add_argument(
-        "--orientations",
-        type=count_type,
-        metavar="N",
-        help="round the oracle's actions to N orientations",
-    )
-    reliability = benchmarks.add_parser(
-        "reliability", help="whether a decision's confidence is its probability of success"
-    )
-    reliability.add_argument(
-        "--scenes", type=count_type, default=100, help="number of drawn scenes (100)"
-    )
-    reliability.add_argument(
-        "--seed", type=seed_type, default=900_000, help="seed of the first scenes (900000)"
-    )
-    reliability.add_argument(
-        "--weights", type=Path, metavar="FILE", help="of the networks (default: the generalist)"
-    )
-    reliability.add_argument(
-        "--fit",
-        action="store_true",
-        help="fit the confidence to these decisions: writes confidence.json",
-    )
-    tracing = benchmarks.add_parser(
-        "trace", help="error of the outlines that `hkd trace` finds in drawn photos of tools"
-    )
-    tracing.add_argument(
-        "--tools", nargs="+", metavar="NAME", help="tools, three photos of each (default: 20)"
-    )
-    tracing.add_argument(
-        "--no-exif", action="store_true", help="the photos do not tell their focal length"
-    )
-    tracing.add_argument("--keep", action="store_true", help="keep the photos and the pictures")
-    reach = benchmarks.add_parser(
-        "reach", help="where an arm reaches in a workspace, and the best place for its base"
-    )
-    reach.add_argument(
-        "--robot",
-        type=Path,
-        metavar="ROBOT.yaml",
-        help="model and base of the arm (default: those of !FrankaArm)",
-    )
-    reach.add_argument(
-        "--camera",
-        type=Path,
-        metavar="CALIBRATION.yaml",
-        help="its workspace is used (default: the cell's)",
-    )
-    paper = benchmarks.add_parser(
-        "paper", help="collect, train and evaluate for the cells of the paper's tables; takes days"
-    )
-    paper.add_argument(
-        "--cells",
-        nargs="+",
-        default=["*"],
-        metavar="PATTERN",
-        help="names of the cells, in this order (*: all, the most informative first)",
-    )
-    paper.add_argument(
-        "--results",
-        type=Path,
-        metavar="DIR",
-        default=Path("docs/results"),
-        help="folder of the table of runs, which finished cells are added to (docs/results)",
-    )
-    paper.add_argument("--workers", type=count_type, default=1, help="parallel episodes (1)")
-    for benchmark in benchmarks.choices.values():
-        benchmark.add_argument(
-            "--output", type=Path, default=Path("output/benchmark"), help="folder for the files"
-        )
-        benchmark.add_argument("--quiet", action="store_true", help="print nothing but errors")
-    return parser
 
 
 def _add_endurance(benchmarks: Any) -> None:
@@ -193,6 +148,94 @@ def _add_endurance(benchmarks: Any) -> None:
         "--seed", type=seed_type, help="seed of the first scene (default: the scenario's)"
     )
     add_workers_flags(endurance)
+
+
+def _add_mujoco(benchmarks: Any) -> None:
+    opinion = benchmarks.add_parser(
+        "mujoco", help="compare the resting poses of placed tools in Drake and MuJoCo"
+    )
+    opinion.add_argument(
+        "--placements", type=count_type, default=50, help="number of placements (50)"
+    )
+    opinion.add_argument("--seed", type=seed_type, default=0, help="seed of the first episode (0)")
+    opinion.add_argument(
+        "--orientations",
+        type=count_type,
+        metavar="N",
+        help="round the oracle's actions to N orientations",
+    )
+
+
+def _add_reliability(benchmarks: Any) -> None:
+    reliability = benchmarks.add_parser(
+        "reliability", help="whether a decision's confidence is its probability of success"
+    )
+    reliability.add_argument(
+        "--scenes", type=count_type, default=100, help="number of drawn scenes (100)"
+    )
+    reliability.add_argument(
+        "--seed", type=seed_type, default=900_000, help="seed of the first scenes (900000)"
+    )
+    reliability.add_argument(
+        "--weights", type=Path, metavar="FILE", help="of the networks (default: the generalist)"
+    )
+    reliability.add_argument(
+        "--fit",
+        action="store_true",
+        help="fit the confidence to these decisions: writes confidence.json",
+    )
+
+
+def _add_trace(benchmarks: Any) -> None:
+    tracing = benchmarks.add_parser(
+        "trace", help="error of the outlines that `hkd trace` finds in drawn photos of tools"
+    )
+    tracing.add_argument(
+        "--tools", nargs="+", metavar="NAME", help="tools, three photos of each (default: 20)"
+    )
+    tracing.add_argument(
+        "--no-exif", action="store_true", help="the photos do not tell their focal length"
+    )
+    tracing.add_argument("--keep", action="store_true", help="keep the photos and the pictures")
+
+
+def _add_reach(benchmarks: Any) -> None:
+    reach = benchmarks.add_parser(
+        "reach", help="where an arm reaches in a workspace, and the best place for its base"
+    )
+    reach.add_argument(
+        "--robot",
+        type=Path,
+        metavar="ROBOT.yaml",
+        help="model and base of the arm (default: those of !FrankaArm)",
+    )
+    reach.add_argument(
+        "--camera",
+        type=Path,
+        metavar="CALIBRATION.yaml",
+        help="its workspace is used (default: the cell's)",
+    )
+
+
+def _add_paper(benchmarks: Any) -> None:
+    paper = benchmarks.add_parser(
+        "paper", help="collect, train and evaluate for the cells of the paper's tables; takes days"
+    )
+    paper.add_argument(
+        "--cells",
+        nargs="+",
+        default=["*"],
+        metavar="PATTERN",
+        help="names of the cells, in this order (*: all, the most informative first)",
+    )
+    paper.add_argument(
+        "--results",
+        type=Path,
+        metavar="DIR",
+        default=Path("docs/results"),
+        help="folder of the table of runs, which finished cells are added to (docs/results)",
+    )
+    paper.add_argument("--workers", type=count_type, default=1, help="parallel episodes (1)")
 
 
 def _duration(text: str) -> float:

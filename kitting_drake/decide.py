@@ -208,6 +208,28 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--output", type=Path, default=Path("output/decide"), metavar="DIR", help="folder for files"
     )
+    _add_policy_flags(parser)
+    _add_camera_flags(parser)
+    parser.add_argument(
+        "--time",
+        type=float,
+        metavar="S",
+        help="in a recording, take the frame this long after its start, in s",
+    )
+    parser.add_argument(
+        "--robot",
+        type=Path,
+        metavar="ROBOT.yaml",
+        help="also plan the joint trajectory of a Franka arm, and refuse what it cannot reach",
+    )
+    parser.add_argument(
+        "--rate", type=int, metavar="HZ", help="points of the trajectory in a second (1000)"
+    )
+    parser.add_argument("--quiet", action="store_true", help="print nothing but errors")
+    return parser
+
+
+def _add_policy_flags(parser: argparse.ArgumentParser) -> None:
     policy = parser.add_mutually_exclusive_group()
     policy.add_argument(
         "--weights",
@@ -236,6 +258,9 @@ def _parser() -> argparse.ArgumentParser:
         help="act only with at least this probability of success (default: as fitted)",
     )
     parser.add_argument("--recover", action="store_true", help="recover from failed insertions")
+
+
+def _add_camera_flags(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--table_height",
         type=float,
@@ -270,23 +295,6 @@ def _parser() -> argparse.ArgumentParser:
         metavar="BOARD.yaml",
         help="find the cameras' poses by a board of markers on the table; --camera may lack poses",
     )
-    parser.add_argument(
-        "--time",
-        type=float,
-        metavar="S",
-        help="in a recording, take the frame this long after its start, in s",
-    )
-    parser.add_argument(
-        "--robot",
-        type=Path,
-        metavar="ROBOT.yaml",
-        help="also plan the joint trajectory of a Franka arm, and refuse what it cannot reach",
-    )
-    parser.add_argument(
-        "--rate", type=int, metavar="HZ", help="points of the trajectory in a second (1000)"
-    )
-    parser.add_argument("--quiet", action="store_true", help="print nothing but errors")
-    return parser
 
 
 def _policy(arguments: argparse.Namespace) -> BenchPolicy:

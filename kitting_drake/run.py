@@ -4,6 +4,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from pydrake.geometry import Meshcat
 from pydrake.systems.framework import DiagramBuilder
 from rich.console import Console
 
@@ -81,13 +82,8 @@ def main() -> int:
         "commit": commit(),
     }
     write_json(folder / "results.json", result.as_dict() | told)
-    # Remove stale files.
-    (folder / REPLAY).unlink(missing_ok=True)
+    _save_replay(folder / REPLAY, meshcat)
     _save_decisions(folder / "decisions", decisions)
-    if meshcat is not None:
-        meshcat.StopRecording()
-        meshcat.PublishRecording()
-        write_atomically(folder / REPLAY, meshcat.StaticHtml())
     if arguments.picture and progress.last_context is not None:
         context = station.scene_graph.GetMyMutableContextFromRoot(progress.last_context)
         save_png(
@@ -127,6 +123,15 @@ def _parser() -> argparse.ArgumentParser:
         "--video", type=Path, metavar="FILE.gif", help="also record a video (.gif or .webp)"
     )
     return parser
+
+
+def _save_replay(path: Path, meshcat: Meshcat | None) -> None:
+    """Saves the recording, if there is one; removes a stale one."""
+    path.unlink(missing_ok=True)
+    if meshcat is not None:
+        meshcat.StopRecording()
+        meshcat.PublishRecording()
+        write_atomically(path, meshcat.StaticHtml())
 
 
 def _save_decisions(folder: Path, decisions: "list[tuple[Observation, Decision]]") -> None:

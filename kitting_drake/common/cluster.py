@@ -61,7 +61,7 @@ class RayWorkers:
         Raises:
             UserError: Ray is not installed, there is no such cluster, or it rejects the files.
         """
-        # Ray reports a dead node in one message. This keeps it from printing the node's log, too.
+        # Ray reports a dead node in one message. This keeps it from also printing the node's log.
         os.environ.setdefault("RAY_DEDUP_LOGS_SKIP_REGEX", "Raylet is terminated")
         self._ray = import_extra("ray", purpose="--ray", extra="cluster")
         address = _find_cluster(self._address)

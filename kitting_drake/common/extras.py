@@ -28,7 +28,7 @@ def import_extra(package: str, *modules: str, purpose: str, extra: str) -> Modul
 
     Args:
         package: its name.
-        modules: submodules to import, too.
+        modules: submodules to import with it.
         purpose: the command or option that needs it, for the error message.
         extra: the project's extra that contains it.
 

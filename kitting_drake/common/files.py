@@ -107,7 +107,7 @@ def claim_folder(folder: Path, name: str, described: Any, *, of: str) -> None:
             raise UserError(
                 f"{path} is damaged: give another --output, or delete {folder}"
             ) from error
-        # The order of tools or paints counts, too.
+        # The order of tools or paints also counts.
         if json.dumps(found) != json.dumps(described):
             raise UserError(
                 f"{folder} holds the files of another {of}"

@@ -168,7 +168,7 @@ def picture_camera(
 
 
 def render_picture(
-    scene_graph: SceneGraph, context: Context, X_WC: RigidTransform = X_WOVERVIEW
+    scene_graph: SceneGraph, context: Context, X_WC: RigidTransform
 ) -> NDArray[np.uint8]:
     """(800, 1280, 3) picture of a scene graph in its context, from a camera pose.
 

@@ -1,4 +1,4 @@
-"""What is left over at the end of an episode, and whether the reason for stopping is right.
+"""The objects left over at the end of an episode, and whether the reason for stopping is right.
 
 It uses true poses, which policies cannot see.
 """
@@ -52,7 +52,7 @@ class Remainder:
 
 
 def find_left_over(station: KittingStation, root_context: Context) -> Remainder:
-    """What is left over: as the stopping policy reported it, else in the true state."""
+    """The objects and goals left over: as the policy reported them, else of the true state."""
     action = station.accepted_action(root_context)
     if action.stop and action.left_over is not None:
         seen = action.left_over

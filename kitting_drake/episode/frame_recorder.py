@@ -13,7 +13,7 @@ from systems.placement import ALL
 
 
 class FrameRecorder:
-    """Samples a station; pass its `sample` to `run_episode` as a log.
+    """Samples a station, as a `Sampler` of `run_episode`.
 
     A frame is taken at the step nearest to each multiple of the period.
     """

@@ -43,7 +43,7 @@ class JointView:
         self.cameras = chosen_cameras(recording, station.scenario.cameras)
         joints = joint_names(station.scenario.robot)
         self.names = (*joints, GRIPPER)
-        """Of the entries of state and command."""
+        """The names of the entries of state and command."""
         self._joints = len(joints)
         self._stiffness = station.scenario.controller.finger_stiffness
 

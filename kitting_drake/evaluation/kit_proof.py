@@ -51,14 +51,14 @@ Progress = Callable[[str, int, int], None]
 
 @dataclass
 class ToolProof:
-    """The results of one tool over all episodes."""
+    """The results of one tool, over all episodes."""
 
     name: str
     kitted: int = 0
     tried: int = 0
     peak_force_n: float = 0.0
     causes: Counter[str] = field(default_factory=Counter)
-    """How often it was not kitted for each cause, in the words of `results.json`."""
+    """Why it was not kitted, by the words of `results.json`."""
 
     def as_dict(self) -> dict[str, Any]:
         """For JSON."""

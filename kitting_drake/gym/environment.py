@@ -67,7 +67,7 @@ class KittingEnvironment(gymnasium.Env[dict[str, Any], NDArray[Any]]):
             scenario_name: a scenario in the file; None: the first.
             scenario_text: YAML merged over it.
             perturb: perturbations, as for `--perturb`.
-            cameras: whether observations contain the cameras' images, too.
+            cameras: whether observations also contain the cameras' images.
             render_mode: `rgb_array` for `render`, or None.
 
         Raises:

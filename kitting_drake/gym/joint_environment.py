@@ -90,7 +90,7 @@ class JointEnvironment(gymnasium.Env[dict[str, NDArray[Any]], NDArray[np.float32
         self.metadata = {**self.metadata, "render_fps": fps}
         config = self._chosen.scenario
         self.names = (*joint_names(config.robot), GRIPPER)
-        """Of the entries of state and action."""
+        """The names of the entries of state and action."""
         images = {}
         for name in chosen_cameras(self._recording, config.cameras):
             camera = config.cameras[name]
@@ -261,7 +261,8 @@ class JointEnvironment(gymnasium.Env[dict[str, NDArray[Any]], NDArray[np.float32
         if self._station is None:
             raise gymnasium.error.ResetNeeded("there is no scene to render: call reset() first")
         scene_graph = self._station.scene_graph
-        return render_picture(scene_graph, scene_graph.GetMyContextFromRoot(self._context))
+        context = scene_graph.GetMyContextFromRoot(self._context)
+        return render_picture(scene_graph, context, self._station.X_WOverview)
 
     def close(self) -> None:
         """Frees the simulation."""

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from kitting_drake.policies.data.images import Image, rotation_matrix
 from kitting_drake.policies.matching.inventory import Inventory
-from kitting_drake.policies.matching.jaw_clearance import RETRY_DISTANCE
+from kitting_drake.policies.matching.jaw_clearance import RETRY_DISTANCE, failed_pixels
 from kitting_drake.policies.matching.segmentation import Segmentation
 from kitting_drake.policies.networks.factored import AnglePrediction, Networks, PlacePrediction
 from kitting_drake.policies.networks.layers.correlation import Candidate
@@ -102,8 +102,7 @@ class Look:
     @cached_property
     def failed_pixels(self) -> Array:
         """(n, 2): the (row, col) of each failed pick."""
-        places = np.array([(pick.x, pick.y) for pick in self.failed_picks]).reshape(-1, 2)
-        return self.observation.grid.to_pixel(places)
+        return failed_pixels(self.observation.grid, self.failed_picks)
 
     def first_logits(self) -> Tensor:
         """(rows, cols): the logits of the pick, -inf near failed picks."""

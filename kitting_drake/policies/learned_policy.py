@@ -51,7 +51,7 @@ class Decision:
     moved_place: float = 0.0
     """How far they moved the place, in mm."""
     geometry: Evidence = dataclasses.field(default_factory=dict)
-    """What o_t tells about the action (`geometric_evidence`), if outlines are used."""
+    """Geometric facts about the action (`geometric_evidence`), if outlines are used."""
     kit_seen: bool | None = None
     """Whether o_t shows a kit; None if outlines are not used."""
     place_margin: float = 0.0
@@ -171,12 +171,15 @@ def _decision(draft: Draft) -> Decision:
 
 
 def _left_over(draft: Draft) -> LeftOver | None:
-    """What a stopping policy still sees; None if it goes on, or does not look at outlines."""
+    """The objects and recesses that a stopping policy still sees.
+
+    None if the policy goes on, or does not use outlines.
+    """
     return draft.look.inventory.left_over if draft.stop and draft.outlined else None
 
 
 def _told(draft: Draft) -> dict[str, Any]:
-    """How far the stages moved an action, and what o_t tells about it."""
+    """How far the stages moved an action, and the geometric facts about it."""
     if draft.stop or not draft.outlined:
         return {}
     millimetres = 1e3 * draft.look.resolution

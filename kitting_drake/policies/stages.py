@@ -117,8 +117,8 @@ class JawRoom:
 class OutlinePlace:
     """Fits the place to the outlines of object and recess where they agree.
 
-    It begins at the networks' place (`refine_place`). Where that leads nowhere, it takes the recess
-    into which the object fits (`Inventory.pairs`), if there is one.
+    It begins at the networks' place (`refine_place`). If that fails, it takes the recess into
+    which the object fits (`Inventory.pairs`), if there is one.
     """
 
     def refine(self, draft: Draft) -> Draft:
@@ -311,6 +311,6 @@ class Recovery:
         if draft.belongs and not draft.stop:
             return draft
         if draft.stop:
-            arguments = look.inventory, self.planner, tuple(look.failed_picks)
+            arguments = look.inventory, self.planner, look.failed_picks
             mending = separating_action(*arguments) or mending or turning_action(*arguments)
         return dataclasses.replace(draft, mending=mending)

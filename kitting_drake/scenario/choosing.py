@@ -90,8 +90,10 @@ class ChosenScenario:
         return describe(self.scenario)
 
     def identity(self) -> dict[str, Any]:
-        """What episodes depend on, and what resumed runs must share: the scenario, versions and
-        digests of its input files."""
+        """The scenario, versions and digests of its input files.
+
+        Episodes depend on them, so a resumed run must have the same.
+        """
         scenario = self.scenario
         return {
             **self.described,

@@ -36,9 +36,8 @@ class FrankaArm:
     # fr3 (Franka Research 3) or panda (Franka Emika Robot).
     model: str = "fr3"
 
-    # Where it stands: x, y, z in m, and its rotation about the world's z. At zero it faces +x.
-    # From here it reaches all of the default kitting scenes, nearly all with the arm in a vertical
-    # plane.
+    # The base: x, y, z in m, and its rotation about the world's z. At zero it faces +x. From here
+    # it reaches all of the default kitting scenes, nearly all with the arm in a vertical plane.
     base: list[float] = bounded([0.04, 0.0, 0.0], -3.0, 3.0)
     yaw_deg: float = bounded(0.0, -180.0, 180.0)
 
@@ -91,7 +90,7 @@ class FrankaArm:
             )
 
     def arm_base(self) -> ArmBase:
-        """Where it stands."""
+        """The pose of its base."""
         x, y, z = self.base
         return ArmBase(x, y, z, math.radians(self.yaw_deg))
 

@@ -70,7 +70,7 @@ class Footprint:
     grasps: tuple[Grasp, ...] = ()
     """Grasps at which the hand picks or places there; the open fingers need free space."""
     tall: bool = False
-    """Whether it is, or will be built, so high that the palm needs free space, too."""
+    """Whether it is so high, or will be built so high, that the palm also needs free space."""
 
     @cached_property
     def fingers(self) -> tuple[Polygon, ...]:

@@ -47,7 +47,7 @@ class Demonstration:
     """The share of the objects that were placed."""
     steps: tuple[DemonstrationStep, ...]
     final: FinalObservation | None = None
-    """None if the episode ended before the hand was ready for another action."""
+    """The observation at the end; missing if the hand was not ready for another action by then."""
     commit: str | None = None
     """The commit of the code that ran it; None if unknown."""
     digest: str | None = None

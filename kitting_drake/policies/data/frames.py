@@ -84,7 +84,7 @@ class EpisodeFrames:
     seed: int
     fps: int
     names: tuple[str, ...]
-    """Of the entries of state and action: the joints that move the hand, then `GRIPPER`."""
+    """The entries of state and action: the joints that move the hand, then `GRIPPER`."""
     state: NDArray[np.float32]
     """(n, entries) measured; m and rad."""
     action: NDArray[np.float32]
@@ -94,7 +94,7 @@ class EpisodeFrames:
     success: NDArray[np.bool_]
     """(n) whether every goal is filled at the next frame."""
     images: dict[str, list[bytes]] = field(default_factory=dict)
-    """By camera, a PNG for each frame."""
+    """For each camera, the PNG of each frame."""
 
     def __len__(self) -> int:
         return len(self.state)

@@ -5,8 +5,8 @@ Parquet files of frames (`data/`) and of episodes (`meta/episodes/`), tasks (`me
 statistics (`meta/stats.json`) and features (`meta/info.json`). The export needs pyarrow, but
 neither LeRobot nor torch.
 
-Images are PNG inside the Parquet files: they are small, and video would be lossy. What LeRobot does
-not know (seeds, scenario, versions) is in `meta/kitting_drake.json`.
+Images are PNG inside the Parquet files: they are small, and video would be lossy. Metadata that
+LeRobot does not know (seeds, scenario, versions) is in `meta/kitting_drake.json`.
 """
 
 from __future__ import annotations

@@ -36,7 +36,7 @@ class Pair:
     recess: int
     """The index of the recess in `Segmentation.recesses`."""
     fit: Registration
-    """Of the object's outline to the recess's."""
+    """The registration of the object's outline to the recess's."""
     mismatch: float
     """See `registration.mismatch`, in metres."""
 
@@ -86,9 +86,8 @@ def reversed_objects(
     objects, regions = segmentation.objects, segmentation.recesses
     known = {pair.item: pair for pair in pairs}
     filled = {pair.recess for pair in pairs}
-    free = [
-        j for j, item in enumerate(regions) if any(item is r for r in segmentation.free_recesses)
-    ]
+    flat = {id(item) for item in segmentation.free_recesses}
+    free = [j for j, item in enumerate(regions) if id(item) in flat]
     traced = {j: trace_outline(regions[j].mask, resolution) for j in free}
     found = []
     for i, item in enumerate(objects):

@@ -1,4 +1,4 @@
-"""What o_t tells about a pick and place: the geometric facts behind its confidence."""
+"""Geometric facts about a pick and place in o_t, from which its confidence is computed."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ Evidence = dict[str, float]
 _RING = 3
 """The surroundings of an object extend this far, in pixels."""
 _HOLE = 0.003
-"""What is lower than its rim by more than this is a hole, in metres."""
+"""A hole is lower than its rim by more than this, in metres."""
 _WORST_FIT = 0.002
 _WORST_GRASP = 5.0
 

@@ -1,4 +1,4 @@
-"""What o_t shows of a kit and its objects, together with what was tried before."""
+"""The objects and recesses that o_t shows, together with earlier actions."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class Inventory:
 
     observation: Observation
     segmentation: Segmentation
-    """With touching objects told apart, where the recesses show how."""
+    """The regions of o_t. Touching objects are separated if the recesses show how."""
     matches: tuple[Pair, ...]
     """All objects and recesses that fit, best fit first."""
     reversed_items: tuple[Region, ...] = ()
@@ -199,7 +199,7 @@ class Inventory:
 
 
 def _left_at(attempt: Attempt) -> PlanarPose:
-    """Where an action left its object, as far as the robot knows."""
+    """The pose at which an action left its object, as far as the robot knows."""
     return attempt.action.place if attempt.outcome == "placed" else attempt.action.pick
 
 

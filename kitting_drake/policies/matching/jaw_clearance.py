@@ -18,6 +18,7 @@ from scipy import ndimage
 from kitting_drake.policies.matching.segmentation import Region, Segmentation
 from systems.hand_geometry import FINGERTIP_DEPTH, PAD_LENGTH, PALM_HEIGHT, PALM_SIZE
 from systems.pick_place_parameters import PickPlaceParameters
+from systems.signals import PixelGrid, PlanarPose
 
 Array = NDArray[np.float64]
 
@@ -56,12 +57,18 @@ class JawGrasp:
     """A dimensionless penalty for distance from the centre and for crooked faces; 0 is best."""
 
 
+def failed_pixels(grid: PixelGrid, failed_picks: Sequence[PlanarPose]) -> Array:
+    """(n, 2): the (row, col) of each failed pick."""
+    places = np.array([(pick.x, pick.y) for pick in failed_picks]).reshape(-1, 2)
+    return grid.to_pixel(places)
+
+
 def untried(grasps: Sequence[JawGrasp], failed: Array, resolution: float) -> list[JawGrasp]:
     """The grasps farther than `RETRY_DISTANCE` from every failed one.
 
     Args:
         grasps: candidates.
-        failed: (n, 2), the (row, col) of the failed grasps.
+        failed: (n, 2), see `failed_pixels`.
         resolution: the side of a pixel, in metres.
     """
     return [

@@ -170,8 +170,8 @@ class Segmentation:
     def _is_flat(self, recess: Region) -> bool:
         if self.noise > _NOISY:
             return True
-        # Heights at the walls are those of the wall or of the floor. Measured from the fixture's
-        # top, the floor of a tilted fixture is flat, too.
+        # Heights at the walls are those of the wall or of the floor. Depths are measured from the
+        # fixture's top, so that the floor of a tilted fixture is also flat.
         core = ndimage.binary_erosion(recess.mask) & self.visibility.seen
         floor = self.depth[core if core.any() else recess.mask]
         away = np.abs(floor - np.median(floor))

@@ -8,6 +8,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -17,7 +18,7 @@ from scipy.spatial import ConvexHull
 
 from kitting_drake.policies.data.images import make_action, rotation_matrix
 from kitting_drake.policies.matching.inventory import Inventory
-from kitting_drake.policies.matching.jaw_clearance import jaw_grasps, untried
+from kitting_drake.policies.matching.jaw_clearance import failed_pixels, jaw_grasps, untried
 from kitting_drake.policies.matching.segmentation import Region, Segmentation
 from systems.ledge import Ledge, moved_gripper
 from systems.pick_place_parameters import PickPlaceParameters
@@ -40,7 +41,7 @@ _GRASPS = 6
 
 
 def separating_action(
-    inventory: Inventory, planner: PickPlaceParameters, failed_picks: tuple[PlanarPose, ...] = ()
+    inventory: Inventory, planner: PickPlaceParameters, failed_picks: Sequence[PlanarPose] = ()
 ) -> PickPlaceAction | None:
     """Lays the topmost part of the first stranger that can be gripped on a free place.
 
@@ -54,8 +55,7 @@ def separating_action(
     """
     observation, segmentation = inventory.observation, inventory.segmentation
     resolution = observation.grid.resolution
-    places = np.array([(pick.x, pick.y) for pick in failed_picks]).reshape(-1, 2)
-    failed = observation.grid.to_pixel(places)
+    failed = failed_pixels(observation.grid, failed_picks)
     strangers = sorted(inventory.worth_a_try, key=lambda item: -item.height)
     for stranger in strangers:
         for layer in _layers(segmentation, stranger):
@@ -71,7 +71,7 @@ def separating_action(
 
 
 def turning_action(
-    inventory: Inventory, planner: PickPlaceParameters, failed_picks: tuple[PlanarPose, ...] = ()
+    inventory: Inventory, planner: PickPlaceParameters, failed_picks: Sequence[PlanarPose] = ()
 ) -> PickPlaceAction | None:
     """Lets go of an object that lies on the wrong face so that it tips over the edge of a block.
 
@@ -84,8 +84,7 @@ def turning_action(
         The action; None if no object lies on the wrong face, or none has a grasp and a free edge.
     """
     segmentation, grid = inventory.segmentation, inventory.observation.grid
-    places = np.array([(pick.x, pick.y) for pick in failed_picks]).reshape(-1, 2)
-    failed = grid.to_pixel(places)
+    failed = failed_pixels(grid, failed_picks)
     corners = np.array([[0, 0], [grid.rows - 1, grid.cols - 1]])
     low, high = (tuple(corner) for corner in grid.to_world(corners).tolist())
     for region in inventory.reversed_items:
@@ -101,16 +100,17 @@ def turning_action(
         others = segmentation.occupied & ~region.mask & ~segmentation.fixture
         pixels = np.argwhere(others)
         around = np.column_stack([grid.to_world(pixels), segmentation.relief[others]])
-        for ledge in _ledges(segmentation, grid):
-            turned = ledge.turning_pose(outline, center, around, (low, high))
-            if turned is None:
-                continue
-            grasps = jaw_grasps(segmentation, region, grid.resolution, planner)
-            for grasp in untried(grasps, failed, grid.resolution)[:1]:
-                x, y = grid.to_world(grasp.pixel).tolist()
-                pick = PlanarPose(x, y, grasp.theta)
-                place = moved_gripper(pick, center, yaw, turned)
-                return PickPlaceAction(pick=pick, place=place, aside=True)
+        ledges = _ledges(segmentation, grid)
+        poses = (ledge.turning_pose(outline, center, around, (low, high)) for ledge in ledges)
+        turned = next((pose for pose in poses if pose is not None), None)
+        if turned is None:
+            continue
+        grasps = jaw_grasps(segmentation, region, grid.resolution, planner)
+        if grasps := untried(grasps, failed, grid.resolution):
+            x, y = grid.to_world(grasps[0].pixel).tolist()
+            pick = PlanarPose(x, y, grasps[0].theta)
+            place = moved_gripper(pick, center, yaw, turned)
+            return PickPlaceAction(pick=pick, place=place, aside=True)
     return None
 
 
@@ -171,7 +171,7 @@ def _free_pose(
             if free is None:
                 continue
             away = np.linalg.norm(free - pick, axis=1) * resolution
-            # A turn of the wrist costs time, too.
+            # A turn of the wrist also costs time.
             index = int(away.argmin())
             cost = float(away[index] + 0.05 * abs(angle))
             if best is None or cost < best[0]:

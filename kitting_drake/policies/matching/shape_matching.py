@@ -5,12 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import numpy as np
-
 from kitting_drake.policies.data.images import make_action
 from kitting_drake.policies.matching.evidence import Evidence, geometric_evidence
 from kitting_drake.policies.matching.inventory import Inventory
-from kitting_drake.policies.matching.jaw_clearance import jaw_grasps, untried
+from kitting_drake.policies.matching.jaw_clearance import failed_pixels, jaw_grasps, untried
 from kitting_drake.policies.matching.recovery import recovery_action
 from kitting_drake.policies.matching.separating import separating_action, turning_action
 from systems.pick_place_parameters import PickPlaceParameters
@@ -69,8 +67,8 @@ class ShapeMatchingPolicy:
         if matched is not None:
             return matched
         if self._recover:
-            arguments = inventory, self._planner, tuple(failed_picks)
-            # What may fail again comes last, because the number of actions is limited.
+            arguments = inventory, self._planner, failed_picks
+            # The riskiest comes last, because the number of actions is limited.
             prepared = separating_action(*arguments) or mending or turning_action(*arguments)
             if prepared is not None:
                 return Matched(prepared)
@@ -82,8 +80,7 @@ class ShapeMatchingPolicy:
     ) -> tuple[Matched | None, str]:
         """The best insertion, or why there is none."""
         observation, segmentation = inventory.observation, inventory.segmentation
-        places = np.array([(pick.x, pick.y) for pick in failed_picks]).reshape(-1, 2)
-        failed = observation.grid.to_pixel(places)
+        failed = failed_pixels(observation.grid, failed_picks)
         resolution = observation.grid.resolution
         reason = ""
         for pair in inventory.pairs:

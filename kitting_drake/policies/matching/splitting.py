@@ -47,12 +47,12 @@ needs a larger share of such points."""
 _LEAST_PART = 0.35
 """A region smaller than this share of a recess's area holds no object of that recess."""
 _HIGHER, _ACROSS = 0.006, 6
-"""What is higher than an object's middle by this, in metres, and has this many pixels on both sides
-of its outline, lies on it."""
+"""Something lies on an object if it is higher than its middle by this, in metres, and has this many
+pixels on both sides of its outline."""
 _SLIVER = 1
-"""What is left of a region is thinned by this many pixels, to drop slivers."""
+"""The rest of a region is thinned by this many pixels, to drop slivers."""
 _LEAST_REST = 0.0002
-"""What is left of a region is no object below this area, in square metres."""
+"""The rest of a region is an object if its area is at least this, in square metres."""
 
 
 @dataclass(frozen=True)
@@ -135,7 +135,7 @@ def _split(
 
 
 def _rest(rest: Mask, relief: NDArray[np.float32], resolution: float) -> list[Region]:
-    """What is left of a region, without slivers."""
+    """The objects in the rest of a region; slivers are dropped."""
     core = ndimage.binary_erosion(rest, iterations=_SLIVER)
     labels, count = ndimage.label(ndimage.binary_propagation(core, mask=rest))
     regions = (labels == number for number in range(1, count + 1))
@@ -180,7 +180,7 @@ def _judge(
     back = (positions - fit.shift) @ rotation_matrix(fit.rotation)
     distance = template.sample(template.distance, back, math.inf).reshape(region.shape)
     covered = distance < -fit.offset
-    # Notches are closed in a recess, so they are closed in the region, too.
+    # Close the notches of the region, because those of recesses are closed.
     filled = closed(region, resolution)
     if not covered.any() or filled[covered].mean() < _INSIDE:
         return None

@@ -1,4 +1,4 @@
-"""Where o_t shows enough to pick and place.
+"""The parts of o_t that are seen well enough to pick and place there.
 
 A robot must not reach where no camera looks. It may reach into a small shadow, because one camera
 sees no object from all sides. So the pick itself and most of what the jaws sweep must be seen, and

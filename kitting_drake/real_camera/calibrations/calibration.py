@@ -127,7 +127,7 @@ class Calibration:
     grid: PixelGrid
     """The pixels of o_t; `z_min` is the height of the table in the base frame."""
     outline: TableOutline = dataclasses.field(default_factory=TableOutline)
-    """What of the workspace is table."""
+    """The part of the workspace that is table."""
     verified: bool = False
     """Whether x, y, yaw and the orientation of the image were checked. A bare table does not show
     errors of these."""

@@ -19,7 +19,7 @@ _WORDS = {
     HAND: r"hand|tool|flange|gripper|tcp|effector|wrist|(^|[_/-])ee([_/-]|$)|link_?[5-8]$|axis",
     BASE: r"base|world|map|robot|table|link_?0$",
 }
-"""What names of frames contain. The first that fits counts, so camera_base is a camera."""
+"""Patterns in the names of frames. The first that fits counts, so camera_base is a camera."""
 _BODY = r"(link|base|base[_-]frame|screw[_-]frame|camera[_-]frame)$"
 """Names of cameras' bodies, whose x points forward, as ROS's drivers give them."""
 

@@ -46,7 +46,7 @@ class Intrinsics:
     """By default k1, k2, p1, p2, k3, k4, k5, k6, s1, s2, s3, s4 in the order of OpenCV and ROS;
     fewer, or none."""
     model: str = BROWN
-    """Of the distortion, as in `lens_distortion.py`."""
+    """The model of the distortion, as in `lens_distortion.py`."""
 
 
 def has_intrinsics(node: dict[str, Any]) -> bool:

@@ -73,7 +73,7 @@ def checked_coefficients(model: str, values: tuple[float, ...], where: str) -> t
 
 
 def distort(x: Array, y: Array, model: str, values: tuple[float, ...]) -> tuple[Array, Array]:
-    """Where a lens images straight rays (x, y, 1), at depth 1."""
+    """Applies a lens's distortion to straight rays (x, y, 1); returns x and y at depth 1."""
     if model == EQUIDISTANT:
         radius = np.hypot(x, y)
         angle = np.arctan(radius)

@@ -131,8 +131,8 @@ def _filled(mask: NDArray[np.bool_], camera: BenchCamera) -> NDArray[np.bool_]:
 
 
 def _on_plane(camera: BenchCamera, X_BC: Array, height: float) -> tuple[Array, Array]:
-    """Where each pixel's ray meets a horizontal plane, (height, width, 2) in metres, and the area
-    that the pixel covers there, (height, width), up to a factor."""
+    """The point in which each pixel's ray meets a horizontal plane, (height, width, 2) in metres;
+    and the area that the pixel covers there, (height, width), up to a factor."""
     u, v = (item.astype(float) for item in np.broadcast_arrays(camera.rays.u, camera.rays.v))
     directions = np.stack([u, v, np.ones_like(u)], axis=-1) @ X_BC[:3, :3].T
     # The area of a pixel at depth 1, which varies only with distortion.

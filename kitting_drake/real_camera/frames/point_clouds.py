@@ -79,7 +79,7 @@ def read_cloud(
 
 
 def project_points(points: Array, lens: Intrinsics) -> tuple[Array, Array]:
-    """Where a lens images points (n, 3) in front of it: column and row, from pixel centres."""
+    """Projects points (n, 3) in front of a lens to column and row, measured from pixel centres."""
     x, y = points[:, 0] / points[:, 2], points[:, 1] / points[:, 2]
     if lens.distortion:
         x, y = distort(x, y, lens.model, lens.distortion)

@@ -51,11 +51,11 @@ class Board:
     """
 
     path: Path
-    """Of its description, for errors."""
+    """The file of its description, for errors."""
     pattern: Any
     """OpenCV's board."""
     size: tuple[float, float]
-    """Of the pattern along x and y, in metres."""
+    """The size of the pattern along x and y, in metres."""
     is_chessboard: bool
     """Whether it has the corners of a chessboard (ChArUco) beside those of its markers."""
     count: int

@@ -32,10 +32,10 @@ class BenchRobot:
     model: str = "fr3"
     """`fr3` or `panda`."""
     base: ArmBase = dataclasses.field(default_factory=ArmBase)
-    """Where it stands, in the calibration's base frame."""
+    """The pose of the arm's base in the calibration's base frame."""
     home: tuple[float, float, float, float] | None = None
-    """Where the hand returns to: x, y, height of the fingertips in m, yaw in rad; None: the cell's
-    `planner.home`. It keeps its y and yaw if it can."""
+    """The hand waits at this x, y, height of the fingertips (m) and yaw (rad); None: at the cell's
+    `planner.home`. After an action it returns to this x, and keeps its y if it can."""
     joints: tuple[float, ...] | None = None
     """Seven joint positions from which it starts, in rad; None: those of the home."""
     rate: int = FASTEST_RATE
@@ -43,7 +43,7 @@ class BenchRobot:
 
     @property
     def limits(self) -> ArmLimits:
-        """Of its joints."""
+        """The limits of its joints."""
         return ARM_LIMITS[self.model]
 
     @property

@@ -47,7 +47,7 @@ class PhotoSpec:
     sheet: tuple[float, float] = (297.0, 210.0)
     """The size of the sheet along x and y."""
     distance: float = 430.0
-    """Of the camera from the middle of the sheet."""
+    """The distance of the camera from the middle of the sheet."""
     tilt: float = 0.0
     """The angle between the line of sight and the vertical, in degrees."""
     azimuth: float = 0.0
@@ -65,11 +65,11 @@ class PhotoSpec:
     falloff: float = 0.25
     """The loss of light from one side of the sheet to the other."""
     blur: float = 1.0
-    """In pixels, standard deviation."""
+    """The standard deviation of the blur, in pixels."""
     noise: float = 0.006
-    """Of the picture's values of 0 to 1, standard deviation."""
+    """The standard deviation of the noise; values are from 0 to 1."""
     quality: int = 90
-    """Of the JPEG."""
+    """The quality of the JPEG."""
     distortion: float = 0.0
     """k1 of the lens, in OpenCV's model."""
     exif: bool = True
@@ -212,7 +212,7 @@ def _light_on_ground(cv2: Any, tools: list[PlacedTool], camera: _Camera, spec: P
     to_plane = np.array(
         [[1 / _SHADOW_PX_PER_MM, 0, low[0]], [0, 1 / _SHADOW_PX_PER_MM, low[1]], [0, 0, 1.0]]
     )
-    # The tool also blocks ambient light close to it.
+    # Close to the tool, ambient light is also blocked.
     near = cv2.GaussianBlur((hidden > 0.9).astype(np.float32), (0, 0), 3 * _SHADOW_PX_PER_MM)
     light = (1 - spec.shadow * hidden) * (1 - 0.25 * near)
     across = np.linspace(-1, 1, columns, dtype=np.float32)
@@ -270,7 +270,7 @@ def _paint_tool(
             normal = np.array([along[1], -along[0]]) / length
             shade = 0.55 + 0.35 * float(normal @ [-0.6, -0.4])
             distance = float(np.linalg.norm(loop[i] - camera.C[:2]))
-            # Short pieces of uneven shade, because sides also have a texture.
+            # Short pieces of uneven shade give the sides a texture.
             cuts = np.linspace(0, 1, max(1, round(length / _PIECE_MM)) + 1)
             for start, end in itertools.pairwise(cuts):
                 low_edge = foot[i] + np.outer((start, end), foot[j] - foot[i])

@@ -37,7 +37,7 @@ _EXPECTED_SHARE = 0.3
 
 @dataclass(frozen=True)
 class Plan:
-    """What to measure, and how often."""
+    """The measurements, and the number of their repeats."""
 
     preset: str = "small"
     compared_preset: str | None = "paper"

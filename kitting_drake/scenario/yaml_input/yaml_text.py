@@ -70,7 +70,7 @@ def parse(content: str, where: str) -> dict:
 # Benchmarks load one file hundreds of times.
 @functools.lru_cache(maxsize=64)
 def _checked(content: str) -> Any:
-    """What a text holds, for callers not to change."""
+    """The content of a text. It is cached, so callers must not change it."""
     # Check for repeated fields here: a Python mapping would keep only the last.
     try:
         node = yaml.compose(content, Loader=_Composer)

@@ -18,7 +18,7 @@ _LEAST_VOLUME = 1e-9
 _THINNED_MM = 0.2
 """Tolerance of the pieces' corners, in mm."""
 _MASS = 0.1
-"""The mass of a tool that has none, in kg. Where it rests hardly depends on it."""
+"""The mass of a tool that has none, in kg. The resting pose hardly depends on it."""
 
 
 def convex_body(tool: Tool) -> ConvexBody:

@@ -340,7 +340,7 @@ class ToolsetKitting(_DrawnKitting):
         return [pool[i] for _ in range(rounds) for i in rng.permutation(len(pool))][: self.count]
 
     def _drawn_lengths(self, names: list[str], seed: int, base: Path) -> list[Tool]:
-        """The tools with random lengths; parts with random proportions, too."""
+        """The tools with random lengths; parts also have random proportions."""
         least, greatest = self.tool_length
         lengths = np.random.default_rng([seed, 2]).uniform(least, greatest, len(names))
         shapes = np.random.default_rng([seed, 8]).uniform(size=(len(names), 2))

@@ -52,7 +52,7 @@ class Group:
     members: dict[int, RigidTransform]
     """Poses relative to the group's frame by the tool's index, or `KIT`."""
     outline: CrossSection
-    """What it covers on the table, in the group's frame, in metres."""
+    """The area that it covers on the table, in the group's frame, in metres."""
 
 
 def start_groups(

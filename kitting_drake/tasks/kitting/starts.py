@@ -42,7 +42,7 @@ _TRIES, _RESTARTS = 200, 20
 
 @dataclass(frozen=True)
 class _Room:
-    """Where the tools' outlines may be."""
+    """The area and the yaws that are allowed for the tools."""
 
     grid: PixelGrid
     spacing: float

@@ -1,4 +1,4 @@
-"""What of the workspace is table: read, written, and used by o_t and by the checks."""
+"""The part of the workspace that is table: read, written, and used by o_t and by the checks."""
 
 import dataclasses
 from pathlib import Path

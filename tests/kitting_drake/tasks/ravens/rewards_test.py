@@ -95,7 +95,7 @@ def test_each_red_cube_in_a_green_bowl_earns_its_share():
     assert reward(scene, poses) == pytest.approx(1 / 3)
     poses[1] = moved(bowls[1], x=-0.049)
     assert reward(scene, poses) == pytest.approx(2 / 3)
-    # Two cubes in one bowl count, too.
+    # Two cubes in one bowl also count.
     poses[2] = moved(bowls[1], x=0.03)
     assert reward(scene, poses) == pytest.approx(1)
     poses[2] = moved(bowls[1], x=0.051)
