@@ -300,7 +300,7 @@ class ArmMotion(JawMotion):
         way.over[6] = now[6]
 
     def back_off(self, state: PlannerState, distance: float) -> None:
-        """Moves the goal of the present mode, in which the hand only stops, up by a distance."""
+        """Raises the goal of the present mode. See `RobotMotion`."""
         assert isinstance(state, ArmState)
         way = WayVector(state.way)
         if np.isfinite(way.line[2]):
@@ -320,7 +320,7 @@ class ArmMotion(JawMotion):
         return self._way(state).hand_acceleration(time - state.way_start)
 
     def arrival(self, state: PlannerState) -> float:
-        """When motion, jaws and force of the present mode have all arrived, in s."""
+        """When all of the present mode has arrived. See `RobotMotion`."""
         assert isinstance(state, ArmState)
         return self.jaws_arrival(state, state.way_start + self._way(state).duration)
 

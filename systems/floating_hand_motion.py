@@ -71,16 +71,7 @@ class HandMotion(JawMotion):
         opening: float | None = None,
         at: NDArray[np.float64] | None = None,
     ) -> None:
-        """Starts a mode from the present commands.
-
-        Args:
-            state: the planner's state; modified.
-            mode: the mode to begin.
-            time: the present time, in s.
-            z: stop the fingertips at this height, in m.
-            opening: stop the jaws at this opening, in m.
-            at: (4) stop the hand at this x, y, z and yaw.
-        """
+        """Starts a mode from the present commands. See `RobotMotion`."""
         now, rate, _ = np.split(self.motion_at(state, time), 3)
         if z is not None:
             now[2] = z
@@ -184,7 +175,7 @@ class HandMotion(JawMotion):
         return self._limits[Mode(int(state.mode))]
 
     def back_off(self, state: PlannerState, distance: float) -> None:
-        """Moves the goal of the present mode up by a distance, in m."""
+        """Raises the goal of the present mode. See `RobotMotion`."""
         state.goal[Z] += distance
         self.set_times(state)
 
@@ -205,11 +196,11 @@ class HandMotion(JawMotion):
     def hand_acceleration(
         self, state: PlannerState, time: float, desired: NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        """(3) of the motion `desired`, which is that of `motion_at`, in m/s^2."""
+        """(3) of the motion `desired`. See `RobotMotion`."""
         return desired[8:11]
 
     def arrival(self, state: PlannerState) -> float:
-        """When motion, jaws and force of the present mode have all arrived, in s."""
+        """When all of the present mode has arrived. See `RobotMotion`."""
         return self.jaws_arrival(state, state.start_time + state.duration)
 
     def brakes_above(self, state: PlannerState, time: float, height: float) -> bool:

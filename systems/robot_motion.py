@@ -1,4 +1,4 @@
-"""What the planner asks of the robot that moves the hand."""
+"""The interface between the planner and the robot that moves the hand."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ class RobotMotion(Protocol):
         """
 
     def back_off(self, state: PlannerState, distance: float) -> None:
-        """Moves the goal of the present mode, in which the hand only stops, up by a distance."""
+        """Raises the goal of the present mode, a straight line of the hand, by a distance."""
 
     def motion_at(self, state: PlannerState, time: float) -> NDArray[np.float64]:
         """(size) q_d, v_d, a_d of the robot's joints."""
