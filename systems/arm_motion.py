@@ -144,31 +144,22 @@ class ArmMotion(JawMotion):
 
     def reach_problem(self, state: PlannerState) -> str:
         """A sentence that says why the arm cannot do the action in the state; empty if it can."""
-        assert isinstance(state, ArmState)
-        found, problem = self._choose(state)
-        if problem:
-            return problem
-        trial = self.view(np.array(state.vector))
-        self._set_joints(trial, found)
-        return self._problem_on_the_ways(trial)
-
-    def _choose(self, state: PlannerState) -> tuple[list[NDArray[np.float64]], str]:
-        assert isinstance(state, ArmState)
-        return self.postures.choose(self.stops(state), self._way(state).at(math.inf)[:JOINTS])
+        return self._prepare(self.view(np.array(state.vector)))
 
     def prepare(self, state: PlannerState) -> bool:
         """Chooses the joint positions at pick and place for the whole action."""
-        assert isinstance(state, ArmState)
-        found, problem = self._choose(state)
-        if problem:
-            return False
-        self._set_joints(state, found)
-        return not self._problem_on_the_ways(state)
+        return not self._prepare(self.view(state.vector))
 
-    def _set_joints(self, state: ArmState, found: list[NDArray[np.float64]]) -> None:
+    def _prepare(self, state: ArmState) -> str:
+        """Prepares an action; the sentence of `reach_problem`."""
+        now = self._way(state).at(math.inf)[:JOINTS]
+        found, problem = self.postures.choose(self.stops(state), now)
+        if problem:
+            return problem
         state.pick_joints, state.place_joints = found[0], found[-1]
         state.pick[2] = self.postures.hand_pose(found[0])[3]
         state.place[2] = self.postures.hand_pose(found[-1])[3]
+        return self._problem_on_the_ways(state)
 
     def _problem_on_the_ways(self, state: ArmState) -> str:
         """What the arm would touch on the ways that it will take; empty if nothing."""

@@ -118,7 +118,8 @@ class ArmPostures:
             now: (7) present joint positions.
 
         Returns:
-            (7) joint positions for each stop, and a sentence that says why there are none.
+            (7) joint positions for each stop, and a sentence that says why the arm cannot do it;
+            empty if it can.
         """
         options: list[list[tuple[int, NDArray[np.float64]]]] = []
         for swivels in (np.zeros(1), _SWIVELS):
@@ -139,10 +140,10 @@ class ArmPostures:
         share = np.linspace(0.0, 1.0, _CHECKED)[:, None]
         ways = [start + share * (end - start) for start, end in itertools.pairwise(way)]
         highest = max(stops, key=lambda stop: stop.surface)
-        if not self._collision(np.concatenate(ways), highest):
+        if not self.collision(np.concatenate(ways), highest.surface):
             return ""
         for stop, points in zip(stops, ways, strict=True):
-            touched = self._collision(points, stop)
+            touched = self.collision(points, stop.surface)
             if touched:
                 return f"on the way to {stop.name} the arm would collide with {touched}"
         return ""
@@ -188,8 +189,8 @@ class ArmPostures:
             if self.within(way).all() and self._is_continuous(way)
         ]
         # Usually nothing collides: ask once for all.
-        if found and self._collision(np.concatenate([way for _, way in found]), stop):
-            found = [(turned, way) for turned, way in found if not self._collision(way, stop)]
+        if found and self.collision(np.concatenate([way for _, way in found]), stop.surface):
+            found = [item for item in found if not self.collision(item[1], stop.surface)]
         return [(turned, way[-1]) for turned, way in found]
 
     def _is_continuous(self, way: NDArray[np.float64]) -> bool:
@@ -201,9 +202,6 @@ class ArmPostures:
         top, bottom = self.hand_pose(way[-1]), self.hand_pose(way[0])
         line = self.along(np.linspace(top, bottom, _CHECKED), way[-1])
         return bool(self.within(line).all())
-
-    def _collision(self, way: NDArray[np.float64], stop: HandStop) -> str:
-        return self.collision(way, stop.surface)
 
     def collision(self, way: NDArray[np.float64], surface: float, held: float = 0.0) -> str:
         """What the arm collides with; see `arm_collisions.collision`."""
@@ -241,7 +239,7 @@ class ArmPostures:
             return [way for way in ways if self.within(way).all()]
 
         found = reached(stop.yaw, stop.yaw + math.pi)
-        touched = [self._collision(way, stop) for way in found]
+        touched = [self.collision(way, stop.surface) for way in found]
         if found and all(touched):
             return f"for {where} the arm would collide with {touched[0]}"
         if found:
